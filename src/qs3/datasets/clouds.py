@@ -1,0 +1,69 @@
+"""Point clouds in memory: with labels, and a type that cannot carry any."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+@dataclass(frozen=True)
+class UnlabelledClouds:
+    """Clouds of a target domain. There is no field for a label, so none can reach training."""
+
+    points: Float[np.ndarray, "b n 3"]
+    """Points of every cloud, as read (not yet normalised), float32."""
+    ids: tuple[str, ...]
+    """One name a cloud, in the order of the points."""
+    checksum: str = ""
+    """SHA-256 over what was read, for the record of a run."""
+
+    def __post_init__(self) -> None:
+        if len(self.ids) != len(self.points):
+            raise ValueError(f"{len(self.ids)} ids for {len(self.points)} clouds")
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+@dataclass(frozen=True)
+class PointClouds:
+    """Labelled clouds."""
+
+    points: Float[np.ndarray, "b n 3"]
+    """Points of every cloud, as read (not yet normalised), float32."""
+    labels: Int[np.ndarray, "b"]
+    """Index into ``class_names``."""
+    class_names: tuple[str, ...]
+    """Names of the classes, in the order of the label."""
+    ids: tuple[str, ...]
+    """One name a cloud."""
+    checksum: str = ""
+    """SHA-256 over what was read, for the record of a run."""
+
+    def __post_init__(self) -> None:
+        if not len(self.ids) == len(self.points) == len(self.labels):
+            raise ValueError(
+                f"{len(self.ids)} ids, {len(self.points)} clouds and {len(self.labels)} labels"
+            )
+        if len(self.labels) and not (
+            0 <= self.labels.min() and self.labels.max() < len(self.class_names)
+        ):
+            raise ValueError(f"labels go beyond the {len(self.class_names)} class names")
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def select(self, rows: np.ndarray) -> "PointClouds":
+        """Return the clouds at ``rows`` (indices or a mask), in that order."""
+        index = np.arange(len(self))[rows]
+        return PointClouds(
+            points=self.points[index],
+            labels=self.labels[index],
+            class_names=self.class_names,
+            ids=tuple(self.ids[i] for i in index),
+            checksum=self.checksum,
+        )
+
+    def without_labels(self) -> UnlabelledClouds:
+        """Return the same clouds with the labels left behind."""
+        return UnlabelledClouds(points=self.points, ids=self.ids, checksum=self.checksum)

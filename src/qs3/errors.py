@@ -1,0 +1,16 @@
+"""Errors that a user can act on: one line that names what is wrong and the fix."""
+
+
+class QS3Error(Exception):
+    """Base of every error whose message is meant for the user; the command line prints it alone."""
+
+
+class InputError(QS3Error, ValueError):
+    """A file, folder or setting handed in is not usable; the message names it and the fix."""
+
+
+class MissingExtraError(QS3Error, ImportError):
+    """An optional package is needed; the message names the extra that brings it."""
+
+    def __init__(self, package: str, extra: str) -> None:
+        super().__init__(f"{package} is not installed; get it with: pip install 'qs3[{extra}]'")

@@ -1,0 +1,79 @@
+"""Rigid transforms and the conventions that everything else keeps.
+
+Convention:
+    World: right-handed, z up. Camera (OpenCV): x right, y down, z forward. A pose is the 4×4
+    camera-to-world matrix. Pixel (0, 0) is the centre of the top-left pixel, so an image of width
+    w has its centre at (w − 1)/2. Angles are in radians unless a name says degrees.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+
+def look_at(
+    position: Float[np.ndarray, "3"],
+    target: Float[np.ndarray, "3"],
+    up: Float[np.ndarray, "3"] | None = None,
+) -> Float[np.ndarray, "4 4"]:
+    """Camera-to-world pose of a camera at ``position`` that looks at ``target``.
+
+    Convention:
+        OpenCV camera; the image's upward direction is as near to ``up`` (default +z) as it can be.
+
+    Raises:
+        ValueError: where the viewing direction is zero or parallel to ``up``.
+
+    Example:
+        >>> pose = look_at(np.array([0.0, -2.0, 0.0]), np.zeros(3))
+        >>> pose[:3, 2].tolist()  # forward
+        [0.0, 1.0, 0.0]
+        >>> (pose[:3, 0] + 0.0).tolist()  # right
+        [1.0, 0.0, 0.0]
+    """
+    up = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, dtype=np.float64)
+    forward = np.asarray(target, dtype=np.float64) - position
+    right = np.cross(forward, up)
+    if np.linalg.norm(forward) < 1e-12 or np.linalg.norm(right) < 1e-9 * np.linalg.norm(forward):
+        raise ValueError("the camera must not look along `up`, nor stand at its target")
+    forward = forward / np.linalg.norm(forward)
+    right = right / np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, 0] = right
+    pose[:3, 1] = np.cross(forward, right)
+    pose[:3, 2] = forward
+    pose[:3, 3] = position
+    return pose
+
+
+def rotation_z(angle: float) -> Float[np.ndarray, "3 3"]:
+    """Rotation by ``angle`` radians about +z, anticlockwise seen from above.
+
+    Example:
+        >>> np.round(rotation_z(np.pi / 2) @ [1.0, 0.0, 0.0], 6).tolist()
+        [0.0, 1.0, 0.0]
+    """
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def rotation_xyz(angles: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Rotation by Euler angles: first about x, then y, then z (fixed axes)."""
+    (cx, cy, _), (sx, sy, _) = np.cos(angles), np.sin(angles)
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
+    about_y = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
+    return rotation_z(float(angles[2])) @ about_y @ about_x
+
+
+def transform_points(
+    matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Apply a rigid transform to points: R·p + t for each row p."""
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def invert_rigid(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """Inverse of a rotation and translation."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = matrix[:3, :3].T
+    inverse[:3, 3] = -matrix[:3, :3].T @ matrix[:3, 3]
+    return inverse
