@@ -1,0 +1,28 @@
+"""Fixtures for every test."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of the real meshes and scans; the test is skipped where it is not here."""
+    named = os.environ.get("QS3_SHARED_DATA")
+    if named:
+        folder = Path(named)
+        if not folder.is_dir():
+            pytest.fail(f"QS3_SHARED_DATA names {folder}, which is no folder")
+        return folder
+    folder = Path(__file__).resolve().parents[2] / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip("no real data here: set QS3_SHARED_DATA to the folder that holds it")
+    return folder
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """A generator with a fixed seed, fresh for each test."""
+    return np.random.default_rng(20220712)
