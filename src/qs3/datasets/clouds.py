@@ -46,7 +46,7 @@ class PointClouds:
                 f"{len(self.ids)} ids, {len(self.points)} clouds and {len(self.labels)} labels"
             )
         if len(self.labels) and not (
-            0 <= self.labels.min() and self.labels.max() < len(self.class_names)
+            self.labels.min() >= 0 and self.labels.max() < len(self.class_names)
         ):
             raise ValueError(f"labels go beyond the {len(self.class_names)} class names")
 

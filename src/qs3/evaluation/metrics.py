@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.stats import beta, norm
+from scipy.special import betaincinv, ndtri
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,9 @@ def confusion_matrix(
         >>> confusion_matrix(np.array([0, 1, 1]), np.array([0, 0, 1]), 2).tolist()
         [[1, 0], [1, 1]]
     """
-    if len(labels) and not (0 <= labels.min() and labels.max() < num_classes):
+    if len(labels) and not (labels.min() >= 0 and labels.max() < num_classes):
         raise ValueError(f"a label is out of 0 to {num_classes - 1}")
-    if len(labels) and not (-1 <= predictions.min() and predictions.max() < num_classes):
+    if len(labels) and not (predictions.min() >= -1 and predictions.max() < num_classes):
         raise ValueError(f"a prediction is out of -1 to {num_classes - 1}")
     matrix = np.zeros((num_classes, num_classes + 1), dtype=np.int64)
     np.add.at(matrix, (labels.astype(np.int64), predictions.astype(np.int64)), 1)
@@ -141,7 +141,7 @@ def wilson_interval(correct: int, total: int, level: float = 0.95) -> tuple[floa
         [0.336, 0.664]
     """
     _check_counts(correct, total)
-    z = float(norm.ppf(0.5 + level / 2.0))
+    z = float(ndtri(0.5 + level / 2.0))
     share = correct / total
     centre = (share + z * z / (2 * total)) / (1 + z * z / total)
     half = (
@@ -165,8 +165,8 @@ def clopper_pearson_interval(correct: int, total: int, level: float = 0.95) -> t
     """
     _check_counts(correct, total)
     tail = (1 - level) / 2
-    low = 0.0 if correct == 0 else float(beta.ppf(tail, correct, total - correct + 1))
-    high = 1.0 if correct == total else float(beta.ppf(1 - tail, correct + 1, total - correct))
+    low = 0.0 if correct == 0 else float(betaincinv(correct, total - correct + 1, tail))
+    high = 1.0 if correct == total else float(betaincinv(correct + 1, total - correct, 1 - tail))
     return low, high
 
 
