@@ -1,1 +1,6 @@
-"""Part of qs3."""
+"""Photographing a scene: what a renderer is handed and what it hands back."""
+
+from qs3.sensor.render.scene import LightSettings as LightSettings
+from qs3.sensor.render.scene import Renderer as Renderer
+from qs3.sensor.render.scene import Scene as Scene
+from qs3.sensor.render.scene import StereoPair as StereoPair

@@ -1,0 +1,85 @@
+"""From disparity to depth to points (supplement, Eq. 1 to 3).
+
+Convention:
+    Depth is along the optical axis, NaN where there is none. A point is z·K⁻¹·(u, v, 1) in the
+    left OpenCV camera, then taken to the world by the camera's pose.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from qs3.geometry import transform_points
+from qs3.sensor.rig import Pose, Region, StereoRig
+
+
+@dataclass(frozen=True)
+class DepthSettings:
+    """Which depths are kept, and on which grid."""
+
+    near: float = 1.0
+    """Depths at or below are dropped, in the unit of the scene."""
+    far: float = 6.0
+    """Depths at or above are dropped."""
+    stride: int = 4
+    """Every stride-th pixel of the frame is kept, from pixel 0: the ×0.25 nearest resize."""
+    principal_point: Literal["true", "released"] = "true"
+    """``true`` is (w − 1)/2 of the frame; ``released`` is w/2 of the reduced image, half a pixel
+    of the frame and more away from where the optical axis is."""
+
+
+def depth_from_disparity(
+    disparity: Float[np.ndarray, "h w"], rig: StereoRig, settings: DepthSettings
+) -> Float[np.ndarray, "h w"]:
+    """Depth z = f·b/d where near < z < far, NaN elsewhere."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = rig.focal * rig.baseline / disparity.astype(np.float64)
+        return gate(np.where(disparity > 0, depth, np.nan), settings)
+
+
+def gate(depth: Float[np.ndarray, "h w"], settings: DepthSettings) -> Float[np.ndarray, "h w"]:
+    """Keep near < z < far, NaN elsewhere."""
+    with np.errstate(invalid="ignore"):
+        return np.where((depth > settings.near) & (depth < settings.far), depth, np.nan)
+
+
+def backproject(
+    depth: Float[np.ndarray, "h w"],
+    rig: StereoRig,
+    region: Region,
+    pose: Pose,
+    settings: DepthSettings,
+) -> Float[np.ndarray, "m 3"]:
+    """Lift the valid pixels of the reduced grid to world points.
+
+    Args:
+        depth: Depth of the pixels of ``region``, at full resolution.
+        rig: Supplies focal length and principal point.
+        region: Where in the frame ``depth`` lies.
+        pose: Pose of the left camera.
+        settings: Grid and principal point.
+
+    Returns:
+        World points in row-major order of the pixels.
+
+    Example:
+        >>> rig = StereoRig(width=5, height=5, focal=4.0)
+        >>> at = Pose(np.eye(4))
+        >>> backproject(np.full((5, 5), 2.0), rig, rig.full_frame, at, DepthSettings()).tolist()[0]
+        [-1.0, -1.0, 2.0]
+    """
+    stride = settings.stride
+    first_row, first_column = -region.y % stride, -region.x % stride
+    grid = depth[first_row::stride, first_column::stride]
+    row, column = np.nonzero(np.isfinite(grid))
+    z = grid[row, column]
+    v = region.y + first_row + stride * row
+    u = region.x + first_column + stride * column
+    cx, cy = rig.principal_point
+    if settings.principal_point == "released":
+        # Reduced image: pixel i of w/stride with its centre taken as (w/stride)/2.
+        cx, cy = rig.width / 2, rig.height / 2
+    local = np.stack([(u - cx) * z / rig.focal, (v - cy) * z / rig.focal, z], axis=1)
+    return transform_points(pose.camera_to_world, local)

@@ -1,0 +1,239 @@
+"""The default renderer: Mitsuba 3, on CUDA, LLVM or plain C++, whichever is here.
+
+Only the object's region is rendered, with a shifted principal point and a film whose sides are
+multiples of 128 pixels: a film size that changes at every image would compile a kernel each time.
+"""
+
+import functools
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import trimesh
+from jaxtyping import Float32
+
+from qs3.errors import InputError
+from qs3.sensor.render.scene import LightSettings, Scene, StereoPair
+from qs3.sensor.rig import Pose, Region, StereoRig
+
+VARIANTS = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
+_FILM_STEP = 128
+_TEXTURE_SIZE = 2048
+_SKY_ROWS, _SKY_COLUMNS = 512, 4
+
+# Mitsuba's cameras and projectors look along +z with x to the left and y up.
+_OPENCV_TO_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+_PROBE = """
+import sys
+import mitsuba as mi
+mi.set_variant(sys.argv[1])
+scene = mi.load_dict({
+    "type": "scene",
+    "integrator": {"type": "path"},
+    "shape": {"type": "sphere"},
+    "light": {"type": "constant"},
+    "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
+})
+mi.render(scene, spp=1)
+"""
+
+
+@functools.cache
+def usable(variant: str) -> bool:
+    """Whether a Mitsuba variant renders here, tried in a child process.
+
+    A system libLLVM that does not suit the processor aborts the whole process, hence the child.
+    """
+    probe = [sys.executable, "-c", _PROBE, variant]
+    return subprocess.run(probe, capture_output=True, timeout=300).returncode == 0
+
+
+@functools.cache
+def best_variant() -> str:
+    """The fastest variant that works here, of ``VARIANTS``.
+
+    Raises:
+        InputError: where none does.
+    """
+    for variant in VARIANTS:
+        if usable(variant):
+            return variant
+    raise InputError("Mitsuba does not render here, not even as scalar_rgb; see: qs3 doctor")
+
+
+@dataclass(frozen=True)
+class MitsubaRenderer:
+    """Photographs scenes with Mitsuba 3 (path tracing, box filter, one bounce of light)."""
+
+    variant: str = ""
+    """One of ``VARIANTS``; empty picks the fastest that works here."""
+    samples: int = 16
+    """Rays a pixel."""
+    max_depth: int = 3
+    """Longest path: 2 is direct light alone, 3 adds one bounce."""
+    full_frame: bool = False
+    """Render whole frames in place of the object's region."""
+
+    def __post_init__(self) -> None:
+        if not self.variant:
+            object.__setattr__(self, "variant", best_variant())
+        elif self.variant not in VARIANTS:
+            raise InputError(
+                f"renderer: no variant {self.variant!r}; choose one of {', '.join(VARIANTS)}"
+            )
+        elif not usable(self.variant):
+            raise InputError(f"renderer: {self.variant} does not work here; see: qs3 doctor")
+
+    @property
+    def description(self) -> dict[str, str]:
+        """Name, version and variant, for records."""
+        return {"name": "mitsuba", "version": _mitsuba(self.variant).__version__} | {
+            "variant": self.variant
+        }
+
+    def render(
+        self, scene: Scene, rig: StereoRig, poses: Sequence[Pose], seeds: Sequence[int]
+    ) -> list[StereoPair]:
+        """Photograph ``scene`` once from each pose.
+
+        Raises:
+            ValueError: where there is not one seed for each pose.
+        """
+        if len(poses) != len(seeds):
+            raise ValueError(f"{len(poses)} poses and {len(seeds)} seeds")
+        mi = _mitsuba(self.variant)
+        built = _build(mi, scene, self.max_depth)
+        parameters = mi.traverse(built)
+        transform = mi.ScalarTransform4f if self.variant.startswith("scalar") else mi.Transform4f
+        bounds = np.asarray(scene.mesh.bounds)
+        pairs = []
+        for pose, seed in zip(poses, seeds, strict=True):
+            parameters["projector.to_world"] = transform(_to_world(rig.projector(pose)))
+            parameters.update()
+            images, regions = [], []
+            for side, camera in enumerate((pose, rig.right(pose))):
+                region = rig.full_frame if self.full_frame else rig.region_of(bounds, camera, 2)
+                # Two streams that never meet: the left camera's seeds are even.
+                noise_seed = (2 * seed + side) % 2**32
+                images.append(_photograph(mi, built, rig, camera, region, self.samples, noise_seed))
+                regions.append(region)
+            pairs.append(StereoPair(*images, *regions, scene.light.ambient, pose))
+        return pairs
+
+
+@functools.cache
+def _mitsuba(variant: str) -> Any:
+    """Import Mitsuba with ``variant`` set; one process keeps to one variant."""
+    import mitsuba as mi
+
+    if mi.variant() != variant:
+        mi.set_variant(variant)
+    mi.set_log_level(mi.LogLevel.Error)
+    return mi
+
+
+def _to_world(pose: Pose) -> list[list[float]]:
+    return (pose.camera_to_world @ _OPENCV_TO_MITSUBA).tolist()
+
+
+def _build(mi: Any, scene: Scene, max_depth: int) -> Any:
+    extent = np.degrees(2 * np.arctan(scene.tan_half_extent))
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": max_depth},
+            "object": _mesh(mi, scene.mesh, scene.light.albedo),
+            "projector": {
+                "type": "projector",
+                "fov": float(extent),
+                "irradiance": {
+                    "type": "bitmap",
+                    "bitmap": mi.Bitmap(_square(scene.pattern)[..., None]),
+                    "raw": True,
+                    "wrap_mode": "clamp",
+                },
+                "scale": scene.light.projector,
+            },
+            "sky": {
+                "type": "envmap",
+                "bitmap": mi.Bitmap(_sky(scene.light)),
+                "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90),
+            },
+        }
+    )
+
+
+def _mesh(mi: Any, mesh: trimesh.Trimesh, albedo: float) -> Any:
+    # Two-sided: artists' meshes have faces of either winding.
+    material = mi.load_dict(
+        {
+            "type": "twosided",
+            "material": {
+                "type": "diffuse",
+                "reflectance": {"type": "rgb", "value": [albedo] * 3},
+            },
+        }
+    )
+    properties = mi.Properties()
+    properties["mesh_bsdf"] = material
+    built = mi.Mesh("object", len(mesh.vertices), len(mesh.faces), props=properties)
+    parameters = mi.traverse(built)
+    parameters["vertex_positions"] = np.asarray(mesh.vertices, dtype=np.float32).ravel()
+    parameters["faces"] = np.asarray(mesh.faces, dtype=np.uint32).ravel()
+    parameters.update()
+    return built
+
+
+def _square(pattern: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "s s"]:
+    """The pattern on square texels; a projector of Mitsuba takes its shape from its picture."""
+    return cv2.resize(pattern, (_TEXTURE_SIZE, _TEXTURE_SIZE), interpolation=cv2.INTER_LINEAR)
+
+
+def _sky(light: LightSettings) -> Float32[np.ndarray, "h w c"]:
+    """Sky over ground as a latitude-longitude picture, the zenith at the top."""
+    elevation = 90.0 - 180.0 * (np.arange(_SKY_ROWS) + 0.5) / _SKY_ROWS
+    radiance = np.where(elevation > light.sky_elevation, light.sky, 0.0) + light.ambient
+    image = np.broadcast_to(radiance[:, None, None], (_SKY_ROWS, _SKY_COLUMNS, 3))
+    return np.ascontiguousarray(image, dtype=np.float32)
+
+
+def _photograph(
+    mi: Any, scene: Any, rig: StereoRig, camera: Pose, region: Region, samples: int, seed: int
+) -> Float32[np.ndarray, "h w"]:
+    """Render one region of one camera's frame."""
+    if not region.width or not region.height:
+        return np.zeros((region.height, region.width), dtype=np.float32)
+    width = -(-region.width // _FILM_STEP) * _FILM_STEP
+    height = -(-region.height // _FILM_STEP) * _FILM_STEP
+    cx, cy = rig.principal_point
+    # Shift of the film from the optical axis, as a share of the film.
+    shift_x = ((width - 1) / 2 + region.x - cx) / width
+    shift_y = ((height - 1) / 2 + region.y - cy) / height
+    sensor = mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": float(np.degrees(2 * np.arctan(width / 2 / rig.focal))),
+            "fov_axis": "x",
+            "near_clip": 1e-2,
+            "far_clip": 1e3,
+            "principal_point_offset_x": float(shift_x),
+            "principal_point_offset_y": float(shift_y),
+            "to_world": mi.ScalarTransform4f(_to_world(camera)),
+            "film": {
+                "type": "hdrfilm",
+                "width": width,
+                "height": height,
+                "pixel_format": "luminance",
+                "component_format": "float32",
+                "rfilter": {"type": "box"},
+            },
+            "sampler": {"type": "independent", "sample_count": samples},
+        }
+    )
+    image = np.array(mi.render(scene, sensor=sensor, seed=seed, spp=samples), dtype=np.float32)
+    return np.ascontiguousarray(image[: region.height, : region.width, 0])

@@ -1,0 +1,147 @@
+"""The stereo rig: one focal length, two cameras a baseline apart, a projector between them.
+
+Convention:
+    OpenCV cameras (x right, y down, z forward), rectified: both image planes are one plane and the
+    right camera stands ``baseline`` along the left camera's +x. Pixel (0, 0) is the centre of the
+    top-left pixel. Disparity is u_left − u_right ≥ 0. The left camera is the reference.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from qs3.geometry import invert_rigid, look_at, transform_points
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where the left camera stands and looks."""
+
+    camera_to_world: Float[np.ndarray, "4 4"]
+    """Rigid transform from OpenCV camera coordinates to the world."""
+
+    @property
+    def position(self) -> Float[np.ndarray, "3"]:
+        """Optical centre in the world."""
+        return self.camera_to_world[:3, 3]
+
+    @classmethod
+    def looking_at(cls, position: np.ndarray, target: np.ndarray) -> "Pose":
+        """Stand at ``position`` and look at ``target`` with the image's top towards +z."""
+        return cls(look_at(np.asarray(position, float), np.asarray(target, float)))
+
+    def shifted(self, along_x: float) -> "Pose":
+        """The pose moved along its own x axis, with the same rotation."""
+        matrix = self.camera_to_world.copy()
+        matrix[:3, 3] += matrix[:3, 0] * along_x
+        return Pose(matrix)
+
+
+@dataclass(frozen=True)
+class Region:
+    """A rectangle of pixels: columns x … x + width − 1, rows y … y + height − 1."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Index of the rectangle in a full-frame image, rows first."""
+        return slice(self.y, self.y + self.height), slice(self.x, self.x + self.width)
+
+    @property
+    def bounds(self) -> tuple[int, int, int, int]:
+        """First column and row, and the column and row after the last."""
+        return self.x, self.y, self.x + self.width, self.y + self.height
+
+
+@dataclass(frozen=True)
+class StereoRig:
+    """A rectified pair of pinhole cameras and the projector's place between them.
+
+    Example:
+        >>> rig = StereoRig()
+        >>> rig.principal_point, float(rig.disparity(3.0))
+        ((539.5, 539.5), 50.0)
+    """
+
+    width: int = 1080
+    """Columns of the image."""
+    height: int = 1080
+    """Rows of the image."""
+    focal: float = 1500.0
+    """Focal length in pixels."""
+    baseline: float = 0.1
+    """Distance between the two cameras, in the unit of the scene."""
+    projector_offset: float = 0.5
+    """Place of the projector on the baseline: 0 at the left camera, 1 at the right one."""
+
+    def __post_init__(self) -> None:
+        if min(self.width, self.height) < 1 or not (self.focal > 0 and self.baseline > 0):
+            raise ValueError("width, height, focal and baseline of a rig must be positive")
+
+    @property
+    def principal_point(self) -> tuple[float, float]:
+        """Column and row where the optical axis meets the image: its centre, (w − 1)/2."""
+        return (self.width - 1) / 2, (self.height - 1) / 2
+
+    @property
+    def full_frame(self) -> Region:
+        """The whole image as a region."""
+        return Region(0, 0, self.width, self.height)
+
+    def disparity(self, depth: np.ndarray | float) -> np.ndarray:
+        """Disparity in pixels of a point at ``depth`` along the optical axis: f·b/z."""
+        return np.asarray(self.focal * self.baseline / np.asarray(depth, dtype=np.float64))
+
+    def right(self, left: Pose) -> Pose:
+        """Pose of the right camera."""
+        return left.shifted(self.baseline)
+
+    def projector(self, left: Pose) -> Pose:
+        """Pose of the projector."""
+        return left.shifted(self.baseline * self.projector_offset)
+
+    def project(
+        self, points: Float[np.ndarray, "n 3"], camera: Pose
+    ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
+        """Project world points: pixel positions (column, row) and depth along the axis."""
+        local = transform_points(invert_rigid(camera.camera_to_world), points)
+        depth = local[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pixels = self.focal * local[:, :2] / depth[:, None] + np.array(self.principal_point)
+        return pixels, depth
+
+    def region_of(self, bounds: Float[np.ndarray, "2 3"], camera: Pose, margin: int) -> Region:
+        """Smallest rectangle that holds an axis-aligned box as ``camera`` sees it.
+
+        Args:
+            bounds: Lower and upper corner of the box in the world.
+            camera: Pose of the camera.
+            margin: Pixels added on every side.
+
+        Returns:
+            The rectangle, cut at the image's borders; the whole image where the box reaches
+            behind the camera; an empty rectangle (width or height 0) where none of it is seen.
+        """
+        corners = np.array(
+            [
+                [bounds[i, 0], bounds[j, 1], bounds[k, 2]]
+                for i in (0, 1)
+                for j in (0, 1)
+                for k in (0, 1)
+            ]
+        )
+        pixels, depth = self.project(corners, camera)
+        if depth.min() <= 1e-6:
+            return self.full_frame
+        low = np.floor(pixels.min(axis=0)).astype(int) - margin
+        high = np.ceil(pixels.max(axis=0)).astype(int) + margin + 1
+        x0, y0 = max(0, low[0]), max(0, low[1])
+        x1, y1 = min(self.width, high[0]), min(self.height, high[1])
+        if x0 >= x1 or y0 >= y1:
+            return Region(0, 0, 0, 0)
+        return Region(int(x0), int(y0), int(x1 - x0), int(y1 - y0))

@@ -1,0 +1,63 @@
+"""What the sensor got right and wrong in one view, against the true depth."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from qs3.sensor.rig import StereoRig
+
+_GROSS = 3.0  # pixels of disparity beyond which a match is simply wrong
+_RING = 10  # pixels outside the silhouette in which fattening is measured
+
+
+@dataclass(frozen=True)
+class ViewStatistics:
+    """Errors of the disparity in one view; None where there is nothing to measure."""
+
+    object_pixels: int
+    """Pixels of the left image that show the object."""
+    valid_fraction: float | None
+    """Share of these with a disparity."""
+    disparity_bias: float | None
+    """Median of d − f·b/z over valid object pixels, in pixels."""
+    disparity_sigma: float | None
+    """1.4826 × median absolute deviation of the same, in pixels."""
+    gross_share: float | None
+    """Share of valid object pixels that are more than 3 px off."""
+    ring_fraction: float | None
+    """Share of pixels at most 10 px outside the silhouette that have a disparity: fattening."""
+
+
+def view_statistics(
+    disparity: Float[np.ndarray, "h w"], true_depth: Float[np.ndarray, "h w"], rig: StereoRig
+) -> ViewStatistics:
+    """Compare the disparity of a region with its true depth.
+
+    Example:
+        >>> rig = StereoRig()
+        >>> stats = view_statistics(np.full((4, 4), 50.5), np.full((4, 4), 3.0), rig)
+        >>> stats.disparity_bias, stats.disparity_sigma, stats.valid_fraction
+        (0.5, 0.0, 1.0)
+    """
+    mask = np.isfinite(true_depth)
+    valid = np.isfinite(disparity)
+    count = int(mask.sum())
+    error = disparity[mask & valid] - rig.disparity(true_depth[mask & valid])
+    bias = sigma = gross = None
+    if error.size:
+        bias = float(np.median(error))
+        sigma = float(1.4826 * np.median(np.abs(error - bias)))
+        gross = float((np.abs(error) > _GROSS).mean())
+    side = 2 * _RING + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    ring = (cv2.dilate(mask.astype(np.uint8), disc) > 0) & ~mask
+    return ViewStatistics(
+        object_pixels=count,
+        valid_fraction=float(valid[mask].mean()) if count else None,
+        disparity_bias=bias,
+        disparity_sigma=sigma,
+        gross_share=gross,
+        ring_fraction=float(valid[ring].mean()) if ring.any() else None,
+    )
