@@ -4,6 +4,8 @@ Convention:
     z is up. Every function returns new float32 arrays and leaves its input as it was.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 
@@ -92,3 +94,28 @@ def resample(
         start = 0 if rng is None else int(rng.integers(count))
         index = farthest_point_sample(cloud, num_points, start)
     return cloud[index].astype(np.float32)
+
+
+def stack(
+    clouds: Sequence[Float[np.ndarray, "_ 3"]], num_points: int | None, where: str
+) -> Float[np.ndarray, "b n 3"]:
+    """Put clouds into one array; `resample` brings them to one size.
+
+    Args:
+        clouds: Clouds of any sizes.
+        num_points: Common size; None accepts only clouds that have one already.
+        where: What was read, for the message.
+
+    Raises:
+        InputError: where there is no cloud, or sizes differ and no size is asked for.
+    """
+    if not clouds:
+        raise InputError(f"{where}: no cloud found")
+    sizes = {len(cloud) for cloud in clouds}
+    if num_points is None and len(sizes) > 1:
+        raise InputError(
+            f"{where}: clouds have {min(sizes)} to {max(sizes)} points; name one number for all"
+        )
+    if num_points is not None and sizes != {num_points}:
+        clouds = [resample(cloud, num_points) for cloud in clouds]
+    return np.stack(clouds).astype(np.float32)

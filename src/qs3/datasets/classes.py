@@ -1,0 +1,146 @@
+"""The one table of class names and aliases, and the merging of labels.
+
+Convention:
+    The ten classes of PointDA-10 in alphabetical order are the common tongue of all data sets.
+"""
+
+import re
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from qs3.errors import InputError
+
+POINTDA10: tuple[str, ...] = (
+    "bathtub",
+    "bed",
+    "bookshelf",
+    "cabinet",
+    "chair",
+    "lamp",
+    "monitor",
+    "plant",
+    "sofa",
+    "table",
+)
+
+_ALIASES: dict[str, tuple[str, ...]] = {
+    "bathtub": ("bath", "bath_tub", "tub"),
+    "bookshelf": ("shelf", "bookcase", "book_shelf", "shelves"),
+    "cabinet": (
+        "night_stand",
+        "nightstand",
+        "bedside_table",
+        "dresser",
+        "wardrobe",
+        "cupboard",
+        "chest_of_drawers",
+        "file_cabinet",
+        "filing_cabinet",
+    ),
+    "chair": (
+        "armchair",
+        "office_chair",
+        "swivel_chair",
+        "stool",
+        "bar_stool",
+        "barstool",
+        "bench",
+    ),
+    "lamp": ("floor_lamp", "desk_lamp", "table_lamp", "light"),
+    "monitor": ("television", "tv", "tv_monitor", "tvmonitor", "display", "screen"),
+    "plant": ("potted_plant", "pottedplant", "house_plant", "houseplant"),
+    "sofa": ("couch", "settee", "loveseat"),
+    "table": ("desk", "dining_table", "diningtable", "coffee_table", "side_table", "end_table"),
+}
+_CANONICAL = {alias: name for name, aliases in _ALIASES.items() for alias in aliases}
+
+
+def canonical(name: str) -> str:
+    """Fold case, spaces and hyphens, and replace an alias by its class of PointDA-10.
+
+    A name that is in no row of the table comes back folded.
+
+    Example:
+        >>> canonical("Night Stand"), canonical("TV-monitor"), canonical("toilet")
+        ('cabinet', 'monitor', 'toilet')
+    """
+    folded = re.sub(r"[\s_-]+", "_", name.strip().lower())
+    return _CANONICAL.get(folded, folded)
+
+
+def _positions(names: Sequence[str], to: Sequence[str]) -> Int[np.ndarray, "k"]:
+    """Position in ``to`` of each name, −1 where it is in none: as it is, else by the table."""
+    exact = {name: position for position, name in enumerate(to)}
+    merged = {canonical(name): position for position, name in reversed(list(enumerate(to)))}
+    rows = [exact.get(name, merged.get(canonical(name), -1)) for name in names]
+    return np.array(rows, dtype=np.int64)
+
+
+def map_labels(
+    class_names: Sequence[str],
+    labels: Int[np.ndarray, "b"],
+    to: Sequence[str] = POINTDA10,
+    unmapped: Literal["error", "drop"] = "error",
+) -> tuple[Int[np.ndarray, "m"], Bool[np.ndarray, "b"]]:
+    """Put labels onto another list of classes by the table of aliases.
+
+    A name that the other list has as it is keeps it; otherwise aliases are followed on both sides.
+
+    Args:
+        class_names: Names that the labels index.
+        labels: Labels of the clouds.
+        to: Names that the result indexes.
+        unmapped: What to do with clouds of a class that is not in ``to``.
+
+    Returns:
+        The new labels of the clouds that are kept, and which clouds are kept.
+
+    Raises:
+        InputError: where a class of some cloud is not in ``to`` and ``unmapped`` is ``error``.
+
+    Example:
+        >>> labels, kept = map_labels(["desk", "dresser"], np.array([1, 0]))
+        >>> [POINTDA10[i] for i in labels]
+        ['cabinet', 'table']
+    """
+    mapped = _positions(class_names, to)[labels]
+    kept = mapped >= 0
+    if unmapped == "error" and not kept.all():
+        missing = sorted({class_names[int(i)] for i in np.unique(labels[~kept])})
+        raise InputError(
+            f"class {', '.join(map(repr, missing))} is none of: {', '.join(to)}; rename it, or "
+            "name the classes to use"
+        )
+    return mapped[kept], kept
+
+
+def merge_predictions(
+    predictions: Int[np.ndarray, "b"], class_names: Sequence[str], to: Sequence[str]
+) -> Int[np.ndarray, "b"]:
+    """Put a network's answers, after the arg-max, onto the classes of a test set.
+
+    The network keeps all its classes to choose from; an answer that the test set has no class for
+    becomes −1, which every score counts as wrong.
+
+    Args:
+        predictions: Arg-max over the network's classes.
+        class_names: The network's classes.
+        to: Classes of the test set.
+
+    Raises:
+        InputError: where no class of the network is in ``to``.
+
+    Example:
+        >>> merge_predictions(np.array([0, 1, 2]), ["desk", "toilet", "bed"], ["bed", "table"])
+        array([ 1, -1,  0])
+    """
+    positions = _positions(class_names, to)
+    if (positions < 0).all():
+        raise InputError(
+            f"the network's classes ({', '.join(class_names)}) and the data's ({', '.join(to)}) "
+            "have none in common"
+        )
+    return positions[predictions]

@@ -1,0 +1,71 @@
+"""Meshes and scans that cost nothing; a module of its own so that worker processes can load it."""
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+
+from qs3.datasets.classes import POINTDA10
+from qs3.datasets.generate import GenerateSettings, Item, scan_seed
+from qs3.datasets.shards import CloudRow
+
+
+@dataclass(frozen=True)
+class FakeItem:
+    id: str
+    class_name: str = "chair"
+    split: str | None = "train"
+
+    def load(self):
+        raise AssertionError("a fake has no mesh")
+
+
+def fake_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    seed = scan_seed(settings.seed, item.id, scan)
+    rng = np.random.default_rng(seed)
+    n = settings.num_points
+    return CloudRow(
+        id=f"{item.id}#{scan}",
+        object=item.id,
+        scan=scan,
+        label=POINTDA10.index(item.class_name),
+        class_name=item.class_name,
+        split=item.split or "",
+        seed=seed,
+        points=rng.random((n, 3), dtype=np.float32),
+        view=rng.integers(0, settings.views, n, dtype=np.uint8),
+        clean=rng.random((n, 3), dtype=np.float32),
+        clean_view=np.zeros(n, dtype=np.uint8),
+        surface=rng.random((n, 3), dtype=np.float32),
+        yaw=float(rng.random()),
+        valid_fraction=0.9,
+    )
+
+
+def flaky_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    if item.id.startswith("bad"):
+        raise ValueError(f"{item.id} is broken\nsecond line")
+    return fake_row(item, scan, settings)
+
+
+def deadly_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    if item.id.startswith("bad"):
+        os._exit(9)
+    return fake_row(item, scan, settings)
+
+
+def unavailable_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    raise ModuleNotFoundError("No module named 'nowhere'")
+
+
+class Interrupting:
+    """Scans a number of rows, then acts as Ctrl-C does."""
+
+    def __init__(self, after: int) -> None:
+        self.left = after
+
+    def __call__(self, item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+        if self.left == 0:
+            raise KeyboardInterrupt
+        self.left -= 1
+        return fake_row(item, scan, settings)
