@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
@@ -19,11 +19,12 @@ import numpy as np
 
 from qs3.datasets.classes import POINTDA10, map_labels
 from qs3.datasets.executors import Failure, run_ordered
+from qs3.datasets.failures import forget_failures, log_failure
 from qs3.datasets.shards import STATISTICS, CloudRow, write_shard
-from qs3.datasets.store import FAILURES, MANIFEST, Manifest, shard_path, write_manifest
+from qs3.datasets.store import MANIFEST, Manifest, shard_path, write_manifest
 from qs3.datasets.versions import package_versions
 from qs3.errors import InputError
-from qs3.files import claim_folder, write_text
+from qs3.files import claim_folder, sha256
 
 if TYPE_CHECKING:
     import trimesh
@@ -100,6 +101,11 @@ class GenerateSettings:
         plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         plain["classes"] = list(self.classes)
         plain["sensor"] = settings_dict(sensor)
+        pattern = plain["sensor"]["pattern"]
+        if pattern["image"] is not None:
+            # The picture counts, not where it lies.
+            path = Path(pattern["image"])
+            pattern["image"] = {"name": path.name, "sha256": sha256(path)}
         if self.renderer is not None:
             names = [f.name for f in dataclasses.fields(self.renderer)]
             own = {name: getattr(self.renderer, name) for name in names}
@@ -225,7 +231,7 @@ def generate(
     folder = claim_folder(out, MANIFEST)
     write_manifest(folder, manifest)
     todo = [index for index in range(count) if not shard_path(folder, index).is_file()]
-    _forget_failures(folder, set(todo))
+    forget_failures(folder, set(todo))
 
     tasks = [
         (index, row) for index in todo for row in range(size) if index * size + row < len(work)
@@ -243,7 +249,9 @@ def generate(
             item, scan = work[index * size + row]
             if isinstance(result, Failure):
                 failed += 1
-                _log_failure(folder, index, item, scan, result)
+                record = {"id": _row_id(item, scan), "object": item.id, "scan": scan}
+                record |= {"class_name": item.class_name, "shard": index}
+                log_failure(folder, record | {"error": result.kind, "reason": result.reason})
             else:
                 rows.append(result)
             if row == size - 1 or index * size + row == len(work) - 1:
@@ -298,32 +306,3 @@ def _split(item: Item, settings: GenerateSettings) -> str:
 def _mean(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
-
-
-def _log_failure(folder: Path, shard: int, item: Item, scan: int, failure: Failure) -> None:
-    record: Mapping[str, Any] = {
-        "id": _row_id(item, scan),
-        "object": item.id,
-        "scan": scan,
-        "class_name": item.class_name,
-        "shard": shard,
-        "error": failure.kind,
-        "reason": failure.reason,
-    }
-    with (folder / FAILURES).open("a", encoding="utf-8") as handle:
-        handle.write(json.dumps(record, ensure_ascii=False) + "\n")
-
-
-def _forget_failures(folder: Path, shards: set[int]) -> None:
-    """Drop the failures of shards that are scanned again, and a line that was cut off."""
-    path = folder / FAILURES
-    if not path.is_file():
-        return
-    kept = []
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-        try:
-            if json.loads(line)["shard"] not in shards:
-                kept.append(line + "\n")
-        except (json.JSONDecodeError, KeyError, TypeError):
-            continue
-    write_text(path, "".join(kept))

@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 
 from qs3.datasets.clouds import PointClouds
+from qs3.datasets.failures import read_failures
+from qs3.datasets.ragged import RaggedClouds
 from qs3.datasets.shards import CloudKind, flat_clouds, read_shard
 from qs3.datasets.transforms import stack
 from qs3.errors import InputError
 from qs3.files import read_json, sha256, write_json
 
 MANIFEST = "dataset.json"
-FAILURES = "failures.jsonl"
 SCHEMA_VERSION = 1
 
 
@@ -106,27 +107,20 @@ def _finished(folder: Path, manifest: Manifest) -> list[Path]:
     return [path for path in paths if path.is_file()]
 
 
-def read_store(
-    folder: Path,
-    cloud: CloudKind = "points",
-    split: str | None = None,
-    num_points: int | None = None,
-    classes: Sequence[str] | None = None,
-    partial: bool = False,
-) -> PointClouds:
-    """Read one kind of cloud of a data set.
+def read_ragged(
+    folder: Path, cloud: CloudKind = "points", split: str | None = None, partial: bool = False
+) -> RaggedClouds:
+    """Read one kind of cloud of a data set, each in its own size.
 
     Args:
         folder: Folder of the data set.
         cloud: ``points`` (noisy), ``clean`` or ``surface``.
         split: Rows of this split only.
-        num_points: Points a cloud; others are resampled. None keeps what is there.
-        classes: Classes to keep, in the order of the new label.
         partial: Accept a data set whose generation has not finished.
 
     Raises:
-        InputError: where the folder is not a data set, is unfinished or damaged, has no such
-            rows, or its clouds differ in size and ``num_points`` is None.
+        InputError: where the folder is not a data set, is unfinished or damaged, or has no such
+            rows.
     """
     manifest = open_dataset(folder)
     shards = _finished(folder, manifest)
@@ -135,48 +129,75 @@ def read_store(
             f"{folder}: unfinished, {len(shards)} of {manifest.shards} shards; run the same "
             "generate again"
         )
-    names = manifest.class_names if classes is None else tuple(classes)
-    if unknown := [name for name in names if name not in manifest.class_names]:
-        raise InputError(
-            f"{folder}: has no class {unknown[0]!r}, only {', '.join(manifest.class_names)}"
-        )
     ids: list[str] = []
     labels: list[int] = []
     clouds: list[np.ndarray] = []
+    splits: set[str] = set()
     digest = hashlib.sha256()
     for path in shards:
         digest.update(bytes.fromhex(sha256(path)))
-        table = read_shard(path, ["id", "class_name", "split", cloud])
+        table = read_shard(path, ["id", "label", "split", cloud])
+        columns = (table[name].to_pylist() for name in ("id", "label", "split"))
         scanned = flat_clouds(table, cloud, path)
-        for row, name in enumerate(table["class_name"].to_pylist()):
-            if name in names and split in (None, table["split"][row].as_py()):
-                ids.append(table["id"][row].as_py())
-                labels.append(names.index(name))
-                clouds.append(scanned[row])
-    where = f"{folder}" if split is None else f"{folder}, split {split!r}"
-    return PointClouds(
-        points=stack(clouds, num_points, where),
-        labels=np.array(labels, dtype=np.int64),
-        class_names=names,
+        for identifier, label, part, points in zip(*columns, scanned, strict=True):
+            if not 0 <= label < len(manifest.class_names):
+                raise InputError(f"{path}: label {label} of {identifier!r} has no class name")
+            splits.add(part)
+            if split in (None, part):
+                ids.append(identifier)
+                labels.append(label)
+                clouds.append(points)
+    if not clouds:
+        there = ", ".join(sorted(filter(None, splits))) or "none"
+        wanted = "no cloud" if split is None else f"no cloud of split {split!r}; splits: {there}"
+        raise InputError(f"{folder}: {wanted}")
+    return RaggedClouds(
+        clouds=clouds,
         ids=tuple(ids),
         checksum=digest.hexdigest(),
+        labels=np.array(labels, dtype=np.int64),
+        class_names=manifest.class_names,
     )
 
 
-def read_failures(folder: Path) -> list[dict[str, Any]]:
-    """Return the objects that could not be scanned, one record each, in the order of the ids.
+def read_store(
+    folder: Path,
+    cloud: CloudKind = "points",
+    split: str | None = None,
+    num_points: int | None = None,
+    classes: Sequence[str] | None = None,
+    partial: bool = False,
+) -> PointClouds:
+    """Read one kind of cloud of a data set, all in one size.
+
+    Args:
+        folder: Folder of the data set.
+        cloud: ``points`` (noisy), ``clean`` or ``surface``.
+        split: Rows of this split only.
+        num_points: Points a cloud; others are resampled. None keeps what is there.
+        classes: Classes to keep, in the order of the new label; None keeps all.
+        partial: Accept a data set whose generation has not finished.
 
     Raises:
-        InputError: where the log is damaged.
+        InputError: as `read_ragged` and `transforms.stack` do, or where a class is unknown.
     """
-    path = Path(folder) / FAILURES
-    if not path.is_file():
-        return []
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-        return sorted((json.loads(line) for line in lines), key=lambda record: record["id"])
-    except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: damaged ({error}); delete it") from error
+    ragged = read_ragged(folder, cloud, split, partial)
+    names = ragged.class_names if classes is None else tuple(classes)
+    if unknown := [name for name in names if name not in ragged.class_names]:
+        raise InputError(
+            f"{folder}: has no class {unknown[0]!r}, only {', '.join(ragged.class_names)}"
+        )
+    place = np.array([names.index(n) if n in names else -1 for n in ragged.class_names])
+    labels = place[ragged.labels]
+    rows = np.flatnonzero(labels >= 0).tolist()
+    clouds = [ragged.clouds[row] for row in rows]
+    return PointClouds(
+        points=stack(clouds, num_points, str(folder)),
+        labels=labels[rows],
+        class_names=names,
+        ids=tuple(ragged.ids[row] for row in rows),
+        checksum=ragged.checksum,
+    )
 
 
 def info(folder: Path) -> dict[str, Any]:

@@ -1,0 +1,71 @@
+"""One door to every kind of data set: a store, a folder of point files, or an archive."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from qs3.datasets.clouds import PointClouds, UnlabelledClouds
+from qs3.datasets.ragged import RaggedClouds
+from qs3.datasets.shards import CloudKind
+from qs3.datasets.store import MANIFEST, read_ragged
+from qs3.errors import InputError
+
+
+def load_clouds(
+    source: str | Path,
+    *,
+    split: str | None = None,
+    num_points: int | None = 1024,
+    cloud: CloudKind = "points",
+    class_names: Sequence[str] | None = None,
+) -> PointClouds:
+    """Read labelled clouds from whatever ``source`` is.
+
+    Args:
+        source: Folder written by ``generate``, folder of class folders, or npz archive.
+        split: Part to read; None takes all.
+        num_points: Points a cloud; others are resampled. None keeps what is there.
+        cloud: Which cloud of a generated data set.
+        class_names: Classes that the labels shall index, found by name or alias. None takes
+            PointDA-10's ten where all map onto them, else the source's own.
+
+    Raises:
+        InputError: where the source is none of these, is damaged, has no labels, or has a class
+            that is not in ``class_names``.
+    """
+    return _read(source, split, cloud).labelled(num_points, class_names, str(source))
+
+
+def load_unlabelled(
+    source: str | Path,
+    *,
+    split: str | None = None,
+    num_points: int | None = 1024,
+    cloud: CloudKind = "points",
+) -> UnlabelledClouds:
+    """Read clouds and leave any labels behind; a flat folder of point files will do too.
+
+    The arguments are those of `load_clouds`.
+
+    Raises:
+        InputError: where the source is no data set or is damaged.
+    """
+    return _read(source, split, cloud).unlabelled(num_points, str(source))
+
+
+def _read(source: str | Path, split: str | None, cloud: CloudKind) -> RaggedClouds:
+    path = Path(source)
+    if path.is_dir() and (path / MANIFEST).is_file():
+        return read_ragged(path, cloud, split)
+    if cloud != "points":
+        raise InputError(f"{path}: only a data set made by qs3 generate has {cloud!r} clouds")
+    if path.is_dir():
+        from qs3.datasets.folder import read_folder
+
+        return read_folder(path, split)
+    if path.suffix.lower() == ".npz":
+        from qs3.datasets.npz import read_npz
+
+        return read_npz(path, split)
+    if path.exists():
+        raise InputError(f"{path}: neither a folder nor an npz archive")
+    raise InputError(f"{path}: no such file or folder")

@@ -1,0 +1,102 @@
+"""Point clouds from single files: npy, xyz, txt, ply, pcd, off."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from jaxtyping import Float32
+
+from qs3.datasets.pcd import parse_pcd
+from qs3.errors import InputError
+from qs3.meshes import sample_surface
+
+POINT_FILES = (".npy", ".xyz", ".txt", ".ply", ".pcd", ".off")
+
+
+def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np.ndarray, "n 3"]:
+    """Read the points of one file.
+
+    Columns after the third (normals, colours) are dropped. A file that holds a mesh (PLY or OFF
+    with faces) gives samples of its surface. A PCD file's points with NaN are left out, as they
+    mark pixels that saw nothing; in any other file a NaN is a fault.
+
+    Args:
+        path: The file; its ending tells the format, one of ``POINT_FILES``.
+        mesh_points: Samples of a mesh.
+        seed: Seed of these samples.
+
+    Raises:
+        InputError: where the file is missing, of another format, damaged, empty or not finite.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    suffix = path.suffix.lower()
+    if suffix not in POINT_FILES:
+        raise InputError(f"{path}: not a point cloud file; known are {', '.join(POINT_FILES)}")
+    content = path.read_bytes()
+    if not content.strip():
+        raise InputError(f"{path}: empty file")
+    try:
+        if suffix == ".npy":
+            points = _npy(content)
+        elif suffix == ".pcd":
+            points = parse_pcd(content)
+        elif suffix in (".xyz", ".txt"):
+            points = _text(content)
+        else:
+            points = _trimesh(content, suffix[1:], mesh_points, seed)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except Exception as error:  # parsers of damaged files raise whatever they stumble over
+        lines = str(error).splitlines()
+        reason = lines[0] if lines else type(error).__name__
+        raise InputError(f"{path}: cannot be read as {suffix[1:]} ({reason})") from error
+    if not len(points):
+        raise InputError(f"{path}: holds no point")
+    with np.errstate(over="ignore"):
+        points = np.ascontiguousarray(points, dtype=np.float32)
+    if not np.isfinite(points).all():
+        raise InputError(f"{path}: a point is not finite; remove points with NaN or infinity")
+    return points
+
+
+def _npy(content: bytes) -> np.ndarray:
+    array = np.load(io.BytesIO(content), allow_pickle=False)
+    if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
+        raise InputError(
+            f"needs numbers of shape [n, 3] or more columns, not {array.dtype} of shape "
+            f"{list(array.shape)}"
+        )
+    return array[:, :3]
+
+
+def _text(content: bytes) -> np.ndarray:
+    """Rows of numbers apart by spaces or commas; ``#`` begins a comment."""
+    rows: list[list[float]] = []
+    columns = 0
+    for number, line in enumerate(content.decode("utf-8").splitlines(), start=1):
+        words = line.split("#")[0].replace(",", " ").replace(";", " ").split()
+        if not words:
+            continue
+        columns = columns or len(words)
+        if len(words) < 3 or len(words) != columns:
+            raise InputError(
+                f"line {number} has {len(words)} columns; every line needs the same number, "
+                "at least 3"
+            )
+        try:
+            rows.append([float(word) for word in words[:3]])
+        except ValueError:
+            raise InputError(f"line {number} is not three numbers: {line.strip()[:40]!r}") from None
+    return np.array(rows, dtype=np.float64).reshape(-1, 3)
+
+
+def _trimesh(content: bytes, file_type: str, mesh_points: int, seed: int) -> np.ndarray:
+    loaded = trimesh.load(io.BytesIO(content), file_type=file_type, process=False)
+    if isinstance(loaded, trimesh.Trimesh) and len(loaded.faces):
+        return sample_surface(loaded, mesh_points, np.random.default_rng(seed))
+    if isinstance(loaded, trimesh.Trimesh | trimesh.PointCloud):
+        return np.asarray(loaded.vertices)
+    raise InputError("holds neither points nor a mesh")
