@@ -1,0 +1,73 @@
+"""Where a run took place: versions, hardware and commit, without importing torch."""
+
+import os
+import platform
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from qs3.datasets.versions import package_versions
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that a result depends on.
+
+    Example:
+        >>> "numpy" in versions()
+        True
+    """
+    return package_versions()
+
+
+def hardware() -> dict[str, Any]:
+    """Return ``cpu`` (model), ``cores`` (that this process may use) and ``gpus`` (names).
+
+    Example:
+        >>> sorted(hardware())
+        ['cores', 'cpu', 'gpus']
+    """
+    affinity = getattr(os, "sched_getaffinity", None)
+    cores = len(affinity(0)) if affinity is not None else os.cpu_count() or 1
+    return {"cpu": _cpu(), "cores": cores, "gpus": _gpus()}
+
+
+def _cpu() -> str:
+    listing = Path("/proc/cpuinfo")
+    if listing.is_file():
+        found = re.search(r"^model name\s*:\s*(.+)$", listing.read_text(), re.MULTILINE)
+        if found:
+            return found[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def _gpus() -> list[str]:
+    """Ask the driver's own tool; a machine without it has no NVIDIA GPU to speak of."""
+    if shutil.which("nvidia-smi") is None:
+        return []
+    query = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
+    return _output(query, Path.cwd()).splitlines()
+
+
+def git_commit() -> str:
+    """Return the commit of the source tree that this package runs from; empty if there is none.
+
+    A tree with changes that are not committed gets ``-dirty`` after the commit.
+    """
+    here = Path(__file__).resolve().parent
+    root = _output(["git", "rev-parse", "--show-toplevel"], here)
+    # An installed package may lie inside some other repository, whose commit means nothing here.
+    if not root or not (Path(root) / "src" / "qs3" / "evaluation" / Path(__file__).name).is_file():
+        return ""
+    commit = _output(["git", "rev-parse", "HEAD"], here)
+    changed = _output(["git", "status", "--porcelain", "--untracked-files=no", "src"], Path(root))
+    return f"{commit}-dirty" if commit and changed else commit
+
+
+def _output(command: list[str], folder: Path) -> str:
+    try:
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=20)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""
