@@ -1,0 +1,98 @@
+"""What every picture shares: style, colours, and PNG bytes that depend on the input alone."""
+
+import functools
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import ParamSpec, TypeVar
+
+import matplotlib
+import matplotlib.style
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from qs3.files import write_bytes
+
+PALETTE = (
+    "#332288",
+    "#88ccee",
+    "#44aa99",
+    "#117733",
+    "#999933",
+    "#ddcc77",
+    "#cc6677",
+    "#882255",
+    "#aa4499",
+    "#7a7a7a",
+)
+"""Paul Tol's `muted` scheme, distinct for colour-blind readers (https://personal.sron.nl/~pault);
+its pale grey is darkened to be seen on white."""
+
+BEFORE, AFTER = "#bbbbbb", "#117733"
+"""Colours of a score before and after adaptation: also told apart by lightness alone."""
+
+NO_VALUE = "#c9c9c9"
+"""Grey of pixels without a value; it is in none of the colour maps used."""
+
+_STYLE = {
+    "font.family": "DejaVu Sans",
+    "font.size": 10.0,
+    "axes.titlesize": 10.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": False,
+    "text.parse_math": False,  # a class may be called "a$b$"
+    "legend.frameon": False,
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+}
+
+_Given = ParamSpec("_Given")
+_Result = TypeVar("_Result")
+
+
+def house_style(draw: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
+    """Run a drawing function under the house style, whatever matplotlibrc the user has."""
+
+    @functools.wraps(draw)
+    def styled(*args: _Given.args, **kwargs: _Given.kwargs) -> _Result:
+        with matplotlib.style.context(["default", _STYLE]):
+            return draw(*args, **kwargs)
+
+    return styled
+
+
+@house_style
+def png_bytes(figure: Figure, dpi: int = 150) -> bytes:
+    """Return the figure as PNG; equal figures give equal bytes (no version, no time inside).
+
+    Example:
+        >>> png_bytes(Figure(figsize=(1, 1)))[1:4]
+        b'PNG'
+    """
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def write_png(path: Path, figure: Figure, dpi: int = 150) -> None:
+    """Write the figure to ``path`` as PNG, whole or not at all."""
+    write_bytes(Path(path), png_bytes(figure, dpi))
+
+
+def class_colour(index: int) -> str:
+    """Colour of the class at ``index``; the ten colours come again after the tenth.
+
+    Example:
+        >>> class_colour(0) == class_colour(10)
+        True
+    """
+    return PALETTE[index % len(PALETTE)]
+
+
+def without_frame(axes: Axes) -> None:
+    """Take ticks and frame away from ``axes``, but keep the title."""
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_visible(False)
