@@ -1,6 +1,7 @@
 """Meshes and scans that cost nothing; a module of its own so that worker processes can load it."""
 
 import os
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,3 +70,8 @@ class Interrupting:
             raise KeyboardInterrupt
         self.left -= 1
         return fake_row(item, scan, settings)
+
+
+def slow_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    time.sleep(0.05)
+    return fake_row(item, scan, settings)

@@ -4,12 +4,10 @@ import io
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from jaxtyping import Float32
 
 from qs3.datasets.pcd import parse_pcd
 from qs3.errors import InputError
-from qs3.meshes import sample_surface
 
 POINT_FILES = (".npy", ".xyz", ".txt", ".ply", ".pcd", ".off")
 
@@ -94,6 +92,11 @@ def _text(content: bytes) -> np.ndarray:
 
 
 def _trimesh(content: bytes, file_type: str, mesh_points: int, seed: int) -> np.ndarray:
+    # Imported here: point files that are no meshes do without.
+    import trimesh
+
+    from qs3.meshes.normalise import sample_surface
+
     loaded = trimesh.load(io.BytesIO(content), file_type=file_type, process=False)
     if isinstance(loaded, trimesh.Trimesh) and len(loaded.faces):
         return sample_surface(loaded, mesh_points, np.random.default_rng(seed))
