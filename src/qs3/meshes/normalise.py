@@ -1,0 +1,71 @@
+"""Meshes brought to one size, and points on their surface."""
+
+from typing import Literal
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+from qs3.errors import InputError
+
+
+def normalise(mesh: trimesh.Trimesh, size: Literal["box", "ball"] = "box") -> trimesh.Trimesh:
+    """Return a copy of ``mesh`` about the origin in a standard size.
+
+    Args:
+        mesh: Any mesh; only its vertices that a face uses count.
+        size: ``"box"``: the longest side of the axis-aligned box becomes 1 (the paper's released
+            code). ``"ball"``: the vertex farthest from the box's centre lands at radius 1 (the
+            paper's text). In both the centre of the axis-aligned box becomes the origin.
+
+    Returns:
+        A new mesh with the same faces; nothing is rotated.
+
+    Raises:
+        InputError: where the mesh has no extent, or ``size`` is neither of the two.
+
+    Example:
+        >>> brick = trimesh.creation.box((4.0, 2.0, 1.0))
+        >>> normalise(brick).extents.tolist()
+        [1.0, 0.5, 0.25]
+    """
+    if size not in ("box", "ball"):
+        raise InputError(f'size {size!r}: choose "box" or "ball"')
+    used = np.asarray(mesh.vertices)[np.unique(mesh.faces)] if len(mesh.faces) else np.empty((0, 3))
+    if not len(used):
+        raise InputError("cannot normalise a mesh without faces")
+    low, high = used.min(axis=0), used.max(axis=0)
+    centre = (low + high) / 2
+    scale = (high - low).max() if size == "box" else np.linalg.norm(used - centre, axis=1).max()
+    if not np.isfinite(scale) or scale <= 0:
+        raise InputError("cannot normalise a mesh whose vertices all lie in one place")
+    vertices = (np.asarray(mesh.vertices) - centre) / scale
+    return trimesh.Trimesh(vertices=vertices, faces=np.asarray(mesh.faces), process=False)
+
+
+def sample_surface(
+    mesh: trimesh.Trimesh, n: int, rng: np.random.Generator
+) -> Float[np.ndarray, "n 3"]:
+    """Draw ``n`` points uniformly by area from the surface of a mesh, float32.
+
+    A face is drawn in proportion to its area; a point in it is a + √r₁(1 − r₂)(b − a) + √r₁r₂(c − a)
+    with r₁, r₂ uniform, which is uniform over the triangle.
+
+    Raises:
+        InputError: where the surface has no area.
+
+    Example:
+        >>> ball = trimesh.creation.icosphere(subdivisions=3)
+        >>> points = sample_surface(ball, 100, np.random.default_rng(0))
+        >>> bool((np.abs(np.linalg.norm(points, axis=1) - 1) < 0.02).all())
+        True
+    """
+    triangles = np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)]
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    ladder = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    if not len(ladder) or not np.isfinite(ladder[-1]) or ladder[-1] <= 0:
+        raise InputError("cannot sample a mesh whose surface has no area")
+    face = np.searchsorted(ladder, rng.random(n) * ladder[-1], side="right").clip(max=len(a) - 1)
+    root, along = np.sqrt(rng.random((n, 1))), rng.random((n, 1))
+    points = a[face] + root * (1 - along) * (b - a)[face] + root * along * (c - a)[face]
+    return points.astype(np.float32)
