@@ -134,12 +134,11 @@ def gallery(
     if not samples or columns < 1:
         raise InputError("gallery: hand in at least one class and one column")
     rows = len(samples)
-    cell, margin = 0.95, 0.9
+    cell, margin = 0.95, 1.0
     figure = Figure(figsize=(margin + cell * columns, 0.35 + cell * rows), layout="constrained")
     axes = figure.add_subplot()
     spots, colours = [], []
-    for row, (name, clouds) in enumerate(samples.items()):
-        axes.text(-0.58, -row, name, ha="right", va="center")
+    for row, clouds in enumerate(samples.values()):
         if not clouds:
             axes.text(0.0, -row, "none", ha="center", va="center", color="#666666")
         for column, cloud in enumerate(clouds[:columns]):
@@ -161,6 +160,8 @@ def gallery(
     axes.set_aspect("equal")
     axes.set_title(title)
     without_frame(axes)
+    axes.set_yticks(-np.arange(rows), list(samples))
+    axes.tick_params(axis="y", length=0)
     return figure
 
 

@@ -43,6 +43,8 @@ _STYLE = {
     "axes.grid": False,
     "text.parse_math": False,  # a class may be called "a$b$"
     "legend.frameon": False,
+    "figure.constrained_layout.w_pad": 0.08,
+    "figure.constrained_layout.h_pad": 0.08,
     "figure.facecolor": "white",
     "savefig.facecolor": "white",
 }

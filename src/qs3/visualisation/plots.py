@@ -93,6 +93,8 @@ def training_curves(
 def selection_counts(rounds: Sequence[SelectionRound], class_names: Sequence[str]) -> Figure:
     """Draw the selected clouds of each round stacked by class, and the threshold θ above them.
 
+    A dotted outline shows how many clouds were above the threshold.
+
     Raises:
         InputError: where there is no round, or its counts do not fit the class names.
     """
@@ -113,20 +115,14 @@ def selection_counts(rounds: Sequence[SelectionRound], class_names: Sequence[str
             places, height, 0.75, floor, color=class_colour(index), label=name, edgecolor="white"
         )
         floor += height
-    for place, total, record in zip(places, floor, rounds, strict=True):
-        text = f"{int(total)}" if total or not record.note else "–"
-        lower.text(place, total, text, ha="center", va="bottom", fontsize=9)
-    lower.plot(
-        places,
-        [int(r.confident.sum()) for r in rounds],
-        "_",
-        color="black",
-        markersize=16,
-        label="above θ",
-    )
+    above = np.array([int(r.confident.sum()) for r in rounds])
+    outline = {"color": "none", "edgecolor": "#555555", "linestyle": ":", "linewidth": 1.2}
+    lower.bar(places, above, 0.83, label="above θ", zorder=0, **outline)
     lower.set_ylabel("selected clouds")
-    lower.set_xlabel("round")
-    lower.xaxis.set_major_locator(MaxNLocator(10, integer=True))
+    lower.set_xlabel("round, and selected / above θ")
+    totals = zip(places, floor.astype(int), above, strict=True)
+    lower.set_xticks(places, [f"{place}\n{kept}/{total}" for place, kept, total in totals])
+    lower.tick_params(axis="x", labelsize=9 if len(rounds) < 9 else 7.5)
     lower.yaxis.set_major_locator(MaxNLocator(6, integer=True))
     lower.margins(y=0.12)
     figure.legend(loc="outside lower center", ncols=3, fontsize=9)
