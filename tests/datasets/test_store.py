@@ -159,7 +159,9 @@ def test_other_settings_are_refused_by_name(fake, tmp_path):
     with pytest.raises(InputError, match=r"sensor\.rig\.focal = 1500\.0, not 900\.0"):
         write_manifest(tmp_path, dataclasses.replace(there, settings=other))
     with pytest.raises(InputError, match=r"views = 5, not None"):
-        write_manifest(tmp_path, dataclasses.replace(there, settings={"sensor": there.settings["sensor"]}))
+        write_manifest(
+            tmp_path, dataclasses.replace(there, settings={"sensor": there.settings["sensor"]})
+        )
     assert open_dataset(tmp_path) == there
 
 

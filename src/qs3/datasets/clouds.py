@@ -1,9 +1,13 @@
 """Point clouds in memory: with labels, and a type that cannot carry any."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
+
+CloudKind = Literal["points", "clean", "surface"]
+"""A scanned object's noisy cloud, its twin from the true z-buffer, samples of its whole surface."""
 
 
 @dataclass(frozen=True)

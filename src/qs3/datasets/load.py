@@ -3,10 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from qs3.datasets.clouds import PointClouds, UnlabelledClouds
+from qs3.datasets.clouds import CloudKind, PointClouds, UnlabelledClouds
 from qs3.datasets.ragged import RaggedClouds
-from qs3.datasets.shards import CloudKind
-from qs3.datasets.store import MANIFEST, read_ragged
 from qs3.errors import InputError
 
 
@@ -54,7 +52,9 @@ def load_unlabelled(
 
 def _read(source: str | Path, split: str | None, cloud: CloudKind) -> RaggedClouds:
     path = Path(source)
-    if path.is_dir() and (path / MANIFEST).is_file():
+    if path.is_dir() and (path / "dataset.json").is_file():
+        from qs3.datasets.store import read_ragged
+
         return read_ragged(path, cloud, split)
     if cloud != "points":
         raise InputError(f"{path}: only a data set made by qs3 generate has {cloud!r} clouds")

@@ -29,10 +29,11 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        # Opened here: np.load leaves the handle open where the content is no archive.
+        with path.open("rb") as handle, np.load(handle, allow_pickle=False) as archive:
             wanted = ("points", "offset", "label", "class_names", "is_train", "name")
             arrays = {name: archive[name] for name in wanted if name in archive.files}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, AttributeError, KeyError) as error:
+    except (ValueError, TypeError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: not a NumPy archive of plain arrays ({error})") from error
     clouds = _clouds(path, arrays)
     count = len(clouds)

@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -20,7 +20,6 @@ from qs3.errors import InputError
 from qs3.files import atomic_path
 
 STATISTICS = ("valid_fraction", "disparity_bias", "disparity_sigma", "gross_share")
-CloudKind = Literal["points", "clean", "surface"]
 
 _CLOUD = pa.list_(pa.field("element", pa.float32(), nullable=False))
 _VIEW = pa.list_(pa.field("element", pa.uint8(), nullable=False))

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from qs3.datasets.clouds import PointClouds
+from qs3.datasets.clouds import CloudKind, PointClouds
 from qs3.datasets.failures import read_failures
 from qs3.datasets.ragged import RaggedClouds
-from qs3.datasets.shards import CloudKind, flat_clouds, read_shard
+from qs3.datasets.shards import flat_clouds, read_shard
 from qs3.datasets.transforms import stack
 from qs3.errors import InputError
 from qs3.files import read_json, sha256, write_json

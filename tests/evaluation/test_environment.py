@@ -1,0 +1,49 @@
+import importlib.metadata
+import os
+import subprocess
+import sys
+
+import numpy as np
+
+from qs3.evaluation import environment
+
+
+def test_versions_and_hardware_are_those_of_this_machine():
+    assert environment.versions()["numpy"] == np.__version__
+    assert environment.versions()["qs3"] == importlib.metadata.version("qs3")
+    found = environment.hardware()
+    assert 1 <= found["cores"] <= (os.cpu_count() or 1)
+    assert found["cpu"]
+    assert all(isinstance(name, str) for name in found["gpus"])
+
+
+def test_a_copy_outside_a_repository_has_no_commit(monkeypatch, tmp_path):
+    place = tmp_path / "environment.py"
+    monkeypatch.setattr(environment, "__file__", str(place))
+    assert environment.git_commit() == ""
+
+
+def test_a_package_inside_a_foreign_repository_does_not_take_its_commit(monkeypatch, tmp_path):
+    subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
+    (tmp_path / "lib").mkdir()
+    monkeypatch.setattr(environment, "__file__", str(tmp_path / "lib" / "environment.py"))
+    assert environment.git_commit() == ""
+
+
+def test_a_commit_is_told_and_a_change_marks_it(monkeypatch, tmp_path):
+    place = tmp_path / "src" / "qs3" / "evaluation"
+    place.mkdir(parents=True)
+    (place / "environment.py").write_text("")
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b.c"]
+    for command in (["init", "-q"], ["add", "src"], ["commit", "-q", "-m", "x"]):
+        subprocess.run([*git, *command], check=True)
+    monkeypatch.setattr(environment, "__file__", str(place / "environment.py"))
+    commit = environment.git_commit()
+    assert len(commit) == 40
+    (place / "environment.py").write_text("changed")
+    assert environment.git_commit() == f"{commit}-dirty"
+
+
+def test_the_numpy_side_needs_no_torch():
+    code = "import sys, qs3.datasets, qs3.evaluation; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0

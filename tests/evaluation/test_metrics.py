@@ -1,0 +1,87 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import binomtest, sem
+from sklearn import metrics as reference
+
+from qs3.evaluation.metrics import (
+    accuracy,
+    class_mean_accuracy,
+    clopper_pearson_interval,
+    confusion_matrix,
+    mean_sem,
+    per_class_accuracy,
+    wilson_interval,
+)
+
+K = 4
+answers = st.lists(
+    st.tuples(st.integers(0, K - 1), st.integers(0, K - 1)), min_size=1, max_size=60
+).map(lambda pairs: tuple(np.array(pairs).T))
+
+
+@given(pair=answers)
+@settings(deadline=None)
+def test_scores_agree_with_scikit_learn(pair):
+    labels, predictions = pair
+    assert accuracy(labels, predictions) == reference.accuracy_score(labels, predictions)
+    expected = reference.confusion_matrix(labels, predictions, labels=range(K))
+    np.testing.assert_array_equal(confusion_matrix(labels, predictions, K), expected)
+    recall = reference.recall_score(
+        labels, predictions, labels=range(K), average=None, zero_division=np.nan
+    )
+    np.testing.assert_allclose(per_class_accuracy(labels, predictions, K), recall)
+    balanced = np.mean([recall[k] for k in np.unique(labels)])
+    assert class_mean_accuracy(labels, predictions, K) == pytest.approx(balanced)
+
+
+def test_an_answer_of_none_of_the_classes_is_wrong_and_counted_apart():
+    labels, predictions = np.array([0, 0, 1]), np.array([0, -1, -1])
+    assert accuracy(labels, predictions) == pytest.approx(1 / 3)
+    assert class_mean_accuracy(labels, predictions, 2) == 0.25
+    assert confusion_matrix(labels, predictions, 2, other=True).tolist() == [[1, 0, 1], [0, 0, 1]]
+    assert confusion_matrix(labels, predictions, 2).tolist() == [[1, 0], [0, 0]]
+
+
+def test_labels_and_predictions_out_of_range_are_refused():
+    for labels, predictions in [([2], [0]), ([-1], [0]), ([0], [2]), ([0], [-2])]:
+        with pytest.raises(ValueError, match="out of"):
+            confusion_matrix(np.array(labels), np.array(predictions), 2)
+
+
+def test_an_empty_set_has_no_score():
+    nothing = np.zeros(0, dtype=np.int64)
+    assert np.isnan(accuracy(nothing, nothing))
+    assert np.isnan(class_mean_accuracy(nothing, nothing, 3))
+    with pytest.raises(ValueError, match="no value"):
+        mean_sem([])
+
+
+@given(st.lists(st.floats(0, 1), min_size=2, max_size=10))
+def test_the_standard_error_is_that_of_scipy(values):
+    result = mean_sem(values)
+    assert result.mean == pytest.approx(np.mean(values))
+    assert result.sem == pytest.approx(sem(values, ddof=1), abs=1e-12)
+    assert result.n == len(values)
+
+
+def test_one_value_has_no_standard_error():
+    assert mean_sem([0.25]).sem is None
+    assert mean_sem([0.25]).format() == "25.0 (n=1)"
+
+
+@given(st.integers(1, 200).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
+@settings(deadline=None)
+def test_intervals_are_those_of_scipy(counts):
+    correct, total = counts
+    for function, method in [(wilson_interval, "wilson"), (clopper_pearson_interval, "exact")]:
+        expected = binomtest(correct, total).proportion_ci(0.95, method=method)
+        assert function(correct, total) == pytest.approx((expected.low, expected.high), abs=1e-9)
+
+
+@pytest.mark.parametrize(("correct", "total"), [(0, 0), (-1, 3), (4, 3)])
+def test_counts_that_are_no_score_are_refused(correct, total):
+    for function in (wilson_interval, clopper_pearson_interval):
+        with pytest.raises(ValueError, match="not a score"):
+            function(correct, total)
