@@ -1,5 +1,9 @@
-"""Meshes: read from files, brought to size, or made on the spot."""
+"""Meshes: read from files, brought to one size, or made on the spot."""
 
 from qs3.meshes import shapes as shapes
+from qs3.meshes.collections import MeshItem as MeshItem
+from qs3.meshes.collections import collect as collect
+from qs3.meshes.loading import EXTENSIONS as EXTENSIONS
+from qs3.meshes.loading import load_mesh as load_mesh
 from qs3.meshes.normalise import normalise as normalise
 from qs3.meshes.normalise import sample_surface as sample_surface
