@@ -104,6 +104,7 @@ def test_a_run_that_was_stopped_goes_on_and_ends_the_same(fake, tmp_path):
                     items(fake), folder, SETTINGS, scan_one=fake.Interrupting(6), progress=False
                 )
             assert sorted(content(folder)) == [MANIFEST, "shard-00000.parquet"]
+            (folder / ".shard-00001.parquet.7.tmp.parquet").write_bytes(b"cut o")  # power cut
             stamp = (folder / "shard-00000.parquet").stat().st_mtime_ns
         report = generate(items(fake), folder, SETTINGS, scan_one=fake.fake_row, progress=False)
     assert report == GenerateReport(done=11, skipped=4, failed=0)

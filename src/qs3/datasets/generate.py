@@ -13,105 +13,23 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
-from qs3.datasets.classes import POINTDA10, map_labels
+from qs3.datasets.classes import map_labels
 from qs3.datasets.executors import Failure, run_ordered
 from qs3.datasets.failures import forget_failures, log_failure
-from qs3.datasets.shards import STATISTICS, CloudRow, write_shard
+from qs3.datasets.scan_item import GenerateSettings as GenerateSettings
+from qs3.datasets.scan_item import Item as Item
+from qs3.datasets.scan_item import row_id
+from qs3.datasets.scan_item import scan_item as scan_item
+from qs3.datasets.scan_item import scan_seed as scan_seed
+from qs3.datasets.shards import CloudRow, write_shard
 from qs3.datasets.store import MANIFEST, Manifest, shard_path, write_manifest
 from qs3.datasets.versions import package_versions
 from qs3.errors import InputError
-from qs3.files import claim_folder, sha256
-
-if TYPE_CHECKING:
-    import trimesh
-
-
-@runtime_checkable
-class Item(Protocol):
-    """One mesh of the work list, as `qs3.meshes.MeshItem` is."""
-
-    @property
-    def id(self) -> str:
-        """Unique name."""
-        ...
-
-    @property
-    def class_name(self) -> str:
-        """Name of the class."""
-        ...
-
-    @property
-    def split(self) -> str | None:
-        """``train``, ``test``, empty or None."""
-        ...
-
-    def load(self) -> "trimesh.Trimesh":
-        """Read or make the mesh."""
-        ...
-
-
-@dataclass(frozen=True)
-class GenerateSettings:
-    """What a data set's bytes depend on, together with the work list."""
-
-    meshes: str = "shapes"
-    """``shapes`` or the name (not the path) of the folder of meshes; a label for the record."""
-    per_class: int | None = None
-    """Objects a class; None takes all."""
-    scans_per_mesh: int = 1
-    """Scans of each object, each from other poses."""
-    sensor: Any = "qs3"
-    """Name of a sensor preset, or a `qs3.sensor.presets.Sensor`."""
-    renderer: Any = None
-    """A picklable renderer; None resolves to the default one before any work is handed out."""
-    views: int = 5
-    """Views fused into a cloud."""
-    view_layout: Literal["orbit", "jitter"] = "orbit"
-    """Poses around the object, or jittered copies of one."""
-    size: Literal["box", "ball"] = "box"
-    """Longest side 1, or the unit ball."""
-    box_crop: bool = True
-    """Keep only points inside the object's box."""
-    num_points: int = 2048
-    """Points of each cloud."""
-    classes: tuple[str, ...] = POINTDA10
-    """Classes in the order of the label."""
-    split: str | None = None
-    """Split of every row; None takes each item's own."""
-    seed: int = 0
-    """Root of all seeds."""
-    rows_per_shard: int = 64
-    """Scans a shard."""
-
-    def __post_init__(self) -> None:
-        for name in ("scans_per_mesh", "views", "num_points", "rows_per_shard"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if self.seed < 0:
-            raise InputError(f"seed must not be negative, but is {self.seed}")
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values, the sensor's and the renderer's settings among them."""
-        from qs3.sensor.presets import get_sensor, settings_dict
-
-        sensor = get_sensor(self.sensor) if isinstance(self.sensor, str) else self.sensor
-        plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        plain["classes"] = list(self.classes)
-        plain["sensor"] = settings_dict(sensor)
-        pattern = plain["sensor"]["pattern"]
-        if pattern["image"] is not None:
-            # The picture counts, not where it lies.
-            path = Path(pattern["image"])
-            pattern["image"] = {"name": path.name, "sha256": sha256(path)}
-        if self.renderer is not None:
-            names = [f.name for f in dataclasses.fields(self.renderer)]
-            own = {name: getattr(self.renderer, name) for name in names}
-            plain["renderer"] = own | self.renderer.description
-        return plain
+from qs3.files import claim_folder
 
 
 @dataclass(frozen=True)
@@ -124,68 +42,6 @@ class GenerateReport:
     """In shards that were finished before."""
     failed: int
     """Failed in this call; each is in ``failures.jsonl``."""
-
-
-def scan_seed(root: int, object_id: str, scan: int) -> int:
-    """Seed of one scan, 0 to 2⁶³ − 1; order, worker count and machine do not matter.
-
-    Example:
-        >>> scan_seed(0, "chair/a", 0) == scan_seed(0, "chair/a", 0) != scan_seed(0, "chair/a", 1)
-        True
-    """
-    digest = hashlib.sha256(object_id.encode("utf-8")).digest()
-    words = np.frombuffer(digest, dtype="<u4").tolist()
-    state = np.random.SeedSequence([root, *words, scan]).generate_state(1, np.uint64)
-    return int(state[0] >> np.uint64(1))
-
-
-def scan_item(item: Item, scan_index: int, settings: GenerateSettings) -> CloudRow:
-    """Scan one object once with the simulated sensor.
-
-    Args:
-        item: The object.
-        scan_index: Which of its scans.
-        settings: Settings of the data set.
-
-    Raises:
-        InputError: where the mesh is unusable or the sensor sees nothing of it.
-    """
-    from qs3.meshes import sample_surface
-    from qs3.sensor.scan import scan
-
-    seed = scan_seed(settings.seed, item.id, scan_index)
-    result = scan(
-        item.load(),
-        sensor=settings.sensor,
-        views=settings.views,
-        view_layout=settings.view_layout,
-        seed=seed,
-        size=settings.size,
-        box_crop=settings.box_crop,
-        num_points=settings.num_points,
-        renderer=settings.renderer,
-    )
-    # The scan draws from children of `seed`; the key keeps this stream apart from them.
-    surface_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0x50BF,)))
-    surface = sample_surface(result.mesh, settings.num_points, surface_rng)
-    label = map_labels([item.class_name], np.zeros(1, dtype=np.int64), settings.classes)[0]
-    means = {name: _mean([getattr(view, name) for view in result.views]) for name in STATISTICS}
-    return CloudRow(
-        id=_row_id(item, scan_index),
-        object=item.id,
-        scan=scan_index,
-        label=int(label[0]),
-        class_name=settings.classes[int(label[0])],
-        split=_split(item, settings),
-        seed=seed,
-        points=result.points,
-        view=result.view,
-        clean=result.clean,
-        clean_view=result.clean_view,
-        surface=surface.astype(np.float32),
-        yaw=result.yaw,
-        **means,
-    )
 
 
 def generate(
@@ -232,6 +88,8 @@ def generate(
     folder = claim_folder(out, MANIFEST)
     write_manifest(folder, manifest)
     todo = [index for index in range(count) if not shard_path(folder, index).is_file()]
+    for stale in folder.glob(".shard-*.tmp.parquet"):  # a run that was killed while writing
+        stale.unlink()
     forget_failures(folder, set(todo))
 
     tasks = [
@@ -250,7 +108,7 @@ def generate(
             item, scan = work[index * size + row]
             if isinstance(result, Failure):
                 failed += 1
-                record = {"id": _row_id(item, scan), "object": item.id, "scan": scan}
+                record = {"id": row_id(item, scan), "object": item.id, "scan": scan}
                 record |= {"class_name": item.class_name, "shard": index}
                 log_failure(folder, record | {"error": result.kind, "reason": result.reason})
             else:
@@ -294,16 +152,3 @@ def _check(items: Sequence[Item], settings: GenerateSettings, workers: int) -> N
         seen.add(item.id)
     names = sorted({item.class_name for item in items})
     map_labels(names, np.arange(len(names)), settings.classes)
-
-
-def _row_id(item: Item, scan: int) -> str:
-    return f"{item.id}#{scan}"
-
-
-def _split(item: Item, settings: GenerateSettings) -> str:
-    return (item.split or "") if settings.split is None else settings.split
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
