@@ -1,1 +1,8 @@
-"""Part of qs3."""
+"""Networks that classify point clouds."""
+
+from qs3.models.classifier import Features as Features
+from qs3.models.classifier import PointClassifier as PointClassifier
+from qs3.models.dgcnn import DGCNN as DGCNN
+from qs3.models.factory import create_model as create_model
+from qs3.models.factory import list_models as list_models
+from qs3.models.pointnet import PointNet as PointNet

@@ -1,0 +1,98 @@
+"""What every network of this package offers."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+@dataclass(frozen=True)
+class Features:
+    """What a network knows of a cloud before it decides on a class."""
+
+    pooled: Float[Tensor, "b c"]
+    """One vector a cloud, the input of the head."""
+    per_point: Float[Tensor, "b n d"] | None = None
+    """One vector a point from the last layer before pooling; None where a network has none."""
+    local: Float[Tensor, "b n e"] | None = None
+    """One vector a point from the earlier layers; None where a network has none."""
+
+
+class PointClassifier(nn.Module, ABC):
+    """A network from clouds to class scores.
+
+    Convention:
+        Points are [b n 3], z up, in the unit ball. Other layouts are private to the network.
+    """
+
+    @abstractmethod
+    def encode(self, points: Float[Tensor, "b n 3"]) -> Features:
+        """Describe each cloud."""
+
+    @abstractmethod
+    def head(self, features: Features) -> Float[Tensor, "b k"]:
+        """Return the logits of the k classes."""
+
+    def forward(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b k"]:
+        """Return the logits of each cloud."""
+        return self.head(self.encode(points))
+
+
+class ClassifierHead(nn.Module):
+    """Fully connected layers with batch normalisation and dropout, then the class scores.
+
+    Args:
+        channels: Width of the pooled feature.
+        hidden: Widths of the hidden layers. The last linear layer has a bias; so have the hidden
+            ones after the first, as in the official DGCNN.
+        num_classes: k.
+        dropout: Probability of dropping a hidden unit, after each hidden layer.
+        slope: Slope of the leaky ReLU below zero; 0 is a plain ReLU.
+    """
+
+    def __init__(
+        self,
+        channels: int,
+        hidden: tuple[int, ...],
+        num_classes: int,
+        dropout: float,
+        slope: float,
+    ) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for depth, width in enumerate(hidden):
+            layers += [
+                nn.Linear(channels, width, bias=depth > 0),
+                nn.BatchNorm1d(width),
+                nn.LeakyReLU(slope),
+                nn.Dropout(dropout),
+            ]
+            channels = width
+        self.layers = nn.Sequential(*layers, nn.Linear(channels, num_classes))
+
+    def forward(self, pooled: Float[Tensor, "b c"]) -> Float[Tensor, "b k"]:
+        """Return the logits."""
+        return self.layers(pooled)
+
+
+class PointwiseLayer(nn.Module):
+    """The same linear map at every point, batch normalisation over all points, leaky ReLU.
+
+    Args:
+        channels: Width of the input.
+        width: Width of the output.
+        slope: Slope of the leaky ReLU below zero; 0 is a plain ReLU.
+    """
+
+    def __init__(self, channels: int, width: int, slope: float) -> None:
+        super().__init__()
+        self.linear = nn.Linear(channels, width, bias=False)
+        self.norm = nn.BatchNorm1d(width)
+        self.slope = slope
+
+    def forward(self, points: Float[Tensor, "b n c"]) -> Float[Tensor, "b n d"]:
+        """Return the new features of each point."""
+        b, n, _ = points.shape
+        normed = self.norm(self.linear(points).flatten(0, 1))
+        return nn.functional.leaky_relu(normed, self.slope, inplace=True).view(b, n, -1)

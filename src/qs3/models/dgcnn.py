@@ -1,0 +1,174 @@
+"""Dynamic graph CNN (Wang et al., TOG 2019), with a factorised EdgeConv."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from qs3.errors import InputError
+from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
+from qs3.models.ops import flat_indices, knn, neighbour_max, neighbour_sum
+
+_SLOPE = 0.2
+
+
+class EdgeConv(nn.Module):
+    """EdgeConv with batch normalisation and the maximum over neighbours (Wang et al., §3.1).
+
+    The function is that of the textbook: for every edge from point i to neighbour j,
+    e_ij = W (x_j − x_i, x_i), batch normalisation over all b·n·k edges, leaky ReLU 0.2, maximum
+    over j. No edge is ever formed. With W = (W₁, W₂) and V = W₂ − W₁, e_ij = W₁ x_j + V x_i, so:
+
+    - Mean and covariance of the pair (x_j, x_i) follow from each point's number of appearances as
+      a neighbour and from the sums over neighbours; the variance of channel o is then w_oᵀ Σ w_o
+      for row w_o of (W₁, V). Moments are taken about the mean, which a cloud far from the origin
+      needs, and clamped at 0, which repeated points need.
+    - The scale γ/σ goes into the weights, and max_j is taken of the scaled W₁ x_j alone: the rest
+      is the same for all j, and the leaky ReLU is monotone. The sign of γ needs no case.
+
+    Args:
+        channels: Width of the input.
+        width: Width of the output.
+    """
+
+    def __init__(self, channels: int, width: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(2 * channels, width, bias=False)
+        # Holds scale, shift and running statistics; applied to edges below.
+        self.norm = nn.BatchNorm1d(width)
+
+    def forward(
+        self, points: Float[Tensor, "b n c"], neighbours: Int[Tensor, "b n k"]
+    ) -> Float[Tensor, "b n d"]:
+        """Return the new features of each point.
+
+        Args:
+            points: Features of each point.
+            neighbours: Indices within the own cloud.
+        """
+        with torch.autocast(points.device.type, enabled=False):
+            dtype = self.linear.weight.dtype
+            return self._convolve(points.to(dtype), neighbours)
+
+    def _convolve(self, points: Tensor, neighbours: Tensor) -> Tensor:
+        c = points.shape[2]
+        first, second = self.linear.weight.split(c, dim=1)
+        weight = torch.cat([first, second - first], dim=1)
+        own_mean = points.mean(dim=(0, 1))
+        norm = self.norm
+        assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
+        if norm.training:
+            nodes = points.shape[0] * points.shape[1]
+            degree = torch.bincount(flat_indices(neighbours).view(-1), minlength=nodes)
+            share = degree.to(points.dtype) / neighbours.numel()
+            neighbour_mean = share @ points.flatten(0, 1)
+            mean = weight @ torch.cat([neighbour_mean, own_mean])
+            covariance = edge_covariance(points, neighbours, share, neighbour_mean, own_mean)
+            variance = ((weight @ covariance) * weight).sum(dim=1).clamp_min(0.0)
+            self._update_running(mean.detach(), variance.detach(), neighbours.numel())
+            offset = norm.bias
+            scale = norm.weight * torch.rsqrt(variance + norm.eps)
+        else:
+            neighbour_mean = own_mean
+            scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
+            mean = weight @ torch.cat([neighbour_mean, own_mean])
+            offset = norm.bias + scale * (mean - norm.running_mean)
+        first, second = (scale[:, None] * weight).split(c, dim=1)
+        best = neighbour_max(nn.functional.linear(points - neighbour_mean, first), neighbours)
+        own = nn.functional.linear(points - own_mean, second, offset)
+        return nn.functional.leaky_relu(best + own, _SLOPE, inplace=True)
+
+    @torch.no_grad()
+    def _update_running(self, mean: Tensor, variance: Tensor, edges: int) -> None:
+        """Move the running statistics as BatchNorm does: the variance is the unbiased one."""
+        norm = self.norm
+        assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
+        assert norm.num_batches_tracked is not None and norm.momentum is not None  # noqa: S101
+        norm.num_batches_tracked.add_(1)
+        norm.running_mean.lerp_(mean, norm.momentum)
+        norm.running_var.lerp_(variance * (edges / max(edges - 1, 1)), norm.momentum)
+
+
+def edge_covariance(
+    points: Float[Tensor, "b n c"],
+    neighbours: Int[Tensor, "b n k"],
+    share: Float[Tensor, "bn"],
+    neighbour_mean: Float[Tensor, "c"],
+    own_mean: Float[Tensor, "c"],
+) -> Float[Tensor, "2c 2c"]:
+    """Covariance over all edges of the pair (x_j, x_i), neighbour first.
+
+    Args:
+        points: Features of each point.
+        neighbours: Indices within the own cloud.
+        share: Share of the edges that end in each point; sums to 1.
+        neighbour_mean: Mean of x_j over the edges.
+        own_mean: Mean of x_i over the edges.
+    """
+    at_end = points - neighbour_mean
+    at_start = (points - own_mean).flatten(0, 1)
+    around = neighbour_sum(at_end, neighbours).flatten(0, 1)
+    at_end = at_end.flatten(0, 1)
+    cross = around.t() @ at_start / neighbours.numel()
+    ends = (share[:, None] * at_end).t() @ at_end
+    starts = at_start.t() @ at_start / len(at_start)
+    return torch.cat([torch.cat([ends, cross], 1), torch.cat([cross.t(), starts], 1)])
+
+
+class DGCNN(PointClassifier):
+    """DGCNN as in the official classification network.
+
+    Four EdgeConvs on graphs rebuilt in feature space, one layer over their concatenation, maximum
+    and mean over the points, three fully connected layers. ``per_point`` is that one layer's
+    output, ``local`` the concatenation.
+
+    Args:
+        num_classes: k.
+        neighbours: Neighbours of each point, itself among them; at most 255. A cloud of fewer
+            points takes all of them.
+        channels: Widths of the EdgeConvs.
+        embedding: Width of the layer before pooling.
+        hidden: Widths of the head's hidden layers.
+        dropout: Probability of dropping a hidden unit of the head.
+
+    Example:
+        >>> network = DGCNN(10, neighbours=4, channels=(8, 8), embedding=16, hidden=(8,)).eval()
+        >>> network(torch.zeros(2, 32, 3)).shape
+        torch.Size([2, 10])
+    """
+
+    def __init__(
+        self,
+        num_classes: int,
+        neighbours: int = 20,
+        channels: tuple[int, ...] = (64, 64, 128, 256),
+        embedding: int = 1024,
+        hidden: tuple[int, ...] = (512, 256),
+        dropout: float = 0.5,
+    ) -> None:
+        super().__init__()
+        if not 1 <= neighbours <= 255:
+            raise InputError(f"neighbours must be 1 to 255, not {neighbours}")
+        self.neighbours = neighbours
+        widths = (3, *channels)
+        self.convolutions = nn.ModuleList(
+            EdgeConv(c, d) for c, d in zip(widths[:-1], widths[1:], strict=True)
+        )
+        self.embed = PointwiseLayer(sum(channels), embedding, _SLOPE)
+        self.classify = ClassifierHead(2 * embedding, hidden, num_classes, dropout, _SLOPE)
+
+    def encode(self, points: Float[Tensor, "b n 3"]) -> Features:
+        """Describe each cloud by the maximum and the mean over its points."""
+        k = min(self.neighbours, points.shape[1])
+        levels = []
+        features = points
+        for convolution in self.convolutions:
+            features = convolution(features, knn(features, k))
+            levels.append(features)
+        local = torch.cat(levels, dim=2)
+        per_point = self.embed(local)
+        pooled = torch.cat([per_point.amax(dim=1), per_point.mean(dim=1)], dim=1)
+        return Features(pooled=pooled, per_point=per_point, local=local)
+
+    def head(self, features: Features) -> Float[Tensor, "b k"]:
+        """Return the logits."""
+        return self.classify(features.pooled)

@@ -1,0 +1,52 @@
+"""Networks by name."""
+
+import inspect
+from typing import Any
+
+from qs3.errors import InputError
+from qs3.models.classifier import PointClassifier
+from qs3.models.dgcnn import DGCNN
+from qs3.models.pointnet import PointNet
+
+_MODELS: dict[str, type[PointClassifier]] = {"dgcnn": DGCNN, "pointnet": PointNet}
+
+
+def list_models() -> tuple[str, ...]:
+    """Return the names that `create_model` knows.
+
+    Example:
+        >>> list_models()
+        ('dgcnn', 'pointnet')
+    """
+    return tuple(_MODELS)
+
+
+def create_model(name: str, num_classes: int, **settings: Any) -> PointClassifier:
+    """Make a network with fresh weights from PyTorch's current random state.
+
+    Args:
+        name: One of `list_models`.
+        num_classes: Number of classes, at least 1.
+        settings: Arguments of that network; those left out keep their defaults.
+
+    Raises:
+        InputError: where the name or a setting is unknown, or a value is unusable.
+
+    Example:
+        >>> type(create_model("pointnet", 10, dropout=0.1)).__name__
+        'PointNet'
+    """
+    if name not in _MODELS:
+        raise InputError(f"unknown model {name!r}; choose one of {', '.join(_MODELS)}")
+    if num_classes < 1:
+        raise InputError(f"num_classes must be at least 1, not {num_classes}")
+    known = [p for p in inspect.signature(_MODELS[name]).parameters if p != "num_classes"]
+    for key in settings:
+        if key not in known:
+            raise InputError(f"unknown setting {key!r} of {name}; choose from {', '.join(known)}")
+    # JSON has lists only; the networks want tuples.
+    values = {key: tuple(v) if isinstance(v, list) else v for key, v in settings.items()}
+    try:
+        return _MODELS[name](num_classes, **values)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"settings {settings} do not make a {name}: {error}") from error
