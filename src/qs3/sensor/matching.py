@@ -40,8 +40,11 @@ class MatchingSettings:
 
 
 def matching_margin(settings: MatchingSettings) -> int:
-    """Pixels that the matcher looks at around a pixel: half a block and the Sobel filter's rim."""
-    return settings.block_size // 2 + 2
+    """Pixels that the matcher looks at around a pixel: half a block, the Sobel filter, a spare row.
+
+    OpenCV's Sobel filter takes rows in pairs and blanks a last odd one, hence the spare row.
+    """
+    return settings.block_size // 2 + 3
 
 
 def match(
@@ -80,5 +83,6 @@ def matching_canvas(region: Region, rig: StereoRig, settings: MatchingSettings) 
     x0, y0, x1, y1 = region.bounds
     x0, y0 = max(0, x0 - settings.num_disparities - margin), max(0, y0 - margin)
     x1 = min(rig.width, max(x1 + margin, x0 + settings.num_disparities + settings.block_size))
+    y0 -= y0 % 2  # the pairs of rows that the Sobel filter takes are those of the full frame
     y1 = min(rig.height, max(y1 + margin, y0 + settings.block_size))
     return Region(x0, y0, x1 - x0, y1 - y0)

@@ -47,7 +47,7 @@ SENSORS: dict[str, Sensor] = {
     # The `qs3` camera in a bright room with a grainy imager and a weaker projector.
     "bright-room": Sensor(
         name="bright-room",
-        light=LightSettings(projector=80.0, sky=1.6, ambient=0.15),
+        light=LightSettings(projector=30.0, sky=1.6, ambient=0.15),
         exposure=ExposureSettings(gain=0.5, noise=3.0),
     ),
 }

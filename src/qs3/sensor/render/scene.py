@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Float32
+from jaxtyping import Float32
 
 from qs3.sensor.rig import Pose, Region, StereoRig
 
@@ -19,8 +19,9 @@ class LightSettings:
     above 9.3° of elevation, with radiance P/(π·A) = 1000/(π·24.34²) = 0.537, and is modelled so.
     """
 
-    projector: float = 143.0
-    """Radiant intensity of a lit cell: 300 W/(4π) times the released emission strength of 6."""
+    projector: float = 45.6
+    """Radiant intensity of a lit cell: 300 W/(4π²), as Blender has it, times the released emission
+    strength of 6. With it the grey levels are those measured in the released sample image."""
     sky: float = 0.537
     """Radiance from directions above ``sky_elevation``, beside the ambient light."""
     sky_elevation: float = 9.3
@@ -86,6 +87,7 @@ def _paste(
     return canvas
 
 
+@runtime_checkable
 class Renderer(Protocol):
     """One of the three plug points: anything that photographs a scene with a stereo rig."""
 

@@ -1,0 +1,171 @@
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from qs3.sensor.exposure import ExposureSettings, expose
+from qs3.sensor.matching import MatchingSettings, match
+from qs3.sensor.render import LightSettings, Scene
+from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
+from qs3.sensor.render.raycast import DepthCaster
+from qs3.sensor.rig import Pose, StereoRig
+from qs3.sensor.speckle import PatternSettings, pattern_image
+
+
+def scene_of(mesh, pattern=None) -> Scene:
+    pattern = pattern_image(PatternSettings()) if pattern is None else pattern
+    return Scene(mesh, LightSettings(), pattern, 0.625)
+
+
+def asymmetric() -> trimesh.Trimesh:
+    """An L with a tower: no mirror image of it is itself."""
+    parts = [([0, 0, -0.2], [1, 0.4, 0.1]), ([0.4, 0.25, -0.2], [0.2, 0.3, 0.1])]
+    parts += [([-0.4, 0.0, 0.05], [0.2, 0.2, 0.5])]
+    boxes = [trimesh.creation.box(extents=e).apply_translation(c) for c, e in parts]
+    return trimesh.util.concatenate(boxes)
+
+
+POSE = Pose.looking_at(np.array([2.0, -3.0, 2.0]), np.array([0.1, 0.0, -0.1]))
+
+
+def test_convention_true_depth_is_along_the_axis_through_pixel_centres(small_rig):
+    plate = trimesh.creation.box(extents=[4, 4, 0.02])
+    plate.apply_translation([0, 0, 3.01])  # its near face is at z = 3 of a camera at the origin
+    depth = DepthCaster(plate).depth(small_rig, Pose(np.eye(4)), small_rig.full_frame)
+    np.testing.assert_allclose(depth, 3.0, atol=1e-9)
+
+
+def test_true_depth_of_a_tilted_plane_is_the_formula(small_rig):
+    slope = 0.4  # z = 3 + slope·x
+    corners = np.array([[x, y, 3 + slope * x] for x in (-3.0, 3) for y in (-3.0, 3)])
+    plane = trimesh.Trimesh(corners, [[0, 1, 2], [1, 3, 2]], process=False)
+    depth = DepthCaster(plane).depth(small_rig, Pose(np.eye(4)), small_rig.full_frame)
+    u = (np.arange(540) - 269.5) / 750
+    np.testing.assert_allclose(depth, np.broadcast_to(3 / (1 - slope * u), (540, 540)), rtol=1e-6)
+
+
+def test_convention_images_lie_on_the_true_silhouette_and_are_not_mirrored(small_rig, renderer):
+    mesh = asymmetric()
+    pair = renderer.render(scene_of(mesh), small_rig, [POSE], [1])[0]
+    frame = small_rig.full_frame
+    for image, camera in zip(pair.canvas(frame), (POSE, small_rig.right(POSE)), strict=True):
+        seen = np.abs(image - pair.background) > 1e-4
+        true = np.isfinite(DepthCaster(mesh).depth(small_rig, camera, frame))
+        overlap = (seen & true).sum() / (seen | true).sum()
+        assert overlap > 0.97
+        assert (seen[:, ::-1] & true).sum() / (seen[:, ::-1] | true).sum() < 0.9
+
+
+def test_region_rendering_shows_what_full_frame_rendering_shows(small_rig):
+    mesh = asymmetric()
+    images = []
+    for full_frame in (False, True):
+        renderer = MitsubaRenderer(variant="scalar_rgb", samples=16, full_frame=full_frame)
+        pair = renderer.render(scene_of(mesh), small_rig, [POSE], [3])[0]
+        images.append(pair.canvas(small_rig.full_frame))
+    for part, whole in zip(*images, strict=True):
+        # Only the noise of the ray sampling differs; a shift of one pixel is far worse.
+        difference = np.abs(part - whole).mean()
+        for axis in (0, 1):
+            for step in (-1, 1):
+                assert difference < 0.6 * np.abs(np.roll(part, step, axis) - whole).mean()
+        assert part.mean() == pytest.approx(whole.mean(), rel=2e-3)
+
+
+def test_full_frame_and_region_disparity_agree(small_rig):
+    mesh = asymmetric()
+    disparity = []
+    for full_frame in (False, True):
+        renderer = MitsubaRenderer(variant="scalar_rgb", samples=16, full_frame=full_frame)
+        pair = renderer.render(scene_of(mesh), small_rig, [POSE], [3])[0]
+        grey = [expose(i, ExposureSettings()) for i in pair.canvas(small_rig.full_frame)]
+        disparity.append(match(*grey, MatchingSettings(num_disparities=80)))
+    both = np.isfinite(disparity[0]) & np.isfinite(disparity[1])
+    assert both.sum() > 0.9 * np.isfinite(disparity[1]).sum()
+    assert np.abs(np.median((disparity[0] - disparity[1])[both])) <= 1 / 16
+
+
+def test_convention_projected_picture_is_upright(small_rig, renderer):
+    # A picture that is bright in its top left quarter alone, thrown on a plate square to the rig.
+    picture = np.zeros((64, 64), np.float32)
+    picture[:32, :32] = 1.0
+    plate = trimesh.creation.box(extents=[1.6, 1.6, 0.02])
+    turn = np.eye(4)
+    turn[:3, :3] = Pose.looking_at(np.array([0.0, -3.0, 0.0]), np.zeros(3)).camera_to_world[:3, :3]
+    plate.apply_transform(turn)
+    pose = Pose.looking_at(np.array([0.0, -3.0, 0.0]), np.zeros(3))
+    pair = renderer.render(scene_of(plate, picture), small_rig, [pose], [0])[0]
+    image = pair.canvas(small_rig.full_frame)[0]
+    quarter = image[150:390, 150:390]
+    top_left, rest = quarter[:110, :110].mean(), quarter[130:, 130:].mean()
+    assert top_left > 3 * rest
+    assert top_left > 3 * quarter[:110, 150:].mean()
+    assert top_left > 3 * quarter[150:, :110].mean()
+
+
+def test_projector_casts_hard_shadows(small_rig, renderer):
+    # A small plate stands before a wall: the wall's lit share falls where the plate shades it.
+    wall = trimesh.creation.box(extents=[3, 0.02, 3]).apply_translation([0, 0.5, 0])
+    plate = trimesh.creation.box(extents=[0.3, 0.02, 0.3]).apply_translation([0, -0.5, 0])
+    pose = Pose.looking_at(np.array([0.0, -3.0, 0.0]), np.zeros(3))
+    rig = StereoRig(width=540, height=540, focal=750.0, baseline=0.6)
+    bright = np.ones((16, 16), np.float32)
+    scene = scene_of(trimesh.util.concatenate([wall, plate]), bright)
+    image = renderer.render(scene, rig, [pose], [0])[0].canvas(rig.full_frame)[0]
+    # The left camera stands at 0, the projector at +0.3: seen from the camera the shadow falls on
+    # the wall from tan −0.094 to the plate's left edge at tan −0.06, and not at its right.
+    row = image[260:280].mean(axis=0)
+    centre = round(rig.principal_point[0])
+    shaded, lit = row[centre - 68 : centre - 48], row[centre + 48 : centre + 68]
+    assert shaded.max() < 0.7 * lit.min()
+
+
+def test_equal_seeds_give_equal_images_and_others_do_not(small_rig, renderer):
+    images = [
+        renderer.render(scene_of(asymmetric()), small_rig, [POSE], [seed])[0] for seed in (5, 5, 6)
+    ]
+    np.testing.assert_array_equal(images[0].left, images[1].left)
+    np.testing.assert_array_equal(images[0].right, images[1].right)
+    assert (images[0].left != images[2].left).any()
+    with pytest.raises(ValueError, match="seeds"):
+        renderer.render(scene_of(asymmetric()), small_rig, [POSE], [1, 2])
+
+
+def test_llvm_shows_what_the_scalar_variant_shows(small_rig):
+    if not usable("llvm_ad_mono"):
+        pytest.skip("llvm_ad_mono does not work here: no suitable libLLVM (19 is known to work)")
+    means = []
+    for variant in ("scalar_rgb", "llvm_ad_mono"):
+        # One process keeps to one variant, hence the child processes.
+        means.append(render_in_child(variant))
+    np.testing.assert_allclose(means[0], means[1], rtol=0.01)
+
+
+def render_in_child(variant: str) -> list[float]:
+    import json
+    import subprocess
+    import sys
+    from pathlib import Path
+
+    code = (
+        "import sys, json, numpy as np; sys.path.insert(0, sys.argv[1]);"
+        "from test_render import *;"
+        "r = MitsubaRenderer(variant=sys.argv[2], samples=16);"
+        "p = r.render(scene_of(asymmetric()), StereoRig(540, 540, 750.0), [POSE], [1])[0];"
+        "print(json.dumps([float(x) for i in (p.left, p.right) for x in "
+        "[i.mean(), i[: len(i) // 2].mean(), i[:, : i.shape[1] // 2].mean()]]))"
+    )
+    here = str(Path(__file__).parent)
+    out = subprocess.run(
+        [sys.executable, "-c", code, here, variant], capture_output=True, text=True, check=True
+    )
+    return json.loads(out.stdout)
+
+
+def test_user_pattern_reaches_the_scene(tmp_path, small_rig, renderer):
+    Image.new("L", (64, 64), 0).save(tmp_path / "dark.png")
+    dark = pattern_image(PatternSettings(image=str(tmp_path / "dark.png")))
+    mesh = asymmetric()
+    with_dots = renderer.render(scene_of(mesh), small_rig, [POSE], [0])[0]
+    without = renderer.render(scene_of(mesh, dark), small_rig, [POSE], [0])[0]
+    assert np.percentile(without.left, 99) < 0.5 * np.percentile(with_dots.left, 99)

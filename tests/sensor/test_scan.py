@@ -1,0 +1,244 @@
+"""The whole chain: what goes in comes back where it was."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from qs3.errors import InputError
+from qs3.geometry import rotation_z
+from qs3.meshes import normalise, sample_surface
+from qs3.sensor.depth import DepthSettings
+from qs3.sensor.matching import MatchingSettings
+from qs3.sensor.presets import SENSORS, Sensor, get_sensor
+from qs3.sensor.render.mitsuba import MitsubaRenderer
+from qs3.sensor.rig import StereoRig
+from qs3.sensor.scan import Scan, scan
+from qs3.sensor.views import Placement
+
+# A quarter of the pixels of `qs3`, with its f·b = 150.
+SMALL = Sensor(
+    name="small",
+    rig=StereoRig(width=540, height=540, focal=750.0, baseline=0.2),
+    matching=MatchingSettings(num_disparities=80, block_size=11),
+    depth=DepthSettings(stride=2),
+)
+
+
+def boxes(*parts) -> trimesh.Trimesh:
+    made = [trimesh.creation.box(extents=e).apply_translation(c) for c, e in parts]
+    return trimesh.util.concatenate(made)
+
+
+def asymmetric() -> trimesh.Trimesh:
+    return boxes(
+        ([0, 0, -0.2], [1, 0.5, 0.12]),
+        ([0.4, 0.3, -0.2], [0.2, 0.3, 0.12]),
+        ([-0.4, 0.0, 0.1], [0.2, 0.3, 0.5]),
+    )
+
+
+def distance_to(mesh: trimesh.Trimesh, points) -> np.ndarray:
+    dense = sample_surface(mesh, 60_000, np.random.default_rng(0))
+    return cKDTree(dense).query(points)[0]
+
+
+@pytest.fixture(scope="module")
+def scanned(renderer) -> Scan:
+    return scan(
+        asymmetric(),
+        sensor=SMALL,
+        views=3,
+        seed=4,
+        num_points=1024,
+        renderer=renderer,
+        keep_images=True,
+    )
+
+
+def test_convention_fused_cloud_lies_on_the_mesh(renderer):
+    # All fused points: farthest point sampling prefers the outlying ones.
+    found = scan(asymmetric(), sensor=SMALL, views=3, seed=4, num_points=40_000, renderer=renderer)
+    assert found.fused_points < 40_000
+    distance = distance_to(found.mesh, found.points[: found.fused_points])
+    # The noise law at the mean distance of 4: σz = z²·σd/(f·b), with σd as measured in the views.
+    sigma = np.median([v.disparity_sigma for v in found.views])
+    assert np.median(distance) < 16 * sigma / 150
+
+
+def test_cloud_has_the_size_and_type_asked_for(scanned):
+    assert scanned.points.shape == (1024, 3)
+    assert scanned.points.dtype == np.float32
+
+
+def test_clean_twin_lies_on_the_mesh(scanned):
+    assert np.percentile(distance_to(scanned.mesh, scanned.clean), 99) < 0.02
+    exact = trimesh.proximity.closest_point(scanned.mesh, scanned.clean)[1]
+    assert exact.max() < 1e-5
+
+
+@pytest.mark.parametrize("mirror", [[-1, 1, 1], [1, -1, 1], [1, 1, -1]])
+def test_convention_no_mirror_image_fits(scanned, mirror):
+    for cloud in (scanned.points, scanned.clean):
+        fits = distance_to(scanned.mesh, cloud).mean()
+        mirrored = cloud * np.array(mirror, dtype=np.float32)
+        assert distance_to(scanned.mesh, mirrored).mean() > 2 * fits
+
+
+def test_convention_yaw_is_undone_and_recorded(scanned):
+    turned = scanned.points @ rotation_z(scanned.yaw).T
+    fits = distance_to(scanned.mesh, scanned.points).mean()
+    assert distance_to(scanned.mesh, turned).mean() > 2 * fits
+    # In the frame of the rotated object each view's clean points are seen from its camera.
+    first = scanned.clean[scanned.clean_view == 0] @ rotation_z(scanned.yaw).T
+    pixels, depth = SMALL.rig.project(first.astype(np.float64), scanned.poses[0])
+    images = scanned.images[0]
+    column, row = np.round(pixels).astype(int).T
+    seen = images.true_depth[row - images.region.y, column - images.region.x]
+    np.testing.assert_allclose(depth, seen, atol=1e-4)
+
+
+def test_every_view_gives_points_and_statistics(scanned):
+    assert set(scanned.view.tolist()) == {0, 1, 2}
+    assert len(scanned.views) == len(scanned.poses) == len(scanned.images) == 3
+    for view in scanned.views:
+        assert view.valid_fraction is not None
+        assert view.valid_fraction > 0.5
+        assert view.disparity_sigma is not None
+        assert 0.02 < view.disparity_sigma < 0.4
+        assert view.disparity_bias is not None
+        assert abs(view.disparity_bias) < 0.08
+        assert view.gross_share is not None
+        assert view.gross_share < 0.03
+        assert view.ring_fraction is not None
+        assert view.ring_fraction > 0.3  # half a block of fattening is there
+
+
+def test_box_crop_keeps_to_the_turned_box(scanned):
+    turned = scanned.points.astype(np.float64) @ rotation_z(scanned.yaw).T
+    bounds = normalise(asymmetric()).vertices @ rotation_z(scanned.yaw).T
+    assert (turned >= bounds.min(axis=0) - 1e-6).all()
+    assert (turned <= bounds.max(axis=0) + 1e-6).all()
+
+
+def test_without_the_crop_points_lie_outside_too(renderer):
+    free = scan(asymmetric(), sensor=SMALL, views=1, seed=4, box_crop=False, renderer=renderer)
+    turned = free.points.astype(np.float64) @ rotation_z(free.yaw).T
+    bounds = normalise(asymmetric()).vertices @ rotation_z(free.yaw).T
+    outside = (turned < bounds.min(axis=0)) | (turned > bounds.max(axis=0))
+    assert outside.any(axis=1).mean() > 0.05
+
+
+def test_same_seed_same_scan_other_seed_other_scan(renderer):
+    scans = [
+        scan(asymmetric(), sensor=SMALL, views=1, seed=s, num_points=256, renderer=renderer)
+        for s in (7, 7, 8)
+    ]
+    np.testing.assert_array_equal(scans[0].points, scans[1].points)
+    np.testing.assert_array_equal(scans[0].clean, scans[1].clean)
+    assert scans[0].yaw == scans[1].yaw != scans[2].yaw
+
+
+def test_convention_a_step_comes_back_as_high_as_it_was(renderer):
+    step = boxes(([0, 0, -0.1], [1, 1, 0.1]), ([0.25, 0, 0.1], [0.5, 1, 0.3]))
+    cloud = scan(step, sensor=SMALL, views=4, seed=1, renderer=renderer, box_crop=False)
+    x, y, z = cloud.points.T
+    inner = np.abs(y) < 0.3
+    # Normalised: longest side 1 already, box from −0.15 to 0.25 → centred by 0.05.
+    low = np.median(z[inner & (x > -0.4) & (x < -0.15) & (z < 0.05)])
+    high = np.median(z[inner & (x > 0.15) & (x < 0.4) & (z > 0.05)])
+    assert low == pytest.approx(-0.1, abs=0.02)
+    assert high == pytest.approx(0.2, abs=0.02)
+
+
+def test_convention_a_tilted_plane_comes_back_tilted_the_same_way(renderer):
+    angle = np.radians(25)
+    plate = trimesh.creation.box(extents=[1, 1, 0.02])
+    plate.apply_transform(trimesh.transformations.rotation_matrix(angle, [0, 1, 0]))
+    cloud = scan(plate, sensor=SMALL, views=4, seed=2, renderer=renderer)
+    inner = np.linalg.norm(cloud.points, axis=1) < 0.35
+    # Total least squares: the noise is along the rays, not along z.
+    normal = np.linalg.svd(cloud.points[inner] - cloud.points[inner].mean(axis=0))[2][2]
+    normal = normal * np.sign(normal[2])
+    expected = [np.sin(angle), 0.0, np.cos(angle)]  # about +y: z falls along +x
+    assert np.degrees(np.arccos(normal @ expected)) < 2
+
+
+def test_convention_plane_square_to_the_rig_has_disparity_f_b_over_z(renderer):
+    # A plate seen straight from above at height z: every pixel has d = f·b/z.
+    overhead = Sensor(
+        rig=SMALL.rig,
+        matching=SMALL.matching,
+        depth=SMALL.depth,
+        placement=Placement(radius=(3.0, 3.0), elevation=(89.9, 89.9)),
+    )
+    plate = trimesh.creation.box(extents=[1, 1, 0.02])
+    found = scan(plate, sensor=overhead, views=1, seed=0, renderer=renderer, keep_images=True)
+    image = found.images[0]
+    on_plate = np.isfinite(image.true_depth) & np.isfinite(image.disparity)
+    assert np.median(image.disparity[on_plate]) == pytest.approx(150 / 2.99, abs=1 / 16 + 0.03)
+
+
+def test_rig_argument_replaces_the_sensors_rig(renderer):
+    wide = StereoRig(width=540, height=540, focal=750.0, baseline=0.15)
+    found = scan(
+        asymmetric(), sensor=SMALL, rig=wide, views=1, seed=0, renderer=renderer, keep_images=True
+    )
+    image = found.images[0]
+    both = np.isfinite(image.disparity) & np.isfinite(image.true_depth)
+    product = np.median((image.disparity * image.true_depth)[both])
+    assert product == pytest.approx(750 * 0.15, rel=0.01)
+
+
+def test_size_ball_and_box():
+    mesh = asymmetric()
+    assert normalise(mesh, "box").extents.max() == pytest.approx(1.0)
+    assert np.linalg.norm(normalise(mesh, "ball").vertices, axis=1).max() == pytest.approx(1.0)
+
+
+def test_an_object_out_of_the_gate_is_refused(renderer):
+    blind = Sensor(rig=SMALL.rig, matching=SMALL.matching, depth=DepthSettings(near=5.9))
+    with pytest.raises(InputError, match="saw no point"):
+        scan(asymmetric(), sensor=blind, views=1, renderer=renderer)
+
+
+def test_unknown_sensor_and_size_are_refused(renderer):
+    with pytest.raises(InputError, match="no preset 'kinect'"):
+        scan(asymmetric(), sensor="kinect", renderer=renderer)
+    with pytest.raises(InputError, match="num_points"):
+        scan(asymmetric(), sensor=SMALL, num_points=0, renderer=renderer)
+
+
+def test_presets_hold_the_released_values():
+    sensor = get_sensor("qs3")
+    assert sensor.rig == StereoRig(1080, 1080, 1500.0, 0.1, 0.5)
+    assert (sensor.matching.num_disparities, sensor.matching.block_size) == (160, 19)
+    assert sensor.placement.radius == (3.0, 5.0)
+    assert sensor.placement.elevation == (20.0, 50.0)
+    assert sensor.pattern.tan_half_extent == 0.625
+    assert (sensor.depth.near, sensor.depth.far, sensor.depth.stride) == (1.0, 6.0, 4)
+    assert all(name == preset.name for name, preset in SENSORS.items())
+
+
+def test_image_noise_changes_the_cloud_and_follows_the_seed(renderer):
+    noisy = get_sensor("bright-room")
+    small = Sensor(
+        rig=SMALL.rig,
+        light=noisy.light,
+        exposure=noisy.exposure,
+        matching=SMALL.matching,
+        depth=SMALL.depth,
+    )
+    scans = [
+        scan(asymmetric(), sensor=s, views=1, seed=3, num_points=256, renderer=renderer)
+        for s in (small, small, SMALL)
+    ]
+    np.testing.assert_array_equal(scans[0].points, scans[1].points)
+    sigma = [s.views[0].disparity_sigma for s in scans]
+    assert sigma[0] is not None
+    assert sigma[2] is not None
+    assert sigma[0] > 1.1 * sigma[2]
+
+
+def test_scalar_renderer_is_named_in_its_description(renderer: MitsubaRenderer):
+    assert renderer.description["variant"] == "scalar_rgb"
