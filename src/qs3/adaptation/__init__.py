@@ -1,1 +1,32 @@
-"""Part of qs3."""
+"""Methods of adaptation, their losses, and the rules that select pseudo labels.
+
+`qs3.adaptation.pseudo_labels` needs NumPy only; the methods load PyTorch when first asked for.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from qs3.adaptation.pseudo_labels import SingleClassWarning as SingleClassWarning
+from qs3.adaptation.pseudo_labels import select_confident as select_confident
+from qs3.adaptation.pseudo_labels import select_quasi_balanced as select_quasi_balanced
+
+if TYPE_CHECKING:
+    from qs3.adaptation.losses import cross_entropy as cross_entropy
+    from qs3.adaptation.method import Batch as Batch
+    from qs3.adaptation.method import Method as Method
+    from qs3.adaptation.source_only import SourceOnly as SourceOnly
+
+_LAZY = {
+    "cross_entropy": "losses",
+    "Batch": "method",
+    "Method": "method",
+    "SourceOnly": "source_only",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name that needs PyTorch."""
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)

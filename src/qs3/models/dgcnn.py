@@ -1,5 +1,7 @@
 """Dynamic graph CNN (Wang et al., TOG 2019), with a factorised EdgeConv."""
 
+import itertools
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
@@ -150,9 +152,7 @@ class DGCNN(PointClassifier):
             raise InputError(f"neighbours must be 1 to 255, not {neighbours}")
         self.neighbours = neighbours
         widths = (3, *channels)
-        self.convolutions = nn.ModuleList(
-            EdgeConv(c, d) for c, d in zip(widths[:-1], widths[1:], strict=True)
-        )
+        self.convolutions = nn.ModuleList(EdgeConv(c, d) for c, d in itertools.pairwise(widths))
         self.embed = PointwiseLayer(sum(channels), embedding, _SLOPE)
         self.classify = ClassifierHead(2 * embedding, hidden, num_classes, dropout, _SLOPE)
 

@@ -170,7 +170,7 @@ class _NeighbourMax(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         neighbours, winner = ctx.saved_tensors
-        b, n, c = gradient.shape
+        b, _, c = gradient.shape
         source = neighbours.gather(2, winner.long())
         if not gradient.is_cuda:
             return torch.zeros_like(gradient).scatter_add_(1, source, gradient), None

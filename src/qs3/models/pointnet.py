@@ -1,5 +1,7 @@
 """PointNet (Qi et al., CVPR 2017): a shared network a point, then the maximum over the points."""
 
+import itertools
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -20,7 +22,7 @@ class TransformNet(nn.Module):
         super().__init__()
         ends = (channels, *widths)
         self.shared = nn.Sequential(
-            *(PointwiseLayer(c, d, 0.0) for c, d in zip(ends[:-1], ends[1:], strict=True))
+            *(PointwiseLayer(c, d, 0.0) for c, d in itertools.pairwise(ends))
         )
         self.regress = ClassifierHead(widths[-1], hidden, channels * channels, 0.0, 0.0)
         last = self.regress.layers[-1]
@@ -64,7 +66,7 @@ class PointNet(PointClassifier):
     ) -> None:
         super().__init__()
         widths = (3, *channels)
-        layers = [PointwiseLayer(c, d, 0.0) for c, d in zip(widths[:-1], widths[1:], strict=True)]
+        layers = [PointwiseLayer(c, d, 0.0) for c, d in itertools.pairwise(widths)]
         self.early = nn.Sequential(*layers[:2])
         self.late = nn.Sequential(*layers[2:])
         early = widths[min(2, len(channels))]

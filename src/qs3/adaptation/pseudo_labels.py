@@ -1,0 +1,142 @@
+"""Which pseudo labels to believe: pure rules on class probabilities (NumPy only).
+
+Convention:
+    Probabilities are [m k]: m unlabelled clouds, k classes, rows summing to 1. The pseudo label of
+    a cloud is its most probable class, the first one at ties; its confidence is that probability.
+"""
+
+import warnings
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from qs3.errors import InputError
+
+Selection = Literal["most-confident", "least-confident"]
+"""End of a class's ranking by confidence that is kept."""
+SingleClass = Literal["keep", "drop"]
+"""What becomes of the confident clouds where all of them have one class (μ = 0)."""
+
+_TOLERANCE = 1e-3
+
+
+class SingleClassWarning(UserWarning):
+    """Every confident cloud has the same pseudo label, so that balancing would keep none."""
+
+
+def select_confident(
+    probabilities: Float[np.ndarray, "m k"], threshold: float, *, inclusive: bool = False
+) -> Bool[np.ndarray, "m"]:
+    """Select the clouds whose confidence exceeds a threshold (Algorithm 1, line 4).
+
+    NOTE: the algorithm as printed compares the index of the class, a slip for its probability.
+
+    Args:
+        probabilities: Class probabilities.
+        threshold: θ, in 0 to 1.
+        inclusive: Whether a confidence equal to θ is enough.
+
+    Raises:
+        InputError: where rows are not probabilities or θ is not in 0 to 1.
+
+    Example:
+        >>> select_confident(np.array([[0.9, 0.1], [0.3, 0.7]]), 0.8).tolist()
+        [True, False]
+    """
+    check_probabilities(probabilities)
+    if not 0.0 <= threshold <= 1.0:
+        raise InputError(f"threshold must be 0 to 1, not {threshold}")
+    confidence = probabilities.max(axis=1)
+    return confidence >= threshold if inclusive else confidence > threshold
+
+
+def select_quasi_balanced(
+    probabilities: Float[np.ndarray, "m k"],
+    threshold: float,
+    *,
+    selection: Selection = "most-confident",
+    inclusive: bool = False,
+    single_class: SingleClass = "keep",
+) -> Bool[np.ndarray, "m"]:
+    """Select confident clouds, fewer from dominant classes (QS³, Algorithm 1, lines 4–17).
+
+    Of the L clouds over the threshold, L_k have class k; ⌈L_k μ_k⌉ of these are kept, with
+    μ_k = 1 − L_k / L. Counts are exact integers; the floating-point form is wrong for some pairs
+    (9 of 27). Ties in confidence go by order.
+
+    Args:
+        probabilities: Class probabilities.
+        threshold: θ, in 0 to 1.
+        selection: Which of a class to keep; ``least-confident`` is what the released code does.
+        inclusive: Whether a confidence equal to θ is enough.
+        single_class: Where all L clouds have one class, μ = 0 and the algorithm selects nothing;
+            ``keep`` selects all of them and warns, ``drop`` follows the algorithm.
+
+    Raises:
+        InputError: where rows are not probabilities, or a setting is unusable.
+
+    Warns:
+        SingleClassWarning: where ``keep`` applies.
+
+    Example:
+        Three confident clouds of class 0 and one of class 1: ⌈3 · 1/4⌉ = 1 and ⌈1 · 3/4⌉ = 1.
+
+        >>> p = np.array([0.9, 0.95, 0.85, 0.1, 0.5])
+        >>> select_quasi_balanced(np.stack([p, 1 - p], axis=1), 0.8).tolist()
+        [False, True, False, True, False]
+    """
+    if selection not in ("most-confident", "least-confident"):
+        raise InputError(f"selection must be most-confident or least-confident, not {selection!r}")
+    if single_class not in ("keep", "drop"):
+        raise InputError(f"single_class must be keep or drop, not {single_class!r}")
+    confident = select_confident(probabilities, threshold, inclusive=inclusive)
+    labels = probabilities.argmax(axis=1)
+    confidence = probabilities.max(axis=1)
+    total = int(confident.sum())
+    classes = np.unique(labels[confident])
+    if len(classes) == 1 and single_class == "keep":
+        warnings.warn(
+            f"all {total} confident clouds are of class {classes[0]}: keeping all of them",
+            SingleClassWarning,
+            stacklevel=2,
+        )
+        return confident
+    chosen = np.zeros(len(probabilities), dtype=bool)
+    for label in classes:
+        members = np.flatnonzero(confident & (labels == label))
+        ranking = confidence[members] if selection == "least-confident" else -confidence[members]
+        order = np.argsort(ranking, kind="stable")
+        chosen[members[order[: balanced_count(len(members), total)]]] = True
+    return chosen
+
+
+def balanced_count(members: int, total: int) -> int:
+    """Return ⌈n_k (1 − n_k / n)⌉ in exact integers.
+
+    Args:
+        members: n_k, confident clouds of the class.
+        total: n, all confident clouds; at least 1.
+
+    Example:
+        >>> balanced_count(9, 27)
+        6
+    """
+    return -(-members * (total - members) // total)
+
+
+def check_probabilities(probabilities: Float[np.ndarray, "m k"]) -> None:
+    """Check that rows are probabilities.
+
+    Raises:
+        InputError: where there is no class, a value is not finite or is negative, or a row's sum
+            is not 1 within 0.001.
+    """
+    if probabilities.shape[1] == 0:
+        raise InputError("probabilities have no class")
+    if not np.isfinite(probabilities).all():
+        raise InputError("probabilities hold NaN or infinity; the network has diverged")
+    if (probabilities < -_TOLERANCE).any():
+        raise InputError("probabilities are negative; hand in softmax outputs, not logits")
+    if (np.abs(probabilities.sum(axis=1, dtype=np.float64) - 1.0) > _TOLERANCE).any():
+        raise InputError("probabilities do not sum to 1; hand in softmax outputs, not logits")
