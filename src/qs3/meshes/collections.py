@@ -96,8 +96,9 @@ def _draws(per_class: int, seed: int, classes: Sequence[str] | None) -> list[Mes
         shapes.families(name)
         for index in range(per_class):
             entropy = [seed, shapes.CLASSES.index(name), index]
-            drawn = np.random.SeedSequence(entropy).generate_state(1, np.uint64)
-            items.append(MeshItem(f"shapes/{name}/{index:06d}", name, "", None, int(drawn[0])))
+            drawn = int(np.random.SeedSequence(entropy).generate_state(1, np.uint64)[0])
+            # 63 bits: the seed has to fit the signed integers of a table.
+            items.append(MeshItem(f"shapes/{name}/{index:06d}", name, "", None, drawn >> 1))
     return items
 
 
@@ -108,7 +109,7 @@ def _files(root: Path) -> list[MeshItem]:
     found: list[tuple[Path, str, str]] = []
     for folder in (root, *sorted(root.iterdir())):
         name = "" if folder == root else folder.name
-        if not folder.is_dir():
+        if not folder.is_dir() or name.startswith("."):
             continue
         found += [(path, name, "") for path in _meshes(folder)]
         if folder != root:
@@ -125,7 +126,9 @@ def _files(root: Path) -> list[MeshItem]:
         below = path.relative_to(root)
         stem = below.with_suffix("").as_posix()
         # Two formats of one name keep their endings, or their clouds would share an id.
-        items.append(MeshItem(stem if stems[stem] == 1 else below.as_posix(), name, part, path, None))
+        items.append(
+            MeshItem(stem if stems[stem] == 1 else below.as_posix(), name, part, path, None)
+        )
     return sorted(items, key=lambda item: item.id)
 
 

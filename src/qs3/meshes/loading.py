@@ -2,12 +2,14 @@
 
 import re
 import warnings
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
+from trimesh.resolvers import Resolver
 
 from qs3.errors import InputError
 
@@ -17,17 +19,17 @@ EXTENSIONS: tuple[str, ...] = (".off", ".obj", ".ply", ".stl", ".glb", ".gltf")
 _Y_UP = (".glb", ".gltf")
 
 
-class _OwnFolder(trimesh.resolvers.Resolver):
+class _OwnFolder(Resolver):
     """Hands out files that lie beside the mesh, and nothing else."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
-    def get(self, name: str) -> bytes:
+    def get(self, key: str) -> bytes:
         """Return the bytes of a file in the mesh's own folder or below it."""
-        path = (self.folder / name).resolve()
+        path = (self.folder / key).resolve()
         if not path.is_relative_to(self.folder.resolve()) or not path.is_file():
-            raise InputError(f"needs {name!r}, which is no file beside it")
+            raise InputError(f"needs {key!r}, which is no file beside it")
         return path.read_bytes()
 
     def write(self, name: str, data: Any) -> None:
@@ -143,9 +145,7 @@ def _read_off(path: Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 
             corners = [int(word) for word in words[1 : 1 + int(words[0])]]
             if len(corners) != int(words[0]):
                 raise ValueError
-            triangles += [
-                (corners[0], b, c) for b, c in zip(corners[1:-1], corners[2:], strict=True)
-            ]
+            triangles += [(corners[0], b, c) for b, c in pairwise(corners[1:])]
     except (IndexError, ValueError):
         raise InputError(f"{path}: a damaged line among its vertices or faces") from None
     return vertices, np.array(triangles, dtype=np.int64).reshape(-1, 3)

@@ -31,7 +31,7 @@ def normalise(mesh: trimesh.Trimesh, size: Literal["box", "ball"] = "box") -> tr
     """
     if size not in ("box", "ball"):
         raise InputError(f'size {size!r}: choose "box" or "ball"')
-    used = np.asarray(mesh.vertices)[np.unique(mesh.faces)] if len(mesh.faces) else np.empty((0, 3))
+    used = np.asarray(mesh.vertices)[np.unique(mesh.faces)] if len(mesh.faces) else np.zeros((0, 3))
     if not len(used):
         raise InputError("cannot normalise a mesh without faces")
     low, high = used.min(axis=0), used.max(axis=0)
@@ -48,8 +48,8 @@ def sample_surface(
 ) -> Float[np.ndarray, "n 3"]:
     """Draw ``n`` points uniformly by area from the surface of a mesh, float32.
 
-    A face is drawn in proportion to its area; a point in it is a + √r₁(1 − r₂)(b − a) + √r₁r₂(c − a)
-    with r₁, r₂ uniform, which is uniform over the triangle.
+    A face is drawn in proportion to its area; a point in it is
+    a + √r₁(1 − r₂)(b − a) + √r₁r₂(c − a) with r₁, r₂ uniform, which is uniform over the triangle.
 
     Raises:
         InputError: where the surface has no area.

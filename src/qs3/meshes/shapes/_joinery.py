@@ -12,9 +12,7 @@ LEGS = ("square", "tapered", "round", "cone", "turned")
 
 def corners(x: Span, y: Span, inset: float) -> list[tuple[float, float]]:
     """Four spots ``inset`` inside a rectangle."""
-    return [
-        (px, py) for px in (x[0] + inset, x[1] - inset) for py in (y[0] + inset, y[1] - inset)
-    ]
+    return [(px, py) for px in (x[0] + inset, x[1] - inset) for py in (y[0] + inset, y[1] - inset)]
 
 
 def legs(
@@ -41,17 +39,28 @@ def legs(
         elif style == "turned" and splay == 0.0:
             r = thick / 2
             profile = [
-                (0.6, 0.0), (0.8, 0.06), (0.5, 0.12), (0.7, 0.35), (1.0, 0.62), (0.6, 0.68),
-                (1.1, 0.72), (0.7, 0.76), (1.1, 0.8), (1.1, 1.0),
-            ]  # fmt: skip
+                (0.6, 0.0),
+                (0.8, 0.06),
+                (0.5, 0.12),
+                (0.7, 0.35),
+                (1.0, 0.62),
+                (0.6, 0.68),
+                (1.1, 0.72),
+                (0.7, 0.76),
+                (1.1, 0.8),
+                (1.1, 1.0),
+            ]
             parts.append(lathe([(r * a, top * b) for a, b in profile], dice.sides, x, y))
         else:
             radii = [waist * thick / 2 if style == "cone" else thick / 2, thick / 2]
             drop = np.array([foot, head], dtype=float)
             ring = lathe([(radii[0], 0.0), (radii[1], top)], dice.sides)
             lean = (ring.vertices[:, 2:] / top) * (drop[1] - drop[0])[None, :2] + drop[0, :2]
-            parts.append(Part(np.column_stack([ring.vertices[:, :2] + lean, ring.vertices[:, 2]]),
-                              ring.faces))  # fmt: skip
+            parts.append(
+                Part(
+                    np.column_stack([ring.vertices[:, :2] + lean, ring.vertices[:, 2]]), ring.faces
+                )
+            )
     return parts
 
 
@@ -67,8 +76,13 @@ def carcass(
     if bottom:
         parts.append(block((x[0] + board / 2, x[1] - board / 2), y, (z[0], z[0] + board)))
     if back:
-        parts.append(block((x[0] + board / 2, x[1] - board / 2), (y[1] - board / 2, y[1]),
-                           (z[0] + board / 2 if bottom else z[0], z[1] - board / 2)))  # fmt: skip
+        parts.append(
+            block(
+                (x[0] + board / 2, x[1] - board / 2),
+                (y[1] - board / 2, y[1]),
+                (z[0] + board / 2 if bottom else z[0], z[1] - board / 2),
+            )
+        )
     return parts
 
 
@@ -82,10 +96,19 @@ def handle(dice: Dice, style: str, x: float, y: float, z: float, upright: bool) 
     ends = [(0.0, -half), (0.0, half)] if upright else [(-half, 0.0), (half, 0.0)]
     if style == "plate":
         (ax, az), (bx, bz) = ends
-        return [block((x + ax - 0.012, x + bx + 0.012), (y - 0.025, y + 0.002),
-                      (z + az - 0.012, z + bz + 0.012))]  # fmt: skip
-    path = [(x + ends[0][0], y + 0.002, z + ends[0][1]), (x + ends[0][0], y - 0.03, z + ends[0][1]),
-            (x + ends[1][0], y - 0.03, z + ends[1][1]), (x + ends[1][0], y + 0.002, z + ends[1][1])]  # fmt: skip
+        return [
+            block(
+                (x + ax - 0.012, x + bx + 0.012),
+                (y - 0.025, y + 0.002),
+                (z + az - 0.012, z + bz + 0.012),
+            )
+        ]
+    path = [
+        (x + ends[0][0], y + 0.002, z + ends[0][1]),
+        (x + ends[0][0], y - 0.03, z + ends[0][1]),
+        (x + ends[1][0], y - 0.03, z + ends[1][1]),
+        (x + ends[1][0], y + 0.002, z + ends[1][1]),
+    ]
     return [tube(path, 0.006, 6)]
 
 
@@ -116,9 +139,13 @@ def fronts(
                 parts += [
                     block((a, a + edge), (proud, face + 0.001), (c, d)),
                     block((b - edge, b), (proud, face + 0.001), (c, d)),
-                    block((a + edge - 0.001, b - edge + 0.001), (proud, face + 0.001), (c, c + edge)),
-                    block((a + edge - 0.001, b - edge + 0.001), (proud, face + 0.001), (d - edge, d)),
-                ]  # fmt: skip
+                    block(
+                        (a + edge - 0.001, b - edge + 0.001), (proud, face + 0.001), (c, c + edge)
+                    ),
+                    block(
+                        (a + edge - 0.001, b - edge + 0.001), (proud, face + 0.001), (d - edge, d)
+                    ),
+                ]
             if style == "none":
                 continue
             if kind == "drawer":
@@ -170,8 +197,16 @@ def knick_knacks(dice: Dice, x: Span, y: Span, z: float, room: float = 0.5) -> l
             box = cushion((-half, half), (-half, half), (z - 0.002, z + tall), 0.01, steps=1)
             parts.append(box.turn("z", dice.between(0, 90)).move(cx, middle))
         elif kind == "vase":
-            shape = [(0.5, 0.0), (0.9, 0.3), (0.8, 0.6), (0.4, 0.8), (0.55, 1.0), (0.4, 0.98),
-                     (0.3, 0.8), (0.0, 0.2)]  # fmt: skip
+            shape = [
+                (0.5, 0.0),
+                (0.9, 0.3),
+                (0.8, 0.6),
+                (0.4, 0.8),
+                (0.55, 1.0),
+                (0.4, 0.98),
+                (0.3, 0.8),
+                (0.0, 0.2),
+            ]
             profile = [(half * r, z - 0.002 + tall * h) for r, h in shape]
             parts.append(lathe(profile, dice.sides, cx, middle))
         elif kind == "row":

@@ -119,10 +119,8 @@ def block(x: Span, y: Span, z: Span) -> Part:
     return slab(corners, z)
 
 
-def cushion(
-    x: Span, y: Span, z: Span, radius: float, crown: float = 0.0, steps: int = 3
-) -> Part:
-    """Box with edges rounded to ``radius`` and a top that swells by ``crown``; 1 step is a bevel."""
+def cushion(x: Span, y: Span, z: Span, radius: float, crown: float = 0.0, steps: int = 3) -> Part:
+    """Box with edges rounded to ``radius`` and a top swollen by ``crown``; 1 step is a bevel."""
     low, high = np.array([x[0], y[0], z[0]], float), np.array([x[1], y[1], z[1]], float)
     half = (high - low) / 2
     r = min(radius, 0.98 * half.min())
@@ -227,7 +225,9 @@ def sheet(grid: Float[np.ndarray, "r c 3"], thickness: float) -> Part:
     return loft(np.concatenate([grid + normal, (grid - normal)[:, ::-1]], axis=1), cap="zip")
 
 
-def ribbon(path: Float[np.ndarray, "n 3"], across: Float[np.ndarray, "n 3"], thickness: float) -> Part:
+def ribbon(
+    path: Float[np.ndarray, "n 3"], across: Float[np.ndarray, "n 3"], thickness: float
+) -> Part:
     """Strip along ``path`` that reaches ``across`` to either side of it."""
     return sheet(np.stack([path - across, path, path + across], axis=1), thickness)
 

@@ -6,7 +6,18 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.meshes.shapes._dice import Dice
-from qs3.meshes.shapes._parts import Part, at_height, ball, beam, bend, block, lathe, loft, outline, tube
+from qs3.meshes.shapes._parts import (
+    Part,
+    at_height,
+    ball,
+    beam,
+    bend,
+    block,
+    lathe,
+    loft,
+    outline,
+    tube,
+)
 
 Rim = Callable[[Float[np.ndarray, "n"]], Float[np.ndarray, "n"]]
 """Height added to the rim at each x ÷ half length."""
@@ -46,13 +57,19 @@ def _size(dice: Dice) -> tuple[float, float, float]:
     return dice.between(1.35, 1.9), dice.between(0.66, 0.92), dice.between(0.46, 0.66)
 
 
-def _hollow(dice: Dice, high: float, rim: tuple[float, float], deep: float) -> list[tuple[float, float, float]]:
+def _hollow(
+    dice: Dice, high: float, rim: tuple[float, float], deep: float
+) -> list[tuple[float, float, float]]:
     """Rings of a hollow whose mouth leaves a rim of these shares of length and width."""
     a, b = 1 - 2 * rim[0], 1 - 2 * rim[1]
     floor = high - deep
     foot = dice.between(0.72, 0.92)
-    return [(a, b, high), (a * (1 + foot) / 2, b * (1 + foot) / 2, floor + 0.35 * deep),
-            (a * foot, b * foot, floor + 0.06), (a * foot * 0.85, b * foot * 0.85, floor)]  # fmt: skip
+    return [
+        (a, b, high),
+        (a * (1 + foot) / 2, b * (1 + foot) / 2, floor + 0.35 * deep),
+        (a * foot, b * foot, floor + 0.06),
+        (a * foot * 0.85, b * foot * 0.85, floor),
+    ]
 
 
 def _tap(dice: Dice, x: float, y: float, z: float, toward: float) -> list[Part]:
@@ -61,11 +78,15 @@ def _tap(dice: Dice, x: float, y: float, z: float, toward: float) -> list[Part]:
     spout = bend([(0, 0, -0.01), (0, 0, rise), (run, 0, rise), (run, 0, rise - 0.05)], 0.05)
     parts = [tube(spout, 0.013, 8)]
     for s in (-1, 1):
-        parts.append(lathe([(0.012, -0.01), (0.012, 0.04), (0.026, 0.05), (0.026, 0.065)], 8, 0.0, s * 0.08))
+        parts.append(
+            lathe([(0.012, -0.01), (0.012, 0.04), (0.026, 0.05), (0.026, 0.065)], 8, 0.0, s * 0.08)
+        )
     return [part.turn("z", toward).move(x, y, z) for part in parts]
 
 
-def _maybe_tap(dice: Dice, length: float, z: float, share: float = 0.5, rim: float = 0.05) -> list[Part]:
+def _maybe_tap(
+    dice: Dice, length: float, z: float, share: float = 0.5, rim: float = 0.05
+) -> list[Part]:
     return _tap(dice, length / 2 - rim / 2, 0.0, z, 180) if dice.chance(share) else []
 
 
@@ -76,12 +97,23 @@ def built_in(dice: Dice) -> list[Part]:
     wall = dice.between(0.03, 0.1)
     inner = _hollow(dice, high, (wall / length, wall / width), high - dice.between(0.06, 0.14))
     lip = dice.pick(0.0, 0.02)
-    outer = [(1 - lip, 1 - 2 * lip, 0.0), (1 - lip, 1 - 2 * lip, high - 0.05), (1.0, 1.0, high - 0.05), (1.0, 1.0, high)]
+    outer = [
+        (1 - lip, 1 - 2 * lip, 0.0),
+        (1 - lip, 1 - 2 * lip, high - 0.05),
+        (1.0, 1.0, high - 0.05),
+        (1.0, 1.0, high),
+    ]
     if lip == 0.0:
         outer = [outer[0], outer[-1]]
     parts = [_tub(outer, inner, (length, width), (40.0, dice.pick(3.0, 5.0, 12.0, 40.0)), 64)]
     if dice.chance(0.2):
-        parts.append(block((length / 2 - 0.03, length / 2), (-width / 2, width / 2), (high - 0.01, high + dice.between(0.2, 0.5))))
+        parts.append(
+            block(
+                (length / 2 - 0.03, length / 2),
+                (-width / 2, width / 2),
+                (high - 0.01, high + dice.between(0.2, 0.5)),
+            )
+        )
     return parts + _maybe_tap(dice, length, high, rim=wall)
 
 
@@ -106,8 +138,12 @@ def oval(dice: Dice) -> list[Part]:
     rim = (wall / length, wall / width)
     outer = [(foot, foot, 0.0), (waist, waist, 0.5 * high), (1.0, 1.0, high)]
     scale = 1 - 2 * rim[1]
-    inner = [(1 - 2 * rim[0], scale, high), (waist * (1 - 2 * rim[0]) - 0.02, waist * scale - 0.02, 0.5 * high),
-             (foot * 0.85, foot * 0.8, 0.12), (foot * 0.6, foot * 0.55, 0.09)]  # fmt: skip
+    inner = [
+        (1 - 2 * rim[0], scale, high),
+        (waist * (1 - 2 * rim[0]) - 0.02, waist * scale - 0.02, 0.5 * high),
+        (foot * 0.85, foot * 0.8, 0.12),
+        (foot * 0.6, foot * 0.55, 0.09),
+    ]
     e = dice.between(2.0, 3.5)
     parts = [_tub(outer, inner, (length, width), (e, e), max(24, 2 * dice.sides))]
     if dice.chance(0.3):
@@ -116,25 +152,50 @@ def oval(dice: Dice) -> list[Part]:
 
 
 def _standing_tap(x: float, high: float) -> list[Part]:
-    path = bend([(x, 0, 0.0), (x, 0, high + 0.25), (x - 0.22, 0, high + 0.25), (x - 0.22, 0, high + 0.15)], 0.06)
-    return [tube(path, 0.014, 8), lathe([(0.05, 0), (0.05, 0.015)], 12, x),
-            beam((x, 0, high - 0.06), (x - 0.12, 0, high - 0.06), 0.02, 0.02)]  # fmt: skip
+    path = bend(
+        [(x, 0, 0.0), (x, 0, high + 0.25), (x - 0.22, 0, high + 0.25), (x - 0.22, 0, high + 0.15)],
+        0.06,
+    )
+    return [
+        tube(path, 0.014, 8),
+        lathe([(0.05, 0), (0.05, 0.015)], 12, x),
+        beam((x, 0, high - 0.06), (x - 0.12, 0, high - 0.06), 0.02, 0.02),
+    ]
 
 
 def _footed(dice: Dice, rim: Rim | None) -> list[Part]:
     length, width, high = _size(dice)
     lift, wall, e = dice.between(0.08, 0.17), dice.between(0.02, 0.04), dice.between(2.1, 3.2)
     belly = high - lift
-    outer = [(0.5, 0.45, lift), (0.78, 0.74, lift + 0.12 * belly), (0.92, 0.9, lift + 0.5 * belly), (0.96, 0.95, high - 0.04)]
-    lip = [(1.0, 1.02, high - 0.02), (1.0, 1.02, high)] if dice.chance(0.7) else [(0.97, 0.97, high)]
+    outer = [
+        (0.5, 0.45, lift),
+        (0.78, 0.74, lift + 0.12 * belly),
+        (0.92, 0.9, lift + 0.5 * belly),
+        (0.96, 0.95, high - 0.04),
+    ]
+    lip = (
+        [(1.0, 1.02, high - 0.02), (1.0, 1.02, high)] if dice.chance(0.7) else [(0.97, 0.97, high)]
+    )
     a, b = 2 * wall / length, 2 * wall / width
-    inner = [(0.96 - a, 0.95 - b, high), (0.92 - a, 0.9 - b, lift + 0.5 * belly), (0.76 - a, 0.72 - b, lift + 0.14 * belly), (0.5, 0.4, lift + wall)]  # fmt: skip
+    inner = [
+        (0.96 - a, 0.95 - b, high),
+        (0.92 - a, 0.9 - b, lift + 0.5 * belly),
+        (0.76 - a, 0.72 - b, lift + 0.14 * belly),
+        (0.5, 0.4, lift + wall),
+    ]
     parts = [_tub([*outer, *lip], inner, (length, width), (e, e), max(24, 2 * dice.sides), rim)]
     for sx in (-1, 1):
         for sy in (-1, 1):
             x, y = sx * 0.3 * length, sy * 0.27 * width
-            foot = [(x * 0.9, y * 0.75, lift + 0.08 * belly), (x, y, lift * 0.75), (x * 1.02, y * 1.08, 0.03)]
-            parts += [tube(foot, [0.05, 0.035, 0.022], 8), ball(0.034, (x * 1.02, y * 1.08, 0.034), 8)]
+            foot = [
+                (x * 0.9, y * 0.75, lift + 0.08 * belly),
+                (x, y, lift * 0.75),
+                (x * 1.02, y * 1.08, 0.03),
+            ]
+            parts += [
+                tube(foot, [0.05, 0.035, 0.022], 8),
+                ball(0.034, (x * 1.02, y * 1.08, 0.034), 8),
+            ]
     if rim is None:
         parts += _maybe_tap(dice, 0.95 * length, high, 0.3, 0.02)
     return parts
@@ -185,8 +246,13 @@ def corner(dice: Dice) -> list[Part]:
     reach = 1 / (np.abs(hollow[:, 0]) ** 2.6 + np.abs(hollow[:, 1]) ** 2.6) ** (1 / 2.6)
     hollow = hollow * np.minimum(reach, 1.08)[:, None] * mouth
     floor = dice.between(0.08, 0.14)
-    rings = [at_height(wall, 0.0), at_height(wall, high), at_height(middle + hollow, high),
-             at_height(middle + 0.85 * hollow, floor + 0.1), at_height(middle + 0.7 * hollow, floor)]  # fmt: skip
+    rings = [
+        at_height(wall, 0.0),
+        at_height(wall, high),
+        at_height(middle + hollow, high),
+        at_height(middle + 0.85 * hollow, floor + 0.1),
+        at_height(middle + 0.7 * hollow, floor),
+    ]
     parts = [loft(np.stack(rings))]
     if dice.chance(0.4):
         parts += _tap(dice, 0.12, 0.12, high, 45)
@@ -199,7 +265,12 @@ def whirlpool(dice: Dice) -> list[Part]:
     e = dice.pick(2.0, 6.0, 40.0)
     share = rim / size
     inner = _hollow(dice, high, (share, share), high - dice.between(0.1, 0.2))
-    outer = [(0.97, 0.97, 0.0), (0.97, 0.97, high - 0.06), (1.0, 1.0, high - 0.06), (1.0, 1.0, high)]
+    outer = [
+        (0.97, 0.97, 0.0),
+        (0.97, 0.97, high - 0.06),
+        (1.0, 1.0, high - 0.06),
+        (1.0, 1.0, high),
+    ]
     depth = size * dice.pick(1.0, dice.between(0.7, 1.0))
     parts = [_tub(outer, inner, (size, depth), (e, max(2.0, e / 2)), 64)]
     if dice.chance(0.4):

@@ -1,5 +1,7 @@
 """Bookshelves: backed, open, ladder, corner, cubes, wall board, rack, with doors."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from qs3.meshes.shapes._dice import Dice
@@ -24,31 +26,54 @@ def _backed(dice: Dice, doors: bool) -> list[Part]:
     x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
     parts = carcass(x, y, (foot, high), board, back=dice.chance(0.85) or doors)
     share = dice.pick(0.0, 0.0, dice.between(0.3, 1.0))
-    bays = np.linspace(x[0] + board / 2, x[1] - board / 2, 1 + max(1, round(width / dice.between(0.5, 1.0))))
+    bays = np.linspace(
+        x[0] + board / 2, x[1] - board / 2, 1 + max(1, round(width / dice.between(0.5, 1.0)))
+    )
     for px in bays[1:-1]:
-        parts.append(block((float(px) - board / 2, float(px) + board / 2), y, (foot, high - board / 2)))
+        parts.append(
+            block((float(px) - board / 2, float(px) + board / 2), y, (foot, high - board / 2))
+        )
     rows = max(2, round((high - foot) / dice.between(0.25, 0.45)))
     shut = foot + (dice.between(0.2, 0.4) * (high - foot) if doors else 0.0)
     levels = np.linspace(foot, high - board, rows + 1)
     for i, level in enumerate(levels[:-1]):
         if i:
             z = float(level)
-            parts.append(block((x[0] + board / 2, x[1] - board / 2), (y[0] + 0.004, y[1] - 0.002), (z, z + board)))
+            parts.append(
+                block(
+                    (x[0] + board / 2, x[1] - board / 2),
+                    (y[0] + 0.004, y[1] - 0.002),
+                    (z, z + board),
+                )
+            )
         if level < shut:
             continue
-        for a, b in zip(bays[:-1], bays[1:], strict=True):
+        for a, b in pairwise(bays):
             span = (float(a) + board / 2 + 0.005, float(b) - board / 2 - 0.005)
-            parts += _fill(dice, span, (y[0] + 0.01, y[1] - board / 2), float(level) + board, float(levels[1] - levels[0]) - board, share)  # fmt: skip
+            parts += _fill(
+                dice,
+                span,
+                (y[0] + 0.01, y[1] - board / 2),
+                float(level) + board,
+                float(levels[1] - levels[0]) - board,
+                share,
+            )
     if doors:
-        parts += fronts(dice, x, (foot, shut), y[0], max(1, round(width / 0.45)), dice.pick(1, 1, 2), "door")
+        parts += fronts(
+            dice, x, (foot, shut), y[0], max(1, round(width / 0.45)), dice.pick(1, 1, 2), "door"
+        )
     if foot > 0:
         if dice.chance(0.5):
-            parts.append(block((x[0] + 0.01, x[1] - 0.01), (y[0] + 0.02, y[1] - 0.01), (0, foot + board / 2)))
+            parts.append(
+                block((x[0] + 0.01, x[1] - 0.01), (y[0] + 0.02, y[1] - 0.01), (0, foot + board / 2))
+            )
         else:
             parts += legs(dice, corners(x, y, 0.035), foot + board / 2, 0.04)
     if dice.chance(0.2):
         over = dice.between(0.01, 0.04)
-        parts.append(block((x[0] - over, x[1] + over), (y[0] - over, y[1]), (high - 0.002, high + 0.03)))
+        parts.append(
+            block((x[0] - over, x[1] + over), (y[0] - over, y[1]), (high - 0.002, high + 0.03))
+        )
     return parts
 
 
@@ -73,14 +98,24 @@ def open_frame(dice: Dice) -> list[Part]:
     share = dice.pick(0.0, 0.0, dice.between(0.3, 1.0))
     for i, level in enumerate(levels):
         z = float(level)
-        parts.append(block((x[0] + 0.005, x[1] - 0.005), (y[0] + 0.005, y[1] - 0.005), (z, z + board)))
+        parts.append(
+            block((x[0] + 0.005, x[1] - 0.005), (y[0] + 0.005, y[1] - 0.005), (z, z + board))
+        )
         if i < rows - 1:
             room = float(levels[1] - levels[0]) - board
-            parts += _fill(dice, (x[0] + post, x[1] - post), (y[0] + post, y[1] - 0.01), z + board, room, share)
+            parts += _fill(
+                dice, (x[0] + post, x[1] - post), (y[0] + post, y[1] - 0.01), z + board, room, share
+            )
     if dice.chance(0.4):
         a, b = float(levels[0]) + board / 2, float(levels[-1]) + board / 2
-        parts += [beam((x[0] + post, y[1] - post / 2, a), (x[1] - post, y[1] - post / 2, b), 0.012, 0.012),
-                  beam((x[1] - post, y[1] - post / 2, a), (x[0] + post, y[1] - post / 2, b), 0.012, 0.012)]  # fmt: skip
+        parts += [
+            beam(
+                (x[0] + post, y[1] - post / 2, a), (x[1] - post, y[1] - post / 2, b), 0.012, 0.012
+            ),
+            beam(
+                (x[1] - post, y[1] - post / 2, a), (x[0] + post, y[1] - post / 2, b), 0.012, 0.012
+            ),
+        ]
     return parts
 
 
@@ -95,7 +130,13 @@ def ladder(dice: Dice) -> list[Part]:
         parts.append(beam((px, -depth / 2, 0), (px, depth / 2 - bar, high), bar, bar))
         if rear:
             parts.append(beam((px, depth / 2, 0), (px, depth / 2, high), bar, bar))
-            parts.append(block((px - bar / 2, px + bar / 2), (depth / 2 - 1.6 * bar, depth / 2 + bar / 2), (high - 0.03, high)))
+            parts.append(
+                block(
+                    (px - bar / 2, px + bar / 2),
+                    (depth / 2 - 1.6 * bar, depth / 2 + bar / 2),
+                    (high - 0.03, high),
+                )
+            )
     share = dice.pick(0.0, dice.between(0.3, 1.0))
     levels = np.linspace(dice.between(0.12, 0.3), high - dice.between(0.05, 0.2), rows)
     for level in levels:
@@ -104,35 +145,64 @@ def ladder(dice: Dice) -> list[Part]:
         span = (front, depth / 2)
         parts.append(block((-width / 2 + 0.002, width / 2 - 0.002), span, (z, z + board)))
         if span[1] - span[0] > 0.14 and z < levels[-1]:
-            parts += _fill(dice, (-width / 2 + bar, width / 2 - bar), (span[0] + bar, span[1] - 0.02), z + board, 0.3, share)
+            parts += _fill(
+                dice,
+                (-width / 2 + bar, width / 2 - bar),
+                (span[0] + bar, span[1] - 0.02),
+                z + board,
+                0.3,
+                share,
+            )
     return parts
 
 
 def corner(dice: Dice) -> list[Part]:
     """Two bookcases that meet at a right angle."""
     run, down, depth = dice.between(0.6, 1.4), dice.between(0.6, 1.4), dice.between(0.25, 0.38)
-    high, board, rows = dice.between(0.8, 2.1), dice.between(0.018, 0.03) * dice.bulk, dice.count(2, 6)
+    high, board, rows = (
+        dice.between(0.8, 2.1),
+        dice.between(0.018, 0.03) * dice.bulk,
+        dice.count(2, 6),
+    )
     parts = []
     for level in np.linspace(0.0, high - board, rows + 1):
         z = float(level)
-        parts += [block((0, run), (-depth, 0), (z, z + board)), block((0, depth), (-down, -depth + 0.002), (z, z + board))]
-    ends = [block((run - board, run), (-depth, 0), (0, high)), block((0, depth), (-down, -down + board), (0, high)),
-            block((0, board / 2), (-down, 0), (0, high)), block((0, run), (-board / 2, 0), (0, high))]  # fmt: skip
+        parts += [
+            block((0, run), (-depth, 0), (z, z + board)),
+            block((0, depth), (-down, -depth + 0.002), (z, z + board)),
+        ]
+    ends = [
+        block((run - board, run), (-depth, 0), (0, high)),
+        block((0, depth), (-down, -down + board), (0, high)),
+        block((0, board / 2), (-down, 0), (0, high)),
+        block((0, run), (-board / 2, 0), (0, high)),
+    ]
     share = dice.pick(0.0, dice.between(0.3, 0.9))
     room = high / rows - board
     for level in np.linspace(0.0, high - board, rows + 1)[:-1]:
-        parts += _fill(dice, (depth + 0.02, run - board), (-depth + 0.01, -board), float(level) + board, room, share)
+        parts += _fill(
+            dice,
+            (depth + 0.02, run - board),
+            (-depth + 0.01, -board),
+            float(level) + board,
+            room,
+            share,
+        )
     return parts + ends
 
 
 def cubes(dice: Dice) -> list[Part]:
     """Grid of square bays, complete or stepped."""
     columns, rows = dice.count(1, 5), dice.count(1, 5)
-    if columns * rows < 2:
-        columns = 2
+    if columns == 1:
+        rows = max(rows, 2)
     bay, depth = dice.between(0.3, 0.42), dice.between(0.25, 0.42)
     board = dice.between(0.016, 0.04) * dice.bulk
-    steps = sorted((dice.count(1, rows) for _ in range(columns)), reverse=True) if dice.chance(0.3) else [rows] * columns
+    steps = (
+        sorted((dice.count(1, rows) for _ in range(columns)), reverse=True)
+        if columns > 2 and dice.chance(0.3)
+        else [rows] * columns
+    )
     y, back, share = (-depth / 2, depth / 2), dice.chance(0.5), dice.pick(0.0, 0.3, 0.8)
     parts = []
     for i, tall in enumerate(steps):
@@ -142,9 +212,22 @@ def cubes(dice: Dice) -> list[Part]:
             parts += carcass((a - board / 2, b + board / 2), y, (c, d + board), board, back)
             kind = dice.pick("open", "open", "open", "box")
             if kind == "box" and share > 0:
-                parts.append(block((a + board / 2 + 0.01, b - board / 2 - 0.01), (y[0] + 0.01, y[1] - board), (c + board - 0.002, d - 0.04)))  # fmt: skip
+                parts.append(
+                    block(
+                        (a + board / 2 + 0.01, b - board / 2 - 0.01),
+                        (y[0] + 0.01, y[1] - board),
+                        (c + board - 0.002, d - 0.04),
+                    )
+                )
             else:
-                parts += _fill(dice, (a + board / 2 + 0.01, b - board / 2 - 0.01), (y[0] + 0.01, y[1] - board), c + board, bay - board, share)  # fmt: skip
+                parts += _fill(
+                    dice,
+                    (a + board / 2 + 0.01, b - board / 2 - 0.01),
+                    (y[0] + 0.01, y[1] - board),
+                    c + board,
+                    bay - board,
+                    share,
+                )
     return parts
 
 
@@ -166,9 +249,18 @@ def wall_board(dice: Dice) -> list[Part]:
             span = (px - wide / 2, px + wide / 2)
             if count == 1:
                 reach = dice.between(0.5, 0.95) * depth
-                parts += [block(span, (y[1] - 0.03, y[1]), (z - drop, z + 0.005)),
-                          block(span, (y[1] - reach, y[1]), (z - 0.03, z + 0.005))]  # fmt: skip
-                parts.append(beam((px, y[1] - 0.02, z - 0.8 * drop), (px, y[1] - 0.8 * reach, z - 0.01), 0.8 * wide, 0.02))
+                parts += [
+                    block(span, (y[1] - 0.03, y[1]), (z - drop, z + 0.005)),
+                    block(span, (y[1] - reach, y[1]), (z - 0.03, z + 0.005)),
+                ]
+                parts.append(
+                    beam(
+                        (px, y[1] - 0.02, z - 0.8 * drop),
+                        (px, y[1] - 0.8 * reach, z - 0.01),
+                        0.8 * wide,
+                        0.02,
+                    )
+                )
         if dice.chance(share):
             if dice.chance(0.5):
                 parts += books(dice, (x[0] + 0.02, x[1] - 0.02), y, z + board, 0.32)
@@ -177,7 +269,13 @@ def wall_board(dice: Dice) -> list[Part]:
     if count > 1:
         for s in (-1, 1):
             px = s * (width / 2 - inset)
-            parts.append(block((px - wide / 2, px + wide / 2), (y[1] - 0.02, y[1]), (0.0, drop + (count - 1) * step + 0.1)))
+            parts.append(
+                block(
+                    (px - wide / 2, px + wide / 2),
+                    (y[1] - 0.02, y[1]),
+                    (0.0, drop + (count - 1) * step + 0.1),
+                )
+            )
     return parts
 
 
@@ -191,9 +289,19 @@ def rack(dice: Dice) -> list[Part]:
     for level in np.linspace(0.1, high - 0.08, rows):
         if dice.chance(0.3):
             for py in np.linspace(y[0] + 0.04, y[1] - 0.04, 4):
-                parts.append(block((x[0] + board / 2, x[1] - board / 2), (float(py) - 0.015, float(py) + 0.015), (float(level), float(level) + 0.02)))  # fmt: skip
+                parts.append(
+                    block(
+                        (x[0] + board / 2, x[1] - board / 2),
+                        (float(py) - 0.015, float(py) + 0.015),
+                        (float(level), float(level) + 0.02),
+                    )
+                )
         else:
-            shelf = block((x[0] + board / 2, x[1] - board / 2), (y[0] + 0.02, y[1] - 0.02), (float(level), float(level) + 0.8 * board))
+            shelf = block(
+                (x[0] + board / 2, x[1] - board / 2),
+                (y[0] + 0.02, y[1] - 0.02),
+                (float(level), float(level) + 0.8 * board),
+            )
             parts.append(shelf.turn("x", slope, (0, 0, float(level))))
     if dice.chance(0.4):
         parts.append(block(x, (y[0], y[1]), (high - board, high)))

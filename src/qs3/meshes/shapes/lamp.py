@@ -27,17 +27,22 @@ def _shade(dice: Dice, wide: float, tall: float, z: float, sides: int) -> list[P
     mid = z + 0.5 * tall
     belly = dice.pick(0.0, dice.between(-0.15, 0.2))
     levels = np.linspace(0, 1, 5)
-    outer = [(wide + (top - wide) * t + belly * wide * np.sin(np.pi * t), z + tall * t) for t in levels]
+    outer = [
+        (wide + (top - wide) * t + belly * wide * np.sin(np.pi * t), z + tall * t) for t in levels
+    ]
     inner = [(r - _WALL, h) for r, h in outer]
     loop = [*outer, *inner[::-1]]
     square = dice.chance(0.15)
-    rings = [at_height(outline(2 * r, 2 * r, 4 if square else sides, phase=0.5), h) for r, h in loop]
+    rings = [
+        at_height(outline(2 * r, 2 * r, 4 if square else sides, phase=0.5), h) for r, h in loop
+    ]
     shade = loft(np.stack(rings), cyclic=True)
-    reach = 0.5 * (wide + top) + belly * wide
-    reach = reach * (0.72 if square else 0.99)
-    spokes = [beam((-reach, 0, mid), (reach, 0, mid), 0.008, 0.008),
-              beam((0, -reach, mid), (0, reach, mid), 0.008, 0.008)]  # fmt: skip
-    return [shade, *spokes, ball(0.035, (0, 0, mid + 0.02), 8)]
+    # The spoke along x meets the middle of a flat side, which is nearer than the corners.
+    reach = (0.5 * (wide + top) + belly * wide - 0.5 * _WALL) * np.cos(
+        np.pi / (4 if square else sides)
+    )
+    spoke = beam((-reach, 0, mid), (reach, 0, mid), 0.008, 0.006)
+    return [shade, spoke, ball(0.035, (0, 0, mid + 0.02), 8)]
 
 
 def _foot(dice: Dice, radius: float) -> list[Part]:
@@ -45,7 +50,12 @@ def _foot(dice: Dice, radius: float) -> list[Part]:
     if dice.chance(0.25):
         return [block((-radius, radius), (-radius, radius), (0, thick))]
     dome = dice.between(0.3, 1.0)
-    return [lathe([(radius, 0), (radius, thick), (dome * radius, thick * 1.4), (0.1 * radius, thick * 2)], dice.sides)]
+    return [
+        lathe(
+            [(radius, 0), (radius, thick), (dome * radius, thick * 1.4), (0.1 * radius, thick * 2)],
+            dice.sides,
+        )
+    ]
 
 
 def floor(dice: Dice) -> list[Part]:
@@ -56,11 +66,13 @@ def floor(dice: Dice) -> list[Part]:
     low = 0.01
     if dice.chance(0.3):
         hub = dice.between(0.4, 0.9) * (high - tall)
-        spots = [(0.02 * np.cos(a), 0.02 * np.sin(a)) for a in np.radians([90, 210, 330])]
         tips = [(dice.between(0.18, 0.3), a) for a in (90, 210, 330)]
-        del spots
         for reach, a in tips:
-            tip: Point = (reach * float(np.cos(np.radians(a))), reach * float(np.sin(np.radians(a))), post * 0.5)
+            tip: Point = (
+                reach * float(np.cos(np.radians(a))),
+                reach * float(np.sin(np.radians(a))),
+                post * 0.5,
+            )
             parts.append(tube([tip, (0, 0, hub)], post, 8))
             parts.append(lathe([(post, 0.0), (post, 2 * post)], 8, tip[0], tip[1]))
         low = hub - 0.02
@@ -75,31 +87,65 @@ def arc(dice: Dice) -> list[Part]:
     bar = dice.between(0.009, 0.018) * dice.bulk**0.5
     t = np.linspace(0, 1, 13)
     drop = dice.between(0.05, 0.35)
-    path = np.stack([reach * (1 - np.cos(t * np.pi * 0.55)) / (1 - np.cos(np.pi * 0.55)), 0 * t,
-                     high * np.sin(t * np.pi * dice.between(0.55, 0.66))], axis=1)  # fmt: skip
+    path = np.stack(
+        [
+            reach * (1 - np.cos(t * np.pi * 0.55)) / (1 - np.cos(np.pi * 0.55)),
+            0 * t,
+            high * np.sin(t * np.pi * dice.between(0.55, 0.66)),
+        ],
+        axis=1,
+    )
     end = path[-1]
     low = float(end[2]) - drop
     tall = wide * dice.between(0.6, 1.1)
     bowl = [(wide * np.cos(a), low - tall + tall * np.sin(a)) for a in np.linspace(0, 1.5, 6)]
-    inner = [((wide - _WALL) * np.cos(a), low - tall + (tall - _WALL) * np.sin(a)) for a in np.linspace(0, 1.5, 6)]
+    inner = [
+        ((wide - _WALL) * np.cos(a), low - tall + (tall - _WALL) * np.sin(a))
+        for a in np.linspace(0, 1.5, 6)
+    ]
     shade = lathe([*bowl, (0.0, low), (0.0, low - _WALL), *inner[::-1]], dice.sides)
-    foot = lathe([(dice.between(0.16, 0.22), 0), (0.16, dice.between(0.03, 0.07))], max(12, dice.sides))
-    return [tube(path, bar, 8), tube([end, (end[0], 0, low - 0.02)], bar * 0.8, 6),
-            shade.move(float(end[0])), foot.move(-0.04 + 0.04)]  # fmt: skip
+    foot = lathe(
+        [(dice.between(0.16, 0.22), 0), (0.16, dice.between(0.03, 0.07))], max(12, dice.sides)
+    )
+    return [
+        tube(path, bar, 8),
+        tube([end, (end[0], 0, low - 0.02)], bar * 0.8, 6),
+        shade.move(float(end[0])),
+        foot,
+    ]
 
 
 def torchiere(dice: Dice) -> list[Part]:
     """Uplighter: a bowl on a tall post, perhaps with a reading arm."""
-    high, post, wide = dice.between(1.55, 1.95), dice.between(0.01, 0.022) * dice.bulk**0.7, dice.between(0.12, 0.2)
+    high, post, wide = (
+        dice.between(1.55, 1.95),
+        dice.between(0.01, 0.022) * dice.bulk**0.7,
+        dice.between(0.12, 0.2),
+    )
     deep = dice.between(0.04, 0.14)
-    bowl = [(0.03, high - deep), (0.7 * wide, high - 0.6 * deep), (wide, high), (wide - 0.008, high),
-            (0.65 * wide, high - 0.5 * deep), (0.0, high - 0.8 * deep)]  # fmt: skip
-    parts = [lathe(bowl, dice.sides), *_foot(dice, dice.between(0.12, 0.17)),
-             lathe([(post, 0.01), (post, high - 0.8 * deep)], 8)]  # fmt: skip
+    bowl = [
+        (0.03, high - deep),
+        (0.7 * wide, high - 0.6 * deep),
+        (wide, high),
+        (wide - 0.008, high),
+        (0.65 * wide, high - 0.5 * deep),
+        (0.0, high - 0.8 * deep),
+    ]
+    parts = [
+        lathe(bowl, dice.sides),
+        *_foot(dice, dice.between(0.12, 0.17)),
+        lathe([(post, 0.01), (post, high - 0.8 * deep)], 8),
+    ]
     if dice.chance(0.4):
         z, run = dice.between(0.55, 0.75) * high, dice.between(0.15, 0.3)
-        parts.append(tube(bend([(0, 0, z), (run * 0.5, 0, z + 0.05), (run, 0, z - 0.02)], 0.05), 0.008, 6))
-        parts.append(lathe([(0.05, -0.08), (0.02, 0.01), (0.015, 0.01), (0.044, -0.08)], 10).turn("y", -20).move(run, 0, z - 0.02))
+        parts.append(
+            tube(bend([(0, 0, z), (run * 0.5, 0, z + 0.05), (run, 0, z - 0.02)], 0.05), 0.008, 6)
+        )
+        parts.append(
+            lathe([(0.05, -0.08), (0.02, 0.01), (0.015, 0.01), (0.044, -0.08)], 10)
+            .turn("y", -20)
+            .move(run, 0, z - 0.02)
+        )
     return parts
 
 
@@ -111,15 +157,36 @@ def table(dice: Dice) -> list[Part]:
     r = dice.between(0.3, 0.7) * wide
     kind = dice.pick("vase", "ball", "post", "square", "turned")
     if kind == "square":
-        parts += [block((-r, r), (-r, r), (0, 0.025)), block((-0.45 * r, 0.45 * r), (-0.45 * r, 0.45 * r), (0.02, body))]
+        parts += [
+            block((-r, r), (-r, r), (0, 0.025)),
+            block((-0.45 * r, 0.45 * r), (-0.45 * r, 0.45 * r), (0.02, body)),
+        ]
     elif kind == "post":
         parts += [*_foot(dice, r), lathe([(0.12 * r + 0.008, 0.01), (0.12 * r + 0.008, body)], 8)]
     else:
         profile = {
             "vase": [(0.6, 0.0), (1.0, 0.35), (0.9, 0.6), (0.35, 0.85), (0.25, 1.0)],
-            "ball": [(0.6, 0.0), (0.5, 0.06), (0.9, 0.25), (1.0, 0.45), (0.85, 0.7), (0.3, 0.85), (0.2, 1.0)],
-            "turned": [(1.0, 0.0), (0.9, 0.08), (0.35, 0.14), (0.3, 0.3), (0.55, 0.4), (0.6, 0.5), (0.3, 0.65), (0.4, 0.8), (0.2, 1.0)],
-        }[kind]  # fmt: skip
+            "ball": [
+                (0.6, 0.0),
+                (0.5, 0.06),
+                (0.9, 0.25),
+                (1.0, 0.45),
+                (0.85, 0.7),
+                (0.3, 0.85),
+                (0.2, 1.0),
+            ],
+            "turned": [
+                (1.0, 0.0),
+                (0.9, 0.08),
+                (0.35, 0.14),
+                (0.3, 0.3),
+                (0.55, 0.4),
+                (0.6, 0.5),
+                (0.3, 0.65),
+                (0.4, 0.8),
+                (0.2, 1.0),
+            ],
+        }[kind]
         parts.append(lathe([(r * a, body * b) for a, b in profile], dice.sides))
     stem = high - 0.5 * tall + 0.01
     parts.append(lathe([(0.009, 0.9 * body), (0.009, max(stem, 0.92 * body))], 6))
@@ -129,11 +196,21 @@ def table(dice: Dice) -> list[Part]:
 def _bell(dice: Dice, wide: float, tall: float) -> Part:
     """Reflector that opens downward below the origin."""
     neck = dice.between(0.25, 0.5) * wide
-    outer = [(wide, -tall), (dice.between(0.75, 1.0) * wide, -0.5 * tall), (neck, -0.1 * tall), (neck, 0.15 * tall)]
-    inner = [(0.0, 0.0), (neck - _WALL, -0.1 * tall), (outer[1][0] - _WALL, -0.5 * tall), (wide - _WALL, -tall)]
-    return lathe([*outer, *inner], dice.sides) if False else loft(
-        np.stack([at_height(outline(2 * r, 2 * r, dice.sides, phase=0.5), z)
-                  for r, z in [*outer, (0.0, 0.15 * tall), *inner]]), cyclic=True)  # fmt: skip
+    outer = [
+        (wide, -tall),
+        (dice.between(0.75, 1.0) * wide, -0.5 * tall),
+        (neck, -0.1 * tall),
+        (neck, 0.15 * tall),
+    ]
+    inner = [
+        (0.0, 0.0),
+        (neck - _WALL, -0.1 * tall),
+        (outer[1][0] - _WALL, -0.5 * tall),
+        (wide - _WALL, -tall),
+    ]
+    profile = [*outer, (0.0, 0.15 * tall), *inner]
+    rings = [at_height(outline(2 * r, 2 * r, dice.sides, phase=0.5), z) for r, z in profile]
+    return loft(np.stack(rings), cyclic=True)
 
 
 def desk_arm(dice: Dice) -> list[Part]:
@@ -143,7 +220,16 @@ def desk_arm(dice: Dice) -> list[Part]:
     parts = _foot(dice, dice.between(0.07, 0.12))
     if dice.chance(0.35):
         high = lower + 0.6 * upper
-        path = bend([(0, 0, 0.01), (0, 0, high), (upper * 0.7, 0, high + 0.02), (upper * 0.8, 0, high - 0.1)], 0.2, 8)
+        path = bend(
+            [
+                (0, 0, 0.01),
+                (0, 0, high),
+                (upper * 0.7, 0, high + 0.02),
+                (upper * 0.8, 0, high - 0.1),
+            ],
+            0.2,
+            8,
+        )
         end, tilt = path[-1], -15.0
         parts.append(tube(path, bar, 8))
     else:
@@ -156,7 +242,9 @@ def desk_arm(dice: Dice) -> list[Part]:
             parts.append(tube([(elbow[0], shift, elbow[2]), (tip[0], shift, tip[2])], bar, 6))
         joint = max(2 * bar, 0.018)
         for spot in ((0.0, 0.0, 0.03), elbow, tip):
-            parts.append(ball(joint * 1.3 if twin else joint, (float(spot[0]), 0.0, float(spot[2])), 8))
+            parts.append(
+                ball(joint * 1.3 if twin else joint, (float(spot[0]), 0.0, float(spot[2])), 8)
+            )
         end, tilt = np.array(tip), dice.between(-45, -5)
     head = _bell(dice, wide, wide * dice.between(1.0, 1.8))
     parts.append(head.turn("y", tilt).move(float(end[0]), 0, float(end[2])))
@@ -172,7 +260,10 @@ def pendant(dice: Dice) -> list[Part]:
         head = [_bell(dice, wide, tall), ball(0.03, (0, 0, -0.2 * tall), 8)]
         low = 0.0
     elif kind == "globe":
-        head, low = [ball(0.7 * wide, (0, 0, -0.65 * wide), max(10, dice.sides), dice.between(0.7, 1.1))], -0.02
+        head, low = (
+            [ball(0.7 * wide, (0, 0, -0.65 * wide), max(10, dice.sides), dice.between(0.7, 1.1))],
+            -0.02,
+        )
         low = -0.3 * wide
     elif kind == "drum":
         head = _shade(dice, wide, 0.8 * tall, -0.8 * tall, dice.sides)
@@ -180,33 +271,54 @@ def pendant(dice: Dice) -> list[Part]:
     else:
         head, low = [lathe([(wide, -0.03), (wide, 0.0), (0.1 * wide, 0.04)], dice.sides)], 0.0
     rose = dice.between(0.04, 0.07)
-    return [*head, lathe([(0.005, low), (0.005, cord)], 6),
-            lathe([(rose * 0.6, cord - 0.02), (rose, cord), (rose, cord + 0.02)], max(8, dice.sides))]  # fmt: skip
+    return [
+        *head,
+        lathe([(0.005, low), (0.005, cord)], 6),
+        lathe([(rose * 0.6, cord - 0.02), (rose, cord), (rose, cord + 0.02)], max(8, dice.sides)),
+    ]
 
 
 def ceiling(dice: Dice) -> list[Part]:
     """Saucer, drum or square panel close under the ceiling."""
     wide, deep = dice.between(0.14, 0.32), dice.between(0.06, 0.2)
     if dice.chance(0.2):
-        return [block((-wide, wide), (-wide, wide), (0, 0.5 * deep)), block((-0.5 * wide, 0.5 * wide), (-0.5 * wide, 0.5 * wide), (0.4 * deep, deep))]
+        return [
+            block((-wide, wide), (-wide, wide), (0, 0.5 * deep)),
+            block((-0.5 * wide, 0.5 * wide), (-0.5 * wide, 0.5 * wide), (0.4 * deep, deep)),
+        ]
     angle = np.linspace(-np.pi / 2, 0, 7)
     e = dice.between(0.6, 1.6)
     profile = [(wide * np.cos(a) ** e, deep + deep * np.sin(a)) for a in angle]
     parts = [lathe([*profile, (wide, deep + 0.01), (0.6 * wide, deep + 0.02)], max(dice.sides, 8))]
-    parts.append(lathe([(dice.between(0.4, 0.9) * wide, deep), (0.5 * wide, deep + dice.between(0.03, 0.12))], dice.sides))
+    parts.append(
+        lathe(
+            [(dice.between(0.4, 0.9) * wide, deep), (0.5 * wide, deep + dice.between(0.03, 0.12))],
+            dice.sides,
+        )
+    )
     return parts
 
 
 def chandelier(dice: Dice) -> list[Part]:
     """Bent arms about a hub, each with a candle or small shade."""
     count, reach, cord = dice.count(3, 8), dice.between(0.22, 0.45), dice.between(0.2, 0.6)
-    parts = [lathe([(0.0, -0.1), (0.04, -0.06), (0.03, 0.0), (0.045, 0.06), (0.01, 0.14)], 10),
-             lathe([(0.008, 0.1), (0.008, cord)], 6), lathe([(0.05, cord - 0.02), (0.06, cord + 0.01)], 10)]  # fmt: skip
+    parts = [
+        lathe([(0.0, -0.1), (0.04, -0.06), (0.03, 0.0), (0.045, 0.06), (0.01, 0.14)], 10),
+        lathe([(0.008, 0.1), (0.008, cord)], 6),
+        lathe([(0.05, cord - 0.02), (0.06, cord + 0.01)], 10),
+    ]
     sag = dice.between(0.04, 0.12)
     shaded = dice.chance(0.5)
     for i in range(count):
-        arm = bend([(0.02, 0, -0.02), (0.5 * reach, 0, -sag - 0.03), (reach, 0, -sag), (reach, 0, 0.02)], 0.1)
-        group = [tube(arm, 0.009, 6), lathe([(0.02, 0.0), (0.035, 0.02)], 8, reach), lathe([(0.012, 0.01), (0.012, 0.1)], 8, reach)]
+        arm = bend(
+            [(0.02, 0, -0.02), (0.5 * reach, 0, -sag - 0.03), (reach, 0, -sag), (reach, 0, 0.02)],
+            0.1,
+        )
+        group = [
+            tube(arm, 0.009, 6),
+            lathe([(0.02, 0.0), (0.035, 0.02)], 8, reach),
+            lathe([(0.012, 0.01), (0.012, 0.1)], 8, reach),
+        ]
         if shaded:
             group.append(lathe([(0.07, 0.05), (0.04, 0.14), (0.01, 0.14), (0.01, 0.085)], 8, reach))
         parts += [part.turn("z", 360 * i / count) for part in group]
@@ -224,12 +336,18 @@ def column(dice: Dice) -> list[Part]:
     t = np.linspace(0, 1, 6)
     taper = dice.between(0.8, 1.15)
     radii = half * (1.41 if square else 1.0) * ((1 - t) + taper * t + bulge * np.sin(np.pi * t))
-    rings = [at_height(outline(2 * r, 2 * r, sides, phase=phase), foot + (high - foot) * s) for r, s in zip(radii, t, strict=True)]
+    rings = [
+        at_height(outline(2 * r, 2 * r, sides, phase=phase), foot + (high - foot) * s)
+        for r, s in zip(radii, t, strict=True)
+    ]
     parts = [loft(np.stack(rings))]
     if dice.chance(0.4):
-        spots = [(sx * 0.8 * half, sy * 0.8 * half) for sx in (-1, 1) for sy in (-1, 1)]
+        spots = [(sx * 0.5 * half, sy * 0.5 * half) for sx in (-1, 1) for sy in (-1, 1)]
         return parts + legs(dice, spots, foot + 0.02, 0.02, "square")
-    return [*parts, lathe([(plate, 0), (plate, 0.02), (0.02, 0.03), (0.02, foot + 0.01)], dice.sides)]
+    return [
+        *parts,
+        lathe([(plate, 0), (plate, 0.02), (0.02, 0.03), (0.02, foot + 0.01)], dice.sides),
+    ]
 
 
 FAMILIES = {

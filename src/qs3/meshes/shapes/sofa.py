@@ -1,82 +1,13 @@
-"""Sofas: straight, corner, chaise, chesterfield, slab, curved, futon, loveseat."""
+"""Sofas: straight, corner, chaise, daybed, chesterfield, slab, curved, futon."""
+
+from itertools import pairwise
 
 import numpy as np
 
 from qs3.meshes.shapes._dice import Dice
 from qs3.meshes.shapes._joinery import corners, legs
-from qs3.meshes.shapes._parts import Part, Span, beam, block, cushion, pillow, sheet, tube
-
-
-def upholstered(
-    dice: Dice, width: float, seats: int, lean: float | None = None
-) -> list[Part]:
-    """Base, back, two arms and cushions: an armchair with one seat, a sofa with more.
-
-    The first part is the base.
-    """
-    depth, seat = dice.between(0.74, 1.0), dice.between(0.36, 0.46)
-    foot = dice.pick(0.0, dice.between(0.03, 0.08), dice.between(0.08, 0.18))
-    high, arm = seat + dice.between(0.28, 0.5), seat + dice.between(0.08, 0.26)
-    side = dice.between(0.08, 0.26) * (0.8 if seats == 1 else 1.0)
-    back = dice.between(0.12, 0.26)
-    soft = dice.pick(0.005, 0.03, dice.between(0.03, 0.09))
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
-    base = seat - dice.between(0.1, 0.18)
-    parts = [cushion((x[0] + 0.01, x[1] - 0.01), (y[0] + 0.02, y[1] - 0.01), (foot, base), min(soft, 0.03), steps=dice.steps)]  # fmt: skip
-    lean = dice.pick(0.0, dice.between(2, 14)) if lean is None else lean
-    rest = cushion((x[0] + side * 0.5, x[1] - side * 0.5), (y[1] - back, y[1]), (foot + 0.03, high), soft, steps=dice.steps)  # fmt: skip
-    parts.append(rest.turn("x", -lean, (0, y[1], base)))
-    parts += _arms(dice, x, (y[0] + dice.pick(0.0, 0.05), y[1] - 0.01), (foot, arm), side, soft)
-    inner = (x[0] + side - 0.005, x[1] - side + 0.005)
-    edges = np.linspace(*inner, seats + 1)
-    run = (y[0] - dice.pick(0.0, 0.03), y[1] - back + 0.01)
-    plump = dice.between(0.0, 0.04)
-    loose = dice.chance(0.7)
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
-        span = (float(a) + 0.002, float(b) - 0.002)
-        parts.append(cushion(span, run, (base - 0.01, seat), max(soft, 0.02), plump, dice.steps))
-        if loose:
-            thick = dice.between(0.1, 0.18)
-            pad = cushion(span, (run[1] - thick, run[1] + 0.03), (seat - 0.02, high + dice.between(-0.06, 0.05)), max(soft, 0.03), steps=dice.steps)  # fmt: skip
-            parts.append(pad.turn("x", -lean, (0, y[1], base)))
-    if dice.chance(0.35):
-        parts += _throw_pillows(dice, inner, run[1] - 0.18 * loose, seat)
-    if foot > 0:
-        parts += legs(dice, corners(x, y, 0.07), foot + 0.01, dice.between(0.03, 0.07), dice.pick("square", "tapered", "cone"))  # fmt: skip
-    return parts
-
-
-def _arms(dice: Dice, x: Span, y: Span, z: Span, side: float, soft: float) -> list[Part]:
-    style = dice.pick("square", "square", "rolled", "sloped")
-    parts = []
-    for s, span in ((-1, (x[0], x[0] + side)), (1, (x[1] - side, x[1]))):
-        top = z[1]
-        if style == "rolled":
-            r = max(0.6 * side, 0.07)
-            parts.append(cushion(span, y, (z[0], top - r * 0.8), min(soft, 0.03), steps=dice.steps))
-            cx = (span[0] + span[1]) / 2 + s * 0.15 * side
-            parts.append(tube([(cx, y[0] - 0.01, top - r), (cx, y[1], top - r)], r, max(8, dice.sides)))
-        else:
-            arm = cushion(span, y, (z[0], top), soft, steps=dice.steps)
-            if style == "sloped":
-                v = arm.vertices.copy()
-                fall = dice.between(0.1, 0.35) * (top - z[0])
-                share = (v[:, 1] - y[0]) / (y[1] - y[0])
-                v[:, 2] -= fall * (1 - share) * (v[:, 2] - z[0]) / (top - z[0])
-                arm = Part(v, arm.faces)
-            parts.append(arm)
-    return parts
-
-
-def _throw_pillows(dice: Dice, x: Span, y: float, z: float) -> list[Part]:
-    half, parts = dice.between(0.17, 0.23), []
-    spots = [x[0] + half, x[1] - half, (x[0] + x[1]) / 2]
-    if x[1] - x[0] < 4.2 * half:
-        spots = spots[2:]
-    for cx in dice.shuffled(spots)[: dice.count(1, len(spots))]:
-        pad = pillow((-half, half), (-0.08, 0.08), (-half, half)).turn("x", dice.between(-32, -15))
-        parts.append(pad.move(cx, y - 0.1, z - pad.vertices[:, 2].min() - 0.015))
-    return parts
+from qs3.meshes.shapes._parts import Part, Span, beam, block, cushion, sheet, tube
+from qs3.meshes.shapes._upholstery import upholstered
 
 
 def straight(dice: Dice) -> list[Part]:
@@ -92,24 +23,57 @@ def _module(dice: Dice, x: Span, y: Span, look: dict[str, float], backs: str) ->
     a, b = [x[0], x[1]], [y[0], y[1]]
     for name in backs:
         if name == "n":
-            parts.append(cushion(x, (y[1] - back, y[1]), (look["foot"], high), soft, steps=dice.steps))
+            parts.append(
+                cushion(x, (y[1] - back, y[1]), (look["foot"], high), soft, steps=dice.steps)
+            )
             b[1] = y[1] - back + 0.01
         elif name == "e":
-            parts.append(cushion((x[1] - back, x[1]), y, (look["foot"], high), soft, steps=dice.steps))
+            parts.append(
+                cushion((x[1] - back, x[1]), y, (look["foot"], high), soft, steps=dice.steps)
+            )
             a[1] = x[1] - back + 0.01
         elif name == "w":
-            parts.append(cushion((x[0], x[0] + back), y, (look["foot"], high), soft, steps=dice.steps))
+            parts.append(
+                cushion((x[0], x[0] + back), y, (look["foot"], high), soft, steps=dice.steps)
+            )
             a[0] = x[0] + back - 0.01
         else:
-            parts.append(cushion(x, (y[0], y[0] + back), (look["foot"], look["arm"]), soft, steps=dice.steps))
+            parts.append(
+                cushion(x, (y[0], y[0] + back), (look["foot"], look["arm"]), soft, steps=dice.steps)
+            )
             b[0] = y[0] + back - 0.01
-    parts.append(cushion((a[0], a[1]), (b[0], b[1]), (seat - 0.13, seat), max(soft, 0.02), look["plump"], dice.steps))
+    parts.append(
+        cushion(
+            (a[0], a[1]),
+            (b[0], b[1]),
+            (seat - 0.13, seat),
+            max(soft, 0.02),
+            look["plump"],
+            dice.steps,
+        )
+    )
     if dice.chance(look["loose"]):
         z = (seat - 0.02, high + look["proud"])
         if "n" in backs:
-            parts.append(cushion((a[0] + 0.01, a[1] - 0.01), (b[1] - 0.14, b[1] + 0.02), z, 0.04, steps=dice.steps))
+            parts.append(
+                cushion(
+                    (a[0] + 0.01, a[1] - 0.01),
+                    (b[1] - 0.14, b[1] + 0.02),
+                    z,
+                    0.04,
+                    steps=dice.steps,
+                )
+            )
         if "e" in backs:
-            parts.append(cushion((a[1] - 0.14, a[1] + 0.02), (b[0] + 0.01, b[1] - 0.01), z, 0.04, steps=dice.steps))
+            parts.append(
+                cushion(
+                    (a[1] - 0.14, a[1] + 0.02),
+                    (b[0] + 0.01, b[1] - 0.01),
+                    z,
+                    0.04,
+                    steps=dice.steps,
+                )
+            )
     if look["foot"] > 0:
         parts += legs(dice, corners(x, y, 0.06), look["foot"] + 0.01, 0.04, "square")
     return parts
@@ -144,9 +108,13 @@ def corner(dice: Dice) -> list[Part]:
     if dice.chance(0.6):
         arm, side = (look["foot"], look["arm"]), look["back"]
         left = -along * unit + 0.004
-        parts.append(cushion((left - side, left + 0.01), (0.0, depth), arm, look["soft"], steps=dice.steps))
+        parts.append(
+            cushion((left - side, left + 0.01), (0.0, depth), arm, look["soft"], steps=dice.steps)
+        )
         front = -down * unit + 0.004
-        parts.append(cushion((0.0, depth), (front - side, front + 0.01), arm, look["soft"], steps=dice.steps))
+        parts.append(
+            cushion((0.0, depth), (front - side, front + 0.01), arm, look["soft"], steps=dice.steps)
+        )
     return parts
 
 
@@ -161,9 +129,13 @@ def chaise(dice: Dice) -> list[Part]:
     parts += _module(dice, (0.0, unit), (-run, depth), look, "n")
     arm, side = (look["foot"], look["arm"]), look["back"]
     left = -seats * unit + 0.004
-    parts.append(cushion((left - side, left + 0.01), (0.0, depth), arm, look["soft"], steps=dice.steps))
+    parts.append(
+        cushion((left - side, left + 0.01), (0.0, depth), arm, look["soft"], steps=dice.steps)
+    )
     if dice.chance(0.6):
-        parts.append(cushion((unit - 0.01, unit + side), (0.0, depth), arm, look["soft"], steps=dice.steps))
+        parts.append(
+            cushion((unit - 0.01, unit + side), (0.0, depth), arm, look["soft"], steps=dice.steps)
+        )
     return parts
 
 
@@ -173,34 +145,66 @@ def daybed(dice: Dice) -> list[Part]:
     foot, thick = dice.between(0.1, 0.2), dice.between(0.1, 0.16)
     x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
     parts = [cushion(x, y, (foot, seat), 0.04, 0.02, dice.steps)]
-    head = cushion((x[0], x[0] + thick), y, (foot + 0.05, seat + dice.between(0.25, 0.45)), 0.05, steps=dice.steps)
+    head = cushion(
+        (x[0], x[0] + thick),
+        y,
+        (foot + 0.05, seat + dice.between(0.25, 0.45)),
+        0.05,
+        steps=dice.steps,
+    )
     parts.append(head.turn("y", -dice.between(5, 25), (x[0], 0, foot + 0.05)))
     if dice.chance(0.5):
-        parts.append(cushion((x[0], x[0] + dice.between(0.5, 0.9) * width), (y[1] - 0.12, y[1]),
-                             (foot + 0.05, seat + dice.between(0.18, 0.35)), 0.05, steps=dice.steps))  # fmt: skip
+        parts.append(
+            cushion(
+                (x[0], x[0] + dice.between(0.5, 0.9) * width),
+                (y[1] - 0.12, y[1]),
+                (foot + 0.05, seat + dice.between(0.18, 0.35)),
+                0.05,
+                steps=dice.steps,
+            )
+        )
     return parts + legs(dice, corners(x, y, 0.08), foot + 0.02, 0.05)
 
 
 def chesterfield(dice: Dice) -> list[Part]:
     """Low roll all round: arms as high as the back."""
     width, depth, seat = dice.between(1.4, 2.3), dice.between(0.8, 0.98), dice.between(0.4, 0.48)
-    high, r, foot = seat + dice.between(0.22, 0.36), dice.between(0.08, 0.13), dice.between(0.06, 0.14)
+    high, r, foot = (
+        seat + dice.between(0.22, 0.36),
+        dice.between(0.08, 0.13),
+        dice.between(0.06, 0.14),
+    )
     wall = r * dice.between(1.0, 1.6)
     x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
-    parts = [cushion((x[0] + 0.01, x[1] - 0.01), (y[0] + 0.03, y[1] - 0.01), (foot, seat - 0.12), 0.02, steps=dice.steps),
-             block(x, (y[1] - wall, y[1]), (foot, high - r))]  # fmt: skip
-    roll = [(x[0], y[0], high - r), (x[0], y[1], high - r), (x[1], y[1], high - r), (x[1], y[0], high - r)]
+    parts = [
+        cushion(
+            (x[0] + 0.01, x[1] - 0.01),
+            (y[0] + 0.03, y[1] - 0.01),
+            (foot, seat - 0.12),
+            0.02,
+            steps=dice.steps,
+        ),
+        block(x, (y[1] - wall, y[1]), (foot, high - r)),
+    ]
     for s in (-1, 1):
         span = (x[0], x[0] + wall) if s < 0 else (x[1] - wall, x[1])
         parts.append(block(span, (y[0] + 0.01, y[1]), (foot, high - r)))
         cx = s * (width / 2 - 0.3 * wall)
         parts.append(tube([(cx, y[0], high - r), (cx, y[1], high - r)], r, max(10, dice.sides)))
-    del roll
     cy = y[1] - 0.3 * wall
     parts.append(tube([(x[0], cy, high - r), (x[1], cy, high - r)], r, max(10, dice.sides)))
     edges = np.linspace(x[0] + wall - 0.01, x[1] - wall + 0.01, dice.count(2, 3) + 1)
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
-        parts.append(cushion((float(a), float(b) - 0.003), (y[0], y[1] - wall + 0.01), (seat - 0.13, seat), 0.04, 0.02, dice.steps))  # fmt: skip
+    for a, b in pairwise(edges):
+        parts.append(
+            cushion(
+                (float(a), float(b) - 0.003),
+                (y[0], y[1] - wall + 0.01),
+                (seat - 0.13, seat),
+                0.04,
+                0.02,
+                dice.steps,
+            )
+        )
     return parts + legs(dice, corners(x, y, 0.09), foot + 0.01, 0.06)
 
 
@@ -216,15 +220,37 @@ def slab(dice: Dice) -> list[Part]:
     for s in sides:
         parts.append(block((x[0], x[0] + wall) if s < 0 else (x[1] - wall, x[1]), y, (foot, arm)))
     edges = np.linspace(x[0] + wall if -1 in sides else x[0], x[1] - wall, dice.count(1, 3) + 1)
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
-        parts.append(cushion((float(a), float(b) - 0.004), (y[0], y[1] - wall + 0.003), (foot + 0.05, seat), 0.025, 0.01, dice.steps))  # fmt: skip
+    for a, b in pairwise(edges):
+        parts.append(
+            cushion(
+                (float(a), float(b) - 0.004),
+                (y[0], y[1] - wall + 0.003),
+                (foot + 0.05, seat),
+                0.025,
+                0.01,
+                dice.steps,
+            )
+        )
         if dice.chance(0.5):
-            parts.append(cushion((float(a) + 0.02, float(b) - 0.02), (y[1] - wall - 0.13, y[1] - wall + 0.01), (seat - 0.02, high + 0.06), 0.04, steps=dice.steps))  # fmt: skip
+            parts.append(
+                cushion(
+                    (float(a) + 0.02, float(b) - 0.02),
+                    (y[1] - wall - 0.13, y[1] - wall + 0.01),
+                    (seat - 0.02, high + 0.06),
+                    0.04,
+                    steps=dice.steps,
+                )
+            )
     if dice.chance(0.3):
         for s in (-1, 1):
             px = s * (width / 2 - 0.15)
-            parts += [block((px - 0.02, px + 0.02), y, (0, 0.03)),
-                      *(block((px - 0.02, px + 0.02), (py - 0.02, py + 0.02), (0.01, foot + 0.01)) for py in (y[0] + 0.1, y[1] - 0.1))]  # fmt: skip
+            parts += [
+                block((px - 0.02, px + 0.02), y, (0, 0.03)),
+                *(
+                    block((px - 0.02, px + 0.02), (py - 0.02, py + 0.02), (0.01, foot + 0.01))
+                    for py in (y[0] + 0.1, y[1] - 0.1)
+                ),
+            ]
         return parts
     return parts + legs(dice, corners(x, y, 0.1), foot + 0.01, 0.04)
 
@@ -237,15 +263,22 @@ def curved(dice: Dice) -> list[Part]:
     angle = np.radians(np.linspace(90 - sweep, 90 + sweep, 17))
 
     def arc(radius: float, z: Span, thick: float) -> Part:
-        grid = np.stack([np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(17, h)], axis=1)
-                         for h in np.linspace(*z, 3)])  # fmt: skip
+        grid = np.stack(
+            [
+                np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(17, h)], axis=1)
+                for h in np.linspace(*z, 3)
+            ]
+        )
         return sheet(grid.swapaxes(0, 1), thick)
 
     middle = outer - depth / 2
     parts = [arc(middle, (foot, seat), depth), arc(outer - back / 2, (foot, high), back)]
     if foot > 0:
-        spots = [(radius * np.cos(a), radius * np.sin(a)) for radius in (outer - 0.1, outer - depth + 0.1)
-                 for a in angle[[2, 8, 14]]]  # fmt: skip
+        spots = [
+            (radius * np.cos(a), radius * np.sin(a))
+            for radius in (outer - 0.1, outer - depth + 0.1)
+            for a in angle[[2, 8, 14]]
+        ]
         parts += legs(dice, spots, foot + 0.02, 0.04, "round")
     return parts
 
@@ -259,7 +292,9 @@ def futon(dice: Dice) -> list[Part]:
     parts = [cushion(x, y, (base, seat), 0.05, 0.02, dice.steps)]
     pad = cushion(x, (y[1] - thick, y[1]), (base, base + thick + tall), 0.05, steps=dice.steps)
     parts.append(pad.turn("x", -lean, (0, y[1], base)))
-    parts.append(block((x[0] + 0.03, x[1] - 0.03), (y[0] + 0.03, y[1] - 0.01), (base - 0.05, base + 0.02)))
+    parts.append(
+        block((x[0] + 0.03, x[1] - 0.03), (y[0] + 0.03, y[1] - 0.01), (base - 0.05, base + 0.02))
+    )
     parts += legs(dice, corners(x, y, 0.06), base - 0.02, dice.between(0.04, 0.07))
     if dice.chance(0.5):
         arm = seat + dice.between(0.12, 0.2)

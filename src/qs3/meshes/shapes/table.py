@@ -1,9 +1,12 @@
-"""Tables: four legs, pedestal, trestle, desk, corner desk, coffee, folding, panel, counter."""
+"""Tables: four legs, pedestal, trestle, coffee, folding, panel; desks and counters beside."""
+
+from itertools import pairwise
 
 import numpy as np
 
+from qs3.meshes.shapes._desks import corner_desk, counter, desk, writing_desk
 from qs3.meshes.shapes._dice import Dice
-from qs3.meshes.shapes._joinery import carcass, corners, fronts, legs
+from qs3.meshes.shapes._joinery import corners, fronts, legs
 from qs3.meshes.shapes._parts import (
     Part,
     Span,
@@ -12,7 +15,6 @@ from qs3.meshes.shapes._parts import (
     block,
     lathe,
     outline,
-    sheet,
     slab,
     tube,
 )
@@ -59,7 +61,10 @@ def four_legs(dice: Dice) -> list[Part]:
         top = slab(outline(width, depth, max(16, dice.sides)), (height - thick, height))
         inset = 0.2 * min(width, depth)
     else:
-        top, inset = block(x, y, (height - thick, height)), leg / 2 + dice.pick(0.0, 0.02, dice.between(0.02, 0.1))
+        top, inset = (
+            block(x, y, (height - thick, height)),
+            leg / 2 + dice.pick(0.0, 0.02, dice.between(0.02, 0.1)),
+        )
     spots = corners(x, y, inset)
     splay = dice.pick(0.0, 0.0, 0.0, dice.between(0.02, 0.08))
     parts = [top, *legs(dice, spots, height - thick / 2, leg, splay=splay)]
@@ -81,8 +86,19 @@ def four_legs(dice: Dice) -> list[Part]:
         parts.append(block(*inner, (z, z + 0.8 * thick)))
     if dice.chance(0.08) and not round_top:
         fall, over = dice.between(0.1, 0.3) * height, 0.012
-        parts += _apron((x[0] - over, x[1] + over), (y[0] - over, y[1] + over), (height - fall, height + 0.004), 0.03)
-        parts.append(block((x[0] - over, x[1] + over), (y[0] - over, y[1] + over), (height - 0.004, height + 0.006)))
+        parts += _apron(
+            (x[0] - over, x[1] + over),
+            (y[0] - over, y[1] + over),
+            (height - fall, height + 0.004),
+            0.03,
+        )
+        parts.append(
+            block(
+                (x[0] - over, x[1] + over),
+                (y[0] - over, y[1] + over),
+                (height - 0.004, height + 0.006),
+            )
+        )
     return parts
 
 
@@ -93,8 +109,11 @@ def pedestal(dice: Dice) -> list[Part]:
     width = min(width, 0.9) if height > 0.9 else width
     thick, r = dice.between(0.02, 0.04) * dice.bulk, dice.between(0.025, 0.06) * dice.bulk
     depth = width * dice.pick(1.0, 1.0, dice.between(0.7, 1.0))
-    parts = [_top(dice, width, depth, height, thick)] if dice.chance(0.5) else [
-        slab(outline(width, depth, max(8, dice.sides), phase=0.5), (height - thick, height))]  # fmt: skip
+    parts = (
+        [_top(dice, width, depth, height, thick)]
+        if dice.chance(0.5)
+        else [slab(outline(width, depth, max(8, dice.sides), phase=0.5), (height - thick, height))]
+    )
     foot = dice.pick("plate", "cone", "spider", "square")
     reach = width * dice.between(0.26, 0.36)
     if foot == "spider":
@@ -105,13 +124,35 @@ def pedestal(dice: Dice) -> list[Part]:
             foot_pad = lathe([(0.025, 0.0), (0.025, 0.03)], 8, reach - 0.01)
             parts += [leg.turn("z", 360 * i / count + 45), foot_pad.turn("z", 360 * i / count + 45)]
     elif foot == "square":
-        parts += [block((-reach, reach), (-reach, reach), (0, 0.03 * dice.bulk)),
-                  block((-r, r), (-r, r), (0.01, height - thick / 2))]  # fmt: skip
+        parts += [
+            block((-reach, reach), (-reach, reach), (0, 0.03 * dice.bulk)),
+            block((-r, r), (-r, r), (0.01, height - thick / 2)),
+        ]
     elif foot == "plate":
-        parts.append(lathe([(reach, 0), (reach, 0.02 * dice.bulk), (r, 0.04 * dice.bulk), (r, height - thick / 2)], dice.sides))
+        parts.append(
+            lathe(
+                [
+                    (reach, 0),
+                    (reach, 0.02 * dice.bulk),
+                    (r, 0.04 * dice.bulk),
+                    (r, height - thick / 2),
+                ],
+                dice.sides,
+            )
+        )
     else:
         waist = dice.between(0.25, 0.7)
-        parts.append(lathe([(reach, 0), (r, waist * height), (r, 0.8 * height), (min(reach, 0.3 * width), height - thick / 2)], dice.sides))  # fmt: skip
+        parts.append(
+            lathe(
+                [
+                    (reach, 0),
+                    (r, waist * height),
+                    (r, 0.8 * height),
+                    (min(reach, 0.3 * width), height - thick / 2),
+                ],
+                dice.sides,
+            )
+        )
     return parts
 
 
@@ -125,15 +166,38 @@ def trestle(dice: Dice) -> list[Part]:
     for s in (-1, 1):
         x = s * (width / 2 - inset)
         if style == "post":
-            parts += [block((x - bar / 2, x + bar / 2), (-half, half), (0, bar)),
-                      block((x - bar / 2, x + bar / 2), (-half * 0.35, half * 0.35), (bar / 2, under + 0.005)),
-                      block((x - bar / 2, x + bar / 2), (-half * 0.8, half * 0.8), (under - bar, under + 0.005))]  # fmt: skip
+            parts += [
+                block((x - bar / 2, x + bar / 2), (-half, half), (0, bar)),
+                block(
+                    (x - bar / 2, x + bar / 2),
+                    (-half * 0.35, half * 0.35),
+                    (bar / 2, under + 0.005),
+                ),
+                block(
+                    (x - bar / 2, x + bar / 2),
+                    (-half * 0.8, half * 0.8),
+                    (under - bar, under + 0.005),
+                ),
+            ]
         else:
             spread = half if style == "X" else half * 0.25
             for t in (-1, 1):
                 end = -t * spread if style == "X" else t * spread
-                parts.append(beam((x + s * 0.01 * t, t * half, 0), (x + s * 0.01 * t, end, under + 0.005), bar, bar))
-            parts.append(block((x - bar / 2, x + bar / 2), (-half * 0.9, half * 0.9), (under - bar * 0.7, under + 0.003)))
+                parts.append(
+                    beam(
+                        (x + s * 0.01 * t, t * half, 0),
+                        (x + s * 0.01 * t, end, under + 0.005),
+                        bar,
+                        bar,
+                    )
+                )
+            parts.append(
+                block(
+                    (x - bar / 2, x + bar / 2),
+                    (-half * 0.9, half * 0.9),
+                    (under - bar * 0.7, under + 0.003),
+                )
+            )
             z = under * (0.5 if style == "X" else dice.between(0.3, 0.5))
             run = 0.04 if style == "X" else half + (spread - half) * z / under
             parts.append(block((x - bar / 2, x + bar / 2), (-run, run), (z - bar / 2, z + bar / 2)))
@@ -143,80 +207,11 @@ def trestle(dice: Dice) -> list[Part]:
             z = under * 0.5
         elif style == "A":
             z = under - bar / 2
-        parts.append(block((-width / 2 + inset, width / 2 - inset), (-0.02, 0.02), (z - bar / 2, z + bar / 2)))
-    return parts
-
-
-def desk(dice: Dice) -> list[Part]:
-    """Desk with drawers on one or both sides, panels or legs."""
-    width, depth, height = dice.between(1.0, 1.9), dice.between(0.5, 0.8), dice.between(0.7, 0.78)
-    thick = dice.between(0.02, 0.04) * dice.bulk
-    x, y, under = (-width / 2, width / 2), (-depth / 2, depth / 2), height - thick
-    parts = [block(x, y, (under, height))]
-    unit, inset = dice.between(0.3, 0.45), dice.between(0.0, 0.04)
-    floor = dice.pick(0.0, 0.0, dice.between(0.1, 0.5) * under)
-    both = dice.chance(0.35) and width > 1.2
-    for s in (-1, 1):
-        outer = s * (width / 2 - inset)
-        if s > 0 or both:
-            span = (min(outer, outer - s * unit), max(outer, outer - s * unit))
-            parts.append(block(span, (y[0] + inset, y[1] - inset), (floor, under + 0.003)))
-            parts += fronts(dice, span, (floor + 0.02, under - 0.01), y[0] + inset, 1, dice.count(1, 4))
-        elif dice.chance(0.4):
-            span = (min(outer, outer - s * thick), max(outer, outer - s * thick))
-            parts.append(block(span, (y[0] + inset, y[1] - inset), (0, under + 0.003)))
-        else:
-            leg = dice.between(0.035, 0.06) * dice.bulk**0.7
-            spots = [(outer - s * leg / 2, y[0] + leg), (outer - s * leg / 2, y[1] - leg)]
-            parts += legs(dice, spots, under + 0.005, leg, dice.pick("square", "round", "tapered"))
-    if floor > 0:
-        parts += legs(dice, corners(x, y, 0.05 + inset), under + 0.004, 0.045 * dice.bulk**0.7, "square")
-    if dice.chance(0.5):
-        parts.append(block((x[0] + inset, x[1] - inset), (y[1] - inset - 0.03, y[1] - inset - 0.01),
-                           (dice.between(0.1, 0.6) * under, under + 0.003)))  # fmt: skip
-    if dice.chance(0.12):
-        shelf = height + dice.between(0.12, 0.3)
-        parts += carcass((x[0] + 0.02, x[1] - 0.02), (y[1] - 0.25, y[1] - 0.01), (height - 0.003, shelf), 0.02)
-    return parts
-
-
-def writing_desk(dice: Dice) -> list[Part]:
-    """Slim desk or console whose flat drawers hang under the top, on four legs."""
-    width, depth, height = dice.between(0.8, 1.4), dice.between(0.38, 0.65), dice.between(0.7, 0.8)
-    thick, leg = 0.02 * dice.bulk, dice.between(0.03, 0.05) * dice.bulk**0.7
-    box = dice.between(0.09, 0.18)
-    x, y, under = (-width / 2, width / 2), (-depth / 2, depth / 2), height - thick
-    inset = leg / 2 + 0.01
-    parts = [block(x, y, (under, height))]
-    span = (x[0] + inset, x[1] - inset)
-    parts.append(block(span, (y[0] + inset, y[1] - inset), (under - box, under + 0.003)))
-    parts += fronts(dice, span, (under - box + 0.01, under - 0.005), y[0] + inset, dice.count(1, 3), 1)
-    parts += legs(dice, corners(x, y, inset), under + 0.004, leg, splay=dice.pick(0.0, 0.0, 0.03))
-    return parts
-
-
-def corner_desk(dice: Dice) -> list[Part]:
-    """L-shaped desk."""
-    width, run, depth = dice.between(1.2, 1.8), dice.between(1.1, 1.7), dice.between(0.45, 0.7)
-    height, thick = dice.between(0.7, 0.78), dice.between(0.025, 0.045) * dice.bulk
-    under = height - thick
-    parts = [block((0, width), (-depth, 0), (under, height)), block((0, depth), (-run, -depth + 0.002), (under, height))]
-    if dice.chance(0.5):
-        board = thick
-        parts += [block((width - board, width), (-depth + 0.02, 0), (0, under + 0.003)),
-                  block((0.02, depth - 0.02), (-run, -run + board), (0, under + 0.003)),
-                  block((0.0, width), (-0.03, -0.01), (dice.between(0.0, 0.4), under + 0.003)),
-                  block((0.01, 0.03), (-run, 0), (dice.between(0.0, 0.4), under + 0.003)),
-                  block((0.0, 0.05), (-0.05, 0.0), (0, under + 0.003))]  # fmt: skip
-    else:
-        spots = [(0.05, -0.05), (width - 0.05, -0.05), (width - 0.05, 0.05 - depth), (0.05, 0.05 - run),
-                 (depth - 0.05, 0.05 - run)]  # fmt: skip
-        parts += legs(dice, spots, under + 0.004, dice.between(0.035, 0.06) * dice.bulk**0.5, dice.pick("square", "round"))
-    if dice.chance(0.6):
-        unit = dice.between(0.3, 0.42)
-        span = (width - unit, width - 0.02)
-        parts.append(block(span, (-depth + 0.03, -0.03), (0, under + 0.003)))
-        parts += fronts(dice, span, (0.02, under - 0.01), -depth + 0.03, 1, dice.count(2, 4))
+        parts.append(
+            block(
+                (-width / 2 + inset, width / 2 - inset), (-0.02, 0.02), (z - bar / 2, z + bar / 2)
+            )
+        )
     return parts
 
 
@@ -230,31 +225,57 @@ def coffee(dice: Dice) -> list[Part]:
         wide = dice.between(0.45, 0.9)
         taper = dice.between(0.6, 1.0)
         rim = max(12, dice.sides)
-        return [slab(outline(wide, wide, rim), (height - thick, height)),
-                lathe([(taper * wide * 0.46, 0), (wide * 0.46, height - thick / 2)], rim)]  # fmt: skip
+        return [
+            slab(outline(wide, wide, rim, phase=0.5), (height - thick, height)),
+            lathe([(taper * wide * 0.46, 0), (wide * 0.46, height - thick / 2)], rim),
+        ]
     top = block(x, y, (height - thick, height))
     if kind == "box":
         over = dice.between(0.01, 0.06)
-        body = ((x[0] + over, x[1] - over), (y[0] + over, y[1] - over), (dice.pick(0.0, 0.06), height - thick / 2))
+        body = (
+            (x[0] + over, x[1] - over),
+            (y[0] + over, y[1] - over),
+            (dice.pick(0.0, 0.06), height - thick / 2),
+        )
         parts = [top, block(*body)]
         if body[2][0] > 0:
             parts += legs(dice, corners(body[0], body[1], 0.05), 0.07, 0.05, "square")
         if dice.chance(0.5):
-            parts += fronts(dice, body[0], (body[2][0] + 0.03, height - thick - 0.02), body[1][0], dice.count(1, 3), 1)
+            parts += fronts(
+                dice,
+                body[0],
+                (body[2][0] + 0.03, height - thick - 0.02),
+                body[1][0],
+                dice.count(1, 3),
+                1,
+            )
         return parts
     if kind == "open_box":
         board = thick
-        parts = [top, *(block((px, px + board), y, (0, height - thick / 2)) for px in (x[0], x[1] - board))]
+        parts = [
+            top,
+            *(block((px, px + board), y, (0, height - thick / 2)) for px in (x[0], x[1] - board)),
+        ]
         shelf = dice.between(0.05, 0.5) * height
         return [*parts, block((x[0] + board / 2, x[1] - board / 2), y, (shelf, shelf + board))]
     leg = dice.between(0.04, 0.08) * dice.bulk**0.8
     spots = corners(x, y, leg / 2 + dice.pick(0.0, 0.03))
-    parts = [top, *legs(dice, spots, height - thick / 2, leg, dice.pick("square", "tapered", "turned"))]
+    parts = [
+        top,
+        *legs(dice, spots, height - thick / 2, leg, dice.pick("square", "tapered", "turned")),
+    ]
     z = dice.between(0.15, 0.4) * height
     if kind == "shelf":
-        parts.append(block((spots[0][0], spots[2][0]), (spots[0][1], spots[1][1]), (z, z + 0.7 * thick)))
+        parts.append(
+            block((spots[0][0], spots[2][0]), (spots[0][1], spots[1][1]), (z, z + 0.7 * thick))
+        )
     else:
-        parts += _apron((spots[0][0], spots[2][0]), (spots[0][1], spots[1][1]), (height - thick - 0.07, height - thick / 2), 0.03)
+        parts += _apron(
+            (spots[0][0], spots[2][0]),
+            (spots[0][1], spots[1][1]),
+            (height - thick - 0.07, height - thick / 2),
+            0.03,
+        )
     return parts
 
 
@@ -265,8 +286,10 @@ def folding(dice: Dice) -> list[Part]:
     x, y, under = (-width / 2, width / 2), (-depth / 2, depth / 2), height - thick
     parts, planks = [], dice.pick(1, 1, dice.count(4, 8))
     edges = np.linspace(*y, planks + 1)
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
-        parts.append(block(x, (float(a), float(b) - (0.01 if planks > 1 else 0.0)), (under, height)))
+    for a, b in pairwise(edges):
+        parts.append(
+            block(x, (float(a), float(b) - (0.01 if planks > 1 else 0.0)), (under, height))
+        )
     reach = width / 2 - dice.between(0.05, 0.15)
     for s in (-1, 1):
         for t in (-1, 1):
@@ -274,7 +297,9 @@ def folding(dice: Dice) -> list[Part]:
             low, high = (t * reach, py, 0.0), (-t * reach, py, under + 0.004)
             parts.append(beam(low, high, bar, bar))
     for px in (-reach, reach):
-        parts.append(beam((px, y[0] + 0.03, under - 0.015), (px, y[1] - 0.03, under - 0.015), 0.04, 0.04))
+        parts.append(
+            beam((px, y[0] + 0.03, under - 0.015), (px, y[1] - 0.03, under - 0.015), 0.04, 0.04)
+        )
     return [*parts, beam((0, y[0] + 0.05, under / 2), (0, y[1] - 0.05, under / 2), 0.02, 0.02)]
 
 
@@ -286,41 +311,41 @@ def panel(dice: Dice) -> list[Part]:
     parts = [block(x, y, (height - thick, height))]
     if dice.chance(0.5):
         inset = dice.pick(0.0, dice.between(0.05, 0.2) * width)
-        parts += [block((s * (width / 2 - inset) - thick / 2 * (1 + s), s * (width / 2 - inset) + thick / 2 * (1 - s)),
-                        y, (0, height - thick / 2)) for s in (-1, 1)]  # fmt: skip
+        parts += [
+            block(
+                (
+                    s * (width / 2 - inset) - thick / 2 * (1 + s),
+                    s * (width / 2 - inset) + thick / 2 * (1 - s),
+                ),
+                y,
+                (0, height - thick / 2),
+            )
+            for s in (-1, 1)
+        ]
         if dice.chance(0.5):
-            parts.append(block((x[0] + inset + thick / 2, x[1] - inset - thick / 2), (-0.015, 0.015),
-                               (dice.between(0.0, 0.6) * height, height - thick / 2)))  # fmt: skip
+            parts.append(
+                block(
+                    (x[0] + inset + thick / 2, x[1] - inset - thick / 2),
+                    (-0.015, 0.015),
+                    (dice.between(0.0, 0.6) * height, height - thick / 2),
+                )
+            )
         return parts
     bar = dice.between(0.012, 0.03) * dice.bulk**0.5
     for s in (-1, 1):
         px = s * (width / 2 - dice.between(0.04, 0.08))
         top, front, rear = height - thick, y[0] + 0.05, y[1] - 0.05
         tuck = dice.pick(0.0, 0.08)
-        loop = [(px, 0, top), (px, front + tuck, top), (px, front, bar), (px, rear, bar), (px, rear - tuck, top), (px, 0, top)]
+        loop = [
+            (px, -0.02, top),
+            (px, front + tuck, top),
+            (px, front, bar),
+            (px, rear, bar),
+            (px, rear - tuck, top),
+            (px, 0.02, top),
+        ]
         parts.append(tube(bend(loop, dice.between(0.02, 0.1)), bar, dice.pick(4, 8, dice.sides)))
     return parts
-
-
-def counter(dice: Dice) -> list[Part]:
-    """Reception counter, straight or bent into an arc."""
-    height, depth = dice.between(0.72, 1.1), dice.between(0.45, 0.75)
-    thick = dice.between(0.03, 0.06)
-    if dice.chance(0.3):
-        width = dice.between(1.4, 2.4)
-        x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
-        return [block(x, y, (height - thick, height)), block((x[0] + 0.03, x[1] - 0.03), (y[0] + 0.04, y[0] + 0.08), (0, height - thick / 2)),
-                *(block((px, px + 0.03), (y[0] + 0.05, y[1] - 0.05), (0, height - thick / 2)) for px in (x[0] + 0.03, x[1] - 0.06))]  # fmt: skip
-    radius, sweep = dice.between(1.1, 1.8), dice.between(45, 95)
-    angle = np.radians(np.linspace(-90 - sweep, -90 + sweep, 25))
-    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(25)], axis=1)
-    up = np.array([0.0, 0.0, 1.0])
-    top = np.stack([ring * r + up * (height - thick / 2) for r in (radius - depth, radius - depth / 2, radius)], axis=1)
-    wall = np.stack([ring * (radius - 0.08) + up * z for z in (0.0, height / 2, height - thick / 2)], axis=1)
-    ends = [block((0.0, depth - 0.08), (-0.015, 0.015), (0, height - thick / 2)).move(radius - depth)
-            .turn("z", float(np.degrees(a))) for a in (angle[0], angle[-1])]  # fmt: skip
-    ends = [end for end in ends if end is not None]
-    return [sheet(top, thick), sheet(wall, 0.04), *ends]
 
 
 FAMILIES = {

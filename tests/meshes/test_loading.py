@@ -1,0 +1,198 @@
+"""Every format read back, and one clear line for every bad file."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from qs3.errors import InputError
+from qs3.meshes import load_mesh, shapes
+
+TETRA = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]])
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+
+
+def tetra() -> trimesh.Trimesh:
+    return trimesh.Trimesh(TETRA, FACES, process=False)
+
+
+def same_surface(mesh: trimesh.Trimesh, triangles: np.ndarray) -> bool:
+    def rows(values: np.ndarray) -> np.ndarray:
+        flat = np.round(values.astype(float), 5).reshape(-1, 9)
+        return flat[np.lexsort(flat.T)]
+
+    return np.array_equal(rows(np.asarray(mesh.triangles)), rows(triangles))
+
+
+@pytest.mark.parametrize("ending", ["off", "obj", "ply", "stl"])
+def test_z_up_formats_come_back_as_written(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"solid.{ending}"
+    tetra().export(path)
+    mesh = load_mesh(path)
+    assert same_surface(mesh, TETRA[FACES])
+    again = load_mesh(path)
+    assert np.array_equal(mesh.vertices, again.vertices)
+    assert np.array_equal(mesh.faces, again.faces)
+
+
+@pytest.mark.parametrize("ending", ["glb", "gltf"])
+def test_convention_gltf_is_turned_from_y_up_to_z_up(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"solid.{ending}"
+    if ending == "glb":
+        tetra().export(path)
+    else:
+        for name, data in trimesh.exchange.gltf.export_gltf(trimesh.Scene(tetra())).items():
+            (tmp_path / name.replace("model", "solid")).write_bytes(data)
+    upright = np.stack([TETRA[:, 0], -TETRA[:, 2], TETRA[:, 1]], axis=1)
+    assert same_surface(load_mesh(path), upright[FACES])
+    assert same_surface(load_mesh(path, up="z"), TETRA[FACES])
+    # A chair written by the standard stands again.
+    chair = shapes.make("chair", 1)
+    lying = chair.copy()
+    lying.vertices = chair.vertices[:, [0, 2, 1]] * [1, 1, -1]
+    lying.export(tmp_path / "chair.glb")
+    np.testing.assert_allclose(load_mesh(tmp_path / "chair.glb").bounds, chair.bounds, atol=1e-5)
+
+
+def test_y_up_obj_by_request(tmp_path: Path) -> None:
+    tetra().export(tmp_path / "solid.obj")
+    mesh = load_mesh(tmp_path / "solid.obj", up="y")
+    upright = np.stack([TETRA[:, 0], -TETRA[:, 2], TETRA[:, 1]], axis=1)
+    assert same_surface(mesh, upright[FACES])
+    assert mesh.volume == pytest.approx(1)  # a turn, not a mirror
+
+
+def test_scene_parts_are_placed_by_their_transforms(tmp_path: Path) -> None:
+    scene = trimesh.Scene()
+    shift = trimesh.transformations.translation_matrix([10, 0, 0])
+    scene.add_geometry(tetra())
+    scene.add_geometry(tetra(), transform=shift)
+    scene.export(tmp_path / "two.glb")
+    mesh = load_mesh(tmp_path / "two.glb", up="z")
+    assert same_surface(mesh, np.concatenate([TETRA[FACES], TETRA[FACES] + [10, 0, 0]]))
+
+
+@pytest.mark.parametrize("head", ["OFF\n5 2 0", "OFF5 2 0", "OFF 5 2 0", "OFF\n# note\n\n5 2 7"])
+def test_off_heads_and_polygons(tmp_path: Path, head: str) -> None:
+    body = "0 0 0\n1 0 0\n1 1 0\n0 1 0\n0 0 1\n4 0 1 2 3\n3 0 1 4 255 0 0\n"
+    path = tmp_path / "a.off"
+    path.write_text(f"{head}\n{body}")
+    mesh = load_mesh(path)
+    assert len(mesh.faces) == 3
+    assert mesh.area == pytest.approx(1.5)
+
+
+def test_polygons_of_ply_and_obj_are_triangulated(tmp_path: Path) -> None:
+    corners = [(np.cos(a), np.sin(a), 0.5) for a in np.arange(5) * 2 * np.pi / 5]
+    lines = ["{:.6f} {:.6f} {:.6f}".format(*p) for p in corners]
+    (tmp_path / "p.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nproperty float y\n"
+        "property float z\nelement face 2\nproperty list uchar int vertex_indices\n"
+        "end_header\n" + "\n".join(lines) + "\n4 0 1 2 3\n3 0 3 4\n"
+    )
+    (tmp_path / "p.obj").write_text(
+        "mtllib ../secret.mtl\nusemtl a\n" + "".join(f"v {p}\n" for p in lines) + "f 1 2 3 4 5\n"
+    )
+    area = 2.5 * np.sin(2 * np.pi / 5)
+    for name in ("p.ply", "p.obj"):
+        assert load_mesh(tmp_path / name).area == pytest.approx(area, rel=1e-4)
+
+
+def test_faces_without_area_and_loose_vertices_are_dropped(tmp_path: Path) -> None:
+    path = tmp_path / "a.off"
+    path.write_text("OFF\n5 3 0\n0 0 0\n1 0 0\n0 1 0\n2 0 0\n9 9 9\n3 0 1 2\n3 0 1 3\n3 1 1 2\n")
+    mesh = load_mesh(path)
+    assert len(mesh.faces) == 1
+    assert len(mesh.vertices) == 3
+
+
+POINTS_PLY = (
+    "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+    "property float z\nend_header\n0 0 0\n1 0 0\n0 1 0\n"
+)
+OFF3 = "OFF\n3 1 0\n{}\n{}\n{}\n3 0 1 {}\n"
+BAD = {
+    "garbage.off": ("hello, this is a letter\n", "not an OFF file"),
+    "counts.off": ("OFF\nmany vertices\n", "not an OFF file"),
+    "binary.off": (b"\xff\xfe\x00\x01" * 9, "not an OFF file"),
+    "empty.off": ("", "empty"),
+    "blank.off": ("\n\n", "not an OFF file"),
+    "novertex.off": ("OFF\n0 0 0\n", "empty"),
+    "noface.off": ("OFF\n2 0 0\n0 0 0\n1 1 1\n", "no faces"),
+    "short.off": ("OFF\n4 4 0\n0 0 0\n1 0 0\n", "cut short"),
+    "line.off": ("OFF\n3 1 0\n0 0 0\n1 0 x\n0 1 0\n3 0 1 2\n", "damaged line"),
+    "row.off": ("OFF\n3 1 0\n0 0 0\n1 0\n0 1 0\n3 0 1 2\n", "damaged line"),
+    "face.off": ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1\n", "damaged line"),
+    "range.off": (OFF3.format("0 0 0", "1 0 0", "0 1 0", 7), "names vertex 7"),
+    "minus.off": (OFF3.format("0 0 0", "1 0 0", "0 1 0", -1), "names vertex -1"),
+    "nan.off": (OFF3.format("nan 0 0", "1 0 0", "0 1 0", 2), "NaN or infinite"),
+    "inf.off": (OFF3.format("inf 0 0", "1 0 0", "0 1 0", 2), "NaN or infinite"),
+    "zero.off": (OFF3.format("1 1 1", "1 1 1", "1 1 1", 2), "zero size"),
+    "sliver.off": (OFF3.format("0 0 0", "1 0 0", "2 0 0", 2), "no face with an area"),
+    "points.ply": (POINTS_PLY, "no faces"),
+    "points.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", ""),
+    "range.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", ""),
+    "garbage.obj": ("dear reader\n", ""),
+    "garbage.ply": ("dear reader\n", ""),
+    "garbage.stl": ("dear reader\n", ""),
+    "garbage.glb": ("dear reader\n", ""),
+    "garbage.gltf": ("dear reader\n", ""),
+    "mesh.xyz": ("0 0 0\n", "not a mesh format"),
+    "mesh": ("0 0 0\n", "not a mesh format"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_files_give_one_line_with_their_name(tmp_path: Path, name: str) -> None:
+    content, reason = BAD[name]
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(InputError) as caught:
+        load_mesh(path)
+    message = str(caught.value)
+    assert message.startswith(str(path))
+    assert reason in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize("ending", ["ply", "stl", "glb", "off", "obj"])
+def test_truncated_files_are_refused(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"cut.{ending}"
+    trimesh.creation.icosphere(subdivisions=2).export(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(0.3 * len(whole))])
+    with pytest.raises(InputError, match="cut"):
+        load_mesh(path)
+
+
+def test_missing_file_and_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        load_mesh(tmp_path / "none.off")
+    with pytest.raises(InputError, match="is a folder"):
+        load_mesh(tmp_path)
+
+
+@pytest.mark.parametrize("uri", ["../outside.bin", "https://example.org/a.bin", "/etc/hostname"])
+def test_nothing_outside_the_folder_is_read(tmp_path: Path, uri: str) -> None:
+    inner = tmp_path / "inner"
+    inner.mkdir()
+    files = trimesh.exchange.gltf.export_gltf(trimesh.Scene(tetra()))
+    tree = json.loads(files["model.gltf"])
+    for i, buffer in enumerate(tree["buffers"]):
+        (tmp_path / "outside.bin").write_bytes(files[buffer["uri"]]) if i == 0 else None
+        buffer["uri"] = uri
+    (inner / "a.gltf").write_text(json.dumps(tree))
+    with pytest.raises(InputError, match="no file beside it"):
+        load_mesh(inner / "a.gltf")
+
+
+@pytest.mark.data
+def test_artists_meshes_load(shared_data: Path) -> None:
+    files = sorted((shared_data / "cad").glob("*/*.ply"))
+    assert len(files) == 147
+    for path in files:
+        mesh = load_mesh(path)
+        reference = trimesh.load(path, force="mesh", process=False)
+        assert mesh.area == pytest.approx(reference.area, rel=1e-6)
