@@ -137,15 +137,15 @@ def _selection(report: Report) -> str:
         return ""
     told = any(r.agreement is not None for r in report.rounds)
     noted = any(r.note for r in report.rounds)
-    head = ["round", "θ", "above θ", "selected", *report.class_names]
-    head += ["agreement"] * told + ["note"] * noted
+    head = ["round", "θ", "above θ", "selected"]
+    head += ["agreement"] * told + ["note"] * noted + list(report.class_names)
     rows = []
     for r in report.rounds:
         pairs = zip(r.kept, r.confident, strict=True)
         share = "–" if r.agreement is None else f"{100.0 * r.agreement:.1f} %"
         cells = [r.index, f"{r.theta:.3f}", int(r.confident.sum()), int(r.kept.sum())]
-        cells += [f"{int(kept)} / {int(above)}" for kept, above in pairs]
-        rows.append(cells + [share] * told + [r.note] * noted)
+        cells += [share] * told + [r.note] * noted
+        rows.append(cells + [f"{int(kept)} / {int(above)}" for kept, above in pairs])
     return section(
         "What self-training selected",
         picture(
@@ -153,7 +153,7 @@ def _selection(report: Report) -> str:
             "Selected clouds of each round by predicted class, and the threshold",
         ),
         paragraph("By class: selected / above θ.", "soft"),
-        table(head, rows, text=[len(head) - 1] if noted else []),
+        table(head, rows, text=[4 + told] if noted else []),
         paragraph(report.agreement_meaning, "soft") if told and report.agreement_meaning else "",
     )
 

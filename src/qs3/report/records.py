@@ -117,8 +117,9 @@ class Report:
         for outcome in (self.before, self.after):
             if len(outcome.confusion) != k:
                 raise InputError(f"{outcome.name}: its confusion matrix is not of {k} classes")
-        if self.before.total != self.after.total:
+        before, after = (o.confusion.sum(axis=1).tolist() for o in (self.before, self.after))
+        if before != after:
             raise InputError(
-                f"{self.before.name} was scored on {self.before.total} clouds and "
-                f"{self.after.name} on {self.after.total}; score both on the same"
+                f"{self.before.name} was scored on {before} clouds of the classes and "
+                f"{self.after.name} on {after}; score both on the same clouds"
             )

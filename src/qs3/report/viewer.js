@@ -50,7 +50,7 @@
     const ratio = window.devicePixelRatio || 1, size = Math.round(canvas.clientWidth * ratio);
     if (!size) return;
     if (canvas.width !== size) canvas.width = canvas.height = size;
-    const pen = canvas.getContext("2d"), scale = size * 0.46, dot = Math.max(1.5, size / 110);
+    const pen = canvas.getContext("2d"), scale = size * 0.46, dot = Math.max(2, size / 75);
     const ca = Math.cos(yaw), sa = Math.sin(yaw), ce = Math.cos(pitch), se = Math.sin(pitch);
     for (let i = 0; i < near.length; i++) {
       near[i] = (points[3 * i] * sa - points[3 * i + 1] * ca) * ce + points[3 * i + 2] * se;

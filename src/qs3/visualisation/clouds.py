@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from qs3.errors import InputError
-from qs3.visualisation.figure import house_style, without_frame
+from qs3.visualisation.figure import house_style, short, without_frame
 
 SIDES = {"front": (0.0, 0.0), "side": (90.0, 0.0), "top": (0.0, 90.0)}
 """Azimuth and elevation of the three sides."""
@@ -133,10 +133,11 @@ def gallery(
     """
     if not samples or columns < 1:
         raise InputError("gallery: hand in at least one class and one column")
-    rows = len(samples)
-    cell, margin = 0.95, 1.0
-    figure = Figure(figsize=(margin + cell * columns, 0.35 + cell * rows), layout="constrained")
-    axes = figure.add_subplot()
+    names, rows = [short(name) for name in samples], len(samples)
+    cell, left, top = 0.95, 0.25 + 0.09 * max(map(len, names)), 0.35  # inches
+    width, height = left + cell * columns, top + cell * rows
+    figure = Figure(figsize=(width, height))
+    axes = figure.add_axes((left / width, 0.0, 1.0 - left / width, 1.0 - top / height))
     spots, colours = [], []
     for row, clouds in enumerate(samples.values()):
         if not clouds:
@@ -155,12 +156,11 @@ def gallery(
     if spots:
         spot = np.concatenate(spots)
         axes.scatter(spot[:, 0], spot[:, 1], s=point_size, c=np.concatenate(colours), linewidths=0)
-    axes.set_xlim(-0.55, columns - 0.45)
-    axes.set_ylim(0.55 - rows, 0.55)
-    axes.set_aspect("equal")
-    axes.set_title(title)
+    axes.set_xlim(-0.5, columns - 0.5)
+    axes.set_ylim(0.5 - rows, 0.5)
+    axes.set_title(short(title, 40))
     without_frame(axes)
-    axes.set_yticks(-np.arange(rows), list(samples))
+    axes.set_yticks(-np.arange(rows), names)
     axes.tick_params(axis="y", length=0)
     return figure
 

@@ -23,10 +23,10 @@ PALETTE = (
     "#cc6677",
     "#882255",
     "#aa4499",
-    "#7a7a7a",
+    "#c4c4c4",
 )
 """Paul Tol's `muted` scheme, distinct for colour-blind readers (https://personal.sron.nl/~pault);
-its pale grey is darkened to be seen on white."""
+its pale grey is a shade darker here, to be seen on white."""
 
 BEFORE, AFTER = "#bbbbbb", "#117733"
 """Colours of a score before and after adaptation: also told apart by lightness alone."""
@@ -90,6 +90,16 @@ def class_colour(index: int) -> str:
         True
     """
     return PALETTE[index % len(PALETTE)]
+
+
+def short(name: str, length: int = 16) -> str:
+    """Return a name cut to ``length`` characters, so that no name crowds out its picture.
+
+    Example:
+        >>> short("chair"), short("a chair with a very long name")
+        ('chair', 'a chair with a …')
+    """
+    return name if len(name) <= length else name[: length - 1] + "…"
 
 
 def without_frame(axes: Axes) -> None:

@@ -19,7 +19,7 @@ from matplotlib.ticker import MaxNLocator
 
 from qs3.errors import InputError
 from qs3.visualisation.clouds import SIDES, draw_cloud
-from qs3.visualisation.figure import NO_VALUE, house_style, without_frame
+from qs3.visualisation.figure import NO_VALUE, house_style, short, without_frame
 
 _LOST, _EXTRA = "#6e6e6e", "#ddaa33"
 
@@ -103,7 +103,7 @@ def montage(view: MontageView, title: str = "") -> Figure:
     cells = upper.subplots(2, 4).ravel()
     places = lower.subplots(len(clouds), 3, squeeze=False)
     if title:
-        figure.suptitle(title, fontsize=13)
+        figure.suptitle(short(title, 90), fontsize=13)
 
     _pattern(cells[0], view.pattern)
     _picture(cells[1], view.left[part], "left image", extent)

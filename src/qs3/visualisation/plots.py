@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from qs3.errors import InputError
-from qs3.visualisation.figure import AFTER, BEFORE, PALETTE, class_colour, house_style
+from qs3.visualisation.figure import AFTER, BEFORE, PALETTE, class_colour, house_style, short
 
 _WIDTH = 5.2  # inches: at a phone's 360 px the 10-point text is still about 10 px high
 
@@ -76,12 +76,12 @@ def training_curves(
                 curve.y,
                 style,
                 color=_LINES[index % len(_LINES)],
-                label=curve.name,
+                label=short(curve.name, 28),
                 linewidth=1.8,
                 marker="o" if len(curve.x) < 12 else None,
                 markersize=3.5,
             )
-        axes.set_ylabel(panel)
+        axes.set_ylabel(short(panel, 24))
         axes.margins(y=0.08)
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, fontsize=9)
     grid[-1, 0].set_xlabel("epoch" + (f" (grey line: {mark_label} begins)" if len(marks) else ""))
@@ -112,7 +112,13 @@ def selection_counts(rounds: Sequence[SelectionRound], class_names: Sequence[str
     for index, name in enumerate(class_names):
         height = np.array([r.kept[index] for r in rounds], dtype=np.float64)
         lower.bar(
-            places, height, 0.75, floor, color=class_colour(index), label=name, edgecolor="white"
+            places,
+            height,
+            0.75,
+            floor,
+            color=class_colour(index),
+            label=short(name),
+            edgecolor="white",
         )
         floor += height
     above = np.array([int(r.confident.sum()) for r in rounds])
@@ -148,7 +154,8 @@ def confusion_heatmap(
         raise InputError(f"confusion_heatmap: {matrix.shape} does not fit {k} class names")
     total = matrix.sum(axis=1, keepdims=True)
     share = np.divide(matrix, total, out=np.zeros(matrix.shape), where=total > 0)
-    columns = [*class_names, "other"][: matrix.shape[1]]
+    names = [short(name) for name in class_names]
+    columns = [*names, "other"][: matrix.shape[1]]
     edge = max(_WIDTH, 0.36 * k + 1.4)
     figure = Figure(figsize=(edge, edge + 0.15), layout="constrained")
     axes = figure.add_subplot()
@@ -168,7 +175,7 @@ def confusion_heatmap(
                 fontweight=weight,
             )
     axes.set_xticks(range(len(columns)), columns, rotation=55, ha="right", rotation_mode="anchor")
-    axes.set_yticks(range(k), class_names)
+    axes.set_yticks(range(k), names)
     axes.set_xticks(np.arange(len(columns) - 1) + 0.5, minor=True)
     axes.set_yticks(np.arange(k - 1) + 0.5, minor=True)
     axes.grid(which="minor", color="#dddddd", linewidth=0.6)
@@ -178,7 +185,7 @@ def confusion_heatmap(
         spine.set_color("#bbbbbb")
     axes.set_xlabel("predicted")
     axes.set_ylabel("true")
-    axes.set_title(title)
+    axes.set_title(short(title, 40))
     return figure
 
 
@@ -213,12 +220,12 @@ def class_accuracy(
         (0.2, after, names[1], AFTER),
     ):
         known = np.nan_to_num(values, nan=0.0)
-        axes.barh(rows + offset, 100.0 * known, 0.38, color=colour, label=name)
+        axes.barh(rows + offset, 100.0 * known, 0.38, color=colour, label=short(name, 24))
         for row, value in zip(rows, values, strict=True):
             text = "no cloud" if np.isnan(value) else f"{100.0 * value:.0f}"
             if not (np.isnan(value) and offset > 0):
                 axes.text(100.0 * known[row] + 1, row + offset, text, va="center", fontsize=8.5)
-    axes.set_yticks(rows, [f"{n} ({c})" for n, c in zip(class_names, counts, strict=True)])
+    axes.set_yticks(rows, [f"{short(n)} ({c})" for n, c in zip(class_names, counts, strict=True)])
     axes.invert_yaxis()
     axes.set_xlim(0, 108)
     axes.set_xticks(range(0, 101, 20))

@@ -1,0 +1,207 @@
+import base64
+import dataclasses
+import hashlib
+import io
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from qs3.report import render, write_report
+from qs3.report.verdict import judge
+from qs3.report.viewer import encode_points, viewer
+
+from .conftest import HOSTILE
+
+VOID = {"meta", "img", "br", "input", "link", "hr"}
+
+
+class Page(HTMLParser):
+    """Collects what a browser would see, and that every tag is closed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+        self.code: dict[str, str] = {}
+        self.open: list[str] = []
+        self.feed(text)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] in ("script", "style"):
+            self.code[self.open[-1]] = self.code.get(self.open[-1], "") + data
+        else:
+            self.words.append(data)
+
+    def named(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+@pytest.fixture
+def source(page_path) -> str:
+    return page_path.read_text(encoding="utf-8")
+
+
+def test_nothing_is_fetched_and_nothing_hostile_runs(source):
+    page = Page(source)
+    tags = {name for name, _ in page.tags}
+    assert not tags & {"link", "iframe", "object", "embed", "base", "form", "video", "audio"}
+    assert len(page.named("script")) == len(page.named("style")) == 1
+    for _, attributes in page.tags:
+        assert not any(name.startswith("on") or name in ("href", "srcset") for name in attributes)
+        assert "style" not in attributes  # the policy would refuse it
+        if "src" in attributes:
+            assert attributes["src"].startswith("data:image/png;base64,")
+    code = page.code["script"] + page.code["style"]
+    assert not re.search(r"url\(|@import|fetch|XMLHttp|https?:|innerHTML|eval|Function", code)
+
+
+def test_policy_names_exactly_the_style_and_script_of_the_page(source):
+    page = Page(source)
+    policy = page.named("meta")[1]["content"]
+    for tag, code in page.code.items():
+        digest = base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()
+        assert f"{tag}-src 'sha256-{digest}'" in policy
+    assert policy.startswith("default-src 'none'; img-src data:;")
+
+
+def test_hostile_text_is_shown_as_it_is_wherever_it_comes_from(source):
+    text = "\n".join(Page(source).words)
+    for start in ("Title", "Summary", "before", "after", "qs3 demo", "0.1.0", "target"):
+        assert f"{start} {HOSTILE}" in text
+    for start in ("Agreement", "Note", "chair"):
+        assert f"{start} {HOSTILE}" in text
+    alternatives = [i["alt"] for i in Page(source).named("img")]
+    assert any(HOSTILE in text for text in alternatives)
+
+
+def test_images_decode_and_are_described(source):
+    images = Page(source).named("img")
+    assert len(images) == 8  # montage, two galleries, curves, selection, two matrices, bars
+    for image in images:
+        data = base64.b64decode(image["src"].split(",")[1], validate=True)
+        pixels = imread(io.BytesIO(data), format="png")
+        assert pixels.shape[1] >= 500
+        assert pixels[..., :3].std() > 0.01
+        assert image["alt"]
+
+
+def test_phone_dark_mode_and_language(source):
+    page = Page(source)
+    assert page.named("html") == [{"lang": "en"}]
+    view = [m for m in page.named("meta") if m.get("name") == "viewport"]
+    assert view[0]["content"] == "width=device-width, initial-scale=1"
+    assert "prefers-color-scheme: dark" in page.code["style"]
+
+
+def test_verdict_and_scores_are_on_the_page(report, source):
+    text = "".join(Page(source).words)
+    assert "Adaptation helped." in text
+    assert "53.3 %" in text  # 16 of 30
+    assert "96.7 %" in text
+    assert "n = 30" in text
+    low, high = (100 * x for x in report.before.interval)
+    assert f"95 % interval {low:.1f} to {high:.1f} %" in text
+
+
+@pytest.mark.parametrize(
+    ("turned", "kind", "words"),
+    [(False, "hurt", "Adaptation hurt."), (None, "unclear", "No clear difference.")],
+)
+def test_bad_news_is_told_as_it_is(report, turned, kind, words):
+    after = report.before
+    before = report.before if turned is None else report.after
+    changed = dataclasses.replace(
+        report, before=before, after=after, montage=None, samples={}, curves=(), rounds=()
+    )
+    page = Page(render(changed, judge(before, after)))
+    assert [a["class"] for a in page.named("div") if a.get("id") == "verdict"] == [
+        f"verdict {kind}"
+    ]
+    assert words in "".join(page.words)
+    assert "Adaptation helped" not in "".join(page.words)
+
+
+def test_table_of_rounds_holds_every_number(source):
+    rows = re.findall(r"<tr>(.*?)</tr>", source)
+    cells = [re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row) for row in rows]
+    assert cells[0][:6] == ["round", "θ", "above θ", "selected", "agreement", "note"]
+    assert cells[1] == ["1", "0.800", "8", "4", "50.0 %", "", "2 / 5", "0 / 0", "2 / 3"]
+    assert cells[2][:5] == ["2", "0.805", "1", "0", "–"]
+    assert cells[2][6:] == ["0 / 1", "0 / 0", "0 / 0"]
+
+
+def test_settings_are_folded_away_and_complete(source):
+    assert len(Page(source).named("details")) == 2
+    assert '<td class="text">sensor.views</td><td class="text">5</td>' in source
+
+
+def test_parts_that_are_empty_are_left_out(report):
+    bare = dataclasses.replace(
+        report,
+        montage=None,
+        samples={},
+        curves=(),
+        rounds=(),
+        settings={},
+        versions={},
+        notes=(),
+        agreement_meaning="",
+    )
+    page = Page(render(bare, judge(bare.before, bare.after)))
+    assert len(page.named("img")) == 3
+    assert len(page.named("section")) == 2
+    assert not page.named("canvas")
+
+
+def test_same_report_gives_the_same_bytes_and_its_verdict(report, page_path, tmp_path):
+    again = tmp_path / "again.html"
+    assert write_report(again, report) == judge(report.before, report.after)
+    assert again.read_bytes() == page_path.read_bytes()
+    assert list(tmp_path.iterdir()) == [again]
+    assert str(tmp_path).encode() not in again.read_bytes()
+
+
+def test_viewer_shows_each_class_of_both_domains_side_by_side(report, source):
+    page = Page(source)
+    assert "hidden" in next(a for a in page.named("div") if a.get("id") == "viewer")
+    labels = [canvas["aria-label"] for canvas in page.named("canvas")]
+    assert len(labels) == 2 * len(report.class_names)
+    for index, name in enumerate(report.class_names):
+        assert labels[2 * index] == f"{name}, source, can be turned"
+        assert labels[2 * index + 1].startswith(f"{name}, target")
+
+
+def test_class_that_one_domain_lacks_is_not_in_the_viewer(report):
+    samples = {
+        "source": report.samples["source"],
+        "target": {"bed": report.samples["source"]["bed"]},
+    }
+    assert viewer(samples).count("<canvas") == 2
+    assert viewer({**samples, "target": {}}) == ""
+    assert viewer({}) == ""
+
+
+def test_encoded_points_are_the_points_in_the_unit_ball(rng):
+    points = 7.0 + rng.normal(size=(100, 3)) * [3, 1, 1]
+    points[3] = np.nan
+    whole = np.frombuffer(base64.b64decode(encode_points(points)), "<i2").reshape(-1, 3) / 32767
+    assert np.linalg.norm(whole, axis=1).max() == pytest.approx(1.0, abs=1e-4)
+    kept = np.delete(points, 3, axis=0)
+    centre = (kept.min(axis=0) + kept.max(axis=0)) / 2
+    scale = np.linalg.norm(kept - centre, axis=1).max()
+    np.testing.assert_allclose(whole, (kept - centre) / scale, atol=2e-5)
+    assert len(base64.b64decode(encode_points(rng.normal(size=(5000, 3))))) == 1024 * 6
+    assert encode_points(np.zeros((0, 3))) == ""
