@@ -6,6 +6,7 @@ import numpy as np
 
 from qs3.meshes.shapes._dice import Dice
 from qs3.meshes.shapes._parts import (
+    Number,
     Part,
     Span,
     block,
@@ -21,7 +22,7 @@ def bed_size(dice: Dice) -> tuple[float, float]:
     return width, dice.between(1.9, 2.15)
 
 
-def bedding(dice: Dice, x: Span, y: Span, z: float, thick: float) -> list[Part]:
+def bedding(dice: Dice, x: Span, y: Span, z: Number, thick: Number) -> list[Part]:
     """Mattress on ``z`` with pillows at its head (+y) and perhaps a blanket."""
     top = z + thick
     parts = [cushion(x, y, (z - 0.003, top), dice.between(0.02, 0.06), 0.01, dice.steps)]
@@ -59,7 +60,7 @@ def bedding(dice: Dice, x: Span, y: Span, z: float, thick: float) -> list[Part]:
     return parts
 
 
-def headboard(dice: Dice, x: Span, y: float, z: Span, thick: float) -> list[Part]:
+def headboard(dice: Dice, x: Span, y: Number, z: Span, thick: Number) -> list[Part]:
     style = dice.pick("board", "board", "padded", "slats", "posts", "arch")
     low, high = z
     if style == "board":

@@ -26,7 +26,7 @@ class Dice:
         self.bulk = float(rng.choice([1.0, 1.0, rng.uniform(1.0, 2.2)]))
         """Thickness of boards and legs as a multiple of slender, up to a toy's chunkiness."""
 
-    def between(self, low: float, high: float) -> float:
+    def between(self, low: int | float, high: int | float) -> float:
         """Return a length or angle, uniform."""
         return float(self.rng.uniform(low, high))
 
@@ -34,7 +34,7 @@ class Dice:
         """Return a whole number from ``low`` to ``high``, both included."""
         return int(self.rng.integers(low, high + 1))
 
-    def chance(self, probability: float) -> bool:
+    def chance(self, probability: int | float) -> bool:
         """Return True with this probability."""
         return bool(self.rng.random() < probability)
 

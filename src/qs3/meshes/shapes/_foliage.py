@@ -5,6 +5,7 @@ import numpy as np
 from qs3.meshes.shapes._dice import Dice
 from qs3.meshes.shapes._joinery import corners, legs
 from qs3.meshes.shapes._parts import (
+    Number,
     Part,
     Point,
     at_height,
@@ -17,7 +18,7 @@ from qs3.meshes.shapes._parts import (
 )
 
 
-def potted(dice: Dice, radius: float, tall: float) -> tuple[list[Part], float]:
+def potted(dice: Dice, radius: Number, tall: Number) -> tuple[list[Part], float]:
     """Pot filled with earth, and the height of the earth."""
     foot = radius * dice.between(0.55, 0.95)
     wall = max(0.008, 0.08 * radius) * dice.bulk**0.5
@@ -65,12 +66,12 @@ def potted(dice: Dice, radius: float, tall: float) -> tuple[list[Part], float]:
 
 def leaf(
     start: Point,
-    azimuth: float,
-    rise: float,
-    length: float,
-    width: float,
-    droop: float,
-    thick: float = 0.004,
+    azimuth: Number,
+    rise: Number,
+    length: Number,
+    width: Number,
+    droop: Number,
+    thick: Number = 0.004,
 ) -> Part:
     """Leaf from ``start``: leaves at ``rise`` degrees above level and bends down by ``droop``."""
     t = np.linspace(0, 1, 7)
@@ -88,7 +89,7 @@ def leaf(
     return ribbon(path, across, thick)
 
 
-def crown(dice: Dice, centre: Point, size: float, smooth: bool) -> list[Part]:
+def crown(dice: Dice, centre: Point, size: Number, smooth: bool) -> list[Part]:
     """Crown of foliage: overlapping balls, or many leaves about a core."""
     x, y, z = centre
     if smooth:

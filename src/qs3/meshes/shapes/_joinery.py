@@ -5,23 +5,23 @@ from collections.abc import Sequence
 import numpy as np
 
 from qs3.meshes.shapes._dice import Dice
-from qs3.meshes.shapes._parts import Part, Span, beam, block, cushion, lathe, tube
+from qs3.meshes.shapes._parts import Number, Part, Span, beam, block, cushion, lathe, tube
 
 LEGS = ("square", "tapered", "round", "cone", "turned")
 
 
-def corners(x: Span, y: Span, inset: float) -> list[tuple[float, float]]:
+def corners(x: Span, y: Span, inset: Number) -> list[tuple[float, float]]:
     """Four spots ``inset`` inside a rectangle."""
     return [(px, py) for px in (x[0] + inset, x[1] - inset) for py in (y[0] + inset, y[1] - inset)]
 
 
 def legs(
     dice: Dice,
-    spots: Sequence[tuple[float, float]],
-    top: float,
-    thick: float,
+    spots: Sequence[Span],
+    top: Number,
+    thick: Number,
     style: str | None = None,
-    splay: float = 0.0,
+    splay: Number = 0.0,
 ) -> list[Part]:
     """Legs from the floor up to ``top`` at each spot, leaning outward by ``splay`` metres."""
     style = style or dice.pick(*LEGS)
@@ -65,7 +65,7 @@ def legs(
 
 
 def carcass(
-    x: Span, y: Span, z: Span, board: float, back: bool = True, bottom: bool = True
+    x: Span, y: Span, z: Span, board: Number, back: bool = True, bottom: bool = True
 ) -> list[Part]:
     """Box of boards, open at the front (−y)."""
     parts = [
@@ -86,7 +86,7 @@ def carcass(
     return parts
 
 
-def handle(dice: Dice, style: str, x: float, y: float, z: float, upright: bool) -> list[Part]:
+def handle(dice: Dice, style: str, x: Number, y: Number, z: Number, upright: bool) -> list[Part]:
     """Handle on a front whose face lies at ``y`` (it sticks out toward −y)."""
     if style == "knob":
         r = dice.between(0.01, 0.022)
@@ -116,7 +116,7 @@ def fronts(
     dice: Dice,
     x: Span,
     z: Span,
-    y: float,
+    y: Number,
     columns: int,
     rows: int,
     kind: str = "drawer",
@@ -160,7 +160,7 @@ def fronts(
     return parts
 
 
-def books(dice: Dice, x: Span, y: Span, z: float, room: float) -> list[Part]:
+def books(dice: Dice, x: Span, y: Span, z: Number, room: Number) -> list[Part]:
     """A row of upright books on a board whose top is at ``z``, ``room`` metres below the next."""
     parts, at = [], x[0] + dice.between(0.0, 0.03)
     end = x[1] - dice.between(0.0, 0.5) * (x[1] - x[0])
@@ -175,7 +175,7 @@ def books(dice: Dice, x: Span, y: Span, z: float, room: float) -> list[Part]:
         at += thick + (dice.between(0.02, 0.1) if dice.chance(0.1) else 0.0)
 
 
-def knick_knacks(dice: Dice, x: Span, y: Span, z: float, room: float = 0.5) -> list[Part]:
+def knick_knacks(dice: Dice, x: Span, y: Span, z: Number, room: Number = 0.5) -> list[Part]:
     """A few things that lie about on a top at ``z``: books, a box, a vase, a potted cactus."""
     width, parts = x[1] - x[0], []
     count = max(1, min(4, int(width / 0.28)))

@@ -8,8 +8,10 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
-Span = tuple[float, float]
-Point = tuple[float, float, float]
+Number = int | float
+"""So that a plain 0 may stand for 0.0 where arguments are checked at run time."""
+Span = tuple[Number, Number]
+Point = tuple[Number, Number, Number]
 
 
 @dataclass(frozen=True)
@@ -21,12 +23,12 @@ class Part:
     faces: Int[np.ndarray, "m 3"]
     """Corners of each triangle, anticlockwise seen from outside."""
 
-    def move(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Part":
+    def move(self, x: Number = 0.0, y: Number = 0.0, z: Number = 0.0) -> "Part":
         """Return the part shifted."""
         return Part(self.vertices + np.array([x, y, z], dtype=float), self.faces)
 
     def turn(
-        self, axis: Literal["x", "y", "z"], degrees: float, about: Point = (0.0, 0.0, 0.0)
+        self, axis: Literal["x", "y", "z"], degrees: Number, about: Point = (0.0, 0.0, 0.0)
     ) -> "Part":
         """Return the part turned about an axis through ``about``, anticlockwise seen from +axis."""
         c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
@@ -94,7 +96,7 @@ def _closed(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -
 
 
 def outline(
-    width: float, depth: float, sides: int = 24, exponent: float = 2.0, phase: float = 0.0
+    width: Number, depth: Number, sides: int = 24, exponent: Number = 2.0, phase: Number = 0.0
 ) -> Float[np.ndarray, "n 2"]:
     """Superellipse |2x/width|ᵉ + |2y/depth|ᵉ = 1 as a polygon: e = 2 an ellipse, 8 nearly a box."""
     angle = 2 * np.pi * (np.arange(sides) + phase) / sides
@@ -103,7 +105,7 @@ def outline(
     return np.stack([width / 2 * reach * c, depth / 2 * reach * s], axis=1)
 
 
-def at_height(polygon: Float[np.ndarray, "n 2"], z: float) -> Float[np.ndarray, "n 3"]:
+def at_height(polygon: Float[np.ndarray, "n 2"], z: Number) -> Float[np.ndarray, "n 3"]:
     """Lay a polygon of the ground plane at height ``z``."""
     return np.column_stack([polygon, np.full(len(polygon), z)])
 
@@ -119,7 +121,7 @@ def block(x: Span, y: Span, z: Span) -> Part:
     return slab(corners, z)
 
 
-def cushion(x: Span, y: Span, z: Span, radius: float, crown: float = 0.0, steps: int = 3) -> Part:
+def cushion(x: Span, y: Span, z: Span, radius: Number, crown: Number = 0.0, steps: int = 3) -> Part:
     """Box with edges rounded to ``radius`` and a top swollen by ``crown``; 1 step is a bevel."""
     low, high = np.array([x[0], y[0], z[0]], float), np.array([x[1], y[1], z[1]], float)
     half = (high - low) / 2
@@ -154,9 +156,7 @@ def pillow(x: Span, y: Span, z: Span, sides: int = 8) -> Part:
     return loft(rings * half + middle, cap="zip")
 
 
-def lathe(
-    profile: Sequence[tuple[float, float]], sides: int = 16, x: float = 0.0, y: float = 0.0
-) -> Part:
+def lathe(profile: Sequence[Span], sides: int = 16, x: Number = 0.0, y: Number = 0.0) -> Part:
     """Turn a profile of (radius, z) about the vertical through (x, y).
 
     A vessel's profile runs up the outside and down the inside to radius 0.
@@ -165,7 +165,7 @@ def lathe(
     return loft(np.stack(rings) + np.array([x, y, 0.0]))
 
 
-def ball(radius: float, centre: Point, sides: int = 12, squash: float = 1.0) -> Part:
+def ball(radius: Number, centre: Point, sides: int = 12, squash: Number = 1.0) -> Part:
     """Sphere, or with ``squash`` ≠ 1 one whose height is scaled."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, max(4, sides // 2 + 1))
     profile = [
@@ -176,7 +176,7 @@ def ball(radius: float, centre: Point, sides: int = 12, squash: float = 1.0) -> 
 
 def tube(
     path: Sequence[Point] | Float[np.ndarray, "n 3"],
-    radius: float | Sequence[float],
+    radius: Number | Sequence[Number],
     sides: int = 8,
     closed: bool = False,
 ) -> Part:
@@ -199,7 +199,7 @@ def tube(
     return loft(np.stack(rings), cyclic=closed)
 
 
-def beam(start: Point, end: Point, width: float, depth: float, taper: float = 1.0) -> Part:
+def beam(start: Point, end: Point, width: Number, depth: Number, taper: Number = 1.0) -> Part:
     """Straight bar of rectangular section: ``width`` along x where it can be, ``depth`` across.
 
     An upright beam has its ends cut level, so that a splayed leg stands flat on the floor.
@@ -217,7 +217,7 @@ def beam(start: Point, end: Point, width: float, depth: float, taper: float = 1.
     return loft(np.stack([a + square @ frame, b + taper * (square @ frame)]))
 
 
-def sheet(grid: Float[np.ndarray, "r c 3"], thickness: float) -> Part:
+def sheet(grid: Float[np.ndarray, "r c 3"], thickness: Number) -> Part:
     """Solid of even thickness about a curved surface given as a grid of points."""
     normal = np.cross(np.gradient(grid, axis=0), np.gradient(grid, axis=1))
     length = np.linalg.norm(normal, axis=2, keepdims=True)
@@ -226,13 +226,13 @@ def sheet(grid: Float[np.ndarray, "r c 3"], thickness: float) -> Part:
 
 
 def ribbon(
-    path: Float[np.ndarray, "n 3"], across: Float[np.ndarray, "n 3"], thickness: float
+    path: Float[np.ndarray, "n 3"], across: Float[np.ndarray, "n 3"], thickness: Number
 ) -> Part:
     """Strip along ``path`` that reaches ``across`` to either side of it."""
     return sheet(np.stack([path - across, path, path + across], axis=1), thickness)
 
 
-def bend(corners: Sequence[Point], radius: float, steps: int = 4) -> Float[np.ndarray, "n 3"]:
+def bend(corners: Sequence[Point], radius: Number, steps: int = 4) -> Float[np.ndarray, "n 3"]:
     """Polyline with its inner corners rounded, as a pipe is bent."""
     points = np.asarray(corners, dtype=float)
     path = [points[0]]

@@ -5,6 +5,7 @@ import numpy as np
 from qs3.meshes.shapes._dice import Dice
 from qs3.meshes.shapes._joinery import corners, legs
 from qs3.meshes.shapes._parts import (
+    Number,
     Part,
     beam,
     block,
@@ -16,7 +17,7 @@ from qs3.meshes.shapes._parts import (
 )
 
 
-def _stool_top(dice: Dice, width: float, z: float) -> list[Part]:
+def _stool_top(dice: Dice, width: Number, z: Number) -> list[Part]:
     thick = dice.between(0.025, 0.05) * dice.bulk
     kind = dice.pick("round", "square", "pad", "low_poly")
     if kind == "square":

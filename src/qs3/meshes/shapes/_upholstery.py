@@ -6,10 +6,10 @@ import numpy as np
 
 from qs3.meshes.shapes._dice import Dice
 from qs3.meshes.shapes._joinery import corners, legs
-from qs3.meshes.shapes._parts import Part, Span, cushion, pillow, tube
+from qs3.meshes.shapes._parts import Number, Part, Span, cushion, pillow, tube
 
 
-def upholstered(dice: Dice, width: float, seats: int, lean: float | None = None) -> list[Part]:
+def upholstered(dice: Dice, width: Number, seats: int, lean: Number | None = None) -> list[Part]:
     """Base, back, two arms and cushions: an armchair with one seat, a sofa with more.
 
     The first part is the base.
@@ -72,7 +72,7 @@ def upholstered(dice: Dice, width: float, seats: int, lean: float | None = None)
     return parts
 
 
-def _arms(dice: Dice, x: Span, y: Span, z: Span, side: float, soft: float) -> list[Part]:
+def _arms(dice: Dice, x: Span, y: Span, z: Span, side: Number, soft: Number) -> list[Part]:
     style = dice.pick("square", "square", "rolled", "sloped")
     parts = []
     for s, span in ((-1, (x[0], x[0] + side)), (1, (x[1] - side, x[1]))):
@@ -96,7 +96,7 @@ def _arms(dice: Dice, x: Span, y: Span, z: Span, side: float, soft: float) -> li
     return parts
 
 
-def _throw_pillows(dice: Dice, x: Span, y: float, z: float) -> list[Part]:
+def _throw_pillows(dice: Dice, x: Span, y: Number, z: Number) -> list[Part]:
     half, parts = dice.between(0.17, 0.23), []
     spots = [x[0] + half, x[1] - half, (x[0] + x[1]) / 2]
     if x[1] - x[0] < 4.2 * half:

@@ -7,7 +7,10 @@ from jaxtyping import Float
 
 from qs3.meshes.shapes._dice import Dice
 from qs3.meshes.shapes._parts import (
+    Number,
     Part,
+    Point,
+    Span,
     at_height,
     ball,
     beam,
@@ -24,10 +27,10 @@ Rim = Callable[[Float[np.ndarray, "n"]], Float[np.ndarray, "n"]]
 
 
 def _tub(
-    outer: list[tuple[float, float, float]],
-    inner: list[tuple[float, float, float]],
-    size: tuple[float, float],
-    exponents: tuple[float, float],
+    outer: list[Point],
+    inner: list[Point],
+    size: Span,
+    exponents: Span,
     sides: int,
     rim: Rim | None = None,
 ) -> Part:
@@ -57,9 +60,7 @@ def _size(dice: Dice) -> tuple[float, float, float]:
     return dice.between(1.35, 1.9), dice.between(0.66, 0.92), dice.between(0.46, 0.66)
 
 
-def _hollow(
-    dice: Dice, high: float, rim: tuple[float, float], deep: float
-) -> list[tuple[float, float, float]]:
+def _hollow(dice: Dice, high: Number, rim: Span, deep: Number) -> list[tuple[float, float, float]]:
     """Rings of a hollow whose mouth leaves a rim of these shares of length and width."""
     a, b = 1 - 2 * rim[0], 1 - 2 * rim[1]
     floor = high - deep
@@ -72,7 +73,7 @@ def _hollow(
     ]
 
 
-def _tap(dice: Dice, x: float, y: float, z: float, toward: float) -> list[Part]:
+def _tap(dice: Dice, x: Number, y: Number, z: Number, toward: Number) -> list[Part]:
     """Tap with two handles that stands at (x, y, z) and spouts toward the direction in degrees."""
     rise, run = dice.between(0.08, 0.2), dice.between(0.08, 0.16)
     spout = bend([(0, 0, -0.01), (0, 0, rise), (run, 0, rise), (run, 0, rise - 0.05)], 0.05)
@@ -85,7 +86,7 @@ def _tap(dice: Dice, x: float, y: float, z: float, toward: float) -> list[Part]:
 
 
 def _maybe_tap(
-    dice: Dice, length: float, z: float, share: float = 0.5, rim: float = 0.05
+    dice: Dice, length: Number, z: Number, share: Number = 0.5, rim: Number = 0.05
 ) -> list[Part]:
     return _tap(dice, length / 2 - rim / 2, 0.0, z, 180) if dice.chance(share) else []
 
@@ -151,7 +152,7 @@ def oval(dice: Dice) -> list[Part]:
     return parts
 
 
-def _standing_tap(x: float, high: float) -> list[Part]:
+def _standing_tap(x: Number, high: Number) -> list[Part]:
     path = bend(
         [(x, 0, 0.0), (x, 0, high + 0.25), (x - 0.22, 0, high + 0.25), (x - 0.22, 0, high + 0.15)],
         0.06,

@@ -6,10 +6,10 @@ import numpy as np
 
 from qs3.meshes.shapes._dice import Dice
 from qs3.meshes.shapes._joinery import books, carcass, corners, fronts, knick_knacks, legs
-from qs3.meshes.shapes._parts import Part, Span, beam, block
+from qs3.meshes.shapes._parts import Number, Part, Span, beam, block
 
 
-def _fill(dice: Dice, x: Span, y: Span, z: float, room: float, share: float) -> list[Part]:
+def _fill(dice: Dice, x: Span, y: Span, z: Number, room: Number, share: Number) -> list[Part]:
     """Books or knick-knacks on one board, with probability ``share``."""
     if room < 0.12 or x[1] - x[0] < 0.12 or not dice.chance(share):
         return []

@@ -2,7 +2,7 @@
 
 from qs3.meshes.shapes._dice import Dice
 from qs3.meshes.shapes._joinery import carcass, corners, fronts, knick_knacks, legs
-from qs3.meshes.shapes._parts import Part, Span, block
+from qs3.meshes.shapes._parts import Number, Part, Span, block
 
 
 def _body(dice: Dice, x: Span, y: Span, z: Span) -> tuple[list[Part], Span]:
@@ -47,7 +47,9 @@ def _body(dice: Dice, x: Span, y: Span, z: Span) -> tuple[list[Part], Span]:
     return parts, (z[0] + foot + 0.01, z[1] - top - 0.005)
 
 
-def _topped(dice: Dice, parts: list[Part], x: Span, y: Span, z: float, share: float) -> list[Part]:
+def _topped(
+    dice: Dice, parts: list[Part], x: Span, y: Span, z: Number, share: Number
+) -> list[Part]:
     if dice.chance(share):
         parts = parts + knick_knacks(
             dice, (x[0] + 0.03, x[1] - 0.03), (y[0] + 0.03, y[1] - 0.03), z, 0.45

@@ -6,6 +6,7 @@ from qs3.meshes.shapes._dice import Dice
 from qs3.meshes.shapes._easy_chairs import armchair, lounge, recliner, tub, wing
 from qs3.meshes.shapes._joinery import corners, legs
 from qs3.meshes.shapes._parts import (
+    Number,
     Part,
     Span,
     beam,
@@ -20,7 +21,7 @@ from qs3.meshes.shapes._parts import (
 from qs3.meshes.shapes._stools import bar_stool, bench, stool
 
 
-def _backrest(dice: Dice, width: float, y: float, z: Span, thick: float) -> list[Part]:
+def _backrest(dice: Dice, width: Number, y: Number, z: Span, thick: Number) -> list[Part]:
     """Backrest that stands upright on the seat's rear edge, to be tilted as one piece."""
     style = dice.pick("panel", "panel", "slats", "ladder", "frame", "round", "pad")
     low, high = z
@@ -157,7 +158,7 @@ def four_legs(dice: Dice) -> list[Part]:
     return parts
 
 
-def _star_base(dice: Dice, height: float) -> list[Part]:
+def _star_base(dice: Dice, height: Number) -> list[Part]:
     """Star of four to six feet with a gas spring up to ``height``."""
     feet, reach, castor = dice.count(4, 6), dice.between(0.26, 0.34), dice.chance(0.7)
     level = 0.06 if castor else 0.02
@@ -315,7 +316,7 @@ def shell(dice: Dice) -> list[Part]:
         side = [
             (r + 0.08, thick / 2),
             (r - 0.08, thick / 2),
-            (f + 0.2, thick / 2 + 0.03),
+            (f + 0.16, thick / 2),
             (f + 0.1, 0.14),
             (f + 0.04, 0.3),
             *side,

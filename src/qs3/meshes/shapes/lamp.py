@@ -5,6 +5,7 @@ import numpy as np
 from qs3.meshes.shapes._dice import Dice
 from qs3.meshes.shapes._joinery import legs
 from qs3.meshes.shapes._parts import (
+    Number,
     Part,
     Point,
     at_height,
@@ -21,7 +22,7 @@ from qs3.meshes.shapes._parts import (
 _WALL = 0.006
 
 
-def _shade(dice: Dice, wide: float, tall: float, z: float, sides: int) -> list[Part]:
+def _shade(dice: Dice, wide: Number, tall: Number, z: Number, sides: int) -> list[Part]:
     """Open shade about the z axis from ``z`` up, with the spokes that carry it at its middle."""
     top = dice.pick(dice.between(0.35, 0.75), dice.between(0.8, 1.0)) * wide
     mid = z + 0.5 * tall
@@ -45,7 +46,7 @@ def _shade(dice: Dice, wide: float, tall: float, z: float, sides: int) -> list[P
     return [shade, spoke, ball(0.035, (0, 0, mid + 0.02), 8)]
 
 
-def _foot(dice: Dice, radius: float) -> list[Part]:
+def _foot(dice: Dice, radius: Number) -> list[Part]:
     thick = dice.between(0.015, 0.035)
     if dice.chance(0.25):
         return [block((-radius, radius), (-radius, radius), (0, thick))]
@@ -109,7 +110,7 @@ def arc(dice: Dice) -> list[Part]:
     )
     return [
         tube(path, bar, 8),
-        tube([end, (end[0], 0, low - 0.02)], bar * 0.8, 6),
+        tube(np.stack([end, [end[0], 0, low - 0.02]]), bar * 0.8, 6),
         shade.move(float(end[0])),
         foot,
     ]
@@ -193,7 +194,7 @@ def table(dice: Dice) -> list[Part]:
     return parts
 
 
-def _bell(dice: Dice, wide: float, tall: float) -> Part:
+def _bell(dice: Dice, wide: Number, tall: Number) -> Part:
     """Reflector that opens downward below the origin."""
     neck = dice.between(0.25, 0.5) * wide
     outer = [

@@ -4,6 +4,7 @@ import numpy as np
 
 from qs3.meshes.shapes._dice import Dice
 from qs3.meshes.shapes._parts import (
+    Number,
     Part,
     Span,
     beam,
@@ -17,7 +18,7 @@ from qs3.meshes.shapes._parts import (
 )
 
 
-def _screen(dice: Dice, width: float, high: float, z: float, thick: float) -> list[Part]:
+def _screen(dice: Dice, width: Number, high: Number, z: Number, thick: Number) -> list[Part]:
     """Flat screen that faces −y with a raised frame and perhaps a hump behind."""
     x, y = (-width / 2, width / 2), (-thick / 2, thick / 2)
     body = (

@@ -6,7 +6,7 @@ import numpy as np
 
 from qs3.meshes.shapes._dice import Dice
 from qs3.meshes.shapes._joinery import corners, legs
-from qs3.meshes.shapes._parts import Part, Span, beam, block, cushion, sheet, tube
+from qs3.meshes.shapes._parts import Number, Part, Span, beam, block, cushion, sheet, tube
 from qs3.meshes.shapes._upholstery import upholstered
 
 
@@ -262,7 +262,7 @@ def curved(dice: Dice) -> list[Part]:
     back, high = dice.between(0.14, 0.24), dice.between(0.7, 0.85)
     angle = np.radians(np.linspace(90 - sweep, 90 + sweep, 17))
 
-    def arc(radius: float, z: Span, thick: float) -> Part:
+    def arc(radius: Number, z: Span, thick: Number) -> Part:
         grid = np.stack(
             [
                 np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(17, h)], axis=1)

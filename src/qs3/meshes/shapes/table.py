@@ -8,6 +8,7 @@ from qs3.meshes.shapes._desks import corner_desk, counter, desk, writing_desk
 from qs3.meshes.shapes._dice import Dice
 from qs3.meshes.shapes._joinery import corners, fronts, legs
 from qs3.meshes.shapes._parts import (
+    Number,
     Part,
     Span,
     beam,
@@ -35,14 +36,14 @@ def _size(dice: Dice) -> tuple[float, float, float]:
     return dice.between(0.4, 0.7), dice.between(0.4, 0.6), dice.between(0.4, 0.65)
 
 
-def _top(dice: Dice, width: float, depth: float, height: float, thick: float) -> Part:
+def _top(dice: Dice, width: Number, depth: Number, height: Number, thick: Number) -> Part:
     exponent = dice.pick(2.0, 2.6, 6.0, 0.0, 0.0, 0.0, 0.0)
     if exponent == 0.0:
         return block((-width / 2, width / 2), (-depth / 2, depth / 2), (height - thick, height))
     return slab(outline(width, depth, max(16, dice.sides), exponent), (height - thick, height))
 
 
-def _apron(x: Span, y: Span, z: Span, thick: float = 0.02) -> list[Part]:
+def _apron(x: Span, y: Span, z: Span, thick: Number = 0.02) -> list[Part]:
     """Four boards under a top, between the legs."""
     return [
         *(block(x, (v - thick / 2, v + thick / 2), z) for v in y),
