@@ -12,7 +12,12 @@
     const points = new Float32Array(bytes.length / 2);
     for (let i = 0; i < points.length; i++) points[i] = view.getInt16(2 * i, true) / 32767;
     const order = Uint32Array.from({ length: points.length / 3 }, (_, i) => i);
-    clouds.push({ canvas, points, order, near: new Float32Array(order.length) });
+    let low = Infinity, high = -Infinity;
+    for (const i of order) {
+      low = Math.min(low, points[3 * i + 2]);
+      high = Math.max(high, points[3 * i + 2]);
+    }
+    clouds.push({ canvas, points, order, near: new Float32Array(order.length), low, span: high - low || 1 });
     canvas.addEventListener("pointerdown", (e) => canvas.setPointerCapture(e.pointerId));
     canvas.addEventListener("pointermove", (e) => {
       if (e.buttons) turn(e.movementX * 0.012, e.movementY * 0.012);
@@ -37,8 +42,8 @@
 
   // Colour by height: five stations of the viridis map, faded towards white with distance.
   const STATIONS = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [200, 220, 50]];
-  function colour(height, far) {
-    const at = Math.max(0, Math.min(3.999, (height + 1) * 2)), low = Math.floor(at), part = at - low;
+  function colour(share, far) {
+    const at = Math.min(3.999, 4 * share), low = Math.floor(at), part = at - low;
     const mix = (k) => {
       const value = STATIONS[low][k] * (1 - part) + STATIONS[low + 1][k] * part;
       return Math.round(value + (255 - value) * far);
@@ -46,7 +51,7 @@
     return `rgb(${mix(0)},${mix(1)},${mix(2)})`;
   }
 
-  function draw({ canvas, points, order, near }) {
+  function draw({ canvas, points, order, near, low, span }) {
     const ratio = window.devicePixelRatio || 1, size = Math.round(canvas.clientWidth * ratio);
     if (!size) return;
     if (canvas.width !== size) canvas.width = canvas.height = size;
@@ -60,7 +65,7 @@
     for (const i of order) {
       const x = points[3 * i], y = points[3 * i + 1], z = points[3 * i + 2];
       const right = x * ca + y * sa, up = (y * ca - x * sa) * se + z * ce;
-      pen.fillStyle = colour(z, 0.3 * (1 - near[i]));
+      pen.fillStyle = colour((z - low) / span, 0.3 * (1 - near[i]));
       pen.fillRect(size / 2 + scale * right - dot / 2, size / 2 - scale * up - dot / 2, dot, dot);
     }
   }
