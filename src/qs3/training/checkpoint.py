@@ -1,0 +1,228 @@
+"""Weights and training states as safetensors with JSON; nothing is ever unpickled."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from qs3.datasets.clouds import PointClouds, UnlabelledClouds
+from qs3.errors import InputError
+from qs3.files import read_json, write_bytes, write_json
+from qs3.models import PointClassifier, create_model
+from qs3.training.config import TrainSettings
+
+SETTINGS = "settings.json"
+MODEL = "model.safetensors"
+FORMAT = 1
+
+
+class LoadedModel(NamedTuple):
+    """What the folder of a run holds."""
+
+    model: PointClassifier
+    """The trained network, in evaluation mode, on the CPU."""
+    class_names: tuple[str, ...]
+    """Names of the classes, in the order of the logits."""
+    settings: dict[str, Any]
+    """The content of ``settings.json``."""
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> None:
+    """Write named tensors and JSON facts to one safetensors file, atomically."""
+    # Copies: safetensors refuses tensors that share memory.
+    plain = {name: t.detach().cpu().clone().contiguous() for name, t in tensors.items()}
+    metadata = {"qs3": json.dumps(facts, allow_nan=False)}
+    write_bytes(path, safetensors.torch.save(plain, metadata))
+
+
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read what `write_tensors` wrote.
+
+    Raises:
+        InputError: where the file is missing, is not safetensors, or was not written by qs3.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        with safetensors.safe_open(path, framework="pt") as handle:  # pyright: ignore[reportPrivateImportUsage]
+            facts = json.loads((handle.metadata() or {})["qs3"])
+            tensors = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118
+    except (safetensors.SafetensorError, KeyError, ValueError, OSError) as error:
+        raise InputError(f"{path}: not a safetensors file of qs3 ({error})") from error
+    if not isinstance(facts, dict):
+        raise InputError(f"{path}: not a safetensors file of qs3 (facts are no object)")
+    return tensors, facts
+
+
+def load_tensors_into(module: torch.nn.Module, tensors: Mapping[str, Tensor], where: Path) -> None:
+    """Set a module's parameters and buffers.
+
+    Raises:
+        InputError: where names or shapes are not those of the module.
+    """
+    try:
+        module.load_state_dict(dict(tensors), strict=True)
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{where}: weights are of another network ({reason})") from error
+
+
+def optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """Flatten an optimiser's state to tensors named ``<index of parameter>.<name>``."""
+    state = optimiser.state_dict()["state"]
+    return {f"{i}.{name}": torch.as_tensor(v) for i, s in state.items() for name, v in s.items()}
+
+
+def load_optimiser(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
+    """Set an optimiser's state from `optimiser_tensors`."""
+    state: dict[int, dict[str, Tensor]] = {}
+    for key, value in tensors.items():
+        index, name = key.split(".", 1)
+        state.setdefault(int(index), {})[name] = value
+    groups = optimiser.state_dict()["param_groups"]
+    optimiser.load_state_dict({"state": state, "param_groups": groups})
+
+
+def prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Put ``prefix/`` before every name."""
+    return {f"{prefix}/{name}": value for name, value in tensors.items()}
+
+
+def without_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors under ``prefix/``, without it.
+
+    Example:
+        >>> without_prefix("a", prefixed("a", {"x": torch.zeros(1)}))
+        {'x': tensor([0.])}
+    """
+    start = f"{prefix}/"
+    return {name[len(start) :]: v for name, v in tensors.items() if name.startswith(start)}
+
+
+def fingerprint(clouds: PointClouds | UnlabelledClouds) -> str:
+    """SHA-256 over points, and labels and class names where there are any."""
+    digest = hashlib.sha256(str(clouds.points.shape).encode())
+    digest.update(np.ascontiguousarray(clouds.points, dtype=np.float32).tobytes())
+    if isinstance(clouds, PointClouds):
+        digest.update(np.ascontiguousarray(clouds.labels, dtype=np.int64).tobytes())
+        digest.update("\0".join(clouds.class_names).encode())
+    return digest.hexdigest()
+
+
+def claim_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
+    """Write a run's settings to its folder, or check that they are the ones already there.
+
+    Raises:
+        InputError: where the folder is a file, holds something else, or a run of other settings;
+            the first setting that differs is named.
+    """
+    run_dir = Path(run_dir)
+    wanted = json.loads(json.dumps(settings, allow_nan=False))
+    path = run_dir / SETTINGS
+    if run_dir.exists() and not run_dir.is_dir():
+        raise InputError(f"{run_dir}: is a file; name a folder for the run")
+    if path.is_file():
+        there, here = _flat(read_json(path)), _flat(wanted)
+        for name in sorted(there.keys() | here.keys()):
+            if there.get(name) != here.get(name):
+                raise InputError(
+                    f"{run_dir}: holds a run with {name} = {there.get(name)!r}, not "
+                    f"{here.get(name)!r}; name another folder or use its settings"
+                )
+        return
+    if run_dir.is_dir() and any(run_dir.iterdir()):
+        raise InputError(f"{run_dir}: holds something else (no {SETTINGS}); name a new folder")
+    write_json(path, wanted)
+
+
+def _flat(value: Any, name: str = "") -> dict[str, Any]:
+    if not isinstance(value, dict):
+        return {name: value}
+    items: dict[str, Any] = {}
+    for key, inner in value.items():
+        items |= _flat(inner, f"{name}.{key}" if name else key)
+    return items
+
+
+def derived_seed(*path: int) -> int:
+    """Return a seed for PyTorch that depends on every number of ``path``.
+
+    Example:
+        >>> derived_seed(0, 1) == derived_seed(0, 2)
+        False
+    """
+    return int(np.random.SeedSequence(path).generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def new_model(settings: TrainSettings, num_classes: int, seed: int) -> PointClassifier:
+    """Make the network of the settings with weights drawn from ``seed`` alone."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return create_model(settings.model, num_classes, **settings.model_settings)
+
+
+def save_model(
+    run_dir: Path, model: PointClassifier, class_names: tuple[str, ...], settings: TrainSettings
+) -> Path:
+    """Write the weights to ``model.safetensors`` in a run's folder.
+
+    The file alone is enough to make the network again.
+
+    Returns:
+        The file.
+    """
+    facts = {
+        "format": FORMAT,
+        "class_names": list(class_names),
+        "model": settings.model,
+        "model_settings": dict(settings.model_settings),
+        "num_points": settings.num_points,
+    }
+    path = Path(run_dir) / MODEL
+    write_tensors(path, model.state_dict(), facts)
+    return path
+
+
+def load_model(run_dir: Path) -> LoadedModel:
+    """Read the network of a run.
+
+    Args:
+        run_dir: Folder of the run, or a ``.safetensors`` file that `save_model` wrote. For a file
+            the settings hold what the file tells: network, its settings and number of points,
+            under ``train``.
+
+    Raises:
+        InputError: where files are missing, damaged or do not belong together.
+    """
+    run_dir = Path(run_dir)
+    path = run_dir if run_dir.is_file() else run_dir / MODEL
+    if not path.is_file():
+        state = "the run is not finished" if (run_dir / SETTINGS).is_file() else "not a run of qs3"
+        raise InputError(f"{run_dir}: no {MODEL} here; {state}")
+    tensors, facts = read_tensors(path)
+    try:
+        if facts["format"] != FORMAT:
+            raise InputError(f"{path}: format {facts['format']}, this version reads {FORMAT}")
+        class_names = tuple(str(name) for name in facts["class_names"])
+        name, arguments = facts["model"], dict(facts["model_settings"])
+        with torch.random.fork_rng(devices=[]):
+            model = create_model(name, len(class_names), **arguments)
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path}: does not say which network it holds ({error})") from error
+    load_tensors_into(model, tensors, path)
+    if path == run_dir:
+        kept = ("model", "model_settings", "num_points")
+        settings = {"train": {key: facts[key] for key in kept if key in facts}}
+    else:
+        settings = read_json(run_dir / SETTINGS)
+        if not isinstance(settings, dict):
+            raise InputError(f"{run_dir / SETTINGS}: not the settings of a run")
+    return LoadedModel(model.eval(), class_names, settings)

@@ -1,0 +1,152 @@
+"""Settings of a training and of the self-training after it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from qs3.adaptation.pseudo_labels import Selection, SingleClass
+from qs3.errors import InputError
+
+Precision = Literal["32-true", "bf16-mixed", "16-mixed", "64-true"]
+"""Number formats that Lightning Fabric offers here."""
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """How a network is trained on labelled clouds."""
+
+    model: str = "dgcnn"
+    """Network, one of `qs3.models.list_models`."""
+    model_settings: Annotated[Mapping[str, Any], tyro.conf.Suppress] = field(default_factory=dict)
+    """Arguments of the network that differ from its defaults."""
+    num_points: int = 1024
+    """Points a cloud, by farthest point sampling after normalisation to the unit ball."""
+    epochs: int = 200
+    """Passes over the source."""
+    batch_size: int = 32
+    """Clouds of each labelled set in an optimiser step."""
+    learning_rate: float = 1e-3
+    """Adam's learning rate at the start; it falls to 0 along a cosine, epoch by epoch."""
+    weight_decay: float = 5e-5
+    """L2 penalty in Adam's gradient."""
+    label_smoothing: float = 0.0
+    """Probability mass spread evenly over the classes."""
+    rotate_z: bool = True
+    """Whether each cloud is turned about the vertical at random, anew in each epoch."""
+    jitter_sigma: float = 0.01
+    """Standard deviation of the Gaussian noise on each coordinate, in unit-ball units."""
+    jitter_clip: float = 0.02
+    """Largest noise on each coordinate."""
+    seed: int = 0
+    """Root of all random steps."""
+    precision: Precision = "32-true"
+    """Number format; neighbours and edge statistics are always in full precision."""
+    accelerator: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    """Where to compute."""
+    threads: int | None = None
+    """CPU threads; None leaves PyTorch's choice. Results are bit-identical for equal numbers."""
+
+    def __post_init__(self) -> None:
+        for name in ("num_points", "epochs", "learning_rate"):
+            _check(self, name, getattr(self, name) > 0, "must be above 0")
+        _check(self, "batch_size", self.batch_size >= 2, "must be at least 2")
+        for name in ("weight_decay", "jitter_sigma", "jitter_clip", "seed"):
+            _check(self, name, getattr(self, name) >= 0, "must not be negative")
+        _check(self, "label_smoothing", 0 <= self.label_smoothing < 1, "must be in 0 to below 1")
+        _check(self, "threads", self.threads is None or self.threads > 0, "must be above 0")
+
+
+@dataclass(frozen=True)
+class SelfTrainingSettings:
+    """How pseudo labels of the target are selected and used (QS³, Algorithm 1)."""
+
+    threshold: float = 0.8
+    """θ₀, the confidence that a pseudo label must exceed in round 1."""
+    step: float = 0.005
+    """ε, added to θ after each round."""
+    rounds: int = 10
+    """Number of rounds."""
+    epochs: int = 10
+    """Passes over the selected clouds in each round."""
+    steps_per_epoch: int | None = None
+    """Optimiser steps an epoch; None makes one pass over the selected clouds."""
+    selection: Selection = "most-confident"
+    """End of a class's ranking by confidence that is kept."""
+    inclusive: bool = False
+    """Whether a confidence equal to θ is enough."""
+    pool: Literal["all", "shrinking", "split"] = "all"
+    """Clouds to select from: all; those that the last round kept (lines 6 and 16 of Algorithm 1,
+    read literally); or in every round the 80 % whose index modulo 10 is below 8."""
+    init: Literal["warm-up", "scratch"] = "warm-up"
+    """Weights that round 1 starts from; later rounds go on from there."""
+    labeller: Literal["latest", "best"] = "latest"
+    """Network that gives the pseudo labels: that of the last round, or the one that was best on
+    the fifth of the pseudo-labelled clouds that is then held out of the training."""
+    source_loss: bool = True
+    """Whether each step takes as many labelled clouds of the source too."""
+    schedule: Literal["per-round", "continuous"] = "per-round"
+    """A fresh optimiser and cosine in each round; or one optimiser and one cosine whose half
+    period is a round, so that the rate rises again in every second round."""
+    single_class: SingleClass = "keep"
+    """What becomes of the confident clouds where all have one class: kept, or none selected."""
+
+    def __post_init__(self) -> None:
+        _check(self, "threshold", 0 <= self.threshold <= 1, "must be in 0 to 1")
+        last = self.threshold + self.step * (self.rounds - 1)
+        _check(
+            self, "step", self.step >= 0 and last <= 1, "takes θ out of 0 to 1 within the rounds"
+        )
+        for name in ("rounds", "epochs"):
+            _check(self, name, getattr(self, name) > 0, "must be above 0")
+        steps = self.steps_per_epoch
+        _check(self, "steps_per_epoch", steps is None or steps > 0, "must be above 0")
+
+
+def _check(settings: Any, name: str, good: bool, fault: str) -> None:
+    if not good:
+        raise InputError(f"setting {name} = {getattr(settings, name)} {fault}")
+
+
+PRESETS: Mapping[str, SelfTrainingSettings] = {
+    "default": SelfTrainingSettings(),
+    # Algorithm 1 takes Φ_init as an input of its own beside the warm-up Φ_0: fresh weights.
+    "paper": SelfTrainingSettings(
+        pool="shrinking", init="scratch", source_loss=False, single_class="drop"
+    ),
+    "released": SelfTrainingSettings(
+        selection="least-confident",
+        inclusive=True,
+        pool="split",
+        init="scratch",
+        labeller="best",
+        source_loss=False,
+        schedule="continuous",
+        single_class="drop",
+    ),
+}
+"""Whole columns of settings: our defaults, the paper's text, the released code."""
+
+
+def self_training_preset(name: str, **overrides: Any) -> SelfTrainingSettings:
+    """Return a preset with some settings changed.
+
+    Args:
+        name: ``default``, ``paper`` or ``released``.
+        overrides: Settings that differ from the preset.
+
+    Raises:
+        InputError: where the preset or a setting is unknown.
+
+    Example:
+        >>> self_training_preset("released", rounds=3).labeller
+        'best'
+    """
+    if name not in PRESETS:
+        raise InputError(f"unknown preset {name!r}; choose one of {', '.join(PRESETS)}")
+    known = [f.name for f in fields(SelfTrainingSettings)]
+    for key in overrides:
+        if key not in known:
+            raise InputError(f"unknown setting {key!r}; choose from {', '.join(known)}")
+    return replace(PRESETS[name], **overrides)

@@ -1,0 +1,305 @@
+"""Self-training in rounds: label the target, select, train, raise the threshold (Algorithm 1)."""
+
+import copy
+import logging
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from lightning_fabric import Fabric
+from torch import Tensor
+
+from qs3.adaptation import Method, SourceOnly, select_confident, select_quasi_balanced
+from qs3.datasets.clouds import PointClouds, UnlabelledClouds
+from qs3.errors import InputError
+from qs3.evaluation.metrics import accuracy
+from qs3.models import PointClassifier
+from qs3.training.checkpoint import (
+    derived_seed,
+    load_tensors_into,
+    new_model,
+    prefixed,
+    read_tensors,
+    without_prefix,
+    write_tensors,
+)
+from qs3.training.config import SelfTrainingSettings, TrainSettings
+from qs3.training.loop import CHECKPOINT, EpochCallback, make_fabric, train
+from qs3.training.predict import predict_probabilities
+
+_LOG = logging.getLogger(__name__)
+STATE = "rounds.safetensors"
+STREAM = 1
+"""Sets the random draws of the rounds apart from those of the warm-up."""
+
+Select = Callable[[Float[np.ndarray, "m k"], float], Bool[np.ndarray, "m"]]
+"""A rule that selects among clouds by their probabilities and θ."""
+
+
+@dataclass(frozen=True)
+class RoundRecord:
+    """What one round of self-training did."""
+
+    round: int
+    """Count from 1."""
+    theta: float
+    """Threshold of this round."""
+    pool: int
+    """Clouds to select from."""
+    confident: int
+    """Clouds of the pool over the threshold."""
+    kept: tuple[int, ...]
+    """Clouds that the rule kept, by pseudo label."""
+    agreement: float | None
+    """Share of the target whose pseudo label is that of the round before; None in round 1."""
+    skipped: bool
+    """Whether fewer than 2·k clouds were kept, so that the network stayed as it was."""
+    single_class: bool
+    """Whether all confident clouds had one class."""
+    held_out: float | None
+    """Best accuracy so far on held-out pseudo labels; None without a ``best`` labeller."""
+    losses: tuple[Mapping[str, float], ...]
+    """Mean losses of each epoch."""
+    seconds: float
+    """Wall-clock seconds of the run that finished the round."""
+
+
+RoundCallback = Callable[[RoundRecord, PointClassifier], None]
+"""Called after each round, when its state is written."""
+
+
+def quasi_balanced_rule(settings: SelfTrainingSettings) -> Select:
+    """Return QBST's selection rule with the settings' choices."""
+    return partial(
+        select_quasi_balanced,
+        selection=settings.selection,
+        inclusive=settings.inclusive,
+        single_class=settings.single_class,
+    )
+
+
+def self_train(
+    model: PointClassifier,
+    source: PointClouds,
+    target: UnlabelledClouds,
+    settings: TrainSettings,
+    self_training: SelfTrainingSettings,
+    *,
+    select: Select | None = None,
+    fabric: Fabric | None = None,
+    run_dir: Path | None = None,
+    on_round: RoundCallback | None = None,
+    on_epoch: EpochCallback | None = None,
+) -> tuple[PointClassifier, list[RoundRecord]]:
+    """Adapt a warmed-up network to an unlabelled target (QS³, Algorithm 1).
+
+    Each round labels the target without augmentation, selects by confidence and class balance,
+    trains on the selected clouds, and raises the threshold.
+
+    Args:
+        model: The warm-up network Φ₀; it is not changed.
+        source: Labelled clouds, prepared by `qs3.training.batches.prepare`. Their labels are used
+            where ``source_loss`` is set; their class names always.
+        target: Clouds without labels, prepared.
+        settings: Network, batch size, rate, augmentation, seed. Its epochs are not used.
+        self_training: Settings of the rounds.
+        select: Selection rule; `quasi_balanced_rule` where it is not given.
+        fabric: Device and number format; made from the settings where it is not given.
+        run_dir: Folder for states: a run that was killed goes on after its last epoch.
+        on_round: Called after each round.
+        on_epoch: Called after each epoch.
+
+    Returns:
+        The network of the last round, and a record of each round.
+
+    Raises:
+        InputError: where the target is empty, or stored states do not fit.
+    """
+    if not len(target):
+        raise InputError("the target has no cloud; give unlabelled clouds")
+    fabric = fabric or make_fabric(settings)
+    select = select or quasi_balanced_rule(self_training)
+    folder = None if run_dir is None else Path(run_dir)
+    rounds = _Rounds(model, source, target, settings, self_training, fabric, folder)
+    for number in range(len(rounds.records) + 1, self_training.rounds + 1):
+        record = rounds.run(number, select, on_epoch)
+        if on_round is not None:
+            on_round(record, rounds.latest)
+    return rounds.latest, rounds.records
+
+
+class _Rounds:
+    """State between rounds: networks, optimiser, pool and last pseudo labels."""
+
+    def __init__(
+        self,
+        model: PointClassifier,
+        source: PointClouds,
+        target: UnlabelledClouds,
+        settings: TrainSettings,
+        rounds: SelfTrainingSettings,
+        fabric: Fabric,
+        run_dir: Path | None,
+    ) -> None:
+        self.source, self.target = source, target
+        self.settings, self.rounds = settings, rounds
+        self.fabric, self.run_dir = fabric, run_dir
+        self.latest = copy.deepcopy(model)
+        fabric.to_device(self.latest)
+        self.best = _Best(copy.deepcopy(self.latest), settings.batch_size, fabric)
+        self.optimiser: dict[str, Tensor] = {}
+        index = np.arange(len(target))
+        self.pool = index[index % 10 < 8] if rounds.pool == "split" else index
+        self.labels: np.ndarray | None = None
+        self.records: list[RoundRecord] = []
+        if run_dir is not None and (run_dir / STATE).is_file():
+            self._load(run_dir / STATE)
+
+    def run(self, number: int, select: Select, on_epoch: EpochCallback | None) -> RoundRecord:
+        """Label, select, train; write the state."""
+        start = time.perf_counter()
+        k = len(self.source.class_names)
+        theta = self.rounds.threshold + (number - 1) * self.rounds.step
+        probabilities = predict_probabilities(
+            self.best.model if self.rounds.labeller == "best" else self.latest,
+            self.target.points,
+            batch_size=self.settings.batch_size,
+            fabric=self.fabric,
+        )
+        labels = probabilities.argmax(axis=1)
+        candidates = probabilities[self.pool]
+        confident = select_confident(candidates, theta, inclusive=self.rounds.inclusive)
+        chosen = self.pool[select(candidates, theta)]
+        pool = len(self.pool)
+        skipped = len(chosen) < 2 * k
+        losses: tuple[Mapping[str, float], ...] = ()
+        if skipped:
+            _LOG.warning(
+                "round %d: %d clouds selected, fewer than 2 for each of %d classes; "
+                "the network stays as it was",
+                number,
+                len(chosen),
+                k,
+            )
+        else:
+            losses = self._train(number, chosen, labels[chosen], on_epoch)
+            self.pool = chosen if self.rounds.pool == "shrinking" else self.pool
+        record = RoundRecord(
+            round=number,
+            theta=theta,
+            pool=pool,
+            confident=int(confident.sum()),
+            kept=tuple(np.bincount(labels[chosen], minlength=k).tolist()),
+            agreement=None if self.labels is None else float((labels == self.labels).mean()),
+            skipped=skipped,
+            single_class=len(np.unique(candidates[confident].argmax(axis=1))) == 1,
+            held_out=self.best.score if self.rounds.labeller == "best" else None,
+            losses=losses,
+            seconds=time.perf_counter() - start,
+        )
+        self.labels = labels
+        self.records.append(record)
+        if self.run_dir is not None:
+            self._save(self.run_dir / STATE)
+            (self.run_dir / CHECKPOINT).unlink(missing_ok=True)
+        return record
+
+    def _train(
+        self, number: int, chosen: np.ndarray, labels: np.ndarray, on_epoch: EpochCallback | None
+    ) -> tuple[Mapping[str, float], ...]:
+        rounds = self.rounds
+        best = rounds.labeller == "best"
+        held = np.arange(len(chosen)) % 10 >= 8 if best else np.zeros(len(chosen), dtype=bool)
+        pseudo = PointClouds(
+            points=self.target.points[chosen[~held]],
+            labels=labels[~held].astype(np.int64),
+            class_names=self.source.class_names,
+            ids=tuple(self.target.ids[i] for i in chosen[~held]),
+        )
+        self.best.watch(self.target.points[chosen[held]], labels[held])
+        trained = sum(not record.skipped for record in self.records)
+        if trained == 0 and rounds.init == "scratch":
+            seed = derived_seed(self.settings.seed, STREAM, 0)
+            fresh = new_model(self.settings, len(self.source.class_names), seed)
+            self.latest.load_state_dict(fresh.state_dict())
+        continuous = rounds.schedule == "continuous"
+        method: Method = SourceOnly(self.latest, self.settings.label_smoothing)
+        history, optimiser = train(
+            method,
+            [pseudo, self.source] if rounds.source_loss else pseudo,
+            None,
+            replace(self.settings, epochs=rounds.epochs),
+            fabric=self.fabric,
+            run_dir=self.run_dir,
+            stream=(STREAM, number),
+            steps_per_epoch=rounds.steps_per_epoch,
+            first_epoch=trained * rounds.epochs if continuous else 0,
+            optimiser_state=self.optimiser if continuous else None,
+            observer=self.best if best else None,
+            on_epoch=on_epoch,
+            description=f"round {number}/{rounds.rounds}",
+        )
+        self.optimiser = optimiser if continuous else {}
+        return tuple(record.losses for record in history)
+
+    def _save(self, path: Path) -> None:
+        tensors = prefixed("latest", self.latest.state_dict())
+        tensors |= prefixed("optimiser", self.optimiser)
+        tensors["pool"] = torch.from_numpy(self.pool)
+        tensors["labels"] = torch.from_numpy(self.labels)
+        if self.rounds.labeller == "best":
+            tensors |= prefixed("best", self.best.tensors())
+        write_tensors(path, tensors, {"records": [asdict(record) for record in self.records]})
+
+    def _load(self, path: Path) -> None:
+        tensors, facts = read_tensors(path)
+        try:
+            self.pool, self.labels = tensors["pool"].numpy(), tensors["labels"].numpy()
+            self.records = [
+                RoundRecord(**{**r, "kept": tuple(r["kept"]), "losses": tuple(r["losses"])})
+                for r in facts["records"]
+            ]
+        except (KeyError, TypeError) as error:
+            raise InputError(f"{path}: not a state of this version; delete the run") from error
+        load_tensors_into(self.latest, without_prefix("latest", tensors), path)
+        self.optimiser = without_prefix("optimiser", tensors)
+        if self.rounds.labeller == "best":
+            self.best.load(without_prefix("best", tensors))
+
+
+class _Best:
+    """Keeps the network that was best on held-out pseudo labels, over all rounds."""
+
+    def __init__(self, model: PointClassifier, batch_size: int, fabric: Fabric) -> None:
+        self.model = model
+        self.score = 0.0
+        self.batch_size, self.fabric = batch_size, fabric
+        self.watch(np.zeros((0, 1, 3), dtype=np.float32), np.zeros(0, dtype=np.int64))
+
+    def watch(self, points: np.ndarray, labels: np.ndarray) -> None:
+        """Set the clouds that are held out of this round's training."""
+        self.points, self.labels = points, labels
+
+    def after_epoch(self, method: Method, epoch: int) -> None:
+        if not len(self.labels):
+            return
+        probabilities = predict_probabilities(
+            method.model, self.points, batch_size=self.batch_size, fabric=self.fabric
+        )
+        score = accuracy(self.labels, probabilities.argmax(axis=1))
+        if score > self.score:
+            self.score = score
+            self.model.load_state_dict(method.model.state_dict())
+
+    def tensors(self) -> dict[str, Tensor]:
+        score = torch.tensor(self.score, dtype=torch.float64)
+        return {"score": score, **prefixed("model", self.model.state_dict())}
+
+    def load(self, tensors: Mapping[str, Tensor]) -> None:
+        self.score = float(tensors["score"])
+        self.model.load_state_dict(without_prefix("model", tensors))
