@@ -29,7 +29,7 @@ from qs3.datasets.shards import CloudRow, write_shard
 from qs3.datasets.store import MANIFEST, Manifest, shard_path, write_manifest
 from qs3.datasets.versions import package_versions
 from qs3.errors import InputError
-from qs3.files import claim_folder
+from qs3.files import claim_folder, sha256
 
 
 @dataclass(frozen=True)
@@ -129,13 +129,13 @@ def _scan_task(
 
 
 def work_list_checksum(items: Sequence[Item]) -> str:
-    """SHA-256 over the names, classes, splits, shape seeds and file sizes of a work list."""
+    """SHA-256 over the names, classes, splits, shape seeds and file contents of a work list."""
     digest = hashlib.sha256()
     for item in items:
         path = getattr(item, "path", None)
-        size = None if path is None else Path(path).stat().st_size
+        content = None if path is None else sha256(Path(path))
         shape_seed = getattr(item, "shape_seed", None)
-        line = json.dumps([item.id, item.class_name, item.split, shape_seed, size])
+        line = json.dumps([item.id, item.class_name, item.split, shape_seed, content])
         digest.update(line.encode("utf-8") + b"\n")
     return digest.hexdigest()
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from qs3.errors import InputError
 
@@ -35,7 +35,7 @@ def farthest_point_sample(
         raise InputError("cannot sample a cloud with a point that is not finite")
     points = np.ascontiguousarray(points, dtype=np.float64)
     columns = np.ascontiguousarray(points.T)
-    tree: cKDTree | None = None
+    tree: KDTree | None = None
     nearest = np.full(n, np.inf)
     chosen = np.zeros(num_points, dtype=np.int64)
     index = start
@@ -45,7 +45,7 @@ def farthest_point_sample(
         radius = np.sqrt(nearest[index])
         # Below a tenth of the cloud's size the ball holds few points and the tree pays.
         if tree is None and radius < 0.1 * np.linalg.norm(np.ptp(points, axis=0)):
-            tree = cKDTree(points)
+            tree = KDTree(points)
         if tree is None:
             x, y, z = (columns[axis] - centre[axis] for axis in range(3))
             np.minimum(nearest, x * x + y * y + z * z, out=nearest)

@@ -1,7 +1,7 @@
 """The default renderer: Mitsuba 3, on CUDA, LLVM or plain C++, whichever is here.
 
 Only the object's region is rendered, with a shifted principal point and a film whose sides are
-multiples of 128 pixels: a film size that changes at every image would compile a kernel each time.
+multiples of 64 pixels: a film size that changes at every image would compile a kernel each time.
 """
 
 import functools
@@ -21,7 +21,7 @@ from qs3.sensor.render.scene import LightSettings, Scene, StereoPair
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 VARIANTS = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
-_FILM_STEP = 128
+_FILM_STEP = 64
 _TEXTURE_SIZE = 2048
 _SKY_ROWS, _SKY_COLUMNS = 512, 4
 
@@ -72,7 +72,7 @@ class MitsubaRenderer:
 
     variant: str = ""
     """One of ``VARIANTS``; empty picks the fastest that works here."""
-    samples: int = 16
+    samples: int = 8
     """Rays a pixel."""
     max_depth: int = 3
     """Longest path: 2 is direct light alone, 3 adds one bounce."""
@@ -115,14 +115,16 @@ class MitsubaRenderer:
         for pose, seed in zip(poses, seeds, strict=True):
             parameters["projector.to_world"] = transform(_to_world(rig.projector(pose)))
             parameters.update()
-            images, regions = [], []
+            shots = []
             for side, camera in enumerate((pose, rig.right(pose))):
                 region = rig.full_frame if self.full_frame else rig.region_of(bounds, camera, 2)
                 # Two streams that never meet: the left camera's seeds are even.
                 noise_seed = (2 * seed + side) % 2**32
-                images.append(_photograph(mi, built, rig, camera, region, self.samples, noise_seed))
-                regions.append(region)
-            pairs.append(StereoPair(*images, *regions, scene.light.ambient, pose))
+                image = _photograph(mi, built, rig, camera, region, self.samples, noise_seed)
+                shots.append((image, region))
+            (left, left_region), (right, right_region) = shots
+            background = scene.light.ambient
+            pairs.append(StereoPair(left, right, left_region, right_region, background, pose))
         return pairs
 
 
@@ -161,6 +163,10 @@ def _build(mi: Any, scene: Scene, max_depth: int) -> Any:
             },
             "sky": {
                 "type": "envmap",
+                # Of the two lights the projector, a point, is found by light sampling alone; the
+                # sky is found as well by following the surface's own scattering. Measured: as
+                # many rays give 0.14 px of disparity noise in place of 0.18.
+                "sampling_weight": 0.02,
                 "bitmap": mi.Bitmap(_sky(scene.light)),
                 "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90),
             },

@@ -1,0 +1,81 @@
+"""Settings of the simulated camera that `scan` and `generate` share."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from qs3.errors import InputError
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """The simulated camera."""
+
+    sensor: str = "qs3"
+    """Preset of the sensor: qs3 (the released scanner), qs3-800, bright-room."""
+    preset: Literal["default", "paper", "released"] = "default"
+    """Which column of the settings in which the paper's text and its code differ."""
+    views: int = 5
+    """Views fused into one cloud."""
+    view_layout: Literal["orbit", "jitter"] | None = None
+    """orbit around the object, or jitter of one pose as released; default by preset."""
+    size: Literal["box", "ball"] | None = None
+    """Longest side 1, or the unit ball; default by preset."""
+    box_crop: Literal["on", "off"] | None = None
+    """Keep only points inside the object's box; default by preset."""
+    num_points: int = 2048
+    """Points of each cloud."""
+    image_noise: float | None = None
+    """Gaussian noise of the images in grey levels of 255; default by sensor."""
+    bias_correction: bool = False
+    """Take off the 1/32 px by which OpenCV's block matching rounds up."""
+    pattern: Path | None = None
+    """Your own picture to project in place of the speckle dots."""
+    samples: int = 8
+    """Rays a pixel."""
+    variant: Literal["auto", "cuda_ad_mono", "llvm_ad_mono", "scalar_rgb"] = "auto"
+    """Variant of Mitsuba; auto takes the fastest that works here."""
+
+    def resolve_sensor(self) -> Any:
+        """The sensor with every option applied."""
+        from qs3.sensor.presets import get_sensor
+
+        sensor = get_sensor(self.sensor)
+        if self.image_noise is not None:
+            if self.image_noise < 0:
+                raise InputError(f"--image-noise {self.image_noise}: must not be below 0")
+            exposure = dataclasses.replace(sensor.exposure, noise=self.image_noise)
+            sensor = dataclasses.replace(sensor, exposure=exposure)
+        if self.bias_correction:
+            matching = dataclasses.replace(sensor.matching, bias_correction=True)
+            sensor = dataclasses.replace(sensor, matching=matching)
+        if self.pattern is not None:
+            pattern = dataclasses.replace(sensor.pattern, image=str(self.pattern))
+            sensor = dataclasses.replace(sensor, pattern=pattern)
+        if self.preset == "released":
+            depth = dataclasses.replace(sensor.depth, principal_point="released")
+            sensor = dataclasses.replace(sensor, depth=depth)
+        return sensor
+
+    def resolve_renderer(self) -> Any:
+        """The renderer asked for; raises where it does not work here."""
+        from qs3.sensor.render.mitsuba import MitsubaRenderer
+
+        if self.samples < 1:
+            raise InputError(f"--samples {self.samples}: at least 1 is needed")
+        variant = "" if self.variant == "auto" else self.variant
+        return MitsubaRenderer(variant=variant, samples=self.samples)
+
+    def scan_arguments(self) -> dict[str, Any]:
+        """Settings of a scan by the names that `qs3.scan` and `generate` share."""
+        from qs3.sensor.scan import PRESETS, ScanSettings
+
+        chosen = dataclasses.asdict(ScanSettings()) | PRESETS.get(self.preset, {})
+        given = {
+            "view_layout": self.view_layout,
+            "size": self.size,
+            "box_crop": None if self.box_crop is None else self.box_crop == "on",
+        }
+        chosen |= {name: value for name, value in given.items() if value is not None}
+        return chosen | {"views": self.views, "num_points": self.num_points}

@@ -1,0 +1,97 @@
+"""``qs3 doctor``: what is here, what is missing, how to get it."""
+
+import importlib.metadata
+import importlib.util
+import json
+import platform
+from typing import Any
+
+_CORE = [
+    "numpy",
+    "scipy",
+    "trimesh",
+    "embreex",
+    "mitsuba",
+    "opencv-python-headless",
+    "pyarrow",
+    "torch",
+    "lightning-fabric",
+    "safetensors",
+    "matplotlib",
+    "tyro",
+]
+_EXTRAS = {
+    "cycles": ("bpy", "the paper's renderer, Blender's Cycles"),
+    "ray": ("ray", "data sets made on a cluster"),
+    "view": ("viser", "the interactive viewer"),
+    "track": ("tensorboard", "training curves in TensorBoard"),
+    "export": ("onnx", "models as ONNX"),
+}
+
+
+def doctor(json_output: bool = False) -> int:
+    """Tell what works on this machine and how to get what does not.
+
+    Args:
+        json_output: Print JSON in place of text.
+    """
+    found = examine()
+    if json_output:
+        print(json.dumps(found, indent=2))
+    else:
+        _print(found)
+    return 0 if found["ready"] else 1
+
+
+def examine() -> dict[str, Any]:
+    """Look at packages, Mitsuba's variants, the device for training and the extras."""
+    from qs3.sensor.render.mitsuba import VARIANTS, usable
+
+    packages: dict[str, str | None] = {}
+    for name in _CORE:
+        try:
+            packages[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            packages[name] = None
+    variants = {variant: usable(variant) for variant in VARIANTS}
+    device = None
+    if packages["torch"] is not None:
+        import torch
+
+        device = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
+    return {
+        "python": platform.python_version(),
+        "packages": packages,
+        "renderers": variants,
+        "renderer": next((variant for variant in VARIANTS if variants[variant]), None),
+        "device": device,
+        "extras": {
+            extra: importlib.util.find_spec(module) is not None
+            for extra, (module, _) in _EXTRAS.items()
+        },
+        "ready": all(packages.values()) and any(variants.values()),
+    }
+
+
+def _print(found: dict[str, Any]) -> None:
+    print(f"Python {found['python']}")
+    for name, version in found["packages"].items():
+        print(f"  {'ok     ' if version else 'MISSING'} {name} {version or ''}".rstrip())
+        if version is None:
+            print(f"          get it with: pip install {name}")
+    advice = {
+        "cuda_ad_mono": "needs an NVIDIA GPU whose driver has OptiX",
+        "llvm_ad_mono": "needs a system libLLVM (19 is known to work; on Debian: libllvm19)",
+        "scalar_rgb": "comes with the mitsuba wheel; reinstall it",
+    }
+    print("Renderer (Mitsuba 3, fastest first)")
+    for variant, works in found["renderers"].items():
+        used = "   <- used" if variant == found["renderer"] else ""
+        reason = "" if works else f": {advice[variant]}"
+        print(f"  {'ok     ' if works else 'absent '} {variant}{reason}{used}")
+    print(f"Training on: {found['device']}")
+    print("Extras")
+    for extra, here in found["extras"].items():
+        how = "" if here else f": pip install 'qs3[{extra}]'"
+        print(f"  {'ok     ' if here else 'absent '} {extra} ({_EXTRAS[extra][1]}){how}")
+    print("Ready." if found["ready"] else "Not ready: mend what is marked MISSING or absent above.")

@@ -1,0 +1,166 @@
+"""``qs3 evaluate`` and ``qs3 predict``: scores of a run, and its answers for single files."""
+
+import dataclasses
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+
+from qs3.cli.train import RUN
+from qs3.evaluation.records import DataRecord, RunRecord, Scores
+from qs3.files import read_json
+
+
+@dataclass(frozen=True)
+class EvaluateOptions:
+    """Score a run on labelled clouds; the only verb that reads labels of a target."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run."""
+    data: Path
+    """Labelled clouds: a folder that qs3 generate made, a folder of class folders, an npz file."""
+    split: str | None = None
+    """Part of the data, such as test; all of it by default."""
+    cloud: Literal["points", "clean", "surface"] = "points"
+    """Of generated data: noisy scans, their clean twins, or samples of the whole surface."""
+    json: bool = False
+    """Print the whole record as JSON in place of text."""
+
+
+@dataclass(frozen=True)
+class PredictOptions:
+    """Tell the class of single clouds."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Folder of a run, or its model.safetensors."""
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Clouds: NPY, XYZ, PLY, PCD, or a mesh as OFF; z up."""
+    json: bool = False
+    """Print JSON with the probability of every class in place of text."""
+
+
+def evaluate(options: Annotated[EvaluateOptions, tyro.conf.arg(name="")]) -> int:
+    """Score a run: accuracy, class-mean accuracy, confusion matrix; leaves a record in the run."""
+    record, path = make_record(options.run, options.data, options.split, options.cloud)
+    if options.json:
+        print(json.dumps(dataclasses.asdict(record), indent=2))
+    else:
+        print(describe(record.scores, record.marks))
+    print(f"record: {path}", file=sys.stderr)
+    return 0
+
+
+def make_record(
+    run: Path,
+    data: Path,
+    split: str | None = None,
+    cloud: Literal["points", "clean", "surface"] = "points",
+) -> tuple[RunRecord, Path]:
+    """Score a run and write the record into its folder ``records``."""
+    from qs3.datasets import load_clouds
+    from qs3.evaluation import git_commit, hardware, score, versions, write_record
+    from qs3.training import load_model, predict_probabilities
+
+    loaded = load_model(run)
+    settings = loaded.settings["train"]
+    told = read_json(run / RUN)
+    # Labels of the data are put onto the network's classes by name; an answer that the data has
+    # no cloud of stays an answer, and is wrong.
+    test = load_clouds(
+        data,
+        split=split,
+        num_points=settings["num_points"],
+        cloud=cloud,
+        class_names=loaded.class_names,
+    )
+    answers = predict_probabilities(loaded.model, test.points).argmax(axis=1)
+    source, target = (
+        None if told["data"][name] is None else DataRecord(**told["data"][name])
+        for name in ("source", "target")
+    )
+    assert source is not None  # noqa: S101
+    name = data.resolve().name
+    marks = []
+    if target is not None and target.checksum == test.checksum:
+        marks.append("transductive")
+    if source.name == name:
+        marks.append("supervised")
+    record = RunRecord(
+        method=told["method"],
+        model=settings["model"],
+        settings=loaded.settings | {"preset": told["preset"]},
+        source=source,
+        target=target,
+        test=DataRecord(name, test.checksum, len(test), split, cloud),
+        seed=settings["seed"],
+        selection=told["selection"],
+        scores=score(test.labels, answers, loaded.class_names),
+        seconds=told["seconds"],
+        versions=versions(),
+        hardware=hardware(),
+        commit=git_commit(),
+        rounds=tuple(told["rounds"]),
+        marks=tuple(marks),
+    )
+    text = json.dumps(dataclasses.asdict(record), sort_keys=True)
+    import hashlib
+
+    digest = hashlib.sha256(text.encode()).hexdigest()[:10]
+    return record, write_record(run / "records" / f"{Path(name).stem}-{digest}.json", record)
+
+
+def describe(scores: Scores, marks: Sequence[str] = ()) -> str:
+    """Scores as text: accuracies, recall of each class, confusion matrix."""
+    low, high = scores.interval
+    lines = [
+        f"accuracy            {scores.accuracy:.1%}  (95 % interval {low:.0%} to {high:.0%}, "
+        f"{scores.clouds} clouds)",
+        f"class-mean accuracy {scores.class_mean_accuracy:.1%}",
+    ]
+    if marks:
+        lines.append(f"marks               {', '.join(marks)}")
+    width = max(len(name) for name in scores.class_names)
+    counts = [list(row) for row in scores.confusion]
+    cell = max(5, len(str(max(max(row) for row in counts))) + 1)
+    head = "".join(f"{name[: cell - 1]:>{cell}}" for name in scores.class_names)
+    lines.append(f"\n{'true, predicted:':<{width + 9}}{head}")
+    for name, recall, row in zip(scores.class_names, scores.per_class, counts, strict=True):
+        share = "   –  " if recall is None else f"{recall:6.1%}"
+        cells = "".join(f"{count:>{cell}}" for count in row[: len(scores.class_names)])
+        lines.append(f"{name:<{width}}  {share} {cells}")
+    return "\n".join(lines)
+
+
+def predict(options: Annotated[PredictOptions, tyro.conf.arg(name="")]) -> int:
+    """Tell the class of each file and how confident the network is."""
+    from qs3.datasets import read_cloud
+    from qs3.datasets.transforms import stack
+    from qs3.training import load_model, predict_probabilities
+
+    loaded = load_model(options.run)
+    points = loaded.settings["train"]["num_points"]
+    clouds = [read_cloud(path) for path in options.files]
+    found: list[dict[str, Any]] = []
+    for path, cloud in zip(options.files, clouds, strict=True):
+        batch = stack([cloud], points, str(path))
+        shares = predict_probabilities(loaded.model, batch)[0]
+        best = int(np.argmax(shares))
+        found.append(
+            {
+                "file": str(path),
+                "class": loaded.class_names[best],
+                "confidence": float(shares[best]),
+                "probabilities": dict(zip(loaded.class_names, shares.tolist(), strict=True)),
+            }
+        )
+    if options.json:
+        print(json.dumps(found, indent=2))
+    else:
+        for row in found:
+            print(f"{row['file']}\t{row['class']}\t{row['confidence']:.3f}")
+    return 0

@@ -1,0 +1,31 @@
+"""The pictures of a scan, gathered for its montage."""
+
+from typing import Any
+
+import numpy as np
+
+
+def montage_view(result: Any, sensor: Any) -> tuple[Any, int]:
+    """The view that shows most of the object, as `qs3.visualisation.MontageView`, and its index.
+
+    Args:
+        result: A `qs3.Scan` made with ``keep_images``.
+        sensor: The `qs3.Sensor` that made it.
+    """
+    from qs3.sensor.speckle import pattern_image
+    from qs3.visualisation import MontageView, object_box
+
+    best = int(np.argmax([view.object_pixels for view in result.views]))
+    images = result.images[best]
+    view = MontageView(
+        left=images.left,
+        right=images.right,
+        disparity=images.disparity,
+        depth=images.depth,
+        true_depth=images.true_depth,
+        cloud=result.points,
+        clean=result.clean,
+        pattern=pattern_image(sensor.pattern),
+        box=object_box(images.true_depth, 20),
+    )
+    return view, best

@@ -1,0 +1,141 @@
+"""``qs3 train``: a classifier from labelled clouds, adapted to unlabelled ones if asked."""
+
+import dataclasses
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from qs3.errors import InputError
+from qs3.evaluation.records import DataRecord
+from qs3.files import write_json
+from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
+
+RUN = "run.json"
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """Train a classifier on labelled clouds; with qbst, adapt it to clouds without labels."""
+
+    source: Path
+    """Labelled clouds: a folder that qs3 generate made, a folder of class folders, an npz file."""
+    out: Path
+    """Folder of the run; run the same command again to go on after a stop."""
+    method: Literal["source-only", "qbst"] = "source-only"
+    """source-only, or quasi-balanced self-training."""
+    target: Path | None = None
+    """Clouds of the target, for qbst; labels that lie there are not read."""
+    source_split: str | None = None
+    """Part of the source, such as train; all of it by default."""
+    target_split: str | None = None
+    """Part of the target."""
+    source_cloud: Literal["points", "clean", "surface"] = "points"
+    """Of generated data: noisy scans, their clean twins, or samples of the whole surface."""
+    warm_up: Path | None = None
+    """Run whose network qbst starts from, in place of training on the source first."""
+    preset: Literal["default", "paper", "released"] = "default"
+    """Settings of the self-training: ours, the paper's text, or its released code."""
+    train: Annotated[TrainSettings, tyro.conf.arg(name="")] = TrainSettings()
+    """How the network is trained."""
+    self_training: SelfTrainingSettings = SelfTrainingSettings()
+    """How rounds of self-training select and train; --preset sets a whole column."""
+
+
+def preset_options(arguments: list[str]) -> TrainOptions:
+    """The defaults of ``qs3 train`` under the preset that the command line names.
+
+    A preset sets the defaults of all self-training settings, so that one given beside it wins and
+    the help shows what is in force.
+    """
+    preset = "default"
+    for index, argument in enumerate(arguments):
+        if argument == "--preset" and index + 1 < len(arguments):
+            preset = arguments[index + 1]
+        elif argument.startswith("--preset="):
+            preset = argument.partition("=")[2]
+    return TrainOptions(
+        source=tyro.MISSING,
+        out=tyro.MISSING,
+        self_training=PRESETS.get(preset, PRESETS["default"]),
+    )
+
+
+def train(options: Annotated[TrainOptions, tyro.conf.arg(name="")]) -> int:
+    """Train a classifier, source-only or with quasi-balanced self-training on a target."""
+    run(options)
+    print(options.out)
+    print(f"Next: qs3 evaluate {options.out} --data DATA", file=sys.stderr)
+    return 0
+
+
+def run(options: TrainOptions) -> Any:
+    """Read the data, train, and write what ``evaluate`` needs to make a record."""
+    from qs3.datasets import load_clouds, load_unlabelled
+    from qs3.training import fit
+
+    adapts = options.method == "qbst"
+    if adapts and options.target is None:
+        raise InputError("--method qbst needs --target: a folder or file of unlabelled clouds")
+    if not adapts and (options.target is not None or options.warm_up is not None):
+        raise InputError("--method source-only takes no --target and no --warm-up; see qbst")
+    points = options.train.num_points
+    source = load_clouds(
+        options.source,
+        split=options.source_split,
+        num_points=points,
+        cloud=options.source_cloud,
+    )
+    target = None
+    if options.target is not None:
+        target = load_unlabelled(options.target, split=options.target_split, num_points=points)
+    result = fit(
+        options.method,
+        source,
+        target,
+        options.train,
+        options.self_training if adapts else None,
+        run_dir=options.out,
+        warm_up=options.warm_up,
+    )
+    data = {
+        "source": DataRecord(
+            options.source.resolve().name,
+            source.checksum,
+            len(source),
+            options.source_split,
+            options.source_cloud,
+        ),
+        "target": None
+        if target is None or options.target is None
+        else DataRecord(
+            options.target.resolve().name, target.checksum, len(target), options.target_split
+        ),
+    }
+    seconds = {"source": sum(epoch.seconds for epoch in result.history)}
+    seconds["rounds"] = float(sum(record.seconds for record in result.rounds))
+    seconds["total"] = sum(seconds.values())
+    write_json(
+        options.out / RUN,
+        {
+            "method": options.method,
+            "preset": options.preset if adapts else None,
+            "selection": result.selection,
+            "data": {
+                name: None if record is None else dataclasses.asdict(record)
+                for name, record in data.items()
+            },
+            "rounds": [dataclasses.asdict(record) for record in result.rounds],
+            "seconds": seconds,
+        },
+    )
+    for record in result.rounds:
+        if record.skipped:
+            print(
+                f"round {record.round}: only {sum(record.kept)} clouds selected, fewer than two a "
+                "class; the network stayed as it was",
+                file=sys.stderr,
+            )
+    return result

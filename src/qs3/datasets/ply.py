@@ -1,0 +1,40 @@
+"""Writing a cloud as a PLY file, the same bytes for the same points."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from qs3.files import write_bytes
+
+
+def write_ply(
+    path: Path, points: Float[np.ndarray, "n 3"], view: UInt8[np.ndarray, "n"] | None = None
+) -> None:
+    """Write points as a binary PLY of float32 vertices, atomically.
+
+    Args:
+        path: File to write.
+        points: The cloud.
+        view: Index of the view of each point; stored as the vertex property ``view``.
+
+    Example:
+        >>> import tempfile
+        >>> file = Path(tempfile.mkdtemp()) / "cloud.ply"
+        >>> write_ply(file, np.zeros((2, 3)))
+        >>> file.read_bytes().splitlines()[2]
+        b'element vertex 2'
+    """
+    kinds = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    lines += [f"property float {axis}" for axis in "xyz"]
+    if view is not None:
+        kinds.append(("view", "u1"))
+        lines.append("property uchar view")
+    table = np.zeros(len(points), dtype=kinds)
+    for column, axis in enumerate("xyz"):
+        table[axis] = points[:, column]
+    if view is not None:
+        table["view"] = view
+    header = "\n".join([*lines, "end_header"]) + "\n"
+    write_bytes(path, header.encode("ascii") + table.tobytes())
