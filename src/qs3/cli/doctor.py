@@ -6,7 +6,7 @@ import json
 import platform
 from typing import Any
 
-_CORE = [
+_CORE = (
     "numpy",
     "scipy",
     "trimesh",
@@ -19,7 +19,7 @@ _CORE = [
     "safetensors",
     "matplotlib",
     "tyro",
-]
+)
 _EXTRAS = {
     "cycles": ("bpy", "the paper's renderer, Blender's Cycles"),
     "ray": ("ray", "data sets made on a cluster"),

@@ -2,7 +2,7 @@
 
 import dataclasses
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -38,9 +38,9 @@ class TrainOptions:
     """Run whose network qbst starts from, in place of training on the source first."""
     preset: Literal["default", "paper", "released"] = "default"
     """Settings of the self-training: ours, the paper's text, or its released code."""
-    train: Annotated[TrainSettings, tyro.conf.arg(name="")] = TrainSettings()
+    train: Annotated[TrainSettings, tyro.conf.arg(name="")] = field(default_factory=TrainSettings)
     """How the network is trained."""
-    self_training: SelfTrainingSettings = SelfTrainingSettings()
+    self_training: SelfTrainingSettings = field(default_factory=SelfTrainingSettings)
     """How rounds of self-training select and train; --preset sets a whole column."""
 
 

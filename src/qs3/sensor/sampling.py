@@ -36,6 +36,8 @@ def farthest_point_sample(
     points = np.ascontiguousarray(points, dtype=np.float64)
     columns = np.ascontiguousarray(points.T)
     tree: KDTree | None = None
+    # Below a tenth of the cloud's size the ball holds few points and the tree pays.
+    small = 0.1 * float(np.linalg.norm(np.ptp(points, axis=0)))
     nearest = np.full(n, np.inf)
     chosen = np.zeros(num_points, dtype=np.int64)
     index = start
@@ -43,8 +45,7 @@ def farthest_point_sample(
         chosen[i] = index
         centre = points[index]
         radius = np.sqrt(nearest[index])
-        # Below a tenth of the cloud's size the ball holds few points and the tree pays.
-        if tree is None and radius < 0.1 * np.linalg.norm(np.ptp(points, axis=0)):
+        if tree is None and radius < small:
             tree = KDTree(points)
         if tree is None:
             x, y, z = (columns[axis] - centre[axis] for axis in range(3))
