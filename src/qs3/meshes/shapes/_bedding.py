@@ -84,7 +84,7 @@ def headboard(dice: Dice, x: Span, y: Number, z: Span, thick: Number) -> list[Pa
         block((px - post / 2, px + post / 2), (y, y + post), (low, high + dice.between(0.0, 0.08)))
         for px in (x[0] + post / 2, x[1] - post / 2)
     ]
-    mid = y + post / 2
+    mid = y + thick / 3 - 0.003
     if style == "posts":
         return [*parts, block(x, (mid - thick / 3, mid + thick / 3), (low, high - 0.03))]
     rail = dice.between(0.06, 0.12)
@@ -94,7 +94,7 @@ def headboard(dice: Dice, x: Span, y: Number, z: Span, thick: Number) -> list[Pa
         parts.append(
             block(
                 (float(px) - 0.015, float(px) + 0.015),
-                (mid - 0.01, mid + 0.01),
+                (y - 0.002, mid + 0.01),
                 (low, high - rail / 2),
             )
         )

@@ -81,7 +81,9 @@ def recliner(dice: Dice) -> list[Part]:
     rest = cushion(
         (-half, half), (front - run, front + 0.06), (low - thick, low), 0.03, steps=dice.steps
     )
-    return [*parts, rest.turn("x", dice.between(0, 25), (0, front, low))]
+    # The footrest hangs down, but not as far as the floor.
+    steepest = float(np.degrees(np.arcsin(np.clip((low - thick - 0.04) / run, 0.0, 0.42))))
+    return [*parts, rest.turn("x", dice.between(0, 1) * steepest, (0, front, low))]
 
 
 def lounge(dice: Dice) -> list[Part]:
@@ -158,7 +160,7 @@ def tub(dice: Dice) -> list[Part]:
         )
     return parts + legs(
         dice,
-        corners((-width / 2, width / 2), (-depth / 2, depth / 2), 0.2 * width),
+        corners((-0.3 * width, 0.3 * width), (-0.3 * depth, 0.3 * depth), 0.0),
         foot + 0.01,
         0.04,
     )

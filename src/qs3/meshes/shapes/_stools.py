@@ -41,11 +41,8 @@ def stool(dice: Dice) -> list[Part]:
     """Low stool without a back, or a pouffe."""
     width, high = dice.between(0.32, 0.5), dice.between(0.3, 0.52)
     if dice.chance(0.12):
-        return [
-            cushion(
-                (-width / 2, width / 2), (-width / 2, width / 2), (0, high), 0.06, 0.02, dice.steps
-            )
-        ]
+        side, soft = (-width / 2, width / 2), dice.between(0.05, 0.12)
+        return [cushion(side, side, (0.0, min(high, 0.9 * width)), soft, 0.02, max(3, dice.steps))]
     leg = dice.between(0.03, 0.05) * dice.bulk**1.2
     inset = 0.16 * width
     spots = corners((-width / 2, width / 2), (-width / 2, width / 2), inset)

@@ -142,11 +142,7 @@ def torchiere(dice: Dice) -> list[Part]:
         parts.append(
             tube(bend([(0, 0, z), (run * 0.5, 0, z + 0.05), (run, 0, z - 0.02)], 0.05), 0.008, 6)
         )
-        parts.append(
-            lathe([(0.05, -0.08), (0.02, 0.01), (0.015, 0.01), (0.044, -0.08)], 10)
-            .turn("y", -20)
-            .move(run, 0, z - 0.02)
-        )
+        parts.append(_bell(dice, 0.05, 0.08).turn("y", -20).move(run, 0, z - 0.02))
     return parts
 
 
@@ -258,7 +254,7 @@ def pendant(dice: Dice) -> list[Part]:
     tall = wide * dice.between(0.5, 1.4)
     kind = dice.pick("bell", "globe", "drum", "disc")
     if kind == "bell":
-        head = [_bell(dice, wide, tall), ball(0.03, (0, 0, -0.2 * tall), 8)]
+        head = [_bell(dice, wide, tall), ball(0.03, (0, 0, -0.02), 8)]
         low = 0.0
     elif kind == "globe":
         head, low = (
@@ -283,9 +279,10 @@ def ceiling(dice: Dice) -> list[Part]:
     """Saucer, drum or square panel close under the ceiling."""
     wide, deep = dice.between(0.14, 0.32), dice.between(0.06, 0.2)
     if dice.chance(0.2):
+        rod, rim = dice.between(0.3, 0.8) * wide, dice.between(0.02, 0.05)
         return [
-            block((-wide, wide), (-wide, wide), (0, 0.5 * deep)),
-            block((-0.5 * wide, 0.5 * wide), (-0.5 * wide, 0.5 * wide), (0.4 * deep, deep)),
+            block((-wide, wide), (-wide, wide), (0.0, rim)),
+            block((-rod, rod), (-rod, rod), (rim - 0.002, rim + 0.35 * deep)),
         ]
     angle = np.linspace(-np.pi / 2, 0, 7)
     e = dice.between(0.6, 1.6)

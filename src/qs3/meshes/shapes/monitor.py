@@ -30,12 +30,14 @@ def _screen(dice: Dice, width: Number, high: Number, z: Number, thick: Number) -
     if dice.chance(0.6):
         frame, proud = dice.between(0.01, 0.035), dice.between(0.002, 0.012)
         chin = frame * dice.pick(1.0, 1.0, 2.0)
-        front: Span = (y[0] - proud, y[0] + 0.002)
+        # Deep enough to meet a body with rounded edges, and a hair inside its outline.
+        front: Span = (y[0] - proud, y[0] + 0.45 * thick)
+        left, right, low, top = x[0] + 0.001, x[1] - 0.001, z + 0.001, z + high - 0.001
         parts += [
-            block((x[0], x[0] + frame), front, (z, z + high)),
-            block((x[1] - frame, x[1]), front, (z, z + high)),
-            block((x[0] + 0.001, x[1] - 0.001), front, (z, z + chin)),
-            block((x[0] + 0.001, x[1] - 0.001), front, (z + high - frame, z + high)),
+            block((left, left + frame), front, (low, top)),
+            block((right - frame, right), front, (low, top)),
+            block((left + 0.001, right - 0.001), front, (low + 0.001, low + chin)),
+            block((left + 0.001, right - 0.001), front, (top - frame, top - 0.001)),
         ]
     if dice.chance(0.6):
         deep, share = dice.between(0.015, 0.06), dice.between(0.3, 0.75)
