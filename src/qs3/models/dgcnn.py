@@ -93,10 +93,10 @@ class EdgeConv(nn.Module):
 def edge_covariance(
     points: Float[Tensor, "b n c"],
     neighbours: Int[Tensor, "b n k"],
-    share: Float[Tensor, "bn"],
+    share: Float[Tensor, "b*n"],
     neighbour_mean: Float[Tensor, "c"],
     own_mean: Float[Tensor, "c"],
-) -> Float[Tensor, "2c 2c"]:
+) -> Float[Tensor, "2*c 2*c"]:
     """Covariance over all edges of the pair (x_j, x_i), neighbour first.
 
     Args:

@@ -83,7 +83,7 @@ def _smallest(values: Float[Tensor, "b r n"], k: int) -> Int[Tensor, "b r k"]:
     return candidates.gather(2, chosen)
 
 
-def flat_indices(neighbours: Int[Tensor, "b n k"]) -> Int[Tensor, "bn k"]:
+def flat_indices(neighbours: Int[Tensor, "b n k"]) -> Int[Tensor, "b*n k"]:
     """Return neighbour indices that count through all clouds of the batch.
 
     Example:

@@ -7,9 +7,22 @@ import numpy as np
 import torch
 
 from qs3.adaptation import Batch
-from qs3.datasets.clouds import PointClouds
+from qs3.datasets.clouds import PointClouds, UnlabelledClouds
 from qs3.datasets.transforms import jitter, resample, rotate_z, unit_ball
+from qs3.errors import InputError
 from qs3.training.config import TrainSettings
+
+
+def require_unlabelled(target: UnlabelledClouds) -> None:
+    """Refuse clouds that carry labels where those of a target belong.
+
+    Raises:
+        InputError: where the clouds are not `UnlabelledClouds`.
+    """
+    if not isinstance(target, UnlabelledClouds):
+        raise InputError(
+            f"a target is UnlabelledClouds, not {type(target).__name__}; use .without_labels()"
+        )
 
 
 def prepare(points: np.ndarray, num_points: int) -> np.ndarray:

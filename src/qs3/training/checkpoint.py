@@ -152,14 +152,22 @@ def _flat(value: Any, name: str = "") -> dict[str, Any]:
     return items
 
 
-def derived_seed(*path: int) -> int:
-    """Return a seed for PyTorch that depends on every number of ``path``.
+def seed_sequence(seed: int, *path: int) -> np.random.SeedSequence:
+    """Return random bits that depend on the root seed and on every number of ``path``.
+
+    The path is a spawn key: as plain entropy, a zero at its end would make no difference.
+    """
+    return np.random.SeedSequence(seed, spawn_key=path)
+
+
+def derived_seed(seed: int, *path: int) -> int:
+    """Return a seed for PyTorch, as `seed_sequence`.
 
     Example:
         >>> derived_seed(0, 1) == derived_seed(0, 2)
         False
     """
-    return int(np.random.SeedSequence(path).generate_state(1, np.uint64)[0] >> np.uint64(1))
+    return int(seed_sequence(seed, *path).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
 def new_model(settings: TrainSettings, num_classes: int, seed: int) -> PointClassifier:
@@ -195,9 +203,9 @@ def load_model(run_dir: Path) -> LoadedModel:
     """Read the network of a run.
 
     Args:
-        run_dir: Folder of the run, or a ``.safetensors`` file that `save_model` wrote. For a file
-            the settings hold what the file tells: network, its settings and number of points,
-            under ``train``.
+        run_dir: Folder of the run, or a ``.safetensors`` file that `save_model` wrote. Without a
+            ``settings.json`` beside the file, the settings hold what the file itself tells:
+            network, its settings and number of points, under ``train``.
 
     Raises:
         InputError: where files are missing, damaged or do not belong together.
@@ -218,11 +226,11 @@ def load_model(run_dir: Path) -> LoadedModel:
     except (KeyError, TypeError) as error:
         raise InputError(f"{path}: does not say which network it holds ({error})") from error
     load_tensors_into(model, tensors, path)
-    if path == run_dir:
+    if not (path.parent / SETTINGS).is_file():
         kept = ("model", "model_settings", "num_points")
         settings = {"train": {key: facts[key] for key in kept if key in facts}}
     else:
-        settings = read_json(run_dir / SETTINGS)
+        settings = read_json(path.parent / SETTINGS)
         if not isinstance(settings, dict):
-            raise InputError(f"{run_dir / SETTINGS}: not the settings of a run")
+            raise InputError(f"{path.parent / SETTINGS}: not the settings of a run")
     return LoadedModel(model.eval(), class_names, settings)

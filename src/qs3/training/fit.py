@@ -15,7 +15,7 @@ from qs3.datasets.clouds import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.files import write_text
 from qs3.models import PointClassifier
-from qs3.training.batches import prepare
+from qs3.training.batches import prepare, require_unlabelled
 from qs3.training.checkpoint import (
     MODEL,
     claim_run,
@@ -95,6 +95,8 @@ def fit(
     }.items():
         if not adapts and value is not None:
             raise InputError(f"method {method} takes no {name}; leave it out or choose qbst")
+    if target is not None:
+        require_unlabelled(target)
     rounds_settings = (self_training or SelfTrainingSettings()) if adapts else None
     start = None if warm_up is None else _load_warm_up(Path(warm_up), source, settings)
     run_dir = Path(run_dir)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ from qs3.training.checkpoint import (
     optimiser_tensors,
     prefixed,
     read_tensors,
+    seed_sequence,
     without_prefix,
     write_tensors,
 )
@@ -51,6 +52,7 @@ EpochCallback = Callable[[EpochRecord, Method], None]
 """Called after each epoch; an exception ends the training, which then resumes after this epoch."""
 
 
+@runtime_checkable
 class Observer(Protocol):
     """Watches the network over the epochs and keeps tensors that a resumed training needs."""
 
@@ -158,7 +160,7 @@ def train(
             factor = cosine(first_epoch + epoch, settings.epochs)
             for group, rate in zip(optimiser.param_groups, base_rates, strict=True):
                 group["lr"] = rate * factor
-            rng = np.random.default_rng(np.random.SeedSequence([settings.seed, *stream, epoch]))
+            rng = np.random.default_rng(seed_sequence(settings.seed, *stream, epoch))
             generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
             orders = [endless_batches(len(clouds), settings.batch_size, rng) for clouds in sets]
             others = (

@@ -19,6 +19,7 @@ from qs3.datasets.clouds import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.evaluation.metrics import accuracy
 from qs3.models import PointClassifier
+from qs3.training.batches import require_unlabelled
 from qs3.training.checkpoint import (
     derived_seed,
     load_tensors_into,
@@ -120,6 +121,7 @@ def self_train(
     Raises:
         InputError: where the target is empty, or stored states do not fit.
     """
+    require_unlabelled(target)
     if not len(target):
         raise InputError("the target has no cloud; give unlabelled clouds")
     fabric = fabric or make_fabric(settings)

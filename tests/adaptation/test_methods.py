@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+import torch
+from scipy.special import log_softmax
+
+import qs3.adaptation
+from qs3.adaptation import Batch, Method, SourceOnly, cross_entropy
+from qs3.models import create_model
+
+
+def make_method(**settings):
+    torch.manual_seed(0)
+    model = create_model("pointnet", 3, channels=(8, 8, 16), hidden=(8,))
+    return SourceOnly(model, **settings)
+
+
+def make_batch():
+    generator = torch.Generator().manual_seed(0)
+    return Batch(torch.randn(4, 20, 3, generator=generator), torch.tensor([0, 1, 2, 0]))
+
+
+@pytest.mark.parametrize("smoothing", [0.0, 0.2])
+def test_cross_entropy_is_the_formula(smoothing):
+    rng = np.random.default_rng(0)
+    logits, labels = rng.normal(size=(6, 4)), rng.integers(4, size=6)
+    goal = np.full((6, 4), smoothing / 4)
+    goal[np.arange(6), labels] += 1 - smoothing
+    expected = -(goal * log_softmax(logits, axis=1)).sum(axis=1).mean()
+    value = cross_entropy(torch.from_numpy(logits), torch.from_numpy(labels), smoothing)
+    assert float(value) == pytest.approx(expected, abs=1e-12)
+
+
+def test_source_only_is_the_cross_entropy_of_the_source():
+    method = make_method(label_smoothing=0.1).eval()
+    batch = make_batch()
+    losses = method(batch, None, 0.0, torch.Generator())
+    assert list(losses) == ["source"]
+    expected = cross_entropy(method.model(batch.points), batch.labels, 0.1)
+    assert torch.equal(losses["source"], expected)
+
+
+def test_source_only_ignores_a_target():
+    method = make_method().eval()
+    losses = method.losses(make_batch(), torch.zeros(2, 5, 3), 0.5, torch.Generator())
+    assert torch.equal(
+        losses["source"], method(make_batch(), None, 0.0, torch.Generator())["source"]
+    )
+
+
+def test_default_parameter_group_holds_every_trainable_parameter():
+    method = make_method()
+    frozen = next(method.parameters()).requires_grad_(False)
+    (group,) = method.parameter_groups(0.5)
+    assert group["lr"] == 0.5
+    assert len(group["params"]) == sum(1 for _ in method.parameters()) - 1
+    assert all(p is not frozen for p in group["params"])
+
+
+def test_method_is_abstract():
+    with pytest.raises(TypeError, match="losses"):
+        Method(create_model("pointnet", 2))  # pyright: ignore[reportAbstractUsage]
+
+
+def test_unknown_name_of_the_package():
+    with pytest.raises(AttributeError, match="nothing_here"):
+        _ = qs3.adaptation.nothing_here

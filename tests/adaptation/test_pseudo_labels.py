@@ -1,0 +1,172 @@
+"""Laws of the selection (QS³, Algorithm 1)."""
+
+import subprocess
+import sys
+import warnings
+from fractions import Fraction
+from math import ceil
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from qs3.adaptation.pseudo_labels import (
+    SingleClassWarning,
+    balanced_count,
+    select_confident,
+    select_quasi_balanced,
+)
+from qs3.errors import InputError
+
+thresholds = st.sampled_from([0.0, 0.3, 0.5, 0.8, 0.805])
+
+
+@st.composite
+def probabilities(draw, distinct=False):
+    """Rows with a chosen top class and a chosen confidence of at least 0.51."""
+    k, m = draw(st.integers(2, 5)), draw(st.integers(0, 40))
+    top = draw(arrays(np.int64, m, elements=st.integers(0, k - 1)))
+    grid = draw(
+        arrays(np.int64, m, elements=st.integers(0, 490 if distinct else 12), unique=distinct)
+    )
+    confidence = 0.51 + grid * (0.001 if distinct else 0.04)
+    rows = np.repeat(((1 - confidence) / (k - 1))[:, None], k, axis=1)
+    rows[np.arange(m), top] = confidence
+    return rows
+
+
+def select(rows, threshold, **settings):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SingleClassWarning)
+        return select_quasi_balanced(rows, threshold, **settings)
+
+
+@given(probabilities(), thresholds, st.booleans(), st.sampled_from(["most", "least"]))
+def test_selected_are_confident(rows, threshold, inclusive, end):
+    chosen = select(rows, threshold, selection=f"{end}-confident", inclusive=inclusive)
+    assert not (chosen & ~select_confident(rows, threshold, inclusive=inclusive)).any()
+
+
+@given(probabilities(), thresholds, st.booleans(), st.sampled_from(["most", "least"]))
+def test_count_of_each_class(rows, threshold, inclusive, end):
+    chosen = select(rows, threshold, selection=f"{end}-confident", inclusive=inclusive)
+    confident = select_confident(rows, threshold, inclusive=inclusive)
+    labels = rows.argmax(axis=1)
+    total = int(confident.sum())
+    one_class = len(set(labels[confident].tolist())) == 1
+    for label in range(rows.shape[1]):
+        members = int((confident & (labels == label)).sum())
+        share = Fraction(members, total) if total else Fraction(0)
+        expected = members if one_class else ceil(members * (1 - share))
+        assert (chosen & (labels == label)).sum() == expected
+
+
+@given(probabilities(), thresholds, st.sampled_from([1, -1]))
+def test_they_are_the_ends_of_each_class(rows, threshold, sign):
+    end = "most-confident" if sign == 1 else "least-confident"
+    chosen = select(rows, threshold, selection=end)
+    dropped = select_confident(rows, threshold) & ~chosen
+    labels, confidence = rows.argmax(axis=1), sign * rows.max(axis=1)
+    for label in range(rows.shape[1]):
+        kept, left = (np.flatnonzero(mask & (labels == label)) for mask in (chosen, dropped))
+        if len(kept) and len(left):
+            assert confidence[kept].min() >= confidence[left].max()
+            # Ties go by order.
+            for i in kept[confidence[kept] == confidence[left].max()]:
+                assert i < left[confidence[left] == confidence[left].max()].min()
+
+
+@given(probabilities(distinct=True), thresholds, st.randoms(use_true_random=False))
+def test_order_of_the_clouds_does_not_matter(rows, threshold, random):
+    order = np.array(random.sample(range(len(rows)), len(rows)), dtype=np.int64)
+    chosen = select(rows, threshold)
+    assert np.array_equal(select(rows[order], threshold), chosen[order])
+
+
+@given(probabilities(distinct=True), thresholds, st.randoms(use_true_random=False))
+def test_names_of_the_classes_do_not_matter(rows, threshold, random):
+    columns = np.array(random.sample(range(rows.shape[1]), rows.shape[1]), dtype=np.int64)
+    assert np.array_equal(select(rows[:, columns], threshold), select(rows, threshold))
+
+
+@given(probabilities(), thresholds)
+def test_unconfident_clouds_do_not_matter(rows, threshold):
+    confident = select_confident(rows, threshold)
+    chosen = select(rows, threshold)
+    assert np.array_equal(select(rows[confident], threshold), chosen[confident])
+
+
+@given(st.integers(1, 300), st.integers(0, 300))
+@settings(max_examples=300)
+def test_counts_are_exact(total, members):
+    assume(members <= total)
+    assert balanced_count(members, total) == ceil(members * (1 - Fraction(members, total)))
+
+
+def test_the_floating_point_form_would_be_wrong():
+    assert balanced_count(9, 27) == 6
+    assert ceil(9 * (1 - 9 / 27)) == 7
+
+
+def one_class(m=5):
+    confidence = np.linspace(0.85, 0.95, m)
+    return np.stack([1 - confidence, confidence], axis=1)
+
+
+def test_one_class_is_kept_with_one_warning():
+    with pytest.warns(SingleClassWarning, match="all 5 confident clouds are of class 1") as caught:
+        chosen = select_quasi_balanced(one_class(), 0.8)
+    assert len(caught) == 1
+    assert chosen.all()
+
+
+def test_one_class_can_be_dropped_in_silence():
+    assert not select_quasi_balanced(one_class(), 0.8, single_class="drop").any()
+
+
+def test_nothing_confident_selects_nothing_in_silence():
+    assert not select_quasi_balanced(one_class(), 0.99).any()
+    assert select_quasi_balanced(np.zeros((0, 3)), 0.5).shape == (0,)
+
+
+def test_the_threshold_itself_is_out_unless_inclusive():
+    rows = np.array([[0.75, 0.25], [0.25, 0.75]])
+    assert not select_quasi_balanced(rows, 0.75).any()
+    assert select_quasi_balanced(rows, 0.75, inclusive=True).all()
+
+
+def test_ends_differ():
+    """Six of class 0 and two of class 1: ⌈6 · 2/8⌉ = 2 and ⌈2 · 6/8⌉ = 2 are kept."""
+    confidence = np.array([0.9, 0.95, 0.85, 0.99, 0.81, 0.82, 0.1, 0.1])
+    rows = np.stack([confidence, 1 - confidence], axis=1)
+    most = select_quasi_balanced(rows, 0.8)
+    least = select_quasi_balanced(rows, 0.8, selection="least-confident")
+    assert np.flatnonzero(most).tolist() == [1, 3, 6, 7]
+    assert np.flatnonzero(least).tolist() == [4, 5, 6, 7]
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ([[np.nan, 1.0]], "NaN"),
+        ([[np.inf, 0.0]], "NaN or infinity"),
+        ([[2.0, -1.0]], "negative"),
+        ([[0.5, 0.6]], "sum to 1"),
+        ([[]], "no class"),
+    ],
+)
+def test_rows_must_be_probabilities(rows, message):
+    with pytest.raises(InputError, match=message):
+        select_quasi_balanced(np.array(rows, dtype=np.float64), 0.8)
+
+
+def test_settings_are_checked():
+    with pytest.raises(InputError, match="threshold must be 0 to 1"):
+        select_confident(one_class(), 1.2)
+
+
+def test_imports_without_torch():
+    code = "import sys, qs3.adaptation.pseudo_labels; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,138 @@
+"""One suite over all networks."""
+
+import pytest
+import torch
+
+from qs3.errors import InputError
+from qs3.models import DGCNN, Features, create_model, list_models
+
+SMALL = {
+    "dgcnn": {"neighbours": 6, "channels": (8, 8, 16), "embedding": 32, "hidden": (16, 8)},
+    "pointnet": {"channels": (8, 8, 16), "hidden": (16, 8)},
+    "pointnet with T-Nets": {"channels": (8, 8, 16), "hidden": (16, 8), "transforms": True},
+}
+NAMES = sorted(SMALL)
+
+
+def small(name, seed=0):
+    torch.manual_seed(seed)
+    return create_model(name.split()[0], 5, **SMALL[name])
+
+
+def clouds(b=4, n=40, seed=0):
+    return torch.randn(b, n, 3, generator=torch.Generator().manual_seed(seed))
+
+
+def test_every_model_is_in_the_suite():
+    assert set(list_models()) == {name.split()[0] for name in NAMES}
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("n", [1, 3, 40])
+def test_shapes(name, n):
+    model = small(name).eval()
+    features = model.encode(clouds(n=n))
+    assert isinstance(features, Features)
+    assert features.pooled.ndim == 2
+    assert features.per_point is None or features.per_point.shape[:2] == (4, n)
+    assert features.local is None or features.local.shape[:2] == (4, n)
+    logits = model(clouds(n=n))
+    assert logits.shape == (4, 5)
+    assert torch.equal(logits, model.head(features))
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("train", [True, False])
+def test_order_of_the_points_does_not_matter(name, train):
+    model = small(name).double().train(train)
+    for layer in model.modules():
+        if isinstance(layer, torch.nn.Dropout):
+            layer.eval()
+    points = clouds().double()
+    order = torch.randperm(40, generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(model(points[:, order]), model(points), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_clouds_do_not_mix_in_evaluation(name):
+    model = small(name).double().eval()
+    points = clouds().double()
+    torch.testing.assert_close(model(points)[2:3], model(points[2:3]), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gradient_reaches_every_parameter(name):
+    model = small(name).train()
+    loss = torch.nn.functional.cross_entropy(model(clouds()), torch.tensor([0, 1, 2, 3]))
+    loss.backward()
+    for parameter_name, parameter in model.named_parameters():
+        assert parameter.grad is not None, parameter_name
+        assert parameter.grad.isfinite().all(), parameter_name
+        if "transform" not in parameter_name:  # its last layer starts at zero weights
+            assert parameter.grad.abs().sum() > 0, parameter_name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_same_seed_same_weights_and_other_seed_others(name):
+    first, again, other = (small(name, seed).state_dict() for seed in (0, 0, 1))
+    assert all(torch.equal(first[key], again[key]) for key in first)
+    assert any(not torch.equal(first[key], other[key]) for key in first)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_training_steps_are_bit_identical(name):
+    def steps():
+        model = small(name).train()
+        optimiser = torch.optim.Adam(model.parameters())
+        torch.manual_seed(5)
+        for step in range(3):
+            optimiser.zero_grad()
+            logits = model(clouds(seed=step))
+            torch.nn.functional.cross_entropy(logits, torch.tensor([0, 1, 2, 3])).backward()
+            optimiser.step()
+        return model.state_dict()
+
+    first, again = steps(), steps()
+    assert all(torch.equal(first[key], again[key]) for key in first)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_state_dict_round_trip(name):
+    model, other = small(name, 0).eval(), small(name, 1).eval()
+    other.load_state_dict(model.state_dict())
+    assert torch.equal(model(clouds()), other(clouds()))
+
+
+def test_official_dgcnn_has_the_official_number_of_parameters():
+    # Convolutions 2·3·64 + 2·64·64 + 2·64·128 + 2·128·256, embedding 512·1024, head
+    # 2048·512 + 512·256 + 256 + 256·40 + 40, and two for each normalised channel.
+    weights = 384 + 8192 + 16384 + 65536 + 524288 + 1048576 + 131072 + 256 + 10240 + 40
+    normalised = 2 * (64 + 64 + 128 + 256 + 1024 + 512 + 256)
+    total = sum(p.numel() for p in DGCNN(40).parameters())
+    assert total == weights + normalised
+
+
+def test_pointnet_transforms_start_at_the_identity():
+    model = small("pointnet with T-Nets").eval()
+    points = clouds()
+    torch.testing.assert_close(model.input_transform(points), points, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: create_model("dgcn", 5), "choose one of dgcnn, pointnet"),
+        (lambda: create_model("dgcnn", 5, neighbors=3), "unknown setting 'neighbors'.*neighbours"),
+        (lambda: create_model("dgcnn", 0), "num_classes"),
+        (lambda: create_model("dgcnn", 5, neighbours=256), "1 to 255"),
+        (lambda: create_model("pointnet", 5, dropout=2.0), "do not make a pointnet"),
+    ],
+)
+def test_faults_name_the_choices(call, message):
+    with pytest.raises(InputError, match=message):
+        call()
+
+
+def test_json_lists_make_the_same_network():
+    model = create_model("pointnet", 5, channels=[8, 8, 16], hidden=[8])
+    assert model(clouds()).shape == (4, 5)

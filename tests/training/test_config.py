@@ -1,0 +1,64 @@
+from dataclasses import asdict, replace
+
+import pytest
+import tyro
+
+from qs3.errors import InputError
+from qs3.training import PRESETS, SelfTrainingSettings, TrainSettings, self_training_preset
+
+# The table "Where the paper's text, its released code and we differ", row by row.
+TABLE = {
+    "selection": ("most-confident", "most-confident", "least-confident"),
+    "inclusive": (False, False, True),
+    "pool": ("all", "shrinking", "split"),
+    "init": ("warm-up", "scratch", "scratch"),
+    "labeller": ("latest", "latest", "best"),
+    "source_loss": (True, False, False),
+    "schedule": ("per-round", "per-round", "continuous"),
+    "single_class": ("keep", "drop", "drop"),
+}
+COMMON = {"threshold": 0.8, "step": 0.005, "rounds": 10, "epochs": 10, "steps_per_epoch": None}
+
+
+@pytest.mark.parametrize(("column", "name"), list(enumerate(["default", "paper", "released"])))
+def test_presets_are_the_columns_of_the_table(column, name):
+    expected = {row: values[column] for row, values in TABLE.items()} | COMMON
+    assert asdict(self_training_preset(name)) == expected
+    assert PRESETS[name] == self_training_preset(name)
+
+
+def test_default_preset_is_the_default():
+    assert PRESETS["default"] == SelfTrainingSettings()
+
+
+def test_overrides():
+    changed = self_training_preset("released", rounds=3, pool="all")
+    assert changed == replace(PRESETS["released"], rounds=3, pool="all")
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: self_training_preset("papers"), "choose one of default, paper, released"),
+        (lambda: self_training_preset("paper", theta=0.9), "unknown setting 'theta'.*threshold"),
+        (lambda: SelfTrainingSettings(threshold=1.5), "threshold = 1.5 must be in 0 to 1"),
+        (lambda: SelfTrainingSettings(threshold=0.9, step=0.02), "step = 0.02 takes θ out"),
+        (lambda: SelfTrainingSettings(rounds=0), "rounds = 0"),
+        (lambda: SelfTrainingSettings(steps_per_epoch=0), "steps_per_epoch = 0"),
+        (lambda: TrainSettings(batch_size=1), "batch_size = 1 must be at least 2"),
+        (lambda: TrainSettings(epochs=0), "epochs = 0"),
+        (lambda: TrainSettings(label_smoothing=1.0), "label_smoothing"),
+        (lambda: TrainSettings(threads=0), "threads = 0"),
+        (lambda: TrainSettings(seed=-1), "seed = -1"),
+    ],
+)
+def test_faults_name_the_setting(call, message):
+    with pytest.raises(InputError, match=message):
+        call()
+
+
+def test_command_line_makes_the_settings():
+    made = tyro.cli(TrainSettings, args=["--model", "pointnet", "--epochs", "3", "--no-rotate-z"])
+    assert made == TrainSettings(model="pointnet", epochs=3, rotate_z=False)
+    rounds = tyro.cli(SelfTrainingSettings, args=["--pool", "split", "--no-source-loss"])
+    assert rounds == SelfTrainingSettings(pool="split", source_loss=False)

@@ -1,0 +1,188 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from qs3.errors import InputError
+from qs3.training import (
+    SelfTrainingSettings,
+    fit,
+    is_finished,
+    load_model,
+    predict_probabilities,
+    save_model,
+)
+from qs3.training.checkpoint import MODEL, fingerprint, new_model, read_tensors, write_tensors
+
+ROUNDS = SelfTrainingSettings(rounds=1, epochs=1, threshold=0.4)
+
+
+def same(a, b):
+    a, b = a.state_dict(), b.state_dict()
+    return all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_source_only(source, settings, tmp_path):
+    result = fit("source-only", source, None, settings, run_dir=tmp_path / "run")
+    assert len(result.history) == settings.epochs
+    assert result.rounds == ()
+    assert result.selection == "last"
+    assert is_finished(tmp_path / "run")
+    loaded = load_model(tmp_path / "run")
+    assert same(loaded.model, result.model)
+    assert not loaded.model.training
+    assert loaded.class_names == ("ball", "disc", "rod")
+    assert loaded.settings["method"] == "source-only"
+    assert loaded.settings["train"]["num_points"] == 64
+    alone = load_model(tmp_path / "run" / MODEL)
+    assert same(alone.model, result.model)
+    assert alone.settings["train"]["num_points"] == 64
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"seed": 1}, "train.seed = 0, not 1"),
+        ({"learning_rate": 0.5}, "train.learning_rate = 0.01, not 0.5"),
+        ({"model_settings": {}}, "train.model_settings"),
+    ],
+)
+def test_other_settings_in_the_folder_are_refused(source, settings, tmp_path, change, named):
+    fit("source-only", source, None, settings, run_dir=tmp_path)
+    with pytest.raises(InputError, match=named):
+        fit("source-only", source, None, replace(settings, **change), run_dir=tmp_path)
+
+
+def test_other_data_or_method_in_the_folder_are_refused(source, target, settings, tmp_path):
+    fit("source-only", source, None, settings, run_dir=tmp_path)
+    with pytest.raises(InputError, match="source = "):
+        fit("source-only", target, None, settings, run_dir=tmp_path)
+    with pytest.raises(InputError, match="method = 'source-only', not 'qbst'"):
+        fit("qbst", source, target.without_labels(), settings, ROUNDS, run_dir=tmp_path)
+
+
+def test_folder_of_somebody_else_is_refused(source, settings, tmp_path):
+    (tmp_path / "thesis.tex").write_text("mine")
+    with pytest.raises(InputError, match="holds something else"):
+        fit("source-only", source, None, settings, run_dir=tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+    with pytest.raises(InputError, match="is a file"):
+        fit("source-only", source, None, settings, run_dir=tmp_path / "thesis.tex")
+
+
+def test_arguments_that_do_not_go_together(source, target, settings, tmp_path):
+    unlabelled = target.without_labels()
+    run = tmp_path / "run"
+    with pytest.raises(InputError, match="needs a target"):
+        fit("qbst", source, None, settings, run_dir=run)
+    with pytest.raises(InputError, match="takes no target"):
+        fit("source-only", source, unlabelled, settings, run_dir=run)
+    with pytest.raises(InputError, match="takes no self-training settings"):
+        fit("source-only", source, None, settings, ROUNDS, run_dir=run)
+    with pytest.raises(InputError, match="takes no warm-up"):
+        fit("source-only", source, None, settings, run_dir=run, warm_up=tmp_path)
+    assert not run.exists()
+
+
+def test_warm_up_must_fit(source, target, settings, tmp_path):
+    unlabelled = target.without_labels()
+    fit("source-only", source, None, settings, run_dir=tmp_path / "warm")
+    other = replace(source, class_names=("a", "b", "c"))
+    for case, (clouds, changed, message) in enumerate(
+        [
+            (other, settings, "classes"),
+            (source, replace(settings, num_points=32), "num_points = 64, not 32"),
+            (source, replace(settings, model="dgcnn", model_settings={}), "model = 'pointnet'"),
+        ]
+    ):
+        with pytest.raises(InputError, match=message):
+            fit(
+                "qbst",
+                clouds,
+                unlabelled,
+                changed,
+                ROUNDS,
+                run_dir=tmp_path / str(case),
+                warm_up=tmp_path / "warm",
+            )
+    with pytest.raises(InputError, match=r"no model\.safetensors"):
+        load_model(tmp_path / "0")
+
+
+def test_given_warm_up_is_the_trained_one(source, target, settings, tmp_path):
+    """A warm-up trained first or handed over leads to the same bits."""
+    unlabelled = target.without_labels()
+    settings = replace(settings, epochs=20)
+    fit("source-only", source, None, settings, run_dir=tmp_path / "warm")
+    handed = fit(
+        "qbst",
+        source,
+        unlabelled,
+        settings,
+        ROUNDS,
+        run_dir=tmp_path / "a",
+        warm_up=tmp_path / "warm",
+    )
+    trained = fit("qbst", source, unlabelled, settings, ROUNDS, run_dir=tmp_path / "b")
+    assert same(handed.model, trained.model)
+    assert same(load_model(tmp_path / "b" / "warm-up").model, load_model(tmp_path / "warm").model)
+
+
+def test_threads_are_put_back(source, settings, tmp_path):
+    before = torch.get_num_threads()
+    fit("source-only", source, None, replace(settings, threads=2), run_dir=tmp_path)
+    assert torch.get_num_threads() == before
+
+
+@pytest.mark.parametrize("content", [b"", b"garbage", b"\xff" * 64])
+def test_garbage_weights_are_told(tmp_path, content):
+    (tmp_path / MODEL).write_bytes(content)
+    with pytest.raises(InputError, match="not a safetensors file of qs3"):
+        load_model(tmp_path)
+
+
+def test_weights_of_another_kind_are_told(settings, tmp_path):
+    path = tmp_path / MODEL
+    write_tensors(path, {"a": torch.zeros(1)}, {"format": 1})
+    with pytest.raises(InputError, match="does not say which network"):
+        load_model(path)
+    write_tensors(path, {}, {"format": 99})
+    with pytest.raises(InputError, match="format 99"):
+        load_model(path)
+    save_model(tmp_path, new_model(settings, 3, 0), ("a", "b"), settings)
+    with pytest.raises(InputError, match="another network"):
+        load_model(path)
+
+
+def test_tensors_round_trip(tmp_path):
+    tensors = {"a": torch.arange(3), "b": torch.zeros(2, 2)[:, 0], "c": torch.tensor(1.5)}
+    write_tensors(tmp_path / "x.safetensors", tensors, {"n": [1, 2]})
+    back, facts = read_tensors(tmp_path / "x.safetensors")
+    assert facts == {"n": [1, 2]}
+    assert back.keys() == tensors.keys()
+    assert all(torch.equal(back[name], tensors[name]) for name in tensors)
+
+
+def test_fingerprint_sees_points_labels_and_names(source):
+    seen = {fingerprint(source), fingerprint(source.without_labels())}
+    seen.add(fingerprint(replace(source, labels=source.labels[::-1].copy())))
+    seen.add(fingerprint(replace(source, class_names=("x", "y", "z"))))
+    seen.add(fingerprint(replace(source, points=source.points + 1)))
+    assert len(seen) == 5
+    assert fingerprint(source) == fingerprint(replace(source, ids=source.ids[::-1]))
+
+
+def test_predictions_are_probabilities_and_deterministic(source, settings):
+    model = new_model(settings, 3, 0).train()
+    first = predict_probabilities(model, source.points)
+    assert model.training  # the mode is put back
+    assert first.dtype == np.float64
+    np.testing.assert_allclose(first.sum(axis=1), 1.0, atol=1e-12)
+    assert np.array_equal(first, predict_probabilities(model, source.points))
+    np.testing.assert_allclose(
+        first, predict_probabilities(model, source.points, batch_size=5), atol=1e-6
+    )
+    moved = predict_probabilities(model, source.points * 5 + 2)  # the unit ball undoes it
+    np.testing.assert_allclose(first, moved, atol=1e-4)
+    assert predict_probabilities(model, source.points[:0]).shape == (0, 3)

@@ -1,0 +1,200 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from qs3.adaptation import Method, SourceOnly
+from qs3.errors import InputError, QS3Error
+from qs3.training.batches import batches, count_batches, prepare
+from qs3.training.checkpoint import new_model
+from qs3.training.loop import CHECKPOINT, cosine, train
+from qs3.training.predict import predict_probabilities
+
+
+class Stop(Exception):  # noqa: N818
+    """Ends a training from a callback, as a kill would."""
+
+
+def stop_after(epoch):
+    def callback(record, method):
+        if record.epoch == epoch:
+            raise Stop
+
+    return callback
+
+
+def run(source, settings, seed=0, **arguments):
+    method = SourceOnly(new_model(settings, 3, seed))
+    history, _ = train(method, source, None, settings, **arguments)
+    return method.model, history
+
+
+def same(a, b):
+    a, b = a.state_dict(), b.state_dict()
+    return all(torch.equal(a[name], b[name]) for name in a)
+
+
+def losses_of(history):
+    return [record.losses for record in history]
+
+
+def test_learns_the_training_set(source, settings):
+    source = replace(source, points=prepare(source.points, 64))
+    model, history = run(source, replace(settings, epochs=40))
+    predictions = predict_probabilities(model, source.points).argmax(axis=1)
+    assert (predictions == source.labels).mean() >= 0.95
+    assert history[-1].losses["source"] < 0.5 * history[0].losses["source"]
+    assert [record.epoch for record in history] == list(range(40))
+
+
+@pytest.mark.parametrize("model", ["pointnet", "dgcnn"])
+def test_same_seed_same_bits_and_other_seed_others(source, settings, model):
+    if model == "dgcnn":
+        small = {"neighbours": 5, "channels": (8, 8), "embedding": 16, "hidden": (8,)}
+        settings = replace(settings, model="dgcnn", model_settings=small, epochs=2)
+    first, _ = run(source, settings)
+    torch.rand(3)  # the caller's random state must not matter
+    again, _ = run(source, settings)
+    other, _ = run(source, replace(settings, seed=1))
+    assert same(first, again)
+    assert not same(first, other)
+
+
+def test_random_state_of_the_caller_is_untouched(source, settings):
+    torch.manual_seed(3)
+    expected = torch.rand(1)
+    torch.manual_seed(3)
+    run(source, settings)
+    assert torch.equal(torch.rand(1), expected)
+
+
+@pytest.mark.parametrize("epoch", [0, 2, 3])
+def test_resumed_is_uninterrupted(source, settings, tmp_path, epoch):
+    whole, history = run(source, settings)
+    with pytest.raises(Stop):
+        run(source, settings, run_dir=tmp_path, on_epoch=stop_after(epoch))
+    seen = []
+    resumed, resumed_history = run(
+        source, settings, seed=99, run_dir=tmp_path, on_epoch=lambda r, m: seen.append(r.epoch)
+    )
+    assert seen == list(range(epoch + 1, settings.epochs))
+    assert same(whole, resumed)
+    assert losses_of(history) == losses_of(resumed_history)
+
+
+def test_checkpoint_of_another_stream_is_left_aside(source, settings, tmp_path):
+    run(source, settings, run_dir=tmp_path, stream=(1, 1))
+    other, _ = run(source, settings, run_dir=tmp_path, stream=(1, 2))
+    assert same(other, run(source, settings, stream=(1, 2))[0])
+    assert not same(other, run(source, settings, stream=(1, 1))[0])
+
+
+def test_damaged_checkpoint_is_told(source, settings, tmp_path):
+    (tmp_path / CHECKPOINT).write_bytes(b"nothing of use")
+    with pytest.raises(InputError, match=r"checkpoint\.safetensors"):
+        run(source, settings, run_dir=tmp_path)
+
+
+def test_checkpoint_of_another_network_is_told(source, settings, tmp_path):
+    run(source, settings, run_dir=tmp_path)
+    with pytest.raises(InputError, match="another network"):
+        run(source, replace(settings, model_settings={"hidden": (4,)}), run_dir=tmp_path)
+
+
+def test_two_sets_share_each_step(source, target, settings):
+    shapes = []
+
+    class Watch(SourceOnly):
+        def losses(self, source, target, progress, generator):
+            shapes.append((len(source.labels), progress))
+            return super().losses(source, target, progress, generator)
+
+    few = source.select(np.arange(10))
+    method = Watch(new_model(settings, 3, 0))
+    train(method, [few, target], None, settings)
+    # One pass over the first set: 8 and 2 of it; of the second always 8.
+    assert [size for size, _ in shapes] == [16, 10] * settings.epochs
+    assert [progress for _, progress in shapes] == [i / 8 for i in range(8)]
+
+
+def test_steps_per_epoch(source, settings):
+    counted = []
+    method = SourceOnly(new_model(settings, 3, 0))
+    method.after_step = lambda: counted.append(1)
+    train(method, source, None, settings, steps_per_epoch=5)
+    assert len(counted) == 5 * settings.epochs
+
+
+def test_target_reaches_a_method_that_uses_it(source, target, settings):
+    class Sees(Method):
+        uses_target = True
+
+        def losses(self, source, target, progress, generator):
+            assert target is not None
+            assert target.shape[1:] == (64, 3)
+            logits = self.model(source.points)
+            return {"a": logits.square().mean(), "b": self.model(target).square().mean()}
+
+    model = new_model(settings, 3, 0)
+    history, _ = train(Sees(model), source, target.without_labels(), settings)
+    assert set(history[0].losses) == {"a", "b"}
+    with pytest.raises(InputError, match="Sees needs a target"):
+        train(Sees(model), source, None, settings)
+
+
+def test_loss_that_is_not_finite_names_epoch_and_batch(source, settings):
+    class Diverges(SourceOnly):
+        def losses(self, source, target, progress, generator):
+            losses = super().losses(source, target, progress, generator)
+            return {"source": losses["source"] * (math.nan if progress >= 0.5 else 1.0)}
+
+    with pytest.raises(QS3Error, match="nan in epoch 2, batch 0"):
+        train(Diverges(new_model(settings, 3, 0)), source, None, settings)
+
+
+def test_one_cloud_is_too_few(source, settings):
+    with pytest.raises(InputError, match="1 clouds are too few"):
+        run(source.select(np.array([0])), settings)
+
+
+def test_rate_follows_the_cosine(source, settings):
+    _, history = run(source, settings)
+    expected = [settings.learning_rate * cosine(e, 4) for e in range(4)]
+    assert [record.learning_rate for record in history] == pytest.approx(expected)
+    reference = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=1.0)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(reference, T_max=4)
+    for epoch in range(9):
+        assert schedule.get_last_lr()[0] == pytest.approx(cosine(epoch, 4), abs=1e-9)
+        reference.step()
+        schedule.step()
+
+
+def test_bf16_trains(source, settings):
+    model, history = run(source, replace(settings, precision="bf16-mixed", epochs=2))
+    assert math.isfinite(history[-1].losses["source"])
+    assert all(p.dtype == torch.float32 for p in model.parameters())
+
+
+def test_device_that_is_not_here_is_told(source, settings):
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    with pytest.raises(InputError, match="accelerator 'cuda'"):
+        run(source, replace(settings, accelerator="cuda"))
+
+
+@pytest.mark.parametrize("count", [2, 3, 8, 9, 10, 17])
+def test_batches_hold_each_cloud_once_but_for_a_last_single_one(count):
+    cut = list(batches(count, 4, np.random.default_rng(0)))
+    assert len(cut) == count_batches(count, 4)
+    assert min(map(len, cut)) >= 2
+    rows = np.concatenate(cut)
+    assert len(set(rows.tolist())) == len(rows) == count - (count % 4 == 1)
+
+
+def test_prepare_is_in_the_unit_ball_with_the_asked_points(source):
+    prepared = prepare(source.points * 7 + 3, 16)
+    assert prepared.shape == (24, 16, 3)
+    assert prepared.dtype == np.float32
+    assert np.linalg.norm(prepared, axis=2).max() <= 1 + 1e-6
