@@ -139,7 +139,8 @@ def _maximum(
     b, n, c = values.shape
     table = values.reshape(b * n, c)
     columns = flat_indices(neighbours).t().contiguous()
-    rows = b * n if values.is_cuda else n  # on a CPU one cloud at a time stays in the cache
+    # On a CPU a block should stay in the cache, yet not be so small that threads only wait.
+    rows = b * n if values.is_cuda else max(1, 2**19 // c)
     maximum = torch.zeros_like(table)
     for start in range(0, b * n, rows):
         block = slice(start, start + rows)
