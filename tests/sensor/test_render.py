@@ -4,7 +4,8 @@ import trimesh
 from PIL import Image
 
 from qs3.sensor.exposure import ExposureSettings, expose
-from qs3.sensor.matching import MatchingSettings, match
+from qs3.sensor.matching import MatchingSettings, match, matching_canvas
+from qs3.sensor.presets import get_sensor
 from qs3.sensor.render import LightSettings, Scene
 from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
 from qs3.sensor.render.raycast import DepthCaster
@@ -83,6 +84,23 @@ def test_full_frame_and_region_disparity_agree(small_rig):
     both = np.isfinite(disparity[0]) & np.isfinite(disparity[1])
     assert both.sum() > 0.9 * np.isfinite(disparity[1]).sum()
     assert np.abs(np.median((disparity[0] - disparity[1])[both])) <= 1 / 16
+
+
+def test_region_pipeline_gives_the_bits_of_the_full_frame(renderer):
+    # The same rendered pair, matched in its region and in the whole frame of the released rig.
+    sensor = get_sensor("qs3")
+    pair = renderer.render(scene_of(asymmetric()), sensor.rig, [POSE], [1])[0]
+    region = sensor.rig.region_of(np.asarray(asymmetric().bounds), POSE, 16)
+    canvas = matching_canvas(region, sensor.rig, sensor.matching)
+    assert canvas.width * canvas.height < 0.7 * 1080**2
+    whole, part = (
+        match(*(expose(i, sensor.exposure) for i in pair.canvas(where)), sensor.matching)
+        for where in (sensor.rig.full_frame, canvas)
+    )
+    y, x = region.y - canvas.y, region.x - canvas.x
+    inner = part[y : y + region.height, x : x + region.width]
+    assert np.isfinite(inner).sum() > 50_000
+    np.testing.assert_array_equal(inner, whole[region.slices])
 
 
 def test_convention_projected_picture_is_upright(small_rig, renderer):

@@ -64,7 +64,8 @@ def test_improves_or_keeps_an_easy_target(source, target, settings, warm, tmp_pa
     assert [record.round for record in result.rounds] == [1, 2, 3]
     assert [record.theta for record in result.rounds] == pytest.approx([0.4, 0.405, 0.41])
     for record in result.rounds:
-        assert sum(record.kept) <= record.confident <= record.pool == 30
+        assert sum(record.kept) <= sum(record.confident) <= record.pool == 30
+        assert all(k <= c for k, c in zip(record.kept, record.confident, strict=True))
         assert len(record.losses) == 2
     assert result.rounds[0].agreement is None
     assert 0 <= result.rounds[1].agreement <= 1

@@ -131,11 +131,4 @@ def run(options: TrainOptions) -> Any:
             "seconds": seconds,
         },
     )
-    for record in result.rounds:
-        if record.skipped:
-            print(
-                f"round {record.round}: only {sum(record.kept)} clouds selected, fewer than two a "
-                "class; the network stayed as it was",
-                file=sys.stderr,
-            )
     return result

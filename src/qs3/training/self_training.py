@@ -52,8 +52,8 @@ class RoundRecord:
     """Threshold of this round."""
     pool: int
     """Clouds to select from."""
-    confident: int
-    """Clouds of the pool over the threshold."""
+    confident: tuple[int, ...]
+    """Clouds of the pool over the threshold, by pseudo label."""
     kept: tuple[int, ...]
     """Clouds that the rule kept, by pseudo label."""
     agreement: float | None
@@ -176,6 +176,7 @@ class _Rounds:
         labels = probabilities.argmax(axis=1)
         candidates = probabilities[self.pool]
         confident = select_confident(candidates, theta, inclusive=self.rounds.inclusive)
+        over = np.bincount(candidates[confident].argmax(axis=1), minlength=k)
         chosen = self.pool[select(candidates, theta)]
         pool = len(self.pool)
         skipped = len(chosen) < 2 * k
@@ -195,11 +196,11 @@ class _Rounds:
             round=number,
             theta=theta,
             pool=pool,
-            confident=int(confident.sum()),
+            confident=tuple(over.tolist()),
             kept=tuple(np.bincount(labels[chosen], minlength=k).tolist()),
             agreement=None if self.labels is None else float((labels == self.labels).mean()),
             skipped=skipped,
-            single_class=len(np.unique(candidates[confident].argmax(axis=1))) == 1,
+            single_class=int(np.count_nonzero(over)) == 1,
             held_out=self.best.score if self.rounds.labeller == "best" else None,
             losses=losses,
             seconds=time.perf_counter() - start,
@@ -263,7 +264,7 @@ class _Rounds:
         try:
             self.pool, self.labels = tensors["pool"].numpy(), tensors["labels"].numpy()
             self.records = [
-                RoundRecord(**{**r, "kept": tuple(r["kept"]), "losses": tuple(r["losses"])})
+                RoundRecord(**{**r, **{n: tuple(r[n]) for n in ("confident", "kept", "losses")}})
                 for r in facts["records"]
             ]
         except (KeyError, TypeError) as error:
