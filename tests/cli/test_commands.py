@@ -83,10 +83,13 @@ def test_store_holds_noisy_clean_and_surface_clouds_that_overlay(store):
     clouds = [load_clouds(store, num_points=128, cloud=c) for c in ("points", "clean", "surface")]
     assert [len(c) for c in clouds] == [10, 10, 10]
     assert clouds[0].labels.tolist() == list(range(10))
-    # All lie in the normalised mesh's box; the noisy cloud in that box turned about z.
+    # All lie in the normalised mesh's box; the noisy cloud in the box of the turned mesh, whose
+    # corners are at most at a radius of 1.
     assert np.abs(clouds[1].points).max() <= 0.5 + 1e-5
     assert np.abs(clouds[2].points).max() <= 0.5 + 1e-5
-    assert 0.3 < np.abs(clouds[0].points).max() <= 0.5 * np.sqrt(2) + 1e-5
+    radius = np.linalg.norm(clouds[0].points[:, :, :2], axis=2)
+    assert 0.3 < radius.max() <= 1 + 1e-5
+    assert np.abs(clouds[0].points[:, :, 2]).max() <= 0.5 + 1e-5
 
 
 def test_train_evaluate_predict(qs3, run, store, tmp_path):
@@ -149,11 +152,11 @@ def test_every_verb_explains_itself(qs3):
 
 def test_a_demo_of_the_smallest_size(qs3, tmp_path):
     out = tmp_path / "demo"
-    size = ("--settings.source-per-class", 2, "--settings.target-per-class", 2,
-            "--settings.source-views", 1, "--settings.samples", 1,
-            "--settings.variant", "scalar_rgb", "--settings.model", "pointnet",
-            "--settings.num-points", 64, "--settings.epochs", 3, "--settings.rounds", 2,
-            "--settings.round-epochs", 1, "--settings.workers", 1)  # fmt: skip
+    size = ("--source-per-class", 2, "--target-per-class", 2,
+            "--source-views", 1, "--samples", 1,
+            "--variant", "scalar_rgb", "--model", "pointnet",
+            "--num-points", 64, "--epochs", 3, "--rounds", 2,
+            "--round-epochs", 1, "--workers", 1)  # fmt: skip
     done = qs3("demo", "--out", out, *size)
     assert str(out / "report.html") in done.stdout
     assert done.stdout.count("accuracy on the target") == 2

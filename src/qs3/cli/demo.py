@@ -10,9 +10,10 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import tyro
 
 from qs3.cli.pictures import montage_view
 from qs3.files import claim_folder, write_json
@@ -54,7 +55,13 @@ class DemoSettings:
     """Processes that scan."""
 
 
-def demo(out: Path = Path("demo"), settings: DemoSettings | None = None) -> int:
+DEFAULTS = DemoSettings()
+
+
+def demo(
+    out: Path = Path("demo"),
+    settings: Annotated[DemoSettings, tyro.conf.arg(name="")] = DEFAULTS,
+) -> int:
     """Run everything once on built-in shapes: scan, train, adapt, report.
 
     Args:
@@ -62,7 +69,6 @@ def demo(out: Path = Path("demo"), settings: DemoSettings | None = None) -> int:
         settings: Size of the demo.
     """
     start = time.perf_counter()
-    settings = settings or DemoSettings()
     folder = claim_folder(out, _MARKER)
     write_json(folder / _MARKER, dataclasses.asdict(settings))
     for step, (title, make) in enumerate(
