@@ -10,9 +10,10 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 # Real meshes and scans for the tests that read them; those skip where it is absent.
-QS3_SHARED_DATA ?= $(abspath ../shared/data)
+QS3_SHARED_DATA ?= $(abspath $(wildcard ../shared/data))
 export QS3_SHARED_DATA
 
+.DELETE_ON_ERROR:
 .PHONY: demo test slow check examples clean
 
 demo: $(VENV)/.installed
@@ -38,7 +39,7 @@ clean:
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit("qs3 needs Python 3.11 or newer; this is " + sys.version.split()[0] + ". Name another with: make demo PYTHON=python3.12") if sys.version_info < (3, 11) else None'
-	$(PYTHON) -m venv $(VENV)
+	$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); echo 'no virtual environment could be made; on Debian: apt-get install python3-venv'; exit 1; }
 
 $(VENV)/.installed: $(BIN)/python pyproject.toml constraints.txt
 	$(PIP) $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch

@@ -27,13 +27,18 @@ def main() -> None:
     parser.add_argument("runs", type=Path)
     parser.add_argument("--epochs", type=int, default=15)
     parser.add_argument("--num-points", type=int, default=512)
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--threads", type=int, default=None)
     parser.add_argument("--model", default="dgcnn")
     options = parser.parse_args()
     results: dict[str, list[tuple[float, float]]] = {}
-    for seed in range(options.seeds):
+    for seed in options.seeds:
         settings = TrainSettings(
-            model=options.model, num_points=options.num_points, epochs=options.epochs, seed=seed
+            model=options.model,
+            num_points=options.num_points,
+            epochs=options.epochs,
+            seed=seed,
+            threads=options.threads,
         )
         plans = {
             f"source-only, {name}": TrainOptions(

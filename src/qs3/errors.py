@@ -13,4 +13,7 @@ class MissingExtraError(QS3Error, ImportError):
     """An optional package is needed; the message names the extra that brings it."""
 
     def __init__(self, package: str, extra: str) -> None:
-        super().__init__(f"{package} is not installed; get it with: pip install 'qs3[{extra}]'")
+        super().__init__(
+            f"{package} is not installed; it comes with the extra {extra!r}: in a checkout of qs3, "
+            f"pip install -e '.[{extra}]'"
+        )

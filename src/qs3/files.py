@@ -3,12 +3,15 @@
 import hashlib
 import json
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from qs3.errors import InputError
+
+_LEFT_OVER = re.compile(r"\..+\.\d+\.tmp(\.\w+)?$")
 
 
 @contextmanager
@@ -75,6 +78,11 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
+def holds_something(path: Path) -> bool:
+    """Whether ``path`` is a folder with content, left-overs of an interrupted write aside."""
+    return path.is_dir() and any(not _LEFT_OVER.match(entry.name) for entry in path.iterdir())
+
+
 def claim_folder(path: Path, marker: str) -> Path:
     """Return ``path`` as an output folder: made if absent, accepted if empty or ours.
 
@@ -88,7 +96,7 @@ def claim_folder(path: Path, marker: str) -> Path:
     path = Path(path)
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; name a folder for --out")
-    if path.is_dir() and any(path.iterdir()) and not (path / marker).is_file():
+    if holds_something(path) and not (path / marker).is_file():
         raise InputError(f"{path}: holds something else (no {marker}); name a new or empty folder")
     path.mkdir(parents=True, exist_ok=True)
     return path

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+TETRAHEDRON = "OFF\n4 4 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n"
 BAD_MESHES = {
     "missing.off": None,
     "empty.off": "OFF\n0 0 0\n",
@@ -42,11 +43,15 @@ def test_unknown_class_lists_the_classes(qs3, quick, tmp_path):
         (("scan", "chair", "--samples", "0"), "samples"),
         (("scan", "chair", "--views", "0"), "views"),
         (("scan", "chair", "--image-noise", "-2"), "noise"),
+        (("scan", "chair", "--image-noise", "nan"), "noise"),
+        (("scan", "chair", "--views", "300"), "views"),
+        (("generate", "--meshes", "shapes", "--pattern", "absent.png"), "absent.png"),
         (("scan", "chair", "--pattern", "absent.png"), "absent.png"),
         (("generate", "--meshes", "absent-folder"), "absent-folder"),
         (("generate", "--meshes", "shapes", "--scans-per-mesh", "0"), "scans_per_mesh"),
         (("train", "--source", "absent-data"), "absent-data"),
         (("train", "--source", "absent-data", "--epochs", "0"), "epochs"),
+        (("train", "--source", "absent-data", "--learning-rate", "inf"), "learning_rate"),
         (("train", "--source", "x", "--method", "qbst"), "target"),
         (("train", "--source", "x", "--target", "y"), "target"),
     ],
@@ -110,11 +115,44 @@ def test_other_settings_do_not_overwrite_a_run_or_a_data_set(qs3, quick, run, st
     assert "epochs" in line
 
 
+def test_a_network_that_is_not_there_leaves_no_run_behind(qs3, store, tmp_path):
+    out = tmp_path / "run"
+    assert "foo" in qs3.refuses("train", "--source", store, "--out", out, "--model", "foo")
+    assert not out.exists()
+
+
+def test_predict_needs_files(qs3, run):
+    assert "files" in qs3.refuses("predict", run)
+
+
+def test_an_output_below_a_file_is_one_line(qs3, quick, tmp_path):
+    (tmp_path / "file").write_text("x")
+    assert "file" in qs3.refuses("scan", "chair", *quick, "--out", tmp_path / "file" / "out")
+
+
+def test_a_flat_folder_of_meshes_is_told_what_it_lacks(qs3, quick, tmp_path):
+    (tmp_path / "cad").mkdir()
+    (tmp_path / "cad" / "a.off").write_text(TETRAHEDRON)
+    line = qs3.refuses("generate", "--meshes", tmp_path / "cad", "--out", tmp_path / "o", *quick)
+    assert "folder a class" in line
+    assert not (tmp_path / "o").exists()
+
+
+def test_classes_of_ones_own_are_taken(qs3, quick, tmp_path):
+    for name in ("bolt", "nut"):
+        (tmp_path / "cad" / name).mkdir(parents=True)
+        (tmp_path / "cad" / name / "a.off").write_text(TETRAHEDRON)
+    out = tmp_path / "out"
+    qs3("generate", "--meshes", tmp_path / "cad", "--out", out, "--num-points", 64, *quick)
+    from qs3.datasets import load_clouds
+
+    assert load_clouds(out, num_points=64).class_names == ("bolt", "nut")
+
+
 def test_a_failed_object_is_logged_and_the_others_are_written(qs3, quick, tmp_path):
     for name in ("bed", "chair"):
         (tmp_path / "cad" / name).mkdir(parents=True)
-    tetrahedron = "OFF\n4 4 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n"
-    (tmp_path / "cad" / "bed" / "good.off").write_text(tetrahedron)
+    (tmp_path / "cad" / "bed" / "good.off").write_text(TETRAHEDRON)
     (tmp_path / "cad" / "chair" / "bad.off").write_text("nonsense")
     line = qs3(
         "generate", "--meshes", tmp_path / "cad", "--out", tmp_path / "out", *quick, code=2

@@ -98,7 +98,7 @@ def test_train_evaluate_predict(qs3, run, store, tmp_path):
     assert record["method"] == "source-only"
     assert record["selection"] == "last"
     assert record["scores"]["clouds"] == 10
-    assert record["marks"] == ["supervised"]
+    assert record["marks"] == ["training clouds"]
     assert record["source"]["checksum"] == record["test"]["checksum"]
     assert sum(map(sum, record["scores"]["confusion"])) == 10
     text = qs3("evaluate", run, "--data", store).stdout
@@ -140,7 +140,7 @@ def test_doctor_tells_what_is_here(qs3):
     text = qs3("doctor").stdout
     assert "Ready." in text
     for extra, here in found["extras"].items():
-        assert here or f"qs3[{extra}]" in text
+        assert here or f".[{extra}]" in text
 
 
 def test_every_verb_explains_itself(qs3):

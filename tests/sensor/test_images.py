@@ -165,8 +165,9 @@ def test_statistics_measure_what_they_say():
     assert found.ring_fraction == pytest.approx(0.22, abs=0.03)
 
 
-def test_statistics_of_nothing_are_none():
-    empty = np.full((5, 5), np.nan)
+@pytest.mark.parametrize("shape", [(5, 5), (0, 0)])
+def test_statistics_of_nothing_are_none(shape):
+    empty = np.full(shape, np.nan)
     found = view_statistics(empty, empty, StereoRig())
     assert found.object_pixels == 0
     assert found.valid_fraction is None

@@ -3,6 +3,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+from qs3.errors import InputError
 from qs3.sensor.exposure import ExposureSettings, expose
 from qs3.sensor.matching import MatchingSettings, match, matching_canvas
 from qs3.sensor.presets import get_sensor
@@ -13,9 +14,13 @@ from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.speckle import PatternSettings, pattern_image
 
 
-def scene_of(mesh, pattern=None) -> Scene:
+def scene_of(mesh, pattern=None, light=None) -> Scene:
     pattern = pattern_image(PatternSettings()) if pattern is None else pattern
-    return Scene(mesh, LightSettings(), pattern, 0.625)
+    return Scene(mesh, light or LightSettings(), pattern, 0.625)
+
+
+# For cameras that look level: the sky begins above what they see.
+HIGH_SKY = LightSettings(sky_elevation=30.0)
 
 
 def asymmetric() -> trimesh.Trimesh:
@@ -112,7 +117,7 @@ def test_convention_projected_picture_is_upright(small_rig, renderer):
     turn[:3, :3] = Pose.looking_at(np.array([0.0, -3.0, 0.0]), np.zeros(3)).camera_to_world[:3, :3]
     plate.apply_transform(turn)
     pose = Pose.looking_at(np.array([0.0, -3.0, 0.0]), np.zeros(3))
-    pair = renderer.render(scene_of(plate, picture), small_rig, [pose], [0])[0]
+    pair = renderer.render(scene_of(plate, picture, HIGH_SKY), small_rig, [pose], [0])[0]
     image = pair.canvas(small_rig.full_frame)[0]
     quarter = image[150:390, 150:390]
     top_left, rest = quarter[:110, :110].mean(), quarter[130:, 130:].mean()
@@ -128,7 +133,7 @@ def test_projector_casts_hard_shadows(small_rig, renderer):
     pose = Pose.looking_at(np.array([0.0, -3.0, 0.0]), np.zeros(3))
     rig = StereoRig(width=540, height=540, focal=750.0, baseline=0.6)
     bright = np.ones((16, 16), np.float32)
-    scene = scene_of(trimesh.util.concatenate([wall, plate]), bright)
+    scene = scene_of(trimesh.util.concatenate([wall, plate]), bright, HIGH_SKY)
     image = renderer.render(scene, rig, [pose], [0])[0].canvas(rig.full_frame)[0]
     # The left camera stands at 0, the projector at +0.3: seen from the camera the shadow falls on
     # the wall from tan −0.094 to the plate's left edge at tan −0.06, and not at its right.
@@ -136,6 +141,21 @@ def test_projector_casts_hard_shadows(small_rig, renderer):
     centre = round(rig.principal_point[0])
     shaded, lit = row[centre - 68 : centre - 48], row[centre + 48 : centre + 68]
     assert shaded.max() < 0.7 * lit.min()
+
+
+def test_a_view_into_the_sky_is_refused(small_rig, renderer):
+    # What is not rendered is filled with the ground's light; the sky would be missing.
+    low = Pose.looking_at(np.array([0.0, -3.0, 0.2]), np.zeros(3))
+    with pytest.raises(InputError, match="sky"):
+        renderer.render(scene_of(asymmetric()), small_rig, [low], [0])
+
+
+def test_a_variant_is_set_again_after_another(renderer):
+    import mitsuba
+
+    mitsuba.set_variant("scalar_spectral")
+    assert renderer.description["variant"] == "scalar_rgb"
+    assert mitsuba.variant() == "scalar_rgb"
 
 
 def test_equal_seeds_give_equal_images_and_others_do_not(small_rig, renderer):

@@ -33,6 +33,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         # The reader of our output went away (`qs3 … | head`): nothing to tell it.
         sys.stderr.close()
         sys.exit(141)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        print(f"qs3: {error.filename or 'file system'}: {reason}", file=sys.stderr)
+        sys.exit(2)
     sys.exit(code or 0)
 
 

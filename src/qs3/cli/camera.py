@@ -1,6 +1,7 @@
 """Settings of the simulated camera that `scan` and `generate` share."""
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -40,11 +41,12 @@ class CameraOptions:
     def resolve_sensor(self) -> Any:
         """The sensor with every option applied."""
         from qs3.sensor.presets import get_sensor
+        from qs3.sensor.speckle import pattern_image
 
         sensor = get_sensor(self.sensor)
         if self.image_noise is not None:
-            if self.image_noise < 0:
-                raise InputError(f"--image-noise {self.image_noise}: must not be below 0")
+            if not 0 <= self.image_noise < math.inf:
+                raise InputError(f"--image-noise {self.image_noise}: must be 0 or above")
             exposure = dataclasses.replace(sensor.exposure, noise=self.image_noise)
             sensor = dataclasses.replace(sensor, exposure=exposure)
         if self.bias_correction:
@@ -53,6 +55,7 @@ class CameraOptions:
         if self.pattern is not None:
             pattern = dataclasses.replace(sensor.pattern, image=str(self.pattern))
             sensor = dataclasses.replace(sensor, pattern=pattern)
+            pattern_image(pattern)  # a picture that cannot be read stops here
         if self.preset == "released":
             depth = dataclasses.replace(sensor.depth, principal_point="released")
             sensor = dataclasses.replace(sensor, depth=depth)

@@ -17,6 +17,8 @@ _CORE = (
     "torch",
     "lightning-fabric",
     "safetensors",
+    "jaxtyping",
+    "tqdm",
     "matplotlib",
     "tyro",
 )
@@ -90,8 +92,8 @@ def _print(found: dict[str, Any]) -> None:
         reason = "" if works else f": {advice[variant]}"
         print(f"  {'ok     ' if works else 'absent '} {variant}{reason}{used}")
     print(f"Training on: {found['device']}")
-    print("Extras")
+    print("Extras (for commands to come; nothing in this version needs them)")
     for extra, here in found["extras"].items():
-        how = "" if here else f": pip install 'qs3[{extra}]'"
+        how = "" if here else f": in a checkout, pip install -e '.[{extra}]'"
         print(f"  {'ok     ' if here else 'absent '} {extra} ({_EXTRAS[extra][1]}){how}")
     print("Ready." if found["ready"] else "Not ready: mend what is marked MISSING or absent above.")

@@ -1,6 +1,7 @@
 """``qs3 evaluate`` and ``qs3 predict``: scores of a run, and its answers for single files."""
 
 import dataclasses
+import hashlib
 import json
 import sys
 from collections.abc import Sequence
@@ -12,8 +13,22 @@ import numpy as np
 import tyro
 
 from qs3.cli.train import RUN
+from qs3.errors import InputError
 from qs3.evaluation.records import DataRecord, RunRecord, Scores
 from qs3.files import read_json
+
+# What `train` leaves in run.json.
+_TOLD = (
+    "method",
+    "selection",
+    "preset",
+    "data",
+    "supervised",
+    "source_clouds",
+    "target_clouds",
+    "rounds",
+    "seconds",
+)
 
 
 @dataclass(frozen=True)
@@ -63,12 +78,15 @@ def make_record(
 ) -> tuple[RunRecord, Path]:
     """Score a run and write the record into its folder ``records``."""
     from qs3.datasets import load_clouds
+    from qs3.datasets.clouds import digests
     from qs3.evaluation import git_commit, hardware, score, versions, write_record
     from qs3.training import load_model, predict_probabilities
 
     loaded = load_model(run)
-    settings = loaded.settings["train"]
     told = read_json(run / RUN)
+    settings = _setting(run, loaded.settings, "train")
+    for name in _TOLD:
+        _setting(run / RUN, told, name)
     # Labels of the data are put onto the network's classes by name; an answer that the data has
     # no cloud of stays an answer, and is wrong.
     test = load_clouds(
@@ -85,11 +103,7 @@ def make_record(
     )
     assert source is not None  # noqa: S101
     name = data.resolve().name
-    marks = []
-    if target is not None and target.checksum == test.checksum:
-        marks.append("transductive")
-    if source.name == name:
-        marks.append("supervised")
+    marks = _marks(told, set(digests(test.points)))
     record = RunRecord(
         method=told["method"],
         model=settings["model"],
@@ -108,10 +122,29 @@ def make_record(
         marks=tuple(marks),
     )
     text = json.dumps(dataclasses.asdict(record), sort_keys=True)
-    import hashlib
-
     digest = hashlib.sha256(text.encode()).hexdigest()[:10]
     return record, write_record(run / "records" / f"{Path(name).stem}-{digest}.json", record)
+
+
+def _marks(told: dict[str, Any], tested: set[str]) -> list[str]:
+    """Caveats of a score: which of the tested clouds the run has seen, by their checksums."""
+    marks = []
+    if tested & set(told["target_clouds"]):
+        marks.append("transductive")
+    if told["supervised"]:
+        marks.append("supervised")
+    if tested & set(told["source_clouds"]):
+        marks.append("training clouds")
+    return marks
+
+
+def _setting(where: Path, values: Any, *names: str) -> Any:
+    """Look up a value in the JSON of a run, or say which file is not one of ours."""
+    for name in names:
+        if not isinstance(values, dict) or name not in values:
+            raise InputError(f"{where}: not a finished run of qs3 train (no {name!r} in it)")
+        values = values[name]
+    return values
 
 
 def describe(scores: Scores, marks: Sequence[str] = ()) -> str:
@@ -142,8 +175,10 @@ def predict(options: Annotated[PredictOptions, tyro.conf.arg(name="")]) -> int:
     from qs3.datasets.transforms import stack
     from qs3.training import load_model, predict_probabilities
 
+    if not options.files:
+        raise InputError("name one or more files of points after the run")
     loaded = load_model(options.run)
-    points = loaded.settings["train"]["num_points"]
+    points = _setting(options.run, loaded.settings, "train", "num_points")
     clouds = [read_cloud(path) for path in options.files]
     found: list[dict[str, Any]] = []
     for path, cloud in zip(options.files, clouds, strict=True):

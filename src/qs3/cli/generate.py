@@ -25,6 +25,8 @@ class GenerateOptions:
     """Objects a class, of the built-in shapes."""
     scans_per_mesh: int = 1
     """Scans of each object."""
+    classes: tuple[str, ...] = ()
+    """Classes to scan, by the names of their folders; all by default."""
     workers: int = 1
     """Processes. The bytes written do not depend on it."""
     split: str = ""
@@ -42,9 +44,21 @@ def generate(options: Annotated[GenerateOptions, tyro.conf.arg(name="")]) -> int
 
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: must not be negative")
-    items = collect(options.meshes, per_class=options.per_class, seed=options.seed)
+    items = collect(
+        options.meshes,
+        per_class=options.per_class,
+        seed=options.seed,
+        classes=options.classes or None,
+    )
     built_in = options.meshes == "shapes"
+    names = {item.class_name for item in items}
+    if "" in names:
+        raise InputError(
+            f"{options.meshes}: meshes lie flat in this folder and their classes are unknown; put "
+            "them into one folder a class"
+        )
     settings = GenerateSettings(
+        classes=_classes(names),
         meshes="shapes" if built_in else Path(options.meshes).resolve().name,
         per_class=options.per_class if built_in else None,
         scans_per_mesh=options.scans_per_mesh,
@@ -69,3 +83,12 @@ def generate(options: Annotated[GenerateOptions, tyro.conf.arg(name="")]) -> int
             f"{first['id']}: {first['reason']}"
         )
     return 0
+
+
+def _classes(names: set[str]) -> tuple[str, ...]:
+    """PointDA-10's ten classes where all names map onto them, else the folders' own."""
+    from qs3.datasets.classes import POINTDA10, canonical
+
+    if all(canonical(name) in POINTDA10 for name in names):
+        return POINTDA10
+    return tuple(sorted(names))

@@ -51,15 +51,18 @@ def scan(options: Annotated[ScanOptions, tyro.conf.arg(name="")]) -> int:
     view, best = montage_view(result, sensor)
     title = f"{origin['name']} · sensor {sensor.name} · view {best + 1} of {len(result.views)}"
     figure = montage(view, title)
+    record = _record(options.seed, settings, sensor, renderer, origin, result)
     folder = claim_folder(options.out, "scan.json")
+    # The record first: it marks the folder as ours, should this be stopped in between.
+    write_json(folder / "scan.json", record)
+    for stale in folder.glob("view-*-*.*"):  # of an earlier scan into this folder
+        stale.unlink()
     write_ply(folder / "cloud.ply", result.points, result.view)
     write_ply(folder / "clean.ply", result.clean, result.clean_view)
     write_png(folder / "montage.png", figure)
     written = ["cloud.ply", "clean.ply", "montage.png", "scan.json"]
     if options.save_images:
         written += _save_images(folder, result, sensor)
-    record = _record(options.seed, settings, sensor, renderer, origin, result)
-    write_json(folder / "scan.json", record)
     for name in written:
         print(folder / name)
     _tell(result, time.perf_counter() - start, folder)
@@ -113,6 +116,8 @@ def _save_images(folder: Path, result: Any, sensor: Any) -> list[str]:
 
     names = []
     for index, (images, pose) in enumerate(zip(result.images, result.poses, strict=True)):
+        if not images.left.size:  # the object is out of this view's sight
+            continue
         depth = np.nan_to_num(np.clip(np.rint(images.depth * 1e4), 0, 65535)).astype(np.uint16)
         true = np.nan_to_num(np.clip(np.rint(images.true_depth * 1e4), 0, 65535)).astype(np.uint16)
         pictures = {"left": images.left, "right": images.right, "depth": depth, "true-depth": true}

@@ -27,13 +27,15 @@ class TrainOptions:
     method: Literal["source-only", "qbst"] = "source-only"
     """source-only, or quasi-balanced self-training."""
     target: Path | None = None
-    """Clouds of the target, for qbst; labels that lie there are not read."""
+    """Clouds of the target, for qbst; labels that lie there are dropped unused."""
     source_split: str | None = None
     """Part of the source, such as train; all of it by default."""
     target_split: str | None = None
     """Part of the target."""
     source_cloud: Literal["points", "clean", "surface"] = "points"
     """Of generated data: noisy scans, their clean twins, or samples of the whole surface."""
+    supervised: bool = False
+    """Mark the run as supervised: its source is the labelled training part of the target."""
     warm_up: Path | None = None
     """Run whose network qbst starts from, in place of training on the source first."""
     preset: Literal["default", "paper", "released"] = "default"
@@ -74,6 +76,7 @@ def train(options: Annotated[TrainOptions, tyro.conf.arg(name="")]) -> int:
 def run(options: TrainOptions) -> Any:
     """Read the data, train, and write what ``evaluate`` needs to make a record."""
     from qs3.datasets import load_clouds, load_unlabelled
+    from qs3.datasets.clouds import digests
     from qs3.training import fit
 
     adapts = options.method == "qbst"
@@ -127,6 +130,9 @@ def run(options: TrainOptions) -> Any:
                 name: None if record is None else dataclasses.asdict(record)
                 for name, record in data.items()
             },
+            "supervised": options.supervised,
+            "source_clouds": digests(source.points),
+            "target_clouds": [] if target is None else digests(target.points),
             "rounds": [dataclasses.asdict(record) for record in result.rounds],
             "seconds": seconds,
         },

@@ -1,5 +1,6 @@
 """Point clouds in memory: with labels, and a type that cannot carry any."""
 
+import hashlib
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,7 +18,7 @@ class UnlabelledClouds:
     points: Float[np.ndarray, "b n 3"]
     """Points of every cloud, as read (not yet normalised), float32."""
     ids: tuple[str, ...]
-    """One name a cloud, in the order of the points."""
+    """One name a cloud, in the order of the points; a number, since names may tell the class."""
     checksum: str = ""
     """SHA-256 over what was read, for the record of a run."""
 
@@ -69,5 +70,16 @@ class PointClouds:
         )
 
     def without_labels(self) -> UnlabelledClouds:
-        """Return the same clouds with the labels left behind."""
-        return UnlabelledClouds(points=self.points, ids=self.ids, checksum=self.checksum)
+        """Return the same clouds without labels, nor names, which may tell them."""
+        return UnlabelledClouds(self.points, numbered(len(self)), self.checksum)
+
+
+def numbered(count: int) -> tuple[str, ...]:
+    """Return names that tell nothing: 000000, 000001 and so on."""
+    return tuple(f"{index:06d}" for index in range(count))
+
+
+def digests(points: Float[np.ndarray, "b n 3"]) -> list[str]:
+    """A short checksum of each cloud, by which the same cloud is known in two data sets."""
+    whole = np.ascontiguousarray(points, dtype=np.float32)
+    return [hashlib.sha256(cloud.tobytes()).hexdigest()[:16] for cloud in whole]

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Int
 
 from qs3.datasets.classes import POINTDA10, map_labels
-from qs3.datasets.clouds import PointClouds, UnlabelledClouds
+from qs3.datasets.clouds import PointClouds, UnlabelledClouds, numbered
 from qs3.datasets.transforms import stack
 from qs3.errors import InputError
 
@@ -56,9 +56,12 @@ class RaggedClouds:
         return PointClouds(points, labels, names, self.ids, self.checksum)
 
     def unlabelled(self, num_points: int | None, where: str) -> UnlabelledClouds:
-        """Return clouds of one size without labels.
+        """Return clouds of one size without labels, and with numbers for names.
+
+        Names of files and objects often tell the class; not even they go along.
 
         Raises:
             InputError: where there is no cloud, or sizes differ and no size is asked for.
         """
-        return UnlabelledClouds(stack(self.clouds, num_points, where), self.ids, self.checksum)
+        points = stack(self.clouds, num_points, where)
+        return UnlabelledClouds(points, numbered(len(points)), self.checksum)

@@ -1,5 +1,6 @@
 """From radiance to the 8-bit grey image that the matcher sees."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -45,7 +46,7 @@ def expose(
         >>> expose(np.array([[0.0, 0.0509, 0.18]]), ExposureSettings()).tolist()
         [[0, 71, 128]]
     """
-    if settings.gain <= 0 or settings.noise < 0:
+    if not (0 < settings.gain < math.inf and 0 <= settings.noise < math.inf):
         raise InputError("exposure: gain must be above 0 and noise not below 0")
     light = np.maximum(radiance, 0.0) * settings.gain
     if settings.response == "film":

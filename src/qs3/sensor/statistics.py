@@ -41,6 +41,8 @@ def view_statistics(
         >>> stats.disparity_bias, stats.disparity_sigma, stats.valid_fraction
         (0.5, 0.0, 1.0)
     """
+    if not true_depth.size:  # the object is out of this view's sight
+        return ViewStatistics(0, None, None, None, None, None)
     mask = np.isfinite(true_depth)
     valid = np.isfinite(disparity)
     count = int(mask.sum())

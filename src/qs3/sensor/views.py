@@ -43,10 +43,10 @@ def place_views(
     clip(0.1·(i + 1)/V·N(0, 1), ±0.1 rad).
 
     Raises:
-        InputError: where ``views`` is below 1 or the layout is unknown.
+        InputError: where ``views`` is not within 1…256 or the layout is unknown.
     """
-    if views < 1:
-        raise InputError(f"views: {views} is too few; at least 1 is needed")
+    if not 1 <= views <= 256:
+        raise InputError(f"views: {views} is not within 1…256")
     if layout not in ("orbit", "jitter"):
         raise InputError(f"view_layout: no layout {layout!r}; choose orbit or jitter")
     azimuth = np.radians(rng.uniform(*placement.azimuth))

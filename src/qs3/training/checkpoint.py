@@ -14,7 +14,7 @@ from torch import Tensor
 
 from qs3.datasets.clouds import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
-from qs3.files import read_json, write_bytes, write_json
+from qs3.files import holds_something, read_json, write_bytes, write_json
 from qs3.models import PointClassifier, create_model
 from qs3.training.config import TrainSettings
 
@@ -138,7 +138,7 @@ def claim_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
                     f"{here.get(name)!r}; name another folder or use its settings"
                 )
         return
-    if run_dir.is_dir() and any(run_dir.iterdir()):
+    if holds_something(run_dir):
         raise InputError(f"{run_dir}: holds something else (no {SETTINGS}); name a new folder")
     write_json(path, wanted)
 

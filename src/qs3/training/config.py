@@ -1,5 +1,6 @@
 """Settings of a training and of the self-training after it."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, Literal
@@ -105,7 +106,8 @@ class SelfTrainingSettings:
 
 
 def _check(settings: Any, name: str, good: bool, fault: str) -> None:
-    if not good:
+    value = getattr(settings, name)
+    if not good or (isinstance(value, float) and not math.isfinite(value)):
         raise InputError(f"setting {name} = {getattr(settings, name)} {fault}")
 
 

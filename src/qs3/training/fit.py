@@ -100,6 +100,10 @@ def fit(
     rounds_settings = (self_training or SelfTrainingSettings()) if adapts else None
     start = None if warm_up is None else _load_warm_up(Path(warm_up), source, settings)
     run_dir = Path(run_dir)
+    # What cannot be made must not leave a folder behind that refuses the corrected call.
+    with _threads(settings.threads):
+        fabric = make_fabric(settings)
+        fresh = new_model(settings, len(source.class_names), derived_seed(settings.seed, 0))
     claim_run(
         run_dir,
         {
@@ -116,10 +120,9 @@ def fit(
     source = replace(source, points=prepare(source.points, settings.num_points))
     with _threads(settings.threads):
         history: list[EpochRecord] = []
-        fabric = make_fabric(settings)
         if start is None:
             folder = run_dir / WARM_UP if adapts else run_dir
-            start = new_model(settings, len(source.class_names), derived_seed(settings.seed, 0))
+            start = fresh
             history, _ = train(
                 SourceOnly(start, settings.label_smoothing),
                 source,

@@ -50,7 +50,10 @@ def usable(variant: str) -> bool:
     A system libLLVM that does not suit the processor aborts the whole process, hence the child.
     """
     probe = [sys.executable, "-c", _PROBE, variant]
-    return subprocess.run(probe, capture_output=True, timeout=300).returncode == 0
+    try:
+        return subprocess.run(probe, capture_output=True, timeout=300).returncode == 0
+    except subprocess.TimeoutExpired:
+        return False
 
 
 @functools.cache
@@ -113,6 +116,7 @@ class MitsubaRenderer:
         bounds = np.asarray(scene.mesh.bounds)
         pairs = []
         for pose, seed in zip(poses, seeds, strict=True):
+            _refuse_sky(rig, pose, scene.light)
             parameters["projector.to_world"] = transform(_to_world(rig.projector(pose)))
             parameters.update()
             shots = []
@@ -128,15 +132,31 @@ class MitsubaRenderer:
         return pairs
 
 
-@functools.cache
 def _mitsuba(variant: str) -> Any:
-    """Import Mitsuba with ``variant`` set; one process keeps to one variant."""
+    """Import Mitsuba with ``variant`` set, whichever was set before."""
     import mitsuba as mi
 
     if mi.variant() != variant:
         mi.set_variant(variant)
-    mi.set_log_level(mi.LogLevel.Error)
+        mi.set_log_level(mi.LogLevel.Error)
     return mi
+
+
+def _refuse_sky(rig: StereoRig, pose: Pose, light: LightSettings) -> None:
+    """Refuse a view that has the sky in it: what is not rendered is filled with the ground.
+
+    Raises:
+        InputError: where a ray of the frame's rim rises above the sky's lower edge.
+    """
+    (cx, cy), (x, y) = rig.principal_point, (rig.width - 1, rig.height - 1)
+    rim = np.array([[u - cx, v - cy, rig.focal] for u in (0, cx, x) for v in (0, cy, y)])
+    rays = rim @ pose.camera_to_world[:3, :3].T
+    highest = np.degrees(np.arcsin((rays[:, 2] / np.linalg.norm(rays, axis=1)).max()))
+    if highest > light.sky_elevation:
+        raise InputError(
+            f"the camera sees up to {highest:.0f}° above the horizon, into the light of the sky "
+            f"({light.sky_elevation}°): place it higher or narrow its field of view"
+        )
 
 
 def _to_world(pose: Pose) -> list[list[float]]:
