@@ -29,7 +29,7 @@ class DemoSettings:
     """Objects a class of the source."""
     target_per_class: int = 6
     """Objects a class of the target, other draws than the source's."""
-    source_views: int = 3
+    source_views: int = 2
     """Views fused into a cloud of the source, around the object."""
     target_sensor: str = "bright-room"
     """Preset of the target's sensor; it sees each object once."""
@@ -41,7 +41,7 @@ class DemoSettings:
     """Network."""
     num_points: int = 512
     """Points a cloud."""
-    epochs: int = 40
+    epochs: int = 30
     """Passes over the source."""
     batch_size: int = 16
     """Clouds in an optimiser step."""

@@ -102,26 +102,21 @@ def generate(
         progress=f"{folder.name}: scans" if progress else None,
     )
     done = failed = 0
-    died = False
     rows: list[CloudRow] = []
     with contextlib.closing(results):
         for (index, row), result in zip(tasks, results, strict=True):
             item, scan = work[index * size + row]
             if isinstance(result, Failure):
                 failed += 1
-                # A process that died says nothing of the mesh (memory, a signal): the shard stays
-                # open, and the next call tries again.
-                died = died or result.kind == "ProcessDied"
                 record = {"id": row_id(item, scan), "object": item.id, "scan": scan}
                 record |= {"class_name": item.class_name, "shard": index}
                 log_failure(folder, record | {"error": result.kind, "reason": result.reason})
             else:
                 rows.append(result)
             if row == size - 1 or index * size + row == len(work) - 1:
-                if not died:
-                    write_shard(shard_path(folder, index), rows)
-                    done += len(rows)
-                died, rows = False, []
+                write_shard(shard_path(folder, index), rows)
+                done += len(rows)
+                rows = []
     return GenerateReport(done=done, skipped=len(work) - len(tasks), failed=failed)
 
 
