@@ -44,11 +44,11 @@ SENSORS: dict[str, Sensor] = {
         rig=StereoRig(width=800, height=800, focal=800 * 50 / 36, baseline=0.2),
         placement=Placement(radius=(1.95, 1.95)),
     ),
-    # The `qs3` camera in a bright room with a grainy imager and a weaker projector.
+    # The `qs3` camera in a brighter room, with a grainy imager.
     "bright-room": Sensor(
         name="bright-room",
-        light=LightSettings(projector=30.0, sky=1.6, ambient=0.15),
-        exposure=ExposureSettings(gain=0.5, noise=3.0),
+        light=LightSettings(sky=0.8, ambient=0.08),
+        exposure=ExposureSettings(gain=0.7, noise=1.0),
     ),
 }
 
