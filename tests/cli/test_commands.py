@@ -1,6 +1,8 @@
 """Every verb, as the README has it, on the smallest input that means something."""
 
 import json
+import re
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -166,3 +168,15 @@ def test_a_demo_of_the_smallest_size(qs3, tmp_path):
     assert "qbst" in page
     again = qs3("demo", "--out", out, *size)
     assert again.stdout == done.stdout
+
+
+def test_flags_of_the_readme_exist(qs3):
+    readme = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```sh\n(.*?)```", readme, flags=re.DOTALL)
+    text = "\n".join(blocks).replace("\\\n", " ")
+    commands = re.findall(r"^qs3 (\S+)([^#\n]*)", text, flags=re.MULTILINE)
+    assert {verb for verb, _ in commands} >= {"scan", "generate", "train", "evaluate", "predict"}
+    helps = {verb: qs3(verb, "--help").stdout for verb in {verb for verb, _ in commands}}
+    for verb, arguments in commands:
+        for flag in re.findall(r"--[a-z-]+", arguments):
+            assert flag in helps[verb], f"qs3 {verb} {flag}"

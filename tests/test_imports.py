@@ -1,0 +1,31 @@
+"""What a render node loads: the NumPy side must not bring PyTorch along."""
+
+import subprocess
+import sys
+
+import pytest
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        "qs3",
+        "qs3.sensor.scan",
+        "qs3.datasets.generate",
+        "qs3.datasets.store",
+        "qs3.evaluation",
+        "qs3.adaptation.pseudo_labels",
+        "qs3.cli.scan",
+        "qs3.cli.generate",
+    ],
+)
+def test_imports_without_torch(module):
+    code = f"import sys, {module}; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_public_names_are_those_of_the_readme():
+    import qs3
+
+    for name in ("scan", "shapes", "load_mesh", "Scan", "Sensor", "StereoRig", "Pose"):
+        assert hasattr(qs3, name)
