@@ -203,7 +203,9 @@ PINNED = 8173939628446060847
 
 
 SCRIPT = """
-import sys, time
+import signal, sys, time
+# A job started in the background inherits that Ctrl-C is ignored; this one is to act on it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 sys.path.insert(0, sys.argv[1])
 from pathlib import Path
 from qs3_fake_scan import FakeItem, slow_row
