@@ -204,13 +204,13 @@ PINNED = 8173939628446060847
 
 SCRIPT = """
 import signal, sys, time
-# A job started in the background inherits that Ctrl-C is ignored; this one is to act on it.
-signal.signal(signal.SIGINT, signal.default_int_handler)
 sys.path.insert(0, sys.argv[1])
 from pathlib import Path
 from qs3_fake_scan import FakeItem, slow_row
 from qs3.datasets.generate import GenerateSettings, generate
 if __name__ == "__main__":
+    # A job started in the background inherits that Ctrl-C is ignored; this one is to act on it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     settings = GenerateSettings(num_points=16, rows_per_shard=2)
     work = [FakeItem(f"m{i}") for i in range(400)]
     try:

@@ -93,7 +93,7 @@ def _run_pool(
             try:
                 # A few tasks ahead keep the workers busy without holding many results.
                 while next_task < len(tasks) and len(ahead) < 4 * workers:
-                    future = pool.submit(_guarded, function, tasks[next_task])
+                    future = _submit(pool, _guarded, function, tasks[next_task])
                     ahead.append((next_task, future))
                     next_task += 1
                 result = ahead[0][1].result()
@@ -114,7 +114,7 @@ def _one_by_one(
     """Run again what was under way when a process died, each with nothing beside it."""
     pool = _pool(1)
     try:
-        pool.submit(int).result()
+        _submit(pool, int).result()
     except BrokenProcessPool as error:
         raise InputError(
             "workers: no process can be started; use workers=1, or put the call of a script "
@@ -127,7 +127,7 @@ def _one_by_one(
                 yield future.result()
                 continue
             try:
-                result = pool.submit(_guarded, function, tasks[index]).result()
+                result = _submit(pool, _guarded, function, tasks[index]).result()
             except BrokenProcessPool:
                 pool.shutdown(wait=True, cancel_futures=True)
                 pool = _pool(1)
@@ -135,6 +135,20 @@ def _one_by_one(
             yield result
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _submit(pool: ProcessPoolExecutor, *call: Any) -> Future[Any]:
+    """Submit a call; a worker that is started for it never sees Ctrl-C, not even while it loads.
+
+    A blocked signal stays blocked in a new process; in this one it is delivered afterwards.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        return pool.submit(*call)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        return pool.submit(*call)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _pool(workers: int) -> ProcessPoolExecutor:
