@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
+from qs3.cli.camera import CameraOptions
 from qs3.cli.pictures import montage_view
 from qs3.files import claim_folder, write_json
 
@@ -118,10 +119,7 @@ def _generate(folder: Path, settings: DemoSettings, per_class: int, seed: int, *
 
 
 def _renderer(settings: DemoSettings) -> Any:
-    from qs3.sensor.render.mitsuba import MitsubaRenderer
-
-    variant = "" if settings.variant == "auto" else settings.variant
-    return MitsubaRenderer(variant=variant, samples=settings.samples)
+    return CameraOptions(samples=settings.samples, variant=settings.variant).resolve_renderer()
 
 
 def _source(folder: Path, settings: DemoSettings) -> None:

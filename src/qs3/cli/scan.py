@@ -88,10 +88,6 @@ def _record(
     from qs3.evaluation import versions
     from qs3.sensor.presets import settings_dict
 
-    plain = settings_dict(sensor)
-    if plain["pattern"]["image"] is not None:
-        path = Path(plain["pattern"]["image"])
-        plain["pattern"]["image"] = {"name": path.name, "sha256": sha256(path)}
     views = [
         dataclasses.asdict(view) | {"camera_to_world": pose.camera_to_world.tolist()}
         for view, pose in zip(result.views, result.poses, strict=True)
@@ -100,7 +96,7 @@ def _record(
         "mesh": origin,
         "seed": seed,
         "settings": settings,
-        "sensor": plain,
+        "sensor": settings_dict(sensor),
         "renderer": {**dataclasses.asdict(renderer), **renderer.description},
         "yaw": result.yaw,
         "fused_points": result.fused_points,

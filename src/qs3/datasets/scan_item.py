@@ -4,7 +4,6 @@ import dataclasses
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -12,7 +11,6 @@ import numpy as np
 from qs3.datasets.classes import POINTDA10, map_labels
 from qs3.datasets.shards import STATISTICS, CloudRow
 from qs3.errors import InputError
-from qs3.files import sha256
 
 if TYPE_CHECKING:
     import trimesh
@@ -90,11 +88,6 @@ class GenerateSettings:
         plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         plain["classes"] = list(self.classes)
         plain["sensor"] = settings_dict(sensor)
-        pattern = plain["sensor"]["pattern"]
-        if pattern["image"] is not None:
-            # The picture counts, not where it lies.
-            path = Path(pattern["image"])
-            pattern["image"] = {"name": path.name, "sha256": sha256(path)}
         if self.renderer is not None:
             names = [f.name for f in dataclasses.fields(self.renderer)]
             own = {name: getattr(self.renderer, name) for name in names}

@@ -2,9 +2,11 @@
 
 import dataclasses
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from qs3.errors import InputError
+from qs3.files import sha256
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.exposure import ExposureSettings
 from qs3.sensor.matching import MatchingSettings
@@ -69,5 +71,12 @@ def get_sensor(name: str) -> Sensor:
 
 
 def settings_dict(sensor: Sensor) -> dict[str, Any]:
-    """All settings of a sensor as plain values, for records."""
-    return dataclasses.asdict(sensor)
+    """All settings of a sensor as plain values, for records.
+
+    A projected picture is told by its name and content: where it lies does not count.
+    """
+    plain = dataclasses.asdict(sensor)
+    if sensor.pattern.image is not None:
+        path = Path(sensor.pattern.image)
+        plain["pattern"]["image"] = {"name": path.name, "sha256": sha256(path)}
+    return plain
