@@ -13,7 +13,7 @@ from qs3.meshes import normalise, shapes
 from qs3.sensor.exposure import expose
 from qs3.sensor.matching import match, matching_canvas
 from qs3.sensor.presets import get_sensor
-from qs3.sensor.render import Scene
+from qs3.sensor.render import Body, Scene
 from qs3.sensor.render.mitsuba import MitsubaRenderer
 from qs3.sensor.rig import Pose
 from qs3.sensor.speckle import pattern_image
@@ -25,7 +25,7 @@ def main() -> None:
     repeats = parser.parse_args().repeats
     sensor = get_sensor("qs3")
     mesh = normalise(shapes.make("chair", seed=1))
-    scene = Scene(mesh, sensor.light, pattern_image(sensor.pattern), 0.625)
+    scene = Scene((Body(mesh),), sensor.light, pattern_image(sensor.pattern), 0.625, 0.625)
     poses = [Pose.looking_at(4 * np.array([0.5, -0.7, 0.5]), np.zeros(3))]
     seconds: dict[bool, list[float]] = {True: [], False: []}
     for repeat in range(repeats + 1):

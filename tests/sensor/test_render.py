@@ -7,7 +7,7 @@ from qs3.errors import InputError
 from qs3.sensor.exposure import ExposureSettings, expose
 from qs3.sensor.matching import MatchingSettings, match, matching_canvas
 from qs3.sensor.presets import get_sensor
-from qs3.sensor.render import LightSettings, Scene
+from qs3.sensor.render import Body, LightSettings, Scene
 from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, StereoRig
@@ -16,7 +16,7 @@ from qs3.sensor.speckle import PatternSettings, pattern_image
 
 def scene_of(mesh, pattern=None, light=None) -> Scene:
     pattern = pattern_image(PatternSettings()) if pattern is None else pattern
-    return Scene(mesh, light or LightSettings(), pattern, 0.625)
+    return Scene((Body(mesh),), light or LightSettings(), pattern, 0.625, 0.625)
 
 
 # For cameras that look level: the sky begins above what they see.

@@ -218,7 +218,7 @@ def test_presets_hold_the_released_values():
     assert (sensor.matching.num_disparities, sensor.matching.block_size) == (160, 19)
     assert sensor.placement.radius == (3.0, 5.0)
     assert sensor.placement.elevation == (20.0, 50.0)
-    assert sensor.pattern.tan_half_extent == 0.625
+    assert sensor.pattern.tan_half_width == sensor.pattern.tan_half_height == 0.625
     assert (sensor.depth.near, sensor.depth.far, sensor.depth.stride) == (1.0, 6.0, 4)
     assert all(name == preset.name for name, preset in SENSORS.items())
 

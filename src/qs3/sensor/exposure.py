@@ -14,12 +14,29 @@ from qs3.errors import InputError
 class ExposureSettings:
     """How the imager turns light into grey levels."""
 
-    response: Literal["film", "linear"] = "film"
-    """``film`` compresses highlights as a film curve does; ``linear`` clips at white."""
+    response: Literal["film", "linear", "gamma"] = "film"
+    """``film`` compresses highlights as a film curve does; ``linear`` clips at white; ``gamma``
+    is linear to the power of 1/``gamma``."""
+    gamma: float = 2.2
+    """Exponent of the ``gamma`` response."""
     gain: float = 1.0
     """Factor on the radiance before the response."""
+    auto: float = 0.0
+    """Auto-exposure: the share of white (0 to 1, before noise) that the 95th percentile of the
+    left image's object region is brought to, by one gain for both cameras; 0 is off."""
+    psf: float = 0.0
+    """Standard deviation in pixels of the lens's Gaussian point-spread function; 0 is none."""
+    vignetting: float = 0.0
+    """Share of the cos⁴ law by which the image darkens away from the optical axis, 0 to 1."""
+    speckle: float = 0.0
+    """Shape of the Gamma distribution of mean 1 that multiplies each pixel (coherent speckle and
+    photon noise); larger is less, 398.12 as Landau et al. measured; 0 is none."""
     noise: float = 0.0
     """Standard deviation of additive Gaussian noise, in grey levels of 255."""
+    offset: float = 0.0
+    """Mean of the same, in grey levels of 255."""
+    bits: Literal[8, 10] = 8
+    """Bits of a pixel."""
 
 
 def expose(

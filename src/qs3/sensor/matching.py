@@ -19,18 +19,38 @@ from qs3.sensor.rig import Region, StereoRig
 class MatchingSettings:
     """The matcher. OpenCV's own defaults hold for what is not named here."""
 
-    method: Literal["opencv-bm"] = "opencv-bm"
-    """``opencv-bm`` is OpenCV's StereoBM."""
+    method: Literal["opencv-bm", "zncc"] = "opencv-bm"
+    """``opencv-bm`` is OpenCV's StereoBM; ``zncc`` our zero-mean normalised cross-correlation."""
     num_disparities: int = 160
     """Disparities searched, from 0; a multiple of 16."""
     block_size: int = 19
     """Side of the square window in pixels; odd, 5 to 255."""
     bias_correction: bool = False
     """Take 1/32 px off: StereoBM rounds up when it packs its result into 1/16 px."""
+    left_band: Literal["opencv", "physical"] = "opencv"
+    """``opencv`` leaves the whole search range at the left border empty; ``physical`` only the
+    columns whose match would lie outside the right image, f·b/z wide."""
+    quantum: float = 0.0
+    """Disparities are rounded to multiples of this many pixels (1/8, 1/16, 1/32); 0 is no
+    rounding beyond the matcher's own."""
+    left_right: float = 1.0
+    """``zncc``: greatest difference in pixels between the matches from left and from right;
+    0 is no check."""
+    uniqueness: float = 0.03
+    """``zncc``: the best correlation must exceed every other further than one pixel away by this;
+    0 is no check."""
+    correlation: float = 0.5
+    """``zncc``: least correlation of a match."""
+    texture: float = 2.0
+    """``zncc``: least standard deviation of a block in grey levels of 255."""
+    median: Literal[0, 3, 5] = 0
+    """``zncc``: side of the median filter over disparities; 0 is none."""
+    min_region: int = 0
+    """``zncc``: connected regions of fewer pixels are dropped; 0 keeps all."""
 
     def __post_init__(self) -> None:
-        if self.method != "opencv-bm":
-            raise InputError(f"matching: no method {self.method!r}; choose opencv-bm")
+        if self.method not in ("opencv-bm", "zncc"):
+            raise InputError(f"matching: no method {self.method!r}; choose opencv-bm or zncc")
         if self.num_disparities < 16 or self.num_disparities % 16:
             raise InputError(
                 f"matching: num_disparities {self.num_disparities} is not a multiple of 16"

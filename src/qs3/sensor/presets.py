@@ -10,6 +10,7 @@ from qs3.files import sha256
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.exposure import ExposureSettings
 from qs3.sensor.matching import MatchingSettings
+from qs3.sensor.materials import Material
 from qs3.sensor.render.scene import LightSettings
 from qs3.sensor.rig import StereoRig
 from qs3.sensor.speckle import PatternSettings
@@ -27,7 +28,9 @@ class Sensor:
     pattern: PatternSettings = field(default_factory=PatternSettings)
     """What the projector throws."""
     light: LightSettings = field(default_factory=LightSettings)
-    """Lights and surface of the scene."""
+    """Lights of the scene."""
+    material: Material = field(default_factory=Material)
+    """Surface of the object."""
     exposure: ExposureSettings = field(default_factory=ExposureSettings)
     """Radiance to grey levels."""
     matching: MatchingSettings = field(default_factory=MatchingSettings)
@@ -36,6 +39,8 @@ class Sensor:
     """Disparity to points."""
     placement: Placement = field(default_factory=Placement)
     """Where the rig stands around the object."""
+    object_size: float = 1.0
+    """Size of a normalised object in the unit of the scene: metres for real cameras."""
 
 
 SENSORS: dict[str, Sensor] = {

@@ -6,11 +6,14 @@ Convention:
     top-left pixel. Disparity is u_left − u_right ≥ 0. The left camera is the reference.
 """
 
+import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from qs3.errors import InputError
 from qs3.geometry import invert_rigid, look_at, transform_points
 
 
@@ -48,6 +51,18 @@ class Region:
     height: int
 
     @property
+    def empty(self) -> bool:
+        """Whether there is no pixel in it."""
+        return self.width < 1 or self.height < 1
+
+    def grown(self, margin: int, width: int, height: int) -> "Region":
+        """The rectangle with ``margin`` pixels more on every side, cut at the frame's borders."""
+        x0, y0 = max(0, self.x - margin), max(0, self.y - margin)
+        x1 = min(width, self.x + self.width + margin)
+        y1 = min(height, self.y + self.height + margin)
+        return Region(x0, y0, x1 - x0, y1 - y0)
+
+    @property
     def slices(self) -> tuple[slice, slice]:
         """Index of the rectangle in a full-frame image, rows first."""
         return slice(self.y, self.y + self.height), slice(self.x, self.x + self.width)
@@ -78,10 +93,27 @@ class StereoRig:
     """Distance between the two cameras, in the unit of the scene."""
     projector_offset: float = 0.5
     """Place of the projector on the baseline: 0 at the left camera, 1 at the right one."""
+    second: Literal["camera", "pattern"] = "camera"
+    """The second image: a ``camera``'s, or the stored ``pattern`` as a camera in the projector's
+    place would see it, which then stands at 1 (Kinect v1)."""
 
     def __post_init__(self) -> None:
-        if min(self.width, self.height) < 1 or not (self.focal > 0 and self.baseline > 0):
-            raise ValueError("width, height, focal and baseline of a rig must be positive")
+        if min(self.width, self.height) < 1 or not (
+            0 < self.focal < math.inf and 0 < self.baseline < math.inf
+        ):
+            raise InputError(
+                f"rig: width {self.width}, height {self.height}, focal {self.focal} and baseline "
+                f"{self.baseline} must be positive"
+            )
+        if self.second not in ("camera", "pattern"):
+            raise InputError(f"rig: no second image {self.second!r}; choose camera or pattern")
+        if not -10 <= self.projector_offset <= 10:
+            raise InputError(
+                f"rig: projector_offset {self.projector_offset} is in baselines from the left "
+                "camera: 0.5 is half way to the right one"
+            )
+        if self.second == "pattern" and self.projector_offset != 1:
+            raise InputError("rig: with the stored pattern as second image projector_offset is 1")
 
     @property
     def principal_point(self) -> tuple[float, float]:

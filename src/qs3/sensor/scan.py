@@ -23,7 +23,7 @@ from qs3.sensor.exposure import expose
 from qs3.sensor.fusion import fuse
 from qs3.sensor.matching import match, matching_canvas
 from qs3.sensor.presets import Sensor, get_sensor
-from qs3.sensor.render import Renderer, Scene, StereoPair
+from qs3.sensor.render import Body, Renderer, Scene, StereoPair
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.sampling import resample
@@ -152,7 +152,13 @@ def scan(
 
     with clock("render"):
         pattern = pattern_image(sensor.pattern)
-        scene = Scene(turned, sensor.light, pattern, sensor.pattern.tan_half_extent)
+        scene = Scene(
+            (Body(turned, sensor.material),),
+            sensor.light,
+            pattern,
+            sensor.pattern.tan_half_width,
+            sensor.pattern.tan_half_height,
+        )
         seeds = [int(s) for s in rng_render.integers(0, 2**31, size=views)]
         pairs = renderer.render(scene, sensor.rig, poses, seeds)
     with clock("true_depth"):

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -21,8 +22,15 @@ class PatternSettings:
     """Cells across the pattern; a multiple of 3."""
     rows: int = 495
     """Cells down the pattern; a multiple of 3."""
-    tan_half_extent: float = 0.625
-    """Tangent of half the opening angle, the same across and down (64° × 64°)."""
+    kind: Literal["tiles", "spots"] = "tiles"
+    """``tiles``: square dots on the cells of a grid, as released. ``spots``: round Gaussian spots
+    at places off the grid, one in each 3×3 tile of cells, as laser projectors throw them."""
+    tan_half_width: float = 0.625
+    """Tangent of half the horizontal opening angle (0.625 is 64°)."""
+    tan_half_height: float = 0.625
+    """Tangent of half the vertical opening angle."""
+    spot_size: float = 1.0
+    """Full width at half maximum of a spot, in cells (``spots`` only)."""
     seed: int = 0
     """Which pattern; one projector has one."""
     image: str | None = None

@@ -1,5 +1,6 @@
 """Photographing a scene: what a renderer is handed and what it hands back."""
 
+from qs3.sensor.render.scene import Body as Body
 from qs3.sensor.render.scene import LightSettings as LightSettings
 from qs3.sensor.render.scene import Renderer as Renderer
 from qs3.sensor.render.scene import Scene as Scene

@@ -13,11 +13,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-import trimesh
 from jaxtyping import Float32
 
 from qs3.errors import InputError
-from qs3.sensor.render.scene import LightSettings, Scene, StereoPair
+from qs3.sensor.materials import Material
+from qs3.sensor.render.scene import Body, LightSettings, Scene, StereoPair, photographed_region
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 VARIANTS = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
@@ -100,28 +100,40 @@ class MitsubaRenderer:
         }
 
     def render(
-        self, scene: Scene, rig: StereoRig, poses: Sequence[Pose], seeds: Sequence[int]
+        self,
+        scene: Scene,
+        rig: StereoRig,
+        poses: Sequence[Pose],
+        seeds: Sequence[int],
+        regions: Sequence[Region] | None = None,
     ) -> list[StereoPair]:
         """Photograph ``scene`` once from each pose.
 
         Raises:
-            ValueError: where there is not one seed for each pose.
+            ValueError: where there is not one seed (and region, if given) for each pose.
         """
-        if len(poses) != len(seeds):
-            raise ValueError(f"{len(poses)} poses and {len(seeds)} seeds")
+        if len(poses) != len(seeds) or (regions is not None and len(regions) != len(poses)):
+            raise ValueError(f"{len(poses)} poses and {len(seeds)} seeds, or too few regions")
         mi = _mitsuba(self.variant)
         built = _build(mi, scene, self.max_depth)
         parameters = mi.traverse(built)
         transform = mi.ScalarTransform4f if self.variant.startswith("scalar") else mi.Transform4f
-        bounds = np.asarray(scene.mesh.bounds)
         pairs = []
-        for pose, seed in zip(poses, seeds, strict=True):
-            _refuse_sky(rig, pose, scene.light)
+        for index, (pose, seed) in enumerate(zip(poses, seeds, strict=True)):
             parameters["projector.to_world"] = transform(_to_world(rig.projector(pose)))
             parameters.update()
             shots = []
             for side, camera in enumerate((pose, rig.right(pose))):
-                region = rig.full_frame if self.full_frame else rig.region_of(bounds, camera, 2)
+                if self.full_frame:
+                    region = rig.full_frame
+                elif regions is not None:
+                    region = regions[index]
+                else:
+                    region = photographed_region(scene, rig, camera)
+                if side == 1 and rig.second == "pattern":
+                    region = Region(0, 0, 0, 0)
+                if region != rig.full_frame and scene.alone:
+                    _refuse_sky(rig, pose, scene.light)
                 # Two streams that never meet: the left camera's seeds are even.
                 noise_seed = (2 * seed + side) % 2**32
                 image = _photograph(mi, built, rig, camera, region, self.samples, noise_seed)
@@ -164,18 +176,19 @@ def _to_world(pose: Pose) -> list[list[float]]:
 
 
 def _build(mi: Any, scene: Scene, max_depth: int) -> Any:
-    extent = np.degrees(2 * np.arctan(scene.tan_half_extent))
+    extent = np.degrees(2 * np.arctan(scene.tan_half_width))
+    bodies = {f"body{i}": _mesh(mi, body) for i, body in enumerate(scene.bodies)}
     return mi.load_dict(
         {
             "type": "scene",
             "integrator": {"type": "path", "max_depth": max_depth},
-            "object": _mesh(mi, scene.mesh, scene.light.albedo),
+            **bodies,
             "projector": {
                 "type": "projector",
                 "fov": float(extent),
                 "irradiance": {
                     "type": "bitmap",
-                    "bitmap": mi.Bitmap(_square(scene.pattern)[..., None]),
+                    "bitmap": mi.Bitmap(_texture(scene)[..., None]),
                     "raw": True,
                     "wrap_mode": "clamp",
                 },
@@ -194,20 +207,11 @@ def _build(mi: Any, scene: Scene, max_depth: int) -> Any:
     )
 
 
-def _mesh(mi: Any, mesh: trimesh.Trimesh, albedo: float) -> Any:
-    # Two-sided: artists' meshes have faces of either winding.
-    material = mi.load_dict(
-        {
-            "type": "twosided",
-            "material": {
-                "type": "diffuse",
-                "reflectance": {"type": "rgb", "value": [albedo] * 3},
-            },
-        }
-    )
+def _mesh(mi: Any, body: Body) -> Any:
     properties = mi.Properties()
-    properties["mesh_bsdf"] = material
-    built = mi.Mesh("object", len(mesh.vertices), len(mesh.faces), props=properties)
+    properties["mesh_bsdf"] = mi.load_dict(_bsdf(body.material))
+    mesh = body.mesh
+    built = mi.Mesh("body", len(mesh.vertices), len(mesh.faces), props=properties)
     parameters = mi.traverse(built)
     parameters["vertex_positions"] = np.asarray(mesh.vertices, dtype=np.float32).ravel()
     parameters["faces"] = np.asarray(mesh.faces, dtype=np.uint32).ravel()
@@ -215,9 +219,35 @@ def _mesh(mi: Any, mesh: trimesh.Trimesh, albedo: float) -> Any:
     return built
 
 
-def _square(pattern: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "s s"]:
-    """The pattern on square texels; a projector of Mitsuba takes its shape from its picture."""
-    return cv2.resize(pattern, (_TEXTURE_SIZE, _TEXTURE_SIZE), interpolation=cv2.INTER_LINEAR)
+def _bsdf(material: Material) -> dict[str, Any]:
+    """The material in Mitsuba's terms; two-sided, as artists' meshes have faces of either winding.
+
+    NOTE: glass is thin (no refraction inside), because meshes of CAD collections are rarely closed.
+    """
+    colour = {"type": "rgb", "value": [material.albedo] * 3}
+    if material.model == "glass":
+        return {"type": "thindielectric", "int_ior": material.ior}
+    surface: dict[str, Any]
+    if material.model == "diffuse":
+        surface = {"type": "diffuse", "reflectance": colour}
+    elif material.model == "mirror":
+        surface = {"type": "conductor", "material": "none", "specular_reflectance": colour}
+    else:
+        surface = {
+            "type": "principled",
+            "base_color": colour,
+            "roughness": material.roughness,
+            "metallic": material.metallic,
+            "eta": material.ior,
+        }
+    return {"type": "twosided", "material": surface}
+
+
+def _texture(scene: Scene) -> Float32[np.ndarray, "h w"]:
+    """The pattern in square texels: a projector of Mitsuba takes its shape from its picture's."""
+    height = round(_TEXTURE_SIZE * scene.tan_half_height / scene.tan_half_width)
+    size = (_TEXTURE_SIZE, max(1, height))
+    return cv2.resize(scene.pattern, size, interpolation=cv2.INTER_LINEAR)
 
 
 def _sky(light: LightSettings) -> Float32[np.ndarray, "h w c"]:

@@ -1,19 +1,22 @@
 """The scene, the stereo pair and the protocol that a renderer keeps."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 import trimesh
 from jaxtyping import Float32
 
+from qs3.errors import InputError
+from qs3.sensor.materials import Material
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 
 @dataclass(frozen=True)
 class LightSettings:
-    """Light and surface of the released scanner's scene.
+    """Light of the released scanner's scene.
 
     The scanner's area light is a square of 24.34 at 2 above the object: from there it is the sky
     above 9.3° of elevation, with radiance P/(π·A) = 1000/(π·24.34²) = 0.537, and is modelled so.
@@ -28,22 +31,54 @@ class LightSettings:
     """Lowest elevation of the sky light in degrees."""
     ambient: float = 0.0509
     """Radiance from every direction: the released world grey, and the images' background."""
-    albedo: float = 0.8
-    """Diffuse reflectance of the object, 0 to 1."""
+
+    def __post_init__(self) -> None:
+        for name in ("projector", "sky", "ambient"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InputError(f"light: {name} {getattr(self, name)} must not be below 0")
+
+
+@dataclass(frozen=True)
+class Body:
+    """One thing in the scene."""
+
+    mesh: trimesh.Trimesh
+    """Its surface, in world coordinates."""
+    material: Material = field(default_factory=Material)
+    """What its surface does to light."""
 
 
 @dataclass(frozen=True)
 class Scene:
     """What stands before the rig."""
 
-    mesh: trimesh.Trimesh
-    """The object, in world coordinates."""
+    bodies: tuple[Body, ...]
+    """The object first, then whatever surrounds it."""
     light: LightSettings
-    """Lights and surface."""
+    """Lights."""
     pattern: Float32[np.ndarray, "h w"]
     """The projected picture in 0…1, row 0 at the top."""
-    tan_half_extent: float
-    """Tangent of half the projector's opening angle, across and down."""
+    tan_half_width: float
+    """Tangent of half the projector's horizontal opening angle."""
+    tan_half_height: float
+    """Tangent of half its vertical opening angle."""
+
+    @property
+    def mesh(self) -> trimesh.Trimesh:
+        """Surface of the object."""
+        return self.bodies[0].mesh
+
+    @property
+    def alone(self) -> bool:
+        """Whether the object stands alone before the background."""
+        return len(self.bodies) == 1
+
+
+def photographed_region(scene: Scene, rig: StereoRig, camera: Pose) -> Region:
+    """What a camera must photograph: the object's box where it stands alone, else everything."""
+    if not scene.alone:
+        return rig.full_frame
+    return rig.region_of(np.asarray(scene.mesh.bounds), camera, 2)
 
 
 @dataclass(frozen=True)
@@ -57,11 +92,14 @@ class StereoPair:
     left_region: Region
     """Where in the left frame ``left`` lies; beyond it no ray meets the object."""
     right_region: Region
-    """Where in the right frame ``right`` lies."""
+    """Where in the right frame ``right`` lies; empty where the rig has no second camera."""
     background: float
     """Radiance of every pixel outside."""
     pose: Pose
     """Pose of the left camera."""
+    display: bool = False
+    """Whether the values are grey levels in 0…1 that a view transform of the renderer made, not
+    linear radiance."""
 
     def canvas(
         self, part: Region
@@ -97,7 +135,22 @@ class Renderer(Protocol):
         ...
 
     def render(
-        self, scene: Scene, rig: StereoRig, poses: Sequence[Pose], seeds: Sequence[int]
+        self,
+        scene: Scene,
+        rig: StereoRig,
+        poses: Sequence[Pose],
+        seeds: Sequence[int],
+        regions: Sequence[Region] | None = None,
     ) -> list[StereoPair]:
-        """Photograph ``scene`` once from each pose; equal seeds give equal images."""
+        """Photograph ``scene`` once from each pose; equal seeds give equal images.
+
+        Args:
+            scene: What stands before the rig.
+            rig: Cameras and projector; a rig whose second image is the stored pattern has no
+                right camera, and the right image of its pairs is empty.
+            poses: Left camera of each view.
+            seeds: One for each view.
+            regions: Part of both frames that must be photographed, for each view; by default the
+                object's box where it stands alone, else the whole frame.
+        """
         ...

@@ -1,0 +1,62 @@
+"""What surfaces do to light: a few parameters that every renderer understands."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from qs3.errors import InputError
+
+
+@dataclass(frozen=True)
+class Material:
+    """The surface of a body. ``principled`` is Disney's model, as Blender and Mitsuba have it."""
+
+    model: Literal["diffuse", "principled", "mirror", "glass"] = "diffuse"
+    """``diffuse`` (Lambert), ``principled``, perfect ``mirror`` or clear ``glass``."""
+    albedo: float = 0.8
+    """Reflectance, 0 to 1: base colour of ``diffuse``, ``principled`` and ``mirror``."""
+    roughness: float = 0.5
+    """Roughness of a principled surface, 0 to 1."""
+    metallic: float = 0.0
+    """1 is a metal, 0 is not; principled only."""
+    ior: float = 1.5
+    """Index of refraction of glass and of a principled surface's coat, above 1."""
+
+    def __post_init__(self) -> None:
+        if self.model not in ("diffuse", "principled", "mirror", "glass"):
+            raise InputError(
+                f"material: no model {self.model!r}; choose diffuse, principled, mirror or glass"
+            )
+        for name in ("albedo", "roughness", "metallic"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(f"material: {name} {getattr(self, name)} is not within 0…1")
+        if not 1 < self.ior < math.inf:
+            raise InputError(f"material: ior {self.ior} must be above 1")
+
+
+MATERIALS: dict[str, Material] = {
+    "diffuse": Material(),
+    # Blender's default surface, the one of the paper's scenes.
+    "principled": Material("principled"),
+    "rough-specular": Material("principled", roughness=0.3),
+    "glossy-plastic": Material("principled", albedo=0.6, roughness=0.08),
+    "metal": Material("principled", albedo=0.9, roughness=0.25, metallic=1.0),
+    "dark": Material(albedo=0.04),
+    "mirror": Material("mirror", albedo=0.95),
+    "glass": Material("glass"),
+}
+
+
+def get_material(name: str) -> Material:
+    """Return the named material.
+
+    Raises:
+        InputError: where there is none; the message lists those there are.
+
+    Example:
+        >>> get_material("dark").albedo
+        0.04
+    """
+    if name not in MATERIALS:
+        raise InputError(f"material: no {name!r}; choose one of {', '.join(MATERIALS)}")
+    return MATERIALS[name]
