@@ -244,10 +244,17 @@ def _bsdf(material: Material) -> dict[str, Any]:
 
 
 def _texture(scene: Scene) -> Float32[np.ndarray, "h w"]:
-    """The pattern in square texels: a projector of Mitsuba takes its shape from its picture's."""
-    height = round(_TEXTURE_SIZE * scene.tan_half_height / scene.tan_half_width)
-    size = (_TEXTURE_SIZE, max(1, height))
-    return cv2.resize(scene.pattern, size, interpolation=cv2.INTER_LINEAR)
+    """The pattern in square texels: a projector of Mitsuba takes its shape from its picture's.
+
+    NOTE: Mitsuba's projector lights a screen evenly, so that its intensity grows by 1/cos³ off the
+    axis; a spot light through a slide, as Blender has it, and a laser's spots do not. Hence cos³.
+    """
+    height = max(1, round(_TEXTURE_SIZE * scene.tan_half_height / scene.tan_half_width))
+    image = cv2.resize(scene.pattern, (_TEXTURE_SIZE, height), interpolation=cv2.INTER_LINEAR)
+    x = (2 * (np.arange(_TEXTURE_SIZE) + 0.5) / _TEXTURE_SIZE - 1) * scene.tan_half_width
+    y = (2 * (np.arange(height) + 0.5) / height - 1) * scene.tan_half_height
+    squared = 1 + x[None, :] ** 2 + y[:, None] ** 2
+    return (image / squared**1.5).astype(np.float32)
 
 
 def _sky(light: LightSettings) -> Float32[np.ndarray, "h w c"]:

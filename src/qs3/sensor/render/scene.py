@@ -23,8 +23,9 @@ class LightSettings:
     """
 
     projector: float = 45.6
-    """Radiant intensity of a lit cell: 300 W/(4π²), as Blender has it, times the released emission
-    strength of 6. With it the grey levels are those measured in the released sample image."""
+    """Radiance of a white diffuse surface at distance 1 that faces a lit cell, that is the cell's
+    radiant intensity over π: 300 W/(4π²), as Blender has it, times the released emission strength
+    of 6. With it the grey levels are those measured in the released sample image."""
     sky: float = 0.537
     """Radiance from directions above ``sky_elevation``, beside the ambient light."""
     sky_elevation: float = 9.3
