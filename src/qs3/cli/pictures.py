@@ -26,6 +26,6 @@ def montage_view(result: Any, sensor: Any) -> tuple[Any, int]:
         cloud=result.points,
         clean=result.clean,
         pattern=pattern_image(sensor.pattern),
-        box=object_box(images.true_depth, 20),
+        box=object_box(np.where(images.mask, images.true_depth, np.nan), 20),
     )
     return view, best

@@ -6,32 +6,34 @@ are arguments of :func:`scan` (see :data:`PRESETS`).
 
 import dataclasses
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 
 from qs3.errors import InputError
 from qs3.geometry import rotation_z
 from qs3.meshes import normalise
-from qs3.sensor.depth import backproject, depth_from_disparity, gate
+from qs3.sensor.depth import depth_from_disparity
 from qs3.sensor.exposure import expose
 from qs3.sensor.fusion import fuse
 from qs3.sensor.matching import match, matching_canvas
 from qs3.sensor.presets import Sensor, get_sensor
+from qs3.sensor.randomise import draw
 from qs3.sensor.render import Body, Renderer, Scene, StereoPair
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.sampling import resample
 from qs3.sensor.speckle import pattern_image
-from qs3.sensor.statistics import ViewStatistics, view_statistics
+from qs3.sensor.statistics import ViewStatistics
+from qs3.sensor.surroundings import SceneSettings, arrange, check_views
+from qs3.sensor.view import ViewImages as ViewImages
+from qs3.sensor.view import clouds_of, object_region, statistics_of
 from qs3.sensor.views import ViewLayout, place_views
-
-_RIM = 16  # pixels around the object's box that are matched too: fattening reaches half a block
 
 
 @dataclass(frozen=True)
@@ -43,57 +45,53 @@ class ScanSettings:
     view_layout: ViewLayout = "orbit"
     """``orbit`` around the object (the paper's text) or ``jitter`` of one pose (as released)."""
     size: Literal["box", "ball"] = "box"
-    """Longest side 1 (as released) or the unit ball (the paper's text)."""
+    """Longest side 1 (as released) or the unit ball (the paper's text), times the object size."""
     box_crop: bool = True
     """Keep only points inside the object's axis-aligned box (as released)."""
+    box_margin: float = 0.0
+    """The box of ``box_crop`` is larger by this on every side, in the unit of the scene."""
+    mask_crop: bool = False
+    """Keep only pixels that truly show the object."""
     num_points: int = 2048
     """Points of the cloud after farthest point sampling."""
 
-
-@dataclass(frozen=True)
-class ViewImages:
-    """The pictures of one view, all of the same part of the left frame."""
-
-    region: Region
-    """That part."""
-    left: UInt8[np.ndarray, "h w"]
-    """Exposed left image."""
-    right: UInt8[np.ndarray, "h w"]
-    """Exposed right image, the same columns of its frame."""
-    disparity: Float32[np.ndarray, "h w"]
-    """Disparity in pixels, NaN where none."""
-    depth: Float[np.ndarray, "h w"]
-    """Depth after the gate, NaN where none."""
-    true_depth: Float[np.ndarray, "h w"]
-    """Depth of the z-buffer, NaN where the ray misses the object."""
+    def __post_init__(self) -> None:
+        if self.num_points < 1:
+            raise InputError(f"num_points: {self.num_points} is too few; at least 1 is needed")
+        if not 0 <= self.box_margin < float("inf"):
+            raise InputError(f"box_margin: {self.box_margin} must not be below 0")
 
 
 @dataclass(frozen=True)
 class Scan:
-    """A scanned object. Clouds are in the frame of the normalised mesh and overlay it."""
+    """A scanned object. Clouds are in the frame of ``mesh`` and overlay it."""
 
     points: Float32[np.ndarray, "n 3"]
     """The noisy cloud."""
     view: UInt8[np.ndarray, "n"]
     """Index of the view each point comes from."""
     clean: Float32[np.ndarray, "m 3"]
-    """The clean twin: the true z-buffer on the same grid of pixels, taken the same way."""
+    """The clean twin: the true z-buffer on the same grid of pixels, where it shows the object."""
     clean_view: UInt8[np.ndarray, "m"]
     """Index of the view of each clean point."""
     mesh: trimesh.Trimesh
-    """The normalised mesh."""
+    """The normalised mesh in the sensor's object size, in metres for real cameras."""
     yaw: float
     """Random rotation about z under which the object was photographed, in radians; undone."""
     poses: tuple[Pose, ...]
     """Left camera of each view, in the frame of the rotated object."""
     views: tuple[ViewStatistics, ...]
-    """What the sensor got right and wrong in each view."""
+    """What the sensor got right and wrong in each view; all None where it saw no object."""
     fused_points: int
     """Points of all views before sampling."""
     seconds: dict[str, float]
     """Wall-clock seconds of each stage."""
+    sensor: Sensor
+    """The sensor as it was used: with the rig, the object size and what was drawn."""
+    drawn: dict[str, Any] = field(default_factory=dict)
+    """What ``randomise`` drew, by name."""
     images: tuple[ViewImages, ...] = field(default=())
-    """The pictures of each view, where ``keep_images`` asked for them."""
+    """The pictures of each view, where ``keep_images`` or ``full_frames`` asked for them."""
 
 
 def scan(
@@ -101,14 +99,21 @@ def scan(
     *,
     sensor: Sensor | str = "qs3",
     rig: StereoRig | None = None,
+    object_size: float | None = None,
     views: int = 5,
     view_layout: ViewLayout = "orbit",
     seed: int = 0,
     size: Literal["box", "ball"] = "box",
     box_crop: bool = True,
+    box_margin: float = 0.0,
+    mask_crop: bool = False,
     num_points: int = 2048,
+    scene: SceneSettings | str = "alone",
+    neighbour: trimesh.Trimesh | None = None,
+    randomise: Mapping[str, Sequence[Any]] | str | None = None,
     renderer: Renderer | None = None,
     keep_images: bool = False,
+    full_frames: bool = False,
 ) -> Scan:
     """Photograph a mesh with a simulated active stereo sensor and return the fused cloud.
 
@@ -120,67 +125,92 @@ def scan(
         mesh: The object, z up, in any unit.
         sensor: A preset's name or settings of your own.
         rig: Replaces the sensor's rig.
+        object_size: Replaces the sensor's: size of the normalised mesh in the unit of the scene.
         views: Views fused.
         view_layout: ``orbit`` or ``jitter``.
         seed: All random steps follow from it.
         size: ``box`` or ``ball``.
         box_crop: Crop the points to the object's box.
+        box_margin: Enlarges that box on every side, in the unit of the scene.
+        mask_crop: Keep the pixels that truly show the object only.
         num_points: Points of the result; where fewer were seen they are repeated in turn.
+        scene: The object's surroundings: a layout's name or settings.
+        neighbour: Another mesh, for the layouts ``behind`` and ``beside``; it is normalised too.
+        randomise: Ranges of settings drawn for this scan, see `qs3.sensor.randomise`. Without it
+            the same seed gives the same poses, turn and sampling.
         renderer: Default: Mitsuba in its fastest variant that works here.
         keep_images: Return the pictures too.
+        full_frames: Match whole frames and return them, with normals and silhouettes, for
+            `qs3.sensor.frames.write_frames`.
 
     Raises:
-        InputError: where the mesh or a setting is unusable, or no point of it was seen.
+        InputError: where the mesh or a setting is unusable, a camera or the projector stands in
+            something, or no point of the object was seen.
+
+    Example:
+        >>> from qs3.meshes import shapes
+        >>> cloud = scan(shapes.make("chair", seed=0), views=1)  # doctest: +SKIP
+        >>> cloud.points.shape  # doctest: +SKIP
+        (2048, 3)
     """
-    settings = ScanSettings(views, view_layout, size, box_crop, num_points)
-    sensor = get_sensor(sensor) if isinstance(sensor, str) else sensor
-    if rig is not None:
-        sensor = dataclasses.replace(sensor, rig=rig)
-    if num_points < 1:
-        raise InputError(f"num_points: {num_points} is too few; at least 1 is needed")
+    how = ScanSettings(views, view_layout, size, box_crop, box_margin, mask_crop, num_points)
+    scene = SceneSettings(scene) if isinstance(scene, str) else scene
+    sensor = _replaced(get_sensor(sensor) if isinstance(sensor, str) else sensor, rig, object_size)
     renderer = renderer or _default_renderer()
-    rng_place, rng_render, rng_noise, rng_sample = (
-        np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)
+    rng_place, rng_render, rng_noise, rng_sample, rng_scene, rng_settings = (
+        np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(6)
     )
     clock = _Clock()
 
-    normalised = normalise(mesh, settings.size)
+    sensor, drawn = draw(sensor, randomise, rng_settings)
+    normalised = _sized(mesh, how.size, sensor.object_size)
     yaw = float(rng_place.uniform(0, 2 * np.pi))
     turned = normalised.copy()
     turned.vertices = turned.vertices @ rotation_z(yaw).T
-    poses = place_views(views, view_layout, sensor.placement, rng_place)
+    bounds = np.asarray(turned.bounds)
+    if neighbour is not None:
+        neighbour = _sized(neighbour, how.size, sensor.object_size * scene.neighbour_size)
+    around = arrange(
+        scene,
+        Body(turned, sensor.material),
+        place_views(views, view_layout, sensor.placement, rng_place),
+        sensor.object_size,
+        neighbour,
+        rng_scene,
+    )
+    check_views(around, sensor)
+    parts = [object_region(bounds, sensor, pose) for pose in around.poses]
+    regions = [sensor.rig.full_frame] * views if full_frames else parts
 
     with clock("render"):
-        pattern = pattern_image(sensor.pattern)
-        scene = Scene(
-            (Body(turned, sensor.material),),
-            sensor.light,
-            pattern,
-            sensor.pattern.tan_half_width,
-            sensor.pattern.tan_half_height,
-        )
         seeds = [int(s) for s in rng_render.integers(0, 2**31, size=views)]
-        pairs = renderer.render(scene, sensor.rig, poses, seeds)
+        canvases = [matching_canvas(region, sensor.rig, sensor.matching) for region in regions]
+        built = _scene(around.bodies, sensor)
+        # An object alone needs no more than its own box: the rest is background.
+        wanted = None if built.alone else canvases
+        pairs = renderer.render(built, sensor.rig, around.poses, seeds, wanted)
     with clock("true_depth"):
-        caster = DepthCaster(turned)
-    images = [_view(pair, sensor, turned, caster, rng_noise, clock) for pair in pairs]
+        casters = [DepthCaster(*(body.mesh for body in around.bodies))]
+        casters += [DepthCaster(turned)] if full_frames else []
+    images = [
+        _view(pair, sensor, region, casters, rng_noise, clock)
+        for pair, region in zip(pairs, regions, strict=True)
+    ]
 
     with clock("fusion"):
-        bounds = np.asarray(turned.bounds) if box_crop else None
-        noisy = [_lift(i.depth, i, p, sensor) for i, p in zip(images, poses, strict=True)]
-        true = [gate(i.true_depth, sensor.depth) for i in images]
-        clean = [_lift(d, i, p, sensor) for d, i, p in zip(true, images, poses, strict=True)]
-        points, view = fuse(noisy, bounds)
-        clean_points, clean_view = fuse(clean)
+        shown = list(zip(images, parts, around.poses, strict=True))
+        clouds = [clouds_of(*view, sensor, how.mask_crop) for view in shown]
+        crop = bounds + np.array([[-box_margin], [box_margin]]) if box_crop else None
+        points, view = fuse([noisy for noisy, _ in clouds], crop)
+        clean_points, clean_view = fuse([clean for _, clean in clouds])
     if not len(points) or not len(clean_points):
         raise InputError(
-            "the sensor saw no point of the object: it is too thin, out of the depth gate, or "
-            "outside the image; check the mesh and the sensor's placement"
+            "the sensor saw no point of the object: it is too thin, hidden, out of the depth gate, "
+            "or outside the image; check the mesh, the scene and the sensor's placement"
         )
     with clock("sampling"):
         kept = resample(points, num_points, rng_sample)
         clean_kept = resample(clean_points, num_points, rng_sample)
-    statistics = tuple(view_statistics(i.disparity, i.true_depth, sensor.rig) for i in images)
     undo = rotation_z(-yaw).T
     return Scan(
         points=(points[kept] @ undo).astype(np.float32),
@@ -189,25 +219,30 @@ def scan(
         clean_view=clean_view[clean_kept],
         mesh=normalised,
         yaw=yaw,
-        poses=tuple(poses),
-        views=statistics,
+        poses=around.poses,
+        views=tuple(statistics_of(i, part, sensor) for i, part, _ in shown),
         fused_points=len(points),
         seconds=clock.seconds,
-        images=tuple(images) if keep_images else (),
+        sensor=sensor,
+        drawn=drawn,
+        images=tuple(images) if keep_images or full_frames else (),
     )
 
 
 def _view(
     pair: StereoPair,
     sensor: Sensor,
-    mesh: trimesh.Trimesh,
-    caster: DepthCaster,
+    region: Region,
+    casters: Sequence[DepthCaster],
     rng: np.random.Generator,
     clock: "_Clock",
 ) -> ViewImages:
-    """Expose and match one view around the object; cast its true depth."""
+    """Expose and match ``region`` of one view; cast its true depth.
+
+    The first of ``casters`` holds the scene; a second one, of the object alone, makes the view
+    one of whole frames, with silhouette and normals.
+    """
     rig = sensor.rig
-    region = rig.region_of(np.asarray(mesh.bounds), pair.pose, _RIM)
     canvas = matching_canvas(region, rig, sensor.matching)
     inner = (
         slice(region.y - canvas.y, region.y - canvas.y + region.height),
@@ -225,21 +260,45 @@ def _view(
     with clock("matching"):
         disparity = match(grey[0], grey[1], sensor.matching)[inner]
     with clock("true_depth"):
-        true_depth = caster.depth(rig, pair.pose, region)
+        whole = len(casters) > 1
+        cast = casters[0].cast(rig, pair.pose, region, normals=whole)
+        silhouette = casters[1].cast(rig, pair.pose, region).mask if whole else None
     return ViewImages(
         region=region,
         left=grey[0][inner],
         right=grey[1][inner],
         disparity=disparity,
         depth=depth_from_disparity(disparity, rig, sensor.depth),
-        true_depth=true_depth,
+        true_depth=cast.depth,
+        mask=cast.mask,
+        silhouette=silhouette,
+        normals=cast.normals,
     )
 
 
-def _lift(
-    depth: Float[np.ndarray, "h w"], images: ViewImages, pose: Pose, sensor: Sensor
-) -> Float[np.ndarray, "n 3"]:
-    return backproject(depth, sensor.rig, images.region, pose, sensor.depth)
+def _replaced(sensor: Sensor, rig: StereoRig | None, object_size: float | None) -> Sensor:
+    if rig is not None:
+        sensor = dataclasses.replace(sensor, rig=rig)
+    if object_size is not None:
+        sensor = dataclasses.replace(sensor, object_size=object_size)
+    if not 0 < sensor.object_size < float("inf"):
+        raise InputError(f"object_size: {sensor.object_size} must be above 0")
+    return sensor
+
+
+def _sized(
+    mesh: trimesh.Trimesh, size: Literal["box", "ball"], object_size: float
+) -> trimesh.Trimesh:
+    """The normalised mesh in the unit of the scene."""
+    made = normalise(mesh, size)
+    made.vertices = made.vertices * object_size
+    return made
+
+
+def _scene(bodies: tuple[Body, ...], sensor: Sensor) -> Scene:
+    thrown = sensor.pattern
+    light, picture = sensor.light, pattern_image(thrown)
+    return Scene(bodies, light, picture, thrown.tan_half_width, thrown.tan_half_height)
 
 
 def _default_renderer() -> Renderer:

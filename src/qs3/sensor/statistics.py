@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from qs3.sensor.rig import StereoRig
 
@@ -27,13 +27,27 @@ class ViewStatistics:
     gross_share: float | None
     """Share of valid object pixels that are more than 3 px off."""
     ring_fraction: float | None
-    """Share of pixels at most 10 px outside the silhouette that have a disparity: fattening."""
+    """Share of pixels at most 10 px outside the silhouette, with no other surface behind them,
+    that have a disparity: fattening."""
+
+
+EMPTY_VIEW = ViewStatistics(0, None, None, None, None, None)
+"""Of a view in which nothing of the object is to be measured."""
 
 
 def view_statistics(
-    disparity: Float[np.ndarray, "h w"], true_depth: Float[np.ndarray, "h w"], rig: StereoRig
+    disparity: Float[np.ndarray, "h w"],
+    true_depth: Float[np.ndarray, "h w"],
+    rig: StereoRig,
+    mask: Bool[np.ndarray, "h w"] | None = None,
 ) -> ViewStatistics:
     """Compare the disparity of a region with its true depth.
+
+    Args:
+        disparity: Disparity in pixels, NaN where none.
+        true_depth: True depth of whatever is seen, NaN where nothing is.
+        rig: Supplies focal length and baseline.
+        mask: Pixels that show the object; by default all that have a true depth.
 
     Example:
         >>> rig = StereoRig()
@@ -42,8 +56,9 @@ def view_statistics(
         (0.5, 0.0, 1.0)
     """
     if not true_depth.size:  # the object is out of this view's sight
-        return ViewStatistics(0, None, None, None, None, None)
-    mask = np.isfinite(true_depth)
+        return EMPTY_VIEW
+    seen = np.isfinite(true_depth)
+    mask = seen if mask is None else mask & seen
     valid = np.isfinite(disparity)
     count = int(mask.sum())
     error = disparity[mask & valid] - rig.disparity(true_depth[mask & valid])
@@ -54,7 +69,7 @@ def view_statistics(
         gross = float((np.abs(error) > _GROSS).mean())
     side = 2 * _RING + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    ring = (cv2.dilate(mask.astype(np.uint8), disc) > 0) & ~mask
+    ring = (cv2.dilate(mask.astype(np.uint8), disc) > 0) & ~seen
     return ViewStatistics(
         object_pixels=count,
         valid_fraction=float(valid[mask].mean()) if count else None,

@@ -2,47 +2,105 @@
 
 Convention:
     One ray through the centre of each pixel; depth along the optical axis, NaN where it misses.
+    Normals are those of the flat triangles, of length 1, in the left OpenCV camera (x right,
+    y down, z forward), turned towards the camera; NaN where the ray misses.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 
-class DepthCaster:
-    """Casts depth images of one mesh; holds its acceleration structure."""
+@dataclass(frozen=True)
+class Cast:
+    """What the rays of one region met."""
 
-    def __init__(self, mesh: trimesh.Trimesh) -> None:
-        self._intersector = RayMeshIntersector(mesh)
-        triangles = np.asarray(mesh.triangles, dtype=np.float64)
+    depth: Float[np.ndarray, "h w"]
+    """Depth of the first surface, NaN where there is none."""
+    body: Int[np.ndarray, "h w"]
+    """Index of the mesh met, −1 where there is none."""
+    normals: Float[np.ndarray, "h w 3"] | None
+    """Normal of the surface, where asked for."""
+
+    @property
+    def mask(self) -> Bool[np.ndarray, "h w"]:
+        """Pixels that show the first mesh."""
+        return self.body == 0
+
+
+class DepthCaster:
+    """Casts depth images of one or several meshes; holds their acceleration structure.
+
+    Example:
+        >>> plate = trimesh.creation.box(extents=[1, 1, 0.5]).apply_translation([0, 0, 2.25])
+        >>> rig = StereoRig(width=5, height=3, focal=4.0)
+        >>> DepthCaster(plate).depth(rig, Pose(np.eye(4)), rig.full_frame)[1].tolist()
+        [nan, 2.0, 2.0, 2.0, nan]
+    """
+
+    def __init__(self, mesh: trimesh.Trimesh, *others: trimesh.Trimesh) -> None:
+        meshes = (mesh, *others)
+        triangles = np.concatenate([np.asarray(one.triangles, np.float64) for one in meshes])
+        joined = trimesh.Trimesh(
+            vertices=triangles.reshape(-1, 3),
+            faces=np.arange(3 * len(triangles)).reshape(-1, 3),
+            process=False,
+        )
+        self._intersector = RayMeshIntersector(joined if others else mesh)
         self._corner = triangles[:, 0]
         self._normal = np.cross(
             triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
         )
+        self._body = np.repeat(np.arange(len(meshes)), [len(one.faces) for one in meshes])
 
     def depth(self, rig: StereoRig, pose: Pose, region: Region) -> Float[np.ndarray, "h w"]:
-        """True depth of the pixels of ``region``.
+        """True depth of the pixels of ``region``."""
+        return self.cast(rig, pose, region).depth
+
+    def cast(self, rig: StereoRig, pose: Pose, region: Region, normals: bool = False) -> Cast:
+        """Follow a ray through every pixel of ``region``.
 
         Embree finds the triangle in single precision; the depth on its plane is then computed in
         double precision.
+
+        Args:
+            rig: Supplies focal length and principal point.
+            pose: Pose of the left camera.
+            region: Part of the frame.
+            normals: Whether normals are wanted.
         """
+        shape = (region.height, region.width)
         depth = np.full(region.height * region.width, np.nan)
-        if not depth.size:
-            return depth.reshape(region.height, region.width)
-        v, u = np.mgrid[region.slices[0], region.slices[1]].reshape(2, -1)
-        cx, cy = rig.principal_point
-        local = np.stack([(u - cx) / rig.focal, (v - cy) / rig.focal, np.ones(u.shape)], axis=1)
-        rays = local @ pose.camera_to_world[:3, :3].T
-        origins = np.broadcast_to(pose.position, rays.shape)
-        triangle = self._intersector.intersects_first(origins, rays)
-        hit = triangle >= 0
-        normal = self._normal[triangle[hit]]
-        # Rays have unit length along the optical axis, so the ray parameter is the depth.
-        along = np.einsum("ij,ij->i", normal, self._corner[triangle[hit]] - pose.position)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            z = along / np.einsum("ij,ij->i", normal, rays[hit])
-        depth[hit] = np.where(np.isfinite(z) & (z > 0), z, np.nan)
-        return depth.reshape(region.height, region.width)
+        body = np.full(depth.shape, -1)
+        towards = np.full((*depth.shape, 3), np.nan) if normals else None
+        if depth.size:
+            v, u = np.mgrid[region.slices[0], region.slices[1]].reshape(2, -1)
+            cx, cy = rig.principal_point
+            local = np.stack([(u - cx) / rig.focal, (v - cy) / rig.focal, np.ones(u.shape)], axis=1)
+            rays = local @ pose.camera_to_world[:3, :3].T
+            origins = np.broadcast_to(pose.position, rays.shape)
+            triangle = self._intersector.intersects_first(origins, rays)
+            hit = triangle >= 0
+            normal = self._normal[triangle[hit]]
+            # Rays have unit length along the optical axis, so the ray parameter is the depth.
+            along = np.einsum("ij,ij->i", normal, self._corner[triangle[hit]] - pose.position)
+            slope = np.einsum("ij,ij->i", normal, rays[hit])
+            with np.errstate(divide="ignore", invalid="ignore"):
+                z = along / slope
+            good = np.isfinite(z) & (z > 0)
+            depth[hit] = np.where(good, z, np.nan)
+            body[hit] = np.where(good, self._body[triangle[hit]], -1)
+            if towards is not None:
+                unit = normal / np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-300)
+                unit = -np.sign(slope)[:, None] * unit @ pose.camera_to_world[:3, :3]
+                towards[hit] = np.where(good[:, None], unit, np.nan)
+        return Cast(
+            depth.reshape(shape),
+            body.reshape(shape),
+            None if towards is None else towards.reshape(*shape, 3),
+        )

@@ -1,0 +1,212 @@
+"""Domain randomisation: settings of the sensor drawn anew for each object.
+
+Names are the sensor's own with dots, such as ``light.ambient``. ``material`` draws one of the
+named materials; every other name draws a number from a range.
+"""
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from qs3.errors import InputError
+from qs3.sensor.materials import MATERIALS, get_material
+from qs3.sensor.presets import Sensor
+
+# What a depth camera sees in a home: no mirrors and no glass, of which it sees nothing.
+_COMMON = ("diffuse", "principled", "rough-specular", "glossy-plastic", "metal", "dark")
+
+
+def default_ranges(sensor: Sensor) -> dict[str, tuple[Any, ...]]:
+    """The bundle ``default``: common materials, and light and gain about the sensor's own.
+
+    Ambient light from none to twice the sensor's; the projector from half to twice its power; gain
+    from 0.7 to 1.4 of its own.
+
+    Example:
+        >>> default_ranges(Sensor())["light.projector"]
+        (22.8, 91.2, 'log')
+    """
+    light, gain = sensor.light, sensor.exposure.gain
+    ranges: dict[str, tuple[Any, ...]] = {
+        "material": _COMMON,
+        "light.ambient": (0.0, 2 * light.ambient),
+        "exposure.gain": (0.7 * gain, 1.4 * gain, "log"),
+    }
+    if light.projector > 0:
+        ranges["light.projector"] = (light.projector / 2, 2 * light.projector, "log")
+    return ranges
+
+
+def resolve_ranges(
+    sensor: Sensor, randomise: Mapping[str, Sequence[Any]] | str | None
+) -> dict[str, tuple[Any, ...]]:
+    """Check the ranges and return them as plain values, in a fixed order.
+
+    Args:
+        sensor: The sensor whose settings are named.
+        randomise: ``(low, high)`` (uniform) or ``(low, high, "log")`` (uniform in the logarithm)
+            by name, and ``material`` a list of names; ``"default"`` is `default_ranges`.
+
+    Raises:
+        InputError: for a name that is no number of the sensor, a range that is none, or one at
+            whose ends the sensor would be invalid.
+
+    Example:
+        >>> resolve_ranges(Sensor(), {"light.ambient": (0, 0.1)})
+        {'light.ambient': (0.0, 0.1)}
+    """
+    if randomise is None:
+        return {}
+    if isinstance(randomise, str):
+        if randomise != "default":
+            raise InputError(f"randomise: no bundle {randomise!r}; there is default")
+        randomise = default_ranges(sensor)
+    ranges = {name: _range(sensor, name, randomise[name]) for name in sorted(randomise)}
+    # Settings check themselves when they are made: each end of each range is tried once.
+    for name, values in ranges.items():
+        for value in values if name == "material" else values[:2]:
+            _replaced(sensor, name, value)
+    return ranges
+
+
+def draw(
+    sensor: Sensor,
+    randomise: Mapping[str, Sequence[Any]] | str | None,
+    rng: np.random.Generator,
+) -> tuple[Sensor, dict[str, Any]]:
+    """Draw a sensor from ranges.
+
+    Args:
+        sensor: Supplies what is not drawn.
+        randomise: As for `resolve_ranges`.
+        rng: One number is drawn for each name, in alphabetical order.
+
+    Returns:
+        The sensor, and what was drawn by name.
+
+    Raises:
+        InputError: as `resolve_ranges` does.
+
+    Example:
+        >>> ranges = {"material": ("metal",), "exposure.gain": (0.5, 0.5)}
+        >>> drawn = draw(Sensor(), ranges, np.random.default_rng(0))[1]
+        >>> drawn
+        {'exposure.gain': 0.5, 'material': 'metal'}
+    """
+    drawn: dict[str, Any] = {}
+    # The material comes before its own numbers, such as material.albedo: m < material.
+    for name, values in resolve_ranges(sensor, randomise).items():
+        share = float(rng.random())
+        if name == "material":
+            value = values[min(int(share * len(values)), len(values) - 1)]
+        elif isinstance(values[0], int):
+            low, high = values[0], values[1]
+            value = min(low + int(share * (high - low + 1)), high)
+        elif len(values) == 3:
+            low, high = math.log(values[0]), math.log(values[1])
+            value = min(max(math.exp(low + share * (high - low)), values[0]), values[1])
+        else:
+            value = values[0] + share * (values[1] - values[0])
+        sensor = _replaced(sensor, name, value)
+        drawn[name] = value
+    return sensor, drawn
+
+
+def parse_ranges(tokens: Sequence[str]) -> dict[str, tuple[Any, ...]] | str | None:
+    """Read ranges from the words of a command line.
+
+    Args:
+        tokens: ``light.ambient=0:0.1``, ``exposure.gain=0.5:2:log``, ``material=diffuse,metal``,
+            or the one word ``default``.
+
+    Raises:
+        InputError: for a word that is none of these.
+
+    Example:
+        >>> parse_ranges(["material=dark,metal", "light.ambient=0:0.1"])
+        {'material': ('dark', 'metal'), 'light.ambient': (0.0, 0.1)}
+    """
+    if not tokens:
+        return None
+    if list(tokens) == ["default"]:
+        return "default"
+    ranges: dict[str, tuple[Any, ...]] = {}
+    for token in tokens:
+        name, equals, text = token.partition("=")
+        if not equals or name in ranges:
+            raise InputError(
+                f"randomise: {token!r} is not understood, or named twice; write "
+                "light.ambient=0:0.1, material=diffuse,metal, or default alone"
+            )
+        if name == "material":
+            ranges[name] = tuple(text.split(","))
+            continue
+        numbers, log = text.split(":"), ()
+        if numbers[-1] == "log":
+            numbers, log = numbers[:-1], ("log",)
+        try:
+            ranges[name] = (*(float(number) for number in numbers), *log)
+        except ValueError:
+            raise InputError(f"randomise: {token!r} has no range such as 0.0:0.1") from None
+    return ranges
+
+
+def numbers_of(settings: Any, prefix: str = "") -> dict[str, type]:
+    """The type, int or float, of every number within settings by its dotted name.
+
+    Example:
+        >>> numbers_of(Sensor())["light.ambient"]
+        <class 'float'>
+    """
+    found: dict[str, type] = {}
+    for part in dataclasses.fields(settings):
+        value, name = getattr(settings, part.name), prefix + part.name
+        if dataclasses.is_dataclass(value):
+            found |= numbers_of(value, f"{name}.")
+        elif part.type is int or part.type is float:
+            found[name] = part.type
+    return found
+
+
+def _range(sensor: Sensor, name: str, values: Sequence[Any]) -> tuple[Any, ...]:
+    if name == "material":
+        chosen = (values,) if isinstance(values, str) else tuple(values)
+        if not chosen:
+            raise InputError(f"randomise: material: name some of {', '.join(MATERIALS)}")
+        return tuple(chosen)
+    known = numbers_of(sensor)
+    if name not in known:
+        near = difflib.get_close_matches(name, ["material", *known], n=3, cutoff=0.4)
+        near = near or [other for other in known if other.split(".")[-1] == name.split(".")[-1]]
+        hint = f"did you mean {' or '.join(near)}?" if near else "see: qs3 sensors show qs3"
+        raise InputError(f"randomise: the sensor has no number {name!r}; {hint}")
+    plain = [] if isinstance(values, str) else list(values)
+    log = plain[2:] == ["log"]
+    numbers = plain[:2]
+    good = len(plain) == 2 + log and all(
+        isinstance(number, int | float) and math.isfinite(number) for number in numbers
+    )
+    if not good or numbers[0] > numbers[1] or (log and numbers[0] <= 0):
+        raise InputError(
+            f"randomise: {name}: {values!r} is no range; give low and high in this order, and "
+            "'log' only where both are above 0"
+        )
+    if known[name] is int:
+        if log or any(number != int(number) for number in numbers):
+            raise InputError(f"randomise: {name} takes whole numbers, not {values!r}")
+        return int(numbers[0]), int(numbers[1])
+    return (float(numbers[0]), float(numbers[1]), *(["log"] if log else []))
+
+
+def _replaced(settings: Any, name: str, value: Any) -> Any:
+    """The settings with one dotted name replaced."""
+    head, _, rest = name.partition(".")
+    if rest:
+        value = _replaced(getattr(settings, head), rest, value)
+    elif head == "material":
+        value = get_material(value)
+    return dataclasses.replace(settings, **{head: value})
