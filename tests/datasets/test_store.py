@@ -177,7 +177,7 @@ def test_a_folder_without_manifest_and_another_schema_are_refused(fake, tmp_path
         open_dataset(tmp_path)
     make(tmp_path, fake)
     path = tmp_path / MANIFEST
-    path.write_text(path.read_text().replace('"schema": 1', '"schema": 7'))
+    path.write_text(path.read_text().replace('"schema": 2', '"schema": 7'))
     with pytest.raises(InputError, match="schema 7"):
         open_dataset(tmp_path)
 

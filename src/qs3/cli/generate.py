@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 
 from qs3.cli.camera import CameraOptions
+from qs3.cli.scene import SceneOptions
 from qs3.errors import InputError
 
 
@@ -31,6 +32,8 @@ class GenerateOptions:
     """Processes. The bytes written do not depend on it."""
     split: str = ""
     """Name of the split of every row, such as train or test; empty keeps the folder's own."""
+    scene: Annotated[SceneOptions, tyro.conf.arg(name="")] = field(default_factory=SceneOptions)
+    """What stands around the object, and what is kept. A neighbour is another of the meshes."""
     camera: Annotated[CameraOptions, tyro.conf.arg(name="")] = field(default_factory=CameraOptions)
     """The simulated camera."""
 
@@ -57,16 +60,17 @@ def generate(options: Annotated[GenerateOptions, tyro.conf.arg(name="")]) -> int
             f"{options.meshes}: meshes lie flat in this folder and their classes are unknown; put "
             "them into one folder a class"
         )
+    sensor = options.scene.resolve_sensor(options.camera.resolve_sensor())
     settings = GenerateSettings(
         classes=_classes(names),
         meshes="shapes" if built_in else Path(options.meshes).resolve().name,
         per_class=options.per_class if built_in else None,
         scans_per_mesh=options.scans_per_mesh,
-        sensor=options.camera.resolve_sensor(),
+        sensor=sensor,
         renderer=options.camera.resolve_renderer(),
         split=options.split or None,
         seed=options.seed,
-        **options.camera.scan_arguments(),
+        **(options.camera.scan_arguments() | options.scene.scan_arguments(sensor)),
     )
     report = generate_data(items, options.out, settings, workers=options.workers)
     print(options.out)

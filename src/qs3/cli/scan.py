@@ -12,6 +12,7 @@ import tyro
 
 from qs3.cli.camera import CameraOptions
 from qs3.cli.pictures import montage_view
+from qs3.cli.scene import SceneOptions
 from qs3.errors import InputError
 from qs3.files import claim_folder, sha256, write_bytes, write_json
 
@@ -27,7 +28,14 @@ class ScanOptions:
     seed: int = 0
     """All random steps follow from it."""
     save_images: bool = False
-    """Also write the 8-bit pair, the 16-bit depth and the camera of each view."""
+    """Also write the grey pair, the 16-bit depth and the camera of each view, object's part."""
+    frames: bool = False
+    """Also write whole frames in BOP's scene layout, into frames/: grey pair, depth, true depth,
+    masks, normals, cameras and poses."""
+    neighbour: str = ""
+    """Mesh file or built-in class that stands in front (scene behind) or beside."""
+    scene: Annotated[SceneOptions, tyro.conf.arg(name="")] = field(default_factory=SceneOptions)
+    """What stands around the object, and what is kept."""
     camera: Annotated[CameraOptions, tyro.conf.arg(name="")] = field(default_factory=CameraOptions)
     """The simulated camera."""
 
@@ -35,6 +43,7 @@ class ScanOptions:
 def scan(options: Annotated[ScanOptions, tyro.conf.arg(name="")]) -> int:
     """Photograph one mesh: noisy cloud, clean twin, a picture of every stage, and statistics."""
     from qs3.datasets.ply import write_ply
+    from qs3.sensor.frames import write_frames
     from qs3.sensor.scan import scan as scan_mesh
     from qs3.visualisation import montage, write_png
 
@@ -42,11 +51,24 @@ def scan(options: Annotated[ScanOptions, tyro.conf.arg(name="")]) -> int:
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: must not be negative")
     mesh, origin = _load(options.mesh, options.seed)
-    sensor, renderer = options.camera.resolve_sensor(), options.camera.resolve_renderer()
-    settings = options.camera.scan_arguments()
+    sensor = options.scene.resolve_sensor(options.camera.resolve_sensor())
+    settings = options.camera.scan_arguments() | options.scene.scan_arguments(sensor)
+    beside = None
+    if options.neighbour:
+        # Its own draw: a chair beside a chair is another one.
+        beside, origin["neighbour"] = _load(options.neighbour, options.seed + 1)
+    renderer = options.camera.resolve_renderer()
     result = scan_mesh(
-        mesh, sensor=sensor, seed=options.seed, renderer=renderer, keep_images=True, **settings
+        mesh,
+        sensor=sensor,
+        seed=options.seed,
+        renderer=renderer,
+        neighbour=beside,
+        keep_images=True,
+        full_frames=options.frames,
+        **settings,
     )
+    sensor = result.sensor
     # Everything is computed before the folder is touched: a fault leaves nothing behind.
     view, best = montage_view(result, sensor)
     title = f"{origin['name']} · sensor {sensor.name} · view {best + 1} of {len(result.views)}"
@@ -63,13 +85,16 @@ def scan(options: Annotated[ScanOptions, tyro.conf.arg(name="")]) -> int:
     written = ["cloud.ply", "clean.ply", "montage.png", "scan.json"]
     if options.save_images:
         written += _save_images(folder, result, sensor)
+    if options.frames:
+        write_frames(folder / "frames", result)
+        written.append("frames")
     for name in written:
         print(folder / name)
     _tell(result, time.perf_counter() - start, folder)
     return 0
 
 
-def _load(name: str, seed: int) -> tuple[Any, dict[str, str]]:
+def _load(name: str, seed: int) -> tuple[Any, dict[str, Any]]:
     from qs3.meshes import load_mesh, shapes
 
     if name in shapes.CLASSES and not Path(name).exists():
@@ -95,8 +120,9 @@ def _record(
     return {
         "mesh": origin,
         "seed": seed,
-        "settings": settings,
+        "settings": settings | {"scene": dataclasses.asdict(settings["scene"])},
         "sensor": settings_dict(sensor),
+        "drawn": result.drawn,
         "renderer": {**dataclasses.asdict(renderer), **renderer.description},
         "yaw": result.yaw,
         "fused_points": result.fused_points,
@@ -132,7 +158,7 @@ def _save_images(folder: Path, result: Any, sensor: Any) -> list[str]:
             "baseline": sensor.rig.baseline,
             "depth_unit": 1e-4,
             "camera_to_world": pose.camera_to_world.tolist(),
-            "world": "the normalised mesh turned about z by yaw (scan.json)",
+            "world": "the mesh in its object size, turned about z by yaw (scan.json)",
         }
         write_json(folder / f"view-{index}-camera.json", camera)
         names.append(f"view-{index}-camera.json")

@@ -22,7 +22,7 @@ from qs3.datasets.executors import Failure, run_ordered
 from qs3.datasets.failures import forget_failures, log_failure
 from qs3.datasets.scan_item import GenerateSettings as GenerateSettings
 from qs3.datasets.scan_item import Item as Item
-from qs3.datasets.scan_item import row_id
+from qs3.datasets.scan_item import neighbour_of, row_id
 from qs3.datasets.scan_item import scan_item as scan_item
 from qs3.datasets.scan_item import scan_seed as scan_seed
 from qs3.datasets.shards import CloudRow, write_shard
@@ -49,7 +49,7 @@ def generate(
     out: Path,
     settings: GenerateSettings,
     *,
-    scan_one: Callable[[Any, int, GenerateSettings], CloudRow] = scan_item,
+    scan_one: Callable[..., CloudRow] = scan_item,
     workers: int = 1,
     progress: bool = True,
 ) -> GenerateReport:
@@ -62,7 +62,8 @@ def generate(
         items: Meshes, in the order of the rows.
         out: New or empty folder, or one that the same call began.
         settings: Settings of the data set.
-        scan_one: Makes one row; a picklable function of a module.
+        scan_one: Makes one row; a picklable function of a module. It is handed an item, the index
+            of its scan and the settings, and a second item where the scene has a neighbour.
         workers: Processes; with 1 the work is done in this one.
         progress: Show a bar on the standard error stream.
 
@@ -75,7 +76,7 @@ def generate(
         from qs3.sensor.render.mitsuba import MitsubaRenderer
 
         settings = dataclasses.replace(settings, renderer=MitsubaRenderer())
-    work = [(item, scan) for item in items for scan in range(settings.scans_per_mesh)]
+    work = _work(items, settings)
     size = settings.rows_per_shard
     count = -(-len(work) // size)
     manifest = Manifest(
@@ -105,7 +106,7 @@ def generate(
     rows: list[CloudRow] = []
     with contextlib.closing(results):
         for (index, row), result in zip(tasks, results, strict=True):
-            item, scan = work[index * size + row]
+            item, scan = work[index * size + row][:2]
             if isinstance(result, Failure):
                 failed += 1
                 record = {"id": row_id(item, scan), "object": item.id, "scan": scan}
@@ -120,12 +121,19 @@ def generate(
     return GenerateReport(done=done, skipped=len(work) - len(tasks), failed=failed)
 
 
+def _work(items: Sequence[Item], settings: GenerateSettings) -> list[tuple[Any, ...]]:
+    """An item and the index of its scan for each row, and its neighbour where there is one."""
+    rows = [(item, scan) for item in items for scan in range(settings.scans_per_mesh)]
+    if not settings.scene.needs_neighbour:
+        return rows
+    return [(*row, neighbour_of(*row, items, settings.seed)) for row in rows]
+
+
 def _scan_task(
-    scan_one: Callable[[Any, int, GenerateSettings], CloudRow],
-    settings: GenerateSettings,
-    task: tuple[Any, int],
+    scan_one: Callable[..., CloudRow], settings: GenerateSettings, task: tuple[Any, ...]
 ) -> CloudRow:
-    return scan_one(*task, settings)
+    item, scan, *neighbour = task
+    return scan_one(item, scan, settings, *neighbour)
 
 
 def work_list_checksum(items: Sequence[Item]) -> str:

@@ -2,8 +2,9 @@
 
 import dataclasses
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from qs3.datasets.classes import POINTDA10, map_labels
 from qs3.datasets.shards import STATISTICS, CloudRow
 from qs3.errors import InputError
+from qs3.sensor.surroundings import SceneSettings
 
 if TYPE_CHECKING:
     import trimesh
@@ -62,6 +64,14 @@ class GenerateSettings:
     """Longest side 1, or the unit ball."""
     box_crop: bool = True
     """Keep only points inside the object's box."""
+    box_margin: float = 0.0
+    """That box is larger by this on every side, in the unit of the scene."""
+    mask_crop: bool = False
+    """Keep only pixels that truly show the object."""
+    scene: SceneSettings = field(default_factory=SceneSettings)
+    """What stands around the object; a neighbour is another item of the work list."""
+    randomise: Mapping[str, Sequence[Any]] | str | None = None
+    """Ranges of the sensor's settings drawn anew for each scan; see `qs3.sensor.randomise`."""
     num_points: int = 2048
     """Points of each cloud."""
     classes: tuple[str, ...] = POINTDA10
@@ -83,11 +93,14 @@ class GenerateSettings:
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, the sensor's and the renderer's settings among them."""
         from qs3.sensor.presets import get_sensor, settings_dict
+        from qs3.sensor.randomise import resolve_ranges
 
         sensor = get_sensor(self.sensor) if isinstance(self.sensor, str) else self.sensor
         plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         plain["classes"] = list(self.classes)
         plain["sensor"] = settings_dict(sensor)
+        plain["scene"] = dataclasses.asdict(self.scene)
+        plain["randomise"] = resolve_ranges(sensor, self.randomise)
         if self.renderer is not None:
             names = [f.name for f in dataclasses.fields(self.renderer)]
             own = {name: getattr(self.renderer, name) for name in names}
@@ -108,13 +121,29 @@ def scan_seed(root: int, object_id: str, scan: int) -> int:
     return int(state[0] >> np.uint64(1))
 
 
-def scan_item(item: Item, scan_index: int, settings: GenerateSettings) -> CloudRow:
+def neighbour_of(item: Item, scan: int, items: Sequence[Item], root: int) -> Item:
+    """Draw another item of the work list for a scan; order and worker count do not matter.
+
+    Raises:
+        InputError: where there is no other.
+    """
+    others = [other for other in items if other.id != item.id]
+    if not others:
+        raise InputError(f"{item.id}: a scene with a neighbour needs a second mesh to draw from")
+    key = np.random.SeedSequence(scan_seed(root, item.id, scan), spawn_key=(0x4E42,))
+    return others[int(np.random.default_rng(key).integers(len(others)))]
+
+
+def scan_item(
+    item: Item, scan_index: int, settings: GenerateSettings, neighbour: Item | None = None
+) -> CloudRow:
     """Scan one object once with the simulated sensor.
 
     Args:
         item: The object.
         scan_index: Which of its scans.
         settings: Settings of the data set.
+        neighbour: What stands before or beside it, where the scene has a neighbour.
 
     Raises:
         InputError: where the mesh is unusable or the sensor sees nothing of it.
@@ -131,6 +160,11 @@ def scan_item(item: Item, scan_index: int, settings: GenerateSettings) -> CloudR
         seed=seed,
         size=settings.size,
         box_crop=settings.box_crop,
+        box_margin=settings.box_margin,
+        mask_crop=settings.mask_crop,
+        scene=settings.scene,
+        neighbour=None if neighbour is None else neighbour.load(),
+        randomise=settings.randomise,
         num_points=settings.num_points,
         renderer=settings.renderer,
     )
@@ -139,6 +173,7 @@ def scan_item(item: Item, scan_index: int, settings: GenerateSettings) -> CloudR
     surface = sample_surface(result.mesh, settings.num_points, surface_rng)
     label = map_labels([item.class_name], np.zeros(1, dtype=np.int64), settings.classes)[0]
     means = {name: _mean([getattr(view, name) for view in result.views]) for name in STATISTICS}
+    drawn = result.drawn | ({} if neighbour is None else {"neighbour": neighbour.id})
     return CloudRow(
         id=row_id(item, scan_index),
         object=item.id,
@@ -153,6 +188,7 @@ def scan_item(item: Item, scan_index: int, settings: GenerateSettings) -> CloudR
         clean_view=result.clean_view,
         surface=surface.astype(np.float32),
         yaw=result.yaw,
+        drawn=json.dumps(drawn, sort_keys=True),
         **means,
     )
 

@@ -39,8 +39,11 @@ _SCHEMA = pa.schema(
         pa.field("clean", _CLOUD, nullable=False),
         pa.field("clean_view", _VIEW, nullable=False),
         pa.field("surface", _CLOUD, nullable=False),
+        pa.field("drawn", pa.string(), nullable=False),
     ]
 )
+# Shards of schema 1 have no `drawn`: nothing could be.
+_SCHEMA_1 = pa.schema([column for column in _SCHEMA if column.name != "drawn"])
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,8 @@ class CloudRow:
     """Robust standard deviation of the disparity error in pixels, mean over views."""
     gross_share: float | None = None
     """Share of grossly wrong disparities, mean over views."""
+    drawn: str = "{}"
+    """What was drawn for this scan (settings of the sensor, the neighbour), a JSON object."""
 
 
 def write_shard(path: Path, rows: Sequence[CloudRow]) -> None:
@@ -111,7 +116,7 @@ def write_shard(path: Path, rows: Sequence[CloudRow]) -> None:
 
 
 def read_shard(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
-    """Read a shard, or some of its columns.
+    """Read a shard, or some of its columns; one of schema 1 with nothing drawn.
 
     Raises:
         InputError: where the file is missing, cut off, or not a shard of this schema.
@@ -121,9 +126,15 @@ def read_shard(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
         raise InputError(f"{path}: no such file")
     try:
         with pq.ParquetFile(path) as file:
-            if not file.schema_arrow.equals(_SCHEMA):
+            wanted = list(_SCHEMA.names if columns is None else columns)
+            if file.schema_arrow.equals(_SCHEMA):
+                return file.read(columns=wanted)
+            if not file.schema_arrow.equals(_SCHEMA_1):
                 raise InputError(f"{path}: not a shard of a qs3 data set (other columns)")
-            return file.read(columns=None if columns is None else list(columns))
+            table = file.read(columns=[name for name in wanted if name != "drawn"])
+            if "drawn" in wanted:
+                table = table.append_column(_SCHEMA.field("drawn"), [["{}"] * len(table)])
+            return table.select(wanted)
     except (pa.ArrowException, OSError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(

@@ -20,7 +20,8 @@ from qs3.errors import InputError
 from qs3.files import read_json, sha256, write_json
 
 MANIFEST = "dataset.json"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+_READABLE = (1, 2)  # 2 has the column `drawn`
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ def open_dataset(folder: Path) -> Manifest:
     names = {field.name for field in dataclasses.fields(Manifest)}
     if not isinstance(value, dict) or set(value) != names:
         raise InputError(f"{path}: not the description of a qs3 data set; generate it again")
-    if value["schema"] != SCHEMA_VERSION:
+    if value["schema"] not in _READABLE:
         raise InputError(
             f"{path}: schema {value['schema']}, this version reads {SCHEMA_VERSION}; generate again"
         )
