@@ -33,6 +33,8 @@ class CameraOptions:
     """Take off the 1/32 px by which OpenCV's block matching rounds up."""
     pattern: Path | None = None
     """Your own picture to project in place of the speckle dots."""
+    renderer: Literal["mitsuba", "cycles"] = "mitsuba"
+    """mitsuba, or cycles: the paper's renderer, Blender's (`make cycles` brings it)."""
     samples: int = 8
     """Rays a pixel."""
     variant: Literal["auto", "cuda_ad_mono", "llvm_ad_mono", "scalar_rgb"] = "auto"
@@ -63,10 +65,18 @@ class CameraOptions:
 
     def resolve_renderer(self) -> Any:
         """The renderer asked for; raises where it does not work here."""
-        from qs3.sensor.render.mitsuba import MitsubaRenderer
-
         if self.samples < 1:
             raise InputError(f"--samples {self.samples}: at least 1 is needed")
+        if self.renderer == "cycles":
+            from qs3.sensor.render.cycles import CyclesRenderer
+
+            if self.variant != "auto":
+                raise InputError(f"--variant {self.variant} is Mitsuba's: leave it out with cycles")
+            renderer = CyclesRenderer(samples=self.samples)
+            _ = renderer.description  # a Blender that is missing or does not start stops here
+            return renderer
+        from qs3.sensor.render.mitsuba import MitsubaRenderer
+
         variant = "" if self.variant == "auto" else self.variant
         return MitsubaRenderer(variant=variant, samples=self.samples)
 
