@@ -33,6 +33,11 @@ class Material:
         if not 1 < self.ior < math.inf:
             raise InputError(f"material: ior {self.ior} must be above 1")
 
+    @property
+    def rough(self) -> bool:
+        """Whether soft light on it looks the same from both cameras: no mirror, no sharp gloss."""
+        return self.model == "diffuse" or (self.model == "principled" and self.roughness >= 0.25)
+
 
 MATERIALS: dict[str, Material] = {
     "diffuse": Material(),

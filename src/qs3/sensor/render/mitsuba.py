@@ -7,9 +7,9 @@ multiples of 64 pixels: a film size that changes at every image would compile a 
 import functools
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -17,6 +17,9 @@ from jaxtyping import Float32
 
 from qs3.errors import InputError
 from qs3.sensor.materials import Material
+from qs3.sensor.render.cache import CacheSettings
+from qs3.sensor.render.embree import EmbreePhotographer
+from qs3.sensor.render.jit import JitPhotographer
 from qs3.sensor.render.scene import Body, LightSettings, Scene, StereoPair, photographed_region
 from qs3.sensor.rig import Pose, Region, StereoRig
 
@@ -71,7 +74,7 @@ def best_variant() -> str:
 
 @dataclass(frozen=True)
 class MitsubaRenderer:
-    """Photographs scenes with Mitsuba 3 (path tracing, box filter, one bounce of light)."""
+    """Photographs scenes with Mitsuba 3 (box filter, one bounce of light)."""
 
     variant: str = ""
     """One of ``VARIANTS``; empty picks the fastest that works here."""
@@ -79,6 +82,14 @@ class MitsubaRenderer:
     """Rays a pixel."""
     max_depth: int = 3
     """Longest path: 2 is direct light alone, 3 adds one bounce."""
+    indirect: Literal["cached", "path"] = "cached"
+    """``cached``: the projector's light by the pixel, all other light from an irradiance cache
+    (:mod:`qs3.sensor.render.jit`), where every surface is rough; else, and with ``path``, plain
+    path tracing, with many times the noise at as many rays."""
+    cache_cell: int = 4
+    """Side in pixels of a cell of the cache."""
+    cache_rays: int = 32
+    """Rays over the hemisphere in each cell."""
     full_frame: bool = False
     """Render whole frames in place of the object's region."""
 
@@ -91,6 +102,11 @@ class MitsubaRenderer:
             )
         elif not usable(self.variant):
             raise InputError(f"renderer: {self.variant} does not work here; see: qs3 doctor")
+        if self.samples < 1 or self.max_depth < 2:
+            raise InputError("renderer: at least 1 sample and a max_depth of 2 are needed")
+        if self.indirect not in ("cached", "path"):
+            raise InputError(f"renderer: no indirect {self.indirect!r}; choose cached or path")
+        CacheSettings(self.cache_cell, self.cache_rays)  # refuses values that make no sense
 
     @property
     def description(self) -> dict[str, str]:
@@ -115,33 +131,74 @@ class MitsubaRenderer:
         if len(poses) != len(seeds) or (regions is not None and len(regions) != len(poses)):
             raise ValueError(f"{len(poses)} poses and {len(seeds)} seeds, or too few regions")
         mi = _mitsuba(self.variant)
+        photograph = self._cached(mi, scene) or self._traced(mi, scene)
+        pairs = []
+        for index, (pose, seed) in enumerate(zip(poses, seeds, strict=True)):
+            parts = []
+            for side, camera in enumerate((pose, rig.right(pose))):
+                if side == 1 and rig.second == "pattern":
+                    part = Region(0, 0, 0, 0)
+                elif self.full_frame:
+                    part = rig.full_frame
+                elif regions is not None:
+                    part = regions[index]
+                else:
+                    part = photographed_region(scene, rig, camera)
+                parts.append(part)
+            if parts[0] != rig.full_frame and scene.alone:
+                _refuse_sky(rig, pose, scene.light)
+            left, right = photograph(rig, pose, (parts[0], parts[1]), seed)
+            background = scene.light.ambient
+            pairs.append(StereoPair(left, right, parts[0], parts[1], background, pose))
+        return pairs
+
+    def _cached(self, mi: Any, scene: Scene) -> "_Photograph | None":
+        """Photographing with an irradiance cache, where the scene allows it."""
+        materials = [body.material for body in scene.bodies]
+        plain = self.variant.startswith("scalar")
+        allowed = all(m.model == "diffuse" if plain else m.rough for m in materials)
+        if self.indirect == "path" or not allowed:
+            return None
+        cache = CacheSettings(self.cache_cell, self.cache_rays)
+        if plain:
+            photographer = EmbreePhotographer(scene, self.max_depth)
+        else:
+            bodies = {f"body{i}": _mesh(mi, body) for i, body in enumerate(scene.bodies)}
+            shapes = mi.load_dict({"type": "scene", **bodies})
+            photographer = JitPhotographer(mi, scene, shapes, self.max_depth)
+
+        def photograph(
+            rig: StereoRig, pose: Pose, regions: tuple[Region, Region], seed: int
+        ) -> list[Float32[np.ndarray, "_ _"]]:
+            return photographer.photograph(rig, pose, regions, self.samples, cache, seed)
+
+        return photograph
+
+    def _traced(self, mi: Any, scene: Scene) -> "_Photograph":
+        """Photographing with Mitsuba's path integrator."""
         built = _build(mi, scene, self.max_depth)
         parameters = mi.traverse(built)
         transform = mi.ScalarTransform4f if self.variant.startswith("scalar") else mi.Transform4f
-        pairs = []
-        for index, (pose, seed) in enumerate(zip(poses, seeds, strict=True)):
+
+        def photograph(
+            rig: StereoRig, pose: Pose, regions: tuple[Region, Region], seed: int
+        ) -> list[Float32[np.ndarray, "_ _"]]:
             parameters["projector.to_world"] = transform(_to_world(rig.projector(pose)))
             parameters.update()
-            shots = []
-            for side, camera in enumerate((pose, rig.right(pose))):
-                if self.full_frame:
-                    region = rig.full_frame
-                elif regions is not None:
-                    region = regions[index]
-                else:
-                    region = photographed_region(scene, rig, camera)
-                if side == 1 and rig.second == "pattern":
-                    region = Region(0, 0, 0, 0)
-                if region != rig.full_frame and scene.alone:
-                    _refuse_sky(rig, pose, scene.light)
-                # Two streams that never meet: the left camera's seeds are even.
-                noise_seed = (2 * seed + side) % 2**32
-                image = _photograph(mi, built, rig, camera, region, self.samples, noise_seed)
-                shots.append((image, region))
-            (left, left_region), (right, right_region) = shots
-            background = scene.light.ambient
-            pairs.append(StereoPair(left, right, left_region, right_region, background, pose))
-        return pairs
+            # Two streams that never meet: the left camera's seeds are even.
+            return [
+                _photograph(mi, built, rig, camera, region, self.samples, (2 * seed + side) % 2**32)
+                for side, (camera, region) in enumerate(
+                    zip((pose, rig.right(pose)), regions, strict=True)
+                )
+            ]
+
+        return photograph
+
+
+_Photograph = Callable[
+    [StereoRig, Pose, tuple[Region, Region], int], list[Float32[np.ndarray, "_ _"]]
+]
 
 
 def _mitsuba(variant: str) -> Any:

@@ -1,0 +1,43 @@
+"""What the two irradiance caches share: their settings, their cells and where rays go."""
+
+import math
+from dataclasses import dataclass
+
+from qs3.errors import InputError
+from qs3.sensor.rig import Region
+
+# Roberts (2018), the plane's counterpart of the golden ratio: multiples of it, without their whole
+# part, cover the unit square evenly, however many are taken.
+R2 = (0.7548776662466927, 0.5698402909980532)
+GOLDEN = (math.sqrt(5) - 1) / 2
+TRIES = 12  # places in a cell that are tried for one that shows a surface
+
+
+@dataclass(frozen=True)
+class CacheSettings:
+    """How finely the soft light is gathered."""
+
+    cell: int = 4
+    """Side in pixels of a cell."""
+    rays: int = 32
+    """Rays over the hemisphere in each cell."""
+    smoothing: int = 1
+    """Cells on either side that are averaged with a cell, where position and normal agree."""
+
+    def __post_init__(self) -> None:
+        if self.cell < 1 or self.rays < 1 or self.smoothing < 0:
+            raise InputError(
+                f"renderer: cell {self.cell} and rays {self.rays} must be at least 1, smoothing "
+                f"{self.smoothing} not below 0"
+            )
+
+
+def cells(region: Region, cell: int) -> Region:
+    """The region in whole cells, at least one.
+
+    Example:
+        >>> cells(Region(3, 5, 10, 8), 4)
+        Region(x=3, y=5, width=12, height=8)
+    """
+    columns, rows = (max(1, -(-side // cell)) for side in (region.width, region.height))
+    return Region(region.x, region.y, columns * cell, rows * cell)

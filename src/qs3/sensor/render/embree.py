@@ -1,0 +1,377 @@
+"""The irradiance cache of the Dr.Jit photographer in NumPy, on Embree's rays, for diffuse bodies.
+
+For machines without a system libLLVM: Mitsuba's plain variant spends most of its time where a
+few coherent rays through Embree do the same.
+"""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int32
+
+from qs3.errors import InputError
+from qs3.geometry import invert_rigid, transform_points
+from qs3.sensor.render.cache import GOLDEN, R2, TRIES, CacheSettings, cells
+from qs3.sensor.render.scene import Scene
+from qs3.sensor.rig import Pose, Region, StereoRig
+
+_OFFSET = 1e-4  # of the scene's size: where a ray that leaves a surface starts, above it
+
+
+class EmbreePhotographer:
+    """Photographs one scene of diffuse bodies; holds its geometry and pattern."""
+
+    def __init__(self, scene: Scene, max_depth: int) -> None:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        if any(body.material.model != "diffuse" for body in scene.bodies):
+            raise InputError("renderer: only diffuse bodies are rendered in this way")
+        meshes = [body.mesh for body in scene.bodies]
+        triangles = np.concatenate([np.asarray(mesh.triangles, np.float32) for mesh in meshes])
+        self._embree = EmbreeScene()
+        TriangleMesh(self._embree, triangles)
+        first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+        normal = np.cross(first.astype(np.float64), second.astype(np.float64))
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        self._corner = triangles[:, 0].copy()
+        self._normal = (normal / np.maximum(length, 1e-300)).astype(np.float32)
+        self._albedo = np.repeat(
+            np.array([body.material.albedo for body in scene.bodies], np.float32),
+            [len(mesh.faces) for mesh in meshes],
+        )
+        self._offset = np.float32(_OFFSET * np.ptp(triangles.reshape(-1, 3), axis=0).max())
+        self._scene = scene
+        self._bounces = max_depth - 2
+
+    def photograph(
+        self,
+        rig: StereoRig,
+        pose: Pose,
+        regions: tuple[Region, Region],
+        samples: int,
+        cache: CacheSettings,
+        seed: int,
+    ) -> list[Float32[np.ndarray, "_ _"]]:
+        """Radiance in the two regions of the pair at ``pose``; an empty region stays empty."""
+        projector = rig.projector(pose)
+        gathered = self._gather(rig, pose, regions[0], projector, cache, seed)
+        images = []
+        for camera, region in zip((pose, rig.right(pose)), regions, strict=True):
+            if region.empty:
+                image = np.zeros((max(region.height, 0), max(region.width, 0)), np.float32)
+            else:
+                image = self._expose(rig, camera, region, projector, samples, gathered)
+            images.append(image)
+        return images
+
+    def _expose(
+        self,
+        rig: StereoRig,
+        camera: Pose,
+        region: Region,
+        projector: Pose,
+        samples: int,
+        cache: "_Cache",
+    ) -> Float32[np.ndarray, "h w"]:
+        pixels = region.width * region.height
+        row, column = _grid(region.height, region.width)
+        origin = camera.position.astype(np.float32)
+        centre = np.float32(0.5)
+        light = self._environment(
+            _directions(rig, camera, region, column + centre, row + centre)
+        ) * np.float32(samples)
+        background = light / np.float32(samples)
+        seen = np.zeros(pixels, np.float32)
+        place, facing = np.zeros((pixels, 3), np.float32), np.zeros((pixels, 3), np.float32)
+        lane = np.arange(pixels)
+        for k in range(samples):
+            a, b = (np.float32((k + 0.5) * step % 1) for step in R2)
+            rays = _directions(rig, camera, region, column[lane] + a, row[lane] + b)
+            triangle, points, normals = self._meet(np.tile(origin, (len(rays), 1)), rays)
+            met = triangle >= 0
+            hit = lane[met]
+            direct = self._from_projector(points, normals, triangle[met], projector)
+            light[hit] += direct - background[hit]
+            seen[hit] += 1
+            place[hit] += points
+            facing[hit] += normals
+            if k == 0:
+                # Most of a region shows nothing. NOTE: what is thinner than a pixel and more than
+                # a pixel away from all that the first ray of each pixel meets is not seen.
+                mask = seen.reshape(region.height, region.width).astype(np.uint8)
+                lane = np.flatnonzero(cv2.dilate(mask, np.ones((3, 3), np.uint8)))
+        shown = np.flatnonzero(seen)
+        place, facing = place[shown] / seen[shown, None], facing[shown]
+        facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), np.float32(1e-6))
+        light[shown] += seen[shown] * cache.at(place, facing)
+        return (light / np.float32(samples)).reshape(region.height, region.width)
+
+    def _gather(
+        self,
+        rig: StereoRig,
+        pose: Pose,
+        region: Region,
+        projector: Pose,
+        settings: CacheSettings,
+        seed: int,
+    ) -> "_Cache":
+        grid = cells(region, settings.cell)
+        columns, rows = grid.width // settings.cell, grid.height // settings.cell
+        row, column = _grid(rows, columns)
+        found = np.full(columns * rows, -1, np.int32)
+        place, facing = np.zeros((len(found), 3), np.float32), np.zeros((len(found), 3), np.float32)
+        origin = pose.position.astype(np.float32)
+        for k in range(TRIES):
+            left = np.flatnonzero(found < 0)
+            x, y = ((0.5 + k * step) % 1 for step in R2)
+            u = (column[left] + np.float32(x)) * np.float32(settings.cell)
+            v = (row[left] + np.float32(y)) * np.float32(settings.cell)
+            rays = _directions(rig, pose, grid, u, v)
+            triangle, points, normals = self._meet(np.tile(origin, (len(rays), 1)), rays)
+            hit = left[triangle >= 0]
+            found[hit] = triangle[triangle >= 0]
+            place[hit], facing[hit] = points, normals
+        shown = np.flatnonzero(found >= 0)
+        light = np.zeros(len(found), np.float32)
+        if len(shown):
+            rng = np.random.default_rng(seed)
+            light[shown] = self._soft(
+                place[shown], facing[shown], found[shown], projector, settings.rays, rng
+            )
+        cache = _Cache(rig, pose, grid, settings.cell, place, facing, light, found >= 0)
+        if settings.smoothing > 0:
+            around = range(-settings.smoothing, settings.smoothing + 1)
+            taps = [(x, y, np.float32(1)) for y in around for x in around]
+            light[shown] = cache.average(
+                place[shown],
+                facing[shown],
+                column[shown].astype(np.int32),
+                row[shown].astype(np.int32),
+                taps,
+            )
+        return cache
+
+    def _soft(
+        self,
+        points: Float32[np.ndarray, "n 3"],
+        normals: Float32[np.ndarray, "n 3"],
+        triangle: Int32[np.ndarray, "n"],
+        projector: Pose,
+        rays: int,
+        rng: np.random.Generator,
+    ) -> Float32[np.ndarray, "n"]:
+        """Radiance of diffuse points by light that does not come straight from the projector."""
+        turn = rng.random((2, len(points), 1), dtype=np.float32)
+        k = np.arange(rays, dtype=np.float32)[None]
+        p = ((k + 0.5) / rays + turn[0]) % 1
+        q = (k * np.float32(GOLDEN) + turn[1]) % 1
+        owner = np.repeat(np.arange(len(points), dtype=np.int32), rays)
+        start, up, beta = points[owner], normals[owner], self._albedo[triangle][owner]
+        light = np.zeros(len(owner), np.float32)
+        lane = np.arange(len(owner))
+        p, q = p.ravel(), q.ravel()
+        for bounce in range(self._bounces + 1):
+            way = _cosine(up, p, q)
+            start = start + self._offset * up
+            if bounce == self._bounces:
+                free = ~self._blocked(start, way)
+                light[lane[free]] += beta[free] * self._environment(way[free])
+                break
+            met, where, facing = self._meet(start, way)
+            free = met < 0
+            light[lane[free]] += beta[free] * self._environment(way[free])
+            lane, met, beta = lane[~free], met[~free], beta[~free]
+            light[lane] += beta * self._from_projector(where, facing, met, projector)
+            start, up, beta = where, facing, beta * self._albedo[met]
+            p, q = rng.random((2, len(lane)), dtype=np.float32)
+        return light.reshape(len(points), rays).mean(axis=1)
+
+    def _meet(
+        self, origins: Float32[np.ndarray, "n 3"], rays: Float32[np.ndarray, "n 3"]
+    ) -> tuple[Int32[np.ndarray, "n"], Float32[np.ndarray, "m 3"], Float32[np.ndarray, "m 3"]]:
+        """First triangle of each ray (−1: none); points and facing normals of those that hit."""
+        triangle = self._embree.run(origins, rays, query="INTERSECT")
+        hit = np.flatnonzero(triangle >= 0)
+        met, start, way = triangle[hit], origins[hit], rays[hit]
+        normals = self._normal[met]
+        slope = np.einsum("ij,ij->i", normals, way)
+        # The hit on the triangle's plane; a ray within the plane starts where it ends.
+        rise = np.einsum("ij,ij->i", normals, self._corner[met] - start)
+        points = start + (rise / np.where(slope == 0, 1, slope))[:, None] * way
+        normals *= -np.copysign(np.float32(1), slope)[:, None]
+        return triangle, points, normals
+
+    def _blocked(
+        self,
+        origins: Float32[np.ndarray, "n 3"],
+        rays: Float32[np.ndarray, "n 3"],
+        within: Float32[np.ndarray, "n"] | None = None,
+    ) -> Bool[np.ndarray, "n"]:
+        return self._embree.run(origins, rays, dists=within, query="OCCLUDED") >= 0
+
+    def _environment(self, rays: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n"]:
+        light = self._scene.light
+        sine = rays[:, 2] / np.sqrt(np.einsum("ij,ij->i", rays, rays))
+        high = sine > np.float32(np.sin(np.radians(light.sky_elevation)))
+        return np.where(high, np.float32(light.sky + light.ambient), np.float32(light.ambient))
+
+    def _from_projector(
+        self,
+        points: Float32[np.ndarray, "n 3"],
+        normals: Float32[np.ndarray, "n 3"],
+        triangle: Int32[np.ndarray, "n"],
+        projector: Pose,
+    ) -> Float32[np.ndarray, "n"]:
+        """Radiance that diffuse points give back of the projector's light."""
+        scene = self._scene
+        local = transform_points(invert_rigid(projector.camera_to_world), points)
+        local = local.astype(np.float32)
+        z = local[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = local[:, 0] / z * np.float32(0.5 / scene.tan_half_width) + np.float32(0.5)
+            v = local[:, 1] / z * np.float32(0.5 / scene.tan_half_height) + np.float32(0.5)
+            lit = np.flatnonzero((z > 0) & (u > 0) & (u < 1) & (v > 0) & (v < 1))
+        slide = _bilinear(scene.pattern, u[lit], v[lit])
+        lit, slide = lit[slide > 0], slide[slide > 0]
+        towards = np.float32(projector.position) - points[lit]
+        squared = np.einsum("ij,ij->i", towards, towards)
+        cosine = np.einsum("ij,ij->i", normals[lit], towards) / np.sqrt(squared)
+        front = cosine > 0
+        lit, slide, towards = lit[front], slide[front], towards[front]
+        squared, cosine = squared[front], cosine[front]
+        start = points[lit] + self._offset * normals[lit]
+        free = ~self._blocked(start, towards, np.ones(len(lit), np.float32))
+        light = np.zeros(len(points), np.float32)
+        strength = np.float32(scene.light.projector) * self._albedo[triangle[lit]] * slide
+        light[lit] = np.where(free, strength * cosine / squared, 0)
+        return light
+
+
+class _Cache:
+    """Soft light on a grid of cells of the left image."""
+
+    def __init__(
+        self,
+        rig: StereoRig,
+        pose: Pose,
+        grid: Region,
+        cell: int,
+        place: Float32[np.ndarray, "m 3"],
+        facing: Float32[np.ndarray, "m 3"],
+        light: Float32[np.ndarray, "m"],
+        filled: Bool[np.ndarray, "m"],
+    ) -> None:
+        self._world_to_camera = invert_rigid(pose.camera_to_world)
+        cx, cy = rig.principal_point
+        self._focal = np.float32(rig.focal)
+        self._corner = (np.float32(grid.x - cx - 0.5), np.float32(grid.y - cy - 0.5))
+        self._cell = np.float32(cell)
+        self._columns, self._rows = grid.width // cell, grid.height // cell
+        self._reach = np.float32(2 * cell / rig.focal)
+        self._place, self._facing, self._light, self._filled = place, facing, light, filled
+
+    def at(
+        self, points: Float32[np.ndarray, "n 3"], normals: Float32[np.ndarray, "n 3"]
+    ) -> Float32[np.ndarray, "n"]:
+        """Radiance at surface points, between the four cells around."""
+        local = transform_points(self._world_to_camera, points).astype(np.float32)
+        scale = self._focal / local[:, 2]
+        x = (local[:, 0] * scale - self._corner[0]) / self._cell - np.float32(0.5)
+        y = (local[:, 1] * scale - self._corner[1]) / self._cell - np.float32(0.5)
+        # The right camera may see a little beyond the left region: the border cell stands there.
+        x, y = np.clip(x, 0, self._columns - 1), np.clip(y, 0, self._rows - 1)
+        x0, y0 = np.floor(x), np.floor(y)
+        fx, fy = x - x0, y - y0
+        taps = [
+            (0, 0, (1 - fx) * (1 - fy)),
+            (1, 0, fx * (1 - fy)),
+            (0, 1, (1 - fx) * fy),
+            (1, 1, fx * fy),
+        ]
+        return self.average(points, normals, x0.astype(np.int32), y0.astype(np.int32), taps)
+
+    def average(
+        self,
+        points: Float32[np.ndarray, "n 3"],
+        normals: Float32[np.ndarray, "n 3"],
+        column: Int32[np.ndarray, "n"],
+        row: Int32[np.ndarray, "n"],
+        taps: Sequence[tuple[int, int, Float[np.ndarray, "n"] | np.float32]],
+    ) -> Float32[np.ndarray, "n"]:
+        """Mean radiance of neighbouring cells, by how well they lie on the surface's plane."""
+        depth = transform_points(self._world_to_camera, points)[:, 2].astype(np.float32)
+        limit = 1 / (self._reach * depth)
+        light, total = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
+        for dx, dy, share in taps:
+            x, y = column + np.int32(dx), row + np.int32(dy)
+            inside = (x >= 0) & (y >= 0) & (x < self._columns) & (y < self._rows)
+            cell = np.where(inside, y * np.int32(self._columns) + x, 0)
+            inside &= self._filled[cell]
+            off = np.einsum("ij,ij->i", self._place[cell] - points, normals) * limit
+            along = np.maximum(np.einsum("ij,ij->i", self._facing[cell], normals), 0)
+            # Even a cell that fits badly counts a little: it is all there is at some edges.
+            weight = (share + np.float32(1e-3)) * (along**4 / (1 + off**4) + np.float32(1e-4))
+            weight = np.where(inside, weight, 0)
+            light += weight * self._light[cell]
+            total += weight
+        mean = self._light[self._filled].mean(dtype=np.float32) if self._filled.any() else 0
+        return np.where(total > 0, light / np.maximum(total, np.float32(1e-30)), mean)
+
+
+def _directions(
+    rig: StereoRig,
+    camera: Pose,
+    region: Region,
+    u: Float32[np.ndarray, "n"],
+    v: Float32[np.ndarray, "n"],
+) -> Float32[np.ndarray, "n 3"]:
+    """Rays of length 1 along the optical axis; pixel i of the region reaches from i to i + 1."""
+    cx, cy = rig.principal_point
+    x = (u + np.float32(region.x - cx - 0.5)) * np.float32(1 / rig.focal)
+    y = (v + np.float32(region.y - cy - 0.5)) * np.float32(1 / rig.focal)
+    turn = camera.camera_to_world[:3, :3].astype(np.float32)
+    return np.stack([turn[i, 0] * x + turn[i, 1] * y + turn[i, 2] for i in range(3)], axis=1)
+
+
+def _grid(rows: int, columns: int) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"]]:
+    """Row and column of each place, row by row; single precision, as Embree wants it."""
+    row, column = np.divmod(np.arange(rows * columns, dtype=np.int32), np.int32(columns))
+    return row.astype(np.float32), column.astype(np.float32)
+
+
+def _cosine(
+    normals: Float32[np.ndarray, "n 3"],
+    p: Float32[np.ndarray, "n"],
+    q: Float32[np.ndarray, "n"],
+) -> Float32[np.ndarray, "n 3"]:
+    """Directions around ``normals`` by Lambert's cosine (Duff et al. 2017 for the frame)."""
+    radius, angle = np.sqrt(p), np.float32(2 * np.pi) * q
+    x, y, z = radius * np.cos(angle), radius * np.sin(angle), np.sqrt(np.maximum(0, 1 - p))
+    nx, ny, nz = normals.T
+    sign = np.copysign(np.float32(1), nz)
+    a = -1 / (sign + nz)
+    b = nx * ny * a
+    first = np.stack([1 + sign * nx * nx * a, sign * b, -sign * nx], axis=1)
+    second = np.stack([b, sign + ny * ny * a, -ny], axis=1)
+    return x[:, None] * first + y[:, None] * second + z[:, None] * normals
+
+
+def _bilinear(
+    image: Float32[np.ndarray, "h w"],
+    u: Float32[np.ndarray, "n"],
+    v: Float32[np.ndarray, "n"],
+) -> Float32[np.ndarray, "n"]:
+    """Value at positions in 0…1 of a picture, its border continued."""
+    height, width = image.shape
+    x, y = u * np.float32(width) - np.float32(0.5), v * np.float32(height) - np.float32(0.5)
+    x0, y0 = np.floor(x), np.floor(y)
+    fx, fy = x - x0, y - y0
+    left = np.clip(x0.astype(np.int32), 0, width - 1)
+    right = np.clip(x0.astype(np.int32) + 1, 0, width - 1)
+    top = np.clip(y0.astype(np.int32), 0, height - 1)
+    bottom = np.clip(y0.astype(np.int32) + 1, 0, height - 1)
+    upper = image[top, left] * (1 - fx) + image[top, right] * fx
+    lower = image[bottom, left] * (1 - fx) + image[bottom, right] * fx
+    return upper * (1 - fy) + lower * fy
