@@ -17,15 +17,16 @@ def montage_view(result: Any, sensor: Any) -> tuple[Any, int]:
 
     best = int(np.argmax([view.object_pixels for view in result.views]))
     images = result.images[best]
+    true_depth = np.where(images.mask, images.true_depth, np.nan)  # of the object alone
     view = MontageView(
         left=images.left,
         right=images.right,
         disparity=images.disparity,
         depth=images.depth,
-        true_depth=images.true_depth,
+        true_depth=true_depth,
         cloud=result.points,
         clean=result.clean,
         pattern=pattern_image(sensor.pattern),
-        box=object_box(np.where(images.mask, images.true_depth, np.nan), 20),
+        box=object_box(true_depth, 20),
     )
     return view, best

@@ -22,6 +22,7 @@ from qs3.sensor.depth import depth_from_disparity
 from qs3.sensor.exposure import expose
 from qs3.sensor.fusion import fuse
 from qs3.sensor.matching import match, matching_canvas
+from qs3.sensor.obstacles import check_views
 from qs3.sensor.presets import Sensor, get_sensor
 from qs3.sensor.randomise import draw
 from qs3.sensor.render import Body, Renderer, Scene, StereoPair
@@ -30,7 +31,7 @@ from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.sampling import resample
 from qs3.sensor.speckle import pattern_image
 from qs3.sensor.statistics import ViewStatistics
-from qs3.sensor.surroundings import SceneSettings, arrange, check_views
+from qs3.sensor.surroundings import SceneSettings, arrange
 from qs3.sensor.view import ViewImages as ViewImages
 from qs3.sensor.view import clouds_of, object_region, statistics_of
 from qs3.sensor.views import ViewLayout, place_views
@@ -187,7 +188,9 @@ def scan(
         canvases = [matching_canvas(region, sensor.rig, sensor.matching) for region in regions]
         built = _scene(around.bodies, sensor)
         # An object alone needs no more than its own box: the rest is background.
-        wanted = None if built.alone else canvases
+        reach = int(np.ceil(4 * sensor.exposure.psf))
+        size_of_frame = (sensor.rig.width, sensor.rig.height)
+        wanted = None if built.alone else [c.grown(reach, *size_of_frame) for c in canvases]
         pairs = renderer.render(built, sensor.rig, around.poses, seeds, wanted)
     with clock("true_depth"):
         casters = [DepthCaster(*(body.mesh for body in around.bodies))]

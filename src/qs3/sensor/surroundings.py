@@ -17,13 +17,14 @@ import trimesh
 from jaxtyping import Float
 
 from qs3.errors import InputError
-from qs3.geometry import rotation_z
+from qs3.geometry import invert_rigid, rotation_z, transform_points
 from qs3.sensor.materials import Material
-from qs3.sensor.presets import Sensor
+from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.render.scene import Body
-from qs3.sensor.rig import Pose
+from qs3.sensor.rig import Pose, StereoRig
 
 LAYOUTS = ("alone", "floor", "wall", "room", "behind", "beside")
+_SURVEY, _STEPS = 96, 25  # pixels and places at which a neighbour's cover is tried
 _LIFT = 1e-4  # of the object's size between it and the floor: equal planes would flicker
 
 
@@ -46,9 +47,9 @@ class SceneSettings:
     """Between the object and its neighbour."""
     neighbour_size: float = 1.0
     """Size of the neighbour."""
-    cover: float = 0.4
-    """``behind``: share of the object's width, as the first view sees it, that the neighbour
-    reaches across from one side."""
+    cover: float = 0.3
+    """``behind``: share of what the first view sees of the object that the neighbour hides, as
+    near as its shape allows."""
     extent: float = 20.0
     """Side of the floor and of the wall."""
     arc: float = 120.0
@@ -128,7 +129,11 @@ def arrange(
         InputError: where the layout needs a neighbour and there is none, or the other way round.
     """
     if settings.needs_neighbour != (neighbour is not None):
-        wanted = "needs a neighbour: name its mesh" if neighbour is None else "has no neighbour"
+        wanted = (
+            "needs a neighbour: name its mesh (neighbour)"
+            if neighbour is None
+            else "has no neighbour"
+        )
         raise InputError(f"scene: layout {settings.layout!r} {wanted}")
     parts = settings.parts
     if parts & {"wall", "behind"}:
@@ -161,52 +166,6 @@ def arrange(
         bodies.append(Body(_square(centre, front * half, across * half), settings.floor))
         names.append("floor")
     return Surroundings(tuple(bodies), tuple(names), tuple(poses))
-
-
-def check_views(surroundings: Surroundings, sensor: Sensor) -> None:
-    """Refuse what no camera can stand in or light up, before anything is rendered.
-
-    Raises:
-        InputError: where a camera or the projector stands in the box of the object or of its
-            neighbour, under the floor or behind the wall, or where no view's projector can reach
-            the object.
-    """
-    rig = sensor.rig
-    for index, pose in enumerate(surroundings.poses):
-        eyes = {"camera": pose, "right camera": rig.right(pose), "projector": rig.projector(pose)}
-        for eye, stands in eyes.items():
-            for body, name in zip(surroundings.bodies, surroundings.names, strict=True):
-                if where := _blocked(stands.position, body, name):
-                    raise InputError(
-                        f"view {index}: the {eye} stands {where}; give placement a larger radius "
-                        "or another elevation, or make the object smaller (object_size)"
-                    )
-    if sensor.light.projector > 0 and not any(
-        _lit(surroundings.bodies[0].mesh, sensor, pose) for pose in surroundings.poses
-    ):
-        raise InputError(
-            f"the projector ({rig.projector_offset} baselines from the left camera) throws its "
-            "pattern past the object in every view; bring it nearer (rig.projector_offset) or "
-            "widen pattern.tan_half_width and tan_half_height"
-        )
-
-
-def _blocked(at: Float[np.ndarray, "3"], body: Body, name: str) -> str:
-    """Where a position lies that it must not, in words; empty where it may."""
-    if name in ("floor", "wall"):
-        outside = float((at - body.mesh.vertices[0]) @ body.mesh.face_normals[0]) > 0
-        return "" if outside else ("under the floor" if name == "floor" else "behind the wall")
-    low, high = np.asarray(body.mesh.bounds)
-    return f"inside the {name}'s box" if ((at >= low) & (at <= high)).all() else ""
-
-
-def _lit(mesh: trimesh.Trimesh, sensor: Sensor, pose: Pose) -> bool:
-    """Whether the projector's cone and the mesh may meet: no side of the cone parts them."""
-    at = sensor.rig.projector(pose).camera_to_world
-    x, y, z = ((mesh.vertices - at[:3, 3]) @ at[:3, :3]).T
-    wide, high = sensor.pattern.tan_half_width * z, sensor.pattern.tan_half_height * z
-    sides = (z > 0, x < wide, x > -wide, y < high, y > -high)
-    return all(bool(side.any()) for side in sides)
 
 
 def _on_arc(poses: Sequence[Pose], arc: float) -> list[Pose]:
@@ -259,19 +218,35 @@ def _before(
             "scene: no room for a neighbour between the first view's camera and the object; give "
             "placement a larger radius, or make the neighbour smaller (neighbour_size)"
         )
-    right, forward = pose.camera_to_world[:3, 0], pose.camera_to_world[:3, 2]
+    return shift + pose.camera_to_world[:3, 0] * _aside(mesh, other, shift, pose, side, settings)
 
-    def span(vertices: np.ndarray) -> tuple[float, float, float]:
-        local = vertices - pose.position
-        depth = np.maximum(local @ forward, 1e-6)
-        tangent = (local @ right) / depth
-        return float(tangent.min()), float(tangent.max()), float(np.median(depth))
 
-    left_end, right_end, _ = span(mesh.vertices)
-    low, high, depth = span(other.vertices + shift)
-    width = settings.cover * (right_end - left_end)
-    aside = left_end + width - high if side < 0 else right_end - width - low
-    return shift + right * aside * depth
+def _aside(
+    mesh: trimesh.Trimesh,
+    other: trimesh.Trimesh,
+    shift: Float[np.ndarray, "3"],
+    pose: Pose,
+    side: float,
+    settings: SceneSettings,
+) -> float:
+    """How far to move a neighbour along the camera's x axis so that it hides the wanted share."""
+    x, y, z = transform_points(invert_rigid(pose.camera_to_world), np.asarray(mesh.vertices)).T
+    reach = float(np.abs([x / z, y / z]).max())
+    rig = StereoRig(width=_SURVEY, height=_SURVEY, focal=_SURVEY / 2 / reach)
+    seen = DepthCaster(mesh).cast(rig, pose, rig.full_frame).mask
+    moved = other.copy()
+    moved.vertices = moved.vertices + shift
+    caster = DepthCaster(moved)
+    # Far enough to be clear of the object, then inwards until both are in line.
+    width = float(np.ptp((moved.vertices - pose.position) @ pose.camera_to_world[:3, 0]))
+    best, error = 0.0, math.inf
+    for offset in side * np.linspace(width / 2 + reach * float(z.max()), 0.0, _STEPS):
+        # The neighbour moved to the right looks as from a camera moved to the left.
+        hidden = caster.cast(rig, pose.shifted(-offset), rig.full_frame).mask & seen
+        miss = abs(float(hidden.sum()) / max(int(seen.sum()), 1) - settings.cover)
+        if miss < error:
+            best, error = float(offset), miss
+    return best
 
 
 def _beside(

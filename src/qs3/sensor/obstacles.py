@@ -1,0 +1,57 @@
+"""What no camera can stand in and no projector light up, refused before anything is rendered."""
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+from qs3.errors import InputError
+from qs3.sensor.presets import Sensor
+from qs3.sensor.render.scene import Body
+from qs3.sensor.rig import Pose
+from qs3.sensor.surroundings import Surroundings
+
+
+def check_views(surroundings: Surroundings, sensor: Sensor) -> None:
+    """Refuse what no camera can stand in or light up, before anything is rendered.
+
+    Raises:
+        InputError: where a camera or the projector stands in the box of the object or of its
+            neighbour, under the floor or behind the wall, or where no view's projector can reach
+            the object.
+    """
+    rig = sensor.rig
+    for index, pose in enumerate(surroundings.poses):
+        eyes = {"camera": pose, "right camera": rig.right(pose), "projector": rig.projector(pose)}
+        for eye, stands in eyes.items():
+            for body, name in zip(surroundings.bodies, surroundings.names, strict=True):
+                if where := _blocked(stands.position, body, name):
+                    raise InputError(
+                        f"view {index}: the {eye} stands {where}; give placement a larger radius "
+                        "or another elevation, or make the object smaller (object_size)"
+                    )
+    if sensor.light.projector > 0 and not any(
+        _lit(surroundings.bodies[0].mesh, sensor, pose) for pose in surroundings.poses
+    ):
+        raise InputError(
+            f"the projector ({rig.projector_offset} baselines from the left camera) throws its "
+            "pattern past the object in every view; bring it nearer (rig.projector_offset) or "
+            "widen pattern.tan_half_width and tan_half_height"
+        )
+
+
+def _blocked(at: Float[np.ndarray, "3"], body: Body, name: str) -> str:
+    """Where a position lies that it must not, in words; empty where it may."""
+    if name in ("floor", "wall"):
+        outside = float((at - body.mesh.vertices[0]) @ body.mesh.face_normals[0]) > 0
+        return "" if outside else ("under the floor" if name == "floor" else "behind the wall")
+    low, high = np.asarray(body.mesh.bounds)
+    return f"inside the {name}'s box" if ((at >= low) & (at <= high)).all() else ""
+
+
+def _lit(mesh: trimesh.Trimesh, sensor: Sensor, pose: Pose) -> bool:
+    """Whether the projector's cone and the mesh may meet: no side of the cone parts them."""
+    at = sensor.rig.projector(pose).camera_to_world
+    x, y, z = ((mesh.vertices - at[:3, 3]) @ at[:3, :3]).T
+    wide, high = sensor.pattern.tan_half_width * z, sensor.pattern.tan_half_height * z
+    sides = (z > 0, x < wide, x > -wide, y < high, y > -high)
+    return all(bool(side.any()) for side in sides)
