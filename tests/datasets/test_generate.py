@@ -12,7 +12,13 @@ import pytest
 
 from qs3.datasets.classes import POINTDA10
 from qs3.datasets.failures import FAILURES, read_failures
-from qs3.datasets.generate import GenerateReport, GenerateSettings, generate, scan_seed
+from qs3.datasets.generate import (
+    GenerateReport,
+    GenerateSettings,
+    generate,
+    neighbour_of,
+    scan_seed,
+)
 from qs3.datasets.store import MANIFEST, info, read_store
 from qs3.errors import InputError
 
@@ -197,6 +203,59 @@ def test_seeds_depend_on_root_object_and_scan_alone_and_do_not_collide():
     assert np.abs(bits.mean(axis=0) - 0.5).max() < 0.15
     # Pinned: a change would make every data set that exists irreproducible.
     assert scan_seed(0, "chair/a", 0) == PINNED
+
+
+def test_neighbours_are_other_objects_drawn_evenly_from_the_scans_own_seed(fake):
+    work = items(fake)
+    drawn = [neighbour_of(work[1], scan, work, 0).id for scan in range(400)]
+    counts = {name: drawn.count(name) for name in ("m0", "m2", "m3", "m4")}
+    assert sum(counts.values()) == 400
+    assert min(counts.values()) > 70
+    assert drawn == [neighbour_of(work[1], scan, work, 0).id for scan in range(400)]
+    assert drawn != [neighbour_of(work[1], scan, work, 1).id for scan in range(400)]
+    with pytest.raises(InputError, match="second mesh"):
+        neighbour_of(work[1], 0, work[1:2], 0)
+
+
+def test_a_scene_with_a_neighbour_hands_one_to_every_scan(fake, tmp_path):
+    from qs3.sensor.surroundings import SceneSettings
+
+    seen = []
+
+    def scan_one(item, scan, settings, neighbour):
+        seen.append((item.id, scan, neighbour.id))
+        return fake.fake_row(item, scan, settings)
+
+    settings = dataclasses.replace(SETTINGS, scene=SceneSettings("room+behind"))
+    work = items(fake)
+    generate(work, tmp_path, settings, scan_one=scan_one, progress=False)
+    assert seen == [
+        (item.id, scan, neighbour_of(item, scan, work, 0).id) for item in work for scan in range(3)
+    ]
+
+
+def test_scene_and_ranges_belong_to_the_record(fake, tmp_path):
+    generate(items(fake), tmp_path, SETTINGS, scan_one=fake.fake_row, progress=False)
+    from qs3.sensor.surroundings import SceneSettings
+
+    for changed, name in [
+        ({"scene": SceneSettings("floor")}, "scene.layout = alone, not floor"),
+        ({"randomise": {"light.ambient": (0.0, 0.1)}}, "randomise"),
+        ({"mask_crop": True}, "mask_crop"),
+        ({"box_margin": 0.1}, "box_margin"),
+    ]:
+        other = dataclasses.replace(SETTINGS, **changed)
+        with pytest.raises(InputError, match=name):
+            generate(items(fake), tmp_path, other, scan_one=fake.fake_row, progress=False)
+    with pytest.raises(InputError, match=r"light\.ambient"):
+        generate(
+            items(fake),
+            tmp_path / "new",
+            dataclasses.replace(SETTINGS, randomise={"light.ambiant": (0.0, 0.1)}),
+            scan_one=fake.fake_row,
+            progress=False,
+        )
+    assert not (tmp_path / "new").exists()
 
 
 PINNED = 8173939628446060847

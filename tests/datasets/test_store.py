@@ -193,3 +193,23 @@ def test_info_counts(fake, tmp_path):
     }
     assert counts["splits"] == {"test": 3, "train": 3}
     assert counts["points"] == [16, 16]
+
+
+def test_a_data_set_of_schema_1_still_reads(fake, tmp_path):
+    made = make(tmp_path, fake, shards=1)[:4]
+    old = pq.read_table(shard_path(tmp_path, 0)).drop_columns(["drawn"])
+    pq.write_table(old, shard_path(tmp_path, 0))
+    manifest = tmp_path / MANIFEST
+    manifest.write_text(manifest.read_text().replace('"schema": 2', '"schema": 1'))
+    assert open_dataset(tmp_path).schema == 1
+    np.testing.assert_array_equal(read_store(tmp_path).points, [row.points for row in made])
+    assert read_shard(shard_path(tmp_path, 0), ["drawn", "id"])["drawn"].to_pylist() == ["{}"] * 4
+    assert read_shard(shard_path(tmp_path, 0)).column_names[-1] == "drawn"
+    assert info(tmp_path)["rows"] == 4
+
+
+def test_what_was_drawn_is_kept(fake, tmp_path):
+    drawn = '{"light.ambient": 0.1, "neighbour": "m1"}'
+    row = dataclasses.replace(rows(fake)[0], drawn=drawn)
+    write_shard(tmp_path / "a.parquet", [row])
+    assert read_shard(tmp_path / "a.parquet", ["drawn"])["drawn"].to_pylist() == [drawn]

@@ -15,7 +15,8 @@ from qs3.sensor.exposure import ExposureSettings
 from qs3.sensor.matching import MatchingSettings
 from qs3.sensor.presets import SENSORS, Sensor, get_sensor
 from qs3.sensor.render.mitsuba import MitsubaRenderer
-from qs3.sensor.rig import StereoRig
+from qs3.sensor.render.raycast import DepthCaster
+from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.scan import Scan, scan
 from qs3.sensor.views import Placement
 
@@ -238,3 +239,124 @@ def test_image_noise_changes_the_cloud_and_follows_the_seed(renderer):
 
 def test_scalar_renderer_is_named_in_its_description(renderer: MitsubaRenderer):
     assert renderer.description["variant"] == "scalar_rgb"
+
+
+def test_metric_size_scales_mesh_cloud_and_crop(renderer):
+    # One object at twice the size, seen by a rig twice as large from twice as far: the same
+    # pictures, and a cloud twice as large.
+    large = dataclasses.replace(
+        SMALL,
+        rig=dataclasses.replace(SMALL.rig, baseline=2 * SMALL.rig.baseline),
+        placement=Placement(radius=(6.0, 10.0)),
+        depth=DepthSettings(near=2.0, far=12.0, stride=2),
+        # The projector is a point: its light falls with the square of the distance.
+        light=dataclasses.replace(SMALL.light, projector=4 * SMALL.light.projector),
+    )
+    how = {"views": 1, "seed": 4, "num_points": 300, "renderer": renderer, "box_margin": 0.0}
+    one = scan(asymmetric(), sensor=SMALL, **how)
+    two = scan(asymmetric(), sensor=large, object_size=2.0, **how)
+    assert two.mesh.extents.max() == pytest.approx(2.0)
+    assert two.sensor.object_size == 2.0
+    np.testing.assert_allclose(np.sort(two.clean), 2 * np.sort(one.clean), atol=1e-4)
+    exact = trimesh.proximity.closest_point(two.mesh, two.clean)[1]
+    assert exact.max() < 2e-5
+    for a, b in zip(one.views, two.views, strict=True):
+        assert a.object_pixels == b.object_pixels
+        assert a.disparity_sigma == pytest.approx(b.disparity_sigma, rel=0.1)
+
+
+@pytest.mark.parametrize("size", [0.0, -1.0, float("inf"), float("nan")])
+def test_an_impossible_size_is_refused(renderer, size):
+    with pytest.raises(InputError, match="object_size"):
+        scan(asymmetric(), sensor=SMALL, object_size=size, renderer=renderer)
+
+
+def test_a_view_beyond_the_gate_is_recorded_as_empty(renderer):
+    # The copies of a pose stand up to 0.1 nearer or farther; the gate ends within the object's
+    # nearest corner, so that only some views have it within reach.
+    def made(far: float) -> Scan:
+        sensor = dataclasses.replace(
+            SMALL, depth=DepthSettings(far=far, stride=1), placement=Placement(radius=(3.0, 3.0))
+        )
+        return scan(
+            trimesh.creation.icosphere(subdivisions=4),
+            sensor=sensor,
+            views=4,
+            view_layout="jitter",
+            seed=2,
+            box_crop=False,
+            num_points=200,
+            renderer=renderer,
+            keep_images=True,
+        )
+
+    nearest = [np.nanmin(i.true_depth) for i in made(6.0).images]
+    limit = float(np.mean([sorted(nearest)[1], sorted(nearest)[2]]))
+    found = made(limit)
+    reached = [bool(n < limit) for n in nearest]
+    assert sum(reached) == 2
+    assert set(found.clean_view.tolist()) == {i for i in range(4) if reached[i]}
+    assert set(found.view.tolist()) <= {i for i in range(4) if reached[i]}
+    for view, sees in zip(found.views, reached, strict=True):
+        assert (view.object_pixels > 0) is sees
+        if not sees:
+            assert set(dataclasses.asdict(view).values()) == {0, None}
+
+
+def test_wrong_matches_within_the_gate_make_no_cloud_of_an_object_beyond_it(renderer):
+    # At a distance of 6.5 the object lies beyond the gate; whatever falls within it is wrong.
+    far = dataclasses.replace(
+        SMALL, placement=Placement(radius=(6.5, 6.5)), exposure=ExposureSettings(noise=4.0)
+    )
+    far = dataclasses.replace(far, depth=DepthSettings(near=1.0, far=5.5, stride=1))
+    with pytest.raises(InputError, match="saw no point"):
+        scan(asymmetric(), sensor=far, views=2, box_crop=False, renderer=renderer)
+
+
+def test_an_object_smaller_than_a_pixel_is_refused(renderer):
+    with pytest.raises(InputError, match="saw no point"):
+        scan(asymmetric(), sensor=SMALL, object_size=1e-3, views=2, renderer=renderer)
+
+
+def test_a_caster_of_several_bodies_tells_which_is_in_front():
+    rig = StereoRig(width=9, height=3, focal=4.0)
+    pose = Pose(np.eye(4))
+    near = trimesh.creation.box(extents=[1, 1, 0.5]).apply_translation([0, 0, 2.25])
+    far = trimesh.creation.box(extents=[9, 9, 0.5]).apply_translation([0, 0, 4.25])
+    cast = DepthCaster(far, near).cast(rig, pose, rig.full_frame, normals=True)
+    assert cast.body[1].tolist() == [0, 0, 0, 1, 1, 1, 0, 0, 0]
+    np.testing.assert_array_equal(cast.depth[1], np.where(cast.body[1] == 1, 2.0, 4.0))
+    np.testing.assert_array_equal(cast.mask, cast.body == 0)
+    np.testing.assert_allclose(cast.normals, np.broadcast_to([0.0, 0, -1], (3, 9, 3)), atol=1e-12)
+    alone = DepthCaster(near).cast(rig, pose, rig.full_frame)
+    np.testing.assert_array_equal(alone.mask, cast.body == 1)
+    assert (alone.body[~alone.mask] == -1).all()
+
+
+def test_the_renderer_is_asked_for_no_more_than_is_matched(renderer):
+    class Watching:
+        asked: list = []  # noqa: RUF012
+
+        @property
+        def description(self):
+            return renderer.description
+
+        def render(self, scene, rig, poses, seeds, regions=None):
+            self.asked.append(regions)
+            return renderer.render(scene, rig, poses, seeds, regions)
+
+    watching = Watching()
+    how = {"sensor": SMALL, "views": 1, "seed": 3, "num_points": 100, "renderer": watching}
+    part = scan(asymmetric(), scene="room", keep_images=True, **how)
+    whole = scan(asymmetric(), scene="room", full_frames=True, **how)
+    scan(asymmetric(), **how)
+    assert watching.asked[0][0].width < 540
+    assert watching.asked[1] == [SMALL.rig.full_frame]
+    assert watching.asked[2] is None
+    # The part holds what the whole frame holds there, up to the renderer's own noise.
+    inner = part.images[0].region.slices
+    np.testing.assert_array_equal(whole.images[0].true_depth[inner], part.images[0].true_depth)
+    np.testing.assert_array_equal(whole.images[0].mask[inner], part.images[0].mask)
+    differ = whole.images[0].left[inner].astype(float) - part.images[0].left
+    assert abs(differ.mean()) < 0.5
+    assert whole.views[0].disparity_sigma == pytest.approx(part.views[0].disparity_sigma, rel=0.2)

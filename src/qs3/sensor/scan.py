@@ -31,6 +31,7 @@ from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.sampling import resample
 from qs3.sensor.speckle import pattern_image
 from qs3.sensor.statistics import ViewStatistics
+from qs3.sensor.stored import stored_pattern
 from qs3.sensor.surroundings import SceneSettings, arrange
 from qs3.sensor.view import ViewImages as ViewImages
 from qs3.sensor.view import clouds_of, object_region, statistics_of
@@ -253,7 +254,10 @@ def _view(
     )
     with clock("exposure"):
         grey = []
-        for radiance in pair.canvas(canvas):
+        for side, radiance in enumerate(pair.canvas(canvas)):
+            if side == 1 and rig.second == "pattern":
+                grey.append(stored_pattern(rig, sensor.pattern, canvas))
+                continue
             # Noise of the whole frame, so that it does not depend on the region.
             noise = None
             if sensor.exposure.noise > 0:

@@ -1,0 +1,101 @@
+"""``qs3 scan`` and ``qs3 generate`` with surroundings, randomisation and frames."""
+
+import json
+
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import trimesh
+
+from qs3.cli import main
+
+
+def test_scan_writes_frames_of_a_scene_and_records_it(qs3, quick, tmp_path):
+    out = tmp_path / "scan"
+    done = qs3("scan", "chair", "--out", out, "--seed", 2, "--scene", "floor+beside", "--neighbour",
+               "table", "--crop", "mask", "--frames", "--randomise", "light.ambient=0.02:0.08",
+               "material=diffuse,dark", "--floor-material", "dark", "--num-points", 64,
+               *quick)  # fmt: skip
+    assert str(out / "frames") in done.stdout
+    record = json.loads((out / "scan.json").read_text())
+    assert record["settings"]["scene"]["layout"] == "floor+beside"
+    assert record["settings"]["scene"]["floor"]["albedo"] == 0.04
+    assert record["settings"]["mask_crop"] is True
+    assert record["settings"]["box_crop"] is False
+    assert record["mesh"]["neighbour"]["name"] == "table"
+    assert 0.02 <= record["drawn"]["light.ambient"] <= 0.08
+    assert record["drawn"]["material"] in ("diffuse", "dark")
+    assert record["sensor"]["light"]["ambient"] == record["drawn"]["light.ambient"]
+    scene = out / "frames" / "000000"
+    assert {path.name for path in scene.glob("*.json")} == {
+        "scene_camera.json", "scene_gt.json", "scene_gt_info.json"
+    }  # fmt: skip
+    mask = cv2.imread(str(scene / "mask_visib" / "000000_000000.png"), cv2.IMREAD_UNCHANGED)
+    assert mask.shape == (1080, 1080)
+    assert (mask > 0).sum() == record["views"][0]["object_pixels"]
+
+
+def test_object_size_scales_the_cloud(qs3, quick, tmp_path):
+    out = tmp_path / "scan"
+    qs3("scan", "table", "--out", out, "--object-size", 0.5, "--num-points", 64, *quick)
+    record = json.loads((out / "scan.json").read_text())
+    assert record["sensor"]["object_size"] == 0.5
+    cloud = trimesh.load(out / "clean.ply")
+    assert 0.4 < np.ptp(np.asarray(cloud.vertices), axis=0).max() <= 0.5 + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (("scan", "chair", "--scene", "behind"), "neighbour"),
+        (("scan", "chair", "--scene", "attic"), "attic"),
+        (("scan", "chair", "--neighbour", "toaster", "--scene", "behind"), "toaster"),
+        (("scan", "chair", "--neighbour", "table"), "has no neighbour"),
+        (("scan", "chair", "--wall-material", "velvet", "--scene", "wall"), "velvet"),
+        (("scan", "chair", "--box-margin", "-1"), "box_margin"),
+        (("scan", "chair", "--object-size", "0"), "object-size"),
+        (("scan", "chair", "--object-size", "12"), "inside the object's box"),
+        (("scan", "chair", "--randomise", "light.ambiant=0:1"), "light.ambient"),
+        (("generate", "--meshes", "shapes", "--randomise", "wild"), "wild"),
+        (("generate", "--meshes", "shapes", "--scene", "attic"), "attic"),
+        (
+            ("generate", "--meshes", "shapes", "--classes", "chair", "--per-class", "1", "--scene",
+             "beside"),
+            "second mesh",
+        ),
+    ],
+)  # fmt: skip
+def test_faults_are_one_line(capsys, quick, tmp_path, arguments, word):
+    with pytest.raises(SystemExit) as caught:
+        main([*arguments, "--out", str(tmp_path / "out"), *quick])
+    assert caught.value.code == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith("qs3: ")
+    assert told.err.count("\n") == 1
+    assert word in told.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_generate_draws_neighbours_and_settings_and_records_them(qs3, quick, tmp_path):
+    common = ("generate", "--meshes", "shapes", "--classes", "chair", "lamp",
+              "--per-class", 1, "--scene", "room+beside", "--randomise", "default",
+              "--num-points", 64, "--crop", "box", "--box-margin", 0.05, *quick)  # fmt: skip
+    for name, workers in (("a", 1), ("b", 2)):
+        qs3(*common, "--out", tmp_path / name, "--workers", workers)
+    shards = [(tmp_path / name / "shard-00000.parquet").read_bytes() for name in "ab"]
+    assert shards[0] == shards[1]
+    rows = pq.read_table(tmp_path / "a" / "shard-00000.parquet").to_pylist()
+    drawn = [json.loads(row["drawn"]) for row in rows]
+    ids = {row["object"] for row in rows}
+    for row, values in zip(rows, drawn, strict=True):
+        assert values["neighbour"] in ids - {row["object"]}
+        assert set(values) == {
+            "neighbour", "material", "light.ambient", "light.projector", "exposure.gain"
+        }  # fmt: skip
+    assert len({values["light.ambient"] for values in drawn}) == 2
+    settings = json.loads((tmp_path / "a" / "dataset.json").read_text())["settings"]
+    assert settings["scene"]["layout"] == "room+beside"
+    assert settings["box_margin"] == 0.05
+    assert settings["randomise"]["light.projector"][2] == "log"
