@@ -33,11 +33,13 @@ class CacheSettings:
 
 
 def cells(region: Region, cell: int) -> Region:
-    """The region in whole cells, at least one.
+    """The region grown to whole cells of the frame, so that a cell is one in every region.
 
     Example:
         >>> cells(Region(3, 5, 10, 8), 4)
-        Region(x=3, y=5, width=12, height=8)
+        Region(x=0, y=4, width=16, height=12)
     """
-    columns, rows = (max(1, -(-side // cell)) for side in (region.width, region.height))
-    return Region(region.x, region.y, columns * cell, rows * cell)
+    x, y = region.x // cell * cell, region.y // cell * cell
+    columns = max(1, -(-(region.x + region.width - x) // cell))
+    rows = max(1, -(-(region.y + region.height - y) // cell))
+    return Region(x, y, columns * cell, rows * cell)

@@ -71,7 +71,7 @@ class JitPhotographer:
         return images
 
     # Values that change between images must be opaque: literals would compile a kernel each.
-    def _number(self, value: float) -> Any:
+    def _number(self, value: Any) -> Any:
         return self._dr.opaque(self._mi.Float, float(value))
 
     def _count(self, value: int) -> Any:
@@ -136,7 +136,10 @@ class JitPhotographer:
         si = self._shapes.ray_intersect(rays.at(u + place.x, v + place.y), found)
         found &= si.is_valid()
         bsdf = si.bsdf()
-        turn = mi.sample_tea_32(index, self._count(seed % 2**32), rounds=4)
+        # By the cell's place in the frame, whatever the region.
+        across, down = region.x // settings.cell, region.y // settings.cell
+        name = (row + self._count(down)) * 65536 + (index - row * width) + self._count(across)
+        turn = mi.sample_tea_32(name, self._count(seed % 2**32), rounds=4)
         turn_x, turn_y = (mi.Float(word >> 8) * 2**-24 for word in turn)
         total = self._count(settings.rays)
 

@@ -1,0 +1,156 @@
+"""The irradiance cache against path tracing, and its two implementations against each other."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+
+from qs3.errors import InputError
+from qs3.sensor.materials import MATERIALS, Material
+from qs3.sensor.render import Body, LightSettings, Scene
+from qs3.sensor.render.cache import CacheSettings
+from qs3.sensor.render.embree import EmbreePhotographer, _turns
+from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
+from qs3.sensor.rig import Pose, Region, StereoRig
+from qs3.sensor.speckle import PatternSettings, pattern_image
+
+RIG = StereoRig(width=200, height=160, focal=260.0, baseline=0.1)
+POSE = Pose.looking_at(np.array([2.0, 1.0, 1.6]), np.zeros(3))
+CORNER = trimesh.util.concatenate(
+    [
+        trimesh.creation.box((1.0, 1.0, 0.1)),
+        trimesh.creation.box(
+            (0.1, 1.0, 0.8), trimesh.transformations.translation_matrix((-0.4, 0, 0.4))
+        ),
+        trimesh.creation.box(
+            (0.2, 0.2, 0.3), trimesh.transformations.translation_matrix((0.1, 0.1, 0.2))
+        ),
+    ]
+)
+needs_llvm = pytest.mark.skipif(
+    not usable("llvm_ad_mono"), reason="no libLLVM that Mitsuba can use on this machine"
+)
+VARIANTS = [pytest.param("llvm_ad_mono", marks=needs_llvm), "scalar_rgb"]
+
+
+def corner(material: Material | None = None, light: LightSettings | None = None) -> Scene:
+    pattern = pattern_image(PatternSettings(columns=99, rows=99))
+    body = Body(CORNER, material or Material())
+    return Scene((body,), light or LightSettings(), pattern, 0.5, 0.5)
+
+
+def pair(scene, variant, regions=None, rig=RIG, seed=3, **settings):
+    renderer = MitsubaRenderer(variant=variant, **settings)
+    return renderer.render(scene, rig, [POSE], [seed], regions)[0]
+
+
+def smooth(image):
+    """Means over blocks of 5 × 5 pixels."""
+    high, wide = image.shape[0] // 5 * 5, image.shape[1] // 5 * 5
+    return image[:high, :wide].reshape(high // 5, 5, wide // 5, 5).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("max_depth", [2, 3])
+def test_convention_cached_light_is_path_traced_light(variant, max_depth):
+    scene = corner()
+    cached = pair(scene, variant, samples=16, cache_rays=128, max_depth=max_depth)
+    spp = 256 if variant.startswith("llvm") else 64
+    traced = pair(scene, variant, samples=spp, max_depth=max_depth, indirect="path")
+    for ours, theirs in ((cached.left, traced.left), (cached.right, traced.right)):
+        assert ours.shape == theirs.shape
+        assert ours.mean() == pytest.approx(theirs.mean(), rel=0.005)
+        error = smooth(ours) - smooth(theirs)
+        assert np.sqrt((error**2).mean()) < 0.03 * smooth(theirs).max()
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_soft_light_alone_is_path_traced_light(variant):
+    scene = corner(light=LightSettings(projector=0.0))
+    cached = pair(scene, variant, samples=16, cache_rays=128).left
+    spp = 256 if variant.startswith("llvm") else 100
+    traced = pair(scene, variant, samples=spp, indirect="path").left
+    error = np.abs(smooth(cached) - smooth(traced))
+    assert cached.mean() == pytest.approx(traced.mean(), rel=0.005)
+    assert np.quantile(error, 0.9) < 0.03 * traced.max()
+
+
+@needs_llvm
+def test_both_implementations_agree():
+    scene = corner()
+    jit = pair(scene, "llvm_ad_mono", samples=4, cache_rays=512)
+    embree = pair(scene, "scalar_rgb", samples=4, cache_rays=512)
+    for one, other in ((jit.left, embree.left), (jit.right, embree.right)):
+        assert np.median(np.abs(one - other)) < 2e-3
+        assert (np.abs(one - other) > 0.05).mean() < 0.005
+
+
+@needs_llvm
+def test_rough_principled_surfaces_are_cached_and_agree_with_the_path():
+    scene = corner(Material("principled", roughness=0.5))
+    cached = pair(scene, "llvm_ad_mono", samples=16, cache_rays=128).right
+    traced = pair(scene, "llvm_ad_mono", samples=256, indirect="path").right
+    assert cached.mean() == pytest.approx(traced.mean(), rel=0.01)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_same_seed_same_bits_and_another_seed_other_light(variant):
+    first, again, other = (pair(corner(), variant, samples=2, seed=s) for s in (1, 1, 2))
+    assert np.array_equal(first.left, again.left) and np.array_equal(first.right, again.right)
+    assert not np.array_equal(first.left, other.left)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_region_is_cut_out_of_the_frame(variant):
+    part = Region(61, 43, 70, 50)
+    scene = corner()
+    whole = pair(scene, variant, [RIG.full_frame], samples=2)
+    some = pair(scene, variant, [part], samples=2)
+    inner = np.s_[12:-12, 12:-12]  # at the rim cells outside the region are missing
+    cut = whole.left[part.slices][inner]
+    assert np.abs(some.left[inner] - cut).max() < 1e-4
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("name", ["mirror", "glossy-plastic", "glass"])
+def test_shiny_surfaces_are_path_traced_whatever_the_setting(variant, name):
+    scene = corner(MATERIALS[name])
+    cached, traced = (pair(scene, variant, samples=4, indirect=how) for how in ("cached", "path"))
+    assert np.array_equal(cached.left, traced.left)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_stored_pattern_has_no_right_camera(variant):
+    rig = dataclasses.replace(RIG, projector_offset=1.0, second="pattern")
+    photographed = pair(corner(), variant, rig=rig, samples=1)
+    assert photographed.right.size == 0 and photographed.right_region.empty
+    assert photographed.left.max() > 1
+
+
+def test_embree_takes_diffuse_bodies_only():
+    with pytest.raises(InputError, match="diffuse"):
+        EmbreePhotographer(corner(MATERIALS["metal"]), 3)
+
+
+@pytest.mark.parametrize("kwargs", [{"cell": 0}, {"rays": 0}, {"smoothing": -1}])
+def test_senseless_caches_are_refused(kwargs):
+    with pytest.raises(InputError, match="renderer"):
+        CacheSettings(**kwargs)
+
+
+@pytest.mark.parametrize("kwargs", [{"samples": 0}, {"max_depth": 1}, {"cache_cell": 0}])
+def test_senseless_renderers_are_refused(kwargs):
+    with pytest.raises(InputError, match="renderer"):
+        MitsubaRenderer(variant="scalar_rgb", **kwargs)
+
+
+@needs_llvm
+def test_turns_are_those_of_mitsuba():
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_mono")
+    names = np.array([0, 1, 65537, 2**31], dtype=np.uint32)
+    theirs = mi.sample_tea_32(mi.UInt32(names), mi.UInt32(77), rounds=4)
+    theirs = np.stack([np.array(word) for word in theirs]) >> 8
+    assert np.array_equal(_turns(names, 77), theirs.astype(np.float32) * np.float32(2**-24))
