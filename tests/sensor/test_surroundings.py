@@ -238,7 +238,7 @@ def test_a_projector_inside_the_object_is_refused():
     pose = Pose.looking_at(np.array([0.0, -2.0, 0.0]), np.zeros(3))
     box = trimesh.creation.box(extents=[1, 1, 1]).apply_translation([3.0, -2.0, 0.0])
     made = Surroundings((Body(box),), ("object",), (pose,))
-    sensor = dataclasses.replace(TINY, rig=StereoRig(projector_offset=10.0, baseline=0.3))
+    sensor = dataclasses.replace(TINY, rig=StereoRig(300, 300, 420.0, 0.3, projector_offset=10.0))
     with pytest.raises(InputError, match="projector stands inside"):
         check_views(made, sensor)
 

@@ -45,8 +45,14 @@ def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
     from qs3.cli.doctor import doctor
     from qs3.cli.generate import generate
     from qs3.cli.scan import scan
+    from qs3.cli.sensors import sensors
 
-    verbs: dict[str, Callable[..., int]] = {"scan": scan, "generate": generate, "doctor": doctor}
+    verbs: dict[str, Callable[..., int]] = {
+        "scan": scan,
+        "sensors": sensors,
+        "generate": generate,
+        "doctor": doctor,
+    }
     if given and given[0] in verbs:
         return verbs
     import tyro
@@ -64,5 +70,5 @@ def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
 
     train_with_preset.__doc__ = train.__doc__
     verbs |= {"train": train_with_preset, "evaluate": evaluate, "predict": predict, "demo": demo}
-    order = ("scan", "generate", "train", "evaluate", "predict", "doctor", "demo")
+    order = ("scan", "sensors", "generate", "train", "evaluate", "predict", "doctor", "demo")
     return {name: verbs[name] for name in order}

@@ -14,7 +14,7 @@ class CameraOptions:
     """The simulated camera."""
 
     sensor: str = "qs3"
-    """Preset of the sensor: qs3 (the released scanner), qs3-800, bright-room."""
+    """A preset (qs3 sensors lists them: qs3, d435, …) or your own TOML file."""
     preset: Literal["default", "paper", "released"] = "default"
     """Which column of the settings in which the paper's text and its code differ."""
     views: int = 5

@@ -5,12 +5,14 @@ Convention:
     left OpenCV camera, then taken to the world by the camera's pose.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from qs3.errors import InputError
 from qs3.geometry import transform_points
 from qs3.sensor.rig import Pose, Region, StereoRig
 
@@ -28,6 +30,18 @@ class DepthSettings:
     principal_point: Literal["true", "released"] = "true"
     """``true`` is (w − 1)/2 of the frame; ``released`` is w/2 of the reduced image, half a pixel
     of the frame and more away from where the optical axis is."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.near < self.far < math.inf:
+            raise InputError(
+                f"depth: near {self.near} and far {self.far} must be 0 or above and in this order"
+            )
+        if self.stride < 1:
+            raise InputError(f"depth: stride {self.stride} must be at least 1")
+        if self.principal_point not in ("true", "released"):
+            raise InputError(
+                f"depth: no principal_point {self.principal_point!r}; choose true or released"
+            )
 
 
 def depth_from_disparity(

@@ -5,6 +5,7 @@ around the object. ``jitter`` is what the released code does: one pose and sligh
 copies of it, about 1° apart as seen from the object (reference: Mesh2Point, scan utilities).
 """
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -30,6 +31,17 @@ class Placement:
     """Angle above the horizontal plane, in degrees."""
     azimuth: tuple[float, float] = (0.0, 360.0)
     """Angle of the first view about the vertical, in degrees."""
+
+    def __post_init__(self) -> None:
+        # At ±90° the image has no top: it would look along the vertical.
+        limits = {"radius": (0, math.inf), "elevation": (-90, 90), "azimuth": (-1e6, 1e6)}
+        for name, (least, most) in limits.items():
+            low, high = getattr(self, name)
+            if not least < low <= high < most:
+                raise InputError(
+                    f"placement: {name} {low} … {high} must be two values within {least} … {most} "
+                    "(excluded), the smaller one first"
+                )
 
 
 def place_views(

@@ -1,0 +1,56 @@
+"""``qs3 sensors``: the presets, and any of them as a TOML file to copy and edit."""
+
+import sys
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from qs3.errors import InputError
+
+
+def sensors(
+    action: Annotated[Literal["list", "show"], tyro.conf.Positional] = "list",
+    name: Annotated[str, tyro.conf.Positional] = "",
+) -> int:
+    """List the sensors, or show one as TOML to copy and edit.
+
+    Args:
+        action: list all presets, or show one of them.
+        name: What to show: a preset, or a TOML file, whose every setting is then told.
+    """
+    from qs3.sensor.presets import SENSORS, get_sensor, sensor_toml
+
+    if action == "show":
+        if not name:
+            raise InputError(f"sensors show: name one of {', '.join(SENSORS)}, or a TOML file")
+        print(sensor_toml(get_sensor(name)), end="")
+        return 0
+    if name:
+        raise InputError(f"sensors list: takes no name; to see it: qs3 sensors show {name}")
+    rows = [("name", "pixels", "f (px)", "baseline", "range", "from", "what it is")]
+    rows += [_row(sensor) for sensor in SENSORS.values()]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        print("  ".join(cells).rstrip())
+    print(
+        "range: depths kept; from: distance of the rig to the object's centre; without a unit: in "
+        "sizes of the object. Next: qs3 sensors show d435 > my_camera.toml",
+        file=sys.stderr,
+    )
+    return 0
+
+
+def _row(sensor: Any) -> tuple[str, ...]:
+    rig, depth = sensor.rig, sensor.depth
+    near, far = sensor.placement.radius
+    unit = " m" if sensor.metric else ""
+    return (
+        sensor.name,
+        f"{rig.width}×{rig.height}",
+        f"{rig.focal:.0f}",
+        f"{rig.baseline:g}{unit}",
+        f"{depth.near:g}–{depth.far:g}{unit}",
+        f"{near:g}–{far:g}{unit}",
+        sensor.description,
+    )

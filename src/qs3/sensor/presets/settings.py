@@ -1,0 +1,105 @@
+"""A depth camera as one frozen set of settings, checked as a whole."""
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from qs3.errors import InputError
+from qs3.files import sha256
+from qs3.sensor.depth import DepthSettings
+from qs3.sensor.exposure import ExposureSettings
+from qs3.sensor.matching import MatchingSettings
+from qs3.sensor.materials import Material
+from qs3.sensor.render.scene import LightSettings
+from qs3.sensor.rig import StereoRig
+from qs3.sensor.speckle import PatternSettings
+from qs3.sensor.views import Placement
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A depth camera and how it is used.
+
+    Example:
+        >>> Sensor(name="near", placement=Placement(radius=(2.0, 3.0))).depth.far
+        6.0
+    """
+
+    name: str = "qs3"
+    """Name in records."""
+    description: str = "the released scanner: the paper's sensor"
+    """One line for lists; not part of records."""
+    metric: bool = False
+    """Whether the unit of length is the metre; else it is the size of a normalised object."""
+    object_size: float = 1.0
+    """Size of a normalised object in the unit of the scene: metres for real cameras."""
+    rig: StereoRig = field(default_factory=StereoRig)
+    """Cameras and projector."""
+    pattern: PatternSettings = field(default_factory=PatternSettings)
+    """What the projector throws."""
+    light: LightSettings = field(default_factory=LightSettings)
+    """Lights of the scene."""
+    material: Material = field(default_factory=Material)
+    """Surface of the object."""
+    exposure: ExposureSettings = field(default_factory=ExposureSettings)
+    """Radiance to grey levels."""
+    matching: MatchingSettings = field(default_factory=MatchingSettings)
+    """Grey levels to disparity."""
+    depth: DepthSettings = field(default_factory=DepthSettings)
+    """Disparity to points."""
+    placement: Placement = field(default_factory=Placement)
+    """Where the rig stands around the object."""
+
+    def __post_init__(self) -> None:
+        for name in ("name", "description"):
+            if not getattr(self, name).isprintable():
+                raise InputError(f"sensor: {name} must be one line of printable characters")
+        if not self.name:
+            raise InputError("sensor: name must not be empty")
+        if not 0 < self.object_size < math.inf:
+            raise InputError(f"sensor {self.name}: object_size {self.object_size} must be above 0")
+        if self.matching.method == "opencv-bm" and self.exposure.bits != 8:
+            raise InputError(
+                f"sensor {self.name}: matching.method opencv-bm takes 8 bits only, not exposure."
+                f"bits {self.exposure.bits}; take zncc or 8 bits"
+            )
+        self._check_reach()
+
+    def _check_reach(self) -> None:
+        """Refuse a placement from which no view can measure any part of the object."""
+        # Longest side 1 fits into a ball of √3/2, the unit ball into one of 1.
+        nearest = self.placement.radius[0] - self.object_size
+        farthest = self.placement.radius[1] + self.object_size
+        unit = " m" if self.metric else ""
+        if farthest <= self.depth.near or nearest >= self.depth.far:
+            raise InputError(
+                f"sensor {self.name}: the object lies outside the depth gate: from placement."
+                f"radius it reaches from {nearest:g} to {farthest:g}{unit}, but depth.near … "
+                f"depth.far is {self.depth.near:g} … {self.depth.far:g}{unit}"
+            )
+        if nearest <= 0:  # a camera that may stand within the object is the scan's to refuse
+            return
+        least = float(self.rig.disparity(farthest))
+        if least >= self.matching.num_disparities:
+            raise InputError(
+                f"sensor {self.name}: the object's farthest point, at {farthest:g}{unit}, has a "
+                f"disparity f·b/z of {least:.0f} px, beyond matching.num_disparities "
+                f"{self.matching.num_disparities}; search more, or bring rig.focal, rig.baseline "
+                "and placement into one unit"
+            )
+
+
+def settings_dict(sensor: Sensor) -> dict[str, Any]:
+    """All settings of a sensor as plain values, for records.
+
+    A projected picture is told by its name and content: where it lies does not count. The
+    description is no setting.
+    """
+    plain = dataclasses.asdict(sensor)
+    del plain["description"]
+    if sensor.pattern.image is not None:
+        path = Path(sensor.pattern.image)
+        plain["pattern"]["image"] = {"name": path.name, "sha256": sha256(path)}
+    return plain
