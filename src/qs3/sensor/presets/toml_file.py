@@ -83,8 +83,8 @@ def _updated(settings: Any, table: Mapping[str, Any], prefix: str, others: Itera
     values = {}
     for key, value in table.items():
         if key not in hints:
-            known = [*others, *(prefix + name for name in hints)]
-            raise InputError(f"no setting {prefix + key!r}; {_offer(prefix + key, known)}")
+            offer = _offer(key, [*others, *hints], prefix)
+            raise InputError(f"no setting {prefix + key!r}; {offer}")
         if dataclasses.is_dataclass(hints[key]):
             if not isinstance(value, dict):
                 raise InputError(f"{prefix}{key} is a table, not {value!r}; write [{prefix}{key}]")
@@ -132,13 +132,13 @@ def _with_picture(sensor: Sensor, path: Path) -> Sensor:
     return dataclasses.replace(sensor, pattern=pattern)
 
 
-def _offer(given: str, known: Iterable[Any]) -> str:
-    """The nearest of the valid names, or all of them."""
+def _offer(given: str, known: Iterable[Any], prefix: str = "") -> str:
+    """The nearest of the valid names, or all of them, each with ``prefix`` before it."""
     names = [str(name) for name in known]
-    near = difflib.get_close_matches(given, names, n=3, cutoff=0.6)
+    near = [prefix + name for name in difflib.get_close_matches(given, names)]
     if near:
         return f"did you mean {' or '.join(near)}?"
-    return f"choose one of {', '.join(names)}"
+    return f"choose one of {', '.join(prefix + name for name in names)}"
 
 
 def _shown(value: Any) -> str:

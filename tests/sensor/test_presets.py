@@ -1,0 +1,315 @@
+"""Presets are what their sources say; sensors go through TOML unchanged; faults are one line."""
+
+import dataclasses
+import math
+import tomllib
+
+import numpy as np
+import pytest
+import trimesh
+
+from qs3.errors import InputError
+from qs3.sensor.depth import DepthSettings
+from qs3.sensor.exposure import ExposureSettings
+from qs3.sensor.matching import MatchingSettings
+from qs3.sensor.presets import SENSORS, Sensor, get_sensor, load_sensor, sensor_toml, settings_dict
+from qs3.sensor.rig import StereoRig
+from qs3.sensor.scan import scan
+from qs3.sensor.speckle import PatternSettings
+from qs3.sensor.views import Placement
+
+REAL = ("d415", "d435", "d455", "kinect-v1")
+
+
+def write(folder, text: str):
+    path = folder / "mine.toml"
+    path.write_text(text)
+    return path
+
+
+def degrees(tangent: float) -> float:
+    return 2 * math.degrees(math.atan(tangent))
+
+
+# Focal length, baseline (mm), depth field of view (degrees): the published figures.
+@pytest.mark.parametrize(
+    ("name", "focal", "baseline", "view", "tolerance"),
+    [
+        ("d415", 920, 55, (65, 40), 5),
+        ("d435", 430, 50, (87, 58), 3),
+        ("d455", 430, 95, (87, 58), 3),
+        ("kinect-v1", 580, 75, (57, 43), 2),
+    ],
+)
+def test_rigs_have_the_published_geometry(name, focal, baseline, view, tolerance):
+    rig = SENSORS[name].rig
+    assert (rig.focal, rig.baseline) == (focal, pytest.approx(baseline / 1000))
+    assert degrees(rig.width / 2 / rig.focal) == pytest.approx(view[0], abs=tolerance)
+    assert degrees(rig.height / 2 / rig.focal) == pytest.approx(view[1], abs=tolerance)
+
+
+# The law's table of disparities at 0.5, 1 and 3 m.
+@pytest.mark.parametrize(
+    ("name", "pixels"),
+    [
+        ("d435", (43.0, 21.5, 7.2)),
+        ("d415", (101.2, 50.6, 16.9)),
+        ("d455", (81.7, 40.9, 13.6)),
+        ("kinect-v1", (87.0, 43.5, 14.5)),
+    ],
+)
+def test_disparities_follow_the_published_table(name, pixels):
+    np.testing.assert_allclose(SENSORS[name].rig.disparity(np.array([0.5, 1, 3])), pixels, atol=0.1)
+
+
+def test_the_kinect_steps_as_khoshelham_measured():
+    # 2.85e-3 z² metres a step.
+    sensor = SENSORS["kinect-v1"]
+    step = sensor.matching.quantum / (sensor.rig.focal * sensor.rig.baseline)
+    assert step == pytest.approx(2.85e-3, rel=0.02)
+
+
+def test_the_d435_throws_about_5000_spots_over_its_published_field():
+    pattern = SENSORS["d435"].pattern
+    assert pattern.columns * pattern.rows / 9 == pytest.approx(5000, rel=0.02)
+    assert degrees(pattern.tan_half_width) == pytest.approx(90, abs=0.1)
+    assert degrees(pattern.tan_half_height) == pytest.approx(63, abs=0.1)
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_cameras_are_metric_and_their_parts_agree(name):
+    sensor = SENSORS[name]
+    rig, pattern, depth = sensor.rig, sensor.pattern, sensor.depth
+    assert sensor.metric
+    assert sensor.matching.left_band == "physical"
+    # The search reaches to the near end of the gate.
+    assert rig.disparity(depth.near) <= sensor.matching.num_disparities
+    # The pattern covers the left image at the far end of the gate.
+    offset = rig.baseline * rig.projector_offset / depth.far
+    assert pattern.tan_half_width >= rig.width / 2 / rig.focal + offset - 1e-2
+    assert pattern.tan_half_height >= rig.height / 2 / rig.focal
+    # The object's centre is within the image's height wherever the rig stands, half the object
+    # above and below it.
+    near = sensor.placement.radius[0]
+    assert rig.height / 2 / rig.focal * near >= 0.5 * sensor.object_size
+    assert near - sensor.object_size > 0
+    # At least 2,048 pixels of the grid on a square a quarter as large as the object, 5 views.
+    pixels = rig.focal * sensor.object_size / sensor.placement.radius[1] / depth.stride
+    assert 5 * pixels**2 / 4 > 2048
+
+
+def test_the_released_scanner_is_as_it_was():
+    assert SENSORS["qs3"] == Sensor()
+    assert SENSORS["qs3"].rig == StereoRig(1080, 1080, 1500.0, 0.1, 0.5)
+    assert SENSORS["qs3"].matching == MatchingSettings("opencv-bm", 160, 19, left_band="opencv")
+    assert not any(SENSORS[name].metric for name in SENSORS if name not in REAL)
+    assert SENSORS["qs3-800"].rig.baseline == 0.2
+    assert SENSORS["bright-room"].exposure == ExposureSettings(gain=0.7, noise=1.0)
+
+
+def test_records_leave_out_the_description_and_where_a_picture_lies(tmp_path):
+    (tmp_path / "dots.png").write_bytes(b"content")
+    sensor = dataclasses.replace(
+        SENSORS["d435"], pattern=PatternSettings(image=str(tmp_path / "dots.png"))
+    )
+    plain = settings_dict(sensor)
+    assert "description" not in plain
+    assert plain["pattern"]["image"]["name"] == "dots.png"
+    assert str(tmp_path) not in str(plain)
+    assert plain == settings_dict(dataclasses.replace(sensor, description="other"))
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_every_preset_goes_through_a_file_unchanged(name, tmp_path):
+    assert load_sensor(write(tmp_path, sensor_toml(SENSORS[name]))) == SENSORS[name]
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_every_value_of_a_file_is_what_counts(name, tmp_path):
+    # A whole file stands on its own: another base makes no difference.
+    text = 'base = "kinect-v1"\n' + sensor_toml(SENSORS[name])
+    assert load_sensor(write(tmp_path, text)) == SENSORS[name]
+
+
+def test_every_field_is_written_with_its_meaning():
+    lines = sensor_toml(SENSORS["d435"]).splitlines()
+    keys = [i for i, line in enumerate(lines) if line and not line.startswith("# ")]
+    assert len(keys) > 50
+    assert all(lines[i - 1].startswith("# ") for i in keys)
+    assert max(map(len, lines)) <= 100
+
+
+@pytest.mark.parametrize("text", ['a "quoted" one', "back\\slash", "Kamera für 3 m", "a # b"])
+def test_awkward_texts_and_numbers_survive(text, tmp_path):
+    sensor = dataclasses.replace(
+        Sensor(),
+        name=text,
+        rig=StereoRig(focal=1e3 / 3, baseline=1e-5 / 7),
+        light=dataclasses.replace(Sensor().light, projector=1.0e22),
+    )
+    written = sensor_toml(sensor)
+    assert tomllib.loads(written)["name"] == text
+    assert load_sensor(write(tmp_path, written)) == sensor
+
+
+def test_a_file_gives_only_what_differs_from_its_base(tmp_path):
+    path = write(tmp_path, 'base = "d435"\n[rig]\nbaseline = 0.1\n[matching]\nblock_size = 15\n')
+    base, made = SENSORS["d435"], load_sensor(path)
+    assert made.name == "mine"
+    assert made.rig == dataclasses.replace(base.rig, baseline=0.1)
+    assert made.matching == dataclasses.replace(base.matching, block_size=15)
+    rest = {"name": base.name, "description": base.description}
+    assert dataclasses.replace(made, rig=base.rig, matching=base.matching, **rest) == base
+    assert get_sensor(str(path)) == made
+
+
+def test_a_whole_number_stands_for_a_number_with_a_point(tmp_path):
+    made = load_sensor(write(tmp_path, "[rig]\nfocal = 1400\n[placement]\nradius = [3, 4.5]\n"))
+    assert made.rig.focal == 1400
+    assert isinstance(made.rig.focal, float)
+    assert made.placement.radius == (3.0, 4.5)
+
+
+def test_a_picture_is_looked_for_beside_the_file(tmp_path, monkeypatch):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "dots.png").write_bytes(b"x")
+    path = write(tmp_path / "parts", '[pattern]\nimage = "dots.png"\n')
+    monkeypatch.chdir(tmp_path)
+    made = load_sensor(path.relative_to(tmp_path))
+    assert made.pattern.image == str((tmp_path / "parts" / "dots.png").resolve())
+    # Shown in full and written elsewhere it is still found.
+    assert load_sensor(write(tmp_path, sensor_toml(made))) == made
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[rig]\nbaselne = 0.1", "'rig.baselne'.*did you mean rig.baseline"),
+        ("[rgi]\nfocal = 3.0", "'rgi'.*did you mean rig"),
+        ("bse = 'd435'", "'bse'.*did you mean base"),
+        ("[rig]\nbase = 'd435'", "'rig.base'.*rig.baseline"),
+        ("[light]\nx = 1", "'light.x'.*light.projector, light.sky"),
+        ("base = 'd345'", "base: no preset 'd345'.*d435"),
+        ("base = 7", "base: no preset 7"),
+        ("base = ['d435']", "base: no preset"),
+        ("[rig]\nfocal = '430'", "rig.focal = '430'.*number"),
+        ("[rig]\nfocal = true", "rig.focal = True.*number"),
+        ("[rig]\nfocal = nan", "rig.focal = nan.*finite"),
+        ("[rig]\nfocal = inf", "rig.focal = inf.*finite"),
+        (f"[rig]\nfocal = 1{'0' * 400}", "rig.focal = 1000.*finite"),
+        ("[rig]\nwidth = 848.0", "rig.width = 848.0.*whole"),
+        ("[rig]\nwidth = true", "rig.width = True.*whole"),
+        ("[rig]\nfocal = 2026-01-01", "rig.focal = .*number"),
+        ("metric = 1", "metric = 1.*true or false"),
+        ("name = 3", "name = 3.*text"),
+        ("name = ''", "name"),
+        ('name = "a\\nb"', "name must be one line"),
+        ("rig = 5", "rig is a table"),
+        ("[name]\na = 1", "name = .*text"),
+        ("[rig.focal]\na = 1", "rig.focal = .*number"),
+        ("[[rig]]\nfocal = 1.0", "rig is a table"),
+        ("[placement]\nradius = 3.0", "placement.radius = 3.0.*list of 2"),
+        ("[placement]\nradius = [1, 2, 3]", "placement.radius.*list of 2"),
+        ("[placement]\nradius = [1, 'x']", r"placement.radius\[1\] = 'x'.*number"),
+        ("[rig]\nsecond = 'eye'", "rig.second = 'eye'.*camera, pattern"),
+        ("[exposure]\nbits = 12", "exposure.bits = 12.*8, 10"),
+        ("[exposure]\nbits = 8.0", "exposure.bits = 8.0"),
+        ("[pattern]\nimage = 'absent.png'", "pattern.image.*absent.png.*no such file"),
+        ("[pattern]\nimage = ''", "pattern.image.*no such file"),
+        ("[pattern]\nimage = 3", "pattern.image = 3.*text"),
+        ("[rig", "not a TOML file"),
+        ("[rig]\nfocal = 1.0\nfocal = 2.0", "not a TOML file"),
+        # What the settings themselves refuse.
+        ("[rig]\nbaseline = -0.1", "baseline -0.1"),
+        ("[rig]\nprojector_offset = 40.0", "projector_offset 40"),
+        ("[rig]\nsecond = 'pattern'", "projector_offset"),
+        ("[placement]\nradius = [3, 2]", "placement: radius"),
+        ("[placement]\nradius = [-1, 2]", "placement: radius"),
+        ("[placement]\nelevation = [20, 90]", "placement: elevation"),
+        ("[depth]\nnear = 3.0\nfar = 2.0", "depth: near"),
+        ("[depth]\nnear = -1.0", "depth: near"),
+        ("[depth]\nstride = 0", "depth: stride"),
+        ("object_size = 0.0", "object_size"),
+        ("[matching]\nblock_size = 8", "block_size"),
+        ("[material]\nalbedo = 1.5", "albedo"),
+        # What does not go together.
+        ("[exposure]\nbits = 10", "opencv-bm takes 8 bits"),
+        ("[depth]\nnear = 1.0\nfar = 1.5", "outside the depth gate.* 2 to 6.* 1 … 1.5"),
+        ("base = 'd435'\n[depth]\nnear = 4.0", "outside the depth gate.* 0.4 to 2.8 m"),
+        ("base = 'd435'\n[rig]\nbaseline = 50.0", "f·b/z of 7679 px"),
+    ],
+)
+def test_faults_of_a_file_are_one_line_that_names_it(text, message, tmp_path):
+    path = write(tmp_path, text + "\n")
+    with pytest.raises(InputError, match=f"mine.toml: .*{message}") as caught:
+        load_sensor(path)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 500 + len(str(path))
+
+
+def test_missing_and_unreadable_files_are_told(tmp_path):
+    with pytest.raises(InputError, match=r"absent\.toml: no such file"):
+        get_sensor(str(tmp_path / "absent.toml"))
+    with pytest.raises(InputError, match="no such file"):
+        load_sensor(tmp_path)
+    path = tmp_path / "latin.toml"
+    path.write_bytes('name = "Gerät"'.encode("latin-1"))
+    with pytest.raises(InputError, match=r"latin\.toml: not a TOML file"):
+        load_sensor(path)
+    path.write_text("x = " + "[" * 5000)
+    with pytest.raises(InputError, match=r"latin\.toml: not a TOML file"):
+        load_sensor(path)
+
+
+def test_an_unknown_preset_offers_the_nearest():
+    with pytest.raises(InputError, match=r"no preset 'd453'.*did you mean d4.5.*kinect-v1"):
+        get_sensor("d453")
+
+
+class NoRenderer:
+    """Refuses to render: the fault must be found before."""
+
+    @property
+    def description(self) -> dict[str, str]:
+        return {"name": "none"}
+
+    def render(self, *_, **__):
+        raise AssertionError("rendered all the same")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        # The camera inside the object, and a projector beyond which nothing is lit.
+        ("base = 'd435'\n[placement]\nradius = [0.1, 0.2]", "inside the object"),
+        (
+            "base = 'd435'\n[rig]\nbaseline = 0.5\nprojector_offset = 10.0\n"
+            "[matching]\nnum_disparities = 512",
+            "past the object",
+        ),
+    ],
+)
+def test_a_rig_that_cannot_see_is_refused_before_rendering(text, message, tmp_path):
+    sensor = load_sensor(write(tmp_path, text + "\n"))
+    mesh = trimesh.creation.box(extents=[1.0, 0.9, 0.8])
+    with pytest.raises(InputError, match=message):
+        scan(mesh, sensor=sensor, views=1, renderer=NoRenderer())
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        lambda: Placement(radius=(0.0, 1.0)),
+        lambda: Placement(radius=(1.0, math.inf)),
+        lambda: Placement(radius=(math.nan, 1.0)),
+        lambda: Placement(elevation=(50.0, 20.0)),
+        lambda: Placement(azimuth=(10.0, 0.0)),
+        lambda: DepthSettings(near=1.0, far=1.0),
+        lambda: DepthSettings(far=math.inf),
+        lambda: DepthSettings(near=math.nan),
+        lambda: DepthSettings(stride=-4),
+    ],
+)
+def test_impossible_ranges_are_refused(settings):
+    with pytest.raises(InputError):
+        settings()
