@@ -304,11 +304,11 @@ def test_a_view_beyond_the_gate_is_recorded_as_empty(renderer):
 
 
 def test_wrong_matches_within_the_gate_make_no_cloud_of_an_object_beyond_it(renderer):
-    # At a distance of 6.5 the object lies beyond the gate; whatever falls within it is wrong.
+    # At a distance of 6.5 every point of it is farther than 5.8; what falls within 5.7 is wrong.
     far = dataclasses.replace(
         SMALL, placement=Placement(radius=(6.5, 6.5)), exposure=ExposureSettings(noise=4.0)
     )
-    far = dataclasses.replace(far, depth=DepthSettings(near=1.0, far=5.5, stride=1))
+    far = dataclasses.replace(far, depth=DepthSettings(near=1.0, far=5.7, stride=1))
     with pytest.raises(InputError, match="saw no point"):
         scan(asymmetric(), sensor=far, views=2, box_crop=False, renderer=renderer)
 
