@@ -1,13 +1,27 @@
-"""From radiance to the 8-bit grey image that the matcher sees."""
+"""From radiance to the grey image of 8 or 10 bits that the matcher sees.
+
+In this order: vignetting, point-spread function, gain or auto-exposure, response, Gamma speckle,
+Gaussian noise, saturation, rounding. Speckle multiplies grey levels, as in SAPIEN (after Landau et
+al.: shape 398.12; noise −0.231 ± 0.83 of 255); saturation comes last, as a full well's does.
+"""
 
 import math
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, Shaped, UInt8, UInt16
 
 from qs3.errors import InputError
+from qs3.sensor.lens import blur, blur_reach, vignette
+from qs3.sensor.render.scene import StereoPair
+from qs3.sensor.rig import Region, StereoRig
+
+Grey = UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]
+
+_PERCENTILE = 95.0
+# The film curve: middle grey to one half, and the exponent fitted to the released sample image.
+_MIDDLE, _EXPONENT = 0.18, 0.756
 
 
 @dataclass(frozen=True)
@@ -20,10 +34,13 @@ class ExposureSettings:
     gamma: float = 2.2
     """Exponent of the ``gamma`` response."""
     gain: float = 1.0
-    """Factor on the radiance before the response."""
+    """Factor on the radiance before the response, also on what auto-exposure chose."""
     auto: float = 0.0
     """Auto-exposure: the share of white (0 to 1, before noise) that the 95th percentile of the
     left image's object region is brought to, by one gain for both cameras; 0 is off."""
+    max_gain: float = 0.0
+    """Largest gain that auto-exposure chooses, as a real imager's exposure time is bounded;
+    0 is no bound. Without it a dark surface gets as bright an image as a white one."""
     psf: float = 0.0
     """Standard deviation in pixels of the lens's Gaussian point-spread function; 0 is none."""
     vignetting: float = 0.0
@@ -38,13 +55,84 @@ class ExposureSettings:
     bits: Literal[8, 10] = 8
     """Bits of a pixel."""
 
+    def __post_init__(self) -> None:
+        if self.response not in ("film", "linear", "gamma"):
+            raise InputError(
+                f"exposure: no response {self.response!r}; choose film, linear or gamma"
+            )
+        for name in ("gamma", "gain"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InputError(f"exposure: {name} {getattr(self, name)} must be above 0")
+        for name in ("max_gain", "speckle", "noise"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InputError(f"exposure: {name} {getattr(self, name)} must not be below 0")
+        if not 0 <= self.auto < 1:
+            raise InputError(
+                f"exposure: auto {self.auto} is a share of white: from 0 (off) to below 1"
+            )
+        if not 0 <= self.psf <= 20:
+            raise InputError(f"exposure: psf {self.psf} is in pixels and within 0…20")
+        if not 0 <= self.vignetting <= 1:
+            raise InputError(f"exposure: vignetting {self.vignetting} is a share: within 0…1")
+        if not -255 <= self.offset <= 255:
+            raise InputError(f"exposure: offset {self.offset} is in grey levels of 255")
+        if self.bits not in (8, 10):
+            raise InputError(f"exposure: {self.bits} bits; choose 8 or 10")
+
+
+def expose_pair(
+    pair: StereoPair,
+    canvas: Region,
+    focus: Region,
+    rig: StereoRig,
+    settings: ExposureSettings,
+    rng: np.random.Generator,
+) -> tuple[Grey, UInt8[np.ndarray, "h2 w2"] | UInt16[np.ndarray, "h2 w2"]]:
+    """Expose both images of a view.
+
+    The grey levels of a pixel do not depend on the canvas: the lens sees ``blur_reach`` pixels
+    more of the frame, noise is drawn for whole frames, and the gain follows from ``focus`` alone.
+
+    Args:
+        pair: Radiance, or grey levels that a renderer's view transform made: then gain,
+            auto-exposure and response are left out.
+        canvas: Part of both frames that is wanted.
+        focus: Part of the left frame that auto-exposure looks at.
+        rig: Supplies frame, focal length and principal point.
+        settings: The imager.
+        rng: Speckle and noise of the left image, then of the right one; untouched without them.
+
+    Returns:
+        Left and right grey levels, 0…255 or 0…1023; the right image has no pixel where the rig
+        has no second camera.
+    """
+    gain = 1.0 if pair.display else automatic_gain(pair, focus, rig, settings)
+    made = []
+    for side in (0, 1):
+        if side == 1 and rig.second == "pattern":
+            made.append(_quantised(np.zeros((0, 0), np.float32), settings))
+            continue
+        speckle = noise = None
+        shape = (rig.height, rig.width)
+        if settings.speckle > 0:
+            speckle = rng.standard_gamma(settings.speckle, shape, np.float32)[canvas.slices]
+            speckle = speckle / np.float32(settings.speckle)
+        if settings.noise > 0:
+            noise = rng.standard_normal(shape, np.float32)[canvas.slices]
+        light = _through_lens(pair, side, canvas, rig, settings)
+        made.append(expose(light, settings, noise, speckle, gain, pair.display))
+    return made[0], made[1]
+
 
 def expose(
     radiance: Float[np.ndarray, "h w"],
     settings: ExposureSettings,
     noise: Float[np.ndarray, "h w"] | None = None,
-) -> UInt8[np.ndarray, "h w"]:
-    """Expose a radiance image to 8 bits.
+    speckle: Float[np.ndarray, "h w"] | None = None,
+    automatic: float = 1.0,
+    display: bool = False,
+) -> Grey:
+    """Expose one image behind its lens: all that `expose_pair` does but blur and vignetting.
 
     NOTE: the released scanner saves Blender's Filmic view transform. ``film`` stands for it with
     the closed form y = x^a/(x^a + c^a), c = 0.18 (middle grey to one half) and a = 0.756, which
@@ -52,30 +140,99 @@ def expose(
 
     Args:
         radiance: Scene radiance, linear.
-        settings: Response, gain and the size of the noise.
+        settings: Response, gain, bits and the size of the noise.
         noise: Standard normal draws for each pixel; needed where ``settings.noise`` is above 0.
+        speckle: Gamma draws of mean 1; needed where ``settings.speckle`` is above 0.
+        automatic: The gain that auto-exposure chose.
+        display: The values are grey levels in 0…1 already: no gain, no response.
 
     Raises:
-        InputError: for an unknown response, or a gain or noise below zero.
-        ValueError: where noise is asked for and no draws are given.
+        ValueError: where noise or speckle is asked for and no draws are given.
 
     Example:
         >>> expose(np.array([[0.0, 0.0509, 0.18]]), ExposureSettings()).tolist()
         [[0, 71, 128]]
     """
-    if not (0 < settings.gain < math.inf and 0 <= settings.noise < math.inf):
-        raise InputError("exposure: gain must be above 0 and noise not below 0")
-    light = np.maximum(radiance, 0.0) * settings.gain
-    if settings.response == "film":
-        powered = light**0.756
-        grey = powered / (powered + 0.18**0.756)
-    elif settings.response == "linear":
-        grey = np.minimum(light, 1.0)
-    else:
-        raise InputError(f"exposure: no response {settings.response!r}; choose film or linear")
+    light = np.maximum(radiance, 0.0)
+    grey = light if display else _respond(light * (settings.gain * automatic), settings)
     levels = 255.0 * grey
+    if settings.speckle > 0:
+        if speckle is None:
+            raise ValueError("speckle draws are needed where the speckle is above 0")
+        levels = levels * speckle
     if settings.noise > 0:
         if noise is None:
             raise ValueError("noise draws are needed where the noise is above 0")
         levels = levels + settings.noise * noise
-    return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
+    if settings.offset:
+        levels = levels + settings.offset
+    return _quantised(levels, settings)
+
+
+def automatic_gain(
+    pair: StereoPair, focus: Region, rig: StereoRig, settings: ExposureSettings
+) -> float:
+    """The gain of auto-exposure: it brings the left image's 95th percentile to ``settings.auto``.
+
+    Of the pixels of ``focus``, behind the lens, those count that show something: that differ from
+    the background; all of them where none does. A black or empty focus leaves the gain at 1, or
+    at ``max_gain``, where that is set.
+
+    Args:
+        pair: Radiance.
+        focus: Part of the left frame.
+        rig: Supplies frame, focal length and principal point.
+        settings: The imager; 1 is returned where its ``auto`` is 0.
+    """
+    if not settings.auto:
+        return 1.0
+    bound = settings.max_gain or math.inf
+    shown = pair.canvas(focus)[0] != np.float32(pair.background)
+    light = _through_lens(pair, 0, focus, rig, settings)
+    light = light[shown] if shown.any() else light
+    # An order statistic, so that it commutes with the response.
+    level = float(np.percentile(light, _PERCENTILE, method="nearest")) if light.size else 0.0
+    if level > 0:
+        return min(radiance_of(settings.auto, settings) / level, bound)
+    return bound if settings.max_gain else 1.0
+
+
+def radiance_of(share: float, settings: ExposureSettings) -> float:
+    """The radiance that the response turns into ``share`` of white: its inverse below 1.
+
+    Example:
+        >>> radiance_of(0.5, ExposureSettings(response="film"))
+        0.18
+    """
+    if settings.response == "film":
+        return _MIDDLE * (share / (1 - share)) ** (1 / _EXPONENT)
+    return share**settings.gamma if settings.response == "gamma" else share
+
+
+def _respond(light: Shaped[np.ndarray, "h w"], settings: ExposureSettings) -> np.ndarray:
+    """Light to shares of white; above 1 it is not cut yet."""
+    if settings.response == "film":
+        powered = light**_EXPONENT
+        return powered / (powered + _MIDDLE**_EXPONENT)
+    return light ** (1 / settings.gamma) if settings.response == "gamma" else light
+
+
+def _quantised(levels: Float[np.ndarray, "h w"], settings: ExposureSettings) -> Grey:
+    """Cut grey levels of 255 at black and white and round them to the pixel's bits."""
+    if settings.bits == 8:
+        return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
+    return np.clip(np.rint(levels * (1023 / 255)), 0, 1023).astype(np.uint16)
+
+
+def _through_lens(
+    pair: StereoPair, side: int, part: Region, rig: StereoRig, settings: ExposureSettings
+) -> Float32[np.ndarray, "h w"]:
+    """One image's light of ``part`` behind the lens."""
+    reach = blur_reach(settings.psf)
+    wide = part.grown(reach, rig.width, rig.height) if reach and not part.empty else part
+    light = pair.canvas(wide)[side]
+    if settings.vignetting:
+        light = light * vignette(rig, wide, settings.vignetting)
+    light = blur(light, settings.psf)
+    x, y = part.x - wide.x, part.y - wide.y
+    return light[y : y + part.height, x : x + part.width]

@@ -19,8 +19,9 @@ from qs3.errors import InputError
 from qs3.geometry import rotation_z
 from qs3.meshes import normalise
 from qs3.sensor.depth import depth_from_disparity
-from qs3.sensor.exposure import expose
+from qs3.sensor.exposure import expose_pair
 from qs3.sensor.fusion import fuse
+from qs3.sensor.lens import blur_reach
 from qs3.sensor.matching import match, matching_canvas
 from qs3.sensor.obstacles import check_views
 from qs3.sensor.presets import Sensor, get_sensor
@@ -189,7 +190,7 @@ def scan(
         canvases = [matching_canvas(region, sensor.rig, sensor.matching) for region in regions]
         built = _scene(around.bodies, sensor)
         # An object alone needs no more than its own box: the rest is background.
-        reach = int(np.ceil(4 * sensor.exposure.psf))
+        reach = blur_reach(sensor.exposure.psf)
         size_of_frame = (sensor.rig.width, sensor.rig.height)
         wanted = None if built.alone else [c.grown(reach, *size_of_frame) for c in canvases]
         pairs = renderer.render(built, sensor.rig, around.poses, seeds, wanted)
@@ -197,8 +198,8 @@ def scan(
         casters = [DepthCaster(*(body.mesh for body in around.bodies))]
         casters += [DepthCaster(turned)] if full_frames else []
     images = [
-        _view(pair, sensor, region, casters, rng_noise, clock)
-        for pair, region in zip(pairs, regions, strict=True)
+        _view(pair, sensor, region, part, casters, rng_noise, clock)
+        for pair, region, part in zip(pairs, regions, parts, strict=True)
     ]
 
     with clock("fusion"):
@@ -237,11 +238,12 @@ def _view(
     pair: StereoPair,
     sensor: Sensor,
     region: Region,
+    focus: Region,
     casters: Sequence[DepthCaster],
     rng: np.random.Generator,
     clock: "_Clock",
 ) -> ViewImages:
-    """Expose and match ``region`` of one view; cast its true depth.
+    """Expose and match ``region`` of one view, with auto-exposure on ``focus``; cast its depth.
 
     The first of ``casters`` holds the scene; a second one, of the object alone, makes the view
     one of whole frames, with silhouette and normals.
@@ -253,27 +255,19 @@ def _view(
         slice(region.x - canvas.x, region.x - canvas.x + region.width),
     )
     with clock("exposure"):
-        grey = []
-        for side, radiance in enumerate(pair.canvas(canvas)):
-            if side == 1 and rig.second == "pattern":
-                grey.append(stored_pattern(rig, sensor.pattern, canvas))
-                continue
-            # Noise of the whole frame, so that it does not depend on the region.
-            noise = None
-            if sensor.exposure.noise > 0:
-                frame = rng.standard_normal((rig.height, rig.width), dtype=np.float32)
-                noise = frame[canvas.slices]
-            grey.append(expose(radiance, sensor.exposure, noise))
+        left, right = expose_pair(pair, canvas, focus, rig, sensor.exposure, rng)
+        if rig.second == "pattern":
+            right = stored_pattern(rig, sensor.pattern, canvas, sensor.exposure.bits)
     with clock("matching"):
-        disparity = match(grey[0], grey[1], sensor.matching)[inner]
+        disparity = match(left, right, sensor.matching)[inner]
     with clock("true_depth"):
         whole = len(casters) > 1
         cast = casters[0].cast(rig, pair.pose, region, normals=whole)
         silhouette = casters[1].cast(rig, pair.pose, region).mask if whole else None
     return ViewImages(
         region=region,
-        left=grey[0][inner],
-        right=grey[1][inner],
+        left=left[inner],
+        right=right[inner],
         disparity=disparity,
         depth=depth_from_disparity(disparity, rig, sensor.depth),
         true_depth=cast.depth,
