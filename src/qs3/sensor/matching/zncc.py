@@ -33,8 +33,8 @@ def match_zncc(
     A pixel has a match where its block and its match's have texture, the correlation reaches
     ``correlation`` and exceeds all others further than one pixel away by ``uniqueness``, the match
     from the right image is the same within ``left_right``, and the correlations on both sides of
-    the best exist, so that a parabola can be laid: a best disparity at either end of the search,
-    or at the border of the right image, is none.
+    the best exist, so that a parabola can be laid: a best disparity at either end of the search is
+    none. Nor is one whose match u − d < 0 lies outside the right image.
 
     Args:
         left: Grey levels of 8 bits, or of 10 bits in 16.
@@ -87,6 +87,7 @@ def _refined(
     )
     bend = 2 * peak - before - after  # 0 on a plateau, whose middle is the best itself
     offset = np.where(bend > 0, (after - before) / (2 * np.where(bend > 0, bend, 1.0)), 0.0)
+    at = whole + offset
     disparity = np.full(best.shape, np.nan, np.float32)
-    disparity[rows, columns] = whole + offset
+    disparity[rows, columns] = np.where(at <= columns, at, np.nan)
     return disparity

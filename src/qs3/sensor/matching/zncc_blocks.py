@@ -25,7 +25,8 @@ class Edges:
 
     disparity: Int[np.ndarray, "m"]
     column: Int[np.ndarray, "m"]
-    mean_left: Float[np.ndarray, "r m"]
+    whole_left: Float[np.ndarray, "r m"]
+    rest_left: Float[np.ndarray, "r m"]
     sum_right: Float[np.ndarray, "r m"]
     scale_left: Float[np.ndarray, "r m"]
     scale_right: Float[np.ndarray, "r m"]
@@ -55,13 +56,16 @@ class Blocks:
     """A pair and the statistics of its blocks in the working precision.
 
     The correlation of left pixel u and right pixel v, times :attr:`one`, is
-    (Σ LR − mean_left[u] · sum_right[v]) · scale_right[v] · scale_left[u].
+    (Σ LR − whole_left[u] · sum_right[v] − rest_left[u] · sum_right[v]) · scale_right[v] ·
+    scale_left[u]. The mean of the left block is given as a whole number and a rest, because the
+    first product is then exact too, and little is left of two large numbers' difference to round.
     A scale of 0 marks a block without texture.
     """
 
     left: Float[np.ndarray, "h w"]
     right: Float[np.ndarray, "h w"]
-    mean_left: Float[np.ndarray, "h w"]
+    whole_left: Float[np.ndarray, "h w"]
+    rest_left: Float[np.ndarray, "h w"]
     sum_right: Float[np.ndarray, "h w"]
     scale_left: Float[np.ndarray, "h w"]
     scale_right: Float[np.ndarray, "h w"]
@@ -88,13 +92,19 @@ class Blocks:
         return (2**self.index_bits - 1 - np.arange(self.num_disparities)).astype(np.int32)
 
     def edges(self, first: int, last: int) -> Edges:
-        """The cut blocks of rows ``first`` to ``last`` (excluded), of all disparities."""
+        """The cut blocks of rows ``first`` to ``last`` (excluded), of all disparities.
+
+        The pairs u = d − 1 are among them: their match lies one pixel outside the right image, and
+        half its block in it. It serves the parabola of the match at its border.
+        """
         height, width = self.left.shape
         half = self.half
         d = np.arange(self.num_disparities)[:, None]
-        k = np.arange(half)
-        column = np.concatenate([d + k, width - half + k + 0 * d], axis=1).ravel()
-        d = np.repeat(d.ravel(), 2 * half)
+        column = np.concatenate(
+            [d + np.arange(-1, half), 0 * d + np.arange(width - half, width)], axis=1
+        ).ravel()
+        d = np.repeat(d.ravel(), 2 * half + 1)[column >= 0]
+        column = column[column >= 0]
         low, high = np.maximum(column - half, d), np.minimum(column + half + 1, width)
         left, left2, right, right2 = (part[first:last] for part in self.sums)
         count = _rows(height, half)[first:last, None] * (high - low)
@@ -103,12 +113,16 @@ class Blocks:
         spread_left = _spread(count, sum_left, left2[:, high] - left2[:, low])
         spread_right = _spread(count, sum_right, right2[:, high - d] - right2[:, low - d])
         kept_left = (self.scale_left[first:last, column] > 0) & (spread_left > 0)
-        kept_right = (self.scale_right[first:last, column - d] > 0) & (spread_right > 0)
+        kept_right = (self.scale_right[first:last, np.maximum(column - d, 0)] > 0) & (
+            spread_right > 0
+        )
         dtype = self.left.dtype
+        whole, rest = _split(sum_left / count, dtype)
         return Edges(
             d,
             column,
-            (sum_left / count).astype(dtype),
+            whole,
+            rest,
             sum_right.astype(dtype),
             (self.one * _inverse_root(spread_left, kept_left)).astype(dtype),
             _inverse_root(spread_right, kept_right).astype(dtype),
@@ -157,7 +171,7 @@ def block_statistics(
     return Blocks(
         left_image,
         right_image,
-        (left_total / count).astype(dtype),
+        *_split(left_total / count, dtype),
         right_total.astype(dtype),
         (one * left_scale).astype(dtype),
         right_scale.astype(dtype),
@@ -191,6 +205,13 @@ def _spread(
 ) -> Float64[np.ndarray, "h w"]:
     """Sum of squared differences from the mean; exactly 0 for equal pixels."""
     return (count * squares - total**2) / count
+
+
+def _split(
+    mean: Float64[np.ndarray, "h w"], dtype: type[np.floating] | np.dtype
+) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
+    whole = np.rint(mean)
+    return whole.astype(dtype), (mean - whole).astype(dtype)
 
 
 def _inverse_root(

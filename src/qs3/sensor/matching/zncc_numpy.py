@@ -51,75 +51,82 @@ def _search_band(
     spans = [_span(scale[first:last]) for scale in (blocks.scale_left, blocks.scale_right)]
     (low, high), (low_right, high_right) = spans
     d0 = max(0, low - high_right + 1)
-    d1 = min(blocks.num_disparities, high - low_right)
+    d1 = min(blocks.num_disparities, high - low_right + 1)
     if low >= high or low_right >= high_right or d0 >= d1:
         return  # nothing with texture that could match
     n, w = d1 - d0, high - low
 
-    # Zeros beyond the borders: what is not there adds nothing to a sum.
-    pad = blocks.num_disparities + half
+    # Zeros beyond the borders: what is not there adds nothing to a sum. Lines are `wide`; their
+    # last 2 · half columns hold no correlations, and let the sums below run over all lines at once.
+    wide, pad = w + 2 * half, blocks.num_disparities + 2 * half
     left = np.pad(blocks.left, ((0, 0), (half, half)))
-    right = np.pad(blocks.right, ((0, 0), (pad, half)))
-    sum_right = np.pad(blocks.sum_right[first:last], ((0, 0), (pad, half)))
-    scale_right = np.pad(blocks.scale_right[first:last], ((0, 0), (pad, half)))
+    right, sum_right, scale_right = (
+        np.pad(part, ((0, 0), (pad, 2 * half)))
+        for part in (blocks.right, blocks.sum_right, blocks.scale_right)
+    )
+    whole_left, rest_left, scale_left = (
+        np.pad(part[:, low:high], ((0, 0), (0, 2 * half)))
+        for part in (blocks.whole_left, blocks.rest_left, blocks.scale_left)
+    )
 
-    def over_disparities(row: Float[np.ndarray, "c"], start: int, size: int) -> np.ndarray:
+    def over_disparities(row: Float[np.ndarray, "c"], start: int) -> np.ndarray:
         """View row[start + j − (d0 + i)] as element (i, j)."""
         step = row.strides[0]
-        origin = row[start + pad - d0 :]
-        return as_strided(origin, (n, size), (-step, step), writeable=False)
+        return as_strided(row[start + pad - d0 :], (n, wide), (-step, step), writeable=False)
 
-    columns = np.zeros((n, w + 2 * half), left.dtype)  # Σ LR over the rows of the block
-    product = np.zeros_like(columns)
+    columns = np.zeros((n, wide), left.dtype)  # Σ LR over the rows of the block
+    term = np.zeros_like(columns)
 
-    def multiply(y: int) -> np.ndarray:
-        view = over_disparities(right[y], low - half, w + 2 * half)
-        return np.multiply(left[y, low : low + w + 2 * half], view, out=product)
+    def products(y: int) -> np.ndarray:
+        view = over_disparities(right[y], low - half)
+        return np.multiply(left[y, low : low + wide], view, out=term)
 
     for y in range(max(0, first - half), min(height, first + half)):
-        np.add(columns, multiply(y), out=columns)
+        np.add(columns, products(y), out=columns)
 
     cut = _Cut(blocks, first, last, low, d0, n, w) if _touches(spans, blocks) else None
-    box = _Box(n, w, half, left.dtype)
-    term = np.zeros((n, w), left.dtype)
-    # A row of zeros above and below: no disparity beyond the search; zeros on both sides for the
-    # view from the right image.
-    keys = np.zeros((n + 2, w + 2 * (n - 1)), np.int32)
-    inner = keys[1:-1, n - 1 : n - 1 + w]
-    codes = blocks.codes[d0:d1, None]
+    box = _Box(n, wide, half, left.dtype)
+    # A line of zeros above and below: no disparity beyond the search; zeros between the lines for
+    # the view from the right image.
+    keys = np.zeros((n + 2, max(w + n - 1, wide)), np.int32)
+    lines, inner = keys[1:-1], keys[1:-1, :w]
+    codes = np.zeros_like(lines)
+    codes[:, :w] = blocks.codes[d0:d1, None]
     row_step, step = keys.strides
-    diagonal = as_strided(keys[1:], (n, w + n - 1), (row_step + step, step), writeable=False)
-    places = np.arange(n - 1, n - 1 + w)
-    # Right pixels low − d1 + 1 … high − 1 − d0, of which those in the image are kept.
+    # Element (i, t) is the key of disparity d0 + i at right pixel low − d1 + 1 + t.
+    diagonal = as_strided(
+        keys.ravel()[keys.shape[1] - (n - 1) :],
+        (n, w + n - 1),
+        (row_step + step, step),
+        writeable=False,
+    )
+    places = np.arange(w)
     start = low - d1 + 1
     kept = slice(max(0, -start), w + n - 1)
     shown = slice(start + kept.start, start + kept.stop)
 
     for y in range(first, last):
         if y + half < height:
-            np.add(columns, multiply(y + half), out=columns)
+            np.add(columns, products(y + half), out=columns)
         if y > first and y - half - 1 >= 0:
-            np.subtract(columns, multiply(y - half - 1), out=columns)
+            np.subtract(columns, products(y - half - 1), out=columns)
         total = box(columns)
-        row = y - first
-        saved = None if cut is None else cut.take(total)
-        np.multiply(
-            blocks.mean_left[y, low:high], over_disparities(sum_right[row], low, w), out=term
-        )
-        np.subtract(total, term, out=total)
-        np.multiply(total, over_disparities(scale_right[row], low, w), out=total)
-        np.multiply(total, blocks.scale_left[y, low:high], out=total)
-        if cut is not None and saved is not None:
-            cut.put(total, saved, row)
-        np.copyto(inner, total, casting="unsafe")
-        np.left_shift(inner, bits, out=inner)
-        np.add(inner, codes, out=inner)
+        sums = over_disparities(sum_right[y], low)
+        value = np.subtract(total, np.multiply(whole_left[y], sums, out=term), out=box.spare)
+        np.subtract(value, np.multiply(rest_left[y], sums, out=term), out=term)
+        np.multiply(term, over_disparities(scale_right[y], low), out=term)
+        np.multiply(term, scale_left[y], out=term)
+        if cut is not None:
+            cut.replace(term, total, y - first)
+        np.copyto(lines[:, :wide], term, casting="unsafe")
+        np.left_shift(lines, bits, out=lines)
+        np.add(lines, codes, out=lines)
 
         best = inner.max(axis=0)
         found.best[y, low:high] = best
         if both_ways:
             found.right[y, shown] = diagonal.max(axis=0)[kept]
-        at = (2**bits - 1 - d0) - (best & (2**bits - 1))  # row of `keys` above the best one
+        at = (2**bits - 1 - d0) - (best & (2**bits - 1))  # line of `keys` above the best one
         found.before[y, low:high] = keys[at, places] >> bits
         found.after[y, low:high] = keys[at + 2, places] >> bits
         if unique:
@@ -130,26 +137,26 @@ def _search_band(
 
 
 class _Box:
-    """Sums over 2 · half + 1 columns by doubling; additions only, in a fixed order."""
+    """Sums over 2 · half + 1 columns by doubling: additions only, over all lines at once."""
 
-    def __init__(self, n: int, w: int, half: int, dtype: np.dtype) -> None:
-        self.w, self.side = w, 2 * half + 1
-        self.sums = [np.zeros((n, w + 2 * half), dtype) for _ in range(2)]
-        self.total = np.zeros((n, w), dtype)
+    def __init__(self, n: int, wide: int, half: int, dtype: np.dtype) -> None:
+        self.side, self.valid = 2 * half + 1, n * wide - 2 * half
+        self.sums = [np.zeros(n * wide, dtype) for _ in range(2)]
+        self.total = np.zeros((n, wide), dtype)
+        self.spare = self.sums[0].reshape(n, wide)  # free for others between calls
 
-    def __call__(self, columns: np.ndarray) -> np.ndarray:
-        length, offset = 1, 1  # `power` holds sums of `length` columns; `offset` are in `total`
-        power, spare = columns, self.sums
-        first = True
-        while 2 * length <= self.side:
-            size = self.w + self.side - 2 * length
-            doubled = spare[0][:, :size]
-            np.add(power[:, :size], power[:, length : length + size], out=doubled)
-            power, length, spare = doubled, 2 * length, spare[::-1]
+    def __call__(self, columns: Float[np.ndarray, "n w"]) -> Float[np.ndarray, "n w"]:
+        """Sum the block's columns that begin at each column; each line's last ones are void."""
+        total = self.total.ravel()[: self.valid]
+        source = power = columns.ravel()
+        length = done = 1  # `power` holds sums of `length` columns; `done` ones are in `source`
+        for doubled in (self.sums * 2)[: self.side.bit_length() - 1]:
+            size = len(power) - length
+            np.add(power[:size], power[length:], out=doubled[:size])
+            power, length = doubled[:size], 2 * length
             if self.side & length:
-                source = columns if first else self.total
-                np.add(source[:, : self.w], power[:, offset : offset + self.w], out=self.total)
-                first, offset = False, offset + length
+                np.add(source[: self.valid], power[done : done + self.valid], out=total)
+                source, done = total, done + length
         return self.total
 
 
@@ -162,19 +169,18 @@ class _Cut:
         edges = blocks.edges(first, last)
         i, j = edges.disparity - d0, edges.column - low
         inside = (i >= 0) & (i < n) & (j >= 0) & (j < w)
-        self.at = (i * w + j)[inside]
-        self.mean_left = edges.mean_left[:, inside]
+        self.at = (i * (w + 2 * blocks.half) + j)[inside]
+        self.whole_left = edges.whole_left[:, inside]
+        self.rest_left = edges.rest_left[:, inside]
         self.sum_right = edges.sum_right[:, inside]
         self.scale_left = edges.scale_left[:, inside]
         self.scale_right = edges.scale_right[:, inside]
 
-    def take(self, total: np.ndarray) -> np.ndarray:
-        return total.ravel()[self.at]
-
-    def put(self, total: np.ndarray, saved: np.ndarray, row: int) -> None:
-        value = saved - self.mean_left[row] * self.sum_right[row]
-        value = value * self.scale_right[row] * self.scale_left[row]
-        total.ravel()[self.at] = value
+    def replace(self, value: np.ndarray, total: np.ndarray, row: int) -> None:
+        """Put the correlations of these blocks into ``value``; ``total`` holds Σ LR."""
+        made = total.ravel()[self.at] - self.whole_left[row] * self.sum_right[row]
+        made = made - self.rest_left[row] * self.sum_right[row]
+        value.ravel()[self.at] = made * self.scale_right[row] * self.scale_left[row]
 
 
 def _span(scale: Float[np.ndarray, "r w"]) -> tuple[int, int]:

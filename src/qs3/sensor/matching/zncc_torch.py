@@ -15,17 +15,22 @@ ELEMENTS = 2**25
 """Correlations held at a time; about 20 bytes of device memory each."""
 
 
+def available() -> bool:
+    """Whether torch sees a CUDA device."""
+    import torch
+
+    return torch.cuda.is_available()
+
+
 def searcher(device: str) -> Callable[[Blocks, bool, bool], Found] | None:
     """The search on ``cuda``; for ``auto`` None where torch sees no CUDA device.
 
     Raises:
         InputError: for ``cuda`` where torch sees none, and for any other device.
     """
-    import torch
-
     if device not in ("cuda", "auto"):
         raise InputError(f"matching: no device {device!r}; choose cpu, cuda or auto")
-    if torch.cuda.is_available():
+    if available():
         return lambda blocks, unique, both_ways: search(blocks, unique, both_ways, "cuda")
     if device == "cuda":
         raise InputError("matching: torch sees no CUDA device; choose device auto or cpu")
@@ -79,13 +84,16 @@ def _keys(blocks: Blocks, first: int, last: int, device: str) -> "torch.Tensor":
     total = avg_pool2d(total, (1, side), stride=1, divisor_override=1)
 
     inside = slice(first, last)
-    means = put(blocks.mean_left[inside]) * over_disparities(put(blocks.sum_right[inside]))
-    value = total - means
+    sums = over_disparities(put(blocks.sum_right[inside]))
+    value = total - put(blocks.whole_left[inside]) * sums
+    value -= put(blocks.rest_left[inside]) * sums
     value *= over_disparities(put(blocks.scale_right[inside]))
     value *= put(blocks.scale_left[inside])
     edges = blocks.edges(first, last)
     d, column = put(edges.disparity), put(edges.column)
-    cut = total[d, :, column] - (put(edges.mean_left) * put(edges.sum_right)).T
+    sums = put(edges.sum_right).T
+    cut = total[d, :, column] - put(edges.whole_left).T * sums
+    cut -= put(edges.rest_left).T * sums
     cut *= put(edges.scale_right).T
     cut *= put(edges.scale_left).T
     value[d, :, column] = cut
