@@ -1,5 +1,10 @@
-"""The projected pattern: seeded binary dots, or a picture of the user's own."""
+"""The projected pattern: seeded square dots or round spots, or a picture of the user's own.
 
+Either kind has columns/3 × rows/3 of them: 270 × 168 cells hold 90 × 56 = 5,040, about what a
+RealSense D435 throws.
+"""
+
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -7,11 +12,15 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float, Float32
 
 from qs3.errors import InputError
 
 _TILE = 3  # one dot in each 3×3 tile of cells: the density of 1 in 9
+_LEAST_DISTANCE = 1.5  # cells between two spots; the middle of a tile has it from all other tiles
+_SWEEPS = 32  # a spot moves at every second attempt, so that after these none is where it began
+_TEXELS = 4  # texels across a spot's full width at half maximum
+_LARGEST = 4096  # texels along a side
 
 
 @dataclass(frozen=True)
@@ -30,11 +39,24 @@ class PatternSettings:
     tan_half_height: float = 0.625
     """Tangent of half the vertical opening angle."""
     spot_size: float = 1.0
-    """Full width at half maximum of a spot, in cells (``spots`` only)."""
+    """Full width at half maximum of a spot, in cells, up to 2 (``spots`` only)."""
     seed: int = 0
     """Which pattern; one projector has one."""
     image: str | None = None
     """Path of a grey picture to project in place of the dots; white is full power."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("tiles", "spots"):
+            raise InputError(f"pattern: no kind {self.kind!r}; choose tiles or spots")
+        for name in ("tan_half_width", "tan_half_height"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InputError(f"pattern: {name} {getattr(self, name)} must be above 0")
+        if self.seed < 0:
+            raise InputError(f"pattern: seed {self.seed} must not be below 0")
+        if not 0 < self.spot_size <= 2:
+            raise InputError(f"pattern: spot_size {self.spot_size} must be above 0 and up to 2")
+        if self.image is None:
+            _check_cells(self.columns, self.rows)
 
 
 def speckle_pattern(columns: int, rows: int, seed: int) -> Bool[np.ndarray, "rows columns"]:
@@ -51,8 +73,7 @@ def speckle_pattern(columns: int, rows: int, seed: int) -> Bool[np.ndarray, "row
         >>> int(dots.sum())
         6
     """
-    if columns < _TILE or rows < _TILE or columns % _TILE or rows % _TILE:
-        raise InputError(f"pattern: {columns} × {rows} cells; both must be multiples of {_TILE}")
+    _check_cells(columns, rows)
     rng = np.random.default_rng(np.random.SeedSequence([seed, columns, rows]))
     down, across = rows // _TILE, columns // _TILE
     dots = np.zeros((rows + 2, columns + 2), dtype=bool)  # one empty cell all round
@@ -71,23 +92,103 @@ def speckle_pattern(columns: int, rows: int, seed: int) -> Bool[np.ndarray, "row
     return dots[1:-1, 1:-1]
 
 
-@lru_cache(maxsize=4)
-def pattern_image(settings: PatternSettings) -> Float32[np.ndarray, "h w"]:
-    """The pattern as a grey picture in 0…1, two texels a cell, row 0 at the top.
+def spot_places(columns: int, rows: int, seed: int) -> Float[np.ndarray, "n 2"]:
+    """Places off the grid: exactly one in each 3×3 tile of cells, no two nearer than 1.5 cells.
+
+    Drawn evenly from all arrangements that keep these two rules (Gibbs sampling of the hard-core
+    model): all spots begin in the middles of their tiles and are then moved in turn, each to a
+    place drawn evenly from its tile, where that is far enough from the others.
+
+    Returns:
+        Column and row in cells, (0, 0) the outer corner of the top-left cell; tiles row by row.
 
     Raises:
-        InputError: where the user's picture cannot be read.
+        InputError: where ``columns`` or ``rows`` is not a positive multiple of 3.
+
+    Example:
+        >>> spot_places(9, 6, seed=1).shape
+        (6, 2)
     """
-    if settings.image is None:
+    _check_cells(columns, rows)
+    rng = np.random.default_rng(np.random.SeedSequence([seed, columns, rows, 1]))
+    down, across = rows // _TILE, columns // _TILE
+    # One tile all round, its spot infinitely far, saves the borders from being a special case.
+    places = np.full((down + 2, across + 2, 2), np.inf)
+    r, c = np.mgrid[:down, :across]
+    places[1:-1, 1:-1] = _TILE * (np.stack([c, r], axis=-1) + 0.5)
+    for _ in range(_SWEEPS):
+        # Spots of every second tile each way are 3 cells apart at least and are moved at once.
+        for first_row, first_column in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            r, c = np.mgrid[first_row:down:2, first_column:across:2]
+            tried = _TILE * (np.stack([c, r], axis=-1) + rng.random((*r.shape, 2)))
+            free = np.ones(r.shape, dtype=bool)
+            for y, x in _AROUND:
+                apart = places[r + 1 + y, c + 1 + x] - tried
+                free &= (apart**2).sum(axis=-1) >= _LEAST_DISTANCE**2
+            places[r[free] + 1, c[free] + 1] = tried[free]
+    return places[1:-1, 1:-1].reshape(-1, 2)
+
+
+_AROUND = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)]
+
+
+@lru_cache(maxsize=4)
+def pattern_image(settings: PatternSettings) -> Float32[np.ndarray, "h w"]:
+    """The pattern as a grey picture in 0…1, row 0 at the top.
+
+    Square dots have two texels a cell. Round spots have peak 1 and as many texels a cell as give
+    four across a spot, within 4,096 on a side.
+
+    Raises:
+        InputError: where the user's picture cannot be read, or spots are too small for their
+            number.
+    """
+    if settings.image is not None:
+        image = _users_picture(Path(settings.image))
+    elif settings.kind == "spots":
+        image = _spots(settings)
+    else:
         dots = speckle_pattern(settings.columns, settings.rows, settings.seed)
         image = np.kron(dots, np.ones((2, 2), dtype=bool)).astype(np.float32)
-    else:
-        path = Path(settings.image)
-        if not path.is_file():
-            raise InputError(f"{path}: no such file; name a picture to project")
-        grey = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
-        if grey is None:
-            raise InputError(f"{path}: not a picture that OpenCV can read; use PNG or JPEG")
-        image = grey.astype(np.float32) / 255.0
     image.setflags(write=False)
     return image
+
+
+def _check_cells(columns: int, rows: int) -> None:
+    if columns < _TILE or rows < _TILE or columns % _TILE or rows % _TILE:
+        raise InputError(f"pattern: {columns} × {rows} cells; both must be multiples of {_TILE}")
+
+
+def _users_picture(path: Path) -> Float32[np.ndarray, "h w"]:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; name a picture to project")
+    grey = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
+    if grey is None:
+        raise InputError(f"{path}: not a picture that OpenCV can read; use PNG or JPEG")
+    return grey.astype(np.float32) / 255.0
+
+
+def _spots(settings: PatternSettings) -> Float32[np.ndarray, "h w"]:
+    """Round spots, cut at white where they run together."""
+    columns, rows = settings.columns, settings.rows
+    scale = min(math.ceil(_TEXELS / settings.spot_size), _LARGEST // max(columns, rows))
+    if scale * settings.spot_size < _TEXELS / 2:
+        raise InputError(
+            f"pattern: spots of {settings.spot_size} cells on {columns} × {rows} cells are finer "
+            f"than a picture of {_LARGEST} texels shows; enlarge spot_size or take fewer cells"
+        )
+    width, height = scale * columns, scale * rows
+    sigma = scale * settings.spot_size / math.sqrt(8 * math.log(2))
+    # Texel i reaches from i to i + 1, so that its centre is at i + 1/2.
+    centre = spot_places(columns, rows, settings.seed) * scale - 0.5
+    nearest = np.rint(centre).astype(int)
+    reach = np.arange(-math.ceil(4 * sigma), math.ceil(4 * sigma) + 1)
+    x, y = (nearest[:, axis, None] + reach for axis in (0, 1))
+    across, along = (
+        np.exp(-0.5 * ((at - centre[:, axis, None]) / sigma) ** 2) * ((at >= 0) & (at < size))
+        for axis, (at, size) in enumerate(((x, width), (y, height)))
+    )
+    weight = along[:, :, None] * across[:, None, :]
+    texel = y.clip(0, height - 1)[:, :, None] * width + x.clip(0, width - 1)[:, None, :]
+    image = np.bincount(texel.ravel(), weight.ravel(), minlength=width * height)
+    return np.minimum(image, 1.0).reshape(height, width).astype(np.float32)
