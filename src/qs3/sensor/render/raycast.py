@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float, Int
-from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from qs3.sensor.rig import Pose, Region, StereoRig
 
@@ -46,12 +47,10 @@ class DepthCaster:
     def __init__(self, mesh: trimesh.Trimesh, *others: trimesh.Trimesh) -> None:
         meshes = (mesh, *others)
         triangles = np.concatenate([np.asarray(one.triangles, np.float64) for one in meshes])
-        joined = trimesh.Trimesh(
-            vertices=triangles.reshape(-1, 3),
-            faces=np.arange(3 * len(triangles)).reshape(-1, 3),
-            process=False,
-        )
-        self._intersector = RayMeshIntersector(joined if others else mesh)
+        # Embree's geometry is in single precision: about its middle, where that is finest.
+        self._middle = triangles.reshape(-1, 3).mean(axis=0)
+        self._embree = EmbreeScene()
+        TriangleMesh(self._embree, (triangles - self._middle).astype(np.float32))
         self._corner = triangles[:, 0]
         self._normal = np.cross(
             triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
@@ -79,17 +78,22 @@ class DepthCaster:
         body = np.full(depth.shape, -1)
         towards = np.full((*depth.shape, 3), np.nan) if normals else None
         if depth.size:
-            v, u = np.mgrid[region.slices[0], region.slices[1]].reshape(2, -1)
+            turn = pose.camera_to_world[:3, :3]
             cx, cy = rig.principal_point
-            local = np.stack([(u - cx) / rig.focal, (v - cy) / rig.focal, np.ones(u.shape)], axis=1)
-            rays = local @ pose.camera_to_world[:3, :3].T
-            origins = np.broadcast_to(pose.position, rays.shape)
-            triangle = self._intersector.intersects_first(origins, rays)
-            hit = triangle >= 0
+            x = (np.arange(region.x, region.x + region.width) - cx) / rig.focal
+            y = (np.arange(region.y, region.y + region.height) - cy) / rig.focal
+            across = (x[:, None] * turn[:, 0]).astype(np.float32)
+            down = (y[:, None] * turn[:, 1] + turn[:, 2]).astype(np.float32)
+            rays = (down[:, None] + across[None]).reshape(-1, 3)
+            origins = np.tile((pose.position - self._middle).astype(np.float32), (len(rays), 1))
+            triangle = self._embree.run(origins, rays, query="INTERSECT")
+            hit = np.flatnonzero(triangle >= 0)
+            v, u = np.divmod(hit, region.width)
+            way = x[u, None] * turn[:, 0] + y[v, None] * turn[:, 1] + turn[:, 2]
             normal = self._normal[triangle[hit]]
             # Rays have unit length along the optical axis, so the ray parameter is the depth.
             along = np.einsum("ij,ij->i", normal, self._corner[triangle[hit]] - pose.position)
-            slope = np.einsum("ij,ij->i", normal, rays[hit])
+            slope = np.einsum("ij,ij->i", normal, way)
             with np.errstate(divide="ignore", invalid="ignore"):
                 z = along / slope
             good = np.isfinite(z) & (z > 0)
