@@ -47,10 +47,8 @@ class DepthCaster:
     def __init__(self, mesh: trimesh.Trimesh, *others: trimesh.Trimesh) -> None:
         meshes = (mesh, *others)
         triangles = np.concatenate([np.asarray(one.triangles, np.float64) for one in meshes])
-        # Embree's geometry is in single precision: about its middle, where that is finest.
-        self._middle = triangles.reshape(-1, 3).mean(axis=0)
         self._embree = EmbreeScene()
-        TriangleMesh(self._embree, (triangles - self._middle).astype(np.float32))
+        TriangleMesh(self._embree, triangles.astype(np.float32))
         self._corner = triangles[:, 0]
         self._normal = np.cross(
             triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
@@ -85,7 +83,7 @@ class DepthCaster:
             across = (x[:, None] * turn[:, 0]).astype(np.float32)
             down = (y[:, None] * turn[:, 1] + turn[:, 2]).astype(np.float32)
             rays = (down[:, None] + across[None]).reshape(-1, 3)
-            origins = np.tile((pose.position - self._middle).astype(np.float32), (len(rays), 1))
+            origins = np.tile(pose.position.astype(np.float32), (len(rays), 1))
             triangle = self._embree.run(origins, rays, query="INTERSECT")
             hit = np.flatnonzero(triangle >= 0)
             v, u = np.divmod(hit, region.width)
