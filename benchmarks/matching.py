@@ -12,13 +12,14 @@ above) and valid pixels as shares; then the least seconds of three for one pair 
 
 import argparse
 import time
+from typing import Literal
 
 import cv2
 import numpy as np
 
 from qs3.sensor.matching import MatchingSettings, match
 
-CANDIDATES = [
+CANDIDATES: list[tuple[Literal["opencv-bm", "zncc"], int, bool]] = [
     ("opencv-bm", 15, False),
     ("opencv-bm", 15, True),
     ("opencv-bm", 19, True),
@@ -83,7 +84,7 @@ def main() -> None:
         seconds = []
         for _ in range(3):
             start = time.perf_counter()
-            match(*big, large, options.device)
+            match(big[0], big[1], large, options.device)
             seconds.append(time.perf_counter() - start)
         for noise in (0.0, 3.0):
             rng = np.random.default_rng(2)
