@@ -138,7 +138,7 @@ KINECT_V1 = Sensor(
     # KHOSHELHAM: 640×480, f 580 px, b 75 mm; the projector is the second, virtual camera.
     rig=StereoRig(640, 480, 580.0, 0.075, projector_offset=1.0, second="pattern"),
     # REICHINGER: 633×495 cells, one spot in nine. Our choice: it covers a little more than the
-    # image of 58° × 45°, so that a cell is 1.1 px and a spot 2 px wide: narrower ones lock to pixels.
+    # image of 58° × 45°; a cell is 1.1 px wide, a spot 2 px: narrower ones lock to pixels.
     pattern=PatternSettings(
         columns=633,
         rows=495,
