@@ -23,20 +23,23 @@ class CameraOptions:
     """orbit around the object, or jitter of one pose as released; default by preset."""
     size: Literal["box", "ball"] | None = None
     """Longest side 1, or the unit ball; default by preset."""
-    box_crop: Literal["on", "off"] | None = None
-    """Keep only points inside the object's box; default by preset."""
     num_points: int = 2048
     """Points of each cloud."""
     image_noise: float | None = None
     """Gaussian noise of the images in grey levels of 255; default by sensor."""
+    matching: Literal["opencv-bm", "zncc"] | None = None
+    """OpenCV's block matching, or our own of twice the precision; default by sensor."""
     bias_correction: bool = False
     """Take off the 1/32 px by which OpenCV's block matching rounds up."""
     pattern: Path | None = None
     """Your own picture to project in place of the speckle dots."""
     renderer: Literal["mitsuba", "cycles"] = "mitsuba"
     """mitsuba, or cycles: the paper's renderer, Blender's (`make cycles` brings it)."""
-    samples: int = 8
-    """Rays a pixel."""
+    samples: int | None = None
+    """Rays a pixel; default by renderer: 4 of mitsuba, 128 of cycles."""
+    indirect: Literal["cached", "path"] = "cached"
+    """Soft light of mitsuba: from an irradiance cache, or by plain path tracing (use 64 samples
+    and more)."""
     variant: Literal["auto", "cuda_ad_mono", "llvm_ad_mono", "scalar_rgb"] = "auto"
     """Variant of Mitsuba; auto takes the fastest that works here."""
 
@@ -51,9 +54,12 @@ class CameraOptions:
                 raise InputError(f"--image-noise {self.image_noise}: must be 0 or above")
             exposure = dataclasses.replace(sensor.exposure, noise=self.image_noise)
             sensor = dataclasses.replace(sensor, exposure=exposure)
-        if self.bias_correction:
-            matching = dataclasses.replace(sensor.matching, bias_correction=True)
-            sensor = dataclasses.replace(sensor, matching=matching)
+        matching = dataclasses.replace(
+            sensor.matching,
+            method=self.matching or sensor.matching.method,
+            bias_correction=self.bias_correction or sensor.matching.bias_correction,
+        )
+        sensor = dataclasses.replace(sensor, matching=matching)
         if self.pattern is not None:
             pattern = dataclasses.replace(sensor.pattern, image=str(self.pattern))
             sensor = dataclasses.replace(sensor, pattern=pattern)
@@ -65,20 +71,21 @@ class CameraOptions:
 
     def resolve_renderer(self) -> Any:
         """The renderer asked for; raises where it does not work here."""
-        if self.samples < 1:
+        if self.samples is not None and self.samples < 1:
             raise InputError(f"--samples {self.samples}: at least 1 is needed")
         if self.renderer == "cycles":
             from qs3.sensor.render.cycles import CyclesRenderer
 
             if self.variant != "auto":
                 raise InputError(f"--variant {self.variant} is Mitsuba's: leave it out with cycles")
-            renderer = CyclesRenderer(samples=self.samples)
+            renderer = CyclesRenderer(samples=self.samples or CyclesRenderer.samples)
             _ = renderer.description  # a Blender that is missing or does not start stops here
             return renderer
         from qs3.sensor.render.mitsuba import MitsubaRenderer
 
         variant = "" if self.variant == "auto" else self.variant
-        return MitsubaRenderer(variant=variant, samples=self.samples)
+        samples = self.samples or MitsubaRenderer.samples
+        return MitsubaRenderer(variant=variant, samples=samples, indirect=self.indirect)
 
     def scan_arguments(self) -> dict[str, Any]:
         """Settings of a scan by the names that `qs3.scan` and `generate` share."""
@@ -88,7 +95,6 @@ class CameraOptions:
         given = {
             "view_layout": self.view_layout,
             "size": self.size,
-            "box_crop": None if self.box_crop is None else self.box_crop == "on",
         }
         chosen |= {name: value for name, value in given.items() if value is not None}
         return chosen | {"views": self.views, "num_points": self.num_points}

@@ -14,6 +14,9 @@ class SceneOptions:
     scene: str = "alone"
     """alone (the paper), floor, wall, room (both), behind a neighbour or beside one; joined by +
     as in room+beside."""
+    material: str = ""
+    """Surface of the object by name: diffuse, principled, rough-specular, glossy-plastic, metal,
+    dark, mirror or glass; default by sensor."""
     floor_material: str = ""
     """Surface of the floor by name, such as dark; default: diffuse, albedo 0.5."""
     wall_material: str = ""
@@ -30,7 +33,11 @@ class SceneOptions:
     material=diffuse,metal,dark, or default alone (materials, ambient light, projector, gain)."""
 
     def resolve_sensor(self, sensor: Any) -> Any:
-        """The sensor in the object size asked for."""
+        """The sensor with the object's size and surface asked for."""
+        from qs3.sensor.materials import get_material
+
+        if self.material:
+            sensor = dataclasses.replace(sensor, material=get_material(self.material))
         if self.object_size is None:
             return sensor
         if not 0 < self.object_size < float("inf"):
