@@ -1,0 +1,347 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy import linalg, stats
+
+from qs3.errors import InputError
+from qs3.sensor.exposure import ExposureSettings, expose, expose_pair, radiance_of
+from qs3.sensor.lens import blur, blur_reach
+from qs3.sensor.render import StereoPair
+from qs3.sensor.rig import Pose, Region, StereoRig
+
+RIG = StereoRig(width=201, height=161, focal=100.0)
+OBJECT = Region(40, 30, 110, 90)
+LINEAR = ExposureSettings(response="linear")
+EVERYTHING = ExposureSettings(
+    response="gamma",
+    auto=0.6,
+    psf=1.2,
+    vignetting=0.7,
+    speckle=200.0,
+    noise=2.0,
+    offset=-0.5,
+)
+
+
+def pair_of(left, right=None, where=RIG.full_frame, background=0.05, display=False) -> StereoPair:
+    right = left if right is None else right
+    left, right = (np.asarray(image, np.float32) for image in (left, right))
+    return StereoPair(left, right, where, where, background, Pose(np.eye(4)), display)
+
+
+def textured(seed=0, scale=1.0, display=False) -> StereoPair:
+    """An object of uneven radiance before an even background."""
+    rng = np.random.default_rng(seed)
+    left, right = (scale * rng.gamma(2.0, 0.2, (2, OBJECT.height, OBJECT.width))).astype(np.float32)
+    if display:
+        left, right = left.clip(0, 1), right.clip(0, 1)
+    return pair_of(left, right, OBJECT, 0.05 * scale, display)
+
+
+def exposed(pair, settings, seed=0, canvas=RIG.full_frame, focus=OBJECT, rig=RIG):
+    return expose_pair(pair, canvas, focus, rig, settings, np.random.default_rng(seed))
+
+
+# Responses
+
+
+@pytest.mark.parametrize("response", ["film", "linear", "gamma"])
+@pytest.mark.parametrize("bits", [8, 10])
+def test_responses_are_monotone_from_black_to_white(response, bits):
+    light = np.concatenate([np.linspace(0, 2, 400), np.geomspace(2, 1e9, 100)])[None]
+    grey = expose(light, ExposureSettings(response=response, bits=bits)).astype(int)
+    assert (np.diff(grey[0]) >= 0).all()
+    assert (grey[0, 0], grey[0, -1]) == (0, 2**bits - 1)
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.8, 2.2])
+def test_gamma_is_a_power(exponent):
+    light = np.linspace(0, 1, 300)[None]
+    settings = ExposureSettings(response="gamma", gamma=exponent, bits=10)
+    np.testing.assert_array_equal(expose(light, settings), np.rint(1023 * light ** (1 / exponent)))
+
+
+def test_film_is_a_logistic_curve_of_the_logarithm():
+    light = np.geomspace(1e-4, 1e3, 300)[None]
+    logistic = 1 / (1 + np.exp(-0.756 * np.log(light / 0.18)))
+    np.testing.assert_array_equal(expose(light, ExposureSettings()), np.rint(255 * logistic))
+
+
+@pytest.mark.parametrize("response", ["film", "linear", "gamma"])
+def test_radiance_of_a_share_is_the_inverse(response):
+    settings = ExposureSettings(response=response, bits=10)
+    for share in (0.05, 0.5, 0.9):
+        assert expose(np.array([[radiance_of(share, settings)]]), settings) == round(1023 * share)
+
+
+def test_gain_multiplies_the_radiance():
+    light = np.random.default_rng(0).random((20, 20))
+    brighter = dataclasses.replace(LINEAR, gain=0.5)
+    np.testing.assert_array_equal(expose(light, brighter), expose(light / 2, LINEAR))
+
+
+def test_display_referred_values_are_grey_already():
+    settings = ExposureSettings(response="film", gain=7.0, auto=0.3)
+    pair = textured(display=True)
+    left, right = exposed(pair, settings)
+    for grey, values in zip((left, right), pair.canvas(RIG.full_frame), strict=True):
+        np.testing.assert_array_equal(grey, np.rint(255 * values))
+
+
+def test_ten_bits_hold_the_eight():
+    for settings in (LINEAR, EVERYTHING):
+        fine = exposed(textured(), dataclasses.replace(settings, bits=10))
+        coarse = exposed(textured(), settings)
+        for ten, eight in zip(fine, coarse, strict=True):
+            assert (ten.dtype, eight.dtype) == (np.uint16, np.uint8)
+            assert np.abs((ten >> 2).astype(int) - eight).max() <= 1
+            np.testing.assert_allclose(ten / 1023, eight / 255, atol=0.5 / 255 + 0.5 / 1023)
+
+
+# Speckle and noise
+
+
+def test_speckle_is_gamma_of_mean_one_and_the_stated_shape():
+    shape, level = 50.0, 0.25
+    settings = ExposureSettings(response="linear", speckle=shape, bits=10)
+    pair = pair_of(np.full((400, 500), level), where=Region(0, 0, 500, 400))
+    rig = StereoRig(width=500, height=400, focal=500.0)
+    left, right = exposed(pair, settings, canvas=rig.full_frame, rig=rig)
+    for grey in (left, right):
+        factor = grey / 1023 / level
+        count = factor.size
+        variance = 1 / shape + 1 / 12 / (1023 * level) ** 2
+        kurtosis = 3 + 6 / shape
+        assert factor.mean() == pytest.approx(1, abs=4 * np.sqrt(variance / count))
+        error = 4 * variance * np.sqrt((kurtosis - 1) / count)
+        assert factor.var() == pytest.approx(variance, abs=error)
+        assert stats.skew(factor.ravel()) == pytest.approx(2 / np.sqrt(shape), rel=0.1)
+    assert abs(np.corrcoef(left.ravel(), right.ravel())[0, 1]) < 0.01
+    assert abs(np.corrcoef(left[:, 1:].ravel(), left[:, :-1].ravel())[0, 1]) < 0.01
+
+
+def test_speckle_grows_with_the_grey_level_and_spares_black():
+    settings = ExposureSettings(response="linear", speckle=398.12, bits=10)
+    for level in (0.1, 0.2, 0.4):
+        left, _ = exposed(pair_of(np.full((161, 201), level)), settings)
+        assert left.std() == pytest.approx(1023 * level / np.sqrt(398.12), rel=0.03)
+    assert not exposed(pair_of(np.zeros((161, 201))), settings)[0].any()
+
+
+def test_saturation_comes_after_the_speckle():
+    settings = ExposureSettings(response="linear", speckle=398.12)
+    left, _ = exposed(pair_of(np.full((161, 201), 2.0)), settings)
+    assert (left == 255).all()
+
+
+def test_noise_has_the_mean_and_size_asked_for():
+    settings = ExposureSettings(response="linear", noise=3.0, offset=-7.25)
+    left, right = (
+        grey.astype(float) for grey in exposed(pair_of(np.full((161, 201), 0.5)), settings)
+    )
+    for grey in (left, right):
+        assert grey.mean() == pytest.approx(127.5 - 7.25, abs=4 * 3 / np.sqrt(grey.size))
+        assert grey.std() == pytest.approx(np.hypot(3.0, 1 / np.sqrt(12)), rel=0.02)
+    assert abs(np.corrcoef(left.ravel(), right.ravel())[0, 1]) < 0.03
+
+
+def test_draws_are_needed_where_noise_is():
+    for name in ("noise", "speckle"):
+        with pytest.raises(ValueError, match=name):
+            expose(np.full((2, 2), 0.5), dataclasses.replace(LINEAR, **{name: 3.0}))
+
+
+def test_equal_seeds_give_equal_bytes():
+    one, same, other = (exposed(textured(), EVERYTHING, seed) for seed in (1, 1, 2))
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(one, same, strict=True))
+    assert all((a != b).any() for a, b in zip(one, other, strict=True))
+
+
+def test_nothing_is_drawn_where_nothing_is_random():
+    quiet = dataclasses.replace(EVERYTHING, noise=0.0, speckle=0.0)
+    rng = np.random.default_rng(0)
+    before = rng.bit_generator.state
+    expose_pair(textured(), RIG.full_frame, OBJECT, RIG, quiet, rng)
+    assert rng.bit_generator.state == before
+
+
+def test_a_rig_of_one_camera_has_no_right_image():
+    one = dataclasses.replace(RIG, projector_offset=1.0, second="pattern")
+    pair = textured()
+    left, right = exposed(pair, EVERYTHING, rig=one)
+    assert right.size == 0
+    np.testing.assert_array_equal(left, exposed(pair, EVERYTHING)[0])
+
+
+# Auto-exposure
+
+
+@pytest.mark.parametrize("response", ["film", "linear", "gamma"])
+@pytest.mark.parametrize("scale", [0.01, 1.0, 40.0])
+def test_auto_exposure_brings_the_percentile_to_its_share(response, scale):
+    settings = ExposureSettings(response=response, auto=0.6)
+    left, _ = exposed(textured(scale=scale), settings)
+    shown = left[OBJECT.slices]
+    assert np.percentile(shown, 95, method="nearest") == pytest.approx(0.6 * 255, abs=1)
+
+
+@pytest.mark.parametrize("response", ["film", "linear", "gamma"])
+def test_auto_exposure_makes_the_radiances_scale_immaterial(response):
+    settings = dataclasses.replace(EVERYTHING, response=response)
+    found = [exposed(textured(scale=scale), settings) for scale in (1.0, 8.0, 10.0)]
+    for one, eight, ten in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, eight)  # a power of two rounds alike
+        # Ten does not: single precision may tip a level that lies at one half.
+        assert np.abs(one.astype(int) - ten).max() <= 1
+        assert (one != ten).mean() < 1e-3
+
+
+def test_both_cameras_have_one_gain():
+    pair = textured()
+    darker = dataclasses.replace(pair, right=pair.left / 4)
+    left, right = exposed(darker, ExposureSettings(response="linear", auto=0.5, bits=10))
+    inside = left[OBJECT.slices]
+    cut = inside < 1023
+    np.testing.assert_allclose(right[OBJECT.slices][cut], inside[cut] / 4, atol=0.63)
+
+
+def test_auto_exposure_looks_at_the_object_and_not_at_the_background():
+    settings = ExposureSettings(auto=0.5, psf=0.8)
+    around = [OBJECT, OBJECT.grown(30, 201, 161), RIG.full_frame]
+    greys = [exposed(textured(), settings, focus=focus)[0] for focus in around]
+    for grey in greys[1:]:
+        np.testing.assert_array_equal(grey, greys[0])
+
+
+def test_gain_compensates_what_auto_exposure_chose():
+    auto = ExposureSettings(response="linear", auto=0.4)
+    plain = exposed(textured(), auto)[0][OBJECT.slices]
+    less = exposed(textured(), dataclasses.replace(auto, gain=0.5))[0][OBJECT.slices]
+    cut = plain < 255
+    np.testing.assert_allclose(less[cut], plain[cut] / 2, atol=0.76)
+
+
+def test_auto_exposure_has_a_largest_gain():
+    settings = ExposureSettings(response="linear", auto=0.6, max_gain=2.0)
+    dark = textured(scale=0.02)
+    fixed = exposed(dark, ExposureSettings(response="linear", gain=2.0))
+    np.testing.assert_array_equal(exposed(dark, settings), fixed)
+    bright = exposed(textured(), settings)
+    np.testing.assert_array_equal(bright, exposed(textured(), ExposureSettings("linear", auto=0.6)))
+
+
+@pytest.mark.parametrize("focus", [OBJECT, Region(0, 0, 0, 0), Region(0, 0, 20, 20)])
+def test_auto_exposure_of_nothing_is_defined(focus):
+    black = pair_of(np.zeros((161, 201)), background=0.0)
+    left, right = exposed(black, ExposureSettings(auto=0.6, psf=1.0), focus=focus)
+    assert not left.any()
+    assert not right.any()
+
+
+# The lens
+
+
+@pytest.mark.parametrize("psf", [0.3, 0.5, 1.0, 2.5])
+def test_blur_keeps_energy_and_has_the_stated_second_moment(psf):
+    point = np.zeros((81, 91), np.float32)
+    point[40, 45] = 1.0
+    spread = blur(point, psf).astype(float)
+    v, u = np.mgrid[-40:41, -45:46]
+    assert spread.sum() == pytest.approx(1, abs=1e-6)
+    for axis in (u, v):
+        assert (spread * axis).sum() == pytest.approx(0, abs=1e-6)
+        assert (spread * axis**2).sum() == pytest.approx(psf**2, rel=2e-3)
+    assert not spread[np.maximum(np.abs(u), np.abs(v)) > blur_reach(psf)].any()
+    np.testing.assert_array_equal(spread, spread[::-1, ::-1])
+
+
+def test_blurs_add_their_variances():
+    image = np.random.default_rng(0).random((60, 70), dtype=np.float32)
+    twice, once = blur(blur(image, 0.6), 0.8), blur(image, 1.0)
+    np.testing.assert_allclose(twice[8:-8, 8:-8], once[8:-8, 8:-8], atol=1e-4)
+
+
+@pytest.mark.parametrize("psf", [0.5, 1.2, 3.0])
+def test_blur_solves_the_heat_equation_on_the_pixels(psf):
+    image = np.random.default_rng(0).random((80, 90), dtype=np.float32)
+    down, across = (
+        linalg.expm(psf**2 / 2 * (np.eye(n, k=1) - 2 * np.eye(n) + np.eye(n, k=-1)))
+        for n in image.shape
+    )
+    rim = 2 * blur_reach(psf)
+    inner = (slice(rim, -rim), slice(rim, -rim))
+    np.testing.assert_allclose(blur(image, psf)[inner], (down @ image @ across)[inner], atol=1e-4)
+
+
+@pytest.mark.parametrize("bits", [8, 10])
+def test_an_even_image_stays_even_to_the_rim(bits):
+    settings = ExposureSettings(response="linear", psf=2.0, bits=bits)
+    left, _ = exposed(pair_of(np.full((161, 201), 0.4)), settings)
+    assert (left == round(0.4 * (2**bits - 1))).all()
+
+
+def test_vignetting_is_cos4_of_the_angle_from_the_axis():
+    # f = 100 px, the principal point at (100, 80): the rim's middle is seen at 45°.
+    settings = ExposureSettings(response="linear", vignetting=1.0, bits=10)
+    for grey in exposed(pair_of(np.full((161, 201), 0.8)), settings):
+        assert grey[80, 100] == round(1023 * 0.8)
+        for column in (0, 200):
+            assert grey[80, column] == round(1023 * 0.8 * np.cos(np.pi / 4) ** 4)
+        angle = np.arctan(np.hypot(1.0, 0.8))
+        assert grey[0, 0] == grey[160, 200] == round(1023 * 0.8 * np.cos(angle) ** 4)
+    some = exposed(pair_of(np.full((161, 201), 0.8)), dataclasses.replace(settings, vignetting=0.4))
+    assert some[0][80, 0] == round(1023 * 0.8 * (0.6 + 0.4 * 0.25))
+
+
+@pytest.mark.parametrize(
+    "canvas",
+    [
+        Region(60, 50, 40, 31),
+        Region(0, 0, 33, 27),
+        Region(150, 100, 51, 61),
+        Region(1, 40, 199, 3),
+        Region(77, 80, 1, 1),
+    ],
+)
+@pytest.mark.parametrize("bits", [8, 10])
+def test_grey_levels_do_not_depend_on_the_canvas(canvas, bits):
+    settings = dataclasses.replace(EVERYTHING, bits=bits)
+    whole, part = exposed(textured(), settings), exposed(textured(), settings, canvas=canvas)
+    for full, cut in zip(whole, part, strict=True):
+        np.testing.assert_array_equal(cut, full[canvas.slices])
+
+
+# Settings
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("gamma", 0.0),
+        ("gain", 0.0),
+        ("gain", float("inf")),
+        ("auto", 1.0),
+        ("auto", -0.1),
+        ("max_gain", -1.0),
+        ("psf", -0.5),
+        ("psf", float("nan")),
+        ("vignetting", 1.5),
+        ("speckle", -1.0),
+        ("noise", -1.0),
+        ("noise", float("nan")),
+        ("offset", 300.0),
+    ],
+)
+def test_settings_are_checked(name, value):
+    with pytest.raises(InputError, match=f"exposure: {name}") as caught:
+        ExposureSettings(**{name: value})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("name", "value"), [("response", "log"), ("bits", 12)])
+def test_choices_are_checked(name, value):
+    settings = ExposureSettings()
+    object.__setattr__(settings, name, value)  # past the tests' own check of types
+    with pytest.raises(InputError, match=f"exposure: .*{name}.*choose"):
+        settings.__post_init__()

@@ -1,0 +1,231 @@
+import hashlib
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from scipy import signal, stats
+from scipy.spatial import cKDTree
+
+from qs3.errors import InputError
+from qs3.sensor.render import Body, LightSettings, Scene
+from qs3.sensor.render.mitsuba import MitsubaRenderer
+from qs3.sensor.rig import Pose, StereoRig
+from qs3.sensor.speckle import PatternSettings, pattern_image, speckle_pattern, spot_places
+from qs3.sensor.stored import stored_pattern
+
+SPOTS = PatternSettings(columns=270, rows=168, kind="spots", spot_size=0.7)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 7])
+def test_pattern_has_one_dot_in_nine_and_none_adjacent(seed):
+    dots = speckle_pattern(633, 495, seed)
+    assert dots.sum() == 633 * 495 // 9
+    neighbours = cv2.filter2D(dots.astype(np.float32), -1, np.ones((3, 3), np.float32))
+    assert neighbours[dots].max() == 1  # itself alone
+    distance = cKDTree(np.argwhere(dots)).query(np.argwhere(dots), 2)[0][:, 1]
+    assert distance.min() >= 2
+    assert np.median(distance) <= 3
+
+
+def test_pattern_follows_its_seed():
+    np.testing.assert_array_equal(speckle_pattern(30, 30, 4), speckle_pattern(30, 30, 4))
+    assert (speckle_pattern(30, 30, 4) != speckle_pattern(30, 30, 5)).any()
+    with pytest.raises(InputError, match="multiples of 3"):
+        speckle_pattern(31, 30, 0)
+
+
+def test_a_users_picture_is_projected_and_faults_name_it(tmp_path):
+    picture = np.zeros((4, 6), np.uint8)
+    picture[0, 5] = 255
+    cv2.imwrite(str(tmp_path / "mine.png"), picture)
+    image = pattern_image(PatternSettings(image=str(tmp_path / "mine.png")))
+    np.testing.assert_array_equal(image, picture / 255)
+    (tmp_path / "text.png").write_text("no picture")
+    for name in ("text.png", "absent.png"):
+        with pytest.raises(InputError, match=name):
+            pattern_image(PatternSettings(image=str(tmp_path / name)))
+
+
+@pytest.mark.parametrize(
+    ("size", "digest"), [((633, 495, 0), "53e5882594f997ae"), ((177, 138, 3), "5153553d342d93e2")]
+)
+def test_dots_stay_the_same_for_ever(size, digest):
+    packed = np.packbits(speckle_pattern(*size)).tobytes()
+    assert hashlib.sha256(packed).hexdigest()[:16] == digest
+
+
+# Spots
+
+
+@pytest.mark.parametrize(("columns", "rows", "seed"), [(270, 168, 0), (270, 168, 5), (633, 495, 1)])
+def test_every_tile_has_one_spot_and_none_is_near_another(columns, rows, seed):
+    places = spot_places(columns, rows, seed)
+    assert len(places) == (columns // 3) * (rows // 3)
+    tiles = np.unique(places // 3, axis=0)
+    assert len(tiles) == len(places)
+    assert places.min() >= 0
+    assert (places < [columns, rows]).all()
+    distance = cKDTree(places).query(places, 2)[0][:, 1]
+    assert distance.min() >= 1.5
+    assert 1.9 < np.median(distance) < 2.2
+    assert distance.max() < 3 * np.sqrt(8)
+
+
+def test_two_spots_are_spread_as_rejection_spreads_them():
+    rng = np.random.default_rng(0)
+    drawn = 3 * rng.random((20000, 2, 2)) + [[0, 0], [3, 0]]  # two tiles side by side
+    wanted = np.linalg.norm(drawn[:, 0] - drawn[:, 1], axis=1)
+    wanted = wanted[wanted >= 1.5]
+    found = [np.linalg.norm(np.diff(spot_places(6, 3, seed), axis=0)) for seed in range(200)]
+    _, chance = stats.ks_2samp(found, wanted)
+    assert chance > 0.01
+
+
+def test_spots_are_off_the_grid_and_lean_to_no_side():
+    inside = np.concatenate([spot_places(270, 168, seed) for seed in range(3)]) % 3
+    assert len(np.unique(inside)) == inside.size
+    half_way = 1.5 / np.sqrt(len(inside))  # the standard error of a mean is below 0.87/√n
+    np.testing.assert_allclose(inside.mean(axis=0), 1.5, atol=3 * half_way)
+    assert abs(np.corrcoef(inside.T)[0, 1]) < 3 / np.sqrt(len(inside))
+    # The rule of distance favours the middles of tiles, and nothing but that: the sides are alike,
+    # and so are the corners.
+    share = np.histogram2d(*inside.T, bins=3, range=[[0, 3]] * 2)[0] / len(inside)
+    error = np.sqrt(share.max() / len(inside))
+    corners, sides = share[::2, ::2].ravel(), share.ravel()[1::2]
+    assert np.ptp(corners) < 5 * error
+    assert np.ptp(sides) < 5 * error
+    assert corners.mean() < sides.mean() < share[1, 1]
+    # What is left of the period of 3 cells; it is 1 for a grid. Its square bounds the likeness
+    # at a distance.
+    assert np.abs(np.exp(2j * np.pi / 3 * inside).mean(axis=0)).max() < 0.15
+
+
+def test_the_field_is_evenly_filled():
+    image = pattern_image(SPOTS)
+    blocks = image.reshape(8, image.shape[0] // 8, 9, image.shape[1] // 9).mean(axis=(1, 3))
+    # 70 spots a block: were they strewn at random, blocks would differ by 12 %.
+    assert blocks.std() / blocks.mean() < 0.06
+    sigma = 0.7 / np.sqrt(8 * np.log(2))
+    assert image.mean() == pytest.approx(2 * np.pi * sigma**2 / 9, rel=0.01)
+    assert (image > 0.5).mean() == pytest.approx(np.pi * 0.35**2 / 9, rel=0.02)
+
+
+def self_correlation(image):
+    """Correlation of the parts of a picture that overlap, at shifts up to half of it."""
+    image = image - image.mean()
+    ones = np.ones_like(image)
+    both = signal.fftconvolve(ones, ones[::-1, ::-1])
+    found = signal.fftconvolve(image, image[::-1, ::-1]) / (both * image.var())
+    (h, w), (y, x) = image.shape, np.indices(found.shape)
+    y, x = y - (h - 1), x - (w - 1)
+    inner = (np.abs(y) <= h / 2) & (np.abs(x) <= w / 2)
+    return found[inner], np.hypot(y, x)[inner]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_spots_are_like_themselves_at_no_distance(seed):
+    coarse = PatternSettings(columns=270, rows=168, kind="spots", spot_size=1.3, seed=seed)
+    image = pattern_image(coarse)
+    cells = image.shape[1] / 270
+    found, distance = self_correlation(image)
+    assert found[distance == 0] == pytest.approx(1)
+    assert np.abs(found[distance > 3 * cells]).max() < 0.05
+    # The bound tells something: along a grid without the jitter it is broken at once.
+    middles = np.zeros((168, 270), np.float32)
+    middles[1::3, 1::3] = 1
+    found, distance = self_correlation(middles)
+    assert found[distance > 3].max() > 0.9
+
+
+def test_spots_are_gaussian_of_the_stated_width():
+    settings = PatternSettings(columns=12, rows=9, kind="spots", spot_size=0.8, seed=2)
+    image = pattern_image(settings)
+    scale = image.shape[1] // 12
+    assert image.shape == (9 * scale, 12 * scale)
+    y, x = (np.indices(image.shape) + 0.5) / scale  # centres of texels, in cells
+    wanted = np.zeros(image.shape)
+    for column, row in spot_places(12, 9, 2):
+        wanted += 0.5 ** (((x - column) ** 2 + (y - row) ** 2) / 0.4**2)
+    np.testing.assert_allclose(image, np.minimum(wanted, 1), atol=2e-3)
+
+
+def test_spots_follow_their_seed():
+    assert spot_places(30, 30, 4).tobytes() == spot_places(30, 30, 4).tobytes()
+    assert (spot_places(30, 30, 4) != spot_places(30, 30, 5)).any()
+
+
+@pytest.mark.parametrize("spot_size", [0.3, 0.7, 1.2, 2.0])
+def test_pictures_of_spots_are_fine_enough_and_not_too_large(spot_size):
+    image = pattern_image(PatternSettings(columns=300, rows=90, kind="spots", spot_size=spot_size))
+    assert max(image.shape) <= 4096
+    assert image.shape[1] / 300 * spot_size >= 2
+    assert 0 <= image.min() < 0.01
+    assert 0.9 < image.max() <= 1
+    with pytest.raises(ValueError, match="read-only"):
+        image[0, 0] = 1
+
+
+@pytest.mark.parametrize(
+    ("changed", "match"),
+    [
+        ({"columns": 31}, "multiples of 3"),
+        ({"rows": 0}, "multiples of 3"),
+        ({"spot_size": 0.0}, "spot_size"),
+        ({"spot_size": 2.5}, "spot_size"),
+        ({"tan_half_width": 0.0}, "tan_half_width"),
+        ({"tan_half_height": float("nan")}, "tan_half_height"),
+        ({"seed": -1}, "seed"),
+    ],
+)
+def test_pattern_settings_are_checked(changed, match):
+    with pytest.raises(InputError, match=f"pattern: .*{match}"):
+        PatternSettings(**changed)
+
+
+def test_spots_too_fine_for_any_picture_are_refused():
+    fine = PatternSettings(columns=3000, rows=300, kind="spots", spot_size=0.5)
+    with pytest.raises(InputError, match="enlarge spot_size"):
+        pattern_image(fine)
+
+
+# The stored pattern
+
+
+@pytest.mark.parametrize("indirect", ["cached", "path"])
+@pytest.mark.parametrize("kind", ["tiles", "spots"])
+def test_convention_stored_pattern_is_what_the_projector_throws(kind, indirect):
+    rig = StereoRig(240, 180, 300.0, 0.2, projector_offset=1.0, second="pattern")
+    depth, shift = 3.0, 20  # f·b/z
+    pattern = PatternSettings(
+        columns=120, rows=90, kind=kind, tan_half_width=0.6, tan_half_height=0.45
+    )
+    wall = trimesh.creation.box(extents=[20, 20, 0.2]).apply_translation([0, 0, depth + 0.1])
+    light = LightSettings(projector=10.0, sky=0.0, sky_elevation=90.0, ambient=0.03)
+    scene = Scene((Body(wall),), light, pattern_image(pattern), 0.6, 0.45)
+    renderer = MitsubaRenderer(variant="scalar_rgb", samples=8, indirect=indirect)
+    pair = renderer.render(scene, rig, [Pose(np.eye(4))], [0])[0]
+    seen = pair.canvas(rig.full_frame)[0][20:-20, 40:-20].astype(float)
+    stored = stored_pattern(rig, pattern, rig.full_frame).astype(float)
+
+    def likeness(reference, right=0, down=0):
+        part = reference[20 + down : 160 + down, 40 - shift + right : 220 - shift + right]
+        return np.corrcoef(seen.ravel(), part.ravel())[0, 1]
+
+    assert likeness(stored) > 0.95
+    for turned in (stored[:, ::-1], stored[::-1], stored[::-1, ::-1]):
+        assert abs(likeness(turned)) < 0.1
+    assert likeness(stored, right=2 * shift) < 0.1  # the left camera's side is not the right's
+    for step in ({"right": 1}, {"down": 1}):
+        before, peak, after = (
+            likeness(stored, **{k: n * v for k, v in step.items()}) for n in (-1, 0, 1)
+        )
+        assert abs((after - before) / (2 * (2 * peak - before - after))) < 0.03
+
+
+def test_stored_pattern_of_ten_bits_holds_the_eight():
+    rig = StereoRig(80, 60, 800.0)
+    eight, ten = (stored_pattern(rig, SPOTS, rig.full_frame, bits) for bits in (8, 10))
+    assert (eight.dtype, ten.dtype) == (np.uint8, np.uint16)
+    assert ten.max() > 255
+    np.testing.assert_allclose(ten / 1023, eight / 255, atol=0.5 / 255 + 0.5 / 1023)
