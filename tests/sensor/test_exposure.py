@@ -2,13 +2,17 @@ import dataclasses
 
 import numpy as np
 import pytest
+import trimesh
 from scipy import linalg, stats
 
 from qs3.errors import InputError
 from qs3.sensor.exposure import ExposureSettings, expose, expose_pair, radiance_of
 from qs3.sensor.lens import blur, blur_reach
+from qs3.sensor.matching import MatchingSettings
+from qs3.sensor.presets import Sensor
 from qs3.sensor.render import StereoPair
 from qs3.sensor.rig import Pose, Region, StereoRig
+from qs3.sensor.scan import scan
 
 RIG = StereoRig(width=201, height=161, focal=100.0)
 OBJECT = Region(40, 30, 110, 90)
@@ -345,3 +349,22 @@ def test_choices_are_checked(name, value):
     object.__setattr__(settings, name, value)  # past the tests' own check of types
     with pytest.raises(InputError, match=f"exposure: .*{name}.*choose"):
         settings.__post_init__()
+
+
+def test_a_scan_of_whole_frames_has_the_same_grey_levels(renderer):
+    sensor = Sensor(
+        rig=StereoRig(360, 300, 400.0),
+        exposure=EVERYTHING,
+        matching=MatchingSettings(num_disparities=32, block_size=9),
+    )
+    plate = trimesh.creation.box(extents=[1, 0.3, 0.02])
+    part, whole = (
+        scan(
+            plate, sensor=sensor, views=2, renderer=renderer, keep_images=True, full_frames=full
+        ).images
+        for full in (False, True)
+    )
+    for cut, frame in zip(part, whole, strict=True):
+        assert cut.region != frame.region
+        np.testing.assert_array_equal(cut.left, frame.part(frame.left, cut.region))
+        np.testing.assert_array_equal(cut.right, frame.part(frame.right, cut.region))
