@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -9,7 +10,7 @@ import trimesh
 from qs3.errors import InputError
 from qs3.sensor.materials import MATERIALS, Material
 from qs3.sensor.render import Body, LightSettings, Scene
-from qs3.sensor.render.cache import CacheSettings
+from qs3.sensor.render.cache import CacheSettings, places
 from qs3.sensor.render.embree import EmbreePhotographer, _turns
 from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
 from qs3.sensor.rig import Pose, Region, StereoRig
@@ -63,6 +64,24 @@ def test_convention_cached_light_is_path_traced_light(variant, max_depth):
         assert ours.mean() == pytest.approx(theirs.mean(), rel=0.005)
         error = smooth(ours) - smooth(theirs)
         assert np.sqrt((error**2).mean()) < 0.03 * smooth(theirs).max()
+
+
+@pytest.mark.parametrize("samples", [1, 2, 4, 7, 16, 64])
+def test_rays_of_a_pixel_form_a_latin_square_about_its_centre(samples):
+    steps = (np.arange(samples) + 0.5) / samples
+    for axis in places(samples).T:
+        np.testing.assert_allclose(np.sort(axis), steps, rtol=1e-6)
+        assert axis.mean() == pytest.approx(0.5, abs=1e-6)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_pictures_lie_where_those_of_the_path_lie(variant):
+    scene = corner()
+    cached = pair(scene, variant, [Region(0, 0, 200, 160)], samples=4).left
+    spp = 256 if variant.startswith("llvm") else 64
+    traced = pair(scene, variant, [Region(0, 0, 200, 160)], samples=spp, indirect="path").left
+    shift, _ = cv2.phaseCorrelate(cached.astype(np.float64), traced.astype(np.float64))
+    assert np.abs(shift).max() < 0.03
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

@@ -3,6 +3,9 @@
 import math
 from dataclasses import dataclass
 
+import numpy as np
+from jaxtyping import Float32
+
 from qs3.errors import InputError
 from qs3.sensor.rig import Region
 
@@ -11,6 +14,18 @@ from qs3.sensor.rig import Region
 R2 = (0.7548776662466927, 0.5698402909980532)
 GOLDEN = (math.sqrt(5) - 1) / 2
 TRIES = 12  # places in a cell that are tried for one that shows a surface
+
+
+def places(samples: int) -> Float32[np.ndarray, "n 2"]:
+    """Where in a pixel its rays go, in 0…1: a Latin square, whose mean is the pixel's centre.
+
+    Example:
+        >>> places(4).tolist()
+        [[0.125, 0.125], [0.375, 0.625], [0.625, 0.375], [0.875, 0.875]]
+    """
+    ranks = np.argsort(np.argsort(np.arange(samples) * GOLDEN % 1))
+    both = np.stack([np.arange(samples), ranks], axis=1)
+    return ((both + 0.5) / samples).astype(np.float32)
 
 
 @dataclass(frozen=True)

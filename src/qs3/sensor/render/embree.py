@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float32, Int32, UInt32
 
 from qs3.errors import InputError
 from qs3.geometry import invert_rigid, transform_points
-from qs3.sensor.render.cache import GOLDEN, R2, TRIES, CacheSettings, cells
+from qs3.sensor.render.cache import GOLDEN, R2, TRIES, CacheSettings, cells, places
 from qs3.sensor.render.scene import Scene
 from qs3.sensor.rig import Pose, Region, StereoRig
 
@@ -86,8 +86,7 @@ class EmbreePhotographer:
         seen = np.zeros(pixels, np.float32)
         place, facing = np.zeros((pixels, 3), np.float32), np.zeros((pixels, 3), np.float32)
         lane = np.arange(pixels)
-        for k in range(samples):
-            a, b = (np.float32((k + 0.5) * step % 1) for step in R2)
+        for k, (a, b) in enumerate(places(samples)):
             rays = _directions(rig, camera, region, column[lane] + a, row[lane] + b)
             triangle, points, normals = self._meet(np.tile(origin, (len(rays), 1)), rays)
             met = triangle >= 0

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from qs3.sensor.render.cache import GOLDEN, R2, TRIES, CacheSettings, cells
+from qs3.sensor.render.cache import GOLDEN, R2, TRIES, CacheSettings, cells, places
 from qs3.sensor.render.scene import Scene
 from qs3.sensor.rig import Pose, Region, StereoRig
 
@@ -222,18 +222,14 @@ class JitPhotographer:
         row = index // width
         u, v = mi.Float(index - row * width), mi.Float(row)
         total = self._count(samples)
+        across, down = (mi.Float(np.ascontiguousarray(axis)) for axis in places(samples).T)
         none = dr.zeros(mi.Float, region.width * region.height)
 
         def go_on(k: Any, *_: Any) -> Any:
             return k < total
 
         def step(k: Any, sharp: Any, seen: Any, place: Any, facing: Any) -> Any:
-            ray = rays.at(
-                *(
-                    w + _fraction(dr, (mi.Float(k) + 0.5) * a)
-                    for w, a in zip((u, v), R2, strict=True)
-                )
-            )
+            ray = rays.at(u + dr.gather(mi.Float, across, k), v + dr.gather(mi.Float, down, k))
             si = self._shapes.ray_intersect(ray)
             hit = si.is_valid()
             sharp += self._from_projector(si, projector, hit)
