@@ -23,6 +23,7 @@ sys.path[:] = [folder for folder in sys.path if os.path.abspath(folder or ".") !
 import numpy as np  # noqa: E402
 
 MARK = "@qs3 "
+TOUCH = 1.5e-4  # Mitsuba's rays start so far from an object of size 1
 # OpenCV's camera (x right, y down, z forward) in terms of Blender's (x right, y up, z backward).
 _TO_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -170,11 +171,10 @@ class Studio:
         split = graph.add(
             "ShaderNodeSeparateXYZ", graph.add("ShaderNodeTexCoord").outputs["Normal"]
         )
-        x, y, z = split.outputs
         place = graph.add("ShaderNodeCombineXYZ")
         self.slopes = []
-        for axis, value in enumerate((x, y)):
-            ratio = graph.math("DIVIDE", value, z)
+        for axis in (0, 1):
+            ratio = graph.math("DIVIDE", split.outputs[axis], split.outputs[2])
             scaled = graph.math("MULTIPLY_ADD", ratio, 1.0, 0.5)
             self.slopes.append(graph.nodes[-1].inputs[1])
             graph.link(scaled, place.inputs[axis])
@@ -194,7 +194,8 @@ class Studio:
         above = graph.math("GREATER_THAN", height, 0.0)
         self.sky_edge = graph.nodes[-1].inputs[1]
         total = graph.math("MULTIPLY_ADD", above, 1.0, 0.0)
-        self.sky_level, self.ambient_level = graph.nodes[-1].inputs[1:3]
+        self.sky_level = graph.nodes[-1].inputs[1]
+        self.ambient_level = graph.nodes[-1].inputs[2]
         white = graph.add("ShaderNodeRGB").outputs[0]
         white.default_value = (1.0, 1.0, 1.0, 1.0)
         background = graph.add("ShaderNodeBackground", white, total)
@@ -274,7 +275,7 @@ class Studio:
             _inputs(surface, IOR=settings["ior"], **{"Base Color": grey})
         else:
             surface = graph.thin_glass(settings["ior"])
-        graph.add("ShaderNodeOutputMaterial", surface.outputs[0])
+        graph.add("ShaderNodeOutputMaterial", graph.beyond_touch(surface.outputs[0]))
         return material
 
     def _set_quality(self, quality):
@@ -363,6 +364,19 @@ class _Graph:
         for slot, feed in zip(node.inputs, feeds):  # noqa: B905
             self.link(feed, slot)
         return node.outputs[0]
+
+    def beyond_touch(self, surface):
+        """Let rays that have only just left a surface pass what lies in the same plane.
+
+        Cycles starts a ray in the surface itself and leaves out that one triangle, so that where
+        faces of artists' meshes coincide each would shade the other to black.
+        """
+        path = self.add("ShaderNodeLightPath").outputs
+        near = self.math("LESS_THAN", path["Ray Length"], TOUCH)
+        start = self.math("MULTIPLY", near, self.math("SUBTRACT", 1.0, path["Is Camera Ray"]))
+        clear = self.add("ShaderNodeBsdfTransparent")
+        _inputs(clear, Color=(1.0,) * 4)
+        return self.add("ShaderNodeMixShader", start, surface, clear.outputs[0]).outputs[0]
 
     def thin_glass(self, ior):
         """A pane: reflects R = 2F/(1 + F) of the light, lets the rest pass unbent.

@@ -29,11 +29,17 @@ _TAIL_LINES = 12
 class RenderError(QS3Error, RuntimeError):
     """A renderer's own process failed; the object it was given fails, the next one does not."""
 
-    def __init__(self, reason: str, log: str) -> None:
-        tail = log.strip()
-        super().__init__(reason + (f"; the end of its log:\n{tail}" if tail else ""))
+    def __init__(self, reason: str, log: str = "") -> None:
+        super().__init__(reason, log)
+        self.reason = reason
+        """What happened to the process."""
         self.log = log
         """The end of what the process printed."""
+
+    def __str__(self) -> str:
+        """One line: what happened and the last that was printed."""
+        lines = [line.strip() for line in self.log.splitlines() if line.strip()]
+        return self.reason + (f"; its log ends: {' | '.join(lines[-4:])}" if lines else "")
 
 
 class Worker:
@@ -139,7 +145,7 @@ class Worker:
 
     def _end(self) -> str:
         try:
-            code = self._process.wait(5)
+            code = self._process.wait(1)
         except subprocess.TimeoutExpired:
             return "closed its output"
         if code >= 0:

@@ -220,9 +220,9 @@ def _command() -> tuple[str, ...]:
     command = interpreter()
     if command is None:
         error = MissingExtraError("bpy (Blender's Cycles)", "cycles")
-        error.args = (
+        error.msg = (
             "Cycles is not here: in a checkout, `make cycles` brings it (the extra 'cycles'), or "
-            "set QS3_BLENDER to a Blender 4.2 or newer, or QS3_CYCLES_PYTHON to a Python with bpy",
+            "set QS3_BLENDER to a Blender 4.2 or newer, or QS3_CYCLES_PYTHON to a Python with bpy"
         )
         raise error
     return command

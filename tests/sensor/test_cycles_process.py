@@ -1,0 +1,346 @@
+"""The life of the renderer's child process, with small stand-ins for Blender."""
+
+import os
+import pickle
+import signal
+import stat
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from qs3.errors import InputError, MissingExtraError
+from qs3.sensor.render import Body, LightSettings, Scene
+from qs3.sensor.render._worker_process import RenderError, close_workers
+from qs3.sensor.render.cycles import CyclesRenderer, find_cycles, interpreter
+from qs3.sensor.rig import Pose, Region, StereoRig
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="the stand-ins are POSIX programs")
+
+RIG = StereoRig(width=32, height=24, focal=40.0)
+POSE = Pose.looking_at(np.array([2.0, -3.0, 2.0]), np.zeros(3))
+SCENE = Scene(
+    (Body(trimesh.creation.box()),), LightSettings(), np.ones((4, 6), np.float32), 0.6, 0.5
+)
+
+# Answers as the worker does; the images show its process id, so that a test knows who made them.
+STAND_IN = """
+import json, os, signal, subprocess, sys, time
+import numpy as np
+def say(**message):
+    print("@qs3 " + json.dumps(message), flush=True)
+say(event="ready", blender="0.0", python="0.0")
+for count, line in enumerate(sys.stdin):
+    request = json.loads(line)
+    BODY
+    for index, shot in enumerate(request["shots"]):
+        x, y, w, h = shot["region"]
+        image = np.full((h, w), os.getpid(), np.float32)
+        image[0, 0] = shot["seed"]
+        np.save(shot["file"], image)
+        say(event="image", index=index, file=shot["file"])
+    say(event="done", background=0.25)
+"""
+
+# Blender's module as far as the real worker needs it to start; a rendering takes for ever.
+BPY = """
+import sys, time
+from unittest.mock import MagicMock
+bpy = MagicMock(name="bpy")
+bpy.app.version_string = "4.2.0"
+bpy.ops.render.render = lambda **_: time.sleep(600)
+sys.modules["bpy"] = bpy
+"""
+
+
+@pytest.fixture
+def stand_in(tmp_path, monkeypatch):
+    """Make a program and name it as the Python of Cycles."""
+
+    def make(body: str = "pass") -> Path:
+        path = tmp_path / "python"
+        indented = textwrap.indent(textwrap.dedent(body), "    ").strip()
+        path.write_text(f"#!{sys.executable}\n{STAND_IN.replace('BODY', indented)}")
+        path.chmod(path.stat().st_mode | stat.S_IXUSR)
+        monkeypatch.setenv("QS3_CYCLES_PYTHON", str(path))
+        return path
+
+    monkeypatch.delenv("QS3_BLENDER", raising=False)
+    yield make
+    close_workers()
+
+
+@pytest.fixture
+def stub_bpy(tmp_path, monkeypatch):
+    """Name this Python, with a stub of Blender's module, as the Python of Cycles."""
+    (tmp_path / "stub").mkdir()
+    (tmp_path / "stub" / "bpy.py").write_text(BPY)
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.delenv("QS3_BLENDER", raising=False)
+    monkeypatch.setenv("QS3_CYCLES_PYTHON", sys.executable)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "stub"))
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
+    yield tmp_path
+    close_workers()
+
+
+def maker(renderer: CyclesRenderer = CyclesRenderer(), seed: int = 0) -> int:  # noqa: B008
+    """Process id of the worker that renders one object."""
+    return int(renderer.render(SCENE, RIG, [POSE], [seed])[0].left[-1, -1])
+
+
+def gone(pid: int, within: float = 10.0) -> bool:
+    for _ in range(int(within * 20)):
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+        except (FileNotFoundError, ProcessLookupError):
+            return True
+        if state == "Z":
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def test_a_worker_serves_object_after_object_and_left_and_right_seeds_never_meet(stand_in):
+    stand_in()
+    first = CyclesRenderer().render(SCENE, RIG, [POSE, POSE], [3, 2**31 - 1])
+    assert [pair.left[0, 0] for pair in first] == [6, np.float32(2**31 - 2)]
+    assert [pair.right[0, 0] for pair in first] == [7, np.float32(2**31 - 1)]
+    assert first[0].left.shape == (first[0].left_region.height, first[0].left_region.width)
+    assert first[0].background == 0.25
+    assert not first[0].display
+    assert CyclesRenderer(view_transform="Filmic").render(SCENE, RIG, [POSE], [0])[0].display
+    assert maker() == int(first[0].left[-1, -1])
+
+
+def test_what_else_is_printed_is_passed_over(stand_in):
+    stand_in(
+        """
+        print("Fra:1 Mem:20M | Sample 1/4"); print("@qs3 {not json"); print("@qs3 [1]")
+        print('{"event": "done"}'); sys.stdout.buffer.write(b"\\xff\\xfe\\n"); sys.stdout.flush()
+        """
+    )
+    assert maker() == maker()
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("sys.stderr.write('out of luck'); sys.stderr.flush(); os._exit(3)", "exit code 3"),
+        ("os.kill(os.getpid(), signal.SIGSEGV)", "SIGSEGV"),
+        ("say(event='error', reason='no such node')", "no such node"),
+        ("say(event='done', background=0)", "done"),
+        ("os.close(1); time.sleep(600)", "closed its output"),
+    ],
+)
+def test_a_crash_fails_its_object_alone(stand_in, tmp_path, fault, words):
+    stand_in(
+        f"""
+        if count == 1:
+            {fault}
+        """
+    )
+    first = maker()
+    with pytest.raises(RenderError, match=words) as caught:
+        maker()
+    if "luck" in fault:
+        assert "out of luck" in caught.value.log
+        assert "out of luck" in str(caught.value)
+        assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)  # noqa: S301
+    assert gone(first)
+    assert maker() != first
+
+
+def test_a_hang_ends_with_the_whole_process_group(stand_in, tmp_path):
+    stand_in(
+        f"""
+        child = subprocess.Popen(["sleep", "600"])
+        open({str(tmp_path / "child")!r}, "w").write(str(child.pid))
+        print("thinking", file=sys.stderr, flush=True)
+        time.sleep(600)
+        """
+    )
+    with pytest.raises(RenderError, match=r"silent for 1 s.*thinking"):
+        maker(CyclesRenderer(timeout=1.0))
+    assert gone(int((tmp_path / "child").read_text()))
+
+
+def test_a_worker_is_replaced_after_k_objects(stand_in):
+    stand_in()
+    makers = [maker(CyclesRenderer(objects_per_worker=2)) for _ in range(5)]
+    assert [makers.index(m) for m in makers] == [0, 0, 2, 2, 4]
+    assert len(set(makers)) == 3
+    assert gone(makers[0])
+    assert gone(makers[2])
+    endless = [maker(CyclesRenderer(objects_per_worker=0)) for _ in range(3)]
+    assert set(endless) == {makers[4]}
+
+
+def test_a_program_that_does_not_start_is_named(stand_in):
+    stand_in().write_text("#!/no/such/program\n")
+    with pytest.raises(RenderError, match="does not start"):
+        maker()
+    stand_in().write_text(f"#!{sys.executable}\nimport sys; sys.exit('bpy: libXrender.so.1')\n")
+    with pytest.raises(RenderError, match=r"exit code 1.*libXrender"):
+        maker()
+
+
+def test_no_folder_stays_behind(stand_in, tmp_path, monkeypatch):
+    import tempfile
+
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    stand_in("time.sleep(600) if count == 1 else None")
+    maker()
+    with pytest.raises(RenderError):
+        maker(CyclesRenderer(timeout=0.3))
+    maker()
+    close_workers()
+    assert not list((tmp_path / "temporary").iterdir())
+
+
+def test_only_what_is_seen_is_rendered(stand_in):
+    stand_in()
+    away = Pose.looking_at(np.array([2.0, -3.0, 2.0]), np.array([4.0, -6.0, 4.0]))
+    pair = CyclesRenderer().render(SCENE, RIG, [away], [0], [Region(0, 0, 0, 0)])[0]
+    assert pair.left.size == pair.right.size == 0
+    given = CyclesRenderer().render(SCENE, RIG, [POSE], [0], [Region(3, 4, 5, 6)])[0]
+    assert given.left.shape == given.right.shape == (6, 5)
+    kinect = StereoRig(32, 24, 40.0, projector_offset=1.0, second="pattern")
+    assert CyclesRenderer().render(SCENE, kinect, [POSE], [0])[0].right.size == 0
+    whole = CyclesRenderer(full_frame=True).render(SCENE, RIG, [POSE], [0])[0]
+    assert whole.left_region == RIG.full_frame
+    with pytest.raises(ValueError, match="seeds"):
+        CyclesRenderer().render(SCENE, RIG, [POSE], [1, 2])
+
+
+def test_settings_are_values(stand_in):
+    stand_in()
+    renderer = CyclesRenderer(samples=4)
+    maker(renderer)
+    assert pickle.loads(pickle.dumps(renderer)) == renderer  # noqa: S301
+    assert hash(renderer) == hash(CyclesRenderer(samples=4))
+    assert renderer.description["name"] == "cycles"
+    for bad in (
+        {"samples": 0},
+        {"max_bounces": -1},
+        {"timeout": 0.0},
+        {"objects_per_worker": -1},
+    ):
+        with pytest.raises(InputError, match=next(iter(bad))):
+            CyclesRenderer(**bad)
+
+
+def test_the_interpreter_is_looked_up_in_order(tmp_path, monkeypatch):
+    for name in ("QS3_BLENDER", "QS3_CYCLES_PYTHON"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / "env"))
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert interpreter() is None
+    assert find_cycles() == {}
+    with pytest.raises(MissingExtraError, match=r"make cycles.*'cycles'"):
+        maker()
+    beside = tmp_path / "env-cycles" / "bin" / "python"
+    beside.parent.mkdir(parents=True)
+    beside.touch()
+    assert (interpreter() or ())[0] == str(beside)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: object())
+    assert (interpreter() or ())[0] == sys.executable
+    named = tmp_path / "python"
+    monkeypatch.setenv("QS3_CYCLES_PYTHON", str(named))
+    with pytest.raises(InputError, match="QS3_CYCLES_PYTHON"):
+        interpreter()
+    named.touch()
+    assert (interpreter() or ())[0] == str(named)
+    monkeypatch.setenv("QS3_BLENDER", str(beside))
+    command = interpreter() or ()
+    assert command[0] == str(beside)
+    assert command[1] == "--background"
+    assert command[-1] == "--"
+
+
+def test_a_blender_program_serves_as_well(stub_bpy, monkeypatch):
+    # As Blender does: eats its own options, runs the file behind --python, leaves the rest.
+    blender = stub_bpy / "blender"
+    blender.write_text(
+        f"#!/bin/sh\nwhile [ $1 != --python ]; do shift; done\nshift\n"
+        f'file=$1; shift; echo "Blender 4.2.0"; exec {sys.executable} "$file" "$@"\n'
+    )
+    blender.chmod(0o755)
+    monkeypatch.setenv("QS3_BLENDER", str(blender))
+    found = find_cycles()
+    assert found["command"] == str(blender)
+    assert found["blender"] == "4.2.0"
+
+
+def start(*arguments: str) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        [sys.executable, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def worker_of(pid: int) -> int:
+    """The child that renders, once it has been handed a scene."""
+    for _ in range(300):
+        for line in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+            command = Path(f"/proc/{line}/cmdline").read_bytes().split(b"\0")
+            if any(word.endswith(b"_cycles_worker.py") for word in command):
+                folder = Path(command[-2].decode())
+                if (folder / "scene.npz").exists():
+                    return int(line)
+        time.sleep(0.05)
+    raise AssertionError("no worker was started")
+
+
+SCAN = ("-m", "qs3", "scan", "chair", "--renderer", "cycles", "--out")
+LINUX = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="reads /proc of Linux")
+
+
+@LINUX
+def test_the_worker_leaves_when_its_parent_is_killed_while_it_renders(stub_bpy):
+    parent = start(*SCAN, str(stub_bpy / "out"))
+    worker = worker_of(parent.pid)
+    os.kill(parent.pid, signal.SIGKILL)
+    parent.communicate()
+    assert gone(worker)
+    assert not list((stub_bpy / "temporary").iterdir())
+
+
+@LINUX
+def test_ctrl_c_leaves_neither_worker_nor_traceback(stub_bpy):
+    parent = start(*SCAN, str(stub_bpy / "out"))
+    worker = worker_of(parent.pid)
+    os.killpg(parent.pid, signal.SIGINT)
+    _, talk = parent.communicate(timeout=20)
+    assert parent.returncode == 130
+    assert "Traceback" not in talk
+    assert "stopped" in talk
+    assert gone(worker)
+    assert not list((stub_bpy / "temporary").iterdir())
+
+
+def test_a_forked_child_leaves_the_parents_worker_alone(stand_in):
+    stand_in()
+    here = str(Path(__file__).parent)
+    code = f"""
+import os, sys
+sys.path.insert(0, {here!r})
+from test_cycles_process import maker
+first = maker()
+child = os.fork()
+if child == 0:
+    ok = maker() != first
+    sys.exit(0 if ok else 1)
+assert os.waitpid(child, 0)[1] == 0
+assert maker() == first
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
