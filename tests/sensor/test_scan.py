@@ -321,7 +321,7 @@ def test_an_object_smaller_than_a_pixel_is_refused(renderer):
 def test_a_caster_of_several_bodies_tells_which_is_in_front():
     rig = StereoRig(width=9, height=3, focal=4.0)
     pose = Pose(np.eye(4))
-    near = trimesh.creation.box(extents=[1, 1, 0.5]).apply_translation([0, 0, 2.25])
+    near = trimesh.creation.box(extents=[1.1, 1.1, 0.5]).apply_translation([0, 0, 2.25])
     far = trimesh.creation.box(extents=[9, 9, 0.5]).apply_translation([0, 0, 4.25])
     cast = DepthCaster(far, near).cast(rig, pose, rig.full_frame, normals=True)
     assert cast.body[1].tolist() == [0, 0, 0, 1, 1, 1, 0, 0, 0]

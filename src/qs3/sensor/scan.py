@@ -5,9 +5,7 @@ are arguments of :func:`scan` (see :data:`PRESETS`).
 """
 
 import dataclasses
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -18,24 +16,21 @@ from jaxtyping import Float32, UInt8
 from qs3.errors import InputError
 from qs3.geometry import rotation_z
 from qs3.meshes import normalise
-from qs3.sensor.depth import depth_from_disparity
-from qs3.sensor.exposure import expose_pair
 from qs3.sensor.fusion import fuse
 from qs3.sensor.lens import blur_reach
-from qs3.sensor.matching import match, matching_canvas
+from qs3.sensor.matching import matching_canvas
 from qs3.sensor.obstacles import check_views
 from qs3.sensor.presets import Sensor, get_sensor
 from qs3.sensor.randomise import draw
-from qs3.sensor.render import Body, Renderer, Scene, StereoPair
+from qs3.sensor.render import Body, Renderer, Scene
 from qs3.sensor.render.raycast import DepthCaster
-from qs3.sensor.rig import Pose, Region, StereoRig
+from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.sampling import resample
 from qs3.sensor.speckle import pattern_image
 from qs3.sensor.statistics import ViewStatistics
-from qs3.sensor.stored import stored_pattern
 from qs3.sensor.surroundings import SceneSettings, arrange
+from qs3.sensor.view import Clock, clouds_of, object_region, statistics_of, take_view
 from qs3.sensor.view import ViewImages as ViewImages
-from qs3.sensor.view import clouds_of, object_region, statistics_of
 from qs3.sensor.views import ViewLayout, place_views
 
 
@@ -163,7 +158,7 @@ def scan(
     rng_place, rng_render, rng_noise, rng_sample, rng_scene, rng_settings = (
         np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(6)
     )
-    clock = _Clock()
+    clock = Clock()
 
     sensor, drawn = draw(sensor, randomise, rng_settings)
     normalised = _sized(mesh, how.size, sensor.object_size)
@@ -198,7 +193,7 @@ def scan(
         casters = [DepthCaster(*(body.mesh for body in around.bodies))]
         casters += [DepthCaster(turned)] if full_frames else []
     images = [
-        _view(pair, sensor, region, part, casters, rng_noise, clock)
+        take_view(pair, sensor, region, part, casters, rng_noise, clock)
         for pair, region, part in zip(pairs, regions, parts, strict=True)
     ]
 
@@ -234,49 +229,6 @@ def scan(
     )
 
 
-def _view(
-    pair: StereoPair,
-    sensor: Sensor,
-    region: Region,
-    focus: Region,
-    casters: Sequence[DepthCaster],
-    rng: np.random.Generator,
-    clock: "_Clock",
-) -> ViewImages:
-    """Expose and match ``region`` of one view, with auto-exposure on ``focus``; cast its depth.
-
-    The first of ``casters`` holds the scene; a second one, of the object alone, makes the view
-    one of whole frames, with silhouette and normals.
-    """
-    rig = sensor.rig
-    canvas = matching_canvas(region, rig, sensor.matching)
-    inner = (
-        slice(region.y - canvas.y, region.y - canvas.y + region.height),
-        slice(region.x - canvas.x, region.x - canvas.x + region.width),
-    )
-    with clock("exposure"):
-        left, right = expose_pair(pair, canvas, focus, rig, sensor.exposure, rng)
-        if rig.second == "pattern":
-            right = stored_pattern(rig, sensor.pattern, canvas, sensor.exposure.bits)
-    with clock("matching"):
-        disparity = match(left, right, sensor.matching)[inner]
-    with clock("true_depth"):
-        whole = len(casters) > 1
-        cast = casters[0].cast(rig, pair.pose, region, normals=whole)
-        silhouette = casters[1].cast(rig, pair.pose, region).mask if whole else None
-    return ViewImages(
-        region=region,
-        left=left[inner],
-        right=right[inner],
-        disparity=disparity,
-        depth=depth_from_disparity(disparity, rig, sensor.depth),
-        true_depth=cast.depth,
-        mask=cast.mask,
-        silhouette=silhouette,
-        normals=cast.normals,
-    )
-
-
 def _replaced(sensor: Sensor, rig: StereoRig | None, object_size: float | None) -> Sensor:
     if rig is not None:
         sensor = dataclasses.replace(sensor, rig=rig)
@@ -306,19 +258,6 @@ def _default_renderer() -> Renderer:
     from qs3.sensor.render.mitsuba import MitsubaRenderer
 
     return MitsubaRenderer()
-
-
-class _Clock:
-    """Adds up wall-clock seconds by stage."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
 
 # The two columns of settings in which the paper's text and its code part ways.

@@ -1,14 +1,22 @@
 """One view of a scan: its pictures, and the part of them that becomes points."""
 
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Shaped, UInt
 
-from qs3.sensor.depth import backproject, gate
+from qs3.sensor.depth import backproject, depth_from_disparity, gate
+from qs3.sensor.exposure import expose_pair
+from qs3.sensor.matching import match, matching_canvas
 from qs3.sensor.presets import Sensor
+from qs3.sensor.render import StereoPair
+from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, Region
 from qs3.sensor.statistics import EMPTY_VIEW, ViewStatistics, view_statistics
+from qs3.sensor.stored import stored_pattern
 
 RIM = 16
 """Pixels around the object's box that are matched too: fattening reaches half a block."""
@@ -92,3 +100,60 @@ def statistics_of(images: ViewImages, part: Region, sensor: Sensor) -> ViewStati
         sensor.rig,
         images.part(images.mask, part),
     )
+
+
+def take_view(
+    pair: StereoPair,
+    sensor: Sensor,
+    region: Region,
+    focus: Region,
+    casters: Sequence[DepthCaster],
+    rng: np.random.Generator,
+    clock: "Clock",
+) -> ViewImages:
+    """Expose and match ``region`` of one view, with auto-exposure on ``focus``; cast its depth.
+
+    The first of ``casters`` holds the scene; a second one, of the object alone, makes the view
+    one of whole frames, with silhouette and normals.
+    """
+    rig = sensor.rig
+    canvas = matching_canvas(region, rig, sensor.matching)
+    inner = (
+        slice(region.y - canvas.y, region.y - canvas.y + region.height),
+        slice(region.x - canvas.x, region.x - canvas.x + region.width),
+    )
+    with clock("exposure"):
+        left, right = expose_pair(pair, canvas, focus, rig, sensor.exposure, rng)
+        if rig.second == "pattern":
+            right = stored_pattern(rig, sensor.pattern, canvas, sensor.exposure.bits)
+    with clock("matching"):
+        disparity = match(left, right, sensor.matching)[inner]
+    with clock("true_depth"):
+        whole = len(casters) > 1
+        cast = casters[0].cast(rig, pair.pose, region, normals=whole)
+        silhouette = casters[1].cast(rig, pair.pose, region).mask if whole else None
+    return ViewImages(
+        region=region,
+        left=left[inner],
+        right=right[inner],
+        disparity=disparity,
+        depth=depth_from_disparity(disparity, rig, sensor.depth),
+        true_depth=cast.depth,
+        mask=cast.mask,
+        silhouette=silhouette,
+        normals=cast.normals,
+    )
+
+
+class Clock:
+    """Adds up wall-clock seconds by stage."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Add the time of the body to ``stage``."""
+        start = time.perf_counter()
+        yield
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
