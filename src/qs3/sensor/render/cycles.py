@@ -20,7 +20,7 @@ from jaxtyping import Float32
 from qs3.errors import InputError, MissingExtraError
 from qs3.sensor.render._worker_process import RenderError as RenderError
 from qs3.sensor.render._worker_process import Worker, borrow
-from qs3.sensor.render.scene import Scene, StereoPair, photographed_region
+from qs3.sensor.render.scene import Scene, StereoPair, photographed_region, refuse_sky
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 _WORKER = Path(__file__).with_name("_cycles_worker.py")
@@ -123,6 +123,7 @@ class CyclesRenderer:
         """Photograph ``scene`` once from each pose; equal seeds give equal bits.
 
         Raises:
+            InputError: where a camera sees the sky past a lone object.
             MissingExtraError: where there is no Blender.
             RenderError: where the worker died, hung or reported a fault; the next call starts a
                 fresh one.
@@ -140,6 +141,8 @@ class CyclesRenderer:
                 if not region.empty:
                     # Two streams that never meet: the left camera's seeds are even.
                     shots.append(_shot(rig, pose, camera, region, (2 * seed + side) % 2**31))
+            if sides[0] != rig.full_frame and scene.alone:
+                refuse_sky(rig, pose, scene.light)
             layout.append((pose, *sides))
         with borrow(_command(), self.objects_per_worker) as worker:
             images, background = self._ask(worker, scene, rig, shots)

@@ -20,7 +20,14 @@ from qs3.sensor.materials import Material
 from qs3.sensor.render.cache import CacheSettings
 from qs3.sensor.render.embree import EmbreePhotographer
 from qs3.sensor.render.jit import JitPhotographer
-from qs3.sensor.render.scene import Body, LightSettings, Scene, StereoPair, photographed_region
+from qs3.sensor.render.scene import (
+    Body,
+    LightSettings,
+    Scene,
+    StereoPair,
+    photographed_region,
+    refuse_sky,
+)
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 VARIANTS = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
@@ -147,7 +154,7 @@ class MitsubaRenderer:
                     part = photographed_region(scene, rig, camera)
                 parts.append(part)
             if parts[0] != rig.full_frame and scene.alone:
-                _refuse_sky(rig, pose, scene.light)
+                refuse_sky(rig, pose, scene.light)
             left, right = photograph(rig, pose, (parts[0], parts[1]), seed)
             background = scene.light.ambient
             pairs.append(StereoPair(left, right, parts[0], parts[1], background, pose))
@@ -210,23 +217,6 @@ def _mitsuba(variant: str) -> Any:
         mi.set_variant(variant)
         mi.set_log_level(mi.LogLevel.Error)
     return mi
-
-
-def _refuse_sky(rig: StereoRig, pose: Pose, light: LightSettings) -> None:
-    """Refuse a view that has the sky in it: what is not rendered is filled with the ground.
-
-    Raises:
-        InputError: where a ray of the frame's rim rises above the sky's lower edge.
-    """
-    (cx, cy), (x, y) = rig.principal_point, (rig.width - 1, rig.height - 1)
-    rim = np.array([[u - cx, v - cy, rig.focal] for u in (0, cx, x) for v in (0, cy, y)])
-    rays = rim @ pose.camera_to_world[:3, :3].T
-    highest = np.degrees(np.arcsin((rays[:, 2] / np.linalg.norm(rays, axis=1)).max()))
-    if highest > light.sky_elevation:
-        raise InputError(
-            f"the camera sees up to {highest:.0f}° above the horizon, into the light of the sky "
-            f"({light.sky_elevation}°): place it higher or narrow its field of view"
-        )
 
 
 def _to_world(pose: Pose) -> list[list[float]]:

@@ -82,6 +82,23 @@ def photographed_region(scene: Scene, rig: StereoRig, camera: Pose) -> Region:
     return rig.region_of(np.asarray(scene.mesh.bounds), camera, 2)
 
 
+def refuse_sky(rig: StereoRig, pose: Pose, light: LightSettings) -> None:
+    """Refuse a view that has the sky in it: what is not rendered is filled with the ground.
+
+    Raises:
+        InputError: where a ray of the frame's rim rises above the sky's lower edge.
+    """
+    (cx, cy), (x, y) = rig.principal_point, (rig.width - 1, rig.height - 1)
+    rim = np.array([[u - cx, v - cy, rig.focal] for u in (0, cx, x) for v in (0, cy, y)])
+    rays = rim @ pose.camera_to_world[:3, :3].T
+    highest = np.degrees(np.arcsin((rays[:, 2] / np.linalg.norm(rays, axis=1)).max()))
+    if highest > light.sky_elevation:
+        raise InputError(
+            f"the camera sees up to {highest:.0f}° above the horizon, into the light of the sky "
+            f"({light.sky_elevation}°): place it higher or narrow its field of view"
+        )
+
+
 @dataclass(frozen=True)
 class StereoPair:
     """The two radiance images of one view; outside the rendered regions lies the background."""
