@@ -2,10 +2,13 @@
 #
 #   make demo TORCH_INDEX=https://download.pytorch.org/whl/cpu    takes PyTorch's CPU build from there
 #   make demo PYTHON=python3.12                                   uses another Python
+#   make cycles                                                   brings the paper's renderer (docs/cycles.md)
 
 PYTHON ?= python3
 TORCH_INDEX ?=
+PYTHON_CYCLES ?= python3.11
 VENV := .venv
+VENV_CYCLES := .venv-cycles
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
@@ -14,7 +17,7 @@ QS3_SHARED_DATA ?= $(abspath $(wildcard ../shared/data))
 export QS3_SHARED_DATA
 
 .DELETE_ON_ERROR:
-.PHONY: demo test slow check examples clean
+.PHONY: demo test slow check examples cycles clean
 
 demo: $(VENV)/.installed
 	$(BIN)/qs3 demo --out demo
@@ -34,8 +37,12 @@ check: $(VENV)/.installed-dev
 examples: $(VENV)/.installed
 	set -e; for file in examples/*.py; do echo "$$file"; $(BIN)/python "$$file"; done
 
+# Blender's module needs one version of Python and an old NumPy, hence an environment of its own.
+cycles: $(VENV_CYCLES)/.installed
+	@$(VENV_CYCLES)/bin/python -c 'import bpy; print("Cycles: Blender " + bpy.app.version_string)'
+
 clean:
-	rm -rf $(VENV) demo
+	rm -rf $(VENV) $(VENV_CYCLES) demo
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit("qs3 needs Python 3.11 or newer; this is " + sys.version.split()[0] + ". Name another with: make demo PYTHON=python3.12") if sys.version_info < (3, 11) else None'
@@ -48,4 +55,12 @@ $(VENV)/.installed: $(BIN)/python pyproject.toml constraints.txt
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	$(PIP) -e '.[dev]'
+	touch $@
+
+$(VENV_CYCLES)/bin/python:
+	@$(PYTHON_CYCLES) -c 'import sys; sys.exit("Cycles needs Python 3.11; this is " + sys.version.split()[0]) if sys.version_info[:2] != (3, 11) else None' || { echo 'name a Python 3.11 with: make cycles PYTHON_CYCLES=/path/to/python3.11 (or set QS3_BLENDER to a Blender 4.2 or newer)'; exit 1; }
+	$(PYTHON_CYCLES) -m venv $(VENV_CYCLES) || { rm -rf $(VENV_CYCLES); echo 'no virtual environment could be made; on Debian: apt-get install python3-venv'; exit 1; }
+
+$(VENV_CYCLES)/.installed: $(VENV_CYCLES)/bin/python constraints-cycles.txt
+	$(VENV_CYCLES)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints-cycles.txt bpy numpy
 	touch $@
