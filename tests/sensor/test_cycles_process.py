@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from qs3.cli.doctor import _print, examine
 from qs3.errors import InputError, MissingExtraError
 from qs3.sensor.render import Body, LightSettings, Scene
 from qs3.sensor.render._worker_process import RenderError, close_workers
-from qs3.sensor.render.cycles import CyclesRenderer, find_cycles, interpreter
+from qs3.sensor.render.cycles import CyclesRenderer, _versions, find_cycles, interpreter
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="the stand-ins are POSIX programs")
@@ -276,6 +277,27 @@ def test_a_blender_program_serves_as_well(stub_bpy, monkeypatch):
     found = find_cycles()
     assert found["command"] == str(blender)
     assert found["blender"] == "4.2.0"
+
+
+def test_doctor_tells_where_cycles_is_or_why_it_is_not(stub_bpy, monkeypatch, capsys):
+    def told() -> str:
+        _print(examine())
+        return capsys.readouterr().out.split("The paper's renderer")[1].splitlines()[1]
+
+    assert "ok" in told()
+    assert "Blender 4.2.0" in told()
+    (stub_bpy / "stub" / "bpy.py").write_text(BPY.replace("4.2.0", "3.6.2"))
+    _versions.cache_clear()
+    close_workers()
+    assert "absent" in told()
+    assert "3.6.2 is too old: 4.2" in told()
+    monkeypatch.setenv("QS3_BLENDER", str(stub_bpy / "none"))
+    assert "QS3_BLENDER" in told()
+    monkeypatch.delenv("QS3_BLENDER")
+    monkeypatch.delenv("QS3_CYCLES_PYTHON")
+    monkeypatch.setattr(sys, "prefix", str(stub_bpy / "env"))
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert "make cycles" in told()
 
 
 def start(*arguments: str) -> "subprocess.Popen[str]":

@@ -6,6 +6,8 @@ import json
 import platform
 from typing import Any
 
+from qs3.errors import QS3Error
+
 _CORE = (
     "numpy",
     "scipy",
@@ -23,7 +25,6 @@ _CORE = (
     "tyro",
 )
 _EXTRAS = {
-    "cycles": ("bpy", "the paper's renderer, Blender's Cycles"),
     "ray": ("ray", "data sets made on a cluster"),
     "view": ("viser", "the interactive viewer"),
     "track": ("tensorboard", "training curves in TensorBoard"),
@@ -46,7 +47,7 @@ def doctor(json_output: bool = False) -> int:
 
 
 def examine() -> dict[str, Any]:
-    """Look at packages, Mitsuba's variants, the device for training and the extras."""
+    """Look at packages, Mitsuba's variants, Cycles, the device for training and the extras."""
     from qs3.sensor.render.mitsuba import VARIANTS, usable
 
     packages: dict[str, str | None] = {}
@@ -66,12 +67,27 @@ def examine() -> dict[str, Any]:
         "packages": packages,
         "renderers": variants,
         "renderer": next((variant for variant in VARIANTS if variants[variant]), None),
+        "cycles": _cycles(),
         "device": device,
         "extras": {
             extra: importlib.util.find_spec(module) is not None
             for extra, (module, _) in _EXTRAS.items()
         },
         "ready": all(packages.values()) and any(variants.values()),
+    }
+
+
+def _cycles() -> dict[str, str]:
+    """Program and versions of Cycles, or ``fault``: why there is none."""
+    from qs3.sensor.render.cycles import find_cycles
+
+    try:
+        found = find_cycles()
+    except QS3Error as error:
+        return {"fault": str(error)}
+    return found or {
+        "fault": "not here; in a checkout, make cycles brings it (or set QS3_BLENDER to a Blender "
+        "4.2 or newer)"
     }
 
 
@@ -91,6 +107,15 @@ def _print(found: dict[str, Any]) -> None:
         used = "   <- used" if variant == found["renderer"] else ""
         reason = "" if works else f": {advice[variant]}"
         print(f"  {'ok     ' if works else 'absent '} {variant}{reason}{used}")
+    cycles = found["cycles"]
+    print("The paper's renderer (--renderer cycles; optional)")
+    if "fault" in cycles:
+        print(f"  absent  cycles: {cycles['fault']}")
+    else:
+        print(
+            f"  ok      cycles: Blender {cycles['blender']} (Python {cycles['python']}), "
+            f"{cycles['command']}"
+        )
     print(f"Training on: {found['device']}")
     print("Extras (for commands to come; nothing in this version needs them)")
     for extra, here in found["extras"].items():

@@ -74,6 +74,8 @@ class Studio:
         self.bpy = bpy
         self.folder = folder
         self.version = bpy.app.version_string
+        if tuple(int(part) for part in self.version.split()[0].split(".")[:2]) < (4, 2):
+            raise RuntimeError(f"Blender {self.version} is too old: 4.2 or newer is needed")
         bpy.ops.wm.read_factory_settings(use_empty=True)
         self.scene = bpy.context.scene
         self.scene.render.engine = "CYCLES"
