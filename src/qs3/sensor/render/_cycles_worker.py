@@ -69,7 +69,7 @@ class Studio:
     """Blender's scene: camera, projector and sky stay, bodies change."""
 
     def __init__(self, folder):
-        import bpy
+        import bpy  # pyright: ignore[reportMissingImports]
 
         self.bpy = bpy
         self.folder = folder
@@ -108,7 +108,7 @@ class Studio:
         path = os.path.join(self.folder, "background.png")  # noqa: PTH118
         image.save_render(path, scene=self.scene)
         self.bpy.data.images.remove(image)
-        return float(self._load(path, 4, 4)[0, 0])
+        return self._load(path, 4, 4).item(0)
 
     # ------------------------------------------------------------------ things that stay
 
