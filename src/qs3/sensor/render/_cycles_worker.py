@@ -79,7 +79,7 @@ class Studio:
         bpy.ops.wm.read_factory_settings(use_empty=True)
         self.scene = bpy.context.scene
         self.scene.render.engine = "CYCLES"
-        self.pattern = None
+        self.pattern = self.quality = None
         self.bodies = []
         self.camera = self._object("camera", bpy.data.cameras.new("camera"))
         self.scene.camera = self.camera
@@ -104,7 +104,7 @@ class Studio:
         if request["quality"]["view_transform"] == "raw":
             return ambient
         image = self.bpy.data.images.new("background", 4, 4, float_buffer=True, is_data=False)
-        image.pixels.foreach_set(np.tile(np.float32([ambient] * 3 + [1.0]), 16))
+        image.pixels.foreach_set(np.tile(np.array([ambient] * 3 + [1.0], np.float32), 16))
         path = os.path.join(self.folder, "background.png")  # noqa: PTH118
         image.save_render(path, scene=self.scene)
         self.bpy.data.images.remove(image)
@@ -212,7 +212,7 @@ class Studio:
             slope.default_value = -0.5 / tangent
         # The cone holds the corners of the picture; the picture itself ends the light.
         self.spot.data.spot_size = min(math.pi, 2.02 * math.atan(math.hypot(*tangents)))
-        # Blender spreads a spot's watts over 4π and takes a further π off for a radiant intensity.
+        # The setting is the radiant intensity over π; Blender spreads a spot's watts over 4π.
         self.spot.data.energy = light["projector"] * 4 * math.pi**2
         if self.pattern is not None and np.array_equal(self.pattern, pattern):
             return
@@ -281,6 +281,12 @@ class Studio:
         return material
 
     def _set_quality(self, quality):
+        if quality != self.quality:
+            # Cycles keeps its table of random numbers once it has grown: let go of it, else the
+            # bits would depend on what was rendered before.
+            self.scene.render.use_persistent_data = False
+            self.scene.render.use_persistent_data = True
+            self.quality = quality
         cycles, bounces = self.scene.cycles, quality["max_bounces"]
         _set(cycles, samples=quality["samples"], max_bounces=bounces)
         for kind in ("diffuse", "glossy", "transmission"):
