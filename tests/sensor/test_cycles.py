@@ -1,0 +1,273 @@
+"""Cycles itself, held against Mitsuba and against what is known of the light."""
+
+import os
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from qs3.sensor.materials import Material, get_material
+from qs3.sensor.render import Body, LightSettings, Scene
+from qs3.sensor.render._worker_process import close_workers
+from qs3.sensor.render.cycles import CyclesRenderer, interpreter
+from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
+from qs3.sensor.rig import Pose, Region, StereoRig
+
+pytestmark = pytest.mark.skipif(
+    interpreter() is None, reason="no Cycles here: make cycles, or set QS3_BLENDER"
+)
+
+RIG = StereoRig(width=96, height=64, focal=110.0, baseline=0.3)
+POSE = Pose.looking_at(np.array([1.0, -2.0, 1.5]), np.array([0.1, 0.0, -0.1]))
+LEVEL = Pose.looking_at(np.array([0.0, -3.0, 0.0]), np.zeros(3))
+WHITE = np.ones((8, 8), np.float32)
+DARK = LightSettings(projector=0.0, sky=0.0, ambient=0.0, sky_elevation=60.0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def tidy():
+    yield
+    close_workers()
+
+
+def mitsuba(samples: int = 64) -> MitsubaRenderer:
+    variant = "llvm_ad_mono" if usable("llvm_ad_mono") else "scalar_rgb"
+    return MitsubaRenderer(variant=variant, samples=samples, indirect="path")
+
+
+def box(extents, centre) -> trimesh.Trimesh:
+    return trimesh.creation.box(extents=extents).apply_translation(centre)
+
+
+def asymmetric() -> trimesh.Trimesh:
+    """An L with a tower: no mirror image of it is itself, and some faces share a plane."""
+    parts = [([1, 0.4, 0.1], [0, 0, -0.2]), ([0.2, 0.3, 0.1], [0.4, 0.25, -0.2])]
+    parts += [([0.2, 0.2, 0.5], [-0.4, 0.0, 0.05])]
+    return trimesh.util.concatenate([box(*part) for part in parts])
+
+
+def wall(material: Material | None = None, light: LightSettings = DARK) -> Scene:
+    """A wall square to the rig that fills the frame."""
+    body = Body(box([9, 0.02, 9], [0, 0.01, 0]), material or Material())
+    return Scene((body,), light, WHITE, 0.625, 0.625)
+
+
+def chart_scene(light: LightSettings | None = None) -> Scene:
+    """An asymmetric thing on a floor in the light of an asymmetric picture."""
+    rng = np.random.default_rng(3)
+    cells = (rng.random((24, 30)) > 0.6).astype(np.uint8) * 255
+    picture = cv2.resize(cells, (240, 192), interpolation=cv2.INTER_NEAREST)
+    cv2.putText(picture, "F7", (30, 120), cv2.FONT_HERSHEY_SIMPLEX, 3, 255, 8)
+    floor = Body(box([6, 6, 0.02], [0, 0, -0.26]))
+    pattern = picture.astype(np.float32) / 255
+    light = light or LightSettings(sky_elevation=30.0)
+    return Scene((Body(asymmetric()), floor), light, pattern, 0.4, 0.32)
+
+
+def displacement(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Shift of b against a in pixels by least squares on the gradient (Lucas and Kanade)."""
+    a, b = (cv2.GaussianBlur(image.astype(np.float64), (0, 0), 1.0) for image in (a, b))
+    rows, columns = np.gradient((a + b) / 2)
+    inner = (slice(8, -8), slice(8, -8))
+    slopes = np.stack([columns[inner].ravel(), rows[inner].ravel()], axis=1)
+    return np.linalg.lstsq(slopes, (a - b)[inner].ravel(), rcond=None)[0]
+
+
+@pytest.mark.parametrize(
+    ("light", "samples"),
+    [
+        (replace(DARK, projector=45.6), 16),
+        (replace(DARK, ambient=0.3), 64),
+        (replace(DARK, sky=1.0, sky_elevation=9.3), 256),
+    ],
+    ids=["projector", "ambient", "sky"],
+)
+def test_each_light_is_as_bright_as_mitsubas(light, samples):
+    images = [
+        renderer.render(wall(light=light), RIG, [LEVEL], [0], [RIG.full_frame])[0].left
+        for renderer in (mitsuba(samples), CyclesRenderer(samples=samples))
+    ]
+    thirds = [cv2.resize(i, (3, 3), interpolation=cv2.INTER_AREA) for i in images]
+    np.testing.assert_allclose(thirds[1], thirds[0], rtol=0.02)
+
+
+def test_the_projector_keeps_the_law_of_a_point_light():
+    # A wall of albedo ρ at distance z has radiance ρ/π · I·cos³θ/z²; the setting is I/π.
+    image = CyclesRenderer(samples=4).render(
+        wall(light=replace(DARK, projector=45.6)), RIG, [LEVEL], [0], [RIG.full_frame]
+    )
+    u, v = np.meshgrid((np.arange(96) - 47.5) / 110, (np.arange(64) - 31.5) / 110)
+    u = u - 0.5 * RIG.baseline / 3  # from the projector, half a baseline to the right
+    expected = 0.8 * 45.6 / 9 / (1 + u**2 + v**2) ** 1.5
+    np.testing.assert_allclose(image[0].left, expected, rtol=5e-3)
+
+
+def test_convention_the_chart_lies_where_mitsuba_has_it():
+    rig = StereoRig(width=192, height=128, focal=240.0, baseline=0.3)
+    pairs = [
+        renderer.render(chart_scene(), rig, [POSE], [0])[0]
+        for renderer in (mitsuba(32), CyclesRenderer(samples=32))
+    ]
+    for ours, theirs in ((pairs[0].left, pairs[1].left), (pairs[0].right, pairs[1].right)):
+        assert np.corrcoef(ours.ravel(), theirs.ravel())[0, 1] > 0.98
+        assert np.corrcoef(ours[:, ::-1].ravel(), theirs.ravel())[0, 1] < 0.5
+        assert np.corrcoef(ours[::-1].ravel(), theirs.ravel())[0, 1] < 0.5
+        assert np.abs(displacement(ours, theirs)).max() < 0.05
+        assert theirs.mean() == pytest.approx(ours.mean(), rel=0.02)
+    assert np.abs(displacement(pairs[1].left, np.roll(pairs[1].left, 1, axis=1))[0] - 1) < 0.2
+
+
+def test_faces_that_share_a_plane_do_not_shade_each_other():
+    # Two plates whose upper faces are one plane where they overlap.
+    plates = [box([2, 1, 0.2], [0.3, 0, -0.1]), box([1, 2, 0.2], [0, 0.1, -0.1])]
+    both, one = trimesh.util.concatenate(plates), plates[0]
+    above = Pose.looking_at(np.array([0.0, -1.0, 3.0]), np.zeros(3))
+    light = LightSettings(ambient=0.3, sky=0.0)
+    region = Region(40, 26, 16, 12)
+    images = [
+        CyclesRenderer(samples=64).render(
+            Scene((Body(mesh),), light, WHITE, 0.6, 0.6), RIG, [above], [0], [region]
+        )[0]
+        for mesh in (one, both)
+    ]
+    np.testing.assert_allclose(images[1].left, images[0].left, rtol=0.05)
+
+
+def test_equal_seeds_give_equal_bits_and_others_do_not():
+    renderer = CyclesRenderer(samples=4)
+    scene = chart_scene()
+    first, again, other = (renderer.render(scene, RIG, [POSE], [s])[0] for s in (5, 5, 6))
+    np.testing.assert_array_equal(first.left, again.left)
+    np.testing.assert_array_equal(first.right, again.right)
+    assert (first.left != other.left).mean() > 0.5
+    # Another worker, after another scene, among other views and on one processor.
+    close_workers()
+    before = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else set()
+    try:
+        if before:
+            os.sched_setaffinity(0, {min(before)})
+        CyclesRenderer(samples=400).render(scene, RIG, [POSE], [5], [Region(0, 0, 9, 9)])
+        renderer.render(chart_scene(DARK), RIG, [POSE], [5])
+        fresh = renderer.render(scene, RIG, [LEVEL, POSE], [0, 5])[1]
+    finally:
+        if before:
+            os.sched_setaffinity(0, before)
+        close_workers()
+    np.testing.assert_array_equal(first.left, fresh.left)
+    np.testing.assert_array_equal(first.right, fresh.right)
+
+
+def test_a_region_has_the_bits_of_the_whole_frame():
+    renderer = CyclesRenderer(samples=4)
+    region = Region(17, 9, 50, 33)
+    whole = renderer.render(chart_scene(), RIG, [POSE], [1])[0]
+    part = renderer.render(chart_scene(), RIG, [POSE], [1], [region])[0]
+    for a, b in ((part.left, whole.left), (part.right, whole.right)):
+        assert a.shape == (33, 50)
+        np.testing.assert_array_equal(a, b[region.slices])
+
+
+def test_filmic_shows_the_released_background():
+    # The released world grey of 0.0509 has the grey level 70 or 71 in the released images.
+    scene = Scene((Body(asymmetric()),), LightSettings(), WHITE, 0.625, 0.625)
+    renderer = CyclesRenderer(samples=4, view_transform="Filmic", full_frame=True)
+    rig = StereoRig(width=96, height=64, focal=220.0)
+    pose = Pose.looking_at(np.array([1.0, -2.0, 1.5]), np.zeros(3))
+    pair = renderer.render(scene, rig, [pose], [0])[0]
+    assert pair.display
+    assert 255 * pair.background == pytest.approx(70.5, abs=1)
+    assert pair.left[0, 0] == pytest.approx(pair.background, abs=1e-3)
+    assert 0.5 < pair.left.max() <= 1
+    raw = replace(renderer, view_transform="raw").render(scene, rig, [pose], [0])[0]
+    assert raw.background == pytest.approx(0.0509)
+    assert raw.left[0, 0] == pytest.approx(0.0509, rel=1e-5)
+    # A view transform keeps the order of the levels.
+    order = np.argsort(raw.left.ravel())
+    assert np.diff(pair.left.ravel()[order]).min() > -1e-3
+
+
+def test_standard_view_transform_is_srgb():
+    light = LightSettings(ambient=0.2)
+    scene = Scene((Body(asymmetric()),), light, WHITE, 0.625, 0.625)
+    renderer = CyclesRenderer(samples=1, view_transform="Standard")
+    pair = renderer.render(scene, RIG, [POSE], [0], [Region(0, 60, 4, 4)])[0]
+    assert pair.background == pytest.approx(1.055 * 0.2 ** (1 / 2.4) - 0.055, abs=1e-3)
+
+
+def test_blackman_harris_blurs():
+    # A wall lit up to one column: the box leaves one mixed column there, the wider filter three.
+    half = np.zeros((4, 64), np.float32)
+    half[:, 32:] = 1.0
+    scene = replace(wall(light=replace(DARK, projector=45.6)), pattern=np.repeat(half, 16, axis=1))
+    widths = []
+    for kind in ("box", "blackman-harris"):
+        renderer = CyclesRenderer(samples=256, pixel_filter=kind)
+        image = renderer.render(scene, RIG, [LEVEL], [0], [Region(30, 28, 40, 8)])[0].left
+        row = image.mean(axis=0) / image.max()
+        widths.append(int(((row > 0.002) & (row < 0.9)).sum()))
+    assert widths[0] <= 2
+    assert widths[1] > widths[0]
+
+
+@pytest.mark.parametrize("name", ["principled", "rough-specular", "glossy-plastic", "metal"])
+def test_either_side_of_a_face_is_the_same_surface(name):
+    plate = trimesh.Trimesh(
+        [[-1.0, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]], [[0, 1, 2], [0, 2, 3]], process=False
+    )
+    light = LightSettings(ambient=0.2, sky_elevation=30.0)
+    means = []
+    for faces in (plate.faces, plate.faces[:, ::-1]):
+        mesh = trimesh.Trimesh(plate.vertices, faces, process=False)
+        scene = Scene((Body(mesh, get_material(name)),), light, WHITE, 0.6, 0.6)
+        part = [Region(32, 16, 32, 32)]
+        pair = CyclesRenderer(samples=64).render(scene, RIG, [LEVEL], [0], part)[0]
+        means.append(pair.left.mean())
+    assert means[0] == pytest.approx(means[1], rel=0.01)
+
+
+def test_glass_is_a_thin_pane():
+    # Head on a pane of index 1.5 reflects R = 2F/(1 + F), F = 0.04, and the room is one level.
+    pane = Scene(
+        (Body(box([2, 0.01, 2], [0, 0, 0]), Material("glass")), Body(box([9, 0.1, 9], [0, 1, 0]))),
+        replace(DARK, projector=45.6),
+        WHITE,
+        0.6,
+        0.6,
+    )
+    bare = replace(pane, bodies=pane.bodies[1:])
+    dimmed, plain = (
+        CyclesRenderer(samples=64, max_bounces=0)
+        .render(scene, RIG, [LEVEL], [0], [Region(44, 28, 8, 8)])[0]
+        .left.mean()
+        for scene in (pane, bare)
+    )
+    reflected = 2 * 0.04 / 1.04
+    # Two faces of the box, each a pane; there and back.
+    assert dimmed / plain == pytest.approx((1 - reflected) ** 4, abs=0.01)
+
+
+def test_a_mirror_shows_no_dots():
+    lit = LightSettings(sky=0.0, ambient=0.1)
+    scene = wall(Material("mirror", albedo=0.95), lit)
+    pair = CyclesRenderer(samples=8).render(scene, RIG, [LEVEL], [0], [RIG.full_frame])[0]
+    np.testing.assert_allclose(pair.left, 0.095, rtol=1e-3)
+
+
+def test_bounces_end_where_mitsubas_do():
+    # A white corner: light that bounces brightens it; equal depths give equal light.
+    corner = [box([4, 0.1, 4], [0, 1.05, 0]), box([0.1, 2, 4], [0.8, 0, 0])]
+    scene = Scene(
+        (Body(trimesh.util.concatenate(corner)),), LightSettings(sky=0.0), WHITE, 0.6, 0.6
+    )
+    levels = []
+    for bounces in (0, 1, 2):
+        theirs = replace(mitsuba(128), max_depth=2 + bounces)
+        ours = CyclesRenderer(samples=64, max_bounces=bounces)
+        part = [Region(32, 16, 32, 32)]
+        pair = [r.render(scene, RIG, [LEVEL], [0], part)[0] for r in (theirs, ours)]
+        assert pair[1].left.mean() == pytest.approx(pair[0].left.mean(), rel=0.01)
+        levels.append(pair[1].left.mean())
+    assert levels[1] > 1.03 * levels[0]
+    assert levels[2] > 1.003 * levels[1]
