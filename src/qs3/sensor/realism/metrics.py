@@ -1,0 +1,94 @@
+"""How flat and how true a wall is, by the definitions of librealsense's depth-quality tool.
+
+Source: librealsense, tools/depth-quality. The plane is fitted to all points by least squares along
+z; the lowest and highest 0.5 % of z are left out before the errors are formed.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from qs3.sensor.rig import Region, StereoRig
+
+_TRIM = 0.005
+
+
+@dataclass(frozen=True)
+class PlaneMetrics:
+    """A wall as the sensor sees it; NaN where fewer than three points were seen."""
+
+    fill: float
+    """Share of the pixels that have a depth."""
+    rms: float
+    """Root mean square of the points' distances from the fitted plane, in the unit of the scene."""
+    sub_pixel: float
+    """Root mean square of b·f/|P| − b·f/|P'|, P' the point's foot on the fitted plane, in pixels."""
+    z_accuracy: float
+    """Median signed error of z after the fitted plane is turned onto the true one (about its point
+    on the optical axis), as a share of the true distance; positive is too far."""
+
+
+def camera_points(
+    depth: Float[np.ndarray, "h w"], rig: StereoRig, region: Region
+) -> Float[np.ndarray, "n 3"]:
+    """Lift every valid pixel of ``region`` to the left camera's frame."""
+    row, column = np.nonzero(np.isfinite(depth))
+    z = depth[row, column]
+    cx, cy = rig.principal_point
+    x = (region.x + column - cx) * z / rig.focal
+    return np.stack([x, (region.y + row - cy) * z / rig.focal, z], axis=1)
+
+
+def fit_plane(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], float]:
+    """Fit a plane by least squares along z.
+
+    Returns:
+        Unit normal n, away from the camera, and offset c of the plane n·p = c.
+
+    Example:
+        >>> normal, offset = fit_plane(np.array([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [1, 1, 2]]))
+        >>> normal.round(6).tolist(), round(offset, 6)
+        ([0.0, 0.0, 1.0], 2.0)
+    """
+    centre = points.mean(axis=0)
+    x, y, z = (points - centre).T
+    (a, b), *_ = np.linalg.lstsq(np.stack([x, y], axis=1), z, rcond=None)
+    normal = np.array([-a, -b, 1.0]) / math.sqrt(a * a + b * b + 1)
+    return normal, float(normal @ centre)
+
+
+def plane_metrics(
+    depth: Float[np.ndarray, "h w"], rig: StereoRig, region: Region, distance: float
+) -> PlaneMetrics:
+    """Measure a wall that faces the camera.
+
+    NOTE: the tool subtracts the distances from the fitted plane where we add them, so that an
+    error has one sign throughout; its median is the same but for the skew of the residuals.
+
+    Args:
+        depth: Depth of ``region``, NaN where there is none.
+        rig: Supplies focal length, baseline and principal point.
+        region: Part of the frame.
+        distance: True distance of the wall along the optical axis.
+    """
+    points = camera_points(depth, rig, region)
+    fill = len(points) / depth.size if depth.size else math.nan
+    if len(points) < 3:
+        return PlaneMetrics(fill, math.nan, math.nan, math.nan)
+    normal, offset = fit_plane(points)
+    points = points[np.argsort(points[:, 2], kind="stable")]
+    out = int(len(points) * _TRIM)
+    points = points[out : len(points) - out]
+    error = points @ normal - offset
+    foot = points - error[:, None] * normal
+    ranges = np.linalg.norm(points, axis=1), np.linalg.norm(foot, axis=1)
+    pixels = rig.focal * rig.baseline * (1 / ranges[0] - 1 / ranges[1])
+    on_axis = offset / normal[2]
+    return PlaneMetrics(
+        fill=fill,
+        rms=float(np.sqrt(np.mean(error**2))),
+        sub_pixel=float(np.sqrt(np.mean(pixels**2))),
+        z_accuracy=float(on_axis - distance + np.median(error)) / distance,
+    )
