@@ -259,7 +259,7 @@ def test_bounces_end_where_mitsubas_do():
     # A white corner: light that bounces brightens it; equal depths give equal light.
     corner = [box([4, 0.1, 4], [0, 1.05, 0]), box([0.1, 2, 4], [0.8, 0, 0])]
     scene = Scene(
-        (Body(trimesh.util.concatenate(corner)),), LightSettings(sky=0.0), WHITE, 0.6, 0.6
+        (Body(trimesh.util.concatenate(corner)),), replace(DARK, projector=45.6), WHITE, 0.6, 0.6
     )
     levels = []
     for bounces in (0, 1, 2):

@@ -19,7 +19,7 @@ from jaxtyping import Float32
 
 from qs3.errors import InputError, MissingExtraError
 from qs3.sensor.render._worker_process import RenderError as RenderError
-from qs3.sensor.render._worker_process import Worker, borrow
+from qs3.sensor.render._worker_process import Worker, borrow, idle_process
 from qs3.sensor.render.scene import Scene, StereoPair, photographed_region, refuse_sky
 from qs3.sensor.rig import Pose, Region, StereoRig
 
@@ -217,6 +217,12 @@ def find_cycles() -> dict[str, str]:
     if command is None:
         return {}
     return {"command": command[0], **_versions(command)}
+
+
+def worker_process() -> int | None:
+    """Process id of this process's worker between two calls, or None where none runs."""
+    command = interpreter()
+    return None if command is None else idle_process(command)
 
 
 def _command() -> tuple[str, ...]:
