@@ -226,10 +226,13 @@ def _to_world(pose: Pose) -> list[list[float]]:
 def _build(mi: Any, scene: Scene, max_depth: int) -> Any:
     extent = np.degrees(2 * np.arctan(scene.tan_half_width))
     bodies = {f"body{i}": _mesh(mi, body) for i, body in enumerate(scene.bodies)}
+    glass = any(body.material.model == "glass" for body in scene.bodies)
     return mi.load_dict(
         {
             "type": "scene",
-            "integrator": {"type": "path", "max_depth": max_depth},
+            # Light passes panes of thin glass, shadow rays as well, and no pane counts as a bounce:
+            # the volumetric integrator does so; the plain one leaves what is behind glass dark.
+            "integrator": {"type": "volpath" if glass else "path", "max_depth": max_depth},
             **bodies,
             "projector": {
                 "type": "projector",
