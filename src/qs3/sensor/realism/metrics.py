@@ -24,7 +24,7 @@ class PlaneMetrics:
     rms: float
     """Root mean square of the points' distances from the fitted plane, in the unit of the scene."""
     sub_pixel: float
-    """Root mean square of b·f/|P| − b·f/|P'|, P' the point's foot on the fitted plane, in pixels."""
+    """Root mean square of b·f/|P| − b·f/|P'|, P' the point's foot on the plane, in pixels."""
     z_accuracy: float
     """Median signed error of z after the fitted plane is turned onto the true one (about its point
     on the optical axis), as a share of the true distance; positive is too far."""

@@ -111,7 +111,6 @@ class Stage:
         inner = slice(y, y + region.height), slice(x, x + region.width)
         disparity = match(left, right, sensor.matching)[inner]
         cast = DepthCaster(*(body.mesh for body in bodies)).cast(rig, VIEW, region, normals=True)
-        assert cast.normals is not None
         return Shot(
             region=region,
             left=left[inner],
@@ -119,7 +118,7 @@ class Stage:
             depth=depth_from_disparity(disparity, rig, sensor.depth),
             true_depth=cast.depth,
             body=cast.body,
-            normals=cast.normals,
+            normals=np.asarray(cast.normals),
         )
 
     def refined(self, samples: int) -> "Stage":

@@ -1,0 +1,145 @@
+"""How far the points of a scanned object lie off its faces, beside the law (T10).
+
+An error δ of disparity moves a point along its ray by z²·δ/(f·b) of depth. With r the ray of length 1
+along the optical axis and n the face's unit normal, the point is then |r·n|·z²·δ/(f·b) off the face.
+With the sub-pixel RMS σ_d that T1 measures on a facing wall at the same distance, a point's distance
+from its face divided by |r·n|·z²·σ_d/(f·b) has median 0 and a median absolute deviation (MAD) of
+1/1.4826, if its noise is that of the wall.
+"""
+
+from typing import Any
+
+import cv2
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float
+
+from qs3.geometry import rotation_z
+from qs3.meshes import normalise, shapes
+from qs3.sensor.realism.checks_wall import Plain, shoot_wall
+from qs3.sensor.realism.metrics import plane_metrics
+from qs3.sensor.realism.results import Row, result, row
+from qs3.sensor.realism.stage import VIEW, Shot, Stage, painted
+from qs3.sensor.rig import StereoRig
+
+MOST_DEGREES = 60.0
+_TILT = 25.0  # degrees by which the object is looked down upon
+_BINS = np.arange(-5.0, 5.01, 0.25)
+
+
+def scanned(stage: Stage, seed: int, quick: bool) -> Plain:
+    """T10: photograph a sofa of flat faces from two sides, and walls at the same distances."""
+    near, far = stage.sensor.placement.radius
+    distance = (near + far) / 2
+    half = 0.75 * stage.sensor.object_size
+    walls = np.geomspace(distance - half, distance + half, 3)
+    sigma = [
+        plane_metrics(shot.depth, stage.rig, shot.region, z).sub_pixel
+        for z in map(float, walls)
+        for shot in [shoot_wall(stage, z, 0.3 if quick else 0.8, seed)]
+    ]
+    parts = []
+    for turn in (20.0,) if quick else (20.0, 65.0):
+        shot = shoot_object(stage, distance, turn, seed)
+        parts.append(off_faces(shot, stage.rig, stage.sensor.matching.block_size, walls, sigma))
+    ratio, cosine = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return result("T10", *scan_rows(ratio, cosine))
+
+
+def shoot_object(stage: Stage, distance: float, turn: float, seed: int) -> Shot:
+    """Photograph a sofa of the sensor's object size, looked down upon.
+
+    Args:
+        stage: The sensor.
+        distance: Of the object's middle.
+        turn: Of the object about its vertical, in degrees.
+        seed: Of image and noise.
+    """
+    mesh = normalise(shapes.make("sofa", seed=1), "box")
+    points = np.asarray(mesh.vertices) * stage.sensor.object_size
+    tilt = np.radians(_TILT)
+    lean = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    points = points @ rotation_z(np.radians(turn)).T @ lean.T + np.array([0.0, distance, 0.0])
+    body = painted(trimesh.Trimesh(points, mesh.faces, process=False))
+    region = stage.rig.region_of(np.asarray(body.mesh.bounds), VIEW, 16)
+    return stage.shoot([body], region, seed)
+
+
+def off_faces(
+    shot: Shot,
+    rig: StereoRig,
+    block: int,
+    walls: Float[np.ndarray, "w"],
+    sigma: list[float],
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Signed distances from the faces in units of the law, of points well inside a face.
+
+    Args:
+        shot: A photograph.
+        rig: Supplies focal length, baseline and principal point.
+        block: The matcher's block: within half of it a pixel's neighbours must show its face.
+        walls: Distances at which the noise on a wall is known.
+        sigma: The sub-pixel RMS there.
+
+    Returns:
+        Distance over expected deviation, positive away from the camera; cosine of the view angle.
+    """
+    cx, cy = rig.principal_point
+    y, x = np.indices(shot.depth.shape)
+    ray = np.stack(
+        [
+            (shot.region.x + x - cx) / rig.focal,
+            (shot.region.y + y - cy) / rig.focal,
+            np.ones(shot.depth.shape),
+        ],
+        axis=-1,
+    )
+    slope = np.abs(np.einsum("ijk,ijk->ij", ray, shot.normals))
+    cosine = slope / np.linalg.norm(ray, axis=-1)
+    kept = inside_faces(shot, ray, block // 2 + 2) & np.isfinite(shot.depth)
+    kept &= cosine > np.cos(np.radians(MOST_DEGREES))
+    z = shot.true_depth[kept]
+    law = z**2 * np.interp(z, walls, sigma) / (rig.focal * rig.baseline)
+    # Both the distance and the law have the factor |r·n|.
+    return (shot.depth[kept] - z) * slope[kept] / (law * slope[kept]), cosine[kept]
+
+
+def inside_faces(
+    shot: Shot, ray: Float[np.ndarray, "h w 3"], reach: int
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels around which all pixels within ``reach`` show the same plane."""
+    offset = np.einsum("ijk,ijk->ij", ray, shot.normals) * shot.true_depth
+    plane = np.concatenate([shot.normals, offset[..., None]], axis=-1)
+    plane = np.where(np.isfinite(plane), plane, 1e3).astype(np.float32)
+    square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    apart = cv2.dilate(plane, square) - cv2.erode(plane, square)
+    return (np.abs(apart).max(axis=-1) < 1e-4) & (shot.body >= 0)
+
+
+def scan_rows(
+    ratio: Float[np.ndarray, "n"], cosine: Float[np.ndarray, "n"]
+) -> tuple[list[Row], dict[str, Any]]:
+    """Judge signed distances in units of the law.
+
+    Args:
+        ratio: Distance over expected deviation of each point.
+        cosine: Cosine of its view angle.
+    """
+    if len(ratio) < 100:
+        return [row("points", float(len(ratio)), 100.0)], {"distance": [], "share": []}
+    median = float(np.median(ratio))
+    mad = float(np.median(np.abs(ratio - median)))
+    counts, _ = np.histogram(ratio, _BINS)
+    angle = np.degrees(np.arccos(np.clip(cosine, 0, 1)))
+    rows = [
+        row("|median| over MAD", abs(median) / mad, None, 0.2, strict=True),
+        row("1.4826 MAD over the law", 1.4826 * mad, 0.75, 1.25),
+        row("points", float(len(ratio))),
+    ]
+    for low in range(0, int(MOST_DEGREES), 15):
+        part = ratio[(angle >= low) & (angle < low + 15)]
+        if len(part) >= 100:
+            spread = 1.4826 * np.median(np.abs(part - np.median(part)))
+            rows.append(row(f"the same, seen at {low} … {low + 15}°", spread))
+    data = {"distance": (_BINS[:-1] + _BINS[1:]) / 2, "share": counts / len(ratio)}
+    return rows, data
