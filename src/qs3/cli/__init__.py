@@ -44,12 +44,14 @@ def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
     """The verbs; only what the one asked for needs is imported, so that a scan starts fast."""
     from qs3.cli.doctor import doctor
     from qs3.cli.generate import generate
+    from qs3.cli.realism import realism
     from qs3.cli.scan import scan
     from qs3.cli.sensors import sensors
 
     verbs: dict[str, Callable[..., int]] = {
         "scan": scan,
         "sensors": sensors,
+        "realism": realism,
         "generate": generate,
         "doctor": doctor,
     }
@@ -70,5 +72,6 @@ def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
 
     train_with_preset.__doc__ = train.__doc__
     verbs |= {"train": train_with_preset, "evaluate": evaluate, "predict": predict, "demo": demo}
-    order = ("scan", "sensors", "generate", "train", "evaluate", "predict", "doctor", "demo")
+    made = ("scan", "sensors", "realism", "generate")
+    order = (*made, "train", "evaluate", "predict", "doctor", "demo")
     return {name: verbs[name] for name in order}

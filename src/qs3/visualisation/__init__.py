@@ -16,3 +16,5 @@ from qs3.visualisation.plots import class_accuracy as class_accuracy
 from qs3.visualisation.plots import confusion_heatmap as confusion_heatmap
 from qs3.visualisation.plots import selection_counts as selection_counts
 from qs3.visualisation.plots import training_curves as training_curves
+from qs3.visualisation.realism import REALISM_PLOTS as REALISM_PLOTS
+from qs3.visualisation.realism import realism_plot as realism_plot
