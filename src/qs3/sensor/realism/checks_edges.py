@@ -17,9 +17,9 @@ _NEAR = 1.0  # pixels of disparity within which a match is one of a surface
 
 
 def edge_distances(stage: Stage) -> tuple[float, float]:
-    """Where plate and wall stand: a plate at 0.6 m before a wall at 1 m, and as much nearer or
-    farther as the sensor needs: the plate at least 1.2 times as far as the nearest that it
-    measures.
+    """Where plate and wall stand: 0.6 m and 1 m, or farther in the same ratio.
+
+    The plate is at least 1.2 times as far as the nearest that the sensor measures.
     """
     nearest = distances(stage.sensor, 2)[0]
     near = max(0.6 if stage.sensor.metric else 0.0, 1.2 * nearest)

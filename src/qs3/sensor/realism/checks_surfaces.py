@@ -147,13 +147,12 @@ def clear_rows(
     on = np.isfinite(own)
     count = max(1, int(on.sum()))
     own_share = (np.abs(disparity - own) < _NEAR)[on].sum() / count if on.any() else np.nan
+    seen = (np.abs(disparity - behind) < _NEAR)[on].sum() / count
+    none = np.isnan(disparity)[on].sum() / count
     return [
         row(f"{name}: share with its own depth", own_share, None, 0.01),
-        row(
-            f"{name}: share with the depth seen in it",
-            (np.abs(disparity - behind) < _NEAR)[on].sum() / count,
-        ),
-        row(f"{name}: share without depth", np.isnan(disparity)[on].sum() / count),
+        row(f"{name}: share with the depth seen in it", seen),
+        row(f"{name}: share without depth", none),
     ]
 
 

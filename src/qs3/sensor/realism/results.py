@@ -23,8 +23,8 @@ TITLES: dict[str, str] = {
 
 EXPECTATIONS: dict[str, str] = {
     "T1": "On a facing wall of albedo 0.6 the RMS about the fitted plane grows as z² (log-log "
-    "slope 1.85 … 2.15) and the sub-pixel RMS is 0.04 … 0.12 px at every distance (Intel's guide to "
-    "tuning depth cameras; definitions of librealsense's depth-quality tool).",
+    "slope 1.85 … 2.15) and the sub-pixel RMS is 0.04 … 0.12 px at every distance (Intel's guide "
+    "to tuning depth cameras; definitions of librealsense's depth-quality tool).",
     "T2": "Over a sweep that covers all fractions of a pixel evenly, the median error of disparity "
     "is below 0.01 px and that of distance below 0.2 %.",
     "T3": "Every disparity is a whole multiple of the preset's quantum, and neighbouring values "
