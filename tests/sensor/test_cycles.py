@@ -79,8 +79,8 @@ def displacement(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     ("light", "samples"),
     [
         (replace(DARK, projector=45.6), 16),
-        (replace(DARK, ambient=0.3), 64),
-        (replace(DARK, sky=1.0, sky_elevation=9.3), 256),
+        (replace(DARK, ambient=0.3), 16),
+        (replace(DARK, sky=1.0, sky_elevation=9.3), 64),
     ],
     ids=["projector", "ambient", "sky"],
 )
@@ -211,7 +211,7 @@ def test_blackman_harris_blurs():
     assert widths[1] > widths[0]
 
 
-@pytest.mark.parametrize("name", ["principled", "rough-specular", "glossy-plastic", "metal"])
+@pytest.mark.parametrize("name", ["principled", "glossy-plastic", "metal"])
 def test_either_side_of_a_face_is_the_same_surface(name):
     plate = trimesh.Trimesh(
         [[-1.0, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]], [[0, 1, 2], [0, 2, 3]], process=False
@@ -225,6 +225,24 @@ def test_either_side_of_a_face_is_the_same_surface(name):
         pair = CyclesRenderer(samples=64).render(scene, RIG, [LEVEL], [0], part)[0]
         means.append(pair.left.mean())
     assert means[0] == pytest.approx(means[1], rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("name", "tolerance"),
+    # Blender's principled model is not Mitsuba's: its coat takes more of the diffuse light.
+    [("diffuse", 0.02), ("mirror", 0.02), ("glass", 0.02), ("metal", 0.03), ("principled", 0.07)],
+)
+def test_a_ball_of_each_material_is_as_bright_as_mitsubas(name, tolerance):
+    ball = Body(trimesh.creation.icosphere(3, 0.45), get_material(name))
+    floor = Body(box([6, 6, 0.02], [0, 0, -0.46]))
+    scene = Scene((ball, floor), LightSettings(), WHITE, 0.4, 0.4)
+    rig = StereoRig(width=64, height=64, focal=170.0)
+    pose = Pose.looking_at(np.array([1.0, -2.0, 1.8]), np.zeros(3))
+    theirs, ours = (
+        renderer.render(scene, rig, [pose], [0])[0].left.mean()
+        for renderer in (mitsuba(64), CyclesRenderer(samples=64))
+    )
+    assert ours == pytest.approx(theirs, rel=tolerance)
 
 
 def test_glass_is_a_thin_pane():
@@ -263,8 +281,8 @@ def test_bounces_end_where_mitsubas_do():
     )
     levels = []
     for bounces in (0, 1, 2):
-        theirs = replace(mitsuba(128), max_depth=2 + bounces)
-        ours = CyclesRenderer(samples=64, max_bounces=bounces)
+        theirs = replace(mitsuba(64), max_depth=2 + bounces)
+        ours = CyclesRenderer(samples=32, max_bounces=bounces)
         part = [Region(32, 16, 32, 32)]
         pair = [r.render(scene, RIG, [LEVEL], [0], part)[0] for r in (theirs, ours)]
         assert pair[1].left.mean() == pytest.approx(pair[0].left.mean(), rel=0.01)

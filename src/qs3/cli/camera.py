@@ -42,6 +42,9 @@ class CameraOptions:
     and more)."""
     variant: Literal["auto", "cuda_ad_mono", "llvm_ad_mono", "scalar_rgb"] = "auto"
     """Variant of Mitsuba; auto takes the fastest that works here."""
+    view_transform: Literal["raw", "Standard", "Filmic", "AgX"] = "raw"
+    """Of cycles: raw hands radiance to the sensor's exposure; the others take Blender's own grey
+    levels in its place (the released images have Filmic)."""
 
     def resolve_sensor(self) -> Any:
         """The sensor with every option applied."""
@@ -78,9 +81,12 @@ class CameraOptions:
 
             if self.variant != "auto":
                 raise InputError(f"--variant {self.variant} is Mitsuba's: leave it out with cycles")
-            renderer = CyclesRenderer(samples=self.samples or CyclesRenderer.samples)
+            samples = self.samples or CyclesRenderer.samples
+            renderer = CyclesRenderer(samples=samples, view_transform=self.view_transform)
             _ = renderer.description  # a Blender that is missing or does not start stops here
             return renderer
+        if self.view_transform != "raw":
+            raise InputError(f"--view-transform {self.view_transform} needs --renderer cycles")
         from qs3.sensor.render.mitsuba import MitsubaRenderer
 
         variant = "" if self.variant == "auto" else self.variant
