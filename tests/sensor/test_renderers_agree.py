@@ -1,4 +1,4 @@
-"""Cycles and Mitsuba before the same scenes: every material, every light, glass, a whole scan."""
+"""Cycles and Mitsuba as they are by default before the same scenes; glass; a whole scan."""
 
 from dataclasses import replace
 
@@ -9,12 +9,11 @@ import trimesh
 
 from qs3.errors import InputError
 from qs3.meshes import shapes
-from qs3.sensor.materials import MATERIALS, Material
+from qs3.sensor.materials import Material
 from qs3.sensor.render import Body, LightSettings, Scene
 from qs3.sensor.render._worker_process import close_workers
 from qs3.sensor.render.cycles import CyclesRenderer, interpreter
 from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
-from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.scan import scan
 
@@ -95,26 +94,6 @@ def test_levels_agree_light_by_light_on_wall_and_object(dark):
         )
         assert cycles.left.mean() == pytest.approx(ours.left.mean(), rel=0.02)
         assert cycles.right.mean() == pytest.approx(ours.right.mean(), rel=0.02)
-
-
-# Share by which the object's mean radiance may differ. Blender takes what the coat of a principled
-# surface reflects off the light below it, Disney's model of 2012, which is Mitsuba's, does not.
-SHARES = {"principled": 0.1, "rough-specular": 0.1, "glossy-plastic": 0.1, "metal": 0.03}
-
-
-@WITH_CYCLES
-@pytest.mark.parametrize("name", MATERIALS)
-def test_every_material_is_about_as_bright(name):
-    scene = alone(MATERIALS[name], LightSettings(), letters())
-    seen = np.isfinite(DepthCaster(asymmetric()).depth(RIG, POSE, RIG.full_frame))
-    cycles, ours = (
-        renderer.render(scene, RIG, [POSE], [1])[0].canvas(RIG.full_frame)[0]
-        for renderer in (CyclesRenderer(samples=64), mitsuba(samples=64, indirect="path"))
-    )
-    assert np.isfinite(cycles).all()
-    assert cycles.min() >= 0
-    ratio = cycles[seen].mean() / ours[seen].mean()
-    assert abs(ratio - 1) < SHARES.get(name, 0.02), f"{name}: {ratio:.3f}"
 
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_mono"])
