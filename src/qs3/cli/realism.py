@@ -163,7 +163,7 @@ def table(results: Sequence[Mapping[str, Any]]) -> list[str]:
         cells.append((result["id"], result["title"], "", "", verdict + why))
         for row in result["rows"]:
             unit = row["unit"] and f" {row['unit']}"
-            value = "–" if row["measured"] is None else f"{row['measured']:.4g}{unit}"
+            value = "–" if row["measured"] is None else _number(row["measured"]) + unit
             bounds = f"{row['expected']}{unit}" if row["expected"] else ""
             verdict = "" if row["passed"] is None else _verdict(row["passed"])
             cells.append(("", row["what"], value, bounds, verdict))
@@ -174,6 +174,11 @@ def table(results: Sequence[Mapping[str, Any]]) -> list[str]:
     ]
 
 
+def _number(value: float) -> str:
+    """Four digits, whole numbers in full: 117,123 rather than 1.171e+05."""
+    return f"{value:,.0f}" if float(value).is_integer() else f"{value:.4g}"
+
+
 def _verdict(passed: bool | None) -> str:
     return {True: "pass", False: "MISS", None: "does not apply"}[passed]
 
@@ -182,10 +187,11 @@ def _tell(results: Sequence[Mapping[str, Any]], folder: Path) -> None:
     """What came out, which plots there are, and where to look."""
     from qs3.visualisation import REALISM_PLOTS
 
-    absent = {name: plot for name, plot in REALISM_PLOTS.items() if not (folder / plot).is_file()}
+    absent = [name for name, plot in REALISM_PLOTS.items() if not (folder / plot).is_file()]
+    verdicts = {result["id"]: _verdict(result["passed"]) for result in results}
     if absent:
-        plots = ", ".join(f"{plot} ({name})" for name, plot in absent.items())
-        print(f"no {plots}: without such a result", file=sys.stderr)
+        plots = (f"{REALISM_PLOTS[n]} ({n} {verdicts.get(n, 'was not asked')})" for n in absent)
+        print(f"no {', '.join(plots)}", file=sys.stderr)
     counts = {True: 0, False: 0, None: 0}
     for result in results:
         counts[result["passed"]] += 1

@@ -1,13 +1,13 @@
 """Plots of what a simulated depth camera measures, beside the laws of real ones."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator, NullFormatter, NullLocator
 
 from qs3.sensor.presets import Sensor
 from qs3.visualisation.figure import NO_VALUE, PALETTE, house_style
@@ -78,21 +78,19 @@ def bias_plot(result: _Result, sensor: Sensor) -> Figure:
     fraction, bias = _series(result, "fraction"), _series(result, "bias")
     order = np.argsort(fraction)
     figure, (axes,) = _figure(1)
-    axes.axhspan(-0.01, 0.01, color=_SECOND, alpha=0.25, label="bounds of the median: ±0.01 px")
+    axes.axhspan(-0.01, 0.01, color=_SECOND, alpha=0.25, label="bounds of the median")
     axes.plot(
         fraction[order], bias[order], "o-", color=_MEASURED, markersize=4, label="mean of a wall"
     )
     median = next((r["measured"] for r in result["rows"] if "median disparity" in r["what"]), None)
     if median is not None:
-        axes.axhline(
-            median, color=_LAW, linestyle="--", label=f"median of all walls: {median:+.4f} px"
-        )
+        axes.axhline(median, color=_LAW, linestyle="--", label=f"median of all: {median:+.4f} px")
     reach = 1.3 * max(0.02, float(np.nanmax(np.abs(bias), initial=0.0)))
     axes.set(xlim=(0, 1), ylim=(-reach, reach))
     axes.set_xlabel("fraction of the true disparity [px]")
     axes.set_ylabel("error of disparity [px]")
     axes.set_title(f"{sensor.name}: bias over a pixel")
-    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.08), fontsize=9, ncols=2)
+    figure.legend(loc="outside lower center", fontsize=9, ncols=2)
     return figure
 
 
@@ -102,7 +100,7 @@ def edge_plot(result: _Result, sensor: Sensor) -> Figure:
     offset = _series(result, "offset")
     half = sensor.matching.block_size / 2
     figure, (axes,) = _figure(1)
-    axes.axvspan(-half, half, color=_SECOND, alpha=0.2, label="half a block")
+    axes.axvspan(-half, half, color=_SECOND, alpha=0.2, label="± half a block")
     axes.axvline(0, color="black", linewidth=0.8)
     axes.plot(
         offset, _series(result, "near_share"), "-", color=_MEASURED, label="depth of the plate"
@@ -112,13 +110,13 @@ def edge_plot(result: _Result, sensor: Sensor) -> Figure:
         _series(result, "between_share"),
         "--",
         color=_LAW,
-        label="depth between plate and wall",
+        label="depth in between",
     )
     axes.set(xlim=(offset.min(), offset.max()), ylim=(-0.03, 1.05))
     axes.set_xlabel("pixels from the true edge (left: on the plate)")
     axes.set_ylabel("share of the rows")
     axes.set_title(f"{sensor.name}: profile of an edge")
-    axes.legend(loc="upper right")
+    figure.legend(loc="outside lower center", fontsize=9, ncols=3)
     return figure
 
 
@@ -131,7 +129,7 @@ def fill_plot(result: _Result, sensor: Sensor) -> Figure:
     left.invert_xaxis()
     left.set_xticks(_series(result, "albedo"))
     left.xaxis.set_major_formatter("{x:g}")
-    left.xaxis.set_minor_formatter(NullFormatter())
+    left.xaxis.set_minor_locator(NullLocator())
     left.set_xlabel("albedo of a patch")
     left.set_ylabel("share of pixels with a depth")
     right.plot(_series(result, "angle"), _series(result, "fill_angle"), "o-", color=_MEASURED)
@@ -178,7 +176,7 @@ def distances_plot(result: _Result, sensor: Sensor) -> Figure:
     axes.set_xlabel("distance from the surface, in σ of the law")
     axes.set_ylabel("share of the points")
     axes.set_title(f"{sensor.name}: a scanned object")
-    axes.legend(loc="upper right")
+    figure.legend(loc="outside lower center", fontsize=9, ncols=2)
     return figure
 
 
@@ -192,9 +190,9 @@ _DRAW: dict[str, Callable[[_Result, Sensor], Figure]] = {
 }
 
 
-def _figure(panels: int) -> tuple[Figure, Sequence[Axes]]:
+def _figure(panels: int) -> tuple[Figure, list[Axes]]:
     figure = Figure(figsize=(_WIDTH * (1.0 if panels == 1 else 1.4), 3.6), layout="constrained")
-    return figure, figure.subplots(1, panels, squeeze=False, sharey=True)[0]
+    return figure, list(figure.subplots(1, panels, squeeze=False, sharey=True)[0])
 
 
 def _series(result: _Result, name: str) -> Float[np.ndarray, "n"]:

@@ -1,0 +1,195 @@
+"""``qs3 realism`` on a small camera: the command itself, in this process but for the killed one."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from qs3.cli import main
+
+# The D435's optics on a small chip: what is far is still measured, and a test takes a second.
+SMALL = """
+base = "d435"
+name = "small"
+
+[rig]
+width = 200
+height = 150
+focal = 215.0
+
+[matching]
+num_disparities = 32
+block_size = 15
+
+[depth]
+near = 0.5
+far = 3.0
+"""
+FAST = ("--quick", "--variant", "scalar_rgb", "--samples", "1")
+
+
+@pytest.fixture(scope="module")
+def camera(tmp_path_factory):
+    path = tmp_path_factory.mktemp("camera") / "small.toml"
+    path.write_text(SMALL)
+    return path
+
+
+class Verb:
+    """Runs ``qs3 realism``; a new process would take seconds to start."""
+
+    def __init__(self, capfd):
+        self.capfd = capfd
+
+    def __call__(self, *arguments, code: int = 0):
+        self.capfd.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main(["realism", *map(str, arguments)])
+        said = self.capfd.readouterr()
+        assert ended.value.code == code, said.err
+        return SimpleNamespace(stdout=said.out, stderr=said.err)
+
+    def refuses(self, *arguments) -> str:
+        said = self(*arguments, code=2)
+        assert said.stdout == ""
+        (line,) = said.stderr.splitlines()
+        assert line.startswith("qs3: ")
+        return line
+
+
+@pytest.fixture
+def realism(capfd):
+    return Verb(capfd)
+
+
+@pytest.fixture(scope="module")
+def first(qs3, camera, tmp_path_factory):
+    """A run of two tests, in a process of its own: its folder and what it said."""
+    folder = tmp_path_factory.mktemp("realism") / "small"
+    done = qs3("realism", "--sensor", camera, "--out", folder, "--tests", "t3", "T1", *FAST)
+    return folder, done
+
+
+def record(folder):
+    return json.loads((folder / "realism.json").read_text())
+
+
+def test_table_record_and_plots(first):
+    folder, done = first
+    made = record(folder)
+    assert made["sensor"]["name"] == "small"
+    assert made["renderer"]["samples"] == 1
+    assert made["settings"] == {"quick": True, "seed": 0}
+    assert made["versions"]
+    assert [one["id"] for one in made["tests"]] == ["T1", "T3"]
+    lines = done.stdout.splitlines()
+    assert lines[0].split() == ["test", "what", "measured", "expected"]
+    for one in made["tests"]:
+        mine = next(line for line in lines if line.startswith(f"{one['id']} "))
+        assert one["title"] in mine
+        assert mine.endswith({True: "pass", False: "MISS", None: "does not apply"}[one["passed"]])
+        for row in one["rows"]:
+            assert any(row["what"] in line and row["expected"] in line for line in lines)
+    pictures = sorted(path.name for path in folder.glob("*.png"))
+    assert pictures == ["rms.png"]
+    assert all((folder / name).read_bytes()[1:4] == b"PNG" for name in pictures)
+    last = done.stderr.strip().splitlines()[-1]
+    assert str(folder / "rms.png") in last
+    assert "fill.png (T6 was not asked)" in done.stderr
+    assert not [path for path in folder.iterdir() if ".tmp" in path.name]
+
+
+def test_the_same_command_goes_on_and_others_add(realism, camera, first):
+    folder, before = first
+    old = record(folder)
+    again = realism("--sensor", camera, "--out", folder, "--tests", "T1", "T3", *FAST)
+    assert record(folder) == old  # seconds and all: nothing was measured anew
+    assert again.stdout == before.stdout
+    assert f"T1, T3: done before, taken from {folder}" in again.stderr
+    (folder / "rms.png").unlink()
+    realism("--sensor", camera, "--out", folder, "--tests", "T9", "T1", *FAST)
+    assert (folder / "rms.png").is_file()
+    tests = record(folder)["tests"]
+    assert [one["id"] for one in tests] == ["T1", "T3", "T9"]
+    assert tests[:2] == old["tests"]
+
+
+def test_other_settings_do_not_mix(realism, camera, first, tmp_path):
+    folder, _ = first
+    old = (folder / "realism.json").read_bytes()
+    common = ("--sensor", camera, "--out", folder, "--tests", "T1")
+    line = realism.refuses(*common, *FAST, "--seed", 3)
+    assert "settings.seed was 0, is 3" in line
+    line = realism.refuses(*common, *FAST, "--matching", "opencv-bm")
+    assert "sensor.matching.method was zncc, is opencv-bm" in line
+    assert (folder / "realism.json").read_bytes() == old
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "thesis.tex").write_text("x")
+    assert "holds something else" in realism.refuses(*common[:3], other, *FAST)
+    (other / "realism.json").write_text("{")
+    assert "realism.json" in realism.refuses(*common[:3], other, *FAST)
+    (other / "realism.json").write_text("[]")
+    assert "not a record" in realism.refuses(*common[:3], other, *FAST)
+
+
+def test_strict_ends_with_one_where_a_test_misses(realism, camera, first):
+    """Verdicts are those of the record: once of a miss, once of a pass."""
+    folder, _ = first
+    path = folder / "realism.json"
+    kept = path.read_text()
+    try:
+        for passed in (False, True):
+            made = json.loads(kept)
+            one = next(test for test in made["tests"] if test["id"] == "T3")
+            one["passed"] = passed
+            path.write_text(json.dumps(made))
+            common = ("--sensor", camera, "--out", folder, "--tests", "T3", *FAST)
+            realism(*common)
+            realism(*common, "--strict", code=0 if passed else 1)
+    finally:
+        path.write_text(kept)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("--tests", "T1", "T11"), "--tests T11"),
+        (("--seed", -1), "--seed -1"),
+        (("--samples", 0), "--samples 0"),
+        (("--sensor", "d345"), "d435"),
+        (("--image-noise", -1), "--image-noise -1"),
+    ],
+)
+def test_faults_are_one_line_and_leave_nothing(realism, tmp_path, arguments, named):
+    out = tmp_path / "out"
+    assert named in realism.refuses("--out", out, *arguments)
+    assert not out.exists()
+
+
+def test_a_killed_run_leaves_a_record_that_goes_on(realism, camera, tmp_path):
+    folder = tmp_path / "killed"
+    common = ("--sensor", camera, "--out", folder, *FAST, "--tests", "T3", "T4", "T9")
+    running = subprocess.Popen(
+        [sys.executable, "-m", "qs3", "realism", *map(str, common)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        for _ in range(600):
+            if (folder / "realism.json").is_file() and record(folder)["tests"]:
+                break
+            time.sleep(0.05)
+    finally:
+        running.send_signal(signal.SIGKILL)
+        running.wait()
+    before = record(folder)["tests"]
+    assert before
+    realism(*common)
+    after = record(folder)["tests"]
+    assert [one["id"] for one in after] == ["T3", "T4", "T9"]
+    assert after[: len(before)] == before
