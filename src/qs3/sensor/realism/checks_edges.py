@@ -1,6 +1,5 @@
 """A plate before a wall: bands without a match (T4) and what happens at the edges (T5)."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -132,7 +131,7 @@ def edge_rows(
     near: float,
     far: float,
     block: int,
-) -> tuple[list[Row], dict[str, Sequence[float]]]:
+) -> tuple[list[Row], dict[str, Any]]:
     """Judge how far a plate reaches beyond its true edges.
 
     Args:

@@ -47,14 +47,15 @@ def shoot_wall(stage: Stage, distance: float, share: float, seed: int) -> Shot:
 
 
 def wall_metrics(stage: Stage, distance: float, share: float, seed: int) -> PlaneMetrics:
-    """The plane metrics of a facing wall, whatever part of a disparity step it happens to fall on.
+    """The plane metrics of a facing wall, whatever disparity it happens to have.
 
-    Where a whole wall falls on one step its rounding is no noise at all, and half way between two
-    it is the greatest: two walls half a step apart are measured and their squares averaged.
+    Noise is the greatest half way between two whole disparities, and rounding to steps adds none
+    where a whole wall falls on one of them. So two walls are measured, half a pixel and half a
+    step apart, and their squares averaged.
     """
     step = disparity_grid(stage.sensor.matching)[0]
     middle, seen = float(stage.rig.disparity(distance)), []
-    for offset in (-step / 4, step / 4) if step else (0.0,):
+    for offset in (-0.25, 0.25 + step / 2):
         z = float(stage.rig.disparity(1.0)) / (middle + offset)
         shot = shoot_wall(stage, z, share, seed)
         seen.append(plane_metrics(shot.depth, stage.rig, shot.region, z))

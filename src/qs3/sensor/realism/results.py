@@ -83,7 +83,7 @@ def row(
     if low is not None or high is not None:
         least, most = -math.inf if low is None else low, math.inf if high is None else high
         inside = value is not None and least <= value <= most
-        passed = inside and not (strict and value in (low, high))
+        passed = bool(inside) and not (strict and value in (low, high))
     return {
         "what": what,
         "measured": value,

@@ -126,13 +126,14 @@ class Stage:
 
         Mirrors and glass are path traced: they need both.
         """
-        renderer: Any = self.renderer
-        if not dataclasses.is_dataclass(renderer) or isinstance(renderer, type):
+        settings = self.renderer
+        if not dataclasses.is_dataclass(settings):
             return self
         least = {"samples": samples, "max_depth": 8}
-        names = {f.name for f in dataclasses.fields(renderer)} & set(least)
-        raised = {name: max(least[name], getattr(renderer, name)) for name in names}
-        return Stage(self.sensor, dataclasses.replace(renderer, **raised))
+        names = {field.name for field in dataclasses.fields(settings)} & set(least)
+        raised = {name: max(least[name], getattr(settings, name)) for name in names}
+        finer: Any = dataclasses.replace(settings, **raised)
+        return Stage(self.sensor, finer)
 
 
 def painted(mesh: trimesh.Trimesh, albedo: float = ALBEDO) -> Body:
