@@ -36,7 +36,8 @@ def scanned(stage: Stage, seed: int, quick: bool) -> Plain:
     near, far = stage.sensor.placement.radius
     half = 0.9 * stage.sensor.object_size
     walls = np.geomspace(max(near - half, 1.05 * stage.sensor.depth.near), far + half, 3)
-    sigma = [wall_metrics(stage, z, 0.3 if quick else 0.8, seed).sub_pixel for z in walls.tolist()]
+    # The middle of the frame, where the object is: the metric divides by the length of the ray.
+    sigma = [wall_metrics(stage, z, 0.3, seed).sub_pixel for z in walls.tolist()]
     count = 5 if quick else 16
     parts = []
     for index in range(count):
