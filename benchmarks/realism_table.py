@@ -6,8 +6,9 @@
 
 The first form puts one row a test and one column a record between the page's first markers. The
 second photographs one wall of albedo 0.6 with the d435 at four distances, each once, hands the same
-images to both matchers with blocks of 15 and 21, and fills the second markers. Either leaves the
-rest of the page as it is.
+images to both matchers with blocks of 15 and 21, and fills the second markers: once with Gaussian
+noise of 1.5 grey levels alone, and once with the preset's noise. Either form leaves the rest of the
+page as it is.
 """
 
 import argparse
@@ -129,14 +130,20 @@ def walls_table(samples: int, seed: int) -> str:
     sensor = get_sensor("d435")
     rig, thrown = sensor.rig, sensor.pattern
     renderer = MitsubaRenderer(samples=samples)
+    own = sensor.exposure
+    noises = {
+        "1.5 grey levels": dataclasses.replace(own, noise=1.5, offset=0.0, speckle=0.0),
+        f"the preset's: {own.noise:g} grey levels, speckle {own.speckle:g}": own,
+    }
     settings = {
-        (method, block): dataclasses.replace(
+        (noise, method, block): dataclasses.replace(
             sensor.matching, method=method, block_size=block, quantum=0.0, bias_correction=False
         )
+        for noise in noises
         for method, block in MATCHERS
     }
-    widest = settings["zncc", 21]
-    seen: dict[tuple[str, int], list[tuple[float, ...]]] = {key: [] for key in settings}
+    widest = max(settings.values(), key=lambda one: (one.method == "zncc", one.block_size))
+    seen: dict[tuple[str, str, int], list[tuple[float, ...]]] = {key: [] for key in settings}
     for index, z in enumerate(DISTANCES):
         region = wall_region(sensor, z)
         canvas = matching_canvas(region, rig, widest)
@@ -149,11 +156,16 @@ def walls_table(samples: int, seed: int) -> str:
             thrown.tan_half_height,
         )
         pair = renderer.render(scene, rig, [VIEW], [seed + index], regions=[wide])[0]
-        rng = np.random.default_rng(seed + index)
-        left, right = expose_pair(pair, canvas, region, rig, sensor.exposure, rng)
+        images = {
+            noise: expose_pair(
+                pair, canvas, region, rig, exposure, np.random.default_rng(seed + index)
+            )
+            for noise, exposure in noises.items()
+        }
         x, y = region.x - canvas.x, region.y - canvas.y
         inner = slice(y, y + region.height), slice(x, x + region.width)
         for key, matching in settings.items():
+            left, right = images[key[0]]
             seconds = []
             for _ in range(3):
                 start = time.perf_counter()
@@ -170,13 +182,19 @@ def walls_table(samples: int, seed: int) -> str:
             median = float(np.median(error))
             seen[key].append((total, plane.sub_pixel, median, fill, gross, min(seconds)))
     head = [
-        "matcher", "block", *(f"total RMS at {z} m" for z in DISTANCES), "greatest",
+        "noise", "matcher", "block", *(f"total RMS at {z} m" for z in DISTANCES), "greatest",
         "sub-pixel RMS", "median bias", "least fill", "gross errors", "seconds a pair",
     ]  # fmt: skip
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    for (method, block), rows in seen.items():
+    for (noise, method, block), rows in seen.items():
         total, plane, bias, fill, gross, seconds = np.array(rows).T
-        cells = [method, str(block), *(f"{value:.3f}" for value in total), f"{total.max():.3f}"]
+        cells = [
+            noise,
+            method,
+            str(block),
+            *(f"{value:.3f}" for value in total),
+            f"{total.max():.3f}",
+        ]
         cells += [
             f"{plane.min():.3f} … {plane.max():.3f}",
             f"{bias.min():+.3f} … {bias.max():+.3f}",
