@@ -22,6 +22,7 @@ from qs3.sensor.realism.stage import VIEW, Shot, Stage, painted
 from qs3.sensor.rig import StereoRig
 
 MOST_DEGREES = 60.0
+_VIEWS = {True: 12, False: 16}
 _TILT = 25.0  # degrees by which the object is looked down upon
 _GOLDEN = 0.381966  # of a full turn: any number of turns is spread evenly
 _BINS = np.arange(-5.0, 5.01, 0.25)
@@ -38,7 +39,7 @@ def scanned(stage: Stage, seed: int, quick: bool) -> Plain:
     walls = np.geomspace(max(near - half, 1.05 * stage.sensor.depth.near), far + half, 3)
     # The middle of the frame, where the object is: the metric divides by the length of the ray.
     sigma = [wall_metrics(stage, z, 0.3, seed).sub_pixel for z in walls.tolist()]
-    count = 5 if quick else 16
+    count = _VIEWS[quick]
     parts = []
     for index in range(count):
         distance = near + (far - near) * (index + 0.5) / count

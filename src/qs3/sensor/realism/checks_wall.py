@@ -30,23 +30,37 @@ def distances(sensor: Sensor, count: int) -> list[float]:
     return [float(z) for z in np.geomspace(near, max(sensor.depth.far / 2, 1.2 * near), count)]
 
 
-def wall_region(sensor: Sensor, distance: float, share: float = 0.8) -> Region:
-    """The middle of what can be measured of a wall: right of the left band f·b/z."""
+def wall_region(
+    sensor: Sensor, distance: float, share: float = 0.8, high: float | None = None
+) -> Region:
+    """The middle of what can be measured of a wall: right of the left band f·b/z.
+
+    Args:
+        sensor: The sensor.
+        distance: Of the wall.
+        share: Share of the columns.
+        high: Share of the rows; ``share`` by default.
+    """
     left = int(np.ceil(sensor.rig.disparity(distance)))
     if sensor.matching.left_band == "opencv":
         left = sensor.matching.num_disparities + sensor.matching.block_size // 2
-    return central(sensor.rig, share, share, left)
+    return central(sensor.rig, share, share if high is None else high, left)
 
 
-def shoot_wall(stage: Stage, distance: float, share: float, seed: int) -> Shot:
-    """Photograph a facing wall."""
-    return stage.shoot([painted(wall(distance))], wall_region(stage.sensor, distance, share), seed)
+def shoot_wall(
+    stage: Stage, distance: float, share: float, seed: int, high: float | None = None
+) -> Shot:
+    """Photograph a facing wall; the other arguments are those of `wall_region`."""
+    region = wall_region(stage.sensor, distance, share, high)
+    return stage.shoot([painted(wall(distance))], region, seed)
 
 
 # T1
 
 
-def wall_metrics(stage: Stage, distance: float, share: float, seed: int) -> PlaneMetrics:
+def wall_metrics(
+    stage: Stage, distance: float, share: float, seed: int, high: float | None = None
+) -> PlaneMetrics:
     """The plane metrics of a facing wall, whatever disparity it happens to have.
 
     Noise is the greatest half way between two whole disparities, and rounding to steps adds none
@@ -57,7 +71,7 @@ def wall_metrics(stage: Stage, distance: float, share: float, seed: int) -> Plan
     middle, seen = float(stage.rig.disparity(distance)), []
     for offset in (-0.25, 0.25 + step / 2):
         z = float(stage.rig.disparity(1.0)) / (middle + offset)
-        shot = shoot_wall(stage, z, share, seed)
+        shot = shoot_wall(stage, z, share, seed, high)
         seen.append(plane_metrics(shot.depth, stage.rig, shot.region, z))
     return averaged(seen)
 
@@ -84,7 +98,8 @@ def noise(stage: Stage, seed: int, quick: bool) -> Plain:
     """T1: photograph walls over the working range."""
     sweep, seen = distances(stage.sensor, 4 if quick else 8), []
     for index, z in enumerate(sweep):
-        seen.append(wall_metrics(stage, z, 0.3 if quick else 0.8, seed + index))
+        # Few rows will do, few columns not: the metric falls with the length of the ray.
+        seen.append(wall_metrics(stage, z, 0.8, seed + index, 0.25 if quick else 0.8))
     return result("T1", *noise_rows(sweep, seen))
 
 
