@@ -94,9 +94,13 @@ def _fitted(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]
 
 
 def sheet(sensor: Sensor) -> UInt8[np.ndarray, "h w 3"]:
-    """Three rows: materials and scenes as ``sensor`` sees them, and all presets."""
+    """Three rows: materials in a room and scenes as ``sensor`` sees them, and all presets."""
     rows = [
-        [cell(name, dataclasses.replace(sensor, material=m)) for name, m in MATERIALS.items()],
+        # In a room: of a mirror or a pane that stands alone there is nothing to be seen.
+        [
+            cell(name, dataclasses.replace(sensor, material=material), "room")
+            for name, material in MATERIALS.items()
+        ],
         [cell(name, sensor, name) for name in _SCENES],
         [cell(name, preset) for name, preset in SENSORS.items()],
     ]
