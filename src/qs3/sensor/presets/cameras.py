@@ -47,15 +47,16 @@ _IMAGER = ExposureSettings(
 )
 
 # Our choice, from optics and to land where TUNING says that walls lie, 0.05 to 0.1 px: a laser's
-# coherent speckle on pixels of 3 µm at f/2.0 (DATASHEET) and 850 nm, whose grains measure
-# (0.85 µm · 2)² = 2.9 µm², 3.1 of them a pixel in each of two polarisations: shape 6 to 8.
+# coherent speckle on pixels of 3 µm (the imager's maker) at f/2.0 (DATASHEET) and 850 nm, whose
+# grains measure (0.85 µm · 2)² = 2.9 µm², 3.1 of them a pixel in each of two polarisations: shape
+# 6 to 8.
 _D4_IMAGER = dataclasses.replace(_IMAGER, speckle=7.0)
 
 # TUNING and Intel's page on subpixel linearity: 128 disparities in steps of 1/32 px; the left band
 # is as wide as the disparity. Our choice: ZNCC in place of the ASIC's census and semi-global
 # matching, which in OpenCV's form locks to whole pixels on spots. A block of 17 is the smallest
 # that sees three spots nearly everywhere: on a wall it fills 100 %, one of 13 98 %. With 19 the
-# noise of slanted faces stays within a quarter of a facing wall's (`qs3 realism`, T10).
+# noise of slanted faces stays nearer to a facing wall's (`qs3 realism`, T10).
 _D4 = MatchingSettings(
     method="zncc",
     num_disparities=128,
@@ -104,11 +105,6 @@ D455 = dataclasses.replace(
     description="RealSense D455: global shutter, wide, long baseline",
     # DATASHEET: 95 mm. Our choice: the D435's optics at 848×480, the projector half way.
     rig=StereoRig(848, 480, 430.0, 0.095, projector_offset=0.5),
-    # Our choice: a longer baseline makes disparity steeper on slanted faces, and noisier there.
-    # With spots of 2.5 px and a shape of 5 it stays within a quarter of a facing wall's, on the
-    # whole (`qs3 realism`, T10); the wall's own rises to 0.09 px.
-    pattern=dataclasses.replace(_WIDE_SPOTS, spot_size=0.8),
-    exposure=dataclasses.replace(_D4_IMAGER, speckle=5.0),
     # f·b/110, as the D435's min-Z is.
     depth=DepthSettings(near=0.37, far=6.0, stride=_STRIDE),
     placement=Placement(radius=(1.2, 2.4)),
