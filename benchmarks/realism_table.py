@@ -211,7 +211,7 @@ def walls_table(samples: int, seed: int) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folders", nargs="*", type=Path, help="of qs3 realism, one a column")
     parser.add_argument("--walls", action="store_true", help="measure the walls anew")
     parser.add_argument("--samples", type=int, default=MitsubaRenderer.samples)
