@@ -28,7 +28,8 @@ class CameraOptions:
     image_noise: float | None = None
     """Gaussian noise of the images in grey levels of 255; default by sensor."""
     matching: Literal["opencv-bm", "zncc"] | None = None
-    """OpenCV's block matching, or our own of twice the precision; default by sensor."""
+    """OpenCV's block matching, or our own, twice as precise where images are not grainy; default by
+    sensor."""
     bias_correction: bool = False
     """Take off the 1/32 px by which OpenCV's block matching rounds up."""
     pattern: Path | None = None
