@@ -323,7 +323,14 @@ def worker_of(pid: int) -> int:
     raise AssertionError("no worker was started")
 
 
-SCAN = ("-m", "qs3", "scan", "chair", "--renderer", "cycles", "--out")
+# A shell that starts the tests in the background has its children ignore Ctrl-C: undone here.
+CODE = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from qs3.cli import main
+main()
+"""
+SCAN = ("-c", CODE, "scan", "chair", "--renderer", "cycles", "--out")
 LINUX = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="reads /proc of Linux")
 
 
@@ -342,7 +349,10 @@ def test_ctrl_c_leaves_neither_worker_nor_traceback(stub_bpy):
     parent = start(*SCAN, str(stub_bpy / "out"))
     worker = worker_of(parent.pid)
     os.killpg(parent.pid, signal.SIGINT)
-    _, talk = parent.communicate(timeout=20)
+    try:
+        _, talk = parent.communicate(timeout=60)
+    finally:
+        parent.kill()
     assert parent.returncode == 130
     assert "Traceback" not in talk
     assert "stopped" in talk

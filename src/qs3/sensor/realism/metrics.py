@@ -49,7 +49,7 @@ def fit_plane(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"],
 
     Example:
         >>> normal, offset = fit_plane(np.array([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [1, 1, 2]]))
-        >>> normal.round(6).tolist(), round(offset, 6)
+        >>> np.abs(normal).round(6).tolist(), round(offset, 6)
         ([0.0, 0.0, 1.0], 2.0)
     """
     centre = points.mean(axis=0)
