@@ -27,6 +27,8 @@ class RaggedClouds:
     """Index into ``class_names``, where the files tell."""
     class_names: tuple[str, ...] = ()
     """Names as the files have them."""
+    splits: tuple[str, ...] = ()
+    """Split of each cloud (``train``, ``test`` or empty), where the files tell."""
 
     def labelled(
         self, num_points: int | None, class_names: Sequence[str] | None, where: str

@@ -1,0 +1,1 @@
+"""Readers and writers of the data sets of this field, one file a layout."""
