@@ -83,6 +83,13 @@ def holds_something(path: Path) -> bool:
     return path.is_dir() and any(not _LEFT_OVER.match(entry.name) for entry in path.iterdir())
 
 
+def remove_left_overs(path: Path) -> None:
+    """Remove what interrupted writes left in a folder; nobody else may be writing there."""
+    for entry in Path(path).iterdir():
+        if _LEFT_OVER.match(entry.name) and entry.is_file():
+            entry.unlink()
+
+
 def claim_folder(path: Path, marker: str) -> Path:
     """Return ``path`` as an output folder: made if absent, accepted if empty or ours.
 

@@ -177,7 +177,7 @@ def test_a_folder_without_manifest_and_another_schema_are_refused(fake, tmp_path
         open_dataset(tmp_path)
     make(tmp_path, fake)
     path = tmp_path / MANIFEST
-    path.write_text(path.read_text().replace('"schema": 2', '"schema": 7'))
+    path.write_text(path.read_text().replace('"schema": 3', '"schema": 7'))
     with pytest.raises(InputError, match="schema 7"):
         open_dataset(tmp_path)
 
@@ -200,7 +200,7 @@ def test_a_data_set_of_schema_1_still_reads(fake, tmp_path):
     old = pq.read_table(shard_path(tmp_path, 0)).drop_columns(["drawn"])
     pq.write_table(old, shard_path(tmp_path, 0))
     manifest = tmp_path / MANIFEST
-    manifest.write_text(manifest.read_text().replace('"schema": 2', '"schema": 1'))
+    manifest.write_text(manifest.read_text().replace('"schema": 3', '"schema": 1'))
     assert open_dataset(tmp_path).schema == 1
     np.testing.assert_array_equal(read_store(tmp_path).points, [row.points for row in made])
     assert read_shard(shard_path(tmp_path, 0), ["drawn", "id"])["drawn"].to_pylist() == ["{}"] * 4

@@ -1,48 +1,42 @@
 """The log of scans that failed: ``failures.jsonl`` beside the shards, one record a line."""
 
 import json
-from collections.abc import Mapping, Set
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from qs3.datasets.storage import Folder, open_folder
 from qs3.errors import InputError
-from qs3.files import write_text
 
 FAILURES = "failures.jsonl"
 
 
-def log_failure(folder: Path, record: Mapping[str, Any]) -> None:
-    """Append one record; ``id`` and ``shard`` are needed to read and to forget it."""
-    with (folder / FAILURES).open("a", encoding="utf-8") as handle:
-        handle.write(json.dumps(record, ensure_ascii=False) + "\n")
-
-
-def forget_failures(folder: Path, shards: Set[int]) -> None:
-    """Drop the failures of shards that are scanned again, and a line that was cut off."""
-    path = folder / FAILURES
-    if not path.is_file():
+def write_failures(folder: Folder, records: Iterable[Mapping[str, Any]]) -> None:
+    """Write the log anew, whole, in the order of shards and rows; an empty one is removed."""
+    ordered = sorted(records, key=lambda record: (record["shard"], record["row"], record["id"]))
+    if not ordered:
+        folder.remove(FAILURES)
         return
-    kept = []
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-        try:
-            if json.loads(line)["shard"] not in shards:
-                kept.append(line + "\n")
-        except (json.JSONDecodeError, KeyError, TypeError):
-            continue
-    write_text(path, "".join(kept))
+    lines = [json.dumps(record, ensure_ascii=False) + "\n" for record in ordered]
+    folder.write(FAILURES, "".join(lines).encode("utf-8"))
 
 
-def read_failures(folder: Path) -> list[dict[str, Any]]:
+def read_failures(where: str | Path | Folder) -> list[dict[str, Any]]:
     """Return the objects that could not be scanned, one record each, in the order of the ids.
+
+    A record has ``id``, ``object``, ``scan``, ``class_name``, ``shard``, ``row`` (in its shard),
+    ``error`` and ``reason``.
 
     Raises:
         InputError: where the log is damaged.
     """
-    path = Path(folder) / FAILURES
-    if not path.is_file():
+    folder = open_folder(where)
+    if not folder.exists(FAILURES):
         return []
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-        return sorted((json.loads(line) for line in lines), key=lambda record: record["id"])
-    except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: damaged ({error}); delete it") from error
+        lines = folder.read(FAILURES).decode("utf-8").splitlines()
+        records = sorted((json.loads(line) for line in lines), key=lambda record: record["id"])
+        # Logs of earlier versions have no row.
+        return [{"row": 0, **record, "shard": int(record["shard"])} for record in records]
+    except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{folder}/{FAILURES}: damaged ({error}); delete it") from error

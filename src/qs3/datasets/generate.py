@@ -1,35 +1,49 @@
 """Scan a list of meshes into a data set: resumable, in parallel, and the same every time.
 
-The work list (objects × scans, in fixed order) is cut into shards of a fixed number of rows. A
-shard is written when all its scans are done; a finished shard is never touched again, so that a
-run that was stopped goes on where it was. An object that fails is logged and absent.
+The work list (objects × scans, in fixed order) is cut into shards of a fixed number of rows. The
+process that makes a scan writes it down at once (`qs3.datasets.parts`); a shard is put together
+when all its scans are there. An object that fails is logged and absent.
 """
 
-import contextlib
-import dataclasses
 import functools
-import hashlib
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from tqdm import tqdm
 
-from qs3.datasets.classes import map_labels
-from qs3.datasets.executors import Failure, run_ordered
-from qs3.datasets.failures import forget_failures, log_failure
+from qs3.datasets.executors import Executor, Failure, InlineExecutor, LocalExecutor
+from qs3.datasets.executors.executor import stop_if_fatal
+from qs3.datasets.failures import read_failures, write_failures
+from qs3.datasets.manifest import (
+    MANIFEST,
+    finished_shards,
+    read_sums,
+    shard_name,
+    write_manifest,
+    write_sums,
+)
+from qs3.datasets.parts import (
+    PARTS,
+    Place,
+    finish_shard,
+    part_folder,
+    parts_there,
+    read_failure,
+    scan_to_part,
+    write_failure,
+)
+from qs3.datasets.plan import Plan, make_plan, resolve_renderer
+from qs3.datasets.plan import work_list_checksum as work_list_checksum
 from qs3.datasets.scan_item import GenerateSettings as GenerateSettings
 from qs3.datasets.scan_item import Item as Item
-from qs3.datasets.scan_item import neighbour_of, row_id
+from qs3.datasets.scan_item import neighbour_of
 from qs3.datasets.scan_item import scan_item as scan_item
 from qs3.datasets.scan_item import scan_seed as scan_seed
-from qs3.datasets.shards import CloudRow, write_shard
-from qs3.datasets.store import MANIFEST, Manifest, shard_path, write_manifest
-from qs3.datasets.versions import package_versions
+from qs3.datasets.shards import CloudRow
+from qs3.datasets.storage import Folder, open_folder
 from qs3.errors import InputError
-from qs3.files import claim_folder, sha256
 
 
 @dataclass(frozen=True)
@@ -39,124 +53,206 @@ class GenerateReport:
     done: int
     """Scanned and written by this call."""
     skipped: int
-    """In shards that were finished before."""
+    """Finished before."""
     failed: int
     """Failed in this call; each is in ``failures.jsonl``."""
 
 
 def generate(
     items: Sequence[Item],
-    out: Path,
+    out: str | Path,
     settings: GenerateSettings,
     *,
     scan_one: Callable[..., CloudRow] = scan_item,
     workers: int = 1,
+    timeout: float | None = None,
+    executor: Executor | None = None,
+    shard: tuple[int, int] = (0, 1),
+    retry_failed: bool = False,
     progress: bool = True,
 ) -> GenerateReport:
     """Scan every item into the data set at ``out``, going on where an earlier call stopped.
 
     The bytes of the shards depend on the items and the settings alone. Ctrl-C lets the scans
-    that are under way end, keeps the finished shards and raises ``KeyboardInterrupt``.
+    that are under way end, keeps them, and raises ``KeyboardInterrupt``.
 
     Args:
         items: Meshes, in the order of the rows.
-        out: New or empty folder, or one that the same call began.
+        out: New or empty folder, or one that the same call began; any address that fsspec knows.
         settings: Settings of the data set.
         scan_one: Makes one row; a picklable function of a module. It is handed an item, the index
             of its scan and the settings, and a second item where the scene has a neighbour.
-        workers: Processes; with 1 the work is done in this one.
+        workers: Processes of this machine; 0 does the work in this one, where a crash or a hang
+            of one scan ends or hangs the run.
+        timeout: Seconds that one scan may take in a process; None waits for ever.
+        executor: Where the work is done, in place of ``workers`` and ``timeout``.
+        shard: ``(i, n)`` makes the shards i, i + n, i + 2n … alone, for one of n machines that
+            each write into a folder of their own; `qs3.datasets.merge` puts them together.
+        retry_failed: Scan again what failed before.
         progress: Show a bar on the standard error stream.
 
     Raises:
-        InputError: where the list is empty or has equal ids, a class is unknown, or the folder
-            holds something else or a data set of other settings.
+        InputError: where the list is empty or has equal ids, a class is unknown, the folder holds
+            something else or a data set of other settings, another process writes into it, or a
+            fault lies with the machine (a missing package, a full disk) and not with an object.
     """
-    _check(items, settings, workers)
-    if scan_one is scan_item and settings.renderer is None:
-        from qs3.sensor.render.mitsuba import MitsubaRenderer
+    index, count = shard
+    if not 0 <= index < count:
+        raise InputError(f"shard {index}/{count}: the first number goes from 0 to {count - 1}")
+    if executor is None:
+        executor = InlineExecutor() if workers == 0 else LocalExecutor(workers, timeout)
+    settings = settings if scan_one is not scan_item else resolve_renderer(settings)
+    plan = make_plan(items, settings)
+    manifest = plan.manifest()
+    folder = open_folder(out)
+    folder.claim(MANIFEST)
+    with folder.locked():
+        write_manifest(folder, manifest)
+        run = _Run(plan, folder, executor, scan_one)
+        run.prepare(range(index, plan.shards, count), retry_failed)
+        text = f"{folder.name}: scans" if progress else None
+        return run.work(text)
 
-        settings = dataclasses.replace(settings, renderer=MitsubaRenderer())
-    work = _work(items, settings)
-    size = settings.rows_per_shard
-    count = -(-len(work) // size)
-    manifest = Manifest(
-        settings={**settings.as_dict(), "work_list": work_list_checksum(items)},
-        class_names=settings.classes,
-        rows=len(work),
-        shards=count,
-        versions=package_versions(),
-    )
-    folder = claim_folder(out, MANIFEST)
-    write_manifest(folder, manifest)
-    todo = [index for index in range(count) if not shard_path(folder, index).is_file()]
-    for stale in folder.glob(".shard-*.tmp.parquet"):  # a run that was killed while writing
-        stale.unlink()
-    forget_failures(folder, set(todo))
 
-    tasks = [
-        (index, row) for index in todo for row in range(size) if index * size + row < len(work)
-    ]
-    results = run_ordered(
-        functools.partial(_scan_task, scan_one, settings),
-        [work[index * size + row] for index, row in tasks],
-        workers=workers,
-        progress=f"{folder.name}: scans" if progress else None,
-    )
-    done = failed = 0
-    rows: list[CloudRow] = []
-    with contextlib.closing(results):
-        for (index, row), result in zip(tasks, results, strict=True):
-            item, scan = work[index * size + row][:2]
-            if isinstance(result, Failure):
-                failed += 1
-                record = {"id": row_id(item, scan), "object": item.id, "scan": scan}
-                record |= {"class_name": item.class_name, "shard": index}
-                log_failure(folder, record | {"error": result.kind, "reason": result.reason})
+class _Run:
+    """One call of `generate`: what is there, what is under way, what is logged."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        folder: Folder,
+        executor: Executor,
+        scan_one: Callable[..., CloudRow],
+    ) -> None:
+        self.plan, self.folder, self.executor = plan, folder, executor
+        self.scan_one = scan_one
+        self.todo: list[Place] = []
+        """Rows to scan, in order."""
+        self.missing: dict[int, set[Place]] = {}
+        """Rows that each unfinished shard waits for."""
+        self.failures: dict[Place, dict[str, Any]] = {}
+        """What failed, now or before."""
+        self.settled: set[int] = set()
+        """Shards that are put together, or all but."""
+        self.total = self.done = self.failed = 0
+
+    def prepare(self, mine: Sequence[int], retry_failed: bool) -> None:
+        """Look at what is there, and list what is to do."""
+        folder, plan = self.folder, self.plan
+        self.sums = read_sums(folder)
+        finished = self.settled = set(finished_shards(folder, plan.shards))
+        parts = parts_there(folder)
+        for record in read_failures(folder):
+            self.failures[Place(record["shard"], record["row"])] = record
+        for place, name in parts.items():
+            if name.endswith(".json"):
+                self.failures[place] = self._record(place, read_failure(folder, name))
             else:
-                rows.append(result)
-            if row == size - 1 or index * size + row == len(work) - 1:
-                write_shard(shard_path(folder, index), rows)
-                done += len(rows)
-                rows = []
-    return GenerateReport(done=done, skipped=len(work) - len(tasks), failed=failed)
+                self.failures.pop(place, None)
+        for shard in mine:
+            places = list(plan.places(shard))
+            self.total += len(places)
+            if shard in finished:
+                lost = [p for p in places if p in self.failures] if retry_failed else []
+                # Parts beside a finished shard: an earlier call was stopped before it tidied up.
+                unsettled = shard_name(shard) not in self.sums or any(
+                    place.shard == shard for place in parts
+                )
+                if not lost and not unsettled:
+                    continue
+            else:
+                lost = [p for p in places if p not in parts]
+                if retry_failed:
+                    lost = [p for p in places if p not in parts or p in self.failures]
+            self.todo += lost
+            self.missing[shard] = set(lost)
 
+    def work(self, text: str | None) -> GenerateReport:
+        """Do what is to do."""
+        skipped = self.total - len(self.todo)
+        bar = tqdm(total=self.total, initial=skipped, desc=text, disable=text is None, unit="scan")
+        with bar, self.executor:
+            try:
+                self._loop(bar)
+            except KeyboardInterrupt:
+                bar.set_description("finishing what is under way (Ctrl-C again: not even that)")
+                self.executor.drain()
+                raise
+        if not parts_there(self.folder):
+            self.folder.remove(PARTS)
+        return GenerateReport(done=self.done, skipped=skipped, failed=self.failed)
 
-def _work(items: Sequence[Item], settings: GenerateSettings) -> list[tuple[Any, ...]]:
-    """An item and the index of its scan for each row, and its neighbour where there is one."""
-    rows = [(item, scan) for item in items for scan in range(settings.scans_per_mesh)]
-    if not settings.scene.needs_neighbour:
-        return rows
-    return [(*row, neighbour_of(*row, items, settings.seed)) for row in rows]
+    def _loop(self, bar: Any) -> None:
+        waiting = iter(self.todo)
+        under_way = 0
+        for shard in [shard for shard, lost in self.missing.items() if not lost]:
+            self._submit_finish(shard)
+            under_way += 1
+        while True:
+            while under_way < self.executor.ahead and (place := next(waiting, None)) is not None:
+                self._submit_scan(place)
+                under_way += 1
+            if not under_way:
+                return
+            key, outcome = self.executor.next()
+            under_way -= 1
+            stop_if_fatal(outcome)
+            if isinstance(key, Place):
+                self._scanned(key, outcome)
+                bar.set_postfix(failed=self.failed, refresh=False)
+                bar.update()
+                if not self.missing[key.shard]:
+                    self._submit_finish(key.shard)
+                    under_way += 1
+            else:
+                self._finished(key, outcome)
 
+    def _submit_scan(self, place: Place) -> None:
+        item, scan = self.plan.work(place)
+        settings = self.plan.settings
+        others = ()
+        if settings.scene.needs_neighbour:
+            others = (neighbour_of(item, scan, self.plan.items, settings.seed),)
+        call = functools.partial(self.scan_one, item, scan, settings, *others)
+        self.executor.submit(place, scan_to_part, self.folder, place, settings.dtype, call)
 
-def _scan_task(
-    scan_one: Callable[..., CloudRow], settings: GenerateSettings, task: tuple[Any, ...]
-) -> CloudRow:
-    item, scan, *neighbour = task
-    return scan_one(item, scan, settings, *neighbour)
+    def _scanned(self, place: Place, outcome: Failure | None) -> None:
+        self.missing[place.shard].discard(place)
+        if outcome is None:
+            self.done += 1
+            self.failures.pop(place, None)
+            return
+        self.failed += 1
+        self.failures[place] = self._record(place, outcome)
+        if outcome.kind in ("ProcessDied", "Timeout"):  # it could not write this itself
+            write_failure(self.folder, place, outcome)
 
+    def _record(self, place: Place, failure: Failure) -> dict[str, Any]:
+        item, scan = self.plan.work(place)
+        return {
+            "id": self.plan.row_id(place),
+            "object": item.id,
+            "scan": scan,
+            "class_name": item.class_name,
+            "shard": place.shard,
+            "row": place.row,
+            "error": failure.kind,
+            "reason": failure.reason,
+        }
 
-def work_list_checksum(items: Sequence[Item]) -> str:
-    """SHA-256 over the names, classes, splits, shape seeds and file contents of a work list."""
-    digest = hashlib.sha256()
-    for item in items:
-        path = getattr(item, "path", None)
-        content = None if path is None else sha256(Path(path))
-        shape_seed = getattr(item, "shape_seed", None)
-        line = json.dumps([item.id, item.class_name, item.split, shape_seed, content])
-        digest.update(line.encode("utf-8") + b"\n")
-    return digest.hexdigest()
+    def _submit_finish(self, shard: int) -> None:
+        # Logged before the shard is there: afterwards nobody would ask why a row is missing.
+        self.settled.add(shard)
+        write_failures(
+            self.folder, [r for place, r in self.failures.items() if place.shard in self.settled]
+        )
+        order = [self.plan.row_id(place) for place in self.plan.places(shard)]
+        dtype = self.plan.settings.dtype
+        self.executor.submit(shard, finish_shard, self.folder, shard, dtype, order)
 
-
-def _check(items: Sequence[Item], settings: GenerateSettings, workers: int) -> None:
-    if workers < 1:
-        raise InputError(f"workers must be at least 1, not {workers}")
-    if not items:
-        raise InputError(f"{settings.meshes}: no mesh to scan")
-    seen: set[str] = set()
-    for item in items:
-        if item.id in seen:
-            raise InputError(f"{settings.meshes}: two meshes are called {item.id!r}; rename one")
-        seen.add(item.id)
-    names = sorted({item.class_name for item in items})
-    map_labels(names, np.arange(len(names)), settings.classes)
+    def _finished(self, shard: int, outcome: str | Failure) -> None:
+        if isinstance(outcome, Failure):
+            raise InputError(outcome.reason)
+        self.sums[shard_name(shard)] = outcome
+        write_sums(self.folder, self.sums)
+        self.folder.remove(part_folder(shard))

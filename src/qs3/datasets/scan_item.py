@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 import numpy as np
 
 from qs3.datasets.classes import POINTDA10, map_labels
-from qs3.datasets.shards import STATISTICS, CloudRow
+from qs3.datasets.shards import STATISTICS, CloudRow, DType
 from qs3.errors import InputError
 from qs3.sensor.surroundings import SceneSettings
 
@@ -82,6 +82,8 @@ class GenerateSettings:
     """Root of all seeds."""
     rows_per_shard: int = 64
     """Scans a shard."""
+    dtype: DType = "float32"
+    """Type of the coordinates on disk."""
 
     def __post_init__(self) -> None:
         for name in ("scans_per_mesh", "views", "num_points", "rows_per_shard"):
@@ -89,6 +91,8 @@ class GenerateSettings:
                 raise InputError(f"{name} must be at least 1, not {getattr(self, name)}")
         if self.seed < 0:
             raise InputError(f"seed must not be negative, but is {self.seed}")
+        if self.dtype not in ("float32", "float16"):
+            raise InputError(f"dtype {self.dtype!r}: choose float32 or float16")
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, the sensor's and the renderer's settings among them."""

@@ -1,11 +1,8 @@
-"""The data set that ``generate`` writes: a folder of Parquet shards and ``dataset.json``."""
+"""Reading data sets in memory: a folder of Parquet shards with its ``dataset.json``."""
 
 import collections
-import dataclasses
 import hashlib
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,140 +10,68 @@ import numpy as np
 
 from qs3.datasets.clouds import CloudKind, PointClouds
 from qs3.datasets.failures import read_failures
+from qs3.datasets.manifest import MANIFEST as MANIFEST
+from qs3.datasets.manifest import Manifest as Manifest
+from qs3.datasets.manifest import finished_shards, shard_name
+from qs3.datasets.manifest import open_dataset as open_dataset
+from qs3.datasets.manifest import shard_path as shard_path
+from qs3.datasets.manifest import write_manifest as write_manifest
 from qs3.datasets.ragged import RaggedClouds
-from qs3.datasets.shards import flat_clouds, read_shard
+from qs3.datasets.shards import STATISTICS, flat_clouds, parse_shard
+from qs3.datasets.storage import Folder, open_folder
 from qs3.datasets.transforms import stack
 from qs3.errors import InputError
-from qs3.files import read_json, sha256, write_json
-
-MANIFEST = "dataset.json"
-SCHEMA_VERSION = 2
-_READABLE = (1, 2)  # 2 has the column `drawn`
-
-
-@dataclass(frozen=True)
-class Manifest:
-    """What ``dataset.json`` says of a data set."""
-
-    settings: Mapping[str, Any]
-    """Every setting that the rows depend on, as plain values."""
-    class_names: tuple[str, ...]
-    """Classes in the order of the label."""
-    rows: int
-    """Rows planned (failed objects are absent)."""
-    shards: int
-    """Shards planned."""
-    versions: Mapping[str, str]
-    """Versions of the packages that began it."""
-    schema: int = SCHEMA_VERSION
-    """Version of the columns."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values, as in the JSON file."""
-        return {**dataclasses.asdict(self), "class_names": list(self.class_names)}
-
-
-def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Write ``dataset.json``, or accept the one that is there if its settings are the same.
-
-    Raises:
-        InputError: where the folder holds a data set of other settings; the first is named.
-    """
-    path = Path(folder) / MANIFEST
-    if path.is_file():
-        there = open_dataset(folder).as_dict()
-        wanted = json.loads(json.dumps(manifest.as_dict()))
-        for key in ("schema", "settings", "class_names", "rows", "shards"):
-            name, old, new = _difference(key, there[key], wanted[key])
-            if name:
-                raise InputError(
-                    f"{folder}: made with {name.removeprefix('settings.')} = {old}, not {new}; "
-                    "name another folder, or use the same settings"
-                )
-        return
-    write_json(path, manifest.as_dict())
-
-
-def _difference(name: str, old: Any, new: Any) -> tuple[str, Any, Any]:
-    """Name and both values of the first setting that differs; an empty name where none does."""
-    if isinstance(old, Mapping) and isinstance(new, Mapping):
-        for key in sorted({*old, *new}):
-            found = _difference(f"{name}.{key}", old.get(key), new.get(key))
-            if found[0]:
-                return found
-        return "", None, None
-    return ("", None, None) if old == new else (name, old, new)
-
-
-def open_dataset(folder: Path) -> Manifest:
-    """Read ``dataset.json``.
-
-    Raises:
-        InputError: where it is missing, damaged, or of another schema version.
-    """
-    path = Path(folder) / MANIFEST
-    if not Path(folder).is_dir() or not path.is_file():
-        raise InputError(f"{folder}: not a qs3 data set (no {MANIFEST})")
-    value = read_json(path)
-    names = {field.name for field in dataclasses.fields(Manifest)}
-    if not isinstance(value, dict) or set(value) != names:
-        raise InputError(f"{path}: not the description of a qs3 data set; generate it again")
-    if value["schema"] not in _READABLE:
-        raise InputError(
-            f"{path}: schema {value['schema']}, this version reads {SCHEMA_VERSION}; generate again"
-        )
-    return Manifest(**{**value, "class_names": tuple(value["class_names"])})
-
-
-def shard_path(folder: Path, index: int) -> Path:
-    """Return the path of shard ``index`` of a data set."""
-    return Path(folder) / f"shard-{index:05d}.parquet"
-
-
-def _finished(folder: Path, manifest: Manifest) -> list[Path]:
-    paths = (shard_path(folder, index) for index in range(manifest.shards))
-    return [path for path in paths if path.is_file()]
 
 
 def read_ragged(
-    folder: Path, cloud: CloudKind = "points", split: str | None = None, partial: bool = False
+    where: str | Path | Folder,
+    cloud: CloudKind = "points",
+    split: str | None = None,
+    partial: bool = False,
 ) -> RaggedClouds:
     """Read one kind of cloud of a data set, each in its own size.
 
     Args:
-        folder: Folder of the data set.
+        where: Folder of the data set, or the address of one.
         cloud: ``points`` (noisy), ``clean`` or ``surface``.
         split: Rows of this split only.
-        partial: Accept a data set whose generation has not finished.
+        partial: Accept a data set whose making has not finished.
 
     Raises:
         InputError: where the folder is not a data set, is unfinished or damaged, or has no such
-            rows.
+            rows or clouds.
     """
+    folder = open_folder(where)
     manifest = open_dataset(folder)
-    shards = _finished(folder, manifest)
+    shards = finished_shards(folder, manifest.shards)
     if len(shards) < manifest.shards and not partial:
         raise InputError(
             f"{folder}: unfinished, {len(shards)} of {manifest.shards} shards; run the same "
-            "generate again"
+            "command again"
         )
     ids: list[str] = []
     labels: list[int] = []
+    parts: list[str] = []
     clouds: list[np.ndarray] = []
     splits: set[str] = set()
     digest = hashlib.sha256()
-    for path in shards:
-        digest.update(bytes.fromhex(sha256(path)))
-        table = read_shard(path, ["id", "label", "split", cloud])
-        columns = (table[name].to_pylist() for name in ("id", "label", "split"))
+    for index in shards:
+        path = f"{folder}/{shard_name(index)}"
+        content = folder.read(shard_name(index))
+        digest.update(hashlib.sha256(content).digest())
+        table = parse_shard(content, path, ["id", "label", "split", cloud])
+        columns = [table[name].to_pylist() for name in ("id", "label", "split")]
+        splits.update(columns[2])
+        if cloud != "points" and len(table) and not len(table[cloud].combine_chunks().values):
+            raise InputError(f"{folder}: has no {cloud!r} clouds, only 'points'")
         scanned = flat_clouds(table, cloud, path)
         for identifier, label, part, points in zip(*columns, scanned, strict=True):
             if not 0 <= label < len(manifest.class_names):
                 raise InputError(f"{path}: label {label} of {identifier!r} has no class name")
-            splits.add(part)
             if split in (None, part):
                 ids.append(identifier)
                 labels.append(label)
+                parts.append(part)
                 clouds.append(points)
     if not clouds:
         there = ", ".join(sorted(filter(None, splits))) or "none"
@@ -158,11 +83,12 @@ def read_ragged(
         checksum=digest.hexdigest(),
         labels=np.array(labels, dtype=np.int64),
         class_names=manifest.class_names,
+        splits=tuple(parts),
     )
 
 
 def read_store(
-    folder: Path,
+    where: str | Path | Folder,
     cloud: CloudKind = "points",
     split: str | None = None,
     num_points: int | None = None,
@@ -172,28 +98,28 @@ def read_store(
     """Read one kind of cloud of a data set, all in one size.
 
     Args:
-        folder: Folder of the data set.
+        where: Folder of the data set, or the address of one.
         cloud: ``points`` (noisy), ``clean`` or ``surface``.
         split: Rows of this split only.
         num_points: Points a cloud; others are resampled. None keeps what is there.
         classes: Classes to keep, in the order of the new label; None keeps all.
-        partial: Accept a data set whose generation has not finished.
+        partial: Accept a data set whose making has not finished.
 
     Raises:
         InputError: as `read_ragged` and `transforms.stack` do, or where a class is unknown.
     """
-    ragged = read_ragged(folder, cloud, split, partial)
+    ragged = read_ragged(where, cloud, split, partial)
     names = ragged.class_names if classes is None else tuple(classes)
     if unknown := [name for name in names if name not in ragged.class_names]:
         raise InputError(
-            f"{folder}: has no class {unknown[0]!r}, only {', '.join(ragged.class_names)}"
+            f"{where}: has no class {unknown[0]!r}, only {', '.join(ragged.class_names)}"
         )
     place = np.array([names.index(n) if n in names else -1 for n in ragged.class_names])
     labels = place[ragged.labels]
     rows = np.flatnonzero(labels >= 0).tolist()
     clouds = [ragged.clouds[row] for row in rows]
     return PointClouds(
-        points=stack(clouds, num_points, str(folder)),
+        points=stack(clouds, num_points, str(where)),
         labels=labels[rows],
         class_names=names,
         ids=tuple(ragged.ids[row] for row in rows),
@@ -201,30 +127,40 @@ def read_store(
     )
 
 
-def info(folder: Path) -> dict[str, Any]:
+def info(where: str | Path | Folder) -> dict[str, Any]:
     """Count what a data set holds.
 
     Returns:
         ``rows``, ``objects``, ``rows_planned``, ``shards``, ``shards_planned``, ``failed``,
-        ``classes`` and ``splits`` (rows by name), ``points`` (smallest and largest noisy cloud),
+        ``bytes`` (of all shards), ``classes`` and ``splits`` (rows by name), ``points`` (smallest
+        and largest noisy cloud), ``statistics`` (median of each over the rows that have it),
         ``settings`` and ``versions``.
 
     Raises:
         InputError: where the folder is not a data set or a shard is damaged.
     """
+    folder = open_folder(where)
     manifest = open_dataset(folder)
     classes = dict.fromkeys(manifest.class_names, 0)
     splits: collections.Counter[str] = collections.Counter()
     objects: set[str] = set()
     sizes: list[int] = []
-    shards = _finished(folder, manifest)
-    for path in shards:
-        table = read_shard(path, ["object", "class_name", "split", "view"])
+    figures: dict[str, list[float]] = {name: [] for name in STATISTICS}
+    shards = finished_shards(folder, manifest.shards)
+    total = 0
+    for index in shards:
+        content = folder.read(shard_name(index))
+        total += len(content)
+        wanted = ["object", "class_name", "split", "points", *STATISTICS]
+        table = parse_shard(content, f"{folder}/{shard_name(index)}", wanted)
         for name in table["class_name"].to_pylist():
             classes[name] = classes.get(name, 0) + 1
         splits.update(table["split"].to_pylist())
         objects.update(table["object"].to_pylist())
-        sizes.extend(len(views) for views in table["view"])
+        offsets = table["points"].combine_chunks().offsets.to_numpy()
+        sizes.extend((np.diff(offsets) // 3).tolist())
+        for name in STATISTICS:
+            figures[name].extend(value for value in table[name].to_pylist() if value is not None)
     return {
         "rows": len(sizes),
         "rows_planned": manifest.rows,
@@ -232,9 +168,11 @@ def info(folder: Path) -> dict[str, Any]:
         "failed": len(read_failures(folder)),
         "shards": len(shards),
         "shards_planned": manifest.shards,
+        "bytes": total,
         "classes": classes,
         "splits": dict(sorted(splits.items())),
         "points": [min(sizes), max(sizes)] if sizes else [],
+        "statistics": {name: float(np.median(v)) for name, v in figures.items() if v},
         "settings": dict(manifest.settings),
         "versions": dict(manifest.versions),
     }

@@ -1,0 +1,85 @@
+"""What every executor does, and what a task that did not end well hands back."""
+
+import errno
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+from qs3.errors import InputError
+
+_STORAGE_IS_AT_FAULT = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A task that did not end well."""
+
+    kind: str
+    """Class of the exception, ``ProcessDied`` or ``Timeout``."""
+    reason: str
+    """Its message, one line."""
+    fatal: bool = False
+    """Whether every other task must fail the same way: a package is missing, the disk is full."""
+
+
+@runtime_checkable
+class Executor(Protocol):
+    """Runs calls somewhere. Used by one thread, as a context manager."""
+
+    @property
+    def ahead(self) -> int:
+        """Tasks worth handing over before the first is done."""
+        ...
+
+    def submit(self, key: Any, function: Callable[..., Any], *arguments: Any) -> None:
+        """Hand over a call; ``key`` comes back with its outcome. All must be picklable."""
+        ...
+
+    def next(self) -> tuple[Any, Any]:
+        """Wait for any call to end: its key, and its value or a `Failure`."""
+        ...
+
+    def drain(self) -> None:
+        """Let the calls under way end and drop those that wait."""
+        ...
+
+    def __enter__(self) -> "Executor":
+        """Start."""
+        ...
+
+    def __exit__(self, *exception: object) -> None:
+        """Stop at once whatever still runs."""
+        ...
+
+
+def guarded(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call, and turn an exception into a value; it would not survive pickling with any certainty.
+
+    Example:
+        >>> guarded(int, "x").kind
+        'ValueError'
+    """
+    try:
+        return function(*arguments)
+    except Exception as error:
+        return failure_of(error)
+
+
+def failure_of(error: Exception) -> Failure:
+    """Tell a fault of one object from one that no other task will be spared."""
+    lines = str(error).strip().splitlines()
+    reason = lines[0] if lines else ""
+    storage = isinstance(error, OSError) and error.errno in _STORAGE_IS_AT_FAULT
+    if storage and isinstance(error, OSError):
+        reason = error.strerror or reason
+    return Failure(type(error).__name__, reason, storage or isinstance(error, ImportError))
+
+
+def stop_if_fatal(outcome: Any) -> None:
+    """Raise what no other task will be spared.
+
+    Raises:
+        InputError: with the reason.
+    """
+    if isinstance(outcome, Failure) and outcome.fatal:
+        raise InputError(outcome.reason)

@@ -1,0 +1,105 @@
+"""The work list of a data set: which scan of which mesh belongs where, in a fixed order."""
+
+import concurrent.futures
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from qs3.datasets.classes import map_labels
+from qs3.datasets.manifest import Manifest
+from qs3.datasets.parts import Place
+from qs3.datasets.scan_item import GenerateSettings, Item, row_id
+from qs3.datasets.versions import package_versions
+from qs3.errors import InputError
+from qs3.files import sha256
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Objects × scans, cut into shards of a fixed number of rows."""
+
+    items: Sequence[Item]
+    """Meshes, in the order of the rows."""
+    settings: GenerateSettings
+    """Settings of the data set."""
+
+    @property
+    def rows(self) -> int:
+        """Scans in all."""
+        return len(self.items) * self.settings.scans_per_mesh
+
+    @property
+    def shards(self) -> int:
+        """Shards in all."""
+        return -(-self.rows // self.settings.rows_per_shard)
+
+    def places(self, shard: int) -> Iterator[Place]:
+        """Places of a shard's rows, in order."""
+        size = self.settings.rows_per_shard
+        return (Place(shard, row) for row in range(min(size, self.rows - shard * size)))
+
+    def work(self, place: Place) -> tuple[Item, int]:
+        """Return the object of a row and the index of its scan."""
+        index = place.shard * self.settings.rows_per_shard + place.row
+        item, scan = divmod(index, self.settings.scans_per_mesh)
+        return self.items[item], scan
+
+    def row_id(self, place: Place) -> str:
+        """Name of a row."""
+        return row_id(*self.work(place))
+
+    def manifest(self) -> Manifest:
+        """What ``dataset.json`` will say; reads every mesh for its checksum."""
+        return Manifest(
+            settings={**self.settings.as_dict(), "work_list": work_list_checksum(self.items)},
+            class_names=self.settings.classes,
+            rows=self.rows,
+            shards=self.shards,
+            versions=package_versions(),
+        )
+
+
+def make_plan(items: Sequence[Item], settings: GenerateSettings) -> Plan:
+    """Check a work list and resolve the renderer, once for all workers.
+
+    Raises:
+        InputError: where the list is empty or has equal ids, or a class is unknown.
+    """
+    if not items:
+        raise InputError(f"{settings.meshes}: no mesh to scan")
+    seen: set[str] = set()
+    for item in items:
+        if item.id in seen:
+            raise InputError(f"{settings.meshes}: two meshes are called {item.id!r}; rename one")
+        seen.add(item.id)
+    names = sorted({item.class_name for item in items})
+    map_labels(names, np.arange(len(names)), settings.classes)
+    return Plan(items, settings)
+
+
+def resolve_renderer(settings: GenerateSettings) -> GenerateSettings:
+    """Choose the default renderer where none is named: the same one for every worker."""
+    if settings.renderer is not None:
+        return settings
+    from qs3.sensor.render.mitsuba import MitsubaRenderer
+
+    return dataclasses.replace(settings, renderer=MitsubaRenderer())
+
+
+def work_list_checksum(items: Sequence[Item]) -> str:
+    """SHA-256 over the names, classes, splits, shape seeds and file contents of a work list."""
+    paths = [getattr(item, "path", None) for item in items]
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        contents = pool.map(lambda path: None if path is None else sha256(Path(path)), paths)
+        digest = hashlib.sha256()
+        for item, content in zip(items, contents, strict=True):
+            line = [item.id, item.class_name, item.split, content]
+            line += [getattr(item, name, None) for name in ("shape_seed", "up")]
+            line = json.dumps(line)
+            digest.update(line.encode("utf-8") + b"\n")
+    return digest.hexdigest()
