@@ -42,17 +42,23 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
     """The verbs; only what the one asked for needs is imported, so that a scan starts fast."""
+    from qs3.cli.convert import convert
     from qs3.cli.doctor import doctor
     from qs3.cli.generate import generate
     from qs3.cli.realism import realism
     from qs3.cli.scan import scan
     from qs3.cli.sensors import sensors
+    from qs3.cli.store import info, merge, verify
 
     verbs: dict[str, Callable[..., int]] = {
         "scan": scan,
         "sensors": sensors,
         "realism": realism,
         "generate": generate,
+        "merge": merge,
+        "info": info,
+        "verify": verify,
+        "convert": convert,
         "doctor": doctor,
     }
     if given and given[0] in verbs:
@@ -72,6 +78,6 @@ def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
 
     train_with_preset.__doc__ = train.__doc__
     verbs |= {"train": train_with_preset, "evaluate": evaluate, "predict": predict, "demo": demo}
-    made = ("scan", "sensors", "realism", "generate")
+    made = ("scan", "sensors", "realism", "generate", "merge", "info", "verify", "convert")
     order = (*made, "train", "evaluate", "predict", "doctor", "demo")
     return {name: verbs[name] for name in order}

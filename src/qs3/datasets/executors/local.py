@@ -171,8 +171,16 @@ def _interrupt_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+def one_thread() -> None:
+    """Let the libraries of this process, none loaded yet, use one thread: workers share cores."""
+    for name in ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM"):
+        os.environ[f"{name}_NUM_THREADS"] = "1"
+    os.environ["OPENCV_FOR_THREADS_NUM"] = "1"
+
+
 def _prepare_worker() -> None:
-    """Leave Ctrl-C to the first process, and end when it is gone."""
+    """Use one thread, leave Ctrl-C to the first process, and end when it is gone."""
+    one_thread()
     with contextlib.suppress(ValueError):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()

@@ -1,0 +1,104 @@
+"""``qs3 info``, ``qs3 verify`` and ``qs3 merge``: look after data sets that are there."""
+
+import json
+import sys
+from typing import Annotated, Any
+
+import tyro
+
+from qs3.errors import InputError
+
+_Folder = Annotated[str, tyro.conf.Positional]
+
+
+def info(folder: _Folder, as_json: bool = False) -> int:
+    """Print what a data set holds: counts, sizes, statistics of the sensor, failures.
+
+    Args:
+        folder: Folder of a data set, or an address such as s3://bucket/folder.
+        as_json: Print everything, settings and versions too, as one JSON object.
+    """
+    from qs3.datasets.failures import read_failures
+    from qs3.datasets.store import info as count
+
+    found = count(folder)
+    failures = read_failures(folder)
+    if as_json:
+        print(json.dumps({**found, "failures": failures}, indent=2, ensure_ascii=False))
+        return 0
+    for line in _lines(found):
+        print(line)
+    for record in failures[:5]:
+        print(f"  {record['id']}: {record['reason']}")
+    if len(failures) > 5:
+        print(f"  and {len(failures) - 5} more in failures.jsonl")
+    if found["shards"] < found["shards_planned"]:
+        print(f"unfinished: run the same command again to go on with {folder}", file=sys.stderr)
+    return 0
+
+
+def _lines(found: dict[str, Any]) -> list[str]:
+    planned = "" if found["rows_planned"] is None else f" of {found['rows_planned']} planned"
+    points = " to ".join(str(size) for size in dict.fromkeys(found["points"])) or "no"
+    lines = [
+        f"{found['rows']} clouds{planned}, of {found['objects']} objects",
+        f"{found['shards']} of {found['shards_planned']} shards, {found['bytes'] / 1e6:.1f} MB",
+        f"{points} points a cloud",
+        "classes: " + _counts(found["classes"]),
+    ]
+    if any(found["splits"]):
+        lines.append("splits: " + _counts(found["splits"]))
+    names = {
+        "valid_fraction": ("valid pixels of the object", "{:.1%}"),
+        "disparity_bias": ("disparity bias, px", "{:+.3f}"),
+        "disparity_sigma": ("disparity σ, px", "{:.3f}"),
+        "gross_share": ("gross errors", "{:.2%}"),
+    }
+    for name, value in found["statistics"].items():
+        label, form = names[name]
+        lines.append(f"{label} (median): {form.format(value)}")
+    sensor = found["settings"].get("sensor")
+    if isinstance(sensor, dict) and "name" in sensor:
+        lines.append(f"sensor: {sensor['name']}")
+    lines.append(f"failed: {found['failed']}")
+    return lines
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name or '(none)'} {count}" for name, count in counts.items() if count)
+
+
+def verify(folder: _Folder) -> int:
+    """Check a data set: checksums, finite points, labels, seeds, duplicates, counts.
+
+    Args:
+        folder: Folder of a data set, or an address such as s3://bucket/folder.
+    """
+    from qs3.datasets.verify import verify as look_through
+
+    faults = look_through(folder)
+    for fault in faults:
+        print(fault)
+    if faults:
+        raise InputError(f"{folder}: {len(faults)} faults, printed above")
+    print(f"{folder}: no fault", file=sys.stderr)
+    return 0
+
+
+def merge(parts: Annotated[tuple[str, ...], tyro.conf.Positional], out: str) -> int:
+    """Put the parts that `qs3 generate --shard i/n` made into one data set.
+
+    Args:
+        parts: Folders or addresses of all parts.
+        out: Folder or address of the whole; run the same command again to go on after a stop.
+    """
+    from qs3.datasets.merge import merge as put_together
+
+    report = put_together(parts, out)
+    print(out)
+    print(
+        f"{report.copied} shards copied, {report.skipped} were there before; {report.failed} scans "
+        f"had failed. Next: qs3 verify {out}",
+        file=sys.stderr,
+    )
+    return 0
