@@ -5,6 +5,7 @@ multiples of 64 pixels: a film size that changes at every image would compile a 
 """
 
 import functools
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -216,6 +217,11 @@ def _mitsuba(variant: str) -> Any:
     if mi.variant() != variant:
         mi.set_variant(variant)
         mi.set_log_level(mi.LogLevel.Error)
+        threads = os.environ.get("OMP_NUM_THREADS", "")
+        if threads.isdigit() and int(threads):  # Dr.Jit does not look at it
+            import drjit as dr
+
+            dr.set_thread_count(int(threads))
     return mi
 
 
