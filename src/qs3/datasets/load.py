@@ -1,4 +1,4 @@
-"""One door to every kind of data set: a store, a folder of point files, or an archive."""
+"""One door to every kind of data set: ours, an archive, a folder, any layout that is known."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,7 +19,8 @@ def load_clouds(
     """Read labelled clouds from whatever ``source`` is.
 
     Args:
-        source: Folder written by ``generate``, folder of class folders, or npz archive.
+        source: Folder written by ``generate``, folder of class folders, npz archive, or any
+            other layout of `qs3.datasets.formats` that its names tell.
         split: Part to read; None takes all.
         num_points: Points a cloud; others are resampled. None keeps what is there.
         cloud: Which cloud of a generated data set.
@@ -58,14 +59,18 @@ def _read(source: str | Path, split: str | None, cloud: CloudKind) -> RaggedClou
         return read_ragged(path, cloud, split)
     if cloud != "points":
         raise InputError(f"{path}: only a data set made by qs3 generate has {cloud!r} clouds")
-    if path.is_dir():
-        from qs3.datasets.folder import read_folder
-
-        return read_folder(path, split)
     if path.suffix.lower() == ".npz":
         from qs3.datasets.npz import read_npz
 
         return read_npz(path, split)
-    if path.exists():
-        raise InputError(f"{path}: neither a folder nor an npz archive")
-    raise InputError(f"{path}: no such file or folder")
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder")
+    from qs3.datasets.folder import read_folder
+    from qs3.datasets.formats.detect import is_general, matching, one_of, read_as
+
+    fits = matching(path)
+    if path.is_dir() and (not fits or is_general(fits[0])):
+        return read_folder(path, split)
+    if not fits:
+        raise InputError(f"{path}: neither a folder nor an npz archive, nor any known layout")
+    return read_as(one_of(path, fits), path, split)

@@ -42,7 +42,7 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
             raise InputError(f"{path}: {name} has shape {arrays[name].shape} for {count} clouds")
     labels, names = _labels(path, arrays)
     rows = _rows(path, arrays, split, count)
-    given = arrays.get("name")
+    given, train = arrays.get("name"), arrays.get("is_train")
     ids = [f"{path.stem}/{i:05d}" for i in range(count)] if given is None else given.tolist()
     return RaggedClouds(
         clouds=[clouds[i] for i in rows],
@@ -50,6 +50,7 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
         checksum=sha256(path),
         labels=None if labels is None else labels[rows],
         class_names=names,
+        splits=() if train is None else tuple("train" if train[i] else "test" for i in rows),
     )
 
 

@@ -1,11 +1,12 @@
-"""Reader of PCD files (Point Cloud Library): ascii, binary and binary_compressed."""
+"""PCD files (Point Cloud Library): reads ascii, binary and binary_compressed, writes binary."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
+_LONGEST_HEADER = 2**20
 
 
 @dataclass(frozen=True)
@@ -44,18 +45,34 @@ def parse_pcd(content: bytes) -> Float32[np.ndarray, "n 3"]:
     return points[~np.isnan(points).any(axis=1)].astype(np.float32)
 
 
+def pcd_bytes(points: Float[np.ndarray, "n 3"]) -> bytes:
+    """Return a binary PCD file (version 0.7) of float32 x, y, z; equal points, equal bytes.
+
+    Example:
+        >>> pcd_bytes(np.zeros((2, 3))).splitlines()[-1][-24:] == bytes(24)
+        True
+    """
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\n"
+        f"TYPE F F F\nCOUNT 1 1 1\nWIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
+        f"POINTS {len(points)}\nDATA binary\n"
+    )
+    return header.encode("ascii") + np.ascontiguousarray(points, dtype="<f4").tobytes()
+
+
 def _scalar(column: np.ndarray) -> np.ndarray:
     return column.reshape(len(column), -1)[:, 0].astype(np.float64)
 
 
 def _header(content: bytes) -> tuple[_Header, bytes]:
     fields: dict[str, list[str]] = {}
-    rest = content
+    position = 0
     while "DATA" not in fields:
-        line, newline, rest = rest.partition(b"\n")
-        if not newline:
+        end = content.find(b"\n", position, _LONGEST_HEADER)
+        if end < 0:
             raise ValueError("not a PCD file: no DATA line")
-        words = line.decode("ascii", errors="replace").split()
+        words = content[position:end].decode("ascii", errors="replace").split()
+        position = end + 1
         if words and not words[0].startswith("#"):
             fields[words[0].upper()] = words[1:]
     try:
@@ -64,6 +81,8 @@ def _header(content: bytes) -> tuple[_Header, bytes]:
         kinds = [_KINDS[word] for word in fields["TYPE"]]
         counts = [int(word) for word in fields.get("COUNT", ["1"] * len(names))]
         points = int(fields["POINTS"][0])
+        if points < 0 or min(counts, default=0) < 1 or min(sizes, default=0) < 1:
+            raise ValueError
         data = fields["DATA"][0]
         parts = [
             (name if name in "xyz" else f"_{index}", f"<{kind}{size}", (count,))
@@ -78,7 +97,7 @@ def _header(content: bytes) -> tuple[_Header, bytes]:
         raise ValueError("has no fields x, y and z")
     if data not in ("ascii", "binary", "binary_compressed"):
         raise ValueError(f"DATA {data} is unknown; save it as binary")
-    return _Header(record, points, data), rest
+    return _Header(record, points, data), content[position:]
 
 
 def _ascii(header: _Header, body: bytes) -> np.ndarray:
@@ -130,7 +149,7 @@ def lzf_decompress(packed: bytes, size: int) -> bytes:
     result = bytearray()
     position = 0
     try:
-        while position < len(packed):
+        while position < len(packed) and len(result) <= size:
             control = packed[position]
             position += 1
             if control < 32:

@@ -1,15 +1,19 @@
 """Point clouds from single files: npy, xyz, txt, ply, pcd, off."""
 
 import io
+import math
+import warnings
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
-from qs3.datasets.pcd import parse_pcd
+from qs3.datasets.pcd import parse_pcd, pcd_bytes
+from qs3.datasets.ply import parse_ply, ply_bytes
 from qs3.errors import InputError
 
 POINT_FILES = (".npy", ".xyz", ".txt", ".ply", ".pcd", ".off")
+WRITTEN_FILES = (".npy", ".xyz", ".ply", ".pcd")
 
 
 def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np.ndarray, "n 3"]:
@@ -44,7 +48,9 @@ def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np
         elif suffix in (".xyz", ".txt"):
             points = _text(content)
         else:
-            points = _trimesh(content, suffix[1:], mesh_points, seed)
+            points = parse_ply(content) if suffix == ".ply" else None
+            if points is None:
+                points = _trimesh(content, suffix[1:], mesh_points, seed)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:  # parsers of damaged files raise whatever they stumble over
@@ -60,18 +66,70 @@ def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np
     return points
 
 
+def cloud_bytes(points: Float[np.ndarray, "n 3"], ending: str) -> bytes:
+    r"""Return the file of a cloud: float32 coordinates that read back equal.
+
+    Args:
+        points: The cloud.
+        ending: One of ``WRITTEN_FILES``; ``.xyz`` is text, nine digits a number.
+
+    Raises:
+        InputError: where the ending is another.
+
+    Example:
+        >>> cloud_bytes(np.array([[0.1, 2, -3]], dtype=np.float32), ".xyz")
+        b'0.100000001 2 -3\n'
+    """
+    plain = np.ascontiguousarray(points, dtype="<f4")
+    if ending == ".npy":
+        buffer = io.BytesIO()
+        np.save(buffer, plain, allow_pickle=False)
+        return buffer.getvalue()
+    if ending == ".xyz":
+        return ("%.9g %.9g %.9g\n" * len(plain) % tuple(plain.ravel().tolist())).encode("ascii")
+    if ending == ".ply":
+        return ply_bytes(plain)
+    if ending == ".pcd":
+        return pcd_bytes(plain)
+    raise InputError(f"{ending}: cannot be written; known are {', '.join(WRITTEN_FILES)}")
+
+
 def _npy(content: bytes) -> np.ndarray:
-    array = np.load(io.BytesIO(content), allow_pickle=False)
-    if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
+    handle = io.BytesIO(content)
+    version = np.lib.format.read_magic(handle)
+    readers = {(1, 0): np.lib.format.read_array_header_1_0}
+    readers[2, 0] = np.lib.format.read_array_header_2_0
+    if version not in readers:
+        raise InputError(f"npy version {version[0]}.{version[1]} holds no plain numbers")
+    shape, _, kind = readers[version](handle)
+    if kind.hasobject:
+        raise ValueError("holds pickled objects, which are never loaded")
+    if len(shape) != 2 or shape[1] < 3 or kind.kind not in "fiu":
         raise InputError(
-            f"needs numbers of shape [n, 3] or more columns, not {array.dtype} of shape "
-            f"{list(array.shape)}"
+            f"needs numbers of shape [n, 3] or more columns, not {kind} of shape {list(shape)}"
         )
-    return array[:, :3]
+    size, there = math.prod(shape) * kind.itemsize, len(content) - handle.tell()
+    if size > there:
+        raise InputError(f"cannot be read as npy (announces {size} bytes, but has {there})")
+    handle.seek(0)
+    return np.load(handle, allow_pickle=False)[:, :3]
 
 
 def _text(content: bytes) -> np.ndarray:
     """Rows of numbers apart by spaces or commas; ``#`` begins a comment."""
+    try:
+        # Ten times as fast; whatever it does not take is told line by line.
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            rows = np.loadtxt(io.BytesIO(content), ndmin=2, encoding="utf-8")
+        if rows.shape[1] >= 3:
+            return rows[:, :3]
+    except (ValueError, UserWarning):
+        pass
+    return _lines(content)
+
+
+def _lines(content: bytes) -> np.ndarray:
     rows: list[list[float]] = []
     columns = 0
     for number, line in enumerate(content.decode("utf-8").splitlines(), start=1):

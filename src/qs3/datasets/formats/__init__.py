@@ -1,1 +1,16 @@
 """Readers and writers of the data sets of this field, one file a layout."""
+
+from qs3.datasets.formats import archive, graspnet, point_folders, store_format, xyz_trees
+from qs3.datasets.formats.format import Format as Format
+
+FORMATS: dict[str, Format] = {
+    layout.name: layout
+    for layout in (
+        store_format.FORMAT,
+        *xyz_trees.FORMATS,
+        *graspnet.FORMATS,
+        *point_folders.FORMATS,
+        archive.FORMAT,
+    )
+}
+"""Every layout by its name; the imports that weigh happen where a layout is read or written."""
