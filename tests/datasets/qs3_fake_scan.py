@@ -1,8 +1,11 @@
 """Meshes and scans that cost nothing; a module of its own so that worker processes can load it."""
 
+import ctypes
 import os
+import signal
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -75,3 +78,32 @@ class Interrupting:
 def slow_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
     time.sleep(0.05)
     return fake_row(item, scan, settings)
+
+
+def hanging_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    """Hang in C with the interpreter locked, as a parser written in C does."""
+    if item.id.startswith("bad"):
+        ctypes.PyDLL(None).sleep(600)
+    return fake_row(item, scan, settings)
+
+
+def crashing_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    if item.id.startswith("bad"):
+        os.kill(os.getpid(), signal.SIGSEGV)
+    return fake_row(item, scan, settings)
+
+
+def marked_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    """Fail as long as the file is there that QS3_FAKE_MARKER names."""
+    if item.id.startswith("bad") and Path(os.environ["QS3_FAKE_MARKER"]).exists():
+        raise ValueError(f"{item.id} is broken")
+    return fake_row(item, scan, settings)
+
+
+def crash_once_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    """Take the process along the first time that a bad item is scanned."""
+    marker = Path(os.environ["QS3_FAKE_MARKER"])
+    if item.id.startswith("bad") and not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return slow_row(item, scan, settings)

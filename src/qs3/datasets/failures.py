@@ -37,6 +37,6 @@ def read_failures(where: str | Path | Folder) -> list[dict[str, Any]]:
         lines = folder.read(FAILURES).decode("utf-8").splitlines()
         records = sorted((json.loads(line) for line in lines), key=lambda record: record["id"])
         # Logs of earlier versions have no row.
-        return [{"row": 0, **record, "shard": int(record["shard"])} for record in records]
+        return [record | {"row": int(record.get("row", 0))} for record in records]
     except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{folder}/{FAILURES}: damaged ({error}); delete it") from error

@@ -1,0 +1,420 @@
+"""Whatever happens on the way, a data set ends with the same bytes, or says why not."""
+
+import dataclasses
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qs3.datasets.executors import InlineExecutor, LocalExecutor
+from qs3.datasets.failures import read_failures
+from qs3.datasets.generate import GenerateReport, GenerateSettings, generate
+from qs3.datasets.merge import MergeReport, merge
+from qs3.datasets.store import read_store
+from qs3.datasets.verify import verify
+from qs3.errors import InputError
+
+HERE = Path(__file__).parent
+ROWS, ROWS_PER_SHARD = 48, 4
+SETTINGS = GenerateSettings(num_points=16, rows_per_shard=ROWS_PER_SHARD)
+
+SCRIPT = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from pathlib import Path
+import qs3_fake_scan as fake
+from qs3.datasets.generate import GenerateSettings, generate
+from qs3.errors import QS3Error
+if __name__ == "__main__":
+    settings = GenerateSettings(num_points=16, rows_per_shard=4)
+    work = [fake.FakeItem("bad0" if i == 9 else f"m{i}") for i in range(48)]
+    try:
+        report = generate(
+            work, Path(sys.argv[2]), settings, scan_one=getattr(fake, sys.argv[3]), workers=2,
+            progress=False,
+        )
+    except QS3Error as error:
+        print(f"qs3: {error}", file=sys.stderr)
+        sys.exit(2)
+    print(report.done, report.skipped, report.failed)
+"""
+
+
+def work(fake, bad=()):
+    return [fake.FakeItem(f"bad{i}" if i in bad else f"m{i}") for i in range(ROWS)]
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
+@pytest.fixture
+def start(tmp_path):
+    """Start a run of 48 scans of 50 ms in a process group of its own."""
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+
+    def started(out: Path, row: str = "slow_row", **how) -> subprocess.Popen:
+        command = [sys.executable, str(script), str(HERE), str(out), row]
+        how |= {"start_new_session": True, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        return subprocess.Popen(command, text=True, **how)
+
+    return started
+
+
+def rows_there(out: Path) -> int:
+    """Scans that are written down, in shards or parts."""
+    parts = list(out.glob(".parts/*/[0-9]*.parquet"))
+    return len(list(out.glob("shard-*.parquet"))) * ROWS_PER_SHARD + len(parts)
+
+
+def kill_at_random_moments(start, tmp_path, kills: int, seed: int) -> list[int]:
+    """Kill the run again and again, spread over its length, and let it end; what was there."""
+    rng = np.random.default_rng(seed)
+    out = tmp_path / "out"
+    there = []
+    for kill in range(kills):
+        process = start(out)
+        goal = int(ROWS * (kill + rng.random()) / (kills + 1))
+        deadline = time.monotonic() + 60
+        while rows_there(out) < goal and time.monotonic() < deadline:
+            time.sleep(0.002)
+        time.sleep(rng.uniform(0, 0.06))  # anywhere within a scan, a write, a shard put together
+        assert process.poll() is None, process.communicate()
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate(timeout=60)
+        there.append(rows_there(out))
+    process = start(out)
+    printed, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    done, skipped, failed = map(int, printed.split())
+    assert (done + skipped, failed) == (ROWS, 0)
+    assert skipped >= there[-1]
+    return there
+
+
+def whole(fake, tmp_path) -> dict[str, bytes]:
+    items = [fake.FakeItem("bad0" if i == 9 else f"m{i}") for i in range(ROWS)]
+    generate(items, tmp_path / "whole", SETTINGS, scan_one=fake.fake_row, workers=0, progress=False)
+    return content(tmp_path / "whole")
+
+
+def test_a_run_killed_at_five_moments_ends_the_same(fake, start, tmp_path):
+    there = kill_at_random_moments(start, tmp_path, kills=5, seed=1)
+    assert there == sorted(there)
+    assert content(tmp_path / "out") == whole(fake, tmp_path)
+
+
+@pytest.mark.slow
+def test_a_run_killed_at_twenty_moments_ends_the_same(fake, start, tmp_path):
+    there = kill_at_random_moments(start, tmp_path, kills=20, seed=2)
+    assert there == sorted(there)  # no scan that was written down was ever lost
+    assert sum(rows >= ROWS_PER_SHARD for rows in there) >= 10
+    assert content(tmp_path / "out") == whole(fake, tmp_path)
+
+
+def test_workers_end_with_the_process_that_started_them(start, tmp_path):
+    process = start(tmp_path / "out")
+    deadline = time.monotonic() + 60
+    while rows_there(tmp_path / "out") < 4 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    workers = children(process.pid)
+    assert len(workers) >= 2
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate(timeout=30)
+    while any(alive(pid) for pid in workers) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not any(alive(pid) for pid in workers)
+
+
+def test_a_worker_killed_from_outside_costs_nothing(fake, start, tmp_path):
+    process = start(tmp_path / "out")
+    deadline = time.monotonic() + 60
+    killed = 0
+    for goal in (6, 20):
+        while rows_there(tmp_path / "out") < goal and time.monotonic() < deadline:
+            time.sleep(0.01)
+        for pid in children(process.pid)[:2]:
+            if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                os.kill(pid, signal.SIGKILL)
+                killed += 1
+    printed, errors = process.communicate(timeout=120)
+    assert killed >= 2
+    assert (process.returncode, printed.split()) == (0, [str(ROWS), "0", "0"]), errors
+    assert content(tmp_path / "out") == whole(fake, tmp_path)
+
+
+def test_an_object_whose_process_dies_once_is_scanned_again(fake, start, tmp_path):
+    marker = tmp_path / "marker"
+    process = start(
+        tmp_path / "out", "crash_once_row", env=os.environ | {"QS3_FAKE_MARKER": str(marker)}
+    )
+    printed, errors = process.communicate(timeout=120)
+    assert marker.exists()
+    assert (process.returncode, printed.split()) == (0, [str(ROWS), "0", "0"]), errors
+    assert content(tmp_path / "out") == whole(fake, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("row", "kind", "reason"),
+    [
+        ("hanging_row", "Timeout", "took over 2 s"),
+        ("crashing_row", "ProcessDied", "SIGSEGV"),
+        ("deadly_row", "ProcessDied", "exit code 9"),
+    ],
+)
+def test_an_object_that_hangs_or_crashes_fails_alone(fake, tmp_path, row, kind, reason):
+    report = generate(
+        work(fake, bad=[2, 7]),
+        tmp_path / "bad",
+        SETTINGS,
+        scan_one=getattr(fake, row),
+        workers=2,
+        timeout=2.0 if kind == "Timeout" else 60.0,
+        progress=False,
+    )
+    assert report == GenerateReport(done=ROWS - 2, skipped=0, failed=2)
+    failures = read_failures(tmp_path / "bad")
+    assert [(record["id"], record["error"]) for record in failures] == [
+        ("bad2#0", kind),
+        ("bad7#0", kind),
+    ]
+    assert all(reason in record["reason"] for record in failures)
+    generate(
+        work(fake, bad=[2, 7]),
+        tmp_path / "raise",
+        SETTINGS,
+        scan_one=fake.flaky_row,
+        workers=0,
+        progress=False,
+    )
+    bad, raised = content(tmp_path / "bad"), content(tmp_path / "raise")
+    del bad["failures.jsonl"], raised["failures.jsonl"]
+    assert bad == raised
+    assert verify(tmp_path / "bad", progress=False) == []
+
+
+def test_what_failed_is_scanned_again_when_asked(fake, tmp_path, monkeypatch):
+    marker = tmp_path / "marker"
+    marker.touch()
+    monkeypatch.setenv("QS3_FAKE_MARKER", str(marker))
+
+    def run(**how):
+        return generate(
+            work(fake, bad=[0, 5, 6, 47]),
+            tmp_path / "out",
+            SETTINGS,
+            scan_one=fake.marked_row,
+            workers=0,
+            progress=False,
+            **how,
+        )
+
+    assert run() == GenerateReport(done=44, skipped=0, failed=4)
+    assert run() == GenerateReport(done=0, skipped=48, failed=0)
+    assert run(retry_failed=True) == GenerateReport(done=0, skipped=44, failed=4)
+    marker.unlink()
+    assert run(retry_failed=True) == GenerateReport(done=4, skipped=44, failed=0)
+    assert read_failures(tmp_path / "out") == []
+    generate(
+        work(fake, bad=[0, 5, 6, 47]),
+        tmp_path / "new",
+        SETTINGS,
+        scan_one=fake.fake_row,
+        workers=0,
+        progress=False,
+    )
+    assert content(tmp_path / "out") == content(tmp_path / "new")
+
+
+def test_every_state_between_two_writes_is_mended(fake, tmp_path, monkeypatch):
+    """Stop after each single write of a run with failures, and go on: always the same end."""
+    from qs3.datasets.storage import LocalFolder
+
+    class Stop(BaseException):
+        """As abrupt as a power cut."""
+
+    items = work(fake, bad=[1])[:10]
+    how = {"scan_one": fake.flaky_row, "workers": 0, "progress": False}
+    generate(items, tmp_path / "whole", SETTINGS, **how)
+    wanted = content(tmp_path / "whole")
+    write, remove = LocalFolder.write, LocalFolder.remove
+    left = [0]
+
+    def counted(change):
+        def changed(self, *arguments):
+            if left[0] == 0:
+                raise Stop
+            left[0] -= 1
+            return change(self, *arguments)
+
+        return changed
+
+    monkeypatch.setattr(LocalFolder, "write", counted(write))
+    monkeypatch.setattr(LocalFolder, "remove", counted(remove))
+    stops = 0
+    for steps in range(1, 100):
+        out = tmp_path / f"out{steps}"
+        left[0] = steps
+        try:
+            generate(items, out, SETTINGS, **how)
+        except Stop:
+            stops += 1
+        else:
+            break
+        left[0] = -1
+        generate(items, out, SETTINGS, **how)
+        assert content(out) == wanted, steps
+    assert stops > 15
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 64 KiB, where this user may mount one; else None."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(folder)]
+    try:
+        mounted = subprocess.run(command, capture_output=True, check=False).returncode == 0
+    except FileNotFoundError:
+        mounted = False
+    yield folder if mounted else None
+    if mounted:
+        subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_a_full_disk_stops_the_run_and_loses_nothing(fake, start, tmp_path, small_disk):
+    """On a small file system where one can be mounted, else under a limit of the file size."""
+    if small_disk is not None:
+        out, limit = small_disk / "out", None
+    else:
+        out = tmp_path / "out"
+
+        def limit():
+            resource.setrlimit(resource.RLIMIT_FSIZE, (12_000, 12_000))
+
+    process = start(out, "fake_row", preexec_fn=limit)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 2, errors
+    assert len(errors.strip().splitlines()) == 1
+    assert "No space left on device" in errors or "File too large" in errors
+    before = rows_there(out)
+    if small_disk is not None:
+        subprocess.run(["mount", "-o", "remount,size=4m", str(small_disk)], check=True)
+    process = start(out, "fake_row")
+    printed, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    done, skipped, failed = map(int, printed.split())
+    assert (done + skipped, failed) == (ROWS, 0)
+    assert skipped >= before > 0
+    assert content(out) == whole(fake, tmp_path)
+
+
+def test_parts_of_several_machines_merge_into_the_bytes_of_one(fake, tmp_path):
+    items = work(fake, bad=[3, 20])
+
+    def run(name, shard):
+        return generate(
+            items,
+            tmp_path / name,
+            SETTINGS,
+            scan_one=fake.flaky_row,
+            workers=0,
+            shard=shard,
+            progress=False,
+        )
+
+    run("whole", (0, 1))
+    reports = [run(f"part{i}", (i, 5)) for i in range(5)]
+    assert sum(report.done + report.failed for report in reports) == ROWS
+    parts = [tmp_path / f"part{i}" for i in range(5)]
+    with pytest.raises(InputError, match=r"2 of 12 shards are in none .* \(numbers 4, 9\)"):
+        merge(parts[:4], tmp_path / "merged", progress=False)
+    assert not (tmp_path / "merged").exists()
+    report = merge(parts, tmp_path / "merged", progress=False)
+    assert report == MergeReport(copied=12, skipped=0, failed=2)
+    assert content(tmp_path / "merged") == content(tmp_path / "whole")
+    assert merge(parts, tmp_path / "merged", progress=False).copied == 0
+    other = dataclasses.replace(SETTINGS, seed=1)
+    generate(items, tmp_path / "other", other, scan_one=fake.flaky_row, workers=0, progress=False)
+    with pytest.raises(InputError, match="seed = 1, not 0"):
+        merge([*parts, tmp_path / "other"], tmp_path / "merged", progress=False)
+    (tmp_path / "part2" / "shard-00002.parquet").write_bytes(b"PAR1")
+    with pytest.raises(InputError, match=r"part2/shard-00002\.parquet: damaged"):
+        merge(parts, tmp_path / "again", progress=False)
+
+
+@pytest.mark.parametrize("shard", [(1, 1), (-1, 2), (5, 2)])
+def test_a_part_that_is_not_there_is_refused(fake, tmp_path, shard):
+    with pytest.raises(InputError, match="shard"):
+        generate(
+            work(fake), tmp_path / "out", SETTINGS, scan_one=fake.fake_row, shard=shard, workers=0
+        )
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_runs_do_not_write_into_one_folder(fake, start, tmp_path):
+    process = start(tmp_path / "out")
+    deadline = time.monotonic() + 60
+    while rows_there(tmp_path / "out") < 1 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    second = start(tmp_path / "out")
+    _, errors = second.communicate(timeout=60)
+    assert second.returncode == 2
+    assert "another qs3 is writing" in errors
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    assert content(tmp_path / "out") == whole(fake, tmp_path)
+
+
+def test_half_precision_is_the_nearest_half(fake, tmp_path):
+    for dtype in ("float32", "float16"):
+        generate(
+            work(fake),
+            tmp_path / dtype,
+            dataclasses.replace(SETTINGS, dtype=dtype),
+            scan_one=fake.fake_row,
+            workers=0,
+            progress=False,
+        )
+    single, half = (read_store(tmp_path / dtype).points for dtype in ("float32", "float16"))
+    assert half.dtype == np.float32
+    np.testing.assert_array_equal(half, single.astype(np.float16).astype(np.float32))
+    assert verify(tmp_path / "float16", progress=False) == []
+
+
+def test_executors_refuse_numbers_out_of_range():
+    for how in ({"workers": 0}, {"workers": -1}, {"timeout": 0.0}):
+        with pytest.raises(InputError):
+            LocalExecutor(**how)
+    with InlineExecutor() as executor:
+        executor.submit("a", int, "7")
+        assert executor.next() == ("a", 7)
+
+
+def children(pid: int) -> list[int]:
+    """Processes that a process started."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                fields = (entry / "stat").read_text().rsplit(")", 1)[1].split()
+            except OSError:
+                continue
+            if int(fields[1]) == pid:
+                found.append(int(entry.name))
+    return sorted(found)
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
