@@ -42,7 +42,7 @@ def main() -> None:
         )
         plans = {
             f"source-only, {name}": TrainOptions(
-                source=options.data,
+                source=str(options.data),
                 out=options.runs / f"{name}-{seed}",
                 source_cloud=cloud,  # pyright: ignore[reportArgumentType]
                 train=settings,
@@ -51,10 +51,10 @@ def main() -> None:
         }
         for preset in ("default", "paper"):
             plans[f"QBST, S, {preset}"] = TrainOptions(
-                source=options.data,
+                source=str(options.data),
                 out=options.runs / f"qbst-{preset}-{seed}",
                 method="qbst",
-                target=options.real,
+                target=str(options.real),
                 warm_up=options.runs / f"S-{seed}",
                 preset=preset,
                 train=settings,

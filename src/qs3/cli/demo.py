@@ -149,7 +149,9 @@ def _train(folder: Path, settings: DemoSettings) -> None:
 
     run(
         TrainOptions(
-            source=folder / "source", out=folder / "source-only", train=_train_settings(settings)
+            source=str(folder / "source"),
+            out=folder / "source-only",
+            train=_train_settings(settings),
         )
     )
 
@@ -160,10 +162,10 @@ def _adapt(folder: Path, settings: DemoSettings) -> None:
 
     run(
         TrainOptions(
-            source=folder / "source",
+            source=str(folder / "source"),
             out=folder / "qbst",
             method="qbst",
-            target=folder / "target",
+            target=str(folder / "target"),
             warm_up=folder / "source-only",
             train=_train_settings(settings),
             self_training=self_training_preset(

@@ -37,7 +37,7 @@ class EvaluateOptions:
 
     run: Annotated[Path, tyro.conf.Positional]
     """Folder of a run."""
-    data: Path
+    data: str
     """Labelled clouds: a folder that qs3 generate made, a folder of class folders, an npz file."""
     split: str | None = None
     """Part of the data, such as test; all of it by default."""
@@ -72,13 +72,14 @@ def evaluate(options: Annotated[EvaluateOptions, tyro.conf.arg(name="")]) -> int
 
 def make_record(
     run: Path,
-    data: Path,
+    data: str | Path,
     split: str | None = None,
     cloud: Literal["points", "clean", "surface"] = "points",
 ) -> tuple[RunRecord, Path]:
     """Score a run and write the record into its folder ``records``."""
     from qs3.datasets import load_clouds
     from qs3.datasets.clouds import digests
+    from qs3.datasets.storage import open_folder
     from qs3.evaluation import git_commit, hardware, score, versions, write_record
     from qs3.training import load_model, predict_probabilities
 
@@ -102,7 +103,7 @@ def make_record(
         for name in ("source", "target")
     )
     assert source is not None  # noqa: S101
-    name = data.resolve().name
+    name = open_folder(data).name
     marks = _marks(told, set(digests(test.points)))
     record = RunRecord(
         method=told["method"],

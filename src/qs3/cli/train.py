@@ -20,13 +20,13 @@ RUN = "run.json"
 class TrainOptions:
     """Train a classifier on labelled clouds; with qbst, adapt it to clouds without labels."""
 
-    source: Path
+    source: str
     """Labelled clouds: a folder that qs3 generate made, a folder of class folders, an npz file."""
     out: Path
     """Folder of the run; run the same command again to go on after a stop."""
     method: Literal["source-only", "qbst"] = "source-only"
     """source-only, or quasi-balanced self-training."""
-    target: Path | None = None
+    target: str | None = None
     """Clouds of the target, for qbst; labels that lie there are dropped unused."""
     source_split: str | None = None
     """Part of the source, such as train; all of it by default."""
@@ -76,6 +76,7 @@ def train(options: Annotated[TrainOptions, tyro.conf.arg(name="")]) -> int:
 def run(options: TrainOptions) -> Any:
     """Read the data, train, and write what ``evaluate`` needs to make a record."""
     from qs3.datasets import load_clouds, load_unlabelled
+    from qs3.datasets.storage import open_folder
     from qs3.datasets.clouds import digests
     from qs3.training import fit
 
@@ -105,7 +106,7 @@ def run(options: TrainOptions) -> Any:
     )
     data = {
         "source": DataRecord(
-            options.source.resolve().name,
+            open_folder(options.source).name,
             source.checksum,
             len(source),
             options.source_split,
@@ -114,7 +115,7 @@ def run(options: TrainOptions) -> Any:
         "target": None
         if target is None or options.target is None
         else DataRecord(
-            options.target.resolve().name, target.checksum, len(target), options.target_split
+            open_folder(options.target).name, target.checksum, len(target), options.target_split
         ),
     }
     seconds = {"source": sum(epoch.seconds for epoch in result.history)}

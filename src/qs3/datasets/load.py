@@ -53,10 +53,11 @@ def load_unlabelled(
 
 def _read(source: str | Path, split: str | None, cloud: CloudKind) -> RaggedClouds:
     path = Path(source)
-    if path.is_dir() and (path / "dataset.json").is_file():
+    remote = isinstance(source, str) and "://" in source
+    if remote or (path.is_dir() and (path / "dataset.json").is_file()):
         from qs3.datasets.store import read_ragged
 
-        return read_ragged(path, cloud, split)
+        return read_ragged(source if remote else path, cloud, split)
     if cloud != "points":
         raise InputError(f"{path}: only a data set made by qs3 generate has {cloud!r} clouds")
     if path.suffix.lower() == ".npz":
