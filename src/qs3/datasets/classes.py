@@ -1,10 +1,5 @@
-"""The one table of class names and aliases, and the merging of labels.
+"""The merging of labels by the one table of class names and aliases, `qs3.meshes.class_names`."""
 
-Convention:
-    The ten classes of PointDA-10 in alphabetical order are the common tongue of all data sets.
-"""
-
-import re
 from collections.abc import Sequence
 from typing import Literal
 
@@ -12,63 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from qs3.errors import InputError
-
-POINTDA10: tuple[str, ...] = (
-    "bathtub",
-    "bed",
-    "bookshelf",
-    "cabinet",
-    "chair",
-    "lamp",
-    "monitor",
-    "plant",
-    "sofa",
-    "table",
-)
-
-_ALIASES: dict[str, tuple[str, ...]] = {
-    "bathtub": ("bath", "bath_tub", "tub"),
-    "bookshelf": ("shelf", "bookcase", "book_shelf", "shelves"),
-    "cabinet": (
-        "night_stand",
-        "nightstand",
-        "bedside_table",
-        "dresser",
-        "wardrobe",
-        "cupboard",
-        "chest_of_drawers",
-        "file_cabinet",
-        "filing_cabinet",
-    ),
-    "chair": (
-        "armchair",
-        "office_chair",
-        "swivel_chair",
-        "stool",
-        "bar_stool",
-        "barstool",
-        "bench",
-    ),
-    "lamp": ("floor_lamp", "desk_lamp", "table_lamp", "light"),
-    "monitor": ("television", "tv", "tv_monitor", "tvmonitor", "display", "screen"),
-    "plant": ("potted_plant", "pottedplant", "house_plant", "houseplant"),
-    "sofa": ("couch", "settee", "loveseat"),
-    "table": ("desk", "dining_table", "diningtable", "coffee_table", "side_table", "end_table"),
-}
-_CANONICAL = {alias: name for name, aliases in _ALIASES.items() for alias in aliases}
-
-
-def canonical(name: str) -> str:
-    """Fold case, spaces and hyphens, and replace an alias by its class of PointDA-10.
-
-    A name that is in no row of the table comes back folded.
-
-    Example:
-        >>> canonical("Night Stand"), canonical("TV-monitor"), canonical("toilet")
-        ('cabinet', 'monitor', 'toilet')
-    """
-    folded = re.sub(r"[\s_-]+", "_", name.strip().lower())
-    return _CANONICAL.get(folded, folded)
+from qs3.meshes.class_names import POINTDA10 as POINTDA10
+from qs3.meshes.class_names import canonical as canonical
 
 
 def _positions(names: Sequence[str], to: Sequence[str]) -> Int[np.ndarray, "k"]:

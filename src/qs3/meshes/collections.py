@@ -1,16 +1,18 @@
 """Lists of meshes to scan: from a folder, or drawn from the procedural shapes."""
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import trimesh
 
 from qs3.errors import InputError
 from qs3.meshes import shapes
-from qs3.meshes.loading import EXTENSIONS, load_mesh
+from qs3.meshes.loading import load_mesh
+from qs3.meshes.selections import POINTDA10_CHOICE, chosen_names, rename
+from qs3.meshes.trees import read_tree
 
 
 @dataclass(frozen=True)
@@ -20,13 +22,15 @@ class MeshItem:
     id: str
     """Name within the collection: the path below its root without ending, or shapes/<class>/<n>."""
     class_name: str
-    """Folder or shape class; empty in a flat folder."""
+    """Class by folder, synset, CSV or shape; empty in a flat folder."""
     split: str
-    """``"train"``, ``"test"``, or empty where the collection has no split."""
+    """``"train"``, ``"test"`` or another, or empty where the collection has no split."""
     path: Path | None
     """The file, or None for a procedural shape."""
     shape_seed: int | None
     """Seed of ``shapes.make``, or None for a file."""
+    up: Literal["z", "y"] | None = None
+    """Up axis of the file, or None to go by its format; see ``load_mesh``."""
 
     def load(self) -> trimesh.Trimesh:
         """Read or make the mesh.
@@ -35,7 +39,7 @@ class MeshItem:
             InputError: where the file cannot be used.
         """
         if self.path is not None:
-            return load_mesh(self.path)
+            return load_mesh(self.path, up=self.up)
         if self.shape_seed is None:
             raise InputError(f"{self.id}: has neither a file nor a shape seed")
         return shapes.make(self.class_name, self.shape_seed)
@@ -46,39 +50,40 @@ def collect(
     *,
     per_class: int = 10,
     seed: int = 0,
-    classes: Sequence[str] | None = None,
+    classes: str | Sequence[str] | None = None,
     split: str | None = None,
+    labels: str | Path | None = None,
 ) -> list[MeshItem]:
     """List the meshes of a collection, always in the same order.
 
     Args:
-        source: ``"shapes"`` for procedural draws; else a folder of one of these forms:
-            ``<root>/<class>/*.ply``, ``<root>/<class>/<train|test>/*.off`` (ModelNet), or meshes
-            lying flat in it (then without a class). Any format of ``load_mesh`` will do. A folder
-            that is itself named shapes is meant by ``./shapes``.
+        source: ``"shapes"`` for procedural draws; else a folder: ModelNet's, ShapeNet's, one
+            folder a class, or meshes lying flat in it (then without a class); see ``read_tree``.
+            Any format of ``load_mesh`` will do. A folder that is itself named shapes is meant by
+            ``./shapes``.
         per_class: Number of draws of each class; for shapes only.
         seed: Another seed gives other draws; for shapes only.
-        classes: Keep these classes only; None keeps all.
+        classes: Keep these classes only; ``"pointda10"`` keeps and renames the ten classes of
+            PointDA-10, see ``rename``; None keeps all.
         split: Keep this split only; None keeps all. Shapes have no split.
+        labels: A CSV that names the class of each mesh, and its split if there is one, see
+            ``read_labels``; meshes without a row are left out.
 
     Raises:
-        InputError: where the folder is missing or holds no mesh, a class is not in it, or a number
-            is out of range.
+        InputError: where the folder is missing or holds no mesh, a class is not in it, the CSV is
+            at fault, or a number is out of range.
 
     Example:
         >>> [item.id for item in collect("shapes", per_class=2, classes=["chair"])]
         ['shapes/chair/000000', 'shapes/chair/000001']
     """
+    names = chosen_names(classes)
     if str(source) == "shapes":
-        items = _draws(per_class, seed, classes)
+        if labels is not None:
+            raise InputError(f"labels {labels}: shapes have their own classes; leave it out")
+        items = _draws(per_class, seed, shapes.CLASSES if names == (POINTDA10_CHOICE,) else names)
     else:
-        items = _files(Path(source))
-        if classes is not None:
-            have = sorted({item.class_name for item in items})
-            for name in classes:
-                if name not in have:
-                    raise InputError(f"{source}: no class {name!r}; it has {', '.join(have)}")
-            items = [item for item in items if item.class_name in classes]
+        items = _files(Path(source), names, None if labels is None else Path(labels))
     if split is not None:
         items = [item for item in items if item.split == split]
     if not items:
@@ -102,41 +107,12 @@ def _draws(per_class: int, seed: int, classes: Sequence[str] | None) -> list[Mes
     return items
 
 
-def _files(root: Path) -> list[MeshItem]:
-    if not root.is_dir():
-        what = "is a file; name the folder that holds it" if root.exists() else "no such folder"
-        raise InputError(f"{root}: {what}")
-    found: list[tuple[Path, str, str]] = []
-    for folder in (root, *sorted(root.iterdir())):
-        name = "" if folder == root else folder.name
-        if not folder.is_dir() or name.startswith("."):
-            continue
-        found += [(path, name, "") for path in _meshes(folder)]
-        if folder != root:
-            for part in ("test", "train"):
-                found += [(path, name, part) for path in _meshes(folder / part)]
-    if not found:
-        raise InputError(
-            f"{root}: holds no mesh; expected <class>/*.ply, <class>/<train|test>/*.off "
-            f"or a flat folder ({', '.join(EXTENSIONS)})"
-        )
-    stems = Counter(path.relative_to(root).with_suffix("").as_posix() for path, _, _ in found)
-    items = []
-    for path, name, part in found:
-        below = path.relative_to(root)
-        stem = below.with_suffix("").as_posix()
-        # Two formats of one name keep their endings, or their clouds would share an id.
-        items.append(
-            MeshItem(stem if stems[stem] == 1 else below.as_posix(), name, part, path, None)
-        )
-    return sorted(items, key=lambda item: item.id)
-
-
-def _meshes(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        return []
-    return sorted(
-        path
-        for path in folder.iterdir()
-        if path.suffix.lower() in EXTENSIONS and path.is_file() and not path.name.startswith(".")
-    )
+def _files(root: Path, classes: Sequence[str] | None, labels: Path | None) -> list[MeshItem]:
+    leaves = read_tree(root, labels)
+    own = [leaf.class_name for leaf in leaves]
+    names = own if classes is None else rename(leaves, classes, str(root))
+    return [
+        MeshItem(leaf.id, name, leaf.split, root / leaf.relative, None, leaf.up)
+        for name, leaf in zip(names, leaves, strict=True)
+        if name is not None
+    ]

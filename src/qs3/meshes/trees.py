@@ -1,0 +1,192 @@
+"""Folders of meshes as others lay them out: ModelNet, ShapeNet, labels in a CSV, class folders."""
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from qs3.errors import InputError
+from qs3.meshes.class_names import MODELNET40, SHAPENET
+from qs3.meshes.labels_csv import read_labels, read_shapenet_splits
+from qs3.meshes.loading import EXTENSIONS
+from qs3.meshes.walking import MeshFile, entries, ids, is_file, walk
+
+SPLITS: tuple[str, ...] = ("train", "test", "val")
+"""Names of folders that are splits, not classes."""
+
+Layout = Literal["modelnet", "shapenet", "folders", "labels"]
+
+_SHAPENET_FILES = ("models/model_normalized.obj", "model.obj")
+
+
+@dataclass(frozen=True, slots=True)
+class Leaf:
+    """One mesh of a tree."""
+
+    id: str
+    """Path below the root without ending, as far as that is unique."""
+    relative: str
+    """Path below the root, with ``/`` on every system."""
+    class_name: str
+    """Name of the class in the tree's own words; empty where it has none."""
+    split: str
+    """Name of the split; empty where it has none."""
+    up: Literal["z", "y"] | None
+    """Up axis that the layout tells, or None."""
+    layout: Layout
+    """What the mesh was recognised as."""
+
+
+def read_tree(root: Path, labels: Path | None = None) -> list[Leaf]:
+    """List the meshes of a folder with their classes and splits, in order of their ids.
+
+    The layouts, tried in this order:
+
+    - with ``labels``: classes from the CSV, see ``read_labels``; splits too, else from folders;
+    - ShapeNetCore, told by a synset's number among the folders:
+      ``<synset>/<id>/models/model_normalized.obj`` (v2) or ``<synset>/<id>/model.obj`` (v1), with
+      splits from ``all.csv`` where that lies in the root;
+    - ModelNet, told by all meshes being ``<class>/<train|test>/<file>`` of ModelNet40's classes;
+    - any other: the first folder is the class, a folder named train, test or val anywhere is the
+      split; meshes right in the root have no class.
+
+    Convention:
+        ShapeNet's meshes are y up. A file is taken for ShapeNet's by its name alone.
+
+    Raises:
+        InputError: where there is no mesh, a folder cannot be read, the CSV is at fault, or the
+            tree lies a level higher or lower than it should.
+    """
+    if not root.is_dir():
+        what = "is a file; name the folder that holds it" if root.exists() else "no such folder"
+        raise InputError(f"{root}: {what}")
+    if labels is not None:
+        leaves = _labelled(root, labels)
+    else:
+        synsets = _synsets(root)
+        leaves = _shapenet(root, synsets) if synsets else []
+        leaves += _folders(root, walk(root, skip=synsets))
+    if not leaves:
+        raise InputError(
+            f"{root}: holds no mesh; expected <class>/*.ply, <class>/<train|test>/*.off, "
+            f"<synset>/<id>/{_SHAPENET_FILES[0]} or a flat folder ({', '.join(EXTENSIONS)})"
+        )
+    leaves.sort(key=lambda leaf: leaf.id)
+    _refuse_odd_names(root, leaves)
+    return leaves
+
+
+def _synsets(root: Path) -> frozenset[str]:
+    """Folders that are named by a synset's number, if a known one is among them."""
+    names = {e.name for e in entries(root) if re.fullmatch("[0-9]{8}", e.name)}
+    names = {name for name in names if (root / name).is_dir()}
+    return frozenset(names if names & SHAPENET.keys() else ())
+
+
+def _shapenet(root: Path, synsets: frozenset[str]) -> list[Leaf]:
+    found: dict[tuple[str, str], str] = {}
+    for synset in synsets:
+        models = [(entry.name, _model(Path(entry.path))) for entry in entries(root / synset)]
+        inside = {(synset, name): file for name, file in models if file}
+        if not inside and walk(root / synset):
+            raise InputError(
+                f"{root / synset}: named as a synset of ShapeNet, but its meshes are not "
+                f"<id>/{' or <id>/'.join(_SHAPENET_FILES)}; bring them into that form, or rename "
+                "the folder (its meshes are then taken to be z up)"
+            )
+        found |= inside
+    table = root / "all.csv"
+    splits = read_shapenet_splits(table, found.keys()) if table.is_file() else {}
+    return [
+        Leaf(
+            f"{synset}/{name}/{file}".removesuffix(".obj"),
+            f"{synset}/{name}/{file}",
+            SHAPENET.get(synset, synset),
+            splits.get((synset, name), ""),
+            "y",
+            "shapenet",
+        )
+        for (synset, name), file in found.items()
+    ]
+
+
+def _model(folder: Path) -> str | None:
+    return next((name for name in _SHAPENET_FILES if is_file(folder / name)), None)
+
+
+def _folders(root: Path, files: Sequence[MeshFile]) -> list[Leaf]:
+    paths = [file.relative.split("/") for file in files]
+    _refuse_wrong_level(root, paths)
+    is_modelnet = all(
+        len(parts) == 3 and parts[0] in MODELNET40 and parts[1] in ("train", "test")
+        for parts in paths
+    )
+    layout = "modelnet" if is_modelnet else "folders"
+    return [
+        Leaf(name, file.relative, *place, _up(file.relative), layout)
+        for name, file, place in zip(ids(files), files, _places(paths), strict=True)
+    ]
+
+
+def _labelled(root: Path, labels: Path) -> list[Leaf]:
+    files = walk(root)
+    table = read_labels(labels, root, files) if files else {}
+    places = _places([file.relative.split("/") for file in files])
+    leaves = []
+    # The ids are those of all meshes: a row more or less leaves them as they are.
+    for name, file, (_, folder_split) in zip(ids(files), files, places, strict=True):
+        if file.relative in table:
+            class_name, split = table[file.relative]
+            split = folder_split if split is None else split
+            up = _up(file.relative)
+            leaves.append(Leaf(name, file.relative, class_name, split, up, "labels"))
+    return leaves
+
+
+def _places(paths: Sequence[list[str]]) -> Iterator[tuple[str, str]]:
+    """Class and split of each path.
+
+    The first folder is the class, even one called train among cars and buses; only where all
+    first folders are splits, the class comes below them.
+    """
+    first = {parts[0] for parts in paths if len(parts) > 1}
+    split_first = first <= set(SPLITS)
+    for parts in paths:
+        folders = parts[:-1]
+        if split_first:
+            yield (folders[1] if len(folders) > 1 else ""), (folders[0] if folders else "")
+        else:
+            split = next((name for name in folders[1:] if name in SPLITS), "")
+            yield (folders[0] if folders else ""), split
+
+
+def _up(relative: str) -> Literal["y"] | None:
+    parts = relative.split("/")
+    v2 = relative.endswith("/" + _SHAPENET_FILES[0])
+    v1 = parts[-1] == _SHAPENET_FILES[1] and any(part in SHAPENET for part in parts)
+    return "y" if v1 or v2 else None
+
+
+def _refuse_wrong_level(root: Path, paths: Sequence[list[str]]) -> None:
+    """Refuse a folder around a data set, or one class of it: names would become classes."""
+    alone = len({parts[0] for parts in paths}) == 1
+    for parts in paths:
+        if len(parts) > 3 and parts[1] in SHAPENET:
+            raise InputError(f"{root}: ShapeNet lies deeper; name {root / parts[0]}")
+        if alone and len(parts) == 4 and parts[1] in MODELNET40 and parts[2] in ("train", "test"):
+            raise InputError(f"{root}: ModelNet lies deeper; name {root / parts[0]}")
+        if root.name in SHAPENET and "/".join(parts[1:]) in _SHAPENET_FILES:
+            raise InputError(
+                f"{root}: one synset of ShapeNet; name the folder that holds it, and the class "
+                f"{SHAPENET[root.name]}"
+            )
+
+
+def _refuse_odd_names(root: Path, leaves: Sequence[Leaf]) -> None:
+    """Refuse names that no table can hold."""
+    for leaf in leaves:
+        try:
+            leaf.relative.encode()
+        except UnicodeEncodeError:
+            raise InputError(f"{root}: rename {leaf.relative!a}, which is not UTF-8") from None
