@@ -107,3 +107,8 @@ def crash_once_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRo
         marker.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return slow_row(item, scan, settings)
+
+
+def slow_flaky_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    time.sleep(0.25)
+    return flaky_row(item, scan, settings)
