@@ -77,12 +77,12 @@ class CloudRow:
     """Seed of the scan."""
     points: Float[np.ndarray, "n 3"]
     """The noisy cloud."""
-    view: UInt8[np.ndarray, "n"]
-    """View that each noisy point comes from."""
+    view: UInt8[np.ndarray, "_"]
+    """View that each noisy point comes from; empty where that is not known."""
     clean: Float[np.ndarray, "m 3"]
     """Its twin from the true z-buffer."""
-    clean_view: UInt8[np.ndarray, "m"]
-    """View that each clean point comes from."""
+    clean_view: UInt8[np.ndarray, "_"]
+    """View that each clean point comes from; empty where that is not known."""
     surface: Float[np.ndarray, "s 3"]
     """Samples of the mesh's whole surface."""
     yaw: float = 0.0

@@ -109,7 +109,7 @@ def write_domain(root: Path, clouds: RaggedClouds, kind: str, camera: str) -> No
 
 
 def _detect(kind: str, cameras: tuple[str, ...], path: Path) -> bool:
-    return any((path / part / kind / camera).is_dir() for part in SPLITS for camera in cameras)
+    return all(any((path / part / kind / camera).is_dir() for part in SPLITS) for camera in cameras)
 
 
 def _read(kind: str, cameras: tuple[str, ...], path: Path, split: str | None) -> RaggedClouds:
