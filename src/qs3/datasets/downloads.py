@@ -7,7 +7,6 @@ import stat
 import urllib.error
 import urllib.request
 import zipfile
-import zlib
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -230,8 +229,13 @@ def unpack(
                 temporary.mkdir()
                 for member in tqdm(members, "unpack", unit="file", disable=None):
                     _extract(opened, member, temporary)
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
-        raise InputError(f"{archive}: not a zip archive, or damaged ({error})") from error
+    except InputError:
+        raise
+    except Exception as error:  # zipfile raises whatever it stumbles over in damaged files
+        lines = str(error).splitlines() or [type(error).__name__]
+        raise InputError(
+            f"{archive}: cannot be unpacked: not a zip archive, or damaged ({lines[0]})"
+        ) from error
     return Path(folder)
 
 
