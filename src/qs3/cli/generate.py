@@ -18,8 +18,9 @@ from qs3.errors import InputError
 class GenerateOptions:
     """Scan a folder of meshes, or the built-in shapes, into a folder of Parquet shards."""
 
-    meshes: str
-    """A folder of meshes (one folder a class), or `shapes` for the built-in ones."""
+    meshes: tuple[str, ...]
+    """Folders of meshes (one folder a class, ModelNet's or ShapeNet's tree), and `shapes` for the
+    built-in ones; several go into one data set."""
     out: str
     """Folder of the data set, or an address such as s3://bucket/folder; run the same command again
     to go on after a stop."""
@@ -91,23 +92,28 @@ def _work(options: GenerateOptions) -> tuple[Any, Any]:
 
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: must not be negative")
-    items = collect(
-        options.meshes,
-        per_class=options.per_class,
-        seed=options.seed,
-        classes=options.classes or None,
-    )
-    built_in = options.meshes == "shapes"
+    if not options.meshes:
+        raise InputError("--meshes: name a folder of meshes, or shapes for the built-in ones")
+    items = []
+    for source in options.meshes:
+        items += collect(
+            source,
+            per_class=options.per_class,
+            seed=options.seed,
+            classes=options.classes or None,
+        )
+    built_in = "shapes" in options.meshes
     names = {item.class_name for item in items}
     if "" in names:
+        flat = next(item for item in items if not item.class_name)
         raise InputError(
-            f"{options.meshes}: meshes lie flat in this folder and their classes are unknown; put "
-            "them into one folder a class"
+            f"{' '.join(options.meshes)}: {flat.id} lies flat in its folder and its class is "
+            "unknown; put the meshes into one folder a class"
         )
     sensor = options.scene.resolve_sensor(options.camera.resolve_sensor())
     settings = GenerateSettings(
         classes=_classes(names),
-        meshes="shapes" if built_in else Path(options.meshes).resolve().name,
+        meshes="+".join(s if s == "shapes" else Path(s).resolve().name for s in options.meshes),
         per_class=options.per_class if built_in else None,
         scans_per_mesh=options.scans_per_mesh,
         sensor=sensor,
