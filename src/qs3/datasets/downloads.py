@@ -21,15 +21,15 @@ _SMALL = 100 * 2**20
 
 DATASETS_PAGES: dict[str, tuple[str, str]] = {
     "pointda10": (
-        "https://github.com/canqin001/PointDAN (PointDA_data.zip on Google Drive)",
+        "https://drive.google.com/file/d/1-LfJWL5geF9h0Z2QpdTL0n4lShy8wy2J (PointDA_data.zip)",
         "modelnet/<class>/<train|test>/*.npy, shapenet/<class>/<train|test>/*.npy, scannet/*.h5",
     ),
     "modelnet10": (
-        "https://modelnet.cs.princeton.edu (ModelNet10.zip)",
+        "http://3dvision.princeton.edu/projects/2014/3DShapeNets/ModelNet10.zip",
         "<class>/<train|test>/*.off",
     ),
     "modelnet": (
-        "https://modelnet.cs.princeton.edu (ModelNet40.zip)",
+        "http://modelnet.cs.princeton.edu/ModelNet40.zip",
         "<class>/<train|test>/*.off; sampled: ply_data_train*.h5 and ply_data_test*.h5",
     ),
     "shapenet": (
@@ -57,7 +57,7 @@ DATASETS_PAGES: dict[str, tuple[str, str]] = {
         "main_split/ and main_split_nobg/ with training_objectdataset*.h5, test_objectdataset*.h5",
     ),
     "graspnetpc10": (
-        "https://github.com/Jhonve/ImplicitPCDA (GraspNetPC-10 on Google Drive)",
+        "https://drive.google.com/file/d/1VVHmsSToFMVccge-LsYJW67IS94rNxWR",
         "<train|test>/<Synthetic|Real>/<kinect|realsense>/<0-9>/*.xyz",
     ),
 }
@@ -71,8 +71,8 @@ def where_to_get(name: str) -> str:
         name: A data set, or a layout whose name begins with one, such as ``pointda10-scannet``.
 
     Example:
-        >>> where_to_get("graspnetpc10-real-kinect")[:52]
-        'get it from https://github.com/Jhonve/ImplicitPCDA ('
+        >>> where_to_get("specklenet10")[:50]
+        'get it from https://github.com/Gorilla-Lab-SCUT/QS'
     """
     key = re.sub(r"[\s_]+", "-", name.strip().lower())
     known = [known for known in DATASETS_PAGES if key.startswith(known)]

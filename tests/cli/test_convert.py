@@ -1,0 +1,111 @@
+"""``qs3 convert`` as a user types it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qs3.cli import main
+from qs3.datasets.formats import FORMATS
+from qs3.datasets.load import load_clouds
+
+
+@pytest.fixture
+def typed(capsys):
+    """Run the command in this process: exit code, standard output and error."""
+
+    def run(*arguments):
+        with pytest.raises(SystemExit) as caught:
+            main([str(argument) for argument in arguments])
+        told = capsys.readouterr()
+        return caught.value.code, told.out, told.err
+
+    return run
+
+
+@pytest.fixture
+def archive(tmp_path, rng):
+    path = tmp_path / "clouds.npz"
+    np.savez(
+        path,
+        points=rng.random((6, 9, 3)).astype(np.float32),
+        label=np.array([0, 1, 2, 0, 1, 2]),
+        class_names=np.array(["desk", "night_stand", "toilet"]),
+        is_train=np.array([True, True, True, False, False, False]),
+        name=np.array([f"thing {i}" for i in range(6)]),
+    )
+    return path
+
+
+def test_one_command_in_its_own_process_gives_a_sound_data_set(qs3, archive, tmp_path):
+    done = qs3("convert", archive, tmp_path / "a", "--to", "qs3", "--classes", "pointda10",
+               "--unmapped", "drop", "--num-points", 16)  # fmt: skip
+    assert done.stdout == f"{tmp_path / 'a'}\n"
+    assert done.stderr.splitlines() == [
+        f"4 clouds of 2 classes written as qs3. Next: qs3 train --source {tmp_path / 'a'} --out RUN"
+    ]
+    qs3("verify", tmp_path / "a")
+    assert load_clouds(tmp_path / "a", split="test", num_points=16).points.shape == (2, 16, 3)
+
+
+def test_the_list_tells_every_layout(typed):
+    code, out, _ = typed("convert", "--list")
+    assert code == 0
+    rows = [line.split() for line in out.splitlines()]
+    assert rows[0] == ["name", "read", "write", "layout"]
+    assert [row[0] for row in rows[1:]] == list(FORMATS)
+    told = {row[0]: (row[1], row[2]) for row in rows[1:]}
+    assert told["npz"] == ("yes", "no")
+    assert told["ply"] == ("yes", "yes")
+
+
+def test_from_split_and_cloud(typed, archive, tmp_path):
+    assert typed("convert", archive, tmp_path / "a", "--to", "npy", "--split", "test")[0] == 0
+    found = sorted(p.relative_to(tmp_path / "a").as_posix() for p in (tmp_path / "a").rglob("*.*"))
+    assert found == [f"{name}/test/thing_{i}.npy"
+                     for name, i in (("desk", 3), ("night_stand", 4), ("toilet", 5))]  # fmt: skip
+    code, _, err = typed("convert", tmp_path / "a", tmp_path / "b", "--to", "ply", "--from", "npy")
+    assert code == 0
+    assert err.startswith("3 clouds of 3 classes written as ply. Next: qs3 train --source ")
+
+
+def test_clouds_without_labels_are_told_so(typed, tmp_path):
+    (tmp_path / "flat").mkdir()
+    (tmp_path / "flat" / "a.xyz").write_text("1 2 3\n")
+    code, _, err = typed("convert", tmp_path / "flat", tmp_path / "b", "--to", "pcd")
+    assert code == 0
+    assert "1 clouds without labels written as pcd. Next: qs3 train --method qbst" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((), ("name what to read", "--list")),
+        (("ARCHIVE", "OUT"), ("name what to read", "--list")),
+        (("ARCHIVE", "OUT", "--to", "obj"), ("'obj'", "depthscannet10")),
+        (("ARCHIVE", "OUT", "--to", "ply", "--from", "zip"), ("'zip'", "depthscannet10")),
+        (("ARCHIVE", "OUT", "--to", "npz"), ("npz", "only read")),
+        (("ARCHIVE", "OUT", "--to", "ply", "--classes", "pointda10"), ("toilet", "--unmapped")),
+        (("ARCHIVE", "OUT", "--to", "ply", "--cloud", "clean"), ("clouds.npz", "'clean'")),
+        (("ARCHIVE", "OUT", "--to", "ply", "--num-points", "-1"), ("--num-points -1",)),
+        (("ARCHIVE", "OUT", "--to", "specklenet10"), ("toilet",)),
+        (("ARCHIVE", "ARCHIVE", "--to", "ply"), ("clouds.npz", "there already")),
+        (("missing", "OUT", "--to", "ply"), ("missing", "no such file or folder")),
+        (("missing", "OUT", "--to", "ply", "--from", "depthscannet10"),
+         ("https://github.com/Gorilla-Lab-SCUT/QS3", "expected: Scannet_single_obj_1012_new")),
+    ],
+)  # fmt: skip
+def test_each_fault_is_one_line_and_leaves_nothing(typed, archive, tmp_path, arguments, words):
+    places = {"ARCHIVE": archive, "OUT": tmp_path / "out"}
+    code, out, err = typed("convert", *[places.get(word, word) for word in arguments])
+    assert (code, out) == (2, "")
+    assert len(err.splitlines()) == 1
+    assert err.startswith("qs3: ")
+    assert all(word in err for word in words)
+    assert [path.name for path in tmp_path.iterdir()] == ["clouds.npz"]
+
+
+def test_the_page_of_layouts_names_them_all():
+    page = (Path(__file__).parents[2] / "docs" / "formats.md").read_text(encoding="utf-8")
+    for name in FORMATS:
+        assert f"`{name}`" in page, name
