@@ -281,7 +281,7 @@ def test_damaged_archives_are_one_line(tmp_path, rng):
     good = archive(tmp_path / "a.zip", [(f"{i}/a.xyz", rng.bytes(50)) for i in range(5)])
     content = good.read_bytes()
     refused = 0
-    for number in range(300):
+    for number in range(120):
         data = bytearray(content)
         for _ in range(rng.integers(1, 4)):
             data[int(rng.integers(len(data)))] = rng.integers(256)
@@ -295,7 +295,7 @@ def test_damaged_archives_are_one_line(tmp_path, rng):
             assert "\n" not in str(error)
             assert str(good) in str(error)
             assert not (tmp_path / "work" / str(number)).exists()
-    assert refused > 100
+    assert refused > 40
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zip", "work"]
 
 

@@ -34,11 +34,7 @@ def whole(path: Path) -> Iterator[Path]:
         >>> [file.name for file in target.iterdir()], len(list(target.parent.iterdir()))
         (['a.txt'], 1)
     """
-    path = Path(path).resolve()
-    if not path.name:
-        raise InputError(f"{path}: name a new folder")
-    if path.exists() and (not path.is_dir() or holds_something(path)):
-        raise InputError(f"{path}: is there already; name a new or empty folder")
+    path = check_free(path)
     hidden = path.with_name(f".{path.name}.unfinished")
     hidden.mkdir(parents=True, exist_ok=True)
     with LocalFolder(hidden).locked():
@@ -53,6 +49,18 @@ def whole(path: Path) -> Iterator[Path]:
             _sync_entry(path.parent)
         finally:
             shutil.rmtree(hidden, ignore_errors=True)
+
+
+def check_free(path: Path) -> Path:
+    """Return a path with its links followed, if it is free to write to or an empty folder.
+
+    Raises:
+        InputError: where it holds something.
+    """
+    path = Path(path).resolve()
+    if not path.name or (path.exists() and (not path.is_dir() or holds_something(path))):
+        raise InputError(f"{path}: is there already; name a new or empty folder")
+    return path
 
 
 def _clear(folder: Path) -> None:

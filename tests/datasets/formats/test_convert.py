@@ -154,6 +154,9 @@ def test_the_target_is_new_or_empty(tmp_path, source):
         with pytest.raises(InputError, match=f"{name}: is there already"):
             convert(source, tmp_path / name, "ply")
     assert (tmp_path / "full" / "mine.txt").read_text() == "keep"
+    # Before anything is read, which can take minutes.
+    with pytest.raises(InputError, match="file: is there already"):
+        convert(tmp_path / "nowhere", tmp_path / "file", "ply")
     (tmp_path / "empty").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "empty")
     convert(source, tmp_path / "link", "ply")

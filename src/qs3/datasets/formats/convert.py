@@ -14,7 +14,7 @@ from qs3.datasets.formats.detect import detect, format_named, read_as, require
 from qs3.datasets.formats.store_format import write_store
 from qs3.datasets.ragged import RaggedClouds
 from qs3.datasets.transforms import resample
-from qs3.datasets.whole import whole
+from qs3.datasets.whole import check_free, whole
 from qs3.errors import InputError
 
 _MANY = 500
@@ -55,6 +55,7 @@ def convert(
     layout = format_named(to)
     if layout.write is None:
         raise InputError(f"{to}: is only read; choose another layout to write")
+    check_free(target)
     clouds, name = read_clouds(source, origin, split, cloud)
     if classes is not None:
         clouds = _map_classes(clouds, classes, unmapped, str(source))
