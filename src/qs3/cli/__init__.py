@@ -44,6 +44,7 @@ def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
     """The verbs; only what the one asked for needs is imported, so that a scan starts fast."""
     from qs3.cli.convert import convert
     from qs3.cli.doctor import doctor
+    from qs3.cli.extract import extract
     from qs3.cli.generate import generate
     from qs3.cli.realism import realism
     from qs3.cli.scan import scan
@@ -59,6 +60,7 @@ def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
         "info": info,
         "verify": verify,
         "convert": convert,
+        "extract": extract,
         "doctor": doctor,
     }
     if given and given[0] in verbs:
@@ -79,5 +81,5 @@ def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
     train_with_preset.__doc__ = train.__doc__
     verbs |= {"train": train_with_preset, "evaluate": evaluate, "predict": predict, "demo": demo}
     made = ("scan", "sensors", "realism", "generate", "merge", "info", "verify", "convert")
-    order = (*made, "train", "evaluate", "predict", "doctor", "demo")
+    order = (*made, "extract", "train", "evaluate", "predict", "doctor", "demo")
     return {name: verbs[name] for name in order}
