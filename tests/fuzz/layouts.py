@@ -1,0 +1,155 @@
+"""A small valid data set of every layout, and the package's own way to load it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qs3.datasets.ragged import RaggedClouds
+
+CLASSES = (
+    "bathtub",
+    "bed",
+    "bookshelf",
+    "cabinet",
+    "chair",
+    "lamp",
+    "monitor",
+    "plant",
+    "sofa",
+    "table",
+)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """One layout."""
+
+    build: Callable[[Path], None]
+    """Write the valid data set into a new folder."""
+    load: Callable[[Path], Any]
+    """Load it, as the commands do."""
+    inside: str = ""
+    """What to load, below the folder."""
+
+    def path(self, folder: Path) -> Path:
+        return folder / self.inside if self.inside else folder
+
+
+def clouds(points: int = 64) -> RaggedClouds:
+    rng = np.random.default_rng(0)
+    return RaggedClouds(
+        clouds=[rng.normal(size=(points, 3)).astype(np.float32) for _ in range(6)],
+        ids=tuple(f"{CLASSES[i % 3]}/{i:03d}" for i in range(6)),
+        checksum="0" * 64,
+        labels=np.arange(6) % 3,
+        class_names=CLASSES,
+        splits=("train", "train", "train", "test", "test", "test"),
+    )
+
+
+def load_any(path: Path) -> Any:
+    from qs3.datasets.load import load_clouds
+
+    return load_clouds(path, num_points=32)
+
+
+def written_as(name: str) -> Callable[[Path], None]:
+    def build(folder: Path) -> None:
+        from qs3.datasets.formats import FORMATS
+
+        write = FORMATS[name].write
+        assert write is not None
+        write(folder, clouds(2048 if "modelnet" in name or "scanobject" in name else 64))
+
+    return build
+
+
+def read_as(name: str) -> Callable[[Path], Any]:
+    def load(path: Path) -> Any:
+        from qs3.datasets.formats.convert import read_clouds
+
+        return read_clouds(path, name, None, "points")
+
+    return load
+
+
+def layout(name: str) -> Layout:
+    return Layout(written_as(name), read_as(name))
+
+
+def build_generated(folder: Path) -> None:
+    """A data set as ``generate`` makes it, every kind of cloud filled."""
+    from qs3.datasets.manifest import Manifest, write_manifest
+    from qs3.datasets.shards import CloudRow, write_shard
+    from qs3.datasets.store import shard_path
+
+    rng = np.random.default_rng(1)
+    rows = []
+    for index in range(6):
+        points = rng.normal(size=(64, 3)).astype(np.float32)
+        view = rng.integers(0, 5, 64, dtype=np.uint8)
+        name = CLASSES[index % 3]
+        rows.append(
+            CloudRow(
+                f"m{index}#0", f"m{index}", 0, index % 3, name, "train", index, points, view,
+                points, view, points, valid_fraction=0.9,
+            )
+        )  # fmt: skip
+    folder.mkdir()
+    write_manifest(folder, Manifest({"views": 5, "seed": 0}, CLASSES, 6, 2, {"qs3": "0"}))
+    for shard in range(2):
+        write_shard(shard_path(folder, shard), rows[3 * shard : 3 * shard + 3])
+
+
+def load_generated(path: Path) -> Any:
+    from qs3.datasets.store import info, read_store
+    from qs3.datasets.verify import verify
+
+    verify(path, progress=False)
+    info(path)
+    return [read_store(path, cloud) for cloud in ("points", "clean", "surface")]
+
+
+def build_npz(folder: Path) -> None:
+    folder.mkdir()
+    given = clouds()
+    np.savez_compressed(
+        folder / "clouds.npz",
+        points=np.stack(given.clouds).astype(np.float16),
+        label=np.arange(6) % 3,
+        class_names=np.array(CLASSES),
+        is_train=np.arange(6) < 3,
+    )
+
+
+def build_meshes(ending: str) -> Callable[[Path], None]:
+    def build(folder: Path) -> None:
+        from qs3.meshes import shapes
+
+        (folder / "chair").mkdir(parents=True)
+        mesh = shapes.make("table", 0)
+        data = mesh.export(file_type=ending)
+        path = folder / "chair" / f"one.{ending}"
+        path.write_bytes(data if isinstance(data, bytes) else data.encode())
+
+    return build
+
+
+def load_meshes(path: Path) -> Any:
+    from qs3.meshes import collect
+
+    return [item.load() for item in collect(str(path))]
+
+
+LAYOUTS: dict[str, Layout] = {
+    "generated": Layout(build_generated, load_generated),
+    "npz": Layout(build_npz, load_any, "clouds.npz"),
+    **{name: layout(name) for name in ("qs3", "ply", "pcd", "npy", "xyz", "specklenet10")},
+    **{
+        f"mesh-{e}": Layout(build_meshes(e), load_meshes)
+        for e in ("off", "obj", "ply", "stl", "glb")
+    },
+}

@@ -1,0 +1,105 @@
+"""Damage to files, as disks, networks, editors and malice make it."""
+
+import re
+
+import numpy as np
+
+_NUMBERS = [
+    0,
+    1,
+    0x7F,
+    0x80,
+    0xFF,
+    0x7FFF,
+    0xFFFF,
+    2**31 - 1,
+    2**31,
+    2**32 - 1,
+    2**63 - 1,
+    2**64 - 1,
+]
+_WORDS = [
+    *(
+        b"nan",
+        b"inf",
+        b"-1",
+        b"0",
+        b"1e999",
+        b"99999999999999999999",
+        b"",
+        b"\xff\xfe",
+        b"..",
+        b"/",
+    ),
+    *(
+        b"../../etc/passwd",
+        b"null",
+        b"true",
+        b"[]",
+        b"{}",
+        b'"',
+        b"\x00",
+        b"-2147483649",
+        b"1e-400",
+    ),
+]
+
+
+def mutate(data: bytes, rng: np.random.Generator) -> bytes:
+    """Damage a file in one to three places."""
+    for _ in range(int(rng.integers(1, 4))):
+        data = _ONE[int(rng.integers(len(_ONE)))](data, rng)
+    return data
+
+
+def _place(data: bytes, rng: np.random.Generator) -> int:
+    # Headers are short and matter most: half of the hits go into the first 256 bytes.
+    end = min(256, len(data)) if rng.random() < 0.5 else len(data)
+    return int(rng.integers(max(end, 1)))
+
+
+def _flip(data: bytes, rng: np.random.Generator) -> bytes:
+    changed = bytearray(data)
+    for _ in range(int(rng.integers(1, 9))):
+        if changed:
+            changed[_place(data, rng)] ^= 1 << int(rng.integers(8))
+    return bytes(changed)
+
+
+def _number(data: bytes, rng: np.random.Generator) -> bytes:
+    at, size = _place(data, rng), int(rng.choice([1, 2, 4, 8]))
+    value = _NUMBERS[int(rng.integers(len(_NUMBERS)))] % 2 ** (8 * size)
+    order = "little" if rng.random() < 0.8 else "big"
+    return data[:at] + value.to_bytes(size, order) + data[at + size :]
+
+
+def _cut(data: bytes, rng: np.random.Generator) -> bytes:
+    return data[: int(rng.integers(len(data) + 1))]
+
+
+def _remove(data: bytes, rng: np.random.Generator) -> bytes:
+    at = _place(data, rng)
+    return data[:at] + data[at + int(rng.integers(1, 64)) :]
+
+
+def _insert(data: bytes, rng: np.random.Generator) -> bytes:
+    at = _place(data, rng)
+    return data[:at] + rng.bytes(int(rng.integers(1, 32))) + data[at:]
+
+
+def _repeat(data: bytes, rng: np.random.Generator) -> bytes:
+    at, size = _place(data, rng), int(rng.integers(1, 256))
+    return data[:at] + data[at : at + size] * 2 + data[at + size :]
+
+
+def _word(data: bytes, rng: np.random.Generator) -> bytes:
+    """Replace one number or name of a text."""
+    found = list(re.finditer(rb"[-+.\w]+", data[:65536]))
+    if not found:
+        return _flip(data, rng)
+    at = found[int(rng.integers(len(found)))]
+    word = _WORDS[int(rng.integers(len(_WORDS)))]
+    return data[: at.start()] + word + data[at.end() :]
+
+
+_ONE = [_flip, _number, _cut, _remove, _insert, _repeat, _word]
