@@ -9,11 +9,9 @@ import struct
 import zipfile
 import zlib
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import UInt8
 
 from qs3.errors import InputError
 
@@ -30,7 +28,7 @@ _ZIP_FAULTS = (
 
 
 class InstanceMasks:
-    """The masks of one scene; a context manager.
+    """The masks of one scene; to be closed after use.
 
     Members are read by their exact names and nothing is written to disk, so that names which would
     lead elsewhere do no harm.
@@ -62,15 +60,8 @@ class InstanceMasks:
         ) as error:
             raise InputError(f"{path}: cannot be read as zip ({error}); copy it again") from error
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Close the zip file."""
         self._zip.close()
 
     def read(self, frame: int) -> UInt8[np.ndarray, "h w"] | None:
@@ -138,8 +129,3 @@ def erode(mask: UInt8[np.ndarray, "h w"], radius: int) -> UInt8[np.ndarray, "h w
     window = np.ones((2 * radius + 1, 2 * radius + 1), dtype=np.uint8)
     same = cv2.erode(mask, window) == cv2.dilate(mask, window)
     return np.where(same, mask, 0).astype(np.uint8)
-
-
-def present(mask: UInt8[np.ndarray, "h w"] | Int[np.ndarray, "n"]) -> set[int]:
-    """Return the values that occur in a mask."""
-    return set(np.flatnonzero(np.bincount(mask.ravel())).tolist())

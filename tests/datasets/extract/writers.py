@@ -1,0 +1,305 @@
+"""Writers of small valid ScanNet files, and a room of boxes to fill them with.
+
+Written from the published description of the formats; nothing of the readers is used here.
+"""
+
+import json
+import struct
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from qs3.geometry import invert_rigid, look_at, transform_points
+
+LOST = np.full((4, 4), -np.inf)
+
+
+def camera_matrix(focal: float, size: tuple[int, int]) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[0, 0] = matrix[1, 1] = focal
+    matrix[0, 2], matrix[1, 2] = (size[0] - 1) / 2, (size[1] - 1) / 2
+    return matrix
+
+
+@dataclass
+class Sens:
+    """A `.sens` file to be; every field can be set to what no honest file says."""
+
+    depth: Sequence[np.ndarray]
+    poses: Sequence[np.ndarray]
+    depth_size: tuple[int, int]
+    depth_intrinsic: np.ndarray
+    color_size: tuple[int, int] = (32, 24)
+    color_intrinsic: np.ndarray = field(default_factory=lambda: camera_matrix(30.0, (32, 24)))
+    color_extrinsic: np.ndarray = field(default_factory=lambda: np.eye(4))
+    depth_extrinsic: np.ndarray = field(default_factory=lambda: np.eye(4))
+    name: bytes = b"StructureSensor"
+    version: int = 4
+    compression: int = 1
+    shift: float = 1000.0
+    announced: int | None = None
+    name_length: int | None = None
+    color: bytes = b"not a jpeg, and nobody looks"
+    tail: bytes = struct.pack("<Q", 0)
+
+    def blobs(self) -> list[bytes]:
+        plain = [np.ascontiguousarray(image, dtype="<u2").tobytes() for image in self.depth]
+        return [zlib.compress(blob, 1) for blob in plain] if self.compression == 1 else plain
+
+    def content(self, blobs: Sequence[bytes] | None = None) -> bytes:
+        blobs = self.blobs() if blobs is None else blobs
+        length = len(self.name) if self.name_length is None else self.name_length
+        parts = [struct.pack("<IQ", self.version, length), self.name]
+        for matrix in (
+            self.color_intrinsic,
+            self.color_extrinsic,
+            self.depth_intrinsic,
+            self.depth_extrinsic,
+        ):
+            parts.append(np.asarray(matrix, dtype="<f4").tobytes())
+        parts.append(struct.pack("<2i4I", 2, self.compression, *self.color_size, *self.depth_size))
+        announced = len(blobs) if self.announced is None else self.announced
+        parts.append(struct.pack("<fQ", self.shift, announced))
+        for index, (blob, pose) in enumerate(zip(blobs, self.poses, strict=True)):
+            parts.append(np.asarray(pose, dtype="<f4").tobytes())
+            parts.append(struct.pack("<4Q", index, index, len(self.color), len(blob)))
+            parts += [self.color, blob]
+        return b"".join([*parts, self.tail])
+
+    def write(self, path: Path, blobs: Sequence[bytes] | None = None) -> Path:
+        path.write_bytes(self.content(blobs))
+        return path
+
+
+def png(mask: np.ndarray) -> bytes:
+    return cv2.imencode(".png", mask)[1].tobytes()
+
+
+def write_masks(path: Path, masks: Mapping[int, np.ndarray | bytes]) -> Path:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for frame, mask in masks.items():
+            content = mask if isinstance(mask, bytes) else png(mask)
+            archive.writestr(f"instance-filt/{frame}.png", content)
+    return path
+
+
+def write_aggregation(path: Path, groups: Sequence[tuple[int, str, Sequence[int]]]) -> Path:
+    listed: list[dict[str, Any]] = [
+        {"id": number, "objectId": number, "segments": list(segments), "label": label}
+        for number, label, segments in groups
+    ]
+    path.write_text(json.dumps({"sceneId": f"scannet.{path.stem}", "segGroups": listed}))
+    return path
+
+
+def write_segments(path: Path, segments: Sequence[int]) -> Path:
+    content = {"params": {"kThresh": "0.0001"}, "sceneId": "s", "segIndices": list(segments)}
+    path.write_text(json.dumps(content))
+    return path
+
+
+def write_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
+    """As `_vh_clean_2.ply` is: float vertices with colours, faces of three ints."""
+    header = [
+        "ply", "format binary_little_endian 1.0", "comment MLIB generated",
+        f"element vertex {len(vertices)}",
+        *(f"property float {axis}" for axis in "xyz"),
+        *(f"property uchar {name}" for name in ("red", "green", "blue", "alpha")),
+        f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header",
+    ]  # fmt: skip
+    rows = np.zeros(len(vertices), dtype=[("p", "<f4", 3), ("c", "u1", 4)])
+    rows["p"] = vertices
+    rows["c"] = 200
+    corners = np.zeros(len(faces), dtype=[("n", "u1"), ("v", "<i4", 3)])
+    corners["n"], corners["v"] = 3, faces
+    text = ("\n".join(header) + "\n").encode("ascii")
+    path.write_bytes(text + rows.tobytes() + corners.tobytes())
+    return path
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned box of one object."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    object: int
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Distance of points [n 3] to its surface."""
+        outside = np.maximum(np.array(self.low) - points, points - np.array(self.high))
+        apart = np.linalg.norm(np.maximum(outside, 0), axis=1)
+        return np.where(apart > 0, apart, -outside.max(axis=1))
+
+    def grid(self, step: float = 0.02) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices over its six faces, and the face of each."""
+        points, faces = [], []
+        axes = [
+            np.linspace(low, high, max(2, round((high - low) / step) + 1))
+            for low, high in zip(self.low, self.high, strict=True)
+        ]
+        for axis in range(3):
+            others = [axes[other] for other in range(3) if other != axis]
+            a, b = (part.ravel() for part in np.meshgrid(*others, indexing="ij"))
+            for side, value in enumerate((self.low[axis], self.high[axis])):
+                face = np.insert(np.stack([a, b], axis=1), axis, value, axis=1)
+                points.append(face)
+                faces.append(np.full(len(face), 2 * axis + side))
+        return np.concatenate(points), np.concatenate(faces)
+
+
+CHAIR, FLOOR, TABLE, SINK = 0, 1, 2, 3
+LABELS = {CHAIR: "office chair", FLOOR: "floor", TABLE: "coffee table", SINK: "sink"}
+# The chair has one arm only, so that its mirror image does not fit.
+ROOM = (
+    Box((-0.90, 0.20, 0.00), (-0.40, 0.70, 0.42), CHAIR),
+    Box((-0.90, 0.60, 0.42), (-0.40, 0.70, 0.95), CHAIR),
+    Box((-0.90, 0.20, 0.42), (-0.80, 0.60, 0.65), CHAIR),
+    Box((0.30, -0.60, 0.00), (1.10, 0.00, 0.50), TABLE),
+    Box((0.20, 0.60, 0.00), (0.60, 0.90, 0.70), SINK),
+    Box((-2.50, -2.50, -0.10), (2.50, 2.50, 0.00), FLOOR),
+)
+
+
+def render(
+    boxes: Sequence[Box], matrix: np.ndarray, size: tuple[int, int], pose: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Depth along the axis in metres, 0 for none, and object id + 1 of every pixel."""
+    v, u = np.mgrid[: size[1], : size[0]].reshape(2, -1)
+    rays = np.stack([u, v, np.ones(len(u))], axis=1) @ np.linalg.inv(matrix[:3, :3]).T
+    rays, origin = rays @ pose[:3, :3].T, pose[:3, 3]
+    depth, owner = np.full(len(u), np.inf), np.zeros(len(u), dtype=np.uint8)
+    with np.errstate(divide="ignore"):
+        for box in boxes:
+            near = (np.array(box.low) - origin) / rays
+            far = (np.array(box.high) - origin) / rays
+            enter = np.minimum(near, far).max(axis=1)
+            leave = np.maximum(near, far).min(axis=1)
+            hit = (enter < leave) & (enter > 0) & (enter < depth)
+            depth[hit], owner[hit] = enter[hit], box.object + 1
+    depth[np.isinf(depth)] = 0.0
+    return depth.reshape(size[::-1]), owner.reshape(size[::-1])
+
+
+@dataclass
+class Room:
+    """What stands in a scene that was written, for comparison."""
+
+    folder: Path
+    align: np.ndarray
+    sens: Sens
+    masks: dict[int, np.ndarray]
+
+    def surface(self, number: int, points: np.ndarray) -> np.ndarray:
+        """Distance of aligned points [n 3] to an object's surface."""
+        parts = [box.distance(points) for box in ROOM if box.object == number]
+        return np.min(parts, axis=0)
+
+    def box(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        parts = [box for box in ROOM if box.object == number]
+        low = np.min([box.low for box in parts], axis=0)
+        return low, np.max([box.high for box in parts], axis=0)
+
+    def measured(self) -> np.ndarray:
+        """Every raw depth point of every frame with a pose, aligned [n 3]."""
+        points = []
+        width, height = self.sens.depth_size
+        v, u = np.mgrid[:height, :width].reshape(2, -1)
+        rays = np.stack([u, v, np.ones(len(u))], axis=1)
+        rays = rays @ np.linalg.inv(self.sens.depth_intrinsic[:3, :3]).T
+        for image, pose in zip(self.sens.depth, self.sens.poses, strict=True):
+            if np.isfinite(pose).all():
+                z = image.ravel() / self.sens.shift
+                to_room = self.align @ np.asarray(pose, np.float32).astype(np.float64)
+                points.append(transform_points(to_room, (rays * z[:, None])[z > 0]))
+        return np.concatenate(points)
+
+
+def write_room(
+    scans: Path,
+    *,
+    name: str = "scene0000_00",
+    frames: int = 12,
+    noise: float = 0.0,
+    tilt: bool = True,
+    apart: float = 0.0,
+    size: tuple[int, int] = (160, 120),
+    copies: int = 1,
+    mesh: bool = True,
+    masks: bool = True,
+) -> Room:
+    """Write the room as a scene: cameras go round it and look inwards.
+
+    Args:
+        scans: Folder that gets the scene's folder.
+        name: Of the scene.
+        frames: Poses.
+        noise: Standard deviation of the depth noise, metres.
+        tilt: Whether the scene's own frame is tilted and shifted against the room's.
+        apart: Distance of the colour camera from the depth camera, metres.
+        size: Of the depth images; those of colour have twice the width and height and a bit.
+        copies: How often the frames follow one another in the file.
+        mesh: Whether to write the mesh and its segments.
+        masks: Whether to write the instance masks.
+    """
+    folder = scans / name
+    folder.mkdir(parents=True)
+    align = np.eye(4)
+    if tilt:
+        align = look_at(np.array([0.3, -0.2, 0.1]), np.array([0.5, 0.6, 0.3]))
+    depth_k = camera_matrix(0.9 * size[0], size)
+    color_size = (2 * size[0] + 4, 2 * size[1] + 2)
+    color_k = camera_matrix(1.9 * size[0], color_size)
+    to_color = np.eye(4)
+    to_color[0, 3] = -apart
+    rng = np.random.default_rng(5)
+    images, poses, seen = [], [], {}
+    for index in range(frames):
+        angle = 2 * np.pi * index / frames
+        eye = np.array([1.9 * np.cos(angle), 1.9 * np.sin(angle), 1.5])
+        pose = look_at(eye, np.array([0.0, 0.0, 0.3]))
+        depth, _ = render(ROOM, depth_k, size, pose)
+        depth += (depth > 0) * rng.normal(0, noise, depth.shape) if noise else 0
+        images.append(np.rint(depth * 1000).astype(np.uint16))
+        poses.append(invert_rigid(align) @ pose)
+        seen[index] = render(ROOM, color_k, color_size, pose @ invert_rigid(to_color))[1]
+    sens = Sens(
+        images * copies,
+        poses * copies,
+        size,
+        depth_k,
+        color_size,
+        color_k,
+        depth_extrinsic=to_color,
+    )
+    sens.write(folder / f"{name}.sens")
+    text = " ".join(f"{value:.9f}" for value in align.ravel())
+    lines = f"colorHeight = {color_size[1]}\nsceneType = Office\n"
+    (folder / f"{name}.txt").write_text(f"axisAlignment = {text}\n{lines}" if tilt else lines)
+    if masks:
+        packed = {index: png(mask) for index, mask in seen.items()}
+        write_masks(
+            folder / f"{name}_2d-instance-filt.zip",
+            {index: packed[index % frames] for index in range(frames * copies)},
+        )
+    grids = [box.grid() for box in ROOM]
+    numbers = np.concatenate([faces + 10 * i for i, (_, faces) in enumerate(grids)])
+    owned = {
+        number: [10 * i + f for i, box in enumerate(ROOM) if box.object == number for f in range(6)]
+        for number in LABELS
+    }
+    groups = [(number, label, owned[number]) for number, label in LABELS.items()]
+    write_aggregation(folder / f"{name}.aggregation.json", groups)
+    if mesh:
+        vertices = np.concatenate([points for points, _ in grids])
+        faces = np.arange(len(vertices) // 3 * 3).reshape(-1, 3)
+        own_frame = transform_points(invert_rigid(align), vertices)
+        write_mesh(folder / f"{name}_vh_clean_2.ply", own_frame, faces)
+        write_segments(folder / f"{name}_vh_clean_2.0.010000.segs.json", numbers.tolist())
+    return Room(folder, align, sens, seen)
