@@ -96,21 +96,26 @@ def _names(relative: str) -> set[str]:
 
 
 def _find(name: str, named: dict[str, list[MeshFile]], root: Path, where: str) -> MeshFile:
-    plain = PurePosixPath(name.replace("\\", "/"))
-    if not name or not plain.parts:
-        raise InputError(f"{where}: names no file")
-    if plain.is_absolute() or PureWindowsPath(name).drive or ".." in plain.parts:
-        raise InputError(f"{where}: {name!r} leads outside {root}; give a path below it")
-    found = named.get(str(plain), [])
-    exact = [file for file in found if file.relative == str(plain)]
-    if len(exact) == 1:
-        return exact[0]
-    if len(found) == 1:
-        return found[0]
+    # What is in the table was found below the root, so only other names can lead out of it.
+    plain = name if name in named else _plain(name, root, where)
+    found = named.get(plain, [])
+    exact = [file for file in found if file.relative == plain]
+    if len(exact or found) == 1:
+        return (exact or found)[0]
     if found:
         some = " and ".join(sorted(file.relative for file in found)[:2])
         raise InputError(f"{where}: {name!r} is {len(found)} files, such as {some}; give the path")
     raise InputError(f"{where}: {name!r} is no mesh below {root}")
+
+
+def _plain(name: str, root: Path, where: str) -> str:
+    """Bring a path below the root into one form: no dot, no double slash, no backslash."""
+    if not name:
+        raise InputError(f"{where}: names no file")
+    path = PurePosixPath(name.replace("\\", "/"))
+    if path.is_absolute() or PureWindowsPath(name).drive or ".." in path.parts:
+        raise InputError(f"{where}: {name!r} leads outside {root}; give a path below it")
+    return str(path)
 
 
 def _lies_below(path: Path, real_root: Path) -> bool:

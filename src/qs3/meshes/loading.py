@@ -165,15 +165,15 @@ def _read_with_trimesh(
                 handle, file_type=ending[1:], resolver=_OwnFolder(path.parent), **options
             )
             parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
+        vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
+        for part in parts:
+            points = np.asarray(getattr(part, "vertices", np.zeros((0, 3))), dtype=np.float64)
+            corners = np.asarray(getattr(part, "faces", np.zeros((0, 3))), dtype=np.int64)
+            vertices.append(points.reshape(-1, 3))
+            faces.append(corners.reshape(-1, 3) + count)
+            count += len(points)
     except Exception as error:
         # A parser may fail in any way on a damaged file; the user needs the file's name.
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: cannot be read as {ending[1:].upper()} ({reason})") from error
-    vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
-    for part in parts:
-        points = np.asarray(getattr(part, "vertices", np.zeros((0, 3))), dtype=np.float64)
-        corners = np.asarray(getattr(part, "faces", np.zeros((0, 3))), dtype=np.int64)
-        vertices.append(points.reshape(-1, 3))
-        faces.append(corners.reshape(-1, 3) + count)
-        count += len(points)
     return np.concatenate(vertices), np.concatenate(faces)

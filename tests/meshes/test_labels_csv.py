@@ -1,0 +1,171 @@
+"""Classes and splits of meshes from a CSV."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qs3.errors import InputError
+from qs3.meshes import MeshItem, collect
+
+
+def listed(items: list[MeshItem]) -> list[tuple[str, str, str]]:
+    return [(item.id, item.class_name, item.split) for item in items]
+
+
+def put(path: Path, text: str) -> Path:
+    path.write_bytes(text.encode())
+    return path
+
+
+def test_objaverse_layout(tree, tmp_path: Path) -> None:
+    root = tree("glbs/000-001/ab12.glb", "glbs/000-002/cd34.glb", "glbs/000-002/ef.56.glb", "x.off")
+    labels = put(
+        tmp_path / "lvis.csv",
+        "uid,name,category,score\ncd34,my mug,mug,1\nab12,seat,armchair,2\nef.56,b,Floor Lamp,3\n",
+    )
+    assert listed(collect(root, labels=labels)) == [
+        ("glbs/000-001/ab12", "armchair", ""),
+        ("glbs/000-002/cd34", "mug", ""),
+        ("glbs/000-002/ef.56", "Floor Lamp", ""),
+    ]
+    assert listed(collect(root, labels=str(labels), classes="pointda10")) == [
+        ("glbs/000-001/ab12", "chair", ""),
+        ("glbs/000-002/ef.56", "lamp", ""),
+    ]
+    assert len(collect(root, labels=labels, classes=["mug"])) == 1
+    with pytest.raises(InputError, match="no class 'cup'; it has Floor Lamp, armchair, mug"):
+        collect(root, labels=labels, classes=["cup"])
+
+
+@pytest.mark.parametrize("name", ["sub/a.off", "./sub//a.off", "sub\\a.off", "sub/a", "a.off", "a"])
+@pytest.mark.parametrize("file", ["file", " Path", "UID", "id", "name"])
+def test_every_way_to_name_a_mesh(tree, tmp_path: Path, name: str, file: str) -> None:
+    for head in ("class", "label", "category", "class_name"):
+        labels = put(tmp_path / "l.csv", f"split,{head},{file}\n test ,chair,{name}\n\n")
+        assert listed(collect(tree("sub/a.off"), labels=labels)) == [("sub/a", "chair", "test")]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "\ufefffile;class\r\na.off;chair\r\n",
+        "file\tclass\ra.off\tchair",
+        'file,class\n"a.off","chair"\n',
+        "file,class,label,split\na.off,chair,7,\n",
+    ],
+)
+def test_spreadsheets_write_csv_in_many_ways(tree, tmp_path: Path, text: str) -> None:
+    labels = put(tmp_path / "l.csv", text)
+    assert listed(collect(tree("a.off", "b.off"), labels=labels)) == [("a", "chair", "")]
+
+
+def test_the_split_is_the_tables_and_else_the_folders(tree, tmp_path: Path) -> None:
+    root = tree("x/train/a.off", "x/train/b.off")
+    labels = put(tmp_path / "l.csv", "file,class,split\na,chair,test\nb,chair,\n")
+    assert [item.split for item in collect(root, labels=labels)] == ["test", "train"]
+    assert listed(collect(root, labels=labels, split="train")) == [("x/train/b", "chair", "train")]
+
+
+def test_an_id_does_not_depend_on_which_rows_there_are(tree, tmp_path: Path) -> None:
+    root = tree("a.off", "a.obj", "b.off")
+    few = put(tmp_path / "few.csv", "file,class\na.off,chair\n")
+    more = put(tmp_path / "more.csv", "file,class\na.off,chair\na.obj,chair\nb,bed\n")
+    assert collect(root, labels=few) == collect(root, labels=more)[1:2]
+    assert collect(root, labels=few)[0].id == "a.off"
+
+
+def test_convention_shapenet_is_y_up_with_labels_too(tree, tmp_path: Path) -> None:
+    root = tree("03001627/a/models/model_normalized.obj", "mine/b.obj")
+    rows = "file,class\n03001627/a/models/model_normalized,seat\nb,bed\n"
+    items = collect(root, labels=put(tmp_path / "l.csv", rows))
+    assert [np.ptp(item.load().vertices, axis=0).tolist() for item in items] == [
+        [1, 0, 3],
+        [1, 3, 0],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "line 1: no column file or path or uid"),
+        ("file,kind\na,chair\n", r"line 1: no column class_name .*; it has 'file', 'kind'$"),
+        ("where,class\na,chair\n", r"line 1: no column file .*; it has 'where', 'class'$"),
+        ("file,class,file\na,chair,b\n", "line 1: two columns are called file"),
+        ("file,class\n", "no row after the headings"),
+        ("file,class\na,chair\nz,chair\n", "line 3: 'z' is no mesh below"),
+        ("file,class\nnotes.txt,chair\n", "line 2: 'notes.txt' is no mesh below"),
+        ("file,class\ntwin,chair\n", "line 2: 'twin' is 2 files, such as d/twin.off and twin.obj"),
+        ("file,class\n../out.off,chair\n", r"line 2: '../out.off' leads outside"),
+        ("file,class\nd/../../out.off,chair\n", "line 2: .* leads outside"),
+        ("file,class\n..\\out.off,chair\n", "line 2: .* leads outside"),
+        ("file,class\n/etc/passwd,chair\n", "line 2: '/etc/passwd' leads outside"),
+        ("file,class\nC:/out.off,chair\n", "line 2: 'C:/out.off' leads outside"),
+        ("file,class\nlink,chair\n", "line 2: 'link' is a link that leads outside"),
+        ("file,class\nlinked/deep/out.off,chair\n", "line 2: .* is a link that leads outside"),
+        ("file,class\na,chair\na.off,chair\n", "line 3: 'a.off' has a row already, line 2"),
+        ("file,class\na, \n", "line 2: 'a' has an empty class"),
+        ('file,class\na,"two\nlines"\n', r"line 3: 'a' has an odd class 'two\\nlines' or split"),
+        ("file,class\n ,chair\n", "line 2: names no file"),
+        ("file,class\na\n", "line 2: has 1 columns, the headings 2"),
+        ("file,class\na,chair,sofa\n", "line 2: has 3 columns, the headings 2"),
+        ('file,class\na,"chair\n', "not a CSV"),
+        ("file,class\n" + "a" * 200_000 + ",chair\n", "not a CSV"),
+        ("file,class\n" + "a" * 2_000_000 + ",chair\n", "line 2: too long for a CSV"),
+        ("file,class\na\0,chair\n", "line 2|not a CSV"),
+    ],
+)
+def test_faulty_tables_are_named_in_one_line(tree, tmp_path: Path, text: str, message: str) -> None:
+    root = tree("a.off", "twin.obj", "d/twin.off", "notes.txt")
+    outside = tmp_path / "outside"
+    (outside / "deep").mkdir(parents=True)
+    (outside / "deep/out.off").write_text("")
+    (root / "link.off").symlink_to(outside / "deep/out.off")
+    (root / "linked").symlink_to(outside)
+    with pytest.raises(InputError, match=message) as caught:
+        collect(root, labels=put(tmp_path / "l.csv", text))
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith(str(tmp_path / "l.csv"))
+
+
+def test_a_link_within_the_root_is_no_way_out(tree, tmp_path: Path) -> None:
+    root = tree("deep/a.off")
+    (root / "b.off").symlink_to(root / "deep/a.off")
+    labels = put(tmp_path / "l.csv", "file,class\nb,chair\n")
+    assert listed(collect(root, labels=labels)) == [("b", "chair", "")]
+
+
+def test_tables_that_are_none(tree, tmp_path: Path) -> None:
+    root = tree("a.off")
+    with pytest.raises(InputError, match=r"none.csv: cannot be read"):
+        collect(root, labels=tmp_path / "none.csv")
+    with pytest.raises(InputError, match="cannot be read"):
+        collect(root, labels=tmp_path)
+    (tmp_path / "binary.csv").write_bytes(b"file,class\n\xff\xfe\x00")
+    with pytest.raises(InputError, match="not UTF-8"):
+        collect(root, labels=tmp_path / "binary.csv")
+    with pytest.raises(InputError, match="shapes have their own classes"):
+        collect("shapes", labels=tmp_path / "binary.csv")
+
+
+def test_damaged_tables_end_in_a_clear_line_or_in_meshes_of_the_root(
+    tree, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    root = tree("a.off", "d/b.off", "d/c.off")
+    valid = b'file,class,split\na.off,chair,train\nd/b,"night stand",test\nc,bed,\n'
+    tokens = [b"..", b"/", b"\\", b'"', b",", b"\n", b"\0", b"\xff", b"\xef\xbb\xbf", b"a" * 300]
+    ids = {item.id for item in collect(root)}
+    refused = 0
+    for _ in range(400):
+        data = bytearray(valid)
+        for _ in range(rng.integers(1, 4)):
+            at = int(rng.integers(len(data)))
+            token = tokens[rng.integers(len(tokens))]
+            data[at : at + int(rng.integers(0, 4))] = token * int(rng.integers(0, 3))
+        (tmp_path / "l.csv").write_bytes(data)
+        try:
+            assert {item.id for item in collect(root, labels=tmp_path / "l.csv")} <= ids
+        except InputError as error:
+            refused += 1
+            assert "\n" not in str(error)
+    assert 100 < refused < 400

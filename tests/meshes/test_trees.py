@@ -1,0 +1,294 @@
+"""Trees of ModelNet, of ShapeNet and of one's own; PointDA-10's ten classes in each."""
+
+import os
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qs3.errors import InputError
+from qs3.meshes import MeshItem, collect
+from qs3.meshes.class_names import MODELNET40, POINTDA10, SHAPENET
+
+# Folders of ModelNet40 as published, apart from the library's own list.
+FOLDERS = """airplane,bathtub,bed,bench,bookshelf,bottle,bowl,car,chair,cone,cup,curtain,desk,door,
+dresser,flower_pot,glass_box,guitar,keyboard,lamp,laptop,mantel,monitor,night_stand,person,piano,
+plant,radio,range_hood,sink,sofa,stairs,stool,table,tent,toilet,tv_stand,vase,wardrobe,xbox"""
+# Meshes of ModelNet40 in PointDA-10, in alphabetical order of its classes (Qin et al. 2019).
+TRAIN = (106, 515, 572, 200, 889, 124, 465, 240, 680, 392)
+TEST = (50, 100, 100, 86, 100, 20, 100, 100, 100, 100)
+
+
+def renames(items: list[MeshItem]) -> set[tuple[str, str]]:
+    return {(item.id.split("/")[0], item.class_name) for item in items}
+
+
+def modelnet_names(per_folder: int = 1) -> list[str]:
+    return [
+        f"{name}/{split}/{name}_{i:04d}.off"
+        for name in FOLDERS.replace("\n", "").split(",")
+        for split in ("train", "test")
+        for i in range(per_folder)
+    ]
+
+
+def test_pointda10_takes_ten_folders_of_modelnet_and_renames_one(tree) -> None:
+    root = tree(*modelnet_names())
+    assert {item.class_name for item in collect(root)} == MODELNET40
+    assert len(MODELNET40) == 40
+    items = collect(root, classes="pointda10")
+    assert items == collect(root, classes=["pointda10"])
+    assert renames(items) == {
+        ("bathtub", "bathtub"),
+        ("bed", "bed"),
+        ("bookshelf", "bookshelf"),
+        ("night_stand", "cabinet"),
+        ("chair", "chair"),
+        ("lamp", "lamp"),
+        ("monitor", "monitor"),
+        ("plant", "plant"),
+        ("sofa", "sofa"),
+        ("table", "table"),
+    }
+    assert len(items) == 20
+    cabinet = next(item for item in items if item.class_name == "cabinet")
+    assert cabinet.id == "night_stand/test/night_stand_0000"
+    assert len(cabinet.load().faces) == 1
+
+
+def test_modelnets_glued_header_loads(tree) -> None:
+    root = tree("chair/train/chair_0001.off")
+    (root / "chair/train/chair_0001.off").write_text("OFF3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    (item,) = collect(root, classes="pointda10")
+    assert item.load().vertices.shape == (3, 3)
+
+
+def test_pointda10_of_modelnet_has_its_published_size(tree) -> None:
+    folders = ["night_stand" if name == "cabinet" else name for name in POINTDA10]
+    root = tree(*modelnet_names())
+    for split, counts in (("train", TRAIN), ("test", TEST)):
+        for folder, count in zip(folders, counts, strict=True):
+            for i in range(1, count):
+                os.close(os.open(root / folder / split / f"{folder}_{i:04d}.off", os.O_CREAT))
+    found = {split: collect(root, classes="pointda10", split=split) for split in ("train", "test")}
+    assert (len(found["train"]), len(found["test"])) == (4183, 856)
+    for split, counts in (("train", TRAIN), ("test", TEST)):
+        count = Counter(item.class_name for item in found[split])
+        assert tuple(count[name] for name in POINTDA10) == counts
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        # "couch" is no class of ModelNet, so this is none of its trees.
+        ["dresser/train/a.off", "couch/test/b.off", "Desk/train/c.off", "rocket/train/d.off"],
+        ["dresser/train/a.off", "couch/b.off", "Desk/new/c.off", "rocket/d.off"],
+    ],
+)
+def test_a_tree_of_ones_own_goes_by_the_table_of_aliases(tree, names) -> None:
+    items = collect(tree(*names), classes="pointda10")
+    assert renames(items) == {("dresser", "cabinet"), ("couch", "sofa"), ("Desk", "table")}
+
+
+@pytest.mark.parametrize("beside", ["desk/train/b.off", "desk/b.off"])
+def test_modelnets_names_without_its_splits_are_ones_own(tree, beside) -> None:
+    items = collect(tree("dresser/a.off", beside), classes="pointda10")
+    assert renames(items) == {("dresser", "cabinet"), ("desk", "table")}
+
+
+def test_none_of_the_ten_is_an_error_and_one_of_them_is_enough(tree) -> None:
+    root = tree("rocket/d.off", "toilet/e.off")
+    with pytest.raises(InputError, match=r"none of PointDA-10's ten classes; it has rocket, toil"):
+        collect(root, classes="pointda10")
+    assert renames(collect(tree("bath tub/a.off"), classes="pointda10")) == {
+        ("bath tub", "bathtub")
+    }
+
+
+def test_pointda10_of_shapes_is_all_of_them() -> None:
+    items = collect("shapes", per_class=1, classes="pointda10")
+    assert tuple(item.class_name for item in items) == POINTDA10
+    assert items == collect("shapes", per_class=1)
+
+
+def test_faulty_choices_of_classes(tree) -> None:
+    root = tree("chair/a.off")
+    with pytest.raises(InputError, match="pointda10 stands for ten"):
+        collect(root, classes=["pointda10", "chair"])
+    with pytest.raises(InputError, match="at least one"):
+        collect(root, classes=[])
+    assert [item.id for item in collect(root, classes="chair")] == ["chair/a"]
+    with pytest.raises(InputError, match="lie flat, without classes"):
+        collect(root / "chair", classes=["chair"])
+    with pytest.raises(InputError, match=r"no class 'x'; it has c00, .*c59 and 5 more"):
+        collect(tree(*(f"c{i:02d}/a.off" for i in range(64))), classes=["x"])
+
+
+def test_shapenet_of_both_versions_with_and_without_splits(tree) -> None:
+    root = tree(
+        "04379243/bb/models/model_normalized.obj",
+        "04379243/bb/models/model_normalized.json",
+        "04379243/bb/images/texture0.jpg",
+        "04379243/aa/model.obj",
+        "02992529/aa/models/model_normalized.obj",
+        "02834778/cc/models/model_normalized.obj",
+        "04379243/empty/images/x.jpg",
+        "taxonomy.json",
+    )
+    found = [(item.id, item.class_name, item.split, item.up) for item in collect(root)]
+    assert found == [
+        ("02834778/cc/models/model_normalized", "02834778", "", "y"),
+        ("02992529/aa/models/model_normalized", "cellular_telephone", "", "y"),
+        ("04379243/aa/model", "table", "", "y"),
+        ("04379243/bb/models/model_normalized", "table", "", "y"),
+    ]
+    (root / "all.csv").write_text(
+        "id,synsetId,subSynsetId,modelId,split\n"
+        "000001,04379243,04379243,aa,train\n"
+        "000002,4379243,04379243,bb,val\n"
+        "000003,02992529,02992529,aa,test\n"
+        "000004,02992529,02992529,not_here,test\n"
+    )
+    assert [item.split for item in collect(root)] == ["", "test", "train", "val"]
+    assert [item.id for item in collect(root, split="val")] == [found[3][0]]
+    with (root / "all.csv").open("a") as handle:
+        handle.write("000005,02992529,02992529,aa,train\n")
+    with pytest.raises(InputError, match=r"all.csv, line 6: 02992529/aa is in 'train' and in 'te"):
+        collect(root)
+    (root / "all.csv").write_text("synset,model\n")
+    with pytest.raises(InputError, match=r"all.csv, line 1: no column synsetid; it has 'synset'"):
+        collect(root)
+
+
+def test_pointda10_takes_ten_synsets_of_shapenet(tree) -> None:
+    root = tree(*(f"{synset}/a/models/model_normalized.obj" for synset in SHAPENET))
+    assert len(collect(root)) == 55
+    assert len({item.class_name for item in collect(root)}) == 55
+    assert renames(collect(root, classes="pointda10")) == {
+        ("02808440", "bathtub"),
+        ("02818832", "bed"),
+        ("02871439", "bookshelf"),
+        ("02933112", "cabinet"),
+        ("03001627", "chair"),
+        ("03636649", "lamp"),
+        ("03211117", "monitor"),
+        ("03991062", "plant"),
+        ("04256520", "sofa"),
+        ("04379243", "table"),
+    }
+
+
+def test_convention_shapenet_is_y_up(tree) -> None:
+    root = tree("03001627/a/models/model_normalized.obj", "03001627/b/model.obj", "x/c.obj")
+    for item in collect(root):
+        # The triangle is 1 along x and 3 along y: the long side has to end up along z.
+        tall = [1, 0, 3] if item.class_name == "chair" else [1, 3, 0]
+        assert np.ptp(item.load().vertices, axis=0).tolist() == tall
+
+
+def test_shapenet_in_another_form_is_refused(tree) -> None:
+    root = tree("03001627/a.obj", "04379243/a/model.obj")
+    with pytest.raises(InputError, match=r"03001627: named as a synset of ShapeNet, but"):
+        collect(root)
+
+
+@pytest.mark.parametrize(
+    ("names", "inner", "message"),
+    [
+        (["v2/03001627/a/models/model_normalized.obj"], "", "ShapeNet lies deeper; name .*root/v2"),
+        (["03001627/a/model.obj"], "03001627", "one synset of ShapeNet; .* class chair"),
+        (["M40/chair/train/a.off", "M40/readme.txt"], "", "ModelNet lies deeper; name .*root/M40"),
+    ],
+)
+def test_the_wrong_level_is_refused(tree, names, inner, message) -> None:
+    with pytest.raises(InputError, match=message):
+        collect(tree(*names) / inner)
+
+
+def test_kinds_above_classes_are_classes_where_there_are_several(tree) -> None:
+    root = tree("indoor/chair/train/a.off", "outdoor/bench/test/b.off")
+    assert [item.class_name for item in collect(root)] == ["indoor", "outdoor"]
+
+
+def test_class_is_the_first_folder_and_splits_lie_anywhere(tree) -> None:
+    root = tree("chair/arm/deep/a.off", "chair/test/arm/b.off", "chair/arm/train/c.off", "d.off")
+    assert [(item.id, item.class_name, item.split) for item in collect(root)] == [
+        ("chair/arm/deep/a", "chair", ""),
+        ("chair/arm/train/c", "chair", "train"),
+        ("chair/test/arm/b", "chair", "test"),
+        ("d", "", ""),
+    ]
+
+
+def test_splits_above_classes(tree) -> None:
+    root = tree("train/chair/a.off", "test/chair/deep/a.off", "val/b.off")
+    assert [(item.class_name, item.split) for item in collect(root)] == [
+        ("chair", "test"),
+        ("chair", "train"),
+        ("", "val"),
+    ]
+
+
+def test_a_train_among_vehicles_is_a_class(tree) -> None:
+    root = tree("bus/a.off", "train/train/b.off", "train/test/c.off")
+    assert [(item.class_name, item.split) for item in collect(root)] == [
+        ("bus", ""),
+        ("train", "test"),
+        ("train", "train"),
+    ]
+
+
+def test_ids_are_unique_and_do_not_depend_on_the_choice(tree) -> None:
+    names = ["a/x.off", "a/x.obj", "a/x.obj.ply", "a/y.off", "b/x.off", "b/x.y.off", "b/x.y/z.off"]
+    items = collect(tree(*names))
+    ids = [item.id for item in items]
+    assert ids == ["a/x.obj", "a/x.obj.ply", "a/x.off", "a/y", "b/x", "b/x.y", "b/x.y/z"]
+    assert collect(tree(), classes=["b"]) == [item for item in items if item.class_name == "b"]
+
+
+def test_order_is_that_of_the_ids_whatever_the_disk_says(
+    tree, monkeypatch, rng: np.random.Generator
+) -> None:
+    root = tree(*(f"{c}/{s}/{i}.off" for c in "ba" for s in ("train", "test") for i in range(9)))
+    expected = collect(root)
+    assert [item.id for item in expected] == sorted(item.id for item in expected)
+    real = os.scandir
+
+    class Shuffled:
+        def __init__(self, folder):
+            with real(folder) as found:
+                found = list(found)
+            self.found = [found[i] for i in rng.permutation(len(found))]
+
+        def __enter__(self):
+            return iter(self.found)
+
+        def __exit__(self, *_):
+            return None
+
+    monkeypatch.setattr(os, "scandir", Shuffled)
+    for _ in range(5):
+        assert collect(root) == expected
+
+
+def test_links_are_followed_and_circles_are_left(tree, tmp_path: Path) -> None:
+    root = tree("chair/a.off")
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    (disk / "b.off").write_text("")
+    (root / "table").symlink_to(disk)
+    (root / "chair/c.off").symlink_to(disk / "b.off")
+    (root / "chair/again").symlink_to(root)
+    (root / "chair/notes").symlink_to(root / "nowhere")
+    assert [item.id for item in collect(root)] == ["chair/a", "chair/c", "table/b"]
+    (root / "table/lost.off").symlink_to(root / "nowhere.off")
+    with pytest.raises(InputError, match=r"lost.off: a link that leads to no file"):
+        collect(root)
+
+
+def test_a_name_that_no_table_can_hold_is_refused(tree) -> None:
+    root = tree("chair/a.off")
+    Path(os.fsdecode(os.fsencode(root) + b"/chair/\xff.off")).write_text("")
+    with pytest.raises(InputError, match=r"rename 'chair/\\udcff.off', which is not UTF-8"):
+        collect(root)
