@@ -24,6 +24,12 @@ from qs3.datasets.manifest import (
     write_manifest,
     write_sums,
 )
+from qs3.datasets.mesh_sums import (
+    changed_meshes,
+    mesh_sums,
+    read_mesh_sums,
+    write_mesh_sums,
+)
 from qs3.datasets.parts import (
     PARTS,
     Place,
@@ -109,6 +115,8 @@ def generate(
     with folder.locked():
         write_manifest(folder, manifest)
         run = _Run(plan, folder, executor, scan_one)
+        run.look()
+        run.check_meshes()
         run.prepare(range(index, plan.shards, count), retry_failed)
         text = f"{folder.name}: scans" if progress else None
         return run.work(text)
@@ -136,19 +144,40 @@ class _Run:
         """Shards that are put together, or all but."""
         self.total = self.done = self.failed = 0
 
-    def prepare(self, mine: Sequence[int], retry_failed: bool) -> None:
-        """Look at what is there, and list what is to do."""
+    def look(self) -> None:
+        """Look at what is there."""
         folder, plan = self.folder, self.plan
         self.sums = read_sums(folder)
-        finished = self.settled = set(finished_shards(folder, plan.shards))
-        parts = parts_there(folder)
+        self.settled = set(finished_shards(folder, plan.shards))
+        self.parts = parts_there(folder)
         for record in read_failures(folder):
             self.failures[Place(record["shard"], record["row"])] = record
-        for place, name in parts.items():
+        for place, name in self.parts.items():
             if name.endswith(".json"):
                 self.failures[place] = self._record(place, read_failure(folder, name))
             else:
                 self.failures.pop(place, None)
+
+    def check_meshes(self) -> None:
+        """Refuse a mesh that is not the one that was scanned; one that failed may be mended."""
+        there, now = read_mesh_sums(self.folder), mesh_sums(self.plan.items)
+        changed = set(changed_meshes(there, now))
+        if changed:
+            scanned = {place for place, name in self.parts.items() if name.endswith(".parquet")}
+            scanned |= {place for shard in self.settled for place in self.plan.places(shard)}
+            for place in sorted(scanned - set(self.failures), key=lambda p: (p.shard, p.row)):
+                name = self.plan.work(place)[0].id
+                if name in changed:
+                    raise InputError(
+                        f"{name}: the mesh has changed since it was scanned into {self.folder}; "
+                        "name another folder, or put the old file back"
+                    )
+        if there != now:
+            write_mesh_sums(self.folder, now)
+
+    def prepare(self, mine: Sequence[int], retry_failed: bool) -> None:
+        """List what is to do."""
+        plan, finished, parts = self.plan, set(self.settled), self.parts
         for shard in mine:
             places = list(plan.places(shard))
             self.total += len(places)

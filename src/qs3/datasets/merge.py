@@ -19,6 +19,7 @@ from qs3.datasets.manifest import (
     write_manifest,
     write_sums,
 )
+from qs3.datasets.mesh_sums import changed_meshes, read_mesh_sums, write_mesh_sums
 from qs3.datasets.storage import Folder, open_folder
 from qs3.errors import InputError
 
@@ -56,6 +57,13 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True
     for folder in folders[1:]:
         check_same(str(folder), open_dataset(folder), manifest)
     sums = [read_sums(folder) for folder in folders]
+    meshes = read_mesh_sums(folders[0])
+    for folder in folders[1:]:
+        if changed := changed_meshes(meshes, read_mesh_sums(folder)):
+            raise InputError(
+                f"{changed[0]}: the mesh is another one in {folder} than in {folders[0]}; run both "
+                "parts again with one of them"
+            )
     held = _holders(folders, manifest.shards)
     missing = [index for index in range(manifest.shards) if index not in held]
     if missing:
@@ -69,6 +77,7 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True
     copied = 0
     with target.locked():
         write_manifest(target, manifest)
+        write_mesh_sums(target, meshes)
         failures: dict[str, dict[str, Any]] = {}
         for folder in folders:
             failures |= {record["id"]: record for record in read_failures(folder)}

@@ -1,12 +1,10 @@
 """The work list of a data set: which scan of which mesh belongs where, in a fixed order."""
 
-import concurrent.futures
 import dataclasses
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -16,7 +14,6 @@ from qs3.datasets.parts import Place
 from qs3.datasets.scan_item import GenerateSettings, Item, row_id
 from qs3.datasets.versions import package_versions
 from qs3.errors import InputError
-from qs3.files import sha256
 
 
 @dataclass(frozen=True)
@@ -54,7 +51,7 @@ class Plan:
         return row_id(*self.work(place))
 
     def manifest(self) -> Manifest:
-        """What ``dataset.json`` will say; reads every mesh for its checksum."""
+        """What ``dataset.json`` will say."""
         return Manifest(
             settings={**self.settings.as_dict(), "work_list": work_list_checksum(self.items)},
             class_names=self.settings.classes,
@@ -92,14 +89,10 @@ def resolve_renderer(settings: GenerateSettings) -> GenerateSettings:
 
 
 def work_list_checksum(items: Sequence[Item]) -> str:
-    """SHA-256 over the names, classes, splits, shape seeds and file contents of a work list."""
-    paths = [getattr(item, "path", None) for item in items]
-    with concurrent.futures.ThreadPoolExecutor() as pool:
-        contents = pool.map(lambda path: None if path is None else sha256(Path(path)), paths)
-        digest = hashlib.sha256()
-        for item, content in zip(items, contents, strict=True):
-            line = [item.id, item.class_name, item.split, content]
-            line += [getattr(item, name, None) for name in ("shape_seed", "up")]
-            line = json.dumps(line)
-            digest.update(line.encode("utf-8") + b"\n")
+    """SHA-256 over the names, classes, splits, axes and shape seeds of a work list."""
+    digest = hashlib.sha256()
+    for item in items:
+        line = [item.id, item.class_name, item.split]
+        line += [getattr(item, name, None) for name in ("shape_seed", "up")]
+        digest.update(json.dumps(line).encode("utf-8") + b"\n")
     return digest.hexdigest()

@@ -20,6 +20,7 @@ from qs3.datasets.manifest import (
     read_sums,
     shard_name,
 )
+from qs3.datasets.mesh_sums import MESHES
 from qs3.datasets.parts import PARTS
 from qs3.datasets.scan_item import scan_seed
 from qs3.datasets.shards import parse_shard
@@ -82,14 +83,14 @@ def _files(
             f"{len(missing)} of {manifest.shards} shards are missing, the first "
             f"{shard_name(missing[0])}: unfinished, run the same command again"
         )
-    known = {MANIFEST, SUMS, FAILURES} | {shard_name(index) for index in there}
+    known = {MANIFEST, SUMS, FAILURES, MESHES} | {shard_name(index) for index in there}
     for name in folder.names():
         if name not in known and not name.startswith(f"{PARTS}/"):
             yield f"{name}: does not belong here"
     if manifest.schema < 3:
         yield f"{SUMS}: absent, this data set is of an earlier version; its bytes are unproven"
     else:
-        for name in sorted(known - {MANIFEST, SUMS, FAILURES} - set(sums)):
+        for name in sorted(known - {MANIFEST, SUMS, FAILURES, MESHES} - set(sums)):
             yield f"{SUMS}: has no checksum of {name}"
     for name in sorted(set(sums) - known):
         yield f"{SUMS}: names {name}, which is not there"

@@ -1,0 +1,50 @@
+"""``meshes.json``: the checksum of each mesh file that a data set is made from."""
+
+import concurrent.futures
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from qs3.datasets.scan_item import Item
+from qs3.datasets.storage import Folder
+from qs3.errors import InputError
+from qs3.files import sha256
+
+MESHES = "meshes.json"
+
+
+def mesh_sums(items: Sequence[Item]) -> dict[str, str]:
+    """Return the SHA-256 of every item's file, by the item's id; shapes have none."""
+    paths = {item.id: getattr(item, "path", None) for item in items}
+    files = {name: Path(path) for name, path in paths.items() if path is not None}
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        return dict(zip(files, pool.map(sha256, files.values()), strict=True))
+
+
+def read_mesh_sums(folder: Folder) -> dict[str, str]:
+    """Return what an earlier call noted; nothing where there is no ``meshes.json``.
+
+    Raises:
+        InputError: where the file is damaged.
+    """
+    if not folder.exists(MESHES):
+        return {}
+    try:
+        sums = json.loads(folder.read(MESHES).decode("utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise InputError(f"{folder}/{MESHES}: damaged ({error}); delete it") from error
+    if not isinstance(sums, dict) or not all(isinstance(value, str) for value in sums.values()):
+        raise InputError(f"{folder}/{MESHES}: damaged (not one checksum a mesh); delete it")
+    return sums
+
+
+def write_mesh_sums(folder: Folder, sums: Mapping[str, str]) -> None:
+    """Write ``meshes.json``, one line a mesh; none where no mesh is a file."""
+    if sums:
+        text = json.dumps(dict(sorted(sums.items())), indent=0, ensure_ascii=False)
+        folder.write(MESHES, f"{text}\n".encode())
+
+
+def changed_meshes(there: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """Ids of the meshes whose files are not those that were noted."""
+    return [name for name, digest in now.items() if there.get(name, digest) != digest]

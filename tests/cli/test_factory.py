@@ -1,0 +1,96 @@
+import json
+import shutil
+
+import pytest
+
+
+@pytest.fixture
+def few(quick):
+    """The flags of a data set of four scans in two shards."""
+    return ("--classes", "chair", "sofa", "--per-class", 2, "--rows-per-shard", 2,
+            "--num-points", 64, "--meshes", "shapes", *quick)  # fmt: skip
+
+
+@pytest.fixture
+def cad(tmp_path):
+    """A folder of three meshes, of which one is broken."""
+    from qs3.meshes import shapes
+
+    for name in ("chair", "sofa"):
+        (tmp_path / "cad" / name).mkdir(parents=True)
+        shapes.make(name, 0).export(tmp_path / "cad" / name / "one.ply")
+    (tmp_path / "cad" / "sofa" / "two.off").write_text("OFF\n0 0 0\n")
+    return tmp_path / "cad"
+
+
+def content(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_a_dry_run_counts_and_writes_nothing(qs3, few, tmp_path):
+    done = qs3("generate", *few, "--scans-per-mesh", 3, "--out", tmp_path / "out", "--dry-run")
+    assert not (tmp_path / "out").exists()
+    assert "chair: 2 objects" in done.stdout
+    assert "12 scans, of which 12 in this part, 6 shards" in done.stdout
+    assert "disk: " in done.stdout
+    assert "hours with" in done.stdout
+
+
+def test_parts_merge_into_what_one_machine_makes(qs3, few, tmp_path):
+    qs3("generate", *few, "--out", tmp_path / "whole")
+    for part in range(2):
+        qs3("generate", *few, "--out", tmp_path / f"part{part}", "--shard", f"{part}/2")
+    line = qs3.refuses("merge", tmp_path / "part0", "--out", tmp_path / "merged")
+    assert "1 of 2 shards are in none of the 1 parts" in line
+    qs3("merge", tmp_path / "part0", tmp_path / "part1", "--out", tmp_path / "merged")
+    assert content(tmp_path / "merged") == content(tmp_path / "whole")
+    line = qs3.refuses("generate", *few, "--out", tmp_path / "x", "--shard", "2/2")
+    assert "--shard 2/2" in line
+
+
+def test_a_mended_mesh_is_scanned_again_and_a_changed_one_refused(qs3, quick, cad, tmp_path):
+    from qs3.meshes import shapes
+
+    flags = ("--meshes", cad, "--out", tmp_path / "out", "--num-points", 64, *quick)
+    done = qs3("generate", *flags, code=2)
+    assert "1 scans failed; the first: sofa/two#0" in done.stderr
+    shapes.make("sofa", 1).export(cad / "sofa" / "two.off")
+    done = qs3("generate", *flags, "--retry-failed")
+    assert "1 scans written, 2 were there before, 0 failed" in done.stderr
+    qs3("generate", "--meshes", cad, "--out", tmp_path / "new", "--num-points", 64, *quick)
+    assert content(tmp_path / "out") == content(tmp_path / "new")
+    shapes.make("chair", 1).export(cad / "chair" / "one.ply")
+    line = qs3.refuses("generate", *flags)
+    assert "chair/one: the mesh has changed since it was scanned" in line
+
+
+def test_info_counts_and_verify_finds_what_is_wrong(qs3, store, tmp_path):
+    done = qs3("info", store)
+    assert "10 clouds of 10 planned, of 10 objects" in done.stdout
+    assert "128 points a cloud" in done.stdout
+    found = json.loads(qs3("info", store, "--as-json").stdout)
+    assert found["rows"] == 10
+    assert found["settings"]["seed"] == 5
+    assert qs3("verify", store).stdout == ""
+    shutil.copytree(store, tmp_path / "copy")
+    shard = tmp_path / "copy" / "shard-00000.parquet"
+    data = bytearray(shard.read_bytes())
+    data[len(data) // 2] ^= 1
+    shard.write_bytes(bytes(data))
+    (tmp_path / "copy" / "notes.txt").write_text("mine")
+    done = qs3("verify", tmp_path / "copy", code=2)
+    assert "shard-00000.parquet: its checksum is not the one in SHA256SUMS" in done.stdout
+    assert "notes.txt: does not belong here" in done.stdout
+    assert "faults, printed above" in done.stderr
+    for verb in ("info", "verify"):
+        assert "not a qs3 data set" in qs3.refuses(verb, tmp_path)
+
+
+def test_shapes_and_meshes_go_into_one_data_set(qs3, quick, cad, tmp_path):
+    (cad / "sofa" / "two.off").unlink()
+    qs3("generate", "--meshes", cad, "shapes", "--per-class", 1, "--classes", "chair", "sofa",
+        "--out", tmp_path / "out", "--num-points", 64, "--dtype", "float16", *quick)  # fmt: skip
+    found = json.loads(qs3("info", tmp_path / "out", "--as-json").stdout)
+    assert {name: n for name, n in found["classes"].items() if n} == {"chair": 2, "sofa": 2}
+    assert found["settings"]["meshes"] == "cad+shapes"
+    assert found["settings"]["dtype"] == "float16"
