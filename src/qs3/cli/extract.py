@@ -66,6 +66,9 @@ class DepthOptions:
     """CSV with the columns name and class: of an image, an instance or a model of BOP."""
     frame: Literal["auto", "world", "camera", "model"] = "auto"
     """Axes of the clouds, in BOP's layout: auto is the world where the scene tells it."""
+    depth_folder: str = "depth"
+    """Folder of the depth pictures in a scene of BOP's layout; depth_true, of qs3 scan --frames,
+    gives clean twins."""
     gravity: tuple[float, float, float] = (0.0, 1.0, 0.0)
     """Downward direction in the camera's axes (x right, y down, z forward), which z is turned
     against."""

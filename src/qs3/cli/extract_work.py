@@ -37,7 +37,9 @@ def depth(options: DepthOptions) -> int:
         if chosen == "auto":
             chosen = "world" if bop.has_world(frames) else "camera"
             print(f"clouds in the axes of the {chosen}", file=sys.stderr)
-        settings = bop.BopSettings(frame=chosen, class_name=options.class_name, **common)
+        settings = bop.BopSettings(
+            frame=chosen, depth=options.depth_folder, class_name=options.class_name, **common
+        )
         classes = {settings.class_of(item.obj_id) for frame in frames for item in frame.objects}
         count = sum(len(frame.objects) for frame in frames)
         if not count:

@@ -9,6 +9,7 @@ Convention:
     OpenCV camera.
 """
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -92,6 +93,9 @@ class BopSettings:
 
     def __post_init__(self) -> None:
         upright(self.gravity)
+        for name in (self.depth, self.mask):
+            if not re.fullmatch(r"\w+", name):
+                raise InputError(f"{name!r} is no folder of a scene; give a name such as depth")
 
     def class_of(self, obj_id: int) -> str:
         """Return the class of a model."""
