@@ -206,6 +206,10 @@ def test_report_counts(tmp_path: Path) -> None:
     assert [cloud.source["frames"] for cloud in clouds] == [6, 6]
     assert {cloud.split for cloud in clouds} == {"test"}
     assert dropped_labels([scene_of(room)] * 2) == {"floor": 2, "sink": 2}
+    beds = dataclasses.replace(SETTINGS, class_names=("bed",))
+    assert list(extract_scene(scene_of(room), beds, report)) == []
+    assert (report["frames"], report["read"]) == (8, 0)  # no object, so no frame is needed
+    assert sum(report["dropped"].values()) == 4
     everything = dataclasses.replace(SETTINGS, min_points=10**6)
     assert list(extract_scene(scene_of(room), everything, report)) == []
     assert report["too_small"] == 2

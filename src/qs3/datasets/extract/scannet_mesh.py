@@ -22,7 +22,6 @@ from jaxtyping import Float, Int
 from qs3.datasets.extract.clouds import ExtractedCloud
 from qs3.datasets.extract.scannet_scene import (
     ScanNetScene,
-    ScanNetSettings,
     SceneObject,
     axis_alignment,
     object_seed,
@@ -30,6 +29,7 @@ from qs3.datasets.extract.scannet_scene import (
     read_segments,
     rest,
 )
+from qs3.datasets.extract.scannet_settings import ScanNetSettings
 from qs3.datasets.ply import parse_ply
 from qs3.errors import InputError
 from qs3.geometry import transform_points

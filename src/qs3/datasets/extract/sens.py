@@ -173,7 +173,7 @@ def _header(path: Path, handle: BinaryIO) -> SensHeader:
     color_k, color_e, depth_k, depth_e = matrices
     # A file without colours has no colour camera.
     cameras = [depth_k] + [color_k] * bool(color[0] * color[1])
-    if not (all(map(_is_camera, cameras)) and _is_rigid(depth_e) and _is_rigid(color_e)):
+    if not (all(map(_is_camera, cameras)) and is_rigid(depth_e) and is_rigid(color_e)):
         raise InputError(f"{path}: damaged: the calibration of its cameras is none")
     return SensHeader(
         sensor=name,
@@ -220,13 +220,18 @@ def _pose(
 ) -> Float[np.ndarray, "4 4"] | None:
     if np.isinf(pose[0, 0]) or not pose.any():
         return None
-    if not _is_rigid(pose):
+    if not is_rigid(pose):
         raise InputError(f"{path}: damaged: the pose of frame {index} is no rigid transform")
     return pose
 
 
-def _is_rigid(matrix: Float[np.ndarray, "4 4"]) -> bool:
-    """Whether a matrix is a rotation and a shift within what float32 and drift leave."""
+def is_rigid(matrix: Float[np.ndarray, "4 4"]) -> bool:
+    """Whether a matrix is a rotation and a shift, within what float32 and drift leave of one.
+
+    Example:
+        >>> is_rigid(np.eye(4)), is_rigid(np.diag([1.0, 1, -1, 1]))
+        (True, False)
+    """
     if not np.isfinite(matrix).all() or np.abs(matrix).max() > 1e6:
         return False
     turn = matrix[:3, :3]
