@@ -169,10 +169,10 @@ def _read(source: Any, where: str, columns: Sequence[str] | None) -> pa.Table:
         with pq.ParquetFile(source, page_checksum_verification=True) as file:
             wanted = list(_NAMES if columns is None else columns)
             if any(file.schema_arrow.equals(schema) for schema in _SCHEMAS.values()):
-                return file.read(columns=wanted)
+                return file.read(columns=wanted, use_threads=False)
             if not file.schema_arrow.equals(_SCHEMA_1):
                 raise InputError(f"{where}: not a shard of a qs3 data set (other columns)")
-            table = file.read(columns=[name for name in wanted if name != "drawn"])
+            table = file.read(columns=[n for n in wanted if n != "drawn"], use_threads=False)
             if "drawn" in wanted:
                 drawn = _SCHEMAS["float32"].field("drawn")
                 table = table.append_column(drawn, [["{}"] * len(table)])
