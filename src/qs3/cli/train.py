@@ -76,8 +76,8 @@ def train(options: Annotated[TrainOptions, tyro.conf.arg(name="")]) -> int:
 def run(options: TrainOptions) -> Any:
     """Read the data, train, and write what ``evaluate`` needs to make a record."""
     from qs3.datasets import load_clouds, load_unlabelled
-    from qs3.datasets.storage import open_folder
     from qs3.datasets.clouds import digests
+    from qs3.datasets.storage import open_folder
     from qs3.training import fit
 
     adapts = options.method == "qbst"
