@@ -1,0 +1,154 @@
+"""HDF5 files of clouds, ``data`` [b n c] and ``label`` [b], opened with every check in one place.
+
+A file may announce far more than it holds, or send its reader to other files. So only plain
+numbers are read that lie in the file itself, and only after their announced size has been held
+against the file's own.
+"""
+
+import io
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Int
+
+from qs3.errors import InputError
+
+MOST_BYTES = 4 * 2**30
+"""Largest announced size of one dataset."""
+DENSEST = 100
+"""Largest ratio of announced size to file; coordinates do not compress that well."""
+
+_SLACK = 2**20
+_BLOCK = 2**24
+# gzip, shuffle, Fletcher's checksum, szip, LZF: what HDF5 and h5py bring; no plugin is loaded.
+_FILTERS = (1, 2, 3, 4, 32000)
+
+
+def read_file(
+    path: Path, columns: Sequence[int], classes: int
+) -> tuple[Float32[np.ndarray, "b n 3"], Int[np.ndarray, "b"]]:
+    """Read ``data`` and ``label`` of one file.
+
+    Args:
+        path: The file.
+        columns: Numbers of columns that ``data`` may have; those after the third are dropped.
+        classes: Number of classes; labels are 0 to one less.
+
+    Raises:
+        InputError: where the file is missing, damaged or cut short, lacks a dataset, has one of
+            another kind, shape or announced size, sends the reader to another file, or holds a
+            label out of range or a point that is not finite.
+    """
+    # Imported here: layouts of other kinds do without.
+    import h5py
+
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    size = path.stat().st_size
+    try:
+        with h5py.File(path, "r") as file:
+            data = _dataset(file, "data", size)
+            label = _dataset(file, "label", size)
+            shape = data.shape
+            if data.dtype.kind != "f" or len(shape) != 3 or shape[2] not in columns:
+                several = " or ".join(str(count) for count in columns)
+                raise InputError(
+                    f"data must be floats of shape [b n {several}], not {data.dtype} of shape "
+                    f"{list(shape)}"
+                )
+            if label.dtype.kind not in "iu" or label.shape not in ((shape[0],), (shape[0], 1)):
+                raise InputError(
+                    f"label must be whole numbers of shape [{shape[0]}], not {label.dtype} of "
+                    f"shape {list(label.shape)}"
+                )
+            if 0 in shape:
+                raise InputError("holds no point")
+            labels = _labels(label[()].reshape(-1), classes)
+            points = _points(data)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except Exception as error:  # the library raises whatever it stumbles over
+        lines = str(error).splitlines() or [type(error).__name__]
+        raise InputError(f"{path}: cannot be read as HDF5 ({lines[0]})") from error
+    return points, labels
+
+
+def _dataset(file: Any, name: str, size: int) -> Any:
+    """Return a dataset of plain numbers that lie in this file, no more than it can hold."""
+    import h5py
+
+    link = file.get(name, getlink=True)
+    if link is None:
+        there = ", ".join(ascii(other) for other in itertools.islice(file, 5))
+        raise InputError(f"has no dataset {name!r}, only {there[:200] or 'none'}")
+    if not isinstance(link, h5py.HardLink):
+        raise InputError(f"{name} is a link, which may lead to another file; links are not read")
+    found = file[name]
+    if not isinstance(found, h5py.Dataset):
+        raise InputError(f"{name} is no dataset")
+    if found.is_virtual or found.external:
+        raise InputError(f"{name} lies in another file, which is not read")
+    if found.shape is None or found.dtype.kind not in "fiu" or found.dtype.itemsize > 8:
+        raise InputError(f"{name} holds {found.dtype}, no plain numbers")
+    _check_size(found, name, size)
+    return found
+
+
+def _check_size(dataset: Any, name: str, size: int) -> None:
+    plist = dataset.id.get_create_plist()
+    for index in range(plist.get_nfilters()):
+        if plist.get_filter(index)[0] not in _FILTERS:
+            raise InputError(f"{name} is compressed by a plugin; write it again with gzip or none")
+    announced = math.prod(dataset.shape) * dataset.dtype.itemsize
+    stored = min(dataset.id.get_storage_size(), size)
+    # Only chunks can be compressed; a chunk may be larger than the dataset.
+    most = stored
+    if dataset.chunks is not None:
+        announced = max(announced, math.prod(dataset.chunks) * dataset.dtype.itemsize)
+        most = max(_SLACK, DENSEST * stored)
+    if announced > min(most, MOST_BYTES):
+        raise InputError(
+            f"{name} announces {announced} bytes (shape {list(dataset.shape)}), but the file has "
+            f"{stored} of it; damaged, or made to fill the memory"
+        )
+
+
+def _labels(numbers: np.ndarray, classes: int) -> Int[np.ndarray, "b"]:
+    low, high = int(numbers.min()), int(numbers.max())
+    if low < 0 or high >= classes:
+        raise InputError(f"label {low if low < 0 else high} is none of 0 to {classes - 1}")
+    return numbers.astype(np.int64)
+
+
+def _points(data: Any) -> Float32[np.ndarray, "b n 3"]:
+    """Read block by block, so that colours and float64 never lie in memory as a whole."""
+    count, number, columns = data.shape
+    step = max(1, _BLOCK // (number * columns * data.dtype.itemsize))
+    if data.chunks is not None:  # no chunk is decompressed for two blocks
+        step = -(-step // data.chunks[0]) * data.chunks[0]
+    points = np.zeros((count, number, 3), dtype=np.float32)
+    for start in range(0, count, step):
+        with np.errstate(over="ignore"):
+            points[start : start + step] = data[start : start + step][..., :3]
+    finite = np.isfinite(points).all(axis=(1, 2))
+    if not finite.all():
+        raise InputError(f"cloud {int(np.argmin(finite))} has a point that is not finite")
+    return points
+
+
+def hdf5_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
+    """Return an HDF5 file of plain datasets; equal arrays give equal bytes.
+
+    Made in memory, so that a full disk shows where the bytes are written and never half-way.
+    """
+    import h5py
+
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        for name, array in arrays.items():
+            file.create_dataset(name, data=array, track_times=False)
+    return buffer.getvalue()
