@@ -94,3 +94,25 @@ def test_shapes_and_meshes_go_into_one_data_set(qs3, quick, cad, tmp_path):
     assert {name: n for name, n in found["classes"].items() if n} == {"chair": 2, "sofa": 2}
     assert found["settings"]["meshes"] == "cad+shapes"
     assert found["settings"]["dtype"] == "float16"
+
+
+def test_labels_in_a_csv_and_the_ten_classes(qs3, quick, tmp_path):
+    from qs3.meshes import shapes
+
+    flat = tmp_path / "flat"
+    flat.mkdir()
+    for index, name in enumerate(("chair", "table", "cabinet")):
+        shapes.make(name, index).export(flat / f"{name}.glb")
+    flags = ("--meshes", flat, "--out", tmp_path / "out", "--num-points", 64, *quick)
+    assert "--labels" in qs3.refuses("generate", *flags)
+    rows = ["uid,category,split", "chair,Arm Chair,train", "table,desk,test", "cabinet,toilet,test"]
+    (tmp_path / "labels.csv").write_text("\n".join(rows) + "\n")
+    named = (*flags, "--labels", tmp_path / "labels.csv")
+    qs3("generate", *named, "--classes", "pointda10")
+    found = json.loads(qs3("info", tmp_path / "out", "--as-json").stdout)
+    assert {name: n for name, n in found["classes"].items() if n} == {"chair": 1, "table": 1}
+    assert found["splits"] == {"test": 1, "train": 1}
+    (tmp_path / "labels.csv").write_text("uid,category\n../thesis,chair\n")
+    line = qs3.refuses("generate", *named, "--classes", "pointda10")
+    assert "labels.csv" in line
+    assert "line 2" in line

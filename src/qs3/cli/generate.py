@@ -1,5 +1,6 @@
 """``qs3 generate``: many meshes in, one data set out."""
 
+import dataclasses
 import os
 import re
 import sys
@@ -26,12 +27,18 @@ class GenerateOptions:
     to go on after a stop."""
     seed: int = 0
     """Root of all seeds; another seed draws other shapes and other poses."""
+    up: Literal["z", "y"] | None = None
+    """Up axis of every mesh file; by default y for glTF and ShapeNet, z for all others."""
     per_class: int = 10
     """Objects a class, of the built-in shapes."""
     scans_per_mesh: int = 1
     """Scans of each object."""
     classes: tuple[str, ...] = ()
-    """Classes to scan, by the names of their folders; all by default."""
+    """Classes to scan, by the names of their folders, or pointda10 for its ten, renamed; all by
+    default."""
+    labels: Path | None = None
+    """CSV that tells the class of each mesh of the folder, and its split: columns file (or uid),
+    class and split."""
     workers: int | None = None
     """Processes, of one thread each; all cores by default. The bytes written do not depend on
     it."""
@@ -94,6 +101,9 @@ def _work(options: GenerateOptions) -> tuple[Any, Any]:
         raise InputError(f"--seed {options.seed}: must not be negative")
     if not options.meshes:
         raise InputError("--meshes: name a folder of meshes, or shapes for the built-in ones")
+    folders = [source for source in options.meshes if source != "shapes"]
+    if options.labels is not None and len(folders) != 1:
+        raise InputError(f"--labels {options.labels}: goes with one folder of --meshes")
     items = []
     for source in options.meshes:
         items += collect(
@@ -101,14 +111,17 @@ def _work(options: GenerateOptions) -> tuple[Any, Any]:
             per_class=options.per_class,
             seed=options.seed,
             classes=options.classes or None,
+            labels=None if source == "shapes" else options.labels,
         )
+    if options.up is not None:
+        items = [i if i.path is None else dataclasses.replace(i, up=options.up) for i in items]
     built_in = "shapes" in options.meshes
     names = {item.class_name for item in items}
     if "" in names:
         flat = next(item for item in items if not item.class_name)
         raise InputError(
             f"{' '.join(options.meshes)}: {flat.id} lies flat in its folder and its class is "
-            "unknown; put the meshes into one folder a class"
+            "unknown; put the meshes into one folder a class, or name a CSV of them: --labels"
         )
     sensor = options.scene.resolve_sensor(options.camera.resolve_sensor())
     settings = GenerateSettings(
@@ -194,9 +207,7 @@ def _tell(report: Any, options: GenerateOptions, part: tuple[int, int]) -> int:
 
 
 def _classes(names: set[str]) -> tuple[str, ...]:
-    """PointDA-10's ten classes where all names map onto them, else the folders' own."""
-    from qs3.datasets.classes import POINTDA10, canonical
+    """PointDA-10's ten classes where all names are among them, else the folders' own."""
+    from qs3.datasets.classes import POINTDA10
 
-    if all(canonical(name) in POINTDA10 for name in names):
-        return POINTDA10
-    return tuple(sorted(names))
+    return POINTDA10 if names <= set(POINTDA10) else tuple(sorted(names))

@@ -5,7 +5,7 @@ import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -27,6 +27,8 @@ class ScanOptions:
     """Folder to write: cloud.ply, clean.ply, montage.png, scan.json."""
     seed: int = 0
     """All random steps follow from it."""
+    up: Literal["z", "y"] | None = None
+    """Up axis of the mesh file; by default y for glTF, z for all others."""
     save_images: bool = False
     """Also write the grey pair, the 16-bit depth and the camera of each view, object's part."""
     frames: bool = False
@@ -50,7 +52,7 @@ def scan(options: Annotated[ScanOptions, tyro.conf.arg(name="")]) -> int:
     start = time.perf_counter()
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: must not be negative")
-    mesh, origin = _load(options.mesh, options.seed)
+    mesh, origin = _load(options.mesh, options.seed, options.up)
     sensor = options.scene.resolve_sensor(options.camera.resolve_sensor())
     settings = options.camera.scan_arguments() | options.scene.scan_arguments(sensor)
     beside = None
@@ -94,7 +96,7 @@ def scan(options: Annotated[ScanOptions, tyro.conf.arg(name="")]) -> int:
     return 0
 
 
-def _load(name: str, seed: int) -> tuple[Any, dict[str, Any]]:
+def _load(name: str, seed: int, up: Literal["z", "y"] | None = None) -> tuple[Any, dict[str, Any]]:
     from qs3.meshes import load_mesh, shapes
 
     if name in shapes.CLASSES and not Path(name).exists():
@@ -104,7 +106,7 @@ def _load(name: str, seed: int) -> tuple[Any, dict[str, Any]]:
         raise InputError(
             f"{name}: neither a mesh file nor a built-in class ({', '.join(shapes.CLASSES)})"
         )
-    return load_mesh(path), {"name": path.name, "source": "file", "sha256": sha256(path)}
+    return load_mesh(path, up), {"name": path.name, "source": "file", "sha256": sha256(path)}
 
 
 def _record(

@@ -35,6 +35,7 @@ _ALIASES: dict[str, tuple[str, ...]] = {
     ),
     "chair": (
         "armchair",
+        "arm_chair",
         "office_chair",
         "swivel_chair",
         "stool",
