@@ -21,6 +21,7 @@ CLOUDS_A_FILE = 2048
 POINTS = 2048
 
 _LONGEST_LIST = 2**20
+_H5_NAME = re.compile(r"[\w.+-]{1,200}\.h5", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,8 @@ def _from_list(root: Path, path: Path) -> list[Path]:
     found = []
     for line in text_lines(path):
         steps = re.split(r"[/\\]", line)
-        if ".." in steps or steps[0] == "" or ":" in line or not steps[-1].endswith(".h5"):
+        inside_names = ".." not in steps and steps[0] != "" and ":" not in line
+        if not inside_names or not _H5_NAME.fullmatch(steps[-1]):
             raise InputError(f"{path}: {line[:80]!r} is no .h5 file of its folder")
         inside = root / steps[-1]
         if not inside.resolve().is_relative_to(root.resolve()):

@@ -4,7 +4,8 @@
 [b 2048 3], ``label`` [b] and in some variants ``mask`` [b 2048], −1 where a point is background.
 They lie in ``main_split`` and ``main_split_nobg``, the latter without background; the variants are
 none, ``_augmented25_norot``, ``_augmented25rot``, ``_augmentedrot`` and
-``_augmentedrot_scale75``. All points are read, background too, as the benchmark's classifiers see them.
+``_augmentedrot_scale75``. All points are read, background too, as the benchmark's classifiers
+see them.
 
 Convention:
     y is up in the files: the code released with them turns clouds about y, and issue 33 of its
