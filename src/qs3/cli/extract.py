@@ -63,7 +63,8 @@ class DepthOptions:
     class_name: Annotated[str, tyro.conf.arg(name="class")] = ""
     """Class of every object; object, or obj_000001 and so on, by default."""
     names: Path | None = None
-    """CSV with the columns name and class: of an image, an instance or a model of BOP."""
+    """CSV with the columns name and class: of an image (a), an instance (a/1, or */1 in any image)
+    or a model of BOP (1 or obj_000001)."""
     frame: Literal["auto", "world", "camera", "model"] = "auto"
     """Axes of the clouds, in BOP's layout: auto is the world where the scene tells it."""
     depth_folder: str = "depth"

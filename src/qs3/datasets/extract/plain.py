@@ -47,7 +47,7 @@ class DepthSettings:
     class_name: str = "object"
     """Class of objects that ``names`` does not tell."""
     names: Mapping[str, str] = field(default_factory=dict)
-    """Class of an image, of an instance number, or of ``image/number``."""
+    """Class of ``image``; with ``instances`` first of ``image/number`` and ``*/number``."""
     split: str = ""
     """Split of every object."""
     cut: CutSettings = field(default_factory=CutSettings)
@@ -62,7 +62,7 @@ class DepthSettings:
 
     def class_of(self, image: str, number: int) -> str:
         """Return the class of an object."""
-        keys = (f"{image}/{number}", image, str(number)) if self.instances else (image,)
+        keys = (f"{image}/{number}", f"*/{number}", image) if self.instances else (image,)
         return next((self.names[key] for key in keys if key in self.names), self.class_name)
 
 

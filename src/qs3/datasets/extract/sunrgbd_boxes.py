@@ -126,7 +126,8 @@ def below(root: Path, name: str) -> Path:
 
 def _frame_name(given: str) -> str:
     """The folder below SUNRGBD of a path on the machine of the authors."""
-    return re.sub("/+", "/", given.rpartition("SUNRGBD/")[2] or given).strip("/")
+    _, mark, tail = given.rpartition("SUNRGBD/")
+    return re.sub("/+", "/", tail.strip("/") if mark else given.rstrip("/"))
 
 
 def _from_mat(
