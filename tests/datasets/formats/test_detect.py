@@ -28,6 +28,11 @@ def touch(root, *names):
         (["raw_pc_multiview_point_at/bed/train/a.xyz"], "specklenet10"),
         (["Scannet_single_obj_1012_new/bed/test/a.xyz"], "depthscannet10"),
         (["train/Real/kinect/0/a.xyz"], "graspnetpc10-real-kinect"),
+        (["modelnet/bed/train/a.npy"], "pointda10"),
+        (["scannet/train_0.h5", "scannet/test_0.h5"], "pointda10"),
+        (["airplane/train/a.off", "airplane/test/b.off"], "modelnet-off"),
+        (["ply_data_train0.h5", "shape_names.txt", "train_files.txt"], "modelnet40-h5"),
+        (["training_objectdataset.h5", "test_objectdataset.h5"], "scanobjectnn"),
     ],
 )
 def test_a_layout_is_known_by_names_alone(tmp_path, files, name):

@@ -188,7 +188,8 @@ HOSTILE = {
                  "properties x, y and z"),
     "ply words": ("a.ply", ply_header("ascii", f"element vertex 1\n{XYZ}") + b"11111111",
                   "too few numbers"),
-    "ply endless header": ("a.ply", b"ply\n" + (b"comment ".ljust(60) + b"\n") * 20_000, "no end_header"),
+    "ply endless header": ("a.ply", b"ply\n" + (b"comment ".ljust(60) + b"\n") * 20_000,
+                           "no end_header"),
     "pcd of 10 GB": ("a.pcd", b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\n"
                      b"POINTS 900000000\nDATA binary\n" + bytes(60), "60 of 10800000000 bytes"),
     "pcd wide": ("a.pcd", b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 2000000000\n"

@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from qs3.datasets.classes import map_labels
 from qs3.datasets.clouds import CloudKind
+from qs3.datasets.formats import FORMATS
 from qs3.datasets.formats.detect import detect, format_named, read_as, require
 from qs3.datasets.formats.store_format import write_store
 from qs3.datasets.ragged import RaggedClouds
@@ -54,7 +55,9 @@ def convert(
     """
     layout = format_named(to)
     if layout.write is None:
-        raise InputError(f"{to}: is only read; choose another layout to write")
+        written = [name for name, known in FORMATS.items() if known.write is not None]
+        kin = [name for name in written if name.startswith(to)] or written
+        raise InputError(f"{to}: is only read; written are {', '.join(kin)}")
     check_free(target)
     clouds, name = read_clouds(source, origin, split, cloud)
     if classes is not None:
