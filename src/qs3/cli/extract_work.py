@@ -166,8 +166,8 @@ def _run(
         left = f" of {planned}, {planned - there} had fewer than {_least(settings)} points"
     print(
         f"{there} objects{left}; {report.units} frames or scenes done, {report.skipped} were there "
-        f"before, {len(failures)} failed. Next: qs3 predict or qs3 train --method qbst --target "
-        f"{options.out}",
+        f"before, {len(failures)} failed. Next: qs3 train --method qbst --source DATA --target "
+        f"{options.out} --out RUN",
         file=sys.stderr,
     )
     if failures:
