@@ -1,5 +1,6 @@
 """Every verb, as the README has it, on the smallest input that means something."""
 
+import functools
 import json
 import re
 from pathlib import Path
@@ -145,9 +146,15 @@ def test_doctor_tells_what_is_here(qs3):
         assert here or f".[{extra}]" in text
 
 
+VERBS = (
+    *("scan", "sensors", "realism", "generate", "merge", "info", "verify", "convert", "extract"),
+    *("train", "evaluate", "predict", "doctor", "demo"),
+)
+
+
 def test_every_verb_explains_itself(qs3):
     text = qs3("--help").stdout
-    for verb in ("scan", "generate", "train", "evaluate", "predict", "doctor", "demo"):
+    for verb in VERBS:
         assert verb in text
         assert "usage: qs3" in qs3(verb, "--help").stdout
 
@@ -170,13 +177,31 @@ def test_a_demo_of_the_smallest_size(qs3, tmp_path):
     assert again.stdout == done.stdout
 
 
-def test_flags_of_the_readme_exist(qs3):
-    readme = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"```sh\n(.*?)```", readme, flags=re.DOTALL)
-    text = "\n".join(blocks).replace("\\\n", " ")
-    commands = re.findall(r"^qs3 (\S+)([^#\n]*)", text, flags=re.MULTILINE)
-    assert {verb for verb, _ in commands} >= {"scan", "generate", "train", "evaluate", "predict"}
-    helps = {verb: qs3(verb, "--help").stdout for verb in {verb for verb, _ in commands}}
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+NESTED = ("extract", "sensors")
+
+
+@pytest.fixture(scope="session")
+def help_of(qs3):
+    """The help of a verb, asked for once."""
+
+    @functools.cache
+    def told(*verbs: str) -> str:
+        return qs3(*verbs, "--help").stdout
+
+    return told
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_and_flags_of_the_pages_exist(help_of, page):
+    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+    commands = re.findall(r"^(?:    )?qs3 (\w+)([^#\n]*)", text, flags=re.MULTILINE)
+    if page.name in ("README.md", "factory.md"):
+        assert {verb for verb, _ in commands} >= {"generate", "merge", "verify"}
     for verb, arguments in commands:
+        words = arguments.split()
+        nested = verb in NESTED and words and words[0].isalpha()
+        told = help_of(verb, words[0]) if nested else help_of(verb)
         for flag in re.findall(r"--[a-z-]+", arguments):
-            assert flag in helps[verb], f"qs3 {verb} {flag}"
+            assert flag in told, f"{page.name}: qs3 {verb}{arguments}: {flag}"
