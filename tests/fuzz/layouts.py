@@ -23,6 +23,16 @@ CLASSES = (
 )
 
 
+OWN_CLASSES = {
+    "scanobjectnn": ("bag", "bin", "box"),
+    "graspnetpc10-real-kinect": ("box", "can", "banana"),
+}
+"""Classes of the layouts that cannot hold PointDA-10's."""
+
+FULL = ("modelnet40-h5", "scanobjectnn", "pointda10-h5", "pointda10-npy", "specklenet10")
+"""Layouts of clouds of 2,048 points."""
+
+
 @dataclass(frozen=True)
 class Layout:
     """One layout."""
@@ -38,14 +48,14 @@ class Layout:
         return folder / self.inside if self.inside else folder
 
 
-def clouds(points: int = 64) -> RaggedClouds:
+def clouds(points: int = 64, classes: tuple[str, ...] = CLASSES) -> RaggedClouds:
     rng = np.random.default_rng(0)
     return RaggedClouds(
         clouds=[rng.normal(size=(points, 3)).astype(np.float32) for _ in range(6)],
-        ids=tuple(f"{CLASSES[i % 3]}/{i:03d}" for i in range(6)),
+        ids=tuple(f"{classes[i % 3]}/{i:03d}" for i in range(6)),
         checksum="0" * 64,
         labels=np.arange(6) % 3,
-        class_names=CLASSES,
+        class_names=classes,
         splits=("train", "train", "train", "test", "test", "test"),
     )
 
@@ -62,7 +72,7 @@ def written_as(name: str) -> Callable[[Path], None]:
 
         write = FORMATS[name].write
         assert write is not None
-        write(folder, clouds(2048 if "modelnet" in name or "scanobject" in name else 64))
+        write(folder, clouds(2048 if name in FULL else 64, OWN_CLASSES.get(name, CLASSES)))
 
     return build
 
@@ -147,7 +157,8 @@ def load_meshes(path: Path) -> Any:
 LAYOUTS: dict[str, Layout] = {
     "generated": Layout(build_generated, load_generated),
     "npz": Layout(build_npz, load_any, "clouds.npz"),
-    **{name: layout(name) for name in ("qs3", "ply", "pcd", "npy", "xyz", "specklenet10")},
+    **{name: layout(name) for name in ("qs3", "ply", "pcd", "npy", "xyz", *FULL)},
+    "graspnetpc10": layout("graspnetpc10-real-kinect"),
     **{
         f"mesh-{e}": Layout(build_meshes(e), load_meshes)
         for e in ("off", "obj", "ply", "stl", "glb")

@@ -21,7 +21,8 @@ class TrainOptions:
     """Train a classifier on labelled clouds; with qbst, adapt it to clouds without labels."""
 
     source: str
-    """Labelled clouds: a folder that qs3 generate made, a folder of class folders, an npz file."""
+    """Labelled clouds: what qs3 generate made (also at an address such as s3://bucket/set), or any
+    layout that qs3 convert --list tells."""
     out: Path
     """Folder of the run; run the same command again to go on after a stop."""
     method: Literal["source-only", "qbst"] = "source-only"
