@@ -29,8 +29,15 @@ OWN_CLASSES = {
 }
 """Classes of the layouts that cannot hold PointDA-10's."""
 
-FULL = ("modelnet40-h5", "scanobjectnn", "pointda10-h5", "pointda10-npy", "specklenet10")
-"""Layouts of clouds of 2,048 points."""
+POINTS = {
+    "modelnet40-h5": 2048,
+    "scanobjectnn": 2048,
+    "pointda10-h5": 2048,
+    "pointda10-npy": 2048,
+    "specklenet10": 2048,
+    "graspnetpc10-real-kinect": 1024,
+}
+"""Layouts of clouds of one size."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +79,7 @@ def written_as(name: str) -> Callable[[Path], None]:
 
         write = FORMATS[name].write
         assert write is not None
-        write(folder, clouds(2048 if name in FULL else 64, OWN_CLASSES.get(name, CLASSES)))
+        write(folder, clouds(POINTS.get(name, 64), OWN_CLASSES.get(name, CLASSES)))
 
     return build
 
@@ -157,8 +164,7 @@ def load_meshes(path: Path) -> Any:
 LAYOUTS: dict[str, Layout] = {
     "generated": Layout(build_generated, load_generated),
     "npz": Layout(build_npz, load_any, "clouds.npz"),
-    **{name: layout(name) for name in ("qs3", "ply", "pcd", "npy", "xyz", *FULL)},
-    "graspnetpc10": layout("graspnetpc10-real-kinect"),
+    **{name: layout(name) for name in ("qs3", "ply", "pcd", "npy", "xyz", *POINTS)},
     **{
         f"mesh-{e}": Layout(build_meshes(e), load_meshes)
         for e in ("off", "obj", "ply", "stl", "glb")
