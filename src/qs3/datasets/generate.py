@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from qs3.datasets.executors import Executor, Failure, InlineExecutor, LocalExecutor
 from qs3.datasets.executors.executor import stop_if_fatal
 from qs3.datasets.failures import read_failures, write_failures
@@ -42,6 +40,7 @@ from qs3.datasets.parts import (
 )
 from qs3.datasets.plan import Plan, make_plan, resolve_renderer
 from qs3.datasets.plan import work_list_checksum as work_list_checksum
+from qs3.datasets.progress import progress_bar
 from qs3.datasets.scan_item import GenerateSettings as GenerateSettings
 from qs3.datasets.scan_item import Item as Item
 from qs3.datasets.scan_item import neighbour_of
@@ -199,7 +198,7 @@ class _Run:
     def work(self, text: str | None) -> GenerateReport:
         """Do what is to do."""
         skipped = self.total - len(self.todo)
-        bar = tqdm(total=self.total, initial=skipped, desc=text, disable=text is None, unit="scan")
+        bar = progress_bar(self.total, text, "scan", skipped)
         with bar, self.executor:
             try:
                 self._loop(bar)

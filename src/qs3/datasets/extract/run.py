@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from qs3.datasets.classes import map_labels
 from qs3.datasets.executors import Executor, Failure, InlineExecutor, LocalExecutor, guarded
@@ -25,6 +24,7 @@ from qs3.datasets.manifest import (
     write_manifest,
     write_sums,
 )
+from qs3.datasets.progress import progress_bar
 from qs3.datasets.shards import CloudRow, shard_bytes, table_of
 from qs3.datasets.storage import Folder, open_folder
 from qs3.datasets.transforms import resample
@@ -103,13 +103,8 @@ def run_extract(
             _unit_to_shard, folder, extract_one, tuple(class_names), num_points
         )
         todo = [index for index in range(len(units)) if index not in settled]
-        bar = tqdm(
-            total=len(units),
-            initial=len(settled),
-            desc=folder.name if progress else None,
-            disable=not progress,
-            unit="scene",
-        )
+        text = folder.name if progress else None
+        bar = progress_bar(len(units), text, "scene", len(settled))
         objects = failed = 0
         with bar, executor:
             try:

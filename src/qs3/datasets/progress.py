@@ -1,0 +1,20 @@
+"""One kind of progress bar: rate and time left, on the standard error stream."""
+
+import sys
+from typing import Any
+
+from tqdm import tqdm
+
+_IN_A_LOG = 10.0  # seconds between two lines where nobody watches
+
+
+def progress_bar(total: int, text: str | None, unit: str, initial: int = 0) -> "tqdm[Any]":
+    """Return a bar; ``text`` None shows none. In a log file it writes every ten seconds at most."""
+    return tqdm(
+        total=total,
+        initial=initial,
+        desc=text,
+        disable=text is None,
+        unit=unit,
+        mininterval=0.1 if sys.stderr.isatty() else _IN_A_LOG,
+    )
