@@ -136,6 +136,10 @@ class ScanNetOptions:
     """Pixels of the depth image by which masks shrink."""
     max_frames: int = 20
     """Frames fused to an object, drawn at random from those that see it; 0 fuses all."""
+    min_pixels: int = 200
+    """Pixels of an object that a frame needs to count."""
+    voxel: float = 0.01
+    """Edge of the voxels that keep one measured point each, in metres."""
     min_points: int = 512
     """Objects of fewer points are left out."""
     seed: int = 0

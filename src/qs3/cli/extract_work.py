@@ -86,12 +86,12 @@ def sunrgbd(options: SunOptions) -> int:
 def scannet(options: ScanNetOptions) -> int:
     """Cut objects from ScanNet."""
     from qs3.datasets.extract.scannet import (
-        ScanNetSettings,
         extract_scene,
         list_scenes,
         read_splits,
     )
     from qs3.datasets.extract.scannet_mesh import extract_mesh_scene
+    from qs3.datasets.extract.scannet_settings import ScanNetSettings
 
     classes = _classes(options.classes)
     if classes is None:
@@ -104,6 +104,8 @@ def scannet(options: ScanNetOptions) -> int:
         cut=options.cut,
         erode=options.erode,
         max_frames=options.max_frames,
+        min_pixels=options.min_pixels,
+        voxel=options.voxel,
         min_points=options.min_points,
         seed=options.seed,
         mesh_points=options.output.num_points,

@@ -156,7 +156,7 @@ def test_a_mask_of_instances_gives_a_cloud_each_with_its_class(taken, tmp_path):
     mask = np.where(depth > 0, 3, 0).astype(np.uint16)
     mask[:, : WIDTH // 2][depth[:, : WIDTH // 2] > 0] = 700
     write_png(tmp_path / "mask" / "a.png", mask)
-    (tmp_path / "names.csv").write_text("name,class\na/3,table\n*/700,chair\na,sofa\n", encoding="utf-8")
+    (tmp_path / "names.csv").write_text("name,class\na/3,table\n*/700,chair\na,sofa\n")
     image = DepthImage("a", folder / "depth" / "a.png", tmp_path / "mask" / "a.png")
     names = read_names(tmp_path / "names.csv")
     clouds = list(extract_depth(image, DepthSettings(CAMERA, instances=True, names=names)))

@@ -24,13 +24,14 @@ from qs3.datasets.extract.depth import (
     check_rotation,
     keep_pixels,
     lift,
+    turn,
     upright,
 )
 from qs3.datasets.extract.depth_images import read_depth, read_mask
 from qs3.datasets.extract.intrinsics import Intrinsics, intrinsics_from_matrix
 from qs3.datasets.extract.json_files import json_numbers, read_json_file, whole_number
 from qs3.errors import InputError
-from qs3.geometry import invert_rigid, transform_points
+from qs3.geometry import invert_rigid
 
 CAMERAS = "scene_camera.json"
 _TRUTH = "scene_gt.json"
@@ -211,7 +212,8 @@ def extract_bop(frame: BopFrame, settings: BopSettings) -> Iterator[ExtractedClo
         local = lift(depth, keep_pixels(depth, mask, settings.cut), frame.camera)
         if len(local) < settings.cut.min_points:
             continue
-        points = transform_points(_out_of_camera(frame, item, settings), local)
+        pose = _out_of_camera(frame, item, settings)
+        points = turn(pose[:3, :3], local) + pose[:3, 3]
         yield ExtractedCloud(
             id=f"{frame.id}/{item.number:06d}",
             class_name=settings.class_of(item.obj_id),
@@ -225,9 +227,9 @@ def _out_of_camera(
     frame: BopFrame, item: BopObject, settings: BopSettings
 ) -> Float[np.ndarray, "4 4"]:
     if settings.frame == "camera":
-        turn = np.eye(4)
-        turn[:3, :3] = upright(settings.gravity)
-        return turn
+        level = np.eye(4)
+        level[:3, :3] = upright(settings.gravity)
+        return level
     pose = frame.world_to_camera if settings.frame == "world" else item.to_camera
     if pose is None:
         file, key = (CAMERAS, "w2c") if settings.frame == "world" else (_TRUTH, "m2c")

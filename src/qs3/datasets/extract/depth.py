@@ -105,6 +105,13 @@ def lift(
     return np.stack([(u - camera.cx) * z / camera.fx, (v - camera.cy) * z / camera.fy, z], axis=1)
 
 
+def turn(
+    rotation: Float[np.ndarray, "3 3"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Rotate points; without BLAS, whose rounding depends on the number of its threads."""
+    return np.einsum("ij,nj->ni", rotation, points)
+
+
 def upright(gravity: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Float[np.ndarray, "3 3"]:
     """Rotation from the OpenCV camera to axes with z up.
 

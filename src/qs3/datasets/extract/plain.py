@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Int32
 
 from qs3.datasets.extract.clouds import ExtractedCloud
-from qs3.datasets.extract.depth import CutSettings, keep_pixels, lift, upright
+from qs3.datasets.extract.depth import CutSettings, keep_pixels, lift, turn, upright
 from qs3.datasets.extract.depth_images import DEPTH_FILES, read_depth, read_mask
 from qs3.datasets.extract.intrinsics import Intrinsics
 from qs3.errors import InputError
@@ -125,10 +125,10 @@ def extract_depth(image: DepthImage, settings: DepthSettings) -> Iterator[Extrac
     """
     depth = read_depth(image.path, settings.depth_scale or settings.camera.depth_scale)
     settings.camera.check_size(depth.shape, str(image.path))
-    turn = upright(settings.gravity)
+    level = upright(settings.gravity)
     for number, mask in _objects(image, settings, depth.shape):
         keep = keep_pixels(depth, mask, settings.cut)
-        points = (lift(depth, keep, settings.camera) @ turn.T).astype(np.float32)
+        points = turn(level, lift(depth, keep, settings.camera)).astype(np.float32)
         if len(points) < settings.cut.min_points:
             continue
         name = f"{image.id}/{number}" if settings.instances else image.id

@@ -18,7 +18,7 @@ from jaxtyping import Float, Float32, UInt16
 
 from qs3.datasets.extract.boxes import OrientedBox, inside_box
 from qs3.datasets.extract.clouds import ExtractedCloud
-from qs3.datasets.extract.depth import CutSettings, check_rotation, keep_pixels, lift
+from qs3.datasets.extract.depth import CutSettings, check_rotation, keep_pixels, lift, turn
 from qs3.datasets.extract.depth_images import read_raw
 from qs3.datasets.extract.intrinsics import Intrinsics, intrinsics_from_matrix
 from qs3.errors import InputError
@@ -83,8 +83,8 @@ def decode_depth(raw: UInt16[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
     """Turn stored numbers into metres; NaN where there is none.
 
     Example:
-        >>> decode_depth(np.array([[0, 2000 << 3, 1 << 3 | 1]], np.uint16)).round(3).tolist()
-        [[nan, 2.0, 8.193]]
+        >>> decode_depth(np.array([[0, 2000 << 3, 500 << 3]], np.uint16)).tolist()
+        [[nan, 2.0, 0.5]]
     """
     millimetres = (raw >> 3) | (raw << 13)
     return np.where(millimetres > 0, millimetres / np.float32(1000), np.float32(np.nan))
@@ -120,7 +120,7 @@ def extract_sunrgbd(frame: SunFrame, settings: SunSettings) -> Iterator[Extracte
     depth = decode_depth(raw)
     keep = keep_pixels(depth, np.ones(depth.shape, dtype=bool), settings.cut)
     x, y, z = lift(depth, keep, camera).T
-    world = np.stack([x, z, -y], axis=1) @ frame.tilt.T
+    world = turn(frame.tilt, np.stack([x, z, -y], axis=1))
     for box in frame.boxes:
         try:
             shape = OrientedBox(box.centre, box.basis, box.half)
