@@ -29,7 +29,15 @@ from qs3.sensor.scan import scan
 from qs3.sensor.speckle import PatternSettings
 from qs3.sensor.views import Placement
 
-from .depth_scene import MATRIX, camera_to_world, off_surface, photograph, thing, write_png
+from .depth_scene import (
+    MATRIX,
+    camera_to_world,
+    mutated,
+    off_surface,
+    photograph,
+    thing,
+    write_png,
+)
 
 PLACE = np.eye(4)
 PLACE[:3, :3] = rotation_z(0.7)
@@ -184,6 +192,7 @@ def spoil(scene, tmp_path, name, change):
         ("scene_camera.json", lambda v: v["0"].update(cam_R_w2c=[1] * 9), "is no rotation"),
         ("scene_camera.json", lambda v: v["0"].update(cam_t_w2c=0), "cam_t_w2c must be 3 numbers"),
         ("scene_camera.json", lambda v: v["0"].update(width=161), "160×120 pixels, the camera 161"),
+        ("scene_camera.json", lambda v: v["0"].update(cam_t_w2c=[1e290, 0, 0]), "beyond 1,000 km"),
         ("scene_gt.json", lambda v: {"0": 5}, "not a list of objects"),
         ("scene_gt.json", lambda v: {"0": [5]}, "not a list of objects"),
         ("scene_gt.json", lambda v: {"0": [{}]}, "obj_id must be a whole number"),
@@ -225,3 +234,31 @@ def test_folders_of_pictures_are_names_and_no_paths():
         with pytest.raises(InputError, match="is no folder of a scene"):
             BopSettings(depth=name)
     assert dataclasses.replace(BopSettings(), depth="depth_true").depth == "depth_true"
+
+
+def fuzz(scene, tmp_path, rng, rounds):
+    shutil.copytree(scene, tmp_path / "scene")
+    refused = 0
+    for number in range(rounds):
+        name = ("scene_camera.json", "scene_gt.json")[number % 2]
+        path = tmp_path / "scene" / name
+        path.write_bytes(mutated((scene / name).read_bytes(), rng))
+        try:
+            frames = list_bop_frames(tmp_path / "scene")
+            if number % 20 == 0:
+                clouds(tmp_path / "scene")
+            assert len(frames) <= 2
+        except InputError as error:
+            assert "\n" not in str(error)
+            refused += 1
+        path.write_bytes((scene / name).read_bytes())
+    assert refused > rounds / 10
+
+
+def test_mutated_scenes_are_read_or_refused(scene, tmp_path, rng):
+    fuzz(scene, tmp_path, rng, 200)
+
+
+@pytest.mark.slow
+def test_many_mutated_scenes_are_read_or_refused(scene, tmp_path, rng):
+    fuzz(scene, tmp_path, rng, 4000)

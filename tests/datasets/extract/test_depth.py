@@ -1,5 +1,6 @@
 """Depth images, masks and cameras from files, and the points they give."""
 
+import dataclasses
 import json
 import struct
 import zlib
@@ -28,6 +29,7 @@ from .depth_scene import (
     WIDTH,
     camera_to_world,
     millimetres,
+    mutated,
     off_surface,
     photograph,
     thing,
@@ -94,7 +96,9 @@ def test_upright_is_a_rotation_that_puts_gravity_down(gravity):
     assert np.linalg.det(turn) > 0
     down = np.array(gravity) / np.linalg.norm(gravity)
     np.testing.assert_allclose(turn @ down, [0, 0, -1], atol=1e-9)
-    ahead = turn @ [0, 0, 1]
+    # Within a milliradian of straight down or up the image's upward direction takes over.
+    straight = np.linalg.norm(down[:2]) <= 1e-3
+    ahead = turn @ ([0, -1, 0] if straight else [0, 0, 1])
     assert abs(ahead[0]) < 1e-9
     assert ahead[1] > -1e-9
 
@@ -186,6 +190,15 @@ def test_small_objects_are_left_out(taken):
     count = int((depth > 0).sum())
     assert len(cut(folder, cut=CutSettings(min_points=count))) == 1
     assert not cut(folder, cut=CutSettings(min_points=count + 1))
+
+
+@pytest.mark.parametrize(("fx", "scale"), [(1e-300, None), (1e-9, None), (150.0, 1e30)])
+def test_points_that_no_camera_sees_are_refused(taken, fx, scale):
+    folder, _, _ = taken
+    image = DepthImage("a", folder / "depth" / "a.png", folder / "mask" / "a.png")
+    camera = dataclasses.replace(CAMERA, fx=fx)
+    with pytest.raises(InputError, match=r"a\.png: a point lies beyond"):
+        list(extract_depth(image, DepthSettings(camera, depth_scale=scale)))
 
 
 def test_every_way_to_tell_a_camera(tmp_path):
@@ -403,13 +416,6 @@ def test_settings_out_of_range_are_refused(bad):
     for wrong in ({"gravity": (0.0, 0.0, 0.0)}, {"box": (5, 0, 5, 9)}, {"box": (-1, 0, 5, 9)}):
         with pytest.raises(InputError):
             DepthSettings(CAMERA, **wrong)
-
-
-def mutated(content: bytes, rng) -> bytes:
-    changed = bytearray(content)
-    for _ in range(int(rng.integers(1, 6))):
-        changed[int(rng.integers(len(changed)))] = int(rng.integers(256))
-    return bytes(changed[: int(rng.integers(len(changed) + 1))] if rng.random() < 0.3 else changed)
 
 
 def resealed(content: bytes) -> bytes:

@@ -15,7 +15,7 @@ from qs3.datasets.extract.sunrgbd import SunSettings, decode_depth, extract_sunr
 from qs3.datasets.extract.sunrgbd_boxes import below, list_sunrgbd, rename_to
 from qs3.errors import InputError
 
-from .depth_scene import off_surface
+from .depth_scene import mutated, off_surface
 from .sun_writers import FRAMES, meta_row, placed, structs, truth, write_sunrgbd
 
 CHAIR = rename_to(["chair"])
@@ -216,8 +216,6 @@ def test_a_truncated_mat_file_is_refused(root, tmp_path):
 
 
 def fuzz(root, tmp_path, rng, rounds):
-    from .test_depth import mutated
-
     savemat(tmp_path / "plain.mat", {"SUNRGBDMeta": structs([
         meta_row(FRAMES[0], np.eye(3), np.eye(3), [("chair", truth(0)), ("bed", truth(1))])
     ])})  # fmt: skip
@@ -241,3 +239,35 @@ def test_mutated_mat_files_are_read_or_refused(root, tmp_path, rng):
 @pytest.mark.slow
 def test_many_mutated_mat_files_are_read_or_refused(root, tmp_path, rng):
     fuzz(root, tmp_path, rng, 5000)
+
+
+def fuzz_json(root, bare, tmp_path, rng, rounds):
+    """The list of boxes, an annotation and its matrices in turn, through to the clouds at times."""
+    frame = bare / FRAMES[0]
+    paths = [tmp_path / "boxes.json", frame / "annotation3Dfinal" / "index.json",
+             frame / "extrinsics" / "20150101.txt", frame / "intrinsics.txt"]  # fmt: skip
+    shutil.copy(root / "boxes.json", paths[0])
+    good = [path.read_bytes() for path in paths]
+    refused = 0
+    for number in range(rounds):
+        which = number % 4
+        paths[which].write_bytes(mutated(good[which], rng))
+        try:
+            frames = list_sunrgbd(bare, paths[0], rename=CHAIR)
+            frames += list_sunrgbd(bare / "kv1", rename=CHAIR)
+            if number % 20 < 4:
+                clouds(frames)
+        except InputError as error:
+            assert "\n" not in str(error)
+            refused += 1
+        paths[which].write_bytes(good[which])
+    assert refused > rounds / 20
+
+
+def test_mutated_lists_of_boxes_are_read_or_refused(root, bare, tmp_path, rng):
+    fuzz_json(root, bare, tmp_path, rng, 120)
+
+
+@pytest.mark.slow
+def test_many_mutated_lists_of_boxes_are_read_or_refused(root, bare, tmp_path, rng):
+    fuzz_json(root, bare, tmp_path, rng, 4000)

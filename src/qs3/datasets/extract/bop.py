@@ -21,6 +21,7 @@ from jaxtyping import Float
 from qs3.datasets.extract.clouds import ExtractedCloud
 from qs3.datasets.extract.depth import (
     CutSettings,
+    as_cloud,
     check_rotation,
     keep_pixels,
     lift,
@@ -213,11 +214,11 @@ def extract_bop(frame: BopFrame, settings: BopSettings) -> Iterator[ExtractedClo
         if len(local) < settings.cut.min_points:
             continue
         pose = _out_of_camera(frame, item, settings)
-        points = turn(pose[:3, :3], local) + pose[:3, 3]
+        points = as_cloud(turn(pose[:3, :3], local) + pose[:3, 3], str(path))
         yield ExtractedCloud(
             id=f"{frame.id}/{item.number:06d}",
             class_name=settings.class_of(item.obj_id),
-            points=points.astype(np.float32),
+            points=points,
             split=settings.split,
             source={"obj_id": item.obj_id, "points": len(points), "pixels": int(mask.sum())},
         )

@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float, Float32
 from qs3.datasets.extract.intrinsics import Intrinsics
 from qs3.errors import InputError
 
+_FARTHEST = 1e6
+
 
 @dataclass(frozen=True)
 class CutSettings:
@@ -102,14 +104,28 @@ def lift(
     """
     v, u = np.nonzero(keep)
     z = depth[keep].astype(np.float64)
-    return np.stack([(u - camera.cx) * z / camera.fx, (v - camera.cy) * z / camera.fy, z], axis=1)
+    with np.errstate(over="ignore"):  # as_cloud refuses what no camera sees
+        x, y = (u - camera.cx) * z / camera.fx, (v - camera.cy) * z / camera.fy
+    return np.stack([x, y, z], axis=1)
+
+
+def as_cloud(points: Float[np.ndarray, "n 3"], where: str) -> Float32[np.ndarray, "n 3"]:
+    """Return points as a cloud of a data set.
+
+    Raises:
+        InputError: where a point is not within 1,000 km, naming ``where``.
+    """
+    if not np.abs(points).max(initial=0.0) < _FARTHEST:
+        raise InputError(f"{where}: a point lies beyond 1,000 km; check camera, depth and pose")
+    return points.astype(np.float32)
 
 
 def turn(
     rotation: Float[np.ndarray, "3 3"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Rotate points; without BLAS, whose rounding depends on the number of its threads."""
-    return np.einsum("ij,nj->ni", rotation, points)
+    with np.errstate(over="ignore", invalid="ignore"):  # as above
+        return np.einsum("ij,nj->ni", rotation, points)
 
 
 def upright(gravity: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Float[np.ndarray, "3 3"]:
@@ -117,7 +133,7 @@ def upright(gravity: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Float[np.n
 
     Convention:
         z is against ``gravity``, exactly; y is the viewing direction as far as it is level (the
-        image's upward direction where the camera looks straight up or down); x is to the right.
+        image's upward direction within a milliradian of straight up or down); x is to the right.
         A level camera's point (x, y, z) becomes (x, z, −y).
 
     Args:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Int32
 
 from qs3.datasets.extract.clouds import ExtractedCloud
-from qs3.datasets.extract.depth import CutSettings, keep_pixels, lift, turn, upright
+from qs3.datasets.extract.depth import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.datasets.extract.depth_images import DEPTH_FILES, read_depth, read_mask
 from qs3.datasets.extract.intrinsics import Intrinsics
 from qs3.errors import InputError
@@ -128,7 +128,7 @@ def extract_depth(image: DepthImage, settings: DepthSettings) -> Iterator[Extrac
     level = upright(settings.gravity)
     for number, mask in _objects(image, settings, depth.shape):
         keep = keep_pixels(depth, mask, settings.cut)
-        points = turn(level, lift(depth, keep, settings.camera)).astype(np.float32)
+        points = as_cloud(turn(level, lift(depth, keep, settings.camera)), str(image.path))
         if len(points) < settings.cut.min_points:
             continue
         name = f"{image.id}/{number}" if settings.instances else image.id

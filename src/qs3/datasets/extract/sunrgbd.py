@@ -18,7 +18,14 @@ from jaxtyping import Float, Float32, UInt16
 
 from qs3.datasets.extract.boxes import OrientedBox, inside_box
 from qs3.datasets.extract.clouds import ExtractedCloud
-from qs3.datasets.extract.depth import CutSettings, check_rotation, keep_pixels, lift, turn
+from qs3.datasets.extract.depth import (
+    CutSettings,
+    as_cloud,
+    check_rotation,
+    keep_pixels,
+    lift,
+    turn,
+)
 from qs3.datasets.extract.depth_images import read_raw
 from qs3.datasets.extract.intrinsics import Intrinsics, intrinsics_from_matrix
 from qs3.errors import InputError
@@ -132,7 +139,7 @@ def extract_sunrgbd(frame: SunFrame, settings: SunSettings) -> Iterator[Extracte
         yield ExtractedCloud(
             id=f"{frame.id}/{box.number:03d}",
             class_name=box.class_name,
-            points=points.astype(np.float32),
+            points=as_cloud(points, frame.id),
             split=frame.split,
             source={"points": len(points), **_plain(shape)},
         )
