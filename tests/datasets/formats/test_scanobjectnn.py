@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from qs3.datasets.classes import POINTDA10
-from qs3.datasets.formats import FORMATS
 from qs3.datasets.formats.convert import convert
 from qs3.datasets.formats.detect import detect
 from qs3.datasets.formats.scanobjectnn import (
@@ -16,11 +15,6 @@ from qs3.datasets.formats.scanobjectnn import (
 )
 from qs3.datasets.load import load_clouds
 from qs3.errors import InputError
-
-
-@pytest.fixture
-def known(monkeypatch):
-    monkeypatch.setitem(FORMATS, FORMAT.name, FORMAT)
 
 
 def release(folder, rng, variant="", labels=range(15)):
@@ -41,7 +35,7 @@ def turned(data):
     return np.stack([data[..., 0], -data[..., 2], data[..., 1]], axis=-1)
 
 
-def test_the_release_is_read_whole_background_too(tmp_path, rng, known):
+def test_the_release_is_read_whole_background_too(tmp_path, rng):
     stored = release(tmp_path / "main_split", rng)
     for path in (tmp_path, tmp_path / "main_split"):
         assert detect(path) is FORMAT
@@ -58,7 +52,7 @@ def test_the_release_is_read_whole_background_too(tmp_path, rng, known):
     np.testing.assert_array_equal(found.points, expected[:15])
 
 
-def test_one_file_is_read_alone(tmp_path, rng, known):
+def test_one_file_is_read_alone(tmp_path, rng):
     release(tmp_path, rng)
     stored = release(tmp_path, rng, "_augmentedrot_scale75")
     path = tmp_path / "test_objectdataset_augmentedrot_scale75.h5"
@@ -145,7 +139,7 @@ def test_one_split_gives_one_file_and_sizes_become_one(tmp_path, rng, formats):
         write_scanobjectnn(tmp_path / "a", given)
 
 
-def test_convert_writes_and_finds_it(tmp_path, rng, known, formats):
+def test_convert_writes_and_finds_it(tmp_path, rng, formats):
     release(tmp_path / "main_split", rng)
     convert(tmp_path / "main_split", tmp_path / "npy", "npy")
     convert(tmp_path / "npy", tmp_path / "again", "scanobjectnn")
