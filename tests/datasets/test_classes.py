@@ -57,3 +57,10 @@ def test_predictions_merge_after_the_arg_max_and_others_are_wrong():
     assert merged.tolist() == [0, 2, 2, -1, -1]
     with pytest.raises(InputError, match="none in common"):
         merge_predictions(np.array([0]), ["toilet"], target)
+
+
+def test_a_class_comes_before_its_alias_where_a_list_has_both():
+    to = ("desk", "table", "chair")
+    labels, kept = map_labels(["dining_table", "desk", "Arm Chair"], np.array([0, 1, 2]), to)
+    assert kept.all()
+    assert [to[i] for i in labels] == ["table", "desk", "chair"]

@@ -109,7 +109,11 @@ def test_an_unfinished_data_set_is_not_taken_for_a_whole_one(fake, tmp_path):
 def test_the_checksum_follows_the_bytes(fake, tmp_path):
     made = make(tmp_path, fake)
     before = read_store(tmp_path).checksum
-    assert read_store(tmp_path, "clean").checksum == before
+    assert read_store(tmp_path, num_points=8).checksum == before  # of what was read, not made
+    assert read_store(tmp_path, "clean").checksum != before
+    other = dataclasses.replace(made[5], label=1 - made[5].label % 2)
+    write_shard(shard_path(tmp_path, 1), [made[4], other])
+    assert read_store(tmp_path).checksum != before
     write_shard(shard_path(tmp_path, 1), made[4:][::-1])
     assert read_store(tmp_path).checksum != before
 

@@ -12,10 +12,14 @@ from qs3.meshes.class_names import canonical as canonical
 
 
 def _positions(names: Sequence[str], to: Sequence[str]) -> Int[np.ndarray, "k"]:
-    """Position in ``to`` of each name, −1 where it is in none: as it is, else by the table."""
+    """Position in ``to`` of each name, −1 where it is in none: as it is, else by the table.
+
+    A list may hold a class beside its alias (ScanObjectNN: table and desk): the class comes first.
+    """
     exact = {name: position for position, name in enumerate(to)}
     merged = {canonical(name): position for position, name in reversed(list(enumerate(to)))}
-    rows = [exact.get(name, merged.get(canonical(name), -1)) for name in names]
+    known = [(name, canonical(name)) for name in names]
+    rows = [exact.get(n, exact.get(folded, merged.get(folded, -1))) for n, folded in known]
     return np.array(rows, dtype=np.int64)
 
 

@@ -1,7 +1,10 @@
 """Reading data sets in memory: a folder of Parquet shards with its ``dataset.json``."""
 
 import collections
+import concurrent.futures
 import hashlib
+import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,10 +20,12 @@ from qs3.datasets.manifest import open_dataset as open_dataset
 from qs3.datasets.manifest import shard_path as shard_path
 from qs3.datasets.manifest import write_manifest as write_manifest
 from qs3.datasets.ragged import RaggedClouds
-from qs3.datasets.shards import STATISTICS, flat_clouds, parse_shard
-from qs3.datasets.storage import Folder, open_folder
+from qs3.datasets.shards import STATISTICS, flat_clouds, parse_shard, read_shard
+from qs3.datasets.storage import Folder, LocalFolder, open_folder
 from qs3.datasets.transforms import stack
 from qs3.errors import InputError
+
+_THREADS = min(os.cpu_count() or 1, 8)
 
 
 def read_ragged(
@@ -55,24 +60,18 @@ def read_ragged(
     clouds: list[np.ndarray] = []
     splits: set[str] = set()
     digest = hashlib.sha256()
-    for index in shards:
-        path = f"{folder}/{shard_name(index)}"
-        content = folder.read(shard_name(index))
-        digest.update(hashlib.sha256(content).digest())
-        table = parse_shard(content, path, ["id", "label", "split", cloud])
-        columns = [table[name].to_pylist() for name in ("id", "label", "split")]
-        splits.update(columns[2])
-        if cloud != "points" and len(table) and not len(table[cloud].combine_chunks().values):
-            raise InputError(f"{folder}: has no {cloud!r} clouds, only 'points'")
-        scanned = flat_clouds(table, cloud, path)
-        for identifier, label, part, points in zip(*columns, scanned, strict=True):
-            if not 0 <= label < len(manifest.class_names):
-                raise InputError(f"{path}: label {label} of {identifier!r} has no class name")
-            if split in (None, part):
-                ids.append(identifier)
-                labels.append(label)
-                parts.append(part)
-                clouds.append(points)
+    # Reading, unpacking and hashing leave the interpreter's lock: threads share the work.
+    with concurrent.futures.ThreadPoolExecutor(_THREADS) as pool:
+        read = pool.map(lambda index: _read_shard(folder, index, cloud, manifest), shards)
+        for columns, scanned, checksum in read:
+            digest.update(checksum)
+            splits.update(columns[2])
+            for identifier, label, part, points in zip(*columns, scanned, strict=True):
+                if split in (None, part):
+                    ids.append(identifier)
+                    labels.append(label)
+                    parts.append(part)
+                    clouds.append(points)
     if not clouds:
         there = ", ".join(sorted(filter(None, splits))) or "none"
         wanted = "no cloud" if split is None else f"no cloud of split {split!r}; splits: {there}"
@@ -85,6 +84,30 @@ def read_ragged(
         class_names=manifest.class_names,
         splits=tuple(parts),
     )
+
+
+def _read_shard(
+    folder: Folder, index: int, cloud: CloudKind, manifest: Manifest
+) -> tuple[list[list[Any]], list[np.ndarray], bytes]:
+    """Ids, labels and splits of a shard, one kind of its clouds, and the checksum of all that."""
+    name = shard_name(index)
+    path = f"{folder}/{name}"
+    wanted = ["id", "label", "split", cloud]
+    if isinstance(folder, LocalFolder):
+        table = read_shard(folder.path / name, wanted)  # these columns alone, not the whole file
+    else:
+        table = parse_shard(folder.read(name), path, wanted)
+    columns = [table[column].to_pylist() for column in wanted[:3]]
+    if cloud != "points" and len(table) and not len(table[cloud].combine_chunks().values):
+        raise InputError(f"{folder}: has no {cloud!r} clouds, only 'points'")
+    for identifier, label in zip(columns[0], columns[1], strict=True):
+        if not 0 <= label < len(manifest.class_names):
+            raise InputError(f"{path}: label {label} of {identifier!r} has no class name")
+    scanned = flat_clouds(table, cloud, path)
+    digest = hashlib.sha256(json.dumps(columns).encode("utf-8"))
+    for points in scanned:
+        digest.update(points.data)
+    return columns, scanned, digest.digest()
 
 
 def read_store(

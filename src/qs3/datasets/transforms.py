@@ -118,4 +118,4 @@ def stack(
         )
     if num_points is not None and sizes != {num_points}:
         clouds = [resample(cloud, num_points) for cloud in clouds]
-    return np.stack(clouds).astype(np.float32)
+    return np.stack(clouds).astype(np.float32, copy=False)
