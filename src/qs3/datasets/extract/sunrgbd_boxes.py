@@ -3,36 +3,31 @@
 ``SUNRGBDMeta3DBB_v2.mat`` of the toolbox; a ``boxes.json`` of this project; or each frame's own
 ``annotation3Dfinal/index.json``. ``boxes.json`` is one object: the frame's folder below the root →
 a list of ``{"class": …, "centroid": [3], "basis": 3×3 (one axis a row), "coeffs": [3]}``.
-
-Convention:
-    An annotation's X and Z are the world's x and y, and −Ymin, −Ymax its z. ``extrinsics`` E
-    turns camera points (x right, y down, z forward); Rtilt is E in the axes (x, z, −y).
 """
 
 import dataclasses
 import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from qs3.datasets.extract.json_files import json_numbers, read_json_file
 from qs3.datasets.extract.matlab import MatArray, read_mat
 from qs3.datasets.extract.scannet_scene import class_of
 from qs3.datasets.extract.sunrgbd import SunBox, SunFrame
+from qs3.datasets.extract.sunrgbd_frames import (
+    DEPTH_FOLDERS,
+    DepthKind,
+    annotated_boxes,
+    read_frame,
+)
 from qs3.errors import InputError
 
 META = "SUNRGBDMeta3DBB_v2.mat"
-DepthKind = Literal["refined", "raw"]
-"""``depth_bfx``, several frames fused and holes filled; or ``depth``, as the camera gave it."""
-
-_FOLDERS = {"refined": "depth_bfx", "raw": "depth"}
 _LARGEST = 1 << 30
-_AXES = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _WORDS = {"endtable": "end table"}  # written as one word here
-_ROOM = ("wall", "floor", "ceiling")
 
 
 def list_sunrgbd(
@@ -76,7 +71,7 @@ def list_sunrgbd(
         told = f"of {found}" if found else "with annotation3Dfinal/index.json"
         raise InputError(
             f"{base}: no frame {told} with such an object is here; expected are "
-            f"kv1/…/{_FOLDERS[depth]}/*.png and so on, as SUNRGBD.zip has them"
+            f"kv1/…/{DEPTH_FOLDERS[depth]}/*.png and so on, as SUNRGBD.zip has them"
         )
     return kept
 
@@ -142,7 +137,7 @@ def _from_mat(
             raise InputError(f"{path}: {str(given)!r} names no depth picture of a frame")
         folder = given.parent.parent
         try:
-            picture = below(base, str(folder / _FOLDERS[depth] / given.name))
+            picture = below(base, str(folder / DEPTH_FOLDERS[depth] / given.name))
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
         if not picture.is_file():
@@ -184,7 +179,7 @@ def _from_json(
         except InputError as error:
             raise InputError(f"{path}: frame {name[:200]!r}: {error}") from error
         if folder.is_dir():
-            yield _frame(base, folder, depth, boxes)
+            yield read_frame(base, folder, depth, boxes)
 
 
 def _json_boxes(value: Any, rename: Callable[[str], str | None]) -> Iterator[SunBox]:
@@ -216,83 +211,14 @@ def _from_annotations(
             objects = value.get("objects") if isinstance(value, dict) else None
             if not isinstance(objects, list):
                 raise InputError(f"{path}: has no list of objects")
-            boxes = list(_annotated(path, objects, rename))
-            frame = _frame(base, folder, depth, boxes) if boxes else None
+            boxes = list(annotated_boxes(path, objects, rename))
+            frame = read_frame(base, folder, depth, boxes) if boxes else None
         except InputError as error:
             # One frame of thousands: it fails alone, and is logged.
             name = folder.relative_to(base).as_posix()
             frame = SunFrame(name, path, np.eye(3), np.eye(3), (), fault=str(error))
         if frame is not None:
             yield frame
-
-
-def _annotated(
-    path: Path, objects: Sequence[Any], rename: Callable[[str], str | None]
-) -> Iterator[SunBox]:
-    for number, entry in enumerate(objects):
-        if not isinstance(entry, dict) or not entry.get("polygon"):
-            continue  # deleted while it was annotated
-        where = f"{path}: object {number}"
-        if not isinstance(entry.get("name"), str) or not isinstance(entry["polygon"], list):
-            raise InputError(f"{where}: needs a name and a list of polygons")
-        called = entry["name"].partition(":")[0].strip(" _")
-        polygon = entry["polygon"][0]
-        name = rename(called) if called not in _ROOM else None
-        if name is None or not isinstance(polygon, dict):
-            continue
-        # Three corners tell a rectangle, as in the toolbox.
-        corners = [_first_three(polygon.get(key), f"{where}: {key}") for key in ("X", "Z")]
-        ends = [json_numbers(polygon.get(k), 1, f"{where}: {k}")[0] for k in ("Ymin", "Ymax")]
-        first, second, third = np.array([*corners, [0.0, 0.0, 0.0]]).T
-        sides = np.stack([second - first, third - second])
-        lengths = np.linalg.norm(sides, axis=1)
-        if (lengths == 0).any():
-            continue  # a line, which holds no point
-        yield SunBox(
-            number,
-            name,
-            (first + third) / 2 - np.array([0.0, 0.0, sum(ends) / 2]),
-            np.vstack([sides / lengths[:, None], [0.0, 0.0, 1.0]]),
-            np.array([*lengths, abs(ends[1] - ends[0])]) / 2,
-        )
-
-
-def _first_three(value: Any, where: str) -> list[float]:
-    if not isinstance(value, list) or len(value) < 3:
-        raise InputError(f"{where} must be a list of four numbers")
-    return json_numbers(value[:3], 3, where)
-
-
-def _frame(base: Path, folder: Path, depth: DepthKind, boxes: Sequence[SunBox]) -> SunFrame:
-    pictures = sorted((folder / _FOLDERS[depth]).glob("*.png"))
-    tilts = sorted((folder / "extrinsics").glob("*.txt"))
-    if len(pictures) != 1 or not tilts:
-        what = f"{len(pictures)} {_FOLDERS[depth]}/*.png instead of 1"
-        raise InputError(f"{folder}: {what if tilts else 'has no extrinsics/*.txt'}")
-    matrix = _text_numbers(folder / "intrinsics.txt", (9,)).reshape(3, 3)
-    # The last one is the latest that was made by hand.
-    turn = _text_numbers(tilts[-1], (9, 12)).reshape(3, -1)[:, :3]
-    return SunFrame(
-        folder.relative_to(base).as_posix(),
-        pictures[0],
-        matrix,
-        _AXES @ turn @ _AXES.T,
-        tuple(boxes),
-    )
-
-
-def _text_numbers(path: Path, counts: tuple[int, ...]) -> Float[np.ndarray, "n"]:
-    try:
-        if path.stat().st_size > 1 << 16:
-            raise ValueError
-        numbers = np.array([float(word) for word in path.read_text("utf-8").split()])
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except ValueError:
-        raise InputError(f"{path}: not a text file of numbers") from None
-    if len(numbers) not in counts:
-        raise InputError(f"{path}: {len(numbers)} numbers instead of {counts[-1]}")
-    return numbers
 
 
 def _read_splits(path: Path) -> dict[str, str]:
