@@ -124,16 +124,18 @@ def main() -> None:
     root = Path(tempfile.mkdtemp(dir=options.folder))
     clouds = make(options.clouds, options.points)
     forms: dict[str, tuple[Path, Reader]] = {}
-    for name, path, write in [
-        ("ours, float32", root / "f32", lambda p: write_store(p, clouds, "float32", False)),
-        ("ours, float16", root / "f16", lambda p: write_store(p, clouds, "float16", False)),
-        ("ours, with clean and surface", root / "all", lambda p: write_store(p, clouds, "float32", True)),
-        ("npy, a file a cloud", root / "npy", lambda p: write_npy(p, clouds)),
-        ("HDF5, contiguous", root / "c.h5", lambda p: write_h5(p, clouds, False)),
-        ("HDF5, a chunk a cloud", root / "k.h5", lambda p: write_h5(p, clouds, True)),
-        ("Zarr, a chunk a cloud", root / "z1", lambda p: write_zarr(p, clouds, 1)),
-        ("Zarr, 64 clouds a chunk", root / "z64", lambda p: write_zarr(p, clouds, 64)),
-    ]:  # fmt: skip
+    writers: dict[str, Callable[[Path], Reader]] = {
+        "ours, float32": lambda path: write_store(path, clouds, "float32", False),
+        "ours, float16": lambda path: write_store(path, clouds, "float16", False),
+        "ours, with clean and surface": lambda path: write_store(path, clouds, "float32", True),
+        "npy, a file a cloud": lambda path: write_npy(path, clouds),
+        "HDF5, contiguous": lambda path: write_h5(path, clouds, False),
+        "HDF5, a chunk a cloud": lambda path: write_h5(path, clouds, True),
+        "Zarr, a chunk a cloud": lambda path: write_zarr(path, clouds, 1),
+        "Zarr, 64 clouds a chunk": lambda path: write_zarr(path, clouds, 64),
+    }
+    for number, (name, write) in enumerate(writers.items()):
+        path = root / str(number)
         forms[name] = (path, write(path))
     rng = np.random.default_rng(1)
     seconds: dict[tuple[str, str], list[float]] = {}

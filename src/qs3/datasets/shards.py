@@ -166,7 +166,7 @@ def parse_shard(content: bytes, where: str, columns: Sequence[str] | None = None
 
 def _read(source: Any, where: str, columns: Sequence[str] | None) -> pa.Table:
     try:
-        with pq.ParquetFile(source, page_checksum_verification=True) as file:
+        with pq.ParquetFile(source, page_checksum_verification=True, pre_buffer=False) as file:
             wanted = list(_NAMES if columns is None else columns)
             if any(file.schema_arrow.equals(schema) for schema in _SCHEMAS.values()):
                 return file.read(columns=wanted, use_threads=False)
