@@ -169,16 +169,19 @@ def _read(source: Any, where: str, columns: Sequence[str] | None) -> pa.Table:
         with pq.ParquetFile(source, page_checksum_verification=True, pre_buffer=False) as file:
             wanted = list(_NAMES if columns is None else columns)
             if any(file.schema_arrow.equals(schema) for schema in _SCHEMAS.values()):
-                return file.read(columns=wanted, use_threads=False)
+                table = file.read(columns=wanted, use_threads=False)
+                table.validate(full=True)  # texts too: Arrow takes any bytes for UTF-8
+                return table
             if not file.schema_arrow.equals(_SCHEMA_1):
                 raise InputError(f"{where}: not a shard of a qs3 data set (other columns)")
             table = file.read(columns=[n for n in wanted if n != "drawn"], use_threads=False)
+            table.validate(full=True)
             if "drawn" in wanted:
                 drawn = _SCHEMAS["float32"].field("drawn")
                 table = table.append_column(drawn, [["{}"] * len(table)])
             return table.select(wanted)
     except (pa.ArrowException, OSError) as error:
-        reason = str(error).splitlines()[0]
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(
             f"{where}: damaged ({reason}); delete it and run the same command again"
         ) from error
