@@ -180,7 +180,7 @@ def _read(source: Any, where: str, columns: Sequence[str] | None) -> pa.Table:
                 drawn = _SCHEMAS["float32"].field("drawn")
                 table = table.append_column(drawn, [["{}"] * len(table)])
             return table.select(wanted)
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(
             f"{where}: damaged ({reason}); delete it and run the same command again"
