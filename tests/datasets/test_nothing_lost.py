@@ -234,6 +234,18 @@ def test_what_failed_is_scanned_again_when_asked(fake, tmp_path, monkeypatch):
     assert content(tmp_path / "out") == content(tmp_path / "new")
 
 
+def test_a_failure_half_forgotten_does_not_come_back(fake, tmp_path):
+    """A row that failed and came later; a power cut while its parts were being removed."""
+    how = {"scan_one": fake.fake_row, "workers": 0, "progress": False}
+    generate(work(fake), tmp_path / "out", SETTINGS, **how)
+    wanted = content(tmp_path / "out")
+    left = tmp_path / "out" / ".parts" / "00002" / "000001.json"
+    left.parent.mkdir(parents=True)
+    left.write_text('{"error": "ValueError", "reason": "broken"}')
+    assert generate(work(fake), tmp_path / "out", SETTINGS, **how).done == 0
+    assert content(tmp_path / "out") == wanted
+
+
 def test_every_state_between_two_writes_is_mended(fake, tmp_path, monkeypatch):
     """Stop after each single write of a run with failures, and go on: always the same end."""
     from qs3.datasets.storage import LocalFolder

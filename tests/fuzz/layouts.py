@@ -7,20 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from qs3.datasets.classes import POINTDA10
 from qs3.datasets.ragged import RaggedClouds
 
-CLASSES = (
-    "bathtub",
-    "bed",
-    "bookshelf",
-    "cabinet",
-    "chair",
-    "lamp",
-    "monitor",
-    "plant",
-    "sofa",
-    "table",
-)
+CLASSES = POINTDA10
 
 
 OWN_CLASSES = {
