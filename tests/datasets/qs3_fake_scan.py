@@ -112,3 +112,17 @@ def crash_once_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRo
 def slow_flaky_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
     time.sleep(0.25)
     return flaky_row(item, scan, settings)
+
+
+def late_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    """Hang, for a bad item, after its part is written and before the answer is given."""
+    from qs3.datasets.storage import LocalFolder
+
+    write = LocalFolder.write
+
+    def write_and_hang(self: LocalFolder, name: str, data: bytes) -> None:
+        write(self, name, data)
+        time.sleep(600)
+
+    LocalFolder.write = write_and_hang if item.id.startswith("bad") else write
+    return fake_row(item, scan, settings)

@@ -169,7 +169,7 @@ def _dry_run(plan: Any, options: GenerateOptions, part: tuple[int, int]) -> int:
     """Print what the run would make and cost."""
     from qs3.datasets.estimate import estimate
 
-    expected = estimate(plan, part)
+    expected = estimate(plan, part, timeout=options.timeout)
     workers = max(_workers(options), 1)
     for name, objects in expected.objects.items():
         print(f"{name}: {objects} objects")

@@ -32,12 +32,15 @@ class Estimate:
     """Scans that this was measured on."""
 
 
-def estimate(plan: Plan, part: tuple[int, int] = (0, 1), scans: int = 3) -> Estimate:
+def estimate(
+    plan: Plan, part: tuple[int, int] = (0, 1), scans: int = 3, timeout: float | None = None
+) -> Estimate:
     """Scan a few objects, spread over the list, and multiply.
 
     Args:
         plan: The work.
         part: ``(i, n)``, as in `generate`.
+        timeout: Seconds that one scan may take; None waits for ever.
         scans: Objects to scan, one after another in one worker, after one more to warm up.
 
     Raises:
@@ -50,7 +53,7 @@ def estimate(plan: Plan, part: tuple[int, int] = (0, 1), scans: int = 3) -> Esti
     sizes: list[int] = []
     seconds: list[float] = []
     failure: Failure | None = None
-    with LocalExecutor(1) as executor:
+    with LocalExecutor(1, timeout) as executor:
         for index in [chosen[0], *chosen]:  # the first scan of a process compiles and loads
             executor.submit(index, _timed, plan, index)
             outcome = executor.next()[1]

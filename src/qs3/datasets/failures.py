@@ -15,10 +15,12 @@ def write_failures(folder: Folder, records: Iterable[Mapping[str, Any]]) -> None
     """Write the log anew, whole, in the order of shards and rows; an empty one is removed."""
     ordered = sorted(records, key=lambda record: (record["shard"], record["row"], record["id"]))
     if not ordered:
-        folder.remove(FAILURES)
+        if folder.exists(FAILURES):
+            folder.remove(FAILURES)
         return
-    lines = [json.dumps(record, ensure_ascii=False) + "\n" for record in ordered]
-    folder.write(FAILURES, "".join(lines).encode("utf-8"))
+    # ASCII alone: some of Unicode's signs end a line in the eyes of some readers.
+    lines = [json.dumps(record) + "\n" for record in ordered]
+    folder.write(FAILURES, "".join(lines).encode("ascii"))
 
 
 def read_failures(where: str | Path | Folder) -> list[dict[str, Any]]:
@@ -34,9 +36,12 @@ def read_failures(where: str | Path | Folder) -> list[dict[str, Any]]:
     if not folder.exists(FAILURES):
         return []
     try:
-        lines = folder.read(FAILURES).decode("utf-8").splitlines()
+        lines = folder.read(FAILURES).decode("utf-8").removesuffix("\n").split("\n")
         records = sorted((json.loads(line) for line in lines), key=lambda record: record["id"])
         # Logs of earlier versions have no row.
         return [record | {"row": int(record.get("row", 0))} for record in records]
     except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{folder}/{FAILURES}: damaged ({error}); delete it") from error
+        raise InputError(
+            f"{folder}/{FAILURES}: damaged ({error}); delete it and run the same "
+            "command again with --retry-failed"
+        ) from error

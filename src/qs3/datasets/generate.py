@@ -70,11 +70,17 @@ def generate(
     manifest = plan.manifest()
     folder = open_folder(out)
     folder.claim(MANIFEST)
+    mine = range(index, plan.shards, count)
     with folder.locked():
-        write_manifest(folder, manifest)
-        run = Generation(plan, folder, executor, scan_one)
-        run.look()
-        run.check_meshes()
-        run.prepare(range(index, plan.shards, count), retry_failed)
-        text = f"{folder.name}: scans" if progress else None
-        return run.work(text)
+        try:
+            write_manifest(folder, manifest)
+            run = Generation(plan, folder, executor, scan_one)
+            run.look()
+            run.check_meshes(mine)
+            run.prepare(mine, retry_failed)
+            return run.work(f"{folder.name}: scans" if progress else None)
+        except OSError as error:
+            raise InputError(
+                f"{folder}: cannot be written to ({error.strerror or error}); mend that and run "
+                "the same command again, nothing is lost"
+            ) from error

@@ -1,6 +1,7 @@
 """One call of ``generate``: what is there, what is under way, what is logged."""
 
 import functools
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -26,6 +27,10 @@ from qs3.datasets.scan_item import neighbour_of
 from qs3.datasets.shards import CloudRow, parse_shard
 from qs3.datasets.storage import Folder
 from qs3.errors import InputError
+
+_KILLED = ("ProcessDied", "Timeout")
+_TOO_MANY = 50
+_SUMS_EVERY = 5.0  # seconds; the whole file is written anew each time
 
 
 @dataclass(frozen=True)
@@ -61,24 +66,33 @@ class Generation:
         self.settled: set[int] = set()
         """Shards that are put together, or all but."""
         self.total = self.done = self.failed = 0
+        self.unlogged = False
+        """Whether the log of failures is behind what is known."""
+        self.in_a_row: set[str] = set()
+        """Objects that failed since the last that did not."""
+        self.summed = time.monotonic()
+        self.summed_up: dict[str, str] = {}
 
     def look(self) -> None:
         """Look at what is there."""
         folder, plan = self.folder, self.plan
         self.sums = read_sums(folder)
+        self.summed_up = dict(self.sums)
         self.settled = set(finished_shards(folder, plan.shards))
         self.parts = parts_there(folder)
         for record in read_failures(folder):
             self.failures[Place(record["shard"], record["row"])] = record
         for place, name in self.parts.items():
+            self.unlogged = True
             if name.endswith(".json"):
                 self.failures[place] = self._record(place, read_failure(folder, name))
             else:
                 self.failures.pop(place, None)
 
-    def check_meshes(self) -> None:
+    def check_meshes(self, mine: Sequence[int]) -> None:
         """Refuse a mesh that is not the one that was scanned; one that failed may be mended."""
-        there, now = read_mesh_sums(self.folder), mesh_sums(self.plan.items)
+        there = read_mesh_sums(self.folder)
+        now = mesh_sums(self.plan.items_of(mine))
         changed = set(changed_meshes(there, now))
         if changed:
             scanned = {place for place, name in self.parts.items() if name.endswith(".parquet")}
@@ -90,8 +104,8 @@ class Generation:
                         f"{name}: the mesh has changed since it was scanned into {self.folder}; "
                         "name another folder, or put the old file back"
                     )
-        if there != now:
-            write_mesh_sums(self.folder, now)
+        if not now.items() <= there.items():
+            write_mesh_sums(self.folder, there | now)
 
     def prepare(self, mine: Sequence[int], retry_failed: bool) -> None:
         """List what is to do."""
@@ -100,16 +114,15 @@ class Generation:
             places = list(plan.places(shard))
             self.total += len(places)
             if shard in finished:
-                lost = [p for p in places if p in self.failures] if retry_failed else []
+                lost = self._missing_rows(shard, places) if retry_failed else []
                 # Parts beside a finished shard: an earlier call was stopped before it tidied up.
                 unsettled = shard_name(shard) not in self.sums or any(
                     place.shard == shard for place in parts
                 )
                 if not lost and not unsettled:
                     continue
-                if unsettled:
-                    self._forget_what_is_there(shard, places)
-                    lost = [p for p in lost if p in self.failures]
+                if unsettled and not retry_failed:
+                    self._missing_rows(shard, places)
             else:
                 lost = [p for p in places if p not in parts]
                 if retry_failed:
@@ -117,14 +130,17 @@ class Generation:
             self.todo += lost
             self.missing[shard] = set(lost)
 
-    def _forget_what_is_there(self, shard: int, places: Sequence[Place]) -> None:
-        """Drop failures whose rows came later: their parts were half removed."""
+    def _missing_rows(self, shard: int, places: Sequence[Place]) -> list[Place]:
+        """Rows that a finished shard lacks; failures of rows that it has are forgotten."""
         name = shard_name(shard)
         table = parse_shard(self.folder.read(name), f"{self.folder}/{name}", ["id"])
         there = set(table["id"].to_pylist())
-        for place in places:
-            if self.plan.row_id(place) in there:
-                self.failures.pop(place, None)
+        self.unlogged = True
+        missing = [place for place in places if self.plan.row_id(place) not in there]
+        for place in set(places) - set(missing):
+            self.failures.pop(place, None)
+        written = {p for p, part in self.parts.items() if part.endswith(".parquet")}
+        return [place for place in missing if place not in written]
 
     def work(self, text: str | None) -> GenerateReport:
         """Do what is to do."""
@@ -137,6 +153,8 @@ class Generation:
                 bar.set_description("finishing what is under way (Ctrl-C again: not even that)")
                 self.executor.drain()
                 raise
+            finally:
+                self._write_sums()
         if not parts_there(self.folder):
             self.folder.remove(PARTS)
         return GenerateReport(done=self.done, skipped=skipped, failed=self.failed)
@@ -171,20 +189,34 @@ class Generation:
         settings = self.plan.settings
         others = ()
         if settings.scene.needs_neighbour:
-            others = (neighbour_of(item, scan, self.plan.items, settings.seed),)
+            position = self.plan.position(place)
+            others = (neighbour_of(item, scan, self.plan.items, settings.seed, position),)
         call = functools.partial(self.scan_one, item, scan, settings, *others)
         self.executor.submit(place, scan_to_part, self.folder, place, settings.dtype, call)
 
     def _scanned(self, place: Place, outcome: Failure | None) -> None:
         self.missing[place.shard].discard(place)
+        if outcome is not None and outcome.kind in _KILLED:
+            # It may have been stopped when its row was written and the answer was not yet here.
+            outcome = None if self.folder.exists(f"{place.stem}.parquet") else outcome
         if outcome is None:
             self.done += 1
-            self.failures.pop(place, None)
+            self.in_a_row.clear()
+            if self.failures.pop(place, None) is not None:
+                self.unlogged = True
             return
         self.failed += 1
+        self.unlogged = True
         self.failures[place] = self._record(place, outcome)
-        if outcome.kind in ("ProcessDied", "Timeout"):  # it could not write this itself
+        if outcome.kind in _KILLED:  # it could not write this itself
             write_failure(self.folder, place, outcome)
+        self.in_a_row.add(self.plan.work(place)[0].id)
+        if len(self.in_a_row) >= _TOO_MANY:
+            raise InputError(
+                f"{_TOO_MANY} objects in a row failed, the last with: {outcome.reason}; if the "
+                "fault is the machine's, mend it and add --retry-failed; if it is theirs, run the "
+                "same command again to go on past them"
+            )
 
     def _record(self, place: Place, failure: Failure) -> dict[str, Any]:
         item, scan = self.plan.work(place)
@@ -202,16 +234,37 @@ class Generation:
     def _submit_finish(self, shard: int) -> None:
         # Logged before the shard is there: afterwards nobody would ask why a row is missing.
         self.settled.add(shard)
-        write_failures(
-            self.folder, [r for place, r in self.failures.items() if place.shard in self.settled]
-        )
-        order = [self.plan.row_id(place) for place in self.plan.places(shard)]
-        dtype = self.plan.settings.dtype
-        self.executor.submit(shard, finish_shard, self.folder, shard, dtype, order)
+        if self.unlogged:
+            known = self.failures.items()
+            write_failures(self.folder, [r for place, r in known if place.shard in self.settled])
+            self.unlogged = any(place.shard not in self.settled for place in self.failures)
+        self.executor.submit(shard, finish_shard, *self._finish_arguments(shard))
+
+    def _finish_arguments(self, shard: int) -> tuple[Any, ...]:
+        places = list(self.plan.places(shard))
+        order = [self.plan.row_id(place) for place in places]
+        failed = [self.plan.row_id(place) for place in places if place in self.failures]
+        return self.folder, shard, self.plan.settings.dtype, order, failed
 
     def _finished(self, shard: int, outcome: str | Failure) -> None:
+        if isinstance(outcome, Failure) and outcome.kind in _KILLED:
+            outcome = finish_shard(*self._finish_arguments(shard))
+        name = shard_name(shard)
         if isinstance(outcome, Failure):
-            raise InputError(outcome.reason)
-        self.sums[shard_name(shard)] = outcome
-        write_sums(self.folder, self.sums)
+            raise InputError(f"{self.folder}/{name}: {outcome.reason}")
+        if not self.folder.exists(name):
+            raise InputError(
+                f"{self.folder}/{name}: was written, but is not there; do all processes see one "
+                "and the same folder? Mend that and run the same command again"
+            )
+        self.sums[name] = outcome
+        if time.monotonic() - self.summed > _SUMS_EVERY:
+            self._write_sums()
         self.folder.remove(part_folder(shard))
+
+    def _write_sums(self) -> None:
+        """Note the checksums; a shard without one is simply put together again."""
+        if self.sums != self.summed_up:
+            write_sums(self.folder, self.sums)
+            self.summed_up = dict(self.sums)
+        self.summed = time.monotonic()

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,7 +54,7 @@ def write_manifest(where: str | Path | Folder, manifest: Manifest) -> None:
 
 
 def check_same(where: str, there: Manifest, wanted: Manifest) -> None:
-    """Refuse a data set of other settings than those wanted; versions may differ.
+    """Refuse a data set of other settings than those wanted; warn where versions differ.
 
     Raises:
         InputError: naming ``where`` and the first setting that differs.
@@ -65,6 +66,13 @@ def check_same(where: str, there: Manifest, wanted: Manifest) -> None:
             raise InputError(
                 f"{where}: made with {name.removeprefix('settings.')} = {was}, not {now}; "
                 "name another folder, or use the same settings"
+            )
+    for package in sorted({*there.versions} & {*wanted.versions}):
+        if there.versions[package] != wanted.versions[package]:
+            warnings.warn(
+                f"{where}: begun with {package} {there.versions[package]}, going on with "
+                f"{wanted.versions[package]}: rows may differ from those of one version",
+                stacklevel=2,
             )
 
 

@@ -57,13 +57,15 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True
     for folder in folders[1:]:
         check_same(str(folder), open_dataset(folder), manifest)
     sums = [read_sums(folder) for folder in folders]
-    meshes = read_mesh_sums(folders[0])
-    for folder in folders[1:]:
-        if changed := changed_meshes(meshes, read_mesh_sums(folder)):
+    meshes: dict[str, str] = {}
+    for folder in folders:
+        own = read_mesh_sums(folder)
+        if changed := changed_meshes(meshes, own):
             raise InputError(
-                f"{changed[0]}: the mesh is another one in {folder} than in {folders[0]}; run both "
-                "parts again with one of them"
+                f"{folder}: was made from other files than the parts named before it: "
+                f"{', '.join(changed[:5])}{' …' if len(changed) > 5 else ''}; run these parts again"
             )
+        meshes |= own
     held = _holders(folders, manifest.shards)
     missing = [index for index in range(manifest.shards) if index not in held]
     if missing:
@@ -76,6 +78,9 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True
     target.claim(MANIFEST)
     copied = 0
     with target.locked():
+        if target.exists(MANIFEST):
+            check_same(str(target), open_dataset(target), manifest)
+            _check_unchanged(target, manifest.shards, sums)
         write_manifest(target, manifest)
         write_mesh_sums(target, meshes)
         failures: dict[str, dict[str, Any]] = {}
@@ -104,6 +109,19 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True
             write_sums(target, done)
             copied += 1
     return MergeReport(copied, manifest.shards - copied, len(failures))
+
+
+def _check_unchanged(target: Folder, shards: int, sums: Sequence[dict[str, str]]) -> None:
+    """Refuse to write over shards that an earlier merge brought and somebody then changed."""
+    there = read_sums(target)
+    for index in finished_shards(target, shards):
+        name = shard_name(index)
+        given = {part[name] for part in sums if name in part}
+        if name in there and given and there[name] not in given:
+            raise InputError(
+                f"{target}/{name}: is neither part's any more, failed scans were made up for here "
+                "or there; merge into a new folder"
+            )
 
 
 def _holders(folders: Sequence[Folder], shards: int) -> dict[int, list[int]]:

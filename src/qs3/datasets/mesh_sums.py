@@ -1,6 +1,7 @@
 """``meshes.json``: the checksum of each mesh file that a data set is made from."""
 
 import concurrent.futures
+import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,11 +15,26 @@ MESHES = "meshes.json"
 
 
 def mesh_sums(items: Sequence[Item]) -> dict[str, str]:
-    """Return the SHA-256 of every item's file, by the item's id; shapes have none."""
+    """Return the SHA-256 of every item's file, by the item's id; shapes have none.
+
+    A file that cannot be read has none either: its scan will fail, and say why.
+    """
     paths = {item.id: getattr(item, "path", None) for item in items}
     files = {name: Path(path) for name, path in paths.items() if path is not None}
     with concurrent.futures.ThreadPoolExecutor() as pool:
-        return dict(zip(files, pool.map(sha256, files.values()), strict=True))
+        sums = dict(zip(files, pool.map(_sum, files.values()), strict=True))
+    return {name: digest for name, digest in sums.items() if digest}
+
+
+def _sum(path: Path) -> str:
+    """Checksum of a mesh file; of a glTF in text, with the buffers that lie beside it."""
+    try:
+        if path.suffix.lower() != ".gltf":
+            return sha256(path)
+        parts = [path, *sorted(path.parent.glob("*.bin"))]
+        return hashlib.sha256("".join(map(sha256, parts)).encode()).hexdigest()
+    except OSError:
+        return ""
 
 
 def read_mesh_sums(folder: Folder) -> dict[str, str]:

@@ -18,9 +18,8 @@ from qs3.datasets.executors import Failure, guarded
 from qs3.datasets.executors.executor import failure_of
 from qs3.datasets.manifest import shard_name
 from qs3.datasets.shards import DType, empty_table, parse_shard, shard_bytes, table_of
-from qs3.datasets.storage import Folder
-
-PARTS = ".parts"
+from qs3.datasets.storage import PARTS, Folder
+from qs3.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -43,10 +42,10 @@ def part_folder(shard: int) -> str:
     return f"{PARTS}/{shard:05d}"
 
 
-def parts_there(folder: Folder) -> dict[Place, str]:
-    """Return the names of the parts in a folder, by their places; of two, the row's."""
+def parts_there(folder: Folder, shard: int | None = None) -> dict[Place, str]:
+    """Return the names of all parts, or of those of a shard, by place; of two, the row's."""
     found: dict[Place, str] = {}
-    for name in folder.names(PARTS):
+    for name in folder.names(PARTS if shard is None else part_folder(shard)):
         words = name.removeprefix(f"{PARTS}/").split("/")
         stem, _, ending = words[-1].partition(".")
         if len(words) == 2 and stem.isdigit() and words[0].isdigit():
@@ -92,31 +91,42 @@ def read_failure(folder: Folder, name: str) -> Failure:
     return Failure(record["error"], record["reason"])
 
 
-def finish_shard(folder: Folder, shard: int, dtype: DType, order: Sequence[str]) -> str:
+def finish_shard(
+    folder: Folder, shard: int, dtype: DType, order: Sequence[str], failed: Sequence[str]
+) -> str:
     """Put the parts of a shard together, with the rows that the shard has already.
 
     Args:
         folder: Folder of the data set.
         shard: Index of the shard.
         dtype: Type of the coordinates.
-        order: Ids of all rows of the shard, in order; failed ones are absent from the result.
+        order: Ids of all rows of the shard, in order.
+        failed: Ids of those that failed; they are absent from the result.
 
     Returns:
         SHA-256 of the shard, in hexadecimal.
 
     Raises:
-        InputError: where a part or the shard that is there is damaged.
+        InputError: where a part or the shard that is there is damaged, or a row is neither there
+            nor among the failed.
     """
     tables = [empty_table(dtype)]
     name = shard_name(shard)
     if folder.exists(name):
         tables.append(parse_shard(folder.read(name), f"{folder}/{name}"))
-    for part in folder.names(part_folder(shard)):
-        if part.endswith(".parquet"):
-            tables.append(parse_shard(folder.read(part), f"{folder}/{part}"))
+    parts = [part for part in parts_there(folder, shard).values() if part.endswith(".parquet")]
+    for part, content in folder.read_many(parts).items():
+        tables.append(parse_shard(content, f"{folder}/{part}"))
     table = pa.concat_tables(tables)
     # A row may be in both where an earlier call was stopped here: they are the same.
     position = {identifier: row for row, identifier in enumerate(table["id"].to_pylist())}
+    known = {*position, *failed}
+    lost = [identifier for identifier in order if identifier not in known]
+    if lost:
+        raise InputError(
+            f"{folder}/{name}: {len(lost)} scans that were made are not there, such as {lost[0]}; "
+            "do all processes see one and the same folder? Mend that and run the same command again"
+        )
     rows = pa.array([position[i] for i in order if i in position], pa.int64())
     content = shard_bytes(table.take(rows))
     folder.write(name, content)

@@ -46,6 +46,16 @@ class Plan:
         item, scan = divmod(index, self.settings.scans_per_mesh)
         return self.items[item], scan
 
+    def position(self, place: Place) -> int:
+        """Return the index of a row's object in the list."""
+        index = place.shard * self.settings.rows_per_shard + place.row
+        return index // self.settings.scans_per_mesh
+
+    def items_of(self, shards: Sequence[int]) -> list[Item]:
+        """Objects that have a row in one of the shards, in order."""
+        wanted = {self.position(place) for shard in shards for place in self.places(shard)}
+        return [self.items[position] for position in sorted(wanted)]
+
     def row_id(self, place: Place) -> str:
         """Name of a row."""
         return row_id(*self.work(place))

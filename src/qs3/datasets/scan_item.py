@@ -125,17 +125,28 @@ def scan_seed(root: int, object_id: str, scan: int) -> int:
     return int(state[0] >> np.uint64(1))
 
 
-def neighbour_of(item: Item, scan: int, items: Sequence[Item], root: int) -> Item:
+def neighbour_of(
+    item: Item, scan: int, items: Sequence[Item], root: int, position: int | None = None
+) -> Item:
     """Draw another item of the work list for a scan; order and worker count do not matter.
+
+    Args:
+        item: The object that is scanned.
+        scan: Index of its scan.
+        items: The work list.
+        root: Root seed.
+        position: Of the object in the list, where it is known: a long list is then not searched.
 
     Raises:
         InputError: where there is no other.
     """
-    others = [other for other in items if other.id != item.id]
-    if not others:
+    if position is None:
+        position = [other.id for other in items].index(item.id)
+    if len(items) < 2:
         raise InputError(f"{item.id}: a scene with a neighbour needs a second mesh to draw from")
     key = np.random.SeedSequence(scan_seed(root, item.id, scan), spawn_key=(0x4E42,))
-    return others[int(np.random.default_rng(key).integers(len(others)))]
+    drawn = int(np.random.default_rng(key).integers(len(items) - 1))
+    return items[drawn + (drawn >= position)]
 
 
 def scan_item(

@@ -4,13 +4,16 @@ import contextlib
 import functools
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from qs3.errors import InputError, MissingExtraError
 from qs3.files import claim_folder, remove_left_overs, write_bytes
+
+PARTS = ".parts"
+"""Sub-folder of what is on its way into a data set."""
 
 _EXTRAS = {
     "s3": ("s3fs", "s3"),
@@ -49,6 +52,10 @@ class LocalFolder:
         if not self.exists(name):
             raise InputError(f"{self.path / name}: no such file")
         return (self.path / name).read_bytes()
+
+    def read_many(self, names: Sequence[str]) -> dict[str, bytes]:
+        """Return the bytes of several files by their names."""
+        return {name: self.read(name) for name in names}
 
     def write(self, name: str, data: bytes) -> None:
         """Write a file under a temporary name, sync it and rename it."""
@@ -107,8 +114,11 @@ class LocalFolder:
                     "another one"
                 ) from None
             except OSError:  # a file system without locks
-                pass
+                yield  # and with no way to know whether somebody else is writing
+                return
             remove_left_overs(self.path)
+            for folder in self.path.glob(f"{PARTS}/*/"):
+                remove_left_overs(folder)
             yield
         finally:
             os.close(handle)
@@ -153,6 +163,15 @@ class RemoteFolder:
             return self._fs.cat_file(self._path(name))
         except FileNotFoundError:
             raise InputError(f"{self.url.rstrip('/')}/{name}: no such file") from None
+
+    def read_many(self, names: Sequence[str]) -> dict[str, bytes]:
+        """Return the bytes of several files by their names, fetched side by side."""
+        if not names:
+            return {}
+        paths = {self._path(name): name for name in names}
+        found = self._fs.cat(list(paths))
+        found = found if isinstance(found, dict) else {next(iter(paths)): found}
+        return {name: found[path] for path, name in paths.items()}
 
     def write(self, name: str, data: bytes) -> None:
         """Write a file by one PUT."""

@@ -7,7 +7,11 @@ from typing import Any, Protocol, runtime_checkable
 
 from qs3.errors import InputError
 
-_STORAGE_IS_AT_FAULT = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
+# Not of one object: a full or lost disk, a mount that went away, no more open files.
+_MACHINE_IS_AT_FAULT = (
+    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO),
+    *(errno.ESTALE, errno.ENOTCONN, errno.EMFILE, errno.ENFILE),
+)
 
 
 @dataclass(frozen=True)
@@ -39,8 +43,8 @@ class Executor(Protocol):
         """Wait for any call to end: its key, and its value or a `Failure`."""
         ...
 
-    def drain(self) -> None:
-        """Let the calls under way end and drop those that wait."""
+    def drain(self) -> list[tuple[Any, Any]]:
+        """Let the calls under way end and drop those that wait; what ended, as `next` gives it."""
         ...
 
     def __enter__(self) -> "Executor":
@@ -69,7 +73,7 @@ def failure_of(error: Exception) -> Failure:
     """Tell a fault of one object from one that no other task will be spared."""
     lines = str(error).strip().splitlines()
     reason = lines[0] if lines else ""
-    storage = isinstance(error, OSError) and error.errno in _STORAGE_IS_AT_FAULT
+    storage = isinstance(error, OSError) and error.errno in _MACHINE_IS_AT_FAULT
     if storage and isinstance(error, OSError):
         reason = error.strerror or reason
     return Failure(type(error).__name__, reason, storage or isinstance(error, ImportError))

@@ -26,9 +26,10 @@ class InlineExecutor:
         key, function, arguments = self._waiting.popleft()
         return key, guarded(function, *arguments)
 
-    def drain(self) -> None:
+    def drain(self) -> list[tuple[Any, Any]]:
         """Drop the calls that wait; none is under way."""
         self._waiting.clear()
+        return []
 
     def __enter__(self) -> "InlineExecutor":
         """Return itself."""

@@ -2,18 +2,28 @@
 
 import concurrent.futures
 import contextlib
+import ctypes
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 from qs3.datasets.executors.executor import Failure, guarded
 from qs3.errors import InputError
 
 _BROKEN_IN_A_ROW = 3
+_NO_PROCESS = (
+    "workers: no process can be started; use workers=0, or put the call of a script under: "
+    "if __name__ == '__main__'"
+)
+_LIBRARIES = ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM")
+ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in _LIBRARIES} | {"OPENCV_FOR_THREADS_NUM": "1"}
+"""Environment in which the libraries use one thread: workers share the cores."""
 
 
 @dataclass(frozen=True)
@@ -59,11 +69,21 @@ class LocalExecutor:
     def _schedule(self, call: _Call) -> None:
         # The first call starts the processes, from threads that inherit what is blocked here:
         # Ctrl-C reaches every process of the terminal, and only the first is to act on it.
-        with _interrupt_blocked():
-            future = self._pool.schedule(
-                guarded, args=(call.function, *call.arguments), timeout=self._timeout
-            )
-        self._calls[future] = call
+        arguments = (call.function, *call.arguments)
+        try:
+            ForkingPickler.dumps(arguments)  # in pebble's own thread a fault would go unseen
+        except Exception as error:
+            raise InputError(f"a call cannot be sent to another process ({error})") from error
+        for _ in range(_BROKEN_IN_A_ROW):
+            try:
+                with _interrupt_blocked():
+                    future = self._pool.schedule(guarded, args=arguments, timeout=self._timeout)
+            except RuntimeError:  # the pool broke while nobody looked: an idle process died
+                self._reopen()
+                continue
+            self._calls[future] = call
+            return
+        raise InputError(_NO_PROCESS)
 
     def next(self) -> tuple[Any, Any]:
         """Wait for any call.
@@ -96,8 +116,8 @@ class LocalExecutor:
         except BrokenProcessPool as error:
             self._restart(call, error)
             return _Again()
-        except Exception as error:  # it could not be sent, or its value could not come back
-            return Failure(type(error).__name__, str(error))
+        except Exception as error:  # its value could not come back; no other's will
+            return Failure(type(error).__name__, str(error), fatal=True)
         self._broken = 0
         return value
 
@@ -105,28 +125,35 @@ class LocalExecutor:
         """Start a new pool where one broke as a whole: a worker died before its first call."""
         self._broken += 1
         if self._broken > _BROKEN_IN_A_ROW:
-            raise InputError(
-                "workers: no process can be started; use workers=0, or put the call of a script "
-                "under: if __name__ == '__main__'"
-            ) from error
-        calls = [call, *self._calls.values()]
+            raise InputError(_NO_PROCESS) from error
+        self._reopen()
+        self._schedule(call)
+
+    def _reopen(self) -> None:
+        """Replace the pool, and hand over anew what it had."""
+        calls = list(self._calls.values())
         self._calls.clear()
         self._close(at_once=True)
         self._open()
         for waiting in calls:
             self._schedule(waiting)
 
-    def drain(self) -> None:
-        """Let the calls under way end, and drop the others."""
+    def drain(self) -> list[tuple[Any, Any]]:
+        """Let the calls under way end, and drop the others; what ended."""
         for future in [future for future in self._calls if not future.running()]:
             future.cancel()
-        running = [future for future in self._calls if not future.cancelled()]
+        running = {f: call for f, call in self._calls.items() if not f.cancelled()}
         concurrent.futures.wait(running)
         self._calls.clear()
+        ended = [(call.key, f) for f, call in running.items() if f.exception() is None]
+        return [(key, future.result()) for key, future in ended]
 
     def _open(self) -> None:
         from pebble import ProcessPool
 
+        # Here, since a process loads its libraries before any code of ours can tell it.
+        self._environment = {name: os.environ.get(name) for name in ONE_THREAD}
+        os.environ.update(ONE_THREAD)
         context: Any = multiprocessing.get_context("spawn")
         self._pool = ProcessPool(self._workers, initializer=_prepare_worker, context=context)
 
@@ -136,6 +163,11 @@ class LocalExecutor:
         else:
             self._pool.close()
         self._pool.join()
+        for name, value in self._environment.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
 
     def __enter__(self) -> "LocalExecutor":
         """Start; processes come with the first call."""
@@ -171,18 +203,14 @@ def _interrupt_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def one_thread() -> None:
-    """Let the libraries of this process, none loaded yet, use one thread: workers share cores."""
-    for name in ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM"):
-        os.environ[f"{name}_NUM_THREADS"] = "1"
-    os.environ["OPENCV_FOR_THREADS_NUM"] = "1"
-
-
 def _prepare_worker() -> None:
-    """Use one thread, leave Ctrl-C to the first process, and end when it is gone."""
-    one_thread()
+    """Leave Ctrl-C to the first process, and end when it is gone."""
     with contextlib.suppress(ValueError):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if sys.platform == "linux":
+        # Also where a mesh hangs in C and no Python runs any more.
+        set_death_signal = 1
+        ctypes.CDLL(None).prctl(set_death_signal, signal.SIGKILL)
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent,), daemon=True).start()

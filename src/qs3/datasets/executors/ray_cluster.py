@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from qs3.datasets.executors.executor import Failure, guarded
-from qs3.datasets.executors.local import one_thread
+from qs3.datasets.executors.local import ONE_THREAD
 from qs3.errors import InputError, MissingExtraError
 
 _LOOK_EVERY = 1.0  # seconds between two looks at what has run too long
@@ -77,15 +77,20 @@ class RayExecutor:
     def next(self) -> tuple[Any, Any]:
         """Wait for any call."""
         while True:
+            self._stop_what_hangs()
             done, _ = self._ray.wait(list(self._calls), num_returns=1, timeout=_LOOK_EVERY)
             if done:
                 key, number = self._calls.pop(done[0])
                 return key, self._outcome(done[0], number)
-            self._stop_what_hangs()
 
     def _outcome(self, reference: Any, number: int) -> Any:
         try:
             return self._ray.get(reference)
+        except self._ray.exceptions.RayTaskError as error:
+            # It failed before any code of ours ran: qs3 or a module of it is missing there.
+            cause = error.cause or error
+            lines = str(cause).strip().splitlines() or [""]
+            return Failure(type(cause).__name__, f"on the cluster: {lines[0]}", fatal=True)
         except self._ray.exceptions.RayError as error:
             if number in self._stopped:
                 return Failure("Timeout", f"took over {self._timeout:g} s and was stopped")
@@ -105,20 +110,23 @@ class RayExecutor:
                 self._stopped.add(number)
                 self._ray.cancel(reference, force=True)
 
-    def drain(self) -> None:
-        """Let the calls under way end, and drop the others."""
+    def drain(self) -> list[tuple[Any, Any]]:
+        """Let the calls under way end, and drop the others; what ended."""
         running: dict[int, float] = {}
         with contextlib.suppress(self._ray.exceptions.RayError):
-            running = self._ray.get(self._clock.running.remote())
+            running = self._ray.get(self._clock.running.remote(), timeout=10 * _LOOK_EVERY)
         wait = []
         for reference, (_, number) in self._calls.items():
             if number in running:
                 wait.append(reference)
             else:
                 self._ray.cancel(reference)
+        done = []
         if wait:
-            self._ray.wait(wait, num_returns=len(wait), timeout=self._timeout)
+            done, _ = self._ray.wait(wait, num_returns=len(wait), timeout=self._timeout)
+        ended = [(self._calls[r][0], self._outcome(r, self._calls[r][1])) for r in done]
         self._calls.clear()
+        return ended
 
     def __enter__(self) -> "RayExecutor":
         """Connect.
@@ -141,13 +149,22 @@ class RayExecutor:
                     "'ray start --head', or use --address local"
                 ) from error
             self._connected_here = True
+        if self._gpus and not ray.cluster_resources().get("GPU"):
+            raise InputError(
+                f"--gpus-per-scan {self._gpus:g}: the cluster has no GPU at this moment; add a "
+                "machine with one, or leave the flag out"
+            )
         here = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
             ray.get_runtime_context().get_node_id(), soft=True
         )
         clock = ray.remote(num_cpus=0, max_restarts=-1, scheduling_strategy=here)(_Clock)
         self._clock = clock.remote()
         self._task = ray.remote(
-            num_cpus=1, num_gpus=self._gpus, max_retries=self._retries, retry_exceptions=False
+            num_cpus=1,
+            num_gpus=self._gpus,
+            max_retries=self._retries,
+            retry_exceptions=False,
+            runtime_env={"env_vars": ONE_THREAD},
         )(_timed)
         return self
 
@@ -182,9 +199,11 @@ def _timed(
     clock: Any, number: int, folder: str, function: Callable[..., Any], arguments: tuple[Any, ...]
 ) -> Any:
     """Make a call on a machine of the cluster."""
-    one_thread()
-    with contextlib.suppress(OSError):  # names relative to where the command was typed
-        os.chdir(folder)
+    try:
+        os.chdir(folder)  # names are relative to where the command was typed
+    except OSError as error:
+        reason = f"{folder}: not there on a machine of the cluster ({error.strerror})"
+        return Failure("OSError", reason, fatal=True)
     clock.begin.remote(number)
     try:
         return guarded(function, *arguments)

@@ -97,8 +97,11 @@ def run_extract(
         failures = {record["shard"]: record for record in read_failures(folder)}
         sums = read_sums(folder)
         settled = {i for i in finished_shards(folder, len(units)) if shard_name(i) in sums}
-        if retry_failed:
+        if retry_failed and failures:
+            # Forgotten first: a shard that is written anew has another checksum.
             settled -= set(failures)
+            sums = {name: sums[name] for name in map(shard_name, sorted(settled))}
+            write_sums(folder, sums)
         call = functools.partial(
             _unit_to_shard, folder, extract_one, tuple(class_names), num_points
         )
@@ -106,26 +109,31 @@ def run_extract(
         text = folder.name if progress else None
         bar = progress_bar(len(units), text, "scene", len(settled))
         objects = failed = 0
+
+        def note(index: int, outcome: Any) -> None:
+            nonlocal objects, failed
+            stop_if_fatal(outcome)
+            was_logged = failures.pop(index, None) is not None
+            if isinstance(outcome, Failure):
+                failed += 1
+                failures[index] = _record(units[index], index, outcome)
+                outcome = _write(folder, index, [])
+            if was_logged or index in failures:
+                write_failures(folder, failures.values())
+            objects += outcome[1]
+            sums[shard_name(index)] = outcome[0]
+            write_sums(folder, sums)
+            bar.set_postfix(objects=objects, failed=failed, refresh=False)
+            bar.update()
+
         with bar, executor:
             try:
                 for index, outcome in _outcomes(executor, call, units, todo):
-                    stop_if_fatal(outcome)
-                    failures.pop(index, None)
-                    if isinstance(outcome, Failure):
-                        failed += 1
-                        failures[index] = _record(units[index], index, outcome)
-                        write_failures(folder, failures.values())
-                        outcome = _write(folder, index, [])
-                    elif retry_failed:
-                        write_failures(folder, failures.values())
-                    digest, count = outcome
-                    objects += count
-                    sums[shard_name(index)] = digest
-                    write_sums(folder, sums)
-                    bar.set_postfix(objects=objects, failed=failed, refresh=False)
-                    bar.update()
+                    note(index, outcome)
             except KeyboardInterrupt:
-                executor.drain()
+                bar.set_description("finishing what is under way")
+                for index, outcome in executor.drain():
+                    note(index, outcome)
                 raise
     return ExtractReport(objects, len(todo), len(settled), failed)
 
