@@ -126,3 +126,8 @@ def late_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
 
     LocalFolder.write = write_and_hang if item.id.startswith("bad") else write
     return fake_row(item, scan, settings)
+
+
+def slow_hanging_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    time.sleep(0.4)
+    return hanging_row(item, scan, settings)

@@ -87,11 +87,46 @@ def test_on_a_cluster_too_what_hangs_or_crashes_fails_alone(fake, tmp_path, clus
             tmp_path / row,
             SETTINGS,
             scan_one=getattr(fake, row),
-            executor=RayExecutor(timeout=3.0 if kind == "Timeout" else None, retries=1),
+            executor=RayExecutor(timeout=12.0 if kind == "Timeout" else None, retries=1),
             progress=False,
         )
         assert report == GenerateReport(done=5, skipped=0, failed=1)
         assert [record["error"] for record in read_failures(tmp_path / row)] == [kind]
+
+
+def test_what_hangs_is_stopped_while_others_go_on(fake, tmp_path, cluster):
+    """A cluster that is never idle still looks at what has run too long."""
+    work = [fake.FakeItem("bad" if i == 0 else f"m{i}") for i in range(240)]
+    order: list[str] = []
+
+    class Watched(RayExecutor):
+        def next(self):
+            key, outcome = super().next()
+            order.append(type(outcome).__name__)
+            return key, outcome
+
+    report = generate(
+        work,
+        tmp_path / "out",
+        SETTINGS,
+        scan_one=fake.slow_hanging_row,
+        executor=Watched(timeout=8.0, retries=1),
+        progress=False,
+    )
+    assert report == GenerateReport(done=239, skipped=0, failed=1)
+    assert order.index("Failure") < len(order) - 30
+
+
+def test_gpus_that_are_not_there_are_refused(fake, tmp_path, cluster):
+    with pytest.raises(InputError, match="no GPU at this moment"):
+        generate(
+            [fake.FakeItem("m")],
+            tmp_path / "out",
+            SETTINGS,
+            scan_one=fake.fake_row,
+            executor=RayExecutor(gpus=0.25),
+            progress=False,
+        )
 
 
 def test_an_address_without_a_cluster_is_told(fake, tmp_path):
