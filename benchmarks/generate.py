@@ -24,6 +24,7 @@ import time
 from pathlib import Path
 
 from qs3.datasets.executors import Executor, LocalExecutor
+from qs3.datasets.executors.local import ONE_THREAD
 from qs3.datasets.failures import read_failures
 from qs3.datasets.generate import generate
 from qs3.datasets.plan import resolve_renderer
@@ -33,10 +34,7 @@ from qs3.meshes import MeshItem, collect
 
 SPECKLENET10 = 5039
 BARE = """
-import sys, time
-from pathlib import Path
-from qs3.datasets.executors.local import one_thread
-one_thread()
+import sys
 from benchmarks_generate import chosen, settings_of, bare
 if __name__ == "__main__":
     print(bare(sys.argv[1], int(sys.argv[2])))
@@ -88,8 +86,8 @@ class Warm:
     def next(self):
         return self.pool.next()
 
-    def drain(self) -> None:
-        self.pool.drain()
+    def drain(self):
+        return self.pool.drain()
 
     def __enter__(self) -> Executor:
         return self.pool
@@ -120,7 +118,8 @@ def compare(options: argparse.Namespace) -> None:
         for turn in range(options.repeats):
             command = [sys.executable, "bare.py", str(Path(options.meshes).resolve())]
             command.append(str(options.objects))
-            found = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+            how = {"cwd": folder, "env": os.environ | ONE_THREAD, "check": True}
+            found = subprocess.run(command, capture_output=True, text=True, **how)
             seconds["bare scan"].append(float(found.stdout))
             seconds["1 worker"].append(factory(items, 1, folder))
             seconds["2 workers"].append(factory(items, 2, folder))
