@@ -196,3 +196,10 @@ def test_artists_meshes_load(shared_data: Path) -> None:
         mesh = load_mesh(path)
         reference = trimesh.load(path, force="mesh", process=False)
         assert mesh.area == pytest.approx(reference.area, rel=1e-6)
+
+
+def test_an_off_face_beyond_all_integers_is_refused(tmp_path):
+    path = tmp_path / "huge.off"
+    path.write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 99999999999999999999\n")
+    with pytest.raises(InputError, match="damaged line"):
+        load_mesh(path)

@@ -129,7 +129,7 @@ def _read_off(path: Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 
         n, m = (int(word) for word in rest[0].split()[:2])
         if n < 0 or m < 0:
             raise ValueError
-    except (IndexError, ValueError):
+    except (IndexError, ValueError, OverflowError):
         raise InputError(f"{path}: not an OFF file (no counts of vertices and faces)") from None
     if len(rest) < 1 + n + m:
         raise InputError(
@@ -146,7 +146,7 @@ def _read_off(path: Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 
             if len(corners) != int(words[0]):
                 raise ValueError
             triangles += [(corners[0], b, c) for b, c in pairwise(corners[1:])]
-    except (IndexError, ValueError):
+    except (IndexError, ValueError, OverflowError):
         raise InputError(f"{path}: a damaged line among its vertices or faces") from None
     return vertices, np.array(triangles, dtype=np.int64).reshape(-1, 3)
 
