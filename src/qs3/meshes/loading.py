@@ -146,9 +146,10 @@ def _read_off(path: Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 
             if len(corners) != int(words[0]):
                 raise ValueError
             triangles += [(corners[0], b, c) for b, c in pairwise(corners[1:])]
+        faces = np.array(triangles, dtype=np.int64).reshape(-1, 3)
     except (IndexError, ValueError, OverflowError):
         raise InputError(f"{path}: a damaged line among its vertices or faces") from None
-    return vertices, np.array(triangles, dtype=np.int64).reshape(-1, 3)
+    return vertices, faces
 
 
 def _read_with_trimesh(
