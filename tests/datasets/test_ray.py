@@ -79,6 +79,7 @@ def test_a_node_killed_half_way_changes_no_byte(fake, tmp_path, cluster):
     assert content(out) == whole(fake, tmp_path / "whole")
 
 
+@pytest.mark.slow
 def test_on_a_cluster_too_what_hangs_or_crashes_fails_alone(fake, tmp_path, cluster):
     for row, kind in (("hanging_row", "Timeout"), ("deadly_row", "ProcessDied")):
         work = [fake.FakeItem("bad" if i == 2 else f"m{i}") for i in range(6)]
@@ -94,6 +95,7 @@ def test_on_a_cluster_too_what_hangs_or_crashes_fails_alone(fake, tmp_path, clus
         assert [record["error"] for record in read_failures(tmp_path / row)] == [kind]
 
 
+@pytest.mark.slow
 def test_what_hangs_is_stopped_while_others_go_on(fake, tmp_path, cluster):
     """A cluster that is never idle still looks at what has run too long."""
     work = [fake.FakeItem("bad" if i == 0 else f"m{i}") for i in range(240)]

@@ -41,7 +41,7 @@ def judge(ends: list[dict], count: int) -> None:
     assert sum(end["end"] == "refused" for end in ends) > count / 10
 
 
-@pytest.mark.parametrize("name", LAYOUTS)
+@pytest.mark.parametrize("name", ["generated", "npz", "pointda10-h5", "mesh-off"])
 def test_a_few_damaged_copies(name, tmp_path):
     judge(run(name, tmp_path, 0, 30), 30)
 
