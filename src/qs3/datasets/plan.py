@@ -84,6 +84,10 @@ def make_plan(items: Sequence[Item], settings: GenerateSettings) -> Plan:
         if item.id in seen:
             raise InputError(f"{settings.meshes}: two meshes are called {item.id!r}; rename one")
         seen.add(item.id)
+    if settings.scene.needs_neighbour and len(items) < 2:
+        raise InputError(
+            f"{items[0].id}: a scene with a neighbour needs a second mesh to draw from"
+        )
     names = sorted({item.class_name for item in items})
     map_labels(names, np.arange(len(names)), settings.classes)
     return Plan(items, settings)
