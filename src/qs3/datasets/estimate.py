@@ -9,8 +9,8 @@ import numpy as np
 
 from qs3.datasets.executors import Failure, LocalExecutor
 from qs3.datasets.plan import Plan
-from qs3.datasets.scan_item import neighbour_of, scan_item
-from qs3.datasets.shards import shard_bytes, table_of
+from qs3.datasets.scan_item import scan_item
+from qs3.datasets.shards import DType, shard_bytes, table_of
 from qs3.errors import InputError
 
 
@@ -55,7 +55,7 @@ def estimate(
     failure: Failure | None = None
     with LocalExecutor(1, timeout) as executor:
         for index in [chosen[0], *chosen]:  # the first scan of a process compiles and loads
-            executor.submit(index, _timed, plan, index)
+            executor.submit(index, _timed, plan.arguments(index, 0), plan.settings.dtype)
             outcome = executor.next()[1]
             if isinstance(outcome, Failure):
                 failure = outcome
@@ -78,12 +78,7 @@ def estimate(
     )
 
 
-def _timed(plan: Plan, index: int) -> tuple[float, int]:
-    item, settings = plan.items[index], plan.settings
+def _timed(arguments: tuple[Any, ...], dtype: DType) -> tuple[float, int]:
     start = time.perf_counter()
-    others: tuple[Any, ...] = ()
-    if settings.scene.needs_neighbour:
-        others = (neighbour_of(item, 0, plan.items, settings.seed),)
-    row = scan_item(item, 0, settings, *others)
-    size = len(shard_bytes(table_of([row], settings.dtype)))
+    size = len(shard_bytes(table_of([scan_item(*arguments)], dtype)))
     return time.perf_counter() - start, size

@@ -23,7 +23,6 @@ from qs3.datasets.parts import (
 )
 from qs3.datasets.plan import Plan
 from qs3.datasets.progress import progress_bar
-from qs3.datasets.scan_item import neighbour_of
 from qs3.datasets.shards import CloudRow, parse_shard
 from qs3.datasets.storage import Folder
 from qs3.errors import InputError
@@ -185,14 +184,9 @@ class Generation:
                 self._finished(key, outcome)
 
     def _submit_scan(self, place: Place) -> None:
-        item, scan = self.plan.work(place)
-        settings = self.plan.settings
-        others = ()
-        if settings.scene.needs_neighbour:
-            position = self.plan.position(place)
-            others = (neighbour_of(item, scan, self.plan.items, settings.seed, position),)
-        call = functools.partial(self.scan_one, item, scan, settings, *others)
-        self.executor.submit(place, scan_to_part, self.folder, place, settings.dtype, call)
+        call = functools.partial(self.scan_one, *self.plan.arguments(*self.plan.position(place)))
+        dtype = self.plan.settings.dtype
+        self.executor.submit(place, scan_to_part, self.folder, place, dtype, call)
 
     def _scanned(self, place: Place, outcome: Failure | None) -> None:
         self.missing[place.shard].discard(place)

@@ -6,7 +6,6 @@ and its parts are removed. Every step can be repeated: whatever a power cut leav
 the same bytes.
 """
 
-import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ import pyarrow as pa
 from qs3.datasets.executors import Failure, guarded
 from qs3.datasets.executors.executor import failure_of
 from qs3.datasets.manifest import shard_name
-from qs3.datasets.shards import DType, empty_table, parse_shard, shard_bytes, table_of
+from qs3.datasets.shards import DType, empty_table, parse_shard, put_shard, shard_bytes, table_of
 from qs3.datasets.storage import PARTS, Folder
 from qs3.errors import InputError
 
@@ -128,6 +127,4 @@ def finish_shard(
             "do all processes see one and the same folder? Mend that and run the same command again"
         )
     rows = pa.array([position[i] for i in order if i in position], pa.int64())
-    content = shard_bytes(table.take(rows))
-    folder.write(name, content)
-    return hashlib.sha256(content).hexdigest()
+    return put_shard(folder, shard, table.take(rows))

@@ -5,13 +5,14 @@ import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from qs3.datasets.classes import map_labels
 from qs3.datasets.manifest import Manifest
 from qs3.datasets.parts import Place
-from qs3.datasets.scan_item import GenerateSettings, Item, row_id
+from qs3.datasets.scan_item import GenerateSettings, Item, neighbour_of, row_id
 from qs3.datasets.versions import package_versions
 from qs3.errors import InputError
 
@@ -42,18 +43,25 @@ class Plan:
 
     def work(self, place: Place) -> tuple[Item, int]:
         """Return the object of a row and the index of its scan."""
-        index = place.shard * self.settings.rows_per_shard + place.row
-        item, scan = divmod(index, self.settings.scans_per_mesh)
-        return self.items[item], scan
+        position, scan = self.position(place)
+        return self.items[position], scan
 
-    def position(self, place: Place) -> int:
-        """Return the index of a row's object in the list."""
+    def position(self, place: Place) -> tuple[int, int]:
+        """Return the index of a row's object in the list and that of its scan."""
         index = place.shard * self.settings.rows_per_shard + place.row
-        return index // self.settings.scans_per_mesh
+        return divmod(index, self.settings.scans_per_mesh)
+
+    def arguments(self, position: int, scan: int) -> tuple[Any, ...]:
+        """What `scan_item` is handed: object, scan, settings, and a neighbour where one stands."""
+        item, settings = self.items[position], self.settings
+        if not settings.scene.needs_neighbour:
+            return item, scan, settings
+        beside = neighbour_of(item, scan, self.items, settings.seed, position)
+        return item, scan, settings, beside
 
     def items_of(self, shards: Sequence[int]) -> list[Item]:
         """Objects that have a row in one of the shards, in order."""
-        wanted = {self.position(place) for shard in shards for place in self.places(shard)}
+        wanted = {self.position(place)[0] for shard in shards for place in self.places(shard)}
         return [self.items[position] for position in sorted(wanted)]
 
     def row_id(self, place: Place) -> str:

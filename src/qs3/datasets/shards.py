@@ -4,6 +4,7 @@ Points lie flat in a list column, x0 y0 z0 x1 …: ``np.reshape(row, (-1, 3))``.
 opens a shard as it is. A shard holds no time, host or path, so equal scans give equal bytes.
 """
 
+import hashlib
 import io
 import itertools
 import math
@@ -17,6 +18,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float, Float32, UInt8
 
+from qs3.datasets.manifest import shard_name
+from qs3.datasets.storage import Folder
 from qs3.errors import InputError
 from qs3.files import write_bytes
 
@@ -97,6 +100,40 @@ class CloudRow:
     """Share of grossly wrong disparities, mean over views."""
     drawn: str = "{}"
     """What was drawn for this scan (settings of the sensor, the neighbour), a JSON object."""
+
+
+def cloud_alone(
+    identifier: str,
+    points: Float32[np.ndarray, "n 3"],
+    label: int,
+    class_name: str,
+    split: str = "",
+    drawn: str = "{}",
+) -> CloudRow:
+    """Return the row of a cloud that was not scanned: without twin, surface, views and seed."""
+    nothing, no_view = np.zeros((0, 3), np.float32), np.zeros(0, np.uint8)
+    return CloudRow(
+        id=identifier,
+        object=identifier,
+        scan=0,
+        label=label,
+        class_name=class_name,
+        split=split,
+        seed=0,
+        points=points,
+        view=no_view,
+        clean=nothing,
+        clean_view=no_view,
+        surface=nothing,
+        drawn=drawn,
+    )
+
+
+def put_shard(folder: Folder, index: int, table: pa.Table) -> str:
+    """Write a table as shard ``index`` of a data set; return the SHA-256 of the file."""
+    content = shard_bytes(table)
+    folder.write(shard_name(index), content)
+    return hashlib.sha256(content).hexdigest()
 
 
 def table_of(rows: Sequence[CloudRow], dtype: DType = "float32") -> pa.Table:

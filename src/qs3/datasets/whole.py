@@ -8,7 +8,7 @@ from pathlib import Path
 
 from qs3.datasets.storage import LocalFolder
 from qs3.errors import InputError
-from qs3.files import holds_something
+from qs3.files import holds_something, sync_entry
 
 
 @contextmanager
@@ -46,7 +46,7 @@ def whole(path: Path) -> Iterator[Path]:
             if path.is_dir():
                 shutil.rmtree(path)
             temporary.replace(path)
-            _sync_entry(path.parent)
+            sync_entry(path.parent)
         finally:
             shutil.rmtree(hidden, ignore_errors=True)
 
@@ -73,19 +73,9 @@ def _clear(folder: Path) -> None:
 
 def _sync(path: Path) -> None:
     if path.is_file():
-        _sync_entry(path)
+        sync_entry(path)
         return
     for folder, _, files in os.walk(path):
         for name in files:
-            _sync_entry(Path(folder) / name)
-        _sync_entry(Path(folder))
-
-
-def _sync_entry(path: Path) -> None:
-    if path.is_dir() and os.name == "nt":  # Windows opens no folder
-        return
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+            sync_entry(Path(folder) / name)
+        sync_entry(Path(folder))

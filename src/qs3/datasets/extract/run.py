@@ -1,7 +1,6 @@
 """Run an extraction over many scenes into a data set, one shard a scene, resumable."""
 
 import functools
-import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,7 +24,7 @@ from qs3.datasets.manifest import (
     write_sums,
 )
 from qs3.datasets.progress import progress_bar
-from qs3.datasets.shards import CloudRow, shard_bytes, table_of
+from qs3.datasets.shards import CloudRow, cloud_alone, put_shard, table_of
 from qs3.datasets.storage import Folder, open_folder
 from qs3.datasets.transforms import resample
 from qs3.datasets.versions import package_versions
@@ -182,9 +181,7 @@ def _unit_to_shard(
 
 
 def _write(folder: Folder, index: int, rows: Sequence[CloudRow]) -> tuple[str, int]:
-    content = shard_bytes(table_of(rows))
-    folder.write(shard_name(index), content)
-    return hashlib.sha256(content).hexdigest(), len(rows)
+    return put_shard(folder, index, table_of(rows)), len(rows)
 
 
 def _row(cloud: ExtractedCloud, class_names: Sequence[str], num_points: int) -> CloudRow:
@@ -192,19 +189,5 @@ def _row(cloud: ExtractedCloud, class_names: Sequence[str], num_points: int) -> 
     points = cloud.points
     if len(points) > num_points:
         points = resample(points, num_points)
-    nothing, no_view = np.zeros((0, 3), np.float32), np.zeros(0, np.uint8)
-    return CloudRow(
-        id=cloud.id,
-        object=cloud.id,
-        scan=0,
-        label=label,
-        class_name=class_names[label],
-        split=cloud.split,
-        seed=0,
-        points=points,
-        view=no_view,
-        clean=nothing,
-        clean_view=no_view,
-        surface=nothing,
-        drawn=json.dumps(dict(cloud.source), sort_keys=True),
-    )
+    drawn = json.dumps(dict(cloud.source), sort_keys=True)
+    return cloud_alone(cloud.id, points, label, class_names[label], cloud.split, drawn)

@@ -9,7 +9,6 @@ from tqdm import tqdm
 from qs3.datasets.formats.format import Format
 from qs3.datasets.ragged import RaggedClouds
 from qs3.errors import InputError
-from qs3.files import sha256
 
 ROWS_PER_SHARD = 64
 _MANY = 500
@@ -28,10 +27,9 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
     Raises:
         InputError: where the clouds have no labels.
     """
-    from qs3.datasets.manifest import write_sums
-    from qs3.datasets.shards import write_shard
+    from qs3.datasets.manifest import Manifest, shard_name, write_manifest, write_sums
+    from qs3.datasets.shards import put_shard, table_of
     from qs3.datasets.storage import LocalFolder
-    from qs3.datasets.store import Manifest, shard_path, write_manifest
     from qs3.datasets.versions import package_versions
 
     if clouds.labels is None:
@@ -52,32 +50,21 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
     with bar:
         for index, start in enumerate(starts):
             rows = [_row(clouds, i) for i in range(start, min(start + ROWS_PER_SHARD, count))]
-            path = shard_path(root, index)
-            write_shard(path, rows)
-            sums[path.name] = sha256(path)
+            sums[shard_name(index)] = put_shard(LocalFolder(root), index, table_of(rows))
             bar.update(len(rows))
     write_sums(LocalFolder(root), sums)
 
 
 def _row(clouds: RaggedClouds, index: int) -> Any:
-    from qs3.datasets.shards import CloudRow
+    from qs3.datasets.shards import cloud_alone
 
-    none, no_view = np.zeros((0, 3), np.float32), np.zeros(0, np.uint8)
     label = int(clouds.labels[index]) if clouds.labels is not None else -1
-    name = _utf8(clouds.ids[index])
-    return CloudRow(
-        id=name,
-        object=name,
-        scan=0,
-        label=label,
-        class_name=_utf8(clouds.class_names[label]),
-        split=clouds.splits[index] if clouds.splits else "",
-        seed=0,
-        points=np.asarray(clouds.clouds[index], dtype=np.float32),
-        view=no_view,
-        clean=none,
-        clean_view=no_view,
-        surface=none,
+    return cloud_alone(
+        _utf8(clouds.ids[index]),
+        np.asarray(clouds.clouds[index], dtype=np.float32),
+        label,
+        _utf8(clouds.class_names[label]),
+        clouds.splits[index] if clouds.splits else "",
     )
 
 
