@@ -60,13 +60,19 @@ def start(tmp_path):
     """Start a run of 48 scans of 50 ms in a process group of its own."""
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
+    processes = []
 
     def started(out: Path, row: str = "slow_row", **how) -> subprocess.Popen:
         command = [sys.executable, str(script), str(HERE), str(out), row]
         how |= {"start_new_session": True, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-        return subprocess.Popen(command, text=True, **how)
+        processes.append(subprocess.Popen(command, text=True, **how))
+        return processes[-1]
 
-    return started
+    yield started
+    for process in processes:  # those that a failed test left
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.communicate()
 
 
 def rows_there(out: Path) -> int:
@@ -487,8 +493,10 @@ def test_two_runs_do_not_write_into_one_folder(fake, start, tmp_path):
     deadline = time.monotonic() + 60
     while rows_there(tmp_path / "out") < 1 and time.monotonic() < deadline:
         time.sleep(0.01)
+    os.kill(process.pid, signal.SIGSTOP)  # or it may have ended before the second one looks
     second = start(tmp_path / "out")
     _, errors = second.communicate(timeout=60)
+    os.kill(process.pid, signal.SIGCONT)
     assert second.returncode == 2
     assert "another qs3 is writing" in errors
     _, errors = process.communicate(timeout=120)
