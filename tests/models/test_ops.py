@@ -3,8 +3,8 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from qs3.models import ops
 from qs3.models.ops import flat_indices, knn, neighbour_max, neighbour_sum
+from qs3.models.ops import neighbours as search
 
 
 def sorted_distances(points, neighbours):
@@ -47,19 +47,21 @@ def test_knn_blocks_do_not_matter(monkeypatch):
     points = torch.randn(3, 512, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     whole = knn(points, 8).sort(dim=2).values
 
-    def small_blocks(b, n, cuda):
+    def small_blocks(b, m, n, cuda):
         for cloud in range(b):
-            for row in range(0, n, 100):
+            for row in range(0, m, 100):
                 yield slice(cloud, cloud + 1), slice(row, row + 100)
 
-    monkeypatch.setattr(ops, "_blocks", small_blocks)
+    monkeypatch.setattr(search, "_blocks", small_blocks)
     assert torch.equal(knn(points, 8).sort(dim=2).values, whole)
 
 
-@pytest.mark.parametrize(("b", "n"), [(1, 1), (5, 1024), (70, 128), (2, 5000)])
-def test_blocks_cover_every_row_once_in_bounded_memory(b, n):
-    seen = np.zeros((b, n), dtype=int)
-    for cloud, row in ops._blocks(b, n, cuda=False):
+@pytest.mark.parametrize(
+    ("b", "m", "n"), [(1, 1, 1), (5, 1024, 1024), (70, 128, 128), (3, 70, 5000)]
+)
+def test_blocks_cover_every_row_once_in_bounded_memory(b, m, n):
+    seen = np.zeros((b, m), dtype=int)
+    for cloud, row in search._blocks(b, m, n, cuda=False):
         size = seen[cloud, row].size * n
         assert size <= max(2**20, n)
         seen[cloud, row] += 1

@@ -1,0 +1,184 @@
+"""Values at indices, and their sums and maxima over neighbours."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+
+def in_single_precision(points: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+    """Return half-precision values as float32 and others as they are."""
+    return points.float() if points.dtype in (torch.float16, torch.bfloat16) else points
+
+
+def gather_points(
+    values: Float[Tensor, "b n c"], index: Int[Tensor, "b *m"]
+) -> Float[Tensor, "b *m c"]:
+    """Take values by index, each cloud from itself; the gradient is summed in a fixed order.
+
+    Example:
+        >>> gather_points(torch.tensor([[[1.0], [2.0]]]), torch.tensor([[1, 1, 0]])).flatten()
+        tensor([2., 2., 1.])
+    """
+    return _Gather.apply(values, index)
+
+
+def scatter_points(
+    values: Float[Tensor, "b *m c"], index: Int[Tensor, "b *m"], n: int
+) -> Float[Tensor, "b n c"]:
+    """Sum values into n points a cloud, in a fixed order: the transpose of `gather_points`.
+
+    Example:
+        >>> scatter_points(torch.tensor([[[1.0], [2.0]]]), torch.tensor([[1, 1]]), 2).flatten()
+        tensor([0., 3.])
+    """
+    return _Scatter.apply(values, index, n)
+
+
+def _take(values: Tensor, index: Tensor) -> Tensor:
+    b, n, c = values.shape
+    flat = flat_indices(index.reshape(b, -1, 1), n).view(-1)
+    return values.reshape(b * n, c).index_select(0, flat).view(*index.shape, c)
+
+
+def _sum_into(values: Tensor, index: Tensor, n: int) -> Tensor:
+    b, c = len(values), values.shape[-1]
+    flat = flat_indices(index.reshape(b, -1, 1), n).view(-1)
+    rows = values.reshape(-1, c)
+    total = torch.zeros((b * n, c), dtype=values.dtype, device=values.device)
+    if values.is_cuda:
+        # On a GPU index_add_ adds in no fixed order; index_put_ sorts first.
+        return total.index_put_((flat,), rows, accumulate=True).view(b, n, c)
+    return total.index_add_(0, flat, rows).view(b, n, c)
+
+
+class _Gather(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, values: Tensor, index: Tensor) -> Tensor:
+        ctx.save_for_backward(index)
+        ctx.n = values.shape[1]
+        return _take(values, index)
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        (index,) = ctx.saved_tensors
+        return scatter_points(gradient, index, ctx.n), None
+
+
+class _Scatter(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, values: Tensor, index: Tensor, n: int) -> Tensor:
+        ctx.save_for_backward(index)
+        return _sum_into(values, index, n)
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        (index,) = ctx.saved_tensors
+        return gather_points(gradient, index), None, None
+
+
+def flat_indices(neighbours: Int[Tensor, "b m k"], n: int | None = None) -> Int[Tensor, "b*m k"]:
+    """Return neighbour indices that count through all clouds of the batch.
+
+    Args:
+        neighbours: Indices within the own cloud.
+        n: Points a cloud; m where None.
+
+    Example:
+        >>> flat_indices(torch.tensor([[[0]], [[0]]])).tolist()
+        [[0], [1]]
+    """
+    b, m, k = neighbours.shape
+    start = torch.arange(b, device=neighbours.device)[:, None, None] * (m if n is None else n)
+    return (neighbours + start).view(b * m, k)
+
+
+def neighbour_sum(
+    values: Float[Tensor, "b n c"], neighbours: Int[Tensor, "b m k"]
+) -> Float[Tensor, "b m c"]:
+    """Sum the values of each point's neighbours: Σ_{j ∈ N(i)} x_j.
+
+    Example:
+        >>> neighbour_sum(torch.tensor([[[1.0], [2.0]]]), torch.tensor([[[0, 1], [1, 1]]])).tolist()
+        [[[3.0], [4.0]]]
+    """
+    b, n, c = values.shape
+    index = flat_indices(neighbours, n)
+    total = torch.nn.functional.embedding_bag(index, values.reshape(b * n, c), mode="sum")
+    return total.view(b, -1, c)
+
+
+def neighbour_max(
+    values: Float[Tensor, "b n c"], neighbours: Int[Tensor, "b m k"]
+) -> Float[Tensor, "b m c"]:
+    """Take the channel-wise maximum over each point's neighbours: max_{j ∈ N(i)} x_j.
+
+    The [b m k c] tensor of neighbour values never exists. At ties the gradient goes to the first.
+
+    Raises:
+        ValueError: where k is over 255.
+
+    Example:
+        >>> neighbour_max(torch.tensor([[[1.0], [2.0]]]), torch.tensor([[[0, 1], [0, 0]]])).tolist()
+        [[[2.0], [1.0]]]
+    """
+    if neighbours.shape[2] > 255:
+        raise ValueError(f"at most 255 neighbours, not {neighbours.shape[2]}")
+    if torch.is_grad_enabled() and values.requires_grad:
+        return _NeighbourMax.apply(values, neighbours)
+    return _maximum(values, neighbours, None)
+
+
+def _maximum(
+    values: Float[Tensor, "b n c"],
+    neighbours: Int[Tensor, "b m k"],
+    winner: Tensor | None,
+) -> Float[Tensor, "b m c"]:
+    """Compute `neighbour_max`; note in ``winner`` (zeros, uint8) which neighbour it was."""
+    b, n, c = values.shape
+    table = values.reshape(b * n, c)
+    columns = flat_indices(neighbours, n).t().contiguous()
+    centres = columns.shape[1]
+    # On a CPU a block should stay in the cache, yet not be so small that threads only wait.
+    rows = centres if values.is_cuda else max(1, 2**19 // c)
+    maximum = torch.zeros((centres, c), dtype=table.dtype, device=table.device)
+    for start in range(0, centres, rows):
+        block = slice(start, start + rows)
+        best = table.index_select(0, columns[0, block])
+        for t in range(1, len(columns)):
+            value = table.index_select(0, columns[t, block])
+            if winner is not None:
+                # A later t is larger, so that a maximum of bytes records the last improvement.
+                better = torch.gt(value, best).view(torch.uint8).mul_(t)
+                torch.maximum(winner[block], better, out=winner[block])
+            torch.maximum(best, value, out=best)
+        maximum[block] = best
+    return maximum.view(b, -1, c)
+
+
+class _NeighbourMax(torch.autograd.Function):
+    """`neighbour_max` with one byte an output kept for the gradient."""
+
+    @staticmethod
+    def forward(ctx, values: Tensor, neighbours: Tensor) -> Tensor:
+        b, n, c = values.shape
+        m = neighbours.shape[1]
+        winner = torch.zeros((b * m, c), dtype=torch.uint8, device=values.device)
+        maximum = _maximum(values, neighbours, winner)
+        ctx.save_for_backward(neighbours, winner.view(b, m, c))
+        ctx.n = n
+        return maximum
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        neighbours, winner = ctx.saved_tensors
+        b, _, c = gradient.shape
+        source = neighbours.gather(2, winner.long())
+        total = torch.zeros((b, ctx.n, c), dtype=gradient.dtype, device=gradient.device)
+        if not gradient.is_cuda:
+            return total.scatter_add_(1, source, gradient), None
+        # On a GPU scatter_add_ adds in no fixed order; index_put_ sorts first.
+        cloud = torch.arange(b, device=gradient.device)[:, None, None]
+        channel = torch.arange(c, device=gradient.device)
+        return total.index_put_((cloud, source, channel), gradient, accumulate=True), None
