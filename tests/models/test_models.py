@@ -1,5 +1,11 @@
 """One suite over all networks."""
 
+import copy
+import json
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -136,3 +142,82 @@ def test_faults_name_the_choices(call, message):
 def test_json_lists_make_the_same_network():
     model = create_model("pointnet", 5, channels=[8, 8, 16], hidden=[8])
     assert model(clouds()).shape == (4, 5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("train", [True, False])
+def test_repeated_points_give_finite_scores_and_gradients(name, train):
+    model = small(name).train(train)
+    points = clouds()[:, :1].expand(4, 40, 3).contiguous()
+    logits = model(points)
+    logits.square().sum().backward()
+    assert logits.isfinite().all()
+    assert all(p.grad.isfinite().all() for p in model.parameters() if p.grad is not None)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_evaluation_changes_nothing_and_repeats_itself(name):
+    model = small(name).eval()
+    before = copy.deepcopy(model.state_dict())
+    first = model(clouds())
+    assert torch.equal(first, model(clouds()))
+    assert all(torch.equal(before[key], value) for key, value in model.state_dict().items())
+    assert torch.equal(first, copy.deepcopy(model)(clouds()))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_training_moves_every_running_statistic(name):
+    model = small(name).train()
+    before = copy.deepcopy(model.state_dict())
+    model(clouds())
+    for key, value in model.state_dict().items():
+        if "running" in key:
+            assert not torch.equal(before[key], value), key
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_double_in_double_out_and_close_to_single(name):
+    model = small(name).eval()
+    single = model(clouds())
+    double = model.double()(clouds().double())
+    assert (single.dtype, double.dtype) == (torch.float32, torch.float64)
+    torch.testing.assert_close(single.double(), double, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_half_the_bits_give_nearly_the_same_scores(name):
+    model = small(name).eval()
+    exact = model(clouds())
+    with torch.autocast("cpu", torch.bfloat16):
+        rough = model(clouds())
+    assert rough.isfinite().all()
+    # 8 bits of mantissa: 0.4 % a product; errors of a dozen layers add up.
+    assert (rough - exact).abs().max() < 0.05 * exact.abs().max()
+    assert not torch.equal(rough.float(), exact)
+
+
+@pytest.mark.parametrize("backend", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)])
+def test_compiled_networks_give_the_same_scores_and_gradients(backend):
+    worker = Path(__file__).with_name("compile_worker.py")
+    given = json.dumps({name: [name.split()[0], SMALL[name]] for name in NAMES})
+    done = subprocess.run(
+        [sys.executable, str(worker), backend], input=given, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    worst = json.loads(done.stdout)
+    assert len(worst) == 2 * len(NAMES)
+    assert all(value < 1e-3 for value in worst.values()), worst
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device")
+@pytest.mark.parametrize("name", NAMES)
+def test_a_gpu_gives_the_same_scores_and_gradients(name):
+    model = small(name).double().eval()
+    twin = copy.deepcopy(model).cuda()
+    here, there = model(clouds().double()), twin(clouds().double().cuda())
+    torch.testing.assert_close(there.cpu(), here, rtol=0, atol=1e-9)
+    here.square().sum().backward()
+    there.square().sum().backward()
+    for one, two in zip(twin.parameters(), model.parameters(), strict=True):
+        torch.testing.assert_close(one.grad.cpu(), two.grad, rtol=1e-9, atol=1e-9)
