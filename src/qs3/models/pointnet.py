@@ -1,12 +1,163 @@
 """PointNet (Qi et al., CVPR 2017): a shared network a point, then the maximum over the points."""
 
 import itertools
+from collections.abc import Iterator
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
+from qs3.errors import InputError
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
+
+
+def orthogonality(matrix: Float[Tensor, "b c c"]) -> Float[Tensor, ""]:
+    """Return how far matrices are from orthogonal: ‖I − A Aᵀ‖² (Eq. 2), mean over the batch.
+
+    The paper adds 0.001 of it, for the 64 × 64 T-Net alone, to the loss. The shared training loop
+    leaves it out, as the adaptation papers do; a method that wants it reads the matrix by a forward
+    hook on ``feature_transform``.
+
+    Example:
+        >>> float(orthogonality(2.0 * torch.eye(3)[None]))
+        27.0
+    """
+    identity = torch.eye(matrix.shape[1], dtype=matrix.dtype, device=matrix.device)
+    return (identity - matrix @ matrix.transpose(1, 2)).square().sum(dim=(1, 2)).mean()
+
+
+def linear_max(
+    points: Float[Tensor, "b n c"], weight: Float[Tensor, "d c"]
+) -> Float[Tensor, "b d"]:
+    """Take the maximum over the points of a linear map: max_n W x_n.
+
+    The [b n d] tensor of products is made in blocks and never kept. The gradient of each output
+    belongs to one point, so that going back costs 1/n of the way forth; at ties it is one of them.
+
+    Example:
+        >>> linear_max(torch.tensor([[[1.0, 2.0], [3.0, 0.0]]]), torch.eye(2)).tolist()
+        [[3.0, 2.0]]
+    """
+    if torch.is_grad_enabled() and (points.requires_grad or weight.requires_grad):
+        return _LinearMax.apply(points, weight)
+    if torch.compiler.is_compiling():  # blocks would fix the number of points
+        return (points @ weight.t()).amax(dim=1).to(points.dtype)
+    best = points.new_full((len(points), len(weight)), -torch.inf)
+    for cloud, row in _blocks(points, len(weight)):
+        product = _product(points[cloud, row], weight)
+        best[cloud] = torch.maximum(best[cloud], product.amax(dim=2).to(best.dtype))
+    return best
+
+
+def _blocks(points: Tensor, width: int) -> Iterator[tuple[slice, slice]]:
+    """Cut [b n] into blocks whose products fit the cache (CPU) or 256 MiB (GPU)."""
+    b, n, _ = points.shape
+    budget = max(1, (2**26 if points.is_cuda else 2**20) // width)
+    clouds, rows = max(1, budget // n), min(n, budget)
+    for cloud in range(0, b, clouds):
+        for row in range(0, n, rows):
+            yield slice(cloud, cloud + clouds), slice(row, row + rows)
+
+
+def _product(points: Float[Tensor, "b n c"], weight: Float[Tensor, "d c"]) -> Tensor:
+    """Return W x_n as [b d n]; a plain ``@`` would copy it from [b n d]."""
+    return torch.bmm(weight.expand(len(points), -1, -1), points.transpose(1, 2))
+
+
+class _LinearMax(torch.autograd.Function):
+    """`linear_max` with the winning point of each output kept for the gradient."""
+
+    @staticmethod
+    def forward(ctx, points: Tensor, weight: Tensor) -> Tensor:
+        best = points.new_full((len(points), len(weight)), -torch.inf)
+        winner = torch.zeros(best.shape, dtype=torch.int64, device=points.device)
+        for cloud, row in _blocks(points, len(weight)):
+            product = _product(points[cloud, row], weight)
+            index = product.argmax(dim=2, keepdim=True)
+            value = product.gather(2, index)[:, :, 0].to(best.dtype)
+            better = value > best[cloud]
+            best[cloud] = torch.where(better, value, best[cloud])
+            winner[cloud] = torch.where(better, index[:, :, 0] + row.start, winner[cloud])
+        ctx.save_for_backward(points, weight, winner)
+        return best
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        points, weight, winner = ctx.saved_tensors
+        b, n, c = points.shape
+        flat = winner + torch.arange(b, device=winner.device)[:, None] * n
+        bag = torch.nn.functional.embedding_bag
+        to_points = to_weight = None
+        if ctx.needs_input_grad[0]:
+            # Sorted by point, the outputs that each point won are a bag of rows of W.
+            point, order = flat.view(-1).sort(stable=True)
+            starts = torch.searchsorted(point, torch.arange(b * n, device=point.device))
+            share = gradient.reshape(-1)[order]
+            rows = order % len(weight)
+            to_points = bag(rows, weight, starts, mode="sum", per_sample_weights=share)
+            to_points = to_points.view(b, n, c)
+        if ctx.needs_input_grad[1]:
+            share = gradient.t().contiguous()
+            table = points.reshape(-1, c)
+            to_weight = bag(flat.t().contiguous(), table, mode="sum", per_sample_weights=share)
+        return to_points, to_weight
+
+
+class PointwiseMax(nn.Module):
+    """Linear map at every point, batch normalisation over all points, ReLU, maximum over points.
+
+    The function is that of `PointwiseLayer` and ``amax``. The variance of channel o over all points
+    is w_oᵀ Σ w_o, with Σ the covariance of the input, so that the scale γ/σ is known before the
+    product and goes into the weights; the shift and ReLU are monotone and follow the maximum.
+    Neither the [b n d] product nor its gradient ever exists as a whole.
+
+    Args:
+        channels: Width of the input.
+        width: Width of the output.
+    """
+
+    def __init__(self, channels: int, width: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(channels, width, bias=False)
+        # Holds scale, shift and running statistics; applied below.
+        self.norm = nn.BatchNorm1d(width)
+
+    def forward(self, points: Float[Tensor, "b n c"]) -> Float[Tensor, "b d"]:
+        """Return the maximum of each channel over each cloud."""
+        norm, weight = self.norm, self.linear.weight
+        assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
+        with torch.autocast(points.device.type, enabled=False):
+            points = points.to(weight.dtype)
+            if norm.training:
+                centre = points.mean(dim=(0, 1))
+                points = points - centre
+                table = points.flatten(0, 1)
+                covariance = table.t() @ table / len(table)
+                variance = ((weight @ covariance) * weight).sum(dim=1).clamp_min(0.0)
+                self._update_running(weight @ centre, variance, len(table))
+                scale, shift = norm.weight * torch.rsqrt(variance + norm.eps), norm.bias
+            else:
+                scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
+                shift = norm.bias - scale * norm.running_mean
+            weight = scale[:, None] * weight
+        return nn.functional.relu(linear_max(points, weight) + shift)
+
+    def each(self, points: Float[Tensor, "b n c"]) -> Float[Tensor, "b n d"]:
+        """Return what `forward` takes the maximum of; costs the time and memory it saves."""
+        normed = self.norm(self.linear(points).flatten(0, 1))
+        return nn.functional.relu(normed, inplace=True).view(*points.shape[:2], -1)
+
+    @torch.no_grad()
+    def _update_running(self, mean: Tensor, variance: Tensor, count: int) -> None:
+        """Move the running statistics as BatchNorm does: the variance is the unbiased one."""
+        norm = self.norm
+        assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
+        assert norm.num_batches_tracked is not None and norm.momentum is not None  # noqa: S101
+        norm.num_batches_tracked.add_(1)
+        norm.running_mean.lerp_(mean, norm.momentum)
+        norm.running_var.lerp_(variance * (count / max(count - 1, 1)), norm.momentum)
 
 
 class TransformNet(nn.Module):
@@ -14,16 +165,17 @@ class TransformNet(nn.Module):
 
     Args:
         channels: c.
-        widths: Widths of the shared layers.
-        hidden: Widths of the layers after pooling.
+        widths: Widths of the shared layers; the official ones are 64, 128, 1024.
+        hidden: Widths of the layers after pooling; the official ones are 512, 256.
     """
 
     def __init__(self, channels: int, widths: tuple[int, ...], hidden: tuple[int, ...]) -> None:
         super().__init__()
         ends = (channels, *widths)
         self.shared = nn.Sequential(
-            *(PointwiseLayer(c, d, 0.0) for c, d in itertools.pairwise(ends))
+            *(PointwiseLayer(c, d, 0.0) for c, d in itertools.pairwise(ends[:-1]))
         )
+        self.pool = PointwiseMax(*ends[-2:])
         self.regress = ClassifierHead(widths[-1], hidden, channels * channels, 0.0, 0.0)
         last = self.regress.layers[-1]
         assert isinstance(last, nn.Linear)  # noqa: S101
@@ -32,24 +184,28 @@ class TransformNet(nn.Module):
             last.bias.copy_(torch.eye(channels).flatten())
         self.channels = channels
 
-    def forward(self, points: Float[Tensor, "b n c"]) -> Float[Tensor, "b n c"]:
-        """Return the points under the regressed matrix."""
-        matrix = self.regress(self.shared(points).amax(dim=1))
-        return points @ matrix.view(-1, self.channels, self.channels)
+    def forward(self, points: Float[Tensor, "b n c"]) -> Float[Tensor, "b c c"]:
+        """Return the matrix A of each cloud; a point x, a row, becomes x A."""
+        matrix = self.regress(self.pool(self.shared(points)))
+        return matrix.view(-1, self.channels, self.channels)
 
 
 class PointNet(PointClassifier):
-    """PointNet; by default without its two T-Nets, which makes it quick.
+    """PointNet as published (§4.2, §5.1), with both T-Nets, or the quick form without.
 
-    NOTE: the published network has T-Nets on the input and on the 64-channel features; DGCNN's
-    authors and the adaptation papers leave the latter's regulariser out, and so does this one.
+    NOTE: the convolutions of the authors' release have biases; before batch normalisation they
+    change nothing, and there are none here. The T-Nets' regulariser is `orthogonality`.
 
     Args:
         num_classes: k.
-        channels: Widths of the shared layers; the second one's output is ``local``.
-        hidden: Widths of the head's hidden layers.
+        channels: Widths of the shared layers; the second one's output, under the second T-Net, is
+            ``local``. The last three are the widths of the T-Nets too.
+        hidden: Widths of the head's hidden layers, and of the T-Nets'.
         dropout: Probability of dropping a hidden unit of the head.
-        transforms: Whether to use the two T-Nets.
+        transforms: Whether to use the two T-Nets; without, it is the paper's "vanilla" network.
+        per_point: Whether `encode` gives ``per_point``: the layer before pooling at each point,
+            for methods that need it. It is the largest tensor of the network by far, and not made
+            otherwise.
 
     Example:
         >>> PointNet(10, channels=(8, 8, 16), hidden=(8,)).eval()(torch.zeros(2, 32, 3)).shape
@@ -62,24 +218,34 @@ class PointNet(PointClassifier):
         channels: tuple[int, ...] = (64, 64, 64, 128, 1024),
         hidden: tuple[int, ...] = (512, 256),
         dropout: float = 0.3,
-        transforms: bool = False,
+        transforms: bool = True,
+        per_point: bool = False,
     ) -> None:
         super().__init__()
-        widths = (3, *channels)
-        layers = [PointwiseLayer(c, d, 0.0) for c, d in itertools.pairwise(widths)]
+        if len(channels) < 3:
+            raise InputError(f"channels must be three widths or more, not {channels}")
+        layers = [PointwiseLayer(c, d, 0.0) for c, d in itertools.pairwise((3, *channels[:-1]))]
         self.early = nn.Sequential(*layers[:2])
         self.late = nn.Sequential(*layers[2:])
-        early = widths[min(2, len(channels))]
-        self.input_transform = TransformNet(3, channels, hidden) if transforms else nn.Identity()
+        self.pool = PointwiseMax(*channels[-2:])
+        self.input_transform = TransformNet(3, channels[-3:], hidden) if transforms else None
         self.feature_transform = (
-            TransformNet(early, channels, hidden) if transforms else nn.Identity()
+            TransformNet(channels[1], channels[-3:], hidden) if transforms else None
         )
         self.classify = ClassifierHead(channels[-1], hidden, num_classes, dropout, 0.0)
+        self.per_point = per_point
 
     def encode(self, points: Float[Tensor, "b n 3"]) -> Features:
         """Describe each cloud by the maximum over its points."""
-        local = self.feature_transform(self.early(self.input_transform(points)))
-        per_point = self.late(local)
+        if self.input_transform is not None:
+            points = points @ self.input_transform(points)
+        local = self.early(points)
+        if self.feature_transform is not None:
+            local = local @ self.feature_transform(local)
+        late = self.late(local)
+        if not self.per_point:
+            return Features(pooled=self.pool(late), local=local)
+        per_point = self.pool.each(late)
         return Features(pooled=per_point.amax(dim=1), per_point=per_point, local=local)
 
     def head(self, features: Features) -> Float[Tensor, "b k"]:
