@@ -7,16 +7,21 @@ from qs3.errors import InputError
 from qs3.models.classifier import PointClassifier
 from qs3.models.dgcnn import DGCNN
 from qs3.models.pointnet import PointNet
+from qs3.models.rscnn import RSCNN
 
-_MODELS: dict[str, type[PointClassifier]] = {"dgcnn": DGCNN, "pointnet": PointNet}
+_MODELS: dict[str, type[PointClassifier]] = {
+    "dgcnn": DGCNN,
+    "pointnet": PointNet,
+    "rscnn": RSCNN,
+}
 
 
 def list_models() -> tuple[str, ...]:
     """Return the names that `create_model` knows.
 
     Example:
-        >>> list_models()
-        ('dgcnn', 'pointnet')
+        >>> "dgcnn" in list_models()
+        True
     """
     return tuple(_MODELS)
 
