@@ -1,0 +1,218 @@
+"""Weights of the authors' releases, by the names that their modules give them."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+import torch
+
+from qs3.errors import InputError
+from qs3.models import create_model
+from qs3.models.ops import knn
+from qs3.models.reference import load_reference
+
+
+def textbook(network):
+    path = Path(__file__).parents[2] / "benchmarks" / "reference" / f"{network}.py"
+    spec = importlib.util.spec_from_file_location(f"textbook_{network}", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def norm(width, *names):
+    shapes = dict.fromkeys(("weight", "bias", "running_mean", "running_var"), (width,))
+    shapes["num_batches_tracked"] = ()
+    return {f"{name}.{part}": shape for name in names for part, shape in shapes.items()}
+
+
+# Written down from the modules of pytorch/model.py (class DGCNN) in WangYueFt/dgcnn and of model.py
+# (class DGCNN_cls) in antao97/dgcnn.pytorch: each bnX is registered alone and within convX.
+DGCNN = {
+    "conv1.0.weight": (64, 6, 1, 1),
+    "conv2.0.weight": (64, 128, 1, 1),
+    "conv3.0.weight": (128, 128, 1, 1),
+    "conv4.0.weight": (256, 256, 1, 1),
+    "conv5.0.weight": (1024, 512, 1),
+    **norm(64, "bn1", "conv1.1"),
+    **norm(64, "bn2", "conv2.1"),
+    **norm(128, "bn3", "conv3.1"),
+    **norm(256, "bn4", "conv4.1"),
+    **norm(1024, "bn5", "conv5.1"),
+    "linear1.weight": (512, 2048),
+    **norm(512, "bn6"),
+    "linear2.weight": (256, 512),
+    "linear2.bias": (256,),
+    **norm(256, "bn7"),
+    "linear3.weight": (40, 256),
+    "linear3.bias": (40,),
+}
+RELEASES = {"dgcnn": DGCNN}
+
+
+def random_weights(shapes, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    tensors = {}
+    for key, shape in shapes.items():
+        if key.endswith("num_batches_tracked"):
+            tensors[key] = torch.tensor(7)
+        elif key.endswith("running_var"):
+            tensors[key] = torch.rand(shape, generator=generator) + 0.5
+        else:
+            size = max(1, torch.Size(shape[1:]).numel())
+            tensors[key] = torch.randn(shape, generator=generator) / size**0.5
+    for key in tensors:  # one tensor under two names
+        if key.startswith("bn") and f"conv{key[2]}.1.weight" in shapes:
+            tensors[key] = tensors[f"conv{key[2]}.1{key[3:]}"]
+    return tensors
+
+
+def clouds(b=2, n=96):
+    return torch.randn(b, n, 3, generator=torch.Generator().manual_seed(1))
+
+
+# The release's name of each part of the textbook form, which itself is written apart from ours.
+TO_TEXTBOOK = {
+    **{f"conv{i + 1}.0": f"convolutions.{i}.convolution" for i in range(4)},
+    **{f"bn{i + 1}": f"convolutions.{i}.norm" for i in range(4)},
+    "conv5.0": "embed.0",
+    "bn5": "embed.1",
+    "linear1": "classify.0",
+    "bn6": "classify.1",
+    "linear2": "classify.4",
+    "bn7": "classify.5",
+    "linear3": "classify.8",
+}
+
+
+def test_dgcnn_is_the_textbook_function_of_the_same_weights():
+    weights = random_weights(DGCNN)
+    model = load_reference("dgcnn", weights)
+    slow = textbook("dgcnn").DGCNN(40)
+    renamed = {}
+    for key, value in weights.items():
+        layer, part = key.rsplit(".", 1)
+        if layer in TO_TEXTBOOK:
+            renamed[f"{TO_TEXTBOOK[layer]}.{part}"] = value
+    slow.load_state_dict(renamed)  # strict
+    slow.double().eval()
+    graphs = []
+    model.double()
+    features = clouds().double()
+    for convolution in model.convolutions:
+        graphs.append(knn(features, 20))
+        features = convolution(features, graphs[-1])
+    expected = slow(clouds().double(), graphs)
+    assert expected.std() > 0.01
+    torch.testing.assert_close(model(clouds().double()), expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", RELEASES)
+def test_every_tensor_of_ours_is_filled(name):
+    first = load_reference(name, random_weights(RELEASES[name], 0)).state_dict()
+    second = load_reference(name, random_weights(RELEASES[name], 1)).state_dict()
+    for key, value in first.items():
+        if key.endswith("num_batches_tracked"):
+            assert value == 7
+        else:
+            assert not torch.equal(value, second[key]), key
+    torch.manual_seed(3)
+    again = load_reference(name, random_weights(RELEASES[name], 0)).state_dict()
+    assert all(torch.equal(first[key], value) for key, value in again.items())
+
+
+def test_default_network_has_the_release_s_shapes():
+    ours = create_model("dgcnn", 40).state_dict()
+    loaded = load_reference("dgcnn", random_weights(DGCNN)).state_dict()
+    assert {k: v.shape for k, v in ours.items()} == {k: v.shape for k, v in loaded.items()}
+
+
+@pytest.mark.parametrize("name", RELEASES)
+def test_prefix_of_data_parallel_makes_no_difference(name):
+    weights = random_weights(RELEASES[name])
+    plain = load_reference(name, weights)
+    wrapped = load_reference(name, {f"module.{key}": value for key, value in weights.items()})
+    assert torch.equal(plain(clouds()), wrapped(clouds()))
+
+
+def test_one_of_two_names_is_enough():
+    """safetensors' save_model keeps one name of a tensor that a module holds twice."""
+    weights = random_weights(DGCNN)
+    whole = load_reference("dgcnn", weights)(clouds())
+    for dropped in ("bn", "conv"):
+        fewer = {
+            key: value
+            for key, value in weights.items()
+            if not (key.startswith(dropped) and key[len(dropped)] in "12345" and ".0." not in key)
+        }
+        assert len(fewer) == len(weights) - 25
+        assert torch.equal(load_reference("dgcnn", fewer)(clouds()), whole)
+
+
+def test_widths_and_classes_come_from_the_weights():
+    shapes = dict(DGCNN)
+    shapes["linear3.weight"], shapes["linear3.bias"] = (10, 256), (10,)
+    model = load_reference("dgcnn", random_weights(shapes), neighbours=40, dropout=0.2)
+    assert model(clouds()).shape == (2, 10)
+    assert model.neighbours == 40
+    assert not model.training
+
+
+def test_random_state_of_the_caller_stays():
+    torch.manual_seed(0)
+    before = torch.random.get_rng_state()
+    load_reference("dgcnn", random_weights(DGCNN))
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+def without(weights, *keys):
+    return {key: value for key, value in weights.items() if key not in keys}
+
+
+@pytest.mark.parametrize("name", RELEASES)
+def test_no_tensor_may_be_left_out_or_added(name):
+    weights = random_weights(RELEASES[name])
+    twice = {f"{a}{i}" for i in range(1, 6) for a in ("bn", "conv")}
+    for key in weights:
+        if name == "dgcnn" and key.split(".")[0] in twice and not key.endswith(".0.weight"):
+            continue  # the same tensor stands under another name
+        with pytest.raises(InputError, match=f"1 missing, such as {key}"):
+            load_reference(name, without(weights, key))
+    with pytest.raises(InputError, match=r"1 unknown, such as conv9\.0\.weight"):
+        load_reference(name, weights | {"conv9.0.weight": torch.zeros(1)})
+
+
+@pytest.mark.parametrize("name", RELEASES)
+def test_odd_shapes_are_refused(name):
+    weights = random_weights(RELEASES[name])
+    for key, value in weights.items():
+        for odd in (torch.zeros(3, *value.shape), torch.cat([value.flatten(), torch.ones(1)])):
+            changed = {k: odd if v is value else v for k, v in weights.items()}
+            with pytest.raises(InputError, match="shape"):
+                load_reference(name, changed)
+        if value.ndim:
+            changed = {k: value[..., :0] if v is value else v for k, v in weights.items()}
+            with pytest.raises(InputError):
+                load_reference(name, changed)
+        assert key
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: load_reference("dgcn", {}), "choose one of dgcnn"),
+        (lambda: load_reference("dgcnn", {}), "45 missing, such as bn6.bias, bn6"),
+        (lambda: load_reference("dgcnn", {"model_state_dict": {}}), "'model_state_dict' is no ten"),
+        (lambda: load_reference("dgcnn", random_weights(DGCNN), num_classes=3), "tell num_classes"),
+        (lambda: load_reference("dgcnn", random_weights(DGCNN), neighbors=3), "'neighbors'"),
+        (
+            lambda: load_reference(
+                "dgcnn", random_weights(DGCNN) | {"bn1.weight": torch.zeros(64)}
+            ),
+            "conv1.1.weight and bn1.weight are one tensor",
+        ),
+    ],
+)
+def test_faults_are_named(call, message):
+    with pytest.raises(InputError, match=message):
+        call()
