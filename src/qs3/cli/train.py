@@ -2,7 +2,9 @@
 
 import dataclasses
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,6 +16,8 @@ from qs3.files import write_json
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
 
 RUN = "run.json"
+TIME_UP = 3
+"""Exit code where --max-time stopped a run that the same command takes up again."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,11 @@ class TrainOptions:
     """Mark the run as supervised: its source is the labelled training part of the target."""
     warm_up: Path | None = None
     """Run whose network qbst starts from, in place of training on the source first."""
+    max_time: str | None = None
+    """Time for this call, as hours, minutes and seconds: 00:30:00. It stops before an epoch that
+    would end later, with exit code 3; the same command goes on."""
+    log: Literal["jsonl", "tensorboard"] = "jsonl"
+    """history.jsonl is always written; tensorboard adds event files in OUT/tensorboard."""
     preset: Literal["default", "paper", "released"] = "default"
     """Settings of the self-training: ours, the paper's text, or its released code."""
     train: Annotated[TrainSettings, tyro.conf.arg(name="")] = field(default_factory=TrainSettings)
@@ -68,7 +77,13 @@ def preset_options(arguments: list[str]) -> TrainOptions:
 
 def train(options: Annotated[TrainOptions, tyro.conf.arg(name="")]) -> int:
     """Train a classifier, source-only or with quasi-balanced self-training on a target."""
-    run(options)
+    from qs3.training.deadline import TimeUpError
+
+    try:
+        run(options)
+    except TimeUpError as stop:
+        print(f"qs3: {stop}", file=sys.stderr)
+        return TIME_UP
     print(options.out)
     print(f"Next: qs3 evaluate {options.out} --data DATA", file=sys.stderr)
     return 0
@@ -79,23 +94,26 @@ def run(options: TrainOptions) -> Any:
     from qs3.datasets import load_clouds, load_unlabelled
     from qs3.datasets.clouds import digests
     from qs3.datasets.storage import open_folder
-    from qs3.training import fit
+    from qs3.training import fit, parse_duration, thin
 
+    seconds_left = None if options.max_time is None else parse_duration(options.max_time)
     adapts = options.method == "qbst"
     if adapts and options.target is None:
         raise InputError("--method qbst needs --target: a folder or file of unlabelled clouds")
     if not adapts and (options.target is not None or options.warm_up is not None):
         raise InputError("--method source-only takes no --target and no --warm-up; see qbst")
     points = options.train.num_points
-    source = load_clouds(
-        options.source,
-        split=options.source_split,
-        num_points=points,
-        cloud=options.source_cloud,
+    source = _whole(
+        partial(
+            load_clouds, options.source, split=options.source_split, cloud=options.source_cloud
+        ),
+        points,
     )
     target = None
     if options.target is not None:
-        target = load_unlabelled(options.target, split=options.target_split, num_points=points)
+        target = _whole(
+            partial(load_unlabelled, options.target, split=options.target_split), points
+        )
     result = fit(
         options.method,
         source,
@@ -104,6 +122,8 @@ def run(options: TrainOptions) -> Any:
         options.self_training if adapts else None,
         run_dir=options.out,
         warm_up=options.warm_up,
+        max_seconds=seconds_left,
+        tensorboard=options.log == "tensorboard",
     )
     data = {
         "source": DataRecord(
@@ -133,10 +153,23 @@ def run(options: TrainOptions) -> Any:
                 for name, record in data.items()
             },
             "supervised": options.supervised,
-            "source_clouds": digests(source.points),
-            "target_clouds": [] if target is None else digests(target.points),
+            "source_clouds": digests(thin(source.points, points, options.out)),
+            "target_clouds": []
+            if target is None
+            else digests(thin(target.points, points, options.out)),
             "rounds": [dataclasses.asdict(record) for record in result.rounds],
             "seconds": seconds,
         },
     )
     return result
+
+
+def _whole(load: Callable[..., Any], num_points: int) -> Any:
+    """Read clouds with all their points, which `fit` thins once and keeps the choice of.
+
+    Clouds of several sizes fit no one array: those are thinned as they are read.
+    """
+    try:
+        return load(num_points=None)
+    except InputError:
+        return load(num_points=num_points)

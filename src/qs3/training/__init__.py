@@ -8,11 +8,14 @@ from qs3.training.config import PRESETS as PRESETS
 from qs3.training.config import SelfTrainingSettings as SelfTrainingSettings
 from qs3.training.config import TrainSettings as TrainSettings
 from qs3.training.config import self_training_preset as self_training_preset
+from qs3.training.deadline import TimeUpError as TimeUpError
+from qs3.training.deadline import parse_duration as parse_duration
 from qs3.training.fit import FitResult as FitResult
 from qs3.training.fit import fit as fit
 from qs3.training.fit import is_finished as is_finished
-from qs3.training.loop import EpochRecord as EpochRecord
 from qs3.training.loop import train as train
 from qs3.training.predict import predict_probabilities as predict_probabilities
+from qs3.training.records import EpochRecord as EpochRecord
 from qs3.training.self_training import RoundRecord as RoundRecord
 from qs3.training.self_training import self_train as self_train
+from qs3.training.thinning import thin as thin

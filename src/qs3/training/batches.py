@@ -1,16 +1,24 @@
 """From clouds in memory to batches on the device."""
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from qs3.adaptation import Batch
 from qs3.datasets.clouds import PointClouds, UnlabelledClouds
-from qs3.datasets.transforms import jitter, resample, rotate_z, unit_ball
+from qs3.datasets.transforms import unit_ball
 from qs3.errors import InputError
 from qs3.training.config import TrainSettings
+from qs3.training.thinning import thin
+
+_SHARE_OF_MEMORY = 0.25
+"""Part of a GPU's free memory that the clouds may take; the network needs the rest."""
 
 
 def require_unlabelled(target: UnlabelledClouds) -> None:
@@ -25,63 +33,149 @@ def require_unlabelled(target: UnlabelledClouds) -> None:
         )
 
 
-def prepare(points: np.ndarray, num_points: int) -> np.ndarray:
-    """Normalise clouds [b n 3] to the unit ball and thin them to ``num_points`` points each.
+def prepare(points: np.ndarray, num_points: int, cache: Path | None = None) -> np.ndarray:
+    """Thin clouds [b n 3] to ``num_points`` points each and bring them to the unit ball.
+
+    Args:
+        points: Clouds, as read.
+        num_points: Points a cloud.
+        cache: Folder that keeps the choice of points; see `qs3.training.thinning.thin`.
 
     Example:
         >>> prepare(np.random.default_rng(0).normal(size=(2, 50, 3)), 16).shape
         (2, 16, 3)
     """
-    balls = unit_ball(points)
-    if balls.shape[1] == num_points or not len(balls):
-        return balls
-    return np.stack([resample(ball, num_points) for ball in balls])
+    return unit_ball(thin(points, num_points, cache))
 
 
-def augment(points: np.ndarray, settings: TrainSettings, rng: np.random.Generator) -> np.ndarray:
-    """Turn clouds [b n 3] about z and jitter them, as the settings say."""
+class Share(NamedTuple):
+    """The part of every batch that falls to one of several devices."""
+
+    rank: int = 0
+    """Number of the device, from 0."""
+    world: int = 1
+    """Number of devices."""
+
+
+WHOLE = Share()
+"""All of every batch."""
+
+
+class DeviceClouds:
+    """Clouds as tensors: on the device once and for all where they fit.
+
+    Args:
+        clouds: Prepared clouds, with labels or without.
+        device: Where to train. A GPU takes them where a quarter of its free memory is enough; else
+            each batch is sent.
+    """
+
+    def __init__(self, clouds: PointClouds | UnlabelledClouds, device: torch.device) -> None:
+        self.device = device
+        self.ids = clouds.ids
+        self.points = torch.from_numpy(np.ascontiguousarray(clouds.points, dtype=np.float32))
+        labels = clouds.labels if isinstance(clouds, PointClouds) else np.zeros(len(clouds))
+        self.labels = torch.from_numpy(labels.astype(np.int64))
+        if self.points.nbytes <= _SHARE_OF_MEMORY * _free_memory(device):
+            self.points, self.labels = self.points.to(device), self.labels.to(device)
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def take(self, rows: np.ndarray) -> Batch:
+        """Return the clouds at ``rows``, on the device."""
+        index = torch.from_numpy(rows).to(self.points.device)
+        return Batch(self.points[index].to(self.device), self.labels[index].to(self.device))
+
+
+def _free_memory(device: torch.device) -> float:
+    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else float("inf")
+
+
+def augment(
+    points: Float[Tensor, "b n 3"],
+    settings: TrainSettings,
+    generator: torch.Generator,
+    rows: Sequence[int] | None = None,
+    total: int | None = None,
+) -> Float[Tensor, "b n 3"]:
+    """Turn clouds about z and jitter them, as the settings say, on their device.
+
+    Convention:
+        Anticlockwise seen from above, as `qs3.datasets.transforms.rotate_z`.
+
+    Args:
+        points: Clouds.
+        settings: Which augmentation, and how strong.
+        generator: Source of the draws, on the device of the points.
+        rows: Places of these clouds in a batch that several devices share: the draws are those of
+            the whole batch.
+        total: Clouds in that batch.
+    """
+    place = torch.arange(len(points)) if rows is None else torch.as_tensor(rows)
+    place, count = place.to(points.device), len(points) if total is None else total
+    drawn = {"generator": generator, "device": points.device, "dtype": points.dtype}
     if settings.rotate_z:
-        points = rotate_z(points, rng)
+        angle = 2 * torch.pi * torch.rand(count, 1, **drawn)[place]
+        c, s = angle.cos(), angle.sin()
+        x, y, z = points.unbind(2)
+        points = torch.stack([c * x - s * y, s * x + c * y, z], dim=2)
     if settings.jitter_sigma > 0 and settings.jitter_clip > 0:
-        points = jitter(points, rng, settings.jitter_sigma, settings.jitter_clip)
-    return np.ascontiguousarray(points, dtype=np.float32)
+        noise = settings.jitter_sigma * torch.randn(count, *points.shape[1:], **drawn)
+        points = points + noise.clamp_(-settings.jitter_clip, settings.jitter_clip)[place]
+    return points
 
 
-def batches(count: int, size: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
-    """Cut a random order into batches; a last batch of one is dropped (batch normalisation)."""
+def batches(
+    count: int, size: int, rng: np.random.Generator, least: int = 2
+) -> Iterator[np.ndarray]:
+    """Cut a random order into batches; a last one of fewer than ``least`` clouds is dropped.
+
+    Batch normalisation needs two clouds on each device.
+    """
     order = rng.permutation(count)
     for start in range(0, count, size):
-        if count - start >= 2:
+        if count - start >= least:
             yield order[start : start + size]
 
 
-def endless_batches(count: int, size: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
+def endless_batches(
+    count: int, size: int, rng: np.random.Generator, least: int = 2
+) -> Iterator[np.ndarray]:
     """Yield the batches of one random order after another, without end."""
-    return itertools.chain.from_iterable(batches(count, size, rng) for _ in itertools.count())
+    orders = (batches(count, size, rng, least) for _ in itertools.count())
+    return itertools.chain.from_iterable(orders)
 
 
-def labelled_batch(
-    sets: list[PointClouds],
-    rows: list[np.ndarray],
-    settings: TrainSettings,
-    rng: np.random.Generator,
-    device: torch.device,
-) -> Batch:
-    """Put the chosen rows of every set, augmented, into one batch on the device."""
-    chosen = list(zip(sets, rows, strict=True))
-    points = np.concatenate([clouds.points[index] for clouds, index in chosen])
-    labels = np.concatenate([clouds.labels[index] for clouds, index in chosen])
-    return Batch(
-        torch.from_numpy(augment(points, settings, rng)).to(device),
-        torch.from_numpy(labels.astype(np.int64)).to(device),
-    )
-
-
-def count_batches(count: int, size: int) -> int:
+def count_batches(count: int, size: int, least: int = 2) -> int:
     """Return how many batches `batches` cuts.
 
     Example:
         >>> count_batches(9, 4), count_batches(10, 4)
         (2, 3)
     """
-    return count // size + (count % size >= 2)
+    return count // size + (count % size >= least)
+
+
+def make_batch(
+    sets: Sequence[DeviceClouds],
+    rows: Sequence[np.ndarray],
+    settings: TrainSettings,
+    generator: torch.Generator,
+    share: Share = WHOLE,
+) -> Batch:
+    """Put this device's share of the chosen rows of every set, augmented, into one batch.
+
+    The augmentation of a cloud does not depend on the number of devices.
+    """
+    parts = [
+        clouds.take(index[share.rank :: share.world])
+        for clouds, index in zip(sets, rows, strict=True)
+    ]
+    places, total = [], 0
+    for index in rows:
+        places += range(total + share.rank, total + len(index), share.world)
+        total += len(index)
+    points = torch.cat([part.points for part in parts])
+    points = augment(points, settings, generator, places, total)
+    return Batch(points, torch.cat([part.labels for part in parts]))

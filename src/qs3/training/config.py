@@ -23,15 +23,20 @@ class TrainSettings:
     model_settings: Annotated[Mapping[str, Any], tyro.conf.Suppress] = field(default_factory=dict)
     """Arguments of the network that differ from its defaults."""
     num_points: int = 1024
-    """Points a cloud, by farthest point sampling after normalisation to the unit ball."""
+    """Points a cloud, by farthest point sampling before normalisation to the unit ball."""
     epochs: int = 200
     """Passes over the source."""
     batch_size: int = 32
-    """Clouds of each labelled set in an optimiser step."""
+    """Clouds of each labelled set in an optimiser step, over all devices together."""
     learning_rate: float = 1e-3
     """Adam's learning rate at the start; it falls to 0 along a cosine, epoch by epoch."""
     weight_decay: float = 5e-5
     """L2 penalty in Adam's gradient."""
+    clip_norm: float | None = None
+    """Largest norm of the gradient of all weights together; a longer one is scaled down to it."""
+    ema_decay: float | None = None
+    """Decay of a moving average of weights and buffers, which then is the trained network; after
+    t steps at most (1 + t)/(10 + t)."""
     label_smoothing: float = 0.0
     """Probability mass spread evenly over the classes."""
     rotate_z: bool = True
@@ -43,16 +48,27 @@ class TrainSettings:
     seed: int = 0
     """Root of all random steps."""
     precision: Precision = "32-true"
-    """Number format; neighbours and edge statistics are always in full precision."""
+    """Number format; neighbours and edge statistics are always in full precision. A CPU without
+    bf16 units computes bf16-mixed slowly."""
     accelerator: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """Where to compute."""
+    devices: int = 1
+    """GPUs, or CPU processes, of this machine that share each batch. Each normalises its own share
+    (batch normalisation), so that results differ a little between numbers of devices."""
     threads: int | None = None
-    """CPU threads; None leaves PyTorch's choice. Results are bit-identical for equal numbers."""
+    """CPU threads of each process; None leaves PyTorch's choice, or shares the cores between
+    several processes. Results are bit-identical for equal numbers."""
 
     def __post_init__(self) -> None:
         for name in ("num_points", "epochs", "learning_rate"):
             _check(self, name, getattr(self, name) > 0, "must be above 0")
-        _check(self, "batch_size", self.batch_size >= 2, "must be at least 2")
+        _check(self, "devices", self.devices > 0, "must be above 0")
+        least = 2 * self.devices
+        fault = f"must be at least {least}" + (", 2 a device" if self.devices > 1 else "")
+        _check(self, "batch_size", self.batch_size >= least, fault)
+        _check(self, "clip_norm", self.clip_norm is None or self.clip_norm > 0, "must be above 0")
+        decay = self.ema_decay
+        _check(self, "ema_decay", decay is None or 0 < decay < 1, "must be between 0 and 1")
         for name in ("weight_decay", "jitter_sigma", "jitter_clip", "seed"):
             _check(self, name, getattr(self, name) >= 0, "must not be negative")
         _check(self, "label_smoothing", 0 <= self.label_smoothing < 1, "must be in 0 to below 1")

@@ -1,36 +1,27 @@
 """Train and adapt in one call, into a folder from which the call can be taken up again."""
 
+import contextlib
 import hashlib
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal, TypeVar
 
-import torch
-
-from qs3.adaptation import SourceOnly
 from qs3.datasets.clouds import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
-from qs3.files import write_text
 from qs3.models import PointClassifier
 from qs3.training.batches import prepare, require_unlabelled
-from qs3.training.checkpoint import (
-    MODEL,
-    claim_run,
-    derived_seed,
-    fingerprint,
-    load_model,
-    new_model,
-    save_model,
-)
+from qs3.training.checkpoint import MODEL, claim_run, fingerprint, load_model
 from qs3.training.config import SelfTrainingSettings, TrainSettings
-from qs3.training.loop import EpochCallback, EpochRecord, make_fabric, train
-from qs3.training.self_training import RoundCallback, RoundRecord, self_train
+from qs3.training.deadline import Deadline
+from qs3.training.distributed import all_devices, make_fabric, threads
+from qs3.training.job import Job, Listeners, fresh_model, run_job, write_job
+from qs3.training.loop import EpochCallback
+from qs3.training.records import EpochRecord, History
+from qs3.training.self_training import RoundCallback, RoundRecord
 
-HISTORY = "history.jsonl"
-WARM_UP = "warm-up"
+_Clouds = TypeVar("_Clouds", PointClouds, UnlabelledClouds)
 MethodName = Literal["source-only", "qbst"]
 """Methods that `fit` knows."""
 
@@ -58,13 +49,15 @@ def fit(
     *,
     run_dir: Path,
     warm_up: Path | None = None,
+    max_seconds: float | None = None,
+    tensorboard: bool = False,
     on_epoch: EpochCallback | None = None,
     on_round: RoundCallback | None = None,
 ) -> FitResult:
     """Train a network on the source and, with ``qbst``, adapt it to an unlabelled target.
 
     Called again with the same arguments it goes on after the last finished epoch, and ends with
-    the same bits as if it had never stopped (same device and number of threads).
+    the same bits as if it had never stopped (same devices and number of threads).
 
     Args:
         method: ``source-only`` or ``qbst``.
@@ -73,15 +66,20 @@ def fit(
         settings: How to train.
         self_training: Settings of the rounds, for ``qbst`` only; the default preset where absent.
         run_dir: Folder of the run: ``settings.json``, ``model.safetensors``, ``history.jsonl``;
-            the warm-up's own in ``warm-up/``.
+            the warm-up's own in ``warm-up/``; and, where clouds were thinned, the choice of points.
         warm_up: Folder of a finished run on the same classes, whose network takes the place of the
             training on the source; for ``qbst`` only.
+        max_seconds: Time for this call; it stops before an epoch that would end later, but never
+            before its first.
+        tensorboard: Whether to write event files too, in ``tensorboard/``.
         on_epoch: Called after each epoch.
         on_round: Called after each round.
 
     Raises:
         InputError: where arguments do not go together, or the folder holds another run.
-        QS3Error: where a loss is not finite.
+        TimeUpError: where the time is up; the same call goes on.
+        MissingExtraError: where TensorBoard is asked for and absent.
+        QS3Error: where a loss is not finite, or the process of another device ended.
     """
     if method not in ("source-only", "qbst"):
         raise InputError(f"unknown method {method!r}; choose source-only or qbst")
@@ -98,12 +96,14 @@ def fit(
     if target is not None:
         require_unlabelled(target)
     rounds_settings = (self_training or SelfTrainingSettings()) if adapts else None
+    limit = Deadline(max_seconds)
     start = None if warm_up is None else _load_warm_up(Path(warm_up), source, settings)
     run_dir = Path(run_dir)
+    job = Job(source, target, settings, rounds_settings, run_dir, start)
     # What cannot be made must not leave a folder behind that refuses the corrected call.
-    with _threads(settings.threads):
-        fabric = make_fabric(settings)
-        fresh = new_model(settings, len(source.class_names), derived_seed(settings.seed, 0))
+    fresh_model(job)
+    make_fabric(settings)
+    history = History(run_dir, tensorboard)
     claim_run(
         run_dir,
         {
@@ -117,48 +117,19 @@ def fit(
             "warm_up": None if start is None else _weights_fingerprint(start),
         },
     )
-    source = replace(source, points=prepare(source.points, settings.num_points))
-    with _threads(settings.threads):
-        history: list[EpochRecord] = []
-        if start is None:
-            folder = run_dir / WARM_UP if adapts else run_dir
-            start = fresh
-            history, _ = train(
-                SourceOnly(start, settings.label_smoothing),
-                source,
-                None,
-                settings,
-                fabric=fabric,
-                run_dir=folder,
-                stream=(0,),
-                on_epoch=on_epoch,
-                description=WARM_UP if adapts else method,
-            )
-            save_model(folder, start, source.class_names, settings)
-        model, records = start, []
-        if rounds_settings is not None and target is not None:
-            prepared = replace(target, points=prepare(target.points, settings.num_points))
-            model, records = self_train(
-                start,
-                source,
-                prepared,
-                settings,
-                rounds_settings,
-                fabric=fabric,
-                run_dir=run_dir,
-                on_epoch=on_epoch,
-                on_round=on_round,
-            )
-            save_model(run_dir, model, source.class_names, settings)
-    lines: list[dict[str, Any]] = [{"kind": "epoch", **asdict(record)} for record in history]
-    lines += [{"kind": "round", **asdict(record)} for record in records]
-    write_text(run_dir / HISTORY, "".join(json.dumps(line) + "\n" for line in lines))
-    return FitResult(model=model.eval(), history=tuple(history), rounds=tuple(records))
+    job = replace(job, source=_prepared(source, job), target=target and _prepared(target, job))
+    with (
+        threads(settings),
+        contextlib.closing(history),
+        all_devices(settings, partial(write_job, job)) as fabric,
+    ):
+        model, epochs, rounds = run_job(job, fabric, Listeners(history, limit, on_epoch, on_round))
+    return FitResult(model=model.eval(), history=tuple(epochs), rounds=tuple(rounds))
 
 
 def is_finished(run_dir: Path) -> bool:
-    """Whether a run has written its network and its history."""
-    return (Path(run_dir) / MODEL).is_file() and (Path(run_dir) / HISTORY).is_file()
+    """Whether a run has written its network."""
+    return (Path(run_dir) / MODEL).is_file()
 
 
 def _load_warm_up(folder: Path, source: PointClouds, settings: TrainSettings) -> PointClassifier:
@@ -187,13 +158,5 @@ def _weights_fingerprint(model: PointClassifier) -> str:
     return digest.hexdigest()
 
 
-@contextmanager
-def _threads(count: int | None) -> Iterator[None]:
-    """Compute with ``count`` CPU threads for a while; None changes nothing."""
-    before = torch.get_num_threads()
-    if count is not None:
-        torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+def _prepared(clouds: _Clouds, job: Job) -> _Clouds:
+    return replace(clouds, points=prepare(clouds.points, job.settings.num_points, job.run_dir))

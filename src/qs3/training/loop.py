@@ -1,82 +1,32 @@
 """The training loop, in one visible function."""
 
 import math
-import sys
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
 from lightning_fabric import Fabric
 from torch import Tensor
-from tqdm import tqdm
 
 from qs3.adaptation import Method
 from qs3.datasets.clouds import PointClouds, UnlabelledClouds
 from qs3.errors import InputError, QS3Error
-from qs3.training.batches import augment, count_batches, endless_batches, labelled_batch
-from qs3.training.checkpoint import (
-    load_optimiser,
-    load_tensors_into,
-    optimiser_tensors,
-    prefixed,
-    read_tensors,
-    seed_sequence,
-    without_prefix,
-    write_tensors,
-)
+from qs3.training.batches import DeviceClouds, Share, count_batches, endless_batches, make_batch
+from qs3.training.checkpoint import load_optimiser, optimiser_tensors, seed_sequence
 from qs3.training.config import TrainSettings
-
-CHECKPOINT = "checkpoint.safetensors"
-
-
-@dataclass(frozen=True)
-class EpochRecord:
-    """What one epoch did."""
-
-    epoch: int
-    """Count from 0."""
-    losses: Mapping[str, float]
-    """Mean of each loss over the steps."""
-    learning_rate: float
-    """Adam's learning rate in this epoch."""
-    seconds: float
-    """Wall-clock seconds."""
-
+from qs3.training.deadline import Deadline, TimeUpError
+from qs3.training.distributed import make_equal, make_fabric, make_module_equal
+from qs3.training.ema import Average
+from qs3.training.progress import Progress
+from qs3.training.records import EpochRecord, Log
+from qs3.training.state import CHECKPOINT as CHECKPOINT
+from qs3.training.state import Observer, TrainingState
 
 EpochCallback = Callable[[EpochRecord, Method], None]
 """Called after each epoch; an exception ends the training, which then resumes after this epoch."""
-
-
-@runtime_checkable
-class Observer(Protocol):
-    """Watches the network over the epochs and keeps tensors that a resumed training needs."""
-
-    def after_epoch(self, method: Method, epoch: int) -> None:
-        """Look at the network after an epoch."""
-
-    def tensors(self) -> dict[str, Tensor]:
-        """Return what to store in the checkpoint."""
-        ...
-
-    def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take back what `tensors` returned."""
-
-
-def make_fabric(settings: TrainSettings) -> Fabric:
-    """Return the device and number format of the settings.
-
-    Raises:
-        InputError: where the device is not there.
-    """
-    try:
-        return Fabric(accelerator=settings.accelerator, devices=1, precision=settings.precision)
-    except (RuntimeError, ValueError) as error:
-        raise InputError(f"accelerator {settings.accelerator!r}: {error}") from error
 
 
 def train(
@@ -93,21 +43,24 @@ def train(
     optimiser_state: Mapping[str, Tensor] | None = None,
     observer: Observer | None = None,
     on_epoch: EpochCallback | None = None,
+    log: Log | None = None,
+    deadline: Deadline | None = None,
     description: str = "train",
 ) -> tuple[list[EpochRecord], dict[str, Tensor]]:
     """Train a method for ``settings.epochs`` epochs.
 
     Order of the clouds, augmentation and dropout are drawn from (seed, stream, epoch), so that a
-    training that stops after any epoch and is started again ends bit-identically, on the same
-    device with the same number of threads.
+    training that stops at any moment and is started again ends bit-identically, on the same
+    devices with the same number of threads.
 
     Args:
-        method: The method with its network; trained in place and left in training mode.
+        method: The method with its network; trained in place and left in training mode. With
+            ``ema_decay`` it holds the moving average at the end.
         source: Labelled clouds, prepared. Of several sets, each step takes a batch of each, and an
             epoch is one pass over the first; the others begin anew when they end.
         target: Clouds of the target, prepared; only for a method that uses them.
         settings: How to train.
-        fabric: Device and number format; made from the settings where it is not given.
+        fabric: Devices and number format; made from the settings where it is not given.
         run_dir: Folder for the checkpoint; without one there is none. A checkpoint of another
             ``stream`` there is left aside and overwritten.
         stream: Numbers that set the random draws of this training apart from others of this seed.
@@ -115,23 +68,28 @@ def train(
         first_epoch: Place on the cosine of this training's first epoch.
         optimiser_state: Adam's state at the start, in place of zeros.
         observer: Watches the network; its tensors go into the checkpoint.
-        on_epoch: Called after each epoch, when its checkpoint is written.
+        on_epoch: Called after each epoch on the first device, when its checkpoint is written.
+        log: Is handed the epochs so far, on the first device.
+        deadline: Ends the training before an epoch that would end too late.
         description: Shown beside the progress bar.
 
     Returns:
         A record of each epoch, and Adam's state at the end.
 
     Raises:
-        InputError: where there are not two clouds of each set, or the target is missing.
+        InputError: where there are not two clouds of each set a device, or the target is missing.
+        TimeUpError: where the deadline has come.
         QS3Error: where a loss is not finite.
     """
+    fabric = fabric or make_fabric(settings)
+    share = Share(fabric.global_rank, fabric.world_size)
+    least = 2 * share.world
     sets = [source] if isinstance(source, PointClouds) else list(source)
-    for clouds in sets:
-        if len(clouds) < 2:
-            raise InputError(f"{len(clouds)} clouds are too few to train on; give at least 2")
+    for clouds in [*sets, *([] if target is None else [target])]:
+        if len(clouds) < least:
+            raise InputError(f"{len(clouds)} clouds are too few to train on; give at least {least}")
     if method.uses_target and target is None:
         raise InputError(f"{type(method).__name__} needs a target; give unlabelled clouds")
-    fabric = fabric or make_fabric(settings)
     optimiser = torch.optim.Adam(
         method.parameter_groups(settings.learning_rate),
         lr=settings.learning_rate,
@@ -141,72 +99,75 @@ def train(
     wrapped, wrapped_optimiser = fabric.setup(method, optimiser)
     if optimiser_state:
         load_optimiser(optimiser, optimiser_state)
-    history: list[EpochRecord] = []
-    path = None if run_dir is None else Path(run_dir) / CHECKPOINT
-    if path is not None and path.is_file():
-        history = _resume(path, method, optimiser, observer, stream)
+    average = None if settings.ema_decay is None else Average(method, settings.ema_decay)
+    state = TrainingState(method, optimiser, average, observer, stream, fabric)
+    history = state.resume(run_dir)
+    if log is not None:
+        log(history)
+    labelled = [DeviceClouds(clouds, fabric.device) for clouds in sets]
+    unlabelled = None if target is None else DeviceClouds(target, fabric.device)
 
-    steps = steps_per_epoch or count_batches(len(sets[0]), settings.batch_size)
+    steps = steps_per_epoch or count_batches(len(sets[0]), settings.batch_size, least)
     total = settings.epochs * steps
-    with tqdm(
-        total=total,
-        initial=len(history) * steps,
-        desc=description,
-        unit="step",
-        mininterval=0.5 if sys.stderr.isatty() else 30.0,
-    ) as bar:
+    with Progress(method, fabric, total, len(history) * steps, description) as bar:
         for epoch in range(len(history), settings.epochs):
-            start = time.perf_counter()
+            _stop_in_time(deadline, fabric, f"{description}, epoch {epoch}")
+            bar.begin_epoch()
             factor = cosine(first_epoch + epoch, settings.epochs)
             for group, rate in zip(optimiser.param_groups, base_rates, strict=True):
                 group["lr"] = rate * factor
             rng = np.random.default_rng(seed_sequence(settings.seed, *stream, epoch))
-            generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-            orders = [endless_batches(len(clouds), settings.batch_size, rng) for clouds in sets]
-            others = (
-                endless_batches(len(target), settings.batch_size, rng)
-                if target is not None
-                else None
+            seeds = [int(seed) for seed in rng.integers(2**62, size=3)]
+            # Augmentation is drawn alike on every device, each for the whole batch.
+            augmentation = torch.Generator(fabric.device).manual_seed(seeds[0])
+            generator = torch.Generator().manual_seed(seeds[1] + share.rank)
+            orders, others = (
+                [endless_batches(len(s), settings.batch_size, rng, least) for s in group]
+                for group in (labelled, [] if unlabelled is None else [unlabelled])
             )
-            sums: dict[str, float] = {}
             method.train()
-            with _seeded(fabric.device, int(rng.integers(2**62))):
+            with _seeded(fabric.device, seeds[2] + share.rank):
                 for step in range(steps):
                     rows = [next(order) for order in orders]
-                    batch = labelled_batch(sets, rows, settings, rng, fabric.device)
-                    unlabelled = None
-                    if others is not None and target is not None:
-                        points = augment(target.points[next(others)], settings, rng)
-                        unlabelled = torch.from_numpy(points).to(fabric.device)
-                    progress = (epoch * steps + step) / total
-                    losses = wrapped(batch, unlabelled, progress, generator)
-                    loss = torch.stack([term.float() for term in losses.values()]).sum()
-                    if not math.isfinite(float(loss.detach())):
-                        raise QS3Error(
-                            f"{description}: the loss is {float(loss.detach())} in epoch {epoch}, "
-                            f"batch {step}; lower the learning rate or look for NaN in the data"
-                        )
+                    batch = make_batch(labelled, rows, settings, augmentation, share)
+                    bar.watch(batch)
+                    other = [next(order) for order in others]
+                    seen = None
+                    if unlabelled is not None:
+                        seen = make_batch([unlabelled], other, settings, augmentation, share).points
+                    losses = wrapped(batch, seen, (epoch * steps + step) / total, generator)
+                    count = sum(map(len, rows))
+                    value = bar.measure(losses, count)
+                    if not math.isfinite(value):
+                        chosen = zip([*labelled, unlabelled], [*rows, *other], strict=False)
+                        where = f"{description}: the loss is {value} in epoch {epoch}, batch {step}"
+                        raise QS3Error(where + _clouds_of(chosen))
+                    # The devices' gradients are averaged: a larger share must weigh more.
+                    weight = len(batch.labels) * share.world / count
+                    loss = torch.stack([term.float() for term in losses.values()]).sum() * weight
                     wrapped_optimiser.zero_grad()
                     fabric.backward(loss)
+                    if settings.clip_norm is not None:
+                        _clip(fabric, wrapped, wrapped_optimiser, settings.clip_norm)
                     wrapped_optimiser.step()
                     method.after_step()
-                    for name, term in losses.items():
-                        sums[name] = sums.get(name, 0.0) + float(term.detach())
-                    bar.update()
+                    if average is not None:
+                        average.update()
+                    bar.step()
             record = EpochRecord(
                 epoch=epoch,
-                losses={name: value / steps for name, value in sums.items()},
+                losses=bar.losses(),
                 learning_rate=settings.learning_rate * factor,
-                seconds=time.perf_counter() - start,
+                seconds=bar.seconds(),
+                accuracy=bar.accuracy(),
+                samples_per_second=bar.rate(),
             )
             history.append(record)
-            bar.set_postfix({name: f"{value:.3f}" for name, value in record.losses.items()})
-            if observer is not None:
-                observer.after_epoch(method, epoch)
-            if path is not None:
-                _write(path, method, optimiser, observer, history, stream)
-            if on_epoch is not None:
-                on_epoch(record, method)
+            _finish_epoch(state, history, run_dir, log, on_epoch)
+            if deadline is not None:
+                deadline.note(bar.seconds())
+    if average is not None:
+        average.settle()
     return history, {k: v.clone() for k, v in optimiser_tensors(optimiser).items()}
 
 
@@ -228,38 +189,59 @@ def _seeded(device: torch.device, seed: int) -> Iterator[None]:
         yield
 
 
-def _write(
-    path: Path,
-    method: Method,
-    optimiser: torch.optim.Optimizer,
-    observer: Observer | None,
+def _clip(fabric: Fabric, module: Any, optimiser: Any, norm: float) -> None:
+    """Scale the gradient down; one that is not finite stays so, and a 16-bit scaler skips it."""
+    fabric.clip_gradients(module, optimiser, max_norm=norm, error_if_nonfinite=False)
+
+
+def _stop_in_time(deadline: Deadline | None, fabric: Fabric, where: str) -> None:
+    """Stop all devices where the first one's deadline has come."""
+    passed = torch.tensor(float(deadline is not None and deadline.passed()), device=fabric.device)
+    make_equal([passed], fabric)
+    if passed:
+        minutes = 0.0 if deadline is None else deadline.elapsed() / 60
+        raise TimeUpError(
+            f"stopped after {minutes:.1f} minutes, before {where}, as the next epoch would not end "
+            "in time; run the same again to go on"
+        )
+
+
+def _finish_epoch(
+    state: TrainingState,
     history: list[EpochRecord],
-    stream: tuple[int, ...],
+    run_dir: Path | None,
+    log: Log | None,
+    on_epoch: EpochCallback | None,
 ) -> None:
-    tensors = prefixed("method", method.state_dict())
-    tensors |= prefixed("optimiser", optimiser_tensors(optimiser))
-    if observer is not None:
-        tensors |= prefixed("observer", observer.tensors())
-    facts = {"stream": list(stream), "history": [asdict(record) for record in history]}
-    write_tensors(path, tensors, facts)
+    """Let everybody see the epoch's network, and write it down."""
+    make_module_equal(state.method, state.fabric)
+    average = state.average
+    if average is not None:
+        make_equal(list(average.tensors().values()), state.fabric)
+    if state.observer is not None:
+        with nullcontext() if average is None else average.shown():
+            state.observer.after_epoch(state.method, history[-1].epoch)
+    state.write(run_dir, history)
+    if log is not None:
+        log(history)
+    if on_epoch is not None:
+        with nullcontext() if average is None else average.shown():
+            on_epoch(history[-1], state.method)
 
 
-def _resume(
-    path: Path,
-    method: Method,
-    optimiser: torch.optim.Optimizer,
-    observer: Observer | None,
-    stream: tuple[int, ...],
-) -> list[EpochRecord]:
-    tensors, facts = read_tensors(path)
-    try:
-        if facts["stream"] != list(stream):
-            return []
-        history = [EpochRecord(**record) for record in facts["history"]]
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{path}: not a checkpoint of this version; delete it") from error
-    load_tensors_into(method, without_prefix("method", tensors), path)
-    load_optimiser(optimiser, without_prefix("optimiser", tensors))
-    if observer is not None:
-        observer.load(without_prefix("observer", tensors))
-    return history
+def _clouds_of(chosen: Iterable[tuple[DeviceClouds | None, np.ndarray]]) -> str:
+    """Name the first clouds of a batch, and those whose points are not finite."""
+    names, bad = [], []
+    for clouds, rows in chosen:
+        if clouds is not None:
+            finite = clouds.take(rows).points.isfinite().flatten(1).all(dim=1).tolist()
+            names += [clouds.ids[row] for row in rows]
+            bad += [clouds.ids[row] for row, good in zip(rows, finite, strict=True) if not good]
+    if bad:
+        return f": points of {_few(bad)} are not finite; leave these clouds out"
+    return f" ({_few(names)}), whose points are all finite; lower the learning rate or clip_norm"
+
+
+def _few(names: list[str]) -> str:
+    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+    return f"cloud{'s' if len(names) > 1 else ''} {', '.join(names[:4])}{more}"

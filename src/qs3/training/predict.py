@@ -9,6 +9,7 @@ from lightning_fabric import Fabric
 
 from qs3.models import PointClassifier
 from qs3.training.batches import prepare
+from qs3.training.distributed import gather_rows
 
 
 @torch.no_grad()
@@ -27,7 +28,8 @@ def predict_probabilities(
         points: Clouds as read; they are brought to the unit ball here.
         num_points: Points a cloud, by farthest point sampling; None takes all.
         batch_size: Clouds in a forward pass. It does not change the result but for rounding.
-        fabric: Number format; single precision where it is not given.
+        fabric: Number format, and devices that share the clouds: all must call, all get the same.
+            Single precision on one device where it is not given.
 
     Returns:
         Softmax in float64; rows sum to 1 to rounding.
@@ -43,16 +45,24 @@ def predict_probabilities(
     context = nullcontext if fabric is None else fabric.autocast
     training = model.training
     model.eval()
-    rows = []
+    mine = _part(len(prepared), fabric)
+    answers = np.zeros((len(prepared), _classes(model)))
     try:
-        for start in range(0, len(prepared), batch_size):
-            batch = torch.from_numpy(prepared[start : start + batch_size])
+        for start in range(mine.start, mine.stop, batch_size):
+            rows = slice(start, min(start + batch_size, mine.stop))
+            batch = torch.from_numpy(prepared[rows])
             with context():
                 logits = model(batch.to(parameter.device, parameter.dtype))
-            rows.append(torch.softmax(logits.double(), dim=1).cpu().numpy())
+            answers[rows] = torch.softmax(logits.double(), dim=1).cpu().numpy()
     finally:
         model.train(training)
-    return np.concatenate(rows) if rows else np.zeros((0, _classes(model)))
+    return answers if fabric is None else gather_rows(answers[mine], mine, len(answers), fabric)
+
+
+def _part(count: int, fabric: Fabric | None) -> slice:
+    """This device's part of the clouds."""
+    rank, world = (0, 1) if fabric is None else (fabric.global_rank, fabric.world_size)
+    return slice(rank * count // world, (rank + 1) * count // world)
 
 
 def _classes(model: PointClassifier) -> int:

@@ -30,8 +30,11 @@ from qs3.training.checkpoint import (
     write_tensors,
 )
 from qs3.training.config import SelfTrainingSettings, TrainSettings
-from qs3.training.loop import CHECKPOINT, EpochCallback, make_fabric, train
+from qs3.training.deadline import Deadline
+from qs3.training.distributed import make_fabric
+from qs3.training.loop import CHECKPOINT, EpochCallback, train
 from qs3.training.predict import predict_probabilities
+from qs3.training.records import History
 
 _LOG = logging.getLogger(__name__)
 STATE = "rounds.safetensors"
@@ -96,6 +99,8 @@ def self_train(
     run_dir: Path | None = None,
     on_round: RoundCallback | None = None,
     on_epoch: EpochCallback | None = None,
+    history: History | None = None,
+    deadline: Deadline | None = None,
 ) -> tuple[PointClassifier, list[RoundRecord]]:
     """Adapt a warmed-up network to an unlabelled target (QS³, Algorithm 1).
 
@@ -114,6 +119,8 @@ def self_train(
         run_dir: Folder for states: a run that was killed goes on after its last epoch.
         on_round: Called after each round.
         on_epoch: Called after each epoch.
+        history: Is told of epochs and rounds.
+        deadline: Ends the rounds before an epoch that would end too late.
 
     Returns:
         The network of the last round, and a record of each round.
@@ -128,8 +135,11 @@ def self_train(
     select = select or quasi_balanced_rule(self_training)
     folder = None if run_dir is None else Path(run_dir)
     rounds = _Rounds(model, source, target, settings, self_training, fabric, folder)
+    rounds.history, rounds.deadline = history, deadline
     for number in range(len(rounds.records) + 1, self_training.rounds + 1):
         record = rounds.run(number, select, on_epoch)
+        if history is not None:
+            history.rounds(rounds.records)
         if on_round is not None:
             on_round(record, rounds.latest)
     return rounds.latest, rounds.records
@@ -159,8 +169,11 @@ class _Rounds:
         self.pool = index[index % 10 < 8] if rounds.pool == "split" else index
         self.labels: np.ndarray | None = None
         self.records: list[RoundRecord] = []
+        self.history: History | None = None
+        self.deadline: Deadline | None = None
         if run_dir is not None and (run_dir / STATE).is_file():
             self._load(run_dir / STATE)
+        fabric.barrier()  # the first device must not write before all have read
 
     def run(self, number: int, select: Select, on_epoch: EpochCallback | None) -> RoundRecord:
         """Label, select, train; write the state."""
@@ -207,9 +220,10 @@ class _Rounds:
         )
         self.labels = labels
         self.records.append(record)
-        if self.run_dir is not None:
+        if self.run_dir is not None and self.fabric.is_global_zero:
             self._save(self.run_dir / STATE)
             (self.run_dir / CHECKPOINT).unlink(missing_ok=True)
+        self.fabric.barrier()
         return record
 
     def _train(
@@ -245,6 +259,8 @@ class _Rounds:
             optimiser_state=self.optimiser if continuous else None,
             observer=self.best if best else None,
             on_epoch=on_epoch,
+            log=None if self.history is None else self.history.training(f"round-{number}"),
+            deadline=self.deadline,
             description=f"round {number}/{rounds.rounds}",
         )
         self.optimiser = optimiser if continuous else {}

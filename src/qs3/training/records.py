@@ -1,0 +1,125 @@
+"""What a training tells of itself: epochs, kept in ``history.jsonl`` and, if asked, TensorBoard."""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from qs3.errors import MissingExtraError
+from qs3.files import write_text
+
+HISTORY = "history.jsonl"
+TENSORBOARD = "tensorboard"
+
+
+@dataclass(frozen=True)
+class EpochRecord:
+    """What one epoch did."""
+
+    epoch: int
+    """Count from 0."""
+    losses: Mapping[str, float]
+    """Mean of each loss over the steps."""
+    learning_rate: float
+    """Adam's learning rate in this epoch."""
+    seconds: float
+    """Wall-clock seconds."""
+    accuracy: float | None = None
+    """Share of the labelled clouds, augmented, that the network in training had right; None where
+    a method does not call the network on them."""
+    samples_per_second: float = 0.0
+    """Labelled clouds a second, over all devices."""
+
+
+Log = Callable[[Sequence[EpochRecord]], None]
+"""Is handed all epochs of a training so far: at its start, resumed or not, and after each epoch."""
+
+
+class History:
+    """Writes ``history.jsonl``: one line an epoch on the source, one a round of self-training.
+
+    Epochs of a round that is not done have a line each; then the round's own line takes their
+    place. The file is written anew, whole, at every change: it is never torn, and a resumed run
+    repeats no line.
+
+    Args:
+        run_dir: Folder of the run.
+        tensorboard: Whether to write event files for TensorBoard too, in ``tensorboard/``.
+
+    Raises:
+        MissingExtraError: where TensorBoard is asked for and is not installed.
+    """
+
+    def __init__(self, run_dir: Path, tensorboard: bool = False) -> None:
+        self.path = Path(run_dir) / HISTORY
+        self.lines: list[dict[str, Any]] = []
+        self.board = _Board(Path(run_dir) / TENSORBOARD) if tensorboard else None
+
+    def training(self, stage: str) -> Log:
+        """Return a log for one training; ``stage`` names its folder in TensorBoard."""
+
+        def log(epochs: Sequence[EpochRecord]) -> None:
+            self._write(self.lines + self._epochs(epochs))
+            if self.board is not None:
+                self.board.show(stage, epochs)
+
+        return log
+
+    def source(self, epochs: Sequence[EpochRecord]) -> None:
+        """Keep the epochs on the source."""
+        self.lines += self._epochs(epochs)
+        self._write(self.lines)
+
+    def rounds(self, records: Sequence[Any]) -> None:
+        """Keep the rounds so far, in place of what was there of rounds."""
+        self.lines = [line for line in self.lines if line["kind"] != "round"]
+        self.lines += [{"kind": "round", **asdict(record)} for record in records]
+        self._write(self.lines)
+
+    def close(self) -> None:
+        """Bring TensorBoard's files to disk."""
+        if self.board is not None:
+            self.board.close()
+
+    @staticmethod
+    def _epochs(epochs: Sequence[EpochRecord]) -> list[dict[str, Any]]:
+        return [{"kind": "epoch", **asdict(record)} for record in epochs]
+
+    def _write(self, lines: list[dict[str, Any]]) -> None:
+        write_text(self.path, "".join(json.dumps(line) + "\n" for line in lines))
+
+
+class _Board:
+    """Event files of TensorBoard, one folder a stage."""
+
+    def __init__(self, folder: Path) -> None:
+        try:
+            from torch.utils.tensorboard.writer import SummaryWriter
+        except ImportError as error:
+            raise MissingExtraError("tensorboard", "track") from error
+        self.make, self.folder = SummaryWriter, folder
+        self.writer: Any = None
+        self.stage, self.shown = "", 0
+
+    def show(self, stage: str, epochs: Sequence[EpochRecord]) -> None:
+        if stage != self.stage:
+            self.close()
+            # What an earlier call wrote of this stage is hidden and told again.
+            self.writer = self.make(str(self.folder / stage), purge_step=0)
+            self.stage, self.shown = stage, 0
+        for record in epochs[self.shown :]:
+            values = {f"loss/{name}": value for name, value in record.losses.items()}
+            values["learning_rate"] = record.learning_rate
+            values["samples_per_second"] = record.samples_per_second
+            if record.accuracy is not None:
+                values["accuracy"] = record.accuracy
+            for name, value in values.items():
+                self.writer.add_scalar(name, value, record.epoch)
+        self.shown = len(epochs)
+        self.writer.flush()
+
+    def close(self) -> None:
+        if self.writer is not None:
+            self.writer.close()
+        self.writer, self.stage = None, ""
