@@ -17,6 +17,22 @@ SMALL = {
     "pointnet": {"channels": (8, 8, 16), "hidden": (16, 8)},
     "pointnet of each point": {"channels": (8, 8, 16), "hidden": (16, 8), "per_point": True},
     "pointnet without T-Nets": {"channels": (8, 8, 16), "hidden": (16, 8), "transforms": False},
+    "pointnet2": {
+        "centres": (12, 5),
+        "scales": (((0.9, 6, (8, 8, 16)),), ((1.4, 4, (16, 16)),)),
+        "embedding": (16, 24),
+        "hidden": (16, 8),
+        "per_point": True,
+    },
+    "pointnet2-msg": {
+        "centres": (12, 5),
+        "scales": (
+            ((0.5, 4, (4, 8)), (0.9, 6, (8, 8, 8))),
+            ((0.8, 3, (8, 16)), (1.4, 4, (8, 8, 8))),
+        ),
+        "embedding": (16, 24),
+        "hidden": (16, 8),
+    },
     "rscnn": {
         "centres": (12, 5),
         "radii": (0.9, 1.4),

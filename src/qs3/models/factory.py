@@ -1,17 +1,22 @@
 """Networks by name."""
 
 import inspect
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from qs3.errors import InputError
 from qs3.models.classifier import PointClassifier
 from qs3.models.dgcnn import DGCNN
 from qs3.models.pointnet import PointNet
+from qs3.models.pointnet2 import PointNet2
 from qs3.models.rscnn import RSCNN
 
-_MODELS: dict[str, type[PointClassifier]] = {
+_MODELS: dict[str, Callable[..., PointClassifier]] = {
     "dgcnn": DGCNN,
     "pointnet": PointNet,
+    "pointnet2": PointNet2,
+    "pointnet2-msg": partial(PointNet2, grouping="msg"),
     "rscnn": RSCNN,
 }
 

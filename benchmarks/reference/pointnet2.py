@@ -1,0 +1,144 @@
+"""Textbook PointNet++ (Qi et al., NeurIPS 2017): explicit groups, Conv2d and BatchNorm2d.
+
+For tests and comparisons of time and memory; the function is that of `qs3.models.PointNet2`.
+"""
+
+import itertools
+
+import torch
+from torch import Tensor, nn
+
+SSG = (((0.2, 32, (64, 64, 128)),), ((0.4, 64, (128, 128, 256)),))
+MSG = (
+    ((0.1, 16, (32, 32, 64)), (0.2, 32, (64, 64, 128)), (0.4, 128, (64, 96, 128))),
+    ((0.2, 32, (64, 64, 128)), (0.4, 64, (128, 128, 256)), (0.8, 128, (128, 128, 256))),
+)
+
+
+def pick(values: Tensor, index: Tensor) -> Tensor:
+    cloud = torch.arange(len(values), device=values.device)
+    return values[cloud.view(-1, *[1] * (index.ndim - 1)), index]
+
+
+def sample(points: Tensor, m: int) -> Tensor:
+    b, n, _ = points.shape
+    newest = (points - points.mean(dim=1, keepdim=True)).square().sum(dim=2).argmax(dim=1)
+    nearest = torch.full((b, n), torch.inf, dtype=points.dtype, device=points.device)
+    chosen = []
+    for _ in range(m):
+        chosen.append(newest)
+        position = points[torch.arange(b, device=points.device), newest][:, None]
+        nearest = torch.minimum(nearest, (points - position).square().sum(dim=2))
+        newest = nearest.argmax(dim=1)
+    return torch.stack(chosen, dim=1)
+
+
+def ball(points: Tensor, centres: Tensor, radius: float, k: int, order: str) -> Tensor:
+    distance = torch.cdist(centres, points)
+    if order == "nearest":
+        found = distance.topk(k, dim=2, largest=False).indices
+        inside = distance.gather(2, found) <= radius
+        return torch.where(inside, found, found[:, :, :1])
+    n = points.shape[1]
+    number = torch.arange(n, device=points.device).expand_as(distance)
+    found = torch.where(distance <= radius, number, n).sort(dim=2).values[:, :, :k]
+    return torch.where(found < n, found, found[:, :, :1])
+
+
+def shared(channels: int, widths: tuple[int, ...]) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for c, d in itertools.pairwise((channels, *widths)):
+        layers += [nn.Conv2d(c, d, 1, bias=False), nn.BatchNorm2d(d), nn.ReLU()]
+    return nn.Sequential(*layers)
+
+
+class PointNet2(nn.Module):
+    """Takes the arguments of `qs3.models.PointNet2`.
+
+    ``groups``, where set, holds for each level the indices of the centres and of each scale's
+    groups, in place of the network's own sampling and ball query.
+    """
+
+    def __init__(
+        self,
+        num_classes: int,
+        grouping: str = "ssg",
+        centres: tuple[int, int] = (512, 128),
+        scales: tuple | None = None,
+        embedding: tuple[int, ...] = (256, 512, 1024),
+        hidden: tuple[int, ...] = (512, 256),
+        dropout: float = 0.4,
+        ball_order: str = "nearest",
+        per_point: bool = False,
+    ) -> None:
+        super().__init__()
+        self.grouping, self.centres, self.ball_order = grouping, centres, ball_order
+        self.scales = scales or (SSG if grouping == "ssg" else MSG)
+        channels = 0
+        self.levels = nn.ModuleList()
+        for level in self.scales:
+            self.levels.append(nn.ModuleList(shared(3 + channels, scale[2]) for scale in level))
+            channels = sum(scale[2][-1] for scale in level)
+        self.embed = shared(3 + channels, embedding)
+        layers: list[nn.Module] = []
+        for depth, (c, d) in enumerate(itertools.pairwise((embedding[-1], *hidden))):
+            layers += [nn.Linear(c, d, bias=depth > 0), nn.BatchNorm1d(d), nn.ReLU()]
+            layers += [nn.Dropout(dropout)]
+        self.classify = nn.Sequential(*layers, nn.Linear((embedding[-1], *hidden)[-1], num_classes))
+        self.groups: list[tuple[Tensor, list[Tensor]]] | None = None
+
+    def forward(self, points: Tensor) -> Tensor:
+        features = None
+        for depth, level in enumerate(self.levels):
+            chosen, balls = self.grouped(points, depth)
+            centres = pick(points, chosen)
+            described = []
+            for network, index in zip(level, balls, strict=True):
+                edges = pick(points, index) - centres[:, :, None]
+                if features is not None:
+                    around = pick(features, index)
+                    both = (around, edges) if self.grouping == "msg" else (edges, around)
+                    edges = torch.cat(both, dim=3)
+                described.append(network(edges.permute(0, 3, 1, 2)).amax(dim=3).transpose(1, 2))
+            points, features = centres, torch.cat(described, dim=2)
+        both = torch.cat([points, features], dim=2).transpose(1, 2)[..., None]
+        return self.classify(self.embed(both).amax(dim=(2, 3)))
+
+    def grouped(self, points: Tensor, depth: int) -> tuple[Tensor, list[Tensor]]:
+        if self.groups is not None:
+            return self.groups[depth]
+        with torch.no_grad():
+            n = points.shape[1]
+            chosen = sample(points, min(self.centres[depth], n))
+            centres = pick(points, chosen)
+            return chosen, [
+                ball(points, centres, radius, min(k, n), self.ball_order)
+                for radius, k, _ in self.scales[depth]
+            ]
+
+
+def from_ours(model: nn.Module) -> PointNet2:
+    """Return the textbook form with the weights, the type and the mode of ours."""
+    layers = list(model.classify.layers)
+    textbook = PointNet2(
+        layers[-1].out_features,
+        model.grouping,
+        tuple(level.centres for level in model.levels),
+        tuple(
+            tuple(
+                (radius, k, tuple(layer.linear.out_features for layer in scale.layers))
+                for (radius, k), scale in zip(level.balls, level.scales, strict=True)
+            )
+            for level in model.levels
+        ),
+        tuple(layer.linear.out_features for layer in model.embed),
+        tuple(layer.out_features for layer in layers[:-1] if isinstance(layer, nn.Linear)),
+        next((layer.p for layer in layers if isinstance(layer, nn.Dropout)), 0.0),
+        model.levels[0].ball_order,
+    )
+    ours = list(model.state_dict().values())
+    textbook.to(ours[0].dtype)
+    state = textbook.state_dict()
+    pairs = zip(state.items(), ours, strict=True)
+    textbook.load_state_dict({key: v.reshape(old.shape) for (key, old), v in pairs})
+    return textbook.train(model.training)

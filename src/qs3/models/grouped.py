@@ -1,0 +1,335 @@
+"""A shared network over the points of each group, then the maximum over the group.
+
+The function is the textbook's: a linear map, batch normalisation and ReLU at every (centre,
+neighbour) edge, several times, then the maximum over the neighbours (Qi et al., NeurIPS 2017).
+What is done otherwise, for speed and memory:
+
+- Batch normalisation never runs over the edges. A linear layer's output has mean W μ and variances
+  w_oᵀ Σ w_o, where μ and Σ are mean and covariance of its input; scale and shift then go into the
+  weights, and each layer is one product with a ReLU in place.
+- The first layer is linear in (x_j − c_i, f_j): its product is made once a point and once a centre.
+- The last layer's output, the widest, exists for one neighbour of every centre at a time: the
+  running maximum and the number of its neighbour (a byte) stay. Backward, only the winners count.
+
+Convention:
+    Edges are neighbour first, [k m c] with the centres of all clouds in m, so that a slice holds
+    one neighbour of every centre.
+"""
+
+import itertools
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from qs3.models.ops import flat_indices, gather_points, scatter_points
+
+
+class Moments(NamedTuple):
+    """Mean and covariance of a layer's input over all edges."""
+
+    mean: Float[Tensor, "c"]
+    covariance: Float[Tensor, "c c"]
+    edges: int
+    """Their number."""
+
+
+class FoldedLayer(nn.Module):
+    """A linear map and batch normalisation that are applied as one linear map.
+
+    Args:
+        channels: Width of the input.
+        width: Width of the output.
+    """
+
+    def __init__(self, channels: int, width: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(channels, width, bias=False)
+        # Holds scale, shift and running statistics.
+        self.norm = nn.BatchNorm1d(width)
+
+    def fold(self, moments: Moments | None) -> tuple[Float[Tensor, "d c"], Float[Tensor, "d"]]:
+        """Return the weight and the shift of the normalised map.
+
+        Args:
+            moments: Those of the input, which move the running statistics; the latter alone are
+                used where None.
+        """
+        norm, weight = self.norm, self.linear.weight
+        assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
+        if moments is None:
+            mean, variance = norm.running_mean, norm.running_var
+        else:
+            mean = weight @ moments.mean
+            variance = ((weight @ moments.covariance) * weight).sum(dim=1).clamp_min(0.0)
+            self._update_running(mean.detach(), variance.detach(), moments.edges)
+        scale = norm.weight * torch.rsqrt(variance + norm.eps)
+        return scale[:, None] * weight, norm.bias - scale * mean
+
+    @torch.no_grad()
+    def _update_running(self, mean: Tensor, variance: Tensor, count: int) -> None:
+        """Move the running statistics as BatchNorm does: the variance is the unbiased one."""
+        norm = self.norm
+        assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
+        assert norm.num_batches_tracked is not None and norm.momentum is not None  # noqa: S101
+        norm.num_batches_tracked.add_(1)
+        norm.running_mean.lerp_(mean, norm.momentum)
+        norm.running_var.lerp_(variance * (count / max(count - 1, 1)), norm.momentum)
+
+
+class GroupedMLP(nn.Module):
+    """Shared layers over the points of each group, and the maximum over each group.
+
+    Args:
+        channels: Width of the points' features; 0 where they have none.
+        widths: Widths of the layers, at least two.
+        features_first: Whether the first layer's weight holds the features before the position.
+    """
+
+    def __init__(
+        self, channels: int, widths: tuple[int, ...], features_first: bool = False
+    ) -> None:
+        super().__init__()
+        if len(widths) < 2:
+            raise ValueError(f"at least two layers are needed, not {len(widths)}")
+        ends = (3 + channels, *widths)
+        self.layers = nn.ModuleList(FoldedLayer(c, d) for c, d in itertools.pairwise(ends))
+        self.features_first = features_first
+
+    def forward(
+        self,
+        points: Float[Tensor, "b n 3"],
+        features: Float[Tensor, "b n c"] | None,
+        centres: Float[Tensor, "b m 3"],
+        index: Int[Tensor, "b m k"],
+    ) -> Float[Tensor, "b m d"]:
+        """Describe each group.
+
+        Args:
+            points: Positions.
+            features: What is known of each point; None where that is its position alone.
+            centres: Centres of the groups.
+            index: Points of each group, counted within the own cloud; k at most 255.
+        """
+        b, m, k = index.shape
+        if k > 255:
+            raise ValueError(f"at most 255 neighbours, not {k}")
+        with torch.autocast(points.device.type, enabled=False):
+            dtype = self._layer(0).linear.weight.dtype
+            mean = points.mean(dim=1, keepdim=True)
+            points, centres = (points - mean).to(dtype), (centres - mean).to(dtype)
+            features = None if features is None else features.to(dtype)
+            first = _FirstInput(points, features, centres, index, self.features_first)
+            if self.training or torch.is_grad_enabled():
+                best = self._all_edges(first)
+            else:
+                best = self._one_neighbour_at_a_time(first, k)
+        return best.view(b, m, -1)
+
+    def _layer(self, depth: int) -> FoldedLayer:
+        layer = self.layers[depth]
+        assert isinstance(layer, FoldedLayer)  # noqa: S101
+        return layer
+
+    def _all_edges(self, first: "_FirstInput") -> Float[Tensor, "r d"]:
+        hidden = first.apply(*self._layer(0).fold(first.moments() if self.training else None))
+        for depth in range(1, len(self.layers)):
+            moments = None
+            if self.training:
+                hidden, mean, covariance = _WithMoments.apply(hidden)
+                moments = Moments(mean, covariance, hidden.shape[0] * hidden.shape[1])
+            weight, shift = self._layer(depth).fold(moments)
+            if depth < len(self.layers) - 1:
+                hidden = nn.functional.linear(hidden, weight, shift).relu_()
+            else:
+                hidden = _LinearMax.apply(hidden, weight).add(shift).relu_()
+        return hidden
+
+    def _one_neighbour_at_a_time(self, first: "_FirstInput", k: int) -> Float[Tensor, "r d"]:
+        folded = [self._layer(depth).fold(None) for depth in range(len(self.layers))]
+        best = None
+        for t in range(k):
+            value = first.apply(*folded[0], neighbour=t)[0]
+            for weight, shift in folded[1:-1]:
+                value = torch.addmm(shift, value, weight.t()).relu_()
+            value = torch.mm(value, folded[-1][0].t())
+            best = value if best is None else torch.maximum(best, value, out=best)
+        assert best is not None  # noqa: S101
+        return best.add_(folded[-1][1]).relu_()
+
+
+class _FirstInput:
+    """The input (x_j − c_i, f_j) of the first layer, of which only the differences are made."""
+
+    def __init__(
+        self,
+        points: Float[Tensor, "b n 3"],
+        features: Float[Tensor, "b n c"] | None,
+        centres: Float[Tensor, "b m 3"],
+        index: Int[Tensor, "b m k"],
+        features_first: bool,
+    ) -> None:
+        self.points, self.features, self.centres = points, features, centres
+        self.index = index
+        self.features_first = features_first
+        self.differences = gather_points(points, index) - centres[:, :, None]
+        self._products: Tensor | None = None
+        self._of_centres: Tensor | None = None
+
+    def _joined(self, position: Tensor, feature: Tensor, dim: int) -> Tensor:
+        parts = (feature, position) if self.features_first else (position, feature)
+        return torch.cat(parts, dim=dim)
+
+    def moments(self) -> Moments:
+        """Return mean and covariance of the input over all edges."""
+        count = self.index.numel()
+        differences = self.differences.reshape(count, 3)
+        mean = differences.mean(dim=0)
+        centred = differences - mean
+        covariance = centred.t() @ centred / count
+        if self.features is None:
+            return Moments(mean, covariance, count)
+        n = self.features.shape[1]
+        features = self.features.flatten(0, 1)
+        flat = flat_indices(self.index, n).view(-1)
+        share = torch.bincount(flat, minlength=len(features)).to(features.dtype) / count
+        feature_mean = share @ features
+        features = features - feature_mean
+        own = (share[:, None] * features).t() @ features
+        # Σ_e d_e f_jᵀ, summed over the edges that end in a point first.
+        around = scatter_points(centred.view(*self.index.shape, 3), self.index, n).flatten(0, 1)
+        cross = around.t() @ features / count
+        if self.features_first:
+            blocks = ((own, cross.t()), (cross, covariance))
+        else:
+            blocks = ((covariance, cross), (cross.t(), own))
+        rows = [torch.cat(row, dim=1) for row in blocks]
+        return Moments(self._joined(mean, feature_mean, 0), torch.cat(rows), count)
+
+    def apply(
+        self, weight: Float[Tensor, "d c"], shift: Float[Tensor, "d"], neighbour: int | None = None
+    ) -> Float[Tensor, "k r d"]:
+        """Return ReLU of the linear map at every edge, or at those of one neighbour."""
+        pick = slice(None) if neighbour is None else slice(neighbour, neighbour + 1)
+        b, m, _ = self.index.shape
+        if self.features is None:
+            edges = self.differences[:, :, pick].permute(2, 0, 1, 3).reshape(-1, b * m, 3)
+            return nn.functional.linear(edges, weight, shift).relu_()
+        n, c = self.features.shape[1:]
+        if self._products is None:
+            position = weight[:, c:] if self.features_first else weight[:, :3]
+            inputs = self._joined(self.points, self.features, 2)
+            self._products = nn.functional.linear(inputs, weight, shift).flatten(0, 1)
+            self._of_centres = nn.functional.linear(self.centres, position).flatten(0, 1)
+        flat = flat_indices(self.index, n)[:, pick].t()
+        return _RectifiedEdges.apply(self._products, self._of_centres, flat)
+
+
+class _RectifiedEdges(torch.autograd.Function):
+    """ReLU(x_j − c_i) for every edge of [k m] indices into all points."""
+
+    @staticmethod
+    def forward(ctx, points: Tensor, centres: Tensor, index: Tensor) -> Tensor:
+        edges = points.index_select(0, index.reshape(-1)).view(*index.shape, -1)
+        edges.sub_(centres).relu_()
+        ctx.save_for_backward(index, edges)
+        ctx.n = len(points)
+        return edges
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor, Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        index, edges = ctx.saved_tensors
+        gradient = torch.where(edges > 0, gradient, 0.0)
+        of_points = scatter_points(gradient[None], index[None], ctx.n)[0]
+        return of_points, gradient.sum(dim=0).neg_(), None
+
+
+class _WithMoments(torch.autograd.Function):
+    """Hand edges on, with their mean and covariance; one product forward and one backward."""
+
+    @staticmethod
+    def forward(ctx, edges: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        rows = edges.view(-1, edges.shape[-1])
+        mean = rows.mean(dim=0)
+        covariance = torch.zeros((len(mean), len(mean)), dtype=rows.dtype, device=rows.device)
+        for block in rows.split(_rows_of_a_block(rows)):
+            centred = block - mean
+            covariance.addmm_(centred.t(), centred)
+        ctx.save_for_backward(edges, mean)
+        return edges.view_as(edges), mean, covariance.div_(len(rows))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, gradient: Tensor, of_mean: Tensor, of_covariance: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        edges, mean = ctx.saved_tensors
+        rows = edges.view(-1, edges.shape[-1])
+        slope = (of_covariance + of_covariance.t()) / len(rows)
+        total = torch.addmm(gradient.reshape(rows.shape), rows, slope)
+        return total.add_(of_mean / len(rows) - mean @ slope).view_as(edges)
+
+
+def _rows_of_a_block(rows: Tensor) -> int:
+    """A block is as large as fits the cache of a CPU; a GPU takes 256 MiB."""
+    return max(1, (2**26 if rows.is_cuda else 2**20) // rows.shape[1])
+
+
+class _LinearMax(torch.autograd.Function):
+    """max_t W x_tm of edges [k m c], without the [k m d] tensor of the products."""
+
+    @staticmethod
+    def forward(ctx, edges: Tensor, weight: Tensor) -> Tensor:
+        across = weight.t().contiguous()
+        best = edges[0] @ across
+        winner = torch.zeros(best.shape, dtype=torch.uint8, device=best.device)
+        value, better = torch.zeros_like(best), torch.zeros_like(winner)
+        for t in range(1, len(edges)):
+            torch.mm(edges[t], across, out=value)
+            # A later t is larger, so that a maximum of bytes records the last improvement.
+            torch.gt(value, best, out=better)
+            torch.maximum(winner, better.mul_(t), out=winner)
+            torch.maximum(best, value, out=best)
+        ctx.save_for_backward(edges, weight, winner)
+        return best
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        edges, weight, winner = ctx.saved_tensors
+        k, m, c = edges.shape
+        rows = edges.view(k * m, c)
+        source = winner.long().mul_(m).add_(torch.arange(m, device=winner.device)[:, None])
+        of_weight = _weighted_sums(source.t(), rows, gradient.t())
+        return _of_edges(gradient, source, weight, k * m).view_as(edges), of_weight
+
+
+def _weighted_sums(
+    index: Int[Tensor, "r s"], table: Float[Tensor, "n c"], weights: Float[Tensor, "r s"]
+) -> Float[Tensor, "r c"]:
+    """Return Σ_s weight_rs · table[index_rs]."""
+    return nn.functional.embedding_bag(
+        index.contiguous(), table, mode="sum", per_sample_weights=weights.contiguous()
+    )
+
+
+def _of_edges(
+    gradient: Float[Tensor, "m d"],
+    source: Int[Tensor, "m d"],
+    weight: Float[Tensor, "d c"],
+    edges: int,
+) -> Float[Tensor, "e c"]:
+    """Return for each edge Σ_o gradient_io · w_o over the channels o that it has won."""
+    d = gradient.shape[1]
+    flat = source.view(-1)
+    order = flat.argsort(stable=True)
+    ends = torch.bincount(flat, minlength=edges).cumsum(0)
+    offsets = torch.cat([ends.new_zeros(1), ends[:-1]])
+    return nn.functional.embedding_bag(
+        order % d,
+        weight,
+        offsets,
+        mode="sum",
+        per_sample_weights=gradient.reshape(-1).index_select(0, order),
+    )
