@@ -31,6 +31,8 @@ from qs3.training.config import TrainSettings
 
 _LOG = logging.getLogger(__name__)
 _MEETING = "meeting"
+READY = "ready"
+"""File that a process makes when it has read its job; its rank follows."""
 _GRACE = 60.0
 """Seconds that this process gets to notice by itself that another one has died."""
 
@@ -191,9 +193,12 @@ def all_devices(settings: TrainSettings, write_job: Callable[[Path], None]) -> I
         folder = Path(name)
         write_job(folder)
         others = [_Other(rank, folder) for rank in range(1, settings.devices)]
-        threading.Thread(target=_watch, args=(others,), daemon=True).start()
         try:
+            for other in others:
+                other.wait_until_ready()
             with join(settings, 0, folder) as fabric:
+                if fabric.device.type == "cuda":
+                    threading.Thread(target=_watch, args=(others,), daemon=True).start()
                 yield fabric
             for other in others:
                 other.process.wait(_GRACE)
@@ -212,7 +217,7 @@ class _Other:
 
     def __init__(self, rank: int, folder: Path) -> None:
         self.rank, self.wanted = rank, True
-        self.said = folder / f"stderr-{rank}"
+        self.said, self.ready = folder / f"stderr-{rank}", folder / f"{READY}-{rank}"
         paths = os.pathsep.join(path or os.getcwd() for path in sys.path)  # noqa: PTH109
         with self.said.open("wb") as stderr:
             # Its standard input is a lifeline: it ends when this process does.
@@ -223,6 +228,13 @@ class _Other:
                 stderr=stderr,
                 env=os.environ | {"PYTHONPATH": paths},
             )
+
+    def wait_until_ready(self) -> None:
+        while not self.ready.exists():
+            fault = self.fault()
+            if fault is not None:
+                raise QS3Error(fault)
+            time.sleep(0.02)
 
     def end(self) -> None:
         self.wanted = False
@@ -260,19 +272,17 @@ def _fault(others: list[_Other]) -> str | None:
 def _watch(others: list[_Other]) -> None:
     """End this process where another one died and a GPU waits for it without end.
 
-    On a CPU the broken connection is an error at once, and this never comes to act.
+    On a CPU the broken connection is an error at once, and nobody needs to watch.
     """
-    while any(other.wanted and other.process.poll() is None for other in others):
+    while any(other.wanted for other in others):
         fault = next((f for f in (other.fault() for other in others) if f), None)
         if fault is not None:
-            break
+            time.sleep(_GRACE)
+            if any(other.wanted for other in others):
+                sys.stderr.write(f"qs3: {fault}\n")
+                sys.stderr.flush()
+                os._exit(2)
         time.sleep(0.5)
-    time.sleep(_GRACE)
-    fault = next((f for f in (other.fault() for other in others) if f), None)
-    if fault is not None:
-        sys.stderr.write(f"qs3: {fault}\n")
-        sys.stderr.flush()
-        os._exit(2)
 
 
 def make_equal(tensors: list[Tensor], fabric: Fabric) -> None:

@@ -15,11 +15,12 @@ def main() -> int:
     threading.Thread(target=_end_with_the_first, daemon=True).start()
     from qs3.errors import QS3Error
     from qs3.training.deadline import TimeUpError
-    from qs3.training.distributed import join, threads
+    from qs3.training.distributed import READY, join, threads
     from qs3.training.job import read_job, run_job
 
     try:
         job = read_job(folder)
+        (folder / f"{READY}-{rank}").touch()
         with threads(job.settings), join(job.settings, rank, folder) as fabric:
             run_job(job, fabric)
     except TimeUpError:
@@ -31,7 +32,9 @@ def main() -> int:
 
 
 def _end_with_the_first() -> None:
-    sys.stdin.buffer.read()
+    # Not through sys.stdin: its lock, held here, would abort an interpreter that ends.
+    while os.read(0, 1):
+        pass
     os._exit(1)
 
 

@@ -1,0 +1,165 @@
+"""Two CPU processes that train together over the loopback interface."""
+
+import copy
+import dataclasses
+import importlib
+import json
+import os
+import signal
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from qs3.adaptation import SourceOnly
+from qs3.errors import InputError, QS3Error
+from qs3.training import SelfTrainingSettings, fit, load_model
+from qs3.training import distributed as module
+from qs3.training.batches import DeviceClouds, Share, make_batch, prepare
+from qs3.training.checkpoint import derived_seed, new_model, seed_sequence
+from qs3.training.distributed import gather_rows, has_bf16_units, make_fabric
+
+
+class Stop(Exception):  # noqa: N818
+    """Ends a run from a callback, as a kill would."""
+
+
+def same(a, b):
+    a, b = a.state_dict(), b.state_dict()
+    return all(torch.equal(a[name], b[name]) for name in a)
+
+
+@pytest.fixture
+def two(settings):
+    return replace(settings, devices=2)
+
+
+def test_one_step_of_two_devices_is_the_step_written_out(source, two, tmp_path):
+    """Each share has its own batch statistics; gradients are the mean over all clouds."""
+    source = source.select(np.arange(23))  # shares of 12 and 11
+    small = {**two.model_settings, "dropout": 0.0}
+    settings = replace(two, epochs=1, batch_size=32, model_settings=small, clip_norm=0.05)
+    result = fit("source-only", source, None, settings, run_dir=tmp_path / "run")
+
+    model = new_model(settings, 3, derived_seed(settings.seed, 0))
+    rng = np.random.default_rng(seed_sequence(settings.seed, 0, 0))
+    augmentation = int(rng.integers(2**62, size=3)[0])
+    order = rng.permutation(23)
+    clouds = DeviceClouds(replace(source, points=prepare(source.points, 64)), torch.device("cpu"))
+    gradients, losses, buffers = [], [], None
+    for rank in range(2):
+        replica = copy.deepcopy(model)
+        generator = torch.Generator().manual_seed(augmentation)
+        batch = make_batch([clouds], [order], settings, generator, Share(rank, 2))
+        assert len(batch.labels) == (12, 11)[rank]
+        loss = SourceOnly(replica).losses(batch, None, 0.0, generator)["source"]
+        loss.backward()
+        gradients.append([p.grad * len(batch.labels) / 23 for p in replica.parameters()])
+        losses.append(float(loss.detach()) * len(batch.labels) / 23)
+        buffers = buffers or dict(replica.named_buffers())
+    for parameter, *parts in zip(model.parameters(), *gradients, strict=True):
+        parameter.grad = parts[0] + parts[1]
+    torch.nn.utils.clip_grad_norm_(model.parameters(), 0.05)
+    torch.optim.Adam(
+        model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
+    ).step()
+    for name, parameter in model.named_parameters():
+        torch.testing.assert_close(
+            result.model.get_parameter(name), parameter, rtol=1e-4, atol=1e-6
+        )
+    for name, buffer in buffers.items():  # those of the first device
+        torch.testing.assert_close(result.model.get_buffer(name), buffer)
+    assert result.history[0].losses["source"] == pytest.approx(sum(losses), rel=1e-5)
+    assert same(load_model(tmp_path / "run").model, result.model)
+
+
+def test_a_killed_process_ends_all_with_a_message(source, two, tmp_path, monkeypatch):
+    made = []
+
+    class Recorded(subprocess.Popen):
+        def __init__(self, *arguments, **options):
+            super().__init__(*arguments, **options)
+            made.append(self)
+
+    monkeypatch.setattr(module.subprocess, "Popen", Recorded)
+
+    def kill(record, method):
+        if record.epoch == 1:
+            os.kill(made[0].pid, signal.SIGKILL)
+
+    with pytest.raises(QS3Error, match=r"device 1 was killed \(signal 9\); run the same again"):
+        fit("source-only", source, None, two, run_dir=tmp_path / "run", on_epoch=kill)
+    assert [process.poll() for process in made] == [-signal.SIGKILL]
+    assert not torch.distributed.is_initialized()
+    assert not {"MASTER_ADDR", "GLOO_SOCKET_IFNAME"} & set(os.environ)
+    lines = (tmp_path / "run" / "history.jsonl").read_text().splitlines()
+    assert [json.loads(line)["epoch"] for line in lines] == [0, 1]
+
+
+@pytest.mark.slow
+def test_resumed_is_uninterrupted(source, target, two, tmp_path):
+    """Averaged weights, clipping and rounds of self-training, stopped in the middle of each."""
+    settings = replace(two, epochs=12, ema_decay=0.9, clip_norm=1.0)
+    rounds = SelfTrainingSettings(rounds=2, epochs=4, threshold=0.34, labeller="best")
+    arguments = ("qbst", source, target.without_labels(), settings, rounds)
+    whole = fit(*arguments, run_dir=tmp_path / "whole")
+    assert not whole.rounds[0].skipped
+    for limit in (3, 11):
+        seen = []
+
+        def stop(record, method, seen=seen, limit=limit):
+            seen.append(record.epoch)
+            if len(seen) == limit:
+                raise Stop
+
+        with pytest.raises(Stop):
+            fit(*arguments, run_dir=tmp_path / "cut", on_epoch=stop)
+    resumed = fit(*arguments, run_dir=tmp_path / "cut")
+    assert same(whole.model, resumed.model)
+
+    def plain(records):
+        return [{**dataclasses.asdict(record), "seconds": 0} for record in records]
+
+    assert plain(whole.rounds) == plain(resumed.rounds)
+
+
+@pytest.mark.slow
+def test_the_fault_of_another_process_is_told(source, two, tmp_path, monkeypatch):
+    fit_module = importlib.import_module("qs3.training.fit")
+    monkeypatch.setattr(fit_module, "write_job", lambda job, folder: None)
+    with pytest.raises(QS3Error, match=r"device 1 failed \(code 2\): .*job.safetensors"):
+        fit("source-only", source, None, two, run_dir=tmp_path / "run")
+
+
+def test_settings_that_cannot_be(settings, source, tmp_path):
+    with pytest.raises(InputError, match="batch_size = 3 must be at least 4, 2 a device"):
+        replace(settings, devices=2, batch_size=3)
+    with pytest.raises(InputError, match="mps"):
+        make_fabric(replace(settings, devices=2, accelerator="mps"))
+    if not torch.cuda.is_available():
+        with pytest.raises(InputError, match="accelerator 'cuda' with devices = 2"):
+            fit(
+                "source-only",
+                source,
+                None,
+                replace(settings, devices=2, accelerator="cuda"),
+                run_dir=tmp_path / "run",
+            )
+        assert not (tmp_path / "run").exists()
+
+
+def test_one_device_gathers_its_own_rows(settings):
+    rows = np.arange(6.0).reshape(3, 2)
+    assert np.array_equal(gather_rows(rows, slice(0, 3), 3, make_fabric(settings)), rows)
+
+
+def test_slow_bf16_is_told_once(settings, monkeypatch, caplog):
+    monkeypatch.setattr(module, "has_bf16_units", lambda: False)
+    module._tell_of_slow_bf16.cache_clear()
+    for _ in range(2):
+        make_fabric(replace(settings, precision="bf16-mixed"))
+    make_fabric(settings)
+    assert [r.message[:10] for r in caplog.records if r.name.startswith("qs3")] == ["bf16-mixed"]
+    assert isinstance(has_bf16_units(), bool)

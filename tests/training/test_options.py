@@ -1,0 +1,265 @@
+"""Clipping, accuracy, faults by name, time limits, logs, kills."""
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+import torch
+
+from qs3.adaptation import SourceOnly
+from qs3.errors import InputError, MissingExtraError, QS3Error
+from qs3.training import SelfTrainingSettings, TimeUpError, fit, parse_duration, records
+from qs3.training.checkpoint import new_model
+from qs3.training.deadline import Deadline
+from qs3.training.loop import train
+
+
+class Stop(Exception):  # noqa: N818
+    """Ends a run from a callback, as a kill would."""
+
+
+def same(a, b):
+    a, b = a.state_dict(), b.state_dict()
+    return all(torch.equal(a[name], b[name]) for name in a)
+
+
+def told(run_dir):
+    return [json.loads(line) for line in (run_dir / records.HISTORY).read_text().splitlines()]
+
+
+@pytest.mark.parametrize("norm", [1e-3, 1e6])
+def test_gradient_is_no_longer_than_asked(source, settings, norm):
+    lengths = []
+
+    class Watch(SourceOnly):
+        def after_step(self):
+            gradients = [p.grad.flatten() for p in self.parameters()]
+            lengths.append(float(torch.cat(gradients).norm()))
+
+    train(Watch(new_model(settings, 3, 0)), source, None, replace(settings, clip_norm=norm))
+    if norm < 1:
+        assert lengths == pytest.approx([norm] * len(lengths), rel=1e-3)
+    else:
+        free, _ = train(SourceOnly(new_model(settings, 3, 0)), source, None, settings)
+        assert 0.01 < max(lengths) < norm
+        assert free
+
+
+def test_accuracy_is_that_of_the_labelled_batches(source, settings):
+    hits = []
+
+    class Watch(SourceOnly):
+        def losses(self, source, target, progress, generator):
+            logits = self.model(source.points)
+            hits.append((logits.argmax(dim=1) == source.labels).float().mean().item())
+            self.model(source.points)  # a second call does not count
+            return {"source": torch.nn.functional.cross_entropy(logits, source.labels)}
+
+    history, _ = train(Watch(new_model(settings, 3, 0)), source, None, settings)
+    expected = np.array(hits).reshape(settings.epochs, -1).mean(axis=1)
+    assert [record.accuracy for record in history] == pytest.approx(expected.tolist())
+    assert all(record.samples_per_second > 0 for record in history)
+
+    class Silent(SourceOnly):
+        def losses(self, source, target, progress, generator):
+            return {"source": self.model.head(self.model.encode(source.points)).square().mean()}
+
+    history, _ = train(Silent(new_model(settings, 3, 0)), source, None, settings)
+    assert [record.accuracy for record in history] == [None] * settings.epochs
+
+
+def test_bar_tells_loss_accuracy_rate_and_time_left(source, settings, capsys):
+    train(SourceOnly(new_model(settings, 3, 0)), source, None, settings, description="here")
+    last = capsys.readouterr().err.split("\r")[-1]
+    for part in ("here: 100%", "12/12", "<00:00", "loss ", "accuracy ", "samples/s"):
+        assert part in last
+
+
+def test_loss_that_is_not_finite_names_the_clouds(source, settings):
+    class Diverges(SourceOnly):
+        def losses(self, source, target, progress, generator):
+            losses = super().losses(source, target, progress, generator)
+            return {"source": losses["source"] * (math.inf if progress >= 0.5 else 1.0)}
+
+    message = (
+        r"loss is inf in epoch 2, batch 0 \(clouds 0-\d+, .* and 4 more\), whose points are all"
+    )
+    with pytest.raises(QS3Error, match=message):
+        train(Diverges(new_model(settings, 3, 0)), source, None, settings)
+    broken = source.points.copy()
+    broken[7, 3, 1] = np.nan
+    message = r"loss is nan in epoch 0, batch \d: points of cloud 0-7 are not finite; leave"
+    with pytest.raises(QS3Error, match=message):
+        train(SourceOnly(new_model(settings, 3, 0)), replace(source, points=broken), None, settings)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "30", "0:00:00", "00:60:00", "1:2:3", "-1:00:00", "1h", "٣:00:00"]
+)
+def test_times_that_are_none(text):
+    with pytest.raises(InputError, match="such as 00:30:00"):
+        parse_duration(text)
+
+
+def test_deadline_looks_one_epoch_ahead(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    deadline = Deadline(10.0)
+    now[0] += 50
+    assert not deadline.passed()  # the first epoch always runs
+    deadline = Deadline(10.0)
+    deadline.note(3.0)
+    for elapsed, passed in ((6.9, False), (7.1, True)):
+        now[0] = 150.0 + elapsed
+        assert deadline.passed() is passed
+    assert not Deadline(None).passed()
+
+
+def test_stopped_in_time_again_and_again_is_uninterrupted(source, target, settings, tmp_path):
+    rounds = SelfTrainingSettings(rounds=2, epochs=2, threshold=0.4)
+    settings = replace(settings, epochs=20, ema_decay=0.8, clip_norm=1.0)
+    arguments = ("qbst", source, target.without_labels(), settings, rounds)
+    whole = fit(*arguments, run_dir=tmp_path / "whole")
+    stops = 0
+    while True:
+        try:
+            result = fit(*arguments, run_dir=tmp_path / "cut", max_seconds=1e-6)
+            break
+        except TimeUpError as error:
+            assert "run the same again to go on" in str(error)
+            stops += 1
+            assert stops < 30
+    assert stops >= 19  # one epoch a call
+    assert same(whole.model, result.model)
+    assert plain(told(tmp_path / "whole")) == plain(told(tmp_path / "cut"))
+
+
+def plain(lines):
+    """Lines without what a clock tells."""
+    clock = {"seconds", "samples_per_second"}
+    return [{key: value for key, value in line.items() if key not in clock} for line in lines]
+
+
+def test_history_is_there_after_each_epoch_and_repeats_nothing(source, settings, tmp_path):
+    seen = []
+
+    def look(record, method):
+        seen.append([line["epoch"] for line in told(tmp_path)])
+        if record.epoch == 1 and len(seen) == 2:
+            raise Stop
+
+    with pytest.raises(Stop):
+        fit("source-only", source, None, settings, run_dir=tmp_path, on_epoch=look)
+    fit("source-only", source, None, settings, run_dir=tmp_path, on_epoch=look)
+    assert seen == [[0], [0, 1], [0, 1, 2], [0, 1, 2, 3]]
+    assert not list(tmp_path.glob("*.csv"))
+
+
+def test_tensorboard_shows_each_epoch_once(source, target, settings, tmp_path):
+    reader = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    rounds = SelfTrainingSettings(rounds=1, epochs=2, threshold=0.34)
+    arguments = ("qbst", source, target.without_labels(), replace(settings, epochs=12), rounds)
+
+    def stop(record, method):
+        if record.epoch == 2:
+            raise Stop
+
+    with pytest.raises(Stop):
+        fit(*arguments, run_dir=tmp_path, tensorboard=True, on_epoch=stop)
+    result = fit(*arguments, run_dir=tmp_path, tensorboard=True)
+    shown = reader.EventAccumulator(str(tmp_path / "tensorboard" / "warm-up")).Reload()
+    assert set(shown.Tags()["scalars"]) == {
+        "loss/source", "accuracy", "learning_rate", "samples_per_second",
+    }  # fmt: skip
+    events = shown.Scalars("loss/source")
+    assert [event.step for event in events] == list(range(12))
+    expected = [record.losses["source"] for record in result.history]
+    assert [event.value for event in events] == pytest.approx(expected, rel=1e-6)
+    shown = reader.EventAccumulator(str(tmp_path / "tensorboard" / "round-1")).Reload()
+    assert len(shown.Scalars("accuracy")) == 2
+
+
+def test_absent_tensorboard_names_the_extra(source, settings, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard.writer", None)
+    with pytest.raises(MissingExtraError, match="track"):
+        fit("source-only", source, None, settings, run_dir=tmp_path / "run", tensorboard=True)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"clip_norm": 0.0}, "clip_norm = 0.0"),
+        ({"clip_norm": math.inf}, "clip_norm = inf"),
+        ({"ema_decay": 1.0}, "ema_decay = 1.0"),
+        ({"ema_decay": 0.0}, "ema_decay = 0.0"),
+        ({"devices": 0}, "devices = 0"),
+    ],
+)
+def test_faulty_settings_are_named(settings, changes, named):
+    with pytest.raises(InputError, match=named):
+        replace(settings, **changes)
+
+
+def test_statistics_stay_in_full_precision_under_bf16(source, settings):
+    """Running statistics under bf16 are those of single precision, to the rounding of bf16."""
+    found = {}
+    for precision in ("32-true", "bf16-mixed"):
+        method = SourceOnly(new_model(settings, 3, 0))
+        changed = replace(settings, epochs=1, batch_size=24, precision=precision)
+        train(method, source, None, changed)
+        found[precision] = dict(method.model.named_buffers())
+    for name, buffer in found["bf16-mixed"].items():
+        assert buffer.dtype == found["32-true"][name].dtype
+        torch.testing.assert_close(buffer, found["32-true"][name], rtol=0.05, atol=0.02)
+
+
+SCRIPT = """
+import json, sys
+import numpy as np
+from pathlib import Path
+from qs3.datasets.clouds import PointClouds, UnlabelledClouds
+from qs3.training import SelfTrainingSettings, TrainSettings, fit
+data, run = np.load(sys.argv[1]), Path(sys.argv[2])
+settings, rounds = json.loads(sys.argv[3])
+names = ("ball", "disc", "rod")
+source = PointClouds(data["points"], data["labels"], names, tuple(map(str, range(24))))
+target = UnlabelledClouds(data["target"], tuple(map(str, range(30))))
+fit("qbst", source, target, TrainSettings(**settings), SelfTrainingSettings(**rounds), run_dir=run)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_killed_in_the_middle_of_an_epoch_is_uninterrupted(source, target, settings, tmp_path, how):
+    settings = replace(settings, epochs=12, ema_decay=0.8, clip_norm=1.0, num_points=32)
+    rounds = SelfTrainingSettings(rounds=2, epochs=8, steps_per_epoch=12, threshold=0.34)
+    arguments = ("qbst", source, target.without_labels(), settings, rounds)
+    whole = fit(*arguments, run_dir=tmp_path / "whole")
+    np.savez(
+        tmp_path / "data.npz", points=source.points, labels=source.labels, target=target.points
+    )
+    cut = tmp_path / "cut"
+    for lines in (4, 15):  # in the warm-up, and in the first round
+        process = subprocess.Popen(
+            [sys.executable, "-c", SCRIPT, str(tmp_path / "data.npz"), str(cut),
+             json.dumps([asdict(settings), asdict(rounds)])],
+            stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        while not (cut / records.HISTORY).exists() or len(told(cut)) < lines:
+            assert process.poll() is None
+            time.sleep(0.005)
+        time.sleep(0.02)
+        os.kill(process.pid, how)
+        assert process.wait() != 0
+    assert len(list(cut.glob("thinned-*"))) == 2
+    result = fit(*arguments, run_dir=cut)
+    assert same(whole.model, result.model)
+    assert plain(told(cut)) == plain(told(tmp_path / "whole"))
