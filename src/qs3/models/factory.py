@@ -8,16 +8,20 @@ from typing import Any
 from qs3.errors import InputError
 from qs3.models.classifier import PointClassifier
 from qs3.models.dgcnn import DGCNN
+from qs3.models.pointmlp import PointMLPElite
 from qs3.models.pointnet import PointNet
 from qs3.models.pointnet2 import PointNet2
 from qs3.models.rscnn import RSCNN
+from qs3.models.simpleview import SimpleView
 
 _MODELS: dict[str, Callable[..., PointClassifier]] = {
     "dgcnn": DGCNN,
+    "pointmlp-elite": PointMLPElite,
     "pointnet": PointNet,
     "pointnet2": PointNet2,
     "pointnet2-msg": partial(PointNet2, grouping="msg"),
     "rscnn": RSCNN,
+    "simpleview": SimpleView,
 }
 
 
