@@ -142,7 +142,7 @@ class GroupedMLP(nn.Module):
                 moments = Moments(mean, covariance, hidden.shape[0] * hidden.shape[1])
             weight, shift = self._layer(depth).fold(moments)
             if depth < len(self.layers) - 1:
-                hidden = nn.functional.linear(hidden, weight, shift).relu_()
+                hidden = _rectified(hidden, weight, shift)
             else:
                 hidden = _LinearMax.apply(hidden, weight).add(shift).relu_()
         return hidden
@@ -153,7 +153,7 @@ class GroupedMLP(nn.Module):
         for t in range(k):
             value = first.apply(*folded[0], neighbour=t)[0]
             for weight, shift in folded[1:-1]:
-                value = torch.addmm(shift, value, weight.t()).relu_()
+                value = _rectified(value[None], weight, shift)[0]
             value = torch.mm(value, folded[-1][0].t())
             best = value if best is None else torch.maximum(best, value, out=best)
         assert best is not None  # noqa: S101
@@ -216,7 +216,7 @@ class _FirstInput:
         b, m, _ = self.index.shape
         if self.features is None:
             edges = self.differences[:, :, pick].permute(2, 0, 1, 3).reshape(-1, b * m, 3)
-            return nn.functional.linear(edges, weight, shift).relu_()
+            return _rectified(edges, weight, shift)
         n, c = self.features.shape[1:]
         if self._products is None:
             position = weight[:, c:] if self.features_first else weight[:, :3]
@@ -225,6 +225,14 @@ class _FirstInput:
             self._of_centres = nn.functional.linear(self.centres, position).flatten(0, 1)
         flat = flat_indices(self.index, n)[:, pick].t()
         return _RectifiedEdges.apply(self._products, self._of_centres, flat)
+
+
+def _rectified(
+    edges: Float[Tensor, "k r c"], weight: Float[Tensor, "d c"], shift: Float[Tensor, "d"]
+) -> Float[Tensor, "k r d"]:
+    """Return ReLU(W x + s); in place, which costs a copy where it is not done on a whole tensor."""
+    rows = torch.addmm(shift, edges.reshape(-1, edges.shape[2]), weight.t()).relu_()
+    return rows.view(*edges.shape[:2], -1)
 
 
 class _RectifiedEdges(torch.autograd.Function):
@@ -267,7 +275,8 @@ class _WithMoments(torch.autograd.Function):
         edges, mean = ctx.saved_tensors
         rows = edges.view(-1, edges.shape[-1])
         slope = (of_covariance + of_covariance.t()) / len(rows)
-        total = torch.addmm(gradient.reshape(rows.shape), rows, slope)
+        # In place: the edges have one reader, whose gradient this is and nobody else's.
+        total = gradient.reshape(rows.shape).addmm_(rows, slope)
         return total.add_(of_mean / len(rows) - mean @ slope).view_as(edges)
 
 

@@ -115,13 +115,13 @@ class PointNet2(PointClassifier):
     def __init__(
         self,
         num_classes: int,
-        grouping: Literal["ssg", "msg"] = "ssg",
+        grouping: str = "ssg",
         centres: tuple[int, int] = (512, 128),
         scales: tuple[tuple[Scale, ...], ...] | None = None,
         embedding: tuple[int, ...] = (256, 512, 1024),
         hidden: tuple[int, ...] = (512, 256),
         dropout: float = 0.4,
-        ball_order: Literal["nearest", "first"] = "nearest",
+        ball_order: str = "nearest",
         per_point: bool = False,
     ) -> None:
         super().__init__()
@@ -129,6 +129,7 @@ class PointNet2(PointClassifier):
             raise InputError(f"grouping must be ssg or msg, not {grouping!r}")
         if ball_order not in ("nearest", "first"):
             raise InputError(f"ball_order must be nearest or first, not {ball_order!r}")
+        order: Literal["nearest", "first"] = "first" if ball_order == "first" else "nearest"
         if scales is None:
             scales = _SSG if grouping == "ssg" else _MSG
         for _, k, _ in itertools.chain(*scales):
@@ -139,7 +140,7 @@ class PointNet2(PointClassifier):
         channels = 0
         levels = []
         for number, level in zip(centres, scales, strict=True):
-            levels.append(SetAbstraction(number, channels, level, ball_order, features_first))
+            levels.append(SetAbstraction(number, channels, level, order, features_first))
             channels = levels[-1].width
         self.levels = nn.ModuleList(levels)
         widths = (3 + channels, *embedding)
