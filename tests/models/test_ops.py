@@ -3,7 +3,18 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from qs3.models.ops import flat_indices, knn, neighbour_max, neighbour_sum
+from qs3.models.ops import (
+    ball_query,
+    farthest_point_sampling,
+    flat_indices,
+    gather_points,
+    knn,
+    neighbour_max,
+    neighbour_sum,
+    sampling,
+    scatter_points,
+    three_nn_interpolate,
+)
 from qs3.models.ops import neighbours as search
 
 
@@ -125,3 +136,168 @@ def test_more_than_255_neighbours_are_refused():
 def test_flat_indices_stay_in_their_cloud():
     flat = flat_indices(torch.tensor([[[1, 0], [1, 1]], [[0, 1], [0, 0]]]))
     assert flat.tolist() == [[1, 0], [1, 1], [2, 3], [2, 2]]
+
+
+def random_clouds(b, n, seed=0):
+    return np.random.default_rng(seed).uniform(-1, 1, size=(b, n, 3))
+
+
+def test_neighbours_of_other_centres_are_those_of_a_kd_tree():
+    points, centres = random_clouds(2, 300), random_clouds(2, 40, seed=1)
+    found = knn(torch.from_numpy(points), 7, torch.from_numpy(centres)).numpy()
+    for cloud in range(2):
+        expected = cKDTree(points[cloud]).query(centres[cloud], 7)[1]
+        assert np.array_equal(np.sort(found[cloud]), np.sort(expected))
+
+
+@pytest.mark.parametrize("offset", [0.0, 30.0])
+@pytest.mark.parametrize("order", ["nearest", "first"])
+@pytest.mark.parametrize(("n", "k"), [(300, 5), (512, 32), (20, 20)])
+def test_balls_are_those_of_a_kd_tree(n, k, order, offset):
+    points, centres = random_clouds(2, n) + offset, random_clouds(2, 30, seed=1) + offset
+    found = ball_query(torch.from_numpy(points), torch.from_numpy(centres), 0.5, k, order).numpy()
+    for cloud in range(2):
+        tree = cKDTree(points[cloud])
+        nearest = tree.query(centres[cloud], 1)[1]
+        inside = tree.query_ball_point(centres[cloud], 0.5)
+        for row, members in enumerate(inside):
+            if order == "nearest":
+                distance = np.linalg.norm(points[cloud][members] - centres[cloud][row], axis=1)
+                members = [members[i] for i in np.argsort(distance)[:k]]
+            else:
+                members = sorted(members)[:k]
+            members = members or [nearest[row]]
+            got = found[cloud, row]
+            assert set(got) == set(members)
+            assert got[0] == members[0]
+            assert (got == got[0]).sum() == k - len(members) + 1
+            if order == "first":
+                assert list(got[: len(members)]) == members
+
+
+@pytest.mark.parametrize("order", ["nearest", "first"])
+def test_ball_blocks_do_not_matter(order, monkeypatch):
+    points = torch.from_numpy(random_clouds(3, 256))
+    whole = ball_query(points, points[:, :90], 0.4, 8, order)
+    monkeypatch.setattr(
+        search,
+        "_blocks",
+        lambda b, m, n, cuda: (
+            (slice(c, c + 1), slice(r, r + 40)) for c in range(b) for r in range(0, m, 40)
+        ),
+    )
+    assert torch.equal(ball_query(points, points[:, :90], 0.4, 8, order), whole)
+
+
+@pytest.mark.parametrize("k", [0, 11])
+def test_balls_refuse_impossible_counts(k):
+    with pytest.raises(ValueError, match="neighbours of 10 points"):
+        ball_query(torch.zeros(1, 10, 3), torch.zeros(1, 2, 3), 1.0, k)
+
+
+@pytest.mark.parametrize("start", [None, 4])
+def test_samples_are_those_of_brute_force(start):
+    points = random_clouds(3, 80)
+    given = None if start is None else torch.full((3,), start)
+    found = farthest_point_sampling(torch.from_numpy(points), 80, given).numpy()
+    for cloud, own in enumerate(points):
+        from_mean = np.linalg.norm(own - own.mean(0), axis=1)
+        chosen = [int(from_mean.argmax()) if start is None else start]
+        while len(chosen) < 80:
+            distance = np.linalg.norm(own[:, None] - own[chosen], axis=2).min(axis=1)
+            chosen.append(int(distance.argmax()))
+        assert list(found[cloud]) == chosen
+
+
+def test_a_sample_begins_with_every_smaller_one_and_ignores_order():
+    points = torch.from_numpy(random_clouds(2, 200))
+    sample = farthest_point_sampling(points, 60)
+    assert torch.equal(farthest_point_sampling(points, 17), sample[:, :17])
+    order = torch.randperm(200, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(order[farthest_point_sampling(points[:, order], 60)], sample)
+
+
+def test_every_point_of_a_cloud_is_sampled_once_even_repeated_ones():
+    points = torch.from_numpy(random_clouds(2, 10)).repeat(1, 5, 1)
+    sample = farthest_point_sampling(points, 50)
+    assert torch.equal(sample.sort(dim=1).values, torch.arange(50).expand(2, 50))
+    assert (sample[:, :10] % 10).sort(dim=1).values.tolist() == [list(range(10))] * 2
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_both_ways_to_sample_give_the_same(dtype):
+    points = torch.from_numpy(random_clouds(3, 300)).to(dtype)
+    planes = points.permute(2, 0, 1).contiguous()
+    start = torch.tensor([5, 0, 299])
+    by_torch = sampling._sample_in_torch(planes, 300, start)
+    assert torch.equal(farthest_point_sampling(points, 300, start), by_torch)
+
+
+@pytest.mark.parametrize("m", [0, 11])
+def test_sampling_refuses_impossible_counts(m):
+    with pytest.raises(ValueError, match="of 10 points"):
+        farthest_point_sampling(torch.zeros(1, 10, 3), m)
+
+
+@pytest.mark.parametrize("shape", [(2, 7), (2, 4, 3), (2, 2, 2, 2)])
+def test_gathering_and_its_gradients(shape):
+    generator = torch.Generator().manual_seed(0)
+    values = torch.randn(2, 6, 3, generator=generator, dtype=torch.float64, requires_grad=True)
+    index = torch.randint(0, 6, shape, generator=generator)
+    cloud = torch.arange(2).view(2, *[1] * (len(shape) - 1))
+    assert torch.equal(gather_points(values, index), values[cloud, index])
+    assert torch.autograd.gradcheck(lambda v: gather_points(v, index), (values,))
+    assert torch.autograd.gradgradcheck(lambda v: gather_points(v, index).square(), (values,))
+
+
+def test_scattering_is_the_transpose_of_gathering():
+    generator = torch.Generator().manual_seed(0)
+    values = torch.randn(2, 6, 3, generator=generator, dtype=torch.float64)
+    index = torch.randint(0, 6, (2, 5, 4), generator=generator)
+    other = torch.randn(2, 5, 4, 3, generator=generator, dtype=torch.float64, requires_grad=True)
+    there = (gather_points(values, index) * other).sum()
+    back = (values * scatter_points(other, index, 6)).sum()
+    torch.testing.assert_close(there, back)
+    assert torch.autograd.gradcheck(lambda v: scatter_points(v, index, 6), (other,))
+
+
+@pytest.mark.parametrize("m", [1, 2, 50])
+def test_interpolation_is_that_of_a_kd_tree(m):
+    points, known = random_clouds(1, 30), random_clouds(1, m, seed=1)
+    features = np.random.default_rng(2).normal(size=(1, m, 4))
+    found = three_nn_interpolate(*map(torch.from_numpy, (points, known, features))).numpy()
+    distance, nearest = cKDTree(known[0]).query(points[0], range(1, min(3, m) + 1))
+    weights = 1 / (distance**2 + 1e-8)
+    weights /= weights.sum(axis=1, keepdims=True)
+    expected = (features[0][nearest] * weights[..., None]).sum(axis=1)
+    np.testing.assert_allclose(found[0], expected, rtol=1e-9, atol=1e-12)
+
+
+def test_interpolation_at_known_points_and_its_gradients():
+    known, points = torch.from_numpy(random_clouds(2, 9)), torch.from_numpy(random_clouds(2, 5, 1))
+    features = torch.randn(
+        2, 9, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64, requires_grad=True
+    )
+    torch.testing.assert_close(
+        three_nn_interpolate(known, known, features), features, rtol=0, atol=1e-5
+    )
+    inputs = (points.requires_grad_(), known.requires_grad_(), features)
+    assert torch.autograd.gradcheck(three_nn_interpolate, inputs)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device")
+def test_a_gpu_gives_what_the_cpu_gives_and_the_same_bits_twice():
+    points = torch.from_numpy(random_clouds(2, 256)).float()
+    there = points.cuda()
+    assert torch.equal(
+        farthest_point_sampling(there, 64).cpu(), farthest_point_sampling(points, 64)
+    )
+    balls = ball_query(points, points, 0.3, 16).sort(dim=2).values
+    assert torch.equal(ball_query(there, there, 0.3, 16).sort(dim=2).values.cpu(), balls)
+    gradients = []
+    for _ in range(2):
+        leaf = there.clone().requires_grad_()
+        gather_points(leaf, balls.cuda()).sin().sum().backward()
+        gradients.append(leaf.grad)
+    assert torch.equal(*gradients)

@@ -5,6 +5,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from qs3.models.ops.exporting import is_exporting
+
 
 def in_single_precision(points: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
     """Return half-precision values as float32 and others as they are."""
@@ -140,9 +142,9 @@ def _maximum(
     columns = flat_indices(neighbours, n).t().contiguous()
     centres = columns.shape[1]
     # On a CPU a block should stay in the cache, yet not be so small that threads only wait.
-    rows = centres if values.is_cuda else max(1, 2**19 // c)
+    rows = centres if values.is_cuda or is_exporting() else max(1, 2**19 // c)
     maximum = torch.zeros((centres, c), dtype=table.dtype, device=table.device)
-    for start in range(0, centres, rows):
+    for start in (0,) if is_exporting() else range(0, centres, rows):
         block = slice(start, start + rows)
         best = table.index_select(0, columns[0, block])
         for t in range(1, len(columns)):

@@ -5,6 +5,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from qs3.models.ops.exporting import is_exporting, sample_in_a_loop
 from qs3.models.ops.gathering import in_single_precision
 
 
@@ -38,8 +39,9 @@ def farthest_point_sampling(
     if start is None:
         start = (points - points.mean(dim=1, keepdim=True)).square().sum(dim=2).argmax(dim=1)
     planes = points.permute(2, 0, 1).contiguous()
-    if _is_exporting():
-        return _sample_in_torch(planes, m, start)
+    if is_exporting():
+        chosen = start[:, None].expand(-1, m).clone()
+        return sample_in_a_loop(planes, chosen, torch.full_like(start[0], m))
     return _sample(planes, m, start)  # pyright: ignore[reportCallIssue]
 
 
@@ -92,8 +94,3 @@ def _sample_in_numpy(
         nearest[cloud, newest] = -1.0
         newest = nearest.argmax(axis=1)
     return np.ascontiguousarray(chosen.T)
-
-
-def _is_exporting() -> bool:
-    """Tell whether a graph is made for elsewhere; older PyTorch tells of any tracing alone."""
-    return getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)()
