@@ -44,8 +44,6 @@ HERE = Path(__file__).parent
 CLASSES = 40
 FORMS = ("ours", "textbook")
 MODES = ("forward", "step")
-# Settings beside the defaults that have a row of their own, and the network that they are of.
-VARIANTS = {"pointnet2-msg": ("pointnet2", {"grouping": "msg"})}
 # What the searches are called in the package and in the textbook forms.
 SEARCHES = {
     "FPS": ("farthest_point_sampling", "farthest_points", "sample", "fps"),
@@ -54,28 +52,18 @@ SEARCHES = {
 }
 
 
-def networks() -> list[str]:
-    """Networks that have a textbook form."""
-    names = [*list_models(), *VARIANTS]
-    return [name for name in names if reference_file(name).is_file() and base(name)[0] in names]
-
-
-def base(name: str) -> tuple[str, dict[str, Any]]:
-    return VARIANTS.get(name, (name, {}))
-
-
 def reference_file(name: str) -> Path:
-    return HERE / "reference" / f"{base(name)[0].replace('-', '_')}.py"
+    """The textbook form of a network; "pointnet2-msg" is made by that of "pointnet2"."""
+    own = HERE / "reference" / f"{name.replace('-', '_')}.py"
+    return own if own.is_file() else own.with_stem(name.split("-")[0])
 
 
 def make(name: str, form: str, device: str) -> nn.Module:
     torch.manual_seed(0)
-    network, settings = base(name)
-    ours = create_model(network, CLASSES, **settings).to(device)
+    ours = create_model(name, CLASSES).to(device)
     if form == "ours":
         return ours
-    reference = importlib.import_module(f"reference.{reference_file(name).stem}")
-    return reference.from_ours(ours).to(device)
+    return importlib.import_module(f"reference.{reference_file(name).stem}").from_ours(ours)
 
 
 def clouds(batch: int, n: int, device: str) -> tuple[Tensor, Tensor]:
@@ -380,7 +368,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    known = networks()
+    known = [name for name in list_models() if reference_file(name).is_file()]
     parser.add_argument("--networks", nargs="+", default=known, choices=known)
     parser.add_argument("--precisions", nargs="+", default=["fp32", "bf16"])
     parser.add_argument("--modes", nargs="+", default=list(MODES), choices=MODES)

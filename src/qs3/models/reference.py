@@ -1,5 +1,6 @@
 """Weights of the authors' PyTorch releases, under their key names, into our networks."""
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -21,6 +22,8 @@ class _Layer(NamedTuple):
     """Its name, or its names where the release registers it twice."""
     dimensions: dict[str, int]
     """Number of dimensions of each of its tensors, by name."""
+    norm: str = ""
+    """Our normalisation after it, whose running mean takes a bias that ours leaves out."""
 
 
 class _Release(NamedTuple):
@@ -28,10 +31,15 @@ class _Release(NamedTuple):
 
     layers: tuple[_Layer, ...]
     settings: Callable[[Mapping[str, Tensor]], dict[str, Any]]
+    defaults: Mapping[str, Any] = {}
+    """Settings in which the release differs from ours and that the weights do not tell."""
 
 
-def _linear(ours: str, theirs: str, dimensions: int = 2, bias: bool = True) -> _Layer:
-    return _Layer(ours, (theirs,), {"weight": dimensions} | ({"bias": 1} if bias else {}))
+def _linear(
+    ours: str, theirs: str, dimensions: int = 2, bias: bool = True, norm: str = ""
+) -> _Layer:
+    parts = {"weight": dimensions} | ({"bias": 1} if bias else {})
+    return _Layer(ours, (theirs,), parts, norm)
 
 
 def _norm(ours: str, *theirs: str) -> _Layer:
@@ -66,7 +74,39 @@ def _dgcnn_settings(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
     }
 
 
-_RELEASES = {"dgcnn": _Release(tuple(_dgcnn_layers()), _dgcnn_settings)}
+def _pointnet2_layers(multi: bool) -> Iterator[_Layer]:
+    for level, scale in itertools.product(range(2), range(3 if multi else 1)):
+        ours = f"levels.{level}.scales.{scale}.layers"
+        kinds = ("conv_blocks", "bn_blocks") if multi else ("mlp_convs", "mlp_bns")
+        block = f".{scale}" if multi else ""
+        for depth in range(3):
+            convolution, norm = (f"sa{level + 1}.{kind}{block}.{depth}" for kind in kinds)
+            yield _norm(f"{ours}.{depth}.norm", norm)
+            yield _linear(f"{ours}.{depth}.linear", convolution, 4, norm=f"{ours}.{depth}.norm")
+    for depth in range(3):
+        ours = f"embed.{depth}"
+        yield _norm(f"{ours}.norm", f"sa3.mlp_bns.{depth}")
+        yield _linear(f"{ours}.linear", f"sa3.mlp_convs.{depth}", 4, norm=f"{ours}.norm")
+    yield _norm("classify.layers.1", "bn1")
+    yield _linear("classify.layers.0", "fc1", norm="classify.layers.1")
+    yield _norm("classify.layers.5", "bn2")
+    yield _linear("classify.layers.4", "fc2")
+    yield _linear("classify.layers.8", "fc3")
+
+
+def _pointnet2_settings(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
+    return {"num_classes": len(tensors["fc3.weight"])}
+
+
+_RELEASES = {
+    "dgcnn": _Release(tuple(_dgcnn_layers()), _dgcnn_settings),
+    "pointnet2": _Release(
+        tuple(_pointnet2_layers(False)), _pointnet2_settings, {"ball_order": "first"}
+    ),
+    "pointnet2-msg": _Release(
+        tuple(_pointnet2_layers(True)), _pointnet2_settings, {"ball_order": "first"}
+    ),
+}
 
 
 def load_reference(name: str, state_dict: Mapping[str, Any], **settings: Any) -> PointClassifier:
@@ -79,6 +119,11 @@ def load_reference(name: str, state_dict: Mapping[str, Any], **settings: Any) ->
       ``DGCNN_cls`` of https://github.com/antao97/dgcnn.pytorch (model.py); both name their layers
       alike and are the function of ours, whose default of 20 neighbours is that of their files for
       1,024 points. Those for 2,048 points need ``neighbours=40``.
+    - ``pointnet2`` and ``pointnet2-msg``: ``pointnet2_cls_ssg`` and ``pointnet2_cls_msg`` of
+      https://github.com/yanx27/Pointnet_Pointnet2_pytorch, trained without normals. A full ball
+      keeps its first points, as there. Two differences stay: sampling starts at the point farthest
+      from the mean, not at a random one, and logits are returned, not their log-softmax. The
+      release's biases before a normalisation go into its running mean.
 
     A published file is a pickle, which this package never opens: reading one can run any code in
     it. Turn it into safetensors outside, once::
@@ -87,7 +132,9 @@ def load_reference(name: str, state_dict: Mapping[str, Any], **settings: Any) ->
 d = torch.load('model.1024.t7', map_location='cpu', weights_only=True); \
 s.save_file({k: v.clone() for k, v in d.get('model_state_dict', d).items()}, 'out.safetensors')"
 
-    and hand over ``safetensors.torch.load_file("out.safetensors")``.
+    and hand over ``safetensors.torch.load_file("out.safetensors")``. Some checkpoints of PointNet++
+    hold NumPy numbers, which ``weights_only=True`` refuses; without it, only a file that you trust
+    should be read.
 
     Args:
         name: The release, from the list above.
@@ -114,7 +161,7 @@ s.save_file({k: v.clone() for k, v in d.get('model_state_dict', d).items()}, 'ou
         if key in told:
             raise InputError(f"weights for {name}: they tell {key} themselves; leave it out")
     with torch.random.fork_rng(devices=[]):  # the fresh weights are not a draw of the caller's
-        model = create_model(name, **told, **settings)
+        model = create_model(name, **told, **(dict(release.defaults) | settings))
     _fill(name, model, tensors, release.layers)
     return model.eval()
 
@@ -183,8 +230,10 @@ def _fill(
     for layer in layers:
         for part, dimensions in layer.dimensions.items():
             key = f"{layer.theirs[0]}.{part}"
-            target = ours[f"{layer.ours}.{part}"]
+            absorbed = f"{layer.ours}.{part}" not in ours
+            target = ours[f"{layer.norm}.running_mean" if absorbed else f"{layer.ours}.{part}"]
             expected = target.shape + (1,) * (dimensions - target.ndim)
             if tensors[key].shape != expected:
                 raise _odd_shape(name, key, tensors[key], str(list(expected)))
-            target.copy_(tensors[key].view_as(target))
+            value = tensors[key].to(target.dtype).reshape(target.shape)
+            target.copy_(target - value if absorbed else value)
