@@ -18,8 +18,9 @@ from qs3.errors import InputError, QS3Error
 from qs3.training import SelfTrainingSettings, fit, load_model
 from qs3.training import distributed as module
 from qs3.training.batches import DeviceClouds, Share, make_batch, prepare
-from qs3.training.checkpoint import derived_seed, new_model, seed_sequence
+from qs3.training.checkpoint import derived_seed, new_model, read_tensors, seed_sequence
 from qs3.training.distributed import gather_rows, has_bf16_units, make_fabric
+from qs3.training.loop import CHECKPOINT
 
 
 class Stop(Exception):  # noqa: N818
@@ -62,13 +63,13 @@ def test_one_step_of_two_devices_is_the_step_written_out(source, two, tmp_path):
     for parameter, *parts in zip(model.parameters(), *gradients, strict=True):
         parameter.grad = parts[0] + parts[1]
     torch.nn.utils.clip_grad_norm_(model.parameters(), 0.05)
-    torch.optim.Adam(
-        model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
-    ).step()
-    for name, parameter in model.named_parameters():
-        torch.testing.assert_close(
-            result.model.get_parameter(name), parameter, rtol=1e-4, atol=1e-6
-        )
+    # Adam's first moment after one step is a tenth of the gradient. (Its step itself would blow up
+    # the rounding of gradients that are zero but for rounding.)
+    moments, _ = read_tensors(tmp_path / "run" / CHECKPOINT)
+    for index, parameter in enumerate(model.parameters()):
+        expected = 0.1 * (parameter.grad + settings.weight_decay * parameter.detach())
+        got = moments[f"optimiser/{index}.exp_avg"]
+        torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-7)
     for name, buffer in buffers.items():  # those of the first device
         torch.testing.assert_close(result.model.get_buffer(name), buffer)
     assert result.history[0].losses["source"] == pytest.approx(sum(losses), rel=1e-5)
@@ -101,12 +102,12 @@ def test_a_killed_process_ends_all_with_a_message(source, two, tmp_path, monkeyp
 @pytest.mark.slow
 def test_resumed_is_uninterrupted(source, target, two, tmp_path):
     """Averaged weights, clipping and rounds of self-training, stopped in the middle of each."""
-    settings = replace(two, epochs=12, ema_decay=0.9, clip_norm=1.0)
+    settings = replace(two, epochs=24, ema_decay=0.8, clip_norm=1.0)
     rounds = SelfTrainingSettings(rounds=2, epochs=4, threshold=0.34, labeller="best")
     arguments = ("qbst", source, target.without_labels(), settings, rounds)
     whole = fit(*arguments, run_dir=tmp_path / "whole")
     assert not whole.rounds[0].skipped
-    for limit in (3, 11):
+    for limit in (3, 23):
         seen = []
 
         def stop(record, method, seen=seen, limit=limit):
