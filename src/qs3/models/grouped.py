@@ -243,7 +243,7 @@ class _RectifiedEdges(torch.autograd.Function):
         edges = points.index_select(0, index.reshape(-1)).view(*index.shape, -1)
         edges.sub_(centres).relu_()
         ctx.save_for_backward(index, edges)
-        ctx.n = len(points)
+        ctx.n = points.shape[0]
         return edges
 
     @staticmethod
