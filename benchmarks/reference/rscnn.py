@@ -13,10 +13,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 
-def farthest_points(points: Tensor, m: int) -> Tensor:
+def farthest_points(points: Tensor, m: int, last: Tensor) -> Tensor:
     b, n, _ = points.shape
     cloud = torch.arange(b, device=points.device)
-    last = (points - points.mean(dim=1, keepdim=True)).square().sum(dim=2).argmax(dim=1)
     distance = points.new_full((b, n), torch.inf)
     chosen = []
     for _ in range(m):
@@ -121,8 +120,10 @@ class RSCNN(nn.Module):
     @torch.no_grad()
     def group(self, points: Tensor) -> list[tuple[Tensor, Tensor]]:
         groups = []
+        last = (points - points.mean(dim=1, keepdim=True)).square().sum(dim=2).argmax(dim=1)
         for centres, radius, k in self.levels:
-            samples = farthest_points(points, min(centres, points.shape[1]))
+            samples = farthest_points(points, min(centres, points.shape[1]), last)
+            last = torch.zeros_like(last)
             groups.append((samples, ball(points, samples, radius, k, self.order)))
             points = points.gather(1, samples[:, :, None].expand(-1, -1, 3))
         return groups

@@ -160,7 +160,7 @@ def test_official_dgcnn_has_the_official_number_of_parameters():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: create_model("dgcn", 5), "choose one of dgcnn, pointnet"),
+        (lambda: create_model("dgcn", 5), "choose one of dgcnn, "),
         (lambda: create_model("dgcnn", 5, neighbors=3), "unknown setting 'neighbors'.*neighbours"),
         (lambda: create_model("dgcnn", 0), "num_classes"),
         (lambda: create_model("dgcnn", 5, neighbours=256), "1 to 255"),

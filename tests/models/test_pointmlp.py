@@ -116,3 +116,96 @@ PRECISIONS = pytest.mark.parametrize(
 @pytest.mark.parametrize("offset", [0.0, 30.0])
 def test_is_the_textbook_function(textbook, dtype, tolerance, train, offset):
     compare(textbook, make(dtype), clouds(offset=offset), tolerance, train)
+
+
+@pytest.mark.parametrize("train", [True, False])
+@pytest.mark.parametrize("n", [2, 5, 9])
+def test_clouds_of_fewer_points_than_neighbours(textbook, n, train):
+    compare(textbook, make(), clouds(n=n), 1e-9, train)
+
+
+def test_one_cloud_in_evaluation(textbook):
+    compare(textbook, make(), clouds(b=8), 1e-9, False)
+    fast = make()
+    slow = textbook.from_ours(fast)
+    for n in (1, 40):
+        points = clouds(b=1, n=n)
+        groups = fast.group(points)
+        logits, _ = run(fast, points, groups, False)
+        close(logits, run(slow, points, groups, False)[0], 1e-9, f"{n} points")
+
+
+@pytest.mark.parametrize("train", [True, False])
+def test_repeated_points(textbook, train):
+    """Ties have no single gradient, so that outputs and statistics alone are compared."""
+    fast = make()
+    compare(textbook, fast, clouds(repeat=True), 1e-9, train, gradients=False)
+    assert all(p.grad.isfinite().all() for p in fast.parameters())
+
+
+def test_zero_scales(textbook):
+    fast = make()
+    with torch.no_grad():
+        for layer in fast.modules():
+            if isinstance(layer, nn.BatchNorm1d):
+                layer.weight[::2] = 0.0
+    compare(textbook, fast, clouds(), 1e-9, True, gradients=False)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_identical_points_give_no_nan(dtype):
+    fast = make(dtype)
+    points = torch.full((3, 12, 3), 30.0, dtype=dtype)
+    logits, gradient = run(fast, points, fast.group(points), True)
+    assert logits.isfinite().all()
+    assert gradient.isfinite().all()
+    assert all(p.grad.isfinite().all() for p in fast.parameters())
+
+
+def test_gradients_by_finite_differences():
+    fast = make(expansions=(1, 2), before=(1, 1), after=(0, 0), neighbours=(3, 3), reducers=(2, 2))
+    points = clouds(b=3, n=8)
+    groups = fast.train().group(points)
+
+    def pooled(points):
+        return fast.encode(points, groups).pooled
+
+    assert torch.autograd.gradcheck(pooled, points.requires_grad_(), fast_mode=True)
+
+
+def test_centres_are_those_of_the_textbook(textbook):
+    """Later stages begin where the one before began: their samples are its first ones."""
+    fast = make()
+    points = clouds(b=3, n=64)
+    for own, (samples, neighbours) in zip(
+        fast.group(points), textbook.from_ours(fast).group(points), strict=True
+    ):
+        assert torch.equal(own.samples, samples)
+        assert torch.equal(own.neighbours.sort(dim=2).values, neighbours.sort(dim=2).values)
+
+
+def test_forward_is_the_textbook_without_a_hand_over(textbook):
+    fast = make().eval()
+    points = clouds()
+    close(fast(points).detach(), textbook.from_ours(fast)(points).detach(), 1e-9)
+
+
+def test_number_of_parameters_is_the_releases_less_what_has_no_effect(textbook):
+    release = sum(p.numel() for p in textbook.PointMLPElite(40).parameters())
+    assert release == 716_232
+    beta, bias = 32 + 64 + 128 + 256, 512
+    assert sum(p.numel() for p in PointMLPElite(40).parameters()) == release - beta - bias
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"reducers": (2, 2)}, "one value for each stage"),
+        ({"neighbours": (0, 4, 4)}, "neighbours must be"),
+        ({"neighbours": (256, 4, 4)}, "neighbours must be"),
+        ({"embedding": 1, "bottleneck": 0.25}, "leaves nothing"),
+    ],
+)
+def test_faults_name_the_setting(settings, message):
+    with pytest.raises(InputError, match=message):
+        make(**settings)

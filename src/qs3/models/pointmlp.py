@@ -1,5 +1,6 @@
 """PointMLP-elite (Ma et al., ICLR 2022): residual layers around points, scaled by their spread."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -55,10 +56,11 @@ class ResidualBlock(nn.Module):
         hidden = self.squeeze_norm(self.squeeze(rows)).relu_()
         moments = row_moments(hidden) if self.widen_norm.training else None
         weight, bias = fold_norm(self.widen_norm, self.widen.weight, moments)
-        total = torch.addmm(rows, hidden, weight.t())
         if group > 1:
             # The bias is the same for all of a group, and ReLU is monotone.
-            total = group_maximum(total.view(-1, group, total.shape[1]))
+            total = residual_maximum(rows, hidden, weight, group)
+        else:
+            total = torch.addmm(rows, hidden, weight.t())
         return (total + bias).relu_()
 
 
@@ -140,10 +142,12 @@ class _Differences:
         square = squares.sum(dim=(1, 2)) - (centre * (2 * sums + k * centre)).sum(dim=(1, 2))
         count = m * k * c
         variance = (square - sums.sum(dim=(1, 2)).square() / count) / max(count - 1, 1)
-        # The gradient of a root at 0 is left out, as by `torch.std`.
-        positive = variance > 0
-        deviation = torch.where(positive, variance, 1.0).sqrt() * positive
-        inverse = 1.0 / (deviation + _FLOOR)[:, None, None]
+        # NOTE: where all points are equal the differences are 0 for any σ. The textbook divides
+        # them by 1e-5, and its gradient, 1e5 times larger at each stage, overflows.
+        rounding = (8 * torch.finfo(features.dtype).eps) ** 2
+        spread = variance > rounding * features.square().mean(dim=(1, 2))
+        deviation = torch.where(spread, variance, 1.0).sqrt()
+        inverse = (spread / (deviation + _FLOOR))[:, None, None]
         self.scaled = points * inverse
         """f / σ, about the cloud's mean."""
         self._centre = centre * inverse
@@ -173,6 +177,13 @@ class _Differences:
         return Moments(torch.cat([mean, torch.zeros_like(mean)]), covariance, rows)
 
 
+def _blocks(centres: int, row: int, cuda: bool) -> Iterator[slice]:
+    """Cut centres of ``row`` values each into blocks that fit the cache (CPU) or 1 GiB (GPU)."""
+    step = max(1, (2**28 if cuda else 2**17) // row)
+    for start in range(0, centres, step):
+        yield slice(start, start + step)
+
+
 def gather_add_relu(
     table: Float[Tensor, "b n c"], own: Float[Tensor, "b m c"], neighbours: Int[Tensor, "b m k"]
 ) -> Float[Tensor, "b m k c"]:
@@ -187,22 +198,86 @@ class _GatherAddRelu(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, table: Tensor, own: Tensor, neighbours: Tensor) -> Tensor:
-        result = gather_points(table, neighbours).add_(own[:, :, None]).relu_()
+        b, m, k = neighbours.shape
+        n, c = table.shape[1:]
+        index = flat_indices(neighbours, n).view(-1)
+        values, shift = table.reshape(b * n, c), own.reshape(b * m, 1, c)
+        result = torch.empty((b * m, k, c), dtype=table.dtype, device=table.device)
+        for block in _blocks(b * m, k * c, table.is_cuda):
+            part = result[block]
+            rows = slice(block.start * k, block.start * k + len(part) * k)
+            torch.index_select(values, 0, index[rows], out=part.view(-1, c))
+            part.add_(shift[block]).relu_()
         ctx.save_for_backward(result, neighbours)
-        ctx.n = table.shape[1]
-        return result
+        ctx.n = n
+        return result.view(b, m, k, c)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, gradient: Tensor) -> tuple[Tensor, Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         result, neighbours = ctx.saved_tensors
-        gradient = gradient * (result > 0)
-        return scatter_points(gradient, neighbours, ctx.n), gradient.sum(dim=2), None
+        b, m, k, c = gradient.shape
+        gradient = gradient.reshape(b * m, k, c)
+        if gradient.is_cuda:
+            masked = gradient * (result > 0)
+            to_table = scatter_points(masked.view(b, m, k, c), neighbours, ctx.n)
+            return to_table, masked.sum(dim=1).view(b, m, c), None
+        index = flat_indices(neighbours, ctx.n).view(-1)
+        to_table = torch.zeros((b * ctx.n, c), dtype=gradient.dtype)
+        to_own = torch.zeros((b * m, c), dtype=gradient.dtype)
+        for block in _blocks(b * m, k * c, False):
+            masked = gradient[block] * (result[block] > 0)
+            rows = slice(block.start * k, block.start * k + len(masked) * k)
+            torch.sum(masked, dim=1, out=to_own[block])
+            to_table.index_add_(0, index[rows], masked.view(-1, c))
+        return to_table.view(b, ctx.n, c), to_own.view(b, m, c), None
 
 
-def group_maximum(values: Float[Tensor, "g k c"]) -> Float[Tensor, "g c"]:
-    """Return the maximum over k; at ties the gradient is shared evenly."""
-    return values.amax(dim=1)
+def residual_maximum(
+    rows: Float[Tensor, "r c"],
+    hidden: Float[Tensor, "r h"],
+    weight: Float[Tensor, "c h"],
+    group: int,
+) -> Float[Tensor, "g c"]:
+    """Return the maximum of x + W h over each ``group`` of rows; at ties the first one counts."""
+    if torch.is_grad_enabled() and (rows.requires_grad or weight.requires_grad):
+        return _ResidualMaximum.apply(rows, hidden, weight, group)
+    total = torch.addmm(rows, hidden, weight.t())
+    return total.view(-1, group, total.shape[1]).amax(dim=1)
+
+
+class _ResidualMaximum(torch.autograd.Function):
+    """`residual_maximum`, whose sums exist for a block at a time; a byte tells the winner."""
+
+    @staticmethod
+    def forward(ctx, rows: Tensor, hidden: Tensor, weight: Tensor, group: int) -> Tensor:
+        c = rows.shape[1]
+        g = rows.shape[0] // group
+        best = torch.zeros((g, c), dtype=rows.dtype, device=rows.device)
+        winner = torch.zeros((g, c), dtype=torch.uint8, device=rows.device)
+        # The first of equals has the largest number.
+        number = torch.arange(group, 0, -1, dtype=torch.uint8, device=rows.device)[:, None]
+        for block in _blocks(g, group * c, rows.is_cuda):
+            span = slice(block.start * group, block.stop * group)
+            total = torch.addmm(rows[span], hidden[span], weight.t()).view(-1, group, c)
+            torch.amax(total, dim=1, out=best[block])
+            wins = total == best[block, None]
+            torch.amax(wins.view(torch.uint8).mul_(number), dim=1, out=winner[block])
+        ctx.save_for_backward(hidden, weight, winner)
+        ctx.group = group
+        return best
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        hidden, weight, winner = ctx.saved_tensors
+        g, c = gradient.shape
+        to_rows = torch.zeros((g, ctx.group, c), dtype=gradient.dtype, device=gradient.device)
+        # No sum has a winner where it is not a number; that gradient is none either.
+        place = (ctx.group - winner.long()).clamp_max_(ctx.group - 1)
+        to_rows.scatter_(1, place[:, None], gradient[:, None])
+        to_rows = to_rows.view(-1, c)
+        return to_rows, to_rows @ weight, to_rows.t() @ hidden, None
 
 
 class PointMLPElite(PointClassifier):
@@ -256,8 +331,8 @@ class PointMLPElite(PointClassifier):
         if len({len(values) for values in levels.values()}) > 1 or not expansions:
             raise InputError(f"{', '.join(levels)} need one value for each stage")
         for name, values in levels.items():
-            if min(values) < (0 if name == "after" else 1):
-                raise InputError(f"{name} must be positive, not {values}")
+            if min(values) < (0 if name == "after" else 1) or max(values) > 255:
+                raise InputError(f"{name} must be 1 to 255, not {values}")
         if int(embedding * bottleneck) < 1:
             raise InputError(f"bottleneck {bottleneck} leaves nothing of {embedding} channels")
         self.neighbours, self.reducers = neighbours, reducers
@@ -282,7 +357,7 @@ class PointMLPElite(PointClassifier):
                 samples = farthest_point_sampling(points, count)
             else:
                 # Farthest point sampling of samples, from the first of them, is their beginning.
-                samples = torch.arange(count, device=points.device).expand(len(points), -1)
+                samples = torch.arange(count, device=points.device).expand(points.shape[0], -1)
             centres = gather_points(points, samples)
             groups.append(Group(samples, knn(points, min(k, points.shape[1]), centres)))
             points = centres

@@ -170,7 +170,7 @@ class _ProductMaximum(torch.autograd.Function):
         slope = 2.0 * for_variance / (g * k)
         level = for_mean / (g * k) - slope * mean
         rows = _rows(weights)
-        to_weights, to_values = torch.zeros_like(weights), torch.zeros_like(values)
+        to_weights, to_values = torch.empty_like(weights), torch.empty_like(values)
         for start in range(0, g, rows):
             block = slice(start, start + rows)
             product = weights[block] * values[block]
@@ -227,8 +227,8 @@ class RSCNN(PointClassifier):
         embedding: int = 1024,
         hidden: tuple[int, ...] = (512, 256),
         dropout: float = 0.5,
-        order: Literal["nearest", "first"] = "nearest",
-        coordinates: Literal["absolute", "relative"] = "absolute",
+        order: str = "nearest",
+        coordinates: str = "absolute",
     ) -> None:
         super().__init__()
         _check_levels(centres, radii, neighbours, channels)
@@ -240,7 +240,7 @@ class RSCNN(PointClassifier):
                 raise InputError(f"{name} must be {' or '.join(choices)}, not {value}")
         self.centres, self.radii, self.neighbours = centres, radii, neighbours
         self.channels, self.dropout = channels, dropout
-        self.order: Literal["nearest", "first"] = order
+        self.order: Literal["nearest", "first"] = "first" if order == "first" else "nearest"
         self.coordinates = coordinates
         widths = (0, *channels[:-1])
         self.convolutions = nn.ModuleList(
