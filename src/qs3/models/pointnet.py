@@ -10,6 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from qs3.errors import InputError
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
+from qs3.models.normalisation import fold_norm, row_moments
 
 
 def orthogonality(matrix: Float[Tensor, "b c c"]) -> Float[Tensor, ""]:
@@ -126,38 +127,16 @@ class PointwiseMax(nn.Module):
 
     def forward(self, points: Float[Tensor, "b n c"]) -> Float[Tensor, "b d"]:
         """Return the maximum of each channel over each cloud."""
-        norm, weight = self.norm, self.linear.weight
-        assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
         with torch.autocast(points.device.type, enabled=False):
-            points = points.to(weight.dtype)
-            if norm.training:
-                centre = points.mean(dim=(0, 1))
-                points = points - centre
-                table = points.flatten(0, 1)
-                covariance = table.t() @ table / len(table)
-                variance = ((weight @ covariance) * weight).sum(dim=1).clamp_min(0.0)
-                self._update_running(weight @ centre, variance, len(table))
-                scale, shift = norm.weight * torch.rsqrt(variance + norm.eps), norm.bias
-            else:
-                scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
-                shift = norm.bias - scale * norm.running_mean
-            weight = scale[:, None] * weight
+            points = points.to(self.linear.weight.dtype)
+            moments = row_moments(points.flatten(0, 1)) if self.norm.training else None
+            weight, shift = fold_norm(self.norm, self.linear.weight, moments)
         return nn.functional.relu(linear_max(points, weight) + shift)
 
     def each(self, points: Float[Tensor, "b n c"]) -> Float[Tensor, "b n d"]:
         """Return what `forward` takes the maximum of; costs the time and memory it saves."""
         normed = self.norm(self.linear(points).flatten(0, 1))
         return nn.functional.relu(normed, inplace=True).view(*points.shape[:2], -1)
-
-    @torch.no_grad()
-    def _update_running(self, mean: Tensor, variance: Tensor, count: int) -> None:
-        """Move the running statistics as BatchNorm does: the variance is the unbiased one."""
-        norm = self.norm
-        assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
-        assert norm.num_batches_tracked is not None and norm.momentum is not None  # noqa: S101
-        norm.num_batches_tracked.add_(1)
-        norm.running_mean.lerp_(mean, norm.momentum)
-        norm.running_var.lerp_(variance * (count / max(count - 1, 1)), norm.momentum)
 
 
 class TransformNet(nn.Module):

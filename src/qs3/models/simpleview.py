@@ -1,0 +1,153 @@
+"""SimpleView (Goyal et al., ICML 2021): a ResNet on six depth images of the cloud."""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from qs3.errors import InputError
+from qs3.models.classifier import ClassifierHead, Features, PointClassifier
+from qs3.models.resnet import ResNet18
+
+Projection = Literal["orthographic", "perspective"]
+"""How points reach a pixel; see `depth_images`."""
+
+_DISTANCE = 1.4
+"""From each camera to the origin, as in the release."""
+_NEAR = 0.01
+"""Points with less depth than this are not seen."""
+_FIXED = 2.0**40
+"""Inverse depths are summed as integers of this unit, whose sum has no order."""
+_VIEWS = (
+    ("+x", (1, 1), (2, -1), (0, -1)),
+    ("+y", (0, -1), (2, -1), (1, -1)),
+    ("-x", (1, -1), (2, -1), (0, 1)),
+    ("-y", (0, 1), (2, -1), (1, 1)),
+    ("+z", (0, 1), (1, -1), (2, -1)),
+    ("-z", (0, 1), (1, 1), (2, 1)),
+)
+"""Where each camera stands, and its right, down and forward as (world axis, sign)."""
+
+
+@torch.no_grad()
+def depth_images(
+    points: Float[Tensor, "b n 3"], resolution: int = 128, projection: Projection = "orthographic"
+) -> Float[Tensor, "b 6 h w"]:
+    """Draw each cloud as seen from six sides; the order of the points does not matter.
+
+    Convention:
+        World: z up. The cameras stand 1.4 from the origin on +x, +y, −x, −y, +z, −z and look at it.
+        They are OpenCV's (x right, y down, z forward), so that no view is mirrored: the four side
+        views are upright, the one from +z is a map (x right, y up), the one from −z has x right
+        and y down. Pixel (0, 0) is the centre of the top-left pixel; the origin is drawn at
+        (w − 1)/2. Depth is along the optical axis, in 0.4 to 2.4 for the unit ball; 0 is empty.
+
+    A point falls on the one pixel nearest to it, as in the release; points beyond the image, or
+    behind the camera, are not seen. No gradient flows to the points.
+
+    - orthographic: x = ±1 falls on the centres of the first and the last column; of several points
+      in a pixel the nearest is taken.
+    - perspective, as the release: 90° of view; several points in a pixel give their mean depth
+      weighted by 1/depth (the harmonic mean).
+
+    NOTE: the release takes rows from x and columns from y, so that its images are mirrored, and
+    draws the origin at w/2. A network trained from scratch cannot tell.
+
+    Args:
+        points: Clouds in the unit ball.
+        resolution: h and w.
+        projection: Orthographic or perspective.
+
+    Example:
+        >>> image = depth_images(torch.tensor([[[0.0, 0.0, 1.0]]]), 3)[0]
+        >>> image[0].nonzero().tolist(), round(float(image[4, 1, 1]), 4)  # at the top; from above
+        ([[0, 1]], 0.4)
+    """
+    if points.dtype in (torch.float16, torch.bfloat16):
+        points = points.float()
+    b = points.shape[0]
+    axes = torch.tensor([[a for a, _ in view[1:]] for view in _VIEWS], device=points.device)
+    signs = torch.tensor([[s for _, s in view[1:]] for view in _VIEWS], device=points.device)
+    right, down, forward = (points[:, :, axes] * signs).unbind(dim=3)
+    depth = forward + _DISTANCE
+    if projection == "perspective":
+        right, down = right / depth, down / depth
+    column, row = ((c + 1.0) * ((resolution - 1) / 2) for c in (right, down))
+    column, row = column.round(), row.round()
+    seen = (column >= 0) & (column < resolution) & (row >= 0) & (row < resolution)
+    seen &= depth >= _NEAR
+    image = torch.arange(b * 6, device=points.device).view(b, 1, 6)
+    pixels = b * 6 * resolution * resolution
+    pixel = (image * resolution + row.long()) * resolution + column.long()
+    # What is not seen goes to one more pixel, which is then dropped.
+    pixel = torch.where(seen, pixel, pixels).view(-1)
+    if projection == "perspective":
+        inverse = (_FIXED / depth.clamp_min(_NEAR)).round().long().view(-1)
+        total = torch.zeros(pixels + 1, dtype=torch.int64, device=points.device)
+        count = total.clone().scatter_add_(0, pixel, torch.ones_like(pixel))
+        total.scatter_add_(0, pixel, inverse)
+        drawn = count.to(depth.dtype) * _FIXED / total.clamp_min(1).to(depth.dtype)
+    else:
+        drawn = torch.full((pixels + 1,), torch.inf, dtype=depth.dtype, device=points.device)
+        drawn.scatter_reduce_(0, pixel, depth.reshape(-1), "amin")
+        drawn = torch.where(drawn.isinf(), 0.0, drawn)
+    return drawn[:-1].view(b, 6, resolution, resolution)
+
+
+class SimpleView(PointClassifier):
+    """SimpleView as published (§3): six depth images, ResNet-18 with a quarter of the filters.
+
+    The features of the six views are normalised together, dropped independently, put side by side
+    and classified by two fully connected layers.
+
+    NOTE: the default draws orthographic images; the release's are perspective. It has a bias before
+    the head's batch normalisation, which changes nothing, and there is none here.
+
+    Args:
+        num_classes: k.
+        width: Width of the ResNet's first stage.
+        resolution: Height and width of the images.
+        projection: orthographic or perspective; see `depth_images`.
+        dropout: Probability of dropping a feature of a view, and a hidden unit of the head.
+
+    Example:
+        >>> SimpleView(10, width=2, resolution=32).eval()(torch.zeros(2, 50, 3)).shape
+        torch.Size([2, 10])
+    """
+
+    def __init__(
+        self,
+        num_classes: int,
+        width: int = 16,
+        resolution: int = 128,
+        projection: Projection = "orthographic",
+        dropout: float = 0.5,
+    ) -> None:
+        super().__init__()
+        if projection not in ("orthographic", "perspective"):
+            raise InputError(f"projection must be orthographic or perspective, not {projection!r}")
+        if not 8 <= resolution <= 1024:
+            raise InputError(f"resolution must be 8 to 1024, not {resolution}")
+        self.resolution = resolution
+        self.projection: Projection = projection
+        self.backbone = ResNet18(1, width)
+        channels = 8 * width
+        self.norm = nn.BatchNorm1d(channels)
+        self.dropout = nn.Dropout(dropout)
+        self.classify = ClassifierHead(6 * channels, (channels,), num_classes, dropout, 0.0)
+
+    def encode(self, points: Float[Tensor, "b n 3"]) -> Features:
+        """Describe each cloud by the features of its six views, side by side."""
+        images = depth_images(points, self.resolution, self.projection)
+        return Features(pooled=self.describe(images.to(self.norm.weight.dtype)))
+
+    def describe(self, images: Float[Tensor, "b 6 h w"]) -> Float[Tensor, "b c"]:
+        """Return the features of six images a cloud, side by side."""
+        return self.backbone(images.flatten(0, 1)[:, None]).view(images.shape[0], -1)
+
+    def head(self, features: Features) -> Float[Tensor, "b k"]:
+        """Return the logits."""
+        views = features.pooled.view(-1, len(self.norm.weight))
+        views = self.dropout(self.norm(views))
+        return self.classify(views.view(features.pooled.shape[0], -1))
