@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from qs3.models.ops import flat_indices, gather_points, scatter_points
+from qs3.models.ops.exporting import is_exporting
 
 
 class Moments(NamedTuple):
@@ -124,6 +125,8 @@ class GroupedMLP(nn.Module):
             first = _FirstInput(points, features, centres, index, self.features_first)
             if self.training or torch.is_grad_enabled():
                 best = self._all_edges(first)
+            elif is_exporting():
+                best = self._all_at_once(first)
             else:
                 best = self._one_neighbour_at_a_time(first, k)
         return best.view(b, m, -1)
@@ -158,6 +161,13 @@ class GroupedMLP(nn.Module):
             best = value if best is None else torch.maximum(best, value, out=best)
         assert best is not None  # noqa: S101
         return best.add_(folded[-1][1]).relu_()
+
+    def _all_at_once(self, first: "_FirstInput") -> Float[Tensor, "r d"]:
+        """Take the way that needs most memory and makes the smallest graph."""
+        value = first.apply(*self._layer(0).fold(None))
+        for depth in range(1, len(self.layers)):
+            value = _rectified(value, *self._layer(depth).fold(None))
+        return value.amax(dim=0)
 
 
 class _FirstInput:
