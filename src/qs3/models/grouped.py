@@ -17,24 +17,15 @@ Convention:
 """
 
 import itertools
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from qs3.models.normalisation import Moments, fold_norm
 from qs3.models.ops import flat_indices, gather_points, scatter_points
 from qs3.models.ops.exporting import is_exporting
-
-
-class Moments(NamedTuple):
-    """Mean and covariance of a layer's input over all edges."""
-
-    mean: Float[Tensor, "c"]
-    covariance: Float[Tensor, "c c"]
-    edges: int
-    """Their number."""
 
 
 class FoldedLayer(nn.Module):
@@ -55,29 +46,9 @@ class FoldedLayer(nn.Module):
         """Return the weight and the shift of the normalised map.
 
         Args:
-            moments: Those of the input, which move the running statistics; the latter alone are
-                used where None.
+            moments: Those of the input; needed in training.
         """
-        norm, weight = self.norm, self.linear.weight
-        assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
-        if moments is None:
-            mean, variance = norm.running_mean, norm.running_var
-        else:
-            mean = weight @ moments.mean
-            variance = ((weight @ moments.covariance) * weight).sum(dim=1).clamp_min(0.0)
-            self._update_running(mean.detach(), variance.detach(), moments.edges)
-        scale = norm.weight * torch.rsqrt(variance + norm.eps)
-        return scale[:, None] * weight, norm.bias - scale * mean
-
-    @torch.no_grad()
-    def _update_running(self, mean: Tensor, variance: Tensor, count: int) -> None:
-        """Move the running statistics as BatchNorm does: the variance is the unbiased one."""
-        norm = self.norm
-        assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
-        assert norm.num_batches_tracked is not None and norm.momentum is not None  # noqa: S101
-        norm.num_batches_tracked.add_(1)
-        norm.running_mean.lerp_(mean, norm.momentum)
-        norm.running_var.lerp_(variance * (count / max(count - 1, 1)), norm.momentum)
+        return fold_norm(self.norm, self.linear.weight, moments)
 
 
 class GroupedMLP(nn.Module):
