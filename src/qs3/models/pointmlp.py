@@ -373,9 +373,10 @@ class PointMLPElite(PointClassifier):
             groups: Centres and neighbours of each stage; those of `group` where None.
         """
         groups = self.group(points) if groups is None else groups
-        features = self._embed(points)
-        for stage, group in zip(self.stages, groups, strict=True):
-            features = stage(features, group)
+        with torch.autocast(points.device.type, enabled=False):  # moments need single precision
+            features = self._embed(points.to(self.embed.linear.weight.dtype))
+            for stage, group in zip(self.stages, groups, strict=True):
+                features = stage(features, group)
         return Features(pooled=features.amax(dim=1))
 
     def _embed(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n c"]:

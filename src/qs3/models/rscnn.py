@@ -280,9 +280,11 @@ class RSCNN(PointClassifier):
         groups = self.group(points) if groups is None else groups
         relative = self.coordinates == "relative"
         features = None
-        for convolution, group in zip(self.convolutions, groups, strict=True):
-            features = convolution(points, features, group, relative)
-            points = gather_points(points, group.samples)
+        points = points.to(self.embed.weight.dtype)
+        with torch.autocast(points.device.type, enabled=False):  # moments need single precision
+            for convolution, group in zip(self.convolutions, groups, strict=True):
+                features = convolution(points, features, group, relative)
+                points = gather_points(points, group.samples)
         assert features is not None  # noqa: S101
         embedded = self.embed(torch.cat([points, features], dim=2))
         normed = self.embed_norm(embedded.flatten(0, 1)).view_as(embedded)
