@@ -69,6 +69,7 @@ def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
 
     from qs3.cli.demo import demo
     from qs3.cli.evaluate import evaluate, predict
+    from qs3.cli.export import export
     from qs3.cli.train import TrainOptions, preset_options, train
 
     defaults = preset_options(given)
@@ -79,7 +80,8 @@ def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
         return train(options)
 
     train_with_preset.__doc__ = train.__doc__
-    verbs |= {"train": train_with_preset, "evaluate": evaluate, "predict": predict, "demo": demo}
+    verbs |= {"train": train_with_preset, "evaluate": evaluate, "predict": predict}
+    verbs |= {"export": export, "demo": demo}
     made = ("scan", "sensors", "realism", "generate", "merge", "info", "verify", "convert")
-    order = (*made, "extract", "train", "evaluate", "predict", "doctor", "demo")
+    order = (*made, "extract", "train", "evaluate", "predict", "export", "doctor", "demo")
     return {name: verbs[name] for name in order}

@@ -1,0 +1,283 @@
+"""A trained network with its pre-processing inside, as ONNX or as a program of torch.export."""
+
+import contextlib
+import io
+import json
+import logging
+import time
+import warnings
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from qs3.errors import InputError, MissingExtraError, QS3Error
+from qs3.files import write_bytes
+from qs3.models import PointClassifier
+from qs3.models.ops.exporting import sample_in_a_loop
+from qs3.training.checkpoint import load_model
+from qs3.training.predict import predict_probabilities
+
+ExportFormat = Literal["onnx", "torch-export"]
+"""Formats that `export_run` writes."""
+
+SUFFIXES: Mapping[str, str] = {"onnx": ".onnx", "torch-export": ".pt2"}
+"""How the names of files of each format end."""
+
+KEY = "qs3"
+"""Name of the metadata: a property of an ONNX file, ``extra/qs3`` in a program's archive."""
+
+BOUND = 1e-4
+"""Largest difference of a probability from the source's that verification lets pass."""
+
+_Runner = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What an export gave."""
+
+    path: Path
+    """The file."""
+    difference: float
+    """Largest difference of a probability from the source's, over the clouds of verification."""
+    clouds: int
+    """Number of those clouds."""
+    seconds: float
+    """Time of the export, without verification."""
+
+
+class CloudClassifier(nn.Module):
+    """A network that takes clouds of any size in any unit, and gives probabilities.
+
+    Inside are the steps of `qs3.training.batches.prepare`, in double precision as there: clouds of
+    more than ``num_points`` points are thinned by farthest point sampling from point 0, points of
+    smaller ones are repeated in order; then the unit ball.
+
+    Convention:
+        Points are [b n 3], finite, z up; all clouds of a batch have the same n.
+
+    Args:
+        model: The network.
+        num_points: Points a cloud that it was trained on.
+
+    Example:
+        >>> from qs3.models import create_model
+        >>> network = CloudClassifier(create_model("pointnet", 4), 16).eval()
+        >>> network(100 * torch.rand(2, 50, 3)).sum(dim=1).allclose(torch.ones(2))
+        True
+    """
+
+    def __init__(self, model: PointClassifier, num_points: int) -> None:
+        super().__init__()
+        self.model = model
+        self.num_points = num_points
+
+    def forward(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b k"]:
+        """Return the probabilities of the classes."""
+        thinned = thin_in_a_graph(points.double(), self.num_points)
+        logits = self.model(unit_ball_in_a_graph(thinned).float())
+        return torch.softmax(logits.double(), dim=1).float()
+
+
+def thin_in_a_graph(points: Float[Tensor, "b n 3"], num_points: int) -> Float[Tensor, "b m 3"]:
+    """Bring clouds to one size as `qs3.training.thinning.thin`, in one graph for every n.
+
+    Example:
+        >>> thin_in_a_graph(torch.tensor([[[0.0, 0, 0], [1, 0, 0]]]), 3)[0, :, 0].tolist()
+        [0.0, 1.0, 0.0]
+    """
+    # A tensor, for what depends on the number of points must be computed and not decided.
+    count = torch.ones_like(points[0, :, 0], dtype=torch.int64).sum()
+    order = torch.arange(num_points, device=points.device) % count
+    chosen = order.expand(points.shape[0], -1).clone()
+    # Where there are too few points the order stays, and no step is made.
+    end = torch.where(count > num_points, num_points, 1)
+    chosen = sample_in_a_loop(points.permute(2, 0, 1).contiguous(), chosen, end, repeat=True)
+    return points.gather(1, chosen[:, :, None].expand(-1, -1, 3))
+
+
+def unit_ball_in_a_graph(points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
+    """Bring clouds to the unit ball as `qs3.datasets.transforms.unit_ball`.
+
+    Example:
+        >>> unit_ball_in_a_graph(torch.tensor([[[0.0, 0, 0], [4, 0, 0]]]))[0, :, 0].tolist()
+        [-1.0, 1.0]
+    """
+    centred = points - points.mean(dim=1, keepdim=True)
+    radius = centred.square().sum(dim=2).sqrt().amax(dim=1)[:, None, None]
+    flat = radius <= 1e-12 * points.abs().amax(dim=(1, 2))[:, None, None]
+    return torch.where(flat, 0.0, centred / torch.where(flat, 1.0, radius))
+
+
+def export_run(run: Path, to: ExportFormat, out: Path | None = None) -> Exported:
+    """Write the network of a run for use without qs3, and compare the file with the source.
+
+    The file is made in memory, run on random clouds of many sizes, and written only where its
+    answers are the source's.
+
+    Args:
+        run: Folder of the run, or a ``.safetensors`` file that training wrote.
+        to: The format.
+        out: The file; ``model.onnx`` or ``model.pt2`` beside the weights where None. An earlier
+            export there is replaced.
+
+    Raises:
+        InputError: where the run or the name of the file is not usable.
+        MissingExtraError: where the packages for ONNX are absent.
+        QS3Error: where the network cannot be exported, or the file gives other answers.
+    """
+    if to not in SUFFIXES:
+        raise InputError(f"unknown format {to!r}; choose {' or '.join(SUFFIXES)}")
+    if to == "onnx":
+        _require_onnx()
+    run = Path(run)
+    loaded = load_model(run)
+    folder = run.parent if run.is_file() else run
+    path = folder / f"model{SUFFIXES[to]}" if out is None else Path(out)
+    _check_place(path, to)
+    train = loaded.settings.get("train")
+    num_points = train.get("num_points") if isinstance(train, dict) else None
+    if not isinstance(num_points, int) or num_points < 1:
+        raise InputError(f"{run}: does not tell the number of points a cloud (num_points)")
+    facts = {"class_names": list(loaded.class_names), "settings": loaded.settings}
+    start = time.perf_counter()
+    data, runner = _serialise(loaded.model, num_points, facts, to)
+    seconds = time.perf_counter() - start
+    difference, clouds = compare(loaded.model, num_points, runner)
+    if not difference <= BOUND:
+        raise QS3Error(
+            f"{path}: not written: on random clouds its probabilities differ by {difference:.1e} "
+            f"from the source's, more than {BOUND:.0e}; export to the other format"
+        )
+    write_bytes(path, data)
+    return Exported(path, difference, clouds, seconds)
+
+
+def compare(
+    model: PointClassifier, num_points: int, runner: _Runner, seed: int = 0
+) -> tuple[float, int]:
+    """Return the largest difference of an exported network's probabilities, and of how many clouds.
+
+    Args:
+        model: The source.
+        num_points: Points a cloud that it was trained on.
+        runner: From clouds to probabilities, by the exported network.
+        seed: Of the clouds.
+    """
+    rng = np.random.default_rng(seed)
+    worst, clouds = 0.0, 0
+    sizes = {1, 2, max(1, num_points // 3), num_points - 1, num_points, num_points + 1}
+    for n in sorted({*sizes, 2 * num_points + 5} - {0}):
+        for b in (1, 3):
+            # Boxes of many shapes and sizes, away from the origin.
+            points = rng.normal(size=(b, n, 3)) * rng.uniform(0.1, 1, size=(b, 1, 3))
+            points = (points + rng.normal(size=(b, 1, 3))) * 10.0 ** rng.uniform(-3, 3)
+            points = points.astype(np.float32)
+            wanted = predict_probabilities(model, points, num_points=num_points)
+            found = runner(points)
+            if found.shape != wanted.shape or not np.isfinite(found).all():
+                return float("inf"), clouds
+            worst, clouds = max(worst, float(np.abs(found - wanted).max())), clouds + b
+    return worst, clouds
+
+
+def _require_onnx() -> None:
+    for package in ("onnx", "onnxscript", "onnxruntime"):
+        try:
+            __import__(package)
+        except ImportError as error:
+            raise MissingExtraError(package, "export") from error
+
+
+def _check_place(path: Path, to: ExportFormat) -> None:
+    """Refuse what is no place for a file of this format, or holds what no export wrote."""
+    if path.suffix != SUFFIXES[to]:
+        raise InputError(f"{path}: name a file that ends in {SUFFIXES[to]} for {to}")
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; name a file for --out")
+    if path.exists() and not (_is_onnx(path) if to == "onnx" else _is_program(path)):
+        raise InputError(f"{path}: holds something else than an export of qs3; name another file")
+
+
+def _is_onnx(path: Path) -> bool:
+    import onnx
+
+    try:
+        model = onnx.load(path, load_external_data=False)
+    except Exception:  # a stranger's file: whatever the parser says, it is not ours
+        return False
+    return any(entry.key == KEY for entry in model.metadata_props)
+
+
+def _is_program(path: Path) -> bool:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return any(name.endswith(f"extra/{KEY}") for name in archive.namelist())
+    except (OSError, zipfile.BadZipFile):
+        return False
+
+
+def _serialise(
+    model: PointClassifier, num_points: int, facts: Mapping[str, Any], to: ExportFormat
+) -> tuple[bytes, _Runner]:
+    """Return the file's bytes, and a way to run them."""
+    network = CloudClassifier(model, num_points).eval().requires_grad_(False)
+    # Its values do not matter; sizes that are not 1 nor num_points fix nothing.
+    example = torch.zeros(2, num_points + 3, 3)
+    text = json.dumps(facts, ensure_ascii=False, sort_keys=True)
+    try:
+        with _quietly(), torch.no_grad():
+            clouds, points = torch.export.Dim("clouds", min=1), torch.export.Dim("points", min=1)
+            program = torch.export.export(
+                network, (example,), dynamic_shapes=({0: clouds, 1: points},), strict=False
+            )
+            if to == "onnx":
+                return _onnx_bytes(program, text)
+            return _program_bytes(program, text)
+    except Exception as error:
+        reason = " ".join(str(error).split())[:200]
+        raise QS3Error(
+            f"{type(model).__name__} cannot be exported to {to} by PyTorch {torch.__version__}: "
+            f"{reason}"
+        ) from error
+
+
+def _program_bytes(program: Any, text: str) -> tuple[bytes, _Runner]:
+    buffer = io.BytesIO()
+    torch.export.save(program, buffer, extra_files={KEY: text})
+    data = buffer.getvalue()
+    module = torch.export.load(io.BytesIO(data)).module()
+    return data, lambda points: module(torch.from_numpy(points)).detach().numpy()
+
+
+def _onnx_bytes(program: Any, text: str) -> tuple[bytes, _Runner]:
+    import onnxruntime
+
+    made = torch.onnx.export(
+        program, dynamo=True, input_names=["points"], output_names=["probabilities"], verbose=False
+    )
+    assert made is not None  # noqa: S101
+    made.model.metadata_props[KEY] = text
+    data = made.model_proto.SerializeToString()
+    session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
+    return data, lambda points: np.asarray(session.run(None, {"points": points})[0])
+
+
+@contextlib.contextmanager
+def _quietly() -> Iterator[None]:
+    """Keep back what the exporters say of their own insides."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(before)
