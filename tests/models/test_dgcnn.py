@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from qs3.models import DGCNN
+from qs3.models import DGCNN, pooling
 from qs3.models.ops import knn
 
 PATH = Path(__file__).parents[2] / "benchmarks" / "reference" / "dgcnn.py"
@@ -86,9 +86,10 @@ def compare(model, points, tolerance, gradients=True):
 @pytest.mark.parametrize("train", [True, False])
 @pytest.mark.parametrize("offset", [0.0, 30.0])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["f64", "f32"])
-def test_is_the_textbook_function(dtype, offset, train):
+@pytest.mark.parametrize("per_point", [False, True])
+def test_is_the_textbook_function(per_point, dtype, offset, train):
     tolerance = 1e-9 if dtype == torch.float64 else 1e-4
-    compare(make(dtype).train(train), clouds(offset=offset), tolerance)
+    compare(make(dtype, per_point=per_point).train(train), clouds(offset=offset), tolerance)
 
 
 @pytest.mark.parametrize("n", [1, 2, 6])
@@ -96,6 +97,53 @@ def test_clouds_with_fewer_points_than_neighbours(n):
     compare(make(torch.float64).eval(), clouds(n=n), 1e-9)
     if n > 1:
         compare(make(torch.float64).train(), clouds(n=n), 1e-9)
+
+
+@pytest.mark.parametrize("train", [True, False])
+def test_blocks_of_the_last_layer_do_not_matter(train, monkeypatch):
+    def single(points, width):
+        return (slice(cloud, cloud + 1) for cloud in range(len(points)))
+
+    monkeypatch.setattr(pooling, "_blocks", single)
+    compare(make(torch.float64).train(train), clouds(), 1e-9)
+
+
+def test_pooled_features_are_those_of_the_points():
+    model = make(torch.float64, per_point=True).eval()
+    features = model.encode(clouds())
+    both = torch.cat([features.per_point.amax(dim=1), features.per_point.mean(dim=1)], dim=1)
+    model.per_point = False
+    lean = model.encode(clouds())
+    assert lean.per_point is None
+    for found in (features.pooled, lean.pooled):
+        torch.testing.assert_close(found, both, rtol=0, atol=1e-12)
+    with torch.no_grad():
+        torch.testing.assert_close(model.encode(clouds()).pooled, both, rtol=0, atol=1e-12)
+
+
+def test_half_precision_costs_no_more_than_in_plain_layers():
+    """Errors of the last layer's gradient, as means: rounding moves the maximum by chance."""
+
+    def gradient(seed, dtype, half, per_point):
+        generator = torch.Generator().manual_seed(seed)
+        points = torch.randn(4, 40, 3, generator=generator).to(dtype)
+        model = make(dtype, per_point=per_point).train()
+        with torch.autocast("cpu", torch.bfloat16, enabled=half):
+            pooled = model.encode(points).pooled
+        weights = torch.randn(pooled.shape, generator=generator).to(pooled.dtype)
+        (pooled * weights).sum().backward()
+        return model.embed.linear.weight.grad.double()
+
+    def error(half, per_point):
+        total = 0.0
+        for seed in range(6):
+            exact = gradient(seed, torch.float64, False, True)
+            found = gradient(seed, torch.float32, half, per_point)
+            total += float((found - exact).norm() / exact.norm()) / 6
+        return total
+
+    assert error(False, False) < 1e-5
+    assert 1e-3 < error(True, False) < 1.5 * error(True, True)
 
 
 def test_batch_of_one():

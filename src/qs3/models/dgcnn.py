@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from qs3.errors import InputError
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
 from qs3.models.ops import flat_indices, knn, neighbour_max, neighbour_sum
+from qs3.models.pooling import pooled_layer
 
 _SLOPE = 0.2
 
@@ -120,8 +121,8 @@ class DGCNN(PointClassifier):
     """DGCNN as in the official classification network.
 
     Four EdgeConvs on graphs rebuilt in feature space, one layer over their concatenation, maximum
-    and mean over the points, three fully connected layers. ``per_point`` is that one layer's
-    output, ``local`` the concatenation.
+    and mean over the points, three fully connected layers. ``local`` is the concatenation,
+    ``per_point`` that one layer's output, which is not made unless it is asked for.
 
     Args:
         num_classes: k.
@@ -131,6 +132,7 @@ class DGCNN(PointClassifier):
         embedding: Width of the layer before pooling.
         hidden: Widths of the head's hidden layers.
         dropout: Probability of dropping a hidden unit of the head.
+        per_point: Whether `encode` gives ``per_point``.
 
     Example:
         >>> network = DGCNN(10, neighbours=4, channels=(8, 8), embedding=16, hidden=(8,)).eval()
@@ -146,11 +148,13 @@ class DGCNN(PointClassifier):
         embedding: int = 1024,
         hidden: tuple[int, ...] = (512, 256),
         dropout: float = 0.5,
+        per_point: bool = False,
     ) -> None:
         super().__init__()
         if not 1 <= neighbours <= 255:
             raise InputError(f"neighbours must be 1 to 255, not {neighbours}")
         self.neighbours = neighbours
+        self.per_point = per_point
         widths = (3, *channels)
         self.convolutions = nn.ModuleList(EdgeConv(c, d) for c, d in itertools.pairwise(widths))
         self.embed = PointwiseLayer(sum(channels), embedding, _SLOPE)
@@ -165,9 +169,13 @@ class DGCNN(PointClassifier):
             features = convolution(features, knn(features, k))
             levels.append(features)
         local = torch.cat(levels, dim=2)
-        per_point = self.embed(local)
-        pooled = torch.cat([per_point.amax(dim=1), per_point.mean(dim=1)], dim=1)
-        return Features(pooled=pooled, per_point=per_point, local=local)
+        if self.per_point:
+            per_point = self.embed(local)
+            parts = (per_point.amax(dim=1), per_point.mean(dim=1))
+        else:
+            per_point = None
+            parts = pooled_layer(self.embed, local)
+        return Features(pooled=torch.cat(parts, dim=1), per_point=per_point, local=local)
 
     def head(self, features: Features) -> Float[Tensor, "b k"]:
         """Return the logits."""
