@@ -106,6 +106,42 @@ class _LinearMax(torch.autograd.Function):
         return to_points, to_weight
 
 
+def _fold(
+    linear: nn.Linear, norm: nn.BatchNorm1d, points: Float[Tensor, "b n c"]
+) -> tuple[Float[Tensor, "b n c"], Float[Tensor, "d c"], Float[Tensor, "d"]]:
+    """Return points, weight and shift of one linear map that is both layers.
+
+    In training the points are taken about their mean, which a cloud far from the origin needs.
+    """
+    points, weight = points.to(linear.weight.dtype), linear.weight
+    if not norm.training:
+        return points, *fold_norm(norm, weight, None)
+    moments = row_moments(points.flatten(0, 1))
+    about_zero = moments._replace(mean=torch.zeros_like(moments.mean))
+    return points - moments.mean, *fold_norm(norm, weight, about_zero, weight @ moments.mean)
+
+
+class FirstLayer(nn.Module):
+    """`PointwiseLayer` with ReLU for few channels, whose moments are cheaper than those after it.
+
+    Args:
+        channels: Width of the input.
+        width: Width of the output.
+    """
+
+    def __init__(self, channels: int, width: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(channels, width, bias=False)
+        # Holds scale, shift and running statistics; goes into the weights below.
+        self.norm = nn.BatchNorm1d(width)
+
+    def forward(self, points: Float[Tensor, "b n c"]) -> Float[Tensor, "b n d"]:
+        """Return the new features of each point."""
+        with torch.autocast(points.device.type, enabled=False):
+            points, weight, shift = _fold(self.linear, self.norm, points)
+        return nn.functional.relu(nn.functional.linear(points, weight, shift), inplace=True)
+
+
 class PointwiseMax(nn.Module):
     """Linear map at every point, batch normalisation over all points, ReLU, maximum over points.
 
@@ -122,21 +158,27 @@ class PointwiseMax(nn.Module):
     def __init__(self, channels: int, width: int) -> None:
         super().__init__()
         self.linear = nn.Linear(channels, width, bias=False)
-        # Holds scale, shift and running statistics; applied below.
+        # Holds scale, shift and running statistics; goes into the weights below.
         self.norm = nn.BatchNorm1d(width)
 
     def forward(self, points: Float[Tensor, "b n c"]) -> Float[Tensor, "b d"]:
         """Return the maximum of each channel over each cloud."""
         with torch.autocast(points.device.type, enabled=False):
-            points = points.to(self.linear.weight.dtype)
-            moments = row_moments(points.flatten(0, 1)) if self.norm.training else None
-            weight, shift = fold_norm(self.norm, self.linear.weight, moments)
+            points, weight, shift = _fold(self.linear, self.norm, points)
         return nn.functional.relu(linear_max(points, weight) + shift)
 
     def each(self, points: Float[Tensor, "b n c"]) -> Float[Tensor, "b n d"]:
         """Return what `forward` takes the maximum of; costs the time and memory it saves."""
         normed = self.norm(self.linear(points).flatten(0, 1))
         return nn.functional.relu(normed, inplace=True).view(*points.shape[:2], -1)
+
+
+def _shared(widths: tuple[int, ...]) -> nn.Sequential:
+    """Layers from one width to the next; the first is of the cheaper kind for coordinates."""
+    pairs = itertools.pairwise(widths)
+    return nn.Sequential(
+        *(FirstLayer(c, d) if c == 3 else PointwiseLayer(c, d, 0.0) for c, d in pairs)
+    )
 
 
 class TransformNet(nn.Module):
@@ -151,9 +193,7 @@ class TransformNet(nn.Module):
     def __init__(self, channels: int, widths: tuple[int, ...], hidden: tuple[int, ...]) -> None:
         super().__init__()
         ends = (channels, *widths)
-        self.shared = nn.Sequential(
-            *(PointwiseLayer(c, d, 0.0) for c, d in itertools.pairwise(ends[:-1]))
-        )
+        self.shared = _shared(ends[:-1])
         self.pool = PointwiseMax(*ends[-2:])
         self.regress = ClassifierHead(widths[-1], hidden, channels * channels, 0.0, 0.0)
         last = self.regress.layers[-1]
@@ -203,9 +243,8 @@ class PointNet(PointClassifier):
         super().__init__()
         if len(channels) < 3:
             raise InputError(f"channels must be three widths or more, not {channels}")
-        layers = [PointwiseLayer(c, d, 0.0) for c, d in itertools.pairwise((3, *channels[:-1]))]
-        self.early = nn.Sequential(*layers[:2])
-        self.late = nn.Sequential(*layers[2:])
+        layers = _shared((3, *channels[:-1]))
+        self.early, self.late = layers[:2], layers[2:]
         self.pool = PointwiseMax(*channels[-2:])
         self.input_transform = TransformNet(3, channels[-3:], hidden) if transforms else None
         self.feature_transform = (
