@@ -1,6 +1,5 @@
 """ResNet-18 (He et al., CVPR 2016) of any width, for small images."""
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -33,29 +32,31 @@ class BasicBlock(nn.Module):
         self.shortcut = nn.Identity()
         if stride != 1 or channels != width:
             self.shortcut = nn.Sequential(
-                _convolution(channels, width, 1, 1), nn.BatchNorm2d(width)
+                _convolution(channels, width, 1, stride), nn.BatchNorm2d(width)
             )
-        self.stride = stride
         self.relu = nn.ReLU(inplace=True)
 
     def forward(self, images: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d h2 w2"]:
         """Return the new channels; a stride of 2 halves height and width, rounded up."""
         inner = self.relu(self.first_norm(self.first(images)))
         inner = self.second_norm(self.second(inner))
-        # Thinned here and not by a stride of the 1×1 convolution: with 4 channels side by side in
-        # memory, oneDNN's gradient of that (in torch 2.13 on a CPU) writes beyond its buffer.
-        thinned = images[:, :, :: self.stride, :: self.stride]
-        return self.relu(inner.add_(self.shortcut(thinned)))
+        return self.relu(inner.add_(self.shortcut(images)))
 
 
 class ResNet18(nn.Module):
     """ResNet-18 whose stem keeps the resolution: a 3×3 convolution without stride or pooling.
+
+    NOTE: channels are not laid side by side in memory (``channels_last``), which is up to 1.3 times
+    faster on a CPU: there PyTorch 2.13 sums a batch normalisation's moments one by one in single
+    precision (errors of 3e-4 on 72 images of 128²), and a strided 1×1 convolution of 4 channels
+    writes beyond its buffer.
 
     Args:
         channels: Channels of the images.
         width: Width of the first stage, 64 in the original; the stages have 1, 2, 4 and 8 times it.
 
     Example:
+        >>> import torch
         >>> ResNet18(1, 4)(torch.zeros(2, 1, 32, 32)).shape
         torch.Size([2, 32])
     """
@@ -73,11 +74,8 @@ class ResNet18(nn.Module):
             blocks += [BasicBlock(before, after, min(2, stage + 1)), BasicBlock(after, after, 1)]
             before = after
         self.blocks = nn.Sequential(*blocks)
-        # Channels in memory side by side: faster on CPUs and GPUs alike.
-        self.to(memory_format=torch.channels_last)
 
     def forward(self, images: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d"]:
         """Describe each image by the mean over its last feature map."""
-        images = images.contiguous(memory_format=torch.channels_last)
         features = self.relu(self.norm(self.stem(images)))
         return self.blocks(features).mean(dim=(2, 3))

@@ -1,0 +1,225 @@
+"""SimpleView: its images against a camera drawn by hand, its network against the textbook form."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from qs3.errors import InputError
+from qs3.models import SimpleView, create_model
+from qs3.models.resnet import ResNet18
+from qs3.models.simpleview import depth_images
+
+FILE = Path(__file__).parents[2] / "benchmarks" / "reference" / "simpleview.py"
+SPEC = importlib.util.spec_from_file_location("simpleview_reference", FILE)
+assert SPEC is not None
+assert SPEC.loader is not None
+textbook = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(textbook)
+
+BOTH = ("orthographic", "perspective")
+SIDES = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1.0]])
+UPS = np.array([[0, 0, 1]] * 4 + [[0, 1, 0], [0, -1, 0.0]])
+
+
+def ball(b=2, n=300, seed=0, dtype=torch.float64):
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.randn(b, n, 3, generator=generator, dtype=torch.float64)
+    radius = torch.rand(b, n, 1, generator=generator, dtype=torch.float64)
+    return (nn.functional.normalize(points, dim=2) * radius).to(dtype)
+
+
+def drawn_by_hand(cloud, size, projection):
+    """Point by point, with cameras that look at the origin from 1.4 away."""
+    images = np.zeros((6, size, size))
+    for image, side, up in zip(images, SIDES, UPS, strict=True):
+        forward = -side
+        right = np.cross(forward, up)
+        down = np.cross(forward, right)
+        hits = {}
+        for point in cloud:
+            depth = (point - 1.4 * side) @ forward
+            x, y = point @ right, point @ down
+            if projection == "perspective":
+                x, y = x / depth, y / depth
+            pixel = tuple(int(np.rint((c + 1) / 2 * (size - 1))) for c in (y, x))
+            if all(0 <= c < size for c in pixel):
+                hits.setdefault(pixel, []).append(depth)
+        for pixel, depths in hits.items():
+            if projection == "perspective":
+                weights = [1 / depth for depth in depths]
+                image[pixel] = np.average(depths, weights=weights)
+            else:
+                image[pixel] = min(depths)
+    return images
+
+
+@pytest.mark.parametrize("projection", BOTH)
+@pytest.mark.parametrize("size", [16, 33])
+def test_images_are_those_drawn_by_hand(size, projection):
+    points = ball()
+    images = depth_images(points, size, projection)
+    expected = np.stack([drawn_by_hand(c, size, projection) for c in points.numpy()])
+    assert (expected > 0).mean() > 0.05
+    np.testing.assert_allclose(images.numpy(), expected, rtol=0, atol=1e-10)
+
+
+LETTER = ("#####", "#....", "###..", "#....", "#....")
+
+
+@pytest.mark.parametrize("projection", BOTH)
+@pytest.mark.parametrize("view", range(6))
+def test_convention_views_are_upright_and_not_mirrored(view, projection):
+    """An F, written where somebody who stands at the camera reads it, is read in the image."""
+    # Right and up of the reader at +x, +y, −x, −y, +z (a map) and −z, written out by hand.
+    rights = ((0, 1, 0), (-1, 0, 0), (0, -1, 0), (1, 0, 0), (1, 0, 0), (1, 0, 0))
+    ups = ((0, 0, 1), (0, 0, 1), (0, 0, 1), (0, 0, 1), (0, 1, 0), (0, -1, 0))
+    right, up = np.array(rights[view]), np.array(ups[view])
+    # The plane through the origin faces the camera; a perspective image is wider by 1.4.
+    size = 1.0 if projection == "orthographic" else 1.4
+    cloud = [
+        size * ((column - 2) / 2 * right + (2 - row) / 2 * up)
+        for row, line in enumerate(LETTER)
+        for column, mark in enumerate(line)
+        if mark == "#"
+    ]
+    image = depth_images(torch.tensor(np.array(cloud))[None], 5, projection)[0, view]
+    read = ["".join("#" if depth > 0 else "." for depth in row) for row in image.tolist()]
+    assert tuple(read) == LETTER
+    torch.testing.assert_close(image[image > 0], torch.full((11,), 1.4, dtype=torch.float64))
+
+
+def test_convention_depth_counts_from_the_camera():
+    point = torch.tensor([[[0.5, 0.0, 0.0]]])
+    images = depth_images(point, 5)[0]
+    depths = [float(image[image > 0]) for image in images]
+    assert depths == pytest.approx([0.9, 1.4, 1.9, 1.4, 1.4, 1.4])
+
+
+def test_the_nearest_point_hides_those_behind_it():
+    points = torch.tensor([[[0.8, 0, 0], [0.2, 0, 0], [-0.6, 0, 0]]])
+    images = depth_images(points, 9)[0]
+    assert float(images[0].max()) == pytest.approx(0.6)
+    assert float(images[2].max()) == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize("projection", BOTH)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_order_of_the_points_does_not_change_a_bit(projection, dtype):
+    points = ball(n=500, dtype=dtype)
+    order = torch.randperm(500, generator=torch.Generator().manual_seed(1))
+    images = depth_images(points, 8, projection)  # many points a pixel
+    assert torch.equal(depth_images(points[:, order], 8, projection), images)
+
+
+@pytest.mark.parametrize("projection", BOTH)
+def test_points_beyond_the_image_are_not_seen(projection):
+    inside = ball(n=50)
+    outside = torch.tensor([[[0.0, 30, 0], [-30, 3, 3], [0, 0, -1e20], [torch.nan, 0, 0]]])
+    both = torch.cat([inside, outside.double().expand(2, -1, -1)], dim=1)
+    away = [2]  # the camera on −x: what lies there lies beyond its image or behind it
+    images = depth_images(both, 16, projection)
+    assert images.isfinite().all()
+    assert torch.equal(images[:, away], depth_images(inside, 16, projection)[:, away])
+    assert not depth_images(inside + 30, 16, "orthographic").any()
+
+
+def random_model(seed=0, **settings):
+    torch.manual_seed(seed)
+    model = SimpleView(5, width=4, resolution=24, dropout=0.0, **settings).double()
+    with torch.no_grad():
+        for layer in model.modules():
+            if isinstance(layer, nn.BatchNorm1d | nn.BatchNorm2d):
+                layer.weight.normal_()
+                layer.bias.normal_()
+                layer.running_mean.normal_(std=0.3)
+                layer.running_var.uniform_(0.5, 2.0)
+    return model
+
+
+def run(logits, model):
+    weights = torch.randn(logits.shape, generator=torch.Generator().manual_seed(2)).to(logits)
+    (logits * weights).sum().backward()
+    return {name: p.grad for name, p in model.named_parameters()}
+
+
+def close(value, reference, tolerance, name=""):
+    value, reference = value.detach().double(), reference.detach().double()
+    scale = float(reference.abs().max())
+    worst = float((value - reference).abs().max())
+    assert worst <= tolerance * max(scale, 1e-12), f"{name}: {worst} of {scale}"
+
+
+@pytest.mark.parametrize("projection", BOTH)
+@pytest.mark.parametrize("train", [False, True])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-9), (torch.float32, 1e-4)])
+def test_is_the_textbook_function(dtype, tolerance, train, projection):
+    # With seed 0 a ReLU of the textbook form itself, rounded, falls on its other side.
+    ours = random_model(seed=1, projection=projection).train(train)
+    slow = textbook.from_ours(ours)  # in double precision, with no rounding of its own
+    points = ball(b=4, dtype=dtype)
+    images = depth_images(points, 24, projection)
+    ours = ours.to(dtype)
+    logits, expected = ours(points), slow(points, images.double())
+    close(logits, expected, tolerance, "logits")
+    run(logits, ours)
+    run(expected, slow)
+    for fast, reference in textbook.pairs(ours, slow):
+        for name, parameter in fast.named_parameters():
+            goal = getattr(reference, name).grad
+            if goal.abs().max() > 1e-6:  # a shift before the head's normalisation has none
+                close(parameter.grad, goal, tolerance, name)
+        for name, buffer in fast.named_buffers():
+            close(buffer, getattr(reference, name), tolerance, name)
+
+
+@pytest.mark.parametrize("projection", BOTH)
+def test_the_textbook_draws_the_same_images(projection):
+    images = depth_images(ball(), 16, projection)
+    torch.testing.assert_close(textbook.depth_images(ball(), 16, projection), images)
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_few_points_and_repeated_ones(n):
+    ours = random_model().eval()
+    slow = textbook.from_ours(ours)
+    points = ball(b=1, n=n)
+    close(ours(points), slow(points), 1e-9)
+    assert torch.equal(ours(torch.cat([points, points], dim=1)), ours(points))
+
+
+def test_pooled_holds_each_view_in_its_place():
+    model = random_model().eval()
+    images = depth_images(ball(), 24)
+    alone = [model.backbone(images[:, view, None]) for view in range(6)]
+    pooled = model.encode(ball()).pooled
+    torch.testing.assert_close(pooled, torch.cat(alone, dim=1), rtol=0, atol=1e-12)
+
+
+def test_blocks_start_as_their_shortcuts():
+    network = ResNet18(1, 4)
+    image = torch.rand(2, 1, 32, 32)
+    before = network(image)
+    for block in network.blocks:
+        nn.init.normal_(block.first.weight)
+    assert torch.equal(network(image), before)
+
+
+def test_default_is_the_published_network():
+    # Goyal et al., Table 4: 0.8 M parameters. The release has 803,992; 128 of them are a bias
+    # before a normalisation.
+    model = create_model("simpleview", 40)
+    assert sum(p.numel() for p in model.parameters()) == 803_992 - 128
+    assert model.resolution == 128
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"resolution": 4}, "8 to 1024"), ({"resolution": 2000}, "8 to 1024")],
+)
+def test_faults_name_the_choices(settings, message):
+    with pytest.raises(InputError, match=message):
+        SimpleView(5, **settings)
