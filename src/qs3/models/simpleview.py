@@ -81,9 +81,9 @@ def depth_images(
     pixels = b * 6 * resolution * resolution
     pixel = (image * resolution + row.long()) * resolution + column.long()
     # What is not seen goes to one more pixel, which is then dropped.
-    pixel = torch.where(seen, pixel, pixels).view(-1)
+    pixel = torch.where(seen, pixel, pixels).reshape(-1)
     if projection == "perspective":
-        inverse = (_FIXED / depth.clamp_min(_NEAR)).round().long().view(-1)
+        inverse = (_FIXED / depth.clamp_min(_NEAR)).round().long().reshape(-1)
         total = torch.zeros(pixels + 1, dtype=torch.int64, device=points.device)
         count = total.clone().scatter_add_(0, pixel, torch.ones_like(pixel))
         total.scatter_add_(0, pixel, inverse)
