@@ -3,15 +3,18 @@
 import itertools
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float64, Int
 from torch import Tensor, nn
 
 from qs3.errors import InputError
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
+from qs3.models.normalisation import update_running
 from qs3.models.ops import flat_indices, knn, neighbour_max, neighbour_sum
 from qs3.models.pooling import pooled_layer
 
 _SLOPE = 0.2
+_FEW = 16
+"""Channels up to which moments are taken in double precision."""
 
 
 class EdgeConv(nn.Module):
@@ -66,8 +69,9 @@ class EdgeConv(nn.Module):
             neighbour_mean = share @ points.flatten(0, 1)
             mean = weight @ torch.cat([neighbour_mean, own_mean])
             covariance = edge_covariance(points, neighbours, share, neighbour_mean, own_mean)
-            variance = ((weight @ covariance) * weight).sum(dim=1).clamp_min(0.0)
-            self._update_running(mean.detach(), variance.detach(), neighbours.numel())
+            exact = weight.to(covariance.dtype)
+            variance = ((exact @ covariance) * exact).sum(dim=1).clamp_min(0.0).to(points.dtype)
+            update_running(norm, mean, variance, neighbours.numel())
             offset = norm.bias
             scale = norm.weight * torch.rsqrt(variance + norm.eps)
         else:
@@ -80,16 +84,6 @@ class EdgeConv(nn.Module):
         own = nn.functional.linear(points - own_mean, second, offset)
         return nn.functional.leaky_relu(best + own, _SLOPE, inplace=True)
 
-    @torch.no_grad()
-    def _update_running(self, mean: Tensor, variance: Tensor, edges: int) -> None:
-        """Move the running statistics as BatchNorm does: the variance is the unbiased one."""
-        norm = self.norm
-        assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
-        assert norm.num_batches_tracked is not None and norm.momentum is not None  # noqa: S101
-        norm.num_batches_tracked.add_(1)
-        norm.running_mean.lerp_(mean, norm.momentum)
-        norm.running_var.lerp_(variance * (edges / max(edges - 1, 1)), norm.momentum)
-
 
 def edge_covariance(
     points: Float[Tensor, "b n c"],
@@ -97,8 +91,13 @@ def edge_covariance(
     share: Float[Tensor, "b*n"],
     neighbour_mean: Float[Tensor, "c"],
     own_mean: Float[Tensor, "c"],
-) -> Float[Tensor, "2*c 2*c"]:
-    """Covariance over all edges of the pair (x_j, x_i), neighbour first.
+) -> Float64[Tensor, "2*c 2*c"]:
+    """Covariance over all edges of the pair (x_j, x_i), neighbour first, in double precision.
+
+    The variance of a channel that looks at x_j − x_i alone is a small difference of its entries. In
+    positions, where neighbours of a dense cloud lie close, single precision would leave three right
+    digits of it; their products are therefore double too. Features of later layers lie further
+    apart, and their products would cost too much.
 
     Args:
         points: Features of each point.
@@ -107,6 +106,8 @@ def edge_covariance(
         neighbour_mean: Mean of x_j over the edges.
         own_mean: Mean of x_i over the edges.
     """
+    if points.shape[2] <= _FEW:
+        points, share = points.double(), share.double()
     at_end = points - neighbour_mean
     at_start = (points - own_mean).flatten(0, 1)
     around = neighbour_sum(at_end, neighbours).flatten(0, 1)
@@ -114,7 +115,8 @@ def edge_covariance(
     cross = around.t() @ at_start / neighbours.numel()
     ends = (share[:, None] * at_end).t() @ at_end
     starts = at_start.t() @ at_start / len(at_start)
-    return torch.cat([torch.cat([ends, cross], 1), torch.cat([cross.t(), starts], 1)])
+    rows = [torch.cat([ends, cross], dim=1), torch.cat([cross.t(), starts], dim=1)]
+    return torch.cat(rows).double()
 
 
 class DGCNN(PointClassifier):

@@ -141,20 +141,29 @@ def _maximum(
     table = values.reshape(b * n, c)
     columns = flat_indices(neighbours, n).t().contiguous()
     centres = columns.shape[1]
-    # On a CPU a block should stay in the cache, yet not be so small that threads only wait.
-    rows = centres if values.is_cuda or is_exporting() else max(1, 2**19 // c)
-    maximum = torch.zeros((centres, c), dtype=table.dtype, device=table.device)
-    for start in (0,) if is_exporting() else range(0, centres, rows):
-        block = slice(start, start + rows)
-        best = table.index_select(0, columns[0, block])
+    if is_exporting():
+        best = table.index_select(0, columns[0])
         for t in range(1, len(columns)):
-            value = table.index_select(0, columns[t, block])
+            best = torch.maximum(best, table.index_select(0, columns[t]))
+        return best.view(b, -1, c)
+    # On a CPU a block should stay in the cache, yet not be so small that threads only wait.
+    rows = centres if values.is_cuda else min(centres, max(1, 2**19 // c))
+    maximum = torch.empty((centres, c), dtype=table.dtype, device=table.device)
+    # Written again and again: fresh memory for each neighbour costs more than the arithmetic.
+    values_here = table.new_empty((rows, c))
+    better_here = table.new_empty((rows, c), dtype=torch.uint8)
+    for start in range(0, centres, rows):
+        block = slice(start, start + rows)
+        best = maximum[block]
+        value, better = values_here[: len(best)], better_here[: len(best)]
+        torch.index_select(table, 0, columns[0, block], out=best)
+        for t in range(1, len(columns)):
+            torch.index_select(table, 0, columns[t, block], out=value)
             if winner is not None:
                 # A later t is larger, so that a maximum of bytes records the last improvement.
-                better = torch.gt(value, best).view(torch.uint8).mul_(t)
-                torch.maximum(winner[block], better, out=winner[block])
+                torch.gt(value, best, out=better.view(torch.bool))
+                torch.maximum(winner[block], better.mul_(t), out=winner[block])
             torch.maximum(best, value, out=best)
-        maximum[block] = best
     return maximum.view(b, -1, c)
 
 
