@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import nn
+from torch.optim.swa_utils import update_bn
 
 from qs3.errors import InputError
 from qs3.models import DGCNN, Features, create_model, list_models
@@ -206,6 +208,57 @@ def test_training_moves_every_running_statistic(name):
     for key, value in model.state_dict().items():
         if "running" in key:
             assert not torch.equal(before[key], value), key
+
+
+def without_dropout(name):
+    model = small(name).double()
+    for layer in model.modules():
+        if isinstance(layer, nn.Dropout):
+            layer.p = 0.0
+    return model
+
+
+def norms(model):
+    return [m for m in model.modules() if isinstance(m, nn.BatchNorm1d | nn.BatchNorm2d)]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("gradients", [True, False])
+def test_each_normalisation_goes_by_its_own_mode(name, gradients):
+    points = clouds().double()
+    trained, adapted, frozen, still = (without_dropout(name) for _ in range(4))
+    trained.train()
+    for model, others in ((adapted, False), (frozen, True)):
+        model.train(others)
+        for norm in norms(model):
+            norm.train(not others)
+    still.eval()
+    with torch.set_grad_enabled(gradients):
+        torch.testing.assert_close(adapted(points), trained(points), rtol=0, atol=1e-9)
+        torch.testing.assert_close(frozen(points), still(points), rtol=0, atol=1e-9)
+    for one, two in ((adapted, trained), (frozen, still)):
+        for key, value in one.state_dict().items():
+            torch.testing.assert_close(value, two.state_dict()[key], rtol=0, atol=1e-9)
+    for norm, twin in zip(norms(adapted), norms(still), strict=True):
+        assert not torch.equal(norm.running_mean, twin.running_mean)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_without_momentum_statistics_are_the_mean_over_the_batches(name):
+    batches = [clouds(seed=seed).double() for seed in range(3)]
+    model = without_dropout(name)
+    update_bn(batches, model)
+    alone = []
+    for batch in batches:
+        once = without_dropout(name)
+        for norm in norms(once):
+            norm.momentum = 1.0
+        once.train()(batch)
+        alone.append(once.state_dict())
+    for key, value in model.state_dict().items():
+        if "running" in key:
+            mean = torch.stack([state[key] for state in alone]).mean(dim=0)
+            torch.testing.assert_close(value, mean, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -23,7 +23,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from qs3.models.normalisation import Moments, fold_norm
+from qs3.models.normalisation import Moments, fold_norm, uses_batch
 from qs3.models.ops import flat_indices, gather_points, scatter_points
 from qs3.models.ops.exporting import is_exporting
 
@@ -94,7 +94,8 @@ class GroupedMLP(nn.Module):
             points, centres = (points - mean).to(dtype), (centres - mean).to(dtype)
             features = None if features is None else features.to(dtype)
             first = _FirstInput(points, features, centres, index, self.features_first)
-            if self.training or torch.is_grad_enabled():
+            batch = any(uses_batch(self._layer(i).norm) for i in range(len(self.layers)))
+            if batch or torch.is_grad_enabled():
                 best = self._all_edges(first)
             elif is_exporting():
                 best = self._all_at_once(first)
@@ -108,10 +109,11 @@ class GroupedMLP(nn.Module):
         return layer
 
     def _all_edges(self, first: "_FirstInput") -> Float[Tensor, "r d"]:
-        hidden = first.apply(*self._layer(0).fold(first.moments() if self.training else None))
+        batch = uses_batch(self._layer(0).norm)
+        hidden = first.apply(*self._layer(0).fold(first.moments() if batch else None))
         for depth in range(1, len(self.layers)):
             moments = None
-            if self.training:
+            if uses_batch(self._layer(depth).norm):
                 hidden, mean, covariance = _WithMoments.apply(hidden)
                 moments = Moments(mean, covariance, hidden.shape[0] * hidden.shape[1])
             weight, shift = self._layer(depth).fold(moments)
@@ -256,8 +258,7 @@ class _WithMoments(torch.autograd.Function):
         edges, mean = ctx.saved_tensors
         rows = edges.view(-1, edges.shape[-1])
         slope = (of_covariance + of_covariance.t()) / len(rows)
-        # In place: the edges have one reader, whose gradient this is and nobody else's.
-        total = gradient.reshape(rows.shape).addmm_(rows, slope)
+        total = torch.addmm(gradient.reshape(rows.shape), rows, slope)
         return total.add_(of_mean / len(rows) - mean @ slope).view_as(edges)
 
 

@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from qs3.errors import InputError
+
 
 class Moments(NamedTuple):
     """Mean and covariance of the rows that a batch normalisation counts."""
@@ -35,6 +37,29 @@ def row_moments(rows: Float[Tensor, "r c"]) -> Moments:
     return Moments(mean, centred.t() @ centred / len(rows), len(rows))
 
 
+def uses_batch(norm: nn.Module) -> bool:
+    """Return whether a batch normalisation takes the statistics of its batch, not running ones.
+
+    The layer's own mode decides, not that of the network around it: a network in evaluation whose
+    normalisations are in training adapts them to what it sees.
+
+    Raises:
+        InputError: where the layer is of a kind that takes statistics beyond its own batch.
+
+    Example:
+        >>> uses_batch(nn.BatchNorm1d(3)), uses_batch(nn.BatchNorm1d(3).eval())
+        (True, False)
+    """
+    assert isinstance(norm, nn.modules.batchnorm._BatchNorm)  # noqa: S101
+    batch = norm.training or norm.running_mean is None or norm.running_var is None
+    if batch and isinstance(norm, nn.SyncBatchNorm):
+        raise InputError(
+            "SyncBatchNorm cannot go into the weights of this network, which would then be "
+            "trained on the statistics of one process; leave BatchNorm1d as it is"
+        )
+    return batch
+
+
 def fold_norm(
     norm: nn.BatchNorm1d,
     weight: Float[Tensor, "d c"],
@@ -48,12 +73,12 @@ def fold_norm(
     Args:
         norm: Scale, shift and running statistics.
         weight: The linear map.
-        moments: Those of its input; needed where ``norm`` is in training.
+        moments: Those of its input; needed where `uses_batch`.
         constant: Added to the linear map's output before the normalisation, which takes it away
             again in training.
     """
-    assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
-    if not norm.training:
+    if not uses_batch(norm):
+        assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
         scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
         known = norm.running_mean if constant is None else norm.running_mean - constant
         return scale[:, None] * weight, norm.bias - scale * known
@@ -69,7 +94,9 @@ def fold_norm(
 def update_running(
     norm: nn.BatchNorm1d, mean: Float[Tensor, "c"], variance: Float[Tensor, "c"], count: int
 ) -> None:
-    """Move the running statistics as batch normalisation does.
+    """Move the running statistics, where there are any, as batch normalisation does.
+
+    Without a momentum they are the plain mean over all batches so far.
 
     Args:
         norm: The layer.
@@ -77,9 +104,16 @@ def update_running(
         variance: Biased variance of its input.
         count: Number of values that both are taken over.
     """
-    assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
-    assert norm.num_batches_tracked is not None and norm.momentum is not None  # noqa: S101
-    norm.num_batches_tracked.add_(1)
-    norm.running_mean.lerp_(mean.to(norm.running_mean), norm.momentum)
+    known_mean, known_variance = norm.running_mean, norm.running_var
+    # A layer without running statistics keeps none; one in evaluation keeps those it has.
+    moves = norm.training and norm.track_running_stats
+    if not moves or known_mean is None or known_variance is None:
+        return
+    momentum = norm.momentum
+    if norm.num_batches_tracked is not None:
+        norm.num_batches_tracked.add_(1)
+        if momentum is None:
+            momentum = norm.num_batches_tracked.to(known_mean.dtype).reciprocal()
+    known_mean.lerp_(mean.to(known_mean), 0.0 if momentum is None else momentum)
     unbiased = variance * (count / max(count - 1, 1))
-    norm.running_var.lerp_(unbiased.to(norm.running_var), norm.momentum)
+    known_variance.lerp_(unbiased.to(known_variance), 0.0 if momentum is None else momentum)

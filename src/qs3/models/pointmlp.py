@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from qs3.errors import InputError
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
-from qs3.models.normalisation import Moments, fold_norm, row_moments
+from qs3.models.normalisation import Moments, fold_norm, row_moments, uses_batch
 from qs3.models.ops import (
     farthest_point_sampling,
     flat_indices,
@@ -54,7 +54,7 @@ class ResidualBlock(nn.Module):
     def forward(self, rows: Float[Tensor, "r c"], group: int = 1) -> Float[Tensor, "g c"]:
         """Return the new rows, or their maximum over each ``group`` of rows in a row."""
         hidden = self.squeeze_norm(self.squeeze(rows)).relu_()
-        moments = row_moments(hidden) if self.widen_norm.training else None
+        moments = row_moments(hidden) if uses_batch(self.widen_norm) else None
         weight, bias = fold_norm(self.widen_norm, self.widen.weight, moments)
         if group > 1:
             # The bias is the same for all of a group, and ReLU is monotone.
@@ -102,9 +102,10 @@ class Stage(nn.Module):
         differences = _Differences(features, group)
         first, second = self.transfer.weight.split(c, dim=1)
         own = gather_points(features, group.samples)
-        origin = own.mean(dim=(0, 1)) * self.transfer_norm.training  # 0 in evaluation
+        batch = uses_batch(self.transfer_norm)
+        origin = own.mean(dim=(0, 1)) * batch  # 0 in evaluation, where clouds do not mix
         own = own - origin
-        moments = differences.moments(own) if self.transfer_norm.training else None
+        moments = differences.moments(own) if batch else None
         weight = torch.cat([first * self.scale, second], dim=1)
         weight, bias = fold_norm(self.transfer_norm, weight, moments, second @ origin)
         first, second = weight.split(c, dim=1)
@@ -382,7 +383,7 @@ class PointMLPElite(PointClassifier):
     def _embed(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n c"]:
         """Apply the first layer about a mean, which clouds far from the origin need."""
         linear, norm = self.embed.linear, self.embed.norm
-        if norm.training:
+        if uses_batch(norm):
             origin = points.mean(dim=(0, 1))
             points = points - origin
             moments = row_moments(points.flatten(0, 1))

@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from qs3.errors import InputError
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
-from qs3.models.normalisation import fold_norm, row_moments
+from qs3.models.normalisation import fold_norm, row_moments, uses_batch
 
 
 def orthogonality(matrix: Float[Tensor, "b c c"]) -> Float[Tensor, ""]:
@@ -114,7 +114,7 @@ def _fold(
     In training the points are taken about their mean, which a cloud far from the origin needs.
     """
     points, weight = points.to(linear.weight.dtype), linear.weight
-    if not norm.training:
+    if not uses_batch(norm):
         return points, *fold_norm(norm, weight, None)
     moments = row_moments(points.flatten(0, 1))
     about_zero = moments._replace(mean=torch.zeros_like(moments.mean))

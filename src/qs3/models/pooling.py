@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from qs3.models.classifier import PointwiseLayer
-from qs3.models.normalisation import update_running
+from qs3.models.normalisation import update_running, uses_batch
 from qs3.models.ops.exporting import is_exporting
 
 
@@ -30,7 +30,10 @@ def pooled_layer(
         each = layer(points)
         return each.amax(dim=1), each.mean(dim=1)
     norm, weight = layer.norm, layer.linear.weight
-    assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
+    batch, known = uses_batch(norm), None
+    if not batch:
+        assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
+        known = (norm.running_mean, norm.running_var)
     kind = points.device.type
     if torch.is_autocast_enabled(kind):
         half = torch.get_autocast_dtype(kind)
@@ -41,11 +44,11 @@ def pooled_layer(
             weight,
             norm.weight,
             norm.bias,
-            None if norm.training else (norm.running_mean, norm.running_var),
+            known,
             norm.eps,
             layer.slope,
         )
-        if norm.training:
+        if batch:
             update_running(norm, mean, variance, points.shape[0] * points.shape[1])
     return largest, average
 

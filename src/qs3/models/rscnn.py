@@ -9,7 +9,7 @@ from torch.autograd.function import once_differentiable
 
 from qs3.errors import InputError
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier
-from qs3.models.normalisation import fold_norm, row_moments, update_running
+from qs3.models.normalisation import fold_norm, row_moments, update_running, uses_batch
 from qs3.models.ops import ball_query, farthest_point_sampling, gather_points
 
 _RAISED = 16
@@ -79,11 +79,14 @@ class RSConv(nn.Module):
         centre = gather_points(points, group.samples)[:, :, None]
         difference = gather_points(points, group.neighbours) - centre
         b, m, k, _ = difference.shape
-        origin = centre.mean(dim=(0, 1, 2)) * self.training  # 0 in evaluation
+        batch = uses_batch(self.relate_norm)
+        if self.xyz_norm is not None:
+            batch = batch or uses_batch(self.xyz_norm)
+        origin = centre.mean(dim=(0, 1, 2)) * batch  # 0 in evaluation, where clouds do not mix
         distance = difference.norm(dim=3, keepdim=True)
         own = (centre - origin).expand_as(difference)
         seven = torch.cat([difference, distance, own], dim=3).view(-1, 7)
-        moments = row_moments(seven) if self.training else None
+        moments = row_moments(seven) if batch else None
         by_distance, by_own, by_other, by_difference = self.relate.weight.split([1, 3, 3, 3], dim=1)
         by_centre = torch.zeros_like(by_own) if relative else by_own + by_other
         weight = torch.cat([by_difference + by_other, by_distance, by_centre], dim=1)
@@ -116,11 +119,11 @@ def _normed_maximum(
     sign: Float[Tensor, "c"],
 ) -> Float[Tensor, "g c"]:
     """Return the maximum over k of the normalised products, whose sign was taken out before."""
-    assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
-    if norm.training:
+    if uses_batch(norm):
         best, mean, variance = _ProductMaximum.apply(weights, values)
         update_running(norm, mean * sign, variance, weights.shape[0] * weights.shape[1])
     else:
+        assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
         best = (weights * values).amax(dim=1)
         mean, variance = norm.running_mean * sign, norm.running_var
     return (best - mean) * (norm.weight.abs() * torch.rsqrt(variance + norm.eps)) + norm.bias
