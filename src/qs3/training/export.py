@@ -10,7 +10,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,17 +24,21 @@ from qs3.models.ops.exporting import sample_in_a_loop
 from qs3.training.checkpoint import load_model
 from qs3.training.predict import predict_probabilities
 
-ExportFormat = Literal["onnx", "torch-export"]
-"""Formats that `export_run` writes."""
-
 SUFFIXES: Mapping[str, str] = {"onnx": ".onnx", "torch-export": ".pt2"}
-"""How the names of files of each format end."""
+"""The formats, and how the names of their files end."""
 
 KEY = "qs3"
 """Name of the metadata: a property of an ONNX file, ``extra/qs3`` in a program's archive."""
 
-BOUND = 1e-4
-"""Largest difference of a probability from the source's that verification lets pass."""
+ROUNDING = 1e-5
+"""Largest difference of a probability that rounding alone explains."""
+
+STRAYS = (2, 1e-2)
+"""How many clouds of the verification may differ by more, and by how much at most: where two points
+are equally far from a third but for rounding, another neighbour is chosen."""
+
+_AXES = {0: "clouds", 1: "points"}
+"""Axes of the input that may have any size."""
 
 _Runner = Callable[[np.ndarray], np.ndarray]
 
@@ -47,8 +51,10 @@ class Exported:
     """The file."""
     difference: float
     """Largest difference of a probability from the source's, over the clouds of verification."""
+    strays: int
+    """Number of those clouds that differ by more than rounding."""
     clouds: int
-    """Number of those clouds."""
+    """Number of those clouds in all."""
     seconds: float
     """Time of the export, without verification."""
 
@@ -116,7 +122,7 @@ def unit_ball_in_a_graph(points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3
     return torch.where(flat, 0.0, centred / torch.where(flat, 1.0, radius))
 
 
-def export_run(run: Path, to: ExportFormat, out: Path | None = None) -> Exported:
+def export_run(run: Path, to: str, out: Path | None = None) -> Exported:
     """Write the network of a run for use without qs3, and compare the file with the source.
 
     The file is made in memory, run on random clouds of many sizes, and written only where its
@@ -124,7 +130,7 @@ def export_run(run: Path, to: ExportFormat, out: Path | None = None) -> Exported
 
     Args:
         run: Folder of the run, or a ``.safetensors`` file that training wrote.
-        to: The format.
+        to: The format, onnx or torch-export.
         out: The file; ``model.onnx`` or ``model.pt2`` beside the weights where None. An earlier
             export there is replaced.
 
@@ -150,20 +156,26 @@ def export_run(run: Path, to: ExportFormat, out: Path | None = None) -> Exported
     start = time.perf_counter()
     data, runner = _serialise(loaded.model, num_points, facts, to)
     seconds = time.perf_counter() - start
-    difference, clouds = compare(loaded.model, num_points, runner)
-    if not difference <= BOUND:
+    differences = compare(loaded.model, num_points, runner)
+    worst, strays = float(differences.max()), int((differences > ROUNDING).sum())
+    if strays > STRAYS[0] or worst > STRAYS[1]:
         raise QS3Error(
-            f"{path}: not written: on random clouds its probabilities differ by {difference:.1e} "
-            f"from the source's, more than {BOUND:.0e}; export to the other format"
+            f"{path}: not written: on {strays} of {len(differences)} random clouds its "
+            f"probabilities are not the source's (difference up to {worst:.1e}); use the other "
+            "format"
         )
     write_bytes(path, data)
-    return Exported(path, difference, clouds, seconds)
+    return Exported(path, worst, strays, len(differences), seconds)
 
 
 def compare(
     model: PointClassifier, num_points: int, runner: _Runner, seed: int = 0
-) -> tuple[float, int]:
-    """Return the largest difference of an exported network's probabilities, and of how many clouds.
+) -> Float[np.ndarray, "m"]:
+    """Return for each of many clouds the largest difference of an exported network's probability.
+
+    The clouds have one point, few, as many as the network takes, one fewer, one more, and many;
+    they lie off the origin, are as large as 0.001 to 1000, and come alone and by threes. An answer
+    of the wrong shape, or one that is not finite, differs infinitely.
 
     Args:
         model: The source.
@@ -172,7 +184,7 @@ def compare(
         seed: Of the clouds.
     """
     rng = np.random.default_rng(seed)
-    worst, clouds = 0.0, 0
+    differences: list[float] = []
     sizes = {1, 2, max(1, num_points // 3), num_points - 1, num_points, num_points + 1}
     for n in sorted({*sizes, 2 * num_points + 5} - {0}):
         for b in (1, 3):
@@ -183,9 +195,10 @@ def compare(
             wanted = predict_probabilities(model, points, num_points=num_points)
             found = runner(points)
             if found.shape != wanted.shape or not np.isfinite(found).all():
-                return float("inf"), clouds
-            worst, clouds = max(worst, float(np.abs(found - wanted).max())), clouds + b
-    return worst, clouds
+                differences += [float("inf")] * b
+            else:
+                differences += np.abs(found - wanted).max(axis=1).tolist()
+    return np.array(differences)
 
 
 def _require_onnx() -> None:
@@ -196,7 +209,7 @@ def _require_onnx() -> None:
             raise MissingExtraError(package, "export") from error
 
 
-def _check_place(path: Path, to: ExportFormat) -> None:
+def _check_place(path: Path, to: str) -> None:
     """Refuse what is no place for a file of this format, or holds what no export wrote."""
     if path.suffix != SUFFIXES[to]:
         raise InputError(f"{path}: name a file that ends in {SUFFIXES[to]} for {to}")
@@ -225,7 +238,7 @@ def _is_program(path: Path) -> bool:
 
 
 def _serialise(
-    model: PointClassifier, num_points: int, facts: Mapping[str, Any], to: ExportFormat
+    model: PointClassifier, num_points: int, facts: Mapping[str, Any], to: str
 ) -> tuple[bytes, _Runner]:
     """Return the file's bytes, and a way to run them."""
     network = CloudClassifier(model, num_points).eval().requires_grad_(False)
@@ -234,9 +247,9 @@ def _serialise(
     text = json.dumps(facts, ensure_ascii=False, sort_keys=True)
     try:
         with _quietly(), torch.no_grad():
-            clouds, points = torch.export.Dim("clouds", min=1), torch.export.Dim("points", min=1)
+            sizes = {axis: torch.export.Dim(name, min=1) for axis, name in _AXES.items()}
             program = torch.export.export(
-                network, (example,), dynamic_shapes=({0: clouds, 1: points},), strict=False
+                network, (example,), dynamic_shapes=(sizes,), strict=False
             )
             if to == "onnx":
                 return _onnx_bytes(program, text)
@@ -261,7 +274,12 @@ def _onnx_bytes(program: Any, text: str) -> tuple[bytes, _Runner]:
     import onnxruntime
 
     made = torch.onnx.export(
-        program, dynamo=True, input_names=["points"], output_names=["probabilities"], verbose=False
+        program,
+        dynamo=True,
+        input_names=["points"],
+        output_names=["probabilities"],
+        dynamic_shapes=(_AXES,),
+        verbose=False,
     )
     assert made is not None  # noqa: S101
     made.model.metadata_props[KEY] = text

@@ -1,0 +1,261 @@
+"""Exported networks, run by onnxruntime and by torch.export, against ours."""
+
+import importlib.util
+import json
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from qs3.datasets.transforms import unit_ball
+from qs3.errors import InputError, MissingExtraError, QS3Error
+from qs3.models import create_model
+from qs3.models.ops import farthest_point_sampling
+from qs3.models.ops.exporting import sample_in_a_loop
+from qs3.training import TrainSettings, export, predict_probabilities, save_model
+from qs3.training.export import compare, export_run, thin_in_a_graph, unit_ball_in_a_graph
+from qs3.training.thinning import thin
+
+_SUITE = Path(__file__).parents[1] / "models" / "test_models.py"
+_SPEC = importlib.util.spec_from_file_location("suite_of_models", _SUITE)
+_MODULE = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(_MODULE)
+SMALL = _MODULE.SMALL
+
+CLASSES = ("Stuhl", "テーブル", 'a "lamp"')
+TINY = "pointnet without T-Nets"
+M = 40
+SIZES = [1, 2, M - 1, M, M + 1, 3 * M]
+
+
+def make_run(folder, name=TINY, num_points=M):
+    """A run whose network has moved statistics and decided answers."""
+    torch.manual_seed(3)
+    kind = name.split()[0]
+    model = create_model(kind, len(CLASSES), **SMALL[name])
+    for layer in model.modules():
+        if isinstance(layer, (torch.nn.BatchNorm1d, torch.nn.BatchNorm2d)):
+            torch.nn.init.uniform_(layer.weight, 0.3, 1)
+    for _ in range(3):
+        model(0.5 * torch.randn(8, num_points, 3))
+    with torch.no_grad():
+        list(model.parameters())[-2].mul_(8)
+    settings = TrainSettings(model=kind, model_settings=SMALL[name], num_points=num_points)
+    save_model(folder, model.eval(), CLASSES, settings)
+    return model
+
+
+def clouds(b, n, seed=0):
+    """Flat boxes far from the origin, in millimetres."""
+    rng = np.random.default_rng(seed)
+    return (1000 * rng.normal(size=(b, n, 3)) * [1, 0.5, 0.1] + 30_000).astype(np.float32)
+
+
+def run_onnx(path):
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    return lambda points: session.run(["probabilities"], {"points": points})[0]
+
+
+def run_program(path):
+    module = torch.export.load(path).module()
+    return lambda points: module(torch.from_numpy(points)).numpy()
+
+
+def check(model, run):
+    for n in SIZES:
+        for b in (1, 3):
+            points = clouds(b, n, seed=n)
+            wanted = predict_probabilities(model, points, num_points=M)
+            found = run(points)
+            assert (found.dtype, found.shape) == (np.float32, wanted.shape)
+            np.testing.assert_allclose(found, wanted, rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("n", SIZES)
+@pytest.mark.parametrize("b", [1, 3])
+def test_thinning_in_a_graph_takes_the_same_points(n, b):
+    points = clouds(b, n)
+    found = thin_in_a_graph(torch.from_numpy(points).double(), M)
+    assert np.array_equal(found.numpy(), thin(points, M).astype(np.float64))
+
+
+def test_thinning_in_a_graph_breaks_ties_and_repeats_points_alike():
+    grid = np.stack(np.meshgrid(*[np.arange(5.0)] * 3), axis=-1).reshape(1, -1, 3)
+    few = np.repeat(grid[:, :7], 20, axis=1)
+    for points in (grid.astype(np.float32), few.astype(np.float32)):
+        found = thin_in_a_graph(torch.from_numpy(points).double(), M)
+        assert np.array_equal(found.numpy(), thin(points, M).astype(np.float64))
+
+
+def test_unit_ball_in_a_graph_is_that_of_training():
+    points = clouds(4, 50)
+    found = unit_ball_in_a_graph(torch.from_numpy(points).double()).float().numpy()
+    np.testing.assert_allclose(found, unit_ball(points), rtol=0, atol=1e-7)
+    same = torch.full((1, 7, 3), 0.1, dtype=torch.float64)
+    assert torch.equal(unit_ball_in_a_graph(same), torch.zeros(1, 7, 3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("m", [1, 9, 40])
+def test_loop_for_graphs_samples_as_networks_do(m):
+    points = torch.randn(3, 40, 3, generator=torch.Generator().manual_seed(0))
+    points[:, 20:] = points[:, :20]
+    start = torch.tensor([0, 7, 39])
+    chosen = start[:, None].expand(-1, m).clone()
+    planes = points.permute(2, 0, 1).contiguous()
+    found = sample_in_a_loop(planes, chosen, torch.tensor(m))
+    assert torch.equal(found, farthest_point_sampling(points, m, start))
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    model = make_run(folder)
+    return model, {to: export_run(folder, to) for to in export.SUFFIXES}
+
+
+def test_default_files_lie_in_the_run(exported):
+    paths = {to: done.path for to, done in exported[1].items()}
+    assert {to: path.name for to, path in paths.items()} == {
+        "onnx": "model.onnx",
+        "torch-export": "model.pt2",
+    }
+    folder = paths["onnx"].parent
+    assert {p.name for p in folder.iterdir()} == {"model.onnx", "model.pt2", "model.safetensors"}
+
+
+def test_onnx_gives_our_probabilities_of_clouds_of_any_size(exported):
+    check(exported[0], run_onnx(exported[1]["onnx"].path))
+
+
+def test_program_gives_our_probabilities_of_clouds_of_any_size(exported):
+    check(exported[0], run_program(exported[1]["torch-export"].path))
+
+
+def test_exports_tell_what_they_hold(exported):
+    import onnx
+
+    model = onnx.load(exported[1]["onnx"].path)
+    facts = json.loads({p.key: p.value for p in model.metadata_props}["qs3"])
+    assert facts["class_names"] == list(CLASSES)
+    assert facts["settings"]["train"]["num_points"] == M
+    dims = model.graph.input[0].type.tensor_type.shape.dim
+    assert [d.dim_param or d.dim_value for d in dims] == ["clouds", "points", 3]
+    extra = {"qs3": ""}
+    torch.export.load(exported[1]["torch-export"].path, extra_files=extra)
+    assert json.loads(extra["qs3"]) == facts
+
+
+def test_program_holds_no_pickled_weights(exported):
+    with zipfile.ZipFile(exported[1]["torch-export"].path) as archive:
+        configs = [n for n in archive.namelist() if n.endswith(("weights_config.json",))]
+        assert configs
+        for name in configs:
+            weights = json.loads(archive.read(name))["config"]
+            assert weights
+            assert not any(entry["use_pickle"] for entry in weights.values())
+
+
+@pytest.mark.slow
+def test_program_runs_without_qs3(exported):
+    code = (
+        "import sys, torch; sys.modules['qs3'] = None\n"
+        f"module = torch.export.load({str(exported[1]['torch-export'].path)!r}).module()\n"
+        "print(module(torch.randn(2, 90, 3)).shape)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == f"torch.Size([2, {len(CLASSES)}])", done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("to", ["onnx", "torch-export"])
+@pytest.mark.parametrize("name", sorted(set(SMALL) - {TINY}))
+def test_every_network_can_be_exported(name, to, tmp_path):
+    model = make_run(tmp_path, name)
+    path = export_run(tmp_path, to).path
+    check(model, run_onnx(path) if to == "onnx" else run_program(path))
+
+
+def test_comparison_sees_a_wrong_answer():
+    torch.manual_seed(0)
+    model = create_model("pointnet", 3, **SMALL[TINY]).eval()
+
+    def right(points):
+        return predict_probabilities(model, points, num_points=M)
+
+    assert compare(model, M, right).tolist() == [0.0] * 28
+    shifted = compare(model, M, lambda points: right(points) + 1e-3)
+    np.testing.assert_allclose(shifted, 1e-3, rtol=0, atol=1e-12)
+    assert (compare(model, M, lambda points: right(points) * np.nan) == np.inf).all()
+    assert (compare(model, M, lambda points: right(points)[:, :2]) == np.inf).all()
+    # Thinned from another point, only clouds of more than M points give other answers.
+    other = compare(model, M, lambda points: right(points[:, ::-1])) > export.ROUNDING
+    assert export.STRAYS[0] < other.sum() <= 8
+
+
+def test_nothing_is_written_where_answers_differ(tmp_path, monkeypatch):
+    make_run(tmp_path)
+    wrong = (b"file", lambda points: np.full((len(points), 3), 1 / 3))
+    monkeypatch.setattr(export, "_serialise", lambda *_: wrong)
+    with pytest.raises(QS3Error, match=r"model.pt2: not written: on \d+ of 28 .*not the source"):
+        export_run(tmp_path, "torch-export")
+    assert not (tmp_path / "model.pt2").exists()
+
+
+def test_earlier_exports_are_replaced_and_other_files_kept(exported, tmp_path, monkeypatch):
+    model = make_run(tmp_path)
+
+    def fresh(points):
+        return predict_probabilities(model, points, num_points=M)
+
+    monkeypatch.setattr(export, "_serialise", lambda *_: (b"new", fresh))
+    for to, suffix in export.SUFFIXES.items():
+        ours, other = tmp_path / f"ours{suffix}", tmp_path / f"other{suffix}"
+        ours.write_bytes(exported[1][to].path.read_bytes())
+        export_run(tmp_path, to, ours)
+        assert ours.read_bytes() == b"new"
+        other.write_bytes(b"precious")
+        with pytest.raises(InputError, match=f"other{suffix}: holds something else"):
+            export_run(tmp_path, to, other)
+        assert other.read_bytes() == b"precious"
+
+
+def test_unusable_places_and_runs_are_refused(tmp_path):
+    make_run(tmp_path)
+    (tmp_path / "folder.onnx").mkdir()
+    faults = [
+        ((tmp_path / "none", "onnx"), "no model.safetensors here"),
+        ((tmp_path, "tflite"), "choose onnx or torch-export"),
+        ((tmp_path, "onnx", tmp_path / "a.pt2"), "ends in .onnx"),
+        ((tmp_path, "onnx", tmp_path / "folder.onnx"), "is a folder"),
+    ]
+    for arguments, message in faults:
+        with pytest.raises(InputError, match=message):
+            export_run(*arguments)
+    (tmp_path / "settings.json").write_text('{"train": {}}')
+    with pytest.raises(InputError, match="num_points"):
+        export_run(tmp_path, "onnx")
+
+
+@pytest.mark.parametrize("package", ["onnx", "onnxscript", "onnxruntime"])
+def test_a_missing_package_names_its_extra(package, tmp_path, monkeypatch):
+    make_run(tmp_path)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(MissingExtraError, match=f"{package}.*'export'"):
+        export_run(tmp_path, "onnx")
+
+
+def test_a_network_that_cannot_be_exported_is_named(tmp_path, monkeypatch):
+    make_run(tmp_path)
+
+    def fails(*_, **__):
+        raise RuntimeError("no way\nto export")
+
+    monkeypatch.setattr(torch.export, "export", fails)
+    with pytest.raises(QS3Error, match=r"PointNet cannot be exported to torch-export.*no way to"):
+        export_run(tmp_path, "torch-export")
