@@ -112,7 +112,8 @@ _RELEASES = {
 def load_reference(name: str, state_dict: Mapping[str, Any], **settings: Any) -> PointClassifier:
     """Make a network from the weights of its authors' PyTorch release.
 
-    Key names and shapes must be the release's, all of them and no others; a ``module.`` in front of
+    Key names and shapes must be the release's, all of them and no others, where a tensor has two
+    names both of them; a ``module.`` in front of
     every name, which ``DataParallel`` leaves, is taken off. Known releases:
 
     - ``dgcnn``: ``DGCNN`` of https://github.com/WangYueFt/dgcnn (pytorch/model.py) and
@@ -124,6 +125,9 @@ def load_reference(name: str, state_dict: Mapping[str, Any], **settings: Any) ->
       keeps its first points, as there. Two differences stay: sampling starts at the point farthest
       from the mean, not at a random one, and logits are returned, not their log-softmax. The
       release's biases before a normalisation go into its running mean.
+
+    NOTE: ``pointnet2_cls_msg`` drops 40 % of the first and 50 % of the second hidden layer; the
+    network here drops ``dropout`` (40 %) of both, which matters where training goes on.
 
     A published file is a pickle, which this package never opens: reading one can run any code in
     it. Turn it into safetensors outside, once::
@@ -145,12 +149,13 @@ s.save_file({k: v.clone() for k, v in d.get('model_state_dict', d).items()}, 'ou
         The network on the CPU in single precision, in evaluation mode.
 
     Raises:
-        InputError: where a name is missing, unknown or of another shape; the first ones are named.
+        InputError: where a name is missing or unknown, or a tensor of another shape or kind; the
+            first ones are named.
 
     Example:
         >>> load_reference("dgcnn", {})  # doctest: +ELLIPSIS
         Traceback (most recent call last):
-        qs3.errors.InputError: weights for dgcnn: 45 missing, such as bn6.bias, bn6.num_batches_...
+        qs3.errors.InputError: weights for dgcnn: 70 missing, such as bn1.bias, bn1.num_batches_...
     """
     if name not in _RELEASES:
         raise InputError(f"no release known for {name!r}; choose one of {', '.join(_RELEASES)}")
@@ -190,15 +195,20 @@ def _under_first_names(
             names = [f"{prefix}.{part}" for prefix in layer.theirs]
             given = [key for key in names if key in tensors]
             unknown.difference_update(given)
-            if not given:
-                missing.append(names[0])
+            missing += [key for key in names if key not in tensors]
+            if len(given) < len(names):
                 continue
-            first, *others = (tensors[key] for key in given)
+            first, *others = (tensors[key] for key in names)
             if first.ndim != dimensions:
-                raise _odd_shape(name, given[0], first, f"{dimensions} dimensions")
+                raise _odd_shape(name, names[0], first, f"{dimensions} dimensions")
+            if part != "num_batches_tracked" and not first.is_floating_point():
+                raise InputError(
+                    f"weights for {name}: {names[0]} holds {first.dtype}, not floating-point "
+                    "numbers; hand over the release's own tensors"
+                )
             if any(not torch.equal(first, other) for other in others):
                 raise InputError(
-                    f"weights for {name}: {' and '.join(given)} are one tensor in the release, "
+                    f"weights for {name}: {' and '.join(names)} are one tensor in the release, "
                     "but differ here"
                 )
             found[names[0]] = first

@@ -1,5 +1,6 @@
 """Features at points between those that have them."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -33,6 +34,11 @@ def three_nn_interpolate(
     neighbours = knn(known, min(3, known.shape[1]), points)
     difference = gather_points(known, neighbours) - points[:, :, None]
     weights = 1.0 / (difference.square().sum(dim=3) + _FLOOR)
-    weights = weights / weights.sum(dim=2, keepdim=True)
-    around = gather_points(features, neighbours)
-    return (around * weights[..., None].to(features.dtype)).sum(dim=2)
+    weights = (weights / weights.sum(dim=2, keepdim=True)).to(features.dtype)
+    # One neighbour of every point at a time: no tensor is larger than the result.
+    first, *others = range(neighbours.shape[2])
+    mean = gather_points(features, neighbours[:, :, first]) * weights[:, :, first, None]
+    for t in others:
+        around = gather_points(features, neighbours[:, :, t])
+        mean = torch.addcmul(mean, around, weights[:, :, t, None])
+    return mean
