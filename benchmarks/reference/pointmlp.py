@@ -42,8 +42,8 @@ class Residual(nn.Module):
         self.widen_norm = nn.BatchNorm2d(channels)
 
     def forward(self, values: Tensor) -> Tensor:
-        hidden = functional.relu(self.squeeze_norm(self.squeeze(values)))
-        return functional.relu(self.widen_norm(self.widen(hidden)) + values)
+        hidden = functional.relu_(self.squeeze_norm(self.squeeze(values)))
+        return functional.relu_(self.widen_norm(self.widen(hidden)) + values)
 
 
 class Stage(nn.Module):
@@ -63,7 +63,7 @@ class Stage(nn.Module):
         deviation = difference.flatten(1).std(dim=1)[:, None, None, None]
         normed = self.scale * difference / (deviation + 1e-5) + self.shift
         grouped = torch.cat([normed, centre.expand_as(normed)], dim=3).permute(0, 3, 1, 2)
-        values = self.before(functional.relu(self.transfer_norm(self.transfer(grouped))))
+        values = self.before(functional.relu_(self.transfer_norm(self.transfer(grouped))))
         best = functional.max_pool2d(values, (1, values.shape[3]))
         return self.after(best).flatten(2).transpose(1, 2)
 
@@ -93,7 +93,12 @@ class PointMLPElite(nn.Module):
         self.stages = nn.ModuleList(stages)
         layers: list[nn.Module] = []
         for d in hidden:
-            layers += [nn.Linear(width, d), nn.BatchNorm1d(d), nn.ReLU(), nn.Dropout(dropout)]
+            layers += [
+                nn.Linear(width, d),
+                nn.BatchNorm1d(d),
+                nn.ReLU(inplace=True),
+                nn.Dropout(dropout),
+            ]
             width = d
         self.classify = nn.Sequential(*layers, nn.Linear(width, num_classes))
 
@@ -114,7 +119,7 @@ class PointMLPElite(nn.Module):
         """Return the logits; ``groups`` are samples [b m] and neighbours [b m k] of each level."""
         groups = self.group(points) if groups is None else groups
         embedded = self.embed_norm(self.embed(points.transpose(1, 2)[..., None]))
-        features = functional.relu(embedded)[..., 0].transpose(1, 2)
+        features = functional.relu_(embedded)[..., 0].transpose(1, 2)
         for stage, (samples, neighbours) in zip(self.stages, groups, strict=True):
             features = stage(features, samples, neighbours)
         return self.classify(features.amax(dim=1))

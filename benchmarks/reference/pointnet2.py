@@ -137,7 +137,7 @@ def from_ours(model: nn.Module) -> PointNet2:
         model.levels[0].ball_order,
     )
     ours = list(model.state_dict().values())
-    textbook.to(ours[0].dtype)
+    textbook.to(ours[0])
     state = textbook.state_dict()
     pairs = zip(state.items(), ours, strict=True)
     textbook.load_state_dict({key: v.reshape(old.shape) for (key, old), v in pairs})

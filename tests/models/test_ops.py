@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from qs3.models.ops import (
     ball_query,
@@ -283,6 +284,22 @@ def test_interpolation_at_known_points_and_its_gradients():
     )
     inputs = (points.requires_grad_(), known.requires_grad_(), features)
     assert torch.autograd.gradcheck(three_nn_interpolate, inputs)
+
+
+def test_interpolation_makes_nothing_larger_than_its_result():
+    largest = 0
+
+    class Watch(TorchDispatchMode):
+        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+            nonlocal largest
+            made = func(*args, **(kwargs or {}))
+            if isinstance(made, torch.Tensor):
+                largest = max(largest, made.numel())
+            return made
+
+    with Watch():
+        three_nn_interpolate(torch.rand(2, 60, 3), torch.rand(2, 20, 3), torch.rand(2, 20, 50))
+    assert largest == 2 * 60 * 50
 
 
 @pytest.mark.gpu

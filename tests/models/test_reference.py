@@ -295,3 +295,16 @@ def test_whole_numbers_are_no_weights(name):
 def test_faults_are_named(call, message):
     with pytest.raises(InputError, match=message):
         call()
+
+
+@pytest.mark.parametrize(
+    ("network", "name"),
+    [(name, name) for name in ("dgcnn", "pointnet", "pointnet2", "rscnn", "simpleview")]
+    + [("pointmlp", "pointmlp-elite"), ("pointnet2", "pointnet2-msg")],
+)
+def test_textbook_forms_take_device_and_type_from_ours(network, name):
+    ours = create_model(name, 5).to(device="meta", dtype=torch.float64)
+    slow = textbook(network).from_ours(ours)
+    for value in itertools.chain(slow.parameters(), slow.buffers()):
+        assert value.device.type == "meta"
+        assert value.dtype in (torch.float64, torch.int64)

@@ -2,8 +2,8 @@
 
 Convention:
     Clouds are batch-first, [b n c]. Indices count within the own cloud, and a point is a neighbour
-    of itself. Every operation gives the same bits at each call and holds bounded memory beside its
-    result.
+    of itself. Every operation gives the same bits at each call. None makes a tensor larger than its
+    inputs, its result or a block of fixed size, whichever is largest.
 """
 
 from qs3.models.ops.gathering import flat_indices as flat_indices
