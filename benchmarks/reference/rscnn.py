@@ -68,15 +68,15 @@ class RSConv(nn.Module):
             [difference.norm(dim=1, keepdim=True), centre.expand_as(around), around, difference],
             dim=1,
         )
-        mapped = functional.relu(self.norm_mapping(self.mapping1(relation)))
+        mapped = functional.relu_(self.norm_mapping(self.mapping1(relation)))
         mapped = self.mapping2(mapped)
         if self.raise_xyz is not None and self.norm_xyz is not None:
-            value = functional.relu(self.norm_xyz(self.raise_xyz(difference)))
+            value = functional.relu_(self.norm_xyz(self.raise_xyz(difference)))
         else:
             value = torch.cat([difference, group(features, neighbours)], dim=1)
-        product = functional.relu(self.norm_product(mapped * value))
+        product = functional.relu_(self.norm_product(mapped * value))
         best = functional.max_pool2d(product, (1, product.shape[3])).squeeze(3)
-        raised = functional.relu(self.norm_raised(self.raise_channels(best)))
+        raised = functional.relu_(self.norm_raised(self.raise_channels(best)))
         return raised.transpose(1, 2)
 
 
@@ -91,12 +91,12 @@ class RSCNN(nn.Module):
         embedding: int = 1024,
         hidden: Sequence[int] = (512, 256),
         dropout: float = 0.5,
-        order: str = "nearest",
+        ball_order: str = "nearest",
         coordinates: str = "absolute",
     ) -> None:
         super().__init__()
         self.levels = list(zip(centres, radii, neighbours, strict=True))
-        self.order = order
+        self.ball_order = ball_order
         self.relative = coordinates == "relative"
         widths = (0, *channels)
         self.convolutions = nn.ModuleList(
@@ -111,7 +111,7 @@ class RSCNN(nn.Module):
             layers += [
                 nn.Linear(width, d, bias=len(layers) > 0),
                 nn.BatchNorm1d(d),
-                nn.ReLU(),
+                nn.ReLU(inplace=True),
                 nn.Dropout(dropout),
             ]
             width = d
@@ -124,7 +124,7 @@ class RSCNN(nn.Module):
         for centres, radius, k in self.levels:
             samples = farthest_points(points, min(centres, points.shape[1]), last)
             last = torch.zeros_like(last)
-            groups.append((samples, ball(points, samples, radius, k, self.order)))
+            groups.append((samples, ball(points, samples, radius, k, self.ball_order)))
             points = points.gather(1, samples[:, :, None].expand(-1, -1, 3))
         return groups
 
@@ -136,7 +136,7 @@ class RSCNN(nn.Module):
             features = convolution(points, features, samples, neighbours, self.relative)
             points = points.gather(1, samples[:, :, None].expand(-1, -1, 3))
         every = torch.cat([points, features], dim=2).transpose(1, 2)[:, :, None]
-        embedded = functional.relu(self.norm_embed(self.embed(every)))
+        embedded = functional.relu_(self.norm_embed(self.embed(every)))
         pooled = functional.max_pool2d(embedded, (1, embedded.shape[3])).flatten(1)
         return self.classify(pooled)
 
@@ -168,7 +168,7 @@ def from_ours(model) -> RSCNN:
         embedding=model.embed.out_features,
         hidden=[layer.out_features for layer in linear[:-1]],
         dropout=model.dropout,
-        order=model.order,
+        ball_order=model.ball_order,
         coordinates=model.coordinates,
     ).to(linear[0].weight)
     for theirs, ours in zip(slow.convolutions, model.convolutions, strict=True):

@@ -13,6 +13,13 @@ from torch.optim.swa_utils import update_bn
 
 from qs3.errors import InputError
 from qs3.models import DGCNN, Features, create_model, list_models
+from qs3.models.checks import (
+    check_choice,
+    check_flag,
+    check_number,
+    check_whole,
+    check_wholes,
+)
 
 SMALL = {
     "dgcnn": {"neighbours": 6, "channels": (8, 8, 16), "embedding": 32, "hidden": (16, 8)},
@@ -166,12 +173,72 @@ def test_official_dgcnn_has_the_official_number_of_parameters():
         (lambda: create_model("dgcnn", 5, neighbors=3), "unknown setting 'neighbors'.*neighbours"),
         (lambda: create_model("dgcnn", 0), "num_classes"),
         (lambda: create_model("dgcnn", 5, neighbours=256), "1 to 255"),
-        (lambda: create_model("pointnet", 5, dropout=2.0), "do not make a pointnet"),
+        (
+            lambda: create_model("pointnet", 5, dropout=2.0),
+            "dropout must be a number, 0 to 1, not 2.0",
+        ),
     ],
 )
 def test_faults_name_the_choices(call, message):
     with pytest.raises(InputError, match=message):
         call()
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "message"),
+    [
+        ("pointnet2", {"centres": (0, 4)}, "centres must be 2 whole numbers, each at least 1"),
+        ("pointnet2", {"centres": (12, 4, 2)}, "centres must be 2 whole numbers"),
+        ("pointnet2", {"embedding": ()}, "embedding must be 1 or more whole numbers"),
+        (
+            "pointnet2",
+            {"scales": (((-0.2, 4, (8, 8)),), ((0.4, 4, (8, 8)),))},
+            "radius in scales must be a number, larger than 0, not -0.2",
+        ),
+        ("pointnet2", {"scales": ()}, "scales must be one or more of"),
+        ("pointnet2-msg", {"grouping": "ssg"}, "unknown setting 'grouping'.* from centres, scal"),
+        ("pointnet", {"channels": ()}, "channels must be 3 or more whole numbers"),
+        ("pointnet", {"channels": (8, 0, 8)}, "channels must be 3 or more .* each at least 1"),
+        ("pointnet", {"hidden": (8, 0)}, "hidden must be 0 or more whole numbers, each at least 1"),
+        ("pointnet", {"dropout": -0.5}, "dropout must be a number, 0 to 1, not -0.5"),
+        ("pointnet", {"dropout": float("nan")}, "dropout must be a number"),
+        ("pointmlp-elite", {"reducers": (2, 2, 2, 0)}, "reducers must be .* each 1 to 255"),
+        ("pointmlp-elite", {"after": (1, 1, 256, 1)}, "after must be .* each 0 to 255"),
+        ("pointmlp-elite", {"bottleneck": 0.0}, "bottleneck must be a number, larger than 0"),
+        ("rscnn", {"radii": (float("inf"), 1.0)}, "radii must be a number"),
+        ("rscnn", {"neighbours": (0, 4)}, "neighbours must be .* each at least 1"),
+        ("rscnn", {"channels": (8, 2)}, "channels must be .* each at least 4"),
+        ("rscnn", {"order": "first"}, "unknown setting 'order'.* ball_order"),
+        ("simpleview", {"width": 0}, "width must be a whole number, at least 1, not 0"),
+    ],
+)
+def test_a_setting_out_of_range_is_named_with_its_range(name, settings, message):
+    with pytest.raises(InputError, match=message):
+        create_model(name, 5, **settings)
+
+
+@pytest.mark.parametrize(
+    ("check", "message"),
+    [
+        (lambda: check_whole("k", 2.5, 1, 255), "k must be a whole number, 1 to 255, not 2.5"),
+        (lambda: check_whole("k", True), "k must be a whole number"),
+        (lambda: check_wholes("widths", 8), "widths must be 1 or more whole numbers"),
+        (lambda: check_wholes("widths", (8, "8")), "widths must be 1 or more whole numbers"),
+        (lambda: check_number("dropout", "0.5", 0.0, 1.0), "dropout must be a number, 0 to 1"),
+        (lambda: check_number("radius", None), "radius must be a number, larger than 0"),
+        (lambda: check_flag("per_point", "yes"), "per_point must be true or false, not 'yes'"),
+        (lambda: check_choice("projection", 3, "near", "far"), "projection must be near or far"),
+    ],
+)
+def test_a_setting_of_another_kind_is_refused(check, message):
+    with pytest.raises(InputError, match=message):
+        check()
+
+
+def test_lists_within_lists_make_the_same_network():
+    scales = json.loads(json.dumps(SMALL["pointnet2"]["scales"]))
+    model = create_model("pointnet2", 5, **SMALL["pointnet2"] | {"scales": scales})
+    assert model.levels[1].balls == small("pointnet2").levels[1].balls
 
 
 def test_json_lists_make_the_same_network():

@@ -219,5 +219,5 @@ def test_regulariser_is_read_by_a_hook():
 
 
 def test_too_few_layers():
-    with pytest.raises(InputError, match="three widths"):
+    with pytest.raises(InputError, match="channels must be 3 or more"):
         PointNet(5, channels=(8, 8))

@@ -192,7 +192,10 @@ def test_features_of_each_point_only_where_asked_for():
         ({"grouping": "mrg"}, "grouping must be ssg or msg"),
         ({"ball_order": "random"}, "ball_order must be nearest or first"),
         ({"scales": (((0.2, 256, (8, 8)),), ((0.4, 8, (8, 8)),))}, "1 to 255"),
-        ({"scales": (((0.2, 8, (8,)),), ((0.4, 8, (8, 8)),))}, "at least two layers"),
+        (
+            {"scales": (((0.2, 8, (8,)),), ((0.4, 8, (8, 8)),))},
+            "widths in scales must be 2 or more",
+        ),
     ],
 )
 def test_faults_name_the_setting(settings, message):

@@ -189,7 +189,7 @@ def test_gradients_by_finite_differences():
 @pytest.mark.parametrize("order", ["nearest", "first"])
 def test_groups_are_those_of_the_textbook(textbook, order):
     """A later level begins where the one before began: its centres are its first ones."""
-    fast = make(order=order, radii=(0.7, 1.0), neighbours=(12, 6))
+    fast = make(ball_order=order, radii=(0.7, 1.0), neighbours=(12, 6))
     points = clouds(n=64)
     here = points
     start = (points - points.mean(dim=1, keepdim=True)).norm(dim=2).argmax(dim=1)
@@ -234,8 +234,8 @@ def test_relative_relation_does_not_see_where_a_ball_is():
     [
         ({"radii": (0.2,)}, "one value for each level"),
         ({"centres": (4, 8)}, "not grow"),
-        ({"radii": (0.0, 1.0)}, "positive"),
-        ({"order": "last"}, "nearest or first"),
+        ({"radii": (0.0, 1.0)}, "each of radii must be a number, larger than 0"),
+        ({"ball_order": "last"}, "nearest or first"),
         ({"coordinates": "polar"}, "absolute or relative"),
     ],
 )

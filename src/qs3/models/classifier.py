@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from qs3.models.checks import check_number, check_whole, check_wholes
+
 
 @dataclass(frozen=True)
 class Features:
@@ -60,6 +62,9 @@ class ClassifierHead(nn.Module):
         slope: float,
     ) -> None:
         super().__init__()
+        check_whole("num_classes", num_classes)
+        check_wholes("hidden", hidden, few=0)
+        check_number("dropout", dropout, 0.0, 1.0)
         layers: list[nn.Module] = []
         for depth, width in enumerate(hidden):
             layers += [

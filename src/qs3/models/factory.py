@@ -6,6 +6,7 @@ from functools import partial
 from typing import Any
 
 from qs3.errors import InputError
+from qs3.models.checks import check_whole
 from qs3.models.classifier import PointClassifier
 from qs3.models.dgcnn import DGCNN
 from qs3.models.pointmlp import PointMLPElite
@@ -52,15 +53,24 @@ def create_model(name: str, num_classes: int, **settings: Any) -> PointClassifie
     """
     if name not in _MODELS:
         raise InputError(f"unknown model {name!r}; choose one of {', '.join(_MODELS)}")
-    if num_classes < 1:
-        raise InputError(f"num_classes must be at least 1, not {num_classes}")
-    known = [p for p in inspect.signature(_MODELS[name]).parameters if p != "num_classes"]
+    check_whole("num_classes", num_classes)
+    make = _MODELS[name]
+    fixed = {"num_classes", *(make.keywords if isinstance(make, partial) else ())}
+    known = [
+        parameter for parameter in inspect.signature(make).parameters if parameter not in fixed
+    ]
     for key in settings:
         if key not in known:
             raise InputError(f"unknown setting {key!r} of {name}; choose from {', '.join(known)}")
-    # JSON has lists only; the networks want tuples.
-    values = {key: tuple(v) if isinstance(v, list) else v for key, v in settings.items()}
+    values = {key: _tuples(value) for key, value in settings.items()}
     try:
-        return _MODELS[name](num_classes, **values)
+        return make(num_classes, **values)
+    except InputError:
+        raise
     except (TypeError, ValueError) as error:
         raise InputError(f"settings {settings} do not make a {name}: {error}") from error
+
+
+def _tuples(value: Any) -> Any:
+    """Return tuples for lists, at any depth: JSON has lists only, the networks want tuples."""
+    return tuple(_tuples(part) for part in value) if isinstance(value, list | tuple) else value

@@ -1,7 +1,6 @@
 """PointMLP-elite (Ma et al., ICLR 2022): residual layers around points, scaled by their spread."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -9,10 +8,11 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from qs3.errors import InputError
+from qs3.models.checks import check_number, check_whole, check_wholes
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
+from qs3.models.levels import Group, nested_samples
 from qs3.models.normalisation import Moments, fold_norm, row_moments, uses_batch
 from qs3.models.ops import (
-    farthest_point_sampling,
     flat_indices,
     gather_points,
     knn,
@@ -22,15 +22,6 @@ from qs3.models.ops import (
 
 _FLOOR = 1e-5
 """Added to a cloud's standard deviation, as in the release."""
-
-
-class Group(NamedTuple):
-    """Which points of a level stay, and which ones each of them sees."""
-
-    samples: Int[Tensor, "b m"]
-    """Indices of the centres."""
-    neighbours: Int[Tensor, "b m k"]
-    """Indices of the points around each centre."""
 
 
 class ResidualBlock(nn.Module):
@@ -327,13 +318,15 @@ class PointMLPElite(PointClassifier):
         dropout: float = 0.5,
     ) -> None:
         super().__init__()
-        levels = {"expansions": expansions, "before": before, "after": after}
-        levels |= {"neighbours": neighbours, "reducers": reducers}
-        if len({len(values) for values in levels.values()}) > 1 or not expansions:
-            raise InputError(f"{', '.join(levels)} need one value for each stage")
+        levels: dict[str, tuple[int, ...]] = {"expansions": expansions, "before": before}
+        levels |= {"after": after, "neighbours": neighbours, "reducers": reducers}
         for name, values in levels.items():
-            if min(values) < (0 if name == "after" else 1) or max(values) > 255:
-                raise InputError(f"{name} must be 1 to 255, not {values}")
+            check_wholes(name, values, 0 if name == "after" else 1, 255)
+        if len({len(values) for values in levels.values()}) > 1:
+            raise InputError(f"{', '.join(levels)} need one value for each stage")
+        check_whole("embedding", embedding)
+        check_number("bottleneck", bottleneck)
+        check_number("dropout", dropout, 0.0, 1.0)
         if int(embedding * bottleneck) < 1:
             raise InputError(f"bottleneck {bottleneck} leaves nothing of {embedding} channels")
         self.neighbours, self.reducers = neighbours, reducers
@@ -350,19 +343,14 @@ class PointMLPElite(PointClassifier):
     @torch.no_grad()
     def group(self, points: Float[Tensor, "b n 3"]) -> tuple[Group, ...]:
         """Choose the centres of each stage and their neighbours."""
-        groups = []
-        samples = None
-        for k, reducer in zip(self.neighbours, self.reducers, strict=True):
-            count = max(1, points.shape[1] // reducer)
-            if samples is None:
-                samples = farthest_point_sampling(points, count)
-            else:
-                # Farthest point sampling of samples, from the first of them, is their beginning.
-                samples = torch.arange(count, device=points.device).expand(points.shape[0], -1)
-            centres = gather_points(points, samples)
-            groups.append(Group(samples, knn(points, min(k, points.shape[1]), centres)))
-            points = centres
-        return tuple(groups)
+        counts = [points.shape[1]]
+        for reducer in self.reducers:
+            counts.append(max(1, counts[-1] // reducer))
+        levels = zip(nested_samples(points, counts[1:]), self.neighbours, strict=True)
+        return tuple(
+            Group(level.samples, knn(level.points, min(k, level.points.shape[1]), level.centres))
+            for level, k in levels
+        )
 
     def encode(
         self, points: Float[Tensor, "b n 3"], groups: tuple[Group, ...] | None = None

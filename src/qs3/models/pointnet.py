@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from qs3.errors import InputError
+from qs3.models.checks import check_flag, check_wholes
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
 from qs3.models.normalisation import fold_norm, row_moments, uses_batch
 
@@ -241,8 +241,9 @@ class PointNet(PointClassifier):
         per_point: bool = False,
     ) -> None:
         super().__init__()
-        if len(channels) < 3:
-            raise InputError(f"channels must be three widths or more, not {channels}")
+        check_wholes("channels", channels, few=3)
+        check_flag("transforms", transforms)
+        check_flag("per_point", per_point)
         layers = _shared((3, *channels[:-1]))
         self.early, self.late = layers[:2], layers[2:]
         self.pool = PointwiseMax(*channels[-2:])

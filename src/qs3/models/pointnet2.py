@@ -8,6 +8,13 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from qs3.errors import InputError
+from qs3.models.checks import (
+    check_choice,
+    check_flag,
+    check_number,
+    check_whole,
+    check_wholes,
+)
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
 from qs3.models.grouped import GroupedMLP
 from qs3.models.ops import (
@@ -97,8 +104,8 @@ class PointNet2(PointClassifier):
     Args:
         num_classes: k.
         grouping: One scale a level ("ssg") or three ("msg").
-        centres: Number of centres of the two levels.
-        scales: Scales of the two levels in place of the grouping's own: radius, neighbours (at
+        centres: Number of centres of each level.
+        scales: Scales of the levels in place of the grouping's own: radius, neighbours (at
             most 255) and widths of each.
         embedding: Widths of the layers over all centres.
         hidden: Widths of the head's hidden layers.
@@ -116,7 +123,7 @@ class PointNet2(PointClassifier):
         self,
         num_classes: int,
         grouping: str = "ssg",
-        centres: tuple[int, int] = (512, 128),
+        centres: tuple[int, ...] = (512, 128),
         scales: tuple[tuple[Scale, ...], ...] | None = None,
         embedding: tuple[int, ...] = (256, 512, 1024),
         hidden: tuple[int, ...] = (512, 256),
@@ -125,16 +132,15 @@ class PointNet2(PointClassifier):
         per_point: bool = False,
     ) -> None:
         super().__init__()
-        if grouping not in ("ssg", "msg"):
-            raise InputError(f"grouping must be ssg or msg, not {grouping!r}")
-        if ball_order not in ("nearest", "first"):
-            raise InputError(f"ball_order must be nearest or first, not {ball_order!r}")
+        check_choice("grouping", grouping, "ssg", "msg")
+        check_choice("ball_order", ball_order, "nearest", "first")
+        check_flag("per_point", per_point)
         order: Literal["nearest", "first"] = "first" if ball_order == "first" else "nearest"
         if scales is None:
             scales = _SSG if grouping == "ssg" else _MSG
-        for _, k, _ in itertools.chain(*scales):
-            if not 1 <= k <= 255:
-                raise InputError(f"neighbours of a ball must be 1 to 255, not {k}")
+        _check_scales(scales)
+        check_wholes("centres", centres, count=len(scales))
+        check_wholes("embedding", embedding)
         # The released multi-scale network holds the features before the position.
         features_first = grouping == "msg"
         channels = 0
@@ -164,3 +170,20 @@ class PointNet2(PointClassifier):
     def head(self, features: Features) -> Float[Tensor, "b k"]:
         """Return the logits."""
         return self.classify(features.pooled)
+
+
+def _check_scales(scales: object) -> None:
+    """Raise InputError where the scales of the levels do not make a network."""
+    fault = "scales must be one or more of (radius, neighbours, widths) for each level"
+    if not isinstance(scales, tuple | list) or not scales:
+        raise InputError(f"{fault}, not {scales!r}")
+    for level in scales:
+        if not isinstance(level, tuple | list) or not level:
+            raise InputError(f"{fault}, not {level!r} for one")
+        for scale in level:
+            if not isinstance(scale, tuple | list) or len(scale) != 3:
+                raise InputError(f"{fault}; one is {scale!r}")
+            radius, k, widths = scale
+            check_number("radius in scales", radius)
+            check_whole("neighbours in scales", k, 1, 255)
+            check_wholes("widths in scales", widths, few=2)

@@ -1,6 +1,6 @@
 """RS-CNN (Liu et al., CVPR 2019): convolution weights from the relation of two points."""
 
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -8,21 +8,14 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from qs3.errors import InputError
+from qs3.models.checks import check_choice, check_number, check_whole, check_wholes
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier
+from qs3.models.levels import Group, nested_samples
 from qs3.models.normalisation import fold_norm, row_moments, update_running, uses_batch
-from qs3.models.ops import ball_query, farthest_point_sampling, gather_points
+from qs3.models.ops import ball_query, gather_points
 
 _RAISED = 16
 """Channels to which the first convolution raises the coordinates."""
-
-
-class Group(NamedTuple):
-    """Which points of a level stay, and which ones each of them sees."""
-
-    samples: Int[Tensor, "b m"]
-    """Indices of the centres."""
-    neighbours: Int[Tensor, "b m k"]
-    """Indices of the points around each centre, itself among them."""
 
 
 class RSConv(nn.Module):
@@ -199,8 +192,8 @@ class RSCNN(PointClassifier):
 
     NOTE: the release takes x_i off the coordinates in place, so that its relation is in effect
     (|x_j − x_i|, 0, x_j − x_i, x_j − x_i); ``coordinates="relative"`` does the same. In a ball of
-    too many points it keeps those that come first in the cloud (``order="first"``), which makes the
-    result depend on the order of the points; by default the nearest stay.
+    too many points it keeps those that come first in the cloud (``ball_order="first"``), which
+    makes the result depend on the order of the points; by default the nearest stay.
 
     Args:
         num_classes: k.
@@ -211,7 +204,7 @@ class RSCNN(PointClassifier):
         embedding: Width of the layer before the maximum over the centres.
         hidden: Widths of the head's hidden layers.
         dropout: Probability of dropping a hidden unit of the head.
-        order: Which points a ball keeps that has too many: the "nearest", or the "first".
+        ball_order: Which points a ball keeps that has too many: the "nearest", or the "first".
         coordinates: What the relation holds of x_i and x_j: "absolute" (paper) or "relative".
 
     Example:
@@ -230,20 +223,20 @@ class RSCNN(PointClassifier):
         embedding: int = 1024,
         hidden: tuple[int, ...] = (512, 256),
         dropout: float = 0.5,
-        order: str = "nearest",
+        ball_order: str = "nearest",
         coordinates: str = "absolute",
     ) -> None:
         super().__init__()
         _check_levels(centres, radii, neighbours, channels)
-        for name, value, choices in (
-            ("order", order, ("nearest", "first")),
-            ("coordinates", coordinates, ("absolute", "relative")),
-        ):
-            if value not in choices:
-                raise InputError(f"{name} must be {' or '.join(choices)}, not {value}")
+        check_choice("ball_order", ball_order, "nearest", "first")
+        check_choice("coordinates", coordinates, "absolute", "relative")
+        check_whole("embedding", embedding)
+        check_number("dropout", dropout, 0.0, 1.0)
         self.centres, self.radii, self.neighbours = centres, radii, neighbours
         self.channels, self.dropout = channels, dropout
-        self.order: Literal["nearest", "first"] = "first" if order == "first" else "nearest"
+        self.ball_order: Literal["nearest", "first"] = (
+            "first" if ball_order == "first" else "nearest"
+        )
         self.coordinates = coordinates
         widths = (0, *channels[:-1])
         self.convolutions = nn.ModuleList(
@@ -257,18 +250,13 @@ class RSCNN(PointClassifier):
     def group(self, points: Float[Tensor, "b n 3"]) -> tuple[Group, ...]:
         """Choose the centres of each level and the points around them."""
         groups = []
-        samples = farthest_point_sampling(points, min(self.centres[0], points.shape[1]))
-        for count, radius, k in zip(self.centres, self.radii, self.neighbours, strict=True):
-            samples = samples[:, :count]
-            centres = gather_points(points, samples)
-            most = min(k + 1, points.shape[1])
-            around = ball_query(points, centres, radius, most, self.order)
-            if self.order == "first":
-                around = _with_centre(around, samples)
-            groups.append(Group(samples, around))
-            # Within the next level's cloud, the first of these centres come first.
-            points = centres
-            samples = torch.arange(samples.shape[1], device=points.device).expand_as(samples)
+        levels = nested_samples(points, [min(count, points.shape[1]) for count in self.centres])
+        for level, radius, k in zip(levels, self.radii, self.neighbours, strict=True):
+            most = min(k + 1, level.points.shape[1])
+            around = ball_query(level.points, level.centres, radius, most, self.ball_order)
+            if self.ball_order == "first":
+                around = _with_centre(around, level.samples)
+            groups.append(Group(level.samples, around))
         return tuple(groups)
 
     def encode(
@@ -305,12 +293,17 @@ def _check_levels(
     channels: tuple[int, ...],
 ) -> None:
     """Raise InputError where the levels' settings do not make a network."""
-    if len({len(centres), len(radii), len(neighbours), len(channels)}) > 1 or not centres:
+    check_wholes("centres", centres)
+    if list(centres) != sorted(centres, reverse=True):
+        raise InputError(f"centres must not grow, not {centres}")
+    if not isinstance(radii, tuple | list):
+        raise InputError(f"radii must be numbers, one for each level, not {radii!r}")
+    for radius in radii:
+        check_number("each of radii", radius)
+    check_wholes("neighbours", neighbours)
+    check_wholes("channels", channels, 4)  # a quarter of them are the relation's
+    if len({len(centres), len(radii), len(neighbours), len(channels)}) > 1:
         raise InputError("centres, radii, neighbours and channels need one value for each level")
-    if list(centres) != sorted(centres, reverse=True) or min(centres) < 1:
-        raise InputError(f"centres must be at least 1 and not grow, not {centres}")
-    if min(radii) <= 0 or min(neighbours) < 1:
-        raise InputError(f"radii and neighbours must be positive, not {radii} and {neighbours}")
 
 
 def _with_centre(around: Int[Tensor, "b m k"], samples: Int[Tensor, "b m"]) -> Int[Tensor, "b m k"]:

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.errors import InputError
+from qs3.models.checks import check_choice, check_number, check_whole
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier
 from qs3.models.resnet import ResNet18
 
@@ -125,10 +125,10 @@ class SimpleView(PointClassifier):
         dropout: float = 0.5,
     ) -> None:
         super().__init__()
-        if projection not in ("orthographic", "perspective"):
-            raise InputError(f"projection must be orthographic or perspective, not {projection!r}")
-        if not 8 <= resolution <= 1024:
-            raise InputError(f"resolution must be 8 to 1024, not {resolution}")
+        check_whole("width", width)
+        check_whole("resolution", resolution, 8, 1024)
+        check_choice("projection", projection, "orthographic", "perspective")
+        check_number("dropout", dropout, 0.0, 1.0)
         self.resolution = resolution
         self.projection: Projection = projection
         self.backbone = ResNet18(1, width)
