@@ -39,7 +39,11 @@ def main() -> None:
     source = surfaces(collect("shapes", per_class=options.per_class, seed=options.seed), 0)
     test = surfaces(collect(options.cad), 1)
     settings = TrainSettings(
-        model="pointnet", num_points=512, epochs=options.epochs, seed=options.seed
+        model="pointnet",
+        model_settings={"transforms": False},
+        num_points=512,
+        epochs=options.epochs,
+        seed=options.seed,
     )
     with tempfile.TemporaryDirectory() as folder:
         model = fit("source-only", source, None, settings, run_dir=Path(folder) / "run").model
