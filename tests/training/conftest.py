@@ -32,7 +32,7 @@ def target():
 def settings():
     return TrainSettings(
         model="pointnet",
-        model_settings={"channels": (16, 16, 32), "hidden": (16,)},
+        model_settings={"channels": (16, 16, 32), "hidden": (16,), "transforms": False},
         num_points=64,
         epochs=4,
         batch_size=8,
