@@ -151,14 +151,15 @@ def test_exports_tell_what_they_hold(exported):
     assert json.loads(extra["qs3"]) == facts
 
 
-def test_program_holds_no_pickled_weights(exported):
+def test_program_holds_nothing_pickled(exported):
     with zipfile.ZipFile(exported[1]["torch-export"].path) as archive:
-        configs = [n for n in archive.namelist() if n.endswith(("weights_config.json",))]
-        assert configs
-        for name in configs:
-            weights = json.loads(archive.read(name))["config"]
-            assert weights
-            assert not any(entry["use_pickle"] for entry in weights.values())
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    assert not any(data.startswith((b"PK", b"\x80")) for data in parts.values())
+    configs = [data for name, data in parts.items() if name.endswith("_config.json")]
+    assert len(configs) == 2
+    entries = [entry for data in configs for entry in json.loads(data)["config"].values()]
+    assert entries
+    assert not any(entry["use_pickle"] for entry in entries)
 
 
 @pytest.mark.slow

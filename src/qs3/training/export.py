@@ -263,6 +263,8 @@ def _serialise(
 
 
 def _program_bytes(program: Any, text: str) -> tuple[bytes, _Runner]:
+    # They would be pickled; without them nothing in the file is.
+    program.example_inputs = None
     buffer = io.BytesIO()
     torch.export.save(program, buffer, extra_files={KEY: text})
     data = buffer.getvalue()
