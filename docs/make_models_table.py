@@ -46,7 +46,7 @@ def reference(name: str) -> ModuleType:
     stem = name.split("-")[0]
     path = _ROOT / "benchmarks" / "reference" / f"{stem}.py"
     spec = importlib.util.spec_from_file_location(f"reference_{stem}", path)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None and spec.loader is not None  # noqa: S101
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
