@@ -82,22 +82,51 @@ def test_bar_tells_loss_accuracy_rate_and_time_left(source, settings, capsys):
         assert part in last
 
 
-def test_loss_that_is_not_finite_names_the_clouds(source, settings):
+def test_loss_that_is_not_finite_names_the_clouds(source, settings, tmp_path):
     class Diverges(SourceOnly):
         def losses(self, source, target, progress, generator):
             losses = super().losses(source, target, progress, generator)
             return {"source": losses["source"] * (math.inf if progress >= 0.5 else 1.0)}
 
     message = (
-        r"loss is inf in epoch 2, batch 0 \(clouds 0-\d+, .* and 4 more\), whose points are all"
+        r"loss is inf in epoch 2, batch 0 \(clouds 0-\d+, .* and 4 more\); train .* new folder"
     )
     with pytest.raises(QS3Error, match=message):
         train(Diverges(new_model(settings, 3, 0)), source, None, settings)
     broken = source.points.copy()
     broken[7, 3, 1] = np.nan
-    message = r"loss is nan in epoch 0, batch \d: points of cloud 0-7 are not finite; leave"
+    broken[9] = np.inf
+    bad = replace(source, points=broken)
+    message = "points of clouds 0-7, 0-9 are not finite; leave"
+    with pytest.raises(InputError, match=message):
+        train(SourceOnly(new_model(settings, 3, 0)), bad, None, settings)
+    with pytest.raises(InputError, match=message):
+        fit("source-only", bad, None, settings, run_dir=tmp_path / "run")
+    with pytest.raises(InputError, match="target: points of clouds 000007, 000009 are not"):
+        fit("qbst", source, bad.without_labels(), settings, run_dir=tmp_path / "run")
+    assert not (tmp_path / "run").exists()  # the corrected call may use the folder
+
+
+class _Spoilt(SourceOnly):
+    """A gradient that is NaN in one step, under a finite loss."""
+
+    def losses(self, source, target, progress, generator):
+        loss = super().losses(source, target, progress, generator)["source"]
+        if 0.5 <= progress < 0.51:
+            loss = loss + torch.sqrt(self.model.classify.layers[-1].bias.sum() * 0.0)
+        return {"source": loss}
+
+
+@pytest.mark.parametrize("norm", [None, 1.0])
+def test_gradient_that_is_not_finite_leaves_the_checkpoint_good(source, settings, tmp_path, norm):
+    changed = replace(settings, clip_norm=norm)
+    message = r"gradient is nan in epoch 2, batch 0 \(clouds 0-\d+, .*; train .* new folder"
     with pytest.raises(QS3Error, match=message):
-        train(SourceOnly(new_model(settings, 3, 0)), replace(source, points=broken), None, settings)
+        train(_Spoilt(new_model(settings, 3, 0)), source, None, changed, run_dir=tmp_path)
+    resumed, whole = (SourceOnly(new_model(settings, 3, 0)) for _ in range(2))
+    train(resumed, source, None, changed, run_dir=tmp_path)
+    train(whole, source, None, changed)
+    assert same(resumed, whole)
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,33 @@ def require_unlabelled(target: UnlabelledClouds) -> None:
         )
 
 
+def require_finite(clouds: PointClouds | UnlabelledClouds, where: str = "") -> None:
+    """Refuse clouds with coordinates that are not finite.
+
+    Args:
+        clouds: Clouds.
+        where: What they are, at the head of the message.
+
+    Raises:
+        InputError: with the ids of the first such clouds.
+    """
+    good = np.isfinite(clouds.points).all(axis=(1, 2))
+    if not good.all():
+        bad = [clouds.ids[row] for row in np.flatnonzero(~good)]
+        raise InputError(f"{where}points of {name_few(bad)} are not finite; leave these clouds out")
+
+
+def name_few(names: Sequence[str]) -> str:
+    """Name clouds, four of them at most.
+
+    Example:
+        >>> name_few(["a"]), name_few(["a", "b", "c", "d", "e"])
+        ('cloud a', 'clouds a, b, c, d and 1 more')
+    """
+    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+    return f"cloud{'s' if len(names) > 1 else ''} {', '.join(names[:4])}{more}"
+
+
 def prepare(points: np.ndarray, num_points: int, cache: Path | None = None) -> np.ndarray:
     """Thin clouds [b n 3] to ``num_points`` points each and bring them to the unit ball.
 
@@ -68,9 +95,13 @@ class DeviceClouds:
         clouds: Prepared clouds, with labels or without.
         device: Where to train. A GPU takes them where a quarter of its free memory is enough; else
             each batch is sent.
+
+    Raises:
+        InputError: where points are not finite.
     """
 
     def __init__(self, clouds: PointClouds | UnlabelledClouds, device: torch.device) -> None:
+        require_finite(clouds)
         self.device = device
         self.ids = clouds.ids
         self.points = torch.from_numpy(np.ascontiguousarray(clouds.points, dtype=np.float32))

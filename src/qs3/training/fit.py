@@ -11,7 +11,7 @@ from typing import Literal, TypeVar
 from qs3.datasets.clouds import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.models import PointClassifier
-from qs3.training.batches import prepare, require_unlabelled
+from qs3.training.batches import prepare, require_finite, require_unlabelled
 from qs3.training.checkpoint import MODEL, claim_run, fingerprint, load_model
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.deadline import Deadline
@@ -76,10 +76,11 @@ def fit(
         on_round: Called after each round.
 
     Raises:
-        InputError: where arguments do not go together, or the folder holds another run.
+        InputError: where arguments do not go together, points are not finite, or the folder holds
+            another run.
         TimeUpError: where the time is up; the same call goes on.
         MissingExtraError: where TensorBoard is asked for and absent.
-        QS3Error: where a loss is not finite, or the process of another device ended.
+        QS3Error: where a loss or a gradient is not finite, or the process of another device ended.
     """
     if method not in ("source-only", "qbst"):
         raise InputError(f"unknown method {method!r}; choose source-only or qbst")
@@ -95,6 +96,9 @@ def fit(
             raise InputError(f"method {method} takes no {name}; leave it out or choose qbst")
     if target is not None:
         require_unlabelled(target)
+    require_finite(source, "source: ")
+    if target is not None:
+        require_finite(target, "target: ")
     rounds_settings = (self_training or SelfTrainingSettings()) if adapts else None
     limit = Deadline(max_seconds)
     start = None if warm_up is None else _load_warm_up(Path(warm_up), source, settings)

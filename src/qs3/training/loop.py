@@ -14,7 +14,14 @@ from torch import Tensor
 from qs3.adaptation import Method
 from qs3.datasets.clouds import PointClouds, UnlabelledClouds
 from qs3.errors import InputError, QS3Error
-from qs3.training.batches import DeviceClouds, Share, count_batches, endless_batches, make_batch
+from qs3.training.batches import (
+    DeviceClouds,
+    Share,
+    count_batches,
+    endless_batches,
+    make_batch,
+    name_few,
+)
 from qs3.training.checkpoint import load_optimiser, optimiser_tensors, seed_sequence
 from qs3.training.config import TrainSettings
 from qs3.training.deadline import Deadline, TimeUpError
@@ -77,9 +84,10 @@ def train(
         A record of each epoch, and Adam's state at the end.
 
     Raises:
-        InputError: where there are not two clouds of each set a device, or the target is missing.
+        InputError: where there are not two clouds of each set a device, points are not finite, or
+            the target is missing.
         TimeUpError: where the deadline has come.
-        QS3Error: where a loss is not finite.
+        QS3Error: where a loss or a gradient is not finite; the last checkpoint stays good.
     """
     fabric = fabric or make_fabric(settings)
     share = Share(fabric.global_rank, fabric.world_size)
@@ -138,17 +146,18 @@ def train(
                     losses = wrapped(batch, seen, (epoch * steps + step) / total, generator)
                     count = sum(map(len, rows))
                     value = bar.measure(losses, count)
-                    if not math.isfinite(value):
-                        chosen = zip([*labelled, unlabelled], [*rows, *other], strict=False)
-                        where = f"{description}: the loss is {value} in epoch {epoch}, batch {step}"
-                        raise QS3Error(where + _clouds_of(chosen))
+                    where = f"epoch {epoch}, batch {step}"
+                    drawn = list(zip([*labelled, unlabelled], [*rows, *other], strict=False))
+                    _require_finite(value, f"{description}: the loss is {value} in {where}", drawn)
                     # The devices' gradients are averaged: a larger share must weigh more.
                     weight = len(batch.labels) * share.world / count
                     loss = torch.stack([term.float() for term in losses.values()]).sum() * weight
                     wrapped_optimiser.zero_grad()
                     fabric.backward(loss)
-                    if settings.clip_norm is not None:
-                        _clip(fabric, wrapped, wrapped_optimiser, settings.clip_norm)
+                    norm = _clip(fabric, wrapped, wrapped_optimiser, settings.clip_norm)
+                    _require_finite(
+                        norm, f"{description}: the gradient is {norm} in {where}", drawn
+                    )
                     wrapped_optimiser.step()
                     method.after_step()
                     if average is not None:
@@ -189,9 +198,19 @@ def _seeded(device: torch.device, seed: int) -> Iterator[None]:
         yield
 
 
-def _clip(fabric: Fabric, module: Any, optimiser: Any, norm: float) -> None:
-    """Scale the gradient down; one that is not finite stays so, and a 16-bit scaler skips it."""
-    fabric.clip_gradients(module, optimiser, max_norm=norm, error_if_nonfinite=False)
+def _clip(fabric: Fabric, module: Any, optimiser: Any, norm: float | None) -> float:
+    """Scale the gradient down where asked, and return its length before; the same on all devices.
+
+    A 16-bit scaler skips steps that are not finite by itself: of those 0 is returned.
+    """
+    scaled = getattr(fabric.strategy.precision, "scaler", None) is not None
+    if scaled and norm is None:
+        return 0.0
+    length = fabric.clip_gradients(
+        module, optimiser, max_norm=math.inf if norm is None else norm, error_if_nonfinite=False
+    )
+    assert length is not None  # noqa: S101
+    return 0.0 if scaled else float(length)
 
 
 def _stop_in_time(deadline: Deadline | None, fabric: Fabric, where: str) -> None:
@@ -229,19 +248,13 @@ def _finish_epoch(
             on_epoch(history[-1], state.method)
 
 
-def _clouds_of(chosen: Iterable[tuple[DeviceClouds | None, np.ndarray]]) -> str:
-    """Name the first clouds of a batch, and those whose points are not finite."""
-    names, bad = [], []
-    for clouds, rows in chosen:
-        if clouds is not None:
-            finite = clouds.take(rows).points.isfinite().flatten(1).all(dim=1).tolist()
-            names += [clouds.ids[row] for row in rows]
-            bad += [clouds.ids[row] for row, good in zip(rows, finite, strict=True) if not good]
-    if bad:
-        return f": points of {_few(bad)} are not finite; leave these clouds out"
-    return f" ({_few(names)}), whose points are all finite; lower the learning rate or clip_norm"
-
-
-def _few(names: list[str]) -> str:
-    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
-    return f"cloud{'s' if len(names) > 1 else ''} {', '.join(names[:4])}{more}"
+def _require_finite(
+    value: float, what: str, drawn: Iterable[tuple[DeviceClouds | None, np.ndarray]]
+) -> None:
+    """Stop before a step that would spoil the weights, and name the first clouds of the batch."""
+    if not math.isfinite(value):
+        names = [clouds.ids[row] for clouds, rows in drawn if clouds is not None for row in rows]
+        raise QS3Error(
+            f"{what} ({name_few(names)}); train with a lower learning rate or clip_norm in a new "
+            "folder, as a run keeps its settings"
+        )

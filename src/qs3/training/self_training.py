@@ -19,7 +19,7 @@ from qs3.datasets.clouds import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.evaluation.metrics import accuracy
 from qs3.models import PointClassifier
-from qs3.training.batches import require_unlabelled
+from qs3.training.batches import require_finite, require_unlabelled
 from qs3.training.checkpoint import (
     derived_seed,
     load_tensors_into,
@@ -126,11 +126,13 @@ def self_train(
         The network of the last round, and a record of each round.
 
     Raises:
-        InputError: where the target is empty, or stored states do not fit.
+        InputError: where the target is empty, its points are not finite, or stored states do not
+            fit.
     """
     require_unlabelled(target)
     if not len(target):
         raise InputError("the target has no cloud; give unlabelled clouds")
+    require_finite(target, "target: ")
     fabric = fabric or make_fabric(settings)
     select = select or quasi_balanced_rule(self_training)
     folder = None if run_dir is None else Path(run_dir)
