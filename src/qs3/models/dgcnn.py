@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor, nn
 
-from qs3.errors import InputError
+from qs3.models.checks import check_flag, check_whole, check_wholes
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
-from qs3.models.normalisation import update_running
+from qs3.models.normalisation import update_running, uses_batch
 from qs3.models.ops import flat_indices, knn, neighbour_max, neighbour_sum
 from qs3.models.pooling import pooled_layer
 
@@ -61,8 +61,7 @@ class EdgeConv(nn.Module):
         weight = torch.cat([first, second - first], dim=1)
         own_mean = points.mean(dim=(0, 1))
         norm = self.norm
-        assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
-        if norm.training:
+        if uses_batch(norm):
             nodes = points.shape[0] * points.shape[1]
             degree = torch.bincount(flat_indices(neighbours).view(-1), minlength=nodes)
             share = degree.to(points.dtype) / neighbours.numel()
@@ -75,6 +74,7 @@ class EdgeConv(nn.Module):
             offset = norm.bias
             scale = norm.weight * torch.rsqrt(variance + norm.eps)
         else:
+            assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
             neighbour_mean = own_mean
             scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
             mean = weight @ torch.cat([neighbour_mean, own_mean])
@@ -153,8 +153,10 @@ class DGCNN(PointClassifier):
         per_point: bool = False,
     ) -> None:
         super().__init__()
-        if not 1 <= neighbours <= 255:
-            raise InputError(f"neighbours must be 1 to 255, not {neighbours}")
+        check_whole("neighbours", neighbours, 1, 255)
+        check_wholes("channels", channels)
+        check_whole("embedding", embedding)
+        check_flag("per_point", per_point)
         self.neighbours = neighbours
         self.per_point = per_point
         widths = (3, *channels)

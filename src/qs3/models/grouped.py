@@ -23,32 +23,9 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from qs3.models.normalisation import Moments, fold_norm, uses_batch
+from qs3.models.normalisation import FoldedLayer, Moments, uses_batch
 from qs3.models.ops import flat_indices, gather_points, scatter_points
 from qs3.models.ops.exporting import is_exporting
-
-
-class FoldedLayer(nn.Module):
-    """A linear map and batch normalisation that are applied as one linear map.
-
-    Args:
-        channels: Width of the input.
-        width: Width of the output.
-    """
-
-    def __init__(self, channels: int, width: int) -> None:
-        super().__init__()
-        self.linear = nn.Linear(channels, width, bias=False)
-        # Holds scale, shift and running statistics.
-        self.norm = nn.BatchNorm1d(width)
-
-    def fold(self, moments: Moments | None) -> tuple[Float[Tensor, "d c"], Float[Tensor, "d"]]:
-        """Return the weight and the shift of the normalised map.
-
-        Args:
-            moments: Those of the input; needed in training.
-        """
-        return fold_norm(self.norm, self.linear.weight, moments)
 
 
 class GroupedMLP(nn.Module):

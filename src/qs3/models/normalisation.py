@@ -117,3 +117,26 @@ def update_running(
     known_mean.lerp_(mean.to(known_mean), 0.0 if momentum is None else momentum)
     unbiased = variance * (count / max(count - 1, 1))
     known_variance.lerp_(unbiased.to(known_variance), 0.0 if momentum is None else momentum)
+
+
+class FoldedLayer(nn.Module):
+    """A linear map and batch normalisation that are applied as one linear map.
+
+    Args:
+        channels: Width of the input.
+        width: Width of the output.
+    """
+
+    def __init__(self, channels: int, width: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(channels, width, bias=False)
+        # Holds scale, shift and running statistics.
+        self.norm = nn.BatchNorm1d(width)
+
+    def fold(self, moments: Moments | None) -> tuple[Float[Tensor, "d c"], Float[Tensor, "d"]]:
+        """Return the weight and the shift of the normalised map.
+
+        Args:
+            moments: Those of the input; needed in training.
+        """
+        return fold_norm(self.norm, self.linear.weight, moments)

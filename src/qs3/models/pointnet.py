@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from qs3.models.checks import check_flag, check_wholes
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
-from qs3.models.normalisation import fold_norm, row_moments, uses_batch
+from qs3.models.normalisation import FoldedLayer, fold_norm, row_moments, uses_batch
 
 
 def orthogonality(matrix: Float[Tensor, "b c c"]) -> Float[Tensor, ""]:
@@ -121,19 +121,13 @@ def _fold(
     return points - moments.mean, *fold_norm(norm, weight, about_zero, weight @ moments.mean)
 
 
-class FirstLayer(nn.Module):
+class FirstLayer(FoldedLayer):
     """`PointwiseLayer` with ReLU for few channels, whose moments are cheaper than those after it.
 
     Args:
         channels: Width of the input.
         width: Width of the output.
     """
-
-    def __init__(self, channels: int, width: int) -> None:
-        super().__init__()
-        self.linear = nn.Linear(channels, width, bias=False)
-        # Holds scale, shift and running statistics; goes into the weights below.
-        self.norm = nn.BatchNorm1d(width)
 
     def forward(self, points: Float[Tensor, "b n c"]) -> Float[Tensor, "b n d"]:
         """Return the new features of each point."""
@@ -142,7 +136,7 @@ class FirstLayer(nn.Module):
         return nn.functional.relu(nn.functional.linear(points, weight, shift), inplace=True)
 
 
-class PointwiseMax(nn.Module):
+class PointwiseMax(FoldedLayer):
     """Linear map at every point, batch normalisation over all points, ReLU, maximum over points.
 
     The function is that of `PointwiseLayer` and ``amax``. The variance of channel o over all points
@@ -154,12 +148,6 @@ class PointwiseMax(nn.Module):
         channels: Width of the input.
         width: Width of the output.
     """
-
-    def __init__(self, channels: int, width: int) -> None:
-        super().__init__()
-        self.linear = nn.Linear(channels, width, bias=False)
-        # Holds scale, shift and running statistics; goes into the weights below.
-        self.norm = nn.BatchNorm1d(width)
 
     def forward(self, points: Float[Tensor, "b n c"]) -> Float[Tensor, "b d"]:
         """Return the maximum of each channel over each cloud."""
