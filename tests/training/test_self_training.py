@@ -13,6 +13,7 @@ from qs3.errors import InputError
 from qs3.training import PRESETS, SelfTrainingSettings, fit, load_model, self_training_preset
 from qs3.training.batches import prepare
 from qs3.training.checkpoint import derived_seed, new_model
+from qs3.training.distributed import make_fabric
 from qs3.training.predict import predict_probabilities
 from qs3.training.self_training import self_train
 
@@ -155,6 +156,35 @@ def test_a_finished_run_is_not_done_again(source, target, settings, warm, tmp_pa
     assert [json.loads(line)["kind"] for line in lines] == ["round"] * 3
 
 
+def test_history_keeps_finished_rounds_over_stops(source, target, settings, warm, tmp_path):
+    """Stopped in round 2, and again right after going on: round 1's line stays."""
+    run = tmp_path / "run"
+    rounds = replace(ROUNDS, rounds=2, epochs=3, threshold=0.34)
+    arguments = ("qbst", source, target.without_labels(), settings, rounds)
+
+    def told():
+        return [json.loads(line) for line in (run / "history.jsonl").read_text().splitlines()]
+
+    for calls in (4, 1):
+        seen = []
+
+        def stop(record, method, seen=seen, calls=calls):
+            seen.append(record)
+            if len(seen) == calls:
+                raise Stop
+
+        with pytest.raises(Stop):
+            fit(*arguments, run_dir=run, warm_up=warm, on_epoch=stop)
+        kinds = [(line["kind"], line.get("stage", line.get("round"))) for line in told()]
+        assert kinds == [("round", 1)] + [("epoch", "round-2")] * (2 if calls == 1 else 1)
+        if calls == 4:
+            first = seen[:3]
+    done = told()[0]
+    assert done["accuracies"] == [epoch.accuracy for epoch in first]
+    assert done["learning_rates"] == [epoch.learning_rate for epoch in first]
+    assert done["losses"] == [epoch.losses for epoch in first]
+
+
 def test_too_few_selected_keeps_the_network(domains, settings, caplog):
     source, target = domains
     model = new_model(settings, 3, 0)
@@ -165,7 +195,7 @@ def test_too_few_selected_keeps_the_network(domains, settings, caplog):
     assert same(model, adapted)
     assert adapted is not model
     assert [record.skipped for record in records] == [True] * 3
-    assert "fewer than 2 for each of 3 classes" in caplog.text
+    assert "fewer than 6 (2 for each of 3 classes" in caplog.text
 
 
 @pytest.mark.parametrize(("count", "skipped"), [(5, True), (6, False)])
@@ -221,6 +251,42 @@ def test_pool_split_leaves_a_fifth_aside(domains, settings):
 
     one_round(domains, settings, note, pool="split", rounds=2)
     assert sizes == [24, 24]
+
+
+@pytest.mark.parametrize(
+    ("count", "labeller", "devices", "skipped"),
+    [
+        (8, "best", 1, False),
+        (7, "latest", 4, True),
+        (8, "latest", 4, False),
+        (9, "best", 5, True),
+        (9, "best", 4, False),  # 8 of them to train on
+    ],
+)
+def test_the_limit_is_two_a_device_without_those_held_out(
+    domains, settings, monkeypatch, count, labeller, devices, skipped
+):
+    """The settings' number of devices counts; here one device computes for all of them."""
+    source, target = domains
+    rounds = replace(ROUNDS, rounds=1, labeller=labeller)
+    trained = []
+
+    def train(method, clouds, *arguments, **options):
+        trained.append(len(clouds[0]))
+        return [], {}
+
+    monkeypatch.setattr("qs3.training.self_training.train", train)
+    _, records = self_train(
+        new_model(settings, 3, 0),
+        source,
+        target,
+        replace(settings, devices=devices, batch_size=16),
+        rounds,
+        select=lambda p, theta: np.arange(len(p)) < count,
+        fabric=make_fabric(settings),
+    )
+    assert records[0].skipped is skipped
+    assert trained == ([] if skipped else [8])
 
 
 def test_pool_shrinks_to_what_was_kept(domains, settings):

@@ -108,7 +108,7 @@ def run_job(
             description=stage,
         )
         if history is not None:
-            history.source(epochs)
+            history.source(stage, epochs)
         _save(folder, model, job, fabric)
     if job.rounds is not None and job.target is not None:
         model, records = self_train(

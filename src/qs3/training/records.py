@@ -39,9 +39,9 @@ Log = Callable[[Sequence[EpochRecord]], None]
 class History:
     """Writes ``history.jsonl``: one line an epoch on the source, one a round of self-training.
 
-    Epochs of a round that is not done have a line each; then the round's own line takes their
-    place. The file is written anew, whole, at every change: it is never torn, and a resumed run
-    repeats no line.
+    A line of an epoch names its stage: ``source-only``, ``warm-up`` or ``round-3``. Epochs of a
+    round that is not done have a line each; then the round's own line takes their place. The file
+    is written anew, whole, at every change: it is never torn, and a resumed run repeats no line.
 
     Args:
         run_dir: Folder of the run.
@@ -57,18 +57,18 @@ class History:
         self.board = _Board(Path(run_dir) / TENSORBOARD) if tensorboard else None
 
     def training(self, stage: str) -> Log:
-        """Return a log for one training; ``stage`` names its folder in TensorBoard."""
+        """Return a log for one training; ``stage`` stands in its lines and names its folder."""
 
         def log(epochs: Sequence[EpochRecord]) -> None:
-            self._write(self.lines + self._epochs(epochs))
+            self._write(self.lines + self._epochs(stage, epochs))
             if self.board is not None:
                 self.board.show(stage, epochs)
 
         return log
 
-    def source(self, epochs: Sequence[EpochRecord]) -> None:
+    def source(self, stage: str, epochs: Sequence[EpochRecord]) -> None:
         """Keep the epochs on the source."""
-        self.lines += self._epochs(epochs)
+        self.lines += self._epochs(stage, epochs)
         self._write(self.lines)
 
     def rounds(self, records: Sequence[Any]) -> None:
@@ -83,8 +83,8 @@ class History:
             self.board.close()
 
     @staticmethod
-    def _epochs(epochs: Sequence[EpochRecord]) -> list[dict[str, Any]]:
-        return [{"kind": "epoch", **asdict(record)} for record in epochs]
+    def _epochs(stage: str, epochs: Sequence[EpochRecord]) -> list[dict[str, Any]]:
+        return [{"kind": "epoch", "stage": stage, **asdict(record)} for record in epochs]
 
     def _write(self, lines: list[dict[str, Any]]) -> None:
         write_text(self.path, "".join(json.dumps(line) + "\n" for line in lines))

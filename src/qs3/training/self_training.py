@@ -34,7 +34,7 @@ from qs3.training.deadline import Deadline
 from qs3.training.distributed import make_fabric
 from qs3.training.loop import CHECKPOINT, EpochCallback, train
 from qs3.training.predict import predict_probabilities
-from qs3.training.records import History
+from qs3.training.records import EpochRecord, History
 
 _LOG = logging.getLogger(__name__)
 STATE = "rounds.safetensors"
@@ -62,7 +62,8 @@ class RoundRecord:
     agreement: float | None
     """Share of the target whose pseudo label is that of the round before; None in round 1."""
     skipped: bool
-    """Whether fewer than 2·k clouds were kept, so that the network stayed as it was."""
+    """Whether too few clouds were kept to train on (fewer than 2 a class or 2 a device, without
+    those held out), so that the network stayed as it was."""
     single_class: bool
     """Whether all confident clouds had one class."""
     held_out: float | None
@@ -71,6 +72,10 @@ class RoundRecord:
     """Mean losses of each epoch."""
     seconds: float
     """Wall-clock seconds of the run that finished the round."""
+    accuracies: tuple[float | None, ...] = ()
+    """Of each epoch, as in `EpochRecord`: on the pseudo labels and the source together."""
+    learning_rates: tuple[float, ...] = ()
+    """Adam's learning rate in each epoch."""
 
 
 RoundCallback = Callable[[RoundRecord, PointClassifier], None]
@@ -138,6 +143,8 @@ def self_train(
     folder = None if run_dir is None else Path(run_dir)
     rounds = _Rounds(model, source, target, settings, self_training, fabric, folder)
     rounds.history, rounds.deadline = history, deadline
+    if history is not None:
+        history.rounds(rounds.records)
     for number in range(len(rounds.records) + 1, self_training.rounds + 1):
         record = rounds.run(number, select, on_epoch)
         if history is not None:
@@ -194,18 +201,18 @@ class _Rounds:
         over = np.bincount(candidates[confident].argmax(axis=1), minlength=k)
         chosen = self.pool[select(candidates, theta)]
         pool = len(self.pool)
-        skipped = len(chosen) < 2 * k
-        losses: tuple[Mapping[str, float], ...] = ()
+        least = 2 * max(k, self.settings.devices)
+        trained = len(chosen) - int(np.count_nonzero(self._held_out(chosen)))
+        skipped = trained < least
+        epochs: list[EpochRecord] = []
         if skipped:
             _LOG.warning(
-                "round %d: %d clouds selected, fewer than 2 for each of %d classes; "
-                "the network stays as it was",
-                number,
-                len(chosen),
-                k,
+                "round %d: %d clouds to train on, fewer than %d (2 for each of %d classes and %d "
+                "devices); the network stays as it was",
+                *(number, trained, least, k, self.settings.devices),
             )
         else:
-            losses = self._train(number, chosen, labels[chosen], on_epoch)
+            epochs = self._train(number, chosen, labels[chosen], on_epoch)
             self.pool = chosen if self.rounds.pool == "shrinking" else self.pool
         record = RoundRecord(
             round=number,
@@ -217,8 +224,10 @@ class _Rounds:
             skipped=skipped,
             single_class=int(np.count_nonzero(over)) == 1,
             held_out=self.best.score if self.rounds.labeller == "best" else None,
-            losses=losses,
+            losses=tuple(epoch.losses for epoch in epochs),
             seconds=time.perf_counter() - start,
+            accuracies=tuple(epoch.accuracy for epoch in epochs),
+            learning_rates=tuple(epoch.learning_rate for epoch in epochs),
         )
         self.labels = labels
         self.records.append(record)
@@ -228,12 +237,16 @@ class _Rounds:
         self.fabric.barrier()
         return record
 
+    def _held_out(self, chosen: np.ndarray) -> Bool[np.ndarray, "m"]:
+        """Which of the chosen clouds are not trained on: a fifth, for a ``best`` labeller."""
+        return (np.arange(len(chosen)) % 10 >= 8) & (self.rounds.labeller == "best")
+
     def _train(
         self, number: int, chosen: np.ndarray, labels: np.ndarray, on_epoch: EpochCallback | None
-    ) -> tuple[Mapping[str, float], ...]:
+    ) -> list[EpochRecord]:
         rounds = self.rounds
         best = rounds.labeller == "best"
-        held = np.arange(len(chosen)) % 10 >= 8 if best else np.zeros(len(chosen), dtype=bool)
+        held = self._held_out(chosen)
         pseudo = PointClouds(
             points=self.target.points[chosen[~held]],
             labels=labels[~held].astype(np.int64),
@@ -266,7 +279,7 @@ class _Rounds:
             description=f"round {number}/{rounds.rounds}",
         )
         self.optimiser = optimiser if continuous else {}
-        return tuple(record.losses for record in history)
+        return history
 
     def _save(self, path: Path) -> None:
         tensors = prefixed("latest", self.latest.state_dict())
@@ -282,7 +295,7 @@ class _Rounds:
         try:
             self.pool, self.labels = tensors["pool"].numpy(), tensors["labels"].numpy()
             self.records = [
-                RoundRecord(**{**r, **{n: tuple(r[n]) for n in ("confident", "kept", "losses")}})
+                RoundRecord(**{n: tuple(v) if isinstance(v, list) else v for n, v in r.items()})
                 for r in facts["records"]
             ]
         except (KeyError, TypeError) as error:
