@@ -9,6 +9,10 @@ class InputError(QS3Error, ValueError):
     """A file, folder or setting handed in is not usable; the message names it and the fix."""
 
 
+class UnevenSizesError(InputError):
+    """Clouds of several sizes, where one array for all was asked for."""
+
+
 class MissingExtraError(QS3Error, ImportError):
     """An optional package is needed; the message names the extra that brings it."""
 

@@ -8,13 +8,16 @@ import subprocess
 import sys
 import time
 from dataclasses import asdict, replace
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 
 from qs3.adaptation import SourceOnly
-from qs3.errors import InputError, MissingExtraError, QS3Error
+from qs3.cli.train import _whole
+from qs3.datasets.transforms import stack
+from qs3.errors import InputError, MissingExtraError, QS3Error, UnevenSizesError
 from qs3.training import SelfTrainingSettings, TimeUpError, fit, parse_duration, records
 from qs3.training.checkpoint import new_model
 from qs3.training.deadline import Deadline
@@ -149,6 +152,28 @@ def test_deadline_looks_one_epoch_ahead(monkeypatch):
         now[0] = 150.0 + elapsed
         assert deadline.passed() is passed
     assert not Deadline(None).passed()
+    deadline = Deadline(10.0, start=now[0] - 8.0)  # eight seconds went into reading
+    deadline.note(3.0)
+    assert deadline.passed()
+    assert deadline.elapsed() == 8.0
+
+
+def test_only_clouds_of_several_sizes_are_read_twice():
+    calls = []
+
+    def load(num_points, error):
+        calls.append(num_points)
+        if num_points is None or error is InputError:
+            raise error("no")
+        return num_points
+
+    assert _whole(partial(load, error=UnevenSizesError), 8) == 8
+    assert calls == [None, 8]
+    with pytest.raises(InputError):
+        _whole(partial(load, error=InputError), 8)
+    assert calls == [None, 8, None]
+    with pytest.raises(UnevenSizesError, match="5 to 6 points"):
+        stack([np.zeros((5, 3), np.float32), np.zeros((6, 3), np.float32)], None, "here")
 
 
 def test_stopped_in_time_again_and_again_is_uninterrupted(source, target, settings, tmp_path):
@@ -159,7 +184,7 @@ def test_stopped_in_time_again_and_again_is_uninterrupted(source, target, settin
     stops = 0
     while True:
         try:
-            result = fit(*arguments, run_dir=tmp_path / "cut", max_seconds=1e-6)
+            result = fit(*arguments, run_dir=tmp_path / "cut", deadline=Deadline(1e-6))
             break
         except TimeUpError as error:
             assert "run the same again to go on" in str(error)
@@ -235,6 +260,12 @@ def test_absent_tensorboard_names_the_extra(source, settings, tmp_path, monkeypa
 def test_faulty_settings_are_named(settings, changes, named):
     with pytest.raises(InputError, match=named):
         replace(settings, **changes)
+
+
+def test_apples_gpus_are_refused(settings):
+    object.__setattr__(settings, "accelerator", "mps")  # as without the type checks of the tests
+    with pytest.raises(InputError, match="accelerator = mps is none of auto, cpu, cuda"):
+        settings.__post_init__()
 
 
 def test_statistics_stay_in_full_precision_under_bf16(source, settings):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -10,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from qs3.errors import InputError
+from qs3.errors import InputError, UnevenSizesError
 from qs3.evaluation.records import DataRecord
 from qs3.files import write_json
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
@@ -91,12 +92,14 @@ def train(options: Annotated[TrainOptions, tyro.conf.arg(name="")]) -> int:
 
 def run(options: TrainOptions) -> Any:
     """Read the data, train, and write what ``evaluate`` needs to make a record."""
+    start = time.monotonic()
     from qs3.datasets import load_clouds, load_unlabelled
     from qs3.datasets.clouds import digests
     from qs3.datasets.storage import open_folder
-    from qs3.training import fit, parse_duration, thin
+    from qs3.training import Deadline, fit, parse_duration, thin
 
-    seconds_left = None if options.max_time is None else parse_duration(options.max_time)
+    seconds = None if options.max_time is None else parse_duration(options.max_time)
+    deadline = Deadline(seconds, start)  # reading the data counts
     adapts = options.method == "qbst"
     if adapts and options.target is None:
         raise InputError("--method qbst needs --target: a folder or file of unlabelled clouds")
@@ -122,7 +125,7 @@ def run(options: TrainOptions) -> Any:
         options.self_training if adapts else None,
         run_dir=options.out,
         warm_up=options.warm_up,
-        max_seconds=seconds_left,
+        deadline=deadline,
         tensorboard=options.log == "tensorboard",
     )
     data = {
@@ -171,5 +174,5 @@ def _whole(load: Callable[..., Any], num_points: int) -> Any:
     """
     try:
         return load(num_points=None)
-    except InputError:
+    except UnevenSizesError:
         return load(num_points=num_points)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from qs3.errors import InputError
+from qs3.errors import InputError, UnevenSizesError
 
 
 def unit_ball(points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n 3"]:
@@ -113,7 +113,7 @@ def stack(
         raise InputError(f"{where}: no cloud found")
     sizes = {len(cloud) for cloud in clouds}
     if num_points is None and len(sizes) > 1:
-        raise InputError(
+        raise UnevenSizesError(
             f"{where}: clouds have {min(sizes)} to {max(sizes)} points; name one number for all"
         )
     if num_points is not None and sizes != {num_points}:

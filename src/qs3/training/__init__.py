@@ -8,6 +8,7 @@ from qs3.training.config import PRESETS as PRESETS
 from qs3.training.config import SelfTrainingSettings as SelfTrainingSettings
 from qs3.training.config import TrainSettings as TrainSettings
 from qs3.training.config import self_training_preset as self_training_preset
+from qs3.training.deadline import Deadline as Deadline
 from qs3.training.deadline import TimeUpError as TimeUpError
 from qs3.training.deadline import parse_duration as parse_duration
 from qs3.training.fit import FitResult as FitResult

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
@@ -12,6 +12,8 @@ from qs3.errors import InputError
 
 Precision = Literal["32-true", "bf16-mixed", "16-mixed", "64-true"]
 """Number formats that Lightning Fabric offers here."""
+Accelerator = Literal["auto", "cpu", "cuda"]
+"""Where a training can compute."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +50,12 @@ class TrainSettings:
     seed: int = 0
     """Root of all random steps."""
     precision: Precision = "32-true"
-    """Number format; neighbours and edge statistics are always in full precision. A CPU without
-    bf16 units computes bf16-mixed slowly."""
-    accelerator: Literal["auto", "cpu", "cuda", "mps"] = "auto"
-    """Where to compute."""
+    """Number format. bf16-mixed reaches the layers over points, the image network of SimpleView and
+    the heads; edge, group and relation layers and batch statistics run in full precision in all
+    networks. A CPU without bf16 units computes bf16-mixed slowly."""
+    accelerator: Accelerator = "auto"
+    """Where to compute; auto takes GPUs of CUDA where there are any. Apple's GPUs are left out, as
+    networks need float64, which they lack."""
     devices: int = 1
     """GPUs, or CPU processes, of this machine that share each batch. Each normalises its own share
     (batch normalisation), so that results differ a little between numbers of devices."""
@@ -62,6 +66,8 @@ class TrainSettings:
     def __post_init__(self) -> None:
         for name in ("num_points", "epochs", "learning_rate"):
             _check(self, name, getattr(self, name) > 0, "must be above 0")
+        known = get_args(Accelerator)
+        _check(self, "accelerator", self.accelerator in known, f"is none of {', '.join(known)}")
         _check(self, "devices", self.devices > 0, "must be above 0")
         least = 2 * self.devices
         fault = f"must be at least {least}" + (", 2 a device" if self.devices > 1 else "")

@@ -34,11 +34,13 @@ class Deadline:
     The first epoch of a call always runs, so that every call gets on.
 
     Args:
-        seconds: Time for the whole call, from now; None sets no limit.
+        seconds: Time for the whole call; None sets no limit.
+        start: When the call began, by ``time.monotonic()``; now where it is not given.
     """
 
-    def __init__(self, seconds: float | None = None) -> None:
-        self.start, self.seconds, self.longest = time.monotonic(), seconds, 0.0
+    def __init__(self, seconds: float | None = None, start: float | None = None) -> None:
+        self.start = time.monotonic() if start is None else start
+        self.seconds, self.longest = seconds, 0.0
 
     def passed(self) -> bool:
         """Whether another epoch as long as the longest so far would end too late."""

@@ -48,12 +48,13 @@ def make_fabric(settings: TrainSettings, rank: int = 0) -> Fabric:
         InputError: where a device is not there.
     """
     count = settings.devices
-    if count > 1 and settings.accelerator == "mps":
-        raise InputError("accelerator 'mps' has one device; set devices to 1")
+    accelerator = settings.accelerator
+    if accelerator == "auto":  # not Lightning's own choice, which may be one without float64
+        accelerator = "cuda" if torch.cuda.is_available() else "cpu"
     strategy = DDPStrategy(cluster_environment=_OneMachine(rank, count)) if count > 1 else "auto"
     try:
         fabric = Fabric(
-            accelerator=settings.accelerator,
+            accelerator=accelerator,
             devices=count,
             strategy=strategy,
             precision=settings.precision,
@@ -180,7 +181,8 @@ def all_devices(settings: TrainSettings, write_job: Callable[[Path], None]) -> I
     Args:
         settings: How many devices, and which.
         write_job: Writes what the other processes need into a folder; called for several devices
-            only.
+            only. Its files are deleted as soon as all have read them, so that a kill leaves no
+            clouds behind.
 
     Raises:
         InputError: where a device is not there.
@@ -192,10 +194,14 @@ def all_devices(settings: TrainSettings, write_job: Callable[[Path], None]) -> I
     with tempfile.TemporaryDirectory(prefix="qs3-") as name:
         folder = Path(name)
         write_job(folder)
+        files = list(folder.iterdir())
         others = [_Other(rank, folder) for rank in range(1, settings.devices)]
         try:
             for other in others:
                 other.wait_until_ready()
+            for file in files:
+                with contextlib.suppress(OSError):  # Windows deletes no file that is mapped
+                    file.unlink()
             with join(settings, 0, folder) as fabric:
                 if fabric.device.type == "cuda":
                     threading.Thread(target=_watch, args=(others,), daemon=True).start()

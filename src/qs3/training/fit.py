@@ -49,7 +49,7 @@ def fit(
     *,
     run_dir: Path,
     warm_up: Path | None = None,
-    max_seconds: float | None = None,
+    deadline: Deadline | None = None,
     tensorboard: bool = False,
     on_epoch: EpochCallback | None = None,
     on_round: RoundCallback | None = None,
@@ -69,7 +69,7 @@ def fit(
             the warm-up's own in ``warm-up/``; and, where clouds were thinned, the choice of points.
         warm_up: Folder of a finished run on the same classes, whose network takes the place of the
             training on the source; for ``qbst`` only.
-        max_seconds: Time for this call; it stops before an epoch that would end later, but never
+        deadline: Time for this call; it stops before an epoch that would end later, but never
             before its first.
         tensorboard: Whether to write event files too, in ``tensorboard/``.
         on_epoch: Called after each epoch.
@@ -100,7 +100,6 @@ def fit(
     if target is not None:
         require_finite(target, "target: ")
     rounds_settings = (self_training or SelfTrainingSettings()) if adapts else None
-    limit = Deadline(max_seconds)
     start = None if warm_up is None else _load_warm_up(Path(warm_up), source, settings)
     run_dir = Path(run_dir)
     job = Job(source, target, settings, rounds_settings, run_dir, start)
@@ -127,7 +126,9 @@ def fit(
         contextlib.closing(history),
         all_devices(settings, partial(write_job, job)) as fabric,
     ):
-        model, epochs, rounds = run_job(job, fabric, Listeners(history, limit, on_epoch, on_round))
+        model, epochs, rounds = run_job(
+            job, fabric, Listeners(history, deadline, on_epoch, on_round)
+        )
     return FitResult(model=model.eval(), history=tuple(epochs), rounds=tuple(rounds))
 
 
