@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -294,10 +295,10 @@ class _Rounds:
         tensors, facts = read_tensors(path)
         try:
             self.pool, self.labels = tensors["pool"].numpy(), tensors["labels"].numpy()
-            self.records = [
-                RoundRecord(**{n: tuple(v) if isinstance(v, list) else v for n, v in r.items()})
-                for r in facts["records"]
-            ]
+            records: list[dict[str, Any]] = facts["records"]
+            for record in records:
+                record |= {n: tuple(v) for n, v in record.items() if isinstance(v, list)}
+            self.records = [RoundRecord(**record) for record in records]
         except (KeyError, TypeError) as error:
             raise InputError(f"{path}: not a state of this version; delete the run") from error
         load_tensors_into(self.latest, without_prefix("latest", tensors), path)
