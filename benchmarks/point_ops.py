@@ -7,8 +7,6 @@ is that of a training step in a process of its own.
 
 import argparse
 import importlib.util
-import platform
-import resource
 import statistics
 import subprocess
 import sys
@@ -18,6 +16,7 @@ from pathlib import Path
 from types import ModuleType
 
 import torch
+from models import peak_memory
 from torch import Tensor, nn
 
 from qs3.models import PointNet2
@@ -51,22 +50,6 @@ def medians(runs: dict[str, Callable[[], object]], repeats: int) -> dict[str, fl
             if repeat:
                 seconds[name].append(time.perf_counter() - start)
     return {name: 1e3 * statistics.median(values) for name, values in seconds.items()}
-
-
-def peak_memory(reset: bool = False) -> int:
-    """High-water mark of the resident set in bytes, or the resident set itself after a reset.
-
-    Linux hands a process the mark of the one that started it, which `getrusage` then tells; the
-    kernel's own table can be set back.
-    """
-    status = Path("/proc/self/status")
-    if status.is_file():
-        if reset:
-            Path("/proc/self/clear_refs").write_text("5")
-        found = next(t for t in status.read_text().splitlines() if t.startswith("VmHWM"))
-        return int(found.split()[1]) * 1024
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if platform.system() == "Darwin" else peak * 1024
 
 
 def main() -> None:

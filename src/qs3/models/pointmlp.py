@@ -326,7 +326,6 @@ class PointMLPElite(PointClassifier):
             raise InputError(f"{', '.join(levels)} need one value for each stage")
         check_whole("embedding", embedding)
         check_number("bottleneck", bottleneck)
-        check_number("dropout", dropout, 0.0, 1.0)
         if int(embedding * bottleneck) < 1:
             raise InputError(f"bottleneck {bottleneck} leaves nothing of {embedding} channels")
         self.neighbours, self.reducers = neighbours, reducers

@@ -231,7 +231,6 @@ class RSCNN(PointClassifier):
         check_choice("ball_order", ball_order, "nearest", "first")
         check_choice("coordinates", coordinates, "absolute", "relative")
         check_whole("embedding", embedding)
-        check_number("dropout", dropout, 0.0, 1.0)
         self.centres, self.radii, self.neighbours = centres, radii, neighbours
         self.channels, self.dropout = channels, dropout
         self.ball_order: Literal["nearest", "first"] = (

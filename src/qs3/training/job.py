@@ -124,8 +124,6 @@ def run_job(
             history=history,
             deadline=tell.deadline,
         )
-        if history is not None:
-            history.rounds(records)
         _save(job.run_dir, model, job, fabric)
     return model, epochs, records
 
