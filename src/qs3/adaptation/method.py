@@ -2,13 +2,19 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from qs3.models import PointClassifier
+from qs3.adaptation.losses import cross_entropy
+from qs3.adaptation.normalisation import DomainNorm, SharedNorm
+from qs3.errors import InputError
+from qs3.models import Features, PointClassifier, feature_widths
+
+Domain = Literal["source", "target"]
+"""Where clouds come from; it decides which batch statistics the network uses."""
 
 
 class Batch(NamedTuple):
@@ -28,14 +34,35 @@ class Method(nn.Module, ABC):
 
     Args:
         model: The network to train.
+        label_smoothing: ε of `qs3.adaptation.losses.cross_entropy` on the source.
+        norm: How the network normalises the two domains; shared statistics by default.
+
+    Raises:
+        InputError: where the method needs local features and the network has none.
     """
 
     uses_target: bool = False
     """Whether `losses` needs a batch of the target."""
+    needs_local: bool = False
+    """Whether the method needs ``Features.local`` of the network."""
 
-    def __init__(self, model: PointClassifier) -> None:
+    def __init__(
+        self,
+        model: PointClassifier,
+        *,
+        label_smoothing: float = 0.0,
+        norm: DomainNorm | None = None,
+    ) -> None:
         super().__init__()
+        if self.needs_local and feature_widths(model).local is None:
+            raise InputError(
+                f"{type(self).__name__} needs features of single points, which "
+                f"{type(model).__name__} does not give; choose dgcnn, pointnet or pointnet2"
+            )
         self.model = model
+        self.label_smoothing = label_smoothing
+        self.norm = SharedNorm(model) if norm is None else norm
+        self.right: Tensor | None = None
 
     @abstractmethod
     def losses(
@@ -62,7 +89,29 @@ class Method(nn.Module, ABC):
         generator: torch.Generator,
     ) -> dict[str, Tensor]:
         """Return `losses`; a distributed wrapper needs the call to pass through here."""
+        self.right = None
         return self.losses(source, target, progress, generator)
+
+    def features(self, points: Float[Tensor, "b n 3"], domain: Domain = "source") -> Features:
+        """Describe clouds of a domain; every pass of the network goes through here or `logits`."""
+        with self.norm.of(domain):
+            return self.model.encode(points)
+
+    def head(self, features: Features, domain: Domain = "source") -> Float[Tensor, "b k"]:
+        """Return the logits of described clouds."""
+        with self.norm.of(domain):
+            return self.model.head(features)
+
+    def logits(
+        self, points: Float[Tensor, "b n 3"], domain: Domain = "source"
+    ) -> Float[Tensor, "b k"]:
+        """Return the logits of clouds of a domain."""
+        return self.head(self.features(points, domain), domain)
+
+    def classification(self, logits: Float[Tensor, "b k"], batch: Batch) -> Float[Tensor, ""]:
+        """Return the cross entropy on labelled clouds, and note how many the network had right."""
+        self.right = (logits.detach().argmax(dim=1) == batch.labels).sum()
+        return cross_entropy(logits, batch.labels, self.label_smoothing)
 
     def parameter_groups(self, learning_rate: float) -> Iterable[dict]:
         """Return the optimiser's parameter groups: by default one with every parameter."""
@@ -71,3 +120,7 @@ class Method(nn.Module, ABC):
     def after_step(self) -> None:
         """Run after each optimiser step; by default nothing."""
         return
+
+    def result(self) -> PointClassifier:
+        """Return the trained network: by default the one that was handed in."""
+        return self.model

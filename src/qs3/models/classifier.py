@@ -2,7 +2,9 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -39,6 +41,36 @@ class PointClassifier(nn.Module, ABC):
     def forward(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b k"]:
         """Return the logits of each cloud."""
         return self.head(self.encode(points))
+
+
+class Widths(NamedTuple):
+    """Channels of a network's `Features`; None for those that it does not give."""
+
+    pooled: int
+    """Of the vector a cloud."""
+    per_point: int | None
+    """Of the last layer before pooling."""
+    local: int | None
+    """Of the earlier layers."""
+
+
+@torch.no_grad()
+def feature_widths(model: PointClassifier) -> Widths:
+    """Return how wide the features of a network are; its mode and statistics stay as they were.
+
+    Example:
+        >>> from qs3.models import create_model
+        >>> feature_widths(create_model("dgcnn", 10))
+        Widths(pooled=2048, per_point=None, local=512)
+    """
+    training = model.training
+    model.eval()
+    try:
+        features = model.encode(torch.zeros(1, 1, 3).to(next(model.parameters())))
+    finally:
+        model.train(training)
+    given = (features.pooled, features.per_point, features.local)
+    return Widths(*(None if part is None else part.shape[-1] for part in given))  # pyright: ignore[reportArgumentType]
 
 
 class ClassifierHead(nn.Module):

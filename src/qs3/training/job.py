@@ -69,7 +69,7 @@ NOBODY = Listeners()
 
 def make_method(model: PointClassifier, settings: TrainSettings) -> Method:
     """Return the method that trains the network on the source."""
-    return SourceOnly(model, settings.label_smoothing)
+    return SourceOnly(model, label_smoothing=settings.label_smoothing)
 
 
 def fresh_model(job: Job) -> PointClassifier:

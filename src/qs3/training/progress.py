@@ -21,8 +21,7 @@ class Progress:
     Losses and accuracy are those of the whole batch, over all devices.
 
     Args:
-        method: Its network is watched: the first answer to as many clouds as there are labels is
-            taken for the answer to the labelled batch.
+        method: Tells how many labelled clouds it had right (`Method.classification`).
         fabric: The devices; only the first one shows a bar.
         total: Steps in all.
         done: Steps of earlier calls.
@@ -32,8 +31,7 @@ class Progress:
     def __init__(
         self, method: Method, fabric: Fabric, total: int, done: int, description: str
     ) -> None:
-        self.fabric, self.labels, self.right = fabric, None, None
-        self.hook = method.model.register_forward_hook(self._answer)
+        self.fabric, self.method, self.labels = fabric, method, None
         self.start, self.clouds = time.perf_counter(), 0
         self.bar = tqdm(
             total=total,
@@ -54,7 +52,6 @@ class Progress:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self.hook.remove()
         self.bar.close()
 
     def begin_epoch(self) -> None:
@@ -66,11 +63,7 @@ class Progress:
 
     def watch(self, batch: Batch) -> None:
         """Note the labels that the network is to find."""
-        self.labels, self.right = batch.labels, None
-
-    def _answer(self, _: torch.nn.Module, __: object, logits: Tensor) -> None:
-        if self.labels is not None and self.right is None and len(logits) == len(self.labels):
-            self.right = (logits.detach().argmax(dim=1) == self.labels).sum()
+        self.labels = batch.labels
 
     def measure(self, losses: dict[str, Tensor], clouds: int) -> float:
         """Sum up one step over all devices, and return its whole loss.
@@ -82,7 +75,8 @@ class Progress:
         assert self.labels is not None  # noqa: S101
         mine = len(self.labels)
         values = [term.detach().float() * mine for term in losses.values()]
-        right = torch.full_like(values[0], torch.nan) if self.right is None else self.right
+        right = self.method.right
+        right = torch.full_like(values[0], torch.nan) if right is None else right
         told = self.fabric.all_reduce(torch.stack([*values, right.to(values[0])]), reduce_op="sum")
         assert isinstance(told, Tensor)  # noqa: S101
         *terms, hits = told.tolist()

@@ -261,7 +261,7 @@ class _Rounds:
             fresh = new_model(self.settings, len(self.source.class_names), seed)
             self.latest.load_state_dict(fresh.state_dict())
         continuous = rounds.schedule == "continuous"
-        method: Method = SourceOnly(self.latest, self.settings.label_smoothing)
+        method: Method = SourceOnly(self.latest, label_smoothing=self.settings.label_smoothing)
         history, optimiser = train(
             method,
             [pseudo, self.source] if rounds.source_loss else pseudo,
