@@ -1,0 +1,124 @@
+"""Normals and curvature of clouds from the covariance of each point's neighbours."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from qs3.errors import InputError
+from qs3.models.ops import gather_points, knn
+
+_BLOCK = 2**22
+"""Neighbour coordinates held at a time."""
+
+
+class Surface(NamedTuple):
+    """Direction and bend of the surface at each point."""
+
+    normals: Float[Tensor, "b n 3"]
+    """Unit normals, pointing away from the mean of the cloud."""
+    curvature: Float[Tensor, "b n"]
+    """Share of the smallest eigenvalue, λ₀ / (λ₀ + λ₁ + λ₂): 0 on a plane, 1/3 at most."""
+
+
+@torch.no_grad()
+def surface(points: Float[Tensor, "b n 3"], neighbours: int = 32) -> Surface:
+    """Estimate normals and curvature by principal component analysis of nearest neighbours.
+
+    The normal is the eigenvector of the smallest eigenvalue λ₀ of the covariance, the curvature
+    its share of the sum, "surface variation" (Pauly et al., VIS 2002).
+
+    Convention:
+        A normal points away from the mean of its cloud. Where neighbours lie on one line, it is a
+        direction across that line and the curvature 0; where they coincide, +z and 0; where all
+        three eigenvalues are equal, +z (or −z) and 1/3.
+
+    Args:
+        points: Clouds, in any unit.
+        neighbours: Points of a neighbourhood, its centre among them; a cloud of fewer points takes
+            all of them.
+
+    Raises:
+        InputError: where there are fewer than 3 neighbours.
+
+    Example:
+        >>> plane = torch.cartesian_prod(torch.arange(4.0), torch.arange(4.0), torch.zeros(1))
+        >>> float(surface(plane[None], 8).curvature.max())
+        0.0
+    """
+    if neighbours < 3:
+        raise InputError(f"neighbours must be at least 3, not {neighbours}; a plane needs three")
+    b, n, _ = points.shape
+    k = min(neighbours, n)
+    with torch.autocast(points.device.type, enabled=False):
+        # Double precision: the smallest eigenvalue of a flat patch is a small difference.
+        exact = points.double()
+        near = knn(points, k)
+        clouds = max(1, _BLOCK // (3 * n * k))
+        rows = max(1, min(n, _BLOCK // (3 * k)))
+        parts = []
+        for first in range(0, b, clouds):
+            cloud = slice(first, first + clouds)
+            for start in range(0, n, rows):
+                around = gather_points(exact[cloud], near[cloud, start : start + rows])
+                around = around - around.mean(dim=2, keepdim=True)
+                parts.append((around.transpose(2, 3) @ around / k).flatten(0, 1))
+        normals, share = smallest_axis(torch.cat(parts))
+        normals = normals.view(b, n, 3)
+        outward = ((exact - exact.mean(dim=1, keepdim=True)) * normals).sum(dim=2, keepdim=True)
+        normals = torch.where(outward < 0, -normals, normals)
+    dtype = torch.promote_types(points.dtype, torch.float32)
+    return Surface(normals.to(dtype), share.view(b, n).to(dtype))
+
+
+def smallest_axis(
+    matrices: Float[Tensor, "r 3 3"],
+) -> tuple[Float[Tensor, "r 3"], Float[Tensor, "r"]]:
+    """Return the unit eigenvector of the smallest eigenvalue and that one's share of the trace.
+
+    Closed form for symmetric matrices without negative eigenvalues (Smith, CACM 1961): as many
+    small problems as there are points are slow for an iterative solver. The eigenvector is the
+    longest product of two rows of A − λ₀ I.
+
+    Example:
+        >>> axis, share = smallest_axis(torch.diag(torch.tensor([2.0, 1.0, 1.0]))[None] * 0.25)
+        >>> round(float(share), 6)
+        0.25
+    """
+    scale = matrices.abs().amax(dim=(1, 2))
+    unit = matrices / scale.where(scale > 0, 1.0)[:, None, None]
+    eye = torch.eye(3, dtype=unit.dtype, device=unit.device)
+    mean = unit.diagonal(dim1=1, dim2=2).mean(dim=1)
+    shifted = unit - mean[:, None, None] * eye
+    spread = (shifted.square().sum(dim=(1, 2)) / 6).sqrt()
+    tiny = 64 * torch.finfo(unit.dtype).eps
+    round_ = spread <= tiny
+    cosine = _determinant(shifted / spread.where(~round_, 1.0)[:, None, None]) / 2
+    angle = cosine.clamp(-1, 1).acos() / 3
+    least = mean + 2 * spread * (angle + 2 * math.pi / 3).cos()
+    rest = unit - least[:, None, None] * eye
+    products = torch.linalg.cross(rest[:, [0, 1, 2]], rest[:, [1, 2, 0]], dim=2)
+    normal, length = _longest(products)
+    # On a line two eigenvalues are 0: anything across it will do.
+    line, _ = _longest(rest)
+    across = torch.linalg.cross(line, eye[line.abs().argmin(dim=1)], dim=1)
+    across = across / across.norm(dim=1, keepdim=True).clamp_min(tiny)
+    normal = torch.where((length <= tiny)[:, None], across, normal)
+    normal = torch.where(round_[:, None], eye[2], normal)
+    share = (least / (3 * mean).where(mean > 0, 1.0)).clamp(0, 1 / 3)
+    return normal, share.where(share > tiny, 0.0)
+
+
+def _longest(rows: Float[Tensor, "r 3 3"]) -> tuple[Float[Tensor, "r 3"], Float[Tensor, "r"]]:
+    """Return the longest of three rows as a unit vector, and its length."""
+    lengths = rows.norm(dim=2)
+    length, which = lengths.max(dim=1)
+    longest = rows.gather(1, which[:, None, None].expand(-1, 1, 3))[:, 0]
+    return longest / length.where(length > 0, 1.0)[:, None], length
+
+
+def _determinant(matrices: Float[Tensor, "r 3 3"]) -> Float[Tensor, "r"]:
+    first, second, third = matrices.unbind(dim=1)
+    return (first * torch.linalg.cross(second, third, dim=1)).sum(dim=1)

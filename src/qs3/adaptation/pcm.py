@@ -1,0 +1,178 @@
+"""Point cloud mixup, PCM (Achituve et al., WACV 2021)."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from qs3.adaptation.losses import cross_entropy
+from qs3.adaptation.method import Batch, Method
+from qs3.adaptation.normalisation import DomainNorm
+from qs3.models import PointClassifier
+from qs3.models.checks import check_number
+from qs3.models.ops import farthest_point_sampling, gather_points
+
+
+class Mixed(NamedTuple):
+    """Clouds made of two."""
+
+    points: Float[Tensor, "b n 3"]
+    """Points of both, in a random order."""
+    labels: Int[Tensor, "b"]
+    """Class of each second cloud; that of the first is the batch's."""
+    share: float
+    """λ: part of the points that come from the first."""
+
+
+def draw_share(concentration: float, generator: torch.Generator) -> float:
+    """Draw λ from Beta(a, a).
+
+    Args:
+        concentration: a; 1 is uniform over 0 to 1.
+        generator: Source of the draw.
+
+    Example:
+        >>> 0.0 <= draw_share(1.0, torch.Generator().manual_seed(0)) <= 1.0
+        True
+    """
+    # PyTorch draws from a Beta distribution only with the global generator.
+    seed = int(torch.randint(2**62, (1,), generator=generator))
+    return float(np.random.default_rng(seed).beta(concentration, concentration))
+
+
+def sample_spread(
+    points: Float[Tensor, "b n 3"], m: int, generator: torch.Generator
+) -> Float[Tensor, "b m 3"]:
+    """Sample m farthest points of each cloud from a random start; none where m is 0."""
+    start = torch.randint(points.shape[1], (len(points),), generator=generator).to(points.device)
+    if m == 0:
+        return points[:, :0]
+    return gather_points(points, farthest_point_sampling(points, m, start))
+
+
+def mix_halves(
+    first: Float[Tensor, "b n 3"],
+    second: Float[Tensor, "b n 3"],
+    share: float,
+    generator: torch.Generator,
+) -> tuple[Float[Tensor, "b n 3"], float]:
+    """Join round(λ n) farthest points of each first cloud and n − round(λ n) of its second.
+
+    Args:
+        first: Clouds.
+        second: Partners, of as many points.
+        share: λ.
+        generator: Source of the draws.
+
+    Returns:
+        The mixed clouds in a random order of points, and the share that rounding left.
+    """
+    n = first.shape[1]
+    m = round(share * n)
+    parts = [sample_spread(first, m, generator), sample_spread(second, n - m, generator)]
+    order = torch.randperm(n, generator=generator).to(first.device)
+    return torch.cat(parts, dim=1)[:, order], m / n
+
+
+def mix_clouds(
+    points: Float[Tensor, "b n 3"],
+    labels: Int[Tensor, "b"],
+    generator: torch.Generator,
+    concentration: float = 1.0,
+) -> Mixed:
+    """Mix each cloud of a batch with one drawn from the same batch.
+
+    λ is drawn once a batch; the partners are a permutation of the batch, which may leave a cloud to
+    itself.
+
+    Args:
+        points: Clouds.
+        labels: Their classes.
+        generator: Source of the draws.
+        concentration: Of the Beta distribution of λ; see `draw_share`.
+
+    Example:
+        >>> clouds, classes = torch.rand(2, 8, 3), torch.tensor([0, 1])
+        >>> mix_clouds(clouds, classes, torch.Generator()).points.shape
+        torch.Size([2, 8, 3])
+    """
+    share = draw_share(concentration, generator)
+    partner = torch.randperm(len(points), generator=generator).to(points.device)
+    mixed, share = mix_halves(points, points[partner], share, generator)
+    return Mixed(mixed, labels[partner], share)
+
+
+def mixed_cross_entropy(
+    logits: Float[Tensor, "b k"],
+    first: Int[Tensor, "b"],
+    second: Int[Tensor, "b"],
+    share: float,
+    label_smoothing: float = 0.0,
+) -> Float[Tensor, ""]:
+    """λ times the cross entropy with the first labels plus 1 − λ times that with the second.
+
+    Example:
+        >>> logits = torch.tensor([[0.0, 1.0]])
+        >>> one, two = torch.tensor([0]), torch.tensor([1])
+        >>> round(float(mixed_cross_entropy(logits, one, two, 0.25)), 4)
+        0.5633
+    """
+    return share * cross_entropy(logits, first, label_smoothing) + (1 - share) * cross_entropy(
+        logits, second, label_smoothing
+    )
+
+
+def mixed_classification(
+    method: Method, batch: Batch, generator: torch.Generator, concentration: float
+) -> Float[Tensor, ""]:
+    """Return PCM's loss on the source, and let the method count what the network had right.
+
+    A mixed cloud counts as right where it is given the class of its larger part.
+    """
+    mixed = mix_clouds(batch.points, batch.labels, generator, concentration)
+    logits = method.logits(mixed.points, "source")
+    larger = batch.labels if mixed.share >= 0.5 else mixed.labels
+    method.classification(logits.detach(), Batch(mixed.points, larger))
+    return mixed_cross_entropy(
+        logits, batch.labels, mixed.labels, mixed.share, method.label_smoothing
+    )
+
+
+class PCM(Method):
+    """Point cloud mixup on the source; the target is not used.
+
+    NOTE: the labels mix as the share of points that rounding leaves, round(λ n) / n, not as λ.
+
+    Args:
+        model: The network to train.
+        concentration: γ of λ ~ Beta(γ, γ); 1 is the paper's.
+        label_smoothing: ε of `qs3.adaptation.losses.cross_entropy`.
+        norm: How the network normalises the two domains.
+
+    Raises:
+        InputError: where ``concentration`` is not larger than 0.
+    """
+
+    def __init__(
+        self,
+        model: PointClassifier,
+        *,
+        concentration: float = 1.0,
+        label_smoothing: float = 0.0,
+        norm: DomainNorm | None = None,
+    ) -> None:
+        super().__init__(model, label_smoothing=label_smoothing, norm=norm)
+        check_number("concentration", concentration)
+        self.concentration = concentration
+
+    def losses(
+        self,
+        source: Batch,
+        target: Float[Tensor, "b_t n_t 3"] | None,
+        progress: float,
+        generator: torch.Generator,
+    ) -> dict[str, Tensor]:
+        """Return the cross entropy of mixed source clouds."""
+        return {"pcm": mixed_classification(self, source, generator, self.concentration)}
