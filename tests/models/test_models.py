@@ -26,6 +26,14 @@ SMALL = {
     "pointnet": {"channels": (8, 8, 16), "hidden": (16, 8)},
     "pointnet of each point": {"channels": (8, 8, 16), "hidden": (16, 8), "per_point": True},
     "pointnet without T-Nets": {"channels": (8, 8, 16), "hidden": (16, 8), "transforms": False},
+    "pointnet-sa": {
+        "channels": (8, 8, 16, 16),
+        "transform_hidden": (16, 8),
+        "nodes": 12,
+        "neighbours": 6,
+        "radius": 0.9,
+        "node_width": 8,
+    },
     "pointnet2": {
         "centres": (12, 5),
         "scales": (((0.9, 6, (8, 8, 16)),), ((1.4, 4, (16, 16)),)),

@@ -6,6 +6,7 @@ from qs3.models.classifier import feature_widths as feature_widths
 from qs3.models.dgcnn import DGCNN as DGCNN
 from qs3.models.factory import create_model as create_model
 from qs3.models.factory import list_models as list_models
+from qs3.models.pointdan_net import PointNetSA as PointNetSA
 from qs3.models.pointmlp import PointMLPElite as PointMLPElite
 from qs3.models.pointnet import PointNet as PointNet
 from qs3.models.pointnet2 import PointNet2 as PointNet2

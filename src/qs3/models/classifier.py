@@ -21,6 +21,8 @@ class Features:
     """One vector a point from the last layer before pooling; None where a network has none."""
     local: Float[Tensor, "b n e"] | None = None
     """One vector a point from the earlier layers; None where a network has none."""
+    nodes: Float[Tensor, "b m f"] | None = None
+    """One vector for each of a fixed number of regions; None where a network has none."""
 
 
 class PointClassifier(nn.Module, ABC):

@@ -9,6 +9,7 @@ from qs3.errors import InputError
 from qs3.models.checks import check_whole
 from qs3.models.classifier import PointClassifier
 from qs3.models.dgcnn import DGCNN
+from qs3.models.pointdan_net import PointNetSA
 from qs3.models.pointmlp import PointMLPElite
 from qs3.models.pointnet import PointNet
 from qs3.models.pointnet2 import PointNet2
@@ -19,6 +20,7 @@ _MODELS: dict[str, Callable[..., PointClassifier]] = {
     "dgcnn": DGCNN,
     "pointmlp-elite": PointMLPElite,
     "pointnet": PointNet,
+    "pointnet-sa": PointNetSA,
     "pointnet2": PointNet2,
     "pointnet2-msg": partial(PointNet2, grouping="msg"),
     "rscnn": RSCNN,

@@ -1,0 +1,121 @@
+"""Self-adaptive nodes: regions that move to where it counts (PointDAN: Qin et al., NeurIPS 2019)."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from qs3.models.checks import check_number, check_whole
+from qs3.models.classifier import PointwiseLayer
+from qs3.models.ops import (
+    ball_query,
+    farthest_point_sampling,
+    gather_points,
+    knn,
+    neighbour_max,
+    three_nn_interpolate,
+)
+
+
+class Nodes(NamedTuple):
+    """Moved nodes of each cloud and what lies around them."""
+
+    positions: Float[Tensor, "b m 3"]
+    """Where the nodes are, in the unit of the points."""
+    features: Float[Tensor, "b m f"]
+    """Maximum of the features around each."""
+
+
+class SANode(nn.Module):
+    """Choose nodes, move each by what it sees in a ball, and describe its new surroundings.
+
+    A node starts at a point x_i with feature f_i, chosen farthest first. Over the points j of its
+    ball it moves by mean_j tanh(W (f_j − f_i)) ∘ (x_j − x_i), and its feature is the maximum of a
+    learnt layer's output over the points nearest to its new place. A cloud of fewer points than
+    nodes has as many nodes as points.
+
+    NOTE: a ball of more points keeps its nearest, where the release keeps its first, and sampling
+    starts at the point farthest from the mean, where the release draws one: so the order of the
+    points does not matter. A ball of fewer is filled with the node's own point, which does
+    not pull.
+
+    Args:
+        channels: Width of the points' features.
+        width: Width of a node's feature.
+        nodes: Nodes of a cloud.
+        neighbours: Points in a ball, and points around a moved node; at most 255.
+        radius: Of the balls, in the unit of the points.
+        steered: Whether a node's feature passes a gradient to its offset: the slope, at the moved
+            node, of the features interpolated between the points; the value stays the maximum. As
+            published there is none, since indices have no gradient: offsets learn only where the
+            nodes are interpolated back to the points.
+
+    Example:
+        >>> nodes = SANode(8, nodes=4)(torch.randn(2, 32, 3), torch.randn(2, 32, 8))
+        >>> nodes.positions.shape, nodes.features.shape
+        (torch.Size([2, 4, 3]), torch.Size([2, 4, 64]))
+    """
+
+    def __init__(
+        self,
+        channels: int,
+        width: int = 64,
+        nodes: int = 64,
+        neighbours: int = 64,
+        radius: float = 0.3,
+        steered: bool = False,
+    ) -> None:
+        super().__init__()
+        check_whole("node_width", width)
+        check_whole("nodes", nodes)
+        check_whole("neighbours", neighbours, 1, 255)
+        check_number("radius", radius)
+        self.nodes, self.neighbours, self.radius = nodes, neighbours, radius
+        self.steered = steered
+        self.offset = nn.Linear(channels, 3, bias=False)
+        self.residual = PointwiseLayer(channels, width, 0.0)
+
+    def forward(self, points: Float[Tensor, "b n 3"], local: Float[Tensor, "b n c"]) -> Nodes:
+        """Return the moved nodes.
+
+        Args:
+            points: The clouds.
+            local: Features of their points.
+        """
+        # Positions and neighbours in single precision, as everywhere in this package.
+        with torch.autocast(points.device.type, enabled=False):
+            dtype = self.offset.weight.dtype
+            points, local = points.to(dtype), local.to(dtype)
+            k = min(self.neighbours, points.shape[1])
+            positions = self.place(points, local)
+            residual = self.residual(local)
+            features = neighbour_max(residual, knn(points, k, positions.detach()))
+            if self.steered:
+                slope = three_nn_interpolate(positions, points, residual.detach())
+                features = features + (slope - slope.detach())
+        return Nodes(positions, features)
+
+    def place(
+        self, points: Float[Tensor, "b n 3"], local: Float[Tensor, "b n c"]
+    ) -> Float[Tensor, "b m 3"]:
+        """Return where the nodes move."""
+        n = points.shape[1]
+        chosen = farthest_point_sampling(points, min(self.nodes, n))
+        start = gather_points(points, chosen)
+        ball = ball_query(points, start, self.radius, min(self.neighbours, n))
+        # W is linear: it is applied to the points, not to the pairs.
+        seen = self.offset(local)
+        pull = torch.tanh(gather_points(seen, ball) - gather_points(seen, chosen)[:, :, None])
+        return start + (pull * (gather_points(points, ball) - start[:, :, None])).mean(dim=2)
+
+
+def fill_nodes(features: Float[Tensor, "b m f"], nodes: int) -> Float[Tensor, "b nodes f"]:
+    """Repeat the nodes of small clouds, in order, until there are ``nodes`` of them.
+
+    Example:
+        >>> fill_nodes(torch.tensor([[[1.0], [2.0]]]), 5).flatten().tolist()
+        [1.0, 2.0, 1.0, 2.0, 1.0]
+    """
+    m = features.shape[1]
+    return features if m == nodes else features[:, torch.arange(nodes, device=features.device) % m]
