@@ -24,6 +24,7 @@ _START, _END = "<!-- sizes: docs/make_models_table.py -->", "<!-- end of sizes -
 # Name: parameters in millions, multiply-adds in millions, where they stand.
 PUBLISHED = {
     "pointnet": ("3.5", "440", "PointNet, Table 6"),
+    "pointnet-sa": ("–", "–", ""),
     "pointnet2": ("1.48", "1,684", "RS-CNN, Table 6"),
     "pointnet2-msg": ("–", "–", ""),
     "dgcnn": ("–", "–", ""),
@@ -43,8 +44,9 @@ def multiply_adds(model: nn.Module) -> float:
 
 def reference(name: str) -> ModuleType:
     """The textbook form of a network, by the name `create_model` takes."""
-    stem = name.split("-")[0]
+    stem = name.replace("-", "_")
     path = _ROOT / "benchmarks" / "reference" / f"{stem}.py"
+    path = path if path.is_file() else path.with_stem(name.split("-")[0])
     spec = importlib.util.spec_from_file_location(f"reference_{stem}", path)
     assert spec is not None and spec.loader is not None  # noqa: S101
     module = importlib.util.module_from_spec(spec)

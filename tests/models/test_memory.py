@@ -15,6 +15,7 @@ SHARES = {
     "dgcnn": 0.25,
     "pointmlp-elite": 0.5,
     "pointnet": 1.0,
+    "pointnet-sa": 0.5,
     "pointnet2": 0.6,
     "pointnet2-msg": 0.6,
     "rscnn": 0.6,

@@ -1,4 +1,4 @@
-"""Self-adaptive nodes: regions that move to where it counts (PointDAN: Qin et al., NeurIPS 2019)."""
+"""Self-adaptive nodes: regions that move where it counts (PointDAN: Qin et al., NeurIPS 2019)."""
 
 from typing import NamedTuple
 
