@@ -12,7 +12,7 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import minimize
-from scipy.special import expit, logsumexp, xlogy
+from scipy.special import expit, xlogy
 
 from qs3.adaptation.clusters import adjusted_mutual_information, k_means
 from qs3.adaptation.pseudo_labels import check_probabilities
@@ -122,11 +122,16 @@ def snd(features: Float[np.ndarray, "m c"], temperature: float = 0.05) -> float:
     rows = np.divide(rows, length, out=np.zeros_like(rows), where=length > 0)
     total, step = 0.0, max(1, _BLOCK // m)
     for start in range(0, m, step):
-        similar = rows[start : start + step] @ rows.T / temperature
+        similar = rows[start : start + step] @ rows.T
         own = np.arange(len(similar))
         similar[own, start + own] = -np.inf
-        share = np.exp(similar - logsumexp(similar, axis=1, keepdims=True))
-        total -= float(xlogy(share, share).sum())
+        similar -= similar.max(axis=1, keepdims=True)
+        similar /= temperature
+        share = np.exp(similar)
+        similar[own, start + own] = 0.0
+        whole = share.sum(axis=1)
+        # The entropy of exp(l) / Z is ln Z minus the mean of l.
+        total += float((np.log(whole) - np.einsum("ij,ij->i", share, similar) / whole).sum())
     return total / m
 
 
