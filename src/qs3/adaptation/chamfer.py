@@ -6,6 +6,11 @@ from torch import Tensor
 
 from qs3.models.ops import gather_points
 
+_BLOCK = 2**18
+"""Distances held at a time on a CPU: they fit its cache."""
+_CUDA_BLOCK = 2**26
+"""The same on a GPU."""
+
 
 def chamfer(
     x: Float[Tensor, "b n 3"],
@@ -73,7 +78,7 @@ def _nearest(
     m = points.shape[1]
     nearest = torch.zeros((b, n), dtype=torch.int64, device=queries.device)
     columns = points.transpose(1, 2).contiguous()
-    budget = 2**26 if queries.is_cuda else 2**18
+    budget = _CUDA_BLOCK if queries.is_cuda else _BLOCK
     clouds = max(1, budget // (n * m))
     rows = n if clouds > 1 else max(1, min(n, budget // m))
     for first in range(0, b, clouds):

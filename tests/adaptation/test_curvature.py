@@ -1,0 +1,127 @@
+"""Normals and curvature where they are known, and against a loop."""
+
+import numpy as np
+import pytest
+import torch
+
+from qs3.adaptation import curvature as module
+from qs3.adaptation.curvature import smallest_axis, surface
+from qs3.errors import InputError
+
+
+def sphere(rng, n, radius=1.0):
+    points = rng.normal(size=(n, 3))
+    return torch.from_numpy(radius * points / np.linalg.norm(points, axis=1, keepdims=True))[None]
+
+
+def turned_plane(rng, n=200):
+    """A square across a random direction, which is returned."""
+    frame = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    flat = np.concatenate([rng.uniform(-1, 1, size=(n, 2)), np.zeros((n, 1))], axis=1)
+    return torch.from_numpy(flat @ frame.T)[None], torch.from_numpy(frame[:, 2])
+
+
+def test_plane(rng):
+    plane, normal = turned_plane(rng)
+    found = surface(plane)
+    assert float(found.curvature.max()) < 1e-14
+    torch.testing.assert_close((found.normals[0] @ normal).abs(), torch.ones(200).double())
+
+
+def test_plane_in_single_precision_far_away(rng):
+    plane, normal = turned_plane(rng)
+    found = surface((plane + 10).float())
+    assert found.normals.dtype == torch.float32
+    assert float(found.curvature.max()) < 1e-10
+    assert float((found.normals[0].double() @ normal).abs().min()) > 1 - 1e-6
+
+
+def test_sphere_has_outward_normals_and_even_curvature(rng):
+    points = sphere(rng, 3000)
+    found = surface(points)
+    cosine = (found.normals * points).sum(dim=2)
+    assert float(cosine.min()) > 0.97
+    # A cap that holds the share s of a sphere, s = 32/3000: z is even over a height of 2 s.
+    height = 2 * 32 / 3000
+    expected = (height**2 / 12) / (height**2 / 12 + height - height**2 / 3)
+    assert float(found.curvature.median()) == pytest.approx(expected, rel=0.25)
+    # Scale does not matter; a smaller share of a sphere is flatter.
+    torch.testing.assert_close(surface(7 * points).curvature, found.curvature)
+    assert float(surface(points, 8).curvature.median()) < 0.5 * expected
+
+
+def test_against_a_loop(rng):
+    points = torch.from_numpy(rng.normal(size=(2, 60, 3)))
+    found = surface(points, 12)
+    for cloud, normals, shares in zip(points.numpy(), *map(torch.Tensor.numpy, found), strict=True):
+        for i, point in enumerate(cloud):
+            near = cloud[np.argsort(((cloud - point) ** 2).sum(axis=1))[:12]]
+            values, vectors = np.linalg.eigh(np.cov(near.T))
+            normal = vectors[:, 0]
+            normal *= np.sign(normal @ (point - cloud.mean(axis=0)))
+            np.testing.assert_allclose(normals[i], normal, atol=1e-8)
+            assert shares[i] == pytest.approx(values[0] / values.sum(), abs=1e-12)
+
+
+def test_closed_form_against_the_iterative_one(rng):
+    factors = rng.normal(size=(500, 3, 3)) * 10.0 ** rng.uniform(-3, 3, size=(500, 1, 3))
+    matrices = factors @ factors.transpose(0, 2, 1)
+    axes, shares = map(torch.Tensor.numpy, smallest_axis(torch.from_numpy(matrices)))
+    values, _ = np.linalg.eigh(matrices)
+    error = np.abs(shares - values[:, 0] / values.sum(axis=1))
+    np.testing.assert_allclose(np.linalg.norm(axes, axis=1), 1)
+    residual = np.einsum("rij,rj->ri", matrices, axes) - values[:, :1] * axes
+    residual = np.linalg.norm(residual, axis=1) / values[:, 2]
+    gap = (values[:, 1] - values[:, 0]) / values[:, 2]
+    apart = gap > 1e-3
+    assert 100 < apart.sum() < 400
+    assert error[apart].max() < 1e-14
+    assert residual[apart].max() < 1e-11
+    # Where the two smallest are all but one, the closed form has half of double's digits for the
+    # share, and for the axis what the gap leaves.
+    assert error.max() < np.finfo(np.float64).eps ** 0.5
+    assert (residual * gap).max() < 1e-14
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 7])
+def test_few_points(rng, n):
+    found = surface(torch.from_numpy(rng.normal(size=(2, n, 3))))
+    torch.testing.assert_close(found.normals.norm(dim=2), torch.ones(2, n).double())
+    assert torch.isfinite(found.curvature).all()
+    if n <= 3:
+        assert float(found.curvature.max()) < 1e-12
+
+
+def test_line(rng):
+    direction = torch.tensor([1.0, 2.0, -2.0], dtype=torch.float64) / 3
+    line = torch.from_numpy(rng.normal(size=50))[:, None] * direction
+    found = surface(line[None])
+    assert not found.curvature.any()
+    assert float((found.normals @ direction).abs().max()) < 1e-6
+    torch.testing.assert_close(found.normals.norm(dim=2), torch.ones(1, 50).double())
+
+
+def test_all_points_equal():
+    found = surface(torch.full((2, 40, 3), 0.3))
+    assert not found.curvature.any()
+    assert torch.equal(found.normals.abs(), torch.tensor([0.0, 0, 1]).expand(2, 40, 3))
+
+
+def test_all_eigenvalues_equal():
+    corners = torch.cartesian_prod(*3 * [torch.tensor([-1.0, 1.0])])[None]
+    found = surface(corners)
+    torch.testing.assert_close(found.curvature, torch.full((1, 8), 1 / 3))
+    assert torch.equal(found.normals[0, :, 2], corners[0, :, 2])
+
+
+def test_blocks_do_not_change_it(rng, monkeypatch):
+    points = torch.from_numpy(rng.normal(size=(3, 50, 3))).float()
+    whole = surface(points)
+    monkeypatch.setattr(module, "_BLOCK", 3 * 32 * 7)
+    for one, other in zip(surface(points), whole, strict=True):
+        assert torch.equal(one, other)
+
+
+def test_settings_are_checked():
+    with pytest.raises(InputError, match="neighbours must be at least 3, not 2"):
+        surface(torch.zeros(1, 4, 3), 2)
