@@ -1,0 +1,388 @@
+"""The mean teacher, its loss, and the views."""
+
+import copy
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import RegularGridInterpolator
+from scipy.ndimage import uniform_filter
+from scipy.special import log_softmax, softmax
+from torch.nn.modules.batchnorm import _BatchNorm
+
+from qs3.adaptation import Batch, views
+from qs3.adaptation.normalisation import make_norm
+from qs3.adaptation.self_distillation import SelfDistillation, distillation_loss, ramp
+from qs3.errors import InputError
+from qs3.models import create_model
+
+ALL = {
+    "jitter": views.jitter,
+    "rescale": views.rescale,
+    "tilt": views.tilt,
+    "occlude": views.occlude,
+    "elastic": views.elastic,
+}
+
+
+def draws(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def ball(b=3, n=50, seed=5):
+    points = torch.randn(b, n, 3, generator=draws(seed))
+    return points / points.norm(dim=2, keepdim=True).amax(dim=1, keepdim=True)
+
+
+def make_model(name="pointnet"):
+    torch.manual_seed(0)
+    if name == "pointnet":
+        return create_model("pointnet", 3, channels=(8, 8, 16), hidden=(8,))
+    return create_model("dgcnn", 3, neighbours=4, channels=(8, 8), embedding=16, hidden=(8,))
+
+
+def make_method(name="pointnet", norm="shared", **settings):
+    model = make_model(name)
+    return SelfDistillation(model, norm=make_norm(norm, model), **settings)
+
+
+def batch(b=4, n=30):
+    return Batch(ball(b, n), torch.arange(b) % 3)
+
+
+def step(method, optimiser, seed, target=None):
+    target = ball(3, 20, 9) if target is None else target
+    losses = method(batch(), target, 0.5, draws(seed))
+    optimiser.zero_grad()
+    torch.stack(list(losses.values())).sum().backward()
+    optimiser.step()
+    method.after_step()
+
+
+def adam(method):
+    return torch.optim.Adam(method.parameter_groups(0.05))
+
+
+def state(method):
+    """Student's network and normalisation, by the teacher's names.
+
+    Without TransNorm's scales, which follow from the running statistics at every pass.
+    """
+    found = {f"teacher.{name}": t for name, t in method.model.state_dict().items()}
+    found |= {f"teacher_norm.{name}": t for name, t in method.norm.state_dict().items()}
+    return {name: t.detach().clone() for name, t in found.items() if not name.endswith(".scale")}
+
+
+def teacher_state(method):
+    found = {name: t for name, t in method.state_dict().items() if name.startswith("teacher")}
+    return {name: t for name, t in found.items() if not name.endswith(".scale")}
+
+
+def test_loss_is_the_cross_entropy_of_softmaxes():
+    rng = np.random.default_rng(0)
+    student, teacher = rng.normal(size=(5, 7)), rng.normal(size=(5, 7))
+    expected = -(softmax(teacher / 0.1, axis=1) * log_softmax(student / 0.5, axis=1)).sum(1).mean()
+    value = distillation_loss(*map(torch.from_numpy, (student, teacher)))
+    assert float(value) == pytest.approx(expected, rel=1e-6)
+
+
+def test_loss_is_least_where_the_student_agrees():
+    teacher = torch.randn(5, 7, generator=draws())
+    agreeing = (5 * teacher).requires_grad_()  # τ_s / τ_t = 5
+    (slope,) = torch.autograd.grad(distillation_loss(agreeing, teacher), agreeing)
+    assert slope.abs().max() < 1e-6
+    assert distillation_loss(agreeing, teacher) < distillation_loss(teacher, teacher)
+
+
+def test_no_gradient_goes_to_the_goal():
+    student, teacher = (torch.randn(2, 3, requires_grad=True) for _ in range(2))
+    distillation_loss(student, teacher).backward()
+    assert teacher.grad is None
+
+
+def test_weight_grows():
+    assert [ramp(t) for t in (0.0, 0.5, 1.0)] == pytest.approx([math.exp(-5), math.exp(-1.25), 1.0])
+
+
+@pytest.mark.parametrize("norm", ["shared", "separate", "transnorm"])
+def test_teacher_begins_as_the_plain_mean_of_the_student(norm):
+    """With t ↦ 1 − 1/(t + 1) it is the mean of all states so far, the first one included."""
+    method = make_method(norm=norm)
+    optimiser = adam(method)
+    seen = [state(method)]
+    for number in range(4):
+        step(method, optimiser, number)
+        seen.append(state(method))
+        for name, tensor in teacher_state(method).items():
+            if tensor.is_floating_point():
+                expected = torch.stack([s[name] for s in seen]).mean(dim=0)
+                assert torch.allclose(tensor, expected, rtol=1e-5, atol=1e-6), name
+            else:
+                assert torch.equal(tensor, seen[-1][name]), name
+    changed = [name for name in seen[0] if not torch.equal(seen[0][name], seen[-1][name])]
+    assert any("running_mean" in name for name in changed)
+    assert any("weight" in name for name in changed)
+
+
+def test_teacher_is_the_moving_average_later():
+    method = make_method(decay=0.3)
+    optimiser = adam(method)
+    expected = state(method)
+    for number in range(3):
+        step(method, optimiser, number)
+        for name, tensor in state(method).items():
+            if tensor.is_floating_point():
+                expected[name] = 0.3 * expected[name] + 0.7 * tensor
+    for name, tensor in teacher_state(method).items():
+        if tensor.is_floating_point():
+            assert torch.allclose(tensor, expected[name], rtol=1e-5, atol=1e-6), name
+
+
+def test_teacher_is_frozen_and_apart():
+    method = make_method()
+    step(method, adam(method), 0)
+    assert not any(p.requires_grad or p.grad is not None for p in method.teacher.parameters())
+    (group,) = method.parameter_groups(0.1)
+    students = {id(p) for p in method.model.parameters()}
+    assert {id(p) for p in group["params"]} == students
+    assert all(p.grad is not None for p in method.model.parameters())
+    assert not students & {id(p) for p in method.teacher.parameters()}
+    assert method.result() is method.model
+
+
+def test_teacher_stands_still_in_a_pass():
+    """Its statistics come from the average alone, also when the method is set to training."""
+    method = make_method().train()
+    before = {name: t.clone() for name, t in teacher_state(method).items()}
+    method(batch(), ball(3, 20, 9), 0.5, draws())
+    after = teacher_state(method)
+    assert all(torch.equal(after[name], before[name]) for name in before)
+    assert any(layer.training for layer in method.model.modules() if isinstance(layer, _BatchNorm))
+
+
+def test_teacher_normalises_the_target_with_its_own_target_statistics():
+    method = make_method(norm="separate")
+    optimiser = adam(method)
+    for number in range(3):
+        step(method, optimiser, number, target=3 + ball(3, 20, number))
+    method.teacher.eval()
+    points = 3 + ball(2, 20, 7)
+    as_source, as_target = (method._describe(points, domain) for domain in ("source", "target"))
+    assert not torch.allclose(as_source, as_target)
+    assert torch.equal(as_source, method.teacher.encode(points).pooled)
+    # It is the teacher's layers that were swapped, and back again.
+    assert torch.equal(as_target, method._describe(points, "target"))
+
+
+@pytest.mark.parametrize("norm", ["shared", "separate", "transnorm"])
+@pytest.mark.parametrize("name", ["pointnet", "dgcnn"])
+def test_resume_is_bit_exact(name, norm):
+    straight = make_method(name, norm)
+    optimiser = adam(straight)
+    torch.manual_seed(1)
+    for number in range(2):
+        step(straight, optimiser, number)
+    weights = {key: t.clone() for key, t in straight.state_dict().items()}
+    moments = copy.deepcopy(optimiser.state_dict())
+    resumed = make_method(name, norm)
+    resumed.load_state_dict(weights)
+    later = adam(resumed)
+    later.load_state_dict(moments)
+    for method, its_optimiser in ((straight, optimiser), (resumed, later)):
+        torch.manual_seed(2)  # dropout
+        step(method, its_optimiser, 2)
+    ours = resumed.state_dict()
+    assert all(torch.equal(tensor, ours[key]) for key, tensor in straight.state_dict().items())
+    assert int(resumed.steps) == 3
+
+
+def test_losses_are_the_parts():
+    """Without draws (no jitter, distortion, scaling, cut) they are plain passes of the network."""
+    still = {"sigma": 0.0, "distortion": 0.0, "scale": (1.0, 1.0), "source_keep": 1.0}
+    method = make_method(weight=2.0, **still).eval()
+    source, target = batch(), ball(3, 20, 9)
+    with torch.no_grad():
+        losses = method(source, target, 0.5, draws())
+        logits = method.model(source.points)
+        described = torch.cat([method.model.encode(p).pooled for p in (source.points, target)])
+    expected = 2.0 * math.exp(-1.25) * distillation_loss(described, described)
+    assert list(losses) == ["source", "distillation"]
+    assert float(losses["source"]) == pytest.approx(
+        float(torch.nn.functional.cross_entropy(logits, source.labels)), rel=1e-6
+    )
+    assert float(losses["distillation"]) == pytest.approx(float(expected), rel=1e-6)
+    assert int(method.right) == int((logits.argmax(dim=1) == source.labels).sum())
+
+
+def test_only_the_generator_is_drawn_from():
+    method = make_method().eval()
+    arguments = (batch(), ball(3, 20, 9), 0.5)
+    before = torch.random.get_rng_state()
+    first = method(*arguments, draws(3))
+    torch.rand(10)
+    again, other = method(*arguments, draws(3)), method(*arguments, draws(4))
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert not torch.equal(first["distillation"], other["distillation"])
+    torch.random.set_rng_state(before)
+    method(*arguments, draws(3))
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+@pytest.mark.parametrize(
+    "target",
+    [ball(2, 3), ball(7, 64), torch.zeros(2, 5, 3), ball(2, 5)[:, [0, 0, 1, 1, 1]]],
+    ids=["few points", "more clouds", "one place", "repeated points"],
+)
+@pytest.mark.parametrize("name", ["pointnet", "dgcnn"])
+def test_awkward_targets(name, target):
+    method = make_method(name, tilt=0.06, target_keep=0.5)
+    losses = method(Batch(ball(2, 6), torch.tensor([0, 1])), target, 0.9, draws())
+    torch.stack(list(losses.values())).sum().backward()
+    assert all(torch.isfinite(p.grad).all() for p in method.model.parameters())
+
+
+def test_distillation_learns():
+    """Trained on it alone, the student's strong views come nearer to the teacher's weak ones."""
+    method = make_method(norm="shared")
+    optimiser = torch.optim.Adam(method.parameter_groups(0.01))
+    target, values = ball(16, 40, 9), []
+    for number in range(30):
+        loss = method(batch(), target, 1.0, draws(number))["distillation"]
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        method.after_step()
+        values.append(float(loss.detach()))
+    assert np.mean(values[-5:]) < 0.9 * np.mean(values[:5])
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"decay": 1.0}, "decay"),
+        ({"weight": -1.0}, "weight"),
+        ({"teacher_temperature": 0.0}, "teacher_temperature"),
+        ({"student_temperature": math.inf}, "student_temperature"),
+        ({"source_keep": 0.0}, "source_keep"),
+        ({"target_keep": 1.1}, "target_keep"),
+        ({"scale": (1.5, 0.7)}, "scale"),
+        ({"sigma": math.nan}, "sigma"),
+        ({"tilt": -0.1}, "tilt"),
+        ({"distortion": -0.1}, "distortion"),
+    ],
+)
+def test_settings_are_checked(settings, message):
+    with pytest.raises(InputError, match=message):
+        make_method(**settings)
+
+
+@pytest.mark.parametrize("name", list(ALL))
+@pytest.mark.parametrize("shape", [(1, 1), (2, 7), (5, 64)])
+def test_views_keep_the_number_of_points_and_draw_from_the_generator_only(name, shape):
+    view, points = ALL[name], ball(*shape)
+    kept, before = points.clone(), torch.random.get_rng_state()
+    first = view(points, draws(1))
+    torch.rand(3)
+    assert first.shape == points.shape
+    assert first.dtype == points.dtype
+    assert torch.isfinite(first).all()
+    assert torch.equal(first, view(points, draws(1)))
+    assert torch.equal(points, kept)
+    if shape == (5, 64):
+        assert not torch.equal(first, view(points, draws(2)))
+        assert not torch.equal(first[0] - points[0], first[1] - points[1])
+    torch.random.set_rng_state(before)
+    view(points, draws(1))
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+def test_jitter_has_its_deviation_and_clip():
+    noise = views.jitter(torch.zeros(4, 5000, 3), draws(), 0.02, 0.05)
+    assert float(noise.std()) == pytest.approx(0.02, rel=0.03)
+    assert float(noise.abs().max()) == pytest.approx(0.05)
+
+
+def test_rescale_is_one_factor_a_cloud_in_its_bounds():
+    points = ball(200, 2)
+    factor = views.rescale(points, draws()) / points
+    assert torch.allclose(factor, factor[:, :1, :1].expand_as(factor), rtol=1e-4)
+    assert 0.7 <= float(factor.min()) < 0.72
+    assert 1.48 < float(factor.max()) <= 1.5 + 1e-4
+
+
+def test_tilt_is_a_small_rotation():
+    points = torch.eye(3).expand(50, 3, 3).double()
+    turned = views.tilt(points, draws(), 0.06, 0.18)
+    assert torch.allclose(turned @ turned.transpose(1, 2), points, atol=1e-6)
+    assert torch.allclose(torch.linalg.det(turned), torch.ones(50).double())
+    trace = turned.diagonal(dim1=1, dim2=2).sum(dim=1)
+    angle = torch.arccos(((trace - 1) / 2).clamp(-1, 1))
+    assert 0.01 < float(angle.mean()) < 0.18
+    assert float(angle.max()) <= 3 * 0.18
+    # Rows are images of the axes: with angles about x, y, z in this order, Rz Ry Rx.
+    a, b, c = (0.06 * torch.randn(50, 3, generator=draws())).clamp(-0.18, 0.18)[0]
+    x = torch.tensor([[1, 0, 0], [0, a.cos(), -a.sin()], [0, a.sin(), a.cos()]])
+    y = torch.tensor([[b.cos(), 0, b.sin()], [0, 1, 0], [-b.sin(), 0, b.cos()]])
+    z = torch.tensor([[c.cos(), -c.sin(), 0], [c.sin(), c.cos(), 0], [0, 0, 1]])
+    assert torch.allclose(turned[0].float().T, z @ y @ x, atol=1e-6)
+
+
+@pytest.mark.parametrize("keep", [0.1, 0.5, 0.7, 1.0])
+def test_occlude_keeps_one_side_of_a_plane(keep):
+    points = ball(6, 41)
+    seen = views.occlude(points, draws(), keep)
+    stayed = (seen == points).all(dim=2)
+    for cloud, after, same in zip(points, seen, stayed, strict=True):
+        left = torch.unique(after, dim=0)
+        assert len(left) == math.ceil(keep * 41)
+        assert int(same.sum()) == len(left)
+        inside = (cloud[:, None] == left).all(dim=2).any(dim=1)
+        assert torch.equal(inside, same)  # kept points keep their place
+    direction = torch.randn(6, 3, 1, generator=draws())
+    depth = (points @ direction)[:, :, 0]
+    for along, same in zip(depth, stayed, strict=True):
+        if not same.all():
+            assert along[same].min() > along[~same].max()
+
+
+def test_occlude_refuses_to_keep_nothing():
+    with pytest.raises(InputError, match="keep"):
+        views.occlude(ball(), draws(), 0.0)
+
+
+def test_elastic_moves_neighbours_alike():
+    """Smooth: twice as near, about half the difference; and of the size that its text says."""
+    points = 0.7 * ball(40, 200)
+    near = points + 0.02 * torch.nn.functional.normalize(torch.randn(points.shape), dim=2)
+    moved, beside = (views.elastic(p, draws(), 0.8, 1.6) - p for p in (points, near))
+    deviation = float(moved.square().mean().sqrt())
+    # An average over the cell's eight nodes lies below the nodes' own deviation, 0.11 · 1.6.
+    assert 0.08 < deviation < 0.19
+    assert float((moved - beside).square().mean().sqrt()) < 0.1 * deviation
+    assert torch.equal(views.elastic(points, draws(), 0.2, 0.0), points)
+
+
+def test_elastic_is_trilinear_between_its_nodes():
+    generator = draws(3)
+    noise = torch.randn(1, 3, 7, 7, 7, generator=draws(3)).numpy()
+    for _ in range(2):
+        noise = uniform_filter(noise, (1, 1, 3, 3, 3), mode="constant")
+    axis = 0.5 * np.arange(-3, 4)
+    points = ball(1, 20)
+    moved = (views.elastic(points, generator, 0.5, 2.0) - points)[0].numpy()
+    for coordinate in range(3):
+        # The field is stored [z y x].
+        field = RegularGridInterpolator((axis, axis, axis), noise[0, coordinate])
+        expected = 2.0 * field(points[0].numpy()[:, ::-1])
+        assert moved[:, coordinate] == pytest.approx(expected, abs=1e-5)
+
+
+def test_elastic_refuses_a_grid_too_fine():
+    with pytest.raises(InputError, match="grain"):
+        views.elastic(ball(), draws(), 0.01)
+
+
+@pytest.mark.parametrize("name", list(ALL))
+def test_views_far_from_the_origin_stay_finite(name):
+    assert torch.isfinite(ALL[name](1e6 + ball(), draws())).all()
