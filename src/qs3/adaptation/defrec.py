@@ -91,7 +91,7 @@ class Reconstruction(nn.Module):
     def __init__(
         self,
         model: PointClassifier,
-        deformation: Deformation,
+        deformation: str,
         weight: float,
         on_source: bool,
         dropout: float,
@@ -192,7 +192,7 @@ class DefRec(Method):
         self,
         model: PointClassifier,
         *,
-        deformation: Deformation = "voxels",
+        deformation: str = "voxels",
         weight: float = 0.2,
         on_source: bool = False,
         dropout: float = 0.5,

@@ -4,7 +4,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from qs3.adaptation.deformations import Deformation
 from qs3.adaptation.defrec import Reconstruction
 from qs3.adaptation.method import Batch, Method
 from qs3.adaptation.normalisation import DomainNorm
@@ -41,7 +40,7 @@ class DefRecPCM(Method):
         self,
         model: PointClassifier,
         *,
-        deformation: Deformation = "voxels",
+        deformation: str = "voxels",
         weight: float = 0.2,
         on_source: bool = False,
         dropout: float = 0.5,

@@ -1,0 +1,188 @@
+"""DefRec: what is rebuilt, what it costs, and that a network can learn it; alone and with PCM."""
+
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from qs3.adaptation import Batch
+from qs3.adaptation.deformations import deform_features, deform_voxels
+from qs3.adaptation.defrec import DefRec, ReconstructionHead, reconstruction_loss
+from qs3.adaptation.defrec_pcm import DefRecPCM
+from qs3.adaptation.losses import cross_entropy
+from qs3.adaptation.pcm import PCM, mix_clouds, mixed_cross_entropy
+from qs3.errors import InputError
+from qs3.models import Features, create_model
+
+KINDS = ["voxels", "radius", "features", "split", "gradient", "lambertian"]
+both = pytest.mark.parametrize("method_class", [DefRec, DefRecPCM])
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def make_model(name="pointnet"):
+    torch.manual_seed(0)
+    if name == "pointnet":
+        return create_model("pointnet", 3, channels=(8, 8, 16), hidden=(8,))
+    return create_model("dgcnn", 3, neighbours=4, channels=(8, 8), embedding=16, hidden=(8,))
+
+
+def make_batch(b=4, n=60):
+    return Batch(torch.rand(b, n, 3, generator=seeded(1)) * 2 - 1, torch.arange(b) % 3)
+
+
+def make_target(b=3, n=50):
+    return torch.rand(b, n, 3, generator=seeded(2)) * 2 - 1
+
+
+def test_loss_is_twenty_times_chamfer_over_moved_points(rng):
+    predicted, original = (torch.from_numpy(rng.normal(size=(3, 30, 3))) for _ in range(2))
+    moved = torch.from_numpy(rng.random((3, 30)) < 0.3)
+    total = 0.0
+    for p, o, mask in zip(predicted, original, moved, strict=True):
+        p, o = p[mask].numpy(), o[mask].numpy()
+        there, back = cKDTree(o).query(p)[0], cKDTree(p).query(o)[0]
+        total += (there**2).mean() + (back**2).mean()
+    assert float(reconstruction_loss(predicted, original, moved)) == pytest.approx(20 * total / 3)
+
+
+def test_head_is_that_of_joined_features():
+    """One product over the joined features gives what two products and a sum give."""
+    torch.manual_seed(0)
+    head = ReconstructionHead(5, 7, 0.0).eval()
+    features = Features(pooled=torch.randn(2, 7), local=torch.randn(2, 9, 5))
+    moved = torch.rand(2, 9, generator=seeded()) < 0.5
+    found = head(features, moved)
+    assert features.local is not None
+    joined = torch.cat([features.local, features.pooled[:, None].expand(-1, 9, -1)], dim=2)
+    weight = torch.cat([head.local.weight, head.pooled.weight], dim=1)
+    expected = head.layers((joined @ weight.t()).flatten(0, 1)).view(2, 9, 3)
+    torch.testing.assert_close(found, expected * moved[:, :, None], atol=1e-6, rtol=1e-5)
+    assert [layer.out_features for layer in head.modules() if isinstance(layer, torch.nn.Linear)][
+        1:
+    ] == [256, 256, 128, 3]
+
+
+def test_terms_of_defrec():
+    method = DefRec(make_model(), weight=0.3, label_smoothing=0.1).eval()
+    batch, target = make_batch(), make_target()
+    losses = method(batch, target, 0.0, seeded())
+    deformed = deform_voxels(target, seeded())
+    predicted = method.rebuild.head(method.model.encode(deformed.points), deformed.moved)
+    rebuilt = reconstruction_loss(predicted, target, deformed.moved)
+    supervised = cross_entropy(method.model(batch.points), batch.labels, 0.1)
+    expected = {"source": 0.7 * supervised, "defrec_target": 0.3 * rebuilt}
+    torch.testing.assert_close(losses, expected)
+
+
+def test_defrec_pcm_is_the_sum_of_the_two():
+    method = DefRecPCM(make_model(), weight=0.3, concentration=2.0).eval()
+    batch, target = make_batch(), make_target()
+    losses = method(batch, target, 0.0, seeded())
+    generator = seeded()
+    mixed = mix_clouds(batch.points, batch.labels, generator, 2.0)
+    logits = method.model(mixed.points)
+    supervised = mixed_cross_entropy(logits, batch.labels, mixed.labels, mixed.share)
+    rebuilt = method.rebuild.losses(method, batch.points, target, generator)
+    torch.testing.assert_close(losses, {"pcm": 0.7 * supervised} | rebuilt)
+    alone = PCM(method.model, concentration=2.0).eval()(batch, None, 0.0, seeded())
+    torch.testing.assert_close(losses["pcm"], 0.7 * alone["pcm"])
+
+
+@both
+def test_on_source_adds_a_term(method_class):
+    method = method_class(make_model(), on_source=True)
+    names = set(method(make_batch(), make_target(), 0.0, seeded()))
+    assert names - {"source", "pcm"} == {"defrec_source", "defrec_target"}
+    assert method_class.uses_target and method_class.needs_local
+
+
+@both
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("sizes", [(4, 60, 3, 50), (2, 3, 4, 2), (2, 70, 2, 20)])
+def test_every_deformation_trains_every_parameter(method_class, kind, sizes):
+    b, n, b_t, n_t = sizes
+    method = method_class(make_model("dgcnn"), deformation=kind, on_source=True)
+    batch, target = make_batch(b, n), make_target(b_t, n_t)
+    if n_t == 20:
+        target[:] = 0.25
+        batch.points[:] = -0.5
+    sum(method(batch, target, 0.0, seeded()).values()).backward()
+    for parameter in method.parameters():
+        assert parameter.grad is not None
+        assert torch.isfinite(parameter.grad).all()
+
+
+@both
+def test_the_generator_alone_decides(method_class):
+    method = method_class(make_model(), dropout=0.0).eval()
+    batch, target = make_batch(), make_target()
+    first, again, other = (method(batch, target, 0.0, seeded(s)) for s in (1, 1, 2))
+    torch.testing.assert_close(first, again, rtol=0, atol=0)
+    assert first["defrec_target"] != other["defrec_target"]
+
+
+def test_only_the_deformed_cloud_enters_the_network(monkeypatch):
+    """The original of a moved part is a goal, never an input, and passes as a target's cloud."""
+    method = DefRec(make_model())
+    seen = []
+    real = method.features
+
+    def spy(points, domain="source"):
+        seen.append((points.clone(), domain))
+        return real(points, domain)
+
+    monkeypatch.setattr(method, "features", spy)
+    target = make_target()
+    method(make_batch(), target, 0.0, seeded())
+    (_, source_domain), (points, domain) = seen
+    assert (source_domain, domain) == ("source", "target")
+    deformed = deform_voxels(target, seeded())
+    assert torch.equal(points, deformed.points)
+    assert not (points == target).all(dim=2)[deformed.moved].any()
+
+
+def test_looking_for_features_leaves_no_trace():
+    method = DefRec(make_model(), deformation="features")
+    target = make_target()
+    before = {k: v.clone() for k, v in method.state_dict().items()}
+    deformed = method.rebuild.deform(method, target, "target", seeded())
+    assert method.model.training
+    assert all(torch.equal(v, before[k]) for k, v in method.state_dict().items())
+    assert not deformed.points.requires_grad
+    local = method.model.eval().encode(target).local
+    assert local is not None
+    expected = deform_features(target, local.detach(), seeded())
+    assert torch.equal(deformed.moved, expected.moved)
+    method.rebuild.deform(method, target, "target", seeded())
+    assert not method.model.training
+
+
+def test_it_learns_to_rebuild():
+    """The error on one batch falls far below that of leaving the points where they are."""
+    method = DefRec(make_model(), weight=1.0, dropout=0.0)
+    batch = make_batch(2)
+    grid = torch.cartesian_prod(*3 * [torch.linspace(-0.8, 0.8, 4)])
+    target = torch.stack([grid, grid * torch.tensor([1.0, 0.6, 0.3])])
+    deformed = deform_voxels(target, seeded())
+    nothing = float(reconstruction_loss(deformed.points, target, deformed.moved))
+    optimiser = torch.optim.Adam(method.parameters(), lr=0.01)
+    value = torch.zeros(())
+    for _ in range(60):
+        value = method(batch, target, 0.0, seeded())["defrec_target"]
+        optimiser.zero_grad()
+        value.backward()
+        optimiser.step()
+    assert float(value.detach()) < 0.2 * nothing
+
+
+def test_settings_are_checked():
+    with pytest.raises(InputError, match="unknown deformation 'volume'; choose one of voxels, rad"):
+        DefRec(make_model(), deformation="volume")
+    with pytest.raises(InputError, match="weight must be a number, 0 to 1, not 2"):
+        DefRecPCM(make_model(), weight=2.0)
+    with pytest.raises(InputError, match="concentration"):
+        DefRecPCM(make_model(), concentration=-1.0)
+    with pytest.raises(InputError, match="DefRec needs features of single points"):
+        DefRec(create_model("simpleview", 3))

@@ -1,0 +1,274 @@
+"""GAST: two turns with two label arrays, distorted cells, curvature weights."""
+
+import numpy as np
+import pytest
+import torch
+
+from qs3.adaptation import Batch, gast
+from qs3.adaptation.curvature import surface
+from qs3.adaptation.deformations import cell_centres, cells
+from qs3.adaptation.gast import (
+    GAST,
+    MixedRotation,
+    location_loss,
+    location_weights,
+    mix_rotations,
+    rotation_loss,
+    turn,
+)
+from qs3.adaptation.losses import cross_entropy
+from qs3.errors import InputError
+from qs3.models import create_model
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def make_model():
+    torch.manual_seed(0)
+    return create_model("pointnet", 3, channels=(8, 8, 16), hidden=(8,))
+
+
+def make_batch(b=4, n=80):
+    return Batch(torch.rand(b, n, 3, generator=seeded(1)) * 2 - 1, torch.arange(b) % 3)
+
+
+def make_target(b=3, n=60):
+    return torch.rand(b, n, 3, generator=seeded(2)) * 2 - 1
+
+
+def rotation(axis, quarters):
+    """Rotation matrix by Rodrigues' formula."""
+    k = np.zeros((3, 3))
+    i, j = {"x": (1, 2), "y": (2, 0)}[axis]
+    k[j, i], k[i, j] = 1, -1
+    angle = quarters * np.pi / 2
+    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+
+
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_convention_turns_are_right_handed(axis):
+    points = make_target(4).double()
+    turned = turn(points, torch.arange(4), axis)
+    for quarters in range(4):
+        expected = points[quarters].numpy() @ rotation(axis, quarters).T
+        np.testing.assert_allclose(turned[quarters], expected, atol=1e-15)
+
+
+def test_turns_are_exact():
+    points = make_target(4)
+    once = torch.ones(4, dtype=torch.int64)
+    four_times = points
+    for _ in range(4):
+        four_times = turn(four_times, once, "y")
+    assert torch.equal(four_times, points)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_labels_are_the_turns_of_the_points(seed):
+    """Each label turns the original into that copy, of which its share of the points is there."""
+    points = make_target(6, 40)
+    mixed = mix_rotations(points, seeded(seed))
+    assert mixed.points.shape == points.shape
+    for cloud, out, x, y in zip(points, mixed.points, mixed.about_x, mixed.about_y, strict=True):
+        first, second = (
+            {tuple(row) for row in turn(cloud[None], quarters[None], axis)[0].tolist()}
+            for quarters, axis in ((x, "x"), (y, "y"))
+        )
+        rows = [tuple(row) for row in out.tolist()]
+        assert set(rows) <= first | second
+        if first != second:
+            assert sum(row in first for row in rows) == round(mixed.share * 40)
+
+
+def test_both_label_arrays_are_drawn_apart():
+    """The released code fills one array twice, so that both heads are taught the turn about y."""
+    mixed = mix_rotations(make_target(4000, 1), seeded())
+    pairs = np.zeros((4, 4))
+    np.add.at(pairs, (mixed.about_x.numpy(), mixed.about_y.numpy()), 1)
+    assert np.abs(pairs - 250).max() < 5 * 250**0.5
+    assert mixed.about_x.data_ptr() != mixed.about_y.data_ptr()
+
+
+def test_heads_are_taught_their_own_labels(monkeypatch):
+    taught = []
+    real = gast.cross_entropy
+    monkeypatch.setattr(
+        gast, "cross_entropy", lambda logits, labels: taught.append(labels) or real(logits, labels)
+    )
+    mixes = []
+    make = gast.mix_rotations
+    monkeypatch.setattr(gast, "mix_rotations", lambda *args: mixes.append(make(*args)) or mixes[-1])
+    method = GAST(make_model(), location=False, on_source=False)
+    method(make_batch(), make_target(12), 0.0, seeded())
+    (mixed,) = mixes
+    assert not torch.equal(mixed.about_x, mixed.about_y)
+    assert torch.equal(taught[0], mixed.about_x)
+    assert torch.equal(taught[1], mixed.about_y)
+
+
+def test_heads_learn_different_things():
+    """Trained alone on fixed clouds, each head names the turn of its own copy, not the other's."""
+    points = make_target(48, 24)
+    mixed = mix_rotations(points, seeded(), concentration=1e4)
+    assert mixed.share == 0.5
+    torch.manual_seed(0)
+    heads = [torch.nn.Linear(72, 4) for _ in range(2)]
+    features = mixed.points.flatten(1)
+    optimiser = torch.optim.Adam([p for head in heads for p in head.parameters()], lr=0.05)
+    for _ in range(150):
+        loss = rotation_loss(heads[0](features), heads[1](features), mixed)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    by_x, by_y = (head(features).argmax(dim=1) for head in heads)
+
+    def agreement(a, b):
+        return float((a == b).float().mean())
+
+    assert agreement(by_x, mixed.about_x) > 0.95 and agreement(by_y, mixed.about_y) > 0.95
+    assert agreement(by_x, mixed.about_y) < 0.5 and agreement(by_y, mixed.about_x) < 0.5
+
+
+def test_rotation_loss_weighs_the_heads_by_the_share():
+    x, y = (torch.randn(5, 4, generator=seeded(s)) for s in (1, 2))
+    mixed = MixedRotation(
+        torch.zeros(5, 1, 3), torch.tensor([0, 1, 2, 3, 0]), torch.tensor([3, 3, 1, 0, 2]), 0.3
+    )
+    log_x, log_y = x.log_softmax(dim=1), y.log_softmax(dim=1)
+    parts = [-0.3 * log_x[i, mixed.about_x[i]] - 0.7 * log_y[i, mixed.about_y[i]] for i in range(5)]
+    torch.testing.assert_close(rotation_loss(x, y, mixed), torch.stack(parts).mean())
+
+
+def test_weights_are_shares_of_curvature(rng):
+    curvature = torch.from_numpy(rng.random((4, 30)))
+    moved = torch.from_numpy(rng.random((4, 30)) < 0.3)
+    shares = np.array(
+        [c[m].sum() / c.sum() for c, m in zip(curvature.numpy(), moved.numpy(), strict=True)]
+    )
+    weights = location_weights(curvature, moved)
+    np.testing.assert_allclose(weights, shares / shares.mean())
+    assert float(weights.mean()) == pytest.approx(1)
+
+
+def test_weights_without_curvature():
+    moved = torch.tensor([[True, True, False, False], [True, False, False, False]])
+    torch.testing.assert_close(
+        location_weights(torch.zeros(2, 4), moved), torch.tensor([4 / 3, 2 / 3])
+    )
+    # Curved, but nowhere where it is distorted: all weigh the same.
+    assert location_weights((~moved).float(), moved).tolist() == [1.0, 1.0]
+
+
+def test_a_corner_weighs_more_than_a_plane():
+    """Of a box without a lid, the corner's cell is curved and the middle of a wall is not."""
+    side = torch.linspace(-0.9, 0.9, 24)
+    wall = torch.cartesian_prod(side, side, torch.tensor([-0.9]))
+    box = torch.cat([wall, wall[:, [2, 0, 1]], wall[:, [0, 2, 1]]])[None].expand(2, -1, -1)
+    flat, corner = cells(torch.tensor([[[0.0, 0, -0.9], [-0.9, -0.9, -0.9]]]))[0]
+    moved = cells(box) == torch.stack([flat, corner])[:, None]
+    weights = location_weights(surface(box).curvature, moved)
+    assert float(weights[1]) > 5 * float(weights[0])
+
+
+def test_location_loss_is_a_weighted_mean():
+    logits = torch.randn(3, 27, generator=seeded())
+    located, weights = torch.tensor([4, 0, 26]), torch.tensor([0.5, 2.0, 0.5])
+    each = -logits.log_softmax(dim=1)[torch.arange(3), located]
+    torch.testing.assert_close(location_loss(logits, located), each.mean())
+    torch.testing.assert_close(location_loss(logits, located, weights), (weights * each).sum() / 3)
+
+
+def test_the_located_cell_is_the_distorted_one(monkeypatch):
+    method = GAST(make_model(), rotation=False, on_source=False, curvature=False)
+    seen, told = [], []
+    features, loss = method.features, gast.location_loss
+
+    def spy(points, domain="source"):
+        if domain == "target":
+            seen.append(points)
+        return features(points, domain)
+
+    monkeypatch.setattr(method, "features", spy)
+    monkeypatch.setattr(gast, "location_loss", lambda *args: told.append(args[1]) or loss(*args))
+    target = make_target(20, 400)
+    method(make_batch(), target, 0.0, seeded())
+    moved = (seen[0] != target).any(dim=2)
+    for cloud, out, mask, label in zip(target, seen[0], moved, told[0], strict=True):
+        assert torch.equal(mask, cells(cloud[None])[0] == label)
+        assert float((out[mask] - cell_centres()[label]).norm(dim=1).max()) < 0.2
+        assert int(mask.sum()) >= 20 or int(mask.sum()) == int(
+            torch.bincount(cells(cloud[None])[0]).max()
+        )
+    assert len(set(told[0].tolist())) > 5
+
+
+def test_terms_and_weights():
+    settings = {"classification_weight": 0.9, "location_weight": 0.7, "rotation_weight": 0.4}
+    method = GAST(make_model(), label_smoothing=0.1, **settings).eval()
+    halved = GAST(make_model(), **{k: v / 2 for k, v in settings.items()}, label_smoothing=0.1)
+    halved.load_state_dict(method.state_dict())
+    batch, target = make_batch(), make_target()
+    losses = method(batch, target, 0.0, seeded())
+    assert list(losses) == ["source"] + [
+        f"{task}_{domain}" for domain in ("source", "target") for task in ("location", "rotation")
+    ]
+    supervised = cross_entropy(method.model(batch.points), batch.labels, 0.1)
+    torch.testing.assert_close(losses["source"], 0.9 * supervised)
+    half = halved.eval()(batch, target, 0.0, seeded())
+    torch.testing.assert_close({k: 2 * v for k, v in half.items()}, losses)
+
+
+@pytest.mark.parametrize(
+    ("settings", "names"),
+    [
+        ({}, {"location_source", "location_target", "rotation_source", "rotation_target"}),
+        ({"rotation": False}, {"location_source", "location_target"}),
+        ({"location": False}, {"rotation_source", "rotation_target"}),
+        ({"on_source": False}, {"location_target", "rotation_target"}),
+    ],
+)
+def test_flags_switch_tasks(settings, names):
+    method = GAST(make_model(), **settings)
+    losses = method(make_batch(), make_target(), 0.0, seeded())
+    assert set(losses) == names | {"source"}
+    sum(losses.values()).backward()
+    assert all(p.grad is not None for p in method.parameters())
+
+
+def test_curvature_changes_the_location_term_alone():
+    with_it, without = (GAST(make_model(), curvature=on).eval() for on in (True, False))
+    without.load_state_dict(with_it.state_dict())
+    batch, target = make_batch(), make_target()
+    first, second = (m(batch, target, 0.0, seeded()) for m in (with_it, without))
+    different = {name for name in first if not torch.equal(first[name], second[name])}
+    assert different == {"location_source", "location_target"}
+
+
+@pytest.mark.parametrize("sizes", [(2, 3, 4, 2), (4, 20, 2, 30), (2, 1, 2, 1)])
+def test_few_equal_and_unequal_clouds(sizes):
+    b, n, b_t, n_t = sizes
+    method = GAST(make_model())
+    batch, target = make_batch(b, n), make_target(b_t, n_t)
+    if n == 20:
+        target[:] = 0.25
+    loss = sum(method(batch, target, 0.0, seeded()).values())
+    assert isinstance(loss, torch.Tensor) and torch.isfinite(loss)
+    loss.backward()
+    assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in method.parameters())
+
+
+def test_the_generator_alone_decides():
+    method = GAST(make_model()).eval()
+    batch, target = make_batch(), make_target()
+    first, again, other = (method(batch, target, 0.0, seeded(s)) for s in (1, 1, 2))
+    torch.testing.assert_close(first, again, rtol=0, atol=0)
+    assert all(first[name] != other[name] for name in first if name != "source")
+
+
+def test_settings_are_checked():
+    with pytest.raises(InputError, match="both off; choose source-only"):
+        GAST(make_model(), rotation=False, location=False)
+    with pytest.raises(InputError, match="rotation_weight must be a number, larger than 0"):
+        GAST(make_model(), rotation_weight=0.0)

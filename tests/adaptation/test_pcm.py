@@ -1,0 +1,145 @@
+"""Point cloud mixup: what is mixed, in which share, and how the labels follow."""
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from qs3.adaptation import Batch, pcm
+from qs3.adaptation.losses import cross_entropy
+from qs3.adaptation.pcm import (
+    PCM,
+    draw_share,
+    mix_clouds,
+    mix_halves,
+    mixed_cross_entropy,
+    sample_spread,
+)
+from qs3.errors import InputError
+from qs3.models import create_model
+from qs3.models.ops import farthest_point_sampling
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def clouds(b=5, n=40):
+    return torch.randn(b, n, 3, generator=seeded(3))
+
+
+def rows(cloud):
+    return [tuple(row) for row in cloud.tolist()]
+
+
+def make_method(**settings):
+    torch.manual_seed(0)
+    return PCM(create_model("pointnet", 3, channels=(8, 8, 16), hidden=(8,)), **settings)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.5, 0.987, 1.0])
+def test_points_come_from_the_two_clouds_in_their_share(share):
+    first, second = clouds(), clouds() + 10
+    mixed, told = mix_halves(first, second, share, seeded())
+    assert mixed.shape == first.shape
+    assert told == round(share * 40) / 40
+    for cloud, a, b in zip(mixed, first, second, strict=True):
+        of_a, of_b = (set(rows(cloud)) & set(rows(part)) for part in (a, b))
+        assert len(of_a) == round(share * 40)
+        # No point is taken twice, and all come from one of the two.
+        assert len(of_a) + len(of_b) == 40
+
+
+def test_points_are_spread_as_by_farthest_point_sampling():
+    points = clouds()
+    taken = sample_spread(points, 12, seeded())
+    for cloud, part in zip(points, taken, strict=True):
+        start = rows(cloud).index(rows(part)[0])
+        index = farthest_point_sampling(cloud[None], 12, torch.tensor([start]))[0]
+        assert torch.equal(part, cloud[index])
+
+
+def test_starts_and_order_are_drawn():
+    points = clouds(1).expand(20, -1, -1)
+    assert len({rows(part)[0] for part in sample_spread(points, 1, seeded())}) > 5
+    mixed = mix_halves(points, points + 10, 0.5, seeded())[0]
+    assert 2 < sum(mixed[0, :20, 0] > 5) < 18
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_second_labels_are_those_of_the_second_clouds(seed):
+    """Every cloud lies in a place of its own, so that each point tells its cloud."""
+    labels = torch.arange(5)
+    points = clouds(n=30) * 0.01 + labels[:, None, None]
+    mixed = mix_clouds(points, labels, seeded(seed))
+    assert sorted(mixed.labels.tolist()) == list(range(5))
+    owner = mixed.points.mean(dim=2).round().long()
+    for own, other, at in zip(labels, mixed.labels, owner, strict=True):
+        assert set(at.tolist()) <= {int(own), int(other)}
+        if own != other:
+            assert int((at == own).sum()) == round(mixed.share * 30)
+
+
+def test_one_share_a_batch_is_drawn_from_the_beta_distribution():
+    for concentration in (1.0, 0.4, 5.0):
+        drawn = [draw_share(concentration, seeded(seed)) for seed in range(300)]
+        law = stats.beta(concentration, concentration).cdf
+        assert stats.kstest(drawn, law).pvalue > 1e-3
+    assert stats.kstest(drawn, stats.uniform.cdf).pvalue < 1e-3
+
+
+def test_the_generator_alone_decides():
+    points, labels = clouds(), torch.arange(5)
+    first, again, other = (mix_clouds(points, labels, seeded(s)) for s in (1, 1, 2))
+    assert torch.equal(first.points, again.points) and first.share == again.share
+    assert not torch.equal(first.points, other.points) and first.share != other.share
+
+
+@pytest.mark.parametrize("points", [clouds(2, 1), clouds(2, 2), torch.full((3, 20, 3), 0.2)])
+def test_few_and_equal_points(points):
+    mixed = mix_clouds(points, torch.arange(len(points)), seeded())
+    assert mixed.points.shape == points.shape
+    assert mixed.share in [m / points.shape[1] for m in range(points.shape[1] + 1)]
+
+
+def test_labels_mix_as_the_share():
+    logits = torch.from_numpy(np.random.default_rng(0).normal(size=(4, 3)))
+    first, second = torch.tensor([0, 1, 2, 0]), torch.tensor([2, 1, 0, 1])
+    goal = 0.3 * torch.eye(3)[first] + 0.7 * torch.eye(3)[second]
+    soft = torch.nn.functional.cross_entropy(logits, goal.double())
+    torch.testing.assert_close(mixed_cross_entropy(logits, first, second, 0.3), soft)
+
+
+def test_loss_of_the_method(monkeypatch):
+    method = make_method(label_smoothing=0.1, concentration=0.7).eval()
+    batch = Batch(clouds(4), torch.tensor([0, 1, 2, 0]))
+    asked = []
+    real = pcm.draw_share
+    monkeypatch.setattr(pcm, "draw_share", lambda c, g: asked.append(c) or real(c, g))
+    losses = method(batch, None, 0.0, seeded())
+    mixed = mix_clouds(batch.points, batch.labels, seeded(), 0.7)
+    logits = method.model(mixed.points)
+    expected = mixed.share * cross_entropy(logits, batch.labels, 0.1)
+    expected = expected + (1 - mixed.share) * cross_entropy(logits, mixed.labels, 0.1)
+    torch.testing.assert_close(losses, {"pcm": expected})
+    assert asked[0] == 0.7
+
+
+@pytest.mark.parametrize("share", [0.2, 0.8])
+def test_the_larger_part_decides_what_counts_as_right(monkeypatch, share):
+    method = make_method().eval()
+    labels = torch.tensor([0, 1, 2, 0])
+    monkeypatch.setattr(pcm, "draw_share", lambda *_: share)
+    mixed = mix_clouds(clouds(4), labels, seeded())
+    assert not torch.equal(mixed.labels, labels)
+    method(Batch(clouds(4), labels), None, 0.0, seeded())
+    guesses = method.model(mixed.points).argmax(dim=1)
+    larger = labels if share > 0.5 else mixed.labels
+    assert method.right is not None
+    assert int(method.right) == int((guesses == larger).sum())
+
+
+def test_it_needs_no_target_and_checks_its_setting():
+    assert not PCM.uses_target and not PCM.needs_local
+    with pytest.raises(InputError, match="concentration must be a number, larger than 0, not 0"):
+        make_method(concentration=0.0)
