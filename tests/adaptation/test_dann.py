@@ -1,0 +1,224 @@
+"""DANN, MMD and CORAL: their terms against plain formulae, and what they do to two domains."""
+
+import math
+
+import pytest
+import torch
+from sklearn.linear_model import LogisticRegression
+from sklearn.metrics import log_loss
+from torch import nn
+
+from qs3.adaptation.coral import CORAL
+from qs3.adaptation.dann import DANN, domain_loss, reversal_coefficient
+from qs3.adaptation.discrepancies import coral, mmd
+from qs3.adaptation.losses import cross_entropy
+from qs3.adaptation.method import Batch
+from qs3.adaptation.mmd import MMD, median_bandwidths
+from qs3.adaptation.source_only import SourceOnly
+from qs3.errors import InputError
+from qs3.models import Features, PointClassifier, create_model
+
+METHODS = [DANN, MMD, CORAL]
+
+
+class Tiny(PointClassifier):
+    """Moments of a cloud through a layer; no normalisation, no dropout."""
+
+    def __init__(self, width=8):
+        super().__init__()
+        self.layer = nn.Sequential(nn.Linear(6, width), nn.Tanh())
+        self.classify = nn.Linear(width, 2)
+
+    def encode(self, points):
+        return Features(
+            self.layer(torch.cat([points.mean(dim=1), points.square().mean(dim=1)], dim=1))
+        )
+
+    def head(self, features):
+        return self.classify(features.pooled)
+
+
+def tiny(seed=0):
+    torch.manual_seed(seed)
+    return Tiny()
+
+
+def domains(b=32, b_t=24, seed=0):
+    """Two classes that differ along x; the target is shifted and stretched along y and z."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def clouds(count):
+        labels = torch.arange(count) % 2
+        points = 0.3 * torch.randn(count, 16, 3, generator=generator)
+        points[:, :, 0] += labels[:, None] * 1.6 - 0.8
+        spread = 0.4 * torch.randn(count, 1, 2, generator=generator)
+        points[:, :, 1:] += spread
+        return points, labels
+
+    points, labels = clouds(b)
+    target, _ = clouds(b_t)
+    target = target * torch.tensor([1.0, 2.5, 0.5]) + torch.tensor([0.0, 0.8, -0.6])
+    return Batch(points, labels), target
+
+
+def train(method, steps=150, optimiser=None):
+    source, target = domains()
+    optimiser = optimiser or torch.optim.Adam(method.parameter_groups(0.01))
+    generator = torch.Generator().manual_seed(0)
+    for step in range(steps):
+        optimiser.zero_grad()
+        sum(method(source, target, step / steps, generator).values()).backward()
+        optimiser.step()
+    with torch.no_grad():
+        here, there = method.model.encode(source.points), method.model.encode(target)
+        right = method.model.head(here).argmax(dim=1) == source.labels
+    assert right.float().mean() > 0.9
+    return here, there
+
+
+def separability(here, there):
+    """Loss of a logistic regression that tells the domains apart from pooled features."""
+    x = torch.cat([here.pooled, there.pooled]).numpy()
+    y = [0] * len(here.pooled) + [1] * len(there.pooled)
+    x = (x - x.mean(axis=0)) / (x.std(axis=0) + 1e-6)
+    return log_loss(y, LogisticRegression(max_iter=1000).fit(x, y).predict_proba(x))
+
+
+def own_mmd(here, there):
+    # Widths relative to the features' own spread, so that small features are no nearer.
+    sigmas = median_bandwidths(here.pooled, there.pooled, (0.5, 1.0, 2.0))
+    return mmd(here.pooled, there.pooled, sigmas).item()
+
+
+def test_dann_makes_the_domains_harder_to_tell_apart():
+    # A game of two needs steps without momentum, or it turns in circles.
+    values = []
+    for method in (SourceOnly(tiny()), DANN(tiny(), hidden=(64,))):
+        optimiser = torch.optim.SGD(method.parameters(), lr=0.3)
+        values.append(separability(*train(method, 500, optimiser)))
+    assert values[0] < 0.3
+    assert values[1] > 0.55  # log 2 = 0.69 is chance
+
+
+def test_mmd_lowers_its_discrepancy():
+    assert own_mmd(*train(MMD(tiny()))) < 0.5 * own_mmd(*train(SourceOnly(tiny())))
+
+
+@pytest.mark.parametrize("layer", ["logits", "pooled"])
+def test_coral_lowers_its_discrepancy(layer):
+    def distance(here, there, model):
+        if layer == "logits":
+            return coral(model.head(here), model.head(there)).item()
+        return coral(here.pooled, there.pooled).item()
+
+    results = []
+    for weight in (0.0, 50.0):
+        method = CORAL(tiny(), coral_weight=weight, layer=layer)
+        features = train(method)
+        with torch.no_grad():
+            results.append(distance(*features, method.model))
+    assert results[1] < 0.5 * results[0]
+
+
+def test_domain_loss_is_the_sum_of_two_mean_cross_entropies():
+    scores = torch.linspace(-3, 4, 7).double()
+    source, target = scores[:3], scores[3:]
+    expected = -sum(math.log(1 - 1 / (1 + math.exp(-s))) for s in source.tolist()) / 3
+    expected -= sum(math.log(1 / (1 + math.exp(-s))) for s in target.tolist()) / 4
+    assert domain_loss(source, target).item() == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_coefficient_is_that_of_the_paper():
+    for p in (0.0, 0.25, 1.0):
+        assert reversal_coefficient(p) == pytest.approx(math.tanh(10 * p / 2))
+    assert reversal_coefficient(0.3, gamma=2.0) == pytest.approx(math.tanh(0.3))
+
+
+def test_an_untrained_discriminator_knows_nothing():
+    torch.manual_seed(0)
+    method = DANN(create_model("pointnet", 4, transforms=False))
+    source = Batch(torch.randn(4, 30, 3), torch.tensor([0, 1, 2, 3]))
+    losses = method(source, torch.randn(3, 20, 3), 0.5, torch.Generator())
+    assert set(losses) == {"source", "domain"}
+    assert losses["domain"].item() == pytest.approx(2 * math.log(2), abs=0.1)
+
+
+def test_the_discriminator_sees_both_domains_and_the_network_the_reverse():
+    source, target = domains()
+    method = DANN(tiny(), hidden=(8,), domain_weight=0.7)
+    seen = []
+    method.discriminator.register_forward_pre_hook(lambda _, args: seen.append(args[0].detach()))
+    method(source, target, 0.2, torch.Generator())["domain"].backward()
+    assert torch.equal(seen[0], method.model.encode(source.points).pooled)
+    assert torch.equal(seen[1], method.model.encode(target).pooled)
+    turned = {name: p.grad.clone() for name, p in method.named_parameters() if p.grad is not None}
+
+    method.zero_grad()
+    judge = method.discriminator
+    scores = [judge(method.model.encode(x).pooled)[:, 0] for x in (source.points, target)]
+    (0.7 * domain_loss(*scores)).backward()
+    assert "model.classify.weight" not in turned
+    for name, parameter in method.named_parameters():
+        if name in turned:
+            own = name.startswith("discriminator")
+            factor = 1.0 if own else -reversal_coefficient(0.2)
+            torch.testing.assert_close(turned[name], factor * parameter.grad)
+
+
+@pytest.mark.parametrize("kind", METHODS)
+def test_the_source_term_is_the_cross_entropy(kind):
+    source, target = domains()
+    method = kind(tiny(), label_smoothing=0.1)
+    losses = method(source, target, 0.5, torch.Generator())
+    expected = cross_entropy(method.model(source.points), source.labels, 0.1)
+    torch.testing.assert_close(losses["source"], expected)
+    assert method.right is not None
+    assert method.result() is method.model
+
+
+def test_mmd_and_coral_are_their_functions_of_the_batches():
+    source, target = domains()
+    model = tiny()
+    here, there = model.encode(source.points), model.encode(target)
+    factors = (0.5, 2.0)
+    method = MMD(model, mmd_weight=0.3, factors=factors, biased=False)
+    value = method(source, target, 0.5, torch.Generator())["mmd"]
+    sigmas = median_bandwidths(here.pooled, there.pooled, factors)
+    expected = 0.3 * mmd(here.pooled, there.pooled, sigmas, biased=False) / 2
+    torch.testing.assert_close(value, expected)
+
+    value = CORAL(model, coral_weight=3.0)(source, target, 0.5, torch.Generator())["coral"]
+    torch.testing.assert_close(value, 3 * coral(model.head(here), model.head(there)))
+    value = CORAL(model, layer="pooled")(source, target, 0.5, torch.Generator())["coral"]
+    torch.testing.assert_close(value, coral(here.pooled, there.pooled))
+
+
+@pytest.mark.parametrize("kind", METHODS)
+@pytest.mark.parametrize("equal", [True, False])
+def test_small_and_degenerate_batches_stay_finite(kind, equal):
+    torch.manual_seed(0)
+    method = kind(create_model("dgcnn", 3, channels=(8,), embedding=8, hidden=(8,)))
+    source = Batch(torch.randn(2, 3, 3) * (not equal), torch.tensor([0, 1]))
+    target = torch.randn(5, 1, 3) * (not equal)
+    losses = method(source, target, 1.0, torch.Generator())
+    sum(losses.values()).backward()
+    for name, parameter in method.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: DANN(tiny(), hidden=(0,)), "hidden must be 0 or more whole numbers"),
+        (lambda: DANN(tiny(), gamma=0.0), "gamma must be a number, larger than 0"),
+        (lambda: DANN(tiny(), domain_weight=-1.0), "domain_weight must be a number, 0 to"),
+        (lambda: MMD(tiny(), mmd_weight=math.inf), "mmd_weight must be a number"),
+        (lambda: MMD(tiny(), factors=()), "factors must be one number or more"),
+        (lambda: MMD(tiny(), factors=(1.0, 0.0)), "each of factors must be a number"),
+        (lambda: CORAL(tiny(), coral_weight=-0.1), "coral_weight must be a number"),
+    ],
+)
+def test_unusable_settings_are_named(make, message):
+    with pytest.raises(InputError, match=message):
+        make()

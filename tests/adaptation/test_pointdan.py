@@ -1,0 +1,320 @@
+"""PointDAN: its parts against plain formulae, its game of two, and networks of any kind."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from qs3.adaptation.discrepancies import mmd
+from qs3.adaptation.losses import cross_entropy
+from qs3.adaptation.method import Batch
+from qs3.adaptation.normalisation import make_norm
+from qs3.adaptation.pointdan import (
+    NodeAttention,
+    PointDAN,
+    fresh_head,
+    head_parameters,
+    reversal_coefficient,
+)
+from qs3.errors import InputError
+from qs3.models import Features, PointClassifier, create_model
+
+SMALL = {
+    "pointnet-sa": {
+        "channels": (8, 8, 16, 16),
+        "transform_hidden": (8,),
+        "nodes": 12,
+        "neighbours": 8,
+        "node_width": 8,
+    },
+    "pointnet": {"channels": (8, 8, 16), "hidden": (8,), "transforms": False},
+    "dgcnn": {"channels": (8, 8), "embedding": 16, "hidden": (8,), "neighbours": 4},
+    "pointnet2": {
+        "centres": (12, 5),
+        "scales": (((0.9, 6, (8, 8, 16)),), ((1.4, 4, (16, 16)),)),
+        "embedding": (16, 24),
+        "hidden": (8,),
+        "per_point": True,
+    },
+}
+
+
+def make(name, seed=0, norm=None, dropout=0.0, **settings):
+    torch.manual_seed(seed)
+    model = create_model(name, 3, **SMALL[name], dropout=dropout)
+    if name != "pointnet-sa":
+        settings = {"nodes": 10, "neighbours": 6, "node_width": 4} | settings
+    return PointDAN(model, norm=None if norm is None else make_norm(norm, model), **settings)
+
+
+def batches(b=4, b_t=5, n=40, n_t=30, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    points = 0.5 * torch.randn(b, n, 3, generator=generator)
+    target = 0.5 * torch.randn(b_t, n_t, 3, generator=generator) * torch.tensor([1.0, 0.6, 1.4])
+    return Batch(points, torch.arange(b) % 3), target
+
+
+def run(method, progress=0.5, **sizes):
+    source, target = batches(**sizes)
+    return method(source, target, progress, torch.Generator())
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_terms_follow_the_formulae(name):
+    method = make(name, source_weight=0.5, discrepancy_weight=2.0, node_weight=3.0)
+    method.eval()
+    source, target = batches()
+    losses = {key: value.item() for key, value in run(method).items()}
+    with torch.no_grad():
+        here, there = method.model.encode(source.points), method.model.encode(target)
+        one, two = method.model.head(here), method.second.head(here)
+        expected = cross_entropy(one, source.labels) + cross_entropy(two, source.labels)
+        assert losses["source"] == pytest.approx(0.5 * expected.item(), rel=1e-5)
+        p1 = method.model.head(there).softmax(dim=1).numpy()
+        p2 = method.second.head(there).softmax(dim=1).numpy()
+        assert losses["discrepancy"] == pytest.approx(-2 * np.abs(p1 - p2).mean(), rel=1e-5)
+        nodes = [method.nodes(source.points, here), method.nodes(target, there)]
+        x = method.attention["source"](nodes[0])
+        y = method.attention["target"](nodes[1])
+        expected = 3 * mmd(x, y, (0.01, 0.1, 1.0, 10.0, 100.0)).item()
+        assert losses["nodes"] == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_every_part_is_trained_in_one_step(name):
+    method = make(name).train()
+    if name == "pointnet-sa":  # T-Nets start at the identity: nothing passes their last layer
+        for net in (method.model.input_transform, method.model.feature_transform):
+            nn.init.normal_(net.regress.layers[-1].weight, std=0.1)
+    sum(run(method).values()).backward()
+    for key, parameter in method.named_parameters():
+        assert parameter.grad is not None, key
+        assert parameter.grad.isfinite().all(), key
+        assert parameter.grad.any(), key
+
+
+def test_the_classifiers_part_and_the_network_brings_them_together():
+    method = make("pointnet").train()
+    progress = 0.4
+    run(method, progress)["discrepancy"].backward()
+    turned = {key: p.grad.clone() for key, p in method.named_parameters() if p.grad is not None}
+    method = make("pointnet").train()
+    _, target = batches()
+    method.model.encode(batches()[0].points)  # as much has passed
+    there = method.model.encode(target)
+    p1, p2 = (head.head(there).softmax(dim=1) for head in (method.model, method.second))
+    (-(p1 - p2).abs().mean()).backward()
+    assert turned.keys() == {k for k, p in method.named_parameters() if p.grad is not None}
+    assert {"model.early.0.linear.weight", "second.classify.layers.0.weight"} <= turned.keys()
+    for key, parameter in method.named_parameters():
+        if key in turned:
+            own = "classify" in key
+            factor = 1.0 if own else -math.sin(0.2 * math.pi)
+            torch.testing.assert_close(turned[key], factor * parameter.grad, rtol=1e-4, atol=1e-7)
+
+
+def test_the_coefficient_rises_from_zero_to_one():
+    values = [reversal_coefficient(p) for p in np.linspace(0, 1, 11)]
+    assert values[0] == 0.0
+    assert values[-1] == 1.0
+    assert values == sorted(values)
+    assert reversal_coefficient(1 / 3) == pytest.approx(0.5)
+
+
+def test_attention_is_the_published_formula():
+    torch.manual_seed(0)
+    layer = NodeAttention(12, reduction=4).double()
+    x = torch.randn(5, 4, 3).double()
+    flat = x.reshape(5, 12).numpy()
+    first, _, second, _ = layer.weigh
+    hidden = np.maximum(flat @ first.weight.detach().numpy().T + first.bias.detach().numpy(), 0)
+    assert hidden.shape == (5, 3)
+    weight = hidden @ second.weight.detach().numpy().T + second.bias.detach().numpy()
+    y = flat / (1 + np.exp(-weight)) + flat
+    expected = (y - y.mean(axis=0)) / np.sqrt(y.var(axis=0) + 1e-5)
+    np.testing.assert_allclose(layer(x).detach().numpy(), expected, atol=1e-10)
+
+
+def test_each_domain_has_an_attention_of_its_own():
+    method = make("pointnet").eval()
+    before = {key: value.item() for key, value in run(method).items()}
+    with torch.no_grad():
+        method.attention["target"].norm.bias.add_(3.0)
+    after = {key: value.item() for key, value in run(method).items()}
+    assert after["nodes"] > before["nodes"] + 0.001
+    assert after["source"] == before["source"]
+    assert not torch.equal(
+        method.attention["source"].weigh[0].weight, method.attention["target"].weigh[0].weight
+    )
+
+
+@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("norm", ["shared", "transnorm"])
+def test_the_second_head_is_the_first_anew(name, norm):
+    method = make(name, norm=norm, dropout=0.3)
+    first, second = method.model.classify, method.second.classify
+    plain = create_model(name, 3, **SMALL[name]).classify
+    shapes = [(key, value.shape) for key, value in second.state_dict().items()]
+    assert shapes == [(key, value.shape) for key, value in plain.state_dict().items()]
+    assert [p.p for p in second.modules() if isinstance(p, nn.Dropout)] == [
+        p.p for p in first.modules() if isinstance(p, nn.Dropout)
+    ]
+    assert [name for name, _ in method.second.named_children()] == ["classify"]
+    assert not torch.equal(first.layers[-1].weight, second.layers[-1].weight)
+    own = {p.data_ptr() for p in method.model.parameters()}
+    assert not own & {p.data_ptr() for p in method.second.parameters()}
+    losses = run(method.train())
+    assert all(value.isfinite() for value in losses.values())
+
+
+class Odd(PointClassifier):
+    """A head of several parts under names of their own, one a bare parameter."""
+
+    def __init__(self):
+        super().__init__()
+        self.body = nn.Linear(3, 6)
+        self.last, self.between = nn.Linear(5, 3), nn.Linear(6, 5)
+        self.scale = nn.Parameter(torch.ones(()))
+        self.shift = nn.Parameter(torch.zeros(3))
+
+    def encode(self, points):
+        local = self.body(points + self.shift).relu()
+        return Features(pooled=local.amax(dim=1), local=local)
+
+    def head(self, features):
+        return self.scale * self.last(self.between(features.pooled).relu())
+
+
+def test_the_head_of_any_network_is_found():
+    torch.manual_seed(0)
+    model = Odd().train()
+    head = head_parameters(model)
+    expected = [model.scale, *model.last.parameters(), *model.between.parameters()]
+    assert {id(p) for p in head} == {id(p) for p in expected}
+    assert model.training
+    assert all(p.grad is None for p in model.parameters())
+    twin = fresh_head(model)
+    assert {name for name, _ in twin.named_parameters()} == {
+        *("scale", "last.weight", "last.bias", "between.weight", "between.bias"),
+    }
+    features = model.encode(torch.randn(2, 7, 3))
+    assert twin.head(features).shape == (2, 3)
+    assert not torch.equal(twin.head(features), model.head(features))
+    assert dict(model.named_children()).keys() == {"body", "last", "between"}
+    method = PointDAN(model, nodes=4, neighbours=3, node_width=4)
+    sum(run(method).values()).backward()
+    assert all(p.grad is not None for p in method.parameters())
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_classifiers_learn_twice_as_fast(name):
+    method = make(name)
+    others, classifiers = method.parameter_groups(1e-4)
+    assert (others["lr"], classifiers["lr"]) == (1e-4, 2e-4)
+    both = [id(p) for group in (others, classifiers) for p in group["params"]]
+    assert len(both) == len(set(both))
+    assert set(both) == {id(p) for p in method.parameters()}
+    expected = [*method.model.classify.parameters(), *method.second.parameters()]
+    assert {id(p) for p in classifiers["params"]} == {id(p) for p in expected}
+
+
+@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("equal", [True, False])
+def test_small_and_degenerate_batches_stay_finite(name, equal):
+    method = make(name).train()
+    source, target = batches(b=2, b_t=3, n=3, n_t=1)
+    if equal:
+        source, target = Batch(torch.zeros(2, 9, 3), source.labels), torch.zeros(3, 4, 3)
+    losses = method(source, target, 1.0, torch.Generator())
+    sum(losses.values()).backward()
+    for key, parameter in method.named_parameters():
+        assert parameter.grad is not None, key
+        assert parameter.grad.isfinite().all(), key
+
+
+def test_steps_are_bit_identical():
+    def steps():
+        method = make("dgcnn").train()
+        optimiser = torch.optim.Adam(method.parameter_groups(1e-3))
+        for step in range(3):
+            optimiser.zero_grad()
+            sum(run(method, step / 3, seed=step).values()).backward()
+            optimiser.step()
+        return method.state_dict()
+
+    first, again = steps(), steps()
+    assert all(torch.equal(first[key], again[key]) for key in first)
+
+
+def nodes_apart(method):
+    """MMD of the attended nodes of fresh clouds, normalised over their own batch."""
+    source, target = batches(b=48, b_t=48, n=24, n_t=24, seed=99)
+    method.train()
+    with torch.no_grad():
+        nodes = [
+            method.attention[domain](method.nodes(points, method.features(points, domain)))
+            for domain, points in (("source", source.points), ("target", target))
+        ]
+    return mmd(*nodes, method.bandwidths).item()
+
+
+def trained(steps=50, **settings):
+    method = make("pointnet", **settings).train()
+    optimiser = torch.optim.Adam(method.parameter_groups(2e-3))
+    for step in range(steps):
+        optimiser.zero_grad()
+        sum(run(method, step / steps, b=16, b_t=16, n=24, n_t=24, seed=step).values()).backward()
+        optimiser.step()
+    return method
+
+
+def disagreement(method):
+    _, target = batches(b_t=24, n_t=24, seed=7)
+    method.eval()
+    with torch.no_grad():
+        features = method.model.encode(target)
+        p1, p2 = (h.head(features).softmax(dim=1) for h in (method.model, method.second))
+    return (p1 - p2).abs().mean().item()
+
+
+def test_both_alignments_do_what_they_are_for():
+    off = trained(node_weight=0.0, discrepancy_weight=0.0, bandwidths=(4.0, 8.0))
+    local = trained(node_weight=20.0, discrepancy_weight=0.0, bandwidths=(4.0, 8.0))
+    assert nodes_apart(local) < 0.8 * nodes_apart(off)
+    apart = trained(node_weight=0.0, discrepancy_weight=5.0)
+    assert disagreement(apart) > 3 * disagreement(off)
+
+
+def test_networks_without_local_features_are_refused():
+    with pytest.raises(InputError, match="PointDAN needs features of single points"):
+        PointDAN(create_model("pointnet2", 3))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"source_weight": 0.0}, "source_weight must be a number, larger than 0"),
+        ({"discrepancy_weight": -1.0}, "discrepancy_weight must be a number, 0 to"),
+        ({"node_weight": math.nan}, "node_weight must be a number, 0 to"),
+        ({"bandwidths": ()}, "bandwidths must be one number or more"),
+        ({"bandwidths": (1.0, 0.0)}, "each of bandwidths must be a number"),
+        ({"nodes": 0}, "nodes must be a whole number"),
+        ({"neighbours": 256}, "neighbours must be a whole number, 1 to 255"),
+        ({"radius": -0.1}, "radius must be a number"),
+        ({"reduction": 0}, "reduction must be a whole number"),
+        ({"classifier_rate": 0.0}, "classifier_rate must be a number"),
+    ],
+)
+def test_unusable_settings_are_named(settings, message):
+    with pytest.raises(InputError, match=message):
+        make("pointnet", **settings)
+
+
+def test_the_result_is_the_plain_network():
+    method = make("pointnet-sa")
+    assert method.result() is method.model
+    assert method.sa_node is None
+    assert dataclasses.is_dataclass(method.model.eval().encode(torch.zeros(1, 5, 3)))
