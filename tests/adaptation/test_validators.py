@@ -19,13 +19,13 @@ from sklearn.metrics import adjusted_mutual_info_score
 
 from qs3.adaptation import validators
 from qs3.adaptation.clusters import adjusted_mutual_information, k_means
+from qs3.adaptation.density import density_ratio
 from qs3.adaptation.validators import (
     VALIDATORS,
     Observation,
     bnm,
     class_ami,
     controlled_risk,
-    density_ratio,
     dev,
     entropy,
     information_maximisation,
@@ -142,12 +142,43 @@ def test_density_ratio_is_that_of_scikit_learn():
     model.fit((both - mean) / spread, np.repeat([0, 1], [80, 50]))
     share = model.predict_proba((source - mean) / spread)
     expected = 80 / 50 * share[:, 1] / share[:, 0]
-    assert density_ratio(source, target, source) == pytest.approx(expected, rel=1e-4)
+    assert density_ratio(source, target, source, 1.0) == pytest.approx(expected, rel=1e-4)
 
 
 def test_density_ratio_of_equal_domains_is_one():
     rows = np.random.default_rng(0).normal(size=(30, 3))
     assert density_ratio(rows, rows, rows) == pytest.approx(np.ones(30), abs=1e-4)
+
+
+def test_density_ratio_of_wide_features_stays_moderate():
+    """300 clouds of 400 channels are separable; only one channel truly differs.
+
+    There w(x) = exp(x − 1/2); a ratio that is too smooth is better than one that is wild.
+    """
+    rng = np.random.default_rng(0)
+    source, target, points = (rng.normal(size=(m, 400)) for m in (150, 150, 500))
+    target[:, 0] += 1.0
+    truth = points[:, 0] - 0.5
+    chosen, fixed = (np.log(density_ratio(source, target, points, s)) for s in (None, 1.0))
+    assert np.abs(chosen - truth).mean() < 1.0 < np.abs(fixed - truth).mean()
+    assert np.corrcoef(chosen, truth)[0, 1] > 0.2
+
+
+def test_density_ratio_of_shifted_gaussians():
+    """Where there is enough to learn from, the weak penalties win and w is exp(x − 1/2)."""
+    rng = np.random.default_rng(0)
+    source, target = rng.normal(size=(4000, 2)), rng.normal([1.0, 0.0], 1.0, size=(2000, 2))
+    points = rng.normal(size=(50, 2))
+    ratio = density_ratio(source, target, points)
+    assert np.log(ratio) == pytest.approx(points[:, 0] - 0.5, abs=0.25)
+
+
+def test_density_ratio_refusals():
+    rows = np.ones((2, 3))
+    with pytest.raises(InputError, match="both domains"):
+        density_ratio(rows[:0], rows, rows)
+    with pytest.raises(InputError, match="strength"):
+        density_ratio(rows, rows, rows, -1.0)
 
 
 def test_density_ratio_ignores_constant_channels():

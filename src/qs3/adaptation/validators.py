@@ -11,17 +11,15 @@ from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.optimize import minimize
-from scipy.special import expit, xlogy
+from scipy.special import xlogy
 
 from qs3.adaptation.clusters import adjusted_mutual_information, k_means
+from qs3.adaptation.density import density_ratio
 from qs3.adaptation.pseudo_labels import check_probabilities
 from qs3.errors import InputError
 
 _BLOCK = 2**22
 """Similarities that are held at a time."""
-_LARGEST_LOG_RATIO = 30.0
-"""Log density ratios are cut here; beyond, the two domains do not overlap in any case."""
 
 
 @dataclass(frozen=True)
@@ -135,51 +133,6 @@ def snd(features: Float[np.ndarray, "m c"], temperature: float = 0.05) -> float:
     return total / m
 
 
-def density_ratio(
-    source: Float[np.ndarray, "s c"],
-    target: Float[np.ndarray, "m c"],
-    points: Float[np.ndarray, "v c"],
-    strength: float = 1.0,
-) -> Float[np.ndarray, "v"]:
-    """Return p_target / p_source at points, from a logistic classifier of the domain.
-
-    With d(x) the classifier's probability of the target, w(x) = (s/m) d(x) / (1 − d(x)). Features
-    are standardised over both domains; channels that do not vary are left out.
-
-    Args:
-        source: Features of the source.
-        target: Features of the target.
-        points: Where to evaluate.
-        strength: λ: the classifier minimises its summed log loss plus λ/2 of its squared weights
-            (not of the constant).
-
-    Example:
-        >>> same = np.array([[0.0], [1.0]])
-        >>> density_ratio(same, same, same).round(6).tolist()
-        [1.0, 1.0]
-    """
-    both = np.concatenate([source, target]).astype(np.float64)
-    mean, spread = both.mean(axis=0), both.std(axis=0)
-    use = spread > 1e-9 * np.maximum(1.0, np.abs(mean))
-    both = (both[:, use] - mean[use]) / spread[use]
-    is_target = np.repeat([0.0, 1.0], [len(source), len(target)])
-
-    def objective(weights: np.ndarray) -> tuple[float, np.ndarray]:
-        score = both @ weights[1:] + weights[0]
-        value = np.logaddexp(0.0, score).sum() - score[len(source) :].sum()
-        error = expit(score) - is_target
-        slope = np.concatenate([[error.sum()], both.T @ error + strength * weights[1:]])
-        return float(value + 0.5 * strength * weights[1:] @ weights[1:]), slope
-
-    start = np.zeros(both.shape[1] + 1)
-    start[0] = np.log(len(target) / len(source))
-    options = {"maxiter": 500, "ftol": 1e-12, "gtol": 1e-6}
-    weights = minimize(objective, start, jac=True, method="L-BFGS-B", options=options).x
-    there = (points[:, use] - mean[use]) / spread[use]
-    log_ratio = there @ weights[1:] + weights[0] + np.log(len(source) / len(target))
-    return np.exp(np.clip(log_ratio, -_LARGEST_LOG_RATIO, _LARGEST_LOG_RATIO))
-
-
 def controlled_risk(weights: Float[np.ndarray, "v"], errors: Float[np.ndarray, "v"]) -> float:
     """Return the importance-weighted risk with its control variate (You et al., ICML 2019, Eq. 8).
 
@@ -208,8 +161,9 @@ def dev(
     The error rate on the source's held-out clouds, each weighted by how much more frequent its
     features are in the target, with a control variate. It may leave the range 0..1.
 
-    NOTE: the domain classifier is logistic (`density_ratio`), where the authors train a network
-    with one hidden layer and choose its size.
+    NOTE: the domain classifier is logistic (`qs3.adaptation.density.density_ratio`), its penalty
+    chosen on held-out clouds, where the authors train a network with one hidden layer. Where the
+    domains hardly overlap in feature space no choice helps: the score varies much.
 
     Raises:
         InputError: where a set is empty, or a value is not finite.
