@@ -65,6 +65,9 @@ def test_an_empty_side_gives_zero_and_no_gradient(rng):
     value.sum().backward()
     assert x.grad is not None and y.grad is not None
     assert not x.grad[1].any() and not y.grad[1].any()
+    y_mask = torch.ones(3, 55, dtype=torch.bool)
+    y_mask[2] = False
+    assert (chamfer(x, y, mask, y_mask) > 0).tolist() == [True, False, False]
     none = torch.zeros(3, 40, dtype=torch.bool)
     empty = chamfer(x, y, none)
     assert torch.equal(empty, torch.zeros_like(empty))

@@ -92,8 +92,9 @@ def test_few_points(rng, n):
         assert float(found.curvature.max()) < 1e-12
 
 
-def test_line(rng):
-    direction = torch.tensor([1.0, 2.0, -2.0], dtype=torch.float64) / 3
+@pytest.mark.parametrize("direction", [[1 / 3, 2 / 3, -2 / 3], [0.0, 1.0, 0.0]])
+def test_line(rng, direction):
+    direction = torch.tensor(direction, dtype=torch.float64)
     line = torch.from_numpy(rng.normal(size=50))[:, None] * direction
     found = surface(line[None])
     assert not found.curvature.any()
