@@ -82,8 +82,8 @@ def test_offsets_follow_the_formula():
     module = SANode(5, width=4, nodes=6, neighbours=50, radius=0.7).double()
     points, local = clouds(b=2, n=50), torch.randn(2, 50, 5).double()
     weight = module.offset.weight.detach().numpy()
-    moved = module.place(points, local).detach().numpy()
     chosen = farthest_point_sampling(points, 6).numpy()
+    moved = module.place(points, local, torch.from_numpy(chosen)).detach().numpy()
     for cloud, node in itertools.product(range(2), range(6)):
         x, f = points[cloud].numpy(), local[cloud].numpy()
         own = chosen[cloud, node]

@@ -39,4 +39,5 @@ def settings():
         learning_rate=1e-2,
         accelerator="cpu",
         threads=1,
+        holdout=0.0,
     )

@@ -17,7 +17,20 @@ TABLE = {
     "schedule": ("per-round", "per-round", "continuous"),
     "single_class": ("keep", "drop", "drop"),
 }
-COMMON = {"threshold": 0.8, "step": 0.005, "rounds": 10, "epochs": 10, "steps_per_epoch": None}
+COMMON = {
+    "rule": "qbst",
+    "refine": False,
+    "prior": "em",
+    "threshold": 0.8,
+    "step": 0.005,
+    "rounds": 10,
+    "epochs": 10,
+    "steps_per_epoch": None,
+    "source_weight": 1.0,
+    "weight_step": 0.0,
+    "portion": 0.2,
+    "portion_step": 0.05,
+}
 
 
 @pytest.mark.parametrize(("column", "name"), list(enumerate(["default", "paper", "released"])))
@@ -29,6 +42,8 @@ def test_presets_are_the_columns_of_the_table(column, name):
 
 def test_default_preset_is_the_default():
     assert PRESETS["default"] == SelfTrainingSettings()
+    spst = asdict(PRESETS["spst"])
+    assert spst == asdict(SelfTrainingSettings()) | {"rule": "spst", "weight_step": 0.005}
 
 
 def test_overrides():
@@ -39,12 +54,20 @@ def test_overrides():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: self_training_preset("papers"), "choose one of default, paper, released"),
+        (lambda: self_training_preset("papers"), "choose one of default, spst, paper, released"),
         (lambda: self_training_preset("paper", theta=0.9), "unknown setting 'theta'.*threshold"),
         (lambda: SelfTrainingSettings(threshold=1.5), "threshold = 1.5 must be in 0 to 1"),
         (lambda: SelfTrainingSettings(threshold=0.9, step=0.02), "step = 0.02 takes θ out"),
         (lambda: SelfTrainingSettings(rounds=0), "rounds = 0"),
         (lambda: SelfTrainingSettings(steps_per_epoch=0), "steps_per_epoch = 0"),
+        (lambda: SelfTrainingSettings(rule="pst"), "rule = pst is none of qbst"),
+        (lambda: SelfTrainingSettings(source_weight=0), "source_weight = 0"),
+        (lambda: SelfTrainingSettings(weight_step=0.02), "takes a factor of the losses to 0"),
+        (lambda: SelfTrainingSettings(portion=0), "portion = 0"),
+        (lambda: TrainSettings(holdout=1.0), "holdout = 1.0"),
+        (lambda: TrainSettings(rule="oracle"), "rule = oracle is none of last"),
+        (lambda: TrainSettings(rule="im", validate_every=0), "leaves no checkpoint"),
+        (lambda: TrainSettings(normalisation="own"), "normalisation = own is none of shared"),
         (lambda: TrainSettings(batch_size=1), "batch_size = 1 must be at least 2"),
         (lambda: TrainSettings(epochs=0), "epochs = 0"),
         (lambda: TrainSettings(label_smoothing=1.0), "label_smoothing"),

@@ -10,15 +10,23 @@ from qs3.adaptation.pseudo_labels import select_confident as select_confident
 from qs3.adaptation.pseudo_labels import select_quasi_balanced as select_quasi_balanced
 
 if TYPE_CHECKING:
+    from qs3.adaptation.factory import create_method as create_method
+    from qs3.adaptation.factory import list_methods as list_methods
+    from qs3.adaptation.factory import method_class as method_class
     from qs3.adaptation.losses import cross_entropy as cross_entropy
     from qs3.adaptation.method import Batch as Batch
     from qs3.adaptation.method import Method as Method
+    from qs3.adaptation.pseudo_labelled import PseudoLabelled as PseudoLabelled
     from qs3.adaptation.source_only import SourceOnly as SourceOnly
 
 _LAZY = {
+    "create_method": "factory",
+    "list_methods": "factory",
+    "method_class": "factory",
     "cross_entropy": "losses",
     "Batch": "method",
     "Method": "method",
+    "PseudoLabelled": "pseudo_labelled",
     "SourceOnly": "source_only",
 }
 

@@ -24,6 +24,8 @@ class Batch(NamedTuple):
     """Augmented clouds."""
     labels: Int[Tensor, "b"]
     """Their classes, or pseudo labels."""
+    parts: tuple[int, ...] = ()
+    """Numbers of clouds from each of several sets, in order; empty where there is one set."""
 
 
 class Method(nn.Module, ABC):

@@ -8,23 +8,18 @@ Convention:
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Literal, get_args
+from typing import get_args
 
 import torch
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
-from torch.nn.utils import parametrize
 
+from qs3.adaptation.names import Normalisation
 from qs3.errors import InputError
 from qs3.models import PointClassifier
 
-Normalisation = Literal["shared", "separate", "adabn", "transnorm"]
-"""shared: running statistics follow both domains as they pass. separate: each domain has its own;
-the trained network keeps the target's. adabn: as shared, then computed anew over the target
-(Li et al., 2018). transnorm: as separate, and channels that differ less between the domains weigh
-more (Wang et al., NeurIPS 2019)."""
-
 _STATISTICS = ("running_mean", "running_var", "num_batches_tracked")
+_AFFINE = ("weight", "bias")
 
 
 class DomainNorm(nn.Module):
@@ -104,53 +99,40 @@ class TransNorm(SeparateNorm):
     those of the batches; so both domains of a step use the same α.
     """
 
-    def __init__(self, model: PointClassifier) -> None:
-        super().__init__(model)
-        for number, layer in enumerate(self._layers):
-            for name in ("weight", "bias"):
-                mean = layer.running_mean
-                assert isinstance(mean, Tensor)  # noqa: S101
-                scale = _Scale(torch.full_like(mean, 2.0))
-                parametrize.register_parametrization(layer, name, scale)
-                self._refresh(number)
-
     @contextmanager
     def of(self, domain: str) -> Iterator[None]:
         """Put the domain's statistics and the present α in place for a while."""
-        if not self._in_target:
-            for number in range(len(self._layers)):
-                self._refresh(number)
+        scales = [1 + self._alpha(number) for number in range(len(self._layers))]
         with super().of(domain):
-            yield
+            held = []
+            for layer, scale in zip(self._layers, scales, strict=True):
+                for name in _AFFINE:
+                    weight = layer._parameters.pop(name)
+                    held.append((layer, name, weight))
+                    # A plain attribute: the product is no parameter, its factor is.
+                    object.__setattr__(layer, name, weight * scale)
+            try:
+                yield
+            finally:
+                for layer, name, weight in held:
+                    object.__delattr__(layer, name)
+                    layer._parameters[name] = weight
 
     @torch.no_grad()
-    def _refresh(self, number: int) -> None:
+    def _alpha(self, number: int) -> Tensor:
         layer, other = self._layers[number], self._other(number)
-        alpha = channel_weights(
-            (layer.running_mean, layer.running_var),  # pyright: ignore[reportArgumentType]
-            (other["running_mean"], other["running_var"]),
-            layer.eps,
-        )
-        for scales in getattr(layer, "parametrizations", {}).values():
-            scales[0].scale.copy_(1 + alpha)
+        here = (layer.running_mean, layer.running_var)
+        there = (other["running_mean"], other["running_var"])
+        return channel_weights(here, there, layer.eps)  # pyright: ignore[reportArgumentType]
 
     @torch.no_grad()
     def settle(self) -> None:
-        """Multiply α into the scales and offsets, and keep the target's statistics."""
+        """Multiply 1 + α into the scales and offsets, and keep the target's statistics."""
         for number, layer in enumerate(self._layers):
-            self._refresh(number)
-            for name in ("weight", "bias"):
-                parametrize.remove_parametrizations(layer, name, leave_parametrized=True)
+            scale = 1 + self._alpha(number)
+            for name in _AFFINE:
+                getattr(layer, name).mul_(scale)
         super().settle()
-
-
-class _Scale(nn.Module):
-    def __init__(self, scale: Tensor) -> None:
-        super().__init__()
-        self.register_buffer("scale", scale)
-
-    def forward(self, value: Tensor) -> Tensor:
-        return value * self.get_buffer("scale")
 
 
 def channel_weights(

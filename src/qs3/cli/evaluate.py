@@ -4,10 +4,10 @@ import dataclasses
 import hashlib
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -16,6 +16,10 @@ from qs3.cli.train import RUN
 from qs3.errors import InputError
 from qs3.evaluation.records import DataRecord, RunRecord, Scores
 from qs3.files import read_json
+
+if TYPE_CHECKING:
+    from qs3.datasets.clouds import PointClouds
+    from qs3.training import LoadedModel
 
 # What `train` leaves in run.json.
 _TOLD = (
@@ -43,6 +47,9 @@ class EvaluateOptions:
     """Part of the data, such as test; all of it by default."""
     cloud: Literal["points", "clean", "surface"] = "points"
     """Of generated data: noisy scans, their clean twins, or samples of the whole surface."""
+    checkpoints: bool = False
+    """Score every checkpoint too, and tell which one each validator would have chosen; apart from
+    them the oracle, an upper bound that looks at the labels of the data."""
     json: bool = False
     """Print the whole record as JSON in place of text."""
 
@@ -61,11 +68,15 @@ class PredictOptions:
 
 def evaluate(options: Annotated[EvaluateOptions, tyro.conf.arg(name="")]) -> int:
     """Score a run: accuracy, class-mean accuracy, confusion matrix; leaves a record in the run."""
-    record, path = make_record(options.run, options.data, options.split, options.cloud)
+    record, path = make_record(
+        options.run, options.data, options.split, options.cloud, options.checkpoints
+    )
     if options.json:
         print(json.dumps(dataclasses.asdict(record), indent=2))
     else:
         print(describe(record.scores, record.marks))
+        if record.choices:
+            print(describe_choices(record.choices))
     print(f"record: {path}", file=sys.stderr)
     return 0
 
@@ -75,6 +86,7 @@ def make_record(
     data: str | Path,
     split: str | None = None,
     cloud: Literal["points", "clean", "surface"] = "points",
+    checkpoints: bool = False,
 ) -> tuple[RunRecord, Path]:
     """Score a run and write the record into its folder ``records``."""
     from qs3.datasets import load_clouds
@@ -120,11 +132,55 @@ def make_record(
         hardware=hardware(),
         commit=git_commit(),
         rounds=tuple(told["rounds"]),
+        choices=_choices(run, loaded, test) if checkpoints else {},
         marks=tuple(marks),
     )
     text = json.dumps(dataclasses.asdict(record), sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:10]
     return record, write_record(run / "records" / f"{Path(name).stem}-{digest}.json", record)
+
+
+def _choices(run: Path, loaded: "LoadedModel", test: "PointClouds") -> dict[str, dict[str, Any]]:
+    """Score the checkpoints of the run's last stage, and let every rule choose among them."""
+    from qs3.adaptation.validators import VALIDATORS
+    from qs3.evaluation import score
+    from qs3.training import predict_probabilities
+    from qs3.training.validation import choose, load_checkpoint, read_checkpoints
+
+    found = read_checkpoints(run)
+    stage = "round" if any(one.stage == "round" for one in found) else None
+    found = [one for one in found if stage in (None, one.stage)]
+    if not found:
+        raise InputError(f"{run}: has no checkpoints; train with --validate-every above 0")
+    scored = {}
+    for one in found:
+        load_checkpoint(run, one, loaded.model)
+        answers = predict_probabilities(loaded.model, test.points).argmax(axis=1)
+        scores = score(test.labels, answers, loaded.class_names)
+        scored[one.file] = {
+            "stage": one.stage,
+            "number": one.number,
+            "accuracy": scores.accuracy,
+            "class_mean_accuracy": scores.class_mean_accuracy,
+        }
+    rules = [
+        "last",
+        *(n for n in VALIDATORS if any(one.validators.get(n) is not None for one in found)),
+    ]
+    choices = {rule: scored[choose(found, rule).file] for rule in rules}
+    choices["oracle"] = max(scored.values(), key=lambda one: one["accuracy"])
+    return choices
+
+
+def describe_choices(choices: Mapping[str, Mapping[str, Any]]) -> str:
+    """What each rule would have chosen, as text."""
+    lines = [f"\n{'chosen by':<14}{'checkpoint':<18}{'accuracy':>10}{'class mean':>12}"]
+    for rule, one in choices.items():
+        where = f"{one['stage']} {one['number']}"
+        name = "oracle *" if rule == "oracle" else rule
+        mean = f"{one['accuracy']:>10.1%}{one['class_mean_accuracy']:>12.1%}"
+        lines.append(f"{name:<14}{where:<18}{mean}")
+    return "\n".join([*lines, "* looks at the labels of this data: an upper bound"])
 
 
 def _marks(told: dict[str, Any], tested: set[str]) -> list[str]:

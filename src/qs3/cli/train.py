@@ -1,9 +1,10 @@
 """``qs3 train``: a classifier from labelled clouds, adapted to unlabelled ones if asked."""
 
 import dataclasses
+import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from qs3.adaptation.names import MethodName, RoundRule, split_method
 from qs3.errors import InputError, UnevenSizesError
 from qs3.evaluation.records import DataRecord
 from qs3.files import write_json
@@ -23,17 +25,21 @@ TIME_UP = 3
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """Train a classifier on labelled clouds; with qbst, adapt it to clouds without labels."""
+    """Train a classifier on labelled clouds; most methods adapt it to clouds without labels."""
 
     source: str
     """Labelled clouds: what qs3 generate made (also at an address such as s3://bucket/set), or any
     layout that qs3 convert --list tells."""
     out: Path
     """Folder of the run; run the same command again to go on after a stop."""
-    method: Literal["source-only", "qbst"] = "source-only"
-    """source-only, or quasi-balanced self-training."""
+    method: MethodName = "source-only"
+    """How the target takes part; spst, qbst, qs3 and gast-spst end in rounds of self-training."""
+    rounds_rule: Annotated[RoundRule | None, tyro.conf.arg(name="self-training")] = None
+    """Rounds of self-training after the method, by this rule: --method gast --self-training
+    qbst."""
     target: str | None = None
-    """Clouds of the target, for qbst; labels that lie there are dropped unused."""
+    """Clouds of the target; labels that lie there are dropped unused. source-only takes them for
+    validators and AdaBN alone."""
     source_split: str | None = None
     """Part of the source, such as train; all of it by default."""
     target_split: str | None = None
@@ -43,14 +49,19 @@ class TrainOptions:
     supervised: bool = False
     """Mark the run as supervised: its source is the labelled training part of the target."""
     warm_up: Path | None = None
-    """Run whose network qbst starts from, in place of training on the source first."""
+    """Run whose network self-training starts from, in place of training first."""
+    model_set: tuple[str, ...] = ()
+    """Settings of the network that differ from its defaults: k=10 dropout=0.3."""
+    method_set: tuple[str, ...] = ()
+    """Settings of the method that differ from its defaults: weight=0.5."""
     max_time: str | None = None
     """Time for this call, as hours, minutes and seconds: 00:30:00. It stops before an epoch that
     would end later, with exit code 3; the same command goes on."""
     log: Literal["jsonl", "tensorboard"] = "jsonl"
     """history.jsonl is always written; tensorboard adds event files in OUT/tensorboard."""
-    preset: Literal["default", "paper", "released"] = "default"
-    """Settings of the self-training: ours, the paper's text, or its released code."""
+    preset: Literal["default", "spst", "paper", "released"] = "default"
+    """Settings of the self-training: ours, GAST's SPST (the default of that rule), QS³'s text, or
+    its released code."""
     train: Annotated[TrainSettings, tyro.conf.arg(name="")] = field(default_factory=TrainSettings)
     """How the network is trained."""
     self_training: SelfTrainingSettings = field(default_factory=SelfTrainingSettings)
@@ -61,14 +72,12 @@ def preset_options(arguments: list[str]) -> TrainOptions:
     """The defaults of ``qs3 train`` under the preset that the command line names.
 
     A preset sets the defaults of all self-training settings, so that one given beside it wins and
-    the help shows what is in force.
+    the help shows what is in force. SPST has its own.
     """
-    preset = "default"
-    for index, argument in enumerate(arguments):
-        if argument == "--preset" and index + 1 < len(arguments):
-            preset = arguments[index + 1]
-        elif argument.startswith("--preset="):
-            preset = argument.partition("=")[2]
+    method = _given(arguments, "--method", "source-only")
+    rule = _given(arguments, "--self-training", "")
+    spst = rule == "spst" or (not rule and method in ("spst", "gast-spst"))
+    preset = _given(arguments, "--preset", "spst" if spst else "default")
     return TrainOptions(
         source=tyro.MISSING,
         out=tyro.MISSING,
@@ -76,8 +85,40 @@ def preset_options(arguments: list[str]) -> TrainOptions:
     )
 
 
+def _given(arguments: Sequence[str], option: str, default: str) -> str:
+    value = default
+    for index, argument in enumerate(arguments):
+        if argument == option and index + 1 < len(arguments):
+            value = arguments[index + 1]
+        elif argument.startswith(f"{option}="):
+            value = argument.partition("=")[2]
+    return value
+
+
+def parse_settings(option: str, given: Sequence[str]) -> dict[str, Any]:
+    """Read ``name=value`` pairs; values are JSON, or words as they are.
+
+    Raises:
+        InputError: where a pair has no equals sign, or a name comes twice.
+
+    Example:
+        >>> parse_settings("--model-set", ["k=10", "grouping=msg", "hidden=[64, 32]"])
+        {'k': 10, 'grouping': 'msg', 'hidden': [64, 32]}
+    """
+    found: dict[str, Any] = {}
+    for pair in given:
+        name, equals, value = pair.partition("=")
+        if not equals or not name or name in found:
+            raise InputError(f"{option} {pair}: give each setting once, as name=value")
+        try:
+            found[name] = json.loads(value)
+        except ValueError:
+            found[name] = value
+    return found
+
+
 def train(options: Annotated[TrainOptions, tyro.conf.arg(name="")]) -> int:
-    """Train a classifier, source-only or with quasi-balanced self-training on a target."""
+    """Train a classifier, with a method of adaptation to an unlabelled target if asked."""
     from qs3.training.deadline import TimeUpError
 
     try:
@@ -100,11 +141,17 @@ def run(options: TrainOptions) -> Any:
 
     seconds = None if options.max_time is None else parse_duration(options.max_time)
     deadline = Deadline(seconds, start)  # reading the data counts
-    adapts = options.method == "qbst"
-    if adapts and options.target is None:
-        raise InputError("--method qbst needs --target: a folder or file of unlabelled clouds")
-    if not adapts and (options.target is not None or options.warm_up is not None):
-        raise InputError("--method source-only takes no --target and no --warm-up; see qbst")
+    try:
+        base, rule = split_method(options.method, options.rounds_rule)
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    if rule is None and options.self_training != SelfTrainingSettings():
+        raise InputError(f"--method {options.method} has no rounds to set; add --self-training")
+    settings = dataclasses.replace(
+        options.train,
+        model_settings=parse_settings("--model-set", options.model_set),
+        method_settings=parse_settings("--method-set", options.method_set),
+    )
     points = options.train.num_points
     source = _whole(
         partial(
@@ -121,8 +168,8 @@ def run(options: TrainOptions) -> Any:
         options.method,
         source,
         target,
-        options.train,
-        options.self_training if adapts else None,
+        settings,
+        None if rule is None else dataclasses.replace(options.self_training, rule=rule),
         run_dir=options.out,
         warm_up=options.warm_up,
         deadline=deadline,
@@ -148,8 +195,10 @@ def run(options: TrainOptions) -> Any:
     write_json(
         options.out / RUN,
         {
-            "method": options.method,
-            "preset": options.preset if adapts else None,
+            "method": options.method
+            if rule is None or options.method != base
+            else f"{base}+{rule}",
+            "preset": options.preset if rule is not None else None,
             "selection": result.selection,
             "data": {
                 name: None if record is None else dataclasses.asdict(record)
@@ -158,7 +207,7 @@ def run(options: TrainOptions) -> Any:
             "supervised": options.supervised,
             "source_clouds": digests(thin(source.points, points, options.out)),
             "target_clouds": []
-            if target is None
+            if target is None or not result.adapted
             else digests(thin(target.points, points, options.out)),
             "rounds": [dataclasses.asdict(record) for record in result.rounds],
             "seconds": seconds,

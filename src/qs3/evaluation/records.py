@@ -22,7 +22,7 @@ from qs3.evaluation.metrics import (
 from qs3.files import read_json, write_json
 
 RECORD = "record.json"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,9 @@ class RunRecord:
     """Commit of the source tree, empty where unknown."""
     rounds: tuple[Mapping[str, Any], ...] = ()
     """What each round of self-training did."""
+    choices: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Where every checkpoint was scored: of each rule its checkpoint, accuracy and class-mean
+    accuracy. ``oracle`` among them chose by the labels of the test set: an upper bound."""
     marks: tuple[str, ...] = ()
     """Caveats printed with the number: ``transductive``, ``supervised`` …"""
     schema: int = field(default=SCHEMA_VERSION)

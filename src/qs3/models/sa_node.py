@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from qs3.models.checks import check_number, check_whole
@@ -83,12 +83,13 @@ class SANode(nn.Module):
             points: The clouds.
             local: Features of their points.
         """
+        chosen = farthest_point_sampling(points, min(self.nodes, points.shape[1]))
         # Positions and neighbours in single precision, as everywhere in this package.
         with torch.autocast(points.device.type, enabled=False):
             dtype = self.offset.weight.dtype
             points, local = points.to(dtype), local.to(dtype)
             k = min(self.neighbours, points.shape[1])
-            positions = self.place(points, local)
+            positions = self.place(points, local, chosen)
             residual = self.residual(local)
             features = neighbour_max(residual, knn(points, k, positions.detach()))
             if self.steered:
@@ -97,13 +98,14 @@ class SANode(nn.Module):
         return Nodes(positions, features)
 
     def place(
-        self, points: Float[Tensor, "b n 3"], local: Float[Tensor, "b n c"]
+        self,
+        points: Float[Tensor, "b n 3"],
+        local: Float[Tensor, "b n c"],
+        chosen: Int[Tensor, "b m"],
     ) -> Float[Tensor, "b m 3"]:
-        """Return where the nodes move."""
-        n = points.shape[1]
-        chosen = farthest_point_sampling(points, min(self.nodes, n))
+        """Return where nodes move that start at the points with the indices ``chosen``."""
         start = gather_points(points, chosen)
-        ball = ball_query(points, start, self.radius, min(self.neighbours, n))
+        ball = ball_query(points, start, self.radius, min(self.neighbours, points.shape[1]))
         # W is linear: it is applied to the points, not to the pairs.
         seen = self.offset(local)
         pull = torch.tanh(gather_points(seen, ball) - gather_points(seen, chosen)[:, :, None])

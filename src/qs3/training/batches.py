@@ -209,4 +209,5 @@ def make_batch(
         total += len(index)
     points = torch.cat([part.points for part in parts])
     points = augment(points, settings, generator, places, total)
-    return Batch(points, torch.cat([part.labels for part in parts]))
+    labels = torch.cat([part.labels for part in parts])
+    return Batch(points, labels, tuple(len(part.labels) for part in parts))

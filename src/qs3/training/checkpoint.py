@@ -178,24 +178,38 @@ def new_model(settings: TrainSettings, num_classes: int, seed: int) -> PointClas
 
 
 def save_model(
-    run_dir: Path, model: PointClassifier, class_names: tuple[str, ...], settings: TrainSettings
+    run_dir: Path,
+    model: PointClassifier,
+    class_names: tuple[str, ...],
+    settings: TrainSettings,
+    *,
+    name: str = MODEL,
+    facts: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write the weights to ``model.safetensors`` in a run's folder.
 
     The file alone is enough to make the network again.
 
+    Args:
+        run_dir: Folder of the run.
+        model: The network.
+        class_names: Names of the classes, in the order of the logits.
+        settings: How it was trained.
+        name: Another name for the file.
+        facts: Written beside the network's own.
+
     Returns:
         The file.
     """
-    facts = {
+    told = dict(facts or {}) | {
         "format": FORMAT,
         "class_names": list(class_names),
         "model": settings.model,
         "model_settings": dict(settings.model_settings),
         "num_points": settings.num_points,
     }
-    path = Path(run_dir) / MODEL
-    write_tensors(path, model.state_dict(), facts)
+    path = Path(run_dir) / name
+    write_tensors(path, model.state_dict(), told)
     return path
 
 

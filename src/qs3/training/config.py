@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
+from qs3.adaptation.names import Normalisation, RoundRule, Rule
 from qs3.adaptation.pseudo_labels import Selection, SingleClass
 from qs3.errors import InputError
 
@@ -41,6 +42,19 @@ class TrainSettings:
     t steps at most (1 + t)/(10 + t)."""
     label_smoothing: float = 0.0
     """Probability mass spread evenly over the classes."""
+    normalisation: Normalisation = "shared"
+    """Whose running statistics batch normalisation keeps: of both domains as they pass; of each
+    apart, or weighed by TransNorm (both need a method that uses the target); or AdaBN, computed
+    anew over the target in the end."""
+    method_settings: Annotated[Mapping[str, Any], tyro.conf.Suppress] = field(default_factory=dict)
+    """Arguments of the method that differ from its defaults."""
+    holdout: float = 0.1
+    """Share of the source that is not trained on, but kept for the validators."""
+    validate_every: int = 10
+    """Epochs from one checkpoint of the network, with all validators, to the next; the last epoch
+    and every round of self-training always make one. 0 makes none."""
+    rule: Rule = "last"
+    """How the network is chosen: the last, or the checkpoint that a validator rates highest."""
     rotate_z: bool = True
     """Whether each cloud is turned about the vertical at random, anew in each epoch."""
     jitter_sigma: float = 0.01
@@ -77,7 +91,18 @@ class TrainSettings:
         _check(self, "ema_decay", decay is None or 0 < decay < 1, "must be between 0 and 1")
         for name in ("weight_decay", "jitter_sigma", "jitter_clip", "seed"):
             _check(self, name, getattr(self, name) >= 0, "must not be negative")
-        _check(self, "label_smoothing", 0 <= self.label_smoothing < 1, "must be in 0 to below 1")
+        for name in ("label_smoothing", "holdout"):
+            _check(self, name, 0 <= getattr(self, name) < 1, "must be in 0 to below 1")
+        _check(self, "validate_every", self.validate_every >= 0, "must not be negative")
+        for name, kind in {"normalisation": Normalisation, "rule": Rule}.items():
+            _check(
+                self,
+                name,
+                getattr(self, name) in get_args(kind),
+                f"is none of {', '.join(get_args(kind))}",
+            )
+        good = self.rule == "last" or self.validate_every > 0
+        _check(self, "validate_every", good, f"leaves no checkpoint for rule = {self.rule!r}")
         _check(self, "threads", self.threads is None or self.threads > 0, "must be above 0")
 
 
@@ -85,6 +110,14 @@ class TrainSettings:
 class SelfTrainingSettings:
     """How pseudo labels of the target are selected and used (QS³, Algorithm 1)."""
 
+    rule: RoundRule = "qbst"
+    """Which clouds are selected: ``qbst`` keeps fewer of dominant classes (QS³); ``spst`` all over
+    the threshold (GAST); ``uniform`` as many of each class; ``prior`` follows an estimate of the
+    target's class shares; ``quantile`` the same share of each class's clouds (CBST)."""
+    refine: bool = False
+    """Whether pseudo labels are first smoothed over a graph of similar clouds."""
+    prior: Literal["em", "bbse"] = "em"
+    """Estimate of the class shares, for ``prior``; ``bbse`` needs a held-out part of the source."""
     threshold: float = 0.8
     """θ₀, the confidence that a pseudo label must exceed in round 1."""
     step: float = 0.005
@@ -109,6 +142,14 @@ class SelfTrainingSettings:
     the fifth of the pseudo-labelled clouds that is then held out of the training."""
     source_loss: bool = True
     """Whether each step takes as many labelled clouds of the source too."""
+    source_weight: float = 1.0
+    """Factor of the source's loss at the start."""
+    weight_step: float = 0.0
+    """Taken off both factors, of the target's and the source's loss, after each epoch."""
+    portion: float = 0.2
+    """Share of each class's clouds that ``quantile`` keeps in round 1."""
+    portion_step: float = 0.05
+    """Added to it after each round, up to all."""
     schedule: Literal["per-round", "continuous"] = "per-round"
     """A fresh optimiser and cosine in each round; or one optimiser and one cosine whose half
     period is a round, so that the rate rises again in every second round."""
@@ -121,8 +162,20 @@ class SelfTrainingSettings:
         _check(
             self, "step", self.step >= 0 and last <= 1, "takes θ out of 0 to 1 within the rounds"
         )
-        for name in ("rounds", "epochs"):
+        for name in ("rounds", "epochs", "source_weight"):
             _check(self, name, getattr(self, name) > 0, "must be above 0")
+        decay = self.weight_step * (self.rounds * self.epochs - 1)
+        good = self.weight_step >= 0 and decay < min(1.0, self.source_weight)
+        _check(self, "weight_step", good, "takes a factor of the losses to 0 within the rounds")
+        _check(self, "portion", 0 < self.portion <= 1, "must be above 0, to 1")
+        _check(self, "portion_step", self.portion_step >= 0, "must not be negative")
+        for name, kind in {"rule": RoundRule, "prior": Literal["em", "bbse"]}.items():
+            _check(
+                self,
+                name,
+                getattr(self, name) in get_args(kind),
+                f"is none of {', '.join(get_args(kind))}",
+            )
         steps = self.steps_per_epoch
         _check(self, "steps_per_epoch", steps is None or steps > 0, "must be above 0")
 
@@ -135,6 +188,8 @@ def _check(settings: Any, name: str, good: bool, fault: str) -> None:
 
 PRESETS: Mapping[str, SelfTrainingSettings] = {
     "default": SelfTrainingSettings(),
+    # GAST's SPST: every confident cloud, both losses weighted alike and falling.
+    "spst": SelfTrainingSettings(rule="spst", weight_step=0.005),
     # Algorithm 1 takes Φ_init as an input of its own beside the warm-up Φ_0: fresh weights.
     "paper": SelfTrainingSettings(
         pool="shrinking", init="scratch", source_loss=False, single_class="drop"
@@ -150,14 +205,14 @@ PRESETS: Mapping[str, SelfTrainingSettings] = {
         single_class="drop",
     ),
 }
-"""Whole columns of settings: our defaults, the paper's text, the released code."""
+"""Whole columns of settings: our defaults, SPST's, QS³'s text, QS³'s released code."""
 
 
 def self_training_preset(name: str, **overrides: Any) -> SelfTrainingSettings:
     """Return a preset with some settings changed.
 
     Args:
-        name: ``default``, ``paper`` or ``released``.
+        name: ``default``, ``spst``, ``paper`` or ``released``.
         overrides: Settings that differ from the preset.
 
     Raises:

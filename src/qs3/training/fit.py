@@ -6,24 +6,25 @@ import json
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import TypeVar
 
+from qs3.adaptation import method_class
+from qs3.adaptation.names import split_method
 from qs3.datasets.clouds import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.models import PointClassifier
 from qs3.training.batches import prepare, require_finite, require_unlabelled
 from qs3.training.checkpoint import MODEL, claim_run, fingerprint, load_model
-from qs3.training.config import SelfTrainingSettings, TrainSettings
+from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
 from qs3.training.deadline import Deadline
 from qs3.training.distributed import all_devices, make_fabric, threads
-from qs3.training.job import Job, Listeners, fresh_model, run_job, write_job
+from qs3.training.job import Job, Listeners, fresh_model, make_method, run_job, write_job
 from qs3.training.loop import EpochCallback
 from qs3.training.records import EpochRecord, History
 from qs3.training.self_training import RoundCallback, RoundRecord
+from qs3.training.validation import Checkpoint, read_checkpoints, split_source
 
 _Clouds = TypeVar("_Clouds", PointClouds, UnlabelledClouds)
-MethodName = Literal["source-only", "qbst"]
-"""Methods that `fit` knows."""
 
 
 @dataclass(frozen=True)
@@ -33,15 +34,19 @@ class FitResult:
     model: PointClassifier
     """The chosen network, in evaluation mode."""
     history: tuple[EpochRecord, ...]
-    """Epochs on the source; empty where a given warm-up took their place."""
+    """Epochs before self-training; empty where a given warm-up took their place."""
     rounds: tuple[RoundRecord, ...]
     """Rounds of self-training."""
     selection: str = "last"
-    """Rule that chose the network: the last epoch of a fixed schedule, no label looked at."""
+    """Rule that chose the network among the checkpoints; no label of the target looked at."""
+    checkpoints: tuple[Checkpoint, ...] = ()
+    """Networks along the way, with what each validator says of them."""
+    adapted: bool = False
+    """Whether the target had a part in the weights or in the choice of the network."""
 
 
 def fit(
-    method: MethodName,
+    method: str,
     source: PointClouds,
     target: UnlabelledClouds | None,
     settings: TrainSettings,
@@ -54,21 +59,25 @@ def fit(
     on_epoch: EpochCallback | None = None,
     on_round: RoundCallback | None = None,
 ) -> FitResult:
-    """Train a network on the source and, with ``qbst``, adapt it to an unlabelled target.
+    """Train a network with a method of adaptation, then in rounds of self-training if asked.
 
     Called again with the same arguments it goes on after the last finished epoch, and ends with
     the same bits as if it had never stopped (same devices and number of threads).
 
     Args:
-        method: ``source-only`` or ``qbst``.
-        source: Labelled clouds, as read.
-        target: Clouds without labels, as read; for ``qbst`` only.
+        method: One of `qs3.adaptation.names.MethodName`; ``spst``, ``qbst``, ``qs3`` and
+            ``gast-spst`` end in self-training.
+        source: Labelled clouds, as read. A share of ``settings.holdout`` is kept for validators.
+        target: Clouds without labels, as read. ``source-only`` takes them for validators and AdaBN
+            alone.
         settings: How to train.
-        self_training: Settings of the rounds, for ``qbst`` only; the default preset where absent.
+        self_training: Settings of the rounds, which follow any method where they are given; a
+            method that ends in self-training takes its own preset where they are absent.
         run_dir: Folder of the run: ``settings.json``, ``model.safetensors``, ``history.jsonl``;
-            the warm-up's own in ``warm-up/``; and, where clouds were thinned, the choice of points.
+            ``checkpoints/``; the warm-up's own in ``warm-up/``; and, where clouds were thinned,
+            the choice of points.
         warm_up: Folder of a finished run on the same classes, whose network takes the place of the
-            training on the source; for ``qbst`` only.
+            training before self-training.
         deadline: Time for this call; it stops before an epoch that would end later, but never
             before its first.
         tensorboard: Whether to write event files too, in ``tensorboard/``.
@@ -82,29 +91,38 @@ def fit(
         MissingExtraError: where TensorBoard is asked for and absent.
         QS3Error: where a loss or a gradient is not finite, or the process of another device ended.
     """
-    if method not in ("source-only", "qbst"):
-        raise InputError(f"unknown method {method!r}; choose source-only or qbst")
-    adapts = method == "qbst"
-    if adapts and target is None:
-        raise InputError("method qbst needs a target: give unlabelled clouds")
-    for name, value in {
-        "target": target,
-        "self-training settings": self_training,
-        "warm-up": warm_up,
-    }.items():
-        if not adapts and value is not None:
-            raise InputError(f"method {method} takes no {name}; leave it out or choose qbst")
+    base, rounds_settings = _plan(method, self_training)
+    needs = rounds_settings is not None or method_class(base).uses_target
+    separate = settings.normalisation in ("separate", "transnorm")
+    if target is None and (needs or settings.normalisation != "shared"):
+        what = f"method {method}" if needs else f"normalisation {settings.normalisation}"
+        raise InputError(f"{what} needs a target: give unlabelled clouds")
+    if separate and not method_class(base).uses_target and warm_up is None:
+        raise InputError(
+            f"normalisation {settings.normalisation} needs a method that uses the target in its "
+            f"training, which {base} does not; choose adabn"
+        )
+    if warm_up is not None and rounds_settings is None:
+        raise InputError(f"method {method} takes no warm-up; leave it out or add self-training")
     if target is not None:
         require_unlabelled(target)
-    require_finite(source, "source: ")
-    if target is not None:
         require_finite(target, "target: ")
-    rounds_settings = (self_training or SelfTrainingSettings()) if adapts else None
+    require_finite(source, "source: ")
     start = None if warm_up is None else _load_warm_up(Path(warm_up), source, settings)
     run_dir = Path(run_dir)
-    job = Job(source, target, settings, rounds_settings, run_dir, start)
+    trained, held = split_source(source, settings)
+    job = Job(
+        base,
+        trained,
+        held if len(held) else None,
+        target,
+        settings,
+        rounds_settings,
+        run_dir,
+        start,
+    )
     # What cannot be made must not leave a folder behind that refuses the corrected call.
-    fresh_model(job)
+    make_method(fresh_model(job), job)
     make_fabric(settings)
     history = History(run_dir, tensorboard)
     claim_run(
@@ -113,14 +131,21 @@ def fit(
             "method": method,
             "train": asdict(settings),
             "self_training": None if rounds_settings is None else asdict(rounds_settings),
-            "selection": "last",
+            "selection": settings.rule,
             "class_names": list(source.class_names),
             "source": fingerprint(source),
             "target": None if target is None else fingerprint(target),
             "warm_up": None if start is None else _weights_fingerprint(start),
         },
     )
-    job = replace(job, source=_prepared(source, job), target=target and _prepared(target, job))
+    source = _prepared(source, job)
+    trained, held = split_source(source, settings)
+    job = replace(
+        job,
+        source=trained,
+        holdout=held if len(held) else None,
+        target=target and _prepared(target, job),
+    )
     with (
         threads(settings),
         contextlib.closing(history),
@@ -129,7 +154,34 @@ def fit(
         model, epochs, rounds = run_job(
             job, fabric, Listeners(history, deadline, on_epoch, on_round)
         )
-    return FitResult(model=model.eval(), history=tuple(epochs), rounds=tuple(rounds))
+    return FitResult(
+        model=model.eval(),
+        history=tuple(epochs),
+        rounds=tuple(rounds),
+        selection=settings.rule,
+        checkpoints=tuple(read_checkpoints(run_dir)),
+        adapted=needs
+        or settings.normalisation != "shared"
+        or settings.rule not in ("last", "source-val"),
+    )
+
+
+def _plan(
+    method: str, self_training: SelfTrainingSettings | None
+) -> tuple[str, SelfTrainingSettings | None]:
+    """Return the warm-up's method and the settings of the rounds, if there are any."""
+    base, rule = split_method(method)
+    method_class(base)  # refuses an unknown name
+    if rule is None:
+        return base, self_training
+    if self_training is None:
+        return base, PRESETS["spst" if rule == "spst" else "default"]
+    if self_training.rule != rule:
+        raise InputError(
+            f"method {method} selects by {rule}, its self-training settings say "
+            f"{self_training.rule}; choose method {base} or rule {rule}"
+        )
+    return base, self_training
 
 
 def is_finished(run_dir: Path) -> bool:

@@ -1,5 +1,6 @@
 """The work of a run, the same on each of its devices."""
 
+import contextlib
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -8,9 +9,10 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor
 
-from qs3.adaptation import Method, SourceOnly
+from qs3.adaptation import Method, create_method, method_class
 from qs3.datasets.clouds import PointClouds, UnlabelledClouds
-from qs3.models import PointClassifier
+from qs3.errors import InputError
+from qs3.models import PointClassifier, feature_widths
 from qs3.training.checkpoint import (
     derived_seed,
     load_tensors_into,
@@ -26,6 +28,14 @@ from qs3.training.deadline import Deadline
 from qs3.training.loop import EpochCallback, train
 from qs3.training.records import EpochRecord, History
 from qs3.training.self_training import RoundCallback, RoundRecord, self_train
+from qs3.training.validation import (
+    Checkpoint,
+    Validation,
+    adapt_statistics,
+    choose,
+    load_checkpoint,
+    read_checkpoints,
+)
 
 WARM_UP = "warm-up"
 JOB = "job.safetensors"
@@ -35,10 +45,14 @@ JOB = "job.safetensors"
 class Job:
     """What is to be trained, on what, and where the files go."""
 
+    method: str
+    """Method of the training, or of the warm-up before self-training."""
     source: PointClouds
-    """Labelled clouds, prepared."""
+    """Labelled clouds to train on, prepared."""
+    holdout: PointClouds | None
+    """Labelled clouds of the source for the validators, prepared."""
     target: UnlabelledClouds | None
-    """Clouds of the target, prepared; None without self-training."""
+    """Clouds of the target, prepared; None where there are none."""
     settings: TrainSettings
     """How to train."""
     rounds: SelfTrainingSettings | None
@@ -67,65 +81,114 @@ NOBODY = Listeners()
 """The further devices tell nobody."""
 
 
-def make_method(model: PointClassifier, settings: TrainSettings) -> Method:
-    """Return the method that trains the network on the source."""
-    return SourceOnly(model, label_smoothing=settings.label_smoothing)
+ROUND = "round"
+"""Stage of the checkpoints that self-training makes."""
+
+
+def make_method(model: PointClassifier, job: Job) -> Method:
+    """Return the method that trains the network; what else it trains is drawn from the seed."""
+    settings = job.settings
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(derived_seed(settings.seed, 4))
+        return create_method(
+            job.method,
+            model,
+            label_smoothing=settings.label_smoothing,
+            normalisation=settings.normalisation,
+            **settings.method_settings,
+        )
 
 
 def fresh_model(job: Job) -> PointClassifier:
     """Return the network with the weights that a training begins with."""
-    seed = derived_seed(job.settings.seed, 0)
-    return new_model(job.settings, len(job.source.class_names), seed)
+    settings, count = job.settings, len(job.source.class_names)
+    seed = derived_seed(settings.seed, 0)
+    model = new_model(settings, count, seed)
+    if method_class(job.method).needs_local and feature_widths(model).local is None:
+        # Only a setting of what `encode` gives: the weights are the same.
+        told = dict(settings.model_settings) | {"per_point": True}
+        with contextlib.suppress(InputError):
+            return new_model(replace(settings, model_settings=told), count, seed)
+    return model
 
 
 def run_job(
     job: Job, fabric: Fabric, tell: Listeners = NOBODY
 ) -> tuple[PointClassifier, list[EpochRecord], list[RoundRecord]]:
-    """Train on the source, then in rounds if asked; go on where an earlier call stopped.
+    """Train the method, then in rounds if asked; go on where an earlier call stopped.
 
     Returns:
-        The network, a record of each epoch on the source, and one of each round.
+        The network, a record of each epoch before the rounds, and one of each round.
     """
     epochs: list[EpochRecord] = []
     records: list[RoundRecord] = []
-    stage = "source-only" if job.rounds is None else WARM_UP
+    stage = job.method if job.rounds is None else WARM_UP
     history = tell.history
+    validation = Validation(job.run_dir, job.source, job.holdout, job.target, job.settings, fabric)
+
+    def looked() -> None:
+        if history is not None:
+            history.checkpoints(read_checkpoints(job.run_dir))
+
+    def look(number: int, model: PointClassifier) -> None:
+        validation.look(ROUND, number, model)
+        looked()
+
     model = job.start
     if model is None:
         folder = job.run_dir if job.rounds is None else job.run_dir / WARM_UP
-        model = fresh_model(job)
+        method = make_method(fresh_model(job), job)
         epochs, _ = train(
-            make_method(model, job.settings),
+            method,
             job.source,
-            None,
+            job.target,
             job.settings,
             fabric=fabric,
             run_dir=folder,
             stream=(0,),
+            observer=validation.of(stage, job.settings.epochs),
             on_epoch=tell.on_epoch,
             log=None if history is None else history.training(stage),
             deadline=tell.deadline,
             description=stage,
         )
+        method.norm.settle()
+        model = method.result()
+        if job.settings.normalisation == "adabn" and job.target is not None:
+            adapt_statistics(model, job.target.points, job.settings.batch_size)
         if history is not None:
             history.source(stage, epochs)
+        looked()
+        if job.rounds is None:
+            _follow_rule(model, stage, job)
         _save(folder, model, job, fabric)
     if job.rounds is not None and job.target is not None:
+        looked()
         model, records = self_train(
             model,
             job.source,
             job.target,
             job.settings,
             job.rounds,
+            holdout=job.holdout,
             fabric=fabric,
             run_dir=job.run_dir,
+            look=look,
             on_epoch=tell.on_epoch,
             on_round=tell.on_round,
             history=history,
             deadline=tell.deadline,
         )
+        _follow_rule(model, ROUND, job)
         _save(job.run_dir, model, job, fabric)
     return model, epochs, records
+
+
+def _follow_rule(model: PointClassifier, stage: str, job: Job) -> None:
+    """Take the weights that the rule picks, where it is not the last."""
+    if job.settings.rule != "last":
+        picked: Checkpoint = choose(read_checkpoints(job.run_dir, stage), job.settings.rule)
+        load_checkpoint(job.run_dir, picked, model)
 
 
 def _save(folder: Path, model: PointClassifier, job: Job, fabric: Fabric) -> None:
@@ -140,16 +203,23 @@ def write_job(job: Job, folder: Path) -> None:
         "source": torch.from_numpy(job.source.points),
         "labels": torch.from_numpy(job.source.labels.astype(np.int64)),
     }
+    if job.holdout is not None:
+        tensors["holdout"] = torch.from_numpy(job.holdout.points)
+        tensors["holdout_labels"] = torch.from_numpy(job.holdout.labels.astype(np.int64))
     if job.target is not None:
         tensors["target"] = torch.from_numpy(job.target.points)
     if job.start is not None:
         tensors |= prefixed("start", job.start.state_dict())
     facts = {
+        "method": job.method,
         "class_names": job.source.class_names,
         "settings": asdict(job.settings),
         "rounds": None if job.rounds is None else asdict(job.rounds),
         "run_dir": str(job.run_dir.resolve()),
-        "ids": [job.source.ids, None if job.target is None else job.target.ids],
+        "ids": [
+            None if clouds is None else clouds.ids
+            for clouds in (job.source, job.holdout, job.target)
+        ],
     }
     write_tensors(folder / JOB, tensors, facts)
 
@@ -158,11 +228,17 @@ def read_job(folder: Path) -> Job:
     """Read what `write_job` wrote."""
     tensors, facts = read_tensors(folder / JOB)
     names = tuple(facts["class_names"])
-    source, target = facts["ids"]
+    source, holdout, target = facts["ids"]
     rounds = facts["rounds"]
     job = Job(
+        method=facts["method"],
         source=PointClouds(
             tensors["source"].numpy(), tensors["labels"].numpy(), names, tuple(source)
+        ),
+        holdout=None
+        if holdout is None
+        else PointClouds(
+            tensors["holdout"].numpy(), tensors["holdout_labels"].numpy(), names, tuple(holdout)
         ),
         target=None
         if target is None

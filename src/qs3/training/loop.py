@@ -65,7 +65,8 @@ def train(
             ``ema_decay`` it holds the moving average at the end.
         source: Labelled clouds, prepared. Of several sets, each step takes a batch of each, and an
             epoch is one pass over the first; the others begin anew when they end.
-        target: Clouds of the target, prepared; only for a method that uses them.
+        target: Clouds of the target, prepared; they are not looked at where the method does not
+            use them. An epoch is one pass over the source or the target, whichever is longer.
         settings: How to train.
         fabric: Devices and number format; made from the settings where it is not given.
         run_dir: Folder for the checkpoint; without one there is none. A checkpoint of another
@@ -93,11 +94,13 @@ def train(
     share = Share(fabric.global_rank, fabric.world_size)
     least = 2 * share.world
     sets = [source] if isinstance(source, PointClouds) else list(source)
-    for clouds in [*sets, *([] if target is None else [target])]:
+    for clouds in sets:
         if len(clouds) < least:
             raise InputError(f"{len(clouds)} clouds are too few to train on; give at least {least}")
-    if method.uses_target and target is None:
+    if method.uses_target and (target is None or not len(target)):
         raise InputError(f"{type(method).__name__} needs a target; give unlabelled clouds")
+    if not method.uses_target:
+        target = None
     optimiser = torch.optim.Adam(
         method.parameter_groups(settings.learning_rate),
         lr=settings.learning_rate,
@@ -115,7 +118,11 @@ def train(
     labelled = [DeviceClouds(clouds, fabric.device) for clouds in sets]
     unlabelled = None if target is None else DeviceClouds(target, fabric.device)
 
-    steps = steps_per_epoch or count_batches(len(sets[0]), settings.batch_size, least)
+    # A target of a single cloud goes in twice, each time with another augmentation.
+    drawn_from = 0 if target is None else max(len(target), least)
+    steps = steps_per_epoch or max(
+        count_batches(count, settings.batch_size, least) for count in (len(sets[0]), drawn_from)
+    )
     total = settings.epochs * steps
     with Progress(method, fabric, total, len(history) * steps, description) as bar:
         for epoch in range(len(history), settings.epochs):
@@ -130,8 +137,8 @@ def train(
             augmentation = torch.Generator(fabric.device).manual_seed(seeds[0])
             generator = torch.Generator().manual_seed(seeds[1] + share.rank)
             orders, others = (
-                [endless_batches(len(s), settings.batch_size, rng, least) for s in group]
-                for group in (labelled, [] if unlabelled is None else [unlabelled])
+                [endless_batches(count, settings.batch_size, rng, least) for count in counts]
+                for counts in (map(len, sets), [drawn_from] if drawn_from else [])
             )
             method.train()
             with _seeded(fabric.device, seeds[2] + share.rank):
@@ -142,6 +149,7 @@ def train(
                     other = [next(order) for order in others]
                     seen = None
                     if unlabelled is not None:
+                        other = [index % len(unlabelled) for index in other]
                         seen = make_batch([unlabelled], other, settings, augmentation, share).points
                     losses = wrapped(batch, seen, (epoch * steps + step) / total, generator)
                     count = sum(map(len, rows))

@@ -1,6 +1,7 @@
 """Class probabilities of clouds."""
 
 from contextlib import nullcontext
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,7 +13,15 @@ from qs3.training.batches import prepare
 from qs3.training.distributed import gather_rows
 
 
-@torch.no_grad()
+class Description(NamedTuple):
+    """What a network says of clouds."""
+
+    probabilities: Float[np.ndarray, "b k"]
+    """Softmax in float64; rows sum to 1 to rounding."""
+    features: Float[np.ndarray, "b c"]
+    """Pooled features, float64."""
+
+
 def predict_probabilities(
     model: PointClassifier,
     points: Float[np.ndarray, "b n 3"],
@@ -41,34 +50,52 @@ def predict_probabilities(
         (3, 4)
     """
     prepared = prepare(points, points.shape[1] if num_points is None else num_points)
+    return describe(model, prepared, batch_size=batch_size, fabric=fabric).probabilities
+
+
+@torch.no_grad()
+def describe(
+    model: PointClassifier,
+    points: Float[np.ndarray, "b n 3"],
+    *,
+    batch_size: int = 32,
+    fabric: Fabric | None = None,
+) -> Description:
+    """Return class probabilities and pooled features of clouds, without augmentation.
+
+    Args:
+        model: The network; its mode is put back afterwards, its device stays.
+        points: Clouds, prepared.
+        batch_size: Clouds in a forward pass.
+        fabric: As in `predict_probabilities`.
+    """
     parameter = next(model.parameters())
     context = nullcontext if fabric is None else fabric.autocast
     training = model.training
     model.eval()
-    mine = _part(len(prepared), fabric)
-    answers = np.zeros((len(prepared), _classes(model)))
+    mine = _part(len(points), fabric)
+    found: list[np.ndarray] = []
     try:
+        # A lone point tells the widths where this device has no cloud.
+        example = torch.zeros(1, 1, 3).to(parameter)
+        encoded = model.encode(example)
+        classes, width = model.head(encoded).shape[1], encoded.pooled.shape[1]
         for start in range(mine.start, mine.stop, batch_size):
-            rows = slice(start, min(start + batch_size, mine.stop))
-            batch = torch.from_numpy(prepared[rows])
+            batch = torch.from_numpy(points[start : min(start + batch_size, mine.stop)])
             with context():
-                logits = model(batch.to(parameter.device, parameter.dtype))
-            answers[rows] = torch.softmax(logits.double(), dim=1).cpu().numpy()
+                encoded = model.encode(batch.to(parameter.device, parameter.dtype))
+                logits = model.head(encoded)
+            parts = (torch.softmax(logits.double(), dim=1), encoded.pooled.double())
+            found.append(torch.cat(parts, dim=1).cpu().numpy())
     finally:
         model.train(training)
-    return answers if fabric is None else gather_rows(answers[mine], mine, len(answers), fabric)
+    rows = np.concatenate([np.zeros((0, classes + width)), *found])
+    if fabric is not None:
+        rows = gather_rows(rows, mine, len(points), fabric)
+    return Description(rows[:, :classes], rows[:, classes:])
 
 
 def _part(count: int, fabric: Fabric | None) -> slice:
     """This device's part of the clouds."""
     rank, world = (0, 1) if fabric is None else (fabric.global_rank, fabric.world_size)
     return slice(rank * count // world, (rank + 1) * count // world)
-
-
-def _classes(model: PointClassifier) -> int:
-    example = torch.zeros(1, 1, 3).to(next(model.parameters()))
-    training = model.training
-    model.eval()
-    count = model(example).shape[1]
-    model.train(training)
-    return count

@@ -37,9 +37,9 @@ Log = Callable[[Sequence[EpochRecord]], None]
 
 
 class History:
-    """Writes ``history.jsonl``: one line an epoch on the source, one a round of self-training.
+    """Writes ``history.jsonl``: a line an epoch, a checkpoint and a round of self-training.
 
-    A line of an epoch names its stage: ``source-only``, ``warm-up`` or ``round-3``. Epochs of a
+    A line of an epoch names its stage: the method, ``warm-up`` or ``round-3``. Epochs of a
     round that is not done have a line each; then the round's own line takes their place. The file
     is written anew, whole, at every change: it is never torn, and a resumed run repeats no line.
 
@@ -75,6 +75,12 @@ class History:
         """Keep the rounds so far, in place of what was there of rounds."""
         self.lines = [line for line in self.lines if line["kind"] != "round"]
         self.lines += [{"kind": "round", **asdict(record)} for record in records]
+        self._write(self.lines)
+
+    def checkpoints(self, records: Sequence[Any]) -> None:
+        """Keep the checkpoints so far and what the validators say of them, as lines of a kind."""
+        self.lines = [line for line in self.lines if line["kind"] != "checkpoint"]
+        self.lines += [{"kind": "checkpoint", **asdict(record)} for record in records]
         self._write(self.lines)
 
     def close(self) -> None:

@@ -5,17 +5,18 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from lightning_fabric import Fabric
 from torch import Tensor
 
-from qs3.adaptation import Method, SourceOnly, select_confident, select_quasi_balanced
+from qs3.adaptation import Method, PseudoLabelled, select_confident
+from qs3.adaptation.graph_labels import refine_probabilities
+from qs3.adaptation.normalisation import make_norm
 from qs3.datasets.clouds import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.evaluation.metrics import accuracy
@@ -34,16 +35,14 @@ from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.deadline import Deadline
 from qs3.training.distributed import make_fabric
 from qs3.training.loop import CHECKPOINT, EpochCallback, train
-from qs3.training.predict import predict_probabilities
+from qs3.training.predict import describe, predict_probabilities
 from qs3.training.records import EpochRecord, History
+from qs3.training.round_rules import Select, make_rule
 
 _LOG = logging.getLogger(__name__)
 STATE = "rounds.safetensors"
 STREAM = 1
 """Sets the random draws of the rounds apart from those of the warm-up."""
-
-Select = Callable[[Float[np.ndarray, "m k"], float], Bool[np.ndarray, "m"]]
-"""A rule that selects among clouds by their probabilities and θ."""
 
 
 @dataclass(frozen=True)
@@ -83,14 +82,8 @@ RoundCallback = Callable[[RoundRecord, PointClassifier], None]
 """Called after each round, when its state is written."""
 
 
-def quasi_balanced_rule(settings: SelfTrainingSettings) -> Select:
-    """Return QBST's selection rule with the settings' choices."""
-    return partial(
-        select_quasi_balanced,
-        selection=settings.selection,
-        inclusive=settings.inclusive,
-        single_class=settings.single_class,
-    )
+Look = Callable[[int, PointClassifier], None]
+"""Called on every device after each round, before its state is written."""
 
 
 def self_train(
@@ -100,9 +93,11 @@ def self_train(
     settings: TrainSettings,
     self_training: SelfTrainingSettings,
     *,
+    holdout: PointClouds | None = None,
     select: Select | None = None,
     fabric: Fabric | None = None,
     run_dir: Path | None = None,
+    look: Look | None = None,
     on_round: RoundCallback | None = None,
     on_epoch: EpochCallback | None = None,
     history: History | None = None,
@@ -120,9 +115,11 @@ def self_train(
         target: Clouds without labels, prepared.
         settings: Network, batch size, rate, augmentation, seed. Its epochs are not used.
         self_training: Settings of the rounds.
-        select: Selection rule; `quasi_balanced_rule` where it is not given.
+        holdout: Part of the source that is not trained on, for an estimate of the class shares.
+        select: Selection rule, in place of the one of the settings.
         fabric: Device and number format; made from the settings where it is not given.
         run_dir: Folder for states: a run that was killed goes on after its last epoch.
+        look: Called after each round on every device, before its state is written.
         on_round: Called after each round.
         on_epoch: Called after each epoch.
         history: Is told of epochs and rounds.
@@ -140,14 +137,14 @@ def self_train(
         raise InputError("the target has no cloud; give unlabelled clouds")
     require_finite(target, "target: ")
     fabric = fabric or make_fabric(settings)
-    select = select or quasi_balanced_rule(self_training)
     folder = None if run_dir is None else Path(run_dir)
     rounds = _Rounds(model, source, target, settings, self_training, fabric, folder)
-    rounds.history, rounds.deadline = history, deadline
+    rounds.history, rounds.deadline, rounds.look = history, deadline, look
+    rounds.holdout, rounds.select = holdout, select
     if history is not None:
         history.rounds(rounds.records)
     for number in range(len(rounds.records) + 1, self_training.rounds + 1):
-        record = rounds.run(number, select, on_epoch)
+        record = rounds.run(number, on_epoch)
         if history is not None:
             history.rounds(rounds.records)
         if on_round is not None:
@@ -181,25 +178,24 @@ class _Rounds:
         self.records: list[RoundRecord] = []
         self.history: History | None = None
         self.deadline: Deadline | None = None
+        self.look: Look | None = None
+        self.holdout: PointClouds | None = None
+        self.select: Select | None = None
         if run_dir is not None and (run_dir / STATE).is_file():
             self._load(run_dir / STATE)
         fabric.barrier()  # the first device must not write before all have read
 
-    def run(self, number: int, select: Select, on_epoch: EpochCallback | None) -> RoundRecord:
+    def run(self, number: int, on_epoch: EpochCallback | None) -> RoundRecord:
         """Label, select, train; write the state."""
         start = time.perf_counter()
         k = len(self.source.class_names)
         theta = self.rounds.threshold + (number - 1) * self.rounds.step
-        probabilities = predict_probabilities(
-            self.best.model if self.rounds.labeller == "best" else self.latest,
-            self.target.points,
-            batch_size=self.settings.batch_size,
-            fabric=self.fabric,
-        )
+        probabilities = self._probabilities()
         labels = probabilities.argmax(axis=1)
         candidates = probabilities[self.pool]
         confident = select_confident(candidates, theta, inclusive=self.rounds.inclusive)
         over = np.bincount(candidates[confident].argmax(axis=1), minlength=k)
+        select = self.select or make_rule(self.rounds, number, self.source.labels, self._held)
         chosen = self.pool[select(candidates, theta)]
         pool = len(self.pool)
         least = 2 * max(k, self.settings.devices)
@@ -232,11 +228,40 @@ class _Rounds:
         )
         self.labels = labels
         self.records.append(record)
+        if self.look is not None:
+            self.look(number, self.latest)
         if self.run_dir is not None and self.fabric.is_global_zero:
             self._save(self.run_dir / STATE)
             (self.run_dir / CHECKPOINT).unlink(missing_ok=True)
         self.fabric.barrier()
         return record
+
+    def _labeller(self) -> PointClassifier:
+        return self.best.model if self.rounds.labeller == "best" else self.latest
+
+    def _probabilities(self) -> np.ndarray:
+        """What the labeller says of the target, smoothed over a graph where asked."""
+        told = describe(
+            self._labeller(),
+            self.target.points,
+            batch_size=self.settings.batch_size,
+            fabric=self.fabric,
+        )
+        if not self.rounds.refine:
+            return told.probabilities
+        return refine_probabilities(told.features, told.probabilities)
+
+    def _held(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Classes and probabilities of the source's held-out part."""
+        if self.holdout is None or not len(self.holdout):
+            return None
+        told = describe(
+            self._labeller(),
+            self.holdout.points,
+            batch_size=self.settings.batch_size,
+            fabric=self.fabric,
+        )
+        return self.holdout.labels, told.probabilities
 
     def _held_out(self, chosen: np.ndarray) -> Bool[np.ndarray, "m"]:
         """Which of the chosen clouds are not trained on: a fifth, for a ``best`` labeller."""
@@ -261,7 +286,7 @@ class _Rounds:
             fresh = new_model(self.settings, len(self.source.class_names), seed)
             self.latest.load_state_dict(fresh.state_dict())
         continuous = rounds.schedule == "continuous"
-        method: Method = SourceOnly(self.latest, label_smoothing=self.settings.label_smoothing)
+        method = self._method(trained)
         history, optimiser = train(
             method,
             [pseudo, self.source] if rounds.source_loss else pseudo,
@@ -279,8 +304,23 @@ class _Rounds:
             deadline=self.deadline,
             description=f"round {number}/{rounds.rounds}",
         )
+        method.norm.settle()
         self.optimiser = optimiser if continuous else {}
         return history
+
+    def _method(self, trained: int) -> Method:
+        """The training of one round, after ``trained`` others."""
+        rounds, settings = self.rounds, self.settings
+        # TransNorm's weights are in the network's scales already; a second time they would double.
+        plain = settings.normalisation in ("shared", "adabn")
+        return PseudoLabelled(
+            self.latest,
+            source_weight=rounds.source_weight,
+            weight_step=rounds.weight_step,
+            epochs=range(trained * rounds.epochs, (trained + 1) * rounds.epochs),
+            label_smoothing=settings.label_smoothing,
+            norm=make_norm("shared" if plain else "separate", self.latest),
+        )
 
     def _save(self, path: Path) -> None:
         tensors = prefixed("latest", self.latest.state_dict())
@@ -323,13 +363,14 @@ class _Best:
     def after_epoch(self, method: Method, epoch: int) -> None:
         if not len(self.labels):
             return
-        probabilities = predict_probabilities(
-            method.model, self.points, batch_size=self.batch_size, fabric=self.fabric
-        )
-        score = accuracy(self.labels, probabilities.argmax(axis=1))
-        if score > self.score:
-            self.score = score
-            self.model.load_state_dict(method.model.state_dict())
+        with method.norm.of("target"):
+            probabilities = predict_probabilities(
+                method.model, self.points, batch_size=self.batch_size, fabric=self.fabric
+            )
+            score = accuracy(self.labels, probabilities.argmax(axis=1))
+            if score > self.score:
+                self.score = score
+                self.model.load_state_dict(method.model.state_dict())
 
     def tensors(self) -> dict[str, Tensor]:
         score = torch.tensor(self.score, dtype=torch.float64)

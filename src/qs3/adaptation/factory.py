@@ -1,0 +1,89 @@
+"""Methods by name."""
+
+import inspect
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
+
+from qs3.adaptation.method import Method
+from qs3.adaptation.names import Normalisation
+from qs3.adaptation.normalisation import make_norm
+from qs3.errors import InputError
+from qs3.models import PointClassifier
+
+_METHODS: Mapping[str, tuple[str, str]] = {
+    "source-only": ("source_only", "SourceOnly"),
+    "dann": ("dann", "DANN"),
+    "mmd": ("mmd", "MMD"),
+    "coral": ("coral", "CORAL"),
+    "pointdan": ("pointdan", "PointDAN"),
+    "defrec": ("defrec", "DefRec"),
+    "pcm": ("pcm", "PCM"),
+    "defrec-pcm": ("defrec_pcm", "DefRecPCM"),
+    "gast": ("gast", "GAST"),
+    "sd": ("self_distillation", "SelfDistillation"),
+}
+"""Module and class of each method."""
+
+
+def list_methods() -> tuple[str, ...]:
+    """Return the names that `create_method` knows.
+
+    Example:
+        >>> "source-only" in list_methods()
+        True
+    """
+    return tuple(_METHODS)
+
+
+def method_class(name: str) -> type[Method]:
+    """Return the class of a method.
+
+    Raises:
+        InputError: where the name is unknown.
+
+    Example:
+        >>> method_class("source-only").uses_target
+        False
+    """
+    if name not in _METHODS:
+        raise InputError(f"unknown method {name!r}; choose one of {', '.join(_METHODS)}")
+    module, kind = _METHODS[name]
+    return getattr(import_module(f"qs3.adaptation.{module}"), kind)
+
+
+def create_method(
+    name: str,
+    model: PointClassifier,
+    *,
+    label_smoothing: float = 0.0,
+    normalisation: Normalisation = "shared",
+    **settings: Any,
+) -> Method:
+    """Make a method around a network; what else it trains is drawn from PyTorch's random state.
+
+    Args:
+        name: One of `list_methods`.
+        model: The network to train.
+        label_smoothing: ε of the source's cross entropy.
+        normalisation: How the network normalises the two domains.
+        settings: Arguments of the method; those left out keep the paper's values.
+
+    Raises:
+        InputError: where the name or a setting is unknown, a value is unusable, or the network
+            does not give what the method needs.
+    """
+    kind = method_class(name)
+    fixed = {"self", "model", "label_smoothing", "norm"}
+    known = [key for key in inspect.signature(kind.__init__).parameters if key not in fixed]
+    for key in settings:
+        if key not in known:
+            choice = f"choose from {', '.join(known)}" if known else "it takes none"
+            raise InputError(f"unknown setting {key!r} of method {name}; {choice}")
+    norm = make_norm(normalisation, model)
+    try:
+        return kind(model, label_smoothing=label_smoothing, norm=norm, **settings)
+    except InputError:
+        raise
+    except (TypeError, ValueError) as error:
+        raise InputError(f"settings {settings} do not make method {name}: {error}") from error

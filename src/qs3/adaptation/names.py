@@ -1,0 +1,67 @@
+"""Names of methods, rules and options, for those who must not wait for PyTorch to load."""
+
+from collections.abc import Mapping
+from typing import Literal
+
+MethodName = Literal[
+    "source-only",
+    "dann",
+    "mmd",
+    "coral",
+    "pointdan",
+    "defrec",
+    "pcm",
+    "defrec-pcm",
+    "gast",
+    "sd",
+    "spst",
+    "qbst",
+    "qs3",
+    "gast-spst",
+]
+"""Methods of adaptation; the last four end in rounds of self-training (`COMPOSED`)."""
+
+RoundRule = Literal["qbst", "spst", "uniform", "prior", "quantile"]
+"""Which clouds a round of self-training selects."""
+
+Normalisation = Literal["shared", "separate", "adabn", "transnorm"]
+"""Batch statistics across domains. shared: running statistics follow both domains as they pass.
+separate: each domain has its own; the trained network keeps the target's. adabn: as shared, then
+computed anew over the target (Li et al., 2018). transnorm: as separate, and channels that differ
+less between the domains weigh more (Wang et al., NeurIPS 2019)."""
+
+Rule = Literal["last", "source-val", "entropy", "im", "bnm", "snd", "dev", "class-ami"]
+"""How the network is chosen among a run's checkpoints; no rule looks at a label of the target."""
+
+COMPOSED: Mapping[str, tuple[str, RoundRule]] = {
+    "spst": ("source-only", "spst"),
+    "qbst": ("source-only", "qbst"),
+    "qs3": ("source-only", "qbst"),
+    "gast-spst": ("gast", "spst"),
+}
+"""Methods that are a warm-up and a rule of self-training; qs3 is qbst on a scanned source."""
+
+
+def split_method(method: str, rounds: str | None = None) -> tuple[str, str | None]:
+    """Return the warm-up and the rule of self-training that a method stands for.
+
+    Args:
+        method: A name.
+        rounds: A rule that is asked for beside it.
+
+    Raises:
+        ValueError: where the method has a rule of its own and another one is asked for.
+
+    Example:
+        >>> split_method("qbst"), split_method("gast", "qbst"), split_method("dann")
+        (('source-only', 'qbst'), ('gast', 'qbst'), ('dann', None))
+    """
+    if method not in COMPOSED:
+        return method, rounds
+    warm_up, own = COMPOSED[method]
+    if rounds is not None and rounds != own:
+        raise ValueError(
+            f"method {method} is {warm_up} with {own}; for another rule choose method {warm_up} "
+            f"with self-training {rounds}"
+        )
+    return warm_up, own

@@ -1,0 +1,65 @@
+"""Training on pseudo labels of the target, with or without the source beside them."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from qs3.adaptation.losses import cross_entropy
+from qs3.adaptation.method import Batch, Method
+from qs3.adaptation.normalisation import DomainNorm
+from qs3.models import PointClassifier
+
+
+class PseudoLabelled(Method):
+    """Cross entropy on pseudo-labelled clouds of the target, plus that on the source.
+
+    The first part of each batch is of the target, the second, where there is one, of the source.
+    Each part passes through the network by itself, the source first.
+
+    Args:
+        model: The network to train.
+        source_weight: Factor of the source's loss in epoch 0; the target's is 1.
+        weight_step: Taken off both factors after each epoch (SPST: 0.005).
+        epochs: Numbers of the epochs of this training, for ``weight_step``.
+        label_smoothing: ε of `qs3.adaptation.losses.cross_entropy`.
+        norm: How the network normalises the two domains.
+    """
+
+    def __init__(
+        self,
+        model: PointClassifier,
+        *,
+        source_weight: float = 1.0,
+        weight_step: float = 0.0,
+        epochs: range = range(1),
+        label_smoothing: float = 0.0,
+        norm: DomainNorm | None = None,
+    ) -> None:
+        super().__init__(model, label_smoothing=label_smoothing, norm=norm)
+        self.source_weight, self.weight_step, self.epochs = source_weight, weight_step, epochs
+
+    def losses(
+        self,
+        source: Batch,
+        target: Float[Tensor, "b_t n_t 3"] | None,
+        progress: float,
+        generator: torch.Generator,
+    ) -> dict[str, Tensor]:
+        """Return the weighted cross entropies, ``pseudo`` and ``source``."""
+        count = source.parts[0] if source.parts else len(source.labels)
+        done = min(int(progress * len(self.epochs) + 1e-9), len(self.epochs) - 1)
+        fallen = self.weight_step * self.epochs[done]
+        terms: dict[str, Tensor] = {}
+        right = torch.zeros((), dtype=torch.int64, device=source.labels.device)
+        for name, domain, rows, weight in (
+            ("source", "source", slice(count, None), self.source_weight - fallen),
+            ("pseudo", "target", slice(0, count), 1.0 - fallen),
+        ):
+            labels = source.labels[rows]
+            if not len(labels):
+                continue
+            logits = self.logits(source.points[rows], domain)
+            right += (logits.detach().argmax(dim=1) == labels).sum()
+            terms[name] = weight * cross_entropy(logits, labels, self.label_smoothing)
+        self.right = right
+        return terms

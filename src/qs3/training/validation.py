@@ -1,0 +1,256 @@
+"""Checkpoints of the network along a run, each with every validator, and the choice among them."""
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from lightning_fabric import Fabric
+from torch import Tensor
+from torch.nn.modules.batchnorm import _BatchNorm
+
+from qs3.adaptation import Method
+from qs3.adaptation.validators import VALIDATORS, Observation, source_accuracy, validate
+from qs3.datasets.clouds import PointClouds, UnlabelledClouds
+from qs3.errors import InputError
+from qs3.models import PointClassifier
+from qs3.training.checkpoint import (
+    load_tensors_into,
+    read_tensors,
+    save_model,
+    seed_sequence,
+)
+from qs3.training.config import TrainSettings
+from qs3.training.predict import describe
+
+CHECKPOINTS = "checkpoints"
+_SOURCE_CLOUDS = 1000
+"""Of the source, at most so many tell DEV where the source lies."""
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A network that the run could end with."""
+
+    stage: str
+    """``round`` for self-training, else the stage of the epochs."""
+    number: int
+    """Epochs, or rounds, that were done."""
+    validators: Mapping[str, float | None]
+    """What each validator says, higher is better; None where it lacks something."""
+    file: str
+    """Weights, relative to the run's folder."""
+
+
+class Validation:
+    """Looks at the network in the course of a run; no label of the target is at hand.
+
+    Args:
+        run_dir: Folder of the run; weights go to ``checkpoints/`` there.
+        source: The part of the source that is trained on, prepared.
+        holdout: The part that is not, prepared; None where there is none.
+        target: Clouds without labels, prepared; None where there are none.
+        settings: How often to look, and whose normalisation counts.
+        fabric: The devices; all must call.
+    """
+
+    def __init__(
+        self,
+        run_dir: Path,
+        source: PointClouds,
+        holdout: PointClouds | None,
+        target: UnlabelledClouds | None,
+        settings: TrainSettings,
+        fabric: Fabric,
+    ) -> None:
+        self.run_dir, self.settings, self.fabric = Path(run_dir), settings, fabric
+        rows = np.random.default_rng(seed_sequence(settings.seed, 2)).permutation(len(source))
+        self.source = source.select(np.sort(rows[:_SOURCE_CLOUDS]))
+        self.holdout, self.target = holdout, target
+        self.class_names = source.class_names
+
+    def of(self, stage: str, epochs: int) -> "EpochWatch | None":
+        """Return the observer of one training; None where there is nothing to look at."""
+        if not self.settings.validate_every:
+            return None
+        return EpochWatch(self, stage, epochs)
+
+    def look(self, stage: str, number: int, model: PointClassifier) -> None:
+        """Measure a network and keep its weights."""
+        if not self.settings.validate_every:
+            return
+        target, holdout, source = (
+            None
+            if clouds is None or not len(clouds)
+            else describe(
+                model, clouds.points, batch_size=self.settings.batch_size, fabric=self.fabric
+            )
+            for clouds in (self.target, self.holdout, self.source)
+        )
+        values: dict[str, float | None] = dict.fromkeys(VALIDATORS)
+        labels = None if self.holdout is None else self.holdout.labels
+        if target is not None:
+            seen = Observation(
+                target_probabilities=target.probabilities,
+                target_features=target.features,
+                validation_probabilities=None if holdout is None else holdout.probabilities,
+                validation_features=None if holdout is None else holdout.features,
+                validation_labels=labels,
+                training_features=None if source is None else source.features,
+            )
+            values |= validate(seen)
+        elif holdout is not None and labels is not None:
+            values["source-val"] = source_accuracy(holdout.probabilities, labels)
+        if self.fabric.is_global_zero:
+            told = {"stage": stage, "number": number, "validators": values}
+            name = f"{CHECKPOINTS}/{stage}-{number:04d}.safetensors"
+            save_model(self.run_dir, model, self.class_names, self.settings, name=name, facts=told)
+        self.fabric.barrier()
+
+    def adapt(self, model: PointClassifier) -> None:
+        """Compute batch statistics anew over the target where the settings ask for AdaBN."""
+        if self.settings.normalisation == "adabn" and self.target is not None:
+            adapt_statistics(model, self.target.points, self.settings.batch_size)
+
+    def settled(self, method: Method) -> PointClassifier:
+        """Return the network that a method would end with now, apart from the method."""
+        copied = copy.deepcopy(method)
+        copied.norm.settle()
+        model = copied.result()
+        self.adapt(model)
+        return model
+
+
+class EpochWatch:
+    """Looks at the network after some epochs of one training."""
+
+    def __init__(self, validation: Validation, stage: str, epochs: int) -> None:
+        self.validation, self.stage, self.epochs = validation, stage, epochs
+
+    def after_epoch(self, method: Method, epoch: int) -> None:
+        """Make a checkpoint where one is due."""
+        done = epoch + 1
+        if done == self.epochs or done % self.validation.settings.validate_every == 0:
+            self.validation.look(self.stage, done, self.validation.settled(method))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Nothing: the files are the state."""
+        return {}
+
+    def load(self, tensors: Mapping[str, Tensor]) -> None:
+        """Nothing to take back."""
+
+
+@torch.no_grad()
+def adapt_statistics(model: PointClassifier, points: np.ndarray, batch_size: int = 32) -> None:
+    """Compute the running statistics of batch normalisation anew over clouds (AdaBN).
+
+    Each layer's mean and variance become the averages over the batches, all of the same weight
+    (Li et al., Adaptive batch normalisation, 2018). Weights stay as they are. Of a single cloud
+    the network must be able to take a batch statistic: it goes in twice.
+
+    Args:
+        model: The network; its mode is put back.
+        points: Clouds [b n 3], prepared, without labels.
+        batch_size: Clouds in a batch; a last one of a single cloud is joined to the one before.
+
+    Raises:
+        InputError: where there is no cloud.
+    """
+    if not len(points):
+        raise InputError("AdaBN needs clouds of the target")
+    layers = [layer for layer in model.modules() if isinstance(layer, _BatchNorm)]
+    momenta = [layer.momentum for layer in layers]
+    training = model.training
+    model.eval()
+    parameter = next(model.parameters())
+    try:
+        for layer in layers:
+            layer.reset_running_stats()
+            layer.momentum = None  # a cumulative average
+            layer.train()
+        rows = np.arange(max(2, len(points))) % len(points)
+        count = max(1, len(rows) // max(2, batch_size))
+        for part in np.array_split(rows, count):
+            model(torch.from_numpy(points[part]).to(parameter.device, parameter.dtype))
+    finally:
+        for layer, momentum in zip(layers, momenta, strict=True):
+            layer.momentum = momentum
+        model.train(training)
+
+
+def read_checkpoints(run_dir: Path, stage: str | None = None) -> list[Checkpoint]:
+    """Return the checkpoints of a run, in order.
+
+    Args:
+        run_dir: Folder of the run.
+        stage: Only those of this stage.
+
+    Raises:
+        InputError: where a file is damaged or not one of ours.
+    """
+    found = []
+    for path in sorted((Path(run_dir) / CHECKPOINTS).glob("*.safetensors")):
+        _, facts = read_tensors(path)
+        try:
+            checkpoint = Checkpoint(
+                stage=str(facts["stage"]),
+                number=int(facts["number"]),
+                validators=dict(facts["validators"]),
+                file=f"{CHECKPOINTS}/{path.name}",
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"{path}: not a checkpoint of a run ({error}); delete it") from error
+        if stage in (None, checkpoint.stage):
+            found.append(checkpoint)
+    return found
+
+
+def choose(checkpoints: Sequence[Checkpoint], rule: str) -> Checkpoint:
+    """Return the checkpoint that a rule picks: the highest, the first of equals.
+
+    Raises:
+        InputError: where there is none, or the validator has said nothing.
+
+    Example:
+        >>> told = [{"im": 0.2}, {"im": 0.4}, {"im": 0.4}]
+        >>> made = [Checkpoint("round", i, values, "") for i, values in enumerate(told)]
+        >>> choose(made, "im").number, choose(made, "last").number
+        (1, 2)
+    """
+    if not checkpoints:
+        raise InputError("the run has no checkpoints; train with validate_every above 0")
+    if rule == "last":
+        return checkpoints[-1]
+    values = [checkpoint.validators.get(rule) for checkpoint in checkpoints]
+    best = max((value for value in values if value is not None), default=None)
+    if best is None:
+        raise InputError(
+            f"rule {rule!r} has nothing to go by: it needs "
+            + ("a held-out part of the source" if rule == "source-val" else "a target")
+            + (" and a held-out part of the source" if rule == "dev" else "")
+        )
+    return checkpoints[values.index(best)]
+
+
+def load_checkpoint(run_dir: Path, checkpoint: Checkpoint, model: PointClassifier) -> None:
+    """Set a network's weights from a checkpoint."""
+    path = Path(run_dir) / checkpoint.file
+    load_tensors_into(model, read_tensors(path)[0], path)
+
+
+def split_source(source: PointClouds, settings: TrainSettings) -> tuple[PointClouds, PointClouds]:
+    """Split the source into a part to train on and one for the validators, by the seed alone.
+
+    Example:
+        >>> clouds = PointClouds(np.zeros((20, 1, 3), np.float32), np.zeros(20, np.int64), ("a",),
+        ...                      tuple(map(str, range(20))))
+        >>> [len(part) for part in split_source(clouds, TrainSettings(holdout=0.1))]
+        [18, 2]
+    """
+    order = np.random.default_rng(seed_sequence(settings.seed, 3)).permutation(len(source))
+    held = np.zeros(len(source), dtype=bool)
+    held[order[: int(settings.holdout * len(source))]] = True
+    return source.select(~held), source.select(held)
