@@ -91,7 +91,7 @@ class SANode(nn.Module):
 
 def interpolate(points: Tensor, known: Tensor, values: Tensor) -> Tensor:
     away, nearest = squared(points, known).topk(min(3, known.shape[1]), dim=2, largest=False)
-    weights = 1 / (away + 1e-8)
+    weights = 1 / away.clamp_min(1e-8)
     weights = weights / weights.sum(dim=2, keepdim=True)
     return (take(values, nearest) * weights[:, :, :, None]).sum(dim=2)
 

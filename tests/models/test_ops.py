@@ -268,7 +268,7 @@ def test_interpolation_is_that_of_a_kd_tree(m):
     features = np.random.default_rng(2).normal(size=(1, m, 4))
     found = three_nn_interpolate(*map(torch.from_numpy, (points, known, features))).numpy()
     distance, nearest = cKDTree(known[0]).query(points[0], range(1, min(3, m) + 1))
-    weights = 1 / (distance**2 + 1e-8)
+    weights = 1 / np.maximum(distance**2, 1e-8)
     weights /= weights.sum(axis=1, keepdims=True)
     expected = (features[0][nearest] * weights[..., None]).sum(axis=1)
     np.testing.assert_allclose(found[0], expected, rtol=1e-9, atol=1e-12)

@@ -8,7 +8,8 @@ from qs3.models.ops.gathering import gather_points
 from qs3.models.ops.neighbours import knn
 
 _FLOOR = 1e-8
-"""Added to squared distances; a point that is itself known then takes that one's features."""
+"""Smallest squared distance; a point that is itself known then takes that one's features. It is no
+summand, which the ONNX exporter would leave out for being small."""
 
 
 def three_nn_interpolate(
@@ -33,7 +34,7 @@ def three_nn_interpolate(
     """
     neighbours = knn(known, min(3, known.shape[1]), points)
     difference = gather_points(known, neighbours) - points[:, :, None]
-    weights = 1.0 / (difference.square().sum(dim=3) + _FLOOR)
+    weights = 1.0 / difference.square().sum(dim=3).clamp_min(_FLOOR)
     weights = (weights / weights.sum(dim=2, keepdim=True)).to(features.dtype)
     # One neighbour of every point at a time: no tensor is larger than the result.
     first, *others = range(neighbours.shape[2])
