@@ -108,6 +108,7 @@ class TransNorm(SeparateNorm):
             for layer, scale in zip(self._layers, scales, strict=True):
                 for name in _AFFINE:
                     weight = layer._parameters.pop(name)
+                    assert weight is not None  # noqa: S101
                     held.append((layer, name, weight))
                     # A plain attribute: the product is no parameter, its factor is.
                     object.__setattr__(layer, name, weight * scale)

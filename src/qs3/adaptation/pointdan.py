@@ -8,7 +8,6 @@ from dataclasses import replace
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.utils import parametrize
 
 from qs3.adaptation.discrepancies import classifier_discrepancy, mmd
 from qs3.adaptation.gradient_reversal import reverse_gradient
@@ -101,27 +100,11 @@ def fresh_head(model: PointClassifier) -> PointClassifier:
         for name, p in model._parameters.items()
         if p is not None and id(p) in used
     }
-    for layer in list(twin.modules()):
-        _make_plain(layer)
+    for layer in twin.modules():
         reset = getattr(layer, "reset_parameters", None)
         if reset is not None:
             reset()
     return twin
-
-
-def _make_plain(layer: nn.Module) -> None:
-    """Undo the parametrisations of a copied layer: a treatment of two domains is not this head's.
-
-    PyTorch's own way back would undo those of the layer it was copied from too, as both have one
-    class, made for them.
-    """
-    if not parametrize.is_parametrized(layer):
-        return
-    kept = {name: part.original for name, part in layer.parametrizations.items()}  # pyright: ignore
-    layer.__class__ = type(layer).__bases__[0]
-    del layer.parametrizations
-    for name, value in kept.items():
-        layer.register_parameter(name, nn.Parameter(value.detach().clone()))
 
 
 class PointDAN(Method):

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from qs3.adaptation.losses import cross_entropy
-from qs3.adaptation.method import Batch, Method
+from qs3.adaptation.method import Batch, Domain, Method
 from qs3.adaptation.normalisation import DomainNorm
 from qs3.models import PointClassifier
 
@@ -51,10 +51,11 @@ class PseudoLabelled(Method):
         fallen = self.weight_step * self.epochs[done]
         terms: dict[str, Tensor] = {}
         right = torch.zeros((), dtype=torch.int64, device=source.labels.device)
-        for name, domain, rows, weight in (
+        passes: tuple[tuple[str, Domain, slice, float], ...] = (
             ("source", "source", slice(count, None), self.source_weight - fallen),
             ("pseudo", "target", slice(0, count), 1.0 - fallen),
-        ):
+        )
+        for name, domain, rows, weight in passes:
             labels = source.labels[rows]
             if not len(labels):
                 continue

@@ -1,0 +1,97 @@
+import numpy as np
+import pytest
+import torch
+from sklearn.base import clone
+
+from qs3.errors import InputError
+from qs3.training import QBST, SPST, Adapter, SelfTrainingSettings, TrainSettings, fit
+
+TRAIN = {
+    "model_settings": {"channels": (16, 16, 32), "hidden": (16,), "transforms": False},
+    "num_points": 64,
+    "epochs": 4,
+    "batch_size": 8,
+    "learning_rate": 1e-2,
+    "accelerator": "cpu",
+    "threads": 1,
+}
+pytestmark = pytest.mark.filterwarnings("ignore::qs3.adaptation.SingleClassWarning")
+ROUNDS = {"rounds": 2, "epochs": 1, "threshold": 0.4}
+
+
+def test_the_line_of_the_readme(source, target):
+    made = QBST(model="pointnet", train=TRAIN, self_training=ROUNDS)
+    predicted = made.fit(source, target.without_labels()).predict(target)
+    assert predicted.shape == (30,)
+    assert set(predicted) <= {"ball", "disc", "rod"}
+    assert made.score(target) == (predicted == np.array(target.class_names)[target.labels]).mean()
+    assert len(made.result_.rounds) == 2
+    probabilities = made.predict_proba(target.points)
+    assert (made.classes_[probabilities.argmax(axis=1)] == predicted).all()
+
+
+@pytest.mark.parametrize(
+    ("made", "method", "rounds"),
+    [
+        (Adapter("dann", "pointnet", train=TRAIN), "dann", None),
+        (QBST("pointnet", train=TRAIN, self_training=ROUNDS), "source-only", {"rule": "qbst"}),
+        (
+            SPST("pointnet", train=TRAIN, self_training=ROUNDS, warm_up="coral"),
+            "coral",
+            {"rule": "spst", "weight_step": 0.005},
+        ),
+        (Adapter("qbst", "pointnet", train=TRAIN, self_training=ROUNDS), "qbst", {}),
+    ],
+)
+def test_it_is_the_fit_of_the_function(source, target, tmp_path, made, method, rounds):
+    made.fit(source, target.without_labels())
+    settings = TrainSettings(**TRAIN, model="pointnet")
+    wanted = fit(
+        method,
+        source,
+        target.without_labels(),
+        settings,
+        None if rounds is None else SelfTrainingSettings(**ROUNDS | rounds),
+        run_dir=tmp_path / "run",
+    )
+    for name, value in wanted.model.state_dict().items():
+        assert torch.equal(value, made.model_.state_dict()[name])
+
+
+@pytest.mark.parametrize("kind", [Adapter, QBST, SPST])
+def test_clone_copies_parameters_and_nothing_else(kind, source):
+    made = kind(model="pointnet", train=TRAIN, random_state=3)
+    copied = clone(made)
+    assert type(copied) is kind
+    assert copied is not made
+    assert copied.get_params() == made.get_params()
+    assert not hasattr(copied, "model_")
+    assert clone(made.set_params(random_state=4)).random_state == 4
+    if kind is not Adapter:
+        assert made.set_params(warm_up="dann").method == "dann"
+        assert "method" not in made.get_params()
+
+
+def test_run_folder_stays_and_is_taken_up(source, target, tmp_path):
+    made = Adapter(model="pointnet", train=TRAIN, run_dir=tmp_path / "run").fit(source)
+    assert (tmp_path / "run" / "model.safetensors").is_file()
+    again = clone(made).fit(source)
+    for name, value in made.model_.state_dict().items():
+        assert torch.equal(value, again.model_.state_dict()[name])
+
+
+def test_faults(source, target):
+    with pytest.raises(InputError, match="not fitted yet"):
+        QBST().predict(target)
+    with pytest.raises(InputError, match="unknown parameter 'epochs'"):
+        QBST().set_params(epochs=3)
+    with pytest.raises(InputError, match="unknown setting 'epoch' in train"):
+        Adapter(train={"epoch": 3}).fit(source)
+    with pytest.raises(InputError, match="give seed as the parameter random_state"):
+        Adapter(train={"seed": 3}).fit(source)
+    with pytest.raises(InputError, match="unknown setting 'theta' in self_training"):
+        QBST(self_training={"theta": 0.9}).fit(source, target.without_labels())
+    with pytest.raises(InputError, match="QBST selects by qbst"):
+        QBST(self_training={"rule": "spst"}).fit(source, target.without_labels())
+    with pytest.raises(InputError, match="needs a target"):
+        QBST().fit(source)
