@@ -1,0 +1,137 @@
+"""Data of the bench: a source and a target of other meshes under another sensor."""
+
+import hashlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from qs3.datasets.generate import GenerateSettings, generate
+from qs3.datasets.plan import Plan, make_plan, resolve_renderer
+from qs3.errors import QS3Error
+from qs3.experiments.runs import Scale
+from qs3.meshes import collect, shapes
+from qs3.meshes.collections import MeshItem
+from qs3.sensor.surroundings import SceneSettings
+
+SOURCE, TARGET = "source", "target"
+REAL = "sunrgbd_objects.npz"
+REAL_CLOUDS = 32
+"""Objects in that file."""
+TARGET_SENSOR = "d435"
+_LEAST = 4
+"""A class with fewer meshes is made of shapes alone: a mesh on one side would leave none."""
+_FAILED_SHARE = 0.05
+_SEEDS = {SOURCE: 1, TARGET: 2}
+
+
+@dataclass(frozen=True)
+class Sides:
+    """The meshes of both domains."""
+
+    source: list[MeshItem]
+    """To learn from."""
+    target: list[MeshItem]
+    """To adapt to (split ``train``) and to score on (``test``)."""
+    cad: int
+    """How many of them are artists' meshes, not procedural shapes."""
+
+
+def side_of(file_name: str) -> str:
+    """Return ``source``, ``train`` or ``test``: half, a quarter and a quarter, by name alone.
+
+    Example:
+        >>> [side_of(f"{name}.ply") for name in ("a", "b", "d")]
+        ['source', 'source', 'source']
+    """
+    byte = hashlib.sha256(file_name.encode("utf-8")).digest()[0]
+    return "source" if byte < 128 else "train" if byte < 192 else "test"
+
+
+def choose_meshes(scale: Scale, shared: Path | None) -> Sides:
+    """Return the meshes of both domains, filled up with procedural shapes.
+
+    Args:
+        scale: How many.
+        shared: Folder with artists' meshes in ``cad``; None takes shapes alone.
+    """
+    parts: dict[tuple[str, str], list[MeshItem]] = {}
+    folder = None if shared is None else shared / "cad"
+    if folder is not None and folder.is_dir():
+        files = collect(folder, classes="pointda10")
+        counts = {name: sum(item.class_name == name for item in files) for name in shapes.CLASSES}
+        for item in files:
+            if counts[item.class_name] >= _LEAST:
+                assert item.path is not None  # noqa: S101
+                parts.setdefault((item.class_name, side_of(item.path.name)), []).append(item)
+    source, target, cad = [], [], 0
+    for name in shapes.CLASSES:
+        wanted = {
+            "source": scale.source_per_class,
+            "train": scale.target_count(name, scale.target_per_class),
+            "test": scale.target_count(name, scale.test_per_class),
+        }
+        drawn = {
+            SOURCE: _draws(name, wanted["source"], _SEEDS[SOURCE]),
+            TARGET: _draws(name, wanted["train"] + wanted["test"], _SEEDS[TARGET]),
+        }
+        for side, count in wanted.items():
+            made = parts.get((name, side), [])[:count]
+            cad += len(made)
+            spare = drawn[SOURCE if side == "source" else TARGET]
+            filled = made + [spare.pop(0) for _ in range(count - len(made))]
+            split = "train" if side == "source" else side
+            (source if side == "source" else target).extend(
+                replace(item, split=split) for item in filled
+            )
+    return Sides(source, target, cad)
+
+
+def _draws(class_name: str, count: int, seed: int) -> list[MeshItem]:
+    return collect("shapes", per_class=count, seed=seed, classes=[class_name])
+
+
+def make_plans(scale: Scale, shared: Path | None, renderer: Any = None) -> dict[str, Plan]:
+    """Return the work lists of both data sets.
+
+    A row of the source has the scan and samples of the surface of the same mesh, so that M and S
+    differ in the sensor alone. The target stands on a floor, partly behind another object.
+    """
+    sides = choose_meshes(scale, shared)
+    common = {
+        "meshes": "shapes+cad" if sides.cad else "shapes",
+        "num_points": scale.data_points,
+        "renderer": renderer,
+        "rows_per_shard": 32,
+    }
+    settings = {
+        SOURCE: GenerateSettings(views=scale.source_views, seed=_SEEDS[SOURCE], **common),
+        TARGET: GenerateSettings(
+            views=1,
+            sensor=TARGET_SENSOR,
+            scene=SceneSettings("floor+behind"),
+            box_crop=False,
+            mask_crop=True,
+            seed=_SEEDS[TARGET],
+            **common,
+        ),
+    }
+    items = {SOURCE: sides.source, TARGET: sides.target}
+    return {name: make_plan(items[name], resolve_renderer(settings[name])) for name in settings}
+
+
+def make_data(folder: Path, plans: dict[str, Plan], workers: int) -> dict[str, int]:
+    """Scan both data sets below a folder, going on where an earlier call stopped.
+
+    Returns:
+        Objects of each that could not be scanned, and are absent.
+
+    Raises:
+        QS3Error: where those are more than one in twenty.
+    """
+    failed = {}
+    for name, plan in plans.items():
+        report = generate(plan.items, folder / name, plan.settings, workers=workers, timeout=900)
+        failed[name] = report.failed
+        if report.failed > _FAILED_SHARE * plan.rows:
+            raise QS3Error(f"{folder / name}/failures.jsonl: {report.failed} scans failed")
+    return failed

@@ -1,0 +1,128 @@
+"""What a step of each method costs, and a grid of runs from it."""
+
+import statistics
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import torch
+
+from qs3.adaptation import Batch, create_method, method_class
+from qs3.adaptation.names import split_method
+from qs3.experiments.runs import Run
+from qs3.models import create_model, feature_widths
+from qs3.training.batches import count_batches
+from qs3.training.config import TrainSettings
+
+_CLASSES = 10
+_PASS = 1 / 3
+"""Of the time of a step, a pass without gradient takes about so much."""
+
+
+class Step:
+    """One optimiser step of a method on random clouds, to be timed.
+
+    Args:
+        method: Name of a method without rounds.
+        settings: Network, points and batch size.
+        device: Where to compute.
+    """
+
+    def __init__(self, method: str, settings: TrainSettings, device: torch.device) -> None:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            told = dict(settings.model_settings)
+            model = create_model(settings.model, _CLASSES, **told)
+            if method_class(method).needs_local and feature_widths(model).local is None:
+                model = create_model(settings.model, _CLASSES, **told | {"per_point": True})
+            self.method = create_method(method, model).to(device).train()
+        self.generator = torch.Generator().manual_seed(0)
+        size = (settings.batch_size, settings.num_points, 3)
+        points = torch.rand(2, *size, generator=self.generator).sub_(0.5).to(device)
+        labels = torch.arange(settings.batch_size, device=device) % _CLASSES
+        self.source = Batch(points[0], labels)
+        self.target = points[1] if self.method.uses_target else None
+        self.optimiser = torch.optim.Adam(self.method.parameter_groups(1e-3))
+        self.device = device
+
+    def __call__(self) -> float:
+        """Take the step and return its seconds."""
+        self._wait()
+        start = time.perf_counter()
+        losses = self.method(self.source, self.target, 0.5, self.generator)
+        self.optimiser.zero_grad()
+        torch.stack(list(losses.values())).sum().backward()
+        self.optimiser.step()
+        self.method.after_step()
+        self._wait()
+        return time.perf_counter() - start
+
+    def _wait(self) -> None:
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+
+
+def device_of(settings: TrainSettings) -> torch.device:
+    """Return the device that a training with these settings takes."""
+    cuda = settings.accelerator != "cpu" and torch.cuda.is_available()
+    return torch.device("cuda" if cuda else "cpu")
+
+
+def step_seconds(
+    methods: Iterable[str], settings: TrainSettings, steps: int = 2
+) -> dict[str, float]:
+    """Return the median seconds of a step of each method, after one to warm up."""
+    threads = torch.get_num_threads()
+    if settings.threads is not None:
+        torch.set_num_threads(settings.threads)
+    try:
+        found = {}
+        for name in methods:
+            step = Step(name, settings, device_of(settings))
+            step()
+            found[name] = statistics.median(step() for _ in range(steps))
+        return found
+    finally:
+        torch.set_num_threads(threads)
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Clouds that a run reads."""
+
+    source: int
+    """Labelled clouds."""
+    target: int
+    """Clouds to adapt to."""
+    test: int
+    """Clouds to score on."""
+
+
+def methods_of(runs: Iterable[Run]) -> list[str]:
+    """Return the methods whose steps a grid takes, each once."""
+    return list(dict.fromkeys(["source-only", *(split_method(run.method)[0] for run in runs)]))
+
+
+def run_seconds(run: Run, counts: Counts, steps: Mapping[str, float]) -> float:
+    """Estimate the seconds of a run; a round is taken to keep every cloud of the target."""
+    settings = run.train
+    base = split_method(run.method)[0]
+    size = settings.batch_size
+    trained = counts.source - int(settings.holdout * counts.source)
+    looks = 1
+    seconds = 0.0
+    if run.warm_up is None:
+        batches = count_batches(trained, size)
+        if method_class(base).uses_target:
+            batches = max(batches, count_batches(counts.target, size))
+        seconds += settings.epochs * batches * steps[base]
+        if settings.validate_every:
+            looks = -(-settings.epochs // settings.validate_every)
+    if run.self_training is not None:
+        rounds = run.self_training
+        parts = 2 if rounds.source_loss else 1
+        batches = rounds.steps_per_epoch or count_batches(counts.target, size)
+        seconds += rounds.rounds * rounds.epochs * batches * parts * steps["source-only"]
+        looks = 2 * rounds.rounds
+    seen = looks * (counts.source + counts.target + counts.test) / size
+    return seconds + seen * _PASS * steps["source-only"]
