@@ -262,6 +262,8 @@ def _curves(folder: Path) -> tuple[tuple[Any, ...], tuple[float, ...]]:
     losses: dict[str, tuple[list[float], list[float]]] = {}
     epoch, marks = 0, []
     for line in lines:
+        if line["kind"] == "checkpoint":
+            continue
         in_round = line["kind"] == "round"
         if in_round:
             marks.append(epoch + 0.5)

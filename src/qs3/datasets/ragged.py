@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Int
 
 from qs3.datasets.classes import POINTDA10, map_labels
-from qs3.datasets.clouds import PointClouds, UnlabelledClouds, numbered
+from qs3.datasets.clouds import PointClouds, UnlabelledClouds, digests, numbered
 from qs3.datasets.transforms import stack
 from qs3.errors import InputError
 
@@ -60,10 +60,13 @@ class RaggedClouds:
     def unlabelled(self, num_points: int | None, where: str) -> UnlabelledClouds:
         """Return clouds of one size without labels, and with numbers for names.
 
-        Names of files and objects often tell the class; not even they go along.
+        Names of files and objects often tell the class; not even they go along. Nor does the order
+        of the files, which folders of classes sort by class: clouds come in that of their
+        points' checksums.
 
         Raises:
             InputError: where there is no cloud, or sizes differ and no size is asked for.
         """
         points = stack(self.clouds, num_points, where)
-        return UnlabelledClouds(points, numbered(len(points)), self.checksum)
+        order = np.argsort(digests(points), kind="stable")
+        return UnlabelledClouds(points[order], numbered(len(points)), self.checksum)
