@@ -189,7 +189,7 @@ def run(options: TrainOptions) -> Any:
             open_folder(options.target).name, target.checksum, len(target), options.target_split
         ),
     }
-    seconds = {"source": sum(epoch.seconds for epoch in result.history)}
+    seconds = {"source": float(sum(epoch.seconds for epoch in result.history))}
     seconds["rounds"] = float(sum(record.seconds for record in result.rounds))
     seconds["total"] = sum(seconds.values())
     write_json(

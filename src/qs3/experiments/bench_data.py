@@ -108,7 +108,7 @@ def make_plans(scale: Scale, shared: Path | None, renderer: Any = None) -> dict[
         TARGET: GenerateSettings(
             views=1,
             sensor=TARGET_SENSOR,
-            scene=SceneSettings("floor+behind"),
+            scene=SceneSettings("floor+behind", neighbour_size=0.5),
             box_crop=False,
             mask_crop=True,
             seed=_SEEDS[TARGET],
@@ -130,7 +130,7 @@ def make_data(folder: Path, plans: dict[str, Plan], workers: int) -> dict[str, i
     """
     failed = {}
     for name, plan in plans.items():
-        report = generate(plan.items, folder / name, plan.settings, workers=workers, timeout=900)
+        report = generate(plan.items, folder / name, plan.settings, workers=workers, timeout=900.0)
         failed[name] = report.failed
         if report.failed > _FAILED_SHARE * plan.rows:
             raise QS3Error(f"{folder / name}/failures.jsonl: {report.failed} scans failed")

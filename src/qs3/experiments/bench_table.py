@@ -158,8 +158,8 @@ def selection_table(lines: Sequence[Line]) -> str | None:
         if not last:
             continue
         names = line.results[0].record.scores.class_names
-        kept = [mean_sem([one["kept"][k] for one in last]).mean for k in range(len(names))]
-        over = mean_sem([sum(one["confident"]) for one in last]).mean
+        kept = [mean_sem([float(one["kept"][k]) for one in last]).mean for k in range(len(names))]
+        over = mean_sem([float(sum(one["confident"])) for one in last]).mean
         rows.append([line.row, *(f"{value:g}" for value in kept), f"{sum(kept):.4g} of {over:.4g}"])
     if names is None:
         return None
