@@ -119,9 +119,9 @@ def make_bench(bench: Bench, train: Train, evaluate: Evaluate, tell: Tell) -> Pa
     runs = bench.runs()
     for run in runs:
         make_work(run, bench.out, bench.shared)  # refuses a task whose data is not there
-    missing(runs, bench.out)
     plans = make_plans(bench.scale, bench.shared)
     _claim(bench, plans)
+    missing(runs, bench.out)  # a damaged record stops here, not after hours
     cost = measure(bench, runs, plans)
     tell(describe(bench, runs, plans, cost))
     failed = make_data(bench.out / DATA, plans, bench.workers)

@@ -109,7 +109,9 @@ def make_plans(scale: Scale, shared: Path | None, renderer: Any = None) -> dict[
             views=1,
             sensor=TARGET_SENSOR,
             scene=SceneSettings("floor+behind", neighbour_size=0.5),
-            box_crop=False,
+            # As annotated frames are cut: by the object's mask, and by its box with a margin, or a
+            # few flying pixels would set the scale of the whole cloud.
+            box_margin=0.05,
             mask_crop=True,
             seed=_SEEDS[TARGET],
             **common,
