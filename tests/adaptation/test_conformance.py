@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from qs3.adaptation import Batch, create_method, list_methods, method_class
-from qs3.adaptation.names import COMPOSED, MethodName
+from qs3.adaptation.names import COMPOSED, WITHOUT_TARGET, MethodName
+from qs3.datasets import load_clouds, load_unlabelled
 from qs3.datasets.clouds import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.models import create_model
@@ -86,6 +87,7 @@ def make(method, network, seed=0):
 
 def test_command_line_knows_every_method():
     assert set(MethodName.__args__) == set(METHODS) | set(COMPOSED)
+    assert set(WITHOUT_TARGET) == {n for n in METHODS if not method_class(n).uses_target}
     assert {warm_up for warm_up, _ in COMPOSED.values()} <= set(METHODS)
 
 
@@ -188,18 +190,17 @@ def test_a_class_absent_from_the_target_and_smallest_batches(method, tmp_path):
 
 
 @pytest.mark.parametrize("method", [*METHODS, *COMPOSED])
-@pytest.mark.parametrize("rule", ["last", "im"])
+@pytest.mark.parametrize("rule", [pytest.param("last", marks=pytest.mark.slow), "im"])
 def test_poisoned_labels_of_the_target_change_no_bit(method, rule, tmp_path):
     """The files' labels are all wrong; read, trained, stopped, resumed, chosen: the same bits."""
-    from qs3.datasets import load_unlabelled
-
     truth = clouds(12, 3)
     names = np.array(truth.class_names)
     found = []
     for case, labels in {"true": truth.labels, "wrong": (truth.labels + 1) % 3}.items():
         path = tmp_path / case / "target.npz"
         path.parent.mkdir()
-        np.savez(path, points=truth.points, labels=labels, class_names=names)
+        np.savez(path, points=truth.points, label=labels, class_names=names)
+        assert load_clouds(path, num_points=None).labels.tolist() == labels.tolist()
         target = load_unlabelled(path, num_points=None)
         assert isinstance(target, UnlabelledClouds)
         run = path.parent / "run"

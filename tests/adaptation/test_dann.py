@@ -90,6 +90,7 @@ def own_mmd(here, there):
     return mmd(here.pooled, there.pooled, sigmas).item()
 
 
+@pytest.mark.slow
 def test_dann_makes_the_domains_harder_to_tell_apart():
     # A game of two needs steps without momentum, or it turns in circles.
     values = []
@@ -100,10 +101,12 @@ def test_dann_makes_the_domains_harder_to_tell_apart():
     assert values[1] > 0.55  # log 2 = 0.69 is chance
 
 
+@pytest.mark.slow
 def test_mmd_lowers_its_discrepancy():
     assert own_mmd(*train(MMD(tiny()))) < 0.5 * own_mmd(*train(SourceOnly(tiny())))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layer", ["logits", "pooled"])
 def test_coral_lowers_its_discrepancy(layer):
     def distance(here, there, model):

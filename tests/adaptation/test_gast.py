@@ -108,6 +108,7 @@ def test_heads_are_taught_their_own_labels(monkeypatch):
     assert torch.equal(taught[1], mixed.about_y)
 
 
+@pytest.mark.slow
 def test_heads_learn_different_things():
     """Trained alone on fixed clouds, each head names the turn of its own copy, not the other's."""
     points = make_target(48, 24)

@@ -280,6 +280,7 @@ def disagreement(method):
     return (p1 - p2).abs().mean().item()
 
 
+@pytest.mark.slow
 def test_both_alignments_do_what_they_are_for():
     off = trained(node_weight=0.0, discrepancy_weight=0.0, bandwidths=(4.0, 8.0))
     local = trained(node_weight=20.0, discrepancy_weight=0.0, bandwidths=(4.0, 8.0))

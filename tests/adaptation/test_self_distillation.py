@@ -242,6 +242,7 @@ def test_awkward_targets(name, target):
     assert all(torch.isfinite(p.grad).all() for p in method.model.parameters())
 
 
+@pytest.mark.slow
 def test_distillation_learns():
     """Trained on it alone, the student's strong views come nearer to the teacher's weak ones."""
     method = make_method(norm="shared")

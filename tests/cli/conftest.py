@@ -1,18 +1,48 @@
+import json
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 
 class Command:
-    """Runs ``qs3`` as a user does: in a process of its own."""
+    """Runs ``qs3`` as a user does: in a process of its own (see ``server.py``)."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.count = folder, 0
+        self.server = subprocess.Popen(
+            [sys.executable, str(Path(__file__).parent / "server.py")],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def close(self) -> None:
+        self.server.communicate()
+        assert self.server.returncode == 0
 
     def __call__(self, *arguments, code: int = 0, timeout: float = 300):
-        done = subprocess.run(
-            [sys.executable, "-m", "qs3", *map(str, arguments)],
-            capture_output=True,
-            text=True,
-            timeout=timeout,
+        self.count += 1
+        out, err = (self.folder / f"{self.count}.{name}" for name in ("out", "err"))
+        asked = {
+            "arguments": list(map(str, arguments)),
+            "environment": dict(os.environ),
+            "folder": str(Path.cwd()),
+            "out": str(out),
+            "err": str(err),
+            "seconds": int(timeout),
+        }
+        assert self.server.stdin is not None
+        assert self.server.stdout is not None
+        self.server.stdin.write(json.dumps(asked) + "\n")
+        self.server.stdin.flush()
+        done = subprocess.CompletedProcess(
+            arguments,
+            int(self.server.stdout.readline()),
+            out.read_text("utf-8"),
+            err.read_text("utf-8"),
         )
         assert done.returncode == code, f"{done.returncode}: {done.stdout}\n{done.stderr}"
         return done
@@ -29,8 +59,10 @@ class Command:
 
 
 @pytest.fixture(scope="session")
-def qs3() -> Command:
-    return Command()
+def qs3(tmp_path_factory):
+    command = Command(tmp_path_factory.mktemp("said"))
+    yield command
+    command.close()
 
 
 # The smallest scan that still runs through everything.

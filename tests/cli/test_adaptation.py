@@ -69,7 +69,7 @@ def test_source_only_looks_at_a_target_without_learning_from_it(qs3, store, tmp_
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--method", "dann"), "method dann needs a target"),
+        (("--method", "dann"), "method dann needs --target"),
         (("--method", "qbst", "--self-training", "spst"), "method qbst is source-only with qbst"),
         (("--self-training.rounds", 3), "has no rounds to set; add --self-training"),
         (("--method-set", "weight=1"), "unknown setting 'weight' of method source-only"),

@@ -53,7 +53,7 @@ def test_unknown_class_lists_the_classes(qs3, quick, tmp_path):
         (("train", "--source", "absent-data", "--epochs", "0"), "epochs"),
         (("train", "--source", "absent-data", "--learning-rate", "inf"), "learning_rate"),
         (("train", "--source", "x", "--method", "qbst"), "target"),
-        (("train", "--source", "x", "--target", "y"), "target"),
+        (("train", "--source", "x", "--self-training", "spst"), "target"),
     ],
 )
 def test_bad_settings_are_one_line(qs3, tmp_path, arguments, word):

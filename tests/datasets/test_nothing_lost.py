@@ -115,6 +115,7 @@ def whole(fake, tmp_path) -> dict[str, bytes]:
     return content(tmp_path / "whole")
 
 
+@pytest.mark.slow
 def test_a_run_killed_at_five_moments_ends_the_same(fake, start, tmp_path):
     kill_at_random_moments(start, tmp_path, kills=5, seed=1)
     assert content(tmp_path / "out") == whole(fake, tmp_path)

@@ -121,6 +121,7 @@ def test_pooled_features_are_those_of_the_points():
         torch.testing.assert_close(model.encode(clouds()).pooled, both, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_half_precision_costs_no_more_than_in_plain_layers():
     """Errors of the last layer's gradient, as means: rounding moves the maximum by chance."""
 

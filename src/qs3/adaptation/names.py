@@ -42,6 +42,10 @@ COMPOSED: Mapping[str, tuple[str, RoundRule]] = {
 """Methods that are a warm-up and a rule of self-training; qs3 is qbst on a scanned source."""
 
 
+WITHOUT_TARGET = ("source-only", "pcm")
+"""Methods whose training does without the target; rounds of self-training never do."""
+
+
 def split_method(method: str, rounds: str | None = None) -> tuple[str, str | None]:
     """Return the warm-up and the rule of self-training that a method stands for.
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from qs3.adaptation.names import MethodName, RoundRule, split_method
+from qs3.adaptation.names import WITHOUT_TARGET, MethodName, RoundRule, split_method
 from qs3.errors import InputError, UnevenSizesError
 from qs3.evaluation.records import DataRecord
 from qs3.files import write_json
@@ -147,6 +147,8 @@ def run(options: TrainOptions) -> Any:
         raise InputError(str(error)) from error
     if rule is None and options.self_training != SelfTrainingSettings():
         raise InputError(f"--method {options.method} has no rounds to set; add --self-training")
+    if options.target is None and (rule is not None or base not in WITHOUT_TARGET):
+        raise InputError(f"method {options.method} needs --target: unlabelled clouds")
     settings = dataclasses.replace(
         options.train,
         model_settings=parse_settings("--model-set", options.model_set),

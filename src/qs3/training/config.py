@@ -110,7 +110,7 @@ class TrainSettings:
 class SelfTrainingSettings:
     """How pseudo labels of the target are selected and used (QS³, Algorithm 1)."""
 
-    rule: RoundRule = "qbst"
+    rule: Annotated[RoundRule, tyro.conf.Suppress] = "qbst"
     """Which clouds are selected: ``qbst`` keeps fewer of dominant classes (QS³); ``spst`` all over
     the threshold (GAST); ``uniform`` as many of each class; ``prior`` follows an estimate of the
     target's class shares; ``quantile`` the same share of each class's clouds (CBST)."""

@@ -1,6 +1,7 @@
 """The work of a run, the same on each of its devices."""
 
 import contextlib
+import copy
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -31,7 +32,6 @@ from qs3.training.self_training import RoundCallback, RoundRecord, self_train
 from qs3.training.validation import (
     Checkpoint,
     Validation,
-    adapt_statistics,
     choose,
     load_checkpoint,
     read_checkpoints,
@@ -131,7 +131,9 @@ def run_job(
             history.checkpoints(read_checkpoints(job.run_dir))
 
     def look(number: int, model: PointClassifier) -> None:
-        validation.look(ROUND, number, model)
+        seen = copy.deepcopy(model)  # the next round goes on from the plain network
+        validation.adapt(seen)
+        validation.look(ROUND, number, seen)
         looked()
 
     model = job.start
@@ -154,8 +156,7 @@ def run_job(
         )
         method.norm.settle()
         model = method.result()
-        if job.settings.normalisation == "adabn" and job.target is not None:
-            adapt_statistics(model, job.target.points, job.settings.batch_size)
+        validation.adapt(model)
         if history is not None:
             history.source(stage, epochs)
         looked()
@@ -179,6 +180,7 @@ def run_job(
             history=history,
             deadline=tell.deadline,
         )
+        validation.adapt(model)
         _follow_rule(model, ROUND, job)
         _save(job.run_dir, model, job, fabric)
     return model, epochs, records
