@@ -168,9 +168,9 @@ def test_it_learns_to_rebuild():
     target = torch.stack([grid, grid * torch.tensor([1.0, 0.6, 0.3])])
     deformed = deform_voxels(target, seeded())
     nothing = float(reconstruction_loss(deformed.points, target, deformed.moved))
-    optimiser = torch.optim.Adam(method.parameters(), lr=0.01)
+    optimiser = torch.optim.Adam(method.parameters(), lr=0.003)
     value = torch.zeros(())
-    for _ in range(200):
+    for _ in range(150):
         value = method(batch, target, 0.0, seeded())["defrec_target"]
         optimiser.zero_grad()
         value.backward()
