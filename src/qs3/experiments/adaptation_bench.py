@@ -72,7 +72,11 @@ class Bench:
     """Folder with artists' meshes and real objects; None takes procedural shapes alone."""
 
     def runs(self) -> list[Run]:
-        """Return the grid."""
+        """Return the grid.
+
+        Raises:
+            InputError: where a name is unknown, or a task needs real objects that are not here.
+        """
         if self.name == "adaptation-ablation":
             if self.tasks:
                 raise InputError(f"{self.name}: is made on {_ABLATION_TASK} alone; leave out tasks")
@@ -82,8 +86,10 @@ class Bench:
             rows, tasks = ROWS, self.tasks or self.scale.tasks
             if not self.tasks and not has_real(self.shared):
                 tasks = tuple(task for task in tasks if not task.endswith("R"))
-        rows = self.rows or rows
-        return make_grid(self.scale, rows, tasks, self.seeds, self.threads)
+        runs = make_grid(self.scale, self.rows or rows, tasks, self.seeds, self.threads)
+        for run in runs:
+            make_work(run, self.out, self.shared)  # refuses a task whose data is not there
+        return runs
 
 
 @dataclass(frozen=True)
@@ -117,8 +123,6 @@ def make_bench(bench: Bench, train: Train, evaluate: Evaluate, tell: Tell) -> Pa
             not of its run.
     """
     runs = bench.runs()
-    for run in runs:
-        make_work(run, bench.out, bench.shared)  # refuses a task whose data is not there
     plans = make_plans(bench.scale, bench.shared)
     _claim(bench, plans)
     missing(runs, bench.out)  # a damaged record stops here, not after hours

@@ -3,7 +3,7 @@
 import statistics
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -71,15 +71,16 @@ def device_of(settings: TrainSettings) -> torch.device:
 def step_seconds(
     methods: Iterable[str], settings: TrainSettings, steps: int = 2
 ) -> dict[str, float]:
-    """Return the median seconds of a step of each method, after one to warm up."""
+    """Return the median seconds of a step of each method, after one on few points to warm up."""
     threads = torch.get_num_threads()
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)
     try:
         found = {}
         for name in methods:
+            few = replace(settings, num_points=64, batch_size=4)
+            Step(name, few, device_of(settings))()
             step = Step(name, settings, device_of(settings))
-            step()
             found[name] = statistics.median(step() for _ in range(steps))
         return found
     finally:
