@@ -5,10 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from qs3.cli.train import parse_settings, preset_options
+from qs3.cli.train import parse_settings, preset_name
 from qs3.errors import InputError
 from qs3.evaluation import read_record
-from qs3.training import PRESETS
 
 QUICK = ("--model", "pointnet", "--model-set", "channels=[8, 8, 16]", "hidden=[8]", "--num-points",
          64, "--batch-size", 5, "--threads", 1, "--accelerator", "cpu", "--epochs", 2,
@@ -102,7 +101,7 @@ def test_settings_are_json_or_words():
     ],
 )
 def test_a_preset_follows_the_method(arguments, preset):
-    assert preset_options(arguments).self_training == PRESETS[preset]
+    assert preset_name(arguments) == preset
 
 
 def test_labels_of_the_target_may_be_anything(qs3, store, tmp_path):

@@ -55,6 +55,7 @@ def whole(fake, folder: Path) -> dict[str, bytes]:
     return content(folder)
 
 
+@pytest.mark.slow
 def test_a_node_killed_half_way_changes_no_byte(fake, tmp_path, cluster):
     out = tmp_path / "out"
     nodes = sorted(cluster.list_all_nodes(), key=lambda node: node.head)

@@ -360,7 +360,7 @@ def test_half_the_bits_give_nearly_the_same_scores(name):
 @pytest.mark.parametrize(
     ("backend", "names"),
     [
-        ("aot_eager", ["dgcnn"]),
+        pytest.param("aot_eager", ["dgcnn"], marks=pytest.mark.slow),
         pytest.param("aot_eager", NAMES, marks=pytest.mark.slow),
         pytest.param("inductor", NAMES, marks=pytest.mark.slow),
     ],

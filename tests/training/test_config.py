@@ -1,3 +1,5 @@
+import subprocess
+import sys
 from dataclasses import asdict, replace
 
 import pytest
@@ -60,14 +62,11 @@ def test_overrides():
         (lambda: SelfTrainingSettings(threshold=0.9, step=0.02), "step = 0.02 takes θ out"),
         (lambda: SelfTrainingSettings(rounds=0), "rounds = 0"),
         (lambda: SelfTrainingSettings(steps_per_epoch=0), "steps_per_epoch = 0"),
-        (lambda: SelfTrainingSettings(rule="pst"), "rule = pst is none of qbst"),
-        (lambda: SelfTrainingSettings(source_weight=0), "source_weight = 0"),
+        (lambda: SelfTrainingSettings(source_weight=0.0), "source_weight = 0"),
         (lambda: SelfTrainingSettings(weight_step=0.02), "takes a factor of the losses to 0"),
-        (lambda: SelfTrainingSettings(portion=0), "portion = 0"),
+        (lambda: SelfTrainingSettings(portion=0.0), "portion = 0"),
         (lambda: TrainSettings(holdout=1.0), "holdout = 1.0"),
-        (lambda: TrainSettings(rule="oracle"), "rule = oracle is none of last"),
         (lambda: TrainSettings(rule="im", validate_every=0), "leaves no checkpoint"),
-        (lambda: TrainSettings(normalisation="own"), "normalisation = own is none of shared"),
         (lambda: TrainSettings(batch_size=1), "batch_size = 1 must be at least 2"),
         (lambda: TrainSettings(epochs=0), "epochs = 0"),
         (lambda: TrainSettings(label_smoothing=1.0), "label_smoothing"),
@@ -78,6 +77,21 @@ def test_overrides():
 def test_faults_name_the_setting(call, message):
     with pytest.raises(InputError, match=message):
         call()
+
+
+def test_unknown_words_are_refused_without_the_type_checks_of_the_tests():
+    calls = {
+        'TrainSettings(rule="oracle")': "rule = oracle is none of last",
+        'TrainSettings(normalisation="own")': "normalisation = own is none of shared",
+        'SelfTrainingSettings(rule="pst")': "rule = pst is none of qbst",
+        'SelfTrainingSettings(prior="ml")': "prior = ml is none of em, bbse",
+    }
+    script = "from qs3.training.config import *\n"
+    for call in calls:
+        script += f"try:\n    {call}\nexcept Exception as error:\n    print(error)\n"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    for said, wanted in zip(done.stdout.splitlines(), calls.values(), strict=True):
+        assert wanted in said
 
 
 def test_command_line_makes_the_settings():

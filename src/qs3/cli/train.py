@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from qs3.adaptation.names import WITHOUT_TARGET, MethodName, RoundRule, split_method
+from qs3.adaptation.names import COMPOSED, WITHOUT_TARGET, MethodName, RoundRule, split_method
 from qs3.errors import InputError, UnevenSizesError
 from qs3.evaluation.records import DataRecord
 from qs3.files import write_json
@@ -74,15 +74,20 @@ def preset_options(arguments: list[str]) -> TrainOptions:
     A preset sets the defaults of all self-training settings, so that one given beside it wins and
     the help shows what is in force. SPST has its own.
     """
+    preset = PRESETS.get(preset_name(arguments), PRESETS["default"])
+    return TrainOptions(source=tyro.MISSING, out=tyro.MISSING, self_training=preset)
+
+
+def preset_name(arguments: Sequence[str]) -> str:
+    """The preset in force: the one that is given, or that of the rule of self-training.
+
+    Example:
+        >>> preset_name(["--method", "gast-spst"]), preset_name(["--method=qbst"])
+        ('spst', 'default')
+    """
     method = _given(arguments, "--method", "source-only")
-    rule = _given(arguments, "--self-training", "")
-    spst = rule == "spst" or (not rule and method in ("spst", "gast-spst"))
-    preset = _given(arguments, "--preset", "spst" if spst else "default")
-    return TrainOptions(
-        source=tyro.MISSING,
-        out=tyro.MISSING,
-        self_training=PRESETS.get(preset, PRESETS["default"]),
-    )
+    rule = _given(arguments, "--self-training", COMPOSED.get(method, ("", ""))[1])
+    return _given(arguments, "--preset", "spst" if rule == "spst" else "default")
 
 
 def _given(arguments: Sequence[str], option: str, default: str) -> str:

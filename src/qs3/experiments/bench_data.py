@@ -41,7 +41,7 @@ def side_of(file_name: str) -> str:
 
     Example:
         >>> [side_of(f"{name}.ply") for name in ("a", "b", "d")]
-        ['source', 'source', 'source']
+        ['test', 'train', 'source']
     """
     byte = hashlib.sha256(file_name.encode("utf-8")).digest()[0]
     return "source" if byte < 128 else "train" if byte < 192 else "test"
