@@ -308,6 +308,22 @@ def test_unknown_names_and_settings():
         create_method("defrec", model, wait=1)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+def test_trains_on_two_devices_and_resumes(method, tmp_path):
+    chosen = settings(method, "dgcnn", devices=2, epochs=2)
+    whole = fit(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "whole")
+
+    def stop(record, _):
+        raise Stop
+
+    with pytest.raises(Stop):
+        fit(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "cut", on_epoch=stop)
+    resumed = fit(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "cut")
+    assert same(state(whole), state(resumed))
+    assert whole.checkpoints == resumed.checkpoints
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("method", METHODS)
