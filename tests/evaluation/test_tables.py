@@ -33,6 +33,18 @@ def test_a_mean_over_unlike_runs_is_refused(with_accuracy, record):
     assert [row.key[2] for row in group([one, clean])] == ["cad/train", "cad/train (clean)"]
 
 
+def test_seeds_of_real_runs_lie_deeper(with_accuracy):
+    def settings(seed, warm_up, epochs=3):
+        return {"train": {"seed": seed, "epochs": epochs}, "warm_up": warm_up}
+
+    one = with_accuracy(0, 0.5, settings=settings(0, "weights of seed 0"))
+    two = with_accuracy(1, 0.6, settings=settings(1, "weights of seed 1"))
+    assert group([one, two])[0].seeds == (0, 1)
+    for other in (settings(1, None), settings(1, "weights of seed 1", epochs=4)):
+        with pytest.raises(InputError, match="not in the seed alone"):
+            group([one, dataclasses.replace(two, settings=other)])
+
+
 def test_markdown_shows_mean_error_and_number_of_seeds(with_accuracy):
     rows = group([with_accuracy(0, 0.5), with_accuracy(1, 0.6)])
     lines = markdown(rows).splitlines()

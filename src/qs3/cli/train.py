@@ -156,8 +156,14 @@ def run(options: TrainOptions) -> Any:
         raise InputError(f"method {options.method} needs --target: unlabelled clouds")
     settings = dataclasses.replace(
         options.train,
-        model_settings=parse_settings("--model-set", options.model_set),
-        method_settings=parse_settings("--method-set", options.method_set),
+        model_settings={
+            **options.train.model_settings,
+            **parse_settings("--model-set", options.model_set),
+        },
+        method_settings={
+            **options.train.method_settings,
+            **parse_settings("--method-set", options.method_set),
+        },
     )
     points = options.train.num_points
     source = _whole(

@@ -1,7 +1,7 @@
 """Tables made from records, and from nothing else."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -83,6 +83,10 @@ def group(records: Sequence[RunRecord], key: Callable[[RunRecord], Key] = defaul
 def _identity(record: RunRecord) -> str:
     """Everything that runs of one line share."""
     settings = {name: value for name, value in record.settings.items() if name != "seed"}
+    if isinstance(settings.get("train"), Mapping):
+        settings["train"] = {k: v for k, v in settings["train"].items() if k != "seed"}
+    # A warm-up is known by its weights, which follow from the seed.
+    settings["warm_up"] = settings.get("warm_up") is not None
     sums = [data.checksum for data in (record.source, record.target, record.test) if data]
     return json.dumps([settings, sums, record.model, record.method], sort_keys=True)
 
