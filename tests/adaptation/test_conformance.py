@@ -16,7 +16,7 @@ from qs3.errors import InputError
 from qs3.models import create_model
 from qs3.training import SelfTrainingSettings, TrainSettings, fit, load_model
 from qs3.training.job import Job, fresh_model, make_method
-from qs3.training.validation import choose, read_checkpoints
+from qs3.training.validation import choose, read_checkpoints, split_source
 
 NETWORKS = {
     "dgcnn": {"neighbours": 6, "channels": (8, 8, 16), "embedding": 32, "hidden": (16, 8)},
@@ -281,17 +281,67 @@ def test_any_warm_up_goes_with_any_self_training(method, tmp_path):
 @pytest.mark.parametrize("rule", ["uniform", "prior", "quantile"])
 @pytest.mark.parametrize("prior", ["em", "bbse"])
 def test_further_rules_of_selection(rule, prior, tmp_path):
-    rounds = replace(ROUNDS, rule=rule, prior=prior)
+    own = {"prior": prior} if rule == "prior" else {}
+    if rule != "quantile":
+        own["threshold"] = ROUNDS.threshold
+    rounds = SelfTrainingSettings(rule=rule, rounds=2, epochs=1, **own)
     chosen = settings("source-only")
     result = fit("source-only", SOURCE, TARGET, chosen, rounds, run_dir=tmp_path)
     assert len(result.rounds) == 2
+    for record in result.rounds:
+        assert all(kept <= over for kept, over in zip(record.kept, record.confident, strict=True))
+        assert (record.theta == 0) == (rule == "quantile")
 
 
-def test_bbse_needs_a_held_out_part(tmp_path):
-    rounds = replace(ROUNDS, rule="prior", prior="bbse")
-    chosen = settings("source-only", holdout=0.0)
-    with pytest.raises(InputError, match="held-out part"):
-        fit("source-only", SOURCE, TARGET, chosen, rounds, run_dir=tmp_path)
+@pytest.mark.parametrize(
+    ("changes", "rounds", "message"),
+    [
+        ({"holdout": 0.0}, replace(ROUNDS, rule="prior", prior="bbse"), "'bbse' needs a held-out"),
+        ({"holdout": 0.0, "rule": "source-val"}, None, "'source-val' needs a held-out"),
+        ({"holdout": 0.0, "rule": "dev"}, None, "'dev' needs a held-out"),
+        ({"rule": "im"}, None, "'im' needs a target"),
+    ],
+)
+def test_what_would_lack_something_in_the_end_is_refused_at_once(
+    changes, rounds, message, tmp_path
+):
+    target = None if changes.get("rule") == "im" else TARGET
+    chosen = settings("source-only", **changes)
+    with pytest.raises(InputError, match=message):
+        fit("source-only", SOURCE, target, chosen, rounds, run_dir=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_warm_up_must_be_of_the_method_and_leave_the_held_out_part_unseen(tmp_path, caplog):
+    chosen = settings("dann", epochs=1)
+    fit("dann", SOURCE, TARGET, chosen, run_dir=tmp_path / "dann")
+
+    def adapt(name, method="dann", **changes):
+        run = tmp_path / name
+        told = replace(chosen, **changes)
+        warm = tmp_path / "dann"
+        return fit(method, SOURCE, TARGET, told, ROUNDS, run_dir=run, warm_up=warm)
+
+    with pytest.raises(InputError, match="is a run of method dann, not source-only"):
+        adapt("a", "qbst", method_settings=SMALLER["dann"])
+    with pytest.raises(InputError, match="trained with method_settings"):
+        adapt("b", method_settings={"hidden": (8,)})
+    assert adapt("c").checkpoints[-1].validators["source-val"] is not None
+    assert not caplog.records
+    assert adapt("d", seed=1).checkpoints[-1].validators["source-val"] is None
+    assert "none of it is left to validate on" in caplog.text
+    with pytest.raises(InputError, match="that no warm-up has seen"):
+        adapt("e", seed=1, rule="source-val")
+    with pytest.raises(InputError, match="is self-trained itself"):
+        fit("dann", SOURCE, TARGET, chosen, ROUNDS, run_dir=tmp_path / "f", warm_up=tmp_path / "c")
+
+
+def test_a_held_out_part_takes_of_every_class_and_never_its_last_cloud():
+    rare = SOURCE.select(np.flatnonzero((SOURCE.labels < 2) | (np.arange(len(SOURCE)) == 2)))
+    for seed in range(5):
+        trained, held = split_source(rare, settings("source-only", holdout=0.5, seed=seed))
+        assert np.bincount(trained.labels, minlength=3)[2] == 1
+        assert np.bincount(held.labels, minlength=3).tolist() == [2, 2, 0]
 
 
 @pytest.mark.parametrize("method", [n for n in METHODS if method_class(n).needs_local])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from qs3.cli.train import parse_settings, preset_name
+from qs3.datasets.classes import POINTDA10
 from qs3.errors import InputError
 from qs3.evaluation import read_record
 
@@ -15,9 +16,18 @@ QUICK = ("--model", "pointnet", "--model-set", "channels=[8, 8, 16]", "hidden=[8
 
 
 @pytest.fixture(scope="module")
-def adapted(qs3, store, tmp_path_factory):
+def source(tmp_path_factory):
+    """Four clouds of each class, so that some can be held out."""
+    path = tmp_path_factory.mktemp("source") / "source.npz"
+    points = np.random.default_rng(0).normal(size=(40, 80, 3))
+    np.savez(path, points=points, label=np.arange(40) % 10, class_names=np.array(POINTDA10))
+    return path
+
+
+@pytest.fixture(scope="module")
+def adapted(qs3, store, source, tmp_path_factory):
     run = tmp_path_factory.mktemp("runs") / "dann"
-    qs3("train", "--source", store, "--target", store, "--out", run, "--method", "dann",
+    qs3("train", "--source", source, "--target", store, "--out", run, "--method", "dann",
         "--method-set", "hidden=[8]", "gamma=5", "--self-training", "qbst",
         "--self-training.rounds", 2, "--self-training.epochs", 1, "--rule", "im",
         *QUICK)  # fmt: skip
@@ -51,11 +61,11 @@ def test_every_validators_choice_is_scored_and_the_oracle_stands_apart(qs3, adap
     assert record.selection == "im"
 
 
-def test_source_only_looks_at_a_target_without_learning_from_it(qs3, store, tmp_path):
+def test_source_only_looks_at_a_target_without_learning_from_it(qs3, store, source, tmp_path):
     weights = []
     for name, target in {"with": ("--target", store), "without": ()}.items():
         run = tmp_path / name
-        qs3("train", "--source", store, *target, "--out", run, *QUICK)
+        qs3("train", "--source", source, *target, "--out", run, *QUICK)
         weights.append((run / "model.safetensors").read_bytes())
         lines = [json.loads(line) for line in (run / "history.jsonl").read_text().splitlines()]
         told = [line["validators"] for line in lines if line["kind"] == "checkpoint"]
@@ -65,11 +75,30 @@ def test_source_only_looks_at_a_target_without_learning_from_it(qs3, store, tmp_
     assert weights[0] == weights[1]
 
 
+def test_what_a_warm_up_has_seen_marks_the_score(qs3, store, tmp_path):
+    warm, adapted = tmp_path / "warm", tmp_path / "adapted"
+    qs3("train", "--source", store, "--supervised", "--out", warm, *QUICK)
+    rounds = ("--self-training.rounds", 1, "--self-training.epochs", 1)
+    qs3("train", "--source", store, "--target", store, "--method", "qbst", "--warm-up", warm,
+        "--out", adapted, *rounds, *QUICK)  # fmt: skip
+    qs3("evaluate", adapted, "--data", store)
+    record = read_record(next((adapted / "records").glob("*.json")))
+    assert record.marks == ("transductive", "supervised", "training clouds")
+    (warm / "run.json").unlink()
+    other = tmp_path / "other"
+    qs3("train", "--source", store, "--target", store, "--method", "qbst", "--warm-up", warm,
+        "--out", other, *rounds, *QUICK)  # fmt: skip
+    qs3("evaluate", other, "--data", store)
+    record = read_record(next((other / "records").glob("*.json")))
+    assert "warm-up of unknown origin" in record.marks
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (("--method", "dann"), "method dann needs --target"),
         (("--method", "qbst", "--self-training", "spst"), "method qbst is source-only with qbst"),
+        (("--method", "spst", "--preset", "paper"), "single_class = drop is not read by rule spst"),
         (("--self-training.rounds", 3), "has no rounds to set; add --self-training"),
         (("--method-set", "weight=1"), "unknown setting 'weight' of method source-only"),
         (("--model-set", "k"), "--model-set k: give each setting once, as name=value"),
@@ -78,6 +107,13 @@ def test_source_only_looks_at_a_target_without_learning_from_it(qs3, store, tmp_
 def test_what_does_not_go_together_is_refused(qs3, store, tmp_path, arguments, said):
     line = qs3.refuses("train", "--source", store, "--out", tmp_path / "run", *arguments)
     assert said in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_setting_that_the_rule_does_not_read_is_refused(qs3, store, tmp_path):
+    done = qs3("train", "--source", store, "--out", tmp_path / "run", "--self-training", "spst",
+               "--self-training.selection", "least-confident", code=2)  # fmt: skip
+    assert "not read by rule spst" in " ".join(done.stderr.replace("│", " ").split())
     assert not (tmp_path / "run").exists()
 
 

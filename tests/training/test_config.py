@@ -30,6 +30,7 @@ COMMON = {
     "steps_per_epoch": None,
     "source_weight": 1.0,
     "weight_step": 0.0,
+    "quantile": 0.5,
     "portion": 0.2,
     "portion_step": 0.05,
 }
@@ -65,6 +66,11 @@ def test_overrides():
         (lambda: SelfTrainingSettings(source_weight=0.0), "source_weight = 0"),
         (lambda: SelfTrainingSettings(weight_step=0.02), "takes a factor of the losses to 0"),
         (lambda: SelfTrainingSettings(portion=0.0), "portion = 0"),
+        (
+            lambda: SelfTrainingSettings(rule="spst", selection="least-confident"),
+            "selection = least-confident is not read by rule spst, only by qbst",
+        ),
+        (lambda: SelfTrainingSettings(portion=0.3), "portion = 0.3 is not read by rule qbst"),
         (lambda: TrainSettings(holdout=1.0), "holdout = 1.0"),
         (lambda: TrainSettings(rule="im", validate_every=0), "leaves no checkpoint"),
         (lambda: TrainSettings(batch_size=1), "batch_size = 1 must be at least 2"),

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import torch
-from sklearn.base import clone
+from sklearn.base import clone, is_classifier
 
 from qs3.errors import InputError
 from qs3.training import QBST, SPST, Adapter, SelfTrainingSettings, TrainSettings, fit
@@ -62,6 +62,7 @@ def test_it_is_the_fit_of_the_function(source, target, tmp_path, made, method, r
 def test_clone_copies_parameters_and_nothing_else(kind, source):
     made = kind(model="pointnet", train=TRAIN, random_state=3)
     copied = clone(made)
+    assert is_classifier(copied)
     assert type(copied) is kind
     assert copied is not made
     assert copied.get_params() == made.get_params()

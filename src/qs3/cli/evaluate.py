@@ -30,6 +30,7 @@ _TOLD = (
     "supervised",
     "source_clouds",
     "target_clouds",
+    "unknown_warm_up",
     "rounds",
     "seconds",
 )
@@ -192,6 +193,8 @@ def _marks(told: dict[str, Any], tested: set[str]) -> list[str]:
         marks.append("supervised")
     if tested & set(told["source_clouds"]):
         marks.append("training clouds")
+    if told["unknown_warm_up"]:
+        marks.append("warm-up of unknown origin")
     return marks
 
 

@@ -8,14 +8,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
 from qs3.adaptation.names import COMPOSED, WITHOUT_TARGET, MethodName, RoundRule, split_method
 from qs3.errors import InputError, UnevenSizesError
 from qs3.evaluation.records import DataRecord
-from qs3.files import write_json
+from qs3.files import read_json, write_json
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
 
 RUN = "run.json"
@@ -75,6 +75,9 @@ def preset_options(arguments: list[str]) -> TrainOptions:
     the help shows what is in force. SPST has its own.
     """
     preset = PRESETS.get(preset_name(arguments), PRESETS["default"])
+    rule: Any = _given(arguments, "--self-training", _own_rule(arguments) or preset.rule)
+    if rule in get_args(RoundRule):
+        preset = dataclasses.replace(preset, rule=rule)
     return TrainOptions(source=tyro.MISSING, out=tyro.MISSING, self_training=preset)
 
 
@@ -85,9 +88,13 @@ def preset_name(arguments: Sequence[str]) -> str:
         >>> preset_name(["--method", "gast-spst"]), preset_name(["--method=qbst"])
         ('spst', 'default')
     """
-    method = _given(arguments, "--method", "source-only")
-    rule = _given(arguments, "--self-training", COMPOSED.get(method, ("", ""))[1])
+    rule = _given(arguments, "--self-training", _own_rule(arguments))
     return _given(arguments, "--preset", "spst" if rule == "spst" else "default")
+
+
+def _own_rule(arguments: Sequence[str]) -> str:
+    """The rule of self-training that the method brings, or nothing."""
+    return COMPOSED.get(_given(arguments, "--method", "source-only"), ("", ""))[1]
 
 
 def _given(arguments: Sequence[str], option: str, default: str) -> str:
@@ -217,16 +224,42 @@ def run(options: TrainOptions) -> Any:
                 name: None if record is None else dataclasses.asdict(record)
                 for name, record in data.items()
             },
-            "supervised": options.supervised,
-            "source_clouds": digests(thin(source.points, points, options.out)),
-            "target_clouds": []
-            if target is None or not result.adapted
-            else digests(thin(target.points, points, options.out)),
+            **_seen(
+                options,
+                digests(thin(source.points, points, options.out)),
+                digests(thin(target.points, points, options.out))
+                if target is not None and result.adapted
+                else [],
+            ),
             "rounds": [dataclasses.asdict(record) for record in result.rounds],
             "seconds": seconds,
         },
     )
     return result
+
+
+def _seen(options: TrainOptions, source: list[str], target: list[str]) -> dict[str, Any]:
+    """What the network has seen in this run or in its warm-up, for the marks of its scores."""
+    seen: dict[str, Any] = {
+        "supervised": options.supervised,
+        "source_clouds": source,
+        "target_clouds": target,
+        "unknown_warm_up": False,
+    }
+    if options.warm_up is None:
+        return seen
+    if not (options.warm_up / RUN).is_file():
+        return seen | {"unknown_warm_up": True}
+    before = read_json(options.warm_up / RUN)
+    try:
+        return {
+            "supervised": bool(before["supervised"]) or options.supervised,
+            "source_clouds": sorted({*before["source_clouds"], *source}),
+            "target_clouds": sorted({*before["target_clouds"], *target}),
+            "unknown_warm_up": bool(before["unknown_warm_up"]),
+        }
+    except (KeyError, TypeError):
+        return seen | {"unknown_warm_up": True}
 
 
 def _whole(load: Callable[..., Any], num_points: int) -> Any:

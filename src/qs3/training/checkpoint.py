@@ -51,15 +51,29 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file")
+    facts = read_facts(path)
     try:
         with safetensors.safe_open(path, framework="pt") as handle:  # pyright: ignore[reportPrivateImportUsage]
-            facts = json.loads((handle.metadata() or {})["qs3"])
             tensors = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118
+    except (safetensors.SafetensorError, OSError) as error:
+        raise InputError(f"{path}: not a safetensors file of qs3 ({error})") from error
+    return tensors, facts
+
+
+def read_facts(path: Path) -> dict[str, Any]:
+    """Read the facts of `read_tensors` alone; the tensors stay on disk.
+
+    Raises:
+        InputError: as `read_tensors`.
+    """
+    try:
+        with safetensors.safe_open(Path(path), framework="pt") as handle:  # pyright: ignore[reportPrivateImportUsage]
+            facts = json.loads((handle.metadata() or {})["qs3"])
     except (safetensors.SafetensorError, KeyError, ValueError, OSError) as error:
         raise InputError(f"{path}: not a safetensors file of qs3 ({error})") from error
     if not isinstance(facts, dict):
         raise InputError(f"{path}: not a safetensors file of qs3 (facts are no object)")
-    return tensors, facts
+    return facts
 
 
 def load_tensors_into(module: torch.nn.Module, tensors: Mapping[str, Tensor], where: Path) -> None:

@@ -146,6 +146,9 @@ class SelfTrainingSettings:
     """Factor of the source's loss at the start."""
     weight_step: float = 0.0
     """Taken off both factors, of the target's and the source's loss, after each epoch."""
+    quantile: float = 0.5
+    """Which of the classes' counts bounds all: ``uniform`` and ``prior`` keep what this quantile of
+    the classes allows, and all of a class with less; at 0 the rarest class decides."""
     portion: float = 0.2
     """Share of each class's clouds that ``quantile`` keeps in round 1."""
     portion_step: float = 0.05
@@ -167,6 +170,7 @@ class SelfTrainingSettings:
         decay = self.weight_step * (self.rounds * self.epochs - 1)
         good = self.weight_step >= 0 and decay < min(1.0, self.source_weight)
         _check(self, "weight_step", good, "takes a factor of the losses to 0 within the rounds")
+        _check(self, "quantile", 0 <= self.quantile <= 1, "must be in 0 to 1")
         _check(self, "portion", 0 < self.portion <= 1, "must be above 0, to 1")
         _check(self, "portion_step", self.portion_step >= 0, "must not be negative")
         for name, kind in {"rule": RoundRule, "prior": Literal["em", "bbse"]}.items():
@@ -176,8 +180,29 @@ class SelfTrainingSettings:
                 getattr(self, name) in get_args(kind),
                 f"is none of {', '.join(get_args(kind))}",
             )
+        for names, rules in _READ_BY.items():
+            for name in names:
+                if self.rule not in rules and getattr(self, name) != _default(type(self), name):
+                    raise InputError(
+                        f"setting {name} = {getattr(self, name)} is not read by rule {self.rule}, "
+                        f"only by {', '.join(rules)}; leave it out"
+                    )
         steps = self.steps_per_epoch
         _check(self, "steps_per_epoch", steps is None or steps > 0, "must be above 0")
+
+
+_READ_BY: Mapping[tuple[str, ...], tuple[str, ...]] = {
+    ("selection", "single_class"): ("qbst",),
+    ("prior",): ("prior",),
+    ("quantile",): ("uniform", "prior"),
+    ("portion", "portion_step"): ("quantile",),
+    ("threshold", "step", "inclusive"): ("qbst", "spst", "uniform", "prior"),
+}
+"""Settings that only some rules of selection look at."""
+
+
+def _default(kind: type, name: str) -> Any:
+    return next(field.default for field in fields(kind) if field.name == name)
 
 
 def _check(settings: Any, name: str, good: bool, fault: str) -> None:

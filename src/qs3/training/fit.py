@@ -3,6 +3,7 @@
 import contextlib
 import hashlib
 import json
+import logging
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,6 +25,7 @@ from qs3.training.records import EpochRecord, History
 from qs3.training.self_training import RoundCallback, RoundRecord
 from qs3.training.validation import Checkpoint, read_checkpoints, split_source
 
+_LOG = logging.getLogger(__name__)
 _Clouds = TypeVar("_Clouds", PointClouds, UnlabelledClouds)
 
 
@@ -108,13 +110,16 @@ def fit(
         require_unlabelled(target)
         require_finite(target, "target: ")
     require_finite(source, "source: ")
-    start = None if warm_up is None else _load_warm_up(Path(warm_up), source, settings)
+    start, unseen = None, True
+    if warm_up is not None:
+        start, unseen = _load_warm_up(Path(warm_up), base, source, settings)
     run_dir = Path(run_dir)
-    trained, held = split_source(source, settings)
+    trained, holdout = _split(source, settings, unseen)
+    _require_judges(settings, rounds_settings, target, holdout)
     job = Job(
         base,
         trained,
-        held if len(held) else None,
+        holdout,
         target,
         settings,
         rounds_settings,
@@ -139,11 +144,11 @@ def fit(
         },
     )
     source = _prepared(source, job)
-    trained, held = split_source(source, settings)
+    trained, holdout = _split(source, settings, unseen)
     job = replace(
         job,
         source=trained,
-        holdout=held if len(held) else None,
+        holdout=holdout,
         target=target and _prepared(target, job),
     )
     with (
@@ -189,8 +194,45 @@ def is_finished(run_dir: Path) -> bool:
     return (Path(run_dir) / MODEL).is_file()
 
 
-def _load_warm_up(folder: Path, source: PointClouds, settings: TrainSettings) -> PointClassifier:
-    """Read the warm-up's network and check that it is one for these classes and settings."""
+def _split(
+    source: PointClouds, settings: TrainSettings, unseen: bool
+) -> tuple[PointClouds, PointClouds | None]:
+    """Return the part to train on, and the held-out one where the warm-up has not seen it."""
+    trained, held = split_source(source, settings)
+    return trained, held if unseen and len(held) else None
+
+
+def _require_judges(
+    settings: TrainSettings,
+    rounds: SelfTrainingSettings | None,
+    target: UnlabelledClouds | None,
+    holdout: PointClouds | None,
+) -> None:
+    """Refuse, before anything is trained, what would lack something in the end.
+
+    Raises:
+        InputError: where the rule or the estimate of the class shares has nothing to go by.
+    """
+    by_source = settings.rule in ("source-val", "dev")
+    bbse = rounds is not None and rounds.rule == "prior" and rounds.prior == "bbse"
+    if holdout is None and (by_source or bbse):
+        what = f"rule {settings.rule!r}" if by_source else "prior 'bbse'"
+        raise InputError(
+            f"{what} needs a held-out part of the source that no warm-up has seen; raise holdout "
+            f"above {settings.holdout}, or give a warm-up of the same source, seed and holdout"
+        )
+    if target is None and settings.rule not in ("last", "source-val"):
+        raise InputError(f"rule {settings.rule!r} needs a target: give unlabelled clouds")
+
+
+def _load_warm_up(
+    folder: Path, base: str, source: PointClouds, settings: TrainSettings
+) -> tuple[PointClassifier, bool]:
+    """Read the warm-up's network; say whether it has left this run's held-out part unseen.
+
+    Raises:
+        InputError: where it is one for other classes or settings, or of another method.
+    """
     model, class_names, there = load_model(folder)
     if class_names != source.class_names:
         raise InputError(
@@ -198,13 +240,32 @@ def _load_warm_up(folder: Path, source: PointClouds, settings: TrainSettings) ->
             f"({', '.join(source.class_names)})"
         )
     wanted = json.loads(json.dumps(asdict(settings)))
-    for name in ("model", "model_settings", "num_points"):
-        if there.get("train", {}).get(name) != wanted[name]:
+    trained = there.get("train", {})
+    names = ["model", "model_settings", "num_points"]
+    names += ["method_settings"] if "method_settings" in trained else []
+    for name in names:
+        if trained.get(name) != wanted[name]:
             raise InputError(
-                f"{folder}: trained with {name} = {there.get('train', {}).get(name)!r}, not "
+                f"{folder}: trained with {name} = {trained.get(name)!r}, not "
                 f"{wanted[name]!r}; use the same setting"
             )
-    return model
+    if there.get("self_training") is not None:
+        raise InputError(f"{folder}: is self-trained itself; name the run before its rounds")
+    method = there.get("method", base)
+    if method != base:
+        raise InputError(
+            f"{folder}: is a run of method {method}, not {base}; choose method {method} with "
+            "self-training after it"
+        )
+    same = all(trained.get(name) == wanted[name] for name in ("seed", "holdout"))
+    unseen = same and there.get("source") == fingerprint(source)
+    if not unseen and settings.holdout > 0:
+        _LOG.warning(
+            "%s: was trained on another part of the source, so that none of it is left to "
+            "validate on; same source, seed and holdout would leave one",
+            folder,
+        )
+    return model, unseen
 
 
 def _weights_fingerprint(model: PointClassifier) -> str:

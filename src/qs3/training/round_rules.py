@@ -40,15 +40,17 @@ def make_rule(
     if settings.rule == "spst":
         return partial(select_confident, inclusive=settings.inclusive)
     if settings.rule == "uniform":
-        return partial(select_uniform, inclusive=settings.inclusive)
+        return partial(select_uniform, quantile=settings.quantile, inclusive=settings.inclusive)
     if settings.rule == "quantile":
-        portion = min(1.0, settings.portion + (number - 1) * settings.portion_step)
+        # Rounded: 0.2 + 2 · 0.05 is a little over 0.3, which would keep one cloud more.
+        portion = min(1.0, round(settings.portion + (number - 1) * settings.portion_step, 12))
         return lambda probabilities, _: select_quantile(probabilities, 0.0, portion)
     if settings.rule == "prior":
         return lambda probabilities, theta: select_prior(
             probabilities,
             theta,
             _prior(settings, probabilities, labels, held),
+            quantile=settings.quantile,
             inclusive=settings.inclusive,
         )
     return partial(
@@ -67,7 +69,9 @@ def _prior(
 ) -> Float[np.ndarray, "k"]:
     k = probabilities.shape[1]
     if settings.prior == "em":
-        return estimate_prior_em(probabilities, np.bincount(labels, minlength=k) / len(labels))
+        # A class that the source lacks has no share to start from; a trace lets EM find it.
+        counts = np.maximum(np.bincount(labels, minlength=k), 1e-3)
+        return estimate_prior_em(probabilities, counts / counts.sum())
     told = held()
     if told is None:
         raise InputError("prior = 'bbse' needs a held-out part of the source; set holdout above 0")

@@ -38,6 +38,7 @@ from qs3.training.loop import CHECKPOINT, EpochCallback, train
 from qs3.training.predict import describe, predict_probabilities
 from qs3.training.records import EpochRecord, History
 from qs3.training.round_rules import Select, make_rule
+from qs3.training.validation import adapt_statistics
 
 _LOG = logging.getLogger(__name__)
 STATE = "rounds.safetensors"
@@ -52,7 +53,7 @@ class RoundRecord:
     round: int
     """Count from 1."""
     theta: float
-    """Threshold of this round."""
+    """Threshold of this round; 0 for rule ``quantile``."""
     pool: int
     """Clouds to select from."""
     confident: tuple[int, ...]
@@ -190,6 +191,8 @@ class _Rounds:
         start = time.perf_counter()
         k = len(self.source.class_names)
         theta = self.rounds.threshold + (number - 1) * self.rounds.step
+        if self.rounds.rule == "quantile":
+            theta = 0.0  # each class has a threshold of its own
         probabilities = self._probabilities()
         labels = probabilities.argmax(axis=1)
         candidates = probabilities[self.pool]
@@ -237,7 +240,12 @@ class _Rounds:
         return record
 
     def _labeller(self) -> PointClassifier:
-        return self.best.model if self.rounds.labeller == "best" else self.latest
+        model = self.best.model if self.rounds.labeller == "best" else self.latest
+        if self.settings.normalisation != "adabn":
+            return model
+        adapted = copy.deepcopy(model)  # training goes on from the statistics of both domains
+        adapt_statistics(adapted, self.target.points, self.settings.batch_size)
+        return adapted
 
     def _probabilities(self) -> np.ndarray:
         """What the labeller says of the target, smoothed over a graph where asked."""

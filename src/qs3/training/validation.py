@@ -1,6 +1,7 @@
 """Checkpoints of the network along a run, each with every validator, and the choice among them."""
 
 import copy
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,13 +19,15 @@ from qs3.errors import InputError
 from qs3.models import PointClassifier
 from qs3.training.checkpoint import (
     load_tensors_into,
+    read_facts,
     read_tensors,
     save_model,
     seed_sequence,
 )
 from qs3.training.config import TrainSettings
-from qs3.training.predict import describe
+from qs3.training.predict import Description, describe
 
+_LOG = logging.getLogger(__name__)
 CHECKPOINTS = "checkpoints"
 _SOURCE_CLOUDS = 1000
 """Of the source, at most so many tell DEV where the source lies."""
@@ -89,25 +92,38 @@ class Validation:
             )
             for clouds in (self.target, self.holdout, self.source)
         )
-        values: dict[str, float | None] = dict.fromkeys(VALIDATORS)
-        labels = None if self.holdout is None else self.holdout.labels
-        if target is not None:
-            seen = Observation(
-                target_probabilities=target.probabilities,
-                target_features=target.features,
-                validation_probabilities=None if holdout is None else holdout.probabilities,
-                validation_features=None if holdout is None else holdout.features,
-                validation_labels=labels,
-                training_features=None if source is None else source.features,
-            )
-            values |= validate(seen)
-        elif holdout is not None and labels is not None:
-            values["source-val"] = source_accuracy(holdout.probabilities, labels)
         if self.fabric.is_global_zero:
+            values = self._values(target, holdout, source)
             told = {"stage": stage, "number": number, "validators": values}
             name = f"{CHECKPOINTS}/{stage}-{number:04d}.safetensors"
             save_model(self.run_dir, model, self.class_names, self.settings, name=name, facts=told)
         self.fabric.barrier()
+
+    def _values(
+        self,
+        target: Description | None,
+        holdout: Description | None,
+        source: Description | None,
+    ) -> dict[str, float | None]:
+        """What each validator says; None where it lacks something or cannot tell."""
+        values: dict[str, float | None] = dict.fromkeys(VALIDATORS)
+        labels = None if self.holdout is None else self.holdout.labels
+        try:
+            if target is not None:
+                seen = Observation(
+                    target_probabilities=target.probabilities,
+                    target_features=target.features,
+                    validation_probabilities=None if holdout is None else holdout.probabilities,
+                    validation_features=None if holdout is None else holdout.features,
+                    validation_labels=labels,
+                    training_features=None if source is None else source.features,
+                )
+                return values | validate(seen)
+            if holdout is not None and labels is not None:
+                values["source-val"] = source_accuracy(holdout.probabilities, labels)
+        except InputError as error:  # NaN, say: a number for the record must not end the run
+            _LOG.warning("the validators cannot judge this checkpoint: %s", error)
+        return values
 
     def adapt(self, model: PointClassifier) -> None:
         """Compute batch statistics anew over the target where the settings ask for AdaBN."""
@@ -192,8 +208,8 @@ def read_checkpoints(run_dir: Path, stage: str | None = None) -> list[Checkpoint
         InputError: where a file is damaged or not one of ours.
     """
     found = []
-    for path in sorted((Path(run_dir) / CHECKPOINTS).glob("*.safetensors")):
-        _, facts = read_tensors(path)
+    for path in (Path(run_dir) / CHECKPOINTS).glob("*.safetensors"):
+        facts = read_facts(path)
         try:
             checkpoint = Checkpoint(
                 stage=str(facts["stage"]),
@@ -205,7 +221,7 @@ def read_checkpoints(run_dir: Path, stage: str | None = None) -> list[Checkpoint
             raise InputError(f"{path}: not a checkpoint of a run ({error}); delete it") from error
         if stage in (None, checkpoint.stage):
             found.append(checkpoint)
-    return found
+    return sorted(found, key=lambda one: (one.stage, one.number))
 
 
 def choose(checkpoints: Sequence[Checkpoint], rule: str) -> Checkpoint:
@@ -244,6 +260,8 @@ def load_checkpoint(run_dir: Path, checkpoint: Checkpoint, model: PointClassifie
 def split_source(source: PointClouds, settings: TrainSettings) -> tuple[PointClouds, PointClouds]:
     """Split the source into a part to train on and one for the validators, by the seed alone.
 
+    The share is taken of each class, rounded; a class never loses its last cloud.
+
     Example:
         >>> clouds = PointClouds(np.zeros((20, 1, 3), np.float32), np.zeros(20, np.int64), ("a",),
         ...                      tuple(map(str, range(20))))
@@ -252,5 +270,8 @@ def split_source(source: PointClouds, settings: TrainSettings) -> tuple[PointClo
     """
     order = np.random.default_rng(seed_sequence(settings.seed, 3)).permutation(len(source))
     held = np.zeros(len(source), dtype=bool)
-    held[order[: int(settings.holdout * len(source))]] = True
+    for label in np.unique(source.labels):
+        members = order[source.labels[order] == label]
+        count = min(round(settings.holdout * len(members)), len(members) - 1)
+        held[members[:count]] = True
     return source.select(~held), source.select(held)
