@@ -19,6 +19,7 @@ from qs3.datasets.generate import (
 )
 from qs3.datasets.generate import generate as generate_anywhere
 from qs3.datasets.manifest import SUMS
+from qs3.datasets.parts import part_folder
 from qs3.datasets.scan_item import neighbour_of
 from qs3.datasets.store import MANIFEST, info, read_store
 from qs3.errors import InputError
@@ -293,7 +294,9 @@ def test_interrupt_of_the_whole_group_keeps_finished_shards(fake, tmp_path):
     command = [sys.executable, str(script), str(Path(__file__).parent), str(out)]
     process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE)
     deadline = time.monotonic() + 60
-    while not (out / "shard-00001.parquet").exists() and time.monotonic() < deadline:
+    shard, parts = out / "shard-00000.parquet", out / part_folder(0)
+    # The run knows of a shard when it takes the parts away, which is a moment after it is written.
+    while (parts.exists() or not shard.exists()) and time.monotonic() < deadline:
         time.sleep(0.02)
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=60)
