@@ -15,7 +15,7 @@ from qs3.adaptation.losses import cross_entropy
 from qs3.adaptation.method import Batch, Method
 from qs3.adaptation.normalisation import DomainNorm
 from qs3.errors import InputError
-from qs3.models import Features, PointClassifier, feature_widths
+from qs3.models import Features, PointClassifier, describe_point
 from qs3.models.checks import check_number, check_whole
 from qs3.models.sa_node import SANode, fill_nodes
 
@@ -54,16 +54,6 @@ class NodeAttention(nn.Module):
         return self.norm(x * self.weigh(x) + x)
 
 
-@torch.no_grad()
-def _describe_nothing(model: PointClassifier) -> Features:
-    training = model.training
-    model.eval()
-    try:
-        return model.encode(torch.zeros(1, 1, 3).to(next(model.parameters())))
-    finally:
-        model.train(training)
-
-
 def head_parameters(model: PointClassifier) -> list[nn.Parameter]:
     """Return the trainable parameters that the logits of described clouds depend on.
 
@@ -73,7 +63,7 @@ def head_parameters(model: PointClassifier) -> list[nn.Parameter]:
         [10, 10]
     """
     parameters = [p for p in model.parameters() if p.requires_grad]
-    training, features = model.training, _describe_nothing(model)
+    training, features = model.training, describe_point(model)
     model.eval()
     with torch.enable_grad():
         total = model.head(features).sum()
@@ -183,10 +173,11 @@ class PointDAN(Method):
         self.discrepancy_weight, self.node_weight = discrepancy_weight, node_weight
         self.bandwidths, self.classifier_rate = tuple(bandwidths), classifier_rate
         self.second = fresh_head(model)
-        given, local = _describe_nothing(model).nodes, feature_widths(model).local
+        seen = describe_point(model)
+        given, local = seen.nodes, seen.local
         assert local is not None  # noqa: S101
         self.sa_node = (
-            SANode(local, node_width, nodes, neighbours, radius, steered=True)
+            SANode(local.shape[2], node_width, nodes, neighbours, radius, steered=True)
             if given is None
             else None
         )

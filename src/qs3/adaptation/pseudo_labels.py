@@ -6,10 +6,11 @@ Convention:
 """
 
 import warnings
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from qs3.errors import InputError
 
@@ -91,10 +92,8 @@ def select_quasi_balanced(
     if single_class not in ("keep", "drop"):
         raise InputError(f"single_class must be keep or drop, not {single_class!r}")
     confident = select_confident(probabilities, threshold, inclusive=inclusive)
-    labels = probabilities.argmax(axis=1)
-    confidence = probabilities.max(axis=1)
-    total = int(confident.sum())
-    classes = np.unique(labels[confident])
+    counts = count_labels(probabilities, confident)
+    total, classes = int(counts.sum()), np.flatnonzero(counts)
     if len(classes) == 1 and single_class == "keep":
         warnings.warn(
             f"all {total} confident clouds are of class {classes[0]}: keeping all of them",
@@ -102,12 +101,37 @@ def select_quasi_balanced(
             stacklevel=2,
         )
         return confident
+    most = [balanced_count(count, total) if count else 0 for count in counts.tolist()]
+    return keep_of_classes(probabilities, confident, most, selection)
+
+
+def count_labels(
+    probabilities: Float[np.ndarray, "m k"], mask: Bool[np.ndarray, "m"]
+) -> Int[np.ndarray, "k"]:
+    """Return how many clouds of a mask have each pseudo label."""
+    return np.bincount(probabilities[mask].argmax(axis=1), minlength=probabilities.shape[1])
+
+
+def keep_of_classes(
+    probabilities: Float[np.ndarray, "m k"],
+    confident: Bool[np.ndarray, "m"],
+    most: Sequence[int],
+    selection: Selection = "most-confident",
+) -> Bool[np.ndarray, "m"]:
+    """Keep at most so many of the confident clouds of each class, from one end of its ranking.
+
+    Args:
+        probabilities: Class probabilities.
+        confident: Clouds to choose from.
+        most: Largest number of each class.
+        selection: End of the ranking; ties in confidence go by order.
+    """
+    labels, confidence = probabilities.argmax(axis=1), probabilities.max(axis=1)
+    ranking = confidence if selection == "least-confident" else -confidence
     chosen = np.zeros(len(probabilities), dtype=bool)
-    for label in classes:
+    for label, count in enumerate(most):
         members = np.flatnonzero(confident & (labels == label))
-        ranking = confidence[members] if selection == "least-confident" else -confidence[members]
-        order = np.argsort(ranking, kind="stable")
-        chosen[members[order[: balanced_count(len(members), total)]]] = True
+        chosen[members[np.argsort(ranking[members], kind="stable")[:count]]] = True
     return chosen
 
 

@@ -12,7 +12,12 @@ from fractions import Fraction
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from qs3.adaptation.pseudo_labels import check_probabilities, select_confident
+from qs3.adaptation.pseudo_labels import (
+    check_probabilities,
+    count_labels,
+    keep_of_classes,
+    select_confident,
+)
 from qs3.errors import InputError
 
 
@@ -45,10 +50,10 @@ def select_uniform(
     """
     _check_share("quantile", quantile)
     confident = select_confident(probabilities, threshold, inclusive=inclusive)
-    counts = _counts(probabilities, confident)
+    counts = count_labels(probabilities, confident)
     present = counts[counts > 0]
     most = int(np.quantile(present, quantile, method="lower")) if len(present) else 0
-    return _keep(probabilities, confident, np.full(len(counts), most))
+    return keep_of_classes(probabilities, confident, [most] * len(counts))
 
 
 def select_prior(
@@ -86,13 +91,14 @@ def select_prior(
     _check_share("quantile", quantile)
     share = _check_prior("prior", prior, probabilities.shape[1])
     confident = select_confident(probabilities, threshold, inclusive=inclusive)
-    counts = _counts(probabilities, confident)
+    counts = count_labels(probabilities, confident)
     use = (counts > 0) & (share > 0)
     if not use.any():
         return np.zeros(len(probabilities), dtype=bool)
     total = float(np.quantile(counts[use] / share[use], quantile, method="lower"))
     # A product that is an integer but for rounding must not gain one.
-    return _keep(probabilities, confident, np.ceil(total * share - 1e-9).astype(np.int64))
+    most = np.ceil(total * share - 1e-9).astype(np.int64)
+    return keep_of_classes(probabilities, confident, most.tolist())
 
 
 def select_quantile(
@@ -127,11 +133,11 @@ def select_quantile(
     """
     _check_share("share", share)
     confident = select_confident(probabilities, threshold, inclusive=inclusive)
-    counts = _counts(probabilities, np.ones(len(probabilities), dtype=bool))
+    counts = count_labels(probabilities, np.ones(len(probabilities), dtype=bool))
     # The share is meant as it is written: 0.07 of 100 is 7, not 8.
     exact = Fraction(str(float(share)))
-    most = np.array([math.ceil(exact * int(count)) for count in counts], dtype=np.int64)
-    return _keep(probabilities, confident, most)
+    most = [math.ceil(exact * count) for count in counts.tolist()]
+    return keep_of_classes(probabilities, confident, most)
 
 
 def estimate_prior_bbse(
@@ -229,28 +235,6 @@ def project_to_simplex(values: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]
     offset = excess[np.flatnonzero(ordered > excess)[-1]]
     positive = np.maximum(values - offset, 0.0)
     return positive / positive.sum()
-
-
-def _counts(
-    probabilities: Float[np.ndarray, "m k"], mask: Bool[np.ndarray, "m"]
-) -> Int[np.ndarray, "k"]:
-    """Return how many clouds of a mask have each pseudo label."""
-    return np.bincount(probabilities[mask].argmax(axis=1), minlength=probabilities.shape[1])
-
-
-def _keep(
-    probabilities: Float[np.ndarray, "m k"],
-    confident: Bool[np.ndarray, "m"],
-    most: Int[np.ndarray, "k"],
-) -> Bool[np.ndarray, "m"]:
-    """Keep at most so many of the confident clouds of each class, the most confident ones."""
-    labels, confidence = probabilities.argmax(axis=1), probabilities.max(axis=1)
-    chosen = np.zeros(len(probabilities), dtype=bool)
-    for label, count in enumerate(most.tolist()):
-        members = np.flatnonzero(confident & (labels == label))
-        order = np.argsort(-confidence[members], kind="stable")
-        chosen[members[order[:count]]] = True
-    return chosen
 
 
 def _check_share(name: str, value: float) -> None:

@@ -146,11 +146,10 @@ def _choices(run: Path, loaded: "LoadedModel", test: "PointClouds") -> dict[str,
     from qs3.adaptation.validators import VALIDATORS
     from qs3.evaluation import score
     from qs3.training import predict_probabilities
+    from qs3.training.job import ROUND
     from qs3.training.validation import choose, load_checkpoint, read_checkpoints
 
-    found = read_checkpoints(run)
-    stage = "round" if any(one.stage == "round" for one in found) else None
-    found = [one for one in found if stage in (None, one.stage)]
+    found = read_checkpoints(run, ROUND) or read_checkpoints(run)
     if not found:
         raise InputError(f"{run}: has no checkpoints; train with --validate-every above 0")
     scored = {}

@@ -1,9 +1,7 @@
 """``qs3 reproduce``: make a table anew, from data to records to Markdown."""
 
-import json
 import os
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -89,17 +87,10 @@ def _train(work: "Work") -> None:
             source_cloud=work.source_cloud,
             supervised=work.run.row == SUPERVISED,
             warm_up=work.warm_up,
-            # `run` takes these from the words of a command line alone.
-            model_set=_words(work.run.train.model_settings),
-            method_set=_words(work.run.train.method_settings),
             train=work.run.train,
             **told,
         )
     )
-
-
-def _words(settings: Mapping[str, Any]) -> tuple[str, ...]:
-    return tuple(f"{name}={json.dumps(value)}" for name, value in settings.items())
 
 
 def _evaluate(work: "Work") -> Any:

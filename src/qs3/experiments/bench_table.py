@@ -61,7 +61,7 @@ def group_results(results: Sequence[Result]) -> list[Line]:
     Raises:
         InputError: where two runs of a domain read different data, or a line has a seed twice.
     """
-    sums: dict[tuple[str, str], tuple[str, str]] = {}
+    sums: dict[str, tuple[str, str]] = {}
     groups: dict[tuple[str, str], list[Result]] = {}
     for result in results:
         run, record = result.run, result.record
@@ -72,7 +72,7 @@ def group_results(results: Sequence[Result]) -> list[Line]:
         if run.row != SUPERVISED:
             data.append((f"source {run.task[0]}", record.source.checksum))
         for name, checksum in data:
-            first, where = sums.setdefault((name, ""), (checksum, run.record))
+            first, where = sums.setdefault(name, (checksum, run.record))
             if first != checksum:
                 raise InputError(
                     f"{run.record}: read other data ({name}) than {where}; delete it and run the "

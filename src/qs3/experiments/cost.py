@@ -10,9 +10,9 @@ import torch
 from qs3.adaptation import Batch, create_method, method_class
 from qs3.adaptation.names import split_method
 from qs3.experiments.runs import Run
-from qs3.models import create_model, feature_widths
 from qs3.training.batches import count_batches
 from qs3.training.config import TrainSettings
+from qs3.training.job import new_model_for
 
 _CLASSES = 10
 _PASS = 1 / 3
@@ -31,10 +31,7 @@ class Step:
     def __init__(self, method: str, settings: TrainSettings, device: torch.device) -> None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
-            told = dict(settings.model_settings)
-            model = create_model(settings.model, _CLASSES, **told)
-            if method_class(method).needs_local and feature_widths(model).local is None:
-                model = create_model(settings.model, _CLASSES, **told | {"per_point": True})
+            model = new_model_for(method, settings, _CLASSES, 0)
             self.method = create_method(method, model).to(device).train()
         self.generator = torch.Generator().manual_seed(0)
         size = (settings.batch_size, settings.num_points, 3)

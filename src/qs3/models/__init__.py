@@ -2,6 +2,7 @@
 
 from qs3.models.classifier import Features as Features
 from qs3.models.classifier import PointClassifier as PointClassifier
+from qs3.models.classifier import describe_point as describe_point
 from qs3.models.classifier import feature_widths as feature_widths
 from qs3.models.dgcnn import DGCNN as DGCNN
 from qs3.models.factory import create_model as create_model

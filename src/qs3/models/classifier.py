@@ -57,6 +57,16 @@ class Widths(NamedTuple):
 
 
 @torch.no_grad()
+def describe_point(model: PointClassifier) -> Features:
+    """Describe a cloud of one point, to see what a network gives; it stays as it was."""
+    training = model.training
+    model.eval()
+    try:
+        return model.encode(torch.zeros(1, 1, 3).to(next(model.parameters())))
+    finally:
+        model.train(training)
+
+
 def feature_widths(model: PointClassifier) -> Widths:
     """Return how wide the features of a network are; its mode and statistics stay as they were.
 
@@ -65,12 +75,7 @@ def feature_widths(model: PointClassifier) -> Widths:
         >>> feature_widths(create_model("dgcnn", 10))
         Widths(pooled=2048, per_point=None, local=512)
     """
-    training = model.training
-    model.eval()
-    try:
-        features = model.encode(torch.zeros(1, 1, 3).to(next(model.parameters())))
-    finally:
-        model.train(training)
+    features = describe_point(model)
     given = (features.pooled, features.per_point, features.local)
     return Widths(*(None if part is None else part.shape[-1] for part in given))  # pyright: ignore[reportArgumentType]
 

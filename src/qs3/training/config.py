@@ -15,6 +15,8 @@ Precision = Literal["32-true", "bf16-mixed", "16-mixed", "64-true"]
 """Number formats that Lightning Fabric offers here."""
 Accelerator = Literal["auto", "cpu", "cuda"]
 """Where a training can compute."""
+Prior = Literal["em", "bbse"]
+"""Estimates of the target's class shares."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +82,7 @@ class TrainSettings:
     def __post_init__(self) -> None:
         for name in ("num_points", "epochs", "learning_rate"):
             _check(self, name, getattr(self, name) > 0, "must be above 0")
-        known = get_args(Accelerator)
-        _check(self, "accelerator", self.accelerator in known, f"is none of {', '.join(known)}")
+        _check_word(self, "accelerator", Accelerator)
         _check(self, "devices", self.devices > 0, "must be above 0")
         least = 2 * self.devices
         fault = f"must be at least {least}" + (", 2 a device" if self.devices > 1 else "")
@@ -94,13 +95,8 @@ class TrainSettings:
         for name in ("label_smoothing", "holdout"):
             _check(self, name, 0 <= getattr(self, name) < 1, "must be in 0 to below 1")
         _check(self, "validate_every", self.validate_every >= 0, "must not be negative")
-        for name, kind in {"normalisation": Normalisation, "rule": Rule}.items():
-            _check(
-                self,
-                name,
-                getattr(self, name) in get_args(kind),
-                f"is none of {', '.join(get_args(kind))}",
-            )
+        _check_word(self, "normalisation", Normalisation)
+        _check_word(self, "rule", Rule)
         good = self.rule == "last" or self.validate_every > 0
         _check(self, "validate_every", good, f"leaves no checkpoint for rule = {self.rule!r}")
         _check(self, "threads", self.threads is None or self.threads > 0, "must be above 0")
@@ -116,7 +112,7 @@ class SelfTrainingSettings:
     target's class shares; ``quantile`` the same share of each class's clouds (CBST)."""
     refine: bool = False
     """Whether pseudo labels are first smoothed over a graph of similar clouds."""
-    prior: Literal["em", "bbse"] = "em"
+    prior: Prior = "em"
     """Estimate of the class shares, for ``prior``; ``bbse`` needs a held-out part of the source."""
     threshold: float = 0.8
     """θ₀, the confidence that a pseudo label must exceed in round 1."""
@@ -173,13 +169,8 @@ class SelfTrainingSettings:
         _check(self, "quantile", 0 <= self.quantile <= 1, "must be in 0 to 1")
         _check(self, "portion", 0 < self.portion <= 1, "must be above 0, to 1")
         _check(self, "portion_step", self.portion_step >= 0, "must not be negative")
-        for name, kind in {"rule": RoundRule, "prior": Literal["em", "bbse"]}.items():
-            _check(
-                self,
-                name,
-                getattr(self, name) in get_args(kind),
-                f"is none of {', '.join(get_args(kind))}",
-            )
+        _check_word(self, "rule", RoundRule)
+        _check_word(self, "prior", Prior)
         for names, rules in _READ_BY.items():
             for name in names:
                 if self.rule not in rules and getattr(self, name) != _default(type(self), name):
@@ -203,6 +194,11 @@ _READ_BY: Mapping[tuple[str, ...], tuple[str, ...]] = {
 
 def _default(kind: type, name: str) -> Any:
     return next(field.default for field in fields(kind) if field.name == name)
+
+
+def _check_word(settings: Any, name: str, kind: Any) -> None:
+    known = get_args(kind)
+    _check(settings, name, getattr(settings, name) in known, f"is none of {', '.join(known)}")
 
 
 def _check(settings: Any, name: str, good: bool, fault: str) -> None:

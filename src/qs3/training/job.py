@@ -30,7 +30,6 @@ from qs3.training.loop import EpochCallback, train
 from qs3.training.records import EpochRecord, History
 from qs3.training.self_training import RoundCallback, RoundRecord, self_train
 from qs3.training.validation import (
-    Checkpoint,
     Validation,
     choose,
     load_checkpoint,
@@ -101,10 +100,14 @@ def make_method(model: PointClassifier, job: Job) -> Method:
 
 def fresh_model(job: Job) -> PointClassifier:
     """Return the network with the weights that a training begins with."""
-    settings, count = job.settings, len(job.source.class_names)
-    seed = derived_seed(settings.seed, 0)
+    seed = derived_seed(job.settings.seed, 0)
+    return new_model_for(job.method, job.settings, len(job.source.class_names), seed)
+
+
+def new_model_for(method: str, settings: TrainSettings, count: int, seed: int) -> PointClassifier:
+    """Make the network of the settings; it gives local features where a method needs them."""
     model = new_model(settings, count, seed)
-    if method_class(job.method).needs_local and feature_widths(model).local is None:
+    if method_class(method).needs_local and feature_widths(model).local is None:
         # Only a setting of what `encode` gives: the weights are the same.
         told = dict(settings.model_settings) | {"per_point": True}
         with contextlib.suppress(InputError):
@@ -189,7 +192,7 @@ def run_job(
 def _follow_rule(model: PointClassifier, stage: str, job: Job) -> None:
     """Take the weights that the rule picks, where it is not the last."""
     if job.settings.rule != "last":
-        picked: Checkpoint = choose(read_checkpoints(job.run_dir, stage), job.settings.rule)
+        picked = choose(read_checkpoints(job.run_dir, stage), job.settings.rule)
         load_checkpoint(job.run_dir, picked, model)
 
 
