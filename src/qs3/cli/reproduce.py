@@ -21,8 +21,9 @@ class ReproduceOptions:
     out: Path
     """Folder; both tables may share one. Run the same command again to go on after a stop. With
     QS3_SHARED_DATA set, artists' meshes and real objects take part."""
-    scale: Literal["smoke", "small"] = "small"
-    """small: the least that ranks methods, hours on a GPU; smoke: shows that everything runs."""
+    scale: Literal["smoke", "laptop", "small"] = "small"
+    """small: the least that ranks methods, hours on a GPU; laptop: hours on one core, networks
+    that learn something; smoke: shows that everything runs."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the trainings."""
     methods: tuple[str, ...] = ()

@@ -11,7 +11,7 @@ from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
 Task = Literal["M-D", "S-D", "M-R", "S-R"]
 """Source and target. M: samples of the meshes' surfaces; S: scans of the same meshes by the
 simulated sensor; D: scans of other meshes by another simulated sensor; R: real objects."""
-ScaleName = Literal["smoke", "small"]
+ScaleName = Literal["smoke", "laptop", "small"]
 """Sizes of the bench; see `SCALES`."""
 
 SUPERVISED = "supervised"
@@ -109,6 +109,26 @@ SCALES: Mapping[str, Scale] = {
         ),
         # Networks of so few clouds are seldom sure.
         rounds={"threshold": 0.4, "rounds": 3, "epochs": 2},
+        tasks=("M-D", "S-D"),
+    ),
+    # Networks that learn something, in a few hours of one core; below the floor all the same.
+    "laptop": Scale(
+        name="laptop",
+        source_per_class=16,
+        target_per_class=6,
+        test_per_class=6,
+        source_views=3,
+        data_points=512,
+        train=TrainSettings(
+            model="dgcnn",
+            model_settings={"neighbours": 10, "channels": (32, 32, 64, 64), "embedding": 256},
+            num_points=256,
+            epochs=24,
+            batch_size=16,
+            learning_rate=2e-3,
+            validate_every=8,
+        ),
+        rounds={"threshold": 0.6, "rounds": 4, "epochs": 3},
         tasks=("M-D", "S-D"),
     ),
     "small": Scale(
