@@ -5,7 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qs3.report import Outcome, Report, write_report
+from qs3.evaluation.metrics import mean_sem
+from qs3.report import (
+    Cloud,
+    DataLine,
+    FeatureMap,
+    Outcome,
+    Report,
+    ScoreLine,
+    write_report,
+)
 from qs3.visualisation import Curve, MontageView, SelectionRound
 
 HOSTILE = '</script><script>alert(\'x\')</script><img src="http://example.org/a.png" onerror="b()">'
@@ -20,19 +29,51 @@ def report() -> Report:
     image = rng.integers(0, 256, true.shape, dtype=np.uint8)
     cloud = rng.normal(size=(60, 3)).astype(np.float32)
     names = ("bed", f"chair {HOSTILE}", "table")
-    clouds = {name: [rng.normal(size=(50, 3)).astype(np.float32)] for name in names}
+    clouds = [
+        Cloud(rng.normal(size=(50, 3)).astype(np.float32), name, f"Taken for {HOSTILE}")
+        for name in names
+    ]
+    matrix = np.array([[6, 4, 0], [5, 5, 0], [0, 5, 5]])
     epochs = np.arange(1, 5)
     return Report(
         title=f"Title {HOSTILE}",
         summary=f"Summary {HOSTILE}",
         class_names=names,
-        before=Outcome(f"before {HOSTILE}", np.array([[6, 4, 0], [5, 5, 0], [0, 5, 5]])),
+        before=Outcome(f"before {HOSTILE}", matrix),
         after=Outcome(f"after {HOSTILE}", np.array([[10, 0, 0], [0, 10, 0], [0, 1, 9]])),
         command=f"qs3 demo {HOSTILE}",
         settings={"seed": 0, "sensor": {"views": 5, "name": HOSTILE}},
         versions={"qs3": f"0.1.0 {HOSTILE}"},
         montage=MontageView(image, image, 30 / depth, depth, true, cloud, cloud, np.eye(16)),
-        samples={"source": clouds, f"target {HOSTILE}": clouds},
+        montage_title=f"mesh {HOSTILE}",
+        data=(DataLine("source", f"data {HOSTILE}", 30, "0a" * 32),),
+        clouds={"source": [*clouds, *clouds], f"target {HOSTILE}": clouds},
+        maps=(
+            FeatureMap(
+                f"map {HOSTILE}",
+                rng.normal(size=(9, 2)),
+                np.arange(9) % 3,
+                ("source",) * 5 + (f"target {HOSTILE}",) * 4,
+            ),
+        ),
+        scores=(
+            ScoreLine(
+                name=f"line {HOSTILE}",
+                network="dgcnn",
+                data=f"a → b {HOSTILE}",
+                selection="last",
+                accuracy=mean_sem([0.5, 0.6]),
+                class_mean_accuracy=mean_sem([0.4, 0.6]),
+                class_names=names,
+                confusion=matrix,
+                seeds=(0, 1),
+                differs=f"theta {HOSTILE}",
+                published="72.4 ± 0.8",
+                choices={"last": mean_sem([0.5, 0.6]), "oracle": mean_sem([0.7, 0.8])},
+                marks=("transductive", f"mark {HOSTILE}"),
+            ),
+        ),
+        published_source=f"paper {HOSTILE}",
         curves=(Curve(f"loss {HOSTILE}", epochs, 1.0 / epochs),),
         marks=(2.0,),
         rounds=(

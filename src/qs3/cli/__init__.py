@@ -70,6 +70,7 @@ def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
     from qs3.cli.demo import demo
     from qs3.cli.evaluate import evaluate, predict
     from qs3.cli.export import export
+    from qs3.cli.report import report
     from qs3.cli.reproduce import reproduce
     from qs3.cli.train import TrainOptions, preset_options, train
 
@@ -83,7 +84,8 @@ def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
     train_with_preset.__doc__ = train.__doc__
     verbs |= {"train": train_with_preset, "evaluate": evaluate, "predict": predict}
     verbs |= {"export": export, "reproduce": reproduce, "demo": demo}
+    verbs["report"] = report
     made = ("scan", "sensors", "realism", "generate", "merge", "info", "verify", "convert")
-    runs = ("train", "evaluate", "predict", "export", "reproduce")
+    runs = ("train", "evaluate", "predict", "export", "reproduce", "report")
     order = (*made, "extract", *runs, "doctor", "demo")
     return {name: verbs[name] for name in order}

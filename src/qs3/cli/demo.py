@@ -12,14 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 import tyro
 
 from qs3.cli.camera import CameraOptions
-from qs3.cli.pictures import montage_view
 from qs3.files import claim_folder, write_json
 
 _MARKER = "demo.json"
+_CLOUDS = 100
+"""Clouds of a domain that the page lets turn."""
 
 
 @dataclass(frozen=True)
@@ -192,24 +192,24 @@ def _train_settings(settings: DemoSettings) -> Any:
 
 def _report(folder: Path, settings: DemoSettings) -> tuple[Any, Any, Path]:
     """Score both networks on the target and write the page."""
+    from qs3.cli import report_parts as parts
     from qs3.cli.evaluate import make_record
     from qs3.datasets import load_clouds
-    from qs3.report import Outcome, Report, write_report
-    from qs3.training import load_model, predict_probabilities
-    from qs3.visualisation import samples_per_class
+    from qs3.meshes import shapes
+    from qs3.report import NamedRecord, Report, score_lines, write_report
+    from qs3.training import load_model
 
     target = load_clouds(folder / "target", num_points=settings.num_points)
     source = load_clouds(folder / "source", num_points=settings.num_points)
-    records, outcomes = [], []
-    for name in ("source-only", "qbst"):
-        record, _ = make_record(folder / name, folder / "target")
-        model = load_model(folder / name).model
-        answers = predict_probabilities(model, target.points).argmax(axis=1)
-        outcomes.append(
-            Outcome(name, np.array(record.scores.confusion), right=answers == target.labels)
-        )
-        records.append(record)
-    curves, marks = _curves(folder)
+    models = {name: load_model(folder / name) for name in ("source-only", "qbst")}
+    records, outcomes, answers = [], [], {}
+    for name, loaded in models.items():
+        records.append(make_record(folder / name, folder / "target")[0])
+        outcome, answers[name] = parts.outcome(name, loaded, target)
+        outcomes.append(outcome)
+    curves, marks = parts.curves([folder / name for name in models])
+    domains = {"source": source, "target": target}
+    last = records[1]
     report = Report(
         title="qs3 demo: from CAD models to a depth camera",
         summary=(
@@ -223,19 +223,24 @@ def _report(folder: Path, settings: DemoSettings) -> tuple[Any, Any, Path]:
         before=outcomes[0],
         after=outcomes[1],
         command=f"qs3 demo --out {folder.name}",
-        settings=dataclasses.asdict(settings) | {"runs": records[1].settings},
-        versions=dict(records[1].versions),
-        montage=_montage(settings),
-        samples={
-            "source": samples_per_class(source.points, source.labels, source.class_names, 3),
-            "target": samples_per_class(target.points, target.labels, target.class_names, 3),
-        },
+        settings=dataclasses.asdict(settings) | {"runs": last.settings},
+        versions=dict(last.versions),
+        montage=parts.picture_scan(
+            shapes.make("chair", seed=settings.seed),
+            "qs3",
+            _renderer(settings),
+            settings.source_views,
+            settings.seed,
+        ),
+        montage_title="chair · sensor qs3",
+        data=parts.data_lines({"source": last.source, "target": last.target, "test": last.test}),
+        clouds=parts.show_clouds(domains, _CLOUDS, {"target": answers}),
+        maps=parts.feature_maps(models, domains),
+        scores=score_lines([NamedRecord(record.method, record) for record in records])[0],
         curves=curves,
         marks=marks,
-        rounds=_rounds(records[1].rounds),
-        agreement_meaning=(
-            "Agreement is the share of the target whose pseudo label is that of the round before."
-        ),
+        rounds=parts.rounds(last.rounds),
+        agreement_meaning=parts.AGREEMENT,
         notes=(
             "Transductive: the network is scored on the clouds that it adapted to; their labels "
             "served the score alone.",
@@ -246,66 +251,3 @@ def _report(folder: Path, settings: DemoSettings) -> tuple[Any, Any, Path]:
     path = folder / "report.html"
     write_report(path, report)
     return records[0].scores, records[1].scores, path
-
-
-def _curves(folder: Path) -> tuple[tuple[Any, ...], tuple[float, ...]]:
-    """Losses over the epochs of the training and of the rounds, from the runs' histories."""
-    import json
-
-    from qs3.visualisation import Curve
-
-    lines = [
-        json.loads(line)
-        for name in ("source-only", "qbst")
-        for line in (folder / name / "history.jsonl").read_text(encoding="utf-8").splitlines()
-    ]
-    losses: dict[str, tuple[list[float], list[float]]] = {}
-    epoch, marks = 0, []
-    for line in lines:
-        if line["kind"] == "checkpoint":
-            continue
-        in_round = line["kind"] == "round"
-        if in_round:
-            marks.append(epoch + 0.5)
-        for values in line["losses"] if in_round else [line["losses"]]:
-            epoch += 1
-            for name, value in values.items():
-                x, y = losses.setdefault(name, ([], []))
-                x.append(float(epoch))
-                y.append(value)
-    curves = tuple(Curve(name, np.array(x), np.array(y)) for name, (x, y) in losses.items())
-    return curves, tuple(marks)
-
-
-def _rounds(rounds: Any) -> tuple[Any, ...]:
-    from qs3.visualisation import SelectionRound
-
-    return tuple(
-        SelectionRound(
-            index=record["round"],
-            theta=record["theta"],
-            confident=np.array(record["confident"]),
-            kept=np.array(record["kept"]),
-            agreement=record["agreement"],
-            note="skipped: fewer than two a class" if record["skipped"] else "",
-        )
-        for record in rounds
-    )
-
-
-def _montage(settings: DemoSettings) -> Any:
-    """One scan through the whole sensor, with its pictures."""
-    from qs3.meshes import shapes
-    from qs3.sensor.presets import get_sensor
-    from qs3.sensor.scan import scan
-
-    sensor = get_sensor("qs3")
-    result = scan(
-        shapes.make("chair", seed=settings.seed),
-        sensor=sensor,
-        views=settings.source_views,
-        seed=settings.seed,
-        renderer=_renderer(settings),
-        keep_images=True,
-    )
-    return montage_view(result, sensor)[0]

@@ -117,7 +117,7 @@ def make_record(
     )
     assert source is not None  # noqa: S101
     name = open_folder(data).name
-    marks = _marks(told, set(digests(test.points)))
+    marks = caveats(told, set(digests(test.points)))
     record = RunRecord(
         method=told["method"],
         model=settings["model"],
@@ -183,7 +183,7 @@ def describe_choices(choices: Mapping[str, Mapping[str, Any]]) -> str:
     return "\n".join([*lines, "* looks at the labels of this data: an upper bound"])
 
 
-def _marks(told: dict[str, Any], tested: set[str]) -> list[str]:
+def caveats(told: dict[str, Any], tested: set[str]) -> list[str]:
     """Caveats of a score: which of the tested clouds the run has seen, by their checksums."""
     marks = []
     if tested & set(told["target_clouds"]):

@@ -5,6 +5,8 @@ import html
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+from jaxtyping import Int
 from matplotlib.figure import Figure
 
 from qs3.visualisation import png_bytes
@@ -63,6 +65,30 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]], text: Sequence[
     return (
         f'<div class="scroll"><table>\n<thead><tr>{cells(head, "th")}</tr></thead>\n'
         f"<tbody>\n{body}\n</tbody></table></div>"
+    )
+
+
+def matrix_table(matrix: Int[np.ndarray, "k columns"], class_names: Sequence[str]) -> str:
+    """Return a confusion matrix as a table, shaded by the share of the true class.
+
+    Args:
+        matrix: Counts [true, predicted]; one column more than classes counts other answers.
+        class_names: Names in the order of the rows.
+    """
+    columns = [*class_names, "other"][: matrix.shape[1]]
+    head = "".join(f"<th>{escape(name)}</th>" for name in ("true, predicted:", *columns))
+    total = matrix.sum(axis=1, keepdims=True)
+    share = np.divide(matrix, total, out=np.zeros(matrix.shape), where=total > 0)
+    rows = []
+    for name, counts, shares in zip(class_names, matrix, share, strict=True):
+        cells = "".join(
+            f'<td class="s{min(4, int(np.ceil(part * 4)))}">{count}</td>' if count else "<td></td>"
+            for count, part in zip(counts, shares, strict=True)
+        )
+        rows.append(f'<tr><th class="text">{escape(name)}</th>{cells}</tr>')
+    return (
+        f'<div class="scroll"><table class="matrix">\n<thead><tr>{head}</tr></thead>\n'
+        f"<tbody>\n{chr(10).join(rows)}\n</tbody></table></div>"
     )
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from qs3.errors import InputError
 from qs3.evaluation.metrics import wilson_interval
+from qs3.report.scores import ScoreLine
 from qs3.visualisation import Curve, MontageView, SelectionRound
 
 
@@ -78,6 +79,46 @@ class Outcome:
 
 
 @dataclass(frozen=True)
+class Cloud:
+    """One cloud that the reader can turn."""
+
+    points: Float[np.ndarray, "n 3"]
+    """Points, z up; each cloud is fitted to its picture."""
+    class_name: str
+    """Its true class."""
+    note: str = ""
+    """What stands below it, such as what the networks took it for."""
+
+
+@dataclass(frozen=True)
+class FeatureMap:
+    """Features of one network in the plane."""
+
+    name: str
+    """Name of the network."""
+    positions: Float[np.ndarray, "b 2"]
+    """Where each cloud lies."""
+    labels: Int[np.ndarray, "b"]
+    """Classes, by index."""
+    domains: tuple[str, ...]
+    """Domain of each cloud."""
+
+
+@dataclass(frozen=True)
+class DataLine:
+    """Data that a run read."""
+
+    role: str
+    """Source, target or test."""
+    name: str
+    """Name of the data set with its split."""
+    clouds: int
+    """Number of clouds."""
+    checksum: str
+    """SHA-256 over what was read."""
+
+
+@dataclass(frozen=True)
 class Report:
     """Everything one page tells. Parts that are left empty are left out of the page."""
 
@@ -87,20 +128,30 @@ class Report:
     """What was run, in a sentence or two."""
     class_names: tuple[str, ...]
     """Names of the classes, in the order of the confusion matrices."""
-    before: Outcome
-    """The model before adaptation."""
-    after: Outcome
-    """The adapted model, on the same clouds."""
     command: str
     """Command that makes this report again."""
+    before: Outcome | None = None
+    """The model before adaptation."""
+    after: Outcome | None = None
+    """The adapted model, on the same clouds; or the only one there is."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the run; mappings inside become groups."""
     versions: Mapping[str, str] = field(default_factory=dict)
     """Versions of the software and kind of the machine."""
     montage: MontageView | None = None
     """One scan through the whole sensor."""
-    samples: Mapping[str, Mapping[str, Sequence[np.ndarray]]] = field(default_factory=dict)
-    """Sample clouds [n 3], z up, by domain and class."""
+    montage_title: str = ""
+    """What was scanned, by which sensor."""
+    data: tuple[DataLine, ...] = ()
+    """What the runs read."""
+    clouds: Mapping[str, Sequence[Cloud]] = field(default_factory=dict)
+    """Clouds to look at, by domain."""
+    maps: tuple[FeatureMap, ...] = ()
+    """Features of the networks, before and after."""
+    scores: tuple[ScoreLine, ...] = ()
+    """Lines of the table of all records."""
+    published_source: str = ""
+    """Where `ScoreLine.published` was printed."""
     curves: tuple[Curve, ...] = ()
     """Losses and scores over epochs."""
     marks: tuple[float, ...] = ()
@@ -114,12 +165,18 @@ class Report:
 
     def __post_init__(self) -> None:
         k = len(self.class_names)
-        for outcome in (self.before, self.after):
+        outcomes = self.outcomes
+        for outcome in outcomes:
             if len(outcome.confusion) != k:
                 raise InputError(f"{outcome.name}: its confusion matrix is not of {k} classes")
-        before, after = (o.confusion.sum(axis=1).tolist() for o in (self.before, self.after))
-        if before != after:
+        counts = [outcome.confusion.sum(axis=1).tolist() for outcome in outcomes]
+        if len(outcomes) == 2 and counts[0] != counts[1]:
             raise InputError(
-                f"{self.before.name} was scored on {before} clouds of the classes and "
-                f"{self.after.name} on {after}; score both on the same clouds"
+                f"{outcomes[0].name} was scored on {counts[0]} clouds of the classes and "
+                f"{outcomes[1].name} on {counts[1]}; score both on the same clouds"
             )
+
+    @property
+    def outcomes(self) -> tuple[Outcome, ...]:
+        """The models that were scored, the one before adaptation first."""
+        return tuple(outcome for outcome in (self.before, self.after) if outcome is not None)

@@ -1,13 +1,41 @@
 "use strict";
-// Every canvas shows one cloud; all turn together, so that two domains are seen from one side.
+// A canvas a domain shows one cloud of the same class; all turn together, seen from one side.
 (() => {
   const holder = document.getElementById("viewer");
   if (!holder) return;
-  const clouds = [];
-  let yaw = 0.5, pitch = 0.35, waiting = false;
+  const select = holder.querySelector("select"), told = holder.querySelector("output");
+  const names = [...select.options].slice(1).map((option) => option.textContent);
+  let yaw = 0.5, pitch = 0.35, waiting = false, at = 0;
 
-  for (const canvas of holder.querySelectorAll("canvas")) {
-    const bytes = Uint8Array.from(atob(canvas.dataset.points), (c) => c.charCodeAt(0));
+  const domains = [...holder.querySelectorAll("figure")].map((figure) => {
+    const canvas = figure.querySelector("canvas");
+    canvas.addEventListener("pointerdown", (e) => canvas.setPointerCapture(e.pointerId));
+    canvas.addEventListener("pointermove", (e) => {
+      if (e.buttons) turn(e.movementX * 0.012, e.movementY * 0.012);
+    });
+    canvas.addEventListener("keydown", (e) => {
+      const step = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, -0.1], ArrowDown: [0, 0.1] }[e.key];
+      if (step) { turn(step[0], step[1]); e.preventDefault(); }
+    });
+    const items = names.map(() => []);
+    for (const item of figure.querySelectorAll("i")) items[Number(item.dataset.class)].push(item);
+    return { name: figure.dataset.domain, canvas, items, caption: figure.querySelector("figcaption"), cloud: null };
+  });
+
+  // What the buttons step through: class and number; the domain with fewer clouds begins anew.
+  function steps() {
+    const found = [];
+    names.forEach((_, kind) => {
+      if (select.value !== "" && Number(select.value) !== kind) return;
+      const most = Math.max(...domains.map((domain) => domain.items[kind].length));
+      for (let number = 0; number < most; number++) found.push([kind, number]);
+    });
+    return found;
+  }
+
+  // Clouds are decoded when it is their turn: two hundred of them at once would take a phone long.
+  function decode(item) {
+    const bytes = Uint8Array.from(atob(item.dataset.points), (c) => c.charCodeAt(0));
     const view = new DataView(bytes.buffer);
     const points = new Float32Array(bytes.length / 2);
     for (let i = 0; i < points.length; i++) points[i] = view.getInt16(2 * i, true) / 32767;
@@ -17,15 +45,23 @@
       low = Math.min(low, points[3 * i + 2]);
       high = Math.max(high, points[3 * i + 2]);
     }
-    clouds.push({ canvas, points, order, near: new Float32Array(order.length), low, span: high - low || 1 });
-    canvas.addEventListener("pointerdown", (e) => canvas.setPointerCapture(e.pointerId));
-    canvas.addEventListener("pointermove", (e) => {
-      if (e.buttons) turn(e.movementX * 0.012, e.movementY * 0.012);
-    });
-    canvas.addEventListener("keydown", (e) => {
-      const step = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, -0.1], ArrowDown: [0, 0.1] }[e.key];
-      if (step) { turn(step[0], step[1]); e.preventDefault(); }
-    });
+    return { points, order, near: new Float32Array(order.length), low, span: high - low || 1 };
+  }
+
+  function show(place) {
+    const all = steps();
+    at = (place + all.length) % all.length;
+    const [kind, number] = all[at];
+    told.textContent = `${at + 1} of ${all.length}`;
+    for (const domain of domains) {
+      const own = domain.items[kind], item = own[number % own.length];
+      domain.cloud = item ? decode(item) : null;
+      domain.caption.textContent = item
+        ? `${domain.name}: ${names[kind]} ${(number % own.length) + 1} of ${own.length}${item.dataset.note ? `. ${item.dataset.note}` : ""}`
+        : `${domain.name}: no ${names[kind]}`;
+      domain.canvas.setAttribute("aria-label", `${domain.caption.textContent}; can be turned`);
+    }
+    redraw();
   }
 
   function turn(x, y) {
@@ -37,7 +73,7 @@
   function redraw() {
     if (waiting) return;
     waiting = true;
-    requestAnimationFrame(() => { waiting = false; clouds.forEach(draw); });
+    requestAnimationFrame(() => { waiting = false; domains.forEach(draw); });
   }
 
   // Colour by height: five stations of the viridis map, faded towards white with distance.
@@ -51,17 +87,19 @@
     return `rgb(${mix(0)},${mix(1)},${mix(2)})`;
   }
 
-  function draw({ canvas, points, order, near, low, span }) {
+  function draw({ canvas, cloud }) {
     const ratio = window.devicePixelRatio || 1, size = Math.round(canvas.clientWidth * ratio);
     if (!size) return;
     if (canvas.width !== size) canvas.width = canvas.height = size;
-    const pen = canvas.getContext("2d"), scale = size * 0.46, dot = Math.max(2, size / 75);
+    const pen = canvas.getContext("2d"), scale = size * 0.46, dot = Math.max(2, size / 110);
+    pen.clearRect(0, 0, size, size);
+    if (!cloud) return;
+    const { points, order, near, low, span } = cloud;
     const ca = Math.cos(yaw), sa = Math.sin(yaw), ce = Math.cos(pitch), se = Math.sin(pitch);
     for (let i = 0; i < near.length; i++) {
       near[i] = (points[3 * i] * sa - points[3 * i + 1] * ca) * ce + points[3 * i + 2] * se;
     }
     order.sort((a, b) => near[a] - near[b]);
-    pen.clearRect(0, 0, size, size);
     for (const i of order) {
       const x = points[3 * i], y = points[3 * i + 1], z = points[3 * i + 2];
       const right = x * ca + y * sa, up = (y * ca - x * sa) * se + z * ce;
@@ -70,8 +108,11 @@
     }
   }
 
-  if (!clouds.length) return;
-  holder.hidden = false;
+  for (const button of holder.querySelectorAll("button")) {
+    button.addEventListener("click", () => show(at + Number(button.dataset.step)));
+  }
+  select.addEventListener("change", () => show(0));
   window.addEventListener("resize", redraw);
-  redraw();
+  holder.hidden = false;
+  show(0);
 })();

@@ -1,4 +1,4 @@
-"""Clouds that a reader can turn: a canvas each, its points in the page, one small script."""
+"""Clouds that a reader can turn: a canvas a domain, the points in the page, one small script."""
 
 import base64
 from collections.abc import Mapping, Sequence
@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.report.html import escape
+from qs3.report.records import Cloud
 
-_CLASSES = 4
 _POINTS = 1024
 
 
@@ -31,30 +31,47 @@ def encode_points(points: Float[np.ndarray, "n 3"]) -> str:
     return base64.b64encode(whole.tobytes()).decode("ascii")
 
 
-def viewer(samples: Mapping[str, Mapping[str, Sequence[np.ndarray]]]) -> str:
-    """Return canvases with one cloud of some classes of each domain, beside one another.
+def viewer(clouds: Mapping[str, Sequence[Cloud]], class_names: Sequence[str]) -> str:
+    """Return one canvas a domain, side by side, and what steps through the clouds of a class.
 
-    The part is hidden until its script shows it. Empty where no class is in every domain.
+    The part is hidden until its script shows it; a cloud is decoded when it is its turn. Empty
+    where there is no cloud.
+
+    Args:
+        clouds: Clouds of each domain.
+        class_names: Classes in the order in which the reader chooses them.
     """
-    shared = [
-        name
-        for name in next(iter(samples.values()), {})
-        if all(len(classes.get(name, ())) for classes in samples.values())
-    ]
-    # Evenly spaced in the list, so that more than its beginning is seen.
-    spots = np.linspace(0, len(shared) - 1, min(_CLASSES, len(shared))).astype(int)
-    figures = [
-        f'<figure><canvas tabindex="0" role="img" aria-label="{escape(f"{name}, {domain}")}, '
-        f'can be turned" data-points="{encode_points(np.asarray(classes[name][0]))}"></canvas>'
-        f"<figcaption>{escape(f'{name}, {domain}')}</figcaption></figure>"
-        for name in (shared[spot] for spot in spots)
-        for domain, classes in samples.items()
-    ]
-    if not figures:
+    shown = [name for name in class_names if any(_of(c, name) for c in clouds.values())]
+    if not shown:
         return ""
-    canvases = "\n".join(figures)
+    options = "".join(
+        f'<option value="{index}">{escape(name)}</option>' for index, name in enumerate(shown)
+    )
+    figures = "\n".join(
+        f'<figure data-domain="{escape(domain)}"><canvas tabindex="0" role="img" '
+        f'aria-label="{escape(domain)}, can be turned"></canvas><figcaption></figcaption>\n'
+        f"<div hidden>\n{_listed(own, shown)}\n</div></figure>"
+        for domain, own in clouds.items()
+    )
     return (
         '<div id="viewer" hidden><h3>Turn them</h3>\n'
         '<p class="soft">Drag sideways, or use the arrow keys: all clouds turn together.</p>\n'
-        f'<div class="viewer">\n{canvases}\n</div></div>'
+        '<div class="steer"><label>Class <select><option value="">all classes</option>'
+        f'{options}</select></label><button type="button" data-step="-1">‹ Previous</button>'
+        '<button type="button" data-step="1">Next ›</button>'
+        '<output aria-live="polite"></output></div>\n'
+        f'<div class="viewer">\n{figures}\n</div></div>'
     )
+
+
+def _listed(clouds: Sequence[Cloud], class_names: Sequence[str]) -> str:
+    return "\n".join(
+        f'<i data-class="{index}" data-note="{escape(cloud.note)}" '
+        f'data-points="{encode_points(np.asarray(cloud.points))}"></i>'
+        for index, name in enumerate(class_names)
+        for cloud in _of(clouds, name)
+    )
+
+
+def _of(clouds: Sequence[Cloud], class_name: str) -> list[Cloud]:
+    return [cloud for cloud in clouds if cloud.class_name == class_name]

@@ -140,7 +140,7 @@ def fit(
             "class_names": list(source.class_names),
             "source": fingerprint(source),
             "target": None if target is None else fingerprint(target),
-            "warm_up": None if start is None else _weights_fingerprint(start),
+            "warm_up": None if start is None else weights_fingerprint(start),
         },
     )
     source = _prepared(source, job)
@@ -268,7 +268,8 @@ def _load_warm_up(
     return model, unseen
 
 
-def _weights_fingerprint(model: PointClassifier) -> str:
+def weights_fingerprint(model: PointClassifier) -> str:
+    """SHA-256 over names and values of a network's weights, by which a warm-up is known."""
     digest = hashlib.sha256()
     for name, tensor in sorted(model.state_dict().items()):
         digest.update(name.encode())

@@ -5,6 +5,8 @@ from qs3.visualisation.clouds import draw_cloud as draw_cloud
 from qs3.visualisation.clouds import gallery as gallery
 from qs3.visualisation.clouds import project as project
 from qs3.visualisation.clouds import samples_per_class as samples_per_class
+from qs3.visualisation.embedding import embed as embed
+from qs3.visualisation.embedding import feature_map as feature_map
 from qs3.visualisation.figure import png_bytes as png_bytes
 from qs3.visualisation.figure import write_png as write_png
 from qs3.visualisation.montage import MontageView as MontageView

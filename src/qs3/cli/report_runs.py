@@ -1,0 +1,260 @@
+"""What lies in the folder of a report: finished runs, unfinished ones, records."""
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from qs3.cli.train import RUN
+from qs3.errors import InputError, QS3Error
+from qs3.evaluation.records import RECORD, DataRecord, read_record
+from qs3.files import read_json
+
+if TYPE_CHECKING:
+    from qs3.datasets.clouds import PointClouds
+    from qs3.report import NamedRecord
+
+_SETTINGS, _MODEL, _DATASET = "settings.json", "model.safetensors", "dataset.json"
+_RECORDS = ("records", "results")
+_LEVELS = 5
+"""How far above a run its data are looked for: a grid has runs/<task>/<row>/<seed>."""
+
+
+@dataclass(frozen=True)
+class FoundRun:
+    """A finished run."""
+
+    folder: Path
+    """Where it lies."""
+    settings: dict[str, Any]
+    """Its settings."""
+    told: dict[str, Any]
+    """Its ``run.json``."""
+
+    @property
+    def method(self) -> str:
+        """Method, as the command line has it."""
+        return str(self.told["method"])
+
+    def data(self, role: str) -> DataRecord | None:
+        """What it read as ``source`` or ``target``."""
+        value = self.told["data"].get(role)
+        return None if value is None else DataRecord(**value)
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a folder holds."""
+
+    runs: tuple[FoundRun, ...]
+    """Finished runs, in the order of their paths."""
+    records: tuple["NamedRecord", ...]
+    """Records that can be read, each once."""
+    faults: tuple[str, ...]
+    """A line for each run or record that had to be left out."""
+
+
+def look(folder: Path) -> Contents:
+    """Find runs and records in a folder: of one run, of several, or of records alone.
+
+    Raises:
+        InputError: where the folder is missing, is an unfinished run, or holds nothing that can be
+            read.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; name the folder of a run, of runs or records")
+    runs: list[FoundRun] = []
+    faults: list[str] = []
+    single = _is_run(folder)
+    for place in [folder] if single else _run_folders(folder):
+        try:
+            runs.append(read_run(place))
+        except QS3Error as error:
+            if single:
+                raise
+            faults.append(str(error))
+    records, refused = _records(folder, any_json=not runs and not faults)
+    faults += refused
+    if not runs and not records:
+        if faults:
+            raise InputError(f"{faults[0]} (and nothing else to report in {folder})")
+        raise InputError(f"{folder}: holds neither a finished run nor a record; train one first")
+    return Contents(tuple(runs), tuple(records), tuple(faults))
+
+
+def read_run(folder: Path) -> FoundRun:
+    """Read what a finished run tells of itself.
+
+    Raises:
+        InputError: where it is not finished, or not a run of ``qs3 train``.
+    """
+    if not (folder / RUN).is_file() or not (folder / _MODEL).is_file():
+        raise InputError(
+            f"{folder}: the run is not finished; run its qs3 train command again to go on"
+        )
+    told, settings = read_json(folder / RUN), read_json(folder / _SETTINGS)
+    try:
+        run = FoundRun(folder, dict(settings), dict(told))
+        _ = (run.method, told["rounds"], settings["train"]["num_points"])
+        for role in ("source", "target"):
+            run.data(role)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{folder}: not a run of this version of qs3 train ({error})") from error
+    return run
+
+
+def _is_run(folder: Path) -> bool:
+    return any((folder / name).is_file() for name in (_SETTINGS, RUN))
+
+
+def _walk(folder: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
+    """Folders from the top in the order of their names, without those of data sets."""
+    for root, folders, files in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        if _DATASET in files:
+            folders.clear()
+            continue
+        yield Path(root), folders, sorted(files)
+
+
+def _run_folders(folder: Path) -> list[Path]:
+    found = []
+    for root, folders, files in _walk(folder):
+        if _SETTINGS in files or RUN in files:
+            found.append(root)
+            folders.clear()
+    return found
+
+
+def _records(folder: Path, any_json: bool) -> tuple[list["NamedRecord"], list[str]]:
+    """Records in the folders that hold them; every JSON file where there is no run."""
+    from qs3.report import NamedRecord
+
+    published, _ = paper()
+    found: list[NamedRecord] = []
+    faults: list[str] = []
+    for root, _, files in _walk(folder):
+        for name in files:
+            wanted = name == RECORD or (
+                name.endswith(".json") and (any_json or root.name in _RECORDS)
+            )
+            if not wanted:
+                continue
+            path = root / name
+            try:
+                record = read_record(path)
+            except QS3Error as error:
+                faults.append(str(error))
+                continue
+            task, row = _line_of(path)
+            told = published.get(task, {}).get(row, "") if task else ""
+            one = NamedRecord(str(path), record, f"{task} {row}" if task else "", told)
+            same = [i for i, other in enumerate(found) if other.record == record]
+            if not same:
+                found.append(one)
+            elif one.task and not found[same[0]].task:
+                found[same[0]] = one
+    return found, faults
+
+
+def paper() -> tuple[dict[str, dict[str, str]], str]:
+    """The paper's accuracies by task and row as text, and where they were printed."""
+    from qs3.experiments.bench_table import published
+
+    tasks, source = {}, ""
+    for task, rows in published().items():
+        if isinstance(rows, str):
+            source = rows if task == "source" else source
+            continue
+        tasks[task] = {
+            row: f"{value[0]:.1f} ± {value[1]:.1f}"
+            for row, value in rows.items()
+            if isinstance(value, list | tuple) and len(value) == 2
+        }
+    return tasks, source
+
+
+def _line_of(path: Path) -> tuple[str, str]:
+    """Task and row of an experiment's record, by the name it gives to files and folders.
+
+    Example:
+        >>> _line_of(Path("results/S-D_qbst_seed-0.json"))
+        ('S-D', 'qbst')
+        >>> _line_of(Path("runs/S-D/gast-spst/seed-1/records/target-0a.json"))
+        ('S-D', 'gast-spst')
+        >>> _line_of(Path("chairs/records/a.json"))
+        ('', '')
+    """
+    for parts in (path.stem.split("_"), path.parts):
+        for task, row, seed in zip(parts, parts[1:], parts[2:], strict=False):
+            if seed.startswith("seed-") and task:
+                return task, row
+    return "", ""
+
+
+def find_before(after: FoundRun, others: tuple[FoundRun, ...]) -> Path | None:
+    """The network that a run started from, or that learnt the same source without the target.
+
+    A warm-up is known by its weights; it is looked for in the run, among the runs of the report
+    and beside the run. Of the other methods the source-only run of the same source and settings
+    stands for the network before.
+    """
+    from qs3.training import load_model
+    from qs3.training.fit import weights_fingerprint
+
+    folder = after.folder
+    if (folder / "warm-up" / _MODEL).is_file():
+        return folder / "warm-up"
+    weights = after.settings.get("warm_up")
+    if weights is not None:
+        beside = [p for p in sorted(folder.parent.glob("*")) if _is_run(p)]
+        grid = [p for p in sorted(folder.parent.parent.glob(f"*/{folder.name}")) if _is_run(p)]
+        places = dict.fromkeys([*(run.folder for run in others), *beside, *grid])
+        for place in places:
+            if place == folder or not (place / _MODEL).is_file():
+                continue
+            try:
+                if weights_fingerprint(load_model(place).model) == weights:
+                    return place
+            except QS3Error:  # a broken neighbour is none of this report's business
+                continue
+        return None
+    if after.method == "source-only":
+        return None
+    for run in others:
+        if run.method == "source-only" and all(
+            run.settings.get(name) == after.settings.get(name)
+            for name in ("source", "class_names", "train")
+        ):
+            return run.folder
+    return None
+
+
+def find_data(data: DataRecord | None, run: Path, num_points: int, names: Any) -> Any:
+    """The clouds that a run read, looked for by name near the run; None where they are not there.
+
+    They must have the checksum of the record: data of the same name are not enough.
+    """
+    from qs3.datasets import load_clouds
+
+    if data is None:
+        return None
+    bases = [run.resolve(), *run.resolve().parents][: _LEVELS + 1]
+    for place in (p for base in bases for p in (base / data.name, base / "data" / data.name)):
+        if not place.exists():
+            continue
+        try:
+            clouds: PointClouds = load_clouds(
+                place,
+                split=data.split,
+                num_points=num_points,
+                cloud=data.cloud,  # pyright: ignore[reportArgumentType]
+                class_names=names,
+            )
+        except QS3Error:
+            continue
+        if clouds.checksum == data.checksum:
+            return clouds
+    return None
