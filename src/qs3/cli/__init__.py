@@ -50,6 +50,7 @@ def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
     from qs3.cli.scan import scan
     from qs3.cli.sensors import sensors
     from qs3.cli.store import info, merge, verify
+    from qs3.cli.view import view
 
     verbs: dict[str, Callable[..., int]] = {
         "scan": scan,
@@ -61,6 +62,7 @@ def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
         "verify": verify,
         "convert": convert,
         "extract": extract,
+        "view": view,
         "doctor": doctor,
     }
     if given and given[0] in verbs:
@@ -87,5 +89,5 @@ def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
     verbs["report"] = report
     made = ("scan", "sensors", "realism", "generate", "merge", "info", "verify", "convert")
     runs = ("train", "evaluate", "predict", "export", "reproduce", "report")
-    order = (*made, "extract", *runs, "doctor", "demo")
+    order = (*made, "extract", *runs, "view", "doctor", "demo")
     return {name: verbs[name] for name in order}
