@@ -38,7 +38,7 @@ class Display:
     def text(self) -> str:
         """The facts as HTML; everything is escaped, whatever a file calls itself."""
         return "".join(
-            f"<div><span style='opacity:0.65'>{html.escape(name)}</span> {html.escape(value)}</div>"
+            f'<div><span style="opacity:0.65">{html.escape(name)}</span> {html.escape(value)}</div>'
             for name, value in self.facts
         )
 
@@ -63,7 +63,6 @@ def compose(
     answers: Answers | None = None,
     row: int = 0,
     limit: float | None = None,
-    unit: str = "",
 ) -> Display:
     """Choose points, colours and words.
 
@@ -74,19 +73,19 @@ def compose(
         answers: Of a network, where there is one.
         row: The object's row in ``answers``.
         limit: Error at the last colour; by default as the cloud needs it.
-        unit: Of lengths, with a space before it.
     """
     if kind not in exhibit.clouds:
         kind = next(iter(exhibit.clouds))
     points = exhibit.clouds[kind]
-    facts = [("object", exhibit.name), ("class", exhibit.class_name or "not known")]
+    facts = [("object", exhibit.name)]
+    facts += [("class", exhibit.class_name)] if exhibit.class_name else []
     facts += [("cloud", f"{KINDS[kind]}, {len(points)} points")]
     if answers is not None:
         facts += answers.facts(row)
         if answers.truth is not None:
             facts += [("this is", "wrong" if answers.wrong[row] else "right")]
     if mode == "error":
-        colouring, told = _error(exhibit, kind, limit, unit)
+        colouring, told = _error(exhibit, kind, limit)
         facts += told
     elif mode == "view":
         known = kind in exhibit.views
@@ -109,9 +108,9 @@ def _unknown(points: np.ndarray, what: str) -> Colouring:
 
 
 def _error(
-    exhibit: Exhibit, kind: CloudKind, limit: float | None, unit: str
+    exhibit: Exhibit, kind: CloudKind, limit: float | None
 ) -> tuple[Colouring, list[tuple[str, str]]]:
-    points = exhibit.clouds[kind]
+    points, unit = exhibit.clouds[kind], exhibit.unit
     facts: list[tuple[str, str]] = []
     if exhibit.mesh is not None and kind != "surface":
         truth, distance = "the mesh", mesh_distance(points, exhibit.mesh)
@@ -133,9 +132,9 @@ def frame_of(exhibit: Exhibit) -> tuple[Float[np.ndarray, "3"], float]:
     The page draws every object about the origin and one unit long, so that the camera always
     stands right. What is measured and printed stays in the unit of the data.
     """
-    kinds = [kind for kind in ("clean", "surface", "points") if kind in exhibit.clouds]
-    known = exhibit.mesh is not None
-    corners = exhibit.mesh.vertices if known else exhibit.clouds[kinds[0]]
+    best: tuple[CloudKind, ...] = ("clean", "surface", "points")
+    known = next(exhibit.clouds[kind] for kind in best if kind in exhibit.clouds)
+    corners = known if exhibit.mesh is None else exhibit.mesh.vertices
     low, high = np.asarray(corners).min(axis=0), np.asarray(corners).max(axis=0)
     side = float((high - low).max())
     return np.asarray((low + high) / 2, dtype=np.float64), side if side > 0 else 1.0

@@ -4,9 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
+import pyarrow as pa
 import trimesh
 from jaxtyping import Float, Float32, Int, UInt8
 
@@ -36,6 +37,8 @@ class Exhibit:
     """Its surface, in the frame of the clouds, where that is known."""
     facts: tuple[tuple[str, str], ...] = ()
     """More to tell: names and values."""
+    unit: str = ""
+    """Of its lengths, with a space before it; empty where they have none."""
 
 
 class Exhibits(Protocol):
@@ -130,7 +133,7 @@ class StoreExhibits:
         shard, place = self._places[row]
         return self._read(shard)[place]
 
-    def _table(self, shard: int, columns: Sequence[str]):
+    def _table(self, shard: int, columns: Sequence[str]) -> pa.Table:
         name = shard_name(shard)
         return parse_shard(self._folder.read(name), f"{self._folder}/{name}", columns)
 
@@ -146,8 +149,8 @@ class StoreExhibits:
         for place, row in enumerate(
             table.select([n for n in wanted if n not in kinds]).to_pylist()
         ):
-            mine = {kind: clouds[kind][place] for kind in there}
-            views = {
+            mine: dict[CloudKind, Any] = {kind: clouds[kind][place] for kind in there}
+            views: dict[CloudKind, Any] = {
                 kind: np.array(row[name], dtype=np.uint8)
                 for kind, name in (("points", "view"), ("clean", "clean_view"))
                 if kind in mine and len(row[name]) == len(mine[kind])

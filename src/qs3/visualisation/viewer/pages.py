@@ -122,6 +122,7 @@ def scan_page(
     """
     gui = server.gui
     stage = Stage(server)
+    stage.add_controls(mesh=True)
     sliders = _Sliders(server, sensors, start)
     with gui.add_folder("Mesh", visible=draws > 0):
         which = gui.add_slider("Draw of the shape", 0, max(draws - 1, draw, 1), 1, draw)
@@ -131,12 +132,10 @@ def scan_page(
     )
 
     def ask() -> None:
-        stage.unit = " m" if sliders.base.metric else ""
         worker.ask(ScanRequest(sliders.base, sliders.controls(), which.value))
 
     sliders.build(ask)
     which.on_update(lambda _: ask())
-    stage.add_controls(mesh=True)
     ask()
     with contextlib.closing(worker):
         yield stage

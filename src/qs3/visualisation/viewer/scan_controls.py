@@ -175,8 +175,7 @@ def exhibit_of(done: Scan, name: str, class_name: str = "") -> Exhibit:
         if known:
             pixels = " px" if key.startswith("disparity") else ""
             facts.append((label, f"{sum(known) / len(known):{form}}{pixels}"))
-    times = ", ".join(f"{stage} {value:.1f}" for stage, value in done.seconds.items())
-    facts.append(("seconds", times))
+    facts.append(("scanned in", f"{sum(done.seconds.values()):.1f} s"))
     return Exhibit(
         name=name,
         class_name=class_name,
@@ -184,6 +183,7 @@ def exhibit_of(done: Scan, name: str, class_name: str = "") -> Exhibit:
         views={"points": done.view, "clean": done.clean_view},
         mesh=done.mesh,
         facts=tuple(facts),
+        unit=" m" if done.sensor.metric else "",
     )
 
 

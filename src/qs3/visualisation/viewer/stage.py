@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from qs3.datasets.clouds import CloudKind
 from qs3.errors import QS3Error
 from qs3.visualisation.viewer.display import compose, frame_of, modes
 from qs3.visualisation.viewer.exhibits import KINDS, Answers, Exhibit
@@ -14,20 +15,20 @@ from qs3.visualisation.viewer.rescan import Outcome
 
 _LOG = logging.getLogger(__name__)
 _CAMERA = (-0.9, -1.5, 0.7)
+_BLOCK = '<div style="padding:0.2em 0.9em;font-size:0.85em;line-height:1.45">{}</div>'
 
 
 class Stage:
     """Draws one exhibit at a time on a viser server."""
 
-    def __init__(self, server: Any, answers: Answers | None = None, unit: str = "") -> None:
+    def __init__(self, server: Any, answers: Answers | None = None) -> None:
         """Set the camera; nothing is drawn yet.
 
         Args:
             server: A `viser.ViserServer`.
             answers: Of a network, where there is one.
-            unit: Of lengths, with a space before it.
         """
-        self._server, self._answers, self.unit = server, answers, unit
+        self._server, self._answers = server, answers
         self._lock = threading.RLock()
         self._shown: tuple[Exhibit, int] | None = None
         server.initial_camera.position = _CAMERA
@@ -52,7 +53,7 @@ class Stage:
             )
             self._size = gui.add_slider("Point size", 0.002, 0.04, 0.001, 0.012)
             self._mesh = gui.add_checkbox("Show the mesh", False, visible=mesh)
-        self._legend = gui.add_html("")
+            self._legend = gui.add_html("")
         for handle in (self._kind, self._mode, self._limit, self._size, self._mesh):
             handle.on_update(lambda _: self.redraw())
 
@@ -65,7 +66,7 @@ class Stage:
 
     def say(self, text: str) -> None:
         """Tell a state, such as that a scan is under way; empty takes it away."""
-        self._state.content = f"<i>{html.escape(text)}</i>" if text else ""
+        self._state.content = _BLOCK.format(f"<i>{html.escape(text)}</i>") if text else ""
 
     def fail(self, error: Exception) -> None:
         """Tell a fault; it stays until something is shown or told again."""
@@ -75,9 +76,9 @@ class Stage:
             text = f"{type(error).__name__}: {error}"
             _LOG.error("the viewer could not show something", exc_info=error)
         with self._lock:
-            self._state.content = (
-                f'<div style="color:#b00020" role="alert"><b>{html.escape(text)}</b>'
-                f"{'<br>The cloud is of the settings before.' if self._shown else ''}</div>"
+            before = "<br>What is drawn is from before." if self._shown else ""
+            self._state.content = _BLOCK.format(
+                f'<div style="color:#b00020" role="alert"><b>{html.escape(text)}</b>{before}</div>'
             )
 
     def outcome(self, outcome: Outcome[Any, tuple[Exhibit, int]]) -> None:
@@ -98,9 +99,9 @@ class Stage:
                 self.fail(error)
 
     def _draw(self, exhibit: Exhibit, row: int) -> None:
-        kind = next(key for key, name in KINDS.items() if name == self._kind.value)
+        kind: CloudKind = next(key for key in KINDS if KINDS[key] == self._kind.value)
         limit = float(self._limit.value) or None
-        shown = compose(exhibit, kind, self._mode.value, self._answers, row, limit, self.unit)
+        shown = compose(exhibit, kind, self._mode.value, self._answers, row, limit)
         middle, side = frame_of(exhibit)
         with self._server.atomic():
             self._server.scene.add_point_cloud(
@@ -123,5 +124,5 @@ class Stage:
                     flat_shading=True,
                     visible=bool(self._mesh.value),
                 )
-            self._text.content = shown.text()
-            self._legend.content = shown.colouring.legend()
+            self._text.content = _BLOCK.format(shown.text())
+            self._legend.content = _BLOCK.format(shown.colouring.legend())
