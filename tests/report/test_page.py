@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from qs3.report import render, write_report
+from qs3.report import Cloud, render, write_report
 from qs3.report.verdict import judge
 from qs3.report.viewer import encode_points, viewer
 
@@ -79,17 +79,20 @@ def test_policy_names_exactly_the_style_and_script_of_the_page(source):
 
 def test_hostile_text_is_shown_as_it_is_wherever_it_comes_from(source):
     text = "\n".join(Page(source).words)
-    for start in ("Title", "Summary", "before", "after", "qs3 demo", "0.1.0", "target"):
+    for start in ("Title", "Summary", "before", "after", "qs3 demo", "0.1.0"):
         assert f"{start} {HOSTILE}" in text
-    for start in ("Agreement", "Note", "chair"):
+    for start in ("Agreement", "Note", "chair", "data", "line", "theta", "mark", "paper"):
         assert f"{start} {HOSTILE}" in text
+    assert any(f["data-domain"] == f"target {HOSTILE}" for f in Page(source).named("figure")
+               if "data-domain" in f)  # fmt: skip
     alternatives = [i["alt"] for i in Page(source).named("img")]
-    assert any(HOSTILE in text for text in alternatives)
+    assert any(f"map {HOSTILE}" in text for text in alternatives)
 
 
 def test_images_decode_and_are_described(source):
     images = Page(source).named("img")
-    assert len(images) == 8  # montage, two galleries, curves, selection, two matrices, bars
+    # montage, two galleries, curves, map, selection, two matrices, bars
+    assert len(images) == 9
     for image in images:
         data = base64.b64decode(image["src"].split(",")[1], validate=True)
         pixels = imread(io.BytesIO(data), format="png")
@@ -124,7 +127,7 @@ def test_bad_news_is_told_as_it_is(report, turned, kind, words):
     after = report.before
     before = report.before if turned is None else report.after
     changed = dataclasses.replace(
-        report, before=before, after=after, montage=None, samples={}, curves=(), rounds=()
+        report, before=before, after=after, montage=None, clouds={}, curves=(), rounds=()
     )
     page = Page(render(changed, judge(before, after)))
     assert [a["class"] for a in page.named("div") if a.get("id") == "verdict"] == [
@@ -144,7 +147,9 @@ def test_table_of_rounds_holds_every_number(source):
 
 
 def test_settings_are_folded_away_and_complete(source):
-    assert len(Page(source).named("details")) == 2
+    opened = [a for a in Page(source).named("details") if "open" in a]
+    assert len(Page(source).named("details")) == 5  # two of them of the records
+    assert not opened
     assert '<td class="text">sensor.views</td><td class="text">5</td>' in source
 
 
@@ -152,7 +157,10 @@ def test_parts_that_are_empty_are_left_out(report):
     bare = dataclasses.replace(
         report,
         montage=None,
-        samples={},
+        clouds={},
+        maps=(),
+        scores=(),
+        data=(),
         curves=(),
         rounds=(),
         settings={},
@@ -174,24 +182,65 @@ def test_same_report_gives_the_same_bytes_and_its_verdict(report, page_path, tmp
     assert str(tmp_path).encode() not in again.read_bytes()
 
 
-def test_viewer_shows_each_class_of_both_domains_side_by_side(report, source):
+def test_one_model_or_none_makes_a_page_without_a_verdict(report, tmp_path):
+    alone = dataclasses.replace(report, before=None, montage=None)
+    assert write_report(tmp_path / "a.html", alone) is None
+    page = Page((tmp_path / "a.html").read_text())
+    assert not [a for a in page.named("div") if a.get("id") == "verdict"]
+    assert len([a for a in page.named("div") if a.get("class") == "score"]) == 1
+    none = Page(render(dataclasses.replace(alone, after=None)))
+    assert not [a for a in none.named("div") if a.get("class") == "score"]
+
+
+def test_table_of_records_has_published_values_marks_and_the_oracle_apart(source):
+    rows = re.findall(r"<tr>(.*?)</tr>", source)
+    cells = [re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row) for row in rows]
+    line = next(row for row in cells if row[0].startswith("line ") and len(row) == 9)
+    assert line[4:8] == ["55.0 ± 5.0 (n=2)", "50.0 ± 10.0 (n=2)", "72.4 ± 0.8", "last"]
+    assert line[8].startswith("transductive, mark ")
+    oracle = next(row for row in cells if row[-1] == "oracle *")
+    assert oracle[2:] == ["last", "oracle *"]
+    assert "an upper bound, no result" in source
+
+
+def test_matrix_of_a_line_holds_its_counts_shaded_by_share(source):
+    table = re.search(r'<table class="matrix">(.*?)</table>', source, re.DOTALL)
+    assert table is not None
+    cells = [
+        re.findall(r"<td(?: class=\"(\w+)\")?>(\d*)</td>", row)
+        for row in re.findall(r"<tr>(.*?)</tr>", table[1])[1:]
+    ]
+    assert cells[0] == [("s3", "6"), ("s2", "4"), ("", "")]
+    assert cells[2] == [("", ""), ("s2", "5"), ("s2", "5")]
+
+
+def test_viewer_has_every_cloud_of_every_domain(report, source):
     page = Page(source)
     assert "hidden" in next(a for a in page.named("div") if a.get("id") == "viewer")
-    labels = [canvas["aria-label"] for canvas in page.named("canvas")]
-    assert len(labels) == 2 * len(report.class_names)
-    for index, name in enumerate(report.class_names):
-        assert labels[2 * index] == f"{name}, source, can be turned"
-        assert labels[2 * index + 1].startswith(f"{name}, target")
+    assert len(page.named("canvas")) == len(report.clouds) == 2
+    clouds = page.named("i")
+    assert [c["data-class"] for c in clouds] == list("001122012")  # two of each, then one
+    for item, cloud in zip(clouds[-3:], list(report.clouds.values())[1], strict=True):
+        assert item["data-points"] == encode_points(cloud.points)
+        assert item["data-note"] == cloud.note
+    assert len(page.named("option")) == 1 + len(report.class_names)
 
 
-def test_class_that_one_domain_lacks_is_not_in_the_viewer(report):
-    samples = {
-        "source": report.samples["source"],
-        "target": {"bed": report.samples["source"]["bed"]},
-    }
-    assert viewer(samples).count("<canvas") == 2
-    assert viewer({**samples, "target": {}}) == ""
-    assert viewer({}) == ""
+def test_class_without_a_cloud_cannot_be_chosen(report):
+    clouds = {"source": report.clouds["source"][:1], "target": []}
+    text = viewer(clouds, report.class_names)
+    assert text.count("<option") == 2
+    assert text.count("<canvas") == 2
+    assert viewer({"source": []}, report.class_names) == viewer({}, ("bed",)) == ""
+
+
+def test_two_hundred_clouds_stay_far_below_fifteen_megabytes(report, page_path, rng):
+    points = rng.normal(size=(200, 1024, 3)).astype(np.float32)
+    names = report.class_names
+    own = [Cloud(cloud, names[i % 3], "x" * 60) for i, cloud in enumerate(points)]
+    full = len(viewer({"source": own[:100], "target": own[100:]}, names).encode())
+    assert page_path.stat().st_size + full < 15e6
+    assert 200 * 8192 < full < 200 * 9000  # base64 of six bytes a point, and a note
 
 
 def test_encoded_points_are_the_points_in_the_unit_ball(rng):

@@ -51,7 +51,8 @@ def make_page(options: "ReportOptions", contents: Contents) -> tuple["Report", t
     notes = [*told.pop("notes", ())]
     left_out = len(contents.faults) + len(faults)
     if left_out:
-        notes.append(f"{left_out} runs or records could not be used and are not on this page.")
+        what = "run or record" if left_out == 1 else "runs or records"
+        notes.append(f"{left_out} {what} could not be used; not on this page.")
     montage, title, note = _montage(options)
     report = _report(
         options,
@@ -126,7 +127,7 @@ def _of_run(run: FoundRun, options: "ReportOptions", contents: Contents) -> dict
     read = {"source": run.data("source"), "target": run.data("target"), "test": test}
     return {
         "title": f"{after_name} with {loaded.settings['train']['model']}: a report",
-        "summary": _summary(run, test),
+        "summary": _summary(run, test) + _others(run, options, contents),
         "class_names": loaded.class_names,
         "before": outcomes[0] if len(outcomes) == 2 else None,
         "after": outcomes[-1] if outcomes else None,
@@ -254,6 +255,15 @@ def _of_records(records: Sequence["NamedRecord"]) -> dict[str, Any]:
         "rounds": parts.rounds(after.rounds),
         "notes": [_MEANING.get(mark, f"Caveat: {mark}.") for mark in after.marks],
     }
+
+
+def _others(run: FoundRun, options: "ReportOptions", contents: Contents) -> str:
+    count = len(contents.runs)
+    root, folder = options.folder.resolve(), run.folder.resolve()
+    if count < 2 or not folder.is_relative_to(root):
+        return ""
+    where = folder.relative_to(root)
+    return f" It is {where}, one of {count} runs; the table has every record."
 
 
 def _summary(run: FoundRun, test: DataRecord | None) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from qs3.files import write_text
 from qs3.report.html import escape, paragraph, section
 from qs3.report.records import Outcome, Report
-from qs3.report.sections import SECTIONS
+from qs3.report.sections import sections
 from qs3.report.verdict import Verdict, judge
 
 _KIND = {"helped": "helped", "hurt": "hurt", "no clear difference": "unclear"}
@@ -39,7 +39,7 @@ def render(report: Report, verdict: Verdict | None = None) -> str:
     )
     parts = [
         _opening(report, verdict),
-        *(make(report) for make in SECTIONS),
+        *sections(report),
         section("How to make it again", f"<pre><code>{escape(report.command)}</code></pre>"),
     ]
     body = "\n".join(part for part in parts if part)

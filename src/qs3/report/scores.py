@@ -174,7 +174,7 @@ def _differences(shared: Sequence[Mapping[str, Any]]) -> list[str]:
         for name in odd:
             value, short = one.get(name, "–"), name.rpartition(".")[2]
             if name.startswith("data."):
-                value, short = value[:8], f"{short} data"
+                value, short = value.strip('"')[:8], f"{short} data"
             parts.append(f"{short} {value}")
         told.append(", ".join(parts))
     return told

@@ -221,15 +221,11 @@ def _settings(report: Report) -> str:
     return section("Settings and versions", *blocks)
 
 
-SECTIONS = (
-    _sensor,
-    _clouds,
-    _training,
-    _features,
-    _selection,
-    _results,
-    _scores,
-    _data,
-    _settings,
-)
-"""Functions from a report to a part of its page; a part without content is empty."""
+def sections(report: Report) -> list[str]:
+    """Return the parts of a page that have content, in their order.
+
+    The table of records comes first where there are more than the runs told in full.
+    """
+    order = [_sensor, _clouds, _training, _features, _selection, _results, _data, _settings]
+    order.insert(0 if len(report.scores) > 2 else -2, _scores)
+    return [part for part in (make(report) for make in order) if part]
