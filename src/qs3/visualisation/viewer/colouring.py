@@ -71,8 +71,8 @@ def by_view(view: UInt8[np.ndarray, "n"]) -> Colouring:
     """
     numbers, counts = np.unique(view, return_counts=True)
     swatches = tuple(
-        (class_colour(int(number)), f"view {number + 1} ({count} point{'s' * (count != 1)})")
-        for number, count in zip(numbers, counts, strict=True)
+        (class_colour(number), f"view {number + 1} ({count} point{'s' * (count != 1)})")
+        for number, count in zip(numbers.tolist(), counts.tolist(), strict=True)
     )
     palette = np.array([_rgb(colour) for colour in PALETTE], dtype=np.uint8)
     return Colouring(palette[view % len(PALETTE)], "view", swatches)

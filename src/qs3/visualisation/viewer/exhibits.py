@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import pyarrow as pa
@@ -19,6 +19,14 @@ from qs3.errors import InputError
 
 KINDS: dict[CloudKind, str] = {"points": "noisy", "clean": "clean", "surface": "surface"}
 """The clouds of an object and the names by which the page calls them."""
+
+STATISTICS = {
+    "valid_fraction": ("valid pixels", ".0%"),
+    "disparity_bias": ("disparity bias (px)", "+.3f"),
+    "disparity_sigma": ("disparity σ (px)", ".3f"),
+    "gross_share": ("gross errors", ".1%"),
+}
+"""Statistics of a scan: what the page calls them and how it writes them."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +49,7 @@ class Exhibit:
     """Of its lengths, with a space before it; empty where they have none."""
 
 
+@runtime_checkable
 class Exhibits(Protocol):
     """Objects in a fixed order."""
 
@@ -138,9 +147,18 @@ class StoreExhibits:
         return parse_shard(self._folder.read(name), f"{self._folder}/{name}", columns)
 
     def _read_shard(self, shard: int) -> list[Exhibit]:
-        numbers = ("seed", "valid_fraction", "disparity_bias", "disparity_sigma", "gross_share")
         kinds = tuple(KINDS)
-        wanted = ("id", "class_name", "split", "view", "clean_view", *numbers, "drawn", *kinds)
+        wanted = (
+            "id",
+            "class_name",
+            "split",
+            "view",
+            "clean_view",
+            "seed",
+            *STATISTICS,
+            "drawn",
+            *kinds,
+        )
         table = self._table(shard, wanted)
         where = f"{self._folder}/{shard_name(shard)}"
         there = [kind for kind in kinds if len(table[kind].combine_chunks().values)]
@@ -155,8 +173,13 @@ class StoreExhibits:
                 for kind, name in (("points", "view"), ("clean", "clean_view"))
                 if kind in mine and len(row[name]) == len(mine[kind])
             }
-            told = [("split", row["split"]), ("drawn", row["drawn"].replace("{}", ""))]
-            told += [(n.replace("_", " "), f"{row[n]:.4g}") for n in numbers if row[n] is not None]
+            told = [("split", row["split"]), ("seed", str(row["seed"] or ""))]
+            told += [("drawn", row["drawn"].replace("{}", ""))]
+            told += [
+                (label, f"{row[n]:{form}}")
+                for n, (label, form) in STATISTICS.items()
+                if row[n] is not None
+            ]
             facts = tuple((name, value) for name, value in told if value)
             found.append(Exhibit(row["id"], row["class_name"], mine, views, None, facts))
         return found
@@ -190,8 +213,7 @@ class Answers:
         """The classes it holds likeliest for a row, with their probabilities."""
         order = np.argsort(-self.probabilities[row], kind="stable")[:count]
         shares = ", ".join(f"{self.class_names[i]} {self.probabilities[row, i]:.1%}" for i in order)
-        told = [("network says", shares), ("of the cloud", KINDS[self.kind])]
-        return tuple(told)
+        return ((f"network, of the {KINDS[self.kind]} cloud", shares),)
 
 
 def single(name: str, points: Float32[np.ndarray, "n 3"]) -> ArrayExhibits:

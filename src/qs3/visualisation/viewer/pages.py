@@ -200,7 +200,7 @@ class _Sliders:
                 "projector": _slider(gui, "Projector ×", 0.0, 4.0, 0.05, now.projector),
                 "room_light": _slider(gui, "Other light ×", 0.0, 20.0, 0.1, now.room_light),
                 "gain": _slider(gui, "Gain ×", 0.1, 8.0, 0.1, now.gain),
-                "image_noise": _slider(gui, "Image noise (grey)", 0, 20.0, 0.1, now.image_noise),
+                "image_noise": _slider(gui, "Image noise (grey)", 0.0, 20.0, 0.1, now.image_noise),
                 "method": gui.add_dropdown(
                     "Matcher", ("opencv-bm", "zncc"), initial_value=now.method
                 ),

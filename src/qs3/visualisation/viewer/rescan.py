@@ -4,7 +4,8 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from typing import Generic, Literal, NamedTuple, TypeVar
+from dataclasses import dataclass
+from typing import Generic, Literal, TypeVar
 
 Settings = TypeVar("Settings")
 Result = TypeVar("Result")
@@ -12,7 +13,8 @@ Result = TypeVar("Result")
 _LOG = logging.getLogger(__name__)
 
 
-class Outcome(NamedTuple, Generic[Settings, Result]):
+@dataclass(frozen=True)
+class Outcome(Generic[Settings, Result]):
     """What became of the settings that were asked for last."""
 
     settings: Settings

@@ -14,7 +14,7 @@ from qs3.sensor.render import Renderer
 from qs3.sensor.scan import Scan, scan
 from qs3.sensor.surroundings import SceneSettings
 from qs3.sensor.views import ViewLayout
-from qs3.visualisation.viewer.exhibits import Exhibit
+from qs3.visualisation.viewer.exhibits import STATISTICS, Exhibit
 
 SCENES = ("alone", "floor", "wall", "room")
 OWN_MATERIAL = "of the sensor"
@@ -164,17 +164,10 @@ def rescan(
 def exhibit_of(done: Scan, name: str, class_name: str = "") -> Exhibit:
     """A scan as something to show."""
     facts = [("fused points", str(done.fused_points))]
-    for label, key, form in (
-        ("valid pixels", "valid_fraction", ".0%"),
-        ("disparity bias", "disparity_bias", "+.3f"),
-        ("disparity σ", "disparity_sigma", ".3f"),
-        ("gross errors", "gross_share", ".1%"),
-    ):
-        values = [getattr(view, key) for view in done.views]
-        known = [value for value in values if value is not None]
+    for key, (label, form) in STATISTICS.items():
+        known = [value for view in done.views if (value := getattr(view, key)) is not None]
         if known:
-            pixels = " px" if key.startswith("disparity") else ""
-            facts.append((label, f"{sum(known) / len(known):{form}}{pixels}"))
+            facts.append((label, f"{sum(known) / len(known):{form}}"))
     facts.append(("scanned in", f"{sum(done.seconds.values()):.1f} s"))
     return Exhibit(
         name=name,

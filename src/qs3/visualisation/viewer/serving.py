@@ -154,10 +154,8 @@ def _start(listener: socket.socket, title: str, cleanup: contextlib.ExitStack) -
     cleanup.callback(server.stop)
     if not used:
         raise InputError("this version of viser is not known to be safe; install viser 1.1")
-    server.gui.configure_theme(
-        control_layout="collapsible", control_width="large", show_logo=False,
-        show_share_button=False,
-    )  # fmt: skip
+    server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+    server.gui.main_panel.dock_right()
     return server
 
 
