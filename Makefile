@@ -17,7 +17,7 @@ QS3_SHARED_DATA ?= $(abspath $(wildcard ../shared/data))
 export QS3_SHARED_DATA
 
 .DELETE_ON_ERROR:
-.PHONY: demo test slow check examples cycles clean
+.PHONY: demo test slow check examples docs cycles clean
 
 demo: $(VENV)/.installed
 	$(BIN)/qs3 demo --out demo
@@ -37,12 +37,16 @@ check: $(VENV)/.installed-dev
 examples: $(VENV)/.installed
 	set -e; for file in examples/*.py; do echo "$$file"; $(BIN)/python "$$file"; done
 
+# The site, in site/; needs no network once the packages are there.
+docs: $(VENV)/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 # Blender's module needs one version of Python and an old NumPy, hence an environment of its own.
 cycles: $(VENV_CYCLES)/.installed
 	@$(VENV_CYCLES)/bin/python -c 'import bpy; print("Cycles: Blender " + bpy.app.version_string)'
 
 clean:
-	rm -rf $(VENV) $(VENV_CYCLES) demo
+	rm -rf $(VENV) $(VENV_CYCLES) demo site
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit("qs3 needs Python 3.11 or newer; this is " + sys.version.split()[0] + ". Name another with: make demo PYTHON=python3.12") if sys.version_info < (3, 11) else None'
@@ -55,6 +59,10 @@ $(VENV)/.installed: $(BIN)/python pyproject.toml constraints.txt
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	$(PIP) -e '.[dev]'
+	touch $@
+
+$(VENV)/.installed-docs: $(VENV)/.installed
+	$(PIP) -e '.[docs]'
 	touch $@
 
 $(VENV_CYCLES)/bin/python:
