@@ -12,7 +12,8 @@ from qs3.datasets.generate import generate, scan_seed
 from qs3.datasets.shards import CloudRow
 from qs3.experiments.adaptation_bench import Bench, make_bench
 from qs3.experiments.bench_data import make_plans
-from qs3.experiments.runs import SCALES, Scale
+from qs3.experiments.reproduction import Setup
+from qs3.experiments.scales import SCALES, Scale
 from qs3.training import TrainSettings
 
 TINY = Scale(
@@ -81,21 +82,24 @@ def make(tmp_path):
         def __init__(self):
             self.told = []
 
-        def data(self, out):
+        def data(self, out, sets=("source", "target")):
             if not out.exists():
-                for name, plan in make_plans(TINY, None).items():
+                for name, plan in make_plans(TINY, None, sets=sets).items():
                     folder = out / "data" / name
                     generate(
                         plan.items, folder, plan.settings, scan_one=blob_row, workers=0,
                         progress=False,
                     )  # fmt: skip
                 marker = {"scale": dataclasses.asdict(TINY), "threads": 1, "meshes": "shapes"}
+                marker["data"] = {}
                 (out / "bench.json").write_text(json.dumps(marker), encoding="utf-8")
 
         def bench(self, out, **changes):
             told = {"rows": ("source-only", "qbst"), "tasks": ("S-D",), "seeds": (0,)}
-            told |= {"threads": 1, "workers": 1} | changes
-            return Bench("adaptation-bench", out, TINY, **told)
+            told |= changes
+            rows, tasks = told.pop("rows"), told.pop("tasks")
+            setup = Setup(out, TINY, **({"threads": 1, "workers": 1} | told))
+            return Bench("adaptation-bench", setup, rows, tasks)
 
         def __call__(self, out, **changes):
             self.data(out)

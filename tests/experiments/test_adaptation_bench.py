@@ -16,7 +16,10 @@ from qs3.experiments.adaptation_bench import Bench
 from qs3.experiments.bench_data import choose_meshes, side_of
 from qs3.experiments.bench_table import Line, Result, group_results, published
 from qs3.experiments.cost import Counts, run_seconds
-from qs3.experiments.runs import ABLATIONS, ROWS, SCALES, make_grid, make_run
+from qs3.experiments.reproduction import Setup
+from qs3.experiments.rows import ABLATIONS, ROWS
+from qs3.experiments.runs import make_grid, make_run
+from qs3.experiments.scales import SCALES
 from qs3.meshes import shapes
 
 # So small a network may be sure of one class alone.
@@ -210,7 +213,7 @@ def test_dry_run_prints_counts_and_hours_and_writes_nothing(
     shutil.rmtree(folder / "results")
     before = sorted(folder.rglob("*"))
     options = ReproduceOptions(
-        "adaptation-bench", folder, "smoke", dry_run=True, threads=1, methods=("qbst",)
+        ("adaptation-bench",), folder, "smoke", dry_run=True, methods=("qbst",)
     )
     assert reproduce(options) == 0
     said = capsys.readouterr().out
@@ -290,7 +293,8 @@ def test_the_target_has_rooms_frequent_classes(tiny):
 def test_real_objects_must_be_at_hand(make, tmp_path):
     with pytest.raises(InputError, match="QS3_SHARED_DATA"):
         make(tmp_path / "bench", tasks=("S-R",))
-    assert all(run.task[-1] == "D" for run in Bench("adaptation-bench", tmp_path, TASKS).runs())
+    setup = Setup(tmp_path, TASKS)
+    assert all(run.target == "D" for run in Bench("adaptation-bench", setup).runs())
 
 
 TASKS = dataclasses.replace(SCALES["smoke"], tasks=("S-D", "S-R"))

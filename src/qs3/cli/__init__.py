@@ -74,6 +74,7 @@ def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
     from qs3.cli.export import export
     from qs3.cli.report import report
     from qs3.cli.reproduce import reproduce
+    from qs3.cli.table import figure, table
     from qs3.cli.train import TrainOptions, preset_options, train
 
     defaults = preset_options(given)
@@ -86,8 +87,9 @@ def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
     train_with_preset.__doc__ = train.__doc__
     verbs |= {"train": train_with_preset, "evaluate": evaluate, "predict": predict}
     verbs |= {"export": export, "reproduce": reproduce, "demo": demo}
+    verbs |= {"table": table, "figure": figure}
     verbs["report"] = report
     made = ("scan", "sensors", "realism", "generate", "merge", "info", "verify", "convert")
-    runs = ("train", "evaluate", "predict", "export", "reproduce", "report")
+    runs = ("train", "evaluate", "predict", "export", "reproduce", "table", "figure", "report")
     order = (*made, "extract", *runs, "view", "doctor", "demo")
     return {name: verbs[name] for name in order}

@@ -1,69 +1,127 @@
-"""``qs3 reproduce``: make a table anew, from data to records to Markdown."""
+"""``qs3 reproduce``: tables and figures anew, from data to records to files."""
 
 import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import tyro
 
+from qs3.errors import InputError
+from qs3.experiments.catalogue import PartName, ScaleName
+
 if TYPE_CHECKING:
     from qs3.experiments.grid import Work
+    from qs3.experiments.reproduction import Part, Setup
 
 
 @dataclass(frozen=True)
 class ReproduceOptions:
-    """Make a table anew: data, trainings, records, Markdown and CSV; resumes after a stop."""
+    """Make tables and figures anew: data, trainings, records, files; resumes after a stop."""
 
-    table: Annotated[Literal["adaptation-bench", "adaptation-ablation"], tyro.conf.Positional]
-    """adaptation-bench: every method of adaptation; adaptation-ablation: the switches of QBST."""
+    names: Annotated[tuple[PartName, ...], tyro.conf.Positional]
+    """What to make; everything by default. ordinary, uda, real2sim, views, thresholds: the
+    paper's; partiality, sensors, pointda10: further tables; galleries: pictures of the domains;
+    adaptation-bench, adaptation-ablation: all methods, every rule of selection."""
     out: Path
-    """Folder; both tables may share one. Run the same command again to go on after a stop. With
+    """Folder; all may share one. Run the same command again to go on after a stop. With
     QS3_SHARED_DATA set, artists' meshes and real objects take part."""
-    scale: Literal["smoke", "laptop", "small"] = "small"
-    """small: the least that ranks methods, hours on a GPU; laptop: hours on one core, networks
-    that learn something; smoke: shows that everything runs."""
+    scale: ScaleName = "small"
+    """smoke: shows that everything runs; laptop: hours on one core, networks that learn something;
+    small: the least that ranks methods, hours on a GPU; paper: the paper's size, days."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the trainings."""
     methods: tuple[str, ...] = ()
-    """Lines of the table; all by default."""
-    tasks: tuple[Literal["M-D", "S-D", "M-R", "S-R"], ...] = ()
-    """M surfaces or S scans to D simulated or R real objects; by default what the scale has."""
+    """Lines of the tables; all by default."""
+    tasks: tuple[str, ...] = ()
+    """Columns of the tables, such as S-D; all by default. M surfaces, S scans, D simulated target,
+    F its noise-free fusion, R real objects."""
+    data: tuple[str, ...] = ()
+    """Data sets of yours in place of what is made here, as NAME=PATH or NAME=PATH:TRAIN:TEST with
+    two parts of it: D=scans/depth."""
     dry_run: bool = False
     """Print counts and hours, measured on a few scans and steps; write nothing."""
-    threads: int | None = None
+    threads: int = 1
     """CPU threads of a training; numbers are the same for the same count."""
     workers: int = 2
-    """Processes that scan."""
+    """Processes that scan, and that train where no device is named."""
+    devices: tuple[str, ...] = ()
+    """GPUs by index; each makes one run at a time, in a process of its own."""
+    executor: Literal["local", "ray"] = "local"
+    """Where runs are made: here, or on a Ray cluster whose machines all see --out."""
 
 
 def reproduce(options: Annotated[ReproduceOptions, tyro.conf.arg(name="")]) -> int:
-    """Make a table anew, with its data and its trainings; only what is missing is done."""
-    from qs3.experiments.adaptation_bench import Bench, describe, make_bench, measure
-    from qs3.experiments.bench_data import make_plans
-    from qs3.experiments.runs import SCALES
+    """Make tables and figures anew, with their data and trainings; only what is missing is done."""
+    from qs3.experiments.grid import missing
+    from qs3.experiments.reproduction import (
+        collect_runs,
+        describe,
+        measure,
+        plans_for,
+    )
+    from qs3.experiments.reproduction import reproduce as make
 
+    setup = _setup(options)
+    parts = _parts(options, setup)
+    if options.dry_run:
+        runs = collect_runs(parts)
+        plans = plans_for(parts, runs, setup)
+        cost = measure(setup, missing(runs, setup.out, setup.own), plans)
+        print(describe(parts, setup, runs, plans, cost))
+        return 0
+    paths = make(parts, setup, _train, _evaluate, _tell)
+    for path in paths:
+        if path.is_file():
+            print(path.read_text(encoding="utf-8"))
+    for path in paths:
+        print(f"made: {path}", file=sys.stderr)
+    return 0
+
+
+def _setup(options: ReproduceOptions) -> "Setup":
+    from qs3.experiments.domains import parse_own
+    from qs3.experiments.reproduction import Setup
+    from qs3.experiments.scales import SCALES
+
+    for name in ("threads", "workers"):
+        if getattr(options, name) < 1:
+            raise InputError(f"--{name} {getattr(options, name)}: must be at least 1")
     shared = os.environ.get("QS3_SHARED_DATA")
-    bench = Bench(
-        name=options.table,
+    return Setup(
         out=options.out,
         scale=SCALES[options.scale],
         seeds=options.seeds,
-        rows=options.methods,
-        tasks=options.tasks,
         threads=options.threads,
         workers=options.workers,
+        devices=options.devices,
+        executor=options.executor,
         shared=Path(shared) if shared else None,
+        own=parse_own(options.data),
     )
-    if options.dry_run:
-        runs, plans = bench.runs(), make_plans(bench.scale, bench.shared)
-        print(describe(bench, runs, plans, measure(bench, runs, plans)))
-        return 0
-    path = make_bench(bench, _train, _evaluate, _tell)
-    print(path.read_text(encoding="utf-8"))
-    print(f"table: {path}", file=sys.stderr)
-    return 0
+
+
+def _parts(options: ReproduceOptions, setup: "Setup") -> "list[Part]":
+    from qs3.experiments.adaptation_bench import Bench
+    from qs3.experiments.galleries import Galleries
+    from qs3.experiments.paper import EXPERIMENTS, PaperTable
+
+    names = options.names or get_args(PartName)
+    if len(set(names)) < len(names):
+        raise InputError(f"{' '.join(names)}: name each once")
+    if not options.seeds or len(set(options.seeds)) < len(options.seeds):
+        raise InputError(f"--seeds {' '.join(map(str, options.seeds))}: name each once")
+    parts: list[Part] = []
+    for name in names:
+        if name == "galleries":
+            parts.append(Galleries(setup))
+        elif name in ("adaptation-bench", "adaptation-ablation"):
+            tasks: Any = options.tasks
+            parts.append(Bench(name, setup, options.methods, tasks))
+        else:
+            parts.append(PaperTable(EXPERIMENTS[name], setup, options.methods, options.tasks))
+    return parts
 
 
 def _tell(line: str) -> None:
@@ -72,7 +130,7 @@ def _tell(line: str) -> None:
 
 def _train(work: "Work") -> None:
     from qs3.cli.train import TrainOptions, run
-    from qs3.experiments.runs import SUPERVISED
+    from qs3.experiments.rows import SUPERVISED
 
     told: dict[str, Any] = {}
     if work.run.self_training is not None:
@@ -86,6 +144,7 @@ def _train(work: "Work") -> None:
             source_split=work.source_split,
             target_split=work.target_split,
             source_cloud=work.source_cloud,
+            target_cloud=work.target_cloud,
             supervised=work.run.row == SUPERVISED,
             warm_up=work.warm_up,
             train=work.run.train,
@@ -96,5 +155,7 @@ def _train(work: "Work") -> None:
 
 def _evaluate(work: "Work") -> Any:
     from qs3.cli.evaluate import make_record
+    from qs3.experiments.rows import ORDINARY
 
-    return make_record(work.out, work.test, work.test_split, checkpoints=True)[0]
+    rated = work.run.row != ORDINARY
+    return make_record(work.out, work.test, work.test_split, work.test_cloud, checkpoints=rated)[0]

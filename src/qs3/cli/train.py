@@ -46,6 +46,8 @@ class TrainOptions:
     """Part of the target."""
     source_cloud: Literal["points", "clean", "surface"] = "points"
     """Of generated data: noisy scans, their clean twins, or samples of the whole surface."""
+    target_cloud: Literal["points", "clean", "surface"] = "points"
+    """The same of the target."""
     supervised: bool = False
     """Mark the run as supervised: its source is the labelled training part of the target."""
     warm_up: Path | None = None
@@ -182,7 +184,13 @@ def run(options: TrainOptions) -> Any:
     target = None
     if options.target is not None:
         target = _whole(
-            partial(load_unlabelled, options.target, split=options.target_split), points
+            partial(
+                load_unlabelled,
+                options.target,
+                split=options.target_split,
+                cloud=options.target_cloud,
+            ),
+            points,
         )
     result = fit(
         options.method,
@@ -206,7 +214,11 @@ def run(options: TrainOptions) -> Any:
         "target": None
         if target is None or options.target is None
         else DataRecord(
-            open_folder(options.target).name, target.checksum, len(target), options.target_split
+            open_folder(options.target).name,
+            target.checksum,
+            len(target),
+            options.target_split,
+            options.target_cloud,
         ),
     }
     seconds = {"source": float(sum(epoch.seconds for epoch in result.history))}

@@ -6,12 +6,12 @@ Convention:
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.special import betaincinv, ndtri
+from scipy.special import betaincinv, ndtri, stdtrit
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,54 @@ class MeanSEM:
         """
         spread = "" if self.sem is None else f" ± {scale * self.sem:.{digits}f}"
         return f"{scale * self.mean:.{digits}f}{spread} (n={self.n})"
+
+
+@dataclass(frozen=True)
+class PairedDifference:
+    """Mean difference of two methods over seeds that both ran."""
+
+    mean: float
+    """Arithmetic mean of first minus second."""
+    interval: tuple[float, float] | None
+    """Student's 95 % interval of the mean (ddof = 1); None for a single seed."""
+    n: int
+    """Number of seeds."""
+
+    def format(self, scale: float = 100.0, digits: int = 1) -> str:
+        """Return the value as text, by default in points of a percentage.
+
+        Example:
+            >>> paired_difference({0: 0.6, 1: 0.7}, {0: 0.5, 1: 0.5}).format()
+            '+15.0 points (95 % interval -48.5 to +78.5, n=2)'
+        """
+        value = f"{scale * self.mean:+.{digits}f} points"
+        if self.interval is None:
+            return f"{value} (one seed, no interval)"
+        low, high = (f"{scale * end:+.{digits}f}" for end in self.interval)
+        return f"{value} (95 % interval {low} to {high}, n={self.n})"
+
+
+def paired_difference(
+    first: Mapping[int, float], second: Mapping[int, float]
+) -> PairedDifference | None:
+    """Compare two methods seed by seed; a seed that one of them lacks is left out.
+
+    Args:
+        first: Score by seed.
+        second: Score by seed.
+
+    Returns:
+        First minus second; None where they share no seed.
+    """
+    seeds = sorted(set(first) & set(second))
+    if not seeds:
+        return None
+    values = np.array([first[seed] - second[seed] for seed in seeds])
+    mean, n = float(values.mean()), len(values)
+    if n == 1:
+        return PairedDifference(mean, None, n)
+    half = float(stdtrit(n - 1, 0.975)) * float(values.std(ddof=1)) / math.sqrt(n)
+    return PairedDifference(mean, (mean - half, mean + half), n)
 
 
 def accuracy(labels: Int[np.ndarray, "b"], predictions: Int[np.ndarray, "b"]) -> float:

@@ -1,27 +1,26 @@
-"""Data of the bench: a source and a target of other meshes under another sensor."""
+"""Data of the tables: sources, and targets of other meshes under another sensor."""
 
 import hashlib
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from qs3.datasets.generate import GenerateSettings, generate
 from qs3.datasets.plan import Plan, make_plan, resolve_renderer
-from qs3.errors import QS3Error
-from qs3.experiments.runs import Scale
+from qs3.errors import InputError, QS3Error
+from qs3.experiments.scales import Scale
 from qs3.meshes import collect, shapes
 from qs3.meshes.collections import MeshItem
 from qs3.sensor.surroundings import SceneSettings
 
 SOURCE, TARGET = "source", "target"
-REAL = "sunrgbd_objects.npz"
-REAL_CLOUDS = 32
-"""Objects in that file."""
 TARGET_SENSOR = "d435"
+_ROOM = SceneSettings("floor+behind", neighbour_size=0.5)
 _LEAST = 4
 """A class with fewer meshes is made of shapes alone: a mesh on one side would leave none."""
 _FAILED_SHARE = 0.05
-_SEEDS = {SOURCE: 1, TARGET: 2}
+_SEEDS = {SOURCE: 1, TARGET: 2, "held": 3, "fused": 4, "second": 5, "sensor": 6}
 
 
 @dataclass(frozen=True)
@@ -90,11 +89,30 @@ def _draws(class_name: str, count: int, seed: int) -> list[MeshItem]:
     return collect("shapes", per_class=count, seed=seed, classes=[class_name])
 
 
-def make_plans(scale: Scale, shared: Path | None, renderer: Any = None) -> dict[str, Plan]:
-    """Return the work lists of both data sets.
+def make_plans(
+    scale: Scale,
+    shared: Path | None,
+    renderer: Any = None,
+    sets: Iterable[str] = (SOURCE, TARGET),
+) -> dict[str, Plan]:
+    """Return the work lists of data sets.
 
-    A row of the source has the scan and samples of the surface of the same mesh, so that M and S
-    differ in the sensor alone. The target stands on a floor, partly behind another object.
+    - ``source``: a row has the scan and samples of the surface of the same mesh, so that M and S
+      differ in the sensor alone; ``held`` is the same of the meshes that are scored on.
+    - ``jitter``: the source from one side, as the released code scans; ``views-N``: from N sides.
+    - ``target``: other meshes on a floor, partly behind another object, one view, another sensor;
+      ``fused``: the same from all around.
+    - ``second``: further procedural shapes, for their surfaces.
+    - ``sensor-NAME``: source and scored meshes under another sensor, one view.
+
+    Args:
+        scale: How many.
+        shared: Folder with artists' meshes; None takes shapes alone.
+        renderer: Renderer; None takes the default.
+        sets: Which of them.
+
+    Raises:
+        InputError: where a name is none of these.
     """
     sides = choose_meshes(scale, shared)
     common = {
@@ -103,26 +121,51 @@ def make_plans(scale: Scale, shared: Path | None, renderer: Any = None) -> dict[
         "renderer": renderer,
         "rows_per_shard": 32,
     }
-    settings = {
-        SOURCE: GenerateSettings(views=scale.source_views, seed=_SEEDS[SOURCE], **common),
-        TARGET: GenerateSettings(
-            views=1,
-            sensor=TARGET_SENSOR,
-            scene=SceneSettings("floor+behind", neighbour_size=0.5),
-            # As annotated frames are cut: by the object's mask, and by its box with a margin, or a
-            # few flying pixels would set the scale of the whole cloud.
-            box_margin=0.05,
-            mask_crop=True,
-            seed=_SEEDS[TARGET],
-            **common,
-        ),
-    }
-    items = {SOURCE: sides.source, TARGET: sides.target}
-    return {name: make_plan(items[name], resolve_renderer(settings[name])) for name in settings}
+    plans = {}
+    for name in dict.fromkeys(sets):
+        items, own = _plan(name, scale, sides)
+        settings = GenerateSettings(**{**common, **own})
+        plans[name] = make_plan(items, resolve_renderer(settings))
+    return plans
+
+
+def _plan(name: str, scale: Scale, sides: Sides) -> tuple[list[MeshItem], dict[str, Any]]:
+    """Return the meshes of a data set and the settings that are its own."""
+    kind, _, rest = name.partition("-")
+    scored = [item for item in sides.target if item.split == "test"]
+    source = {"views": scale.source_views, "seed": _SEEDS[SOURCE]}
+    if name == SOURCE:
+        return sides.source, source
+    if name == "held":
+        return scored, source | {"seed": _SEEDS["held"]}
+    if name == "jitter":
+        return sides.source, source | {"view_layout": "jitter"}
+    if kind == "views" and rest.isdecimal():
+        return sides.source, source | {"views": int(rest)}
+    # As annotated frames are cut: by the object's mask, and by its box with a margin, or a few
+    # flying pixels would set the scale of the whole cloud.
+    room = {"sensor": TARGET_SENSOR, "scene": _ROOM, "box_margin": 0.05, "mask_crop": True}
+    if name == TARGET:
+        return sides.target, room | {"views": 1, "seed": _SEEDS[TARGET]}
+    if name == "fused":
+        return sides.target, room | {"views": scale.source_views, "seed": _SEEDS["fused"]}
+    if name == "second":
+        parts = {"train": scale.source_per_class, "test": scale.test_per_class}
+        items = []
+        for class_name in shapes.CLASSES:
+            drawn = _draws(class_name, sum(parts.values()), _SEEDS["second"])
+            for split, count in parts.items():
+                items += [replace(drawn.pop(0), split=split) for _ in range(count)]
+        return items, {"meshes": "shapes", "views": 1, "seed": _SEEDS["second"]}
+    if kind == "sensor" and rest:
+        # Both sides count their shapes from 0.
+        items = sides.source + [replace(item, id=f"{item.id}-scored") for item in scored]
+        return items, {"sensor": rest, "views": 1, "seed": _SEEDS["sensor"]}
+    raise InputError(f"unknown data set {name!r}")
 
 
 def make_data(folder: Path, plans: dict[str, Plan], workers: int) -> dict[str, int]:
-    """Scan both data sets below a folder, going on where an earlier call stopped.
+    """Scan data sets below a folder, going on where an earlier call stopped.
 
     Returns:
         Objects of each that could not be scanned, and are absent.

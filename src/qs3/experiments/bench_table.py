@@ -11,7 +11,8 @@ from typing import Any
 from qs3.errors import InputError
 from qs3.evaluation.metrics import MeanSEM, mean_sem
 from qs3.evaluation.records import RunRecord
-from qs3.experiments.runs import SUPERVISED, Run
+from qs3.experiments.rows import SUPERVISED
+from qs3.experiments.runs import Run
 
 ORACLE = "oracle"
 
@@ -65,12 +66,12 @@ def group_results(results: Sequence[Result]) -> list[Line]:
     groups: dict[tuple[str, str], list[Result]] = {}
     for result in results:
         run, record = result.run, result.record
-        domain = run.task[-1]
+        domain = run.target
         data = [(f"test {domain}", record.test.checksum)]
         if record.target is not None:
             data.append((f"target {domain}", record.target.checksum))
         if run.row != SUPERVISED:
-            data.append((f"source {run.task[0]}", record.source.checksum))
+            data.append((f"source {run.source}", record.source.checksum))
         for name, checksum in data:
             first, where = sums.setdefault(name, (checksum, run.record))
             if first != checksum:

@@ -65,16 +65,17 @@ def device_of(settings: TrainSettings) -> torch.device:
     return torch.device("cuda" if cuda else "cpu")
 
 
-def step_seconds(
-    methods: Iterable[str], settings: TrainSettings, steps: int = 2
-) -> dict[str, float]:
-    """Return the median seconds of a step of each method, after one on few points to warm up."""
+def step_seconds(runs: Iterable[Run], settings: TrainSettings, steps: int = 2) -> dict[str, float]:
+    """Return the median seconds of a step of each method of some runs of one network.
+
+    The first step, on few points, warms up and is not counted.
+    """
     threads = torch.get_num_threads()
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)
     try:
         found = {}
-        for name in methods:
+        for name in methods_of(runs):
             few = replace(settings, num_points=64, batch_size=4)
             Step(name, few, device_of(settings))()
             step = Step(name, settings, device_of(settings))
@@ -101,14 +102,25 @@ def methods_of(runs: Iterable[Run]) -> list[str]:
     return list(dict.fromkeys(["source-only", *(split_method(run.method)[0] for run in runs)]))
 
 
-def run_seconds(run: Run, counts: Counts, steps: Mapping[str, float]) -> float:
-    """Estimate the seconds of a run; a round is taken to keep every cloud of the target."""
+def run_seconds(
+    run: Run, counts: Counts, steps: Mapping[str, float], only_scores: bool = False
+) -> float:
+    """Estimate the seconds of a run; a round is taken to keep every cloud of the target.
+
+    Args:
+        run: The run.
+        counts: Clouds that it reads.
+        steps: Seconds of a step by method.
+        only_scores: Whether its network is there, and nothing but its scores is missing.
+    """
     settings = run.train
     base = split_method(run.method)[0]
     size = settings.batch_size
     trained = counts.source - int(settings.holdout * counts.source)
     looks = 1
     seconds = 0.0
+    if only_scores:
+        return counts.test / size * _PASS * steps["source-only"]
     if run.warm_up is None:
         batches = count_batches(trained, size)
         if method_class(base).uses_target:

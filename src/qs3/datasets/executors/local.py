@@ -42,12 +42,15 @@ class LocalExecutor:
     this process is killed.
     """
 
-    def __init__(self, workers: int = 1, timeout: float | None = None) -> None:
+    def __init__(
+        self, workers: int = 1, timeout: float | None = None, calls_per_process: int = 0
+    ) -> None:
         """Prepare.
 
         Args:
             workers: Processes.
             timeout: Seconds that one call may take; None waits for ever.
+            calls_per_process: Calls after which a process is replaced; 0 keeps it.
 
         Raises:
             InputError: where a number is out of range.
@@ -59,6 +62,7 @@ class LocalExecutor:
         self.ahead = 2 * workers
         self._workers = workers
         self._timeout = timeout
+        self._calls_per_process = calls_per_process
         self._calls: dict[Any, _Call] = {}
         self._broken = 0
 
@@ -155,7 +159,12 @@ class LocalExecutor:
         self._environment = {name: os.environ.get(name) for name in ONE_THREAD}
         os.environ.update(ONE_THREAD)
         context: Any = multiprocessing.get_context("spawn")
-        self._pool = ProcessPool(self._workers, initializer=_prepare_worker, context=context)
+        self._pool = ProcessPool(
+            self._workers,
+            max_tasks=self._calls_per_process,
+            initializer=_prepare_worker,
+            context=context,
+        )
 
     def _close(self, at_once: bool) -> None:
         if at_once:

@@ -1,0 +1,186 @@
+"""The paper's tables and figures: all of them by name, read from records, written to files."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from qs3.datasets.plan import Plan
+from qs3.errors import InputError
+from qs3.evaluation.records import RunRecord
+from qs3.experiments import (
+    ordinary,
+    partiality,
+    pointda10,
+    real2sim,
+    sensors,
+    thresholds,
+    uda,
+    views,
+)
+from qs3.experiments.domains import domain
+from qs3.experiments.experiment import Experiment, Grid, cell_runs, fill
+from qs3.experiments.figures import draw
+from qs3.experiments.grid import RESULTS, make_work, read_result
+from qs3.experiments.render import to_csv, to_latex, to_markdown
+from qs3.experiments.reproduction import Setup
+from qs3.experiments.runs import Run, with_warm_up
+from qs3.files import write_bytes, write_text
+from qs3.visualisation.figure import png_bytes, svg_bytes
+
+EXPERIMENTS: Mapping[str, Experiment] = {
+    one.EXPERIMENT.name: one.EXPERIMENT
+    for one in (ordinary, uda, real2sim, views, thresholds, partiality, sensors, pointda10)
+}
+"""Every table and figure that comes from records, by name."""
+TableFormat = Literal["md", "csv", "tex"]
+FigureFormat = Literal["png", "svg"]
+
+
+@dataclass(frozen=True)
+class PaperTable:
+    """A table with its figure; one of the parts of `qs3.experiments.reproduction`."""
+
+    experiment: Experiment
+    """Which one."""
+    setup: Setup
+    """Where and how large."""
+    rows: tuple[str, ...] = ()
+    """Lines; empty takes all."""
+    columns: tuple[str, ...] = ()
+    """Columns; empty takes all."""
+
+    @property
+    def name(self) -> str:
+        """Name of the table and of its files."""
+        return self.experiment.name
+
+    def cells(self) -> dict[tuple[str, str], list[Run]]:
+        """Return the runs of each cell.
+
+        Raises:
+            InputError: where no cell is left, or the data of one is not at hand.
+        """
+        setup = self.setup
+        cells = cell_runs(
+            self.experiment, setup.scale, setup.seeds, setup.threads, self.rows, self.columns
+        )
+        if not any(cells.values()):
+            lines, columns = (
+                ", ".join(key for key, _ in named)
+                for named in (
+                    self.experiment.rows(setup.scale),
+                    self.experiment.columns(setup.scale),
+                )
+            )
+            raise InputError(f"{self.name}: its lines are {lines}; its columns are {columns}")
+        return cells
+
+    def runs(self) -> list[Run]:
+        """Return the runs of all cells, a warm-up before what starts from it."""
+        found: dict[str, Run] = {}
+        for seed in self.setup.seeds:  # a seed is finished before the next begins
+            for runs in self.cells().values():
+                for run in (one for one in runs if one.seed == seed):
+                    make_work(run, self.setup.out, self.setup.shared, self.setup.own)
+                    for one in with_warm_up(self.setup.scale, run):
+                        found.setdefault(one.record, one)
+        return list(found.values())
+
+    def sets(self) -> list[str]:
+        """Return no further data sets."""
+        return []
+
+    def write(self, plans: Mapping[str, Plan]) -> Path:
+        """Write the table in all formats and the figure, from the records alone."""
+        grid, faults = self.grid()
+        if faults:
+            raise InputError(faults[0])
+        path = self.setup.out / f"{self.name}.md"
+        for kind in ("md", "csv", "tex"):
+            write_text(path.with_suffix(f".{kind}"), self.text(grid, kind))
+        write_bytes(path.with_suffix(".png"), self.picture(grid, "png"))
+        return path
+
+    def grid(self) -> tuple[Grid, list[str]]:
+        """Fill the table from the records that are there.
+
+        Returns:
+            The table, and what is wrong with each record that was refused.
+        """
+        cells = self.cells()
+        records: dict[str, RunRecord] = {}
+        faults = []
+        for run in (run for runs in cells.values() for run in runs):
+            path = self.setup.out / RESULTS / run.record
+            if path.is_file() and run.record not in records:
+                try:
+                    records[run.record] = read_result(path, run, self.setup.own)
+                except InputError as error:
+                    faults.append(str(error))
+        faults += _mixed(records, cells)
+        return fill(self.experiment, self.setup.scale, cells, records), list(dict.fromkeys(faults))
+
+    def text(self, grid: Grid, kind: TableFormat) -> str:
+        """Return the table as Markdown, CSV or LaTeX."""
+        if kind == "csv":
+            return to_csv(grid)
+        if kind == "tex":
+            return to_latex(grid)
+        return to_markdown(grid, self._intro(), self.command())
+
+    def picture(self, grid: Grid, kind: FigureFormat) -> bytes:
+        """Return the figure as PNG or SVG."""
+        figure = draw(grid)
+        return png_bytes(figure) if kind == "png" else svg_bytes(figure)
+
+    def command(self) -> str:
+        """Return the command that makes what is missing."""
+        setup = self.setup
+        seeds = " ".join(map(str, setup.seeds))
+        own = "".join(f" --data {name}=…" for name in setup.own)
+        return f"qs3 reproduce {self.name} --scale {setup.scale.name} --seeds {seeds} --out …{own}"
+
+    def _intro(self) -> list[str]:
+        scale, train = self.setup.scale, self.setup.scale.train
+        domains = [domain(name, self.setup.own) for name in self.experiment.domains(scale)]
+        text = [
+            f"Scale {scale.name}: {scale.source_per_class} objects a class of the source, "
+            f"{train.num_points} points, {train.epochs} epochs, batches of {train.batch_size}; "
+            f"seeds {', '.join(map(str, self.setup.seeds))}. Per cent, mean ± standard error "
+            "(ddof = 1) over n seeds, from the records alone; the network is the last epoch's.",
+        ]
+        text.append("; ".join(one.title for one in domains) + ".")
+        stand_ins = [f"{one.title[0]} for {one.stands_for}" for one in domains if one.stands_for]
+        if stand_ins:
+            text.append(
+                f"**Stand-ins, made here**: {', '.join(stand_ins)}. A simulator on both sides "
+                "flatters, and the paper's figures are of its own data: a yardstick, no target."
+            )
+        if scale.smoke:
+            text.append(
+                "Below 40 training objects a class, 512 points or the whole networks: shows that "
+                "everything runs, ranks nothing."
+            )
+        return text
+
+
+def _mixed(
+    records: dict[str, RunRecord], cells: Mapping[tuple[str, str], Sequence[Run]]
+) -> list[str]:
+    """Take out records that read other data than the first of their domain, and name them."""
+    sums: dict[str, tuple[str, str]] = {}
+    faults = []
+    for run in (run for runs in cells.values() for run in runs):
+        record = records.get(run.record)
+        if record is None:
+            continue
+        known = {f"source {run.source}": record.source, f"test {run.target}": record.test}
+        if run.row == "supervised":
+            known = {f"test {run.target}": record.test}
+        for name, data in known.items():
+            first, where = sums.setdefault(name, (data.checksum, run.record))
+            if first != data.checksum:
+                faults.append(f"{run.record}: read other data ({name}) than {where}; delete it")
+                records.pop(run.record, None)
+    return faults

@@ -1,0 +1,318 @@
+"""Makes tables anew: data, runs, records, then the tables from the records alone."""
+
+import dataclasses
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Protocol, runtime_checkable
+
+from qs3.datasets.estimate import estimate
+from qs3.datasets.executors import Executor, LocalExecutor
+from qs3.datasets.manifest import MANIFEST
+from qs3.datasets.plan import Plan
+from qs3.errors import InputError
+from qs3.experiments.bench_data import make_data, make_plans
+from qs3.experiments.cost import Counts, run_seconds, step_seconds
+from qs3.experiments.domains import REAL, REAL_CLOUDS, Domain, domain, own_domain
+from qs3.experiments.grid import (
+    DATA,
+    RESULTS,
+    Evaluate,
+    Tell,
+    Train,
+    data_sets,
+    make_work,
+    missing,
+    run_grid,
+)
+from qs3.experiments.rows import ORDINARY, SUPERVISED
+from qs3.experiments.runs import Run
+from qs3.experiments.scales import Scale
+from qs3.files import claim_folder, read_json, write_json
+
+MARKER = "bench.json"
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Where and how large; what all tables of a folder share."""
+
+    out: Path
+    """Folder of data, runs, records and tables."""
+    scale: Scale
+    """Size."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of the trainings; the data are the same for all."""
+    threads: int | None = None
+    """CPU threads of a training."""
+    workers: int = 2
+    """Processes that scan, and that train where no device is named."""
+    devices: tuple[str, ...] = ()
+    """GPUs, by index: each makes one run at a time."""
+    executor: Literal["local", "ray"] = "local"
+    """Where runs are made: here, or on a Ray cluster that sees the same folders."""
+    shared: Path | None = None
+    """Folder with artists' meshes and real objects; None takes procedural shapes alone."""
+    own: Mapping[str, Domain] = field(default_factory=dict)
+    """The user's data sets."""
+
+
+@runtime_checkable
+class Part(Protocol):
+    """A table or a figure."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        ...
+
+    def runs(self) -> list[Run]:
+        """Return the runs that it is made of."""
+        ...
+
+    def sets(self) -> list[str]:
+        """Return data sets that it needs beside those of its runs."""
+        ...
+
+    def write(self, plans: Mapping[str, Plan]) -> Path:
+        """Write it from the records, and return its main file."""
+        ...
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What is left to do, in seconds on one core or device."""
+
+    data: float
+    """Scanning."""
+    runs: dict[str, float]
+    """Each run that is left, by its record."""
+
+    @property
+    def seconds(self) -> float:
+        """All that is left."""
+        return self.data + sum(self.runs.values())
+
+
+def collect_runs(parts: Sequence[Part]) -> list[Run]:
+    """Return the runs of all parts, each once.
+
+    Raises:
+        InputError: where two parts mean different runs by one name.
+    """
+    found: dict[str, Run] = {}
+    for part in parts:
+        for run in part.runs():
+            if found.setdefault(run.record, run) != run:
+                raise InputError(f"{part.name}: its run {run.record} is another one elsewhere")
+    return list(found.values())
+
+
+def plans_for(parts: Sequence[Part], runs: Sequence[Run], setup: Setup) -> dict[str, Plan]:
+    """Return the work lists of all data sets that are to be made."""
+    names = data_sets(runs, setup.own) + [name for part in parts for name in part.sets()]
+    return make_plans(setup.scale, setup.shared, sets=names)
+
+
+def reproduce(
+    parts: Sequence[Part], setup: Setup, train: Train, evaluate: Evaluate, tell: Tell
+) -> list[Path]:
+    """Make data, runs and tables, whatever of them is missing.
+
+    Args:
+        parts: What to make.
+        setup: Where and how large.
+        train: Trains a run; a function of a module where runs are made in other processes.
+        evaluate: Scores it; likewise.
+        tell: Is told how it goes.
+
+    Returns:
+        The main file of each part.
+
+    Raises:
+        InputError: where the folder is for other settings, a record is damaged or not of its run,
+            or a run failed; what was made stays made.
+    """
+    runs = collect_runs(parts)
+    plans = plans_for(parts, runs, setup)
+    claim(setup, plans)
+    left = missing(runs, setup.out, setup.own)  # a damaged record stops here, not after hours
+    cost = measure(setup, left, plans)
+    tell(describe(parts, setup, runs, plans, cost))
+    if len(left) < len(runs):
+        tell(f"{len(runs) - len(left)} of {len(runs)} runs are there already")
+    failed = make_data(setup.out / DATA, plans, setup.workers)
+    for name, count in failed.items():
+        if count:
+            tell(f"{name}: {count} scans failed and are absent")
+    works = [make_work(run, setup.out, setup.shared, setup.own) for run in left]
+    with _quiet_workers():
+        run_grid(
+            works,
+            setup.out,
+            train,
+            evaluate,
+            tell,
+            cost.runs,
+            executor=_executor(setup) if works else None,
+            devices=setup.devices,
+            at_once=setup.workers,
+        )
+    return [part.write(plans) for part in parts]
+
+
+def _executor(setup: Setup) -> Executor | None:
+    if setup.executor == "ray":
+        from qs3.datasets.executors.ray_cluster import RayExecutor
+
+        return RayExecutor(gpus=1.0 if setup.devices else 0.0)
+    if setup.devices:
+        # A process sees the GPU that it was started with: each run has its own.
+        return LocalExecutor(len(setup.devices), calls_per_process=1)
+    return LocalExecutor(setup.workers) if setup.workers > 1 else None
+
+
+@contextmanager
+def _quiet_workers() -> Iterator[None]:
+    """Start processes without progress bars: several would write over one another."""
+    before = os.environ.get("TQDM_DISABLE")
+    os.environ["TQDM_DISABLE"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["TQDM_DISABLE"]
+        else:
+            os.environ["TQDM_DISABLE"] = before
+
+
+def measure(setup: Setup, left: Sequence[Run], plans: Mapping[str, Plan]) -> Cost:
+    """Estimate what is left, from a few timed scans and a few timed steps of each kind."""
+    steps = {
+        network: step_seconds(
+            [run for run in left if run.network == network],
+            setup.scale.train_with(setup.threads, network=network),
+        )
+        for network in dict.fromkeys(run.network for run in left)
+    }
+    counts = {name: _counts(plan) for name, plan in plans.items()}
+    expected, trained = {}, set()
+    for run in left:
+        source, target = domain(run.source, setup.own), domain(run.target, setup.own)
+        learnt = target if run.row == SUPERVISED else source
+        seen = Counts(
+            source=_size(learnt.train, "train", counts),
+            target=0 if run.row == ORDINARY else _size(target.train, "train", counts),
+            test=_size(target.test, "test", counts),
+        )
+        # One training of the source alone serves several test sets.
+        again = run.folder in trained
+        trained.add(run.folder)
+        expected[run.record] = run_seconds(run, seen, steps[run.network], only_scores=again)
+    data = 0.0
+    for name, plan in plans.items():
+        if not (setup.out / DATA / name / MANIFEST).is_file():
+            data += estimate(plan).seconds
+    return Cost(data, expected)
+
+
+def _counts(plan: Plan) -> dict[str, int]:
+    train = sum(item.split == "train" for item in plan.items)
+    return {"train": train, "test": plan.rows - train}
+
+
+def _size(name: str, part: str, counts: Mapping[str, Mapping[str, int]]) -> int:
+    """Clouds of a part of a data set; of the user's own the size is unknown: a thousand."""
+    if name == REAL:
+        return REAL_CLOUDS
+    return counts[name][part] if name in counts else 1000
+
+
+def describe(
+    parts: Sequence[Part],
+    setup: Setup,
+    runs: Sequence[Run],
+    plans: Mapping[str, Plan],
+    cost: Cost,
+) -> str:
+    """Say what will be made and how long it takes."""
+    counts = ", ".join(f"{plan.rows} scans of the {name}" for name, plan in plans.items())
+    at_once = len(setup.devices) or setup.workers
+    names = ", ".join(part.name for part in parts)
+    return (
+        f"{names}, scale {setup.scale.name}: {counts}; {len(runs)} runs, {len(cost.runs)} of them "
+        f"missing; about {cost.seconds / at_once / 3600:.2f} hours here, "
+        f"{cost.data / at_once / 3600:.2f} of them for scans ({at_once} at a time)"
+    )
+
+
+def claim(setup: Setup, plans: Mapping[str, Plan]) -> None:
+    """Write down what the folder is for, or check that it is for the same.
+
+    Raises:
+        InputError: where it is for another scale, other threads, meshes or data.
+    """
+    claim_folder(setup.out, MARKER)
+    wanted = json.loads(
+        json.dumps(
+            {
+                "scale": dataclasses.asdict(setup.scale),
+                "threads": setup.threads,
+                "meshes": _meshes(plans, setup),
+                "data": {
+                    name: [Path(one.train).name, one.cloud] for name, one in setup.own.items()
+                },
+            }
+        )
+    )
+    path = setup.out / MARKER
+    if not path.is_file():
+        write_json(path, wanted)
+        return
+    there: Any = read_json(path)
+    for name, value in wanted.items():
+        if not isinstance(there, dict) or there.get(name) != value:
+            raise InputError(f"{setup.out}: holds a bench of another {name}; name another --out")
+
+
+def read_setup(folder: Path) -> Setup:
+    """Return the setup of a folder that holds records, with the seeds that are there.
+
+    Raises:
+        InputError: where the folder was not made by ``qs3 reproduce``, or by another version.
+    """
+    from qs3.experiments.scales import SCALES
+
+    if not (folder / MARKER).is_file():
+        raise InputError(f"{folder}: has no {MARKER}; name a folder that qs3 reproduce made")
+    there: Any = read_json(folder / MARKER)
+    known = {"scale", "threads", "meshes", "data"}
+    if not isinstance(there, dict) or set(there) != known or not isinstance(there["scale"], dict):
+        raise InputError(f"{folder / MARKER}: is not what qs3 reproduce writes")
+    scale = SCALES.get(str(there["scale"].get("name")))
+    if scale is None or json.loads(json.dumps(dataclasses.asdict(scale))) != there["scale"]:
+        raise InputError(f"{folder / MARKER}: is of a scale that this version does not have")
+    own = {}
+    for name, (data, cloud) in there["data"].items():
+        own[name] = own_domain(name, data, cloud)
+    seeds = sorted(
+        {
+            int(path.stem.rpartition("-")[2])
+            for path in (folder / RESULTS).glob("*_seed-*.json")
+            if path.stem.rpartition("-")[2].isdecimal()
+        }
+    )
+    return Setup(
+        out=folder, scale=scale, seeds=tuple(seeds) or (0, 1, 2), threads=there["threads"], own=own
+    )
+
+
+def _meshes(plans: Mapping[str, Plan], setup: Setup) -> str:
+    """Return which meshes take part; `second` is of shapes always."""
+    found = {plan.settings.meshes for name, plan in plans.items() if name != "second"}
+    if found:
+        return found.pop()
+    return make_plans(setup.scale, setup.shared, sets=["source"])["source"].settings.meshes

@@ -1,0 +1,183 @@
+"""How large the tables are: smoke, laptop, small, paper."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, get_args
+
+from qs3.errors import InputError
+from qs3.experiments.rows import NETWORKS, ORDINARY, PAPER
+from qs3.training.config import TrainSettings
+
+Task = Literal["M-D", "S-D", "M-R", "S-R"]
+"""Source and target of the bench, by the names of `qs3.experiments.domains`. M: samples of the
+meshes' surfaces; S: scans of the same meshes by the simulated sensor; D: scans of other meshes by
+another simulated sensor; R: real objects."""
+
+_FLOOR_OBJECTS, _FLOOR_POINTS = 40, 512
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Size of a bench: its data and its trainings."""
+
+    name: str
+    """Told in the title of the table."""
+    source_per_class: int
+    """Objects a class of the source, of which a tenth is held out for the validators."""
+    target_per_class: int
+    """Objects a class to adapt to."""
+    test_per_class: int
+    """Objects a class to score on."""
+    common: tuple[str, ...] = ("chair", "table")
+    """Classes that are frequent in the target, as in scans of rooms."""
+    common_factor: int = 3
+    """How many times as frequent."""
+    source_views: int = 5
+    """Views fused into a scan of the source."""
+    samples: int = 4
+    """Rays a pixel."""
+    data_points: int = 2048
+    """Points of each cloud on disk."""
+    train: TrainSettings = field(default_factory=TrainSettings)
+    """How networks are trained; the seed is a run's own."""
+    rounds: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of self-training that differ from the preset of its rule."""
+    tasks: tuple[Task, ...] = get_args(Task)
+    """Tasks of the bench by default."""
+    networks: Mapping[str, Mapping[str, Any]] = field(
+        default_factory=lambda: {name: {} for name in NETWORKS}
+    )
+    """Settings of each network that differ from its defaults, for the tables of networks."""
+    ordinary: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of training that the tables of networks change."""
+    fused_views: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7, 8)
+    """Numbers of views that Fig. 1 compares."""
+    thetas: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
+    """θ₀ that Fig. 2 compares."""
+    steps: tuple[float, ...] = (0.0, 0.005, 0.01, 0.02)
+    """ε that Fig. 2 compares."""
+    sensors: tuple[str, ...] = ("qs3", "d435", "kinect-v1")
+    """Presets that are trained and tested on."""
+    pointda10: tuple[str, ...] = (
+        ORDINARY,
+        "dann",
+        "pointdan",
+        "defrec",
+        "defrec-pcm",
+        "gast",
+        "gast-spst",
+        PAPER,
+    )
+    """Rows of the six tasks of PointDA-10."""
+
+    @property
+    def smoke(self) -> bool:
+        """Whether it lies below what a comparison of methods needs."""
+        trained = self.source_per_class * (1 - self.train.holdout)
+        small = trained < _FLOOR_OBJECTS or self.train.num_points < _FLOOR_POINTS
+        return small or self.train.model != "dgcnn" or bool(self.train.model_settings)
+
+    def train_with(self, threads: int | None, seed: int = 0, network: str = "") -> TrainSettings:
+        """Return the settings of a training with a seed and a number of threads.
+
+        Args:
+            threads: CPU threads.
+            seed: Root of all random steps.
+            network: One of ``networks``, trained as the tables of networks do; "" is the bench's.
+
+        Raises:
+            InputError: where the scale has no such network.
+        """
+        if not network:
+            return replace(self.train, seed=seed, threads=threads)
+        if network not in self.networks:
+            raise InputError(f"unknown network {network!r}; choose from {', '.join(self.networks)}")
+        own = {"model": network, "model_settings": self.networks[network], **self.ordinary}
+        return replace(self.train, seed=seed, threads=threads, **own)
+
+    def target_count(self, class_name: str, per_class: int) -> int:
+        """Return how many objects of a class stand in a part of the target."""
+        return per_class * (self.common_factor if class_name in self.common else 1)
+
+
+_NARROW: Mapping[str, Mapping[str, Any]] = {
+    "pointnet2": {
+        "centres": (96, 32),
+        "scales": (((0.25, 16, (32, 32, 64)),), ((0.5, 16, (64, 64, 128)),)),
+        "embedding": (128, 256),
+    },
+    "dgcnn": {"neighbours": 10, "channels": (32, 32, 64, 64), "embedding": 256},
+    "rscnn": {
+        "centres": (96, 32),
+        "radii": (0.25, 0.5),
+        "neighbours": (16, 16),
+        "channels": (64, 128),
+        "embedding": 256,
+    },
+    "simpleview": {"width": 8, "resolution": 32},
+}
+"""Networks for one core: a quarter of the width or less."""
+
+SCALES: Mapping[str, Scale] = {
+    # One seed of M-D and S-D takes about a quarter of an hour on one core.
+    "smoke": Scale(
+        name="smoke",
+        source_per_class=8,
+        target_per_class=4,
+        test_per_class=3,
+        source_views=2,
+        data_points=512,
+        train=TrainSettings(
+            model="dgcnn",
+            model_settings=_NARROW["dgcnn"],
+            num_points=256,
+            epochs=12,
+            batch_size=16,
+            learning_rate=2e-3,
+            validate_every=4,
+        ),
+        # Networks of so few clouds are seldom sure.
+        rounds={"threshold": 0.4, "rounds": 3, "epochs": 2},
+        tasks=("M-D", "S-D"),
+        networks=_NARROW,
+        fused_views=(1, 2, 4, 8),
+        thetas=(0.3, 0.4, 0.5),
+        steps=(0.0, 0.005, 0.02),
+        pointda10=(ORDINARY, "pointdan", PAPER),
+    ),
+    # Networks that learn something, in a few hours of one core; below the floor all the same.
+    "laptop": Scale(
+        name="laptop",
+        source_per_class=16,
+        target_per_class=6,
+        test_per_class=6,
+        source_views=3,
+        data_points=512,
+        train=TrainSettings(
+            model="dgcnn",
+            model_settings=_NARROW["dgcnn"],
+            num_points=256,
+            epochs=24,
+            batch_size=16,
+            learning_rate=2e-3,
+            validate_every=8,
+        ),
+        rounds={"threshold": 0.6, "rounds": 4, "epochs": 3},
+        tasks=("M-D", "S-D"),
+        networks=_NARROW,
+        fused_views=(1, 2, 3, 5, 8),
+        thetas=(0.5, 0.6, 0.7, 0.8),
+        steps=(0.0, 0.005, 0.02),
+        pointda10=(ORDINARY, "pointdan", PAPER),
+    ),
+    "small": Scale(
+        name="small",
+        source_per_class=48,
+        target_per_class=20,
+        test_per_class=20,
+        train=TrainSettings(
+            model="dgcnn", num_points=512, epochs=80, batch_size=16, validate_every=10
+        ),
+    ),
+}
+"""Sizes by name: ``small`` is the least on which methods may be compared."""
