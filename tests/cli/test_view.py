@@ -1,0 +1,177 @@
+"""``qs3 view`` as a user calls it."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import urllib.request
+
+import numpy as np
+import pytest
+
+from qs3.cli import main
+from qs3.meshes import shapes
+
+pytest.importorskip("viser", reason="viser is not installed: pip install 'qs3[view]'")
+
+
+@pytest.fixture
+def archive(tmp_path, rng):
+    """Four labelled clouds."""
+    path = tmp_path / "four.npz"
+    points = rng.normal(size=(4, 32, 3)).astype(np.float32)
+    np.savez(path, points=points, label=[0, 1, 0, 1], class_names=["bed", "chair"])
+    return path
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A network that nobody has trained."""
+    from qs3.training.checkpoint import new_model, save_model
+    from qs3.training.config import TrainSettings
+
+    settings = TrainSettings(model="pointnet", num_points=16)
+    folder = tmp_path / "run"
+    folder.mkdir()
+    save_model(folder, new_model(settings, 2, 0), ("bed", "chair"), settings)
+    return folder
+
+
+def refusal(capsys, *arguments):
+    with pytest.raises(SystemExit) as ended:
+        main(["view", *map(str, arguments), "--port", "0"])
+    told = capsys.readouterr()
+    assert ended.value.code == 2
+    assert told.out == ""  # no address: there is nothing to open
+    lines = told.err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("qs3: ")
+    return lines[0]
+
+
+def test_faults_are_one_line(capsys, archive, run, tmp_path):
+    assert "absent.off: no such file" in refusal(capsys, tmp_path / "absent.off")
+    line = refusal(capsys, "toaster")
+    assert "toaster" in line
+    assert "chair" in line
+    line = refusal(capsys, archive, "--class-name", "sofa")
+    assert "sofa" in line
+    assert "bed, chair" in line
+    assert "split 'test'" in refusal(capsys, archive, "--split", "test")
+    assert "--data" in refusal(capsys, run)
+    assert "gone.npz" in refusal(capsys, run, "--data", tmp_path / "gone.npz")
+    assert "--data goes with a run" in refusal(capsys, archive, "--data", archive)
+    assert "--data goes with a run" in refusal(capsys, "chair", "--data", archive)
+    assert "nosuch" in refusal(capsys, "chair", "--sensor", "nosuch")
+    assert "--seed -1" in refusal(capsys, "chair", "--seed", -1)
+    (tmp_path / "bad.obj").write_text("nonsense")
+    assert "bad.obj" in refusal(capsys, tmp_path / "bad.obj")
+    (tmp_path / "bad.ply").write_text("nonsense")
+    assert "bad.ply" in refusal(capsys, tmp_path / "bad.ply")
+    (tmp_path / "empty").mkdir()
+    assert "empty" in refusal(capsys, tmp_path / "empty")
+
+
+def test_data_of_other_classes_than_the_run_is_refused(capsys, run, tmp_path):
+    path = tmp_path / "other.npz"
+    np.savez(path, points=np.ones((1, 8, 3)), label=[0], class_names=["spoon"])
+    line = refusal(capsys, run, "--data", path)
+    assert "other.npz" in line
+    assert "spoon" in line
+
+
+def test_a_port_in_use_is_named(capsys, archive):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(SystemExit) as ended:
+            main(["view", str(archive), "--port", str(port)])
+    assert ended.value.code == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert f"--port {port} on 127.0.0.1: in use" in told.err
+
+
+def test_without_viser_the_extra_is_named(capsys, monkeypatch, archive):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert "pip install 'qs3[view]'" in refusal(capsys, archive)
+
+
+def test_a_run_answers_for_each_cloud_and_labels_are_only_shown(run, archive, tmp_path):
+    from qs3.cli.view import ViewOptions, _prepare
+    from qs3.datasets import load_clouds
+    from qs3.training import load_model, predict_probabilities
+
+    given = _prepare(ViewOptions(str(run), data=str(archive))).keywords
+    clouds = load_clouds(archive, num_points=16)
+    expected = predict_probabilities(load_model(run).model, clouds.points)
+    np.testing.assert_allclose(given["answers"].probabilities, expected, atol=1e-6)
+    assert given["answers"].truth.tolist() == [0, 1, 0, 1]
+    assert given["exhibits"].labels == ("bed", "chair", "bed", "chair")
+
+    np.savez(tmp_path / "bare.npz", points=clouds.points)
+    given = _prepare(ViewOptions(str(run), data=str(tmp_path / "bare.npz"))).keywords
+    assert given["answers"].truth is None
+
+
+def test_clouds_of_any_size_and_single_files_are_taken(capsys, tmp_path, rng):
+    from qs3.cli.view import ViewOptions, _prepare
+
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    for count in (10, 20):
+        np.savetxt(folder / f"{count}.xyz", rng.normal(size=(count, 3)))
+    given = _prepare(ViewOptions(str(folder))).keywords
+    assert given["exhibits"].points.shape == (2, 2048, 3)
+    assert "several sizes" in capsys.readouterr().err
+    given = _prepare(ViewOptions(str(folder / "10.xyz"))).keywords
+    assert given["exhibits"][0].clouds["points"].shape == (10, 3)
+    from qs3.datasets.ply import write_ply
+
+    write_ply(folder / "cloud.ply", rng.normal(size=(7, 3)))
+    given = _prepare(ViewOptions(str(folder / "cloud.ply"))).keywords
+    assert given["exhibits"][0].clouds["points"].shape == (7, 3)
+
+
+def test_a_mesh_is_scanned_with_the_settings_of_the_page(tmp_path):
+    import dataclasses
+
+    from qs3.cli.camera import CameraOptions
+    from qs3.cli.view import ViewOptions, _prepare
+    from qs3.visualisation.viewer import ScanRequest
+
+    shapes.make("table", seed=1).export(tmp_path / "table.ply")
+    camera = CameraOptions(variant="scalar_rgb", samples=1, views=1, num_points=64)
+    for what, draws in ((str(tmp_path / "table.ply"), 0), ("table", 100)):
+        given = _prepare(ViewOptions(what, camera=camera)).keywords
+        assert given["draws"] == draws
+        sensor = next(iter(given["sensors"].values()))
+        controls = dataclasses.replace(given["start"], object_size=0.5)
+        item = given["scan"](ScanRequest(sensor, controls))
+        assert item.clouds["points"].shape == (64, 3)
+        assert np.ptp(item.mesh.vertices, axis=0).max() == pytest.approx(0.5)
+        assert np.isin(item.views["points"], 0).all()
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])  # noqa: S104
+def test_serves_until_ctrl_c(archive, host):
+    command = [sys.executable, "-m", "qs3", "view", str(archive), "--port", "0", "--host", host]
+    # A process group of its own, so that the interrupt reaches this process alone.
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        env=dict(os.environ, PYTHONWARNINGS=""),
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        address = process.stdout.readline().strip()
+        port = int(address.rsplit(":", 1)[1])
+        with urllib.request.urlopen(address, timeout=30) as page:  # noqa: S310
+            assert page.status == 200
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert out == ""  # the address was all
+    assert err.endswith("stopped\n")
+    assert "Traceback" not in err
+    assert ("anybody who can reach" in err) is (host != "127.0.0.1")
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.1", port), timeout=5)
