@@ -13,12 +13,14 @@ from jaxtyping import Float, Float32, Int, UInt8
 
 from qs3.datasets.clouds import CloudKind, PointClouds, UnlabelledClouds
 from qs3.datasets.manifest import finished_shards, open_dataset, shard_name
-from qs3.datasets.shards import flat_clouds, parse_shard
-from qs3.datasets.storage import open_folder
+from qs3.datasets.shards import flat_clouds, parse_shard, read_shard
+from qs3.datasets.storage import LocalFolder, open_folder
 from qs3.errors import InputError
 
 KINDS: dict[CloudKind, str] = {"points": "noisy", "clean": "clean", "surface": "surface"}
 """The clouds of an object and the names by which the page calls them."""
+
+_VIEWS: dict[CloudKind, str] = {"points": "view", "clean": "clean_view"}
 
 STATISTICS = {
     "valid_fraction": ("valid pixels", ".0%"),
@@ -144,33 +146,25 @@ class StoreExhibits:
 
     def _table(self, shard: int, columns: Sequence[str]) -> pa.Table:
         name = shard_name(shard)
+        if isinstance(self._folder, LocalFolder):
+            return read_shard(self._folder.path / name, columns)  # these alone, not the whole file
         return parse_shard(self._folder.read(name), f"{self._folder}/{name}", columns)
 
     def _read_shard(self, shard: int) -> list[Exhibit]:
         kinds = tuple(KINDS)
-        wanted = (
-            "id",
-            "class_name",
-            "split",
-            "view",
-            "clean_view",
-            "seed",
-            *STATISTICS,
-            "drawn",
-            *kinds,
-        )
-        table = self._table(shard, wanted)
+        words = ("id", "class_name", "split", "seed", "drawn", *_VIEWS.values(), *STATISTICS)
+        table = self._table(shard, (*words, *kinds))
         where = f"{self._folder}/{shard_name(shard)}"
-        there = [kind for kind in kinds if len(table[kind].combine_chunks().values)]
+        there: list[CloudKind] = [
+            kind for kind in kinds if len(table[kind].combine_chunks().values)
+        ]
         clouds = {kind: flat_clouds(table, kind, where) for kind in there}
         found = []
-        for place, row in enumerate(
-            table.select([n for n in wanted if n not in kinds]).to_pylist()
-        ):
+        for place, row in enumerate(table.select(words).to_pylist()):
             mine: dict[CloudKind, Any] = {kind: clouds[kind][place] for kind in there}
             views: dict[CloudKind, Any] = {
                 kind: np.array(row[name], dtype=np.uint8)
-                for kind, name in (("points", "view"), ("clean", "clean_view"))
+                for kind, name in _VIEWS.items()
                 if kind in mine and len(row[name]) == len(mine[kind])
             }
             told = [("split", row["split"]), ("seed", str(row["seed"] or ""))]
