@@ -52,7 +52,7 @@ def test_page_of_several_runs_has_every_part(page):
     assert "Transductive: the network adapted to clouds that it is scored on" in page
     assert "It is second, one of 2 runs" in page
     assert len(re.findall(r'<i data-class="\d+"', page)) == 20
-    assert "Taken for – source-only:" in page
+    assert re.search(r'data-note="Taken for \w+ \(source-only\), \w+ \(qbst\)"', page)
 
 
 def test_same_input_gives_the_same_bytes_and_no_path_of_this_machine(qs3, grid, page, tmp_path):

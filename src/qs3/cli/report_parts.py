@@ -50,10 +50,10 @@ def show_clouds(
         own = []
         for row in even_rows(clouds.labels, count):
             told = [
-                f"{name}: {clouds.class_names[given[row]]}"
+                f"{clouds.class_names[given[row]]} ({name})"
                 for name, given in answers.get(domain, {}).items()
             ]
-            note = f"Taken for – {', '.join(told)}" if told else ""
+            note = f"Taken for {', '.join(told)}" if told else ""
             own.append(Cloud(clouds.points[row], clouds.class_names[clouds.labels[row]], note))
         shown[domain] = own
     return shown

@@ -91,16 +91,16 @@ def _scores(report: Report) -> str:
         return ""
     lines = report.scores
     paper, differ = any(s.published for s in lines), any(s.differs for s in lines)
-    head = ["method", "network", "data"] + ["differs in"] * differ
-    text = list(range(len(head)))
-    head += ["accuracy %", "class mean %"] + ["published %"] * paper
-    text.append(len(head) + 1)
-    head += ["chosen by", "marks"]
+    # Scores stand right after the name: on a phone they are seen without scrolling sideways.
+    head = ["method", *["differs in"] * differ, "accuracy %", "class mean %"]
+    head += ["published %"] * paper + ["marks", "chosen by", "network", "data"]
+    words = ("method", "differs in", "marks", "chosen by", "network", "data")
+    text = [index for index, name in enumerate(head) if name in words]
     rows, parts = [], []
     for s in lines:
-        row = [s.name, s.network, s.data, *[s.differs] * differ]
-        row += [s.accuracy.format(), s.class_mean_accuracy.format()]
-        rows.append([*row, *[s.published or "–"] * paper, s.selection, ", ".join(s.marks) or "–"])
+        row = [s.name, *[s.differs] * differ, s.accuracy.format(), s.class_mean_accuracy.format()]
+        row += [s.published or "–"] * paper + [", ".join(s.marks) or "–"]
+        rows.append([*row, s.selection, s.network, s.data])
         title = " · ".join(filter(None, (s.name, s.network, s.differs)))
         clouds = f"{int(s.confusion.sum())} clouds, seeds {', '.join(map(str, s.seeds))}"
         parts.append(folded(f"{title}: {clouds}", matrix_table(s.confusion, s.class_names)))
