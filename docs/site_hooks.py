@@ -4,6 +4,7 @@
   links to those files lead to these pages.
 - ``<!-- options: VERB -->`` in a page becomes the table of that verb's options, as ``--help`` tells
   them, and ``<!-- package: NAME -->`` the description of a package, so that neither falls behind.
+- A page that would load something from the network stops the build.
 """
 
 import contextlib
@@ -19,6 +20,10 @@ _ROOT = Path(__file__).parent.parent
 _COPIED = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 _OPTIONS = re.compile(r"^<!-- options: ([a-z ]+) -->$", re.MULTILINE)
 _PACKAGE = re.compile(r"^<!-- package: ([a-z0-9.]+) -->$", re.MULTILINE)
+_FETCHED = re.compile(
+    r"<(?:script|link|img|iframe|source|video|audio|embed|object)\b[^>]*?"
+    r"\b(?:src|href|srcset|data)=[\"']?((?:https?:)?//[^\"'\s>]+)"
+)
 _OUTWARD = re.compile(r"\]\((?:\.\./)+(CONTRIBUTING\.md|CHANGELOG\.md|examples/[\w.]*)\)")
 
 
@@ -43,6 +48,18 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     markdown = _OUTWARD.sub(inward, markdown)
     markdown = _PACKAGE.sub(lambda match: site_api.body(match[1]), markdown)
     return _OPTIONS.sub(lambda match: options_table(match[1].split()), markdown)
+
+
+def on_post_page(output: str, page: Any, config: Any) -> str:
+    """Refuse a page that would load anything from the network."""
+    if found := fetched(output):
+        raise ValueError(f"{page.file.src_uri} loads {', '.join(found)}")
+    return output
+
+
+def fetched(html: str) -> list[str]:
+    """Addresses from which a page would load scripts, styles, fonts, pictures or frames."""
+    return [match[1] for match in _FETCHED.finditer(html)]
 
 
 def examples() -> str:

@@ -1,0 +1,276 @@
+"""The pages of the documentation hold together, and every command on them is one that qs3 takes."""
+
+import ast
+import json
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from functools import cache
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+sys.path.insert(0, str(DOCS))
+try:
+    import make_method_pages
+    import site_api
+    import site_hooks
+finally:
+    sys.path.remove(str(DOCS))
+
+from qs3.adaptation.names import MethodName  # noqa: E402
+
+PAGES = sorted(DOCS.rglob("*.md"))
+ALL = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
+NAMES = [str(page.relative_to(ROOT)) for page in ALL]
+MADE = {"contributing.md", "changelog.md", "examples.md"}
+"""Pages that exist in the built site alone."""
+SUBCOMMANDS = {"extract": ("scannet", "sunrgbd", "depth")}
+METHODS = {
+    "qbst",
+    "spst",
+    "qs3",
+    "source-only",
+    "dann",
+    "mmd",
+    "coral",
+    "pointdan",
+    "defrec",
+    "pcm",
+}
+METHODS |= {"defrec-pcm", "gast", "sd"}
+
+
+@cache
+def text(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+def prose(page: Path) -> str:
+    """The page without its blocks of code and its code in lines."""
+    return re.sub(r"```.*?```|`[^`\n]*`", "", text(page), flags=re.DOTALL)
+
+
+def leaves(nav) -> list[str]:
+    if isinstance(nav, str):
+        return [nav]
+    branches = nav.values() if isinstance(nav, dict) else nav
+    return [leaf for branch in branches for leaf in leaves(branch)]
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", text(page), re.DOTALL | re.MULTILINE)
+
+
+def test_nav_lists_every_page_once():
+    config = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
+    listed = leaves(config["nav"])
+    there = {page.relative_to(DOCS).as_posix() for page in PAGES}
+    assert len(listed) == len(set(listed))
+    assert set(listed) == there | MADE
+    assert not MADE & there
+
+
+@pytest.mark.parametrize("page", ALL, ids=NAMES)
+def test_every_link_and_picture_resolves(page):
+    for goal in re.findall(r"\]\(([^)\s]+)\)", prose(page)):
+        if re.match(r"[a-z]+:", goal):
+            continue
+        assert not goal.startswith("/"), goal
+        path, _, anchor = goal.partition("#")
+        there = (page.parent / path).resolve() if path else page
+        assert there.exists(), goal
+        assert ROOT in there.parents, goal
+        if anchor and there.suffix == ".md" and not anchor.startswith("qs3."):
+            assert anchor in anchors(there), goal
+
+
+def anchors(page: Path) -> set[str]:
+    """Anchors of a page's headings, as both GitHub and the site make them."""
+    titles = re.findall(r"^#+ (.+)$", re.sub(r"```.*?```", "", text(page), flags=re.S), re.M)
+    found = (re.sub(r"[^\w\s-]", "", title.lower()).strip() for title in titles)
+    return {re.sub(r"[\s-]+", "-", title) for title in found}
+
+
+def test_links_to_descriptions_of_code_lead_to_what_there_is():
+    count = 0
+    for page in PAGES:
+        for path, name in re.findall(r"\]\(([^)\s#]*)#(qs3\.[\w.]+)\)", text(page)):
+            there = (page.parent / path).resolve()
+            package = re.search(r"<!-- package: ([\w.]+) -->", text(there))
+            assert package is not None, path
+            modules = re.findall(r"^::: (\S+)$", site_api.body(package[1]), re.MULTILINE)
+            module, _, own = name.rpartition(".")
+            assert module in modules, name
+            tree = ast.parse(text((ROOT / "src" / module.replace(".", "/")).with_suffix(".py")))
+            assert own in {getattr(node, "name", None) for node in tree.body}, name
+            count += 1
+    assert count > 10
+
+
+def test_every_public_package_has_its_page():
+    marked = re.findall(
+        r"<!-- package: ([\w.]+) -->", "".join(text(page) for page in (DOCS / "api").glob("*.md"))
+    )
+    assert sorted(marked) == sorted(site_api.PACKAGES)
+    folders = {p.parent.name for p in (ROOT / "src" / "qs3").glob("[!_]*/__init__.py")} - {"cli"}
+    assert {f"qs3.{name}" for name in folders} | {"qs3"} == set(site_api.PACKAGES)
+    body = site_api.body("qs3.training")
+    assert "[`fit`](#qs3.training.fit.fit)" in body
+    assert "\n::: qs3.training.fit\n" in body
+    assert "[`scan`](sensor.md#qs3.sensor.scan.scan)" in site_api.body("qs3")
+
+
+ASK = """
+import json, site_hooks
+from qs3.cli import _verbs
+verbs = list(_verbs([]))
+asked = [verb for verb in verbs if verb != "extract"]
+asked += ["extract scannet", "extract sunrgbd", "extract depth"]
+told = {v: site_hooks.options_of(site_hooks.help_of(v.split())) for v in asked}
+try:
+    refused = site_hooks.options_table(["no-such-verb"])
+except ValueError as error:
+    refused = str(error)
+table = site_hooks.options_table(["info"])
+print(json.dumps({"verbs": verbs, "options": told, "table": table, "refused": refused}))
+"""
+
+
+@cache
+def told() -> dict:
+    """What the commands say of themselves.
+
+    In a process of its own: tyro hands its mark of a missing value to settings, which the checks of
+    types in tests refuse.
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", ASK], cwd=DOCS, capture_output=True, text=True, check=True
+    )
+    return json.loads(done.stdout)
+
+
+def options(verb: str) -> set[str]:
+    """Options that a verb takes, by all names of each."""
+    rows = told()["options"][verb]
+    assert rows, verb
+    return {name for flag, _ in rows for name in re.findall(r"(?<![\w-])--[\w.-]+", flag)}
+
+
+def verbs() -> list[str]:
+    return told()["verbs"]
+
+
+def commands(page: Path) -> list[str]:
+    """Commands in blocks of shell and in indented ones, continued lines joined."""
+    code = "".join(blocks(page, "sh"))
+    code += "".join(f"{line}\n" for line in re.findall(r"^ {4}(qs3 .*)$", prose(page), re.M))
+    joined = code.replace("\\\n", " ")
+    return [
+        found[1]
+        for line in joined.splitlines()
+        if (found := re.match(r"\s*(?:[A-Z0-9_]+=\S+ )*qs3 (.+?)(?:\s[#|>;&]| {4}|$)", line))
+    ]
+
+
+@pytest.mark.parametrize("page", ALL, ids=NAMES)
+def test_commands_name_verbs_and_options_that_exist(page):
+    for command in commands(page):
+        verb, *words = shlex.split(command)
+        assert verb in verbs(), command
+        if verb in SUBCOMMANDS and words and not words[0].startswith("-"):
+            assert words[0] in SUBCOMMANDS[verb], command
+            verb = f"{verb} {words[0]}"
+        for word in (word.strip("[]") for word in words):
+            if word.startswith("--"):
+                name = word.partition("=")[0]
+                assert name in options(verb) or name == "--help", f"{command}: {word}"
+
+
+def test_the_check_of_commands_sees_commands():
+    assert len(commands(ROOT / "README.md")) > 20
+    assert len(commands(DOCS / "commands.md")) >= len(verbs())
+    assert "--no-such-option" not in options("train")
+    assert "--self-training.rounds" in options("train")
+
+
+def test_the_page_of_commands_lists_exactly_the_verbs():
+    page = text(DOCS / "commands.md")
+    listed = re.findall(r"^### (\S+)$", page, re.MULTILINE)
+    assert set(listed) == set(verbs())
+    assert len(listed) == len(set(listed))
+    for verb in listed:
+        part = page.split(f"\n### {verb}\n")[1].split("\n#")[0]
+        assert f"\nqs3 {verb}" in part
+        folded = re.findall(r"^<!-- options: (.+) -->$", part, re.MULTILINE)
+        assert folded == [f"{verb} {more}" for more in SUBCOMMANDS.get(verb, ())] or folded == [
+            verb
+        ]
+
+
+def test_tables_of_options_are_filled_in():
+    assert "| `--as-json, --no-as-json` |" in told()["table"]
+    assert "Print everything" in told()["table"]
+    assert "no option" in told()["refused"]
+
+
+@pytest.mark.parametrize("page", ALL, ids=NAMES)
+def test_python_on_the_pages_compiles(page):
+    for code in blocks(page, "python"):
+        compile(code, str(page), "exec")
+
+
+def test_every_method_has_a_page_in_step_with_the_others():
+    assert {page.stem for page in (DOCS / "methods").glob("*.md")} == METHODS | {"index"}
+    from typing import get_args
+
+    assert METHODS | {"gast-spst"} == set(get_args(MethodName))
+    for page in (DOCS / "methods").glob("*.md"):
+        page_text = text(page)
+        # What stands between markers is that of docs/adaptation.md and docs/settings.md:
+        # `python docs/make_method_pages.py` brings it there.
+        assert make_method_pages.filled(page_text) == page_text, page.name
+        if page.stem != "index":
+            assert f"--method {page.stem}" in page_text or page.stem == "source-only", page.name
+            for heading in ("Formula", "Source", "Published figures", "In Python"):
+                assert f"\n## {heading}\n" in page_text, (page.name, heading)
+
+
+def test_published_figures_of_the_methods_are_those_of_the_table():
+    with (ROOT / "src/qs3/experiments/published.toml").open("rb") as file:
+        table = tomllib.load(file)
+
+    def pairs(node) -> set[tuple[float, float]]:
+        if isinstance(node, dict):
+            return {pair for value in node.values() for pair in pairs(value)}
+        if isinstance(node, list) and len(node) == 2 and isinstance(node[0], float):
+            return {(node[0], node[1])}
+        return (
+            {pair for value in node for pair in pairs(value)} if isinstance(node, list) else set()
+        )
+
+    known = pairs(table)
+    printed = [
+        (float(mean), float(error))
+        for page in (DOCS / "methods").glob("*.md")
+        for mean, error in re.findall(r"(\d+\.\d) ± (\d+\.\d)", text(page))
+    ]
+    assert len(printed) >= 20
+    assert set(printed) <= known
+
+
+def test_examples_are_shown_whole():
+    page = site_hooks.examples()
+    for path in (ROOT / "examples").glob("*.py"):
+        assert path.read_text(encoding="utf-8") in page
+
+
+def test_what_a_page_would_load_from_the_network_is_found():
+    html = """<script src="https://a/x.js"></script><link rel=stylesheet href=//b/x.css>
+    <img alt="" src='http://c/x.png'><a href="https://d">d</a><img src="images/x.png">"""
+    assert site_hooks.fetched(html) == ["https://a/x.js", "//b/x.css", "http://c/x.png"]
