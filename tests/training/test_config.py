@@ -88,6 +88,7 @@ def test_faults_name_the_setting(call, message):
 def test_unknown_words_are_refused_without_the_type_checks_of_the_tests():
     calls = {
         'TrainSettings(rule="oracle")': "rule = oracle is none of last",
+        'TrainSettings(schedule="steps")': "schedule = steps is none of cosine, plateau",
         'TrainSettings(normalisation="own")': "normalisation = own is none of shared",
         'SelfTrainingSettings(rule="pst")': "rule = pst is none of qbst",
         'SelfTrainingSettings(prior="ml")': "prior = ml is none of em, bbse",

@@ -74,6 +74,7 @@ def make_run(
         InputError: where the row or the network is unknown.
 
     Example:
+        >>> from qs3.experiments.scales import SCALES
         >>> run = make_run(SCALES["smoke"], "S-D", "qbst", 0)
         >>> run.method, run.warm_up, run.record
         ('qs3', 'source-only', 'S-D_qbst_seed-0.json')
@@ -142,6 +143,7 @@ def make_grid(
         InputError: where a row, a task or a seed comes twice, or a row is unknown.
 
     Example:
+        >>> from qs3.experiments.scales import SCALES
         >>> [run.row for run in make_grid(SCALES["smoke"], ["qbst"], ["S-D"], [0])]
         ['source-only', 'qbst']
     """

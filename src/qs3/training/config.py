@@ -10,6 +10,7 @@ import tyro
 from qs3.adaptation.names import Normalisation, RoundRule, Rule
 from qs3.adaptation.pseudo_labels import Selection, SingleClass
 from qs3.errors import InputError
+from qs3.training.schedules import Schedule
 
 Precision = Literal["32-true", "bf16-mixed", "16-mixed", "64-true"]
 """Number formats that Lightning Fabric offers here."""
@@ -34,7 +35,10 @@ class TrainSettings:
     batch_size: int = 32
     """Clouds of each labelled set in an optimiser step, over all devices together."""
     learning_rate: float = 1e-3
-    """Adam's learning rate at the start; it falls to 0 along a cosine, epoch by epoch."""
+    """Adam's learning rate at the start."""
+    schedule: Schedule = "cosine"
+    """How it falls, epoch by epoch: to 0 along a cosine; or, on a plateau, by half whenever the
+    loss has not fallen for ten epochs, to 1e-5 at least. Rounds of self-training have a cosine."""
     weight_decay: float = 5e-5
     """L2 penalty in Adam's gradient."""
     clip_norm: float | None = None
@@ -95,6 +99,7 @@ class TrainSettings:
         for name in ("label_smoothing", "holdout"):
             _check(self, name, 0 <= getattr(self, name) < 1, "must be in 0 to below 1")
         _check(self, "validate_every", self.validate_every >= 0, "must not be negative")
+        _check_word(self, "schedule", Schedule)
         _check_word(self, "normalisation", Normalisation)
         _check_word(self, "rule", Rule)
         good = self.rule == "last" or self.validate_every > 0

@@ -29,6 +29,7 @@ from qs3.training.distributed import make_equal, make_fabric, make_module_equal
 from qs3.training.ema import Average
 from qs3.training.progress import Progress
 from qs3.training.records import EpochRecord, Log
+from qs3.training.schedules import cosine, plateau
 from qs3.training.state import CHECKPOINT as CHECKPOINT
 from qs3.training.state import Observer, TrainingState
 
@@ -128,7 +129,11 @@ def train(
         for epoch in range(len(history), settings.epochs):
             _stop_in_time(deadline, fabric, f"{description}, epoch {epoch}")
             bar.begin_epoch()
-            factor = cosine(first_epoch + epoch, settings.epochs)
+            if settings.schedule == "plateau":
+                so_far = [sum(record.losses.values()) for record in history]
+                factor = plateau(so_far, settings.learning_rate)
+            else:
+                factor = cosine(first_epoch + epoch, settings.epochs)
             for group, rate in zip(optimiser.param_groups, base_rates, strict=True):
                 group["lr"] = rate * factor
             rng = np.random.default_rng(seed_sequence(settings.seed, *stream, epoch))
@@ -186,16 +191,6 @@ def train(
     if average is not None:
         average.settle()
     return history, {k: v.clone() for k, v in optimiser_tensors(optimiser).items()}
-
-
-def cosine(epoch: int, period: int) -> float:
-    """Factor of the learning rate: from 1 in epoch 0 to 0 in epoch ``period``, and up again.
-
-    Example:
-        >>> [round(cosine(epoch, 2), 3) for epoch in range(5)]
-        [1.0, 0.5, 0.0, 0.5, 1.0]
-    """
-    return 0.5 * (1.0 + math.cos(math.pi * epoch / period))
 
 
 @contextmanager

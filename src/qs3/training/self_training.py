@@ -299,7 +299,7 @@ class _Rounds:
             method,
             [pseudo, self.source] if rounds.source_loss else pseudo,
             None,
-            replace(self.settings, epochs=rounds.epochs),
+            replace(self.settings, epochs=rounds.epochs, schedule="cosine"),
             fabric=self.fabric,
             run_dir=self.run_dir,
             stream=(STREAM, number),
