@@ -189,6 +189,7 @@ def _mesh_page(options: ViewOptions, mesh: Any) -> Page:
         views=how["views"],
         view_layout=how["view_layout"],
         num_points=how["num_points"],
+        samples=renderer.samples,
         crop="box" if how["box_crop"] else "none",
         seed=options.seed,
     )

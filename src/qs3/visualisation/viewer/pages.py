@@ -167,7 +167,7 @@ class _Sliders:
 
     def _change(self) -> None:
         now = self.controls()
-        kept = ("views", "view_layout", "seed", "num_points", "scene", "crop")
+        kept = ("views", "view_layout", "seed", "num_points", "samples", "scene", "crop")
         self.base = self._sensors[self._sensor.value]
         self._folder.remove()
         self._fill(ScanControls.of(self.base, **{name: getattr(now, name) for name in kept}))
@@ -215,6 +215,7 @@ class _Sliders:
                     now.num_disparities,
                 ),
                 "stride": gui.add_slider("Pixel stride", 1, max(8, now.stride), 1, now.stride),
+                "samples": gui.add_slider("Rays a pixel", 1, max(64, now.samples), 1, now.samples),
                 "num_points": gui.add_slider(
                     "Points", min(64, now.num_points), max(8192, now.num_points), 1, now.num_points
                 ),

@@ -10,7 +10,6 @@ from qs3.errors import InputError
 from qs3.sensor.matching.settings import Method
 from qs3.sensor.materials import MATERIALS, get_material
 from qs3.sensor.presets import Sensor
-from qs3.sensor.render import Renderer
 from qs3.sensor.scan import Scan, scan
 from qs3.sensor.surroundings import SceneSettings
 from qs3.sensor.views import ViewLayout
@@ -32,6 +31,8 @@ class ScanControls:
     """Of the scan: poses, noise, sampling."""
     num_points: int = 2048
     """Points of the cloud."""
+    samples: int = 4
+    """Rays a pixel of the renderer."""
     distance: tuple[float, float] = (3.0, 5.0)
     """Nearest and farthest camera, from the object's middle."""
     elevation: tuple[float, float] = (20.0, 50.0)
@@ -134,10 +135,17 @@ def rescan(
     request: ScanRequest,
     mesh: trimesh.Trimesh,
     name: str,
-    renderer: Renderer,
+    renderer: Any,
     size: Literal["box", "ball"] = "box",
 ) -> Exhibit:
     """Scan a mesh with the settings of the page.
+
+    Args:
+        request: Those settings.
+        mesh: The object.
+        name: What the page calls it.
+        renderer: A renderer whose settings are a frozen dataclass with ``samples``.
+        size: Longest side 1, or the unit ball, times the object's size.
 
     Raises:
         InputError: where the settings make no sensor, or the sensor sees nothing.
@@ -156,7 +164,7 @@ def rescan(
         scene=SceneSettings(how.scene),
         box_crop=how.crop == "box",
         mask_crop=how.crop == "mask",
-        renderer=renderer,
+        renderer=dataclasses.replace(renderer, samples=how.samples),
     )
     return exhibit_of(done, name)
 
