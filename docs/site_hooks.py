@@ -24,7 +24,7 @@ _FETCHED = re.compile(
     r"<(?:script|link|img|iframe|source|video|audio|embed|object)\b[^>]*?"
     r"\b(?:src|href|srcset|data)=[\"']?((?:https?:)?//[^\"'\s>]+)"
 )
-_OUTWARD = re.compile(r"\]\((?:\.\./)+(CONTRIBUTING\.md|CHANGELOG\.md|examples/[\w.]*)\)")
+_OUTWARD = re.compile(r"\]\((?:\.\./)+(CONTRIBUTING\.md|CHANGELOG\.md|examples(?:/[\w.]*)?)\)")
 
 
 def on_files(files: Any, config: Any) -> Any:
