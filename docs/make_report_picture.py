@@ -53,7 +53,7 @@ def main() -> None:
     """Write the picture that the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("page", type=Path)
-    parser.add_argument("--tops", type=int, nargs=3, default=(0, 1700, 1200))
+    parser.add_argument("--tops", type=int, nargs=3, default=(0, 2650, 3560))
     parser.add_argument("--height", type=int, default=1000)
     here = Path(__file__).parent / "images" / "report.png"
     parser.add_argument("--out", type=Path, default=here)

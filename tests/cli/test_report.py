@@ -88,7 +88,7 @@ def test_records_alone_make_tables_and_no_clouds(qs3, grid, tmp_path):
     assert "(n=1)" in text
 
 
-@pytest.mark.parametrize("damage", ["truncated", "foreign", "unfinished"])
+@pytest.mark.parametrize("damage", ["truncated", "foreign", "matrix", "unfinished"])
 def test_what_cannot_be_read_is_named_and_the_rest_is_on_the_page(qs3, grid, tmp_path, damage):
     folder = tmp_path / "grid"
     shutil.copytree(grid, folder)
@@ -98,6 +98,10 @@ def test_what_cannot_be_read_is_named_and_the_rest_is_on_the_page(qs3, grid, tmp
         bad.write_text(whole[:200])
     elif damage == "foreign":
         bad.write_text(json.dumps({**json.loads(whole), "stranger": 1}))
+    elif damage == "matrix":
+        record = json.loads(whole)
+        record["scores"]["confusion"][0] = record["scores"]["confusion"][0][:3]
+        bad.write_text(json.dumps(record))
     else:
         bad = folder / "third"
         bad.mkdir()

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from qs3.cli.train import RUN
 from qs3.errors import InputError, QS3Error
-from qs3.evaluation.records import RECORD, DataRecord, read_record
+from qs3.evaluation.records import RECORD, DataRecord, RunRecord, read_record
 from qs3.files import read_json
 
 if TYPE_CHECKING:
@@ -145,6 +147,7 @@ def _records(folder: Path, any_json: bool) -> tuple[list["NamedRecord"], list[st
             path = root / name
             try:
                 record = read_record(path)
+                _require_sound(path, record)
             except QS3Error as error:
                 faults.append(str(error))
                 continue
@@ -157,6 +160,21 @@ def _records(folder: Path, any_json: bool) -> tuple[list["NamedRecord"], list[st
             elif one.task and not found[same[0]].task:
                 found[same[0]] = one
     return found, faults
+
+
+def _require_sound(path: Path, record: RunRecord) -> None:
+    """Refuse what the schema lets through and a table could not be made of."""
+    try:
+        counts = np.array(record.scores.confusion)
+        k = len(record.scores.class_names)
+        sound = counts.dtype.kind == "i" and counts.shape in {(k, k), (k, k + 1)}
+        sound = sound and bool((counts >= 0).all()) and counts.sum() == record.scores.clouds > 0
+        _ = [float(one["accuracy"]) for one in record.choices.values()]
+        _ = [(one["theta"], one["skipped"], len(one["kept"])) for one in record.rounds]
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: not the record of a run ({error})") from error
+    if not sound:
+        raise InputError(f"{path}: its confusion matrix does not fit its classes and clouds")
 
 
 def paper() -> tuple[dict[str, dict[str, str]], str]:
