@@ -36,6 +36,19 @@ TINY = Scale(
     ),
     rounds={"threshold": 0.0, "rounds": 2, "epochs": 1},
     tasks=("M-D", "S-D"),
+    networks={
+        "pointnet2": {
+            "centres": (8, 4),
+            "scales": (((0.5, 4, (8, 8)),), ((1.0, 4, (8, 8)),)),
+            "embedding": (16,),
+        },
+        "dgcnn": {"neighbours": 4, "channels": (8, 8), "embedding": 16, "hidden": (8,)},
+    },
+    fused_views=(1, 2),
+    thetas=(0.0, 0.2),
+    steps=(0.0, 0.1),
+    sensors=("qs3", "d435"),
+    pointda10=("ordinary", "qbst-paper"),
 )
 
 

@@ -30,8 +30,6 @@ class Experiment:
     """Columns."""
     run: Callable[[Scale, str, str, int, int | None], Run | None]
     """The run of (scale, row, column, seed, threads); None where the table has no such cell."""
-    domains: Callable[[Scale], tuple[str, ...]]
-    """Names of the domains that the reader must be told of."""
     published: Mapping[Place, tuple[float, float | None]] = field(default_factory=dict)
     """The paper's mean and standard error in per cent, by row and column."""
     pairs: Callable[[Scale], Sequence[tuple[str, Place, Place]]] = lambda scale: ()

@@ -9,6 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Int
+
 from qs3.datasets import load_clouds
 from qs3.datasets.plan import Plan
 from qs3.experiments.domains import Domain, domain
@@ -61,6 +64,6 @@ def _place(one: Domain, out: Path) -> Path:
     return Path(one.train) if one.own else out / DATA / one.train
 
 
-def _procedural(ids: tuple[str, ...]) -> list[int]:
+def _procedural(ids: tuple[str, ...]) -> Int[np.ndarray, "s"]:
     """Return the rows of procedural shapes; an artist's mesh has the name of its file."""
-    return [row for row, name in enumerate(ids) if name.startswith("shapes/")]
+    return np.flatnonzero([name.startswith("shapes/") for name in ids])

@@ -31,7 +31,6 @@ EXPERIMENT = Experiment(
     rows=networks,
     columns=lambda scale: tasks("M-D", "S-D", "M-F", "S-F"),
     run=_run,
-    domains=lambda scale: ("M", "S", "D", "F"),
     published=published_cells("ordinary"),
     pairs=_pairs,
 )

@@ -143,7 +143,9 @@ class PaperTable:
 
     def _intro(self) -> list[str]:
         scale, train = self.setup.scale, self.setup.scale.train
-        domains = [domain(name, self.setup.own) for name in self.experiment.domains(scale)]
+        runs = [run for runs in self.cells().values() for run in runs]
+        names = dict.fromkeys([run.source for run in runs] + [run.target for run in runs])
+        domains = [domain(name, self.setup.own) for name in names]
         text = [
             f"Scale {scale.name}: {scale.source_per_class} objects a class of the source, "
             f"{train.num_points} points, {train.epochs} epochs, batches of {train.batch_size}; "
@@ -151,7 +153,11 @@ class PaperTable:
             "(ddof = 1) over n seeds, from the records alone; the network is the last epoch's.",
         ]
         text.append("; ".join(one.title for one in domains) + ".")
-        stand_ins = [f"{one.title[0]} for {one.stands_for}" for one in domains if one.stands_for]
+        stand_ins = [
+            f"{one.title.partition(':')[0]} for {one.stands_for}"
+            for one in domains
+            if one.stands_for
+        ]
         if stand_ins:
             text.append(
                 f"**Stand-ins, made here**: {', '.join(stand_ins)}. A simulator on both sides "

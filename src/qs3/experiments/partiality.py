@@ -40,7 +40,6 @@ EXPERIMENT = Experiment(
     rows=networks,
     columns=lambda scale: _COLUMNS,
     run=_run,
-    domains=lambda scale: ("M", "C", "J", "S", "D"),
     pairs=_pairs,
 )
 """A control that the paper lacks."""

@@ -49,7 +49,6 @@ EXPERIMENT = Experiment(
     rows=_rows,
     columns=lambda scale: tasks(*_TASKS),
     run=_run,
-    domains=lambda scale: ("M", "N", "F"),
     published=published_cells("pointda10"),
     pairs=_pairs,
     corner="method",

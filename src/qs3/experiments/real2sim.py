@@ -27,7 +27,6 @@ EXPERIMENT = Experiment(
     rows=networks,
     columns=lambda scale: tasks("D-M", "D-S"),
     run=_run,
-    domains=lambda scale: ("D", "M", "S"),
     published=published_cells("real2sim"),
     pairs=_pairs,
 )

@@ -40,7 +40,6 @@ EXPERIMENT = Experiment(
     rows=_rows,
     columns=_columns,
     run=_run,
-    domains=lambda scale: tuple(sensor_domain(name) for name in scale.sensors),
     pairs=_pairs,
     corner="DGCNN",
 )

@@ -37,7 +37,6 @@ EXPERIMENT = Experiment(
     rows=lambda scale: _SOURCES,
     columns=_columns,
     run=_run,
-    domains=lambda scale: ("M", "S", "D"),
     pairs=_pairs,
     notes=("The columns of ε have the scale's θ₀, those of θ₀ the preset's ε (0.005).",),
     corner="source",

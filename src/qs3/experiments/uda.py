@@ -59,7 +59,6 @@ EXPERIMENT = Experiment(
     rows=_rows,
     columns=lambda scale: tasks("M-D", "S-D", "S-F"),
     run=_run,
-    domains=lambda scale: ("M", "S", "D", "F"),
     published=published_cells("", _OURS),
     pairs=_pairs,
     corner="method",

@@ -38,7 +38,6 @@ EXPERIMENT = Experiment(
     rows=networks,
     columns=_columns,
     run=_run,
-    domains=lambda scale: ("S", "D"),
     pairs=_pairs,
     lines=(("", "fused views"),),
 )

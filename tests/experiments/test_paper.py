@@ -1,0 +1,397 @@
+"""The paper's tables: what they are made of, that their numbers are the records', and a stop."""
+
+import csv
+import dataclasses
+import json
+import shutil
+from typing import get_args
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from qs3.cli import reproduce as command
+from qs3.cli.table import FigureOptions, TableOptions, figure, table
+from qs3.datasets.executors import Failure
+from qs3.errors import InputError
+from qs3.evaluation.metrics import paired_difference
+from qs3.evaluation.records import read_record
+from qs3.experiments.bench_data import make_plans
+from qs3.experiments.catalogue import PartName, TableName
+from qs3.experiments.domains import domain, parse_own
+from qs3.experiments.experiment import cell_runs
+from qs3.experiments.figures import draw
+from qs3.experiments.galleries import Galleries
+from qs3.experiments.grid import data_sets, make_work, run_grid
+from qs3.experiments.paper import EXPERIMENTS, PaperTable
+from qs3.experiments.reproduction import Setup, collect_runs, read_setup, reproduce
+from qs3.experiments.rows import ORDINARY, PAPER
+from qs3.experiments.runs import make_run
+from qs3.experiments.scales import SCALES
+from qs3.visualisation.figure import png_bytes
+
+# So small a network may be sure of one class alone, or of none.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:all .* confident clouds"),
+    pytest.mark.filterwarnings("ignore:.*warm-up.*"),
+]
+
+
+def setup_of(out, tiny, seeds=(0, 1)):
+    return Setup(out, tiny, seeds=seeds, threads=1, workers=1)
+
+
+def parts_of(setup, *names):
+    return [PaperTable(EXPERIMENTS[name], setup) for name in names]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    return tmp_path_factory.mktemp("paper") / "whole"
+
+
+@pytest.fixture
+def finished(whole, make, tiny, small_scales):
+    """Two tables made once: of networks, and of QBST as the paper has it."""
+    setup = setup_of(whole, tiny)
+    parts = parts_of(setup, "ordinary", "thresholds")
+    if not whole.exists():
+        make.data(whole, data_sets(collect_runs(parts)))
+        reproduce(parts, setup, command._train, command._evaluate, lambda line: None)
+    return whole
+
+
+def test_every_name_of_the_command_line_is_a_table():
+    assert set(get_args(TableName)) == set(EXPERIMENTS)
+    others = {"galleries", "adaptation-bench", "adaptation-ablation"}
+    assert set(get_args(PartName)) == set(EXPERIMENTS) | others
+
+
+@pytest.mark.parametrize("scale", SCALES.values(), ids=SCALES)
+def test_every_cell_has_its_data_and_its_work_list(scale, tmp_path):
+    setup = Setup(tmp_path, scale, seeds=(0,))
+    runs = collect_runs(parts_of(setup, *EXPERIMENTS))
+    sets = data_sets(runs)
+    plans = make_plans(scale, None, renderer="none", sets=[]) | dict.fromkeys(sets)
+    for run in runs:
+        work = make_work(run, tmp_path, None)
+        assert work.source.name in plans and work.test.name in plans
+        assert work.target is None or work.target.name in plans
+    assert {"source", "held", "target", "fused", "jitter", "second"} <= set(sets)
+    assert {f"views-{n}" for n in scale.fused_views if n != scale.source_views} <= set(sets)
+
+
+def test_the_paper_s_cells_have_their_published_figures():
+    scale = SCALES["smoke"]
+    told = {name: EXPERIMENTS[name].published for name in ("ordinary", "uda", "real2sim")}
+    assert told["ordinary"]["dgcnn", "S-D"] == (64.0, 1.0)
+    assert told["uda"][PAPER, "S-D"] == (72.4, 0.8)
+    assert told["uda"][ORDINARY, "M-D"] == (46.7, 1.4)
+    assert told["uda"]["supervised", "S-F"] == (78.7, 0.8)
+    assert told["real2sim"]["simpleview", "D-M"] == (69.4, 1.3)
+    assert len(told["ordinary"]) == 16 and len(told["real2sim"]) == 8
+    cells = cell_runs(EXPERIMENTS["uda"], scale, [0])
+    assert set(told["uda"]) <= set(cells)
+    run = cells[PAPER, "S-D"][0]
+    assert run.self_training is not None and run.self_training.pool == "shrinking"
+    assert run.self_training.init == "scratch" and run.warm_up == ORDINARY
+
+
+def test_numbers_are_those_of_the_records(finished):
+    text = (finished / "ordinary.md").read_text()
+    assert text.startswith("# *smoke* — Networks without adaptation")
+    assert "**Stand-ins, made here**" in text and "ScanNet10 (S*)" in text
+    for network, title in (("pointnet2", "PointNet++"), ("dgcnn", "DGCNN")):
+        line = [title]
+        for task, paper in zip(
+            ("M-D", "S-D", "M-F", "S-F"),
+            {
+                "pointnet2": ("48.4 ± 1.3", "60.9 ± 0.8", "46.1 ± 2.0", "57.9 ± 0.8"),
+                "dgcnn": ("46.7 ± 1.4", "64.0 ± 1.0", "48.7 ± 1.0", "51.1 ± 1.2"),
+            }[network],
+            strict=True,
+        ):
+            name = f"{task}_ordinary@{network}_seed-{{}}.json"
+            records = [read_record(finished / "results" / name.format(seed)) for seed in (0, 1)]
+            values = np.array([record.scores.accuracy for record in records])
+            sem = values.std(ddof=1) / np.sqrt(2)
+            line += [f"{100 * values.mean():.1f} ± {100 * sem:.1f} (n=2)", paper]
+        assert f"| {' | '.join(line)} |" in text
+    with (finished / "ordinary.csv").open() as handle:
+        rows = list(csv.DictReader(handle))
+    assert len(rows) == 2 * 4 * 2
+    for row in rows:
+        name = f"{row['column']}_ordinary@{row['row']}_seed-{row['seed']}.json"
+        assert float(row["accuracy"]) == read_record(finished / "results" / name).scores.accuracy
+    assert (finished / "ordinary.tex").read_text().count(r"\\") == 3
+    assert (finished / "thresholds.png").read_bytes()[1:4] == b"PNG"
+
+
+def test_one_training_of_a_source_serves_all_targets(finished):
+    assert {path.name for path in (finished / "runs" / "S").iterdir()} == {
+        "ordinary@pointnet2", "ordinary@dgcnn", "ordinary"
+    }  # fmt: skip
+    records = [
+        read_record(finished / "results" / f"{task}_ordinary@dgcnn_seed-0.json")
+        for task in ("S-D", "S-F")
+    ]
+    assert records[0].source == records[1].source and records[0].target is None
+    assert [record.test.cloud for record in records] == ["points", "clean"]
+    assert records[0].seconds == records[1].seconds
+
+
+def test_rows_of_thresholds_are_the_paper_s_qbst(finished):
+    settings = json.loads((finished / "runs/S-D/qbst-theta-0.2/seed-0/settings.json").read_text())
+    assert settings["self_training"]["threshold"] == 0.2
+    assert settings["self_training"]["source_loss"] is False
+    other = json.loads((finished / "runs/M-D/qbst-step-0.1/seed-0/settings.json").read_text())
+    assert other["self_training"]["step"] == 0.1
+    assert other["self_training"]["threshold"] == 0.0  # the scale's
+
+
+def test_differences_are_paired_over_seeds(finished, tiny):
+    part = PaperTable(EXPERIMENTS["ordinary"], setup_of(finished, tiny))
+    grid, faults = part.grid()
+    assert faults == []
+    what, difference = grid.differences()[0]
+    assert what == "S over M on D, PointNet++"
+    first = grid.cells["pointnet2", "S-D"].accuracies
+    second = grid.cells["pointnet2", "M-D"].accuracies
+    assert difference.mean == pytest.approx(np.mean([first[s] - second[s] for s in (0, 1)]))
+    assert f"- {what}: {difference.format()}" in (finished / "ordinary.md").read_text()
+
+
+def test_paired_interval_is_the_t_test_s():
+    rng = np.random.default_rng(0)
+    first, second = rng.random(5), rng.random(5)
+    found = paired_difference(dict(enumerate(first)), dict(enumerate(second)) | {9: 1.0})
+    wanted = stats.ttest_rel(first, second).confidence_interval(0.95)
+    assert found is not None and found.n == 5 and found.interval is not None
+    assert found.mean == pytest.approx((first - second).mean())
+    assert found.interval == pytest.approx((wanted.low, wanted.high))
+    assert paired_difference({0: 1.0}, {1: 1.0}) is None
+    one = paired_difference({0: 0.5}, {0: 0.25})
+    assert one is not None and one.interval is None and one.mean == 0.25
+
+
+def test_a_table_without_runs_shows_the_command(finished, capsys, tmp_path):
+    folder = shutil.copytree(finished, tmp_path / "copy")
+    for path in (folder / "results").glob("S-F_ordinary@dgcnn_*"):
+        path.unlink()
+    assert table(TableOptions("ordinary", folder)) == 0
+    said = capsys.readouterr().out
+    assert "1 cells wait for their runs" in said
+    assert "qs3 reproduce ordinary --scale smoke --seeds 0 1 --out" in said
+    assert next(line for line in said.splitlines() if line.startswith("| DGCNN")).count("…") == 1
+
+
+def test_a_damaged_or_foreign_record_is_refused_and_the_rest_tabulated(finished, capsys, tmp_path):
+    folder = shutil.copytree(finished, tmp_path / "copy")
+    results = folder / "results"
+    (results / "S-D_ordinary@dgcnn_seed-0.json").write_text("{")
+    shutil.copy(
+        results / "S-D_ordinary@pointnet2_seed-0.json",
+        results / "M-D_ordinary@pointnet2_seed-0.json",
+    )
+    other = results / "M-F_ordinary@pointnet2_seed-1.json"
+    value = json.loads(other.read_text())
+    value["test"]["checksum"] = "0"
+    other.write_text(json.dumps(value))
+    assert table(TableOptions("ordinary", folder)) == 1
+    out, err = capsys.readouterr()
+    refused = [line for line in err.splitlines() if "refused" in line]
+    names = ("S-D_ordinary@dgcnn_seed-0", "M-D_ordinary@pointnet2_seed-0", other.stem)
+    assert len(refused) == 3
+    for name in names:
+        assert sum(name in line for line in refused) == 1
+    assert "(n=1)" in out and "(n=2)" in out
+    with pytest.raises(InputError, match="M-D_ordinary@pointnet2_seed-0"):
+        reproduce(
+            parts_of(read_setup(folder), "ordinary"), read_setup(folder),
+            command._train, command._evaluate, lambda line: None,
+        )  # fmt: skip
+
+
+def test_what_is_missing_is_made_again_with_the_same_numbers(finished, tiny, tmp_path):
+    folder = shutil.copytree(finished, tmp_path / "copy")
+    lost = "S-F_ordinary@dgcnn_seed-1.json"
+    before = (folder / "results" / lost).read_bytes()
+    (folder / "results" / lost).unlink()
+    texts = {path.name: path.read_bytes() for path in folder.glob("*.*") if path.suffix != ".json"}
+    seen = []
+
+    def train(work):
+        seen.append(work.run.record)
+        command._train(work)
+
+    setup = setup_of(folder, tiny)
+    reproduce(
+        parts_of(setup, "ordinary", "thresholds"), setup, train, command._evaluate, seen.append
+    )
+    assert [one for one in seen if one.endswith(".json")] == [lost]
+    assert (folder / "results" / lost).read_bytes() == before
+    assert {name: (folder / name).read_bytes() for name in texts} == texts
+
+
+@pytest.mark.slow
+def test_several_at_once_give_the_same_numbers(finished, tiny, tmp_path):
+    folder = shutil.copytree(finished, tmp_path / "copy")
+    shutil.rmtree(folder / "runs")
+    shutil.rmtree(folder / "results")
+    setup = dataclasses.replace(setup_of(folder, tiny, seeds=(0,)), workers=2)
+    parts = parts_of(setup, "ordinary", "thresholds")
+    reproduce(parts, setup, command._train, command._evaluate, lambda line: None)
+    for path in (folder / "results").iterdir():
+        old, new = read_record(finished / "results" / path.name), read_record(path)
+        assert (old.scores, old.choices) == (new.scores, new.choices)
+
+
+class Inline:
+    """An executor that ends calls in the order in which it was told."""
+
+    def __init__(self, fail=""):
+        self.calls, self.order, self.fail = [], [], fail
+        self.most = 0
+
+    @property
+    def ahead(self):
+        return 9
+
+    def submit(self, key, function, *arguments):
+        self.calls.append((key, function, arguments))
+        self.most = max(self.most, len(self.calls))
+
+    def next(self):
+        key, function, arguments = self.calls.pop()  # the last first
+        self.order.append(key)
+        if self.fail and self.fail in key:
+            return key, Failure("ProcessDied", "no memory left")
+        return key, function(*arguments)
+
+    def drain(self):
+        return []
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        return None
+
+
+def works_of(finished, tiny):
+    runs = [
+        make_run(tiny, "S-D", ORDINARY, 0, 1),
+        make_run(tiny, "S-F", ORDINARY, 0, 1),
+        make_run(tiny, "S-D", PAPER, 0, 1),
+        make_run(tiny, "S-D", ORDINARY, 0, 1, network="dgcnn"),
+    ]
+    return [make_work(run, finished, None) for run in runs]
+
+
+def test_a_warm_up_is_waited_for_and_a_folder_has_one_run_at_a_time(finished, tiny, tmp_path):
+    works = works_of(finished, tiny)
+    record = read_record(finished / "results" / "S-D_ordinary_seed-0.json")
+    executor, running = Inline(), []
+    run_grid(
+        works, tmp_path, running.append, lambda work: record, lambda line: None,
+        dict.fromkeys([work.run.record for work in works], 1.0), executor, at_once=3,
+    )  # fmt: skip
+    order = [key.partition("|")[2] for key in executor.order]
+    assert sorted(order) == sorted(work.run.record for work in works)
+    assert executor.most == 2  # the source's training, and the other network's
+    assert order.index("S-D_ordinary_seed-0.json") < order.index("S-F_ordinary_seed-0.json")
+    assert order.index("S-F_ordinary_seed-0.json") < order.index("S-D_qbst-paper_seed-0.json")
+
+
+def test_a_failed_run_is_named_and_what_others_made_stays(finished, tiny, tmp_path):
+    works = works_of(finished, tiny)
+    record = read_record(finished / "results" / "S-D_ordinary_seed-0.json")
+    with pytest.raises(InputError, match=r"S/ordinary/seed-0: ProcessDied: no memory left"):
+        run_grid(
+            works, tmp_path, lambda work: None, lambda work: record, lambda line: None,
+            dict.fromkeys([work.run.record for work in works], 1.0),
+            Inline(fail="S-D_ordinary_seed-0"), at_once=2,
+        )  # fmt: skip
+    kept = [path.name for path in (tmp_path / "results").iterdir()]
+    assert kept == ["S-D_ordinary@dgcnn_seed-0.json"]
+
+
+def test_each_device_has_one_run_at_a_time(finished, tiny, tmp_path, monkeypatch):
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    record = read_record(finished / "results" / "S-D_ordinary_seed-0.json")
+    works, executor = works_of(finished, tiny), Inline()
+    import os
+
+    seen = []
+    run_grid(
+        works, tmp_path, lambda work: seen.append(os.environ["CUDA_VISIBLE_DEVICES"]),
+        lambda work: record, lambda line: None,
+        dict.fromkeys([work.run.record for work in works], 1.0), executor, devices=("2", "5"),
+    )  # fmt: skip
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+    assert set(seen) == {"2", "5"} and executor.most == 2
+
+
+def test_figures_are_the_same_bytes_each_time(finished, tiny, tmp_path, capsys):
+    names = ("ordinary", "thresholds")
+    for name in names:
+        grid, _ = PaperTable(EXPERIMENTS[name], setup_of(finished, tiny)).grid()
+        assert png_bytes(draw(grid)) == (finished / f"{name}.png").read_bytes()
+        path = tmp_path / f"{name}.svg"
+        assert figure(FigureOptions(name, finished, path, "svg")) == 0
+        assert "S → D" in path.read_text()
+    assert capsys.readouterr().out.split() == [str(tmp_path / f"{name}.svg") for name in names]
+
+
+def test_galleries_show_procedural_shapes_alone(finished, tiny):
+    part = Galleries(setup_of(finished, tiny))
+    folder = part.write({})
+    assert part.sets() == ["source", "source", "target", "fused"]
+    assert sorted(path.name for path in folder.iterdir()) == ["D.png", "F.png", "M.png", "S.png"]
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["D"], "NAME=PATH"),
+        (["D=nowhere-at-all"], "not there"),
+        (["Q=."], "the domains are"),
+        (["D=.", "D=."], "each domain once"),
+        (["D=.:train"], "NAME=PATH"),
+    ],
+)
+def test_data_of_the_user_that_cannot_be_is_refused(given, said):
+    with pytest.raises(InputError, match=said):
+        parse_own(given)
+
+
+def test_data_of_the_user_takes_a_domain_s_place(finished, tiny, tmp_path):
+    own = parse_own(
+        [f"D={finished / 'data' / 'target'}", f"M={finished / 'data' / 'source'}:train:"]
+    )
+    assert own["D"].stands_for == "" and own["M"].cloud == "surface"
+    run = make_run(tiny, "M-D", ORDINARY, 0, 1)
+    assert data_sets([run], own) == []
+    work = make_work(run, tmp_path, None, own)
+    assert work.test == finished / "data" / "target" and work.test_split == "test"
+    assert work.source == finished / "data" / "source" and work.source_cloud == "surface"
+    setup = dataclasses.replace(setup_of(tmp_path / "own", tiny, seeds=(0,)), own=own)
+    part = PaperTable(EXPERIMENTS["ordinary"], setup, ("dgcnn",), ("M-D",))
+    reproduce([part], setup, command._train, command._evaluate, lambda line: None)
+    text = (tmp_path / "own" / "ordinary.md").read_text()
+    assert "D: target" in text and "Stand-ins" not in text
+    again = read_setup(tmp_path / "own")
+    assert again.own["D"].cloud == "points" and again.seeds == (0,)
+    grid, faults = PaperTable(EXPERIMENTS["ordinary"], again, ("dgcnn",), ("M-D",)).grid()
+    assert faults == [] and grid.empty == []
+
+
+def test_domains_that_are_not_there_are_told(tiny, tmp_path):
+    with pytest.raises(InputError, match="unknown domain"):
+        domain("X")
+    with pytest.raises(InputError, match="no clouds to score on"):
+        make_work(make_run(tiny, "S-J", ORDINARY, 0), tmp_path, None)
+    with pytest.raises(InputError, match="its lines are"):
+        PaperTable(EXPERIMENTS["views"], setup_of(tmp_path, tiny), ("vgg",)).runs()
+    with pytest.raises(InputError, match=r"bench\.json"):
+        read_setup(tmp_path)
