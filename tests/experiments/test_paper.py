@@ -3,7 +3,12 @@
 import csv
 import dataclasses
 import json
+import os
 import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -320,8 +325,6 @@ def test_each_device_has_one_run_at_a_time(finished, tiny, tmp_path, monkeypatch
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     record = read_record(finished / "results" / "S-D_ordinary_seed-0.json")
     works, executor = works_of(finished, tiny), Inline()
-    import os
-
     seen = []
     run_grid(
         works, tmp_path, lambda work: seen.append(os.environ["CUDA_VISIBLE_DEVICES"]),
@@ -395,3 +398,45 @@ def test_domains_that_are_not_there_are_told(tiny, tmp_path):
         PaperTable(EXPERIMENTS["views"], setup_of(tmp_path, tiny), ("vgg",)).runs()
     with pytest.raises(InputError, match=r"bench\.json"):
         read_setup(tmp_path)
+
+
+_KILLED = """
+import runpy, sys
+from pathlib import Path
+tiny = runpy.run_path({conftest!r})["TINY"]
+from qs3.cli import reproduce as command
+from qs3.experiments.paper import EXPERIMENTS, PaperTable
+from qs3.experiments.reproduction import Setup, reproduce
+setup = Setup(Path(sys.argv[1]), tiny, seeds=(0,), threads=1, workers=1)
+parts = [PaperTable(EXPERIMENTS[name], setup) for name in ("ordinary", "thresholds")]
+reproduce(parts, setup, command._train, command._evaluate, print)
+"""
+
+
+@pytest.mark.slow
+def test_killed_at_any_time_it_goes_on_with_the_same_numbers(finished, tmp_path):
+    folder = shutil.copytree(finished, tmp_path / "copy")
+    for name in ("runs", "results"):
+        shutil.rmtree(folder / name)
+    wanted = {path.name: read_record(path) for path in (finished / "results").glob("*seed-0.json")}
+    script = _KILLED.format(conftest=str(Path(__file__).parent / "conftest.py"))
+    kept: set[str] = set()
+    for count in (1, 4, 9, len(wanted)):
+        with subprocess.Popen([sys.executable, "-c", script, str(folder)]) as running:
+            while running.poll() is None and len(list(folder.glob("results/*.json"))) < count:
+                time.sleep(0.01)
+            if count < len(wanted):
+                running.kill()
+        found = {path.name: path.read_bytes() for path in folder.glob("results/*.json")}
+        assert kept <= set(found)
+        kept = set(found)
+    assert running.returncode == 0
+    for name, record in wanted.items():
+        again = read_record(folder / "results" / name)
+        assert (again.scores, again.choices, again.rounds) == (
+            record.scores,
+            record.choices,
+            tuple({**one, "seconds": two["seconds"]} for one, two in zip(
+                record.rounds, again.rounds, strict=True)),
+        )  # fmt: skip
+    assert (folder / "ordinary.md").is_file()
