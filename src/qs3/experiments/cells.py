@@ -50,7 +50,7 @@ def published_cells(
         if isinstance(rows, dict) and "-" in column:
             for row, values in rows.items():
                 mean, *sem = values
-                key = (names or {}).get(row, row)
+                key: str = names.get(row, row) if names else row
                 found[key, column] = (mean, sem[0] if sem else None)
     return found
 
