@@ -1,8 +1,6 @@
 """Every verb, as the README has it, on the smallest input that means something."""
 
-import functools
 import json
-import re
 from pathlib import Path
 
 import cv2
@@ -178,30 +176,3 @@ def test_a_demo_of_the_smallest_size(qs3, tmp_path):
 
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-NESTED = ("extract", "sensors")
-
-
-@pytest.fixture(scope="session")
-def help_of(qs3):
-    """The help of a verb, asked for once."""
-
-    @functools.cache
-    def told(*verbs: str) -> str:
-        return qs3(*verbs, "--help").stdout
-
-    return told
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_commands_and_flags_of_the_pages_exist(help_of, page):
-    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
-    commands = re.findall(r"^(?:    )?qs3 (\w+)([^#\n]*)", text, flags=re.MULTILINE)
-    if page.name in ("README.md", "factory.md"):
-        assert {verb for verb, _ in commands} >= {"generate", "merge", "verify"}
-    for verb, arguments in commands:
-        words = arguments.split()
-        nested = verb in NESTED and words and words[0].isalpha()
-        told = help_of(verb, words[0]) if nested else help_of(verb)
-        for flag in re.findall(r"--[a-z-]+", arguments):
-            assert flag in told, f"{page.name}: qs3 {verb}{arguments}: {flag}"

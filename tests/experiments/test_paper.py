@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ from qs3.experiments.domains import domain, parse_own
 from qs3.experiments.experiment import cell_runs
 from qs3.experiments.figures import draw
 from qs3.experiments.galleries import Galleries
-from qs3.experiments.grid import data_sets, make_work, run_grid
+from qs3.experiments.grid import data_sets, make_run_record, make_work, run_grid
 from qs3.experiments.paper import EXPERIMENTS, PaperTable
 from qs3.experiments.reproduction import Setup, collect_runs, read_setup, reproduce
 from qs3.experiments.rows import ORDINARY, PAPER
@@ -185,8 +185,8 @@ def test_a_table_without_runs_shows_the_command(finished, capsys, tmp_path):
         path.unlink()
     assert table(TableOptions("ordinary", folder)) == 0
     said = capsys.readouterr().out
-    assert "1 cells wait for their runs" in said
-    assert "qs3 reproduce ordinary --scale smoke --seeds 0 1 --out" in said
+    assert "1 cells wait for runs" in said
+    assert "    qs3 reproduce ordinary --out copy --scale smoke --seeds 0 1\n" in said
     assert next(line for line in said.splitlines() if line.startswith("| DGCNN")).count("…") == 1
 
 
@@ -202,11 +202,22 @@ def test_a_damaged_or_foreign_record_is_refused_and_the_rest_tabulated(finished,
     value = json.loads(other.read_text())
     value["test"]["checksum"] = "0"
     other.write_text(json.dumps(value))
+    for name, fault in (
+        ("S-F_ordinary@dgcnn_seed-1", ("scores", "accuracy", 7.0)),
+        ("S-F_ordinary@dgcnn_seed-0", ("test", "split", "train")),
+        ("S-D_ordinary@dgcnn_seed-1", ("source", "cloud", "clean")),
+    ):
+        path = results / f"{name}.json"
+        value = json.loads(path.read_text())
+        value[fault[0]][fault[1]] = fault[2]
+        path.write_text(json.dumps(value))
     assert table(TableOptions("ordinary", folder)) == 1
     out, err = capsys.readouterr()
     refused = [line for line in err.splitlines() if "refused" in line]
-    names = ("S-D_ordinary@dgcnn_seed-0", "M-D_ordinary@pointnet2_seed-0", other.stem)
-    assert len(refused) == 3
+    names = ("S-D_ordinary@dgcnn_seed-0", "M-D_ordinary@pointnet2_seed-0", other.stem,
+             "S-F_ordinary@dgcnn_seed-1", "S-F_ordinary@dgcnn_seed-0",
+             "S-D_ordinary@dgcnn_seed-1")  # fmt: skip
+    assert len(refused) == 6
     for name in names:
         assert sum(name in line for line in refused) == 1
     assert "(n=1)" in out and "(n=2)" in out
@@ -311,28 +322,42 @@ def test_a_warm_up_is_waited_for_and_a_folder_has_one_run_at_a_time(finished, ti
 def test_a_failed_run_is_named_and_what_others_made_stays(finished, tiny, tmp_path):
     works = works_of(finished, tiny)
     record = read_record(finished / "results" / "S-D_ordinary_seed-0.json")
-    with pytest.raises(InputError, match=r"S/ordinary/seed-0: ProcessDied: no memory left"):
-        run_grid(
-            works, tmp_path, lambda work: None, lambda work: record, lambda line: None,
-            dict.fromkeys([work.run.record for work in works], 1.0),
-            Inline(fail="S-D_ordinary_seed-0"), at_once=2,
-        )  # fmt: skip
+    failed = run_grid(
+        works, tmp_path, lambda work: None, lambda work: record, lambda line: None,
+        dict.fromkeys([work.run.record for work in works], 1.0),
+        Inline(fail="S-D_ordinary_seed-0"), at_once=2,
+    )  # fmt: skip
+    assert failed[0] == "S/ordinary/seed-0: ProcessDied: no memory left"
+    # What shares its folder and what starts from it cannot be made either.
+    assert [line.partition(":")[0] for line in failed[1:]] == [
+        "S/ordinary/seed-0", "S-D/qbst-paper/seed-0"
+    ]  # fmt: skip
     kept = [path.name for path in (tmp_path / "results").iterdir()]
     assert kept == ["S-D_ordinary@dgcnn_seed-0.json"]
 
 
 def test_each_device_has_one_run_at_a_time(finished, tiny, tmp_path, monkeypatch):
-    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "7,8,3")
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
     record = read_record(finished / "results" / "S-D_ordinary_seed-0.json")
     works, executor = works_of(finished, tiny), Inline()
     seen = []
+
+    def train(work):
+        seen.append(os.environ["CUDA_VISIBLE_DEVICES"])
+        os.environ["CUDA_VISIBLE_DEVICES"] = "7,8,3"  # a new process has the scheduler's
+
     run_grid(
-        works, tmp_path, lambda work: seen.append(os.environ["CUDA_VISIBLE_DEVICES"]),
+        works, tmp_path, train,
         lambda work: record, lambda line: None,
-        dict.fromkeys([work.run.record for work in works], 1.0), executor, devices=("2", "5"),
+        dict.fromkeys([work.run.record for work in works], 1.0), executor, devices=("2", "0"),
     )  # fmt: skip
-    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
-    assert set(seen) == {"2", "5"} and executor.most == 2
+    assert set(seen) == {"3", "7"} and executor.most == 2
+
+
+def test_a_device_that_is_not_there_is_told(finished, tiny):
+    with pytest.raises(InputError, match="--devices 4: no such GPU"):
+        make_run_record(lambda work: None, read_record, works_of(finished, tiny)[0], "4")
 
 
 def test_figures_are_the_same_bytes_each_time(finished, tiny, tmp_path, capsys):
@@ -348,7 +373,7 @@ def test_figures_are_the_same_bytes_each_time(finished, tiny, tmp_path, capsys):
 
 def test_galleries_show_procedural_shapes_alone(finished, tiny):
     part = Galleries(setup_of(finished, tiny))
-    folder = part.write({})
+    folder = part.write()
     assert part.sets() == ["source", "source", "target", "fused"]
     assert sorted(path.name for path in folder.iterdir()) == ["D.png", "F.png", "M.png", "S.png"]
 
@@ -360,7 +385,8 @@ def test_galleries_show_procedural_shapes_alone(finished, tiny):
         (["D=nowhere-at-all"], "not there"),
         (["Q=."], "the domains are"),
         (["D=.", "D=."], "each domain once"),
-        (["D=.:train"], "NAME=PATH"),
+        (["D=.:train"], "not there"),
+        (["=."], "the domains are"),
     ],
 )
 def test_data_of_the_user_that_cannot_be_is_refused(given, said):
@@ -369,9 +395,8 @@ def test_data_of_the_user_that_cannot_be_is_refused(given, said):
 
 
 def test_data_of_the_user_takes_a_domain_s_place(finished, tiny, tmp_path):
-    own = parse_own(
-        [f"D={finished / 'data' / 'target'}", f"M={finished / 'data' / 'source'}:train:"]
-    )
+    data = finished / "data"
+    own = parse_own([f"D={data / 'target'}", f"M={data / 'source'}:train:"])
     assert own["D"].stands_for == "" and own["M"].cloud == "surface"
     run = make_run(tiny, "M-D", ORDINARY, 0, 1)
     assert data_sets([run], own) == []
@@ -383,10 +408,76 @@ def test_data_of_the_user_takes_a_domain_s_place(finished, tiny, tmp_path):
     reproduce([part], setup, command._train, command._evaluate, lambda line: None)
     text = (tmp_path / "own" / "ordinary.md").read_text()
     assert "D: target" in text and "Stand-ins" not in text
+    for changed, said in (
+        (f"D={data / 'target'}:train:train", "another data"),
+        (f"D={data / 'source'}:train:train", "another data"),
+        (f"D={data / 'source'}", "no cloud of split 'test'"),
+    ):
+        other = dataclasses.replace(setup, own=own | parse_own([changed]))
+        with pytest.raises(InputError, match=said):
+            reproduce([part], other, command._train, command._evaluate, lambda line: None)
     again = read_setup(tmp_path / "own")
     assert again.own["D"].cloud == "points" and again.seeds == (0,)
     grid, faults = PaperTable(EXPERIMENTS["ordinary"], again, ("dgcnn",), ("M-D",)).grid()
     assert faults == [] and grid.empty == []
+
+
+def test_a_path_through_a_link_and_a_name_of_ours_are_the_user_s(finished, tiny, tmp_path):
+    (tmp_path / "link").symlink_to(finished / "data" / "target")
+    own = parse_own([f"S={tmp_path / 'link'}"])
+    assert own["S"].train == str((finished / "data" / "target").resolve())
+    work = make_work(make_run(tiny, "S-D", ORDINARY, 0, 1), tmp_path, None, own)
+    assert work.source == finished / "data" / "target"
+    assert work.test == tmp_path / "data" / "target"  # not the user's, for all its name
+    assert data_sets([work.run], own) == ["target"]
+    with pytest.raises(InputError, match="partiality: compares S"):
+        PaperTable(
+            EXPERIMENTS["partiality"], dataclasses.replace(setup_of(tmp_path, tiny), own=own)
+        ).runs()
+
+
+def test_caveats_of_a_run_stand_below_the_table(finished, tiny, tmp_path):
+    folder = shutil.copytree(finished, tmp_path / "copy")
+    path = folder / "results" / "S-D_ordinary@dgcnn_seed-0.json"
+    value = json.loads(path.read_text())
+    value["marks"] = ["training clouds"]
+    path.write_text(json.dumps(value))
+    part = PaperTable(EXPERIMENTS["ordinary"], setup_of(folder, tiny))
+    grid, _ = part.grid()
+    assert "- training clouds: DGCNN on S → D" in part.text(grid, "md")
+    assert "% training clouds: DGCNN on S → D" in part.text(grid, "tex")
+    assert part.text(grid, "csv").count("training clouds") == 2
+
+
+@pytest.mark.parametrize("option", ["methods", "tasks"])
+def test_a_line_or_column_that_no_table_has_is_refused(option, tmp_path):
+    told: dict[str, Any] = {option: ("typo",)}
+    with pytest.raises(InputError, match=f"--{option} typo: choose from"):
+        command.reproduce(command.ReproduceOptions(("ordinary",), tmp_path, "smoke", **told))
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        {"data": []},
+        {"data": {"D": ["a", "points"]}},
+        {"threads": "a"},
+        {"scale": {"name": "none"}},
+        {"more": 1},
+    ],
+)
+def test_a_damaged_marker_is_told(finished, tmp_path, spoil):
+    value = json.loads((finished / "bench.json").read_text())
+    (tmp_path / "bench.json").write_text(json.dumps(value | spoil))
+    with pytest.raises(InputError, match=r"bench\.json"):
+        read_setup(tmp_path)
+
+
+def test_the_text_tells_how_the_table_s_own_networks_were_trained(tmp_path):
+    part = PaperTable(EXPERIMENTS["ordinary"], Setup(tmp_path, SCALES["paper"], seeds=(0,)))
+    text = part.text(part.grid()[0], "md")
+    assert "1000 epochs, batches of 32, schedule plateau" in text
+    assert "418 objects a class of M and S" in text
 
 
 def test_domains_that_are_not_there_are_told(tiny, tmp_path):
@@ -398,6 +489,25 @@ def test_domains_that_are_not_there_are_told(tiny, tmp_path):
         PaperTable(EXPERIMENTS["views"], setup_of(tmp_path, tiny), ("vgg",)).runs()
     with pytest.raises(InputError, match=r"bench\.json"):
         read_setup(tmp_path)
+
+
+@pytest.mark.slow
+def test_a_ray_cluster_gives_the_same_numbers(finished, tiny, tmp_path):
+    pytest.importorskip("ray")
+    folder = shutil.copytree(finished, tmp_path / "copy")
+    lost = ["M-D_ordinary@dgcnn_seed-0.json", "M-F_ordinary@dgcnn_seed-0.json"]
+    shutil.rmtree(folder / "runs" / "M")
+    wanted = {name: read_record(folder / "results" / name) for name in lost}
+    for name in lost:
+        (folder / "results" / name).unlink()
+    setup = dataclasses.replace(
+        setup_of(folder, tiny, seeds=(0,)), executor="ray", address="local", workers=2
+    )
+    reproduce(
+        parts_of(setup, "ordinary"), setup, command._train, command._evaluate, lambda line: None
+    )
+    for name, record in wanted.items():
+        assert read_record(folder / "results" / name).scores == record.scores
 
 
 _KILLED = """

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
@@ -50,6 +51,8 @@ class ReproduceOptions:
     """GPUs by index; each makes one run at a time, in a process of its own."""
     executor: Literal["local", "ray"] = "local"
     """Where runs are made: here, or on a Ray cluster whose machines all see --out."""
+    address: str = "auto"
+    """Of the Ray cluster's head; auto is the one that this machine belongs to, local starts one."""
 
 
 def reproduce(options: Annotated[ReproduceOptions, tyro.conf.arg(name="")]) -> int:
@@ -85,6 +88,9 @@ def _setup(options: ReproduceOptions) -> "Setup":
     from qs3.experiments.reproduction import Setup
     from qs3.experiments.scales import SCALES
 
+    for device in options.devices:
+        if not device.isdecimal():
+            raise InputError(f"--devices {device}: name GPUs by index, such as 0 1")
     for name in ("threads", "workers"):
         if getattr(options, name) < 1:
             raise InputError(f"--{name} {getattr(options, name)}: must be at least 1")
@@ -97,6 +103,7 @@ def _setup(options: ReproduceOptions) -> "Setup":
         workers=options.workers,
         devices=options.devices,
         executor=options.executor,
+        address=options.address,
         shared=Path(shared) if shared else None,
         own=parse_own(options.data),
     )
@@ -112,6 +119,7 @@ def _parts(options: ReproduceOptions, setup: "Setup") -> "list[Part]":
         raise InputError(f"{' '.join(names)}: name each once")
     if not options.seeds or len(set(options.seeds)) < len(options.seeds):
         raise InputError(f"--seeds {' '.join(map(str, options.seeds))}: name each once")
+    _check_keys(names, options)
     parts: list[Part] = []
     for name in names:
         if name == "galleries":
@@ -122,6 +130,27 @@ def _parts(options: ReproduceOptions, setup: "Setup") -> "list[Part]":
         else:
             parts.append(PaperTable(EXPERIMENTS[name], setup, options.methods, options.tasks))
     return parts
+
+
+def _check_keys(names: Sequence[str], options: ReproduceOptions) -> None:
+    """Refuse a line or a column that no table has."""
+    from qs3.experiments.paper import EXPERIMENTS
+    from qs3.experiments.rows import ABLATIONS, ROWS
+    from qs3.experiments.scales import SCALES
+
+    scale = SCALES[options.scale]
+    rows = {*ROWS, *ABLATIONS} if any(name.startswith("adaptation-") for name in names) else set()
+    columns = {"M-D", "S-D", "M-R", "S-R"} if "adaptation-bench" in names else set()
+    for name in set(names) & set(EXPERIMENTS):
+        rows |= {key for key, _ in EXPERIMENTS[name].rows(scale)}
+        columns |= {key for key, _ in EXPERIMENTS[name].columns(scale)}
+    for option, given, known in (
+        ("methods", options.methods, rows),
+        ("tasks", options.tasks, columns),
+    ):
+        for key in given:
+            if key not in known:
+                raise InputError(f"--{option} {key}: choose from {', '.join(sorted(known))}")
 
 
 def _tell(line: str) -> None:

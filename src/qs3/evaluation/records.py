@@ -184,9 +184,31 @@ def read_record(path: Path) -> RunRecord:
         scores[name] = tuple(scores[name])
     scores["confusion"] = tuple(tuple(row) for row in scores["confusion"])
     fields["scores"] = Scores(**scores)
+    _check_scores(path, fields["scores"])
     for name in ("rounds", "marks"):
         fields[name] = tuple(fields[name])
     return RunRecord(**fields)
+
+
+def _check_scores(path: Path, scores: Scores) -> None:
+    """Refuse scores that are not those of the confusion matrix."""
+    k = len(scores.class_names)
+    try:
+        matrix = np.array(scores.confusion, dtype=np.int64).reshape(k, k + 1)
+    except (TypeError, ValueError):
+        raise InputError(f"{path}: field 'scores.confusion' is no table of counts") from None
+    counts, right = matrix.sum(axis=1), matrix[np.arange(k), np.arange(k)]
+    total = int(counts.sum())
+    if (matrix < 0).any() or total != scores.clouds or not total:
+        raise InputError(f"{path}: field 'scores.clouds' is not the sum of 'scores.confusion'")
+    present = counts > 0
+    wanted = {
+        "accuracy": int(right.sum()) / total,
+        "class_mean_accuracy": float((right[present] / counts[present]).mean()),
+    }
+    for name, value in wanted.items():
+        if not abs(getattr(scores, name) - value) < 1e-9:  # also where it is NaN
+            raise InputError(f"{path}: field 'scores.{name}' is not that of 'scores.confusion'")
 
 
 _MAY_BE_NONE = {"target", "source.split", "target.split", "test.split"}

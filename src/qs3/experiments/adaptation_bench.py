@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from qs3.datasets.plan import Plan
 from qs3.errors import InputError
-from qs3.experiments.bench_data import SOURCE, TARGET
+from qs3.experiments.bench_data import SOURCE, TARGET, make_plans
 from qs3.experiments.bench_table import (
     Result,
     group_results,
@@ -63,6 +63,8 @@ class Bench:
             InputError: where a name is unknown, or a task needs real objects that are not here.
         """
         setup = self.setup
+        if setup.own:
+            raise InputError(f"{self.name}: is made of its own data; leave out --data")
         if self.name == "adaptation-ablation":
             if self.tasks:
                 raise InputError(f"{self.name}: is made on {_ABLATION_TASK} alone; leave out tasks")
@@ -78,11 +80,13 @@ class Bench:
         return runs
 
     def sets(self) -> list[str]:
-        """Return the data sets that the text tells of."""
-        return [SOURCE, TARGET]
+        """Return no data sets: the table is made of records."""
+        return []
 
-    def write(self, plans: Mapping[str, Plan]) -> Path:
+    def write(self) -> Path:
         """Write the Markdown table and the CSV file from the records."""
+        setup = self.setup
+        plans = make_plans(setup.scale, setup.shared, sets=[SOURCE, TARGET])
         return write_table(self, self.runs(), plans)
 
 

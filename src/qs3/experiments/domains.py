@@ -115,35 +115,47 @@ def parse_own(given: Sequence[str]) -> dict[str, Domain]:
     found: dict[str, Domain] = {}
     for text in given:
         name, equals, rest = text.partition("=")
-        path, *parts = rest.split(":")
-        if not equals or not path or len(parts) not in (0, 2) or name in found:
+        path, train, test = rest, "train", "test"
+        if not Path(path).exists() and rest.count(":") > 1:
+            path, train, test = rest.rsplit(":", 2)
+        if not equals or not path or name in found:
             raise InputError(f"--data {text}: say each domain once, as NAME=PATH[:TRAIN:TEST]")
         if name not in _MADE:
             raise InputError(f"--data {text}: the domains are {', '.join(_MADE)}")
         if not Path(path).exists():
-            raise InputError(f"--data {text}: {path} is not there")
-        train, test = parts or ("train", "test")
+            raise InputError(f"--data {text}: {path} is not there; name a folder or a file")
+        whole = Path(path).resolve()
         # Samples of surfaces are one of the clouds of what `qs3 generate` makes.
-        cloud = _MADE[name].cloud if (Path(path) / MANIFEST).is_file() else "points"
-        own = own_domain(name, path, cloud)
-        found[name] = replace(own, train_split=train or None, test_split=test or None)
+        cloud = _MADE[name].cloud if (whole / MANIFEST).is_file() else "points"
+        found[name] = own_domain(name, str(whole), cloud, train or None, test or None)
     return found
 
 
-def own_domain(name: str, path: str, cloud: CloudKind) -> Domain:
+def own_domain(
+    name: str, path: str, cloud: CloudKind, train_split: str | None, test_split: str | None
+) -> Domain:
     """Return a domain whose clouds are the user's.
 
     Args:
         name: Domain whose place they take.
         path: Where they are.
         cloud: Which cloud of a generated data set.
+        train_split: Part to train on or to adapt to; None takes all.
+        test_split: Part to score on; None takes all.
+
+    Raises:
+        InputError: where there is no such domain.
     """
+    if name not in _MADE:
+        raise InputError(f"unknown domain {name!r}; choose from {', '.join(_MADE)}")
     return replace(
         _MADE[name],
         title=f"{name}: {Path(path).name}",
         train=path,
         test=path,
         cloud=cloud,
+        train_split=train_split,
+        test_split=test_split,
         stands_for="",
         own=True,
     )

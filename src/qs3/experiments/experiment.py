@@ -38,6 +38,8 @@ class Experiment:
     """What a reader must know."""
     corner: str = "network"
     """Heading of the first column."""
+    made: tuple[str, ...] = ()
+    """Domains that no data of the user can take the place of, since others are made beside them."""
     lines: tuple[tuple[str, str], ...] = ()
     """Panels of a figure of lines: beginning of the columns' keys and name of the axis; without
     them the figure has bars."""
@@ -53,8 +55,10 @@ class Cell:
     """Class-mean accuracy by seed."""
     published: tuple[float, float | None] | None
     """The paper's mean and standard error, in per cent."""
-    exists: bool = True
-    """Whether the table has such a cell."""
+    marks: tuple[str, ...] = ()
+    """Caveats of its runs, such as ``transductive``."""
+    wanted: int = 1
+    """Runs that it waits for in all; 0 where the table has no such cell."""
 
     @property
     def accuracy(self) -> MeanSEM | None:
@@ -84,8 +88,8 @@ class Grid:
 
     @property
     def empty(self) -> list[Place]:
-        """Places that wait for their runs."""
-        return [p for p, cell in self.cells.items() if cell.exists and not cell.accuracies]
+        """Places that wait for runs."""
+        return [p for p, cell in self.cells.items() if len(cell.accuracies) < cell.wanted]
 
     def differences(self) -> list[tuple[str, PairedDifference]]:
         """Return the comparisons for which there are runs of the same seeds."""
@@ -152,6 +156,7 @@ def fill(
             accuracies={seed: one.scores.accuracy for seed, one in there.items()},
             class_means={seed: one.scores.class_mean_accuracy for seed, one in there.items()},
             published=experiment.published.get(place),
-            exists=bool(runs),
+            marks=tuple(sorted({mark for one in there.values() for mark in one.marks})),
+            wanted=len(runs),
         )
     return Grid(experiment, scale, rows, columns, filled)

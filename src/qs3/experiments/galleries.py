@@ -5,7 +5,6 @@ Command: ``qs3 reproduce galleries --out DIR`` (minutes: scans alone).
 No figures are published. Procedural shapes alone are shown, which anybody may print.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +12,6 @@ import numpy as np
 from jaxtyping import Int
 
 from qs3.datasets import load_clouds
-from qs3.datasets.plan import Plan
 from qs3.experiments.domains import Domain, domain
 from qs3.experiments.grid import DATA
 from qs3.experiments.reproduction import Setup
@@ -43,7 +41,7 @@ class Galleries:
         found = (domain(name, self.setup.own) for name in _DOMAINS)
         return [one.train for one in found if not one.own]
 
-    def write(self, plans: Mapping[str, Plan]) -> Path:
+    def write(self) -> Path:
         """Draw each domain, and return the folder of the pictures."""
         folder = self.setup.out / self.name
         for name in _DOMAINS:

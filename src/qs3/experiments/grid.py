@@ -10,8 +10,9 @@ from typing import Any
 
 from qs3.datasets.clouds import CloudKind
 from qs3.datasets.executors import Executor, Failure
+from qs3.datasets.executors.executor import stop_if_fatal
 from qs3.errors import InputError
-from qs3.evaluation.records import RunRecord, read_record, write_record
+from qs3.evaluation.records import DataRecord, RunRecord, read_record, write_record
 from qs3.experiments.domains import REAL, Domain, domain
 from qs3.experiments.rows import ORDINARY, SUPERVISED
 from qs3.experiments.runs import Run
@@ -73,37 +74,36 @@ def make_work(
             score on.
     """
     source, target = domain(run.source, own), domain(run.target, own)
-    places = {}
-    for name in (source.train, target.train, target.test):
-        if name == REAL:
-            if not has_real(shared):
-                raise InputError(
-                    f"task {run.task}: needs {REAL}; set QS3_SHARED_DATA to the folder that has "
-                    "it, or choose --tasks M-D S-D"
-                )
-            assert shared is not None  # noqa: S101
-            places[name] = shared / REAL
-        else:
-            of_user = any(known.own and name == known.train for known in (source, target))
-            places[name] = Path(name) if of_user else out / DATA / name
+
+    def place(known: Domain, name: str) -> Path:
+        if known.own:
+            return Path(name)
+        if name != REAL:
+            return out / DATA / name
+        if shared is None or not has_real(shared):
+            raise InputError(
+                f"task {run.task}: needs {REAL}; set QS3_SHARED_DATA to the folder that has it, "
+                "or choose --tasks M-D S-D"
+            )
+        return shared / REAL
+
     if not target.test:
         raise InputError(f"task {run.task}: {run.target} has no clouds to score on")
     sees_target = run.row not in (SUPERVISED, ORDINARY)
     learnt = target if run.row == SUPERVISED else source
     warm = None
     if run.warm_up is not None:
-        scale_free = replace(run, row=run.warm_up)
-        warm = out / RUNS / scale_free.folder
+        warm = out / RUNS / replace(run, row=run.warm_up).folder
     return Work(
         run=run,
         out=out / RUNS / run.folder,
-        source=places[learnt.train],
+        source=place(learnt, learnt.train),
         source_split=learnt.train_split,
         source_cloud=learnt.cloud,
-        target=places[target.train] if sees_target else None,
+        target=place(target, target.train) if sees_target else None,
         target_split=target.train_split if sees_target else None,
         target_cloud=target.cloud,
-        test=places[target.test],
+        test=place(target, target.test),
         test_split=target.test_split,
         test_cloud=target.cloud,
         warm_up=warm,
@@ -127,12 +127,10 @@ def data_sets(runs: Iterable[Run], own: Mapping[str, Domain] | None = None) -> l
     found: dict[str, None] = {}
     for run in runs:
         source, target = domain(run.source, own), domain(run.target, own)
-        names = {source.train: source, target.test: target}
-        if run.row not in (SUPERVISED, ORDINARY) or target.train == target.test:
-            names[target.train] = target
-        for name, known in names.items():
-            if not known.own and name != REAL and (known is target or run.row != SUPERVISED):
-                found[name] = None
+        names = [] if run.row == SUPERVISED or source.own else [source.train]
+        if not target.own:
+            names += [target.test] if run.row == ORDINARY else [target.train, target.test]
+        found |= dict.fromkeys(name for name in names if name != REAL)
     return list(found)
 
 
@@ -170,13 +168,17 @@ def read_result(path: Path, run: Run, own: Mapping[str, Domain] | None = None) -
             record.settings.get("self_training"),
             None if run.self_training is None else _plain(run.self_training),
         ),
-        "source": (
-            (record.source.name, record.source.cloud),
-            (Path(learnt.train).name, learnt.cloud),
-        ),
-        "target": (record.target is None, run.row in (SUPERVISED, ORDINARY)),
-        "test": ((record.test.name, record.test.cloud), (Path(target.test).name, target.cloud)),
+        "model": (record.model, run.train.model),
+        "selection": (record.selection, run.train.rule),
+        "source": (_told(record.source), (learnt.train, learnt.train_split, learnt.cloud)),
+        "target": (_told(record.target), (target.train, target.train_split, target.cloud)),
+        "test": (_told(record.test), (target.test, target.test_split, target.cloud)),
     }
+    for name in ("source", "target", "test"):
+        there, (place, split, cloud) = wanted[name]
+        wanted[name] = there, (Path(place).name, split, cloud)
+    if run.row in (SUPERVISED, ORDINARY):
+        wanted["target"] = record.target, None
     for name, (there, here) in wanted.items():
         if there != here:
             raise InputError(
@@ -184,6 +186,10 @@ def read_result(path: Path, run: Run, own: Mapping[str, Domain] | None = None) -
                 "the same command again"
             )
     return record
+
+
+def _told(data: DataRecord | None) -> tuple[str, str | None, str] | None:
+    return None if data is None else (data.name, data.split, data.cloud)
 
 
 def _plain(settings: Any) -> Any:
@@ -197,11 +203,11 @@ def run_grid(
     evaluate: Evaluate,
     tell: Tell,
     expected: Mapping[str, float],
-    executor: Executor | None = None,
+    executor: Executor,
     devices: Sequence[str] = (),
     at_once: int = 1,
-) -> None:
-    """Train and score every run that is given.
+) -> list[str]:
+    """Train and score every run that is given, but for what starts from one that failed.
 
     Args:
         works: Runs without a record, a warm-up before what starts from it.
@@ -210,36 +216,24 @@ def run_grid(
         evaluate: Scores it; likewise.
         tell: Is told of each run.
         expected: Seconds that each run was estimated to take, by its record.
-        executor: Where runs are made, several at once; None makes one after the other here.
+        executor: Where runs are made.
         devices: GPUs that share the work, one run each at a time.
-        at_once: Runs at a time with an executor.
+        at_once: Runs at a time where no device is named.
+
+    Returns:
+        A line for each run that failed, or was left out since its warm-up failed.
 
     Raises:
-        InputError: where a run failed; what others made stays made.
+        InputError: where something failed that no other run will be spared, such as a full disk.
     """
     clock = _Clock(works, expected, tell)
-    if executor is None:
-        for work in works:
-            clock.done(work, _keep(out, work, make_run_record(train, evaluate, work)))
-        return
+    queue, failed = list(works), _Failed(tell)
+    busy: dict[str, Work] = {}
     with executor:
-        queue, busy, free = list(works), {}, list(devices) or [""] * at_once
-        failed: list[str] = []
+        free = list(devices) or [""] * at_once
         while queue or busy:
-            # A run waits for its warm-up, and for another that is trained in the same folder.
-            taken = {work.out for work in busy.values()}
-            before = {work.out for work in queue} | taken
-            ready = [
-                work
-                for index, work in enumerate(queue)
-                if work.warm_up not in before
-                and work.out not in taken
-                and all(other.out != work.out for other in queue[:index])
-            ]
-            if failed:
-                ready = []
-            while ready and free:
-                work = ready.pop(0)
+            queue = [work for work in queue if not failed.blocks(work)]
+            for work in _ready(queue, list(busy.values()))[: len(free)]:
                 queue.remove(work)
                 place = free.pop(0)
                 key = f"{place}|{work.run.record}"
@@ -248,14 +242,50 @@ def run_grid(
             if not busy:
                 break
             key, outcome = executor.next()
+            stop_if_fatal(outcome)
             work = busy.pop(key)
             free.append(key.partition("|")[0])
             if isinstance(outcome, Failure):
-                failed.append(f"{work.run.folder}: {outcome.kind}: {outcome.reason}")
+                failed.add(work, outcome)
             else:
-                clock.done(work, _keep(out, work, outcome))
-    if failed:
-        raise InputError(f"{'; '.join(failed)}; mend that and run the same command again")
+                write_record(out / RESULTS / work.run.record, outcome)
+                clock.done(work, outcome)
+    return failed.lines
+
+
+def _ready(queue: Sequence[Work], busy: Sequence[Work]) -> list[Work]:
+    """Return runs that may begin: their warm-up is there, and nobody trains in their folder."""
+    found: list[Work] = []
+    taken = {work.out for work in busy}
+    waiting = {work.out for work in queue} | taken
+    for work in queue:
+        if work.warm_up not in waiting and work.out not in taken:
+            found.append(work)
+        taken.add(work.out)  # of several in one folder, the first goes first
+    return found
+
+
+class _Failed:
+    """Which runs failed, and which others cannot be made for it."""
+
+    def __init__(self, tell: Tell) -> None:
+        self.lines: list[str] = []
+        self.folders: set[Path] = set()
+        self.tell = tell
+
+    def add(self, work: Work, failure: Failure) -> None:
+        self._note(work, f"{failure.kind}: {failure.reason}")
+
+    def blocks(self, work: Work) -> bool:
+        if work.out in self.folders or work.warm_up in self.folders:
+            self._note(work, "left out, as what it starts from failed")
+            return True
+        return False
+
+    def _note(self, work: Work, why: str) -> None:
+        self.folders.add(work.out)
+        self.lines.append(f"{work.run.folder}: {why}")
+        self.tell(f"failed: {self.lines[-1]}")
 
 
 def make_run_record(train: Train, evaluate: Evaluate, work: Work, device: str = "") -> RunRecord:
@@ -268,14 +298,16 @@ def make_run_record(train: Train, evaluate: Evaluate, work: Work, device: str = 
         device: Index of the GPU to see alone; "" leaves all in sight.
     """
     if device:
-        os.environ["CUDA_VISIBLE_DEVICES"] = device
+        import torch
+
+        inherited = [one for one in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if one]
+        # A cluster's scheduler may have given this process some of the machine's GPUs alone.
+        known = inherited[int(device)] if int(device) < len(inherited) else device
+        os.environ["CUDA_VISIBLE_DEVICES"] = known
+        if not torch.cuda.is_available():
+            raise InputError(f"--devices {device}: no such GPU here")
     train(work)
     return evaluate(work)
-
-
-def _keep(out: Path, work: Work, record: RunRecord) -> RunRecord:
-    write_record(out / RESULTS / work.run.record, record)
-    return record
 
 
 class _Clock:

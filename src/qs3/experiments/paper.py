@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from qs3.datasets.plan import Plan
 from qs3.errors import InputError
 from qs3.evaluation.records import RunRecord
 from qs3.experiments import (
@@ -18,13 +17,15 @@ from qs3.experiments import (
     uda,
     views,
 )
-from qs3.experiments.domains import domain
+from qs3.experiments.domains import Domain, domain
 from qs3.experiments.experiment import Experiment, Grid, cell_runs, fill
 from qs3.experiments.figures import draw
 from qs3.experiments.grid import RESULTS, make_work, read_result
 from qs3.experiments.render import to_csv, to_latex, to_markdown
 from qs3.experiments.reproduction import Setup
+from qs3.experiments.rows import SUPERVISED
 from qs3.experiments.runs import Run, with_warm_up
+from qs3.experiments.scales import Scale
 from qs3.files import write_bytes, write_text
 from qs3.visualisation.figure import png_bytes, svg_bytes
 
@@ -65,6 +66,12 @@ class PaperTable:
         cells = cell_runs(
             self.experiment, setup.scale, setup.seeds, setup.threads, self.rows, self.columns
         )
+        mixed = sorted(set(self.experiment.made) & set(setup.own))
+        if mixed:
+            raise InputError(
+                f"{self.name}: compares {', '.join(mixed)} with what is made here of the same "
+                "meshes; leave out that --data"
+            )
         if not any(cells.values()):
             lines, columns = (
                 ", ".join(key for key, _ in named)
@@ -91,15 +98,19 @@ class PaperTable:
         """Return no further data sets."""
         return []
 
-    def write(self, plans: Mapping[str, Plan]) -> Path:
-        """Write the table in all formats and the figure, from the records alone."""
+    def write(self) -> Path:
+        """Write the table in all formats and the figure, from the records alone.
+
+        Raises:
+            InputError: where a record is refused; the file is named, and the rest is written.
+        """
         grid, faults = self.grid()
-        if faults:
-            raise InputError(faults[0])
         path = self.setup.out / f"{self.name}.md"
         for kind in ("md", "csv", "tex"):
             write_text(path.with_suffix(f".{kind}"), self.text(grid, kind))
         write_bytes(path.with_suffix(".png"), self.picture(grid, "png"))
+        if faults:
+            raise InputError("; ".join(faults))
         return path
 
     def grid(self) -> tuple[Grid, list[str]]:
@@ -137,18 +148,23 @@ class PaperTable:
     def command(self) -> str:
         """Return the command that makes what is missing."""
         setup = self.setup
-        seeds = " ".join(map(str, setup.seeds))
-        own = "".join(f" --data {name}=…" for name in setup.own)
-        return f"qs3 reproduce {self.name} --scale {setup.scale.name} --seeds {seeds} --out …{own}"
+        words = [f"qs3 reproduce {self.name} --out {setup.out.name} --scale {setup.scale.name}"]
+        words.append(f"--seeds {' '.join(map(str, setup.seeds))}")
+        words += [f"--threads {setup.threads}"] if setup.threads not in (None, 1) else []
+        for name, one in setup.own.items():
+            words.append(f"--data {name}={Path(one.train).name}:{one.train_split or ''}:")
+            words[-1] += one.test_split or ""
+        return " ".join(words)
 
     def _intro(self) -> list[str]:
-        scale, train = self.setup.scale, self.setup.scale.train
+        scale = self.setup.scale
         runs = [run for runs in self.cells().values() for run in runs]
+        train = runs[0].train  # the same for all but for network and seed
         names = dict.fromkeys([run.source for run in runs] + [run.target for run in runs])
         domains = [domain(name, self.setup.own) for name in names]
         text = [
-            f"Scale {scale.name}: {scale.source_per_class} objects a class of the source, "
-            f"{train.num_points} points, {train.epochs} epochs, batches of {train.batch_size}; "
+            f"Scale {scale.name}{_objects(scale, domains)}: {train.num_points} points, "
+            f"{train.epochs} epochs, batches of {train.batch_size}, schedule {train.schedule}; "
             f"seeds {', '.join(map(str, self.setup.seeds))}. Per cent, mean ± standard error "
             "(ddof = 1) over n seeds, from the records alone; the network is the last epoch's.",
         ]
@@ -171,6 +187,12 @@ class PaperTable:
         return text
 
 
+def _objects(scale: Scale, domains: Sequence[Domain]) -> str:
+    if any(one.train == "source" for one in domains if not one.own):
+        return f", {scale.source_per_class} objects a class of M and S"
+    return ""
+
+
 def _mixed(
     records: dict[str, RunRecord], cells: Mapping[tuple[str, str], Sequence[Run]]
 ) -> list[str]:
@@ -181,9 +203,10 @@ def _mixed(
         record = records.get(run.record)
         if record is None:
             continue
-        known = {f"source {run.source}": record.source, f"test {run.target}": record.test}
-        if run.row == "supervised":
-            known = {f"test {run.target}": record.test}
+        learnt = run.target if run.row == SUPERVISED else run.source
+        known = {f"train {learnt}": record.source, f"test {run.target}": record.test}
+        if record.target is not None:
+            known[f"train {run.target}"] = record.target
         for name, data in known.items():
             first, where = sums.setdefault(name, (data.checksum, run.record))
             if first != data.checksum:

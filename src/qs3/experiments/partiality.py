@@ -41,5 +41,6 @@ EXPERIMENT = Experiment(
     columns=lambda scale: _COLUMNS,
     run=_run,
     pairs=_pairs,
+    made=("M", "S", "C", "J"),
 )
 """A control that the paper lacks."""

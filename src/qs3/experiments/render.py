@@ -40,12 +40,15 @@ def to_markdown(grid: Grid, intro: Sequence[str], command: str) -> str:
     text += ["Class-mean accuracy:", "", table(head, _lines(grid, "class_mean", set())), ""]
     if grid.empty:
         text += [
-            f"{len(grid.empty)} cells wait for their runs (…); this command makes them, and only "
-            "what is missing:",
+            f"{len(grid.empty)} cells wait for runs (… or few seeds); this command makes them, "
+            "and only what is missing:",
             "",
             f"    {command}",
             "",
         ]
+    marked = _marked(grid)
+    if marked:
+        text += ["Caveats:", "", *(f"- {line}" for line in marked), ""]
     differences = grid.differences()
     if differences:
         text += ["Differences, seed by seed:", ""]
@@ -53,6 +56,16 @@ def to_markdown(grid: Grid, intro: Sequence[str], command: str) -> str:
         text += [""]
     text += [f"Paper: {experiment.source}", ""]
     return "\n".join(text)
+
+
+def _marked(grid: Grid) -> list[str]:
+    """Return which cells have which caveats."""
+    heads, titles = dict(grid.columns), dict(grid.rows)
+    found: dict[str, list[str]] = {}
+    for (row, column), cell in grid.cells.items():
+        for mark in cell.marks:
+            found.setdefault(mark, []).append(f"{titles[row]} on {heads[column]}")
+    return [f"{mark}: {', '.join(cells)}" for mark, cells in found.items()]
 
 
 def _paper_columns(grid: Grid) -> list[tuple[str, str]]:
@@ -78,7 +91,7 @@ def _lines(grid: Grid, score: str, told: set[str]) -> list[list[str]]:
 
 def _value(cell: Cell, value: MeanSEM | None) -> str:
     if value is None:
-        return "…" if cell.exists else "–"
+        return "…" if cell.wanted else "–"
     return value.format()
 
 
@@ -93,13 +106,13 @@ def to_csv(grid: Grid) -> str:
     """Return one line a run."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(
-        ["row", "column", "seed", "accuracy", "class_mean_accuracy", "paper_mean", "paper_sem"]
-    )
+    numbers = ["accuracy", "class_mean_accuracy", "paper_mean", "paper_sem"]
+    writer.writerow(["row", "column", "seed", *numbers, "marks"])
     for (row, column), cell in grid.cells.items():
         paper = ["" if value is None else value for value in cell.published or ("", "")]
         for seed, value in cell.accuracies.items():
-            writer.writerow([row, column, seed, value, cell.class_means[seed], *paper])
+            marks = ", ".join(cell.marks)
+            writer.writerow([row, column, seed, value, cell.class_means[seed], *paper, marks])
     return text.getvalue()
 
 
@@ -120,6 +133,7 @@ def to_latex(grid: Grid) -> str:
         [
             f"% {smoke}{grid.experiment.title}; accuracy in per cent, mean ± standard error over",
             f"% n seeds; in brackets: {grid.experiment.source}",
+            *(f"% {line}" for line in _marked(grid)),
             rf"\begin{{tabular}}{{l{'r' * len(grid.columns)}}}",
             r"\hline",
             " & ".join(part.translate(_LATEX) for part in head) + r" \\",

@@ -7,10 +7,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
+from qs3.datasets import load_clouds
+from qs3.datasets.clouds import CloudKind
 from qs3.datasets.estimate import estimate
-from qs3.datasets.executors import Executor, LocalExecutor
+from qs3.datasets.executors import Executor, InlineExecutor, LocalExecutor
 from qs3.datasets.manifest import MANIFEST
 from qs3.datasets.plan import Plan
 from qs3.errors import InputError
@@ -54,6 +56,8 @@ class Setup:
     """GPUs, by index: each makes one run at a time."""
     executor: Literal["local", "ray"] = "local"
     """Where runs are made: here, or on a Ray cluster that sees the same folders."""
+    address: str = "auto"
+    """Of the Ray cluster's head; ``auto`` is this machine's, ``local`` starts one here."""
     shared: Path | None = None
     """Folder with artists' meshes and real objects; None takes procedural shapes alone."""
     own: Mapping[str, Domain] = field(default_factory=dict)
@@ -74,10 +78,10 @@ class Part(Protocol):
         ...
 
     def sets(self) -> list[str]:
-        """Return data sets that it needs beside those of its runs."""
+        """Return data sets that it is drawn from, runs or none."""
         ...
 
-    def write(self, plans: Mapping[str, Plan]) -> Path:
+    def write(self) -> Path:
         """Write it from the records, and return its main file."""
         ...
 
@@ -140,39 +144,47 @@ def reproduce(
     plans = plans_for(parts, runs, setup)
     claim(setup, plans)
     left = missing(runs, setup.out, setup.own)  # a damaged record stops here, not after hours
+    executor = _executor(setup)  # a missing extra is told before anything is made
+    needed = set(data_sets(left, setup.own)) | {name for part in parts for name in part.sets()}
+    plans = {name: plan for name, plan in plans.items() if name in needed}
     cost = measure(setup, left, plans)
     tell(describe(parts, setup, runs, plans, cost))
     if len(left) < len(runs):
         tell(f"{len(runs) - len(left)} of {len(runs)} runs are there already")
-    failed = make_data(setup.out / DATA, plans, setup.workers)
-    for name, count in failed.items():
+    absent = make_data(setup.out / DATA, plans, setup.workers)
+    for name, count in absent.items():
         if count:
             tell(f"{name}: {count} scans failed and are absent")
-    works = [make_work(run, setup.out, setup.shared, setup.own) for run in left]
-    with _quiet_workers():
-        run_grid(
-            works,
-            setup.out,
-            train,
-            evaluate,
-            tell,
-            cost.runs,
-            executor=_executor(setup) if works else None,
-            devices=setup.devices,
-            at_once=setup.workers,
-        )
-    return [part.write(plans) for part in parts]
+    failed: list[str] = []
+    if left:
+        works = [make_work(run, setup.out, setup.shared, setup.own) for run in left]
+        # A cluster gives a run its GPU itself.
+        devices = () if setup.executor == "ray" else setup.devices
+        at_once = max(len(setup.devices), setup.workers)
+        with _quiet_workers():
+            failed = run_grid(
+                works, setup.out, train, evaluate, tell, cost.runs, executor, devices, at_once
+            )
+    paths = []
+    for part in parts:
+        try:
+            paths.append(part.write())
+        except InputError as error:
+            failed.append(str(error))
+    if failed:
+        raise InputError(f"{'; '.join(failed)}; mend that and run the same command again")
+    return paths
 
 
-def _executor(setup: Setup) -> Executor | None:
+def _executor(setup: Setup) -> Executor:
     if setup.executor == "ray":
         from qs3.datasets.executors.ray_cluster import RayExecutor
 
-        return RayExecutor(gpus=1.0 if setup.devices else 0.0)
+        return RayExecutor(setup.address, gpus=1.0 if setup.devices else 0.0)
     if setup.devices:
         # A process sees the GPU that it was started with: each run has its own.
         return LocalExecutor(len(setup.devices), calls_per_process=1)
-    return LocalExecutor(setup.workers) if setup.workers > 1 else None
+    return LocalExecutor(setup.workers) if setup.workers > 1 else InlineExecutor()
 
 
 @contextmanager
@@ -262,9 +274,7 @@ def claim(setup: Setup, plans: Mapping[str, Plan]) -> None:
                 "scale": dataclasses.asdict(setup.scale),
                 "threads": setup.threads,
                 "meshes": _meshes(plans, setup),
-                "data": {
-                    name: [Path(one.train).name, one.cloud] for name, one in setup.own.items()
-                },
+                "data": {name: _own_data(one, setup.scale) for name, one in setup.own.items()},
             }
         )
     )
@@ -289,15 +299,16 @@ def read_setup(folder: Path) -> Setup:
     if not (folder / MARKER).is_file():
         raise InputError(f"{folder}: has no {MARKER}; name a folder that qs3 reproduce made")
     there: Any = read_json(folder / MARKER)
-    known = {"scale", "threads", "meshes", "data"}
-    if not isinstance(there, dict) or set(there) != known or not isinstance(there["scale"], dict):
+    if not _is_marker(there):
         raise InputError(f"{folder / MARKER}: is not what qs3 reproduce writes")
     scale = SCALES.get(str(there["scale"].get("name")))
     if scale is None or json.loads(json.dumps(dataclasses.asdict(scale))) != there["scale"]:
         raise InputError(f"{folder / MARKER}: is of a scale that this version does not have")
     own = {}
-    for name, (data, cloud) in there["data"].items():
-        own[name] = own_domain(name, data, cloud)
+    for name, one in there["data"].items():
+        own[name] = own_domain(
+            name, one["name"], one["cloud"], one["train_split"], one["test_split"]
+        )
     seeds = sorted(
         {
             int(path.stem.rpartition("-")[2])
@@ -308,6 +319,45 @@ def read_setup(folder: Path) -> Setup:
     return Setup(
         out=folder, scale=scale, seeds=tuple(seeds) or (0, 1, 2), threads=there["threads"], own=own
     )
+
+
+def _is_marker(value: Any) -> bool:
+    if not isinstance(value, dict) or set(value) != {"scale", "threads", "meshes", "data"}:
+        return False
+    threads, data = value["threads"], value["data"]
+    return (
+        isinstance(value["scale"], dict)
+        and (threads is None or type(threads) is int)
+        and isinstance(data, dict)
+        and all(isinstance(one, dict) and set(one) == _OWN_FIELDS for one in data.values())
+        and all(
+            isinstance(one["name"], str)
+            and one["cloud"] in get_args(CloudKind)
+            and all(isinstance(one[part] or "", str) for part in ("train_split", "test_split"))
+            for one in data.values()
+        )
+    )
+
+
+def _own_data(one: Domain, scale: Scale) -> dict[str, Any]:
+    """Return what the user's domain is known by; reading it tells early what is wrong with it."""
+    sums = [
+        load_clouds(
+            one.train, split=split, cloud=one.cloud, num_points=scale.train.num_points
+        ).checksum
+        for split in (one.train_split, one.test_split)
+    ]
+    return {
+        "name": Path(one.train).name,
+        "cloud": one.cloud,
+        "train_split": one.train_split,
+        "test_split": one.test_split,
+        "train": sums[0],
+        "test": sums[1],
+    }
+
+
+_OWN_FIELDS = {"name", "cloud", "train_split", "test_split", "train", "test"}
 
 
 def _meshes(plans: Mapping[str, Plan], setup: Setup) -> str:

@@ -39,6 +39,7 @@ EXPERIMENT = Experiment(
     columns=_columns,
     run=_run,
     pairs=_pairs,
+    made=("S",),
     lines=(("", "fused views"),),
 )
 """The supplement's Fig. 1."""

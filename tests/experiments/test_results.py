@@ -1,0 +1,55 @@
+"""The tables in results/ are what their records say: nothing in them is written by hand."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from qs3.experiments.figures import draw
+from qs3.experiments.paper import EXPERIMENTS, PaperTable
+from qs3.experiments.reproduction import read_setup
+
+ROOT = Path(__file__).parents[2]
+TABLES = [
+    path
+    for path in sorted((ROOT / "results").glob("*/*.md"))
+    if path.stem in EXPERIMENTS and (path.parent / "bench.json").is_file()
+]
+
+
+def part_of(path):
+    """The table with the lines and columns that the file has."""
+    setup = read_setup(path.parent)
+    experiment = EXPERIMENTS[path.stem]
+    whole = PaperTable(experiment, setup)
+    grid, faults = whole.grid()
+    assert faults == []
+    rows = {place[0] for place, cell in grid.cells.items() if cell.accuracies}
+    columns = {place[1] for place, cell in grid.cells.items() if cell.accuracies}
+    return PaperTable(experiment, setup, tuple(rows), tuple(columns))
+
+
+@pytest.mark.parametrize("path", TABLES, ids=[f"{p.parent.name}-{p.stem}" for p in TABLES])
+def test_a_table_is_what_its_records_say(path):
+    part = part_of(path)
+    grid, faults = part.grid()
+    assert faults == [] and grid.empty == []
+    for kind in ("md", "csv", "tex"):
+        assert path.with_suffix(f".{kind}").read_text(encoding="utf-8") == part.text(grid, kind)
+    assert draw(grid).axes and path.with_suffix(".png").read_bytes()[1:4] == b"PNG"
+
+
+def test_the_readme_shows_numbers_of_the_tables():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    tables = "".join(path.read_text(encoding="utf-8") for path in TABLES)
+    shown = re.findall(r"\d+\.\d ± \d+\.\d \(n=\d\)", text)
+    assert shown
+    for value in shown:
+        assert value in tables
+
+
+def test_records_hold_no_path_of_a_machine():
+    records = sorted((ROOT / "results").rglob("*.json"))
+    assert records
+    for path in records:
+        assert not re.search(r'"/[a-z]+/', path.read_text(encoding="utf-8")), path
