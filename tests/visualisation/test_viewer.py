@@ -32,7 +32,7 @@ from qs3.visualisation.viewer import (
 from qs3.visualisation.viewer.colouring import by_error, by_height, by_view, round_limit
 from qs3.visualisation.viewer.display import compose, frame_of, modes
 from qs3.visualisation.viewer.distance import cloud_distance, mesh_distance, spacing
-from qs3.visualisation.viewer.serving import allowed
+from qs3.visualisation.viewer.serving import allowed, own_names
 
 HOSTILE = "<img src=x onerror=alert(1)>{alert(2)}"
 
@@ -417,20 +417,42 @@ class TestServing:
         bind("127.0.0.1", port).close()
 
     @pytest.mark.parametrize(
-        ("host", "origin", "loopback", "wanted"),
+        ("host", "origin", "names", "wanted"),
         [
-            ("127.0.0.1:80", None, True, True),
-            ("[::1]:80", "http://[::1]:80", True, True),
-            ("localhost:80", "http://127.0.0.1:80", True, False),
-            ("evil.org:80", "http://evil.org:80", True, False),
-            ("evil.org:80", "http://evil.org:80", False, True),
-            ("mine:80", "http://evil.org", False, False),
-            ("localhost.evil.org", None, True, False),
-            (None, None, True, False),
+            ("127.0.0.1:80", None, None, True),
+            ("[::1]:80", "http://[::1]:80", None, True),
+            ("localhost:80", "http://127.0.0.1:80", None, False),
+            ("192.0.2.1:80", None, None, False),
+            ("evil.org:80", "http://evil.org:80", None, False),
+            ("evil.org:80", "http://evil.org:80", {"mine", "localhost"}, False),
+            ("mine:80", "http://mine:80", {"mine", "localhost"}, True),
+            ("MINE:80", "http://MINE:80", {"mine", "localhost"}, True),
+            ("192.0.2.1:80", "http://192.0.2.1:80", {"mine"}, True),
+            ("[fe80::1]:80", "http://[fe80::1]:80", {"mine"}, True),
+            ("mine:80", "http://evil.org", {"mine"}, False),
+            ("", None, {"mine"}, False),
+            ("localhost.evil.org", None, None, False),
+            (None, None, None, False),
         ],
     )
-    def test_who_is_let_in(self, host, origin, loopback, wanted):
-        assert allowed(host, origin, loopback) is wanted
+    def test_who_is_let_in(self, host, origin, names, wanted):
+        assert allowed(host, origin, None if names is None else frozenset(names)) is wanted
+
+    def test_own_names_are_the_machines_and_the_one_given(self, monkeypatch):
+        monkeypatch.setattr(socket, "gethostname", lambda: "Box")
+        monkeypatch.setattr(socket, "getfqdn", lambda: "box.example.net")
+        assert own_names("lab") == {"box", "box.example.net", "lab", "localhost"}
+        assert "" not in own_names("")
+
+    def test_on_every_interface_other_names_are_refused(self):
+        """A site that lets its own name point here would read the data."""
+        pytest.importorskip("viser", reason="viser is not installed: pip install 'qs3[view]'")
+        listener = bind("0.0.0.0", 0)  # noqa: S104
+        port = listener.getsockname()[1]
+        with serve(listener, "test", "lab"):
+            for name, code in (("evil.org", 403), ("lab", 200), (socket.gethostname(), 200)):
+                own = f"{name}:{port}"
+                assert self.answer(port, Host=own, Origin=f"http://{own}")[0] == code
 
     def test_loopback_is_known(self):
         hosts = ("127.0.0.1", "::1", "localhost", "0.0.0.0", "::")  # noqa: S104

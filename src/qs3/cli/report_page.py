@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from qs3.cli import report_parts as parts
-from qs3.cli.report_runs import Contents, FoundRun, find_before, find_data, paper, read_run
+from qs3.cli.report_data import find_data, read_data
+from qs3.cli.report_runs import Contents, FoundRun, find_before, paper, read_run
 from qs3.errors import InputError, QS3Error
 from qs3.evaluation.records import DataRecord, RunRecord
 
@@ -67,12 +68,10 @@ def make_page(options: "ReportOptions", contents: Contents) -> tuple["Report", t
 
 
 def _report(options: "ReportOptions", **told: Any) -> "Report":
+    from qs3.cli.report import command_of
     from qs3.report import Report
 
-    given = {"--data": options.data, "--split": options.split, "--source": options.source}
-    asked = [f"{name} {Path(value).name}" for name, value in given.items() if value is not None]
-    command = " ".join(["qs3 report", options.folder.resolve().name, *asked])
-    return Report(command=command, agreement_meaning=parts.AGREEMENT, **told)
+    return Report(command=command_of(options), agreement_meaning=parts.AGREEMENT, **told)
 
 
 def _choose_run(options: "ReportOptions", runs: Sequence[FoundRun]) -> FoundRun | None:
@@ -164,24 +163,19 @@ def _clouds(
     run: FoundRun, options: "ReportOptions", loaded: "LoadedModel", record: RunRecord | None
 ) -> tuple[Any, Any, DataRecord | None]:
     """Source and labelled target, and what is known of the latter."""
-    from qs3.datasets import load_clouds
-    from qs3.datasets.storage import open_folder
-
     points, names = loaded.settings["train"]["num_points"], loaded.class_names
-    if options.source is not None:
-        source = load_clouds(
-            options.source, split=options.source_split, num_points=points, class_names=names
-        )
+    known = run.data("source")
+    if options.source is None:
+        source = find_data(known, run.folder, points, names)
     else:
-        source = find_data(run.data("source"), run.folder, points, names)
-    if options.data is not None:
-        target = load_clouds(
-            options.data, split=options.split, num_points=points, class_names=names
-        )
-        name = open_folder(options.data).name
-        return source, target, DataRecord(name, target.checksum, len(target), options.split)
+        given = options.source, options.source_split, options.source_cloud
+        source, _ = read_data(*given, known, points, names)
     test = None if record is None else record.test
-    return source, find_data(test, run.folder, points, names), test
+    if options.data is None:
+        return source, find_data(test, run.folder, points, names), test
+    given = options.data, options.split, options.cloud
+    target, test = read_data(*given, test or run.data("target"), points, names)
+    return source, target, test
 
 
 def _seen(run: FoundRun, target: Any) -> list[str]:
@@ -270,13 +264,14 @@ def _summary(run: FoundRun, test: DataRecord | None) -> str:
     source, target = run.data("source"), run.data("target")
     text = f"A {run.settings['train']['model']} was trained by {run.method}"
     if source is not None:
-        text += f" on {source.clouds} labelled clouds of {source.name}"
+        text += f" on {source.clouds} labelled clouds of {parts.data_name(source)}"
     if target is not None:
-        text += f" with {target.clouds} clouds of {target.name}, whose labels it never saw"
+        text += (
+            f" with {target.clouds} clouds of {parts.data_name(target)}, whose labels it never saw"
+        )
     text += f"; seed {run.settings['train']['seed']}, chosen by the rule “{run.told['selection']}”."
     if test is not None:
-        part = "" if test.split is None else f"/{test.split}"
-        text += f" Scored on {test.clouds} clouds of {test.name}{part}."
+        text += f" Scored on {test.clouds} clouds of {parts.data_name(test)}."
     return text
 
 

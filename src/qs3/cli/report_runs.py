@@ -1,6 +1,7 @@
 """What lies in the folder of a report: finished runs, unfinished ones, records."""
 
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,13 +15,11 @@ from qs3.evaluation.records import RECORD, DataRecord, RunRecord, read_record
 from qs3.files import read_json
 
 if TYPE_CHECKING:
-    from qs3.datasets.clouds import PointClouds
     from qs3.report import NamedRecord
 
 _SETTINGS, _MODEL, _DATASET = "settings.json", "model.safetensors", "dataset.json"
 _RECORDS = ("records", "results")
-_LEVELS = 5
-"""How far above a run its data are looked for: a grid has runs/<task>/<row>/<seed>."""
+_NAME = re.compile(r"(?P<task>.+)_(?P<row>[^_]+)_seed-\d+")
 
 
 @dataclass(frozen=True)
@@ -200,15 +199,18 @@ def _line_of(path: Path) -> tuple[str, str]:
     Example:
         >>> _line_of(Path("results/S-D_qbst_seed-0.json"))
         ('S-D', 'qbst')
+        >>> _line_of(Path("results/A.kinect_v1-A.d435_ordinary@dgcnn_seed-0.json"))
+        ('A.kinect_v1-A.d435', 'ordinary@dgcnn')
         >>> _line_of(Path("runs/S-D/gast-spst/seed-1/records/target-0a.json"))
         ('S-D', 'gast-spst')
         >>> _line_of(Path("chairs/records/a.json"))
         ('', '')
     """
-    for parts in (path.stem.split("_"), path.parts):
-        for task, row, seed in zip(parts, parts[1:], parts[2:], strict=False):
-            if seed.startswith("seed-") and task:
-                return task, row
+    if (name := _NAME.fullmatch(path.stem)) is not None:
+        return name["task"], name["row"]
+    for task, row, seed in zip(path.parts, path.parts[1:], path.parts[2:], strict=False):
+        if seed.startswith("seed-"):
+            return task, row
     return "", ""
 
 
@@ -247,32 +249,4 @@ def find_before(after: FoundRun, others: tuple[FoundRun, ...]) -> Path | None:
             for name in ("source", "class_names", "train")
         ):
             return run.folder
-    return None
-
-
-def find_data(data: DataRecord | None, run: Path, num_points: int, names: Any) -> Any:
-    """The clouds that a run read, looked for by name near the run; None where they are not there.
-
-    They must have the checksum of the record: data of the same name are not enough.
-    """
-    from qs3.datasets import load_clouds
-
-    if data is None:
-        return None
-    bases = [run.resolve(), *run.resolve().parents][: _LEVELS + 1]
-    for place in (p for base in bases for p in (base / data.name, base / "data" / data.name)):
-        if not place.exists():
-            continue
-        try:
-            clouds: PointClouds = load_clouds(
-                place,
-                split=data.split,
-                num_points=num_points,
-                cloud=data.cloud,  # pyright: ignore[reportArgumentType]
-                class_names=names,
-            )
-        except QS3Error:
-            continue
-        if clouds.checksum == data.checksum:
-            return clouds
     return None

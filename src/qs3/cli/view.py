@@ -48,7 +48,7 @@ class ViewOptions:
     up: Literal["z", "y"] | None = None
     """Up axis of a mesh file; by default y for glTF, z for all others."""
     host: str = "127.0.0.1"
-    """Address to listen on. Anybody who reaches another than 127.0.0.1 sees the data."""
+    """Address or name to listen on. Anybody who reaches another than 127.0.0.1 sees the data."""
     port: int = 8080
     """Port to listen on; 0 takes a free one."""
     camera: Annotated[CameraOptions, tyro.conf.arg(name="")] = field(default_factory=CameraOptions)
@@ -63,7 +63,8 @@ def view(options: Annotated[ViewOptions, tyro.conf.arg(name="")]) -> int:
     listener = bind(options.host, options.port)
     with contextlib.closing(listener):
         prepared = _prepare(options)
-        with serve(listener, f"qs3 view · {Path(options.what).name}") as server, prepared(server):
+        title = f"qs3 view · {Path(options.what).name}"
+        with serve(listener, title, options.host) as server, prepared(server):
             if not is_loopback(listener.getsockname()[0]):
                 print(
                     f"qs3: warning: listening on {options.host}: anybody who can reach this machine"

@@ -67,42 +67,50 @@ def url_of(listener: socket.socket) -> str:
     return f"http://{f'[{host}]' if ':' in host else host}:{port}"
 
 
-def allowed(host: str | None, origin: str | None, loopback: bool) -> bool:
+def own_names(host: str) -> frozenset[str]:
+    """Names by which other machines may ask for the page: this machine's own and the one given."""
+    names = {"localhost", host, socket.gethostname(), socket.getfqdn()}
+    return frozenset(name.lower() for name in names if name)
+
+
+def allowed(host: str | None, origin: str | None, names: frozenset[str] | None) -> bool:
     """Whether a request comes from our own page.
 
     A page of another site that the same browser shows must not read the data: its web socket has
     the other site as its origin. Nor must one that has let its own name point at this machine: then
-    host and origin agree, but are no name of the loopback address.
+    host and origin agree, but are no name of this machine.
 
     Args:
         host: The request's ``Host``.
         origin: Its ``Origin``; browsers send it with every web socket, other programs need not.
-        loopback: Whether the server listens on the loopback address alone.
+        names: Names that other machines may ask by, from `own_names`, besides any address in
+            numbers; None where the server listens on the loopback address alone.
 
     Example:
-        >>> allowed("localhost:8080", "http://localhost:8080", True)
+        >>> allowed("localhost:8080", "http://localhost:8080", None)
         True
-        >>> allowed("localhost:8080", "https://example.org", True)
+        >>> allowed("localhost:8080", "https://example.org", None)
         False
     """
     if host is None or (origin is not None and urlsplit(origin).netloc != host):
         return False
-    return not loopback or _is_own_name(urlsplit(f"//{host}").hostname)
+    return _is_own(urlsplit(f"//{host}").hostname or "", names)
 
 
 @contextlib.contextmanager
-def serve(listener: socket.socket, title: str) -> Iterator[Any]:
+def serve(listener: socket.socket, title: str, host: str = "") -> Iterator[Any]:
     """Run a `viser.ViserServer` on a bound socket until the block ends.
 
     Args:
         listener: From `bind`; closed at the end.
         title: Heading of the page's panel.
+        host: Name that the user gave for the address; requests by that name are answered too.
 
     Raises:
         InputError: where viser is not installed.
     """
     with contextlib.closing(listener), contextlib.ExitStack() as cleanup:
-        server = _start(listener, title, cleanup)
+        server = _start(listener, title, host, cleanup)
         yield server
 
 
@@ -122,7 +130,7 @@ def require_viser() -> Any:
     return viser
 
 
-def _start(listener: socket.socket, title: str, cleanup: contextlib.ExitStack) -> Any:
+def _start(listener: socket.socket, title: str, host: str, cleanup: contextlib.ExitStack) -> Any:
     viser = require_viser()
     import rich
     import websockets.asyncio.server as library
@@ -136,12 +144,13 @@ def _start(listener: socket.socket, title: str, cleanup: contextlib.ExitStack) -
     cleanup.callback(setattr, console, "quiet", console.quiet)
     console.quiet = True
 
-    loopback = is_loopback(listener.getsockname()[0])
+    address = str(listener.getsockname()[0])
+    names = None if is_loopback(address) else own_names(host)
     original, used = library.serve, []
 
     def guarded(handler: Any, host: Any, port: Any, **settings: Any) -> Any:
         used.append(True)
-        settings["process_request"] = _checked(settings["process_request"], loopback)
+        settings["process_request"] = _checked(settings["process_request"], names)
         return original(handler, sock=listener, process_response=_with_policy, **settings)
 
     # NOTE: viser has no way to hand it a socket or a check; it looks this function up when it
@@ -159,13 +168,13 @@ def _start(listener: socket.socket, title: str, cleanup: contextlib.ExitStack) -
     return server
 
 
-def _checked(answer: Callable[..., Any], loopback: bool) -> Callable[..., Any]:
+def _checked(answer: Callable[..., Any], names: frozenset[str] | None) -> Callable[..., Any]:
     def check(connection: Any, request: Any) -> Any:
         # A header that is given twice is a request to refuse.
-        names = {name: request.headers.get_all(name) for name in ("Host", "Origin")}
-        host, origin = (values[0] if len(values) == 1 else None for values in names.values())
-        doubled = any(len(values) > 1 for values in names.values())
-        if doubled or not allowed(host, origin, loopback):
+        given = {name: request.headers.get_all(name) for name in ("Host", "Origin")}
+        host, origin = (values[0] if len(values) == 1 else None for values in given.values())
+        doubled = any(len(values) > 1 for values in given.values())
+        if doubled or not allowed(host, origin, names):
             return connection.respond(http.HTTPStatus.FORBIDDEN, "not from this page\n")
         return answer(connection, request)
 
@@ -187,10 +196,10 @@ def _addresses(host: str) -> list[tuple[socket.AddressFamily, str]]:
     return [(family, str(address[0])) for family, _, _, _, address in found]
 
 
-def _is_own_name(name: str | None) -> bool:
-    if name == "localhost":
-        return True
+def _is_own(name: str, names: frozenset[str] | None) -> bool:
     try:
-        return name is not None and ipaddress.ip_address(name).is_loopback
+        address = ipaddress.ip_address(name)
     except ValueError:
-        return False
+        return name in ({"localhost"} if names is None else names)
+    # No other site can pass itself off as an address of numbers.
+    return names is not None or address.is_loopback
