@@ -1,5 +1,6 @@
 """The bar that shows how a training goes, and the sums behind its numbers."""
 
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -38,7 +39,8 @@ class Progress:
             initial=done,
             desc=description,
             bar_format=_FORMAT,
-            disable=not fabric.is_global_zero,
+            # TQDM_DISABLE is set where several runs share a terminal.
+            disable=not fabric.is_global_zero or "TQDM_DISABLE" in os.environ,
             mininterval=0.5 if sys.stderr.isatty() else 30.0,
         )
         self.begin_epoch()
