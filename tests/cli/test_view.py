@@ -153,7 +153,10 @@ def test_a_mesh_is_scanned_with_the_settings_of_the_page(tmp_path):
         assert np.isin(item.views["points"], 0).all()
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])  # noqa: S104
+@pytest.mark.parametrize(
+    "host",
+    [pytest.param("127.0.0.1", marks=pytest.mark.slow), "0.0.0.0"],  # noqa: S104
+)
 def test_serves_until_ctrl_c(archive, host):
     command = [sys.executable, "-m", "qs3", "view", str(archive), "--port", "0", "--host", host]
     # A process group of its own, so that the interrupt reaches this process alone.
