@@ -248,7 +248,7 @@ def test_page_names_the_cloud_it_was_scored_on(grid, tmp_path):
     report(tmp_path / "run", "--data", grid / "shapes", "--mesh", "none", "--clouds", 0)
     text = (tmp_path / "run" / "report.html").read_text("utf-8")
     assert "Scored on 10 clouds of shapes (clean)." in text
-    assert "<td>shapes (clean)</td>" in text
+    assert ">shapes (clean)</td>" in text
     assert "labelled clouds of shapes (surface)" in text
 
 
