@@ -25,7 +25,7 @@ class Domain:
     """Clouds to train on and clouds to score on."""
 
     title: str
-    """What a table calls it."""
+    """What tables and pictures call it; docs/reproduction.md tells the rest."""
     train: str
     """Data set made here, or a path of the user's, to train on or to adapt to."""
     test: str
@@ -46,13 +46,13 @@ _MADE: Mapping[str, Domain] = {
     "M": Domain("M: surface samples", "source", "held", cloud="surface", stands_for="ModelNet10"),
     "S": Domain("S: scans", "source", "held", stands_for="SpeckleNet10"),
     "D": Domain(
-        "D: one-view scans by another sensor, on a floor, partly hidden",
+        "D: one view, other sensor",
         "target",
         "target",
         stands_for="DepthScanNet10",
     ),
     "F": Domain(
-        "F: noise-free fusion of several views, on a floor, partly hidden",
+        "F: fusion without noise",
         "fused",
         "fused",
         cloud="clean",
