@@ -3,15 +3,19 @@
 import ctypes
 import os
 import signal
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from qs3.datasets.classes import POINTDA10
 from qs3.datasets.generate import GenerateSettings, Item, scan_seed
 from qs3.datasets.shards import CloudRow
+
+_sync = os.fsync
 
 
 @dataclass(frozen=True)
@@ -104,6 +108,34 @@ def crash_once_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRo
     """Take the process along the first time that a bad item is scanned."""
     marker = Path(os.environ["QS3_FAKE_MARKER"])
     if item.id.startswith("bad") and not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return slow_row(item, scan, settings)
+
+
+def crash_in_write_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    """Take the process along the first time that it has a shard written and not yet renamed."""
+    os.fsync = _sync_and_die
+    return slow_row(item, scan, settings)
+
+
+def _sync_and_die(handle: int) -> None:
+    _sync(handle)
+    name = Path(f"/proc/self/fd/{handle}").readlink().name
+    marker = Path(os.environ["QS3_FAKE_MARKER"])
+    if "shard-" in name and not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def crash_with_lock_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    """Take the process along, the first time, with the lock that all workers share held."""
+    marker = Path(os.environ["QS3_FAKE_MARKER"])
+    if item.id.startswith("bad") and not marker.exists():
+        frame: Any = sys._getframe()
+        while "channel" not in frame.f_locals:
+            frame = frame.f_back
+        frame.f_locals["channel"].mutex.acquire()
         marker.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return slow_row(item, scan, settings)

@@ -161,11 +161,12 @@ def test_a_worker_killed_from_outside_costs_nothing(fake, start, tmp_path):
     assert content(tmp_path / "out") == whole(fake, tmp_path)
 
 
-def test_an_object_whose_process_dies_once_is_scanned_again(fake, start, tmp_path):
+@pytest.mark.parametrize("row", ["crash_once_row", "crash_in_write_row", "crash_with_lock_row"])
+def test_a_process_that_dies_once_leaves_nothing_undone_and_nothing_behind(
+    fake, start, tmp_path, row
+):
     marker = tmp_path / "marker"
-    process = start(
-        tmp_path / "out", "crash_once_row", env=os.environ | {"QS3_FAKE_MARKER": str(marker)}
-    )
+    process = start(tmp_path / "out", row, env=os.environ | {"QS3_FAKE_MARKER": str(marker)})
     printed, errors = process.communicate(timeout=120)
     assert marker.exists()
     assert (process.returncode, printed.split()) == (0, [str(ROWS), "0", "0"]), errors

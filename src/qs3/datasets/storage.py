@@ -94,7 +94,8 @@ class LocalFolder:
     def locked(self) -> Iterator[None]:
         """Keep a second process from writing here at the same time; a killed one lets go.
 
-        What an interrupted write left in the folder itself is removed.
+        What an interrupted write left is removed, before and, where no exception ends the block,
+        after: a worker may have been killed while it wrote.
 
         Raises:
             InputError: where another holds it.
@@ -116,12 +117,15 @@ class LocalFolder:
             except OSError:  # a file system without locks
                 yield  # and with no way to know whether somebody else is writing
                 return
-            remove_left_overs(self.path)
-            for folder in self.path.glob(f"{PARTS}/*/"):
-                remove_left_overs(folder)
+            self._remove_left_overs()
             yield
+            self._remove_left_overs()
         finally:
             os.close(handle)
+
+    def _remove_left_overs(self) -> None:
+        for folder in (self.path, *self.path.glob(f"{PARTS}/*/")):
+            remove_left_overs(folder)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,9 @@ from qs3.datasets.executors.executor import Failure, guarded
 from qs3.errors import InputError
 
 _BROKEN_IN_A_ROW = 3
+_LOCK_SECONDS = 5.0
+"""A worker waits so long for the lock that all share, held for milliseconds at a time. One that was
+killed with it never gives it back: those that wait then end, and the pool is opened anew."""
 _NO_PROCESS = (
     "workers: no process can be started; use workers=0, or put the call of a script under: "
     "if __name__ == '__main__'"
@@ -213,7 +216,10 @@ def _interrupt_blocked() -> Iterator[None]:
 
 
 def _prepare_worker() -> None:
-    """Leave Ctrl-C to the first process, and end when it is gone."""
+    """Leave Ctrl-C to the first process, and end when it is gone or died with the lock."""
+    import pebble
+
+    pebble.CONSTS.channel_lock_timeout = _LOCK_SECONDS
     with contextlib.suppress(ValueError):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     if sys.platform == "linux":
