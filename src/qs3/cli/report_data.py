@@ -3,13 +3,13 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from qs3.datasets.manifest import MANIFEST
 from qs3.errors import QS3Error
 from qs3.evaluation.records import DataRecord
 
 if TYPE_CHECKING:
     from qs3.datasets.clouds import PointClouds
 
-_DATASET = "dataset.json"
 _LEVELS = 5
 """How far above a run its data are looked for: a grid has runs/<task>/<row>/<seed>."""
 
@@ -67,7 +67,7 @@ def read_data(
     from qs3.datasets.storage import open_folder
 
     if cloud is None:
-        generated = "://" in place or (Path(place) / _DATASET).is_file()
+        generated = "://" in place or (Path(place) / MANIFEST).is_file()
         # Other data than generated ones have no twin to choose.
         cloud = known.cloud if generated and known is not None else "points"
     clouds = load_clouds(

@@ -264,25 +264,23 @@ def _summary(run: FoundRun, test: DataRecord | None) -> str:
     source, target = run.data("source"), run.data("target")
     text = f"A {run.settings['train']['model']} was trained by {run.method}"
     if source is not None:
-        text += f" on {source.clouds} labelled clouds of {parts.data_name(source)}"
+        text += f" on {source.clouds} labelled clouds of {source.label}"
     if target is not None:
-        text += (
-            f" with {target.clouds} clouds of {parts.data_name(target)}, whose labels it never saw"
-        )
+        text += f" with {target.clouds} clouds of {target.label}, whose labels it never saw"
     text += f"; seed {run.settings['train']['seed']}, chosen by the rule “{run.told['selection']}”."
     if test is not None:
-        text += f" Scored on {test.clouds} clouds of {parts.data_name(test)}."
+        text += f" Scored on {test.clouds} clouds of {test.label}."
     return text
 
 
 def _montage(options: "ReportOptions") -> tuple[Any, str, tuple[str, ...]]:
     """A scan step by step, its title, and a note where none can be made here."""
     from qs3.cli.camera import CameraOptions
-    from qs3.cli.scan import _load
+    from qs3.cli.scan import load_named
 
     if options.mesh == "none":
         return None, "", ()
-    mesh, origin = _load(options.mesh, 0)
+    mesh, origin = load_named(options.mesh, 0)
     camera = CameraOptions(sensor=options.sensor)
     camera.resolve_sensor()
     try:

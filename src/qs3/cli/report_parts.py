@@ -12,7 +12,6 @@ from qs3.errors import InputError
 
 if TYPE_CHECKING:
     from qs3.datasets.clouds import PointClouds
-    from qs3.evaluation.records import DataRecord
     from qs3.report import Cloud, DataLine, FeatureMap, Outcome
     from qs3.training import LoadedModel
 
@@ -184,15 +183,8 @@ def data_lines(parts: Mapping[str, Any]) -> tuple["DataLine", ...]:
     lines = []
     for role, data in parts.items():
         if data is not None:
-            lines.append(DataLine(role, data_name(data), data.clouds, data.checksum))
+            lines.append(DataLine(role, data.label, data.clouds, data.checksum))
     return tuple(lines)
-
-
-def data_name(data: "DataRecord") -> str:
-    """Name, split and cloud of data, such as ``fused/test (clean)``."""
-    split = "" if data.split is None else f"/{data.split}"
-    kind = "" if data.cloud == "points" else f" ({data.cloud})"
-    return f"{data.name}{split}{kind}"
 
 
 def picture_scan(mesh: Any, sensor_name: str, renderer: Any, views: int, seed: int) -> Any:

@@ -1,7 +1,6 @@
 """What lies in the folder of a report: finished runs, unfinished ones, records."""
 
 import os
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,16 +9,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from qs3.cli.train import RUN
+from qs3.datasets.manifest import MANIFEST
 from qs3.errors import InputError, QS3Error
 from qs3.evaluation.records import RECORD, DataRecord, RunRecord, read_record
+from qs3.experiments.runs import parse_record_name
 from qs3.files import read_json
 
 if TYPE_CHECKING:
     from qs3.report import NamedRecord
 
-_SETTINGS, _MODEL, _DATASET = "settings.json", "model.safetensors", "dataset.json"
+_SETTINGS, _MODEL = "settings.json", "model.safetensors"
 _RECORDS = ("records", "results")
-_NAME = re.compile(r"(?P<task>.+)_(?P<row>[^_]+)_seed-\d+")
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def _walk(folder: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
     """Folders from the top in the order of their names, without those of data sets."""
     for root, folders, files in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
-        if _DATASET in files:
+        if MANIFEST in files:
             folders.clear()
             continue
         yield Path(root), folders, sorted(files)
@@ -206,8 +206,8 @@ def _line_of(path: Path) -> tuple[str, str]:
         >>> _line_of(Path("chairs/records/a.json"))
         ('', '')
     """
-    if (name := _NAME.fullmatch(path.stem)) is not None:
-        return name["task"], name["row"]
+    if (name := parse_record_name(path.name)) is not None:
+        return name[:2]
     for task, row, seed in zip(path.parts, path.parts[1:], path.parts[2:], strict=False):
         if seed.startswith("seed-"):
             return task, row

@@ -57,24 +57,11 @@ class ReproduceOptions:
 
 def reproduce(options: Annotated[ReproduceOptions, tyro.conf.arg(name="")]) -> int:
     """Make tables and figures anew, with their data and trainings; only what is missing is done."""
-    from qs3.experiments.grid import missing
-    from qs3.experiments.reproduction import (
-        collect_runs,
-        describe,
-        measure,
-        plans_for,
-    )
     from qs3.experiments.reproduction import reproduce as make
 
     setup = _setup(options)
-    parts = _parts(options, setup)
-    if options.dry_run:
-        runs = collect_runs(parts)
-        plans = plans_for(parts, runs, setup)
-        cost = measure(setup, missing(runs, setup.out, setup.own), plans)
-        print(describe(parts, setup, runs, plans, cost))
-        return 0
-    paths = make(parts, setup, _train, _evaluate, _tell)
+    tell = print if options.dry_run else _tell
+    paths = make(_parts(options, setup), setup, _train, _evaluate, tell, options.dry_run)
     for path in paths:
         if path.is_file():
             print(path.read_text(encoding="utf-8"))

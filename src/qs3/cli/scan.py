@@ -52,13 +52,13 @@ def scan(options: Annotated[ScanOptions, tyro.conf.arg(name="")]) -> int:
     start = time.perf_counter()
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: must not be negative")
-    mesh, origin = _load(options.mesh, options.seed, options.up)
+    mesh, origin = load_named(options.mesh, options.seed, options.up)
     sensor = options.scene.resolve_sensor(options.camera.resolve_sensor())
     settings = options.camera.scan_arguments() | options.scene.scan_arguments(sensor)
     beside = None
     if options.neighbour:
         # Its own draw: a chair beside a chair is another one.
-        beside, origin["neighbour"] = _load(options.neighbour, options.seed + 1)
+        beside, origin["neighbour"] = load_named(options.neighbour, options.seed + 1)
     renderer = options.camera.resolve_renderer()
     result = scan_mesh(
         mesh,
@@ -96,7 +96,14 @@ def scan(options: Annotated[ScanOptions, tyro.conf.arg(name="")]) -> int:
     return 0
 
 
-def _load(name: str, seed: int, up: Literal["z", "y"] | None = None) -> tuple[Any, dict[str, Any]]:
+def load_named(
+    name: str, seed: int, up: Literal["z", "y"] | None = None
+) -> tuple[Any, dict[str, Any]]:
+    """Return the mesh of a file or a built-in class, and where it is from.
+
+    Raises:
+        InputError: where it is neither, or the file holds no mesh.
+    """
     from qs3.meshes import load_mesh, shapes
 
     if name in shapes.CLASSES and not Path(name).exists():

@@ -8,15 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from qs3.errors import InputError
-from qs3.experiments.catalogue import TableName
+from qs3.experiments.catalogue import FigureFormat, TableFormat, TableName
 
 if TYPE_CHECKING:
-    from qs3.experiments.paper import FigureFormat, PaperTable, TableFormat
-else:
-    from typing import Literal
-
-    TableFormat = Literal["md", "csv", "tex"]
-    FigureFormat = Literal["png", "svg"]
+    from qs3.experiments.paper import PaperTable
 
 INCOMPLETE = 1
 """Exit code where a record was refused and the rest is shown."""

@@ -40,6 +40,18 @@ class DataRecord:
     cloud: str = "points"
     """Which cloud of a generated data set."""
 
+    @property
+    def label(self) -> str:
+        """Name, split and, unless it is the scan's, cloud.
+
+        Example:
+            >>> DataRecord("fused", "0a", 9, "test", "clean").label
+            'fused/test (clean)'
+        """
+        split = "" if self.split is None else f"/{self.split}"
+        kind = "" if self.cloud == "points" else f" ({self.cloud})"
+        return f"{self.name}{split}{kind}"
+
 
 @dataclass(frozen=True)
 class Scores:

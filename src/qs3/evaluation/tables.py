@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from qs3.errors import InputError
 from qs3.evaluation.metrics import MeanSEM, mean_sem
@@ -33,13 +33,8 @@ def default_key(record: RunRecord) -> Key:
     Name and part of the data stand for it; a run on the clean or surface clouds of a data set
     says so.
     """
-    parts = []
-    for data in (record.source, record.target, record.test):
-        if data is None:
-            parts.append("-")
-        else:
-            kind = "" if data.cloud == "points" else f" ({data.cloud})"
-            parts.append(f"{data.name}{'' if data.split is None else '/' + data.split}{kind}")
+    data = (record.source, record.target, record.test)
+    parts = ["-" if one is None else one.label for one in data]
     return (record.method, record.model, *parts, record.selection, ", ".join(record.marks))
 
 
@@ -67,7 +62,7 @@ def group(records: Sequence[RunRecord], key: Callable[[RunRecord], Key] = defaul
         label = " · ".join(filter(None, name))
         if len({run.seed for run in runs}) < len(runs):
             raise InputError(f"{label}: two records of one seed; remove one")
-        if len({_identity(run) for run in runs}) > 1:
+        if len({json.dumps(shared(run), sort_keys=True) for run in runs}) > 1:
             raise InputError(f"{label}: runs differ in settings or data, not in the seed alone")
         rows.append(
             Row(
@@ -80,15 +75,23 @@ def group(records: Sequence[RunRecord], key: Callable[[RunRecord], Key] = defaul
     return rows
 
 
-def _identity(record: RunRecord) -> str:
-    """Everything that runs of one line share."""
+def shared(record: RunRecord) -> dict[str, Any]:
+    """Return what all runs of one line share: settings but for the seed, data and classes."""
     settings = {name: value for name, value in record.settings.items() if name != "seed"}
     if isinstance(settings.get("train"), Mapping):
         settings["train"] = {k: v for k, v in settings["train"].items() if k != "seed"}
-    # A warm-up is known by its weights, which follow from the seed.
+    # A warm-up is known by its weights, which follow from the seed; so do the held-out clouds.
     settings["warm_up"] = settings.get("warm_up") is not None
-    sums = [data.checksum for data in (record.source, record.target, record.test) if data]
-    return json.dumps([settings, sums, record.model, record.method], sort_keys=True)
+    for name in ("source", "target"):  # checksums of the clouds, told by the data below
+        settings.pop(name, None)
+    data = {"source": record.source, "target": record.target, "test": record.test}
+    return {
+        "settings": settings,
+        "data": {name: one.checksum for name, one in data.items() if one is not None},
+        "classes": list(record.scores.class_names),
+        "model": record.model,
+        "method": record.method,
+    }
 
 
 def markdown(

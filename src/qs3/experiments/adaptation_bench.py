@@ -4,7 +4,6 @@ Paper: Table of adaptation methods of QS³ (ECCV 2022), whose figures stand besi
 Command: ``qs3 reproduce adaptation-bench --out DIR`` (``--dry-run`` prints counts and hours).
 """
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +33,7 @@ from qs3.experiments.grid import (
 )
 from qs3.experiments.reproduction import Setup, reproduce
 from qs3.experiments.rows import ABLATIONS, ROWS, SUPERVISED
-from qs3.experiments.runs import Run, make_grid
+from qs3.experiments.runs import Run, make_grid, parse_record_name
 from qs3.experiments.scales import Task
 from qs3.files import write_text
 
@@ -108,12 +107,9 @@ def read_results(bench: Bench, runs: Sequence[Run]) -> list[Result]:
     folder, setup = bench.setup.out / RESULTS, bench.setup
     for path in sorted(folder.iterdir()):
         # The other tables' records lie here too; each is checked by its own.
-        if path.suffix == ".json" and not _NAME.fullmatch(path.name):
+        if path.suffix == ".json" and parse_record_name(path.name) is None:
             raise InputError(f"{path}: is no record of this bench; move it elsewhere")
     return [Result(run, read_result(folder / run.record, run, setup.own)) for run in runs]
-
-
-_NAME = re.compile(r"[^-]+-.+_.+_seed-\d+\.json")
 
 
 def write_table(bench: Bench, runs: Sequence[Run], plans: Mapping[str, Plan]) -> Path:

@@ -13,19 +13,11 @@ TableName = Literal[
     "pointda10",
 ]
 """Tables that are read from records, each with its figure."""
-PartName = Literal[
-    "ordinary",
-    "uda",
-    "real2sim",
-    "views",
-    "thresholds",
-    "partiality",
-    "sensors",
-    "pointda10",
-    "galleries",
-    "adaptation-bench",
-    "adaptation-ablation",
-]
+PartName = Literal[TableName, "galleries", "adaptation-bench", "adaptation-ablation"]
 """Everything that can be reproduced."""
 ScaleName = Literal["smoke", "laptop", "small", "paper"]
 """Sizes; see `qs3.experiments.scales.SCALES`."""
+TableFormat = Literal["md", "csv", "tex"]
+"""Forms of a table."""
+FigureFormat = Literal["png", "svg"]
+"""Forms of a figure."""

@@ -14,7 +14,7 @@ from qs3.datasets.executors.executor import stop_if_fatal
 from qs3.errors import InputError
 from qs3.evaluation.records import DataRecord, RunRecord, read_record, write_record
 from qs3.experiments.domains import REAL, Domain, domain
-from qs3.experiments.rows import ORDINARY, SUPERVISED
+from qs3.experiments.rows import SUPERVISED
 from qs3.experiments.runs import Run
 
 RUNS, RESULTS, DATA = "runs", "results", "data"
@@ -73,7 +73,7 @@ def make_work(
         InputError: where it needs real objects and there are none, or a domain has no clouds to
             score on.
     """
-    source, target = domain(run.source, own), domain(run.target, own)
+    learnt, target = domain(run.learns_from, own), domain(run.target, own)
 
     def place(known: Domain, name: str) -> Path:
         if known.own:
@@ -89,8 +89,6 @@ def make_work(
 
     if not target.test:
         raise InputError(f"task {run.task}: {run.target} has no clouds to score on")
-    sees_target = run.row not in (SUPERVISED, ORDINARY)
-    learnt = target if run.row == SUPERVISED else source
     warm = None
     if run.warm_up is not None:
         warm = out / RUNS / replace(run, row=run.warm_up).folder
@@ -100,8 +98,8 @@ def make_work(
         source=place(learnt, learnt.train),
         source_split=learnt.train_split,
         source_cloud=learnt.cloud,
-        target=place(target, target.train) if sees_target else None,
-        target_split=target.train_split if sees_target else None,
+        target=place(target, target.train) if run.sees_target else None,
+        target_split=target.train_split if run.sees_target else None,
         target_cloud=target.cloud,
         test=place(target, target.test),
         test_split=target.test_split,
@@ -126,10 +124,10 @@ def data_sets(runs: Iterable[Run], own: Mapping[str, Domain] | None = None) -> l
     """
     found: dict[str, None] = {}
     for run in runs:
-        source, target = domain(run.source, own), domain(run.target, own)
-        names = [] if run.row == SUPERVISED or source.own else [source.train]
+        learnt, target = domain(run.learns_from, own), domain(run.target, own)
+        names = [] if learnt.own else [learnt.train]
         if not target.own:
-            names += [target.test] if run.row == ORDINARY else [target.train, target.test]
+            names += [target.train, target.test] if run.sees_target else [target.test]
         found |= dict.fromkeys(name for name in names if name != REAL)
     return list(found)
 
@@ -157,8 +155,7 @@ def read_result(path: Path, run: Run, own: Mapping[str, Domain] | None = None) -
         InputError: where it is damaged, or that of another run; the file is named.
     """
     record = read_record(path)
-    source, target = domain(run.source, own), domain(run.target, own)
-    learnt = target if run.row == SUPERVISED else source
+    learnt, target = domain(run.learns_from, own), domain(run.target, own)
     wanted: dict[str, Any] = {
         "method": (record.method, run.method),
         "seed": (record.seed, run.seed),
@@ -170,15 +167,13 @@ def read_result(path: Path, run: Run, own: Mapping[str, Domain] | None = None) -
         ),
         "model": (record.model, run.train.model),
         "selection": (record.selection, run.train.rule),
-        "source": (_told(record.source), (learnt.train, learnt.train_split, learnt.cloud)),
-        "target": (_told(record.target), (target.train, target.train_split, target.cloud)),
-        "test": (_told(record.test), (target.test, target.test_split, target.cloud)),
+        "source": (_told(record.source), _part(learnt, learnt.train, learnt.train_split)),
+        "target": (
+            _told(record.target),
+            _part(target, target.train, target.train_split) if run.sees_target else None,
+        ),
+        "test": (_told(record.test), _part(target, target.test, target.test_split)),
     }
-    for name in ("source", "target", "test"):
-        there, (place, split, cloud) = wanted[name]
-        wanted[name] = there, (Path(place).name, split, cloud)
-    if run.row in (SUPERVISED, ORDINARY):
-        wanted["target"] = record.target, None
     for name, (there, here) in wanted.items():
         if there != here:
             raise InputError(
@@ -190,6 +185,10 @@ def read_result(path: Path, run: Run, own: Mapping[str, Domain] | None = None) -
 
 def _told(data: DataRecord | None) -> tuple[str, str | None, str] | None:
     return None if data is None else (data.name, data.split, data.cloud)
+
+
+def _part(known: Domain, place: str, split: str | None) -> tuple[str, str | None, str]:
+    return Path(place).name, split, known.cloud
 
 
 def _plain(settings: Any) -> Any:

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from qs3.errors import InputError
 from qs3.evaluation.records import RunRecord
@@ -17,13 +16,13 @@ from qs3.experiments import (
     uda,
     views,
 )
+from qs3.experiments.catalogue import FigureFormat, TableFormat
 from qs3.experiments.domains import Domain, domain
 from qs3.experiments.experiment import Experiment, Grid, cell_runs, fill
 from qs3.experiments.figures import draw
 from qs3.experiments.grid import RESULTS, make_work, read_result
 from qs3.experiments.render import to_csv, to_latex, to_markdown
 from qs3.experiments.reproduction import Setup
-from qs3.experiments.rows import SUPERVISED
 from qs3.experiments.runs import Run, with_warm_up
 from qs3.experiments.scales import Scale
 from qs3.files import write_bytes, write_text
@@ -34,8 +33,6 @@ EXPERIMENTS: Mapping[str, Experiment] = {
     for one in (ordinary, uda, real2sim, views, thresholds, partiality, sensors, pointda10)
 }
 """Every table and figure that comes from records, by name."""
-TableFormat = Literal["md", "csv", "tex"]
-FigureFormat = Literal["png", "svg"]
 
 
 @dataclass(frozen=True)
@@ -86,8 +83,9 @@ class PaperTable:
     def runs(self) -> list[Run]:
         """Return the runs of all cells, a warm-up before what starts from it."""
         found: dict[str, Run] = {}
+        cells = self.cells()
         for seed in self.setup.seeds:  # a seed is finished before the next begins
-            for runs in self.cells().values():
+            for runs in cells.values():
                 for run in (one for one in runs if one.seed == seed):
                     make_work(run, self.setup.out, self.setup.shared, self.setup.own)
                     for one in with_warm_up(self.setup.scale, run):
@@ -203,8 +201,7 @@ def _mixed(
         record = records.get(run.record)
         if record is None:
             continue
-        learnt = run.target if run.row == SUPERVISED else run.source
-        known = {f"train {learnt}": record.source, f"test {run.target}": record.test}
+        known = {f"train {run.learns_from}": record.source, f"test {run.target}": record.test}
         if record.target is not None:
             known[f"train {run.target}"] = record.target
         for name, data in known.items():

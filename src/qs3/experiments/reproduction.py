@@ -30,8 +30,8 @@ from qs3.experiments.grid import (
     missing,
     run_grid,
 )
-from qs3.experiments.rows import ORDINARY, SUPERVISED
-from qs3.experiments.runs import Run
+from qs3.experiments.rows import ORDINARY
+from qs3.experiments.runs import Run, parse_record_name
 from qs3.experiments.scales import Scale
 from qs3.files import claim_folder, read_json, write_json
 
@@ -122,7 +122,12 @@ def plans_for(parts: Sequence[Part], runs: Sequence[Run], setup: Setup) -> dict[
 
 
 def reproduce(
-    parts: Sequence[Part], setup: Setup, train: Train, evaluate: Evaluate, tell: Tell
+    parts: Sequence[Part],
+    setup: Setup,
+    train: Train,
+    evaluate: Evaluate,
+    tell: Tell,
+    dry_run: bool = False,
 ) -> list[Path]:
     """Make data, runs and tables, whatever of them is missing.
 
@@ -132,9 +137,10 @@ def reproduce(
         train: Trains a run; a function of a module where runs are made in other processes.
         evaluate: Scores it; likewise.
         tell: Is told how it goes.
+        dry_run: Only tell what is to do and how long it takes; nothing is written.
 
     Returns:
-        The main file of each part.
+        The main file of each part that was made.
 
     Raises:
         InputError: where the folder is for other settings, a record is damaged or not of its run,
@@ -142,13 +148,16 @@ def reproduce(
     """
     runs = collect_runs(parts)
     plans = plans_for(parts, runs, setup)
-    claim(setup, plans)
+    if not dry_run:
+        claim(setup, plans)
     left = missing(runs, setup.out, setup.own)  # a damaged record stops here, not after hours
     executor = _executor(setup)  # a missing extra is told before anything is made
     needed = set(data_sets(left, setup.own)) | {name for part in parts for name in part.sets()}
     plans = {name: plan for name, plan in plans.items() if name in needed}
     cost = measure(setup, left, plans)
     tell(describe(parts, setup, runs, plans, cost))
+    if dry_run:
+        return []
     if len(left) < len(runs):
         tell(f"{len(runs) - len(left)} of {len(runs)} runs are there already")
     absent = make_data(setup.out / DATA, plans, setup.workers)
@@ -213,8 +222,7 @@ def measure(setup: Setup, left: Sequence[Run], plans: Mapping[str, Plan]) -> Cos
     counts = {name: _counts(plan) for name, plan in plans.items()}
     expected, trained = {}, set()
     for run in left:
-        source, target = domain(run.source, setup.own), domain(run.target, setup.own)
-        learnt = target if run.row == SUPERVISED else source
+        learnt, target = domain(run.learns_from, setup.own), domain(run.target, setup.own)
         seen = Counts(
             source=_size(learnt.train, "train", counts),
             target=0 if run.row == ORDINARY else _size(target.train, "train", counts),
@@ -309,15 +317,10 @@ def read_setup(folder: Path) -> Setup:
         own[name] = own_domain(
             name, one["name"], one["cloud"], one["train_split"], one["test_split"]
         )
-    seeds = sorted(
-        {
-            int(path.stem.rpartition("-")[2])
-            for path in (folder / RESULTS).glob("*_seed-*.json")
-            if path.stem.rpartition("-")[2].isdecimal()
-        }
-    )
+    names = [parse_record_name(path.name) for path in (folder / RESULTS).glob("*.json")]
+    seeds = tuple(sorted({name[2] for name in names if name is not None}))
     return Setup(
-        out=folder, scale=scale, seeds=tuple(seeds) or (0, 1, 2), threads=there["threads"], own=own
+        out=folder, scale=scale, seeds=seeds or (0, 1, 2), threads=there["threads"], own=own
     )
 
 

@@ -1,6 +1,7 @@
 """The grid: which runs make a table."""
 
 import contextlib
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,6 +11,8 @@ from qs3.errors import InputError
 from qs3.experiments.rows import ABLATIONS, ORDINARY, PAPER, ROWS, STEP, SUPERVISED, THETA
 from qs3.experiments.scales import Scale, Task
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
+
+_RECORD_NAME = re.compile(r"(?P<task>[^-]+-.+)_(?P<label>[^_]+)_seed-(?P<seed>\d+)\.json")
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,16 @@ class Run:
         return self.task.partition("-")[2]
 
     @property
+    def learns_from(self) -> str:
+        """Name of the domain whose labels it learns: the target's own for the supervised row."""
+        return self.target if self.row == SUPERVISED else self.source
+
+    @property
+    def sees_target(self) -> bool:
+        """Whether its training is handed the target's clouds."""
+        return self.row not in (SUPERVISED, ORDINARY)
+
+    @property
     def label(self) -> str:
         """Row and, where it is not the bench's, network."""
         return f"{self.row}@{self.network}" if self.network else self.row
@@ -58,6 +71,19 @@ class Run:
     def record(self) -> str:
         """Name of the record among the results."""
         return f"{self.task}_{self.label}_seed-{self.seed}.json"
+
+
+def parse_record_name(name: str) -> tuple[str, str, int] | None:
+    """Return task, label and seed of a record's file name; None where it is no such name.
+
+    Example:
+        >>> parse_record_name("A.kinect_v1-A.d435_ordinary@dgcnn_seed-0.json")
+        ('A.kinect_v1-A.d435', 'ordinary@dgcnn', 0)
+        >>> parse_record_name("test-0a1b.json") is None
+        True
+    """
+    found = _RECORD_NAME.fullmatch(name)
+    return None if found is None else (found["task"], found["label"], int(found["seed"]))
 
 
 def make_run(

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Int
 
 from qs3.evaluation.metrics import MeanSEM, mean_sem
-from qs3.evaluation.records import DataRecord, RunRecord
+from qs3.evaluation.records import RunRecord
+from qs3.evaluation.tables import shared
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def score_lines(records: Sequence[NamedRecord]) -> tuple[tuple[ScoreLine, ...], 
     for runs in groups.values():
         alike: dict[str, list[NamedRecord]] = {}
         for one in runs:
-            alike.setdefault(json.dumps(_shared(one.record), sort_keys=True), []).append(one)
+            alike.setdefault(json.dumps(shared(one.record), sort_keys=True), []).append(one)
         told = _differences([json.loads(text) for text in alike])
         for differs, kin in zip(told, alike.values(), strict=True):
             kept: dict[int, NamedRecord] = {}
@@ -133,34 +134,8 @@ def _key(one: NamedRecord) -> tuple[str, ...]:
 
 
 def _data(record: RunRecord) -> str:
-    ways = [_part(data) for data in (record.source, record.target) if data is not None]
-    return f"{' → '.join(ways)}; scored on {_part(record.test)}"
-
-
-def _part(data: DataRecord) -> str:
-    kind = "" if data.cloud == "points" else f" ({data.cloud})"
-    return f"{data.name}{'' if data.split is None else f'/{data.split}'}{kind}"
-
-
-def _shared(record: RunRecord) -> dict[str, Any]:
-    """What runs of one line share: settings but for the seed, and data."""
-    settings = {name: value for name, value in record.settings.items() if name != "seed"}
-    if isinstance(settings.get("train"), Mapping):
-        settings["train"] = {k: v for k, v in settings["train"].items() if k != "seed"}
-    # A warm-up is known by its weights, which follow from the seed; so do the held-out clouds.
-    settings["warm_up"] = settings.get("warm_up") is not None
-    for name in ("source", "target"):  # checksums of the clouds, told by the data below
-        settings.pop(name, None)
-    sums = {
-        name: data.checksum
-        for name, data in (
-            ("source", record.source),
-            ("target", record.target),
-            ("test", record.test),
-        )
-        if data is not None
-    }
-    return {"settings": settings, "data": sums, "classes": list(record.scores.class_names)}
+    ways = [data.label for data in (record.source, record.target) if data is not None]
+    return f"{' → '.join(ways)}; scored on {record.test.label}"
 
 
 def _differences(shared: Sequence[Mapping[str, Any]]) -> list[str]:
