@@ -25,10 +25,10 @@ _START, _END = "<!-- sizes: docs/make_models_table.py -->", "<!-- end of sizes -
 PUBLISHED = {
     "pointnet": ("3.5", "440", "PointNet, Table 6"),
     "pointnet-sa": ("–", "–", ""),
-    "pointnet2": ("1.48", "1,684", "RS-CNN, Table 6"),
+    "pointnet2": ("1.48", "1,684", "RS-CNN, complexity"),
     "pointnet2-msg": ("–", "–", ""),
     "dgcnn": ("–", "–", ""),
-    "rscnn": ("1.41", "295", "RS-CNN, Table 6"),
+    "rscnn": ("1.41", "295", "RS-CNN, complexity"),
     "simpleview": ("0.8", "–", "SimpleView, §4"),
     "pointmlp-elite": ("0.68", "–", "PointMLP, Table 1"),
 }

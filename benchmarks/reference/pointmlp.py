@@ -26,6 +26,10 @@ def farthest_points(points: Tensor, m: int, last: Tensor) -> Tensor:
     return torch.stack(chosen, dim=1)
 
 
+def nearest(centres: Tensor, points: Tensor, k: int) -> Tensor:
+    return torch.cdist(centres, points).topk(k, dim=2, largest=False).indices
+
+
 def pick(values: Tensor, index: Tensor) -> Tensor:
     cloud = torch.arange(len(values), device=values.device)
     return values[cloud.view(-1, *[1] * (index.ndim - 1)), index]
@@ -109,9 +113,7 @@ class PointMLPElite(nn.Module):
         for k, reducer in self.levels:
             samples = farthest_points(points, max(1, points.shape[1] // reducer), last)
             centres = pick(points, samples)
-            k = min(k, points.shape[1])
-            neighbours = torch.cdist(centres, points).topk(k, dim=2, largest=False).indices
-            groups.append((samples, neighbours))
+            groups.append((samples, nearest(centres, points, min(k, points.shape[1]))))
             points, last = centres, torch.zeros_like(last)
         return groups
 

@@ -77,7 +77,12 @@ def test_the_tables_numbers_are_those_of_the_records(finished):
         spread = best.std(ddof=1) / np.sqrt(2)
         assert re.search(rf"\| {row} \|.*\| {best.mean():.1f} ± {spread:.1f} \|\n", text)
     kept = np.mean([record["rounds"][-1]["kept"] for record in records], axis=0)
-    assert f"| qbst | {' | '.join(f'{value:g}' for value in kept)} |" in text
+    over = np.mean([sum(record["rounds"][-1]["confident"]) for record in records])
+    rounds = [one for record in records for one in record["rounds"]]
+    trained = sum(not one["skipped"] for one in rounds)
+    told = [f"{kept.sum():.1f} of {over:.1f}", f"{trained} of {len(rounds)}"]
+    cells = [*(f"{value:.1f}" for value in kept), *told]
+    assert f"| qbst | {' | '.join(cells)} |" in text
 
 
 def test_the_csv_has_every_run_and_rule(finished):

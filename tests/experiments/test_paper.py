@@ -366,7 +366,7 @@ def test_figures_are_the_same_bytes_each_time(finished, tiny, tmp_path, capsys):
         grid, _ = PaperTable(EXPERIMENTS[name], setup_of(finished, tiny)).grid()
         assert png_bytes(draw(grid)) == (finished / f"{name}.png").read_bytes()
         path = tmp_path / f"{name}.svg"
-        assert figure(FigureOptions(name, finished, path, "svg")) == 0
+        assert figure(FigureOptions(name, finished, path)) == 0
         assert "S → D" in path.read_text()
     assert capsys.readouterr().out.split() == [str(tmp_path / f"{name}.svg") for name in names]
 
@@ -447,6 +447,31 @@ def test_caveats_of_a_run_stand_below_the_table(finished, tiny, tmp_path):
     assert "- training clouds: DGCNN on S → D" in part.text(grid, "md")
     assert "% training clouds: DGCNN on S → D" in part.text(grid, "tex")
     assert part.text(grid, "csv").count("training clouds") == 2
+
+
+def test_rounds_that_did_not_train_and_settings_of_the_scale_are_told(finished, tiny, tmp_path):
+    folder = shutil.copytree(finished, tmp_path / "copy")
+    part = PaperTable(EXPERIMENTS["thresholds"], setup_of(folder, tiny))
+    (place, runs) = next(iter(part.cells().items()))
+    for run in runs:
+        value = json.loads((folder / "results" / run.record).read_text())
+        for number, one in enumerate(value["rounds"]):
+            one["skipped"] = number == 1 and run.seed == 0
+        (folder / "results" / run.record).write_text(json.dumps(value))
+    grid, faults = part.grid()
+    assert faults == []
+    told = "1 of 4 rounds skipped, confident clouds too few"
+    assert grid.cells[place].marks[-1] == told
+    text = part.text(grid, "md")
+    assert f"- {told}: {dict(grid.rows)[place[0]]} on {dict(grid.columns)[place[1]]}" in text
+    assert "Self-training here: threshold 0.0, rounds 2, epochs 1 (paper: 0.8, 10, 10)." in text
+
+
+@pytest.mark.parametrize(("name", "kind"), [("a.jpg", None), ("a", None), ("a.png", "svg")])
+def test_a_figure_s_file_says_its_format(finished, tmp_path, name, kind):
+    with pytest.raises(InputError, match=f"--out {tmp_path / name}: must end in .svg|.png or .svg"):
+        figure(FigureOptions("ordinary", finished, tmp_path / name, kind))
+    assert not (tmp_path / name).exists()
 
 
 @pytest.mark.parametrize("option", ["methods", "tasks"])

@@ -46,6 +46,14 @@ def test_the_readme_shows_numbers_of_the_tables():
     value = r"(\d+\.\d ± \d+\.\d \(n=\d\))"
     shown = re.findall(rf"^\| ([\w-]+) \| {value} \| {value} \|$", text, re.M)
     assert len(shown) > 4
+    table = (ROOT / "results" / "laptop" / "ordinary.md").read_text(encoding="utf-8")
+    cell = r"(\d+\.\d ± \d+\.\d) \((\d+\.\d)\)"
+    networks = re.findall(rf"^\| ([\w+-]+) \| {cell} \| {cell} \|$", text, re.M)
+    assert len(networks) == 4
+    for name, surfaces, told, scans, also in networks:
+        cells = rf"{surfaces} \(n=3\) \| {told} ± .* \| {scans} \(n=3\) \| {also} ±"
+        line = rf"\| {re.escape(name)} \| {cells}"
+        assert re.search(line, table)
     for row, surfaces, scans in shown:
         assert f"| {row} | {surfaces} |" in parts["M → D"]
         assert f"| {row} | {scans} |" in parts["S → D"]

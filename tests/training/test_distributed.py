@@ -160,6 +160,11 @@ def test_one_device_gathers_its_own_rows(settings):
     assert np.array_equal(gather_rows(rows, slice(0, 3), 3, make_fabric(settings)), rows)
 
 
+def test_a_number_format_that_a_cpu_lacks_is_refused(settings):
+    with pytest.raises(InputError, match="16-mixed needs a GPU"):
+        make_fabric(replace(settings, precision="16-mixed"))
+
+
 def test_slow_bf16_is_told_once(settings, monkeypatch, caplog):
     monkeypatch.setattr(module, "has_bf16_units", lambda: False)
     module._tell_of_slow_bf16.cache_clear()

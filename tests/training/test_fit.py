@@ -194,6 +194,10 @@ def test_predictions_are_probabilities_and_deterministic(source, settings):
     np.testing.assert_allclose(
         first, predict_probabilities(model, source.points, batch_size=5), atol=1e-6
     )
+    broken = source.points.copy()
+    broken[3, 0, 0] = np.inf
+    with pytest.raises(InputError, match="cloud 3 are not finite"):
+        predict_probabilities(model, broken)
     moved = predict_probabilities(model, source.points * 5 + 2)  # the unit ball undoes it
     np.testing.assert_allclose(first, moved, atol=1e-4)
     assert predict_probabilities(model, source.points[:0]).shape == (0, 3)

@@ -176,6 +176,10 @@ def test_bf16_trains(source, settings):
     model, history = run(source, replace(settings, precision="bf16-mixed", epochs=2))
     assert math.isfinite(history[-1].losses["source"])
     assert all(p.dtype == torch.float32 for p in model.parameters())
+    exact, _ = run(source, replace(settings, epochs=2))
+    pairs = list(zip(model.parameters(), exact.parameters(), strict=True))
+    assert any(not torch.equal(a, b) for a, b in pairs)
+    assert all((a - b).abs().max() < 0.1 for a, b in pairs)
 
 
 def test_device_that_is_not_here_is_told(source, settings):

@@ -1,6 +1,7 @@
 """``qs3 table`` and ``qs3 figure``: a table or a figure of the records that are there."""
 
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,6 +14,7 @@ from qs3.experiments.catalogue import FigureFormat, TableFormat, TableName
 if TYPE_CHECKING:
     from qs3.experiments.paper import PaperTable
 
+_FIGURES: Mapping[str, FigureFormat] = {".png": "png", ".svg": "svg"}
 INCOMPLETE = 1
 """Exit code where a record was refused and the rest is shown."""
 
@@ -39,8 +41,8 @@ class FigureOptions:
     """Folder that qs3 reproduce made, or such a one as lies in results/ of the source."""
     out: Path
     """File to write."""
-    format: FigureFormat = "png"
-    """Pixels or vectors."""
+    format: FigureFormat | None = None
+    """Pixels or vectors; by default what the name of the file says."""
 
 
 def table(options: Annotated[TableOptions, tyro.conf.arg(name="")]) -> int:
@@ -57,9 +59,13 @@ def figure(options: Annotated[FigureOptions, tyro.conf.arg(name="")]) -> int:
 
     if options.out.is_dir():
         raise InputError(f"--out {options.out}: is a folder; name a file")
+    kind = _FIGURES.get(options.out.suffix.lower())
+    if kind is None or options.format not in (None, kind):
+        wanted = " or ".join(_FIGURES) if options.format is None else f".{options.format}"
+        raise InputError(f"--out {options.out}: must end in {wanted}")
     part = _part(options.name, options.results)
     grid, faults = part.grid()
-    write_bytes(options.out, part.picture(grid, options.format))
+    write_bytes(options.out, part.picture(grid, kind))
     print(options.out)
     return _tell(faults)
 

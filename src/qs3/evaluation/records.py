@@ -113,6 +113,11 @@ class RunRecord:
     schema: int = field(default=SCHEMA_VERSION)
     """Version of these fields."""
 
+    @property
+    def rounds_trained(self) -> int:
+        """Rounds of self-training that changed the network; the others kept too few clouds."""
+        return sum(not one.get("skipped", False) for one in self.rounds)
+
 
 def score(
     labels: Int[np.ndarray, "b"], predictions: Int[np.ndarray, "b"], class_names: Sequence[str]

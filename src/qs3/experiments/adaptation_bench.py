@@ -143,6 +143,8 @@ def write_table(bench: Bench, runs: Sequence[Run], plans: Mapping[str, Plan]) ->
         "A simulator on both sides flatters: S and D share a renderer, so S-D is easier than a "
         "real target is.",
     ]
+    if scale.rounds:
+        text.append(scale.rounds_told())
     if scale.smoke:
         text.append(
             "Below 40 training objects a class, 512 points or the whole DGCNN: shows that "

@@ -152,7 +152,11 @@ def _short(value: MeanSEM) -> str:
 
 
 def selection_table(lines: Sequence[Line]) -> str | None:
-    """Clouds kept of the last round by pseudo label, mean over seeds; None without rounds."""
+    """Clouds kept of the last round by pseudo label, mean over seeds; None without rounds.
+
+    A round that keeps fewer than two clouds a class leaves the network as it is: a line without a
+    round that trained is the network before the rounds.
+    """
     rows, names = [], None
     for line in lines:
         last = [result.record.rounds[-1] for result in line.results if result.record.rounds]
@@ -161,10 +165,13 @@ def selection_table(lines: Sequence[Line]) -> str | None:
         names = line.results[0].record.scores.class_names
         kept = [mean_sem([float(one["kept"][k]) for one in last]).mean for k in range(len(names))]
         over = mean_sem([float(sum(one["confident"])) for one in last]).mean
-        rows.append([line.row, *(f"{value:g}" for value in kept), f"{sum(kept):.4g} of {over:.4g}"])
+        trained = sum(result.record.rounds_trained for result in line.results)
+        rounds = sum(len(result.record.rounds) for result in line.results)
+        told = [f"{sum(kept):.1f} of {over:.1f}", f"{trained} of {rounds}"]
+        rows.append([line.row, *(f"{value:.1f}" for value in kept), *told])
     if names is None:
         return None
-    return table(["method", *names, "kept of confident"], rows)
+    return table(["method", *names, "kept of confident", "rounds that trained"], rows)
 
 
 def to_csv(lines: Sequence[Line]) -> str:

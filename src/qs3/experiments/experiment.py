@@ -56,7 +56,7 @@ class Cell:
     published: tuple[float, float | None] | None
     """The paper's mean and standard error, in per cent."""
     marks: tuple[str, ...] = ()
-    """Caveats of its runs, such as ``transductive``."""
+    """Caveats of its runs, such as ``transductive``, or that rounds of them were skipped."""
     wanted: int = 1
     """Runs that it waits for in all; 0 where the table has no such cell."""
 
@@ -132,6 +132,16 @@ def cell_runs(
     return found
 
 
+def _marks(records: Sequence[RunRecord]) -> tuple[str, ...]:
+    marks = sorted({mark for record in records for mark in record.marks})
+    trained = sum(record.rounds_trained for record in records)
+    rounds = sum(len(record.rounds) for record in records)
+    if trained < rounds:
+        # Such a cell says more of the network before the rounds than of them.
+        marks.append(f"{rounds - trained} of {rounds} rounds skipped, confident clouds too few")
+    return tuple(marks)
+
+
 def fill(
     experiment: Experiment,
     scale: Scale,
@@ -156,7 +166,7 @@ def fill(
             accuracies={seed: one.scores.accuracy for seed, one in there.items()},
             class_means={seed: one.scores.class_mean_accuracy for seed, one in there.items()},
             published=experiment.published.get(place),
-            marks=tuple(sorted({mark for one in there.values() for mark in one.marks})),
+            marks=_marks(list(there.values())),
             wanted=len(runs),
         )
     return Grid(experiment, scale, rows, columns, filled)

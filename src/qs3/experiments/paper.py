@@ -177,6 +177,8 @@ class PaperTable:
                 f"**Stand-ins, made here**: {', '.join(stand_ins)}. A simulator on both sides "
                 "flatters, and the paper's figures are of its own data: a yardstick, no target."
             )
+        if any(run.self_training is not None for run in runs) and scale.rounds:
+            text.append(scale.rounds_told())
         if scale.smoke:
             text.append(
                 "Below 40 training objects a class, 512 points or the whole networks: shows that "

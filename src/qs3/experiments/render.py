@@ -65,7 +65,7 @@ def _marked(grid: Grid) -> list[str]:
     for (row, column), cell in grid.cells.items():
         for mark in cell.marks:
             found.setdefault(mark, []).append(f"{titles[row]} on {heads[column]}")
-    return [f"{mark}: {', '.join(cells)}" for mark, cells in found.items()]
+    return [f"{mark}: {'; '.join(cells)}" for mark, cells in found.items()]
 
 
 def _paper_columns(grid: Grid) -> list[tuple[str, str]]:

@@ -6,7 +6,7 @@ from typing import Any, Literal, get_args
 
 from qs3.errors import InputError
 from qs3.experiments.rows import NETWORKS, ORDINARY, PAPER
-from qs3.training.config import TrainSettings
+from qs3.training.config import PRESETS, TrainSettings
 
 Task = Literal["M-D", "S-D", "M-R", "S-R"]
 """Source and target of the bench, by the names of `qs3.experiments.domains`. M: samples of the
@@ -34,8 +34,6 @@ class Scale:
     """How many times as frequent."""
     source_views: int = 5
     """Views fused into a scan of the source."""
-    samples: int = 4
-    """Rays a pixel."""
     data_points: int = 2048
     """Points of each cloud on disk."""
     train: TrainSettings = field(default_factory=TrainSettings)
@@ -94,6 +92,20 @@ class Scale:
             raise InputError(f"unknown network {network!r}; choose from {', '.join(self.networks)}")
         own = {"model": network, "model_settings": self.networks[network], **self.ordinary}
         return replace(self.train, seed=seed, threads=threads, **own)
+
+    def rounds_told(self) -> str:
+        """Say where self-training is not the paper's; empty where it is.
+
+        Example:
+            >>> SCALES["smoke"].rounds_told()
+            'Self-training here: threshold 0.4, rounds 3, epochs 2 (paper: 0.8, 10, 10).'
+        """
+        if not self.rounds:
+            return ""
+        paper = PRESETS["paper"]
+        ours = ", ".join(f"{name} {value}" for name, value in self.rounds.items())
+        theirs = ", ".join(str(getattr(paper, name)) for name in self.rounds)
+        return f"Self-training here: {ours} (paper: {theirs})."
 
     def target_count(self, class_name: str, per_class: int) -> int:
         """Return how many objects of a class stand in a part of the target."""

@@ -59,9 +59,9 @@ class EdgeConv(nn.Module):
         c = points.shape[2]
         first, second = self.linear.weight.split(c, dim=1)
         weight = torch.cat([first, second - first], dim=1)
-        own_mean = points.mean(dim=(0, 1))
         norm = self.norm
         if uses_batch(norm):
+            own_mean = points.mean(dim=(0, 1))
             nodes = points.shape[0] * points.shape[1]
             degree = torch.bincount(flat_indices(neighbours).view(-1), minlength=nodes)
             share = degree.to(points.dtype) / neighbours.numel()
@@ -71,18 +71,21 @@ class EdgeConv(nn.Module):
             exact = weight.to(covariance.dtype)
             variance = ((exact @ covariance) * exact).sum(dim=1).clamp_min(0.0).to(points.dtype)
             update_running(norm, mean, variance, neighbours.numel())
-            offset = norm.bias
             scale = norm.weight * torch.rsqrt(variance + norm.eps)
+            shift = None
         else:
             assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
-            neighbour_mean = own_mean
+            # Each cloud about its own mean: in evaluation clouds do not mix, not even one of NaN.
+            own_mean = neighbour_mean = points.mean(dim=1, keepdim=True)
             scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
-            mean = weight @ torch.cat([neighbour_mean, own_mean])
-            offset = norm.bias + scale * (mean - norm.running_mean)
+            mean = nn.functional.linear(torch.cat([neighbour_mean, own_mean], dim=2), weight)
+            shift = scale * (mean - norm.running_mean)
         first, second = (scale[:, None] * weight).split(c, dim=1)
         best = neighbour_max(nn.functional.linear(points - neighbour_mean, first), neighbours)
-        own = nn.functional.linear(points - own_mean, second, offset)
-        return nn.functional.leaky_relu(best + own, _SLOPE, inplace=True)
+        edge = best + nn.functional.linear(points - own_mean, second, norm.bias)
+        if shift is not None:
+            edge.add_(shift)
+        return nn.functional.leaky_relu(edge, _SLOPE, inplace=True)
 
 
 def edge_covariance(

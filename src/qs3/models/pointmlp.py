@@ -94,7 +94,9 @@ class Stage(nn.Module):
         first, second = self.transfer.weight.split(c, dim=1)
         own = gather_points(features, group.samples)
         batch = uses_batch(self.transfer_norm)
-        origin = own.mean(dim=(0, 1)) * batch  # 0 in evaluation, where clouds do not mix
+        origin = own.new_zeros(c)  # in evaluation, where clouds do not mix
+        if batch:
+            origin = own.mean(dim=(0, 1))
         own = own - origin
         moments = differences.moments(own) if batch else None
         weight = torch.cat([first * self.scale, second], dim=1)

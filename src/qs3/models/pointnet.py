@@ -77,7 +77,7 @@ class _LinearMax(torch.autograd.Function):
             product = _product(points[cloud, row], weight)
             index = product.argmax(dim=2, keepdim=True)
             value = product.gather(2, index)[:, :, 0].to(best.dtype)
-            better = value > best[cloud]
+            better = (value > best[cloud]) | value.isnan()  # NaN must not go unseen
             best[cloud] = torch.where(better, value, best[cloud])
             winner[cloud] = torch.where(better, index[:, :, 0] + row.start, winner[cloud])
         ctx.save_for_backward(points, weight, winner)

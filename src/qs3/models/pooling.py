@@ -130,7 +130,7 @@ class _Pooled(torch.autograd.Function):
         of_scale = (each * weighted + best * at_best).sum(dim=0)
         # In training the batch's mean and deviation depend on every value too.
         share = 0.0 if ctx.known else 1.0 / (b * n)
-        of_points, of_weight = torch.empty_like(points), torch.zeros_like(weight)
+        of_points, of_weight = torch.empty_like(points), scale.new_zeros(weight.shape)
         for block in _blocks(points, len(weight)):
             normed = (product[block] - mean).mul_(deviation)
             above = torch.addcmul(shift, normed, scale) > 0
@@ -142,4 +142,4 @@ class _Pooled(torch.autograd.Function):
             gradient = gradient.mul_(scale * deviation).to(weight.dtype)
             of_points[block] = gradient @ weight
             of_weight += gradient.flatten(0, 1).t() @ points[block].flatten(0, 1)
-        return of_points, of_weight, of_scale, of_shift, None, None, None
+        return of_points, of_weight.to(weight.dtype), of_scale, of_shift, None, None, None

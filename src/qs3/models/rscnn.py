@@ -75,7 +75,9 @@ class RSConv(nn.Module):
         batch = uses_batch(self.relate_norm)
         if self.xyz_norm is not None:
             batch = batch or uses_batch(self.xyz_norm)
-        origin = centre.mean(dim=(0, 1, 2)) * batch  # 0 in evaluation, where clouds do not mix
+        origin = centre.new_zeros(3)  # in evaluation, where clouds do not mix
+        if batch:
+            origin = centre.mean(dim=(0, 1, 2))
         distance = difference.norm(dim=3, keepdim=True)
         own = (centre - origin).expand_as(difference)
         seven = torch.cat([difference, distance, own], dim=3).view(-1, 7)
@@ -187,13 +189,15 @@ class RSCNN(PointClassifier):
     level before, which is what farthest point sampling from its first point gives. Each centre sees
     itself and at most ``neighbours`` others within ``radii``.
 
-    Parameters for 40 classes: 1.29 million; the paper tells 1.41 million (Table 7), the release's
-    network has 1.29 million.
+    Parameters for 40 classes: 1.29 million, as the release's network has; the paper's table of
+    complexity tells 1.41 million.
 
     NOTE: the release takes x_i off the coordinates in place, so that its relation is in effect
     (|x_j − x_i|, 0, x_j − x_i, x_j − x_i); ``coordinates="relative"`` does the same. In a ball of
     too many points it keeps those that come first in the cloud (``ball_order="first"``), which
-    makes the result depend on the order of the points; by default the nearest stay.
+    makes the result depend on the order of the points; by default the nearest stay. It draws
+    weights from Kaiming's normal distribution and sets biases to zero; ours begin as PyTorch's
+    layers do.
 
     Args:
         num_classes: k.

@@ -81,7 +81,8 @@ class TrainSettings:
     (batch normalisation), so that results differ a little between numbers of devices."""
     threads: int | None = None
     """CPU threads of each process; None leaves PyTorch's choice, or shares the cores between
-    several processes. Results are bit-identical for equal numbers."""
+    several processes. Results are bit-identical for equal numbers, and after a stop on at most two
+    devices (DDP sums the first step's gradients of three in another order)."""
 
     def __post_init__(self) -> None:
         for name in ("num_points", "epochs", "learning_rate"):

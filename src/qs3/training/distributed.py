@@ -45,12 +45,15 @@ def make_fabric(settings: TrainSettings, rank: int = 0) -> Fabric:
         rank: Number of this process's device.
 
     Raises:
-        InputError: where a device is not there.
+        InputError: where a device is not there, or lacks the number format.
     """
     count = settings.devices
     accelerator = settings.accelerator
     if accelerator == "auto":  # not Lightning's own choice, which may be one without float64
         accelerator = "cuda" if torch.cuda.is_available() else "cpu"
+    if settings.precision == "16-mixed" and accelerator == "cpu":
+        # Lightning would take bf16 in its place, and the record would tell something else.
+        raise InputError("precision 16-mixed needs a GPU; on a CPU take 32-true or bf16-mixed")
     strategy = DDPStrategy(cluster_environment=_OneMachine(rank, count)) if count > 1 else "auto"
     try:
         fabric = Fabric(

@@ -64,7 +64,7 @@ def fit(
     """Train a network with a method of adaptation, then in rounds of self-training if asked.
 
     Called again with the same arguments it goes on after the last finished epoch, and ends with
-    the same bits as if it had never stopped (same devices and number of threads).
+    the same bits as if it had never stopped (same devices, at most two, and number of threads).
 
     Args:
         method: One of `qs3.adaptation.names.MethodName`; ``spst``, ``qbst``, ``qs3`` and

@@ -59,7 +59,7 @@ def train(
 
     Order of the clouds, augmentation and dropout are drawn from (seed, stream, epoch), so that a
     training that stops at any moment and is started again ends bit-identically, on the same
-    devices with the same number of threads.
+    devices, at most two, with the same number of threads.
 
     Args:
         method: The method with its network; trained in place and left in training mode. With
