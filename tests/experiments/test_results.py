@@ -1,5 +1,6 @@
 """The tables in results/ are what their records say: nothing in them is written by hand."""
 
+import json
 import re
 from pathlib import Path
 
@@ -57,6 +58,19 @@ def test_the_readme_shows_numbers_of_the_tables():
     for row, surfaces, scans in shown:
         assert f"| {row} | {surfaces} |" in parts["M → D"]
         assert f"| {row} | {scans} |" in parts["S → D"]
+
+
+def test_the_networks_page_shows_what_the_records_of_modelnet10_say():
+    text = (ROOT / "docs" / "models.md").read_text(encoding="utf-8")
+    part = text.partition("## ModelNet10")[2].partition("\n## ")[0]
+    records = sorted((ROOT / "results" / "modelnet10").glob("*.json"))
+    assert {path.stem for path in records} == set(re.findall(r"^\| `([\w-]+)` \|", part, re.M))
+    for path in records:
+        value = json.loads(path.read_text(encoding="utf-8"))
+        scores = value["scores"]
+        told = [f"{100 * scores[name]:.1f}" for name in ("accuracy", "class_mean_accuracy")]
+        assert value["model"] == path.stem and value["test"]["clouds"] == 908
+        assert f"| `{path.stem}` | {told[0]} | {told[1]} | 1 |" in part
 
 
 def test_records_hold_no_path_of_a_machine():
