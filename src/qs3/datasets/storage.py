@@ -119,7 +119,8 @@ class LocalFolder:
                 return
             self._remove_left_overs()
             yield
-            self._remove_left_overs()
+            if self.path.is_dir():  # and was not given another name
+                self._remove_left_overs()
         finally:
             os.close(handle)
 
