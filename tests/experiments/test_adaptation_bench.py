@@ -16,10 +16,10 @@ from qs3.experiments.adaptation_bench import Bench
 from qs3.experiments.bench_data import choose_meshes, side_of
 from qs3.experiments.bench_table import Line, Result, group_results, published
 from qs3.experiments.cost import Counts, run_seconds
-from qs3.experiments.reproduction import Setup
 from qs3.experiments.rows import ABLATIONS, ROWS
 from qs3.experiments.runs import make_grid, make_run
 from qs3.experiments.scales import SCALES
+from qs3.experiments.setup import Setup
 from qs3.meshes import shapes
 
 # So small a network may be sure of one class alone.

@@ -8,7 +8,7 @@ import pytest
 
 from qs3.experiments.figures import draw
 from qs3.experiments.paper import EXPERIMENTS, PaperTable
-from qs3.experiments.reproduction import read_setup
+from qs3.experiments.setup import read_setup
 
 ROOT = Path(__file__).parents[2]
 TABLES = [

@@ -14,7 +14,8 @@ from qs3.experiments.catalogue import PartName, ScaleName
 
 if TYPE_CHECKING:
     from qs3.experiments.grid import Work
-    from qs3.experiments.reproduction import Part, Setup
+    from qs3.experiments.reproduction import Part
+    from qs3.experiments.setup import Setup
 
 
 @dataclass(frozen=True)
@@ -72,8 +73,8 @@ def reproduce(options: Annotated[ReproduceOptions, tyro.conf.arg(name="")]) -> i
 
 def _setup(options: ReproduceOptions) -> "Setup":
     from qs3.experiments.domains import parse_own
-    from qs3.experiments.reproduction import Setup
     from qs3.experiments.scales import SCALES
+    from qs3.experiments.setup import Setup
 
     for device in options.devices:
         if not device.isdecimal():

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import tyro
 
@@ -14,7 +14,7 @@ from qs3.experiments.catalogue import FigureFormat, TableFormat, TableName
 if TYPE_CHECKING:
     from qs3.experiments.paper import PaperTable
 
-_FIGURES: Mapping[str, FigureFormat] = {".png": "png", ".svg": "svg"}
+_FIGURES: Mapping[str, FigureFormat] = {f".{kind}": kind for kind in get_args(FigureFormat)}
 INCOMPLETE = 1
 """Exit code where a record was refused and the rest is shown."""
 
@@ -78,7 +78,7 @@ def _tell(faults: list[str]) -> int:
 
 def _part(name: str, folder: Path) -> "PaperTable":
     from qs3.experiments.paper import EXPERIMENTS, PaperTable
-    from qs3.experiments.reproduction import read_setup
+    from qs3.experiments.setup import read_setup
 
     setup = read_setup(folder)
     return PaperTable(EXPERIMENTS[name], setup)

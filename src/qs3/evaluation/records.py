@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -113,10 +113,14 @@ class RunRecord:
     schema: int = field(default=SCHEMA_VERSION)
     """Version of these fields."""
 
-    @property
-    def rounds_trained(self) -> int:
-        """Rounds of self-training that changed the network; the others kept too few clouds."""
-        return sum(not one.get("skipped", False) for one in self.rounds)
+
+def count_rounds(records: Iterable[RunRecord]) -> tuple[int, int]:
+    """Count the rounds of self-training that trained the network, and all rounds.
+
+    The others kept too few clouds and left it as it was.
+    """
+    rounds = [one for record in records for one in record.rounds]
+    return sum(not one.get("skipped", False) for one in rounds), len(rounds)
 
 
 def score(

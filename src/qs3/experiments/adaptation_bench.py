@@ -31,10 +31,11 @@ from qs3.experiments.grid import (
     make_work,
     read_result,
 )
-from qs3.experiments.reproduction import Setup, reproduce
+from qs3.experiments.reproduction import reproduce
 from qs3.experiments.rows import ABLATIONS, ROWS, SUPERVISED
 from qs3.experiments.runs import Run, make_grid, parse_record_name
 from qs3.experiments.scales import Task
+from qs3.experiments.setup import Setup
 from qs3.files import write_text
 
 Name = Literal["adaptation-bench", "adaptation-ablation"]
@@ -143,8 +144,8 @@ def write_table(bench: Bench, runs: Sequence[Run], plans: Mapping[str, Plan]) ->
         "A simulator on both sides flatters: S and D share a renderer, so S-D is easier than a "
         "real target is.",
     ]
-    if scale.rounds:
-        text.append(scale.rounds_told())
+    if told := scale.rounds_told():
+        text.append(told)
     if scale.smoke:
         text.append(
             "Below 40 training objects a class, 512 points or the whole DGCNN: shows that "

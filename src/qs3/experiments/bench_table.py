@@ -10,7 +10,7 @@ from typing import Any
 
 from qs3.errors import InputError
 from qs3.evaluation.metrics import MeanSEM, mean_sem
-from qs3.evaluation.records import RunRecord
+from qs3.evaluation.records import RunRecord, count_rounds
 from qs3.experiments.rows import SUPERVISED
 from qs3.experiments.runs import Run
 
@@ -165,8 +165,7 @@ def selection_table(lines: Sequence[Line]) -> str | None:
         names = line.results[0].record.scores.class_names
         kept = [mean_sem([float(one["kept"][k]) for one in last]).mean for k in range(len(names))]
         over = mean_sem([float(sum(one["confident"])) for one in last]).mean
-        trained = sum(result.record.rounds_trained for result in line.results)
-        rounds = sum(len(result.record.rounds) for result in line.results)
+        trained, rounds = count_rounds(result.record for result in line.results)
         told = [f"{sum(kept):.1f} of {over:.1f}", f"{trained} of {rounds}"]
         rows.append([line.row, *(f"{value:.1f}" for value in kept), *told])
     if names is None:

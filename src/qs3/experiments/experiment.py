@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from qs3.evaluation.metrics import MeanSEM, PairedDifference, mean_sem, paired_difference
-from qs3.evaluation.records import RunRecord
+from qs3.evaluation.records import RunRecord, count_rounds
 from qs3.experiments.runs import Run
 from qs3.experiments.scales import Scale
 
@@ -134,8 +134,7 @@ def cell_runs(
 
 def _marks(records: Sequence[RunRecord]) -> tuple[str, ...]:
     marks = sorted({mark for record in records for mark in record.marks})
-    trained = sum(record.rounds_trained for record in records)
-    rounds = sum(len(record.rounds) for record in records)
+    trained, rounds = count_rounds(records)
     if trained < rounds:
         # Such a cell says more of the network before the rounds than of them.
         marks.append(f"{rounds - trained} of {rounds} rounds skipped, confident clouds too few")

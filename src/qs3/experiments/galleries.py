@@ -14,8 +14,8 @@ from jaxtyping import Int
 from qs3.datasets import load_clouds
 from qs3.experiments.domains import Domain, domain
 from qs3.experiments.grid import DATA
-from qs3.experiments.reproduction import Setup
 from qs3.experiments.runs import Run
+from qs3.experiments.setup import Setup
 from qs3.visualisation import gallery, samples_per_class, write_png
 
 GALLERIES = "galleries"

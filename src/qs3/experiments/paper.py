@@ -22,9 +22,9 @@ from qs3.experiments.experiment import Experiment, Grid, cell_runs, fill
 from qs3.experiments.figures import draw
 from qs3.experiments.grid import RESULTS, make_work, read_result
 from qs3.experiments.render import to_csv, to_latex, to_markdown
-from qs3.experiments.reproduction import Setup
 from qs3.experiments.runs import Run, with_warm_up
 from qs3.experiments.scales import Scale
+from qs3.experiments.setup import Setup
 from qs3.files import write_bytes, write_text
 from qs3.visualisation.figure import png_bytes, svg_bytes
 
@@ -177,8 +177,9 @@ class PaperTable:
                 f"**Stand-ins, made here**: {', '.join(stand_ins)}. A simulator on both sides "
                 "flatters, and the paper's figures are of its own data: a yardstick, no target."
             )
-        if any(run.self_training is not None for run in runs) and scale.rounds:
-            text.append(scale.rounds_told())
+        told = scale.rounds_told()
+        if told and any(run.self_training is not None for run in runs):
+            text.append(told)
         if scale.smoke:
             text.append(
                 "Below 40 training objects a class, 512 points or the whole networks: shows that "

@@ -78,8 +78,8 @@ class EdgeConv(nn.Module):
             # Each cloud about its own mean: in evaluation clouds do not mix, not even one of NaN.
             own_mean = neighbour_mean = points.mean(dim=1, keepdim=True)
             scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
-            mean = nn.functional.linear(torch.cat([neighbour_mean, own_mean], dim=2), weight)
-            shift = scale * (mean - norm.running_mean)
+            # W₁ m + (W₂ − W₁) m is W₂ m.
+            shift = scale * (nn.functional.linear(own_mean, second) - norm.running_mean)
         first, second = (scale[:, None] * weight).split(c, dim=1)
         best = neighbour_max(nn.functional.linear(points - neighbour_mean, first), neighbours)
         edge = best + nn.functional.linear(points - own_mean, second, norm.bias)

@@ -94,9 +94,8 @@ class Stage(nn.Module):
         first, second = self.transfer.weight.split(c, dim=1)
         own = gather_points(features, group.samples)
         batch = uses_batch(self.transfer_norm)
-        origin = own.new_zeros(c)  # in evaluation, where clouds do not mix
-        if batch:
-            origin = own.mean(dim=(0, 1))
+        # In evaluation clouds do not mix.
+        origin = own.mean(dim=(0, 1)) if batch else own.new_zeros(c)
         own = own - origin
         moments = differences.moments(own) if batch else None
         weight = torch.cat([first * self.scale, second], dim=1)

@@ -75,9 +75,8 @@ class RSConv(nn.Module):
         batch = uses_batch(self.relate_norm)
         if self.xyz_norm is not None:
             batch = batch or uses_batch(self.xyz_norm)
-        origin = centre.new_zeros(3)  # in evaluation, where clouds do not mix
-        if batch:
-            origin = centre.mean(dim=(0, 1, 2))
+        # In evaluation clouds do not mix.
+        origin = centre.mean(dim=(0, 1, 2)) if batch else centre.new_zeros(3)
         distance = difference.norm(dim=3, keepdim=True)
         own = (centre - origin).expand_as(difference)
         seven = torch.cat([difference, distance, own], dim=3).view(-1, 7)

@@ -33,19 +33,20 @@ def require_unlabelled(target: UnlabelledClouds) -> None:
         )
 
 
-def require_finite(clouds: PointClouds | UnlabelledClouds, where: str = "") -> None:
+def require_finite(points: np.ndarray, ids: Sequence[str], where: str = "") -> None:
     """Refuse clouds with coordinates that are not finite.
 
     Args:
-        clouds: Clouds.
+        points: Clouds [b n 3].
+        ids: What each is called.
         where: What they are, at the head of the message.
 
     Raises:
         InputError: with the ids of the first such clouds.
     """
-    good = np.isfinite(clouds.points).all(axis=(1, 2))
+    good = np.isfinite(points).all(axis=(1, 2))
     if not good.all():
-        bad = [clouds.ids[row] for row in np.flatnonzero(~good)]
+        bad = [ids[row] for row in np.flatnonzero(~good).tolist()]
         raise InputError(f"{where}points of {name_few(bad)} are not finite; leave these clouds out")
 
 
@@ -101,7 +102,7 @@ class DeviceClouds:
     """
 
     def __init__(self, clouds: PointClouds | UnlabelledClouds, device: torch.device) -> None:
-        require_finite(clouds)
+        require_finite(clouds.points, clouds.ids)
         self.device = device
         self.ids = clouds.ids
         self.points = torch.from_numpy(np.ascontiguousarray(clouds.points, dtype=np.float32))

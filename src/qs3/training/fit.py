@@ -108,8 +108,8 @@ def fit(
         raise InputError(f"method {method} takes no warm-up; leave it out or add self-training")
     if target is not None:
         require_unlabelled(target)
-        require_finite(target, "target: ")
-    require_finite(source, "source: ")
+        require_finite(target.points, target.ids, "target: ")
+    require_finite(source.points, source.ids, "source: ")
     start, unseen = None, True
     if warm_up is not None:
         start, unseen = _load_warm_up(Path(warm_up), base, source, settings)

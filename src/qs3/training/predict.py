@@ -8,9 +8,8 @@ import torch
 from jaxtyping import Float
 from lightning_fabric import Fabric
 
-from qs3.errors import InputError
 from qs3.models import PointClassifier
-from qs3.training.batches import name_few, prepare
+from qs3.training.batches import prepare, require_finite
 from qs3.training.distributed import gather_rows
 
 
@@ -53,10 +52,7 @@ def predict_probabilities(
         >>> predict_probabilities(create_model("pointnet", 4), points, num_points=16).shape
         (3, 4)
     """
-    bad = np.flatnonzero(~np.isfinite(points).all(axis=(1, 2)))
-    if len(bad):
-        named = name_few([str(row) for row in bad])
-        raise InputError(f"points of {named} are not finite; leave these clouds out")
+    require_finite(points, [str(row) for row in range(len(points))])
     prepared = prepare(points, points.shape[1] if num_points is None else num_points)
     return describe(model, prepared, batch_size=batch_size, fabric=fabric).probabilities
 

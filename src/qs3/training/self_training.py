@@ -136,7 +136,7 @@ def self_train(
     require_unlabelled(target)
     if not len(target):
         raise InputError("the target has no cloud; give unlabelled clouds")
-    require_finite(target, "target: ")
+    require_finite(target.points, target.ids, "target: ")
     fabric = fabric or make_fabric(settings)
     folder = None if run_dir is None else Path(run_dir)
     rounds = _Rounds(model, source, target, settings, self_training, fabric, folder)
