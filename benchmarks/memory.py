@@ -19,7 +19,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from qs3.meshes import normalise, shapes
+from qs3 import shapes
+from qs3.meshes import normalise
 from qs3.sensor.render import Body, LightSettings, Renderer, Scene
 from qs3.sensor.render.cycles import CyclesRenderer, worker_process
 from qs3.sensor.render.mitsuba import MitsubaRenderer

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import torch
 
-from qs3.datasets import load_clouds
+from qs3.io import load_clouds
 from qs3.models import create_model, list_models
 
 RECIPE = ["--no-rotate-z", "--label-smoothing", "0.2", "--holdout", "0"]

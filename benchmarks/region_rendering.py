@@ -9,7 +9,8 @@ import time
 
 import numpy as np
 
-from qs3.meshes import normalise, shapes
+from qs3 import shapes
+from qs3.meshes import normalise
 from qs3.sensor.exposure import expose
 from qs3.sensor.matching import match, matching_canvas
 from qs3.sensor.presets import get_sensor

@@ -11,10 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+from qs3 import shapes
 from qs3.cli.evaluate import describe
-from qs3.datasets.clouds import PointClouds
 from qs3.evaluation import score
-from qs3.meshes import collect, normalise, sample_surface, shapes
+from qs3.io.clouds import PointClouds
+from qs3.meshes import collect, normalise, sample_surface
 from qs3.training import TrainSettings, fit, predict_probabilities
 
 

@@ -25,9 +25,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import zarr
 
-from qs3.datasets.manifest import Manifest, write_manifest
-from qs3.datasets.shards import CloudRow, DType, write_shard
-from qs3.datasets.store import read_store, shard_path
+from qs3.io.layouts.contents import read_store, shard_path
+from qs3.store.manifest import Manifest, write_manifest
+from qs3.store.shards import CloudRow, DType, write_shard
 
 ROWS = 64
 Reader = Callable[[np.ndarray | None], np.ndarray]

@@ -12,8 +12,9 @@ import trimesh
 from jaxtyping import Float, UInt8
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
+from qs3 import shapes
 from qs3.geometry import look_at
-from qs3.meshes import normalise, shapes
+from qs3.meshes import normalise
 
 _SUN = np.array([0.35, -0.55, 0.8]) / np.linalg.norm([0.35, -0.55, 0.8])
 

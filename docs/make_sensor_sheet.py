@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from qs3 import shapes
 from qs3.errors import InputError
-from qs3.meshes import shapes
 from qs3.sensor.materials import MATERIALS
 from qs3.sensor.presets import SENSORS, Sensor, get_sensor
 from qs3.sensor.render.mitsuba import MitsubaRenderer

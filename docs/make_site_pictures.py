@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 
 import qs3
 from qs3.adaptation.pseudo_labels import balanced_count
-from qs3.visualisation.clouds import draw_cloud
-from qs3.visualisation.figure import house_style, write_png
+from qs3.report.clouds import draw_cloud
+from qs3.report.figure import house_style, write_png
 
 _MARGIN = 12
 """Pixels of the depth image that are shown around the object."""

@@ -11,18 +11,20 @@ from pathlib import Path
 _SOURCE = Path(__file__).parent.parent / "src"
 PACKAGES = (
     "qs3",
+    "qs3.shapes",
     "qs3.meshes",
     "qs3.sensor",
-    "qs3.datasets",
+    "qs3.store",
+    "qs3.io",
     "qs3.evaluation",
     "qs3.models",
     "qs3.adaptation",
     "qs3.training",
-    "qs3.visualisation",
     "qs3.report",
+    "qs3.viewer",
     "qs3.experiments",
 )
-_ROOT_MODULES = ("qs3.errors", "qs3.geometry", "qs3.files")
+_ROOT_MODULES = ("qs3.errors", "qs3.geometry", "qs3.files", "qs3.structure")
 _DEFINITIONS = (ast.FunctionDef, ast.ClassDef)
 
 

@@ -5,8 +5,11 @@ import os
 # Before PyTorch loads: test processes share the cores already, and threads that wait for each
 # other's core make small networks several times slower.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
+from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -31,3 +34,12 @@ def shared_data() -> Path:
 def rng() -> np.random.Generator:
     """A generator with a fixed seed, fresh for each test."""
     return np.random.default_rng(20220712)
+
+
+@pytest.fixture
+def fake(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    """The module of cheap scans, importable by worker processes too (they inherit the path)."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parent / "store"))
+    import qs3_fake_scan
+
+    yield qs3_fake_scan

@@ -11,8 +11,8 @@ import pytest
     [
         "qs3",
         "qs3.sensor.scan",
-        "qs3.datasets.generate",
-        "qs3.datasets.store",
+        "qs3.store.generate",
+        "qs3.io.layouts.contents",
         "qs3.evaluation",
         "qs3.adaptation.pseudo_labels",
         "qs3.cli.scan",

@@ -1,17 +1,48 @@
 """CAD models to a classifier that works on a real depth camera, with no label from that camera.
 
-The parts that need no PyTorch load at once; the rest is in `qs3.models`, `qs3.training` and
-`qs3.adaptation`.
+What a script needs first is here by name; all of it loads when it is first used, so that a command
+that draws a table waits for no renderer.
 """
 
-from importlib.metadata import version as _version
+import importlib
+import os
+from typing import TYPE_CHECKING, Any
 
-from qs3.meshes import load_mesh as load_mesh
-from qs3.meshes import shapes as shapes
-from qs3.sensor.presets import Sensor as Sensor
-from qs3.sensor.rig import Pose as Pose
-from qs3.sensor.rig import StereoRig as StereoRig
-from qs3.sensor.scan import Scan as Scan
-from qs3.sensor.scan import scan as scan
+if TYPE_CHECKING:
+    from qs3 import shapes as shapes
+    from qs3.meshes import load_mesh as load_mesh
+    from qs3.sensor.presets import Sensor as Sensor
+    from qs3.sensor.rig import Pose as Pose
+    from qs3.sensor.rig import StereoRig as StereoRig
+    from qs3.sensor.scan import Scan as Scan
+    from qs3.sensor.scan import scan as scan
 
-__version__ = _version("qs3")
+# OpenMP's threads, which PyTorch loads with, spin while they wait for one another. Beside another
+# busy program the wait is long, and training keeps a quarter of its rate or less; brief spinning
+# costs nothing on an idle machine. Read once, when PyTorch is first imported.
+os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+
+_LAZY = {
+    "load_mesh": "qs3.meshes",
+    "Sensor": "qs3.sensor.presets",
+    "Pose": "qs3.sensor.rig",
+    "StereoRig": "qs3.sensor.rig",
+    "Scan": "qs3.sensor.scan",
+    "scan": "qs3.sensor.scan",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name == "shapes":
+        return importlib.import_module("qs3.shapes")
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("qs3")
+    if name in _LAZY:
+        return getattr(importlib.import_module(_LAZY[name]), name)
+    raise AttributeError(f"module 'qs3' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_LAZY, "shapes", "__version__"})

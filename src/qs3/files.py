@@ -79,10 +79,30 @@ def read_json(path: Path) -> Any:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file")
+    return parse_json(path.read_bytes(), path)
+
+
+def parse_json(data: bytes | str, where: str | Path) -> Any:
+    """Read JSON text, strictly: no NaN, no infinity, no whole number of thousands of digits.
+
+    Raises:
+        InputError: where it is not such JSON; ``where`` heads the message.
+
+    Example:
+        >>> parse_json(b'{"a": [1, 2]}', "a.json")
+        {'a': [1, 2]}
+    """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{path}: not a JSON file ({error})") from error
+        text = data.decode("utf-8") if isinstance(data, bytes) else data
+        return json.loads(text, parse_constant=_refuse)
+    except RecursionError:
+        raise InputError(f"{where}: not a JSON file (nested too deep)") from None
+    except ValueError as error:  # UnicodeDecodeError and JSONDecodeError among them
+        raise InputError(f"{where}: not a JSON file ({str(error)[:200]})") from error
+
+
+def _refuse(constant: str) -> Any:
+    raise ValueError(f"{constant} is no number of JSON")
 
 
 def sha256(path: Path) -> str:

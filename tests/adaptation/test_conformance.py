@@ -10,9 +10,9 @@ import torch
 
 from qs3.adaptation import Batch, create_method, list_methods, method_class
 from qs3.adaptation.names import COMPOSED, WITHOUT_TARGET, MethodName
-from qs3.datasets import load_clouds, load_unlabelled
-from qs3.datasets.clouds import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
+from qs3.io import load_clouds, load_unlabelled
+from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import create_model
 from qs3.training import SelfTrainingSettings, TrainSettings, fit, load_model
 from qs3.training.job import Job, fresh_model, make_method

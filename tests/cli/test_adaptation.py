@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from qs3.cli.train import parse_settings, preset_name
-from qs3.datasets.classes import POINTDA10
 from qs3.errors import InputError
 from qs3.evaluation import read_record
+from qs3.meshes.classes import POINTDA10
 
 QUICK = ("--model", "pointnet", "--model-set", "channels=[8, 8, 16]", "hidden=[8]", "--num-points",
          64, "--batch-size", 5, "--threads", 1, "--accelerator", "cpu", "--epochs", 2,

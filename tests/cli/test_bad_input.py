@@ -144,7 +144,7 @@ def test_classes_of_ones_own_are_taken(qs3, quick, tmp_path):
         (tmp_path / "cad" / name / "a.off").write_text(TETRAHEDRON)
     out = tmp_path / "out"
     qs3("generate", "--meshes", tmp_path / "cad", "--out", out, "--num-points", 64, *quick)
-    from qs3.datasets import load_clouds
+    from qs3.io import load_clouds
 
     assert load_clouds(out, num_points=64).class_names == ("bolt", "nut")
 

@@ -79,7 +79,7 @@ def test_generate_again_does_nothing(qs3, quick, store):
 
 
 def test_store_holds_noisy_clean_and_surface_clouds_that_overlay(store):
-    from qs3.datasets import load_clouds
+    from qs3.io import load_clouds
 
     clouds = [load_clouds(store, num_points=128, cloud=c) for c in ("points", "clean", "surface")]
     assert [len(c) for c in clouds] == [10, 10, 10]

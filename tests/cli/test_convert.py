@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from qs3.cli import main
-from qs3.datasets.formats import FORMATS
-from qs3.datasets.load import load_clouds
+from qs3.io.layouts import FORMATS
+from qs3.io.load import load_clouds
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from qs3.cli import main
-from qs3.datasets import load_unlabelled
-from qs3.datasets.store import open_dataset, read_ragged
+from qs3.io import load_unlabelled
+from qs3.io.layouts.contents import open_dataset, read_ragged
 
 
 def png(path, image):

@@ -207,7 +207,7 @@ def recorded(grid, folder, cloud):
 def test_data_are_read_as_the_run_and_its_record_read_them(grid, tmp_path):
     """A score on other clouds than the record's would pass for the record's."""
     from qs3.cli.report_page import _clouds
-    from qs3.datasets import load_clouds
+    from qs3.io import load_clouds
     from qs3.training import load_model
 
     contents = recorded(grid, tmp_path / "run", "clean")

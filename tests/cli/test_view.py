@@ -10,8 +10,8 @@ import urllib.request
 import numpy as np
 import pytest
 
+from qs3 import shapes
 from qs3.cli import main
-from qs3.meshes import shapes
 
 pytest.importorskip("viser", reason="viser is not installed: pip install 'qs3[view]'")
 
@@ -99,7 +99,7 @@ def test_without_viser_the_extra_is_named(capsys, monkeypatch, archive):
 
 def test_a_run_answers_for_each_cloud_and_labels_are_only_shown(run, archive, tmp_path):
     from qs3.cli.view import ViewOptions, _prepare
-    from qs3.datasets import load_clouds
+    from qs3.io import load_clouds
     from qs3.training import load_model, predict_probabilities
 
     given = _prepare(ViewOptions(str(run), data=str(archive))).keywords
@@ -126,7 +126,7 @@ def test_clouds_of_any_size_and_single_files_are_taken(capsys, tmp_path, rng):
     assert "several sizes" in capsys.readouterr().err
     given = _prepare(ViewOptions(str(folder / "10.xyz"))).keywords
     assert given["exhibits"][0].clouds["points"].shape == (10, 3)
-    from qs3.datasets.ply import write_ply
+    from qs3.io.ply import write_ply
 
     write_ply(folder / "cloud.ply", rng.normal(size=(7, 3)))
     given = _prepare(ViewOptions(str(folder / "cloud.ply"))).keywords
@@ -138,7 +138,7 @@ def test_a_mesh_is_scanned_with_the_settings_of_the_page(tmp_path):
 
     from qs3.cli.camera import CameraOptions
     from qs3.cli.view import ViewOptions, _prepare
-    from qs3.visualisation.viewer import ScanRequest
+    from qs3.viewer import ScanRequest
 
     shapes.make("table", seed=1).export(tmp_path / "table.ply")
     camera = CameraOptions(variant="scalar_rgb", samples=1, views=1, num_points=64)

@@ -9,6 +9,7 @@ import shutil
 import numpy as np
 import pytest
 
+from qs3 import shapes
 from qs3.cli.reproduce import ReproduceOptions, reproduce
 from qs3.errors import InputError
 from qs3.evaluation.records import read_record
@@ -20,7 +21,6 @@ from qs3.experiments.rows import ABLATIONS, ROWS
 from qs3.experiments.runs import make_grid, make_run
 from qs3.experiments.scales import SCALES
 from qs3.experiments.setup import Setup
-from qs3.meshes import shapes
 
 # So small a network may be sure of one class alone.
 pytestmark = pytest.mark.filterwarnings("ignore:all .* confident clouds")

@@ -17,7 +17,6 @@ from scipy import stats
 
 from qs3.cli import reproduce as command
 from qs3.cli.table import FigureOptions, TableOptions, figure, table
-from qs3.datasets.executors import Failure
 from qs3.errors import InputError
 from qs3.evaluation.metrics import paired_difference
 from qs3.evaluation.records import read_record
@@ -34,7 +33,8 @@ from qs3.experiments.rows import ORDINARY, PAPER
 from qs3.experiments.runs import make_run
 from qs3.experiments.scales import SCALES
 from qs3.experiments.setup import Setup, read_setup
-from qs3.visualisation.figure import png_bytes
+from qs3.report.figure import png_bytes
+from qs3.store.executors import Failure
 
 # So small a network may be sure of one class alone, or of none.
 pytestmark = [

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from qs3.datasets.classes import POINTDA10
-from qs3.datasets.ragged import RaggedClouds
+from qs3.io.ragged import RaggedClouds
+from qs3.meshes.classes import POINTDA10
 
 CLASSES = POINTDA10
 
@@ -58,14 +58,14 @@ def clouds(points: int = 64, classes: tuple[str, ...] = CLASSES) -> RaggedClouds
 
 
 def load_any(path: Path) -> Any:
-    from qs3.datasets.load import load_clouds
+    from qs3.io.load import load_clouds
 
     return load_clouds(path, num_points=32)
 
 
 def written_as(name: str) -> Callable[[Path], None]:
     def build(folder: Path) -> None:
-        from qs3.datasets.formats import FORMATS
+        from qs3.io.layouts import FORMATS
 
         write = FORMATS[name].write
         assert write is not None
@@ -76,7 +76,7 @@ def written_as(name: str) -> Callable[[Path], None]:
 
 def read_as(name: str) -> Callable[[Path], Any]:
     def load(path: Path) -> Any:
-        from qs3.datasets.formats.convert import read_clouds
+        from qs3.io.convert import read_clouds
 
         return read_clouds(path, name, None, "points")
 
@@ -89,9 +89,9 @@ def layout(name: str) -> Layout:
 
 def build_generated(folder: Path) -> None:
     """A data set as ``generate`` makes it, every kind of cloud filled."""
-    from qs3.datasets.manifest import Manifest, write_manifest
-    from qs3.datasets.shards import CloudRow, write_shard
-    from qs3.datasets.store import shard_path
+    from qs3.io.layouts.contents import shard_path
+    from qs3.store.manifest import Manifest, write_manifest
+    from qs3.store.shards import CloudRow, write_shard
 
     rng = np.random.default_rng(1)
     rows = []
@@ -112,8 +112,8 @@ def build_generated(folder: Path) -> None:
 
 
 def load_generated(path: Path) -> Any:
-    from qs3.datasets.store import info, read_store
-    from qs3.datasets.verify import verify
+    from qs3.io.layouts.contents import info, read_store
+    from qs3.store.verify import verify
 
     verify(path, progress=False)
     info(path)
@@ -134,7 +134,7 @@ def build_npz(folder: Path) -> None:
 
 def build_meshes(ending: str) -> Callable[[Path], None]:
     def build(folder: Path) -> None:
-        from qs3.meshes import shapes
+        from qs3 import shapes
 
         (folder / "chair").mkdir(parents=True)
         mesh = shapes.make("table", 0)

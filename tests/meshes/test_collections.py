@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from qs3 import shapes
 from qs3.errors import InputError
-from qs3.meshes import collect, shapes
+from qs3.meshes import collect
 
 TRIANGLE = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from qs3 import shapes
 from qs3.errors import InputError
-from qs3.meshes import load_mesh, shapes
+from qs3.meshes import load_mesh
 
 TETRA = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])

@@ -6,16 +6,9 @@ import numpy as np
 import pytest
 
 from qs3.evaluation.metrics import mean_sem
-from qs3.report import (
-    Cloud,
-    DataLine,
-    FeatureMap,
-    Outcome,
-    Report,
-    ScoreLine,
-    write_report,
-)
-from qs3.visualisation import Curve, MontageView, SelectionRound
+from qs3.report import Cloud, DataLine, FeatureMap, Outcome, Report, ScoreLine, write_report
+from qs3.report.montage import MontageView
+from qs3.report.plots import Curve, SelectionRound
 
 HOSTILE = '</script><script>alert(\'x\')</script><img src="http://example.org/a.png" onerror="b()">'
 

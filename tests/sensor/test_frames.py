@@ -9,8 +9,9 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from qs3 import shapes
 from qs3.errors import InputError
-from qs3.meshes import sample_surface, shapes
+from qs3.meshes import sample_surface
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.frames import depth_scale, encode_depth, write_frames
 from qs3.sensor.matching import MatchingSettings

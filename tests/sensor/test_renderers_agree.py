@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from qs3 import shapes
 from qs3.errors import InputError
-from qs3.meshes import shapes
 from qs3.sensor.materials import Material
 from qs3.sensor.render import Body, LightSettings, Scene
 from qs3.sensor.render._worker_process import close_workers

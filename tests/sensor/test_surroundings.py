@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from qs3 import shapes
 from qs3.errors import InputError
-from qs3.meshes import normalise, shapes
+from qs3.meshes import normalise
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.matching import MatchingSettings
 from qs3.sensor.obstacles import check_views

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from qs3.datasets.clouds import PointClouds
+from qs3.io.clouds import PointClouds
 from qs3.training import TrainSettings
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.datasets.transforms import unit_ball
 from qs3.errors import InputError, MissingExtraError, QS3Error
+from qs3.io.transforms import unit_ball
 from qs3.models import create_model
 from qs3.models.ops import farthest_point_sampling
 from qs3.models.ops.exporting import sample_in_a_loop

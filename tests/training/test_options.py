@@ -16,8 +16,8 @@ import torch
 
 from qs3.adaptation import SourceOnly
 from qs3.cli.train import _whole
-from qs3.datasets.transforms import stack
 from qs3.errors import InputError, MissingExtraError, QS3Error, UnevenSizesError
+from qs3.io.transforms import stack
 from qs3.training import SelfTrainingSettings, TimeUpError, fit, parse_duration, records
 from qs3.training.checkpoint import new_model
 from qs3.training.deadline import Deadline
@@ -285,7 +285,7 @@ SCRIPT = """
 import json, sys
 import numpy as np
 from pathlib import Path
-from qs3.datasets.clouds import PointClouds, UnlabelledClouds
+from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.training import SelfTrainingSettings, TrainSettings, fit
 data, run = np.load(sys.argv[1]), Path(sys.argv[2])
 settings, rounds = json.loads(sys.argv[3])

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from qs3.adaptation.pseudo_labels import SingleClassWarning
-from qs3.datasets.clouds import UnlabelledClouds
 from qs3.errors import InputError
+from qs3.io.clouds import UnlabelledClouds
 from qs3.training import PRESETS, SelfTrainingSettings, fit, load_model, self_training_preset
 from qs3.training.batches import prepare
 from qs3.training.checkpoint import derived_seed, new_model

@@ -44,8 +44,8 @@ def convert(options: Annotated[ConvertOptions, tyro.conf.arg(name="")]) -> int:
     if options.source is None or options.target is None or not options.to:
         raise InputError("convert: name what to read, what to write and its layout: qs3 convert "
                          "SRC DST --to NAME; the names: qs3 convert --list")  # fmt: skip
-    from qs3.datasets.classes import POINTDA10
-    from qs3.datasets.formats.convert import convert as convert_data
+    from qs3.io.convert import convert as convert_data
+    from qs3.meshes.classes import POINTDA10
 
     classes = POINTDA10 if options.classes == ("pointda10",) else options.classes or None
     clouds = convert_data(
@@ -72,7 +72,7 @@ def convert(options: Annotated[ConvertOptions, tyro.conf.arg(name="")]) -> int:
 
 
 def _print_layouts() -> None:
-    from qs3.datasets.formats import FORMATS
+    from qs3.io.layouts import FORMATS
 
     rows = [("name", "read", "write", "layout")]
     for layout in FORMATS.values():

@@ -97,9 +97,9 @@ def demo(
 
 
 def _generate(folder: Path, settings: DemoSettings, per_class: int, seed: int, **how: Any) -> None:
-    from qs3.datasets.generate import GenerateSettings, generate
     from qs3.errors import QS3Error
     from qs3.meshes import collect
+    from qs3.store.generate import GenerateSettings, generate
 
     report = generate(
         collect("shapes", per_class=per_class, seed=seed),
@@ -192,10 +192,10 @@ def _train_settings(settings: DemoSettings) -> Any:
 
 def _report(folder: Path, settings: DemoSettings) -> tuple[Any, Any, Path]:
     """Score both networks on the target and write the page."""
+    from qs3 import shapes
     from qs3.cli import report_parts as parts
     from qs3.cli.evaluate import make_record
-    from qs3.datasets import load_clouds
-    from qs3.meshes import shapes
+    from qs3.io import load_clouds
     from qs3.report import NamedRecord, Report, score_lines, write_report
     from qs3.training import load_model
 

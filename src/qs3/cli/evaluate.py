@@ -18,7 +18,7 @@ from qs3.evaluation.records import DataRecord, RunRecord, Scores
 from qs3.files import read_json
 
 if TYPE_CHECKING:
-    from qs3.datasets.clouds import PointClouds
+    from qs3.io.clouds import PointClouds
     from qs3.training import LoadedModel
 
 # What `train` leaves in run.json.
@@ -90,10 +90,10 @@ def make_record(
     checkpoints: bool = False,
 ) -> tuple[RunRecord, Path]:
     """Score a run and write the record into its folder ``records``."""
-    from qs3.datasets import load_clouds
-    from qs3.datasets.clouds import digests
-    from qs3.datasets.storage import open_folder
     from qs3.evaluation import git_commit, hardware, score, versions, write_record
+    from qs3.io import load_clouds
+    from qs3.io.clouds import digests
+    from qs3.store.folder import open_folder
     from qs3.training import load_model, predict_probabilities
 
     loaded = load_model(run)
@@ -230,8 +230,8 @@ def describe(scores: Scores, marks: Sequence[str] = ()) -> str:
 
 def predict(options: Annotated[PredictOptions, tyro.conf.arg(name="")]) -> int:
     """Tell the class of each file and how confident the network is."""
-    from qs3.datasets import read_cloud
-    from qs3.datasets.transforms import stack
+    from qs3.io import read_cloud
+    from qs3.io.transforms import stack
     from qs3.training import load_model, predict_probabilities
 
     if not options.files:

@@ -8,17 +8,17 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from qs3.cli.extract import CutOptions, DepthOptions, OutOptions, ScanNetOptions, SunOptions
-from qs3.datasets.classes import POINTDA10
-from qs3.datasets.extract.clouds import ExtractedCloud, Unit
-from qs3.datasets.extract.depth import CutSettings
-from qs3.datasets.extract.run import run_extract
 from qs3.errors import InputError
+from qs3.io.extract.clouds import ExtractedCloud, Unit
+from qs3.io.extract.depth import CutSettings
+from qs3.io.extract.run import run_extract
+from qs3.meshes.classes import POINTDA10
 
 
 def depth(options: DepthOptions) -> int:
     """Cut objects from depth images or scenes in BOP's layout."""
-    from qs3.datasets.extract import bop, plain
-    from qs3.datasets.extract.intrinsics import read_intrinsics
+    from qs3.io.extract import bop, plain
+    from qs3.io.extract.intrinsics import read_intrinsics
 
     names = plain.read_names(options.names) if options.names else {}
     common: dict[str, Any] = {
@@ -69,8 +69,8 @@ def depth(options: DepthOptions) -> int:
 
 def sunrgbd(options: SunOptions) -> int:
     """Cut objects from SUN RGB-D."""
-    from qs3.datasets.extract.sunrgbd import SunSettings, extract_sunrgbd
-    from qs3.datasets.extract.sunrgbd_boxes import list_sunrgbd, rename_to
+    from qs3.io.extract.sunrgbd import SunSettings, extract_sunrgbd
+    from qs3.io.extract.sunrgbd_boxes import list_sunrgbd, rename_to
 
     wanted = _classes(options.classes)
     settings = SunSettings(margin=options.margin, cut=_cut(options.cut))
@@ -85,13 +85,13 @@ def sunrgbd(options: SunOptions) -> int:
 
 def scannet(options: ScanNetOptions) -> int:
     """Cut objects from ScanNet."""
-    from qs3.datasets.extract.scannet import (
+    from qs3.io.extract.scannet import (
         extract_scene,
         list_scenes,
         read_splits,
     )
-    from qs3.datasets.extract.scannet_mesh import extract_mesh_scene
-    from qs3.datasets.extract.scannet_settings import ScanNetSettings
+    from qs3.io.extract.scannet_mesh import extract_mesh_scene
+    from qs3.io.extract.scannet_settings import ScanNetSettings
 
     classes = _classes(options.classes)
     if classes is None:
@@ -143,8 +143,8 @@ def _run(
     more: Mapping[str, Any] | None = None,
 ) -> int:
     """Extract, tell what was done and what comes next; failures are an error."""
-    from qs3.datasets.failures import FAILURES, read_failures
-    from qs3.datasets.store import info
+    from qs3.io.layouts.contents import info
+    from qs3.store.failures import FAILURES, read_failures
 
     if options.num_points < 1:
         raise InputError(f"--num-points {options.num_points}: must be at least 1")

@@ -72,8 +72,8 @@ class GenerateOptions:
 
 def generate(options: Annotated[GenerateOptions, tyro.conf.arg(name="")]) -> int:
     """Scan many meshes into a data set; resumes, and logs what failed in failures.jsonl."""
-    from qs3.datasets.generate import generate as generate_data
-    from qs3.datasets.plan import make_plan, resolve_renderer
+    from qs3.store.generate import generate as generate_data
+    from qs3.store.plan import make_plan, resolve_renderer
 
     part = _part(options.shard)
     items, settings = _work(options)
@@ -94,8 +94,8 @@ def generate(options: Annotated[GenerateOptions, tyro.conf.arg(name="")]) -> int
 
 def _work(options: GenerateOptions) -> tuple[Any, Any]:
     """The list of meshes and the settings of the data set."""
-    from qs3.datasets.scan_item import GenerateSettings
     from qs3.meshes import collect
+    from qs3.store.scan_item import GenerateSettings
 
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: must not be negative")
@@ -156,10 +156,10 @@ def _workers(options: GenerateOptions) -> int:
 
 def _executor(options: GenerateOptions) -> Any:
     if options.executor == "ray":
-        from qs3.datasets.executors.ray_cluster import RayExecutor
+        from qs3.store.executors.ray_cluster import RayExecutor
 
         return RayExecutor(options.address, options.timeout, options.gpus_per_scan)
-    from qs3.datasets.executors import InlineExecutor, LocalExecutor
+    from qs3.store.executors import InlineExecutor, LocalExecutor
 
     workers = _workers(options)
     return InlineExecutor() if workers == 0 else LocalExecutor(workers, options.timeout)
@@ -167,7 +167,7 @@ def _executor(options: GenerateOptions) -> Any:
 
 def _dry_run(plan: Any, options: GenerateOptions, part: tuple[int, int]) -> int:
     """Print what the run would make and cost."""
-    from qs3.datasets.estimate import estimate
+    from qs3.store.estimate import estimate
 
     expected = estimate(plan, part, timeout=options.timeout)
     workers = max(_workers(options), 1)
@@ -186,7 +186,7 @@ def _dry_run(plan: Any, options: GenerateOptions, part: tuple[int, int]) -> int:
 
 def _tell(report: Any, options: GenerateOptions, part: tuple[int, int]) -> int:
     """Say what was done and what comes next; failures are an error."""
-    from qs3.datasets.failures import FAILURES, read_failures
+    from qs3.store.failures import FAILURES, read_failures
 
     failures = read_failures(options.out)
     following = f"qs3 train --source {options.out} --out RUN"
@@ -208,6 +208,6 @@ def _tell(report: Any, options: GenerateOptions, part: tuple[int, int]) -> int:
 
 def _classes(names: set[str]) -> tuple[str, ...]:
     """PointDA-10's ten classes where all names are among them, else the folders' own."""
-    from qs3.datasets.classes import POINTDA10
+    from qs3.meshes.classes import POINTDA10
 
     return POINTDA10 if names <= set(POINTDA10) else tuple(sorted(names))

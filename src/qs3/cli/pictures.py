@@ -6,14 +6,14 @@ import numpy as np
 
 
 def montage_view(result: Any, sensor: Any) -> tuple[Any, int]:
-    """The view that shows most of the object, as `qs3.visualisation.MontageView`, and its index.
+    """The view that shows most of the object, as `qs3.report.MontageView`, and its index.
 
     Args:
         result: A `qs3.Scan` made with ``keep_images``.
         sensor: The `qs3.Sensor` that made it.
     """
+    from qs3.report.montage import MontageView, object_box
     from qs3.sensor.speckle import pattern_image
-    from qs3.visualisation import MontageView, object_box
 
     best = int(np.argmax([view.object_pixels for view in result.views]))
     images = result.images[best]

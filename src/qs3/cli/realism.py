@@ -63,10 +63,11 @@ def realism(options: Annotated[RealismOptions, tyro.conf.arg(name="")]) -> int:
     from tqdm import tqdm
 
     from qs3.evaluation import versions
+    from qs3.report.figure import write_png
+    from qs3.report.realism import REALISM_PLOTS, realism_plot
     from qs3.sensor.presets import settings_dict
     from qs3.sensor.realism import RealismSettings
     from qs3.sensor.realism import realism as test_sensor
-    from qs3.visualisation import REALISM_PLOTS, realism_plot, write_png
 
     wanted = _tests(options.tests)
     if options.seed < 0:
@@ -185,7 +186,7 @@ def _verdict(passed: bool | None) -> str:
 
 def _tell(results: Sequence[Mapping[str, Any]], folder: Path) -> None:
     """What came out, which plots there are, and where to look."""
-    from qs3.visualisation import REALISM_PLOTS
+    from qs3.report.realism import REALISM_PLOTS
 
     absent = [name for name, plot in REALISM_PLOTS.items() if not (folder / plot).is_file()]
     verdicts = {result["id"]: _verdict(result["passed"]) for result in results}

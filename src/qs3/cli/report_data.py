@@ -3,12 +3,12 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from qs3.datasets.manifest import MANIFEST
 from qs3.errors import QS3Error
 from qs3.evaluation.records import DataRecord
+from qs3.store.manifest import MANIFEST
 
 if TYPE_CHECKING:
-    from qs3.datasets.clouds import PointClouds
+    from qs3.io.clouds import PointClouds
 
 _LEVELS = 5
 """How far above a run its data are looked for: a grid has runs/<task>/<row>/<seed>."""
@@ -19,7 +19,7 @@ def find_data(data: DataRecord | None, run: Path, num_points: int, names: Any) -
 
     They must have the checksum of the record: data of the same name are not enough.
     """
-    from qs3.datasets import load_clouds
+    from qs3.io import load_clouds
 
     if data is None:
         return None
@@ -63,8 +63,8 @@ def read_data(
     Raises:
         InputError: where they cannot be read or have other classes or no such cloud.
     """
-    from qs3.datasets import load_clouds
-    from qs3.datasets.storage import open_folder
+    from qs3.io import load_clouds
+    from qs3.store.folder import open_folder
 
     if cloud is None:
         generated = "://" in place or (Path(place) / MANIFEST).is_file()

@@ -180,7 +180,7 @@ def _clouds(
 
 def _seen(run: FoundRun, target: Any) -> list[str]:
     from qs3.cli.evaluate import caveats
-    from qs3.datasets.clouds import digests
+    from qs3.io.clouds import digests
 
     return caveats(run.told, set(digests(target.points)))
 

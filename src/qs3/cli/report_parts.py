@@ -11,7 +11,7 @@ from qs3.cli.pictures import montage_view
 from qs3.errors import InputError
 
 if TYPE_CHECKING:
-    from qs3.datasets.clouds import PointClouds
+    from qs3.io.clouds import PointClouds
     from qs3.report import Cloud, DataLine, FeatureMap, Outcome
     from qs3.training import LoadedModel
 
@@ -78,9 +78,9 @@ def feature_maps(
 ) -> tuple["FeatureMap", ...]:
     """Features of each network on both domains, in the plane; none where clouds are too few."""
     from qs3.report import FeatureMap
+    from qs3.report.embedding import embed
     from qs3.training.batches import prepare
     from qs3.training.predict import describe
-    from qs3.visualisation import embed
 
     parts = {
         name: clouds.select(np.array(even_rows(clouds.labels, _MAPPED), np.int64))
@@ -109,7 +109,7 @@ def curves(runs: Sequence[Path]) -> tuple[tuple[Any, ...], tuple[float, ...]]:
     Raises:
         InputError: where a history is damaged.
     """
-    from qs3.visualisation import Curve
+    from qs3.report.plots import Curve
 
     found: dict[tuple[str, str], tuple[list[float], list[float]]] = {}
     epoch, marks = 0, []
@@ -158,7 +158,7 @@ def rounds(records: Sequence[Mapping[str, Any]]) -> tuple[Any, ...]:
     Raises:
         InputError: where a round lacks a field.
     """
-    from qs3.visualisation import SelectionRound
+    from qs3.report.plots import SelectionRound
 
     try:
         return tuple(

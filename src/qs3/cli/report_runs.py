@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from qs3.cli.train import RUN
-from qs3.datasets.manifest import MANIFEST
 from qs3.errors import InputError, QS3Error
 from qs3.evaluation.records import RECORD, DataRecord, RunRecord, read_record
 from qs3.experiments.runs import parse_record_name
 from qs3.files import read_json
+from qs3.store.manifest import MANIFEST
 
 if TYPE_CHECKING:
     from qs3.report import NamedRecord

@@ -44,10 +44,11 @@ class ScanOptions:
 
 def scan(options: Annotated[ScanOptions, tyro.conf.arg(name="")]) -> int:
     """Photograph one mesh: noisy cloud, clean twin, a picture of every stage, and statistics."""
-    from qs3.datasets.ply import write_ply
+    from qs3.io.ply import write_ply
+    from qs3.report.figure import write_png
+    from qs3.report.montage import montage
     from qs3.sensor.frames import write_frames
     from qs3.sensor.scan import scan as scan_mesh
-    from qs3.visualisation import montage, write_png
 
     start = time.perf_counter()
     if options.seed < 0:
@@ -104,7 +105,8 @@ def load_named(
     Raises:
         InputError: where it is neither, or the file holds no mesh.
     """
-    from qs3.meshes import load_mesh, shapes
+    from qs3 import shapes
+    from qs3.meshes import load_mesh
 
     if name in shapes.CLASSES and not Path(name).exists():
         return shapes.make(name, seed=seed), {"name": name, "source": "shapes", "sha256": ""}

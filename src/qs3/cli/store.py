@@ -18,8 +18,8 @@ def info(folder: _Folder, as_json: bool = False) -> int:
         folder: Folder of a data set, or an address such as s3://bucket/folder.
         as_json: Print everything, settings and versions too, as one JSON object.
     """
-    from qs3.datasets.failures import read_failures
-    from qs3.datasets.store import info as count
+    from qs3.io.layouts.contents import info as count
+    from qs3.store.failures import read_failures
 
     found = count(folder)
     failures = read_failures(folder)
@@ -74,7 +74,7 @@ def verify(folder: _Folder) -> int:
     Args:
         folder: Folder of a data set, or an address such as s3://bucket/folder.
     """
-    from qs3.datasets.verify import verify as look_through
+    from qs3.store.verify import verify as look_through
 
     faults = look_through(folder)
     for fault in faults:
@@ -92,7 +92,7 @@ def merge(parts: Annotated[tuple[str, ...], tyro.conf.Positional], out: str) -> 
         parts: Folders or addresses of all parts.
         out: Folder or address of the whole; run the same command again to go on after a stop.
     """
-    from qs3.datasets.merge import merge as put_together
+    from qs3.store.merge import merge as put_together
 
     report = put_together(parts, out)
     print(out)

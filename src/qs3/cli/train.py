@@ -148,9 +148,9 @@ def train(options: Annotated[TrainOptions, tyro.conf.arg(name="")]) -> int:
 def run(options: TrainOptions) -> Any:
     """Read the data, train, and write what ``evaluate`` needs to make a record."""
     start = time.monotonic()
-    from qs3.datasets import load_clouds, load_unlabelled
-    from qs3.datasets.clouds import digests
-    from qs3.datasets.storage import open_folder
+    from qs3.io import load_clouds, load_unlabelled
+    from qs3.io.clouds import digests
+    from qs3.store.folder import open_folder
     from qs3.training import Deadline, fit, parse_duration, thin
 
     seconds = None if options.max_time is None else parse_duration(options.max_time)

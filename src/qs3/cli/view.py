@@ -16,9 +16,9 @@ from qs3.cli.camera import CameraOptions
 from qs3.errors import InputError, UnevenSizesError
 
 if TYPE_CHECKING:
-    from qs3.datasets.clouds import PointClouds, UnlabelledClouds
+    from qs3.io.clouds import PointClouds, UnlabelledClouds
     from qs3.training import LoadedModel
-    from qs3.visualisation.viewer import Answers, Exhibit, ScanRequest
+    from qs3.viewer import Answers, Exhibit, ScanRequest
 
 _SHOWN_POINTS = 2048  # of a cloud, where the clouds of a data set differ in size
 _DRAWS = 100  # of a built-in class to step through
@@ -57,7 +57,7 @@ class ViewOptions:
 
 def view(options: Annotated[ViewOptions, tyro.conf.arg(name="")]) -> int:
     """Look at data, a run or a mesh in a browser on this machine, until Ctrl-C."""
-    from qs3.visualisation.viewer import bind, is_loopback, require_viser, serve, url_of
+    from qs3.viewer import bind, is_loopback, require_viser, serve, url_of
 
     require_viser()
     listener = bind(options.host, options.port)
@@ -83,11 +83,11 @@ def view(options: Annotated[ViewOptions, tyro.conf.arg(name="")]) -> int:
 
 def _prepare(options: ViewOptions) -> Page:
     """Read all that the page needs, so that a fault shows before anything is served."""
-    from qs3.datasets import read_cloud
-    from qs3.datasets.point_files import POINT_FILES
-    from qs3.meshes import shapes
+    from qs3 import shapes
+    from qs3.io import read_cloud
+    from qs3.io.point_files import POINT_FILES
     from qs3.meshes.loading import EXTENSIONS
-    from qs3.visualisation.viewer import gallery_page, single
+    from qs3.viewer import gallery_page, single
 
     path = Path(options.what)
     if options.what in shapes.CLASSES and not path.exists():
@@ -118,7 +118,7 @@ def _prepare(options: ViewOptions) -> Page:
 
 
 def _data_page(options: ViewOptions) -> Page:
-    from qs3.visualisation.viewer import ArrayExhibits, StoreExhibits, gallery_page
+    from qs3.viewer import ArrayExhibits, StoreExhibits, gallery_page
 
     if _is_store(options.what):
         exhibits = StoreExhibits(options.what, options.split)
@@ -137,7 +137,7 @@ def _data_page(options: ViewOptions) -> Page:
 
 def _run_page(options: ViewOptions, run: Path) -> Page:
     from qs3.training import load_model
-    from qs3.visualisation.viewer import ArrayExhibits, StoreExhibits, gallery_page
+    from qs3.viewer import ArrayExhibits, StoreExhibits, gallery_page
 
     if options.data is None:
         raise InputError(f"{run}: is a run; name the clouds to predict on with --data")
@@ -162,9 +162,9 @@ def _answers(
     import numpy as np
     from tqdm import tqdm
 
-    from qs3.datasets.clouds import PointClouds
+    from qs3.io.clouds import PointClouds
     from qs3.training import predict_probabilities
-    from qs3.visualisation.viewer import Answers
+    from qs3.viewer import Answers
 
     parts = []
     for start in tqdm(range(0, len(clouds), 32), "predict", unit="batch", disable=None):
@@ -176,9 +176,9 @@ def _answers(
 
 def _mesh_page(options: ViewOptions, mesh: Any) -> Page:
     """Scan ``mesh`` live; None is the built-in class that the options name."""
-    from qs3.meshes import shapes
+    from qs3 import shapes
     from qs3.sensor.presets import SENSORS
-    from qs3.visualisation.viewer import ScanControls, rescan, scan_page
+    from qs3.viewer import ScanControls, rescan, scan_page
 
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: must not be negative")
@@ -221,7 +221,7 @@ def _read(
     class_names: tuple[str, ...] | None = None,
 ) -> "PointClouds | UnlabelledClouds":
     """Read clouds with their labels, or without where they have none."""
-    from qs3.datasets import load_clouds, load_unlabelled
+    from qs3.io import load_clouds, load_unlabelled
 
     given: dict[str, Any] = {"split": split, "num_points": num_points, "cloud": cloud}
     try:

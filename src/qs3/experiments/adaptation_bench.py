@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from qs3.datasets.plan import Plan
 from qs3.errors import InputError
 from qs3.experiments.bench_data import SOURCE, TARGET, make_plans
 from qs3.experiments.bench_table import (
@@ -37,6 +36,7 @@ from qs3.experiments.runs import Run, make_grid, parse_record_name
 from qs3.experiments.scales import Task
 from qs3.experiments.setup import Setup
 from qs3.files import write_text
+from qs3.store.plan import Plan
 
 Name = Literal["adaptation-bench", "adaptation-ablation"]
 """The tables: all methods, or the switches of QBST on one task."""

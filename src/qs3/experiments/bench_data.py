@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from qs3.datasets.generate import GenerateSettings, generate
-from qs3.datasets.plan import Plan, make_plan, resolve_renderer
+from qs3 import shapes
 from qs3.errors import InputError, QS3Error
 from qs3.experiments.scales import Scale
-from qs3.meshes import collect, shapes
+from qs3.meshes import collect
 from qs3.meshes.collections import MeshItem
 from qs3.sensor.surroundings import SceneSettings
+from qs3.store.generate import GenerateSettings, generate
+from qs3.store.plan import Plan, make_plan, resolve_renderer
 
 SOURCE, TARGET = "source", "target"
 TARGET_SENSOR = "d435"

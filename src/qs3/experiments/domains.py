@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from qs3.datasets.clouds import CloudKind
-from qs3.datasets.manifest import MANIFEST
 from qs3.errors import InputError
+from qs3.io.clouds import CloudKind
+from qs3.store.manifest import MANIFEST
 
 REAL = "sunrgbd_objects.npz"
 REAL_CLOUDS = 32

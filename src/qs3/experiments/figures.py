@@ -5,7 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from qs3.experiments.experiment import Cell, Grid, Named
-from qs3.visualisation.figure import class_colour, house_style
+from qs3.report.figure import class_colour, house_style
 
 _MARKERS = "osD^vP"
 

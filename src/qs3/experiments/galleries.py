@@ -11,12 +11,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int
 
-from qs3.datasets import load_clouds
 from qs3.experiments.domains import Domain, domain
 from qs3.experiments.grid import DATA
 from qs3.experiments.runs import Run
 from qs3.experiments.setup import Setup
-from qs3.visualisation import gallery, samples_per_class, write_png
+from qs3.io import load_clouds
+from qs3.report.clouds import gallery, samples_per_class
+from qs3.report.figure import write_png
 
 GALLERIES = "galleries"
 _DOMAINS = ("M", "S", "D", "F")

@@ -8,14 +8,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from qs3.datasets.clouds import CloudKind
-from qs3.datasets.executors import Executor, Failure
-from qs3.datasets.executors.executor import stop_if_fatal
 from qs3.errors import InputError
 from qs3.evaluation.records import DataRecord, RunRecord, read_record, write_record
 from qs3.experiments.domains import REAL, Domain, domain
 from qs3.experiments.rows import SUPERVISED
 from qs3.experiments.runs import Run
+from qs3.io.clouds import CloudKind
+from qs3.store.executors import Executor, Failure
+from qs3.store.executors.executor import stop_if_fatal
 
 RUNS, RESULTS, DATA = "runs", "results", "data"
 

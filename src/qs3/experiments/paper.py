@@ -26,7 +26,7 @@ from qs3.experiments.runs import Run, with_warm_up
 from qs3.experiments.scales import Scale
 from qs3.experiments.setup import Setup
 from qs3.files import write_bytes, write_text
-from qs3.visualisation.figure import png_bytes, svg_bytes
+from qs3.report.figure import png_bytes, svg_bytes
 
 EXPERIMENTS: Mapping[str, Experiment] = {
     one.EXPERIMENT.name: one.EXPERIMENT

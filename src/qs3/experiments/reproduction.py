@@ -7,10 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from qs3.datasets.estimate import estimate
-from qs3.datasets.executors import Executor, InlineExecutor, LocalExecutor
-from qs3.datasets.manifest import MANIFEST
-from qs3.datasets.plan import Plan
 from qs3.errors import InputError
 from qs3.experiments.bench_data import make_data, make_plans
 from qs3.experiments.cost import Counts, run_seconds, step_seconds
@@ -28,6 +24,10 @@ from qs3.experiments.grid import (
 from qs3.experiments.rows import ORDINARY
 from qs3.experiments.runs import Run
 from qs3.experiments.setup import Setup, claim
+from qs3.store.estimate import estimate
+from qs3.store.executors import Executor, InlineExecutor, LocalExecutor
+from qs3.store.manifest import MANIFEST
+from qs3.store.plan import Plan
 
 
 @runtime_checkable
@@ -153,7 +153,7 @@ def reproduce(
 
 def _executor(setup: Setup) -> Executor:
     if setup.executor == "ray":
-        from qs3.datasets.executors.ray_cluster import RayExecutor
+        from qs3.store.executors.ray_cluster import RayExecutor
 
         return RayExecutor(setup.address, gpus=1.0 if setup.devices else 0.0)
     if setup.devices:

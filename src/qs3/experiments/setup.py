@@ -7,9 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from qs3.datasets import load_clouds
-from qs3.datasets.clouds import CloudKind
-from qs3.datasets.plan import Plan
 from qs3.errors import InputError
 from qs3.experiments.bench_data import make_plans
 from qs3.experiments.domains import Domain, own_domain
@@ -17,6 +14,9 @@ from qs3.experiments.grid import RESULTS
 from qs3.experiments.runs import parse_record_name
 from qs3.experiments.scales import Scale
 from qs3.files import claim_folder, read_json, write_json
+from qs3.io import load_clouds
+from qs3.io.clouds import CloudKind
+from qs3.store.plan import Plan
 
 MARKER = "bench.json"
 

@@ -1,6 +1,5 @@
 """Meshes: read from files, brought to one size, or made on the spot."""
 
-from qs3.meshes import shapes as shapes
 from qs3.meshes.class_names import POINTDA10 as POINTDA10
 from qs3.meshes.class_names import canonical as canonical
 from qs3.meshes.collections import MeshItem as MeshItem

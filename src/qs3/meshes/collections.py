@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 import trimesh
 
+from qs3 import shapes
 from qs3.errors import InputError
-from qs3.meshes import shapes
 from qs3.meshes.loading import load_mesh
 from qs3.meshes.selections import POINTDA10_CHOICE, chosen_names, rename
 from qs3.meshes.trees import read_tree

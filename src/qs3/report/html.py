@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Int
 from matplotlib.figure import Figure
 
-from qs3.visualisation import png_bytes
+from qs3.report.figure import png_bytes
 
 
 def escape(text: object) -> str:

@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float, Int
 
 from qs3.errors import InputError
 from qs3.evaluation.metrics import wilson_interval
+from qs3.report.montage import MontageView
+from qs3.report.plots import Curve, SelectionRound
 from qs3.report.scores import ScoreLine
-from qs3.visualisation import Curve, MontageView, SelectionRound
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from qs3.report.clouds import gallery
+from qs3.report.embedding import feature_map
 from qs3.report.html import (
     flatten,
     folded,
@@ -11,17 +13,10 @@ from qs3.report.html import (
     section,
     table,
 )
+from qs3.report.montage import montage
+from qs3.report.plots import class_accuracy, confusion_heatmap, selection_counts, training_curves
 from qs3.report.records import Report
 from qs3.report.viewer import viewer
-from qs3.visualisation import (
-    class_accuracy,
-    confusion_heatmap,
-    feature_map,
-    gallery,
-    montage,
-    selection_counts,
-    training_curves,
-)
 
 _COLUMNS = 4
 

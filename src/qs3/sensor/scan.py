@@ -146,7 +146,7 @@ def scan(
             something, or no point of the object was seen.
 
     Example:
-        >>> from qs3.meshes import shapes
+        >>> from qs3 import shapes
         >>> cloud = scan(shapes.make("chair", seed=0), views=1)  # doctest: +SKIP
         >>> cloud.points.shape  # doctest: +SKIP
         (2048, 3)

@@ -12,9 +12,9 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from qs3.datasets.clouds import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.files import holds_something, read_json, write_bytes, write_json
+from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier, create_model
 from qs3.training.config import TrainSettings
 

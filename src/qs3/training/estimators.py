@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.adaptation.names import COMPOSED, split_method
-from qs3.datasets.clouds import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
+from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
 from qs3.training.fit import FitResult, fit
 from qs3.training.predict import predict_probabilities

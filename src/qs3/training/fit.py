@@ -11,8 +11,8 @@ from typing import TypeVar
 
 from qs3.adaptation import method_class
 from qs3.adaptation.names import split_method
-from qs3.datasets.clouds import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
+from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.training.batches import prepare, require_finite, require_unlabelled
 from qs3.training.checkpoint import MODEL, claim_run, fingerprint, load_model

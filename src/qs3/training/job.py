@@ -11,8 +11,8 @@ from lightning_fabric import Fabric
 from torch import Tensor
 
 from qs3.adaptation import Method, create_method, method_class
-from qs3.datasets.clouds import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
+from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier, feature_widths
 from qs3.training.checkpoint import (
     derived_seed,

@@ -12,8 +12,8 @@ from lightning_fabric import Fabric
 from torch import Tensor
 
 from qs3.adaptation import Method
-from qs3.datasets.clouds import PointClouds, UnlabelledClouds
 from qs3.errors import InputError, QS3Error
+from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.training.batches import (
     DeviceClouds,
     Share,

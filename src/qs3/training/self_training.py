@@ -17,9 +17,9 @@ from torch import Tensor
 from qs3.adaptation import Method, PseudoLabelled, select_confident
 from qs3.adaptation.graph_labels import refine_probabilities
 from qs3.adaptation.normalisation import make_norm
-from qs3.datasets.clouds import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.evaluation.metrics import accuracy
+from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.training.batches import require_finite, require_unlabelled
 from qs3.training.checkpoint import (

@@ -14,8 +14,8 @@ from torch.nn.modules.batchnorm import _BatchNorm
 
 from qs3.adaptation import Method
 from qs3.adaptation.validators import VALIDATORS, Observation, source_accuracy, validate
-from qs3.datasets.clouds import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
+from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.training.checkpoint import (
     load_tensors_into,

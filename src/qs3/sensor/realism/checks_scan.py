@@ -14,8 +14,9 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float
 
+from qs3 import shapes
 from qs3.geometry import rotation_z
-from qs3.meshes import normalise, shapes
+from qs3.meshes import normalise
 from qs3.sensor.realism.checks_wall import Plain, wall_metrics
 from qs3.sensor.realism.results import Row, result, row
 from qs3.sensor.realism.stage import VIEW, Shot, Stage, painted

@@ -1,0 +1,16 @@
+"""Data sets: clouds in memory, Parquet stores, readers, and the generation of new ones.
+
+Imported by name from their modules, since they need more: `generate` (the sensor), `store` and
+`shards` (Parquet).
+"""
+
+from qs3.io.clouds import CloudKind as CloudKind
+from qs3.io.clouds import PointClouds as PointClouds
+from qs3.io.clouds import UnlabelledClouds as UnlabelledClouds
+from qs3.io.load import load_clouds as load_clouds
+from qs3.io.load import load_unlabelled as load_unlabelled
+from qs3.io.point_files import read_cloud as read_cloud
+from qs3.meshes.classes import POINTDA10 as POINTDA10
+from qs3.meshes.classes import canonical as canonical
+from qs3.meshes.classes import map_labels as map_labels
+from qs3.meshes.classes import merge_predictions as merge_predictions

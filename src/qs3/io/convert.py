@@ -1,0 +1,145 @@
+"""One data set into another layout."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from tqdm import tqdm
+
+from qs3.errors import InputError
+from qs3.io.clouds import CloudKind
+from qs3.io.detect import detect, format_named, read_as, require
+from qs3.io.layouts import FORMATS
+from qs3.io.layouts.store import write_store
+from qs3.io.ragged import RaggedClouds
+from qs3.io.transforms import resample
+from qs3.io.whole import check_free, whole
+from qs3.meshes.classes import map_labels
+
+_MANY = 500
+
+
+def convert(
+    source: Path,
+    target: Path,
+    to: str,
+    *,
+    origin: str | None = None,
+    split: str | None = None,
+    cloud: CloudKind = "points",
+    num_points: int | None = None,
+    classes: Sequence[str] | None = None,
+    unmapped: Literal["error", "drop"] = "error",
+) -> RaggedClouds:
+    """Read a data set and write it in another layout, whole or not at all.
+
+    Args:
+        source: What to read.
+        target: A new path, or an empty folder.
+        to: Name of the layout to write.
+        origin: Name of the layout of ``source``; None finds it out.
+        split: ``train`` or ``test`` only; None takes all.
+        cloud: Which cloud of a data set of ours.
+        num_points: Points a cloud, by `transforms.resample`; None keeps what is there.
+        classes: Classes to map the labels onto, by the table of aliases; None keeps them.
+        unmapped: What to do with clouds of a class that is not in ``classes``.
+
+    Returns:
+        What was written.
+
+    Raises:
+        InputError: where the source cannot be read, the target is taken, a layout is unknown, is
+            not written or cannot hold these clouds, or a class does not map.
+    """
+    layout = format_named(to)
+    if layout.write is None:
+        written = [name for name, known in FORMATS.items() if known.write is not None]
+        kin = [name for name in written if name.startswith(to)] or written
+        raise InputError(f"{to}: is only read; written are {', '.join(kin)}")
+    check_free(target)
+    clouds, name = read_clouds(source, origin, split, cloud)
+    if classes is not None:
+        clouds = _map_classes(clouds, classes, unmapped, str(source))
+    clouds = _plain(clouds, num_points, str(source))
+    with whole(target) as temporary:
+        try:
+            if layout.write is write_store:
+                write_store(temporary, clouds, name)
+            else:
+                layout.write(temporary, clouds)
+        except InputError as error:
+            raise InputError(f"{to}: {error}") from error
+    return clouds
+
+
+def read_clouds(
+    source: Path, origin: str | None, split: str | None, cloud: CloudKind
+) -> tuple[RaggedClouds, str]:
+    """Read a data set in its layout, named or found out; also return the layout's name.
+
+    Raises:
+        InputError: where it cannot be read.
+    """
+    source = Path(source)
+    if origin is None:
+        layout = detect(source)
+    else:
+        layout = format_named(origin)
+        require(source, origin)
+    if layout.write is write_store:
+        from qs3.io.layouts.contents import read_ragged
+
+        return read_ragged(source, cloud, split), layout.name
+    if cloud != "points":
+        raise InputError(f"{source}: only a qs3 data set has {cloud!r} clouds")
+    return read_as(layout, source, split), layout.name
+
+
+def _map_classes(
+    clouds: RaggedClouds, classes: Sequence[str], unmapped: Literal["error", "drop"], where: str
+) -> RaggedClouds:
+    if len(set(classes)) < len(classes):
+        raise InputError(f"--classes {' '.join(classes)}: a name is there twice")
+    if clouds.labels is None:
+        raise InputError(f"{where}: has no labels to map onto {', '.join(classes)}")
+    try:
+        labels, kept = map_labels(clouds.class_names, clouds.labels, classes, unmapped)
+    except InputError as error:
+        raise InputError(f"{where}: {error}; or leave such clouds out: --unmapped drop") from error
+    if not kept.any():
+        raise InputError(f"{where}: no cloud is of any of {', '.join(classes)}")
+    rows = np.flatnonzero(kept).tolist()
+    return dataclasses.replace(
+        clouds,
+        clouds=[clouds.clouds[row] for row in rows],
+        ids=tuple(clouds.ids[row] for row in rows),
+        labels=labels,
+        class_names=tuple(classes),
+        splits=tuple(clouds.splits[row] for row in rows) if clouds.splits else (),
+    )
+
+
+def _plain(clouds: RaggedClouds, num_points: int | None, where: str) -> RaggedClouds:
+    """Clouds of float32, finite, and of one size where one is asked for."""
+    if num_points is not None and num_points < 1:
+        raise InputError(f"--num-points {num_points}: must be at least 1")
+    if not clouds.clouds:
+        raise InputError(f"{where}: holds no cloud")
+    result = []
+    count = len(clouds.clouds)
+    slow = num_points is not None and count > _MANY
+    for cloud, name in tqdm(
+        zip(clouds.clouds, clouds.ids, strict=True),
+        "resample",
+        count,
+        unit="cloud",
+        disable=None if slow else True,
+    ):
+        with np.errstate(over="ignore"):
+            points = np.asarray(cloud, dtype=np.float32)
+        if not len(points) or not np.isfinite(points).all():
+            raise InputError(f"{where}: cloud {name!r} is empty, or a point of it is not finite")
+        result.append(points if num_points is None else resample(points, num_points))
+    return dataclasses.replace(clouds, clouds=result)

@@ -1,0 +1,293 @@
+"""Scenes of ScanNet on disk: which there are, their objects, their axes.
+
+A scene's folder (``scans/scene0000_00`` of the release) holds, of what is read here::
+
+    scene0000_00.sens                         depth frames, poses, calibration
+    scene0000_00.txt                          axisAlignment
+    scene0000_00_2d-instance-filt.zip         instance-filt/<frame>.png
+    scene0000_00.aggregation.json             objects of the decimated mesh
+    scene0000_00_vh_clean_2.ply               that mesh
+    scene0000_00_vh_clean_2.0.010000.segs.json    segment of each of its vertices
+
+Source: https://github.com/ScanNet/ScanNet (data organisation).
+"""
+
+import json
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from qs3.errors import InputError
+from qs3.io.extract.scannet_settings import ScanNetSettings
+from qs3.io.extract.sens import is_rigid
+from qs3.meshes.classes import POINTDA10, map_labels
+
+LABELS: Mapping[str, str] = {
+    "bathroom cabinet": "cabinet",
+    "bunk bed": "bed",
+    "cabinets": "cabinet",
+    "computer desk": "table",
+    "computer monitor": "monitor",
+    "conference table": "table",
+    "flatscreen tv": "monitor",
+    "folded chair": "chair",
+    "folding chair": "chair",
+    "folding table": "table",
+    "kitchen cabinet": "cabinet",
+    "kitchen cabinets": "cabinet",
+    "loft bed": "bed",
+    "plants": "plant",
+    "round table": "table",
+    "sofa bed": "sofa",
+    "sofa chair": "chair",
+    "wardrobe cabinet": "cabinet",
+}
+"""Free labels of ScanNet's annotators that the common table of class names does not hold."""
+
+_SCENE = re.compile(r"scene\d{4}_\d{2}")
+
+
+@dataclass(frozen=True)
+class ScanNetScene:
+    """One scene on disk."""
+
+    id: str
+    """Such as ``scene0000_00``."""
+    folder: Path
+    """Where its files lie."""
+    split: str = ""
+    """``train``, ``test`` or empty."""
+
+    def file(self, ending: str) -> Path:
+        """Path of one of its files, such as ``file(".sens")``."""
+        return self.folder / f"{self.id}{ending}"
+
+
+@dataclass(frozen=True)
+class SceneObject:
+    """One annotated object of a scene that is in a class asked for."""
+
+    id: int
+    """ScanNet's ``objectId``; a mask shows it as ``id`` + 1."""
+    label: str
+    """The annotator's word."""
+    class_name: str
+    """The class it maps to."""
+    segments: tuple[int, ...]
+    """Its segments of the mesh."""
+
+
+def list_scenes(
+    root: Path, scenes: Sequence[str] | None = None, splits: Mapping[str, str] | None = None
+) -> list[ScanNetScene]:
+    """List scenes in the order of their names.
+
+    Args:
+        root: A copy of the release, its ``scans`` folder, or one scene's folder.
+        scenes: Only these; None takes all.
+        splits: Split of each scene, as `read_splits` gives it; only scenes in it are listed.
+
+    Raises:
+        InputError: where the folder or a scene asked for is not there, or nothing is left.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise InputError(f"{root}: no such folder; name the one that holds ScanNet's scans")
+    if _SCENE.fullmatch(root.resolve().name):
+        found = {root.resolve().name: root}
+    else:
+        below = root / "scans" if (root / "scans").is_dir() else root
+        found = {
+            entry.name: entry
+            for entry in below.iterdir()
+            if _SCENE.fullmatch(entry.name) and entry.is_dir()
+        }
+    for name in scenes or ():
+        if name not in found:
+            raise InputError(f"{root}: has no scene {name!r}; its folder is missing")
+    chosen = [
+        name
+        for name in sorted(found)
+        if (scenes is None or name in scenes) and (splits is None or name in splits)
+    ]
+    if not chosen:
+        what = "no folder of the form scene0000_00" if not found else "none of the scenes asked for"
+        raise InputError(f"{root}: holds {what}")
+    return [ScanNetScene(name, found[name], (splits or {}).get(name, "")) for name in chosen]
+
+
+def read_splits(train: Path | None = None, test: Path | None = None) -> dict[str, str]:
+    """Read the official lists, one scene a line, into the split of each scene.
+
+    ScanNet hides the labels of its own test scenes; its validation list is the ``test`` of
+    PointDA-10 and of the clouds made here (1,201 and 312 scenes).
+
+    Args:
+        train: Such as ``scannetv2_train.txt``.
+        test: Such as ``scannetv2_val.txt``.
+
+    Raises:
+        InputError: where a file is missing, a line is no scene, or a scene is in both.
+    """
+    splits: dict[str, str] = {}
+    for split, path in (("train", train), ("test", test)):
+        if path is None:
+            continue
+        for number, line in enumerate(_text(Path(path)).splitlines(), start=1):
+            name = line.strip()
+            if name and not _SCENE.fullmatch(name):
+                raise InputError(f"{path}: line {number} is no scene's name: {name[:40]!r}")
+            if name and splits.setdefault(name, split) != split:
+                raise InputError(f"{path}: {name} is in the list of the other split too")
+    return splits
+
+
+def class_of(label: str, class_names: Sequence[str] = POINTDA10) -> str | None:
+    """Class of an annotator's label, None where it is in none.
+
+    Example:
+        >>> class_of("office chair"), class_of("kitchen cabinets"), class_of("toilet")
+        ('chair', 'cabinet', None)
+    """
+    plain = " ".join(label.lower().split())
+    for name in (plain, LABELS.get(plain, plain)):
+        mapped, kept = map_labels([name], np.zeros(1, dtype=np.int64), class_names, unmapped="drop")
+        if kept[0]:
+            return class_names[int(mapped[0])]
+    return None
+
+
+def read_objects(
+    scene: ScanNetScene, class_names: Sequence[str] = POINTDA10
+) -> tuple[list[SceneObject], dict[str, int]]:
+    """Read the annotated objects of a scene.
+
+    Returns:
+        The objects in a class asked for, and how many were dropped of each other label.
+
+    Raises:
+        InputError: where the aggregation file is missing or is none.
+    """
+    path = scene.file(".aggregation.json")
+    groups = _json(path, "segGroups")
+    objects: dict[int, SceneObject] = {}
+    dropped: Counter[str] = Counter()
+    for place, group in enumerate(groups):
+        try:
+            number, label, segments = group["objectId"], group["label"], group["segments"]
+        except (KeyError, TypeError) as error:
+            raise InputError(
+                f"{path}: entry {place} of segGroups lacks objectId, label or segments"
+            ) from error
+        if not (_is_count(number) and isinstance(label, str) and isinstance(segments, list)) or (
+            not all(_is_count(segment) for segment in segments)
+        ):
+            raise InputError(f"{path}: entry {place} of segGroups is damaged")
+        name = class_of(label, class_names)
+        if name is None:
+            dropped[label] += 1
+        else:
+            # scene0217_00 lists its objects twice: the first stays.
+            objects.setdefault(number, SceneObject(number, label, name, tuple(segments)))
+    return [objects[number] for number in sorted(objects)], dict(sorted(dropped.items()))
+
+
+def dropped_labels(
+    scenes: Iterable[ScanNetScene], class_names: Sequence[str] = POINTDA10
+) -> dict[str, int]:
+    """Count the objects, by label, that scenes hold beyond the classes asked for; most first.
+
+    Raises:
+        InputError: where an aggregation file is missing or is none.
+    """
+    counts: Counter[str] = Counter()
+    for scene in scenes:
+        counts.update(read_objects(scene, class_names)[1])
+    return dict(counts.most_common())
+
+
+def axis_alignment(scene: ScanNetScene) -> Float[np.ndarray, "4 4"]:
+    """World to aligned axes, metres; identity where the scene's ``.txt`` has none.
+
+    Convention:
+        After it z is up and the room's walls lie along x and y. The scene's own frame has z up but
+        for some degrees.
+
+    Raises:
+        InputError: where the line is no rigid transform.
+    """
+    path = scene.file(".txt")
+    if not path.is_file():
+        return np.eye(4)
+    for line in _text(path).splitlines():
+        key, _, value = line.partition("=")
+        if key.strip() != "axisAlignment":
+            continue
+        try:
+            matrix = np.array([float(word) for word in value.split()]).reshape(4, 4)
+        except ValueError as error:
+            raise InputError(f"{path}: axisAlignment is not 16 numbers") from error
+        if not is_rigid(matrix):
+            raise InputError(f"{path}: axisAlignment is no rotation and shift")
+        return matrix
+    return np.eye(4)
+
+
+def rest(
+    points: Float[np.ndarray, "n 3"],
+) -> tuple[Float[np.ndarray, "n 3"], list[float]]:
+    """Put a cloud's box over the origin, its lowest point on z = 0.
+
+    Returns:
+        The cloud and where the origin was, so that adding it gives the scene's coordinates back.
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    origin = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]], dtype=np.float64)
+    return (points - origin).astype(np.float32), [float(value) for value in origin]
+
+
+def object_seed(settings: ScanNetSettings, scene: ScanNetScene, number: int) -> int:
+    """Seed of one object's choices, the same in whatever order scenes are done."""
+    words = [settings.seed, *scene.id.encode("utf-8"), number]
+    return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0])
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**31
+
+
+def _text(path: Path) -> str:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is no text ({error.reason})") from error
+
+
+def _json(path: Path, key: str) -> list[Any]:
+    """The list under ``key`` of a JSON file."""
+    text = _text(path)
+    try:
+        content = json.loads(text)
+    # Besides its own error: a number of thousands of digits, brackets nested without end.
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not a JSON file ({type(error).__name__})") from error
+    if not isinstance(content, dict) or not isinstance(content.get(key), list):
+        raise InputError(f"{path}: has no list {key!r}; it is no annotation of ScanNet")
+    return content[key]
+
+
+def read_segments(scene: ScanNetScene) -> list[Any]:
+    """Segment of each vertex as the scene's ``segs.json`` lists it, unchecked.
+
+    Raises:
+        InputError: where the file is missing or is none.
+    """
+    return _json(scene.file("_vh_clean_2.0.010000.segs.json"), "segIndices")

@@ -1,0 +1,230 @@
+"""Data sets of several HDF5 files: which belong to it, reading them as one, writing them."""
+
+import hashlib
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Int
+
+from qs3.errors import InputError
+from qs3.files import sha256, write_bytes, write_text
+from qs3.io.class_folders import SPLITS
+from qs3.io.layouts.hdf5 import hdf5_bytes, read_file
+from qs3.io.ragged import RaggedClouds
+from qs3.io.transforms import stack
+from qs3.meshes.classes import map_labels
+
+CLOUDS_A_FILE = 2048
+POINTS = 2048
+
+_LONGEST_LIST = 2**20
+_H5_NAME = re.compile(r"[\w.+-]{1,200}\.h5", re.ASCII)
+
+
+@dataclass(frozen=True)
+class Part:
+    """One file of a data set, not yet read."""
+
+    path: Path
+    """The file."""
+    split: str
+    """``train`` or ``test``."""
+
+
+def read_parts(
+    parts: Sequence[Part],
+    class_names: Sequence[str],
+    columns: Sequence[int],
+    turn: Callable[[np.ndarray], np.ndarray] | None = None,
+    salt: str = "",
+) -> RaggedClouds:
+    """Read files one after another; a cloud's id is ``<file>/<row>``.
+
+    Args:
+        parts: The files, no two of one name.
+        class_names: Names that the labels index.
+        columns: Numbers of columns that ``data`` may have; those after the third are dropped.
+        turn: What is done to each cloud.
+        salt: Goes into the checksum, to tell apart what was read in different ways.
+
+    Raises:
+        InputError: where a file is damaged, has other datasets, or a label has no class.
+    """
+    digest = hashlib.sha256(salt.encode())
+    clouds: list[np.ndarray] = []
+    ids: list[str] = []
+    labels: list[np.ndarray] = []
+    splits: list[str] = []
+    for part in parts:
+        points, numbers = read_file(part.path, columns, len(class_names))
+        digest.update(f"{part.path.name} {sha256(part.path)}\n".encode(errors="surrogateescape"))
+        clouds += [cloud if turn is None else turn(cloud) for cloud in points]
+        ids += [f"{part.path.stem}/{row:05d}" for row in range(len(points))]
+        labels.append(numbers)
+        splits += [part.split] * len(points)
+    return RaggedClouds(
+        clouds=clouds,
+        ids=tuple(ids),
+        checksum=digest.hexdigest(),
+        labels=np.concatenate(labels),
+        class_names=tuple(class_names),
+        splits=tuple(splits),
+    )
+
+
+def list_parts(root: Path, pattern: str, told: str, split: str | None) -> list[Part]:
+    """List the files of a folder: by ``<split>_files.txt`` where that lies there, else by names.
+
+    Of a line only the name after the last slash counts, since released lists give the path on the
+    machine that wrote them.
+
+    Args:
+        root: The folder.
+        pattern: Names of the files, with the groups split and number.
+        told: The same for the message.
+        split: ``train`` or ``test``; None takes both.
+
+    Raises:
+        InputError: where there is no such file or split, or a list leads out of the folder or
+            names a file twice.
+    """
+    if not root.is_dir():
+        raise InputError(f"{root}: no such folder")
+    found = {
+        part: _from_list(root, root / f"{part}_files.txt") or _from_names(root, pattern, part)
+        for part in SPLITS
+    }
+    parts = [Part(path, part) for part in SPLITS for path in found[part]]
+    if not parts:
+        raise InputError(f"{root}: holds no {told}")
+    names = [part.path.name for part in parts]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"{root}: {twice} is listed twice")
+    return choose(root, parts, split)
+
+
+def choose(where: Path, parts: Sequence[Part], split: str | None) -> list[Part]:
+    """Keep the files of one split; None keeps all.
+
+    Raises:
+        InputError: where there is none.
+    """
+    chosen = [part for part in parts if split in (None, part.split)]
+    if not chosen:
+        known = ", ".join(sorted({part.split for part in parts}))
+        raise InputError(f"{where}: has no split {split!r}, only {known}")
+    return chosen
+
+
+def _from_list(root: Path, path: Path) -> list[Path]:
+    if not path.is_file():
+        return []
+    found = []
+    for line in text_lines(path):
+        steps = re.split(r"[/\\]", line)
+        inside_names = ".." not in steps and steps[0] != "" and ":" not in line
+        if not inside_names or not _H5_NAME.fullmatch(steps[-1]):
+            raise InputError(f"{path}: {line[:80]!r} is no .h5 file of its folder")
+        inside = root / steps[-1]
+        if not inside.resolve().is_relative_to(root.resolve()):
+            raise InputError(f"{inside}: leads out of its folder; put the file itself there")
+        found.append(inside)
+    return found
+
+
+def _from_names(root: Path, pattern: str, split: str) -> list[Path]:
+    matches = [re.fullmatch(pattern, name) for name in _names(root)]
+    own = sorted((int(match[2]), match[0]) for match in matches if match and match[1] == split)
+    return [root / name for _, name in own]
+
+
+def text_lines(path: Path) -> list[str]:
+    """Return the lines of a short text, blank ones left out.
+
+    Raises:
+        InputError: where it is long or not UTF-8.
+    """
+    if path.stat().st_size > _LONGEST_LIST:
+        raise InputError(f"{path}: too long for a list of names")
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: no text in UTF-8") from error
+    return [line.strip() for line in lines if line.strip()]
+
+
+def named(root: Path, pattern: str) -> bool:
+    """Whether a folder holds a file whose name fits; reads no content."""
+    return any(re.fullmatch(pattern, name) for name in _names(root))
+
+
+def _names(root: Path) -> list[str]:
+    """Names in a folder; none where it cannot be listed, since a search goes on elsewhere."""
+    try:
+        return sorted(entry.name for entry in root.iterdir())
+    except OSError:
+        return []
+
+
+def mapped_labels(clouds: RaggedClouds, class_names: Sequence[str]) -> Int[np.ndarray, "b"]:
+    """Return labels that index ``class_names``, found by name or alias.
+
+    Raises:
+        InputError: where there are no labels, a class is none of the names, or a cloud is of
+            neither train nor test.
+    """
+    if clouds.labels is None:
+        raise InputError("this layout needs labels, and the clouds have none")
+    if not clouds.splits or any(split not in SPLITS for split in clouds.splits):
+        raise InputError("this layout needs train or test for every cloud, and some have neither")
+    return map_labels(clouds.class_names, clouds.labels, class_names)[0]
+
+
+def same_size(clouds: RaggedClouds) -> Float32[np.ndarray, "b n 3"]:
+    """Return all clouds in one array, of their common size where they have one, else ``POINTS``.
+
+    Raises:
+        InputError: where there is none, or one is empty.
+    """
+    sizes = {len(cloud) for cloud in clouds.clouds}
+    return stack(clouds.clouds, None if len(sizes) == 1 else POINTS, "this layout")
+
+
+def write_parts(
+    root: Path,
+    clouds: RaggedClouds,
+    labels: Int[np.ndarray, "b"],
+    name: Callable[[str, int], str],
+    arrays: Callable[[np.ndarray, np.ndarray], Mapping[str, np.ndarray]],
+    *,
+    most: int | None = CLOUDS_A_FILE,
+    listed: str | None = None,
+) -> None:
+    """Write the clouds of each split into files of their own; the order within a split is kept.
+
+    Args:
+        root: Folder to write to.
+        clouds: What to write; of each cloud the split counts.
+        labels: Labels to write.
+        name: Gives the name of a file by its split and its number within it.
+        arrays: Turns points [b n 3] and labels [b] into the datasets of a file.
+        most: Clouds a file; None puts all of a split into one.
+        listed: Put before the names in ``<split>_files.txt``; None writes no such list.
+    """
+    points = same_size(clouds)
+    splits = np.array(clouds.splits)
+    for split in SPLITS:
+        rows = np.flatnonzero(splits == split)
+        step = most or max(len(rows), 1)
+        names = []
+        for index, start in enumerate(range(0, len(rows), step)):
+            own = rows[start : start + step]
+            names.append(name(split, index))
+            write_bytes(root / names[-1], hdf5_bytes(arrays(points[own], labels[own])))
+        if names and listed is not None:
+            lines = "".join(f"{listed}{file}\n" for file in names)
+            write_text(root / f"{split}_files.txt", lines)

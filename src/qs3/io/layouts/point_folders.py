@@ -1,0 +1,195 @@
+"""Folders of single point files, one ending each: PLY, PCD, NPY and XYZ.
+
+``<root>/<class>/<train|test>/<name>.<ending>``; the level of the split only where it is known, that
+of the class only where there are labels.
+"""
+
+import hashlib
+import os
+import re
+import urllib.parse
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from tqdm import tqdm
+
+from qs3.errors import InputError
+from qs3.io.class_folders import SPLITS, read_folder
+from qs3.io.layouts.format import Format
+from qs3.io.point_files import POINT_FILES, WRITTEN_FILES, cloud_bytes
+from qs3.io.ragged import RaggedClouds
+
+_LONGEST_NAME = 180
+_DEPTH = 3
+_MANY = 500
+
+
+def write_folder(root: Path, clouds: RaggedClouds, ending: str) -> None:
+    """Write each cloud as one file; read back with `read_folder`, clouds and labels are equal.
+
+    An id becomes the name of the file: without the class, the split and the ending that it may
+    begin and end with, its parts joined by ``_``, and anything unusual in it as ``%XX``.
+
+    Args:
+        root: Folder to make.
+        clouds: What to write.
+        ending: One of `point_files.WRITTEN_FILES`.
+
+    Raises:
+        InputError: where a class name cannot name a folder, or a split is neither train nor test.
+    """
+    write_files(root, clouds, cloud_folders(clouds), ending)
+
+
+def write_files(root: Path, clouds: RaggedClouds, folders: Sequence[str], ending: str) -> None:
+    """Write each cloud as one file into its own folder below ``root``; names as in `write_folder`.
+
+    Args:
+        root: Folder to make.
+        clouds: What to write.
+        folders: Folder of each cloud, parts apart by ``/``; checked by the caller.
+        ending: One of `point_files.WRITTEN_FILES`.
+    """
+    taken: set[str] = set()
+    count = len(clouds.clouds)
+    for folder in sorted(set(folders)):
+        (root / folder).mkdir(parents=True, exist_ok=True)
+    rows = zip(clouds.clouds, clouds.ids, folders, strict=True)
+    for cloud, identifier, folder in tqdm(
+        rows, "write", count, unit="cloud", disable=None if count > _MANY else True
+    ):
+        name = _free(f"{folder}/{file_stem(identifier, folder)}".lstrip("/"), taken)
+        (root / f"{name}{ending}").write_bytes(cloud_bytes(cloud, ending))
+
+
+def cloud_folders(clouds: RaggedClouds) -> list[str]:
+    """Return the folder of each cloud below the root: class, class/split, split or nothing.
+
+    Raises:
+        InputError: as `write_folder` does.
+    """
+    splits = clouds.splits or ("",) * len(clouds.ids)
+    if other := sorted({split for split in splits if split not in ("", *SPLITS)}):
+        raise InputError(
+            f"split {other[0]!r} has no folder in this layout, which knows train and test; choose "
+            "one with --split and write it alone"
+        )
+    if clouds.labels is None:
+        if len(set(splits)) > 1 and "" in splits:
+            raise InputError("some clouds have a split and others none; choose one with --split")
+        return list(splits)
+    names = [clouds.class_names[label] for label in sorted(set(clouds.labels.tolist()))]
+    for name in names:
+        _check_class(name)
+    folded = [name.casefold() for name in names]
+    if len(set(folded)) < len(folded):
+        raise InputError(
+            f"classes {', '.join(names)}: two differ in capitals only and would share a folder on "
+            "some systems; rename one"
+        )
+    labels = clouds.labels.tolist()
+    return [
+        f"{clouds.class_names[label]}/{split}".rstrip("/")
+        for label, split in zip(labels, splits, strict=True)
+    ]
+
+
+def _check_class(name: str) -> None:
+    plain = name.isprintable() and not set(name) & set('/\\:*?"<>|')
+    if not plain or not name or name != name.strip(" ") or name[0] == "." or name[-1] == ".":
+        raise InputError(f"class {name!r} cannot name a folder; rename it")
+    if name in SPLITS or len(name.encode()) > _LONGEST_NAME:
+        raise InputError(
+            f"class {name[:40]!r} cannot name a folder (too long, or the name of a split)"
+        )
+
+
+def file_stem(identifier: str, folder: str = "") -> str:
+    """Return a file name without ending for an id; it holds no separator and never leads outside.
+
+    Args:
+        identifier: Any text.
+        folder: Folder it goes to, such as ``chair/train``; left out where the id begins with it.
+
+    Example:
+        >>> file_stem("chair/train/chair_0001.off", "chair/train"), file_stem("../../a#0")
+        ('chair_0001', '%2E._.._a_0')
+    """
+    name = identifier.removeprefix(f"{folder}/") if folder else identifier
+    for ending in POINT_FILES:
+        if name.lower().endswith(ending) and len(name) > len(ending):
+            name = name[: -len(ending)]
+            break
+    name = re.sub(r"[/\\#\s]+", "_", name)
+    name = urllib.parse.quote(name, safe="", errors="backslashreplace") or "_"
+    if name[0] == ".":
+        name = "%2E" + name[1:]
+    if len(name) > _LONGEST_NAME:
+        digest = hashlib.sha256(identifier.encode(errors="backslashreplace")).hexdigest()
+        name = f"{name[: _LONGEST_NAME - 17]}-{digest[:16]}"
+    return name
+
+
+def _free(name: str, taken: set[str]) -> str:
+    """Return the name, or one with a number after it where a file has it already."""
+    free, number = name, 1
+    while free.casefold() in taken:
+        number += 1
+        free = f"{name}-{number}"
+    taken.add(free.casefold())
+    return free
+
+
+def endings_of(root: Path) -> set[str]:
+    """Return the endings of all files down to ``<class>/<split>/*``, hidden ones aside."""
+    found: set[str] = set()
+    if not root.is_dir():
+        return found
+    for folder, inner, files in os.walk(root, followlinks=True):
+        depth = len(Path(folder).relative_to(root).parts)
+        inner[:] = [name for name in inner if not name.startswith(".") and depth < _DEPTH - 1]
+        found.update(Path(name).suffix.lower() for name in files if not name.startswith("."))
+    return found
+
+
+def _only(ending: str, root: Path) -> bool:
+    """Whether ``root`` holds point files of this ending and no data of another kind."""
+    return endings_of(root) & {*POINT_FILES, *_OTHER_DATA} == {ending}
+
+
+def _mixed(root: Path) -> bool:
+    found = endings_of(root) & {*POINT_FILES, *_OTHER_DATA}
+    single = len(found) == 1 and found <= set(WRITTEN_FILES)
+    return bool(found) and found <= set(POINT_FILES) and not single
+
+
+def _read(endings: Sequence[str], root: Path, split: str | None) -> RaggedClouds:
+    return read_folder(root, split, endings)
+
+
+def _write(ending: str, root: Path, clouds: RaggedClouds) -> None:
+    write_folder(root, clouds, ending)
+
+
+_OTHER_DATA = (".h5", ".hdf5", ".parquet")
+_WHAT = {".ply": "PLY", ".pcd": "PCD", ".npy": "NumPy", ".xyz": "text"}
+
+FORMATS = (
+    *(
+        Format(
+            name=ending[1:],
+            layout=f"a folder of {what} files, <class>/<train|test>/*{ending} or fewer levels",
+            detect=partial(_only, ending),
+            read=partial(_read, (ending,)),
+            write=partial(_write, ending),
+        )
+        for ending, what in _WHAT.items()
+    ),
+    Format(
+        name="folder",
+        layout=f"a folder of point files of several kinds ({', '.join(POINT_FILES)})",
+        detect=_mixed,
+        read=partial(_read, POINT_FILES),
+    ),
+)

@@ -1,0 +1,301 @@
+"""PointDA-10: three domains of the ten classes that ModelNet40, ShapeNet and ScanNet share.
+
+``modelnet/<class>/<train|test>/*.npy`` (2,048 points), ``shapenet/<class>/<train|test>/*.npy``
+(1,024 points) and ``scannet/<train|test>_<i>.h5`` (``data`` [b 2048 6]: x y z r g b, ``label``),
+which ``train_files.txt`` and ``test_files.txt`` list. Labels are alphabetical, 0 to 9.
+
+Convention:
+    On disk ModelNet is z up; ShapeNet is y up, but for the class plant, which is z up; ScanNet is
+    y up. The released loaders of the aligned protocol multiply rows with a matrix of −90° about x:
+    with c = cos(−90°) = 0 and s = sin(−90°) = −1, R = [[1, 0, 0], [0, c, −s], [0, s, c]] =
+    [[1, 0, 0], [0, 0, 1], [0, −1, 0]] and (x, y, z)·R = (x, −z, y), so +y becomes +z. As a product
+    R·p with columns this is +90°; −90° there would put every object on its head.
+
+    NOTE: ScanNet's objects were cut with their axes written as (x, z, y). That is a swap, not a
+    turn: z became y, and each object its mirror image. The alignment is a turn, as in the field's
+    loaders, so the objects stand upright and stay mirrored: what was (x, y, z) in the scene is
+    (x, −y, z) here.
+
+Source: Qin et al., "PointDAN", NeurIPS 2019 (https://github.com/canqin001/PointDAN); the aligned
+protocol: Achituve et al., "Self-Supervised Learning for Domain Adaptation on Point Clouds", WACV
+2021 (https://github.com/IdanAchituve/DefRec_and_PCM).
+"""
+
+import dataclasses
+import hashlib
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from qs3.errors import InputError
+from qs3.io.class_folders import SPLITS, choose_split, list_folder, read_files
+from qs3.io.layouts.axes import y_up_from_z_up, z_up_from_y_up
+from qs3.io.layouts.format import Format
+from qs3.io.layouts.hdf5_sets import (
+    list_parts,
+    mapped_labels,
+    named,
+    read_parts,
+    same_size,
+    write_parts,
+)
+from qs3.io.layouts.point_folders import write_folder
+from qs3.io.ragged import RaggedClouds
+from qs3.io.transforms import unit_ball
+from qs3.io.whole import check_free
+from qs3.meshes.classes import POINTDA10, map_labels
+
+Protocol = Literal["aligned", "original", "upright", "raw"]
+"""What is done to the clouds as they are stored; see `read_pointda10`."""
+Domain = Literal["modelnet", "shapenet", "scannet"]
+
+DOMAINS: tuple[Domain, ...] = ("modelnet", "shapenet", "scannet")
+ORIGINAL_POINTS = 1024
+_FILES = r"(train|test)_(\d+)\.h5"
+_PLANT = POINTDA10.index("plant")
+
+
+def read_pointda10(
+    path: Path,
+    split: str | None = None,
+    protocol: Protocol = "aligned",
+    domain: Domain | None = None,
+) -> RaggedClouds:
+    """Read one domain.
+
+    The protocols, in the field's two tables of results not comparable with one another:
+
+    - ``aligned`` (DefRec 2020 and all since): turned z up, then centred on the mean and scaled to
+      the unit ball. Loaders then take 1,024 points by farthest point sampling: ``num_points``.
+    - ``original`` (PointDAN 2019): the first 1,024 points, centred and scaled to the unit ball, in
+      ShapeNet filled up with zeros where there are fewer; nothing is turned. Its training turns
+      clouds at random about x, which is nobody's up axis there.
+    - ``upright``: turned z up, in the size and place of the file.
+    - ``raw``: as stored.
+
+    Args:
+        path: ``<root>/modelnet``, ``<root>/shapenet`` or ``<root>/scannet``; the root itself where
+            it holds one of them only.
+        split: ``train`` or ``test``; None takes both.
+        protocol: What is done to the clouds.
+        domain: Which domain it is; None goes by the folder's name, or by its .h5 files.
+
+    Raises:
+        InputError: where the domain cannot be told, the path holds several, a class is none of
+            the ten, a file is bad, or a protocol is unknown.
+    """
+    if protocol not in ("aligned", "original", "upright", "raw"):
+        raise InputError(f"protocol {protocol!r}: choose aligned, original, upright or raw")
+    root, domain = _domain(Path(path), domain)
+    if domain == "scannet":
+        clouds = read_parts(
+            list_parts(root, _FILES, "train_<i>.h5 or test_<i>.h5", split), POINTDA10, (3, 6)
+        )
+    else:
+        clouds = _read_tree(root, split)
+    labels = [] if clouds.labels is None else clouds.labels.tolist()
+    result = [
+        _prepare(cloud, protocol, domain, label)
+        for cloud, label in zip(clouds.clouds, labels, strict=True)
+    ]
+    told = hashlib.sha256(f"{domain} {protocol} {clouds.checksum}".encode()).hexdigest()
+    return dataclasses.replace(clouds, clouds=result, checksum=told)
+
+
+def validation_rows(count: int) -> Bool[np.ndarray, "b"]:
+    """Mark the rows that the field holds back from a domain's train part for validation.
+
+    Those whose index modulo 10 is 8 or 9, one in five; the test part is left whole. The index
+    counts the train part alone, in the order in which `read_pointda10` gives it with
+    ``split="train"`` (classes and file names sorted; .h5 files in turn), as the field's loaders do.
+
+    Args:
+        count: Clouds of the train part.
+
+    Example:
+        >>> validation_rows(12).nonzero()[0].tolist()
+        [8, 9]
+    """
+    return np.arange(count) % 10 >= 8
+
+
+def _prepare(
+    cloud: Float[np.ndarray, "n 3"], protocol: Protocol, domain: Domain, label: int
+) -> Float32[np.ndarray, "m 3"]:
+    if protocol == "raw":
+        return cloud
+    if protocol == "original":
+        cloud = unit_ball(cloud[None, :ORIGINAL_POINTS])[0]
+        short = ORIGINAL_POINTS - len(cloud)
+        return np.pad(cloud, ((0, short), (0, 0))) if domain == "shapenet" else cloud
+    if domain == "scannet" or (domain == "shapenet" and label != _PLANT):
+        cloud = z_up_from_y_up(cloud)
+    return cloud if protocol == "upright" else unit_ball(cloud[None])[0]
+
+
+def _read_tree(root: Path, split: str | None) -> RaggedClouds:
+    files = list_folder(root, (".npy",))
+    for file in files:
+        if file.split not in SPLITS or not file.class_name:
+            raise InputError(f"{file.path}: lies outside <class>/<train|test>/ of this layout")
+    files = choose_split(root, files, split)
+    names = sorted({file.class_name for file in files})
+    try:
+        positions, _ = map_labels(names, np.arange(len(names)))
+    except InputError as error:
+        raise InputError(f"{root}: {error}") from error
+    clouds = read_files(root, files, names)
+    return dataclasses.replace(clouds, labels=positions[clouds.labels], class_names=POINTDA10)
+
+
+def _domain(path: Path, domain: Domain | None) -> tuple[Path, Domain]:
+    """Return the folder of a domain and which one it is."""
+    if not path.is_dir():
+        raise InputError(f"{path}: no such folder")
+    if domain is not None:
+        return path, domain
+    inside = _domains_in(path)
+    if len(inside) > 1:
+        several = ", ".join(str(path / name) for name in inside)
+        raise InputError(f"{path}: holds several domains of PointDA-10; name one: {several}")
+    if inside:
+        return path / inside[0], inside[0]
+    if named(path, _FILES):
+        return path, "scannet"
+    for name in DOMAINS:
+        if name in (path.name, path.resolve().name):
+            return path, name
+    raise InputError(
+        f"{path}: no domain of PointDA-10; name a folder called modelnet, shapenet or scannet, "
+        "since the name tells which axis is up"
+    )
+
+
+def _domains_in(root: Path) -> list[Domain]:
+    if not root.is_dir():
+        return []
+    return [name for name in DOMAINS if _is_domain(root / name, name)]
+
+
+def _is_domain(path: Path, domain: Domain) -> bool:
+    if domain == "scannet":
+        return named(path, _FILES)
+    return any((path / name / part).is_dir() for name in POINTDA10 for part in SPLITS)
+
+
+def _detect(path: Path) -> bool:
+    names = (path.name, path.resolve().name)
+    named_so = any(name in names and _is_domain(path, name) for name in DOMAINS)
+    return named_so or named(path, _FILES) or bool(_domains_in(path))
+
+
+def write_npy(path: Path, clouds: RaggedClouds) -> None:
+    """Write the tree of the domain modelnet, z up, into ``modelnet`` below ``path``.
+
+    Read back as ``upright`` or ``raw``, clouds, labels and splits are equal; as ``aligned`` they
+    are the unit balls of the clouds. Where the clouds have one size it is kept; otherwise all are
+    brought to 2,048 points. All ten classes get a folder, since some loaders count folders.
+
+    Args:
+        path: New or empty folder; where it is called modelnet, the tree goes into it.
+        clouds: What to write.
+
+    Raises:
+        InputError: where the path is taken, there are no labels, a class is none of the ten, or a
+            cloud is of neither train nor test.
+    """
+    labels = mapped_labels(clouds, POINTDA10)
+    points = same_size(clouds)
+    root = _own_folder(path, "modelnet")
+    for name in POINTDA10:
+        for part in SPLITS:
+            (root / name / part).mkdir(parents=True, exist_ok=True)
+    ten = dataclasses.replace(clouds, clouds=list(points), labels=labels, class_names=POINTDA10)
+    write_folder(root, ten, ".npy")
+
+
+def write_h5(path: Path, clouds: RaggedClouds) -> None:
+    """Write the files of the domain scannet, y up, into ``scannet`` below ``path``.
+
+    ``data`` is float32 with black for colour; 2,048 clouds a file. Each cloud is stored as
+    (x, z, −y), which is turned back without rounding: read as ``upright``, clouds, labels and
+    splits are equal; as ``aligned`` they are `transforms.unit_ball` of the clouds, to the bit.
+    Sizes as in `write_npy`; the order within a split is kept, the ids are not.
+
+    Args:
+        path: New or empty folder; where it is called scannet, the files go into it.
+        clouds: What to write.
+
+    Raises:
+        InputError: as `write_npy` does.
+    """
+    labels = mapped_labels(clouds, POINTDA10)
+    root = _own_folder(path, "scannet")
+    write_parts(root, clouds, labels, _file_name, _h5_arrays, listed="./")
+
+
+def _file_name(split: str, index: int) -> str:
+    return f"{split}_{index}.h5"
+
+
+def _h5_arrays(points: Float32[np.ndarray, "b n 3"], labels: np.ndarray) -> dict[str, np.ndarray]:
+    data = np.zeros((*points.shape[:2], 6), dtype=np.float32)
+    for row, cloud in enumerate(points):
+        data[row, :, :3] = y_up_from_z_up(cloud)
+    return {"data": data, "label": labels.astype(np.int32)}
+
+
+def _own_folder(path: Path, domain: Domain) -> Path:
+    path = check_free(path)
+    return path if path.name == domain else path / domain
+
+
+def _read(protocol: Protocol, path: Path, split: str | None) -> RaggedClouds:
+    return read_pointda10(path, split, protocol)
+
+
+def _never(path: Path) -> bool:
+    return False
+
+
+_LAYOUT = "modelnet/ or shapenet/ with <class>/<train|test>/*.npy, or scannet/<train|test>_*.h5"
+
+FORMATS = (
+    Format(
+        name="pointda10",
+        layout=f"a domain of PointDA-10, turned z up, in the unit ball: {_LAYOUT}",
+        detect=_detect,
+        read=partial(_read, "aligned"),
+    ),
+    # The same files read in other ways, and the writers' own readers: only --from chooses these.
+    Format(
+        name="pointda10-original",
+        layout=f"the same as PointDAN read it, not turned, the first 1,024 points: {_LAYOUT}",
+        detect=_never,
+        read=partial(_read, "original"),
+    ),
+    Format(
+        name="pointda10-raw",
+        layout=f"the same as stored: {_LAYOUT}",
+        detect=_never,
+        read=partial(_read, "raw"),
+    ),
+    Format(
+        name="pointda10-npy",
+        layout="the same, turned z up but not scaled; written as "
+        "modelnet/<class>/<train|test>/*.npy",
+        detect=_never,
+        read=partial(_read, "upright"),
+        write=write_npy,
+    ),
+    Format(
+        name="pointda10-h5",
+        layout="the same, turned z up but not scaled; written as scannet/<train|test>_*.h5",
+        detect=_never,
+        read=partial(_read, "upright"),
+        write=write_h5,
+    ),
+)

@@ -1,0 +1,150 @@
+"""ScanObjectNN: real scans of fifteen classes, with or without what surrounds the object.
+
+``training_objectdataset<variant>.h5`` and ``test_objectdataset<variant>.h5`` with ``data``
+[b 2048 3], ``label`` [b] and in some variants ``mask`` [b 2048], −1 where a point is background.
+They lie in ``main_split`` and ``main_split_nobg``, the latter without background; the variants are
+none, ``_augmented25_norot``, ``_augmented25rot``, ``_augmentedrot`` and
+``_augmentedrot_scale75``. All points are read, background too, as the benchmark's classifiers
+see them.
+
+Convention:
+    y is up in the files: the code released with them turns clouds about y, and issue 33 of its
+    repository finds gravity along y. They are turned z up by (x, y, z) → (x, −z, y) and written
+    back by the inverse.
+
+    NOTE: only the up axis is known. Should the release have swapped axes where it could have
+    turned them, its objects are mirror images and stay so here.
+
+Source: Uy et al., "Revisiting Point Cloud Classification", ICCV 2019
+(https://github.com/hkust-vgd/scanobjectnn).
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Int
+
+from qs3.errors import InputError
+from qs3.io.layouts.axes import y_up_from_z_up, z_up_from_y_up
+from qs3.io.layouts.format import Format
+from qs3.io.layouts.hdf5_sets import (
+    Part,
+    choose,
+    mapped_labels,
+    named,
+    read_parts,
+    write_parts,
+)
+from qs3.io.ragged import RaggedClouds
+from qs3.io.whole import check_free
+
+CLASSES = (
+    "bag",
+    "bin",
+    "box",
+    "cabinet",
+    "chair",
+    "desk",
+    "display",
+    "door",
+    "shelf",
+    "table",
+    "bed",
+    "pillow",
+    "sink",
+    "sofa",
+    "toilet",
+)
+"""The classes in the order of their label."""
+
+_FILES = r"(training|test)_objectdataset(.*)\.h5"
+_FOLDERS = ("main_split", "main_split_nobg")
+_SPLITS = {"training": "train", "test": "test"}
+
+
+def read_scanobjectnn(path: Path, split: str | None = None) -> RaggedClouds:
+    """Read the files of one variant.
+
+    Args:
+        path: A folder that holds one variant, its training file, test file or both; or one file.
+        split: ``train`` or ``test``; None takes what is there.
+
+    Raises:
+        InputError: where there is no such file or split, the folder holds several variants, or a
+            file is bad.
+    """
+    path = Path(path)
+    files = _one_variant(path) if path.is_dir() else [path]
+    parts = []
+    for file in files:
+        match = re.fullmatch(_FILES, file.name)
+        if match is None:
+            raise InputError(f"{file}: is not called training_objectdataset*.h5 or test_*")
+        parts.append(Part(file, _SPLITS[match[1]]))
+    return read_parts(choose(path, parts, split), CLASSES, (3,), z_up_from_y_up)
+
+
+def _one_variant(folder: Path) -> list[Path]:
+    found = sorted(file for file in folder.iterdir() if re.fullmatch(_FILES, file.name))
+    variants = sorted({file.name.partition("_")[2] for file in found})
+    if len(variants) > 1:
+        raise InputError(
+            f"{folder}: holds several variants ({', '.join(variants)}); name one file, or put one "
+            "pair into a folder of its own"
+        )
+    if found:
+        return found[::-1]  # training before test
+    inner = [folder / name for name in _FOLDERS if named(folder / name, _FILES)]
+    if len(inner) == 1:
+        return _one_variant(inner[0])
+    if inner:
+        several = " or ".join(str(path) for path in inner)
+        raise InputError(f"{folder}: holds clouds with and without background; name {several}")
+    raise InputError(f"{folder}: holds no training_objectdataset*.h5 or test_objectdataset*.h5")
+
+
+def write_scanobjectnn(path: Path, clouds: RaggedClouds) -> None:
+    """Write ``training_objectdataset.h5`` and ``test_objectdataset.h5``, without a mask.
+
+    Read back, clouds, classes and splits are equal. Where the clouds have one size it is kept;
+    otherwise all are brought to 2,048 points. The order within a split is kept, the ids are not.
+
+    Args:
+        path: New or empty folder.
+        clouds: What to write.
+
+    Raises:
+        InputError: where the path is taken, there are no labels, a class is none of the fifteen,
+            or a cloud is of neither train nor test.
+    """
+    labels = mapped_labels(clouds, CLASSES)
+    root = check_free(path)
+    root.mkdir(parents=True, exist_ok=True)
+    write_parts(root, clouds, labels, _file_name, _arrays, most=None)
+
+
+def _file_name(split: str, index: int) -> str:
+    return f"{'training' if split == 'train' else split}_objectdataset.h5"
+
+
+def _arrays(
+    points: Float32[np.ndarray, "b n 3"], labels: Int[np.ndarray, "b"]
+) -> dict[str, np.ndarray]:
+    data = np.stack([y_up_from_z_up(cloud) for cloud in points])
+    return {"data": data.astype(np.float32), "label": labels.astype(np.int32)}
+
+
+def _detect(path: Path) -> bool:
+    if path.is_file():
+        return re.fullmatch(_FILES, path.name) is not None
+    return named(path, _FILES) or any(named(path / name, _FILES) for name in _FOLDERS)
+
+
+FORMAT = Format(
+    name="scanobjectnn",
+    layout="ScanObjectNN: training_objectdataset*.h5 and test_objectdataset*.h5, one variant",
+    detect=_detect,
+    read=read_scanobjectnn,
+    write=write_scanobjectnn,
+)

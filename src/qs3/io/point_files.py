@@ -1,0 +1,163 @@
+"""Point clouds from single files: npy, xyz, txt, ply, pcd, off."""
+
+import io
+import math
+import warnings
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from qs3.errors import InputError
+from qs3.io.pcd import parse_pcd, pcd_bytes
+from qs3.io.ply import parse_ply, ply_bytes
+
+POINT_FILES = (".npy", ".xyz", ".txt", ".ply", ".pcd", ".off")
+WRITTEN_FILES = (".npy", ".xyz", ".ply", ".pcd")
+
+
+def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np.ndarray, "n 3"]:
+    """Read the points of one file.
+
+    Columns after the third (normals, colours) are dropped. A file that holds a mesh (PLY or OFF
+    with faces) gives samples of its surface. A PCD file's points with NaN are left out, as they
+    mark pixels that saw nothing; in any other file a NaN is a fault.
+
+    Args:
+        path: The file; its ending tells the format, one of ``POINT_FILES``.
+        mesh_points: Samples of a mesh.
+        seed: Seed of these samples.
+
+    Raises:
+        InputError: where the file is missing, of another format, damaged, empty or not finite.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    suffix = path.suffix.lower()
+    if suffix not in POINT_FILES:
+        raise InputError(f"{path}: not a point cloud file; known are {', '.join(POINT_FILES)}")
+    content = path.read_bytes()
+    if not content.strip():
+        raise InputError(f"{path}: empty file")
+    try:
+        if suffix == ".npy":
+            points = _npy(content)
+        elif suffix == ".pcd":
+            points = parse_pcd(content)
+        elif suffix in (".xyz", ".txt"):
+            points = _text(content)
+        else:
+            points = parse_ply(content) if suffix == ".ply" else None
+            if points is None:
+                points = _trimesh(content, suffix[1:], mesh_points, seed)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except Exception as error:  # parsers of damaged files raise whatever they stumble over
+        lines = str(error).splitlines()
+        reason = lines[0] if lines else type(error).__name__
+        raise InputError(f"{path}: cannot be read as {suffix[1:]} ({reason})") from error
+    if not len(points):
+        raise InputError(f"{path}: holds no point")
+    with np.errstate(over="ignore"):
+        points = np.ascontiguousarray(points, dtype=np.float32)
+    if not np.isfinite(points).all():
+        raise InputError(f"{path}: a point is not finite; remove points with NaN or infinity")
+    return points
+
+
+def cloud_bytes(points: Float[np.ndarray, "n 3"], ending: str) -> bytes:
+    r"""Return the file of a cloud: float32 coordinates that read back equal.
+
+    Args:
+        points: The cloud.
+        ending: One of ``WRITTEN_FILES``; ``.xyz`` is text, nine digits a number.
+
+    Raises:
+        InputError: where the ending is another.
+
+    Example:
+        >>> cloud_bytes(np.array([[0.1, 2, -3]], dtype=np.float32), ".xyz")
+        b'0.100000001 2 -3\n'
+    """
+    plain = np.ascontiguousarray(points, dtype="<f4")
+    if ending == ".npy":
+        buffer = io.BytesIO()
+        np.save(buffer, plain, allow_pickle=False)
+        return buffer.getvalue()
+    if ending == ".xyz":
+        return ("%.9g %.9g %.9g\n" * len(plain) % tuple(plain.ravel().tolist())).encode("ascii")
+    if ending == ".ply":
+        return ply_bytes(plain)
+    if ending == ".pcd":
+        return pcd_bytes(plain)
+    raise InputError(f"{ending}: cannot be written; known are {', '.join(WRITTEN_FILES)}")
+
+
+def _npy(content: bytes) -> np.ndarray:
+    handle = io.BytesIO(content)
+    version = np.lib.format.read_magic(handle)
+    readers = {(1, 0): np.lib.format.read_array_header_1_0}
+    readers[2, 0] = np.lib.format.read_array_header_2_0
+    if version not in readers:
+        raise InputError(f"npy version {version[0]}.{version[1]} holds no plain numbers")
+    shape, _, kind = readers[version](handle)
+    if kind.hasobject:
+        raise ValueError("holds pickled objects, which are never loaded")
+    if len(shape) != 2 or shape[1] < 3 or kind.kind not in "fiu":
+        raise InputError(
+            f"needs numbers of shape [n, 3] or more columns, not {kind} of shape {list(shape)}"
+        )
+    size, there = math.prod(shape) * kind.itemsize, len(content) - handle.tell()
+    if size > there:
+        raise InputError(f"cannot be read as npy (announces {size} bytes, but has {there})")
+    handle.seek(0)
+    return np.load(handle, allow_pickle=False)[:, :3]
+
+
+def _text(content: bytes) -> np.ndarray:
+    """Rows of numbers apart by spaces or commas; ``#`` begins a comment."""
+    try:
+        # Ten times as fast; whatever it does not take is told line by line.
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            rows = np.loadtxt(io.BytesIO(content), ndmin=2, encoding="utf-8")
+        if rows.shape[1] >= 3:
+            return rows[:, :3]
+    except (ValueError, UserWarning):
+        pass
+    return _lines(content)
+
+
+def _lines(content: bytes) -> np.ndarray:
+    rows: list[list[float]] = []
+    columns = 0
+    for number, line in enumerate(content.decode("utf-8").splitlines(), start=1):
+        words = line.split("#")[0].replace(",", " ").replace(";", " ").split()
+        if not words:
+            continue
+        columns = columns or len(words)
+        if len(words) < 3 or len(words) != columns:
+            raise InputError(
+                f"line {number} has {len(words)} columns; every line needs the same number, "
+                "at least 3"
+            )
+        try:
+            rows.append([float(word) for word in words[:3]])
+        except ValueError:
+            raise InputError(f"line {number} is not three numbers: {line.strip()[:40]!r}") from None
+    return np.array(rows, dtype=np.float64).reshape(-1, 3)
+
+
+def _trimesh(content: bytes, file_type: str, mesh_points: int, seed: int) -> np.ndarray:
+    # Imported here: point files that are no meshes do without.
+    import trimesh
+
+    from qs3.meshes.normalise import sample_surface
+
+    loaded = trimesh.load(io.BytesIO(content), file_type=file_type, process=False)
+    if isinstance(loaded, trimesh.Trimesh) and len(loaded.faces):
+        return sample_surface(loaded, mesh_points, np.random.default_rng(seed))
+    if isinstance(loaded, trimesh.Trimesh | trimesh.PointCloud):
+        return np.asarray(loaded.vertices)
+    raise InputError("holds neither points nor a mesh")

@@ -1,0 +1,253 @@
+"""One scan on one sheet: pattern, pair, disparity, depth, truth, error, and the cloud.
+
+Convention:
+    Images are in pixel coordinates, y down, pixel (0, 0) at the top left; NaN is drawn grey. The
+    error is depth − true depth: red is too far, blue is too near.
+"""
+
+from dataclasses import dataclass
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float, Shaped, UInt8
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+
+from qs3.errors import InputError
+from qs3.report.clouds import SIDES, draw_cloud
+from qs3.report.figure import NO_VALUE, house_style, short, without_frame
+
+_LOST, _EXTRA = "#6e6e6e", "#ddaa33"
+
+
+@dataclass(frozen=True)
+class MontageView:
+    """The pictures of one view and the clouds of the whole scan."""
+
+    left: UInt8[np.ndarray, "h w"]
+    """Left image."""
+    right: UInt8[np.ndarray, "h w"]
+    """Right image."""
+    disparity: Float[np.ndarray, "h w"]
+    """Disparity in pixels, NaN where there is no match."""
+    depth: Float[np.ndarray, "h w"]
+    """Depth along the optical axis, NaN where there is none."""
+    true_depth: Float[np.ndarray, "h w"]
+    """Depth of the z-buffer, NaN where the ray misses the object."""
+    cloud: Float[np.ndarray, "n 3"]
+    """The noisy cloud, z up."""
+    clean: Float[np.ndarray, "m 3"] | None = None
+    """Its clean twin."""
+    pattern: Shaped[np.ndarray, "ph pw"] | None = None
+    """The projector's pattern, 0 to 1 or 8-bit."""
+    box: tuple[int, int, int, int] | None = None
+    """Show only columns x0 … x1 − 1 and rows y0 … y1 − 1: (x0, y0, x1, y1)."""
+    unit: str = "mesh units"
+    """Unit of lengths."""
+
+
+def object_box(
+    true_depth: Float[np.ndarray, "h w"], margin: int = 12
+) -> tuple[int, int, int, int] | None:
+    """Box (x0, y0, x1, y1) around the pixels that see the object; None where none does.
+
+    Example:
+        >>> depth = np.full((20, 30), np.nan)
+        >>> depth[5:9, 7:20] = 1.0
+        >>> object_box(depth, margin=2)
+        (5, 3, 22, 11)
+    """
+    rows, columns = np.nonzero(np.isfinite(true_depth))
+    if not len(rows):
+        return None
+    height, width = true_depth.shape
+    return (
+        max(int(columns.min()) - margin, 0),
+        max(int(rows.min()) - margin, 0),
+        min(int(columns.max()) + 1 + margin, width),
+        min(int(rows.max()) + 1 + margin, height),
+    )
+
+
+@house_style
+def montage(view: MontageView, title: str = "") -> Figure:
+    """Draw one scan: four pictures, four of its depth, and each cloud from three sides.
+
+    Args:
+        view: What to show.
+        title: Heading.
+
+    Raises:
+        InputError: where ``view.box`` holds no pixel of the images.
+    """
+    height, width = view.left.shape
+    x0, y0, x1, y1 = view.box or (0, 0, width, height)
+    if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
+        raise InputError(f"box: {view.box} does not lie in the image of {width} × {height} pixels")
+    part = slice(y0, y1), slice(x0, x1)
+    extent = (x0 - 0.5, x1 - 0.5, y1 - 0.5, y0 - 0.5)
+    depth, true = view.depth[part], view.true_depth[part]
+    error = (depth - true).astype(np.float64)
+
+    clouds = [("noisy cloud", view.cloud)]
+    if view.clean is not None:
+        clouds.append(("clean twin", view.clean))
+    heights = (6.0, 3.0 * len(clouds))
+    figure = Figure(figsize=(12.0, sum(heights)), layout="constrained")
+    halves = figure.add_gridspec(2, 1, height_ratios=heights)
+    upper, lower = figure.add_subfigure(halves[0]), figure.add_subfigure(halves[1])
+    cells = upper.subplots(2, 4).ravel()
+    places = lower.subplots(len(clouds), 3, squeeze=False)
+    if title:
+        figure.suptitle(short(title, 90), fontsize=13)
+
+    _pattern(cells[0], view.pattern)
+    _picture(cells[1], view.left[part], "left image", extent)
+    _picture(cells[2], view.right[part], "right image", extent)
+    disparity = view.disparity[part]
+    _field(cells[3], disparity, "disparity [px]", extent, _limits(disparity, 2.0))
+    shared = _limits(true if np.isfinite(true).any() else depth, 0.0)
+    _field(cells[4], depth, f"depth [{view.unit}]", extent, shared, "viridis_r")
+    _field(cells[5], true, f"true depth [{view.unit}]", extent, shared, "viridis_r")
+    _error(cells[6], error, depth, true, extent, view.unit)
+    _histogram(cells[7], error, true, view.unit)
+    cells[7].set_box_aspect(error.shape[0] / error.shape[1])
+
+    frame = next((c for c in reversed(clouds) if len(c[1])), None)
+    limits = None if frame is None else (frame[1].min(axis=0), frame[1].max(axis=0))
+    for (name, points), row in zip(clouds, places, strict=True):
+        for axes, (side, angles) in zip(row, SIDES.items(), strict=True):
+            axes.set_title(f"{name} ({len(points)} points), {side}")
+            draw_cloud(axes, points, *angles, limits=limits)
+    return figure
+
+
+def _pattern(axes: Axes, pattern: Shaped[np.ndarray, "ph pw"] | None) -> None:
+    axes.set_title("pattern")
+    if pattern is None:
+        axes.text(0.5, 0.5, "none projected", ha="center", va="center")
+        without_frame(axes)
+        return
+    # A whole pattern shrunk to a thumb shows moiré, not dots: show the middle, dot by dot.
+    height, width = pattern.shape
+    edge = min(height, width, 256)
+    top, left = (height - edge) // 2, (width - edge) // 2
+    if edge < max(height, width):
+        axes.set_title(f"pattern (its middle {edge} px)")
+    high = 255 if pattern.dtype == np.uint8 else 1
+    middle = pattern[top : top + edge, left : left + edge].astype(np.float64)
+    axes.imshow(middle, cmap="gray", vmin=0, vmax=high, interpolation="nearest")
+    without_frame(axes)
+
+
+def _picture(axes: Axes, image: np.ndarray, title: str, extent: tuple) -> None:
+    axes.imshow(image, cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="antialiased")
+    axes.set_title(title)
+    _pixel_ticks(axes)
+
+
+def _field(
+    axes: Axes,
+    values: Float[np.ndarray, "h w"],
+    title: str,
+    extent: tuple,
+    limits: tuple[float, float],
+    colours: str = "viridis",
+    no_value: str = NO_VALUE,
+) -> None:
+    cmap = matplotlib.colormaps[colours].with_extremes(bad=no_value)
+    shown = axes.imshow(
+        np.ma.masked_invalid(values),
+        cmap=cmap,
+        vmin=limits[0],
+        vmax=limits[1],
+        extent=extent,
+        interpolation="nearest",
+    )
+    axes.set_title(title)
+    _pixel_ticks(axes)
+    _colour_bar(axes, shown, values, limits)
+
+
+def _error(
+    axes: Axes,
+    error: Float[np.ndarray, "h w"],
+    depth: Float[np.ndarray, "h w"],
+    true: Float[np.ndarray, "h w"],
+    extent: tuple,
+    unit: str,
+) -> None:
+    """Signed error over a map of the pixels where it does not exist, by the reason."""
+    known = error[np.isfinite(error)]
+    high = max(float(np.quantile(np.abs(known), 0.95)), 1e-9) if len(known) else 1.0
+    reason = np.zeros(error.shape)
+    reason[np.isfinite(true) & ~np.isfinite(depth)] = 1
+    reason[np.isfinite(depth) & ~np.isfinite(true)] = 2
+    back = ListedColormap([NO_VALUE, _LOST, _EXTRA])
+    axes.imshow(reason, cmap=back, vmin=0, vmax=2, extent=extent, interpolation="nearest")
+    _field(axes, error, f"depth error [{unit}]", extent, (-high, high), "RdBu_r", "none")
+    legend = [Patch(color=_LOST, label="lost"), Patch(color=_EXTRA, label="beside the object")]
+    axes.legend(
+        handles=legend,
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.1),
+        ncols=2,
+        fontsize=8,
+        handlelength=1,
+        handleheight=1,
+        columnspacing=1,
+    )
+
+
+def _histogram(
+    axes: Axes, error: Float[np.ndarray, "h w"], true: Float[np.ndarray, "h w"], unit: str
+) -> None:
+    known = error[np.isfinite(error)]
+    axes.set_title("distribution of the error")
+    axes.set_yticks([])
+    axes.spines["left"].set_visible(False)
+    axes.tick_params(labelsize=8)
+    if not len(known):
+        axes.set_xticks([])
+        axes.set_xlabel("no pixel has both depths", fontsize=9)
+        return
+    median = float(np.median(known))
+    sigma = 1.4826 * float(np.median(np.abs(known - median)))
+    reach = max(4.0 * sigma, float(np.quantile(np.abs(known), 0.95)), 1e-9)
+    axes.hist(np.clip(known, -reach, reach), bins=60, range=(-reach, reach), color="#332288")
+    axes.axvline(0.0, color="black", linewidth=0.8)
+    seen = 100.0 * len(known) / max(int(np.isfinite(true).sum()), 1)
+    text = f"depth − true depth [{unit}]\nmedian {median:+.2g}, robust σ {sigma:.2g}\n"
+    axes.set_xlabel(text + f"{seen:.0f} % of the object seen", fontsize=9)
+    axes.locator_params(axis="x", nbins=5)
+
+
+def _colour_bar(
+    axes: Axes, shown: AxesImage, values: Float[np.ndarray, "h w"], limits: tuple[float, float]
+) -> None:
+    known = values[np.isfinite(values)]
+    below = bool(len(known)) and float(known.min()) < limits[0]
+    above = bool(len(known)) and float(known.max()) > limits[1]
+    extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[below, above]
+    bar = axes.figure.colorbar(shown, cax=axes.inset_axes((1.03, 0.0, 0.05, 1.0)), extend=extend)
+    bar.ax.tick_params(labelsize=8)
+    bar.locator = MaxNLocator(5)
+    bar.update_ticks()
+
+
+def _limits(values: Float[np.ndarray, "h w"], percent: float) -> tuple[float, float]:
+    """Range of the finite values without ``percent`` at either end, never empty."""
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return 0.0, 1.0
+    low, high = (float(x) for x in np.percentile(known, [percent, 100.0 - percent]))
+    return (low, high) if high > low else (low - 0.5, high + 0.5)
+
+
+def _pixel_ticks(axes: Axes) -> None:
+    axes.tick_params(labelsize=8, length=2)
+    axes.locator_params(nbins=4, integer=True)

@@ -1,0 +1,238 @@
+"""Plots of a training run: curves, selection by round, confusion and accuracy by class."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, Num
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from qs3.errors import InputError
+from qs3.report.figure import AFTER, BEFORE, PALETTE, class_colour, house_style, short
+
+_WIDTH = 5.2  # inches: at a phone's 360 px the 10-point text is still about 10 px high
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One line of a plot over epochs."""
+
+    name: str
+    """What the legend calls it."""
+    x: Num[np.ndarray, "n"]
+    """Epochs."""
+    y: Num[np.ndarray, "n"]
+    """Values; a NaN leaves a gap."""
+    panel: str = "loss"
+    """Label of the vertical axis; curves of the same panel share one."""
+
+
+@dataclass(frozen=True)
+class SelectionRound:
+    """What one round of self-training selected."""
+
+    index: int
+    """Number of the round, from 1."""
+    theta: float
+    """Threshold θ."""
+    confident: Int[np.ndarray, "k"]
+    """Clouds above the threshold, by predicted class."""
+    kept: Int[np.ndarray, "k"]
+    """Clouds selected for training, by predicted class."""
+    agreement: float | None = None
+    """Share of agreement in 0 … 1, where the run measured one."""
+    note: str = ""
+    """Remark such as "skipped: too few"."""
+
+
+@house_style
+def training_curves(
+    curves: Sequence[Curve], marks: Sequence[float] = (), mark_label: str = "round"
+) -> Figure:
+    """Draw curves over epochs, one panel below the other for each `Curve.panel`.
+
+    Args:
+        curves: What to draw.
+        marks: Epochs at which a thin vertical line stands, for instance where rounds begin.
+        mark_label: What such a line means.
+
+    Raises:
+        InputError: where there is no curve.
+    """
+    if not curves:
+        raise InputError("training_curves: there is no curve to draw")
+    panels = list(dict.fromkeys(curve.panel for curve in curves))
+    figure = Figure(figsize=(_WIDTH, 0.5 + 2.4 * len(panels)), layout="constrained")
+    grid = figure.subplots(len(panels), 1, sharex=True, squeeze=False)
+    for axes, panel in zip(grid[:, 0], panels, strict=True):
+        for mark in marks:
+            axes.axvline(mark, color="#cccccc", linewidth=0.8, zorder=0)
+        lines = [curve for curve in curves if curve.panel == panel]
+        for index, curve in enumerate(lines):
+            style = ("-", "--", ":", "-.")[index % 4]
+            axes.plot(
+                curve.x,
+                curve.y,
+                style,
+                color=_LINES[index % len(_LINES)],
+                label=short(curve.name, 28),
+                linewidth=1.8,
+                marker="o" if len(curve.x) < 12 else None,
+                markersize=3.5,
+            )
+        axes.set_ylabel(short(panel, 24))
+        axes.margins(y=0.08)
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, fontsize=9)
+    grid[-1, 0].set_xlabel("epoch" + (f" (grey line: {mark_label} begins)" if len(marks) else ""))
+    grid[-1, 0].xaxis.set_major_locator(MaxNLocator(8, integer=True))
+    return figure
+
+
+@house_style
+def selection_counts(rounds: Sequence[SelectionRound], class_names: Sequence[str]) -> Figure:
+    """Draw the selected clouds of each round stacked by class, and the threshold θ above them.
+
+    A dotted outline shows how many clouds were above the threshold.
+
+    Raises:
+        InputError: where there is no round, or its counts do not fit the class names.
+    """
+    if not rounds:
+        raise InputError("selection_counts: there is no round to draw")
+    if any(len(r.kept) != len(class_names) for r in rounds):
+        raise InputError(f"selection_counts: counts are not of {len(class_names)} classes")
+    places = np.array([r.index for r in rounds])
+    figure = Figure(figsize=(_WIDTH, 5.6), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(1, 3.4))
+    upper.plot(places, [r.theta for r in rounds], "o-", color="black", markersize=4)
+    upper.set_ylabel("θ")
+    upper.margins(y=0.25)
+    floor = np.zeros(len(rounds))
+    for index, name in enumerate(class_names):
+        height = np.array([r.kept[index] for r in rounds], dtype=np.float64)
+        lower.bar(
+            places,
+            height,
+            0.75,
+            floor,
+            color=class_colour(index),
+            label=short(name),
+            edgecolor="white",
+        )
+        floor += height
+    above = np.array([int(r.confident.sum()) for r in rounds])
+    outline = {"color": "none", "edgecolor": "#555555", "linestyle": ":", "linewidth": 1.2}
+    lower.bar(places, above, 0.83, label="above θ", zorder=0, **outline)
+    lower.set_ylabel("selected clouds")
+    lower.set_xlabel("round, and selected / above θ")
+    totals = zip(places, floor.astype(int), above, strict=True)
+    lower.set_xticks(places, [f"{place}\n{kept}/{total}" for place, kept, total in totals])
+    lower.tick_params(axis="x", labelsize=9 if len(rounds) < 9 else 7.5)
+    lower.yaxis.set_major_locator(MaxNLocator(6, integer=True))
+    lower.margins(y=0.12)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=9)
+    return figure
+
+
+@house_style
+def confusion_heatmap(
+    matrix: Int[np.ndarray, "k columns"], class_names: Sequence[str], title: str = ""
+) -> Figure:
+    """Draw counts by true class (rows) and predicted class, shaded by the share of the row.
+
+    Args:
+        matrix: Counts; one column more than classes counts predictions of none of them.
+        class_names: Names in the order of the rows.
+        title: Heading.
+
+    Raises:
+        InputError: where the matrix does not fit the names.
+    """
+    k = len(class_names)
+    if matrix.shape not in {(k, k), (k, k + 1)} or not k:
+        raise InputError(f"confusion_heatmap: {matrix.shape} does not fit {k} class names")
+    total = matrix.sum(axis=1, keepdims=True)
+    share = np.divide(matrix, total, out=np.zeros(matrix.shape), where=total > 0)
+    names = [short(name) for name in class_names]
+    columns = [*names, "other"][: matrix.shape[1]]
+    edge = max(_WIDTH, 0.36 * k + 1.4)
+    figure = Figure(figsize=(edge, edge + 0.15), layout="constrained")
+    axes = figure.add_subplot()
+    axes.imshow(share, cmap="Blues", vmin=0.0, vmax=1.0)
+    for (row, column), count in np.ndenumerate(matrix):
+        if count:
+            dark = share[row, column] > 0.55
+            weight = "bold" if row == column else "normal"
+            axes.text(
+                column,
+                row,
+                str(count),
+                ha="center",
+                va="center",
+                color="white" if dark else "black",
+                fontsize=9,
+                fontweight=weight,
+            )
+    axes.set_xticks(range(len(columns)), columns, rotation=55, ha="right", rotation_mode="anchor")
+    axes.set_yticks(range(k), names)
+    axes.set_xticks(np.arange(len(columns) - 1) + 0.5, minor=True)
+    axes.set_yticks(np.arange(k - 1) + 0.5, minor=True)
+    axes.grid(which="minor", color="#dddddd", linewidth=0.6)
+    axes.tick_params(which="both", length=0)
+    for spine in axes.spines.values():
+        spine.set_visible(True)
+        spine.set_color("#bbbbbb")
+    axes.set_xlabel("predicted")
+    axes.set_ylabel("true")
+    axes.set_title(short(title, 40))
+    return figure
+
+
+@house_style
+def class_accuracy(
+    before: Float[np.ndarray, "k"],
+    after: Float[np.ndarray, "k"],
+    class_names: Sequence[str],
+    counts: Int[np.ndarray, "k"],
+    names: tuple[str, str] = ("before", "after"),
+) -> Figure:
+    """Draw the accuracy of each class before and after adaptation as pairs of bars.
+
+    Args:
+        before: Recall of each class in 0 … 1; NaN where the class has no cloud.
+        after: The same after adaptation.
+        class_names: Names of the classes.
+        counts: Clouds of each class, told beside its name.
+        names: What the two are called.
+
+    Raises:
+        InputError: where the lengths differ.
+    """
+    k = len(class_names)
+    if not len(before) == len(after) == len(counts) == k or not k:
+        raise InputError(f"class_accuracy: the arrays do not fit {k} class names")
+    figure = Figure(figsize=(_WIDTH, 0.9 + 0.46 * k), layout="constrained")
+    axes = figure.add_subplot()
+    rows = np.arange(k)
+    for offset, values, name, colour in (
+        (-0.2, before, names[0], BEFORE),
+        (0.2, after, names[1], AFTER),
+    ):
+        known = np.nan_to_num(values, nan=0.0)
+        axes.barh(rows + offset, 100.0 * known, 0.38, color=colour, label=short(name, 24))
+        for row, value in zip(rows, values, strict=True):
+            text = "no cloud" if np.isnan(value) else f"{100.0 * value:.0f}"
+            if not (np.isnan(value) and offset > 0):
+                axes.text(100.0 * known[row] + 1, row + offset, text, va="center", fontsize=8.5)
+    axes.set_yticks(rows, [f"{short(n)} ({c})" for n, c in zip(class_names, counts, strict=True)])
+    axes.invert_yaxis()
+    axes.set_xlim(0, 108)
+    axes.set_xticks(range(0, 101, 20))
+    axes.set_xlabel("accuracy of the class [%]")
+    axes.tick_params(axis="y", length=0)
+    figure.legend(loc="outside upper center", ncols=2)
+    return figure
+
+
+_LINES = (PALETTE[0], PALETTE[6], PALETTE[3], PALETTE[7], PALETTE[2], "#000000")

@@ -1,0 +1,206 @@
+"""Plots of what a simulated depth camera measures, beside the laws of real ones."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, NullLocator
+
+from qs3.report.figure import NO_VALUE, PALETTE, house_style
+from qs3.sensor.presets import Sensor
+
+LAW_PIXELS = 0.08
+"""Sub-pixel RMS of the law of noise: a well-lit wall, Intel's guide to tuning depth cameras."""
+
+_WIDTH = 5.2
+_MEASURED, _LAW, _SECOND = PALETTE[0], PALETTE[6], PALETTE[2]
+_Result = Mapping[str, Any]
+
+REALISM_PLOTS: dict[str, str] = {
+    "T1": "rms.png",
+    "T2": "bias.png",
+    "T5": "edge.png",
+    "T6": "fill.png",
+    "T8": "steps.png",
+    "T10": "distances.png",
+}
+"""File name of the plot of each test that has one."""
+
+
+def realism_plot(result: _Result, sensor: Sensor) -> Figure | None:
+    """Draw one test's result, where it has a plot and its curves are there.
+
+    Args:
+        result: As `qs3.sensor.realism.realism` gives it.
+        sensor: What was tested: supplies focal length, baseline and block.
+
+    Returns:
+        None for a test that has no plot, or that did not apply.
+    """
+    if result["id"] not in _DRAW or not result["data"]:
+        return None
+    return _DRAW[result["id"]](result, sensor)
+
+
+@house_style
+def rms_plot(result: _Result, sensor: Sensor) -> Figure:
+    """RMS about the wall's plane against distance (T1), with the law and the fitted slope."""
+    z, rms = _series(result, "z"), _series(result, "rms_mm")
+    figure, (axes,) = _figure(1)
+    reach = np.geomspace(z.min() / 1.1, z.max() * 1.1, 50)
+    law = 1000 * LAW_PIXELS * reach**2 / (sensor.rig.focal * sensor.rig.baseline)
+    axes.plot(reach, law, "--", color=_LAW, label=f"law: {LAW_PIXELS} px · z²/(f·b)")
+    known = rms > 0
+    if known.sum() > 1:
+        slope, start = np.polyfit(np.log(z[known]), np.log(rms[known]), 1)
+        fitted = np.exp(start) * reach**slope
+        axes.plot(reach, fitted, "-", color=NO_VALUE, label=f"fit: slope {slope:.2f}")
+    axes.plot(z, rms, "o", color=_MEASURED, label="measured")
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
+    axes.set_xlabel(_length("distance", "m", sensor))
+    axes.set_ylabel(_length("RMS about the plane", "mm", sensor))
+    axes.set_title(f"{sensor.name}: noise of a facing wall")
+    axes.legend(loc="upper left")
+    return figure
+
+
+@house_style
+def bias_plot(result: _Result, sensor: Sensor) -> Figure:
+    """Mean error of disparity against its fraction of a pixel (T2), with the median's bounds."""
+    fraction, bias = _series(result, "fraction"), _series(result, "bias")
+    order = np.argsort(fraction)
+    figure, (axes,) = _figure(1)
+    axes.axhspan(-0.01, 0.01, color=_SECOND, alpha=0.25, label="bounds of the median")
+    axes.plot(
+        fraction[order], bias[order], "o-", color=_MEASURED, markersize=4, label="mean of a wall"
+    )
+    median = next((r["measured"] for r in result["rows"] if "median disparity" in r["what"]), None)
+    if median is not None:
+        axes.axhline(median, color=_LAW, linestyle="--", label=f"median of all: {median:+.4f} px")
+    reach = 1.3 * max(0.02, float(np.nanmax(np.abs(bias), initial=0.0)))
+    axes.set(xlim=(0, 1), ylim=(-reach, reach))
+    axes.set_xlabel("fraction of the true disparity [px]")
+    axes.set_ylabel("error of disparity [px]")
+    axes.set_title(f"{sensor.name}: bias over a pixel")
+    figure.legend(loc="outside lower center", fontsize=9, ncols=2)
+    return figure
+
+
+@house_style
+def edge_plot(result: _Result, sensor: Sensor) -> Figure:
+    """What is measured across the edge of a plate before a wall (T5), half a block marked."""
+    offset = _series(result, "offset")
+    half = sensor.matching.block_size / 2
+    figure, (axes,) = _figure(1)
+    axes.axvspan(-half, half, color=_SECOND, alpha=0.2, label="± half a block")
+    axes.axvline(0, color="black", linewidth=0.8)
+    axes.plot(
+        offset, _series(result, "near_share"), "-", color=_MEASURED, label="depth of the plate"
+    )
+    axes.plot(
+        offset,
+        _series(result, "between_share"),
+        "--",
+        color=_LAW,
+        label="depth in between",
+    )
+    axes.set(xlim=(offset.min(), offset.max()), ylim=(-0.03, 1.05))
+    axes.set_xlabel("pixels from the true edge (left: on the plate)")
+    axes.set_ylabel("share of the rows")
+    axes.set_title(f"{sensor.name}: profile of an edge")
+    figure.legend(loc="outside lower center", fontsize=9, ncols=3)
+    return figure
+
+
+@house_style
+def fill_plot(result: _Result, sensor: Sensor) -> Figure:
+    """Fill rate against albedo and against the angle of incidence (T6)."""
+    figure, (left, right) = _figure(2)
+    left.plot(_series(result, "albedo"), _series(result, "fill_albedo"), "o-", color=_MEASURED)
+    left.set_xscale("log")
+    left.invert_xaxis()
+    left.set_xticks(_series(result, "albedo"))
+    left.xaxis.set_major_formatter("{x:g}")
+    left.xaxis.set_minor_locator(NullLocator())
+    left.set_xlabel("albedo of a patch")
+    left.set_ylabel("share of pixels with a depth")
+    right.plot(_series(result, "angle"), _series(result, "fill_angle"), "o-", color=_MEASURED)
+    right.set_xticks(_series(result, "angle"))
+    right.set_xlabel("turn of a wall [°]")
+    for axes in (left, right):
+        axes.set_ylim(-0.03, 1.05)
+    figure.suptitle(f"{sensor.name}: darker and more glancing", fontsize=10.5)
+    return figure
+
+
+@house_style
+def steps_plot(result: _Result, sensor: Sensor) -> Figure:
+    """Depth steps and noise against distance (T8), with the measured law of the real camera."""
+    z = _series(result, "z")
+    figure, (axes,) = _figure(1)
+    for name, what, colour, mark in (
+        ("step", "step of depth", _MEASURED, "o"),
+        ("sigma", "noise σ", _LAW, "s"),
+    ):
+        law = _series(result, f"{name}_law_mm")
+        axes.fill_between(z, 0.8 * law, 1.2 * law, color=colour, alpha=0.2, linewidth=0)
+        axes.plot(z, law, "--", color=colour, label=f"{what}: law ± 20 %")
+        measured = _series(result, f"{name}_mm")
+        axes.plot(z, measured, mark, color=colour, label=f"{what}: measured")
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel(_length("distance", "m", sensor))
+    axes.set_ylabel(_length("step, σ", "mm", sensor))
+    axes.set_title(f"{sensor.name}: steps and noise")
+    axes.legend(loc="upper left")
+    return figure
+
+
+@house_style
+def distances_plot(result: _Result, sensor: Sensor) -> Figure:
+    """Distances of scanned points from the surface in units of the law's σ (T10)."""
+    distance, share = _series(result, "distance"), _series(result, "share")
+    width = float(np.median(np.diff(distance))) if len(distance) > 1 else 1.0
+    figure, (axes,) = _figure(1)
+    axes.bar(distance, share, width, color=_SECOND, label="measured")
+    x = np.linspace(distance.min() - width / 2, distance.max() + width / 2, 200)
+    normal = width * np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
+    axes.plot(x, normal, "--", color=_LAW, label="the law: Gaussian of σ = 1")
+    axes.set_xlabel("distance from the surface, in σ of the law")
+    axes.set_ylabel("share of the points")
+    axes.set_title(f"{sensor.name}: a scanned object")
+    figure.legend(loc="outside lower center", fontsize=9, ncols=2)
+    return figure
+
+
+_DRAW: dict[str, Callable[[_Result, Sensor], Figure]] = {
+    "T1": rms_plot,
+    "T2": bias_plot,
+    "T5": edge_plot,
+    "T6": fill_plot,
+    "T8": steps_plot,
+    "T10": distances_plot,
+}
+
+
+def _figure(panels: int) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=(_WIDTH * (1.0 if panels == 1 else 1.4), 3.6), layout="constrained")
+    return figure, list(figure.subplots(1, panels, squeeze=False, sharey=True)[0])
+
+
+def _series(result: _Result, name: str) -> Float[np.ndarray, "n"]:
+    """A curve of a result; None, JSON's word for what is not finite, becomes NaN."""
+    return np.array([np.nan if v is None else v for v in result["data"][name]], dtype=np.float64)
+
+
+def _length(what: str, unit: str, sensor: Sensor) -> str:
+    """The label of an axis of lengths: metric, or in sizes of the object."""
+    sizes = {"m": "sizes of the object", "mm": "1/1000 of the object's size"}
+    return f"{what} [{unit if sensor.metric else sizes[unit]}]"

@@ -1,0 +1,98 @@
+"""Procedural furniture: ten classes that need no file and no download.
+
+Convention:
+    Metres, z up. An object stands on z = 0 (one that hangs has its lowest point there) and its
+    middle lies over the origin; its front looks toward −y.
+"""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import trimesh
+
+from qs3.errors import InputError
+from qs3.shapes import (
+    bathtub,
+    bed,
+    bookshelf,
+    cabinet,
+    chair,
+    lamp,
+    monitor,
+    plant,
+    sofa,
+    table,
+)
+from qs3.shapes._dice import Dice
+from qs3.shapes._parts import Part, assemble
+
+_FAMILIES: dict[str, Mapping[str, Callable[[Dice], list[Part]]]] = {
+    "bathtub": bathtub.FAMILIES,
+    "bed": bed.FAMILIES,
+    "bookshelf": bookshelf.FAMILIES,
+    "cabinet": cabinet.FAMILIES,
+    "chair": chair.FAMILIES,
+    "lamp": lamp.FAMILIES,
+    "monitor": monitor.FAMILIES,
+    "plant": plant.FAMILIES,
+    "sofa": sofa.FAMILIES,
+    "table": table.FAMILIES,
+}
+
+CLASSES: tuple[str, ...] = tuple(_FAMILIES)
+"""The ten classes of PointDA-10, in the order of their label."""
+
+
+def families(class_name: str) -> tuple[str, ...]:
+    """Return the names of a class's structurally different families.
+
+    Raises:
+        InputError: where the class is unknown.
+
+    Example:
+        >>> "four_legs" in families("chair")
+        True
+    """
+    if class_name not in _FAMILIES:
+        raise InputError(f"class {class_name!r} is unknown; choose one of {', '.join(CLASSES)}")
+    return tuple(_FAMILIES[class_name])
+
+
+def make(class_name: str, seed: int = 0, family: str | None = None) -> trimesh.Trimesh:
+    """Make one object; the same class, seed and family give the same vertices.
+
+    Args:
+        class_name: One of ``CLASSES``.
+        seed: Any whole number ≥ 0; every size and option is drawn from it.
+        family: One of ``families(class_name)``; drawn from the seed where it is None. Naming the
+            family that the seed would draw gives the same object.
+
+    Returns:
+        A mesh of closed solids that touch or overlap, in metres, z up (see the module's
+        convention).
+
+    Raises:
+        InputError: where the class or family is unknown, or the seed is negative.
+
+    Example:
+        >>> chair = make("chair", seed=3)
+        >>> float(chair.bounds[0, 2])
+        0.0
+    """
+    names = families(class_name)
+    if family is not None and family not in names:
+        raise InputError(
+            f"family {family!r} of {class_name} is unknown; choose one of {', '.join(names)}"
+        )
+    if seed < 0:
+        raise InputError(f"seed {seed}: choose a whole number from 0 up")
+    rng = np.random.default_rng(np.random.SeedSequence([seed, CLASSES.index(class_name)]))
+    drawn = names[int(rng.integers(len(names)))]
+    mirrored = bool(rng.integers(2))
+    mesh = assemble(_FAMILIES[class_name][family or drawn](Dice(rng)))
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    vertices = vertices - [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]
+    if mirrored:
+        vertices, faces = vertices * [-1.0, 1.0, 1.0], faces[:, ::-1]
+    return trimesh.Trimesh(vertices=vertices, faces=faces, process=False)

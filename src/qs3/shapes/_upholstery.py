@@ -1,0 +1,107 @@
+"""Upholstered seats: an armchair with one cushion, a sofa with more."""
+
+from itertools import pairwise
+
+import numpy as np
+
+from qs3.shapes._dice import Dice
+from qs3.shapes._joinery import corners, legs
+from qs3.shapes._parts import Number, Part, Span, cushion, pillow, tube
+
+
+def upholstered(dice: Dice, width: Number, seats: int, lean: Number | None = None) -> list[Part]:
+    """Base, back, two arms and cushions: an armchair with one seat, a sofa with more.
+
+    The first part is the base.
+    """
+    depth, seat = dice.between(0.74, 1.0), dice.between(0.36, 0.46)
+    foot = dice.pick(0.0, dice.between(0.03, 0.08), dice.between(0.08, 0.18))
+    high, arm = seat + dice.between(0.28, 0.5), seat + dice.between(0.08, 0.26)
+    side = dice.between(0.08, 0.26) * (0.8 if seats == 1 else 1.0)
+    back = dice.between(0.12, 0.26)
+    soft = dice.pick(0.005, 0.03, dice.between(0.03, 0.09))
+    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    base = seat - dice.between(0.1, 0.18)
+    parts = [
+        cushion(
+            (x[0] + 0.01, x[1] - 0.01),
+            (y[0] + 0.02, y[1] - 0.01),
+            (foot, base),
+            min(soft, 0.03),
+            steps=dice.steps,
+        )
+    ]
+    lean = dice.pick(0.0, dice.between(2, 14)) if lean is None else lean
+    rest = cushion(
+        (x[0] + side * 0.5, x[1] - side * 0.5),
+        (y[1] - back, y[1]),
+        (foot + 0.03, high),
+        soft,
+        steps=dice.steps,
+    )
+    parts.append(rest.turn("x", -lean, (0, y[1], base)))
+    parts += _arms(dice, x, (y[0] + dice.pick(0.0, 0.05), y[1] - 0.01), (foot, arm), side, soft)
+    inner = (x[0] + side - 0.005, x[1] - side + 0.005)
+    edges = np.linspace(*inner, seats + 1)
+    run = (y[0] - dice.pick(0.0, 0.03), y[1] - back + 0.01)
+    plump = dice.between(0.0, 0.04)
+    loose = dice.chance(0.7)
+    for a, b in pairwise(edges):
+        span = (float(a) + 0.002, float(b) - 0.002)
+        parts.append(cushion(span, run, (base - 0.01, seat), max(soft, 0.02), plump, dice.steps))
+        if loose:
+            thick = dice.between(0.1, 0.18)
+            pad = cushion(
+                span,
+                (run[1] - thick, run[1] + 0.03),
+                (seat - 0.02, high + dice.between(-0.06, 0.05)),
+                max(soft, 0.03),
+                steps=dice.steps,
+            )
+            parts.append(pad.turn("x", -lean, (0, y[1], base)))
+    if dice.chance(0.35):
+        parts += _throw_pillows(dice, inner, run[1] - 0.18 * loose, seat)
+    if foot > 0:
+        parts += legs(
+            dice,
+            corners(x, y, 0.07),
+            foot + 0.01,
+            dice.between(0.03, 0.07),
+            dice.pick("square", "tapered", "cone"),
+        )
+    return parts
+
+
+def _arms(dice: Dice, x: Span, y: Span, z: Span, side: Number, soft: Number) -> list[Part]:
+    style = dice.pick("square", "square", "rolled", "sloped")
+    parts = []
+    for s, span in ((-1, (x[0], x[0] + side)), (1, (x[1] - side, x[1]))):
+        top = z[1]
+        if style == "rolled":
+            r = max(0.6 * side, 0.07)
+            parts.append(cushion(span, y, (z[0], top - r * 0.8), min(soft, 0.03), steps=dice.steps))
+            cx = (span[0] + span[1]) / 2 + s * 0.15 * side
+            parts.append(
+                tube([(cx, y[0] - 0.01, top - r), (cx, y[1], top - r)], r, max(8, dice.sides))
+            )
+        else:
+            arm = cushion(span, y, (z[0], top), soft, steps=dice.steps)
+            if style == "sloped":
+                v = arm.vertices.copy()
+                fall = dice.between(0.1, 0.35) * (top - z[0])
+                share = (v[:, 1] - y[0]) / (y[1] - y[0])
+                v[:, 2] -= fall * (1 - share) * (v[:, 2] - z[0]) / (top - z[0])
+                arm = Part(v, arm.faces)
+            parts.append(arm)
+    return parts
+
+
+def _throw_pillows(dice: Dice, x: Span, y: Number, z: Number) -> list[Part]:
+    half, parts = dice.between(0.17, 0.23), []
+    spots = [x[0] + half, x[1] - half, (x[0] + x[1]) / 2]
+    if x[1] - x[0] < 4.2 * half:
+        spots = spots[2:]
+    for cx in dice.shuffled(spots)[: dice.count(1, len(spots))]:
+        pad = pillow((-half, half), (-0.08, 0.08), (-half, half)).turn("x", dice.between(-32, -15))
+        parts.append(pad.move(cx, y - 0.1, z - pad.vertices[:, 2].min() - 0.015))
+    return parts

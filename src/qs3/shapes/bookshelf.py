@@ -1,0 +1,320 @@
+"""Bookshelves: backed, open, ladder, corner, cubes, wall board, rack, with doors."""
+
+from itertools import pairwise
+
+import numpy as np
+
+from qs3.shapes._dice import Dice
+from qs3.shapes._joinery import books, carcass, corners, fronts, knick_knacks, legs
+from qs3.shapes._parts import Number, Part, Span, beam, block
+
+
+def _fill(dice: Dice, x: Span, y: Span, z: Number, room: Number, share: Number) -> list[Part]:
+    """Books or knick-knacks on one board, with probability ``share``."""
+    if room < 0.12 or x[1] - x[0] < 0.12 or not dice.chance(share):
+        return []
+    if dice.chance(0.75):
+        return books(dice, x, y, z, room)
+    return knick_knacks(dice, x, y, z, 0.8 * room)
+
+
+def _backed(dice: Dice, doors: bool) -> list[Part]:
+    width = dice.pick(dice.between(0.35, 0.7), dice.between(0.6, 1.2), dice.between(1.1, 1.8))
+    depth, high = dice.between(0.2, 0.4), dice.between(0.9, 2.3)
+    board = dice.between(0.016, 0.03) * dice.bulk
+    foot = dice.pick(0.0, dice.between(0.04, 0.1))
+    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    parts = carcass(x, y, (foot, high), board, back=dice.chance(0.85) or doors)
+    share = dice.pick(0.0, 0.0, dice.between(0.3, 1.0))
+    bays = np.linspace(
+        x[0] + board / 2, x[1] - board / 2, 1 + max(1, round(width / dice.between(0.5, 1.0)))
+    )
+    for px in bays[1:-1]:
+        parts.append(
+            block((float(px) - board / 2, float(px) + board / 2), y, (foot, high - board / 2))
+        )
+    rows = max(2, round((high - foot) / dice.between(0.25, 0.45)))
+    shut = foot + (dice.between(0.2, 0.4) * (high - foot) if doors else 0.0)
+    levels = np.linspace(foot, high - board, rows + 1)
+    for i, level in enumerate(levels[:-1]):
+        if i:
+            z = float(level)
+            parts.append(
+                block(
+                    (x[0] + board / 2, x[1] - board / 2),
+                    (y[0] + 0.004, y[1] - 0.002),
+                    (z, z + board),
+                )
+            )
+        if level < shut:
+            continue
+        for a, b in pairwise(bays):
+            span = (float(a) + board / 2 + 0.005, float(b) - board / 2 - 0.005)
+            parts += _fill(
+                dice,
+                span,
+                (y[0] + 0.01, y[1] - board / 2),
+                float(level) + board,
+                float(levels[1] - levels[0]) - board,
+                share,
+            )
+    if doors:
+        parts += fronts(
+            dice, x, (foot, shut), y[0], max(1, round(width / 0.45)), dice.pick(1, 1, 2), "door"
+        )
+    if foot > 0:
+        if dice.chance(0.5):
+            parts.append(
+                block((x[0] + 0.01, x[1] - 0.01), (y[0] + 0.02, y[1] - 0.01), (0, foot + board / 2))
+            )
+        else:
+            parts += legs(dice, corners(x, y, 0.035), foot + board / 2, 0.04)
+    if dice.chance(0.2):
+        over = dice.between(0.01, 0.04)
+        parts.append(
+            block((x[0] - over, x[1] + over), (y[0] - over, y[1]), (high - 0.002, high + 0.03))
+        )
+    return parts
+
+
+def backed(dice: Dice) -> list[Part]:
+    """Bookcase with sides and mostly a back, empty or filled."""
+    return _backed(dice, doors=False)
+
+
+def with_doors(dice: Dice) -> list[Part]:
+    """Bookcase whose lowest part is shut by doors."""
+    return _backed(dice, doors=True)
+
+
+def open_frame(dice: Dice) -> list[Part]:
+    """Boards between four or six uprights, seen through from all sides."""
+    width, depth, high = dice.between(0.5, 1.5), dice.between(0.25, 0.42), dice.between(0.7, 2.1)
+    post, board = dice.between(0.02, 0.05) * dice.bulk**0.7, dice.between(0.018, 0.03) * dice.bulk
+    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    parts = legs(dice, corners(x, y, post / 2), high, post, dice.pick("square", "round"))
+    rows = dice.count(2, 6)
+    levels = np.linspace(dice.between(0.05, 0.2), high - board, rows)
+    share = dice.pick(0.0, 0.0, dice.between(0.3, 1.0))
+    for i, level in enumerate(levels):
+        z = float(level)
+        parts.append(
+            block((x[0] + 0.005, x[1] - 0.005), (y[0] + 0.005, y[1] - 0.005), (z, z + board))
+        )
+        if i < rows - 1:
+            room = float(levels[1] - levels[0]) - board
+            parts += _fill(
+                dice, (x[0] + post, x[1] - post), (y[0] + post, y[1] - 0.01), z + board, room, share
+            )
+    if dice.chance(0.4):
+        a, b = float(levels[0]) + board / 2, float(levels[-1]) + board / 2
+        parts += [
+            beam(
+                (x[0] + post, y[1] - post / 2, a), (x[1] - post, y[1] - post / 2, b), 0.012, 0.012
+            ),
+            beam(
+                (x[1] - post, y[1] - post / 2, a), (x[0] + post, y[1] - post / 2, b), 0.012, 0.012
+            ),
+        ]
+    return parts
+
+
+def ladder(dice: Dice) -> list[Part]:
+    """Leaning shelf whose boards grow deeper towards the floor."""
+    width, depth, high = dice.between(0.5, 0.9), dice.between(0.35, 0.55), dice.between(1.4, 2.0)
+    bar, board = dice.between(0.025, 0.045), dice.between(0.018, 0.03) * dice.bulk
+    rows, rear = dice.count(3, 5), dice.chance(0.5)
+    parts = []
+    for s in (-1, 1):
+        px = s * (width / 2 - bar / 2)
+        parts.append(beam((px, -depth / 2, 0), (px, depth / 2 - bar, high), bar, bar))
+        if rear:
+            parts.append(beam((px, depth / 2, 0), (px, depth / 2, high), bar, bar))
+            parts.append(
+                block(
+                    (px - bar / 2, px + bar / 2),
+                    (depth / 2 - 1.6 * bar, depth / 2 + bar / 2),
+                    (high - 0.03, high),
+                )
+            )
+    share = dice.pick(0.0, dice.between(0.3, 1.0))
+    levels = np.linspace(dice.between(0.12, 0.3), high - dice.between(0.05, 0.2), rows)
+    for level in levels:
+        z = float(level)
+        front = -depth / 2 + (depth - bar) * z / high - bar / 2
+        span = (front, depth / 2)
+        parts.append(block((-width / 2 + 0.002, width / 2 - 0.002), span, (z, z + board)))
+        if span[1] - span[0] > 0.14 and z < levels[-1]:
+            parts += _fill(
+                dice,
+                (-width / 2 + bar, width / 2 - bar),
+                (span[0] + bar, span[1] - 0.02),
+                z + board,
+                0.3,
+                share,
+            )
+    return parts
+
+
+def corner(dice: Dice) -> list[Part]:
+    """Two bookcases that meet at a right angle."""
+    run, down, depth = dice.between(0.6, 1.4), dice.between(0.6, 1.4), dice.between(0.25, 0.38)
+    high, board, rows = (
+        dice.between(0.8, 2.1),
+        dice.between(0.018, 0.03) * dice.bulk,
+        dice.count(2, 6),
+    )
+    parts = []
+    for level in np.linspace(0.0, high - board, rows + 1):
+        z = float(level)
+        parts += [
+            block((0, run), (-depth, 0), (z, z + board)),
+            block((0, depth), (-down, -depth + 0.002), (z, z + board)),
+        ]
+    ends = [
+        block((run - board, run), (-depth, 0), (0, high)),
+        block((0, depth), (-down, -down + board), (0, high)),
+        block((0, board / 2), (-down, 0), (0, high)),
+        block((0, run), (-board / 2, 0), (0, high)),
+    ]
+    share = dice.pick(0.0, dice.between(0.3, 0.9))
+    room = high / rows - board
+    for level in np.linspace(0.0, high - board, rows + 1)[:-1]:
+        parts += _fill(
+            dice,
+            (depth + 0.02, run - board),
+            (-depth + 0.01, -board),
+            float(level) + board,
+            room,
+            share,
+        )
+    return parts + ends
+
+
+def cubes(dice: Dice) -> list[Part]:
+    """Grid of square bays, complete or stepped."""
+    columns, rows = dice.count(1, 5), dice.count(1, 5)
+    if columns == 1:
+        rows = max(rows, 2)
+    bay, depth = dice.between(0.3, 0.42), dice.between(0.25, 0.42)
+    board = dice.between(0.016, 0.04) * dice.bulk
+    steps = (
+        sorted((dice.count(1, rows) for _ in range(columns)), reverse=True)
+        if columns > 2 and dice.chance(0.3)
+        else [rows] * columns
+    )
+    y, back, share = (-depth / 2, depth / 2), dice.chance(0.5), dice.pick(0.0, 0.3, 0.8)
+    parts = []
+    for i, tall in enumerate(steps):
+        for j in range(tall):
+            a, b = i * bay, (i + 1) * bay
+            c, d = j * bay, (j + 1) * bay
+            parts += carcass((a - board / 2, b + board / 2), y, (c, d + board), board, back)
+            kind = dice.pick("open", "open", "open", "box")
+            if kind == "box" and share > 0:
+                parts.append(
+                    block(
+                        (a + board / 2 + 0.01, b - board / 2 - 0.01),
+                        (y[0] + 0.01, y[1] - board),
+                        (c + board - 0.002, d - 0.04),
+                    )
+                )
+            else:
+                parts += _fill(
+                    dice,
+                    (a + board / 2 + 0.01, b - board / 2 - 0.01),
+                    (y[0] + 0.01, y[1] - board),
+                    c + board,
+                    bay - board,
+                    share,
+                )
+    return parts
+
+
+def wall_board(dice: Dice) -> list[Part]:
+    """One to three boards on brackets for the wall, with things on them."""
+    width, depth = dice.between(0.4, 1.4), dice.between(0.18, 0.32)
+    board, drop = dice.between(0.025, 0.045) * dice.bulk, dice.between(0.1, 0.2)
+    count, step = dice.pick(1, 1, 1, 2, 3), dice.between(0.3, 0.42)
+    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    wide = dice.between(0.02, 0.06) * dice.bulk
+    share = dice.between(0.0, 1.4)
+    inset = dice.between(0.03, 0.2) * width
+    parts = []
+    for i in range(count):
+        z = drop + i * step
+        parts.append(block(x, y, (z, z + board)))
+        for s in (-1, 1):
+            px = s * (width / 2 - inset)
+            span = (px - wide / 2, px + wide / 2)
+            if count == 1:
+                reach = dice.between(0.5, 0.95) * depth
+                parts += [
+                    block(span, (y[1] - 0.03, y[1]), (z - drop, z + 0.005)),
+                    block(span, (y[1] - reach, y[1]), (z - 0.03, z + 0.005)),
+                ]
+                parts.append(
+                    beam(
+                        (px, y[1] - 0.02, z - 0.8 * drop),
+                        (px, y[1] - 0.8 * reach, z - 0.01),
+                        0.8 * wide,
+                        0.02,
+                    )
+                )
+        if dice.chance(share):
+            if dice.chance(0.5):
+                parts += books(dice, (x[0] + 0.02, x[1] - 0.02), y, z + board, 0.32)
+            else:
+                parts += knick_knacks(dice, (x[0] + 0.02, x[1] - 0.02), y, z + board, 0.35)
+    if count > 1:
+        for s in (-1, 1):
+            px = s * (width / 2 - inset)
+            parts.append(
+                block(
+                    (px - wide / 2, px + wide / 2),
+                    (y[1] - 0.02, y[1]),
+                    (0.0, drop + (count - 1) * step + 0.1),
+                )
+            )
+    return parts
+
+
+def rack(dice: Dice) -> list[Part]:
+    """Low rack between two side boards, its shelves level or sloping to show what lies on them."""
+    width, depth, high = dice.between(0.6, 1.2), dice.between(0.25, 0.38), dice.between(0.4, 1.0)
+    board, rows = dice.between(0.018, 0.035) * dice.bulk, dice.count(2, 4)
+    slope = dice.pick(0.0, dice.between(8, 25))
+    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    parts = [block((px, px + board), y, (0, high)) for px in (x[0], x[1] - board)]
+    for level in np.linspace(0.1, high - 0.08, rows):
+        if dice.chance(0.3):
+            for py in np.linspace(y[0] + 0.04, y[1] - 0.04, 4):
+                parts.append(
+                    block(
+                        (x[0] + board / 2, x[1] - board / 2),
+                        (float(py) - 0.015, float(py) + 0.015),
+                        (float(level), float(level) + 0.02),
+                    )
+                )
+        else:
+            shelf = block(
+                (x[0] + board / 2, x[1] - board / 2),
+                (y[0] + 0.02, y[1] - 0.02),
+                (float(level), float(level) + 0.8 * board),
+            )
+            parts.append(shelf.turn("x", slope, (0, 0, float(level))))
+    if dice.chance(0.4):
+        parts.append(block(x, (y[0], y[1]), (high - board, high)))
+    return parts
+
+
+FAMILIES = {
+    "backed": backed,
+    "with_doors": with_doors,
+    "open_frame": open_frame,
+    "ladder": ladder,
+    "corner": corner,
+    "cubes": cubes,
+    "wall_board": wall_board,
+    "rack": rack,
+}

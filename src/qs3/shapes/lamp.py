@@ -1,0 +1,361 @@
+"""Lamps: floor, arc, torchiere, table, desk arm, pendant, ceiling, chandelier, column."""
+
+import numpy as np
+
+from qs3.shapes._dice import Dice
+from qs3.shapes._joinery import legs
+from qs3.shapes._parts import (
+    Number,
+    Part,
+    Point,
+    at_height,
+    ball,
+    beam,
+    bend,
+    block,
+    lathe,
+    loft,
+    outline,
+    tube,
+)
+
+_WALL = 0.006
+
+
+def _shade(dice: Dice, wide: Number, tall: Number, z: Number, sides: int) -> list[Part]:
+    """Open shade about the z axis from ``z`` up, with the spokes that carry it at its middle."""
+    top = dice.pick(dice.between(0.35, 0.75), dice.between(0.8, 1.0)) * wide
+    mid = z + 0.5 * tall
+    belly = dice.pick(0.0, dice.between(-0.15, 0.2))
+    levels = np.linspace(0, 1, 5)
+    outer = [
+        (wide + (top - wide) * t + belly * wide * np.sin(np.pi * t), z + tall * t) for t in levels
+    ]
+    inner = [(r - _WALL, h) for r, h in outer]
+    loop = [*outer, *inner[::-1]]
+    square = dice.chance(0.15)
+    rings = [
+        at_height(outline(2 * r, 2 * r, 4 if square else sides, phase=0.5), h) for r, h in loop
+    ]
+    shade = loft(np.stack(rings), cyclic=True)
+    # The spoke along x meets the middle of a flat side, which is nearer than the corners.
+    reach = (0.5 * (wide + top) + belly * wide - 0.5 * _WALL) * np.cos(
+        np.pi / (4 if square else sides)
+    )
+    spoke = beam((-reach, 0, mid), (reach, 0, mid), 0.008, 0.006)
+    return [shade, spoke, ball(0.035, (0, 0, mid + 0.02), 8)]
+
+
+def _foot(dice: Dice, radius: Number) -> list[Part]:
+    thick = dice.between(0.015, 0.035)
+    if dice.chance(0.25):
+        return [block((-radius, radius), (-radius, radius), (0, thick))]
+    dome = dice.between(0.3, 1.0)
+    return [
+        lathe(
+            [(radius, 0), (radius, thick), (dome * radius, thick * 1.4), (0.1 * radius, thick * 2)],
+            dice.sides,
+        )
+    ]
+
+
+def floor(dice: Dice) -> list[Part]:
+    """Standing lamp with a shade on a post, on a plate or three legs."""
+    high, wide, tall = dice.between(1.2, 1.8), dice.between(0.13, 0.26), dice.between(0.18, 0.4)
+    post = dice.between(0.009, 0.022) * dice.bulk
+    parts = _shade(dice, wide, tall, high - tall, dice.sides)
+    low = 0.01
+    if dice.chance(0.3):
+        hub = dice.between(0.4, 0.9) * (high - tall)
+        tips = [(dice.between(0.18, 0.3), a) for a in (90, 210, 330)]
+        for reach, a in tips:
+            tip: Point = (
+                reach * float(np.cos(np.radians(a))),
+                reach * float(np.sin(np.radians(a))),
+                post * 0.5,
+            )
+            parts.append(tube([tip, (0, 0, hub)], post, 8))
+            parts.append(lathe([(post, 0.0), (post, 2 * post)], 8, tip[0], tip[1]))
+        low = hub - 0.02
+    else:
+        parts += _foot(dice, dice.between(0.12, 0.19))
+    return [*parts, lathe([(post, low), (post, high - 0.5 * tall + 0.01)], max(6, dice.sides // 2))]
+
+
+def arc(dice: Dice) -> list[Part]:
+    """Floor lamp whose bow carries a shade out over a seat."""
+    high, reach, wide = dice.between(1.5, 2.0), dice.between(0.6, 1.3), dice.between(0.12, 0.22)
+    bar = dice.between(0.009, 0.018) * dice.bulk**0.5
+    t = np.linspace(0, 1, 13)
+    drop = dice.between(0.05, 0.35)
+    path = np.stack(
+        [
+            reach * (1 - np.cos(t * np.pi * 0.55)) / (1 - np.cos(np.pi * 0.55)),
+            0 * t,
+            high * np.sin(t * np.pi * dice.between(0.55, 0.66)),
+        ],
+        axis=1,
+    )
+    end = path[-1]
+    low = float(end[2]) - drop
+    tall = wide * dice.between(0.6, 1.1)
+    bowl = [(wide * np.cos(a), low - tall + tall * np.sin(a)) for a in np.linspace(0, 1.5, 6)]
+    inner = [
+        ((wide - _WALL) * np.cos(a), low - tall + (tall - _WALL) * np.sin(a))
+        for a in np.linspace(0, 1.5, 6)
+    ]
+    shade = lathe([*bowl, (0.0, low), (0.0, low - _WALL), *inner[::-1]], dice.sides)
+    foot = lathe(
+        [(dice.between(0.16, 0.22), 0), (0.16, dice.between(0.03, 0.07))], max(12, dice.sides)
+    )
+    return [
+        tube(path, bar, 8),
+        tube(np.stack([end, [end[0], 0, low - 0.02]]), bar * 0.8, 6),
+        shade.move(float(end[0])),
+        foot,
+    ]
+
+
+def torchiere(dice: Dice) -> list[Part]:
+    """Uplighter: a bowl on a tall post, perhaps with a reading arm."""
+    high, post, wide = (
+        dice.between(1.55, 1.95),
+        dice.between(0.01, 0.022) * dice.bulk**0.7,
+        dice.between(0.12, 0.2),
+    )
+    deep = dice.between(0.04, 0.14)
+    bowl = [
+        (0.03, high - deep),
+        (0.7 * wide, high - 0.6 * deep),
+        (wide, high),
+        (wide - 0.008, high),
+        (0.65 * wide, high - 0.5 * deep),
+        (0.0, high - 0.8 * deep),
+    ]
+    parts = [
+        lathe(bowl, dice.sides),
+        *_foot(dice, dice.between(0.12, 0.17)),
+        lathe([(post, 0.01), (post, high - 0.8 * deep)], 8),
+    ]
+    if dice.chance(0.4):
+        z, run = dice.between(0.55, 0.75) * high, dice.between(0.15, 0.3)
+        parts.append(
+            tube(bend([(0, 0, z), (run * 0.5, 0, z + 0.05), (run, 0, z - 0.02)], 0.05), 0.008, 6)
+        )
+        parts.append(_bell(dice, 0.05, 0.08).turn("y", -20).move(run, 0, z - 0.02))
+    return parts
+
+
+def table(dice: Dice) -> list[Part]:
+    """Table lamp with a turned, square or bulging body under a shade."""
+    body, wide, tall = dice.between(0.14, 0.42), dice.between(0.1, 0.24), dice.between(0.12, 0.3)
+    high = body + tall * dice.between(0.75, 1.05)
+    parts = _shade(dice, wide, tall, high - tall, dice.sides)
+    r = dice.between(0.3, 0.7) * wide
+    kind = dice.pick("vase", "ball", "post", "square", "turned")
+    if kind == "square":
+        parts += [
+            block((-r, r), (-r, r), (0, 0.025)),
+            block((-0.45 * r, 0.45 * r), (-0.45 * r, 0.45 * r), (0.02, body)),
+        ]
+    elif kind == "post":
+        parts += [*_foot(dice, r), lathe([(0.12 * r + 0.008, 0.01), (0.12 * r + 0.008, body)], 8)]
+    else:
+        profile = {
+            "vase": [(0.6, 0.0), (1.0, 0.35), (0.9, 0.6), (0.35, 0.85), (0.25, 1.0)],
+            "ball": [
+                (0.6, 0.0),
+                (0.5, 0.06),
+                (0.9, 0.25),
+                (1.0, 0.45),
+                (0.85, 0.7),
+                (0.3, 0.85),
+                (0.2, 1.0),
+            ],
+            "turned": [
+                (1.0, 0.0),
+                (0.9, 0.08),
+                (0.35, 0.14),
+                (0.3, 0.3),
+                (0.55, 0.4),
+                (0.6, 0.5),
+                (0.3, 0.65),
+                (0.4, 0.8),
+                (0.2, 1.0),
+            ],
+        }[kind]
+        parts.append(lathe([(r * a, body * b) for a, b in profile], dice.sides))
+    stem = high - 0.5 * tall + 0.01
+    parts.append(lathe([(0.009, 0.9 * body), (0.009, max(stem, 0.92 * body))], 6))
+    return parts
+
+
+def _bell(dice: Dice, wide: Number, tall: Number) -> Part:
+    """Reflector that opens downward below the origin."""
+    neck = dice.between(0.25, 0.5) * wide
+    outer = [
+        (wide, -tall),
+        (dice.between(0.75, 1.0) * wide, -0.5 * tall),
+        (neck, -0.1 * tall),
+        (neck, 0.15 * tall),
+    ]
+    inner = [
+        (0.0, 0.0),
+        (neck - _WALL, -0.1 * tall),
+        (outer[1][0] - _WALL, -0.5 * tall),
+        (wide - _WALL, -tall),
+    ]
+    profile = [*outer, (0.0, 0.15 * tall), *inner]
+    rings = [at_height(outline(2 * r, 2 * r, dice.sides, phase=0.5), z) for r, z in profile]
+    return loft(np.stack(rings), cyclic=True)
+
+
+def desk_arm(dice: Dice) -> list[Part]:
+    """Work lamp on a jointed or bent arm."""
+    bar, wide = dice.between(0.006, 0.014) * dice.bulk, dice.between(0.05, 0.1)
+    lower, upper = dice.between(0.18, 0.4), dice.between(0.16, 0.4)
+    parts = _foot(dice, dice.between(0.07, 0.12))
+    if dice.chance(0.35):
+        high = lower + 0.6 * upper
+        path = bend(
+            [
+                (0, 0, 0.01),
+                (0, 0, high),
+                (upper * 0.7, 0, high + 0.02),
+                (upper * 0.8, 0, high - 0.1),
+            ],
+            0.2,
+            8,
+        )
+        end, tilt = path[-1], -15.0
+        parts.append(tube(path, bar, 8))
+    else:
+        a, b = np.radians(dice.between(95, 125)), np.radians(dice.between(10, 50))
+        elbow = (lower * np.cos(a), 0.0, 0.03 + lower * np.sin(a))
+        tip = (elbow[0] + upper * np.cos(b), 0.0, elbow[2] + upper * np.sin(b))
+        twin = dice.chance(0.3)
+        for shift in (-0.015, 0.015) if twin else (0.0,):
+            parts.append(tube([(0, shift, 0.02), (elbow[0], shift, elbow[2])], bar, 6))
+            parts.append(tube([(elbow[0], shift, elbow[2]), (tip[0], shift, tip[2])], bar, 6))
+        joint = max(2 * bar, 0.018)
+        for spot in ((0.0, 0.0, 0.03), elbow, tip):
+            parts.append(
+                ball(joint * 1.3 if twin else joint, (float(spot[0]), 0.0, float(spot[2])), 8)
+            )
+        end, tilt = np.array(tip), dice.between(-45, -5)
+    head = _bell(dice, wide, wide * dice.between(1.0, 1.8))
+    parts.append(head.turn("y", tilt).move(float(end[0]), 0, float(end[2])))
+    return parts
+
+
+def pendant(dice: Dice) -> list[Part]:
+    """Lamp that hangs from a ceiling rose by a cord."""
+    cord, wide = dice.between(0.25, 1.0), dice.between(0.1, 0.3)
+    tall = wide * dice.between(0.5, 1.4)
+    kind = dice.pick("bell", "globe", "drum", "disc")
+    if kind == "bell":
+        head = [_bell(dice, wide, tall), ball(0.03, (0, 0, -0.02), 8)]
+        low = 0.0
+    elif kind == "globe":
+        head, low = (
+            [ball(0.7 * wide, (0, 0, -0.65 * wide), max(10, dice.sides), dice.between(0.7, 1.1))],
+            -0.02,
+        )
+        low = -0.3 * wide
+    elif kind == "drum":
+        head = _shade(dice, wide, 0.8 * tall, -0.8 * tall, dice.sides)
+        low = -0.4 * tall
+    else:
+        head, low = [lathe([(wide, -0.03), (wide, 0.0), (0.1 * wide, 0.04)], dice.sides)], 0.0
+    rose = dice.between(0.04, 0.07)
+    return [
+        *head,
+        lathe([(0.005, low), (0.005, cord)], 6),
+        lathe([(rose * 0.6, cord - 0.02), (rose, cord), (rose, cord + 0.02)], max(8, dice.sides)),
+    ]
+
+
+def ceiling(dice: Dice) -> list[Part]:
+    """Saucer, drum or square panel close under the ceiling."""
+    wide, deep = dice.between(0.14, 0.32), dice.between(0.06, 0.2)
+    if dice.chance(0.2):
+        rod, rim = dice.between(0.3, 0.8) * wide, dice.between(0.02, 0.05)
+        return [
+            block((-wide, wide), (-wide, wide), (0.0, rim)),
+            block((-rod, rod), (-rod, rod), (rim - 0.002, rim + 0.35 * deep)),
+        ]
+    angle = np.linspace(-np.pi / 2, 0, 7)
+    e = dice.between(0.6, 1.6)
+    profile = [(wide * np.cos(a) ** e, deep + deep * np.sin(a)) for a in angle]
+    parts = [lathe([*profile, (wide, deep + 0.01), (0.6 * wide, deep + 0.02)], max(dice.sides, 8))]
+    parts.append(
+        lathe(
+            [(dice.between(0.4, 0.9) * wide, deep), (0.5 * wide, deep + dice.between(0.03, 0.12))],
+            dice.sides,
+        )
+    )
+    return parts
+
+
+def chandelier(dice: Dice) -> list[Part]:
+    """Bent arms about a hub, each with a candle or small shade."""
+    count, reach, cord = dice.count(3, 8), dice.between(0.22, 0.45), dice.between(0.2, 0.6)
+    parts = [
+        lathe([(0.0, -0.1), (0.04, -0.06), (0.03, 0.0), (0.045, 0.06), (0.01, 0.14)], 10),
+        lathe([(0.008, 0.1), (0.008, cord)], 6),
+        lathe([(0.05, cord - 0.02), (0.06, cord + 0.01)], 10),
+    ]
+    sag = dice.between(0.04, 0.12)
+    shaded = dice.chance(0.5)
+    for i in range(count):
+        arm = bend(
+            [(0.02, 0, -0.02), (0.5 * reach, 0, -sag - 0.03), (reach, 0, -sag), (reach, 0, 0.02)],
+            0.1,
+        )
+        group = [
+            tube(arm, 0.009, 6),
+            lathe([(0.02, 0.0), (0.035, 0.02)], 8, reach),
+            lathe([(0.012, 0.01), (0.012, 0.1)], 8, reach),
+        ]
+        if shaded:
+            group.append(lathe([(0.07, 0.05), (0.04, 0.14), (0.01, 0.14), (0.01, 0.085)], 8, reach))
+        parts += [part.turn("z", 360 * i / count) for part in group]
+    return parts
+
+
+def column(dice: Dice) -> list[Part]:
+    """Lantern of paper or cloth: a tall box or cylinder on a foot."""
+    high, half = dice.between(0.5, 1.5), dice.between(0.08, 0.17)
+    foot = dice.between(0.03, 0.12)
+    plate = half * dice.between(0.6, 1.0)
+    square = dice.chance(0.6)
+    sides, phase = (4, 0.5) if square else (max(8, dice.sides), 0.5)
+    bulge = dice.pick(0.0, 0.0, dice.between(-0.15, 0.3))
+    t = np.linspace(0, 1, 6)
+    taper = dice.between(0.8, 1.15)
+    radii = half * (1.41 if square else 1.0) * ((1 - t) + taper * t + bulge * np.sin(np.pi * t))
+    rings = [
+        at_height(outline(2 * r, 2 * r, sides, phase=phase), foot + (high - foot) * s)
+        for r, s in zip(radii, t, strict=True)
+    ]
+    parts = [loft(np.stack(rings))]
+    if dice.chance(0.4):
+        spots = [(sx * 0.5 * half, sy * 0.5 * half) for sx in (-1, 1) for sy in (-1, 1)]
+        return parts + legs(dice, spots, foot + 0.02, 0.02, "square")
+    return [
+        *parts,
+        lathe([(plate, 0), (plate, 0.02), (0.02, 0.03), (0.02, foot + 0.01)], dice.sides),
+    ]
+
+
+FAMILIES = {
+    "floor": floor,
+    "arc": arc,
+    "torchiere": torchiere,
+    "table": table,
+    "desk_arm": desk_arm,
+    "pendant": pendant,
+    "ceiling": ceiling,
+    "chandelier": chandelier,
+    "column": column,
+}

@@ -1,0 +1,1 @@
+"""Data sets on disk: Parquet shards with a manifest, made, merged and checked part by part."""

@@ -1,0 +1,7 @@
+"""Where the work of a data set is done: in this process, in several, or on a cluster."""
+
+from qs3.store.executors.executor import Executor as Executor
+from qs3.store.executors.executor import Failure as Failure
+from qs3.store.executors.executor import guarded as guarded
+from qs3.store.executors.inline import InlineExecutor as InlineExecutor
+from qs3.store.executors.local import LocalExecutor as LocalExecutor

@@ -1,0 +1,137 @@
+"""Parts of one data set, made on several machines, put into one folder."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from qs3.errors import InputError
+from qs3.store.failures import read_failures, write_failures
+from qs3.store.folder import Folder, open_folder
+from qs3.store.manifest import (
+    MANIFEST,
+    check_same,
+    finished_shards,
+    open_dataset,
+    read_sums,
+    shard_name,
+    write_manifest,
+    write_sums,
+)
+from qs3.store.mesh_sums import changed_meshes, read_mesh_sums, write_mesh_sums
+
+
+@dataclass(frozen=True)
+class MergeReport:
+    """What one call of `merge` did."""
+
+    copied: int
+    """Shards copied by this call."""
+    skipped: int
+    """Shards that were there before."""
+    failed: int
+    """Failed scans in the log of the whole."""
+
+
+def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True) -> MergeReport:
+    """Copy the shards of several parts into one data set, as if one machine had made it.
+
+    Run again after a stop, it goes on. The parts stay as they are.
+
+    Args:
+        parts: Folders, or addresses that fsspec knows, that ``generate`` with ``shard`` wrote.
+        out: New or empty folder, or one that the same call began.
+        progress: Show a bar on the standard error stream.
+
+    Raises:
+        InputError: where a part has other settings than the first, a shard is damaged, differs
+            between two parts or is in none; or the folder holds something else.
+    """
+    if not parts:
+        raise InputError("no part to merge; name the folders that qs3 generate --shard wrote")
+    folders = [open_folder(part) for part in parts]
+    manifest = open_dataset(folders[0])
+    for folder in folders[1:]:
+        check_same(str(folder), open_dataset(folder), manifest)
+    sums = [read_sums(folder) for folder in folders]
+    meshes: dict[str, str] = {}
+    for folder in folders:
+        own = read_mesh_sums(folder)
+        if changed := changed_meshes(meshes, own):
+            raise InputError(
+                f"{folder}: was made from other files than the parts named before it: "
+                f"{', '.join(changed[:5])}{' …' if len(changed) > 5 else ''}; run these parts again"
+            )
+        meshes |= own
+    held = _holders(folders, manifest.shards)
+    missing = [index for index in range(manifest.shards) if index not in held]
+    if missing:
+        some = ", ".join(str(index) for index in missing[:8]) + (" …" if len(missing) > 8 else "")
+        raise InputError(
+            f"{len(missing)} of {manifest.shards} shards are in none of the {len(parts)} parts "
+            f"(numbers {some}); finish those parts first"
+        )
+    target = open_folder(out)
+    target.claim(MANIFEST)
+    copied = 0
+    with target.locked():
+        if target.exists(MANIFEST):
+            check_same(str(target), open_dataset(target), manifest)
+            _check_unchanged(target, manifest.shards, sums)
+        write_manifest(target, manifest)
+        write_mesh_sums(target, meshes)
+        failures: dict[str, dict[str, Any]] = {}
+        for folder in folders:
+            failures |= {record["id"]: record for record in read_failures(folder)}
+        write_failures(target, failures.values())
+        done = read_sums(target)
+        there = set(finished_shards(target, manifest.shards))
+        indices = tqdm(range(manifest.shards), desc="merge", unit="shard", disable=not progress)
+        for index in indices:
+            name = shard_name(index)
+            expected = {sums[part][name] for part in held[index] if name in sums[part]}
+            if len(expected) > 1:
+                raise InputError(f"{name} differs between {_named(folders, held[index])}")
+            if index in there and {done.get(name)} == expected:
+                continue
+            content = folders[held[index][0]].read(name)
+            digest = sha256(content).hexdigest()
+            if expected and {digest} != expected:
+                raise InputError(
+                    f"{folders[held[index][0]]}/{name}: damaged, its checksum is not the one in "
+                    "SHA256SUMS; delete it and run that part again"
+                )
+            target.write(name, content)
+            done[name] = digest
+            write_sums(target, done)
+            copied += 1
+    return MergeReport(copied, manifest.shards - copied, len(failures))
+
+
+def _check_unchanged(target: Folder, shards: int, sums: Sequence[dict[str, str]]) -> None:
+    """Refuse to write over shards that an earlier merge brought and somebody then changed."""
+    there = read_sums(target)
+    for index in finished_shards(target, shards):
+        name = shard_name(index)
+        given = {part[name] for part in sums if name in part}
+        if name in there and given and there[name] not in given:
+            raise InputError(
+                f"{target}/{name}: is neither part's any more, failed scans were made up for here "
+                "or there; merge into a new folder"
+            )
+
+
+def _holders(folders: Sequence[Folder], shards: int) -> dict[int, list[int]]:
+    """For each shard the parts, by their position, that have it."""
+    held: dict[int, list[int]] = {}
+    for position, folder in enumerate(folders):
+        for index in finished_shards(folder, shards):
+            held.setdefault(index, []).append(position)
+    return held
+
+
+def _named(folders: Sequence[Folder], positions: Sequence[int]) -> str:
+    return " and ".join(str(folders[position]) for position in positions)

@@ -1,0 +1,222 @@
+"""One row of a data set: the settings that make it, its seed, and the scan itself."""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+
+from qs3.errors import InputError
+from qs3.meshes.classes import POINTDA10, map_labels
+from qs3.sensor.surroundings import SceneSettings
+from qs3.store.shards import STATISTICS, CloudRow, DType
+
+if TYPE_CHECKING:
+    import trimesh
+
+
+@runtime_checkable
+class Item(Protocol):
+    """One mesh of the work list, as `qs3.meshes.MeshItem` is."""
+
+    @property
+    def id(self) -> str:
+        """Unique name."""
+        ...
+
+    @property
+    def class_name(self) -> str:
+        """Name of the class."""
+        ...
+
+    @property
+    def split(self) -> str | None:
+        """``train``, ``test``, empty or None."""
+        ...
+
+    def load(self) -> "trimesh.Trimesh":
+        """Read or make the mesh."""
+        ...
+
+
+@dataclass(frozen=True)
+class GenerateSettings:
+    """What a data set's bytes depend on, together with the work list."""
+
+    meshes: str = "shapes"
+    """``shapes`` or the name (not the path) of the folder of meshes; a label for the record."""
+    per_class: int | None = None
+    """Objects a class; None takes all."""
+    scans_per_mesh: int = 1
+    """Scans of each object, each from other poses."""
+    sensor: Any = "qs3"
+    """Name of a sensor preset, or a `qs3.sensor.presets.Sensor`."""
+    renderer: Any = None
+    """A picklable renderer; None resolves to the default one before any work is handed out."""
+    views: int = 5
+    """Views fused into a cloud."""
+    view_layout: Literal["orbit", "jitter"] = "orbit"
+    """Poses around the object, or jittered copies of one."""
+    size: Literal["box", "ball"] = "box"
+    """Longest side 1, or the unit ball."""
+    box_crop: bool = True
+    """Keep only points inside the object's box."""
+    box_margin: float = 0.0
+    """That box is larger by this on every side, in the unit of the scene."""
+    mask_crop: bool = False
+    """Keep only pixels that truly show the object."""
+    scene: SceneSettings = field(default_factory=SceneSettings)
+    """What stands around the object; a neighbour is another item of the work list."""
+    randomise: Mapping[str, Sequence[Any]] | str | None = None
+    """Ranges of the sensor's settings drawn anew for each scan; see `qs3.sensor.randomise`."""
+    num_points: int = 2048
+    """Points of each cloud."""
+    classes: tuple[str, ...] = POINTDA10
+    """Classes in the order of the label."""
+    split: str | None = None
+    """Split of every row; None takes each item's own."""
+    seed: int = 0
+    """Root of all seeds."""
+    rows_per_shard: int = 64
+    """Scans a shard."""
+    dtype: DType = "float32"
+    """Type of the coordinates on disk."""
+
+    def __post_init__(self) -> None:
+        for name in ("scans_per_mesh", "views", "num_points", "rows_per_shard"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if self.seed < 0:
+            raise InputError(f"seed must not be negative, but is {self.seed}")
+        if self.dtype not in ("float32", "float16"):
+            raise InputError(f"dtype {self.dtype!r}: choose float32 or float16")
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, the sensor's and the renderer's settings among them."""
+        from qs3.sensor.presets import get_sensor, settings_dict
+        from qs3.sensor.randomise import resolve_ranges
+
+        sensor = get_sensor(self.sensor) if isinstance(self.sensor, str) else self.sensor
+        plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        plain["classes"] = list(self.classes)
+        plain["sensor"] = settings_dict(sensor)
+        plain["scene"] = dataclasses.asdict(self.scene)
+        plain["randomise"] = resolve_ranges(sensor, self.randomise)
+        if self.renderer is not None:
+            names = [f.name for f in dataclasses.fields(self.renderer)]
+            own = {name: getattr(self.renderer, name) for name in names}
+            plain["renderer"] = own | self.renderer.description
+        return plain
+
+
+def scan_seed(root: int, object_id: str, scan: int) -> int:
+    """Seed of one scan, 0 to 2⁶³ − 1; order, worker count and machine do not matter.
+
+    Example:
+        >>> scan_seed(0, "chair/a", 0) == scan_seed(0, "chair/a", 0) != scan_seed(0, "chair/a", 1)
+        True
+    """
+    digest = hashlib.sha256(object_id.encode("utf-8")).digest()
+    words = np.frombuffer(digest, dtype="<u4").tolist()
+    state = np.random.SeedSequence([root, *words, scan]).generate_state(1, np.uint64)
+    return int(state[0] >> np.uint64(1))
+
+
+def neighbour_of(
+    item: Item, scan: int, items: Sequence[Item], root: int, position: int | None = None
+) -> Item:
+    """Draw another item of the work list for a scan; order and worker count do not matter.
+
+    Args:
+        item: The object that is scanned.
+        scan: Index of its scan.
+        items: The work list.
+        root: Root seed.
+        position: Of the object in the list, where it is known: a long list is then not searched.
+
+    Raises:
+        InputError: where there is no other.
+    """
+    if position is None:
+        position = [other.id for other in items].index(item.id)
+    if len(items) < 2:
+        raise InputError(f"{item.id}: a scene with a neighbour needs a second mesh to draw from")
+    key = np.random.SeedSequence(scan_seed(root, item.id, scan), spawn_key=(0x4E42,))
+    drawn = int(np.random.default_rng(key).integers(len(items) - 1))
+    return items[drawn + (drawn >= position)]
+
+
+def scan_item(
+    item: Item, scan_index: int, settings: GenerateSettings, neighbour: Item | None = None
+) -> CloudRow:
+    """Scan one object once with the simulated sensor.
+
+    Args:
+        item: The object.
+        scan_index: Which of its scans.
+        settings: Settings of the data set.
+        neighbour: What stands before or beside it, where the scene has a neighbour.
+
+    Raises:
+        InputError: where the mesh is unusable or the sensor sees nothing of it.
+    """
+    from qs3.meshes import sample_surface
+    from qs3.sensor.scan import scan
+
+    seed = scan_seed(settings.seed, item.id, scan_index)
+    result = scan(
+        item.load(),
+        sensor=settings.sensor,
+        views=settings.views,
+        view_layout=settings.view_layout,
+        seed=seed,
+        size=settings.size,
+        box_crop=settings.box_crop,
+        box_margin=settings.box_margin,
+        mask_crop=settings.mask_crop,
+        scene=settings.scene,
+        neighbour=None if neighbour is None else neighbour.load(),
+        randomise=settings.randomise,
+        num_points=settings.num_points,
+        renderer=settings.renderer,
+    )
+    # The scan draws from children of `seed`; the key keeps this stream apart from them.
+    surface_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0x50BF,)))
+    surface = sample_surface(result.mesh, settings.num_points, surface_rng)
+    label = map_labels([item.class_name], np.zeros(1, dtype=np.int64), settings.classes)[0]
+    means = {name: _mean([getattr(view, name) for view in result.views]) for name in STATISTICS}
+    drawn = result.drawn | ({} if neighbour is None else {"neighbour": neighbour.id})
+    return CloudRow(
+        id=row_id(item, scan_index),
+        object=item.id,
+        scan=scan_index,
+        label=int(label[0]),
+        class_name=settings.classes[int(label[0])],
+        split=_split(item, settings),
+        seed=seed,
+        points=result.points,
+        view=result.view,
+        clean=result.clean,
+        clean_view=result.clean_view,
+        surface=surface.astype(np.float32),
+        yaw=result.yaw,
+        drawn=json.dumps(drawn, sort_keys=True),
+        **means,
+    )
+
+
+def row_id(item: Item, scan: int) -> str:
+    """Name of one scan of one object in its data set."""
+    return f"{item.id}#{scan}"
+
+
+def _split(item: Item, settings: GenerateSettings) -> str:
+    return (item.split or "") if settings.split is None else settings.split
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None

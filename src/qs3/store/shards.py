@@ -1,0 +1,246 @@
+"""One shard of a data set: a Parquet file, one row a scan of one object.
+
+Points lie flat in a list column, x0 y0 z0 x1 …: ``np.reshape(row, (-1, 3))``. Any Parquet reader
+opens a shard as it is. A shard holds no time, host or path, so equal scans give equal bytes.
+"""
+
+import hashlib
+import io
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from jaxtyping import Float, Float32, UInt8
+
+from qs3.errors import InputError
+from qs3.files import write_bytes
+from qs3.store.folder import Folder
+from qs3.store.manifest import shard_name
+
+STATISTICS = ("valid_fraction", "disparity_bias", "disparity_sigma", "gross_share")
+
+DType = Literal["float32", "float16"]
+"""Type of the coordinates on disk. Half precision is good to 0.0005 at a size of 1."""
+
+
+def _schema(dtype: DType) -> pa.Schema:
+    real = pa.float32() if dtype == "float32" else pa.float16()
+    cloud = pa.list_(pa.field("element", real, nullable=False))
+    view = pa.list_(pa.field("element", pa.uint8(), nullable=False))
+    return pa.schema(
+        [
+            pa.field("id", pa.string(), nullable=False),
+            pa.field("object", pa.string(), nullable=False),
+            pa.field("scan", pa.int32(), nullable=False),
+            pa.field("label", pa.int32(), nullable=False),
+            pa.field("class_name", pa.string(), nullable=False),
+            pa.field("split", pa.string(), nullable=False),
+            pa.field("seed", pa.int64(), nullable=False),
+            pa.field("yaw", pa.float64(), nullable=False),
+            *(pa.field(name, pa.float64()) for name in STATISTICS),
+            pa.field("points", cloud, nullable=False),
+            pa.field("view", view, nullable=False),
+            pa.field("clean", cloud, nullable=False),
+            pa.field("clean_view", view, nullable=False),
+            pa.field("surface", cloud, nullable=False),
+            pa.field("drawn", pa.string(), nullable=False),
+        ]
+    )
+
+
+_SCHEMAS: dict[DType, pa.Schema] = {"float32": _schema("float32"), "float16": _schema("float16")}
+# Shards of schema 1 have no `drawn`: nothing could be.
+_SCHEMA_1 = pa.schema([column for column in _SCHEMAS["float32"] if column.name != "drawn"])
+_NAMES = _SCHEMAS["float32"].names
+
+
+@dataclass(frozen=True)
+class CloudRow:
+    """One scan of one object; clouds are in the frame of the normalised mesh."""
+
+    id: str
+    """Name of the row, unique in the data set."""
+    object: str
+    """Name of the mesh."""
+    scan: int
+    """Which scan of that mesh, from 0."""
+    label: int
+    """Index into the data set's class names."""
+    class_name: str
+    """Name of the class."""
+    split: str
+    """``train``, ``test`` or empty."""
+    seed: int
+    """Seed of the scan."""
+    points: Float[np.ndarray, "n 3"]
+    """The noisy cloud."""
+    view: UInt8[np.ndarray, "_"]
+    """View that each noisy point comes from; empty where that is not known."""
+    clean: Float[np.ndarray, "m 3"]
+    """Its twin from the true z-buffer."""
+    clean_view: UInt8[np.ndarray, "_"]
+    """View that each clean point comes from; empty where that is not known."""
+    surface: Float[np.ndarray, "s 3"]
+    """Samples of the mesh's whole surface."""
+    yaw: float = 0.0
+    """Rotation about z under which the mesh was scanned, radians; undone in the clouds."""
+    valid_fraction: float | None = None
+    """Share of object pixels with a disparity, mean over views."""
+    disparity_bias: float | None = None
+    """Median disparity error in pixels, mean over views."""
+    disparity_sigma: float | None = None
+    """Robust standard deviation of the disparity error in pixels, mean over views."""
+    gross_share: float | None = None
+    """Share of grossly wrong disparities, mean over views."""
+    drawn: str = "{}"
+    """What was drawn for this scan (settings of the sensor, the neighbour), a JSON object."""
+
+
+def cloud_alone(
+    identifier: str,
+    points: Float32[np.ndarray, "n 3"],
+    label: int,
+    class_name: str,
+    split: str = "",
+    drawn: str = "{}",
+) -> CloudRow:
+    """Return the row of a cloud that was not scanned: without twin, surface, views and seed."""
+    nothing, no_view = np.zeros((0, 3), np.float32), np.zeros(0, np.uint8)
+    return CloudRow(
+        id=identifier,
+        object=identifier,
+        scan=0,
+        label=label,
+        class_name=class_name,
+        split=split,
+        seed=0,
+        points=points,
+        view=no_view,
+        clean=nothing,
+        clean_view=no_view,
+        surface=nothing,
+        drawn=drawn,
+    )
+
+
+def put_shard(folder: Folder, index: int, table: pa.Table) -> str:
+    """Write a table as shard ``index`` of a data set; return the SHA-256 of the file."""
+    content = shard_bytes(table)
+    folder.write(shard_name(index), content)
+    return hashlib.sha256(content).hexdigest()
+
+
+def table_of(rows: Sequence[CloudRow], dtype: DType = "float32") -> pa.Table:
+    """Put rows into a table of the data set's columns."""
+    schema = _SCHEMAS[dtype]
+    columns: dict[str, list[Any]] = {name: [] for name in schema.names}
+    for row in rows:
+        for name, values in columns.items():
+            value = getattr(row, name)
+            if isinstance(value, np.ndarray):
+                kind = np.uint8 if name.endswith("view") else np.dtype(dtype)
+                value = np.ascontiguousarray(value, dtype=kind).reshape(-1)
+            elif isinstance(value, float) and name in STATISTICS and math.isnan(value):
+                value = None
+            values.append(value)
+    return pa.Table.from_pydict(columns, schema=schema)
+
+
+def empty_table(dtype: DType = "float32") -> pa.Table:
+    """Return a table without rows."""
+    return _SCHEMAS[dtype].empty_table()
+
+
+def shard_bytes(table: pa.Table) -> bytes:
+    """Return the Parquet file of a table, its pages with checksums; equal rows give equal bytes."""
+    buffer = io.BytesIO()
+    pq.write_table(
+        table.combine_chunks(),
+        buffer,
+        row_group_size=max(len(table), 1),
+        compression="zstd",
+        compression_level=3,
+        use_dictionary=False,
+        write_statistics=False,
+        write_page_checksum=True,
+        version="2.6",
+        data_page_version="1.0",
+    )
+    return buffer.getvalue()
+
+
+def write_shard(path: Path, rows: Sequence[CloudRow], dtype: DType = "float32") -> None:
+    """Write rows as one Parquet file: whole or not at all, equal rows to equal bytes."""
+    write_bytes(path, shard_bytes(table_of(rows, dtype)))
+
+
+def read_shard(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
+    """Read a shard, or some of its columns; one of schema 1 with nothing drawn.
+
+    Raises:
+        InputError: where the file is missing, cut off, or not a shard of this schema.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    return _read(path, str(path), columns)
+
+
+def parse_shard(content: bytes, where: str, columns: Sequence[str] | None = None) -> pa.Table:
+    """Read a shard from its bytes; ``where`` names it in messages.
+
+    Raises:
+        InputError: as `read_shard` does.
+    """
+    return _read(pa.BufferReader(content), where, columns)
+
+
+def _read(source: Any, where: str, columns: Sequence[str] | None) -> pa.Table:
+    try:
+        with pq.ParquetFile(source, page_checksum_verification=True, pre_buffer=False) as file:
+            wanted = list(_NAMES if columns is None else columns)
+            if any(file.schema_arrow.equals(schema) for schema in _SCHEMAS.values()):
+                table = file.read(columns=wanted, use_threads=False)
+                table.validate(full=True)  # texts too: Arrow takes any bytes for UTF-8
+                return table
+            if not file.schema_arrow.equals(_SCHEMA_1):
+                raise InputError(f"{where}: not a shard of a qs3 data set (other columns)")
+            table = file.read(columns=[n for n in wanted if n != "drawn"], use_threads=False)
+            table.validate(full=True)
+            if "drawn" in wanted:
+                drawn = _SCHEMAS["float32"].field("drawn")
+                table = table.append_column(drawn, [["{}"] * len(table)])
+            return table.select(wanted)
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(
+            f"{where}: damaged ({reason}); delete it and run the same command again"
+        ) from error
+
+
+def flat_clouds(table: pa.Table, column: str, path: Any) -> list[Float32[np.ndarray, "_ 3"]]:
+    """Return the clouds of one column, a row each.
+
+    Raises:
+        InputError: where a cloud is empty, not made of triples, or not finite; ``path`` is named.
+    """
+    rows = table[column].combine_chunks()
+    values = rows.values.to_numpy(zero_copy_only=False).astype(np.float32, copy=False)
+    offsets = rows.offsets.to_numpy(zero_copy_only=False)
+    sizes = np.diff(offsets)
+    bad = (sizes == 0) | (sizes % 3 != 0)
+    if not bad.any() and not np.isfinite(values[offsets[0] : offsets[-1]]).all():
+        pairs = itertools.pairwise(offsets)
+        bad = np.array([not np.isfinite(values[begin:end]).all() for begin, end in pairs])
+    if bad.any():
+        name = table["id"][int(np.flatnonzero(bad)[0])].as_py()
+        raise InputError(
+            f"{path}: {column} of {name!r} is empty, not made of triples, or not finite"
+        )
+    return [values[begin:end].reshape(-1, 3) for begin, end in itertools.pairwise(offsets)]

@@ -1,0 +1,163 @@
+"""Colours of points, and the legend that says what they mean; no viser in here."""
+
+import html
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import matplotlib
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from qs3.report.figure import AFTER, NO_VALUE, PALETTE, class_colour
+
+_MAP = matplotlib.colormaps["viridis"]
+_STOPS = 8
+RIGHT, WRONG = AFTER, PALETTE[6]
+"""Colours of a right and of a wrong prediction; told apart by lightness too."""
+
+
+@dataclass(frozen=True)
+class Colouring:
+    """Colours of a cloud's points and what they say."""
+
+    colours: UInt8[np.ndarray, "n 3"]
+    """Red, green and blue of each point."""
+    title: str
+    """What is coloured."""
+    swatches: tuple[tuple[str, str], ...] = ()
+    """Colour (#rrggbb) and meaning, where colours stand for names."""
+    ends: tuple[str, str] | None = None
+    """Lowest and highest value, where colours stand for values."""
+
+    def legend(self) -> str:
+        """The legend as HTML; names are escaped, whatever a file calls itself."""
+        lines = [f"<b>{html.escape(self.title)}</b>"]
+        if self.ends is not None:
+            stops = ",".join(map(_hex, _MAP(np.linspace(0, 1, _STOPS))[:, :3]))
+            low, high = map(html.escape, self.ends)
+            lines += [
+                f'<div style="height:0.7em;background:linear-gradient(to right,{stops})"></div>',
+                '<div style="display:flex;justify-content:space-between">'
+                f"<span>{low}</span><span>{high}</span></div>",
+            ]
+        for colour, meaning in self.swatches:
+            lines.append(
+                f'<div><span style="display:inline-block;width:0.8em;height:0.8em;'
+                f'background:{colour};margin-right:0.5em"></span>{html.escape(meaning)}</div>'
+            )
+        return "".join(lines)
+
+
+def by_height(points: Float[np.ndarray, "n 3"]) -> Colouring:
+    """Colour points by z, from the lowest to the highest.
+
+    Example:
+        >>> by_height(np.array([[0.0, 0, 1], [0, 0, 3]])).ends
+        ('1', '3')
+    """
+    height = points[:, 2]
+    low, high = float(height.min()), float(height.max())
+    share = (height - low) / (high - low) if high > low else np.zeros(len(height))
+    return Colouring(_viridis(share), "height", ends=(f"{low:.3g}", f"{high:.3g}"))
+
+
+def by_view(view: UInt8[np.ndarray, "n"]) -> Colouring:
+    """Colour points by the view that saw them; the ten colours come again after the tenth.
+
+    Example:
+        >>> [name for _, name in by_view(np.array([1, 0, 1], np.uint8)).swatches]
+        ['view 1 (1 point)', 'view 2 (2 points)']
+    """
+    numbers, counts = np.unique(view, return_counts=True)
+    swatches = tuple(
+        (class_colour(number), f"view {number + 1} ({count} point{'s' * (count != 1)})")
+        for number, count in zip(numbers.tolist(), counts.tolist(), strict=True)
+    )
+    palette = np.array([_rgb(colour) for colour in PALETTE], dtype=np.uint8)
+    return Colouring(palette[view % len(PALETTE)], "view", swatches)
+
+
+def by_error(
+    distance: Float[np.ndarray, "n"], truth: str, limit: float | None = None, unit: str = ""
+) -> Colouring:
+    """Colour points by their distance to the truth, from 0 to ``limit``; beyond it as at it.
+
+    Args:
+        distance: Of each point.
+        truth: What it was measured to.
+        limit: Value of the last colour; by default `round_limit`.
+        unit: Of the distance.
+    """
+    limit = round_limit(distance) if limit is None else limit
+    high = f"{limit:g}{unit} and more"
+    return Colouring(_viridis(distance / limit), f"distance to {truth}", ends=(f"0{unit}", high))
+
+
+def round_limit(distance: Float[np.ndarray, "n"]) -> float:
+    """The 95th percentile, rounded up to 1, 2 or 5 times a power of ten, so that it seldom moves.
+
+    Example:
+        >>> round_limit(np.array([0.0, 0.013]))
+        0.02
+    """
+    value = float(np.percentile(distance, 95)) if len(distance) else 0.0
+    if not value > 0 or not math.isfinite(value):
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(value))
+    return float(f"{next((s for s in (1, 2, 5) if s * power >= value), 10) * power:.6g}")
+
+
+def by_class(count: int, index: int, class_names: Sequence[str], title: str) -> Colouring:
+    """Colour all points of a cloud by its class.
+
+    Example:
+        >>> by_class(2, 1, ["bed", "chair"], "predicted class").swatches[0][1]
+        'chair'
+    """
+    colour = class_colour(index)
+    return Colouring(_flat(count, colour), title, ((colour, class_names[index]),))
+
+
+def by_verdict(count: int, right: bool) -> Colouring:
+    """Colour all points of a cloud by whether its prediction is right."""
+    colour = RIGHT if right else WRONG
+    swatches = ((RIGHT, "right"), (WRONG, "wrong"))
+    return Colouring(_flat(count, colour), f"prediction: {swatches[not right][1]}", swatches)
+
+
+def plain(count: int, reason: str) -> Colouring:
+    """Colour all points grey, and say why."""
+    return Colouring(_flat(count, NO_VALUE), reason)
+
+
+def rows_of(
+    labels: Sequence[str], class_name: str | None, wrong: Bool[np.ndarray, "b"] | None = None
+) -> list[int]:
+    """Rows of one class (None: of any), and of those only the wrong ones where these are given.
+
+    Example:
+        >>> rows_of(["bed", "sofa", "bed"], "bed", np.array([False, True, True]))
+        [2]
+    """
+    return [
+        row
+        for row, label in enumerate(labels)
+        if class_name in (None, label) and (wrong is None or wrong[row])
+    ]
+
+
+def _viridis(share: Float[np.ndarray, "n"]) -> UInt8[np.ndarray, "n 3"]:
+    return np.asarray(_MAP(np.clip(share, 0, 1), bytes=True))[:, :3]
+
+
+def _flat(count: int, colour: str) -> UInt8[np.ndarray, "n 3"]:
+    return np.tile(np.array(_rgb(colour), dtype=np.uint8), (count, 1))
+
+
+def _rgb(colour: str) -> tuple[int, int, int]:
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
+
+def _hex(colour: Float[np.ndarray, "3"]) -> str:
+    return "#" + "".join(f"{round(255 * float(part)):02x}" for part in colour)

@@ -1,0 +1,220 @@
+"""What can be shown: the objects of a data set one by one, or one scan; no viser in here."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import pyarrow as pa
+import trimesh
+from jaxtyping import Float, Float32, Int, UInt8
+
+from qs3.errors import InputError
+from qs3.io.clouds import CloudKind, PointClouds, UnlabelledClouds
+from qs3.store.folder import LocalFolder, open_folder
+from qs3.store.manifest import finished_shards, open_dataset, shard_name
+from qs3.store.shards import flat_clouds, parse_shard, read_shard
+
+KINDS: dict[CloudKind, str] = {"points": "noisy", "clean": "clean", "surface": "surface"}
+"""The clouds of an object and the names by which the page calls them."""
+
+_VIEWS: dict[CloudKind, str] = {"points": "view", "clean": "clean_view"}
+
+STATISTICS = {
+    "valid_fraction": ("valid pixels", ".0%"),
+    "disparity_bias": ("disparity bias (px)", "+.3f"),
+    "disparity_sigma": ("disparity σ (px)", ".3f"),
+    "gross_share": ("gross errors", ".1%"),
+}
+"""Statistics of a scan: what the page calls them and how it writes them."""
+
+
+@dataclass(frozen=True)
+class Exhibit:
+    """One object."""
+
+    name: str
+    """Its name in the data."""
+    class_name: str
+    """Its class; empty where that is not known."""
+    clouds: Mapping[CloudKind, Float[np.ndarray, "_ 3"]]
+    """The clouds that there are of it."""
+    views: Mapping[CloudKind, UInt8[np.ndarray, "_"]] = field(default_factory=dict)
+    """View of each point, for the clouds where that is known."""
+    mesh: trimesh.Trimesh | None = None
+    """Its surface, in the frame of the clouds, where that is known."""
+    facts: tuple[tuple[str, str], ...] = ()
+    """More to tell: names and values."""
+    unit: str = ""
+    """Of its lengths, with a space before it; empty where they have none."""
+
+
+@runtime_checkable
+class Exhibits(Protocol):
+    """Objects in a fixed order."""
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Class of each object; empty where not known."""
+        ...
+
+    def __len__(self) -> int:
+        """Their number."""
+        ...
+
+    def __getitem__(self, row: int) -> Exhibit:
+        """The object at a row."""
+        ...
+
+
+@dataclass(frozen=True)
+class ArrayExhibits:
+    """Objects of which there is one cloud each, in memory."""
+
+    points: Float[np.ndarray, "b n 3"]
+    """Their clouds."""
+    names: tuple[str, ...]
+    """Their names."""
+    labels: tuple[str, ...]
+    """Their classes; empty where not known."""
+
+    @classmethod
+    def of(cls, clouds: PointClouds | UnlabelledClouds) -> "ArrayExhibits":
+        """The clouds of a data set, with their classes where it has them."""
+        known = isinstance(clouds, PointClouds)
+        labels = [clouds.class_names[i] for i in clouds.labels] if known else [""] * len(clouds)
+        return cls(clouds.points, clouds.ids, tuple(labels))
+
+    def __len__(self) -> int:
+        """Their number."""
+        return len(self.points)
+
+    def __getitem__(self, row: int) -> Exhibit:
+        """The object at a row."""
+        return Exhibit(self.names[row], self.labels[row], {"points": self.points[row]})
+
+
+class StoreExhibits:
+    """Objects of a data set that ``qs3 generate`` made: read a shard at a time, when shown.
+
+    A set may be larger than memory; at first only names and classes are read.
+    """
+
+    def __init__(self, where: str | Path, split: str | None = None) -> None:
+        """Read names and classes.
+
+        Raises:
+            InputError: where the folder is no finished data set, is damaged, or has no such split.
+        """
+        self._folder = open_folder(where)
+        manifest = open_dataset(self._folder)
+        shards = finished_shards(self._folder, manifest.shards)
+        if len(shards) < manifest.shards:
+            raise InputError(
+                f"{self._folder}: unfinished, {len(shards)} of {manifest.shards} shards; run the "
+                "same command again"
+            )
+        places: list[tuple[int, int]] = []
+        labels: list[str] = []
+        splits: set[str] = set()
+        for shard in shards:
+            table = self._table(shard, ("label", "split"))
+            columns = (table[name].to_pylist() for name in ("label", "split"))
+            for row, (label, part) in enumerate(zip(*columns, strict=True)):
+                splits.add(part)
+                if not 0 <= label < len(manifest.class_names):
+                    raise InputError(f"{self._folder}: label {label} has no class name")
+                if split in (None, part):
+                    places.append((shard, row))
+                    labels.append(manifest.class_names[label])
+        if not places:
+            there = ", ".join(sorted(filter(None, splits))) or "none"
+            raise InputError(f"{self._folder}: no cloud of split {split!r}; splits: {there}")
+        self._places, self.labels = places, tuple(labels)
+        self._read = lru_cache(maxsize=1)(self._read_shard)
+
+    def __len__(self) -> int:
+        """Their number."""
+        return len(self._places)
+
+    def __getitem__(self, row: int) -> Exhibit:
+        """The object at a row; reads its shard unless the last object lay in it too."""
+        shard, place = self._places[row]
+        return self._read(shard)[place]
+
+    def _table(self, shard: int, columns: Sequence[str]) -> pa.Table:
+        name = shard_name(shard)
+        if isinstance(self._folder, LocalFolder):
+            return read_shard(self._folder.path / name, columns)  # these alone, not the whole file
+        return parse_shard(self._folder.read(name), f"{self._folder}/{name}", columns)
+
+    def _read_shard(self, shard: int) -> list[Exhibit]:
+        kinds = tuple(KINDS)
+        words = ("id", "class_name", "split", "seed", "drawn", *_VIEWS.values(), *STATISTICS)
+        table = self._table(shard, (*words, *kinds))
+        where = f"{self._folder}/{shard_name(shard)}"
+        there: list[CloudKind] = [
+            kind for kind in kinds if len(table[kind].combine_chunks().values)
+        ]
+        clouds = {kind: flat_clouds(table, kind, where) for kind in there}
+        found = []
+        for place, row in enumerate(table.select(words).to_pylist()):
+            mine: dict[CloudKind, Any] = {kind: clouds[kind][place] for kind in there}
+            views: dict[CloudKind, Any] = {
+                kind: np.array(row[name], dtype=np.uint8)
+                for kind, name in _VIEWS.items()
+                if kind in mine and len(row[name]) == len(mine[kind])
+            }
+            told = [("split", row["split"]), ("seed", str(row["seed"] or ""))]
+            told += [("drawn", row["drawn"].replace("{}", ""))]
+            told += [
+                (label, f"{row[n]:{form}}")
+                for n, (label, form) in STATISTICS.items()
+                if row[n] is not None
+            ]
+            facts = tuple((name, value) for name, value in told if value)
+            found.append(Exhibit(row["id"], row["class_name"], mine, views, None, facts))
+        return found
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What a network says of the objects of a data set."""
+
+    probabilities: Float[np.ndarray, "b k"]
+    """Of each class, for each object."""
+    class_names: tuple[str, ...]
+    """The network's classes."""
+    truth: Int[np.ndarray, "b"] | None
+    """Their true classes, to show; None where the data has no labels."""
+    kind: CloudKind = "points"
+    """The cloud that the network was shown."""
+
+    def best(self, row: int) -> int:
+        """The class that it answers for the object at a row."""
+        return int(self.probabilities[row].argmax())
+
+    @property
+    def wrong(self) -> np.ndarray:
+        """Whether each answer is wrong; False where the truth is not known."""
+        if self.truth is None:
+            return np.zeros(len(self.probabilities), dtype=bool)
+        return self.probabilities.argmax(axis=1) != self.truth
+
+    def facts(self, row: int, count: int = 3) -> tuple[tuple[str, str], ...]:
+        """The classes it holds likeliest for a row, with their probabilities."""
+        order = np.argsort(-self.probabilities[row], kind="stable")[:count]
+        shares = ", ".join(f"{self.class_names[i]} {self.probabilities[row, i]:.1%}" for i in order)
+        return ((f"network, of the {KINDS[self.kind]} cloud", shares),)
+
+
+def single(name: str, points: Float32[np.ndarray, "n 3"]) -> ArrayExhibits:
+    """One cloud as a collection.
+
+    Example:
+        >>> len(single("a.xyz", np.zeros((5, 3), np.float32)))
+        1
+    """
+    return ArrayExhibits(points[None], (name,), ("",))

@@ -1,0 +1,265 @@
+"""Scenes in BOP's layout: one written here by hand, and one that our own scan writes."""
+
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from qs3 import shapes
+from qs3.errors import InputError
+from qs3.geometry import rotation_z
+from qs3.io.extract.bop import (
+    BopSettings,
+    extract_bop,
+    has_world,
+    is_bop,
+    list_bop_frames,
+)
+from qs3.meshes import sample_surface
+from qs3.sensor.depth import DepthSettings
+from qs3.sensor.frames import write_frames
+from qs3.sensor.matching import MatchingSettings
+from qs3.sensor.presets import Sensor
+from qs3.sensor.render.mitsuba import MitsubaRenderer
+from qs3.sensor.rig import StereoRig
+from qs3.sensor.scan import scan
+from qs3.sensor.speckle import PatternSettings
+from qs3.sensor.views import Placement
+
+from .depth_scene import (
+    MATRIX,
+    camera_to_world,
+    mutated,
+    off_surface,
+    photograph,
+    thing,
+    write_png,
+)
+
+PLACE = np.eye(4)
+PLACE[:3, :3] = rotation_z(0.7)
+PLACE[:3, 3] = [0.1, -0.05, 0.0]
+
+
+def moved(mesh, pose):
+    made = mesh.copy()
+    made.apply_transform(pose)
+    return made
+
+
+def millimetres(pose, kind):
+    return {
+        f"cam_R_{kind}": pose[:3, :3].ravel().tolist(),
+        f"cam_t_{kind}": (pose[:3, 3] * 1000).tolist(),
+    }
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """The thing, placed in a world, from two sides; a second object is hidden in both."""
+    folder = tmp_path_factory.mktemp("bop") / "000042"
+    cameras, truth = {}, {}
+    for image, (yaw, down) in enumerate([(30, 20), (150, 35)]):
+        pose = camera_to_world(yaw, down)
+        depth, face = photograph(moved(thing(), PLACE), pose)
+        write_png(folder / "depth" / f"{image:06d}.png", np.rint(depth * 10000).astype(np.uint16))
+        mask = ((face >= 0) * 255).astype(np.uint8)
+        write_png(folder / "mask_visib" / f"{image:06d}_000000.png", mask)
+        write_png(folder / "mask_visib" / f"{image:06d}_000001.png", mask * 0)
+        to_camera = np.linalg.inv(pose)
+        cameras[image] = {"cam_K": MATRIX.ravel().tolist(), "depth_scale": 0.1}
+        cameras[image] |= millimetres(to_camera, "w2c")
+        model = millimetres(to_camera @ PLACE, "m2c")
+        truth[image] = [{"obj_id": 5, **model}, {"obj_id": 7, **model}]
+    (folder / "scene_camera.json").write_text(json.dumps(cameras))
+    (folder / "scene_gt.json").write_text(json.dumps(truth))
+    return folder
+
+
+def clouds(source, **more):
+    settings = BopSettings(**more)
+    return [cloud for frame in list_bop_frames(source) for cloud in extract_bop(frame, settings)]
+
+
+def test_convention_views_meet_in_the_world_and_in_the_models_axes(scene):
+    for frame, mesh in (("world", moved(thing(), PLACE)), ("model", thing())):
+        found = clouds(scene, frame=frame)
+        assert [cloud.id for cloud in found] == ["000042/000000/000000", "000042/000001/000000"]
+        for cloud in found:
+            assert cloud.points.dtype == np.float32
+            assert len(cloud.points) > 1000
+            # A twentieth of a millimetre along a ray that is at most 1.2 times its depth.
+            assert off_surface(mesh, cloud.points[::7]).max() < 0.00005 * 1.2
+        mirrored = found[0].points[::7] * [-1, 1, 1]
+        assert off_surface(mesh, mirrored).max() > 0.05
+
+
+def test_convention_the_cameras_axes_are_upright(scene):
+    (cloud, _) = clouds(scene, frame="camera")
+    (world, _) = clouds(scene)
+    to_camera = np.linalg.inv(camera_to_world(30, 20))
+    x, y, z = (world.points @ to_camera[:3, :3].T + to_camera[:3, 3]).T
+    np.testing.assert_allclose(cloud.points, np.stack([x, z, -y], axis=1), atol=1e-5)
+
+
+def test_classes_come_from_the_table_then_the_option_then_the_model(scene):
+    names = {"obj_000005": "chair"}
+    assert {c.class_name for c in clouds(scene, names=names)} == {"chair"}
+    assert {c.class_name for c in clouds(scene, names={"5": "sofa"}, class_name="x")} == {"sofa"}
+    assert {c.class_name for c in clouds(scene, class_name="x")} == {"x"}
+    assert {c.class_name for c in clouds(scene)} == {"obj_000005"}
+
+
+def test_a_folder_of_scenes_is_all_its_scenes(scene, tmp_path):
+    for name in ("000002", "000001"):
+        shutil.copytree(scene, tmp_path / name)
+    assert is_bop(tmp_path)
+    assert not is_bop(tmp_path / "000001" / "depth")
+    assert [f.id for f in list_bop_frames(tmp_path)] == [
+        "000001/000000", "000001/000001", "000002/000000", "000002/000001",
+    ]  # fmt: skip
+
+
+METRIC = Sensor(
+    name="metric",
+    rig=StereoRig(width=320, height=240, focal=336.0, baseline=0.09),
+    pattern=PatternSettings(columns=177, rows=138),
+    matching=MatchingSettings(num_disparities=64, block_size=11),
+    depth=DepthSettings(near=0.3, far=3.0, stride=1),
+    placement=Placement(radius=(1.0, 1.2)),
+    object_size=0.5,
+)
+
+
+@pytest.fixture(scope="module")
+def scanned(tmp_path_factory):
+    made = scan(
+        shapes.make("chair", seed=1),
+        sensor=METRIC,
+        views=2,
+        seed=5,
+        num_points=1024,
+        renderer=MitsubaRenderer(variant="scalar_rgb", samples=2),
+        full_frames=True,
+    )
+    folder = tmp_path_factory.mktemp("scan") / "frames"
+    write_frames(folder, made)
+    return folder, made
+
+
+def test_convention_our_own_frames_lie_on_the_mesh_again(scanned):
+    folder, made = scanned
+    mesh = trimesh.load_mesh(folder / "models" / "obj_000001.ply")
+    mesh.apply_scale(0.001)
+    turn = np.eye(4)
+    turn[:3, :3] = rotation_z(made.yaw)
+    for frame, surface in (("model", mesh), ("world", moved(mesh, turn))):
+        true = clouds(folder, frame=frame, depth="depth_true")
+        assert len(true) == 2
+        for cloud in true:
+            # Half a step of 0.1 mm along a ray that is a little longer than the axis.
+            assert off_surface(surface, cloud.points[::9]).max() < 0.5 * 0.0001 * 1.25
+        dense = cKDTree(sample_surface(surface, 50_000, np.random.default_rng(0)))
+        for cloud, statistics in zip(clouds(folder, frame=frame), made.views, strict=True):
+            assert len(cloud.points) > 1000
+            sigma = 1.1**2 * statistics.disparity_sigma / (336 * 0.09)
+            assert np.median(dense.query(cloud.points)[0]) < 1.5 * sigma + 0.001
+
+
+def spoil(scene, tmp_path, name, change):
+    shutil.copytree(scene, tmp_path / "scene")
+    path = tmp_path / "scene" / name
+    value = json.loads(path.read_text())
+    changed = change(value)
+    path.write_text(json.dumps(changed if changed is not None else value))
+    return tmp_path / "scene"
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "told"),
+    [
+        ("scene_camera.json", lambda v: [v], "not a JSON object"),
+        ("scene_camera.json", lambda v: {"../1": v["0"]}, "one entry an image"),
+        ("scene_camera.json", lambda v: {"0": v["0"], "00": v["0"]}, "comes twice"),
+        ("scene_camera.json", lambda v: {"0": 3}, "image 0: not a camera"),
+        ("scene_camera.json", lambda v: v["1"].update(depth_scale=None), "depth_scale must be a n"),
+        ("scene_camera.json", lambda v: v["0"].update(depth_scale=-1), "must be positive"),
+        ("scene_camera.json", lambda v: v["0"].update(cam_K=[1, 2]), "cam_K must be 9 numbers"),
+        ("scene_camera.json", lambda v: v["0"]["cam_K"].__setitem__(0, 0), "must be positive"),
+        ("scene_camera.json", lambda v: v["0"].update(cam_R_w2c=[1] * 9), "is no rotation"),
+        ("scene_camera.json", lambda v: v["0"].update(cam_t_w2c=0), "cam_t_w2c must be 3 numbers"),
+        ("scene_camera.json", lambda v: v["0"].update(width=161), "160×120 pixels, the camera 161"),
+        ("scene_camera.json", lambda v: v["0"].update(cam_t_w2c=[1e290, 0, 0]), "beyond 1,000 km"),
+        ("scene_gt.json", lambda v: {"0": 5}, "not a list of objects"),
+        ("scene_gt.json", lambda v: {"0": [5]}, "not a list of objects"),
+        ("scene_gt.json", lambda v: {"0": [{}]}, "obj_id must be a whole number"),
+        ("scene_gt.json", lambda v: {"0": [{"obj_id": -1}]}, "obj_id must be a whole number"),
+        ("scene_gt.json", lambda v: {"0": [{"obj_id": 1}] * 3}, r"000000_000002\.png: no such"),
+    ],
+)  # fmt: skip
+def test_damaged_scenes_are_refused_by_name(scene, tmp_path, name, change, told):
+    source = spoil(scene, tmp_path, name, change)
+    with pytest.raises(InputError, match=told) as caught:
+        clouds(source)
+    assert "scene" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def drop(*names):
+    def change(value):
+        for image in value.values():
+            for entry in image if isinstance(image, list) else [image]:
+                for name in names:
+                    entry.pop(name)
+
+    return change
+
+
+def test_axes_that_no_file_tells_are_refused(scene, tmp_path):
+    source = spoil(scene, tmp_path, "scene_camera.json", drop("cam_R_w2c", "cam_t_w2c"))
+    assert not has_world(list_bop_frames(source))
+    with pytest.raises(InputError, match="image 0 has no cam_R_w2c"):
+        clouds(source)
+    assert len(clouds(source, frame="camera")) == 2
+    (tmp_path / "scene" / "scene_gt.json").unlink()
+    with pytest.raises(InputError, match=r"scene_gt\.json: no such file"):
+        list_bop_frames(source)
+
+
+def test_folders_of_pictures_are_names_and_no_paths():
+    for name in ("../depth", "/etc", ""):
+        with pytest.raises(InputError, match="is no folder of a scene"):
+            BopSettings(depth=name)
+    assert dataclasses.replace(BopSettings(), depth="depth_true").depth == "depth_true"
+
+
+def fuzz(scene, tmp_path, rng, rounds):
+    shutil.copytree(scene, tmp_path / "scene")
+    refused = 0
+    for number in range(rounds):
+        name = ("scene_camera.json", "scene_gt.json")[number % 2]
+        path = tmp_path / "scene" / name
+        path.write_bytes(mutated((scene / name).read_bytes(), rng))
+        try:
+            frames = list_bop_frames(tmp_path / "scene")
+            if number % 20 == 0:
+                clouds(tmp_path / "scene")
+            assert len(frames) <= 2
+        except InputError as error:
+            assert "\n" not in str(error)
+            refused += 1
+        path.write_bytes((scene / name).read_bytes())
+    assert refused > rounds / 10
+
+
+def test_mutated_scenes_are_read_or_refused(scene, tmp_path, rng):
+    fuzz(scene, tmp_path, rng, 200)
+
+
+@pytest.mark.slow
+def test_many_mutated_scenes_are_read_or_refused(scene, tmp_path, rng):
+    fuzz(scene, tmp_path, rng, 4000)

@@ -1,0 +1,464 @@
+"""Depth images, masks and cameras from files, and the points they give."""
+
+import dataclasses
+import json
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from qs3.errors import InputError
+from qs3.io.extract.depth import CutSettings, keep_pixels, lift, upright
+from qs3.io.extract.depth_images import read_depth, read_mask
+from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
+from qs3.io.extract.plain import (
+    DepthImage,
+    DepthSettings,
+    extract_depth,
+    list_depth_images,
+    read_names,
+)
+
+from .depth_scene import (
+    HEIGHT,
+    MATRIX,
+    WIDTH,
+    camera_to_world,
+    millimetres,
+    mutated,
+    off_surface,
+    photograph,
+    thing,
+    write_png,
+)
+
+CAMERA = Intrinsics(150.0, 140.0, 77.0, 61.0)
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory):
+    """One depth image of the thing with its mask, from the side and above."""
+    folder = tmp_path_factory.mktemp("taken")
+    pose = camera_to_world(35, 25)
+    depth, face = photograph(thing(), pose)
+    write_png(folder / "depth" / "a.png", millimetres(depth))
+    write_png(folder / "mask" / "a.png", ((face >= 0) * 255).astype(np.uint8))
+    return folder, pose, depth
+
+
+def cut(folder, **more):
+    image = DepthImage("a", folder / "depth" / "a.png", folder / "mask" / "a.png")
+    return list(extract_depth(image, DepthSettings(camera=CAMERA, **more)))
+
+
+def test_convention_gravity_makes_the_cloud_upright_and_not_mirrored(taken):
+    folder, pose, depth = taken
+    gravity = pose[:3, :3].T @ [0.0, 0.0, -9.81]
+    (cloud,) = cut(folder, gravity=tuple(gravity))
+    assert cloud.points.dtype == np.float32
+    assert len(cloud.points) == (depth > 0).sum()
+    # All that is left between the cloud and the world is a turn about z and a shift.
+    turn = pose[:3, :3] @ upright(tuple(gravity)).T
+    np.testing.assert_allclose(turn[2], [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(turn[:2, :2], turn[:2, :2].T * [[1, -1], [-1, 1]], atol=1e-12)
+    world = cloud.points @ turn.T + pose[:3, 3]
+    # Half a millimetre along a ray that is at most 1.2 times as long as its depth.
+    assert off_surface(thing(), world[::7]).max() < 0.0005 * 1.2
+    mirrored = (cloud.points * [-1, 1, 1]) @ turn.T + pose[:3, 3]
+    assert off_surface(thing(), mirrored[::7]).mean() > 0.05
+
+
+def test_convention_without_gravity_the_image_is_upright(tmp_path):
+    # One pixel right of the centre, one above it: at 2 m, 100 px of focal length.
+    depth = np.zeros((5, 5), np.uint16)
+    depth[2, 2] = depth[2, 4] = depth[1, 2] = 2000
+    write_png(tmp_path / "d.png", depth)
+    image = DepthImage("d", tmp_path / "d.png", None)
+    options = DepthSettings(
+        Intrinsics(100.0, 50.0, 2.0, 2.0), box=(0, 0, 5, 5), cut=CutSettings(min_points=1)
+    )
+    (cloud,) = extract_depth(image, options)
+    expected = [[0.0, 2.0, 0.04], [0.0, 2.0, 0.0], [0.04, 2.0, 0.0]]
+    np.testing.assert_allclose(cloud.points, expected, atol=1e-6)
+
+
+directions = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda g: np.linalg.norm(g) > 0.1)
+
+
+@given(directions)
+def test_upright_is_a_rotation_that_puts_gravity_down(gravity):
+    turn = upright(gravity)
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(turn) > 0
+    down = np.array(gravity) / np.linalg.norm(gravity)
+    np.testing.assert_allclose(turn @ down, [0, 0, -1], atol=1e-9)
+    # Within a milliradian of straight down or up the image's upward direction takes over.
+    straight = np.linalg.norm(down[:2]) <= 1e-3
+    ahead = turn @ ([0, -1, 0] if straight else [0, 0, 1])
+    assert abs(ahead[0]) < 1e-9
+    assert ahead[1] > -1e-9
+
+
+@given(
+    st.floats(1, 2000), st.floats(1, 2000), st.floats(-50, 50), st.floats(-50, 50),
+    st.integers(0, 2**32 - 1),
+)  # fmt: skip
+@settings(max_examples=50)
+def test_lift_inverts_projection(fx, fy, cx, cy, seed):
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(0.1, 10, (4, 6)).astype(np.float32)
+    keep = rng.random((4, 6)) < 0.7
+    x, y, z = lift(depth, keep, Intrinsics(fx, fy, cx, cy)).T
+    v, u = np.nonzero(keep)
+    np.testing.assert_allclose(fx * x / z + cx, u, atol=1e-6)
+    np.testing.assert_allclose(fy * y / z + cy, v, atol=1e-6)
+    np.testing.assert_array_equal(z.astype(np.float32), depth[keep])
+
+
+def test_every_kind_of_file_tells_the_same_depth(tmp_path, rng):
+    steps = rng.integers(0, 5000, (7, 9)).astype(np.uint16)
+    write_png(tmp_path / "a.png", steps)
+    (tmp_path / "b.tif").write_bytes(cv2.imencode(".tiff", steps)[1].tobytes())
+    metres = (steps / 1000).astype(np.float32)
+    (tmp_path / "c.tiff").write_bytes(cv2.imencode(".tiff", metres)[1].tobytes())
+    np.save(tmp_path / "d.npy", metres.astype(np.float64))
+    np.save(tmp_path / "e.npy", np.asfortranarray(steps.astype(np.int32)))
+    expected = np.where(steps > 0, metres, np.nan)
+    for path in sorted(tmp_path.iterdir()):
+        np.testing.assert_allclose(read_depth(path), expected, rtol=1e-6, err_msg=path.name)
+    np.testing.assert_allclose(read_depth(tmp_path / "a.png", 0.0001), expected / 10, rtol=1e-6)
+    np.testing.assert_allclose(read_depth(tmp_path / "d.npy", 0.01), expected / 100, rtol=1e-6)
+
+
+def test_what_is_no_depth_becomes_nan(tmp_path):
+    np.save(tmp_path / "a.npy", np.array([[0.0, -1.0, np.nan, np.inf, -np.inf, 1e300, 2.0]]))
+    assert np.flatnonzero(np.isfinite(read_depth(tmp_path / "a.npy"))).tolist() == [6]
+
+
+def test_the_gate_the_edge_and_the_flying_pixels():
+    depth = np.full((12, 12), 2.0, np.float32)
+    depth[5, 5] = 2.6
+    mask = np.zeros((12, 12), bool)
+    mask[0:8, 2:10] = True
+    assert keep_pixels(depth, mask, CutSettings()).sum() == 64
+    assert keep_pixels(depth, mask, CutSettings(far=2.5)).sum() == 63
+    assert keep_pixels(depth, mask, CutSettings(far=2.0)).sum() == 0
+    assert keep_pixels(depth, mask, CutSettings(near=2.0)).sum() == 1
+    # Three sides of the mask are edges, the fourth is the image's border.
+    assert keep_pixels(depth, mask, CutSettings(erode=1)).sum() == 7 * 6
+    kept = keep_pixels(depth, mask, CutSettings(flying=0.1))
+    assert kept.sum() == 63
+    assert not kept[5, 5]
+
+
+def test_a_mask_of_instances_gives_a_cloud_each_with_its_class(taken, tmp_path):
+    folder, _, depth = taken
+    mask = np.where(depth > 0, 3, 0).astype(np.uint16)
+    mask[:, : WIDTH // 2][depth[:, : WIDTH // 2] > 0] = 700
+    write_png(tmp_path / "mask" / "a.png", mask)
+    (tmp_path / "names.csv").write_text("name,class\na/3,table\n*/700,chair\na,sofa\n")
+    image = DepthImage("a", folder / "depth" / "a.png", tmp_path / "mask" / "a.png")
+    names = read_names(tmp_path / "names.csv")
+    clouds = list(extract_depth(image, DepthSettings(CAMERA, instances=True, names=names)))
+    assert [(c.id, c.class_name) for c in clouds] == [("a/3", "table"), ("a/700", "chair")]
+    assert sum(len(c.points) for c in clouds) == (depth > 0).sum()
+    # Without the option both are one object; a coloured mask is what is not black.
+    (one,) = extract_depth(image, DepthSettings(CAMERA))
+    assert one.class_name == "object"
+    colour = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    colour[..., 2] = (mask > 0) * 9
+    write_png(tmp_path / "mask" / "colour.png", colour)
+    image = DepthImage("a", image.path, tmp_path / "mask" / "colour.png")
+    (other,) = extract_depth(image, DepthSettings(CAMERA))
+    np.testing.assert_array_equal(one.points, other.points)
+
+
+def test_a_box_is_first_to_before_last_and_cuts_masks_too(taken):
+    folder, _, depth = taken
+    (cloud,) = cut(folder, box=(70, 50, 90, 65))
+    assert len(cloud.points) == (depth[50:65, 70:90] > 0).sum() > 100
+    with pytest.raises(InputError, match="beyond its 160×120"):
+        cut(folder, box=(70, 50, 161, 65))
+
+
+def test_small_objects_are_left_out(taken):
+    folder, _, depth = taken
+    count = int((depth > 0).sum())
+    assert len(cut(folder, cut=CutSettings(min_points=count))) == 1
+    assert not cut(folder, cut=CutSettings(min_points=count + 1))
+
+
+@pytest.mark.parametrize(("fx", "scale"), [(1e-300, None), (1e-9, None), (150.0, 1e30)])
+def test_points_that_no_camera_sees_are_refused(taken, fx, scale):
+    folder, _, _ = taken
+    image = DepthImage("a", folder / "depth" / "a.png", folder / "mask" / "a.png")
+    camera = dataclasses.replace(CAMERA, fx=fx)
+    with pytest.raises(InputError, match=r"a\.png: a point lies beyond"):
+        list(extract_depth(image, DepthSettings(camera, depth_scale=scale)))
+
+
+def test_every_way_to_tell_a_camera(tmp_path):
+    rows = MATRIX.ravel().tolist()
+    wide = np.eye(4)
+    wide[:3, :3] = MATRIX
+    ways = {
+        "bop.json": json.dumps({"fx": 150, "fy": 140.0, "cx": 77, "cy": 61, "depth_scale": 0.1}),
+        "k.json": json.dumps({"K": MATRIX.tolist()}),
+        "cam.json": json.dumps({"cam_K": rows, "width": 160, "height": 120}),
+        "open3d.json": json.dumps({"intrinsic_matrix": MATRIX.T.ravel().tolist()}),
+        "k.txt": "150 0 77\n0 140 61\n0 0 1\n",
+        "four.txt": "150 140 77 61",
+        "scannet.txt": "\n".join(" ".join(map(str, row)) for row in wide),
+    }
+    found = [read_intrinsics("150,140,77,61")]
+    for name, text in ways.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+        found.append(read_intrinsics(tmp_path / name))
+    assert {(c.fx, c.fy, c.cx, c.cy) for c in found} == {(150.0, 140.0, 77.0, 61.0)}
+    assert found[1].depth_scale == pytest.approx(0.0001)
+    own = {"focal": 150, "principal_point": [77, 61], "depth_unit": 1e-4, "width": 9, "height": 8}
+    (tmp_path / "own.json").write_text(json.dumps(own), encoding="utf-8")
+    camera = read_intrinsics(tmp_path / "own.json")
+    assert camera == Intrinsics(150.0, 150.0, 77.0, 61.0, 9, 8, 1e-4)
+    with pytest.raises(InputError, match="160×120 pixels, the camera 9×8"):
+        camera.check_size((120, 160), "a.png")
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("0,140,77,61", "must be positive"),
+        ("-150,140,77,61", "must be positive"),
+        ("nan,140,77,61", "must be finite"),
+        ("150,140,77", "give fx,fy,cx,cy"),
+        ("absent.json", "no such file"),
+    ],
+)
+def test_bad_cameras_on_the_command_line(text, told):
+    with pytest.raises(InputError, match=told):
+        read_intrinsics(text)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "told"),
+    [
+        ("a.json", "[1, 2", "not a JSON file"),
+        ("a.json", "[1, 2]", "not a JSON object"),
+        ("a.json", "[" * 100_000, "not a JSON file"),
+        ("a.json", '{"fx": ' + "1" * 5000 + "}", "not a JSON file"),
+        ("a.json", '{"fx": "150"}', "fx must be a number"),
+        ("a.json", '{"fx": true, "fy": 1, "cx": 1, "cy": 1}', "fx must be a number"),
+        ("a.json", '{"fx": 150, "fy": 140, "cx": 77}', "cy must be a number"),
+        ("a.json", '{"fx": 150, "fy": 140, "cx": 77, "cy": NaN}', "cy must be a number"),
+        ("a.json", '{"fx": 150, "fy": 140, "cx": 77, "cy": 6, "width": 1.5}', "whole number"),
+        ("a.json", '{"fx": 1, "fy": 1, "cx": 7, "cy": 6, "depth_scale": 0}', "must be positive"),
+        ("a.json", '{"K": [[1, 0], [0, 1]]}', "K must be 9 numbers"),
+        ("a.json", '{"focal": 3}', "principal_point"),
+        ("a.json", "{}", "none of fx"),
+        ("a.txt", "150 0 0 0 140 0 77 61 1", "row by row"),
+        ("a.txt", "150 3 77 0 140 61 0 0 1", "skew"),
+        ("a.txt", "150 0 77 0 -140 61 0 0 1", "must be positive"),
+        ("a.txt", "150 0 77 0 140 61 0 0 2", "0 0 1"),
+        ("a.txt", "150 0 nan 0 140 61 0 0 1", "finite"),
+        ("a.txt", "1 2 3", "3 numbers instead"),
+        ("a.txt", "one two", "not a text file of numbers"),
+        ("a.txt", "\0\0", "not a text file of numbers"),
+    ],
+)  # fmt: skip
+def test_bad_camera_files_are_refused_by_name(tmp_path, name, text, told):
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=told) as caught:
+        read_intrinsics(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def png(width, height, bits=16, colour=0, data=b"\0" * 32):
+    def chunk(name, body):
+        return (
+            struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+        )
+
+    header = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)
+    parts = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(data)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + parts
+
+
+def npy(header: str, body=b""):
+    text = header.encode() + b" " * (117 - len(header)) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + body
+
+
+def encoded(ending, image):
+    return cv2.imencode(ending, image)[1].tobytes()
+
+
+GREY16 = np.arange(600, dtype=np.uint16).reshape(20, 30)
+BAD_IMAGES = {
+    "huge.png": (png(60000, 60000), "announces 60000×60000 pixels"),
+    "hollow.png": (png(5000, 5000), "announces 5000×5000 pixels but holds"),
+    "negative.png": (png(2**32 - 1, 1), "announces"),
+    "zero.png": (png(0, 5), "announces 0×5"),
+    "grey8.png": (encoded(".png", GREY16.astype(np.uint8)), "8 bits.*save depth as 16-bit PNG"),
+    "colour.png": (encoded(".png", np.zeros((4, 4, 3), np.uint8)), "colour picture"),
+    "short.png": (encoded(".png", GREY16)[:-30], "cut off"),
+    "flipped.png": (encoded(".png", GREY16)[:60] + b"\0\0\0" + encoded(".png", GREY16)[63:],
+                    "damaged"),
+    "jpeg.png": (encoded(".jpg", GREY16.astype(np.uint8)), "not a PNG file"),
+    "empty.png": (b"", "not a PNG file"),
+    "odd.png": (png(4, 4, bits=7), "damaged"),
+    "short.tif": (encoded(".tiff", GREY16)[:100], "cut off|damaged"),
+    "grey8.tif": (encoded(".tiff", GREY16.astype(np.uint8)), "8 bits"),
+    "text.tif": (b"II+\0 and so on", "not a TIFF"),
+    "far.tif": (b"II*\0" + struct.pack("<I", 2**31), "cut off"),
+    "loop.tif": (b"II*\0" + struct.pack("<IHHHII", 8, 1, 256, 4, 1, 9), "no size"),
+    "huge.tif": (b"II*\0" + struct.pack("<IHHHIIHHII", 8, 2, 256, 4, 1, 60000, 257, 4, 1, 60000),
+                 "announces 60000×60000"),
+    "huge.npy": (npy("{'descr': '<f8', 'fortran_order': False, 'shape': (60000, 60000), }"),
+                 "announces 60000×60000"),
+    "short.npy": (npy("{'descr': '<f8', 'fortran_order': False, 'shape': (600, 600), }", b"0"),
+                  "announces 2880000 bytes but has 1"),
+    "pickle.npy": (npy("{'descr': '|O', 'fortran_order': False, 'shape': (2, 2), }", b"0" * 64),
+                   "holds object"),
+    "line.npy": (npy("{'descr': '<f8', 'fortran_order': False, 'shape': (2,), }", b"0" * 16),
+                 "shape"),
+    "text.npy": (b"depth", "not an npy file"),
+    "code.npy": (npy("__import__('os').getcwd()"), "not an npy file"),
+    "depth.exr": (b"v/1\1", "not a depth image"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD_IMAGES)
+def test_bad_images_are_refused_by_name(tmp_path, name, capfd):
+    content, told = BAD_IMAGES[name]
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=told) as caught:
+        read_depth(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr().err == ""
+    if not name.startswith(("grey8", "colour")):
+        with pytest.raises(InputError):
+            read_mask(path)
+
+
+def test_masks_of_another_size_or_kind_are_refused(tmp_path):
+    write_png(tmp_path / "mask.png", np.ones((120, 161), np.uint8))
+    with pytest.raises(InputError, match=r"mask.png: is 161×120 pixels, the depth image 160×120"):
+        read_mask(tmp_path / "mask.png", (120, 160))
+    np.save(tmp_path / "big.npy", np.full((2, 2), 2**40))
+    with pytest.raises(InputError, match="beyond 32 bits"):
+        read_mask(tmp_path / "big.npy")
+    np.save(tmp_path / "bool.npy", np.eye(2, dtype=bool))
+    assert read_mask(tmp_path / "bool.npy").tolist() == [[1, 0], [0, 1]]
+
+
+def test_a_folder_goes_with_a_folder_of_masks(tmp_path):
+    for name in ("b.png", "a.png", ".hidden.png", "c.npy", "note.txt"):
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "masks").mkdir()
+    for name in ("a.png", "b.tif", "c.png"):
+        (tmp_path / "masks" / name).write_bytes(b"")
+    found = list_depth_images(tmp_path, tmp_path / "masks")
+    assert [(image.id, image.mask.name) for image in found] == [
+        ("a", "a.png"), ("b", "b.tif"), ("c", "c.png"),
+    ]  # fmt: skip
+    with pytest.raises(InputError, match="one mask for 3 depth images"):
+        list_depth_images(tmp_path, tmp_path / "masks" / "a.png")
+    (tmp_path / "masks" / "c.png").unlink()
+    with pytest.raises(InputError, match=r"no mask c\.png"):
+        list_depth_images(tmp_path, tmp_path / "masks")
+    (tmp_path / "a.tif").write_bytes(b"")
+    with pytest.raises(InputError, match="same name"):
+        list_depth_images(tmp_path)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="no depth image"):
+        list_depth_images(tmp_path / "empty")
+    with pytest.raises(InputError, match="no such file"):
+        list_depth_images(tmp_path / "absent")
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("a,b\n1,2\n", "name,class"),
+        ("", "name,class"),
+        ("name,class\n", "no row"),
+        ("name,class\na,chair\na,table\n", "line 3: 'a' comes twice"),
+        ("name,class\na,\n", "line 2: 'a' needs"),
+        ("name,class\na,\x1b[31m\n", "line 2"),
+        ("name,class\na\n", "line 2"),
+        ('name,class\n"a,chair\n', "not a CSV"),
+    ],
+)
+def test_bad_tables_of_classes_are_refused(tmp_path, text, told):
+    (tmp_path / "names.csv").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=told):
+        read_names(tmp_path / "names.csv")
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"near": 2.0, "far": 1.0}, {"near": -1.0}, {"far": float("nan")}, {"erode": -1},
+        {"flying": -0.1}, {"min_points": 0},
+    ],
+)  # fmt: skip
+def test_settings_out_of_range_are_refused(bad):
+    with pytest.raises(InputError):
+        CutSettings(**bad)
+    for wrong in ({"gravity": (0.0, 0.0, 0.0)}, {"box": (5, 0, 5, 9)}, {"box": (-1, 0, 5, 9)}):
+        with pytest.raises(InputError):
+            DepthSettings(CAMERA, **wrong)
+
+
+def resealed(content: bytes) -> bytes:
+    """A PNG whose chunks have the right checksums again, so that the damage reaches further in."""
+    at, parts = 8, [content[:8]]
+    while at + 12 <= len(content):
+        end = at + 8 + struct.unpack_from(">I", content, at)[0]
+        if end + 4 > len(content):
+            break
+        parts += [content[at:end], struct.pack(">I", zlib.crc32(content[at + 4 : end]))]
+        at = end + 4
+    return b"".join(parts)
+
+
+def fuzz(tmp_path, rng, rounds):
+    np.save(tmp_path / "a.npy", GREY16.astype(np.float32))
+    kinds = {
+        "png": encoded(".png", GREY16),
+        "tif": encoded(".tiff", GREY16),
+        "npy": (tmp_path / "a.npy").read_bytes(),
+    }
+    refused = 0
+    for number in range(rounds):
+        for kind, content in kinds.items():
+            bad = mutated(content, rng)
+            path = tmp_path / f"bad.{kind}"
+            path.write_bytes(resealed(bad) if kind == "png" and number % 2 else bad)
+            for read in (read_depth, read_mask):
+                try:
+                    image = read(path)
+                except InputError as error:
+                    assert "\n" not in str(error)
+                    refused += 1
+                else:
+                    assert image.ndim == 2
+                    assert image.size < 1 << 22
+    assert refused > rounds
+
+
+def test_mutated_images_are_read_or_refused(tmp_path, rng):
+    fuzz(tmp_path, rng, 60)
+
+
+@pytest.mark.slow
+def test_many_mutated_images_are_read_or_refused(tmp_path, rng):
+    fuzz(tmp_path, rng, 1500)

@@ -1,0 +1,489 @@
+"""Objects cut from the raw depth frames of a room that the tests render themselves."""
+
+import dataclasses
+import json
+import pickle
+import struct
+import tracemalloc
+import zipfile
+import zlib
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from qs3.errors import InputError
+from qs3.io.extract.clouds import ExtractedCloud
+from qs3.io.extract.scannet import (
+    ScanNetScene,
+    ScanNetSettings,
+    dropped_labels,
+    extract_scene,
+    list_scenes,
+    read_splits,
+)
+from qs3.io.extract.scannet_masks import InstanceMasks, erode
+from qs3.io.extract.scannet_scene import axis_alignment, class_of, read_objects
+
+from .writers import (
+    CHAIR,
+    LOST,
+    ROOM,
+    TABLE,
+    Room,
+    png,
+    render,
+    write_aggregation,
+    write_masks,
+    write_room,
+)
+
+SETTINGS = ScanNetSettings(every=1, min_pixels=30, min_points=100)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Room:
+    """A tilted room, the colour camera 3 cm beside the depth camera."""
+    return write_room(tmp_path_factory.mktemp("room") / "scans", apart=0.03)
+
+
+def scene_of(room: Room, split: str = "") -> ScanNetScene:
+    return ScanNetScene(room.folder.name, room.folder, split)
+
+
+def extract(room: Room, **changes: object) -> dict[int, ExtractedCloud]:
+    settings = dataclasses.replace(SETTINGS, **changes)
+    clouds = extract_scene(scene_of(room), settings)
+    return {int(cloud.id.rpartition("/")[2]): cloud for cloud in clouds}
+
+
+def on_top(room: Room, number: int, points: np.ndarray) -> np.ndarray:
+    """Heights over an object's top of the points [n 3] within 3 cm of it, rim aside."""
+    low, high = room.box(number)
+    inside = ((points > low + 0.02) & (points < high - 0.02))[:, :2].all(axis=1)
+    height = points[inside, 2] - high[2]
+    return height[np.abs(height) < 0.03]
+
+
+def in_room(cloud: ExtractedCloud) -> np.ndarray:
+    return cloud.points + np.array(cloud.source["origin"])
+
+
+def test_clouds_lie_on_their_objects(room: Room) -> None:
+    """Depth is stored in millimetres, so that half of one is all that may be missing."""
+    clouds = extract(room, cut="masks")
+    assert {number: cloud.class_name for number, cloud in clouds.items()} == {
+        CHAIR: "chair",
+        TABLE: "table",
+    }
+    for number, cloud in clouds.items():
+        assert cloud.points.dtype == np.float32
+        assert cloud.id == f"scene0000_00/{number}"
+        points = in_room(cloud)
+        assert room.surface(number, points).max() < 1e-3
+        low, high = room.box(number)
+        np.testing.assert_allclose(points.max(axis=0), high, atol=0.005)
+        np.testing.assert_allclose(points.min(axis=0)[:2], low[:2], atol=0.005)
+        assert points[:, 2].min() < 0.05  # erosion takes the edge with the floor
+        assert points[:, 2].min() > low[2] - 0.001
+
+
+def test_clouds_by_the_mesh_lie_on_their_objects(room: Room) -> None:
+    """The floor's vertices claim the floor's points, but for a rim of half their spacing."""
+    for number, cloud in extract(room, cut="mesh").items():
+        away = room.surface(number, in_room(cloud))
+        assert np.quantile(away, 0.95) < 1e-3
+        assert away.max() < 0.015
+
+
+def test_convention_not_mirrored(room: Room) -> None:
+    """A chair with one arm fits its own surface; its mirror images do not."""
+    points = in_room(extract(room)[CHAIR])
+    low, high = room.box(CHAIR)
+    for axis in range(2):
+        mirrored = points.copy()
+        mirrored[:, axis] = low[axis] + high[axis] - mirrored[:, axis]
+        assert np.quantile(room.surface(CHAIR, mirrored), 0.95) > 0.05
+
+
+def test_convention_z_is_up_after_alignment(tmp_path: Path, room: Room) -> None:
+    """The back of the chair is up and behind, and the cloud stands over the origin."""
+    straight = write_room(tmp_path / "scans", tilt=False, apart=0.03)
+    for one in (room, straight):
+        points = extract(one)[CHAIR].points
+        np.testing.assert_allclose(points.min(axis=0)[2], 0.0, atol=1e-6)
+        np.testing.assert_allclose(points[:, :2].min(axis=0), -points[:, :2].max(axis=0), atol=1e-5)
+        assert 0.88 < points[:, 2].max() < 0.96
+        assert (points[points[:, 2] > 0.75][:, 1] > 0.1).all()
+    # Without the .txt file the scene's own frame stays as it is, which is tilted here.
+    (room.folder / "scene0000_00.txt").rename(room.folder / "kept.txt")
+    try:
+        tilted = extract(room)[CHAIR].points
+    finally:
+        (room.folder / "kept.txt").rename(room.folder / "scene0000_00.txt")
+    assert not 0.88 < np.ptp(tilted[:, 2]) < 0.96
+
+
+def test_every_point_is_one_the_sensor_measured(tmp_path: Path) -> None:
+    """Noise of 1 cm comes out whole: the cloud is a part of the raw points, and as rough."""
+    room = write_room(tmp_path / "scans", noise=0.01)
+    tree = KDTree(room.measured())
+    for number, cloud in extract(room).items():
+        points = in_room(cloud)
+        assert tree.query(points)[0].max() < 2e-6
+        kept, raw = on_top(room, number, points), on_top(room, number, room.measured())
+        assert len(kept) > 300
+        assert kept.std() > 0.95 * raw.std() > 0.004
+
+
+def test_without_noise_the_top_is_flat(room: Room) -> None:
+    assert on_top(room, TABLE, in_room(extract(room)[TABLE])).std() < 0.5e-3
+
+
+def test_the_same_twice_and_another_seed_differs(room: Room) -> None:
+    first, again, other = extract(room), extract(room), extract(room, seed=1)
+    np.testing.assert_array_equal(first[CHAIR].points, again[CHAIR].points)
+    assert first[CHAIR].source == again[CHAIR].source
+    assert first[CHAIR].points.tobytes() != other[CHAIR].points.tobytes()
+
+
+def test_frames_and_points_are_bounded(room: Room) -> None:
+    few = extract(room, max_frames=3, max_points=700)
+    for cloud in few.values():
+        assert cloud.source["frames"] == 3
+        assert cloud.source["frames_seen"] == 12
+        assert len(cloud.points) == 700
+        assert cloud.source["measured"] > 700
+    assert extract(room, max_frames=0)[CHAIR].source["frames"] == 12
+
+
+def test_depth_limits(room: Room) -> None:
+    full, near = extract(room), extract(room, far=1.8)
+    assert near[TABLE].source["measured"] < full[TABLE].source["measured"]
+    assert extract(room, near=3.5, far=4.0) == {}
+
+
+def test_masks_of_the_depth_image_are_taken_pixel_by_pixel(tmp_path: Path) -> None:
+    room = write_room(tmp_path / "scans", frames=4)
+    sens = room.sens
+    masks = {
+        index: render(ROOM, sens.depth_intrinsic, sens.depth_size, room.align @ pose)[1]
+        for index, pose in enumerate(sens.poses)
+    }
+    write_masks(room.folder / "scene0000_00_2d-instance-filt.zip", masks)
+    for number, cloud in extract(room, erode=0, voxel=1e-3, max_points=10**6).items():
+        points = in_room(cloud)
+        assert room.surface(number, points).max() < 1e-3
+        seen = sum(int((mask == number + 1).sum()) for mask in masks.values())
+        assert cloud.source["measured"] == seen
+
+
+def test_hidden_points_are_left_out(tmp_path: Path) -> None:
+    """A colour camera 20 cm aside sees past the chair; what it cannot see is not cut out."""
+    room = write_room(tmp_path / "scans", apart=0.2)
+    for number, cloud in extract(room).items():
+        assert room.surface(number, in_room(cloud)).max() < 1e-3
+
+
+def test_report_counts(tmp_path: Path) -> None:
+    room = write_room(tmp_path / "scans", frames=8)
+    room.sens.poses = [LOST, *list(room.sens.poses)[1:]]
+    room.sens.write(room.folder / "scene0000_00.sens")
+    path = room.folder / "scene0000_00_2d-instance-filt.zip"
+    write_masks(path, {index: mask for index, mask in room.masks.items() if index != 3})
+    report: dict = {}
+    clouds = list(extract_scene(scene_of(room, "test"), SETTINGS, report))
+    assert report == {
+        "frames": 8,
+        "read": 8,
+        "without_pose": 1,
+        "without_mask": 1,
+        "too_small": 0,
+        "dropped": {"floor": 1, "sink": 1},
+    }
+    assert [cloud.source["frames"] for cloud in clouds] == [6, 6]
+    assert {cloud.split for cloud in clouds} == {"test"}
+    assert dropped_labels([scene_of(room)] * 2) == {"floor": 2, "sink": 2}
+    beds = dataclasses.replace(SETTINGS, class_names=("bed",))
+    assert list(extract_scene(scene_of(room), beds, report)) == []
+    assert (report["frames"], report["read"]) == (8, 0)  # no object, so no frame is needed
+    assert sum(report["dropped"].values()) == 4
+    everything = dataclasses.replace(SETTINGS, min_points=10**6)
+    assert list(extract_scene(scene_of(room), everything, report)) == []
+    assert report["too_small"] == 2
+
+
+@pytest.mark.parametrize("copies", [2, pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("cut", ["masks", "mesh"])
+def test_memory_does_not_grow_with_the_scene(tmp_path: Path, cut: str, copies: int) -> None:
+    """Of ten times as many frames nothing is held but the zip file's index: below 1 kB a mask."""
+    peaks, few = [], copies
+    for copies in (few, 10 * few):
+        room = write_room(tmp_path / f"scans{copies}", frames=10, copies=copies, size=(80, 60))
+        tracemalloc.start()
+        clouds = extract(room, cut=cut, max_frames=5)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        assert clouds[CHAIR].source["frames"] == 5
+        assert clouds[CHAIR].source["frames_seen"] == 10 * copies
+    index = 1000 * 90 * few if cut == "masks" else 0
+    assert peaks[1] < 1.03 * peaks[0] + index, peaks
+
+
+def test_a_scene_without_masks_or_mesh_says_so(tmp_path: Path) -> None:
+    room = write_room(tmp_path / "scans", frames=2, mesh=False, masks=False)
+    with pytest.raises(InputError, match=r"neither .*instance-filt.zip nor .*_vh_clean_2.ply"):
+        extract(room)
+    with pytest.raises(InputError, match=r"instance-filt.zip: no such file"):
+        extract(room, cut="masks")
+
+
+def test_a_cut_file_yields_no_object(room: Room, tmp_path: Path) -> None:
+    content = (room.folder / "scene0000_00.sens").read_bytes()
+    other = tmp_path / "scene0000_00"
+    other.mkdir()
+    for path in room.folder.iterdir():
+        (other / path.name).write_bytes(path.read_bytes())
+    (other / "scene0000_00.sens").write_bytes(content[: len(content) * 3 // 4])
+    with pytest.raises(InputError, match=r"cut off in frame \d+ of 12"):
+        next(extract_scene(ScanNetScene("scene0000_00", other), SETTINGS))
+
+
+# Masks.
+
+
+def masks_of(path: Path) -> closing[InstanceMasks]:
+    return closing(InstanceMasks(path, ((64, 48), (32, 24))))
+
+
+def test_masks_come_back(tmp_path: Path, rng: np.random.Generator) -> None:
+    large, little = (rng.integers(0, 200, size, dtype=np.uint8) for size in ((48, 64), (24, 32)))
+    path = write_masks(tmp_path / "a.zip", {0: large, 100: little})
+    with masks_of(path) as masks:
+        np.testing.assert_array_equal(masks.read(0), large)
+        np.testing.assert_array_equal(masks.read(100), little)
+        assert masks.read(1) is None
+
+
+def test_names_that_lead_elsewhere_do_no_harm(tmp_path: Path) -> None:
+    path = tmp_path / "a.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        for name in ("../evil.png", "/evil.png", "instance-filt/../../evil.png", "C:\\evil.png"):
+            archive.writestr(name, b"evil")
+        archive.writestr("instance-filt/0.png", png(np.zeros((48, 64), np.uint8)))
+    with masks_of(path) as masks:
+        assert masks.read(0) is not None
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["a.zip"]
+
+
+def bomb(width: int, height: int, declared: tuple[int, int] | None = None) -> bytes:
+    """A PNG of zeros; its header may declare another size."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        check = struct.pack(">I", zlib.crc32(kind + data))
+        return struct.pack(">I", len(data)) + kind + data + check
+
+    head = struct.pack(">IIBBBBB", *(declared or (width, height)), 8, 0, 0, 0, 0)
+    rows = zlib.compress(bytes((width + 1) * height), 9)
+    parts = [chunk(b"IHDR", head), chunk(b"IDAT", rows), chunk(b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+BAD_MASKS = {
+    "huge": (bomb(4000, 1000), "4000×1000 pixels; expected 64×48 or 32×24"),
+    "huge and declared": (bomb(4, 4, (2**31 - 1, 2**31 - 1)), "expected 64×48"),
+    "no png": (b"GIF89a" + bytes(40), "no PNG"),
+    "empty": (b"", "no PNG"),
+    "cut": (png(np.zeros((48, 64), np.uint8))[:24], "cut off"),
+    "16 bits": (png(np.zeros((48, 64), np.uint16)), "8 bits"),
+    "colour": (png(np.zeros((48, 64, 3), np.uint8)), "8 bits"),
+    "no pixels": (bomb(64, 48)[:40], "damaged"),
+}
+
+
+@pytest.mark.parametrize("fault", BAD_MASKS)
+def test_a_bad_mask_is_one_line(tmp_path: Path, fault: str) -> None:
+    content, told = BAD_MASKS[fault]
+    path = write_masks(tmp_path / "a.zip", {7: content})
+    with masks_of(path) as masks, pytest.raises(InputError, match=told) as caught:
+        masks.read(7)
+    assert "a.zip: instance-filt/7.png" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_zip_bomb_is_not_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "a.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("instance-filt/0.png", bytes(50 * 2**20))
+    content = bytearray(path.read_bytes())
+    honest = struct.pack("<I", 50 * 2**20)
+    for told in (honest, struct.pack("<I", 2000)):
+        path.write_bytes(content.replace(honest, told))
+        tracemalloc.start()
+        with masks_of(path) as masks, pytest.raises(InputError, match=r"unpack to|damaged|no PNG"):
+            masks.read(0)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 2**20
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
+        archive.writestr("instance-filt/0.png", bytes(1000))
+    with masks_of(path) as masks, pytest.raises(InputError, match="deflate"):
+        masks.read(0)
+
+
+def test_no_zip_file_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "a.zip").write_bytes(b"PK\x05\x06" + bytes(10))
+    with pytest.raises(InputError, match="cannot be read as zip"):
+        masks_of(tmp_path / "a.zip")
+
+
+def test_erosion_keeps_what_is_alone_within_reach() -> None:
+    mask = np.zeros((12, 14), np.uint8)
+    mask[:6], mask[6:] = 3, 5
+    mask[2, 4] = 0
+    expected = mask.copy()
+    for row in range(12):
+        for column in range(14):
+            window = mask[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
+            if len(np.unique(window)) > 1:
+                expected[row, column] = 0
+    np.testing.assert_array_equal(erode(mask, 2), expected)
+    np.testing.assert_array_equal(erode(mask, 0), mask)
+
+
+# Scenes.
+
+
+def test_scenes_and_splits(tmp_path: Path) -> None:
+    for name in ("scene0001_00", "scene0000_01", "notes", "scene12"):
+        (tmp_path / "scans" / name).mkdir(parents=True)
+    (tmp_path / "train.txt").write_text("scene0001_00\nscene0009_00\n\n")
+    (tmp_path / "val.txt").write_text("scene0000_01\r\n")
+    splits = read_splits(tmp_path / "train.txt", tmp_path / "val.txt")
+    assert splits == {"scene0001_00": "train", "scene0009_00": "train", "scene0000_01": "test"}
+    for root in (tmp_path, tmp_path / "scans"):
+        scenes = list_scenes(root, splits=splits)
+        assert [(s.id, s.split) for s in scenes] == [
+            ("scene0000_01", "test"),
+            ("scene0001_00", "train"),
+        ]
+    assert [s.id for s in list_scenes(tmp_path, ["scene0001_00"])] == ["scene0001_00"]
+    assert [s.id for s in list_scenes(tmp_path, splits={"scene0001_00": "train"})] == [
+        "scene0001_00"
+    ]
+    one = list_scenes(tmp_path / "scans" / "scene0001_00")
+    assert [s.id for s in one] == ["scene0001_00"]
+    assert pickle.loads(pickle.dumps(one)) == one  # noqa: S301
+
+
+def test_wrong_scenes_and_splits_are_one_line(tmp_path: Path) -> None:
+    (tmp_path / "scene0000_00").mkdir()
+    for root, names, told in (
+        (tmp_path / "none", None, "no such folder"),
+        (tmp_path, ["scene0005_00"], "has no scene"),
+        (tmp_path, ["../etc"], "has no scene"),
+        (tmp_path, [], "none of the scenes"),
+    ):
+        with pytest.raises(InputError, match=told):
+            list_scenes(root, names)
+    list_file = tmp_path / "list.txt"
+    for content, told in (
+        (b"scene0000_00\n../../etc/passwd\n", "line 2 is no scene"),
+        (b"\xff\xfe", "no text"),
+    ):
+        list_file.write_bytes(content)
+        with pytest.raises(InputError, match=told):
+            read_splits(list_file)
+    list_file.write_text("scene0000_00")
+    with pytest.raises(InputError, match="other split"):
+        read_splits(list_file, list_file)
+
+
+def test_labels() -> None:
+    for label, name in {
+        "Office  Chair": "chair",
+        "kitchen cabinets": "cabinet",
+        "tv": "monitor",
+        "coffee table": "table",
+        "couch": "sofa",
+        "shelf": "bookshelf",
+        "nightstand": "cabinet",
+        "sofa chair": "chair",
+        "potted plant": "plant",
+        "toilet": None,
+        "": None,
+        "tv stand": None,
+        "bed sheet": None,
+    }.items():
+        assert class_of(label) == name, label
+    assert class_of("toilet", ("bed", "toilet")) == "toilet"
+
+
+def test_objects_listed_twice_come_once(tmp_path: Path) -> None:
+    scene = ScanNetScene("scene0217_00", tmp_path)
+    groups = [(1, "chair", [1]), (0, "desk", [2]), (1, "couch", [3]), (4, "wall", [4])]
+    write_aggregation(tmp_path / "scene0217_00.aggregation.json", groups)
+    objects, dropped = read_objects(scene)
+    assert [(item.id, item.class_name, item.segments) for item in objects] == [
+        (0, "table", (2,)),
+        (1, "chair", (1,)),
+    ]
+    assert dropped == {"wall": 1}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"\xff\xfe\x00",
+        b"[" * 100_000,
+        b"1" * 10_000,
+        b"[]",
+        b'{"segGroups": 3}',
+        b'{"segGroups": [3]}',
+        b'{"segGroups": [{"objectId": 0, "label": "chair"}]}',
+        b'{"segGroups": [{"objectId": -1, "label": "chair", "segments": []}]}',
+        b'{"segGroups": [{"objectId": 1e400, "label": "chair", "segments": []}]}',
+        b'{"segGroups": [{"objectId": 1, "label": 5, "segments": []}]}',
+        b'{"segGroups": [{"objectId": 1, "label": "chair", "segments": [true]}]}',
+        b'{"segGroups": [{"objectId": 1, "label": "chair", "segments": [99999999999]}]}',
+    ],
+)
+def test_a_bad_aggregation_is_one_line(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "s.aggregation.json"
+    path.write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        read_objects(ScanNetScene("s", tmp_path))
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "value",
+    ["", "1 2 3", "x " * 16, "0 " * 16, "nan " * 16, "-1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"],
+)
+def test_a_bad_alignment_is_one_line(tmp_path: Path, value: str) -> None:
+    (tmp_path / "s.txt").write_text(f"colorHeight = 968\naxisAlignment = {value}\n")
+    with pytest.raises(InputError, match="axisAlignment"):
+        axis_alignment(ScanNetScene("s", tmp_path))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"every": 0},
+        {"near": 4.0},
+        {"far": float("nan")},
+        {"voxel": 0.0},
+        {"distance": -1.0},
+        {"max_frames": -1},
+        {"class_names": ()},
+        {"seed": -1},
+    ],
+)
+def test_settings_out_of_range_are_refused(change: dict) -> None:
+    with pytest.raises(InputError, match=next(iter(change))):
+        ScanNetSettings(**change)
+    json.dumps(dataclasses.asdict(ScanNetSettings()))

@@ -1,0 +1,206 @@
+"""The reader of `.sens` files, against files written from the description of the format."""
+
+import struct
+import tracemalloc
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qs3.errors import InputError
+from qs3.geometry import look_at
+from qs3.io.extract.sens import read_depth_frames, read_sens_header
+
+from .writers import LOST, Sens, camera_matrix
+
+SIZE = (16, 12)
+
+
+def small(frames: int = 4, **changes: object) -> Sens:
+    rng = np.random.default_rng(1)
+    depth = [rng.integers(0, 5000, SIZE[::-1], dtype=np.uint16) for _ in range(frames)]
+    poses = [look_at(np.array([1.0 + i, 2, 3]), np.zeros(3)) for i in range(frames)]
+    sens = Sens(depth, poses, SIZE, camera_matrix(14.0, SIZE))
+    for name, value in changes.items():
+        setattr(sens, name, value)
+    return sens
+
+
+@pytest.mark.parametrize("compression", [0, 1])
+@pytest.mark.parametrize("every", [1, 3, 10])
+def test_frames_come_back(tmp_path: Path, compression: int, every: int) -> None:
+    sens = small(frames=7, compression=compression)
+    frames = list(read_depth_frames(sens.write(tmp_path / "a.sens"), every))
+    assert [frame.index for frame in frames] == list(range(0, 7, every))
+    for frame in frames:
+        np.testing.assert_array_equal(frame.steps, sens.depth[frame.index])
+        assert frame.camera_to_world is not None
+        np.testing.assert_allclose(frame.camera_to_world, sens.poses[frame.index], atol=1e-6)
+
+
+def test_header_comes_back(tmp_path: Path) -> None:
+    shift = np.eye(4)
+    shift[0, 3] = 0.05
+    sens = small(depth_extrinsic=shift, shift=2000.0)
+    header = read_sens_header(sens.write(tmp_path / "a.sens"))
+    assert (header.sensor, header.num_frames, header.depth_shift) == ("StructureSensor", 4, 2000.0)
+    assert (header.depth_size, header.color_size) == (SIZE, (32, 24))
+    np.testing.assert_allclose(header.depth_intrinsic, sens.depth_intrinsic[:3, :3])
+    np.testing.assert_allclose(header.color_intrinsic, sens.color_intrinsic[:3, :3])
+    np.testing.assert_allclose(header.depth_to_color, shift, atol=1e-7)
+
+
+def test_convention_depth_to_color(tmp_path: Path) -> None:
+    """Depth extrinsic first, then out of the frame of the colour camera."""
+    depth, color = look_at(np.array([1.0, 2, 3]), np.zeros(3)), np.eye(4)
+    color[:3, 3] = [0.0, 0.1, 0.0]
+    sens = small(depth_extrinsic=depth, color_extrinsic=color)
+    header = read_sens_header(sens.write(tmp_path / "a.sens"))
+    np.testing.assert_allclose(color @ header.depth_to_color, depth, atol=1e-6)
+
+
+@pytest.mark.parametrize("lost", [LOST, np.full((4, 4), np.inf), np.zeros((4, 4))])
+def test_a_lost_pose_is_none(tmp_path: Path, lost: np.ndarray) -> None:
+    sens = small()
+    sens.poses = [sens.poses[0], lost, *list(sens.poses)[2:]]
+    frames = list(read_depth_frames(sens.write(tmp_path / "a.sens")))
+    assert [frame.camera_to_world is None for frame in frames] == [False, True, False, False]
+
+
+def faulty_pose(value: np.ndarray) -> Sens:
+    sens = small()
+    sens.poses = [*list(sens.poses)[:3], value]
+    return sens
+
+
+NAN = np.eye(4)
+NAN[1, 3] = np.nan
+BAD_HEADERS = {
+    "version": (small(version=5), "version 4"),
+    "frames": (small(announced=10**12), "announces 1000000000000 frames"),
+    "one frame more": (small(announced=5, tail=b""), "cut off|announces"),
+    "no frame": (small(frames=0), "no frame"),
+    "name": (small(name_length=2**63), "name"),
+    "name beyond the file": (small(name_length=4000), "cut off"),
+    "occi": (small(compression=2), "occi_ushort"),
+    "unknown packing": (small(compression=7), "packed as 7"),
+    "size": (small(depth_size=(2**31, 2**31)), "damaged"),
+    "no size": (small(depth_size=(0, 12)), "damaged"),
+    "colour size": (small(color_size=(2**32 - 1, 2**32 - 1)), "damaged"),
+    "shift": (small(shift=0.0), "depth shift"),
+    "NaN shift": (small(shift=float("nan")), "depth shift"),
+    "no focal length": (small(depth_intrinsic=np.zeros((4, 4))), "calibration"),
+    "NaN camera": (small(depth_intrinsic=np.full((4, 4), np.nan)), "calibration"),
+    "scaled extrinsic": (small(depth_extrinsic=2 * np.eye(4)), "calibration"),
+    "mirrored extrinsic": (small(color_extrinsic=np.diag([1.0, 1, -1, 1])), "calibration"),
+    "NaN pose": (faulty_pose(NAN), "pose of frame 3"),
+    "scaled pose": (faulty_pose(np.diag([2.0, 2, 2, 1])), "pose of frame 3"),
+    "mirrored pose": (faulty_pose(np.diag([-1.0, 1, 1, 1])), "pose of frame 3"),
+    "too few raw bytes": (small(compression=0, depth_size=(17, 12)), "bytes of depth"),
+    "another size": (small(depth_size=(15, 12)), "does not unpack to 15×12"),
+}
+
+
+@pytest.mark.parametrize("fault", BAD_HEADERS)
+def test_a_bad_file_is_one_line(tmp_path: Path, fault: str) -> None:
+    sens, told = BAD_HEADERS[fault]
+    path = sens.write(tmp_path / "a.sens")
+    with pytest.raises(InputError, match=told) as caught:
+        list(read_depth_frames(path))
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_cut_file_yields_nothing(tmp_path: Path) -> None:
+    content = small(tail=b"").content()
+    path = tmp_path / "a.sens"
+    for size in range(0, len(content), 37):
+        path.write_bytes(content[:size])
+        with pytest.raises(InputError, match=r"cut off|can hold"):
+            next(read_depth_frames(path))
+
+
+def test_sizes_beyond_the_file_are_refused(tmp_path: Path) -> None:
+    content = bytearray(small(tail=b"").content())
+    begin = read_sens_header(small().write(tmp_path / "a.sens")).begin
+    for place in (begin + 80, begin + 88):
+        for size in (2**40, 2**63, 2**64 - 1):
+            bad = bytearray(content)
+            bad[place : place + 8] = struct.pack("<Q", size)
+            (tmp_path / "a.sens").write_bytes(bad)
+            with pytest.raises(InputError, match="cut off in frame 0 of 4"):
+                next(read_depth_frames(tmp_path / "a.sens"))
+
+
+def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
+    """200 MB of zeros packed to less than a depth image."""
+    size = (512, 512)
+    bomb = zlib.compress(bytes(200 * 2**20), 9)
+    sens = small(frames=1, depth_size=size, depth=[np.zeros(size, np.uint16)])
+    path = sens.write(tmp_path / "a.sens", [bomb])
+    tracemalloc.start()
+    with pytest.raises(InputError, match="does not unpack to 512×512"):
+        list(read_depth_frames(path))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 3 * 2**20
+
+
+@pytest.mark.parametrize(
+    "blob", [b"", b"not zlib", zlib.compress(bytes(383)), zlib.compress(bytes(384))[:-5]]
+)
+def test_damaged_depth_is_refused(tmp_path: Path, blob: bytes) -> None:
+    sens = small()
+    path = sens.write(tmp_path / "a.sens", [*sens.blobs()[:3], blob])
+    frames = read_depth_frames(path)
+    assert [next(frames).index for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(InputError, match="depth of frame 3"):
+        next(frames)
+
+
+def test_wrong_calls(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        read_sens_header(tmp_path / "none.sens")
+    with pytest.raises(InputError, match="at least 1"):
+        next(read_depth_frames(small().write(tmp_path / "a.sens"), every=0))
+
+
+def mutated(content: bytes, rng: np.random.Generator) -> bytes:
+    """Change some bytes, or cut, double or drop a part."""
+    bad = bytearray(content)
+    kind = rng.integers(4)
+    begin, end = sorted(rng.integers(0, len(bad), 2).tolist())
+    if kind == 0:
+        for place in rng.integers(0, len(bad), rng.integers(1, 8)):
+            bad[place] = rng.choice([0, 1, 127, 128, 255, rng.integers(256)])
+    elif kind == 1:
+        del bad[end:]
+    elif kind == 2:
+        del bad[begin:end]
+    else:
+        bad[begin:begin] = bad[begin:end]
+    return bytes(bad)
+
+
+def fuzz(path: Path, count: int) -> int:
+    content, refused = small().content(), 0
+    rng = np.random.default_rng(0)
+    for _ in range(count):
+        path.write_bytes(mutated(content, rng))
+        try:
+            for frame in read_depth_frames(path):
+                assert frame.steps.shape == SIZE[::-1]
+        except InputError as error:
+            refused += 1
+            assert "\n" not in str(error)
+    return refused
+
+
+def test_mutated_files_raise_nothing_else(tmp_path: Path) -> None:
+    assert fuzz(tmp_path / "a.sens", 300) > 100
+
+
+@pytest.mark.slow
+def test_many_mutated_files_raise_nothing_else(tmp_path: Path) -> None:
+    assert fuzz(tmp_path / "a.sens", 3000) > 1000

@@ -1,0 +1,250 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from qs3.errors import InputError
+from qs3.io.convert import convert, read_clouds
+from qs3.io.layouts import FORMATS, xyz_trees
+from qs3.io.layouts.contents import open_dataset, read_ragged
+from qs3.io.layouts.point_folders import write_folder
+from qs3.io.layouts.store import ROWS_PER_SHARD, write_store
+from qs3.io.ragged import RaggedClouds
+from qs3.io.whole import whole
+from qs3.meshes.classes import POINTDA10
+
+PLAIN = ("qs3", "ply", "pcd", "npy", "xyz", "specklenet10", "depthscannet10")
+# Layouts whose classes or sizes the clouds of this file do not have.
+_OTHER_CLASSES = ("graspnet", "scanobjectnn")
+EXACT = tuple(
+    name
+    for name, layout in FORMATS.items()
+    if layout.write is not None and not name.startswith(_OTHER_CLASSES)
+)
+
+
+@pytest.fixture
+def source(rng, tmp_path, formats):
+    """A tree of text files with all ten classes and both splits, 2,048 points a cloud."""
+    clouds = formats.make_clouds(rng, num_points=2048)
+    write_folder(tmp_path / "source", clouds, ".npy")
+    return tmp_path / "source"
+
+
+@pytest.mark.parametrize("to", PLAIN)
+def test_a_round_trip_keeps_points_labels_classes_and_splits(tmp_path, source, formats, to):
+    written = convert(source, tmp_path / "there", to)
+    assert len(written.ids) == 20
+    convert(tmp_path / "there", tmp_path / "back", "npy")
+    there, origin = read_clouds(tmp_path / "there", None, None, "points")
+    back, _ = read_clouds(tmp_path / "back", None, None, "points")
+    first, _ = read_clouds(source, None, None, "points")
+    assert origin == to
+    assert there.class_names == back.class_names == POINTDA10
+    assert formats.told(there) == formats.told(first)
+    assert formats.told(back) == formats.told(first)
+    # Names survive as well, whatever lies between.
+    assert sorted(back.ids) == sorted(first.ids)
+
+
+@pytest.mark.parametrize("to", EXACT)
+def test_whatever_is_written_reads_back_equal_when_its_layout_is_named(tmp_path, rng, formats, to):
+    clouds = formats.make_clouds(rng, num_points=2048)
+    write_folder(tmp_path / "source", clouds, ".npy")
+    convert(tmp_path / "source", tmp_path / "there", to)
+    there, _ = read_clouds(tmp_path / "there", to, None, "points")
+    assert formats.told(there) == formats.told(clouds)
+
+
+def test_equal_input_gives_equal_bytes(tmp_path, source):
+    for to in EXACT:
+        for run in ("a", "b"):
+            convert(source, tmp_path / run / to, to)
+    files = [path for path in sorted((tmp_path / "a").rglob("*")) if path.is_file()]
+    assert len(files) > 100
+    for path in files:
+        assert (tmp_path / "b" / path.relative_to(tmp_path / "a")).read_bytes() == path.read_bytes()
+
+
+def test_a_store_tells_where_it_comes_from(tmp_path, source):
+    convert(source, tmp_path / "store", "qs3", split="test")
+    manifest = open_dataset(tmp_path / "store")
+    first, _ = read_clouds(source, None, "test", "points")
+    assert manifest.settings == {"kind": "converted", "from": "npy", "checksum": first.checksum}
+    assert set(read_ragged(tmp_path / "store").splits) == {"test"}
+    with pytest.raises(InputError, match="has no 'clean' clouds"):
+        convert(tmp_path / "store", tmp_path / "no", "ply", cloud="clean")
+
+
+def test_a_store_of_several_shards_keeps_its_order(rng, tmp_path):
+    count = 2 * ROWS_PER_SHARD + 3
+    clouds = [np.full((2, 3), i, dtype=np.float32) for i in range(count)]
+    ids = tuple(f"row {i}" for i in range(count))
+    labels = np.arange(count) % 2
+    write_store(tmp_path / "a", RaggedClouds(clouds, ids, "", labels, ("bed", "sofa")))
+    assert len(list((tmp_path / "a").glob("shard-*.parquet"))) == 3
+    back = read_ragged(tmp_path / "a")
+    assert back.ids == ids
+    assert [int(cloud[0, 0]) for cloud in back.clouds] == list(range(count))
+    np.testing.assert_array_equal(back.labels, labels)
+
+
+def test_clouds_without_labels_go_into_folders_only(rng, tmp_path):
+    bare = RaggedClouds([np.ones((3, 3), np.float32)], ("x",), "")
+    write_folder(tmp_path / "flat", bare, ".ply")
+    assert convert(tmp_path / "flat", tmp_path / "b", "pcd").labels is None
+    assert [path.name for path in (tmp_path / "b").iterdir()] == ["x.pcd"]
+    for to in ("qs3", "specklenet10", "graspnetpc10-real-kinect"):
+        with pytest.raises(InputError, match=f"{to}: .*labels"):
+            convert(tmp_path / "flat", tmp_path / "c", to)
+    with pytest.raises(InputError, match="has no labels to map"):
+        convert(tmp_path / "flat", tmp_path / "c", "ply", classes=POINTDA10)
+    assert not (tmp_path / "c").exists()
+
+
+def test_classes_are_mapped_dropped_or_named(rng, tmp_path, formats):
+    clouds = formats.make_clouds(rng, ("desk", "night_stand", "toilet"), num_points=8)
+    write_folder(tmp_path / "a", clouds, ".npy")
+    with pytest.raises(InputError, match=r"class 'toilet' is none of.*--unmapped drop"):
+        convert(tmp_path / "a", tmp_path / "b", "npy", classes=POINTDA10)
+    assert not (tmp_path / "b").exists()
+    kept = convert(tmp_path / "a", tmp_path / "b", "npy", classes=POINTDA10, unmapped="drop")
+    assert kept.class_names == POINTDA10
+    assert sorted(path.name for path in (tmp_path / "b").iterdir()) == ["cabinet", "table"]
+    assert len(kept.ids) == len(kept.splits) == 4
+    named = convert(tmp_path / "a", tmp_path / "c", "qs3", classes=("toilet", "table", "cabinet"))
+    assert sorted(named.labels.tolist()) == [0, 0, 1, 1, 2, 2]
+    assert open_dataset(tmp_path / "c").class_names == ("toilet", "table", "cabinet")
+    with pytest.raises(InputError, match="no cloud is of any of sofa"):
+        convert(tmp_path / "a", tmp_path / "d", "npy", classes=("sofa",), unmapped="drop")
+    with pytest.raises(InputError, match="twice"):
+        convert(tmp_path / "a", tmp_path / "d", "npy", classes=("table", "table"))
+
+
+def test_one_number_of_points(rng, tmp_path):
+    (tmp_path / "a" / "bed").mkdir(parents=True)
+    for count in (5, 8, 30):
+        np.save(tmp_path / "a" / "bed" / f"{count}.npy", rng.random((count, 3)))
+    written = convert(tmp_path / "a", tmp_path / "b", "xyz", num_points=8)
+    assert [len(cloud) for cloud in written.clouds] == [8, 8, 8]
+    assert {len(np.loadtxt(path)) for path in (tmp_path / "b" / "bed").iterdir()} == {8}
+    with pytest.raises(InputError, match="--num-points 0"):
+        convert(tmp_path / "a", tmp_path / "c", "xyz", num_points=0)
+
+
+def test_coordinates_beyond_float32_are_refused(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, points=np.full((2, 4, 3), 1e200), name=np.array(["one", "two"]))
+    with pytest.raises(InputError, match="cloud 'one' is empty, or a point of it is not finite"):
+        convert(path, tmp_path / "b", "npy")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"to": "ply2"}, "'ply2' is no known layout.*did you mean ply"),
+        ({"to": "npz"}, "npz: is only read; written are qs3, "),
+        ({"to": "pointda10"}, "is only read; written are pointda10-npy, pointda10-h5$"),
+        ({"to": "ply", "origin": "nyp"}, "'nyp' is no known layout"),
+        ({"to": "ply", "cloud": "clean"}, "only a qs3 data set has 'clean' clouds"),
+        ({"to": "ply", "split": "dev"}, "no split 'dev'"),
+        ({"to": "ply", "origin": "graspnetpc10-real-kinect"}, "no cloud in"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line_and_leaves_nothing(tmp_path, source, options, message):
+    with pytest.raises(InputError, match=message) as caught:
+        convert(source, tmp_path / "out", **options)
+    assert "\n" not in str(caught.value)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["source"]
+
+
+def test_the_target_is_new_or_empty(tmp_path, source):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine.txt").write_text("keep")
+    (tmp_path / "file").write_text("keep")
+    for name in ("full", "file", "source"):
+        with pytest.raises(InputError, match=f"{name}: is there already"):
+            convert(source, tmp_path / name, "ply")
+    assert (tmp_path / "full" / "mine.txt").read_text() == "keep"
+    # Before anything is read, which can take minutes.
+    with pytest.raises(InputError, match="file: is there already"):
+        convert(tmp_path / "nowhere", tmp_path / "file", "ply")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "empty")
+    convert(source, tmp_path / "link", "ply")
+    assert len(list((tmp_path / "empty").iterdir())) == 10
+    convert(source, tmp_path / "new" / "deep", "ply")
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["deep"]
+
+
+def test_a_failure_half_way_leaves_nothing(tmp_path, source, monkeypatch):
+    written = []
+
+    def fail_late(*arguments):
+        written.append(arguments)
+        if len(written) == 13:
+            raise OSError(28, "No space left on device")
+        return b"1 2 3\n"
+
+    monkeypatch.setattr("qs3.io.layouts.point_folders.cloud_bytes", fail_late)
+    with pytest.raises(OSError, match="No space left"):
+        convert(source, tmp_path / "out", "xyz")
+    assert len(written) == 13
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["source"]
+
+
+def test_two_at_a_time_are_refused(tmp_path, source):
+    with (
+        whole(tmp_path / "out") as temporary,
+        pytest.raises(InputError, match="another qs3 is writing"),
+    ):
+        temporary.mkdir()
+        convert(source, tmp_path / "out", "ply")
+
+
+SLOW_CONVERT = """
+import sys, time
+from qs3.io import convert
+from qs3.io.layouts import point_folders
+write = point_folders.cloud_bytes
+def slowly(*arguments):
+    time.sleep(0.02)
+    return write(*arguments)
+point_folders.cloud_bytes = slowly
+convert.convert(sys.argv[1], sys.argv[2], "xyz")
+"""
+
+
+def test_a_killed_run_leaves_no_half_data_set_and_the_next_one_clears_up(tmp_path, source):
+    target, hidden = tmp_path / "out", tmp_path / ".out.unfinished"
+    process = subprocess.Popen([sys.executable, "-c", SLOW_CONVERT, str(source), str(target)])
+    deadline = time.monotonic() + 60
+    while len(list(hidden.rglob("*.xyz"))) < 3:
+        assert time.monotonic() < deadline
+        assert process.poll() is None
+        time.sleep(0.005)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not target.exists()
+    assert 3 <= len(list(hidden.rglob("*.xyz"))) < 20
+    convert(source, target, "xyz")
+    assert not hidden.exists()
+    assert len(list(target.rglob("*.xyz"))) == 20
+
+
+def test_every_layout_that_is_written_is_read_too():
+    for layout in FORMATS.values():
+        assert layout.read is not None, layout.name
+    assert {layout.name for layout in xyz_trees.FORMATS} <= set(FORMATS)
+
+
+def test_the_settings_of_a_store_are_plain_json(tmp_path, source):
+    convert(source, tmp_path / "store", "qs3")
+    told = json.loads((tmp_path / "store" / "dataset.json").read_text())
+    assert told["rows"] == 20
+    assert str(tmp_path) not in json.dumps(told)

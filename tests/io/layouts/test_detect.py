@@ -1,0 +1,116 @@
+import numpy as np
+import pytest
+
+from qs3.errors import InputError
+from qs3.io.detect import detect, format_named, require
+from qs3.io.layouts import FORMATS
+from qs3.io.load import load_clouds, load_unlabelled
+
+
+def touch(root, *names):
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).touch()
+    return root
+
+
+@pytest.mark.parametrize(
+    ("files", "name"),
+    [
+        (["chair/train/a.ply", "chair/test/b.ply", "readme.md"], "ply"),
+        (["chair/a.PLY"], "ply"),
+        (["a.pcd", "b.pcd", "labels.csv"], "pcd"),
+        (["train/chair/a.npy"], "npy"),
+        (["chair/a.xyz", ".hidden.ply"], "xyz"),
+        (["chair/a.xyz", "chair/a.ply"], "folder"),
+        (["chair/a.txt"], "folder"),
+        (["dataset.json", "shard-00000.parquet"], "qs3"),
+        (["raw_pc_multiview_point_at/bed/train/a.xyz"], "specklenet10"),
+        (["Scannet_single_obj_1012_new/bed/test/a.xyz"], "depthscannet10"),
+        (["train/Real/kinect/0/a.xyz"], "graspnetpc10-real-kinect"),
+        (["modelnet/bed/train/a.npy"], "pointda10"),
+        (["scannet/train_0.h5", "scannet/test_0.h5"], "pointda10"),
+        (["airplane/train/a.off", "airplane/test/b.off"], "modelnet-off"),
+        (["ply_data_train0.h5", "shape_names.txt", "train_files.txt"], "modelnet40-h5"),
+        (["training_objectdataset.h5", "test_objectdataset.h5"], "scanobjectnn"),
+    ],
+)
+def test_a_layout_is_known_by_names_alone(tmp_path, files, name):
+    # The files are empty: nothing in them is looked at.
+    assert detect(touch(tmp_path, *files)).name == name
+
+
+def test_an_archive_is_known_by_its_ending(tmp_path):
+    assert detect(touch(tmp_path, "a.npz") / "a.npz").name == "npz"
+
+
+def test_no_layout_lists_them_all(tmp_path):
+    with pytest.raises(InputError) as caught:
+        detect(touch(tmp_path, "letter.docx"))
+    assert "\n" not in str(caught.value)
+    for layout in FORMATS.values():
+        if layout.read is not None:
+            assert f"{layout.name}: {layout.layout}" in str(caught.value)
+
+
+def test_several_layouts_are_told_with_the_option_that_chooses(tmp_path):
+    touch(tmp_path, "train/Real/kinect/0/a.xyz", "train/Real/realsense/0/a.xyz")
+    with pytest.raises(InputError) as caught:
+        detect(tmp_path)
+    assert "--from graspnetpc10-real-kinect: " in str(caught.value)
+    assert "--from graspnetpc10-real-realsense: " in str(caught.value)
+    assert "synthetic" not in str(caught.value)
+
+
+def test_a_missing_path_tells_where_the_data_is_got(tmp_path):
+    with pytest.raises(InputError, match=r"nowhere: no such file or folder$"):
+        detect(tmp_path / "nowhere")
+    with pytest.raises(InputError, match=r"an empty folder; get it from https.*expected: raw_pc"):
+        require(tmp_path, "specklenet10")
+    with pytest.raises(InputError, match=r"no such file or folder; get it from https.*kinect"):
+        require(tmp_path / "nowhere", "graspnetpc10-real-kinect")
+    with pytest.raises(InputError, match=r"an empty folder$"):
+        require(tmp_path, "ply")
+
+
+def test_an_unknown_name_lists_all_and_the_nearest():
+    with pytest.raises(
+        InputError, match=r"'speclenet10' is no known layout.*mean specklenet10"
+    ) as e:
+        format_named("speclenet10")
+    assert all(name in str(e.value) for name in FORMATS)
+    assert format_named("ply").name == "ply"
+
+
+def test_every_layout_tells_what_it_is():
+    for name, layout in FORMATS.items():
+        assert layout.name == name
+        assert layout.layout
+        assert "\n" not in layout.layout
+        assert layout.read is not None or layout.write is not None
+
+
+def test_detection_survives_whatever_it_is_shown(tmp_path):
+    touch(tmp_path, "file", "folder/x")
+    (tmp_path / "loop").symlink_to(tmp_path)
+    (tmp_path / "dangling").symlink_to(tmp_path / "gone")
+    for layout in FORMATS.values():
+        for name in ("file", "folder", "loop", "dangling", "gone", ""):
+            assert layout.detect(tmp_path / name) in (True, False)
+
+
+def test_training_data_loads_from_any_layout_without_labels_leaking(rng, tmp_path):
+    root = tmp_path / "Scannet_single_obj_1012_new"
+    for name in ("night_stand", "chair"):
+        (root / name / "train").mkdir(parents=True)
+        np.savetxt(root / name / "train" / f"{name}_1.xyz", rng.random((6, 3)))
+    assert load_clouds(tmp_path, num_points=6).labels.tolist() == [4, 3]
+    bare = load_unlabelled(tmp_path, split="train", num_points=6)
+    assert bare.ids == ("000000", "000001")
+    assert not hasattr(bare, "labels")
+    assert "chair" not in repr(bare)
+
+
+def test_only_our_own_data_has_clean_clouds(tmp_path):
+    with pytest.raises(InputError, match="'clean' clouds"):
+        load_clouds(touch(tmp_path, "chair/a.ply"), cloud="clean")

@@ -1,0 +1,435 @@
+import dataclasses
+
+import h5py
+import numpy as np
+import pytest
+
+from qs3.errors import InputError
+from qs3.io.convert import convert
+from qs3.io.detect import detect
+from qs3.io.layouts import FORMATS, pointda10
+from qs3.io.layouts.pointda10 import (
+    read_pointda10,
+    validation_rows,
+    write_h5,
+    write_npy,
+)
+from qs3.io.load import load_clouds
+from qs3.io.transforms import unit_ball
+from qs3.meshes.classes import POINTDA10
+
+BY_NAME = {layout.name: layout for layout in pointda10.FORMATS}
+
+
+def standing(rng, count=2048):
+    """A lamp that stands upright, z up: wide foot below, shade on an arm along +x, cord to +y."""
+    foot = np.c_[rng.normal(0, 0.3, (count // 2, 2)), rng.uniform(0, 0.1, count // 2)]
+    arm = np.c_[rng.uniform(0, 0.8, count // 4), np.zeros(count // 4), np.full(count // 4, 2.0)]
+    rest = count - len(foot) - len(arm)
+    cord = np.c_[np.zeros(rest), rng.uniform(0, 1.5, rest), np.full(rest, 0.5)]
+    # Loaders of the first protocol take the first half, which must tell the axes too.
+    return rng.permutation(np.concatenate([foot, arm, cord]))
+
+
+def parts_of(cloud):
+    """Where foot, arm and cord of a lamp lie, whatever its size: the arm is what is highest."""
+    low, high = cloud[:, 2].min(), cloud[:, 2].max()
+    height = (cloud[:, 2] - low) / (high - low)
+    assert (height < 0.1).mean() > 0.4, "the foot is not below"
+    return cloud[height < 0.1].mean(0), cloud[height > 0.9].mean(0), cloud[abs(height - 0.25) < 0.1]
+
+
+def release(root, rng, classes=("chair", "plant"), splits=("train", "test")):
+    """PointDA-10 as it is released; every object is the same lamp that stands upright."""
+    lamp = standing(rng)
+    x, y, z = lamp.T
+    y_up = np.stack([x, z, -y], axis=1)  # ShapeNet: the lamp turned, seen along −z from the front
+    swapped = np.stack([x, z, y], axis=1)  # ScanNet: the axes of a z-up scene written (x, z, y)
+    for name in classes:
+        for part in splits:
+            for domain, cloud in (
+                ("modelnet", lamp),
+                ("shapenet", (lamp if name == "plant" else y_up)[:1024]),
+            ):
+                folder = root / domain / name / part
+                folder.mkdir(parents=True)
+                np.save(folder / f"{name}_0001.npy", cloud)
+    (root / "scannet").mkdir()
+    labels = [POINTDA10.index(name) for name in classes]
+    colour = rng.uniform(-0.5, 0.5, (len(classes), 2048, 3))
+    data = np.concatenate([np.stack([swapped] * len(classes)), colour], axis=2)
+    for part in splits:
+        with h5py.File(root / "scannet" / f"{part}_0.h5", "w") as file:
+            file["data"], file["label"] = data, np.array(labels, dtype=np.int32)
+        (root / "scannet" / f"{part}_files.txt").write_text(f"./{part}_0.h5\n")
+    return lamp
+
+
+@pytest.mark.parametrize("domain", ["modelnet", "shapenet", "scannet"])
+def test_convention_every_domain_stands_upright_and_only_scannet_is_mirrored(tmp_path, rng, domain):
+    lamp = release(tmp_path, rng)
+    clouds = read_pointda10(tmp_path / domain)
+    assert [POINTDA10[i] for i in clouds.labels] in (
+        ["chair", "chair", "plant", "plant"],
+        ["chair", "plant"] * 2,
+    )
+    mirrored = domain == "scannet"
+    expected = lamp * [1, -1, 1] if mirrored else lamp
+    expected = unit_ball(expected[None, : 1024 if domain == "shapenet" else None])[0]
+    for cloud in clouds.clouds:
+        foot, arm, cord = parts_of(cloud)
+        assert arm[0] > foot[0] + 0.1
+        assert np.sign(cord[:, 1].mean() - foot[1]) == (-1 if mirrored else 1)
+        np.testing.assert_allclose(cloud, expected, atol=1e-6)
+
+
+def published_alignment(cloud, turn):
+    """The published rule in its own words: mean, farthest norm, rows times a matrix of −90°."""
+    cloud = cloud - cloud.mean(axis=0)
+    cloud = cloud / np.sqrt((cloud**2).sum(axis=1)).max()
+    c, s = np.cos(-np.pi / 2), np.sin(-np.pi / 2)
+    return cloud @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) if turn else cloud
+
+
+def test_the_aligned_protocol_is_the_published_rule_with_its_plant_exception(tmp_path, rng):
+    classes = ("bathtub", "plant", "table")
+    for name in classes:
+        for domain in ("modelnet", "shapenet"):
+            (tmp_path / domain / name / "train").mkdir(parents=True)
+    stored = rng.normal(size=(3, 3, 512, 3)) * [1, 2, 3] + 5
+    for row, name in enumerate(classes):
+        np.save(tmp_path / "modelnet" / name / "train" / "a.npy", stored[0, row])
+        np.save(tmp_path / "shapenet" / name / "train" / "a.npy", stored[1, row])
+    (tmp_path / "scannet").mkdir()
+    with h5py.File(tmp_path / "scannet" / "train_0.h5", "w") as file:
+        file["data"] = np.concatenate([stored[2], np.zeros_like(stored[2])], axis=2)
+        file["label"] = [POINTDA10.index(name) for name in classes]
+    for index, domain in enumerate(("modelnet", "shapenet", "scannet")):
+        clouds = read_pointda10(tmp_path / domain, "train").clouds
+        for row, name in enumerate(classes):
+            turn = domain == "scannet" or (domain == "shapenet" and name != "plant")
+            expected = published_alignment(stored[index, row], turn)
+            np.testing.assert_allclose(clouds[row], expected, atol=1e-6)
+            # The other sign, and the other choice about plants, would be far off.
+            assert abs(clouds[row] - expected * [1, -1, -1]).max() > 0.3
+            other = published_alignment(stored[index, row], not turn)
+            assert abs(clouds[row] - other).max() > 0.3
+
+
+def test_the_original_protocol_takes_the_first_points_and_turns_nothing(tmp_path, rng):
+    lamp = release(tmp_path, rng)
+    short = tmp_path / "shapenet" / "chair" / "train" / "chair_0001.npy"
+    np.save(short, np.load(short)[:1000])
+    for domain in ("modelnet", "shapenet", "scannet"):
+        clouds = read_pointda10(tmp_path / domain, protocol="original")
+        raw = read_pointda10(tmp_path / domain, protocol="raw")
+        for cloud, stored, label in zip(clouds.clouds, raw.clouds, raw.labels, strict=True):
+            first = stored[:1024].astype(np.float64)
+            expected = published_alignment(first, turn=False)
+            assert cloud.shape == (1024, 3)
+            np.testing.assert_allclose(cloud[: len(first)], expected, atol=1e-6)
+            assert not cloud[len(first) :].any()
+            plain = domain == "modelnet" or (domain == "shapenet" and POINTDA10[label] == "plant")
+            if plain:
+                np.testing.assert_allclose(stored, lamp[: len(stored)].astype(np.float32))
+    assert any(len(c) == 1000 for c in read_pointda10(tmp_path / "shapenet", None, "raw").clouds)
+
+
+def test_raw_is_what_is_stored_and_protocols_have_their_own_checksums(tmp_path, rng):
+    release(tmp_path, rng)
+    raw = read_pointda10(tmp_path / "scannet", "test", "raw")
+    with h5py.File(tmp_path / "scannet" / "test_0.h5") as file:
+        np.testing.assert_array_equal(raw.clouds, file["data"][..., :3].astype(np.float32))
+    sums = [read_pointda10(tmp_path / "scannet", "test", p).checksum for p in ("raw", "aligned")]
+    assert len({*sums, raw.checksum}) == 2
+
+
+def test_the_root_asks_for_one_domain(tmp_path, rng):
+    root = tmp_path / "PointDA_data"
+    release(root, rng)
+    for layout in BY_NAME.values():
+        with pytest.raises(InputError, match=r"name one: .*/modelnet, .*/shapenet, .*/scannet"):
+            layout.read(root, None)
+    assert detect(root) is BY_NAME["pointda10"]
+    for domain in ("modelnet", "shapenet", "scannet"):
+        assert detect(root / domain) is BY_NAME["pointda10"]
+        assert len(load_clouds(root / domain, split="test").ids) == 2
+    # Under another name an npy tree does not tell its up axis.
+    (root / "shapenet").rename(root / "other")
+    assert detect(root / "other").name == "npy"
+    with pytest.raises(InputError, match=r"no domain of PointDA-10; name a folder called modelnet"):
+        read_pointda10(root / "other")
+    told = read_pointda10(root / "other", domain="shapenet")
+    (root / "shapenet").symlink_to(root / "other")
+    linked = read_pointda10(root / "shapenet")
+    np.testing.assert_array_equal(told.clouds, linked.clouds)
+    with pytest.raises(InputError, match="no such folder"):
+        read_pointda10(root / "nowhere")
+
+
+def test_validation_rows_are_the_fields(tmp_path, rng):
+    for name in ("table", "bathtub"):
+        for part, count in (("train", 13), ("test", 4)):
+            folder = tmp_path / "modelnet" / name / part
+            folder.mkdir(parents=True)
+            for number in rng.permutation(count):
+                np.save(folder / f"{name}_{number:04d}.npy", rng.random((4, 3)))
+    clouds = read_pointda10(tmp_path / "modelnet", "train")
+    files = sorted(str(path) for path in tmp_path.glob("modelnet/*/train/*.npy"))
+    assert [str(tmp_path / "modelnet" / name) for name in clouds.ids] == files
+    kept = [i for i in range(len(files)) if i % 10 < 8]
+    np.testing.assert_array_equal(np.flatnonzero(~validation_rows(len(files))), kept)
+    for count in (0, 1, 8, 9, 10, 6110):
+        mask = validation_rows(count)
+        assert mask.dtype == bool
+        assert mask.sum() == sum(i % 10 in (8, 9) for i in range(count))
+
+
+def load_npy_as_published(root, part):
+    """Folders sorted give the label; a cloud a file. Nothing of ours is used."""
+    classes = sorted(path.name for path in root.iterdir())
+    clouds, labels = [], []
+    for label, name in enumerate(classes):
+        for path in sorted((root / name / part).glob("*.npy")):
+            clouds.append(np.load(path)[:, :3])
+            labels.append(label)
+    return clouds, labels
+
+
+def load_h5_as_published(root, part):
+    """Files by their list, ``data`` and ``label`` one after another, as the first loader does."""
+    names = (root / f"{part}_files.txt").read_text().splitlines()
+    data, label = [], []
+    for name in names:
+        with h5py.File(root / name.rstrip().split("/")[-1], "r") as file:
+            data.append(file["data"][:])
+            label.append(file["label"][:])
+    return np.concatenate(data), np.concatenate(label)
+
+
+@pytest.fixture
+def given(rng, formats):
+    """Clouds of all classes and both splits, with their own order of classes."""
+    classes = (*reversed(POINTDA10[1:]), "tub")
+    return formats.make_clouds(rng, classes, num_points=16, per_part=2)
+
+
+def names_and_points(clouds, labels):
+    """Clouds with their classes in PointDA-10's words, in an order of their own."""
+    points = [np.asarray(cloud, dtype="<f4").tobytes() for cloud in clouds]
+    return sorted(zip([POINTDA10[label] for label in labels], points, strict=True))
+
+
+def test_a_loader_from_the_published_description_reads_what_is_written(tmp_path, given):
+    write_npy(tmp_path / "a", given)
+    write_h5(tmp_path / "b", given)
+    names = ["bathtub" if name == "tub" else name for name in given.class_names]
+    labels = [POINTDA10.index(names[label]) for label in given.labels]
+    for part in ("train", "test"):
+        own = [row for row, split in enumerate(given.splits) if split == part]
+        expected = names_and_points([given.clouds[i] for i in own], [labels[i] for i in own])
+        clouds, found = load_npy_as_published(tmp_path / "a" / "modelnet", part)
+        assert names_and_points(clouds, found) == expected
+        data, found = load_h5_as_published(tmp_path / "b" / "scannet", part)
+        assert data.dtype == np.float32
+        assert data.shape == (len(own), 16, 6)
+        assert not data[..., 3:].any()
+        # y up in the file: x y z there is x, z, −y here.
+        back = np.stack([data[..., 0], -data[..., 2], data[..., 1]], axis=-1)
+        assert names_and_points(back, found) == expected
+        # What the field's loader would train on.
+        for i, cloud in zip(own, data, strict=True):
+            if abs(given.clouds[i]).max() < 1e30:
+                expected_cloud = published_alignment(given.clouds[i].astype(float), turn=False)
+                turned = published_alignment(cloud[:, :3].astype(float), turn=True)
+                np.testing.assert_allclose(turned, expected_cloud, atol=1e-6)
+    assert (tmp_path / "b" / "scannet" / "train_files.txt").read_text() == "./train_0.h5\n"
+
+
+@pytest.mark.parametrize("name", ["pointda10-npy", "pointda10-h5"])
+def test_a_round_trip_is_equal_and_aligned_gives_unit_balls(tmp_path, given, formats, name):
+    layout = BY_NAME[name]
+    layout.write(tmp_path / "a", given)
+    back = layout.read(tmp_path / "a", None)
+    assert back.class_names == POINTDA10
+    tub = dataclasses.replace(
+        given, class_names=tuple(n.replace("tub", "bathtub") for n in given.class_names)
+    )
+    assert formats.told(back) == formats.told(tub)
+    assert len(set(back.ids)) == 40
+    test = layout.read(tmp_path / "a", "test")
+    assert set(test.splits) == {"test"}
+    aligned = BY_NAME["pointda10"].read(tmp_path / "a", None)
+    balls = dataclasses.replace(tub, clouds=[unit_ball(c[None])[0] for c in given.clouds])
+    assert formats.told(aligned) == formats.told(balls)
+
+
+def test_other_sizes_become_2048(tmp_path, rng):
+    from qs3.io.ragged import RaggedClouds
+
+    clouds = [rng.random((count, 3)).astype(np.float32) for count in (5, 2048, 2100)]
+    given = RaggedClouds(
+        clouds, ("a", "b", "c"), "", np.zeros(3, int), ("bed",), ("train", "train", "train")
+    )
+    for name in ("pointda10-npy", "pointda10-h5"):
+        BY_NAME[name].write(tmp_path / name, given)
+        back = BY_NAME[name].read(tmp_path / name, None)
+        assert [len(cloud) for cloud in back.clouds] == [2048] * 3
+        np.testing.assert_array_equal(back.clouds[1], clouds[1])
+        np.testing.assert_array_equal(back.clouds[0], np.tile(clouds[0], (410, 1))[:2048])
+
+
+def test_a_file_holds_2048_clouds(tmp_path, rng):
+    from qs3.io.ragged import RaggedClouds
+
+    count = 4097
+    given = RaggedClouds(
+        list(rng.random((count, 2, 3)).astype(np.float32)),
+        tuple(str(i) for i in range(count)),
+        "",
+        np.arange(count) % 10,
+        POINTDA10,
+        ("train",) * count,
+    )
+    write_h5(tmp_path / "a", given)
+    found = {}
+    for path in sorted((tmp_path / "a" / "scannet").iterdir()):
+        if path.suffix == ".h5":
+            with h5py.File(path) as file:
+                found[path.name] = len(file["label"])
+    assert found == {"train_0.h5": 2048, "train_1.h5": 2048, "train_2.h5": 1}
+    back = BY_NAME["pointda10-h5"].read(tmp_path / "a", None)
+    np.testing.assert_array_equal(back.clouds, given.clouds)
+    np.testing.assert_array_equal(back.labels, given.labels)
+
+
+def test_equal_clouds_give_equal_bytes(tmp_path, given):
+    for write in (write_npy, write_h5):
+        for run in ("a", "b"):
+            write(tmp_path / run / write.__name__, given)
+    files = [path for path in sorted((tmp_path / "a").rglob("*")) if path.is_file()]
+    assert len(files) == 44
+    for path in files:
+        assert (tmp_path / "b" / path.relative_to(tmp_path / "a")).read_bytes() == path.read_bytes()
+
+
+def test_what_the_layout_cannot_hold_is_refused(tmp_path, given):
+    bad = {
+        "needs labels": dataclasses.replace(given, labels=None),
+        "needs train or test": dataclasses.replace(given, splits=()),
+        "class 'toilet' is none of": dataclasses.replace(
+            given, class_names=(*POINTDA10[:9], "toilet")
+        ),
+    }
+    for write in (write_npy, write_h5):
+        for message, wrong in bad.items():
+            with pytest.raises(InputError, match=message):
+                write(tmp_path / "set", wrong)
+        assert not (tmp_path / "set").exists()
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine").touch()
+    for write in (write_npy, write_h5):
+        with pytest.raises(InputError, match="is there already"):
+            write(tmp_path / "full", given)
+    assert [path.name for path in (tmp_path / "full").iterdir()] == ["mine"]
+
+
+def test_convert_goes_through_every_layout(tmp_path, given, formats):
+    convert(write_source(tmp_path / "npy", given), tmp_path / "h5", "pointda10-h5")
+    convert(tmp_path / "h5", tmp_path / "back", "npy", origin="pointda10-h5", classes=POINTDA10)
+    convert(tmp_path / "h5", tmp_path / "scannet", "pointda10-h5", origin="pointda10-h5")
+    assert (tmp_path / "scannet" / "train_0.h5").is_file()
+    first = BY_NAME["pointda10-h5"].read(tmp_path / "h5", None)
+    for path, name in ((tmp_path / "back", "npy"), (tmp_path / "scannet", "pointda10-h5")):
+        again = FORMATS[name].read(path, None)
+        assert formats.told(again) == formats.told(first)
+    with pytest.raises(InputError, match="only read"):
+        convert(tmp_path / "h5", tmp_path / "no", "pointda10")
+
+
+def write_source(path, clouds):
+    from qs3.io.layouts.point_folders import write_folder
+
+    write_folder(path, clouds, ".npy")
+    return path
+
+
+def bad_class(root):
+    (root / "modelnet" / "chair").rename(root / "modelnet" / "toilet")
+
+
+def outside(root):
+    np.save(root / "modelnet" / "chair" / "loose.npy", np.ones((4, 3)))
+
+
+def pickled(root):
+    path = root / "modelnet" / "chair" / "train" / "chair_0001.npy"
+    np.save(path, np.array([{"a": 1}], dtype=object), allow_pickle=True)
+
+
+def announced(root):
+    path = root / "modelnet" / "chair" / "train" / "chair_0001.npy"
+    path.write_bytes(path.read_bytes().replace(b"(2048, 3)", b"(9999999999, 3)"))
+
+
+def cut(root):
+    path = root / "modelnet" / "chair" / "train" / "chair_0001.npy"
+    path.write_bytes(path.read_bytes()[:-5])
+
+
+def not_finite(root):
+    np.save(root / "modelnet" / "chair" / "test" / "chair_0001.npy", np.full((4, 3), np.nan))
+
+
+def two_columns(root):
+    np.save(root / "modelnet" / "chair" / "test" / "chair_0001.npy", np.ones((4, 2)))
+
+
+def no_clouds(root):
+    for path in (root / "modelnet").rglob("*.npy"):
+        path.unlink()
+
+
+def eleventh_label(root):
+    with h5py.File(root / "scannet" / "train_0.h5", "a") as file:
+        file["label"][0] = 10
+
+
+def few_columns(root):
+    with h5py.File(root / "scannet" / "train_0.h5", "a") as file:
+        del file["data"]
+        file["data"] = np.ones((2, 2048, 5))
+
+
+def cut_h5(root):
+    path = root / "scannet" / "test_0.h5"
+    path.write_bytes(path.read_bytes()[:3000])
+
+
+def list_outside(root):
+    (root / "scannet" / "train_files.txt").write_text("../../other/train_0.h5\n")
+
+
+@pytest.mark.parametrize(
+    ("damage", "domain", "message"),
+    [
+        (bad_class, "modelnet", r"modelnet: class 'toilet' is none of"),
+        (outside, "modelnet", r"loose\.npy: lies outside <class>/<train\|test>"),
+        (pickled, "modelnet", r"chair_0001\.npy: .*pickled"),
+        (announced, "modelnet", r"chair_0001\.npy: cannot be read as npy"),
+        (cut, "modelnet", r"chair_0001\.npy: cannot be read as npy \(announces"),
+        (not_finite, "modelnet", r"chair_0001\.npy: a point is not finite"),
+        (two_columns, "modelnet", r"chair_0001\.npy: needs numbers of shape"),
+        (no_clouds, "modelnet", r"modelnet: no cloud found"),
+        (eleventh_label, "scannet", r"train_0\.h5: label 10 is none of 0 to 9"),
+        (few_columns, "scannet", r"train_0\.h5: data must be floats of shape \[b n 3 or 6\]"),
+        (cut_h5, "scannet", r"test_0\.h5: cannot be read as HDF5 \(.*truncated"),
+        (list_outside, "scannet", r"train_files\.txt: .* is no \.h5 file of its folder"),
+    ],
+)
+def test_hostile_trees_are_refused_in_one_line(tmp_path, rng, damage, domain, message):
+    release(tmp_path, rng)
+    damage(tmp_path)
+    with pytest.raises(InputError, match=message) as caught:
+        read_pointda10(tmp_path / domain)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,209 @@
+import numpy as np
+import pytest
+
+from qs3.errors import InputError
+from qs3.io.clouds import PointClouds, UnlabelledClouds, digests
+from qs3.io.load import load_clouds, load_unlabelled
+from qs3.meshes.classes import POINTDA10
+from qs3.store.generate import GenerateSettings, generate
+
+
+@pytest.fixture
+def folder(tmp_path, rng):
+    """Two classes under aliases, both splits, clouds of different sizes."""
+    for name, part, count in [
+        ("Night Stand", "train", 20),
+        ("Night Stand", "test", 30),
+        ("desk", "train", 40),
+        ("desk", "test", 64),
+    ]:
+        place = tmp_path / "set" / name / part
+        place.mkdir(parents=True)
+        np.save(place / "a.npy", rng.random((count, 3)))
+        (place / ".hidden.npy").write_bytes(b"")
+        (place / "notes.md").write_text("not a cloud")
+    return tmp_path / "set"
+
+
+def write_npz(path, rng, **changes):
+    arrays = {
+        "points": rng.random((90, 3)).astype(np.float32),
+        "offset": np.array([0, 20, 50, 90]),
+        "label": np.array([1, 0, 1], dtype=np.uint8),
+        "class_names": np.array(["dresser", "bed"]),
+        "is_train": np.array([True, False, True]),
+    } | changes
+    np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
+    return path
+
+
+def test_a_class_folder_maps_onto_the_ten_classes(folder):
+    clouds = load_clouds(folder, split="test", num_points=32)
+    assert isinstance(clouds, PointClouds)
+    assert clouds.points.shape == (2, 32, 3)
+    assert clouds.class_names == POINTDA10
+    assert [POINTDA10[i] for i in clouds.labels] == ["cabinet", "table"]
+    assert clouds.ids == ("Night Stand/test/a.npy", "desk/test/a.npy")
+    assert len(load_clouds(folder, num_points=32)) == 4
+
+
+def test_a_class_folder_without_splits(folder, rng, tmp_path):
+    root = tmp_path / "plain"
+    (root / "sofa").mkdir(parents=True)
+    np.save(root / "sofa" / "b.npy", rng.random((8, 3)))
+    assert load_clouds(root, num_points=8).labels.tolist() == [POINTDA10.index("sofa")]
+    with pytest.raises(InputError, match="no split 'train', only clouds without one"):
+        load_clouds(root, split="train")
+
+
+def test_other_class_names_are_kept_where_they_do_not_all_map(folder, rng):
+    (folder / "toilet").mkdir()
+    np.save(folder / "toilet" / "a.npy", rng.random((8, 3)))
+    clouds = load_clouds(folder, num_points=8)
+    assert clouds.class_names == ("Night Stand", "desk", "toilet")
+    with pytest.raises(InputError, match=r"set: class 'toilet' is none of"):
+        load_clouds(folder, class_names=POINTDA10)
+    named = load_clouds(folder, class_names=["toilet", "table", "cabinet"], num_points=8)
+    assert named.labels.tolist() == [2, 2, 1, 1, 0]
+
+
+def test_labels_are_left_behind_and_never_needed(folder, rng, tmp_path):
+    bare = load_unlabelled(folder, num_points=16)
+    assert isinstance(bare, UnlabelledClouds)
+    labelled = load_clouds(folder, num_points=16).points
+    assert sorted(digests(bare.points)) == sorted(digests(labelled))
+    # The order of the files, which follows the classes, stays behind too.
+    (folder / "Night Stand").rename(folder / "zzz")
+    np.testing.assert_array_equal(load_unlabelled(folder, num_points=16).points, bare.points)
+    flat = tmp_path / "flat"
+    flat.mkdir()
+    for name in ("b.xyz", "a.xyz"):
+        np.savetxt(flat / name, rng.random((9, 3)))
+    # Not even names go along: they often tell the class.
+    assert load_unlabelled(flat, num_points=9).ids == ("000000", "000001")
+    with pytest.raises(InputError, match="has no labels"):
+        load_clouds(flat)
+    path = write_npz(tmp_path / "a.npz", rng, label=None, class_names=None)
+    assert load_unlabelled(path, num_points=8).points.shape == (3, 8, 3)
+
+
+def test_the_checksum_follows_names_and_bytes(folder):
+    before = load_clouds(folder, num_points=8).checksum
+    assert load_unlabelled(folder, num_points=16).checksum == before
+    assert load_clouds(folder, split="test", num_points=8).checksum != before
+    path = folder / "desk" / "test" / "a.npy"
+    path.write_bytes(path.read_bytes()[:-1] + b"\x01")
+    assert load_clouds(folder, num_points=8).checksum != before
+
+
+def test_folders_that_cannot_be_understood(folder, rng, tmp_path):
+    with pytest.raises(InputError, match="clouds have 20 to 64 points"):
+        load_clouds(folder, num_points=None)
+    np.save(folder / "stray.npy", rng.random((4, 3)))
+    with pytest.raises(InputError, match=r"beside them \(stray\.npy\)"):
+        load_clouds(folder)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="no cloud found"):
+        load_clouds(tmp_path / "empty")
+    with pytest.raises(InputError, match="no such file or folder"):
+        load_clouds(tmp_path / "nowhere")
+    (tmp_path / "a.csv").write_text("1")
+    with pytest.raises(InputError, match="neither a folder nor an npz"):
+        load_clouds(tmp_path / "a.csv")
+    with pytest.raises(InputError, match="'clean' clouds"):
+        load_clouds(tmp_path / "empty", cloud="clean")
+
+
+def test_a_bad_file_in_a_folder_is_named(folder):
+    (folder / "desk" / "train" / "bad.xyz").write_text("1 2 nan\n")
+    with pytest.raises(InputError, match=r"desk/train/bad\.xyz: a point is not finite"):
+        load_unlabelled(folder)
+
+
+def test_an_archive_of_clouds_of_different_sizes(rng, tmp_path):
+    path = write_npz(tmp_path / "a.npz", rng)
+    clouds = load_clouds(path, num_points=25)
+    assert clouds.points.shape == (3, 25, 3)
+    assert [POINTDA10[i] for i in clouds.labels] == ["bed", "cabinet", "bed"]
+    assert load_clouds(path, split="test", num_points=8).ids == ("a/00001",)
+    with np.load(path) as archive:
+        np.testing.assert_array_equal(clouds.points[0][:20], archive["points"][:20])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"points": None}, "no array called points"),
+        ({"points": np.zeros((90, 2))}, "2 columns"),
+        ({"points": np.full((90, 3), np.inf)}, "not finite"),
+        ({"points": np.zeros((90, 3), dtype=int)}, "points must be numbers"),
+        ({"offset": np.array([0, 20, 20, 90])}, "offset does not cut"),
+        ({"offset": np.array([0, 20, 50, 80])}, "offset does not cut"),
+        ({"offset": None}, r"shape \[90, 3\]"),
+        ({"label": np.array([0, 1])}, "label has shape"),
+        ({"label": np.array([0, 1, 2])}, "not one of 0 to 1"),
+        ({"class_names": None}, "needs class_names"),
+        ({"class_names": np.array(["bed", None], dtype=object)}, "plain arrays"),
+    ],
+)
+def test_a_bad_archive_is_named(rng, tmp_path, changes, message):
+    path = write_npz(tmp_path / "a.npz", rng, **changes)
+    with pytest.raises(InputError, match=message) as caught:
+        load_clouds(path)
+    assert "a.npz" in str(caught.value)
+
+
+def test_an_archive_that_is_none(rng, tmp_path):
+    path = tmp_path / "a.npz"
+    path.write_bytes(b"no archive")
+    with pytest.raises(InputError, match="not a NumPy archive"):
+        load_clouds(path)
+    with path.open("wb") as handle:
+        np.save(handle, rng.random((2, 8, 3)))
+    with pytest.raises(InputError, match="not a NumPy archive"):
+        load_clouds(path)
+    whole = write_npz(tmp_path / "b.npz", rng).read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="not a NumPy archive"):
+        load_clouds(path)
+    with pytest.raises(InputError, match="no split 'dev'"):
+        load_clouds(tmp_path / "b.npz", split="dev")
+
+
+def test_a_generated_data_set(fake, tmp_path):
+    settings = GenerateSettings(num_points=16, rows_per_shard=2)
+    work = [fake.FakeItem("a", "chair", "train"), fake.FakeItem("b", "sofa", "test")]
+    generate(work, tmp_path, settings, scan_one=fake.fake_row, progress=False)
+    clouds = load_clouds(tmp_path, split="test", num_points=None, cloud="clean")
+    assert clouds.ids == ("b#0",)
+    assert clouds.labels.tolist() == [POINTDA10.index("sofa")]
+    assert load_unlabelled(tmp_path, num_points=4).points.shape == (2, 4, 3)
+
+
+@pytest.mark.data
+def test_the_real_depth_camera_objects(shared_data):
+    clouds = load_clouds(shared_data / "sunrgbd_objects.npz", num_points=128)
+    counts = {name: int((clouds.labels == i).sum()) for i, name in enumerate(clouds.class_names)}
+    assert {name: n for name, n in counts.items() if n} == {
+        "bed": 10,
+        "cabinet": 9,
+        "chair": 10,
+        "table": 3,
+    }
+
+
+@pytest.mark.data
+def test_modelnet10_keeps_its_own_classes(shared_data):
+    path = shared_data / "modelnet10_1024.npz"
+    test = load_clouds(path, split="test")
+    assert test.points.shape == (908, 1024, 3)
+    assert "toilet" in test.class_names
+    assert test.ids[0].startswith("bathtub_")
+    assert len(load_unlabelled(path, split="train")) == 3991
+
+
+@pytest.mark.data
+def test_the_artists_meshes_read_as_surface_samples(shared_data):
+    clouds = load_clouds(shared_data / "cad", num_points=64)
+    assert len(clouds) == 147
+    assert np.bincount(clouds.labels).tolist() == [1, 10, 10, 20, 40, 8, 4, 7, 15, 32]

@@ -1,0 +1,185 @@
+import io
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from qs3.errors import InputError
+from qs3.io.pcd import lzf_decompress
+from qs3.io.point_files import read_cloud
+
+POINTS = np.array([[0.5, -1.25, 3.0], [1e-3, 2.0, -7.5], [0.0, 0.0, 0.25]], dtype=np.float32)
+NORMALS = np.array([[0, 0, 1], [0, 1, 0], [1, 0, 0]], dtype=np.float32)
+
+
+def npy(array: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array)
+    return buffer.getvalue()
+
+
+def text(separator: str) -> bytes:
+    rows = np.hstack([POINTS, NORMALS])
+    lines = [separator.join(str(value) for value in row) for row in rows]
+    return ("# x y z nx ny nz\n" + "\n".join(lines) + "\n\n").encode()
+
+
+def ply(encoding: str) -> bytes:
+    return trimesh.PointCloud(POINTS).export(file_type="ply", encoding=encoding)
+
+
+def pcd_header(data: str, count: int = 3) -> bytes:
+    """Fields out of order, with a colour between and a histogram of four after."""
+    return (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS z rgb x y hist\n"
+        "SIZE 8 4 4 4 2\nTYPE F U F F I\nCOUNT 1 1 1 1 4\n"
+        f"WIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA {data}\n"
+    ).encode()
+
+
+def pcd_ascii() -> bytes:
+    rows = [f"{z} 255 {x} {y} 1 2 3 4" for x, y, z in POINTS.tolist()]
+    return pcd_header("ascii") + "\n".join(rows).encode() + b"\n"
+
+
+def pcd_binary() -> bytes:
+    rows = [struct.pack("<dIff4h", z, 255, x, y, 1, 2, 3, 4) for x, y, z in POINTS.tolist()]
+    return pcd_header("binary") + b"".join(rows)
+
+
+def lzf_literals(raw: bytes) -> bytes:
+    """A valid stream without one back-reference."""
+    chunks = [raw[i : i + 32] for i in range(0, len(raw), 32)]
+    return b"".join(bytes([len(chunk) - 1]) + chunk for chunk in chunks)
+
+
+def pcd_compressed() -> bytes:
+    raw = POINTS[:, 2].astype("<f8").tobytes() + np.full(3, 255, "<u4").tobytes()
+    raw += POINTS[:, 0].tobytes() + POINTS[:, 1].tobytes()
+    raw += np.tile(np.arange(4, dtype="<i2"), 3).tobytes()
+    packed = lzf_literals(raw)
+    sizes = struct.pack("<II", len(packed), len(raw))
+    return pcd_header("binary_compressed") + sizes + packed
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.npy", npy(POINTS)),
+        ("a.npy", npy(np.hstack([POINTS, NORMALS]).astype(np.float64))),
+        ("a.XYZ", text(" ")),
+        ("a.txt", text(",")),
+        ("a.txt", text("\t").replace(b"\n", b"\r\n")),
+        ("a.ply", ply("ascii")),
+        ("a.ply", ply("binary_little_endian")),
+        ("ascii.pcd", pcd_ascii()),
+        ("binary.pcd", pcd_binary()),
+        ("compressed.pcd", pcd_compressed()),
+        ("a.off", b"OFF\n3 0 0\n" + b"\n".join(f"{x} {y} {z}".encode() for x, y, z in POINTS)),
+    ],
+)
+def test_every_format_gives_the_same_points(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content)
+    points = read_cloud(tmp_path / name)
+    assert points.dtype == np.float32
+    np.testing.assert_array_equal(points, POINTS)
+
+
+@pytest.mark.parametrize("suffix", ["off", "ply"])
+def test_a_mesh_gives_seeded_samples_of_its_surface(tmp_path, suffix):
+    path = tmp_path / f"ball.{suffix}"
+    trimesh.creation.icosphere(subdivisions=4).export(path)
+    points = read_cloud(path, mesh_points=500)
+    assert points.shape == (500, 3)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1, atol=0.01)
+    np.testing.assert_array_equal(points, read_cloud(path, mesh_points=500))
+    assert (points != read_cloud(path, mesh_points=500, seed=1)).any()
+
+
+def test_a_pcd_pixel_that_saw_nothing_is_left_out(tmp_path):
+    rows = [struct.pack("<dIff4h", z, 0, x, y, 1, 2, 3, 4) for x, y, z in POINTS.tolist()]
+    nan = struct.pack("<dIff4h", *[float("nan"), 0, float("nan"), float("nan")], 1, 2, 3, 4)
+    (tmp_path / "a.pcd").write_bytes(pcd_header("binary", 4) + rows[0] + nan + rows[1] + rows[2])
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.pcd"), POINTS)
+
+
+def bad_cases() -> dict[str, tuple[str, bytes, str]]:
+    nan = POINTS.copy()
+    nan[1, 1] = np.nan
+    header = pcd_header("ascii")
+    return {
+        "empty": ("a.xyz", b"", "empty file"),
+        "blank": ("a.ply", b"\n \n", "empty file"),
+        "comments alone": ("a.xyz", b"# nothing\n", "holds no point"),
+        "garbage text": ("a.xyz", b"hello dear world\n", "line 1 is not three numbers"),
+        "ragged": ("a.xyz", b"1 2 3\n1 2\n", "line 2 has 2 columns"),
+        "two columns": ("a.txt", b"1 2\n3 4\n", "line 1 has 2 columns"),
+        "NaN": ("a.xyz", b"1 2 nan\n", "not finite"),
+        "binary as text": ("a.txt", bytes(range(128, 256)), "cannot be read as txt"),
+        "too large for float32": ("a.xyz", b"1 2 1e200\n", "not finite"),
+        "npy NaN": ("a.npy", npy(nan), "not finite"),
+        "npy columns": ("a.npy", npy(POINTS[:, :2]), r"\[n, 3\]"),
+        "npy cube": ("a.npy", npy(np.zeros((2, 3, 3))), r"\[n, 3\]"),
+        "npy empty": ("a.npy", npy(np.zeros((0, 3))), "holds no point"),
+        "npy text": ("a.npy", npy(np.array([["a", "b", "c"]])), "needs numbers"),
+        "npy garbage": ("a.npy", b"not numpy", "cannot be read as npy"),
+        "npy cut": ("a.npy", npy(POINTS)[:-9], "cannot be read as npy"),
+        "ply garbage": ("a.ply", b"just some words\n", "cannot be read as ply"),
+        "off garbage": ("a.off", b"just some words\n", "cannot be read as off"),
+        "off empty": ("a.off", b"OFF\n0 0 0\n", "a.off"),
+        "pcd garbage": ("a.pcd", b"just some words\n", "no DATA line"),
+        "pcd short": ("a.pcd", header + b"1 2 3 4 1 2 3 4\n", "1 of 3 points"),
+        "pcd ragged": ("a.pcd", header + b"1 2 3\n" * 3, "8 numbers"),
+        "pcd header": ("a.pcd", b"FIELDS x y z\nDATA ascii\n1 2 3\n", "header is incomplete"),
+        "pcd fields": ("a.pcd", header.replace(b" x y ", b" u v "), "no fields x, y and z"),
+        "pcd data": ("a.pcd", pcd_header("zip"), "DATA zip is unknown"),
+        "pcd cut": ("a.pcd", pcd_binary()[:-1], "cut off"),
+        "pcd compressed cut": ("a.pcd", pcd_compressed()[:-1], "cut off"),
+    }
+
+
+@pytest.mark.parametrize("case", bad_cases())
+def test_a_bad_file_is_one_clear_line_that_names_it(tmp_path, case):
+    name, content, message = bad_cases()[case]
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=message) as caught:
+        read_cloud(tmp_path / name)
+    assert str(caught.value).startswith(str(tmp_path / name))
+    assert "\n" not in str(caught.value)
+
+
+def test_pickled_content_is_never_loaded(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return (Path.touch, (tmp_path / "sprung",))
+
+    np.save(tmp_path / "a.npy", np.array([Trap()], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError, match="cannot be read as npy"):
+        read_cloud(tmp_path / "a.npy")
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_other_files_are_refused(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        read_cloud(tmp_path / "a.npy")
+    (tmp_path / "a.docx").write_bytes(b"x")
+    with pytest.raises(InputError, match="not a point cloud file; known are"):
+        read_cloud(tmp_path / "a.docx")
+
+
+def test_lzf_copies_overlap_and_long_lengths_take_a_byte_more():
+    # "abc", then 3 from 2 back ("bcb"), then 7 + 20 + 2 from 0 back: a run of the last byte.
+    stream = bytes([2]) + b"abc" + bytes([0b001_00000, 1]) + bytes([0b111_00000, 20, 0])
+    assert lzf_decompress(stream, 6 + 29) == b"abcbcb" + b"b" * 29
+    # A distance above 256 uses the low bits of the control byte.
+    plain = bytes(range(256)) * 2
+    stream = lzf_literals(plain) + bytes([0b010_00001, 255])
+    assert lzf_decompress(stream, 516) == plain + plain[:4]
+
+
+@pytest.mark.parametrize("stream", [b"\x20", b"\x20\x05", b"\x00a\x20\x01", b"\x00ab\x00"])
+def test_lzf_damage_is_found(stream):
+    with pytest.raises(ValueError, match="damaged"):
+        lzf_decompress(stream, 100)

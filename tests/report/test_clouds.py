@@ -1,0 +1,92 @@
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
+
+from qs3.errors import InputError
+from qs3.report.clouds import SIDES, draw_cloud, gallery, project, samples_per_class
+
+
+def test_convention_sides():
+    """From the front +x is right and −y is near; from the side +y is right; from above +z near."""
+    x, y, z = np.eye(3)[:, None, :]
+    np.testing.assert_allclose(project(x, *SIDES["front"]), [[1, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(project(y, *SIDES["front"]), [[0, 0, -1]], atol=1e-12)
+    np.testing.assert_allclose(project(y, *SIDES["side"]), [[1, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(project(x, *SIDES["side"]), [[0, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(project(z, *SIDES["top"]), [[0, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(project(y, *SIDES["top"]), [[0, 1, 0]], atol=1e-12)
+
+
+@pytest.mark.parametrize(("azimuth", "elevation"), [(30.0, 20.0), (-110.0, -35.0), (200.0, 90.0)])
+def test_project_is_the_rotation_that_scipy_gives(rng, azimuth, elevation):
+    points = rng.normal(size=(50, 3))
+    turned = Rotation.from_euler("zx", [-azimuth, elevation], degrees=True).apply(points)
+    right, up, towards = turned[:, 0], turned[:, 2], -turned[:, 1]
+    expected = np.stack([right, up, towards], axis=1)
+    np.testing.assert_allclose(project(points, azimuth, elevation), expected, atol=1e-12)
+
+
+def test_near_points_are_drawn_last_and_strongest():
+    points = np.array([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])  # near, far, middle
+    axes = Figure().add_subplot()
+    points[:, 0] = [0.0, 1.0, 2.0]
+    draw_cloud(axes, points, *SIDES["front"])
+    scatter = axes.collections[0]
+    assert np.asarray(scatter.get_offsets())[:, 0].tolist() == [1.0, 2.0, 0.0]
+    lightness = np.asarray(scatter.get_facecolors())[:, :3].sum(axis=1)
+    assert lightness[0] > lightness[1] > lightness[2]
+
+
+def test_shared_limits_frame_both_clouds_alike():
+    limits = np.array([-1.0, -1.0, -1.0]), np.array([1.0, 2.0, 3.0])
+    small, large = (Figure().add_subplot() for _ in range(2))
+    draw_cloud(small, np.zeros((1, 3)), *SIDES["side"], limits=limits)
+    draw_cloud(large, np.full((1, 3), 0.9), *SIDES["side"], limits=limits)
+    assert small.get_xlim() == large.get_xlim()
+    assert small.get_ylim()[0] < -1.0 < 3.0 < small.get_ylim()[1]
+
+
+def test_points_that_are_not_finite_are_left_out():
+    axes = Figure().add_subplot()
+    draw_cloud(axes, np.array([[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]), *SIDES["front"])
+    assert len(np.asarray(axes.collections[0].get_offsets())) == 1
+
+
+def test_samples_per_class_takes_the_first_of_each_class():
+    points = np.arange(5.0)[:, None, None] * np.ones((5, 2, 3))
+    samples = samples_per_class(points, np.array([1, 0, 1, 1, 0]), ["a", "b", "c"], count=2)
+    firsts = {name: [float(c[0, 0]) for c in clouds] for name, clouds in samples.items()}
+    assert firsts == {"a": [1.0, 4.0], "b": [0.0, 2.0], "c": []}
+
+
+def test_gallery_keeps_every_cloud_in_its_cell(rng):
+    samples = {
+        "far away": [1000.0 + 50 * rng.normal(size=(40, 3)), 1e-6 * rng.normal(size=(30, 3))],
+        "flat": [rng.normal(size=(20, 3)) * [1, 1, 0], np.zeros((5, 3)), np.zeros((0, 3))],
+        "absent": [],
+    }
+    figure = gallery(samples, "title", columns=3)
+    axes = figure.axes[0]
+    spots = np.asarray(axes.collections[0].get_offsets())
+    cells, counts = np.unique(np.round(spots), axis=0, return_counts=True)
+    assert dict(zip(map(tuple, cells.astype(int)), counts, strict=True)) == {
+        (0, 0): 40,
+        (1, 0): 30,
+        (0, -1): 20,
+        (1, -1): 5,
+    }
+    assert np.abs(spots - np.round(spots)).max() < 0.47
+    assert [t.get_text() for t in axes.get_yticklabels()] == list(samples)
+    assert "none" in [t.get_text() for t in axes.texts]
+
+
+def test_gallery_shows_no_more_than_its_columns(rng):
+    figure = gallery({"a": [rng.normal(size=(7, 3)) for _ in range(5)]}, columns=2)
+    assert len(np.asarray(figure.axes[0].collections[0].get_offsets())) == 14
+
+
+@pytest.mark.parametrize(("samples", "columns"), [({}, 3), ({"a": []}, 0)])
+def test_gallery_refuses_nothing(samples, columns):
+    with pytest.raises(InputError, match="gallery"):
+        gallery(samples, columns=columns)

@@ -1,0 +1,139 @@
+import dataclasses
+import io
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+
+from qs3.errors import InputError
+from qs3.report.figure import NO_VALUE, png_bytes, write_png
+from qs3.report.montage import MontageView, montage, object_box
+
+HEIGHT, WIDTH = 40, 60
+
+
+@pytest.fixture
+def view(rng) -> MontageView:
+    """A slanted plate, 20 × 30 pixels: two of its columns are lost, one beside it is won."""
+    true = np.full((HEIGHT, WIDTH), np.nan)
+    true[10:30, 20:50] = np.linspace(1.0, 2.0, 30)
+    depth = (true + 0.01).astype(np.float32)
+    depth[10:30, 20:22] = np.nan
+    depth[10:30, 50] = 9.0
+    image = rng.integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
+    cloud = rng.normal(size=(100, 3)).astype(np.float32)
+    return MontageView(image, image, 10.0 / depth, depth, true, cloud, cloud[:50], np.eye(8))
+
+
+def axes_of(figure: Figure) -> dict:
+    return {a.get_title(): a for f in figure.subfigs for a in f.axes if a.get_title()}
+
+
+def test_every_panel_is_there_with_and_without_its_twin(view):
+    names = ["pattern", "left image", "right image", "disparity [px]", "depth [m]"]
+    names += ["true depth [m]", "depth error [m]", "distribution of the error"]
+    noisy = [f"noisy cloud (100 points), {side}" for side in ("front", "side", "top")]
+    clean = [f"clean twin (50 points), {side}" for side in ("front", "side", "top")]
+    view = dataclasses.replace(view, unit="m")
+    assert list(axes_of(montage(view))) == names + noisy + clean
+    assert list(axes_of(montage(dataclasses.replace(view, clean=None)))) == names + noisy
+
+
+def test_convention_pixels_lie_where_they_are_y_down(view):
+    """Pixel (row, column) is drawn at y = row, x = column, with y growing downwards."""
+    axes = axes_of(montage(dataclasses.replace(view, box=(15, 5, 55, 35))))["left image"]
+    shown = axes.images[0]
+    assert list(shown.get_extent()) == [14.5, 54.5, 34.5, 4.5]
+    assert axes.get_ylim()[0] > axes.get_ylim()[1]
+    np.testing.assert_array_equal(shown.get_array(), view.left[5:35, 15:55])
+    assert (shown.origin, shown.get_clim()) == ("upper", (0, 255))
+
+
+def test_depth_and_truth_share_their_colours(view):
+    panels = axes_of(montage(view))
+    depth, true = (panels[f"{n} [mesh units]"].images[0] for n in ("depth", "true depth"))
+    assert depth.get_clim() == true.get_clim() == pytest.approx((1.0, 2.0))
+    assert depth.cmap == true.cmap
+
+
+def test_no_value_is_grey_and_no_map_holds_that_grey(view):
+    shown = axes_of(montage(view))["depth [mesh units]"].images[0]
+    colours = shown.to_rgba(shown.get_array())
+    np.testing.assert_allclose(colours[0, 0, :3], to_rgb(NO_VALUE), atol=1e-6)
+    for name in ("viridis", "viridis_r", "RdBu_r"):
+        distance = np.abs(matplotlib.colormaps[name](np.arange(256))[:, :3] - to_rgb(NO_VALUE))
+        assert distance.max(axis=1).min() > 0.02
+
+
+def test_error_is_signed_centred_and_tells_lost_from_won(view):
+    reasons, error = axes_of(montage(view))["depth error [mesh units]"].images
+    low, high = error.get_clim()
+    assert low == -high < 0
+    values = np.ma.filled(error.get_array(), np.nan)
+    np.testing.assert_allclose(values[10:30, 22:50], 0.01, atol=1e-6)
+    assert np.isnan(values).sum() == HEIGHT * WIDTH - 20 * 28
+    red, _, blue, _ = error.to_rgba(error.get_array())[15, 30]
+    assert red > blue  # too far is red
+    reason = np.asarray(reasons.get_array())
+    assert (reason[10:30, 20:22] == 1).all()
+    assert (reason[10:30, 50] == 2).all()
+    assert (reason != 0).sum() == 20 * 3
+    # Where there is no error, the reasons below must shine through.
+    assert error.to_rgba(error.get_array())[15, 50, 3] == 0
+
+
+def test_histogram_tells_median_and_share_seen(view):
+    label = axes_of(montage(view))["distribution of the error"].get_xlabel()
+    assert "median +0.01," in label
+    assert "93 % of the object seen" in label  # 28 of 30 columns
+
+
+def test_a_scan_that_saw_nothing_is_drawn_too(view):
+    nothing = np.full((HEIGHT, WIDTH), np.nan)
+    blind = dataclasses.replace(
+        view,
+        disparity=nothing,
+        depth=nothing,
+        true_depth=nothing,
+        cloud=np.zeros((0, 3)),
+        clean=None,
+        pattern=None,
+        box=object_box(nothing),
+    )
+    assert len(png_bytes(montage(blind), dpi=40)) > 1000
+
+
+def test_large_pattern_shows_its_middle(view):
+    pattern = np.zeros((300, 400), np.uint8)
+    pattern[150, 200] = 255
+    axes = axes_of(montage(dataclasses.replace(view, pattern=pattern)))
+    shown = axes["pattern (its middle 256 px)"].images[0]
+    assert shown.get_clim() == (0, 255)
+    assert np.argwhere(np.asarray(shown.get_array()) == 255).tolist() == [[128, 128]]
+
+
+@pytest.mark.parametrize("box", [(0, 0, WIDTH + 1, 5), (5, 5, 5, 9), (-1, 0, 4, 4)])
+def test_box_outside_the_image_is_refused(view, box):
+    with pytest.raises(InputError, match="box"):
+        montage(dataclasses.replace(view, box=box))
+
+
+def test_object_box_holds_the_object_and_no_more(view):
+    x0, y0, x1, y1 = object_box(view.true_depth, margin=0)
+    assert np.isfinite(view.true_depth[y0:y1, x0:x1]).all()
+    assert np.isfinite(view.true_depth).sum() == (x1 - x0) * (y1 - y0)
+    assert object_box(view.true_depth, margin=1000) == (0, 0, WIDTH, HEIGHT)
+    assert object_box(np.full((3, 3), np.nan)) is None
+
+
+def test_bytes_depend_on_the_view_alone(view, tmp_path):
+    first = png_bytes(montage(view, "a"), dpi=50)
+    with matplotlib.rc_context({"font.size": 30, "axes.facecolor": "red", "savefig.dpi": 10}):
+        assert png_bytes(montage(view, "a"), dpi=50) == first
+    assert not any(word in first for word in (b"Software", b"matplotlib", b"tIME", b"Creation"))
+    write_png(tmp_path / "new" / "montage.png", montage(view, "b"), dpi=50)
+    assert (tmp_path / "new" / "montage.png").read_bytes() != first
+    assert imread(io.BytesIO(first), format="png").shape[1] == 600

@@ -1,0 +1,120 @@
+import subprocess
+import sys
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+
+from qs3.errors import InputError
+from qs3.report.figure import AFTER, BEFORE, PALETTE, class_colour, png_bytes
+from qs3.report.plots import (
+    Curve,
+    SelectionRound,
+    class_accuracy,
+    confusion_heatmap,
+    selection_counts,
+    training_curves,
+)
+
+NAMES = ("bed", "chair", "table")
+
+
+def a_round(index: int, kept: list[int], above: list[int], note: str = "") -> SelectionRound:
+    return SelectionRound(index, 0.8 + 0.01 * index, np.array(above), np.array(kept), note=note)
+
+
+def test_curves_of_one_panel_share_axes():
+    epochs = np.arange(1, 5)
+    curves = [
+        Curve("train", epochs, np.array([3.0, 2.0, np.nan, 1.0])),
+        Curve("held out", epochs, np.ones(4), "accuracy"),
+        Curve("pseudo", epochs[1:], np.zeros(3), "loss"),
+    ]
+    figure = training_curves(curves, marks=[2.0, 3.0])
+    loss, accuracy = figure.axes
+    assert (loss.get_ylabel(), accuracy.get_ylabel()) == ("loss", "accuracy")
+    drawn = {line.get_label(): line for line in loss.lines}
+    np.testing.assert_array_equal(drawn["train"].get_ydata(), curves[0].y)
+    assert "pseudo" in drawn
+    assert sum(str(name).startswith("_") for name in drawn) == 2  # the two marks
+    styles = {line.get_linestyle() for name, line in drawn.items() if name in ("train", "pseudo")}
+    assert len(styles) == 2  # told apart without colour
+    assert "round begins" in accuracy.get_xlabel()
+
+
+def test_bars_stack_to_what_was_selected():
+    rounds = [a_round(1, [3, 0, 2], [5, 0, 2]), a_round(2, [0, 0, 0], [1, 0, 1], "skipped")]
+    figure = selection_counts(rounds, NAMES)
+    theta, bars = figure.axes
+    np.testing.assert_allclose(theta.lines[0].get_ydata(), [0.81, 0.82])
+    by_class = [[bar.get_height() for bar in group] for group in bars.containers]
+    assert by_class == [[3, 0], [0, 0], [2, 0], [7, 2]]  # the last is the outline above θ
+    assert [bar.get_y() for bar in bars.containers[2]] == [3, 0]
+    assert [t.get_text() for t in bars.get_xticklabels()] == ["1\n5/7", "2\n0/2"]
+
+
+def test_confusion_shades_by_row_and_writes_counts():
+    matrix = np.array([[8, 2, 0, 0], [0, 1, 0, 3], [0, 0, 0, 0]])
+    axes = confusion_heatmap(matrix, NAMES, "before").axes[0]
+    shown = np.asarray(axes.images[0].get_array())
+    np.testing.assert_allclose(shown, [[0.8, 0.2, 0, 0], [0, 0.25, 0, 0.75], [0, 0, 0, 0]])
+    written = {tuple(map(int, t.get_position()))[::-1]: t.get_text() for t in axes.texts}
+    assert written == {(0, 0): "8", (0, 1): "2", (1, 1): "1", (1, 3): "3"}
+    assert [t.get_text() for t in axes.get_xticklabels()] == [*NAMES, "other"]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("predicted", "true")
+
+
+def test_class_bars_and_classes_without_a_cloud():
+    before, after = np.array([0.5, 0.0, np.nan]), np.array([1.0, 0.25, np.nan])
+    axes = class_accuracy(before, after, NAMES, np.array([2, 4, 0]), ("old", "new")).axes[0]
+    assert [[bar.get_width() for bar in group] for group in axes.containers] == [
+        [50, 0, 0],
+        [100, 25, 0],
+    ]
+    assert [t.get_text() for t in axes.get_yticklabels()] == ["bed (2)", "chair (4)", "table (0)"]
+    assert [t.get_text() for t in axes.texts].count("no cloud") == 1
+    assert axes.get_ylim()[0] > axes.get_ylim()[1]  # the first class is on top
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda: training_curves([]),
+        lambda: selection_counts([], NAMES),
+        lambda: selection_counts([a_round(1, [1, 2], [1, 2])], NAMES),
+        lambda: confusion_heatmap(np.zeros((3, 5), int), NAMES),
+        lambda: confusion_heatmap(np.zeros((0, 0), int), ()),
+        lambda: class_accuracy(np.zeros(2), np.zeros(2), NAMES, np.zeros(2, int)),
+    ],
+)
+def test_what_does_not_fit_is_refused(draw):
+    with pytest.raises(InputError):
+        draw()
+
+
+def test_names_are_text_not_formulas():
+    figure = confusion_heatmap(np.eye(2, dtype=int), ("a$b$", r"$\frac{"))
+    assert len(png_bytes(figure, dpi=50)) > 1000
+
+
+def test_colours_differ_for_the_colour_blind():
+    """Viénot's projection for protanopes and deuteranopes keeps all pairs of colours apart."""
+    linear = np.array([to_rgb(colour) for colour in PALETTE]) ** 2.2
+    protan = np.array([[0.1124, 0.8876, 0], [0.1124, 0.8876, 0], [0.0040, -0.0040, 1]])
+    deutan = np.array([[0.2928, 0.7072, 0], [0.2928, 0.7072, 0], [-0.0223, 0.0223, 1]])
+    for matrix in (protan, deutan):
+        seen = np.clip(linear @ matrix.T, 0, 1) ** (1 / 2.2)
+        gap = np.abs(seen[:, None] - seen[None]).max(axis=-1) + np.eye(len(seen))
+        assert gap.min() > 0.1
+    assert class_colour(3) != class_colour(4)
+    assert abs(np.mean(to_rgb(BEFORE)) - np.mean(to_rgb(AFTER))) > 0.3
+
+
+def test_no_global_state_of_pyplot():
+    before = dict(matplotlib.rcParams)
+    png_bytes(confusion_heatmap(np.eye(2, dtype=int), ("a", "b")), dpi=30)
+    assert dict(matplotlib.rcParams) == before
+    code = "import sys, qs3.report, qs3.report; "
+    code += "sys.exit('matplotlib.pyplot' in sys.modules or 'torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,165 @@
+"""Meshes and scans that cost nothing; a module of its own so that worker processes can load it."""
+
+import ctypes
+import os
+import signal
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qs3.meshes.classes import POINTDA10
+from qs3.store.generate import GenerateSettings, Item, scan_seed
+from qs3.store.shards import CloudRow
+
+_sync = os.fsync
+
+
+@dataclass(frozen=True)
+class FakeItem:
+    id: str
+    class_name: str = "chair"
+    split: str | None = "train"
+
+    def load(self):
+        raise AssertionError("a fake has no mesh")
+
+
+def fake_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    seed = scan_seed(settings.seed, item.id, scan)
+    rng = np.random.default_rng(seed)
+    n = settings.num_points
+    return CloudRow(
+        id=f"{item.id}#{scan}",
+        object=item.id,
+        scan=scan,
+        label=POINTDA10.index(item.class_name),
+        class_name=item.class_name,
+        split=item.split or "",
+        seed=seed,
+        points=rng.random((n, 3), dtype=np.float32),
+        view=rng.integers(0, settings.views, n, dtype=np.uint8),
+        clean=rng.random((n, 3), dtype=np.float32),
+        clean_view=np.zeros(n, dtype=np.uint8),
+        surface=rng.random((n, 3), dtype=np.float32),
+        yaw=float(rng.random()),
+        valid_fraction=0.9,
+    )
+
+
+def flaky_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    if item.id.startswith("bad"):
+        raise ValueError(f"{item.id} is broken\nsecond line")
+    return fake_row(item, scan, settings)
+
+
+def deadly_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    if item.id.startswith("bad"):
+        os._exit(9)
+    return fake_row(item, scan, settings)
+
+
+def unavailable_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    raise ModuleNotFoundError("No module named 'nowhere'")
+
+
+class Interrupting:
+    """Scans a number of rows, then acts as Ctrl-C does."""
+
+    def __init__(self, after: int) -> None:
+        self.left = after
+
+    def __call__(self, item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+        if self.left == 0:
+            raise KeyboardInterrupt
+        self.left -= 1
+        return fake_row(item, scan, settings)
+
+
+def slow_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    time.sleep(0.05)
+    return fake_row(item, scan, settings)
+
+
+def hanging_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    """Hang in C with the interpreter locked, as a parser written in C does."""
+    if item.id.startswith("bad"):
+        ctypes.PyDLL(None).sleep(600)
+    return fake_row(item, scan, settings)
+
+
+def crashing_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    if item.id.startswith("bad"):
+        os.kill(os.getpid(), signal.SIGSEGV)
+    return fake_row(item, scan, settings)
+
+
+def marked_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    """Fail as long as the file is there that QS3_FAKE_MARKER names."""
+    if item.id.startswith("bad") and Path(os.environ["QS3_FAKE_MARKER"]).exists():
+        raise ValueError(f"{item.id} is broken")
+    return fake_row(item, scan, settings)
+
+
+def crash_once_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    """Take the process along the first time that a bad item is scanned."""
+    marker = Path(os.environ["QS3_FAKE_MARKER"])
+    if item.id.startswith("bad") and not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return slow_row(item, scan, settings)
+
+
+def crash_in_write_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    """Take the process along the first time that it has a shard written and not yet renamed."""
+    os.fsync = _sync_and_die
+    return slow_row(item, scan, settings)
+
+
+def _sync_and_die(handle: int) -> None:
+    _sync(handle)
+    name = Path(f"/proc/self/fd/{handle}").readlink().name
+    marker = Path(os.environ["QS3_FAKE_MARKER"])
+    if "shard-" in name and not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def crash_with_lock_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    """Take the process along, the first time, with the lock that all workers share held."""
+    marker = Path(os.environ["QS3_FAKE_MARKER"])
+    if item.id.startswith("bad") and not marker.exists():
+        frame: Any = sys._getframe()
+        while "channel" not in frame.f_locals:
+            frame = frame.f_back
+        frame.f_locals["channel"].mutex.acquire()
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return slow_row(item, scan, settings)
+
+
+def slow_flaky_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    time.sleep(0.25)
+    return flaky_row(item, scan, settings)
+
+
+def late_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    """Hang, for a bad item, after its part is written and before the answer is given."""
+    from qs3.store.folder import LocalFolder
+
+    write = LocalFolder.write
+
+    def write_and_hang(self: LocalFolder, name: str, data: bytes) -> None:
+        write(self, name, data)
+        time.sleep(600)
+
+    LocalFolder.write = write_and_hang if item.id.startswith("bad") else write
+    return fake_row(item, scan, settings)
+
+
+def slow_hanging_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    time.sleep(0.4)
+    return hanging_row(item, scan, settings)

@@ -1,0 +1,172 @@
+"""A data set is read as it is by the libraries that people have."""
+
+import dataclasses
+import re
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qs3.io.layouts.contents import read_store
+from qs3.store.generate import GenerateSettings, generate
+
+SETTINGS = GenerateSettings(num_points=16, rows_per_shard=4)
+PAGE = Path(__file__).parents[2] / "docs" / "data.md"
+
+
+@dataclass(frozen=True)
+class Made:
+    """Ten scans in three shards, and what was handed to the writer."""
+
+    folder: Path
+    ids: list[str]
+    labels: list[int]
+    points: np.ndarray
+
+    @property
+    def files(self) -> list[str]:
+        return sorted(map(str, self.folder.glob("*.parquet")))
+
+    def equals(self, ids, labels, clouds) -> None:
+        """Compare bit for bit; a library that knows no half precision may widen it."""
+        assert list(ids) == self.ids
+        assert list(labels) == self.labels
+        rows = [np.asarray(cloud) for cloud in clouds]
+        assert {row.dtype for row in rows} <= {self.points.dtype, np.dtype(np.float32)}
+        there = np.stack(rows).reshape(self.points.shape).astype(np.float32)
+        wanted = self.points.astype(np.float32)
+        np.testing.assert_array_equal(there.view(np.uint32), wanted.view(np.uint32))
+
+
+def work_and_settings(fake, dtype):
+    work = [fake.FakeItem(f"m{i}", ("chair", "sofa")[i % 2]) for i in range(10)]
+    return work, dataclasses.replace(SETTINGS, dtype=dtype)
+
+
+@pytest.fixture(params=["float32", "float16"])
+def made(request, fake, tmp_path):
+    work, settings = work_and_settings(fake, request.param)
+    folder = tmp_path / "set"
+    generate(work, folder, settings, scan_one=fake.fake_row, workers=0, progress=False)
+    rows = [fake.fake_row(item, 0, settings) for item in work]
+    points = np.stack([row.points for row in rows]).astype(request.param)
+    return Made(folder, [row.id for row in rows], [row.label for row in rows], points)
+
+
+def test_our_reader(made):
+    ours = read_store(made.folder)
+    made.equals(ours.ids, ours.labels, ours.points)
+    assert ours.points.dtype == np.float32
+
+
+def test_pandas(made):
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.read_parquet(made.files)
+    made.equals(frame["id"], frame["label"], frame["points"])
+    assert frame["points"][0].dtype == made.points.dtype
+    assert frame.groupby("class_name").size().to_dict() == {"chair": 5, "sofa": 5}
+
+
+def test_polars(made):
+    polars = pytest.importorskip("polars")
+    frame = polars.read_parquet(made.folder / "*.parquet")
+    made.equals(frame["id"], frame["label"], [cloud.to_numpy() for cloud in frame["points"]])
+    lazy = polars.scan_parquet(made.folder / "*.parquet").filter(polars.col("class_name") == "sofa")
+    assert lazy.select("id").collect()["id"].to_list() == made.ids[1::2]
+
+
+def test_duckdb(made):
+    duckdb = pytest.importorskip("duckdb")
+    where = f"FROM '{made.folder}/*.parquet'"
+    with duckdb.connect() as db:  # a connection of its own: the page uses the common one
+        columns = db.sql(f"SELECT id, label, points {where} ORDER BY id").fetchnumpy()
+        count = db.sql(f"SELECT class_name, count(*) {where} GROUP BY ALL ORDER BY ALL").fetchall()
+        asked = db.execute(f"SELECT points {where} WHERE id = ?", [made.ids[7]]).fetchall()
+    made.equals(columns["id"], columns["label"], columns["points"])
+    assert count == [("chair", 5), ("sofa", 5)]
+    ((cloud,),) = asked
+    np.testing.assert_array_equal(np.array(cloud, np.float32).reshape(-1, 3), made.points[7])
+
+
+def test_hugging_face_datasets(made, tmp_path, monkeypatch):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setenv("HF_HOME", str(tmp_path / "hf"))
+    datasets = pytest.importorskip("datasets")
+    cache = str(tmp_path / "cache")
+    loaded = datasets.load_dataset(
+        "parquet", data_files=made.files, split="train", cache_dir=cache
+    ).with_format("numpy")
+    made.equals(loaded["id"], loaded["label"], loaded["points"])
+
+
+def test_pyarrow(made):
+    from pyarrow import dataset
+
+    table = dataset.dataset(made.files).to_table()
+    clouds = [row.values.to_numpy(zero_copy_only=False) for row in table["points"]]
+    made.equals(table["id"].to_pylist(), table["label"].to_pylist(), clouds)
+    assert clouds[0].dtype == made.points.dtype
+
+
+def test_sha256sum_checks_it(made):
+    command = ["sha256sum", "--check", "--strict", "SHA256SUMS"]
+    how = {"cwd": made.folder, "capture_output": True, "text": True, "check": False}
+    done = subprocess.run(command, **how)
+    assert done.returncode == 0, done.stdout
+    assert done.stdout.count(": OK") == 3
+    shard = made.folder / "shard-00001.parquet"
+    content = bytearray(shard.read_bytes())
+    content[len(content) // 2] ^= 1
+    shard.write_bytes(content)
+    assert "shard-00001.parquet: FAILED" in subprocess.run(command, **how).stdout
+
+
+def test_worker_processes_write_the_same_bytes_as_none(fake, tmp_path):
+    work, settings = work_and_settings(fake, "float16")
+    for workers in (0, 2):
+        out = tmp_path / str(workers)
+        generate(work, out, settings, scan_one=fake.fake_row, workers=workers, progress=False)
+    alone, two = (
+        {path.name: path.read_bytes() for path in (tmp_path / name).iterdir() if path.is_file()}
+        for name in ("0", "2")
+    )
+    assert {*alone} == {*(f"shard-0000{i}.parquet" for i in range(3)), "dataset.json", "SHA256SUMS"}
+    assert alone == two
+
+
+def test_the_page_about_data_works(made, tmp_path, monkeypatch):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setenv("HF_HOME", str(tmp_path / "hf"))
+    for name in ("pandas", "polars", "duckdb", "datasets"):
+        pytest.importorskip(name)
+    # Its cache was fixed when it was first imported.
+    monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", tmp_path / "cache")
+    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    assert len(blocks) >= 6
+    monkeypatch.chdir(made.folder.parent)
+    names: dict = {}
+    for block in blocks:
+        exec(compile(block, PAGE.name, "exec"), names)  # noqa: S102
+    assert names["clouds"].shape == made.points.shape
+
+
+def test_the_page_names_every_column_and_file(made):
+    from pyarrow import parquet
+
+    text = PAGE.read_text(encoding="utf-8")
+    columns = parquet.read_schema(made.folder / "shard-00000.parquet").names
+    files = [path.name for path in made.folder.iterdir() if "0000" not in path.name]
+    names = [*columns, *files, "shard-00000.parquet", "failures.jsonl", ".parts/"]
+    assert [name for name in names if f"`{name}`" not in text] == []
+
+
+def test_the_page_tells_what_half_precision_costs(rng):
+    """On the surface of a ball of diameter 1, whose coordinates stay within 0.5."""
+    cloud = rng.normal(size=(200_000, 3))
+    cloud *= 0.5 / np.linalg.norm(cloud, axis=1, keepdims=True)
+    error = cloud.astype(np.float32).astype(np.float16) - cloud
+    largest, rms = np.abs(error).max(), np.sqrt(np.mean(error**2))
+    text = " ".join(PAGE.read_text(encoding="utf-8").split())
+    assert f"{largest:.5f} at most and {rms:.6f} RMS" in text

@@ -1,0 +1,160 @@
+"""The same data set from a Ray cluster as from this machine, also when a node is lost."""
+
+import logging
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from qs3.errors import InputError
+from qs3.store.failures import read_failures
+from qs3.store.generate import GenerateReport, GenerateSettings, generate
+
+pytest.importorskip("ray", reason="needs the extra ray")
+
+from qs3.store.executors.ray_cluster import RayExecutor
+
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
+
+SETTINGS = GenerateSettings(num_points=16, rows_per_shard=4)
+ROWS = 60
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Three nodes of two cores on this machine; the first is the head."""
+    import ray
+    from ray.cluster_utils import Cluster
+
+    # Its workers import the fakes by name.
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+    monkeypatch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    small = {"num_cpus": 2, "object_store_memory": 80 * 2**20}
+    made = Cluster(initialize_head=True, head_node_args=small | {"include_dashboard": False})
+    made.add_node(**small)
+    made.add_node(**small)
+    made.wait_for_nodes()
+    ray.init(address=made.address, log_to_driver=False, logging_level=logging.ERROR)
+    yield made
+    ray.shutdown()
+    made.shutdown()
+
+
+def whole(fake, folder: Path) -> dict[str, bytes]:
+    work = [fake.FakeItem("bad" if i == 7 else f"m{i}") for i in range(ROWS)]
+    generate(work, folder, SETTINGS, scan_one=fake.flaky_row, workers=0, progress=False)
+    return content(folder)
+
+
+@pytest.mark.slow
+def test_a_node_killed_half_way_changes_no_byte(fake, tmp_path, cluster):
+    out = tmp_path / "out"
+    nodes = sorted(cluster.list_all_nodes(), key=lambda node: node.head)
+    seen = []
+
+    def kill_one() -> None:
+        while len(list(out.glob("shard-*.parquet"))) < ROWS // 8:
+            time.sleep(0.05)
+        seen.append(len(list(out.glob("shard-*.parquet"))))
+        cluster.remove_node(nodes[0], allow_graceful=False)
+
+    killer = threading.Thread(target=kill_one)
+    killer.start()
+    work = [fake.FakeItem("bad" if i == 7 else f"m{i}") for i in range(ROWS)]
+    report = generate(
+        work, out, SETTINGS, scan_one=fake.slow_flaky_row, executor=RayExecutor(), progress=False
+    )
+    killer.join()
+    assert ROWS // 8 <= seen[0] < ROWS // 4 - 1, "the node was not killed half-way"
+    assert len(cluster.list_all_nodes()) == 2
+    assert report == GenerateReport(done=ROWS - 1, skipped=0, failed=1)
+    assert content(out) == whole(fake, tmp_path / "whole")
+
+
+@pytest.mark.slow
+def test_on_a_cluster_too_what_hangs_or_crashes_fails_alone(fake, tmp_path, cluster):
+    for row, kind in (("hanging_row", "Timeout"), ("deadly_row", "ProcessDied")):
+        work = [fake.FakeItem("bad" if i == 2 else f"m{i}") for i in range(6)]
+        report = generate(
+            work,
+            tmp_path / row,
+            SETTINGS,
+            scan_one=getattr(fake, row),
+            executor=RayExecutor(timeout=12.0 if kind == "Timeout" else None, retries=1),
+            progress=False,
+        )
+        assert report == GenerateReport(done=5, skipped=0, failed=1)
+        assert [record["error"] for record in read_failures(tmp_path / row)] == [kind]
+
+
+@pytest.mark.slow
+def test_what_hangs_is_stopped_while_others_go_on(fake, tmp_path, cluster):
+    """A cluster that is never idle still looks at what has run too long."""
+    work = [fake.FakeItem("bad" if i == 0 else f"m{i}") for i in range(240)]
+    order: list[str] = []
+
+    class Watched(RayExecutor):
+        def next(self):
+            key, outcome = super().next()
+            order.append(type(outcome).__name__)
+            return key, outcome
+
+    report = generate(
+        work,
+        tmp_path / "out",
+        SETTINGS,
+        scan_one=fake.slow_hanging_row,
+        executor=Watched(timeout=8.0, retries=1),
+        progress=False,
+    )
+    assert report == GenerateReport(done=239, skipped=0, failed=1)
+    assert order.index("Failure") < len(order) - 30
+
+
+def test_gpus_that_are_not_there_are_refused(fake, tmp_path, cluster):
+    with pytest.raises(InputError, match="no GPU at this moment"):
+        generate(
+            [fake.FakeItem("m")],
+            tmp_path / "out",
+            SETTINGS,
+            scan_one=fake.fake_row,
+            executor=RayExecutor(gpus=0.25),
+            progress=False,
+        )
+
+
+def test_an_address_without_a_cluster_is_told(fake, tmp_path):
+    with pytest.raises(InputError, match="no Ray cluster answers there"):
+        generate(
+            [fake.FakeItem("m")],
+            tmp_path / "out",
+            SETTINGS,
+            scan_one=fake.fake_row,
+            executor=RayExecutor("auto"),
+            progress=False,
+        )
+
+
+@pytest.mark.parametrize("how", [{"timeout": 0.0}, {"gpus": -1.0}, {"retries": -1}])
+def test_numbers_out_of_range_are_refused(how):
+    with pytest.raises(InputError):
+        RayExecutor(**how)
+
+
+def test_without_ray_the_extra_is_named(monkeypatch):
+    import sys
+
+    from qs3.errors import MissingExtraError
+
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(MissingExtraError, match=r"\[ray\]"):
+        RayExecutor()

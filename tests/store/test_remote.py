@@ -1,0 +1,124 @@
+"""Data sets at addresses that are no folder of this machine."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qs3.errors import InputError
+from qs3.io.layouts.contents import info, read_store
+from qs3.io.load import load_clouds
+from qs3.store.folder import open_folder
+from qs3.store.generate import GenerateReport, GenerateSettings, generate
+from qs3.store.merge import merge
+from qs3.store.verify import verify
+
+SETTINGS = GenerateSettings(num_points=16, rows_per_shard=4)
+
+
+def items(fake, count=10):
+    return [fake.FakeItem("bad" if i == 5 else f"m{i}") for i in range(count)]
+
+
+def whole(fake, folder: Path) -> dict[str, bytes]:
+    generate(items(fake), folder, SETTINGS, scan_one=fake.flaky_row, workers=0, progress=False)
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def content(url: str) -> dict[str, bytes]:
+    folder = open_folder(url)
+    return {name: folder.read(name) for name in folder.names()}
+
+
+@pytest.fixture
+def memory() -> Iterator[str]:
+    """An empty folder in fsspec's memory."""
+    import fsspec
+
+    yield "memory://shelf/set"
+    fsspec.filesystem("memory").store.clear()
+
+
+@pytest.fixture
+def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A bucket of a server on this machine that speaks S3."""
+    pytest.importorskip("s3fs", reason="needs the extra s3")
+    moto = pytest.importorskip("moto.server", reason="needs moto[server]")
+    server = moto.ThreadedMotoServer(port=0)
+    server.start()
+    host, port = server.get_host_and_port()
+    for name, value in {
+        "AWS_ACCESS_KEY_ID": "testing",
+        "AWS_SECRET_ACCESS_KEY": "testing",
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}",
+    }.items():
+        monkeypatch.setenv(name, value)
+    assert host
+    import s3fs
+
+    s3fs.S3FileSystem.clear_instance_cache()
+    s3fs.S3FileSystem().mkdir("scans")
+    yield "s3://scans/set"
+    server.stop()
+
+
+def test_a_run_into_memory_is_stopped_resumed_and_equal(fake, tmp_path, memory):
+    with pytest.raises(KeyboardInterrupt):
+        generate(
+            items(fake), memory, SETTINGS, scan_one=fake.Interrupting(5), workers=0, progress=False
+        )
+    assert any(name.startswith(".parts/") for name in content(memory))
+    report = generate(
+        items(fake), memory, SETTINGS, scan_one=fake.flaky_row, workers=0, progress=False
+    )
+    assert report == GenerateReport(done=4, skipped=5, failed=1)
+    assert content(memory) == whole(fake, tmp_path / "whole")
+    assert verify(memory, progress=False) == []
+    assert info(memory)["rows"] == 9
+    np.testing.assert_array_equal(read_store(memory).points, read_store(tmp_path / "whole").points)
+    np.testing.assert_array_equal(
+        load_clouds(memory, num_points=None).points, read_store(memory).points
+    )
+
+
+def test_a_folder_of_something_else_is_refused(fake, memory):
+    open_folder(memory).write("thesis.txt", b"mine")
+    with pytest.raises(InputError, match="holds something else"):
+        generate(items(fake), memory, SETTINGS, scan_one=fake.fake_row, workers=0, progress=False)
+    assert set(content(memory)) == {"thesis.txt"}
+
+
+def test_processes_write_to_an_object_store_themselves(fake, tmp_path, bucket):
+    for part in range(2):
+        generate(
+            items(fake),
+            f"{bucket}-{part}",
+            SETTINGS,
+            scan_one=fake.flaky_row,
+            workers=1,
+            shard=(part, 2),
+            progress=False,
+        )
+    merge([f"{bucket}-0", f"{bucket}-1"], bucket, progress=False)
+    wanted = whole(fake, tmp_path / "whole")
+    assert content(bucket) == wanted
+    merge([f"{bucket}-0", f"{bucket}-1"], tmp_path / "merged", progress=False)
+    assert {p.name: p.read_bytes() for p in (tmp_path / "merged").iterdir()} == wanted
+    assert verify(bucket, progress=False) == []
+
+
+def test_a_store_that_cannot_be_reached_is_told_in_one_line(fake):
+    with pytest.raises(InputError, match="nowhere://a"):
+        generate(items(fake), "nowhere://a/b", SETTINGS, scan_one=fake.fake_row, workers=0)
+
+
+def test_a_missing_package_is_named_with_its_extra(fake, monkeypatch):
+    import sys
+
+    from qs3.errors import MissingExtraError
+
+    monkeypatch.setitem(sys.modules, "gcsfs", None)
+    with pytest.raises(MissingExtraError, match=r"gcsfs is not installed.*\[gs\]"):
+        generate(items(fake), "gs://a/b", SETTINGS, scan_one=fake.fake_row, workers=0)

@@ -1,0 +1,220 @@
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from qs3.errors import InputError
+from qs3.io.layouts.contents import (
+    MANIFEST,
+    Manifest,
+    info,
+    open_dataset,
+    read_store,
+    shard_path,
+    write_manifest,
+)
+from qs3.store.generate import GenerateSettings
+from qs3.store.shards import read_shard, write_shard
+
+SETTINGS = GenerateSettings(num_points=16)
+
+
+def rows(fake, count=6):
+    classes = ("chair", "bed", "sofa")
+    items = [fake.FakeItem(f"m{i}", classes[i % 3], ("train", "test")[i % 2]) for i in range(count)]
+    return [fake.fake_row(item, 0, SETTINGS) for item in items]
+
+
+def make(folder: Path, fake, shards=2) -> list:
+    made = rows(fake)
+    manifest = Manifest(
+        settings={"views": 5, "sensor": {"rig": {"focal": 1500.0}}},
+        class_names=SETTINGS.classes,
+        rows=len(made),
+        shards=shards,
+        versions={"qs3": "0"},
+    )
+    write_manifest(folder, manifest)
+    write_shard(shard_path(folder, 0), made[:4])
+    if shards > 1:
+        write_shard(shard_path(folder, 1), made[4:])
+    return made
+
+
+def test_what_is_written_comes_back(fake, tmp_path):
+    made = make(tmp_path, fake)
+    for cloud in ("points", "clean", "surface"):
+        read = read_store(tmp_path, cloud)
+        np.testing.assert_array_equal(read.points, np.stack([getattr(r, cloud) for r in made]))
+        assert read.labels.tolist() == [r.label for r in made]
+        assert read.ids == tuple(r.id for r in made)
+
+
+def test_a_shard_reads_as_plain_parquet(fake, tmp_path):
+    made = rows(fake)
+    made[0] = dataclasses.replace(made[0], gross_share=float("nan"), split="")
+    write_shard(tmp_path / "a.parquet", made)
+    table = pq.read_table(tmp_path / "a.parquet")
+    first = table.slice(0, 1).to_pylist()[0]
+    np.testing.assert_array_equal(np.reshape(first["points"], (-1, 3)), made[0].points)
+    np.testing.assert_array_equal(first["view"], made[0].view)
+    assert first["valid_fraction"] == 0.9
+    assert first["gross_share"] is None
+    assert first["seed"] == made[0].seed
+    assert first["yaw"] == made[0].yaw
+
+
+def test_equal_rows_give_equal_bytes_and_a_bit_shows(fake, tmp_path):
+    made = rows(fake)
+    for name in "ab":
+        write_shard(tmp_path / name, made)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    points = made[0].points.copy()
+    points[0, 0] = np.nextafter(points[0, 0], np.float32(2))
+    write_shard(tmp_path / "b", [dataclasses.replace(made[0], points=points), *made[1:]])
+    assert (tmp_path / "a").read_bytes() != (tmp_path / "b").read_bytes()
+    assert str(tmp_path).encode() not in (tmp_path / "a").read_bytes()
+
+
+def test_an_empty_shard_is_a_shard(tmp_path):
+    write_shard(tmp_path / "a", [])
+    assert read_shard(tmp_path / "a").num_rows == 0
+
+
+def test_split_classes_and_size_are_chosen(fake, tmp_path):
+    made = make(tmp_path, fake)
+    train = read_store(tmp_path, split="train", num_points=5)
+    assert train.points.shape == (3, 5, 3)
+    assert train.ids == ("m0#0", "m2#0", "m4#0")
+    some = read_store(tmp_path, classes=["sofa", "bed"])
+    assert some.class_names == ("sofa", "bed")
+    assert some.labels.tolist() == [1, 0, 1, 0]
+    assert some.ids == tuple(r.id for r in made if r.class_name != "chair")
+    with pytest.raises(InputError, match="no cloud of split 'dev'; splits: test, train"):
+        read_store(tmp_path, split="dev")
+    with pytest.raises(InputError, match="no class 'toilet'"):
+        read_store(tmp_path, classes=["toilet"])
+
+
+def test_an_unfinished_data_set_is_not_taken_for_a_whole_one(fake, tmp_path):
+    make(tmp_path, fake)
+    shard_path(tmp_path, 1).unlink()
+    with pytest.raises(InputError, match="unfinished, 1 of 2 shards"):
+        read_store(tmp_path)
+    assert len(read_store(tmp_path, partial=True)) == 4
+
+
+def test_the_checksum_follows_the_bytes(fake, tmp_path):
+    made = make(tmp_path, fake)
+    before = read_store(tmp_path).checksum
+    assert read_store(tmp_path, num_points=8).checksum == before  # of what was read, not made
+    assert read_store(tmp_path, "clean").checksum != before
+    other = dataclasses.replace(made[5], label=1 - made[5].label % 2)
+    write_shard(shard_path(tmp_path, 1), [made[4], other])
+    assert read_store(tmp_path).checksum != before
+    write_shard(shard_path(tmp_path, 1), made[4:][::-1])
+    assert read_store(tmp_path).checksum != before
+
+
+@pytest.mark.parametrize("damage", ["cut", "text", "empty", "bits"])
+def test_a_damaged_shard_is_named(fake, tmp_path, damage):
+    make(tmp_path, fake)
+    path = shard_path(tmp_path, 1)
+    content = path.read_bytes()
+    begin = content.find(b"\x28\xb5\x2f\xfd")  # the first compressed page
+    path.write_bytes(
+        {
+            "cut": content[: len(content) // 2],
+            "text": b"not parquet at all" * 10,
+            "empty": b"",
+            "bits": content[:begin] + bytes(400) + content[begin + 400 :],
+        }[damage]
+    )
+    with pytest.raises(InputError, match=r"shard-00001\.parquet: damaged") as caught:
+        read_store(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_foreign_parquet_file_is_refused(fake, tmp_path):
+    make(tmp_path, fake)
+    table = read_shard(shard_path(tmp_path, 0)).drop_columns(["clean"])
+    pq.write_table(table, shard_path(tmp_path, 0))
+    with pytest.raises(InputError, match="other columns"):
+        read_store(tmp_path)
+
+
+def test_points_that_are_not_finite_are_refused(fake, tmp_path):
+    made = make(tmp_path, fake)
+    bad = dataclasses.replace(made[0], points=np.full((16, 3), np.nan, dtype=np.float32))
+    write_shard(shard_path(tmp_path, 0), [bad])
+    with pytest.raises(InputError, match="points of 'm0#0'"):
+        read_store(tmp_path)
+    assert len(read_store(tmp_path, "clean")) == 3
+
+
+def test_other_settings_are_refused_by_name(fake, tmp_path):
+    make(tmp_path, fake)
+    there = open_dataset(tmp_path)
+    with pytest.warns(UserWarning, match="begun with qs3 0, going on with 9"):
+        write_manifest(tmp_path, dataclasses.replace(there, versions={"qs3": "9"}))
+    assert open_dataset(tmp_path) == there
+    other = {"views": 5, "sensor": {"rig": {"focal": 900.0}}}
+    with pytest.raises(InputError, match=r"sensor\.rig\.focal = 1500\.0, not 900\.0"):
+        write_manifest(tmp_path, dataclasses.replace(there, settings=other))
+    with pytest.raises(InputError, match=r"views = 5, not None"):
+        write_manifest(
+            tmp_path, dataclasses.replace(there, settings={"sensor": there.settings["sensor"]})
+        )
+    assert open_dataset(tmp_path) == there
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"schema": 1}', "\x80"])
+def test_a_damaged_manifest_is_named(tmp_path, text):
+    (tmp_path / MANIFEST).write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError, match=r"dataset\.json"):
+        open_dataset(tmp_path)
+
+
+def test_a_folder_without_manifest_and_another_schema_are_refused(fake, tmp_path):
+    with pytest.raises(InputError, match="not a qs3 data set"):
+        open_dataset(tmp_path)
+    make(tmp_path, fake)
+    path = tmp_path / MANIFEST
+    path.write_text(path.read_text().replace('"schema": 3', '"schema": 7'))
+    with pytest.raises(InputError, match="schema 7"):
+        open_dataset(tmp_path)
+
+
+def test_info_counts(fake, tmp_path):
+    make(tmp_path, fake)
+    counts = info(tmp_path)
+    assert (counts["rows"], counts["objects"], counts["failed"]) == (6, 6, 0)
+    assert {name: n for name, n in counts["classes"].items() if n} == {
+        "bed": 2,
+        "chair": 2,
+        "sofa": 2,
+    }
+    assert counts["splits"] == {"test": 3, "train": 3}
+    assert counts["points"] == [16, 16]
+
+
+def test_a_data_set_of_schema_1_still_reads(fake, tmp_path):
+    made = make(tmp_path, fake, shards=1)[:4]
+    old = pq.read_table(shard_path(tmp_path, 0)).drop_columns(["drawn"])
+    pq.write_table(old, shard_path(tmp_path, 0))
+    manifest = tmp_path / MANIFEST
+    manifest.write_text(manifest.read_text().replace('"schema": 3', '"schema": 1'))
+    assert open_dataset(tmp_path).schema == 1
+    np.testing.assert_array_equal(read_store(tmp_path).points, [row.points for row in made])
+    assert read_shard(shard_path(tmp_path, 0), ["drawn", "id"])["drawn"].to_pylist() == ["{}"] * 4
+    assert read_shard(shard_path(tmp_path, 0)).column_names[-1] == "drawn"
+    assert info(tmp_path)["rows"] == 4
+
+
+def test_what_was_drawn_is_kept(fake, tmp_path):
+    drawn = '{"light.ambient": 0.1, "neighbour": "m1"}'
+    row = dataclasses.replace(rows(fake)[0], drawn=drawn)
+    write_shard(tmp_path / "a.parquet", [row])
+    assert read_shard(tmp_path / "a.parquet", ["drawn"])["drawn"].to_pylist() == [drawn]
