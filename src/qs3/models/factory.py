@@ -1,11 +1,11 @@
 """Networks by name; a network's module, and PyTorch, load when it is made."""
 
-import inspect
 from collections.abc import Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from qs3.errors import InputError
+from qs3.models.checks import read_settings
 
 if TYPE_CHECKING:
     from qs3.models.classifier import PointClassifier
@@ -52,23 +52,5 @@ def create_model(name: str, num_classes: int, **settings: Any) -> "PointClassifi
         raise InputError(f"unknown model {name!r}; choose one of {', '.join(_MODELS)}")
     module, kind, fixed = _MODELS[name]
     make = getattr(import_module(f"qs3.models.{module}"), kind)
-    choice = [
-        parameter
-        for parameter in inspect.signature(make).parameters
-        if parameter not in {"num_classes", *fixed}
-    ]
-    for key in settings:
-        if key not in choice:
-            raise InputError(f"unknown setting {key!r} of {name}; choose from {', '.join(choice)}")
-    values = {key: _tuples(value) for key, value in settings.items()}
-    try:
-        return make(num_classes, **fixed, **values)
-    except InputError:
-        raise
-    except (TypeError, ValueError) as error:
-        raise InputError(f"settings {settings} do not make a {name}: {error}") from error
-
-
-def _tuples(value: Any) -> Any:
-    """Return tuples for lists, at any depth: JSON has lists only, the networks want tuples."""
-    return tuple(_tuples(part) for part in value) if isinstance(value, list | tuple) else value
+    values = {"num_classes": num_classes, **settings}
+    return make(**read_settings(make, values, name, fixed), **fixed)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from qs3.models.checks import check_number, check_whole, check_wholes
+from qs3.models.checks import check_positive, check_range
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
 from qs3.models.ops import (
     ball_query,
@@ -68,10 +68,10 @@ class SANode(nn.Module):
         steered: bool = False,
     ) -> None:
         super().__init__()
-        check_whole("node_width", width)
-        check_whole("nodes", nodes)
-        check_whole("neighbours", neighbours, 1, 255)
-        check_number("radius", radius)
+        check_range("node_width", width)
+        check_range("nodes", nodes)
+        check_range("neighbours", neighbours, 1, 255)
+        check_positive("radius", radius)
         self.nodes, self.neighbours, self.radius = nodes, neighbours, radius
         self.steered = steered
         self.offset = nn.Linear(channels, 3, bias=False)
@@ -157,7 +157,7 @@ class PointNetSA(PointClassifier):
     def __init__(
         self,
         num_classes: int,
-        channels: tuple[int, ...] = (64, 64, 128, 1024),
+        channels: tuple[int, int, int, int] = (64, 64, 128, 1024),
         transform_hidden: tuple[int, ...] = (512, 256),
         nodes: int = 64,
         neighbours: int = 64,
@@ -167,8 +167,8 @@ class PointNetSA(PointClassifier):
         dropout: float = 0.0,
     ) -> None:
         super().__init__()
-        check_wholes("channels", channels, count=4)
-        check_wholes("transform_hidden", transform_hidden, few=0)
+        check_range("channels", channels)
+        check_range("transform_hidden", (1, *transform_hidden))
         first, second, third, last = channels
         self.input_transform = TransformNet(3, channels[-3:], transform_hidden)
         self.early = nn.Sequential(FirstLayer(3, first), PointwiseLayer(first, second, 0.0))
