@@ -67,8 +67,8 @@ def fit(
     the same bits as if it had never stopped (same devices, at most two, and number of threads).
 
     Args:
-        method: One of `qs3.adaptation.names.MethodName`; ``spst``, ``qbst``, ``qs3`` and
-            ``gast-spst`` end in self-training.
+        method: One of `qs3.adaptation.names.MethodName`; ``spst``, ``qbst`` and ``gast-spst``
+            end in self-training.
         source: Labelled clouds, as read. A share of ``settings.holdout`` is kept for validators.
         target: Clouds without labels, as read. ``source-only`` takes them for validators and AdaBN
             alone.
