@@ -1,8 +1,9 @@
 """MATLAB's MAT files of version 5 to 7: SciPy reads them, once their announced sizes are held.
 
 A cell or struct array of a few bytes may announce billions of elements, a compressed variable may
-unpack to the whole memory, nested cells may overrun the stack, and a wrong type of element ends
-the whole process within SciPy. So the tree of arrays is walked before SciPy sees it. Layout: "MAT-File Format", MathWorks, Level 5 MAT-files.
+unpack to the whole memory, nested cells may overrun the stack, and a wrong type of element ends the
+whole process within SciPy. So the tree of arrays is walked before SciPy sees it. Layout: "MAT-File
+Format", MathWorks, Level 5 MAT-files.
 """
 
 import io
