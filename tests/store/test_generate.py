@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.io.layouts.contents import MANIFEST, info, read_store
+from qs3.io.layouts.contents import MANIFEST, read_store
 from qs3.meshes.classes import POINTDA10
 from qs3.store.failures import FAILURES, read_failures
 from qs3.store.generate import (
@@ -20,6 +20,7 @@ from qs3.store.generate import (
     scan_seed,
 )
 from qs3.store.generate import generate as generate_anywhere
+from qs3.store.info import info
 from qs3.store.manifest import SUMS
 from qs3.store.parts import part_folder
 from qs3.store.scan_item import neighbour_of

@@ -7,29 +7,38 @@ a user can mend is one line on standard error and exit code 2; Ctrl-C ends with 
 import sys
 from collections.abc import Sequence
 
-VERBS: dict[str, tuple[str, str]] = {
-    "scan": ("scan", "Photograph one mesh: noisy cloud, clean twin, a picture of every stage."),
-    "sensors": ("sensors", "List the sensors, or show one as TOML to copy and edit."),
-    "realism": ("realism", "Test a simulated camera against the laws of real ones."),
-    "generate": ("generate", "Scan many meshes into a data set; resumes, and logs what failed."),
-    "merge": ("store", "Put the parts that `qs3 generate --shard i/n` made into one data set."),
-    "info": ("store", "Print what a data set holds: counts, sizes, statistics, failures."),
-    "verify": ("store", "Check a data set: checksums, finite points, labels, seeds, counts."),
-    "convert": ("convert", "Convert a data set into the layout of another."),
-    "extract": ("extract", "Cut objects out of real scans into a data set."),
-    "train": ("train", "Train a classifier, with a method of adaptation to an unlabelled target."),
-    "evaluate": ("evaluate", "Score a run on labelled clouds."),
-    "predict": ("evaluate", "Predict the class of clouds in files."),
-    "export": ("export", "Write a run's network for programs without qs3."),
-    "reproduce": ("reproduce", "Make the paper's tables and figures, or parts of them."),
-    "table": ("table", "Print a table of the paper from results."),
-    "figure": ("table", "Draw a figure of the paper from results."),
-    "report": ("report", "Write one page about runs, data sets and results."),
-    "view": ("view", "Look at data, a run or a mesh in a browser on this machine."),
-    "doctor": ("doctor", "Tell what works on this machine and how to get what does not."),
-    "demo": ("demo", "Run everything once on built-in shapes: scan, train, adapt, report."),
+VERBS = {
+    "scan": (
+        "scan.scan",
+        "Photograph one mesh: noisy cloud, clean twin, a picture of every stage.",
+    ),
+    "sensors": ("sensors.sensors", "List the sensors, or show one as TOML to copy and edit."),
+    "realism": ("realism.realism", "Test a simulated camera against the laws of real ones."),
+    "generate": (
+        "generate.generate",
+        "Scan many meshes into a data set; resumes, and logs what failed.",
+    ),
+    "merge": ("store.merge", "Put the parts of `qs3 generate --shard i/n` into one data set."),
+    "info": ("store.info", "Print what a data set holds: counts, sizes, statistics, failures."),
+    "verify": (
+        "store.verify",
+        "Check a data set: checksums, finite points, labels, seeds, counts.",
+    ),
+    "convert": ("convert.convert", "Convert a data set into the layout of another."),
+    "extract": ("extract.extract", "Cut objects out of real scans into a data set."),
+    "train": ("train.train", "Train a classifier, adapted to clouds without labels if asked."),
+    "evaluate": ("evaluate.evaluate_run", "Score a run on labelled clouds."),
+    "predict": ("evaluate.predict", "Predict the class of clouds in files."),
+    "export": ("export.export", "Write a run's network for programs without qs3."),
+    "reproduce": ("reproduce.reproduce", "Make the paper's tables and figures, or parts of them."),
+    "table": ("table.table", "Print a table of the paper from results."),
+    "figure": ("table.figure", "Draw a figure of the paper from results."),
+    "report": ("report.report", "Write one page about runs, data sets and results."),
+    "view": ("view.view", "Look at data, a run or a mesh in a browser on this machine."),
+    "doctor": ("doctor.doctor", "Tell what works on this machine and how to get what does not."),
+    "demo": ("demo.demo", "Run everything once on built-in shapes: scan, train, adapt, report."),
 }
-"""Each verb's module in this package, with a function of the verb's name, and a line of help."""
+"""Where in this package each verb is, and a line of help."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -76,7 +85,7 @@ def _run(given: list[str]) -> int:
         raise InputError(f"{verb}: no such verb; did you mean {' or '.join(near)}? See qs3 --help")
     from qs3.cli.options import run_verb
 
-    return run_verb(verb, VERBS[verb][0], rest)
+    return run_verb(verb, *VERBS[verb], rest)
 
 
 def _help() -> str:

@@ -15,10 +15,13 @@ Flat = Annotated[_Settings, tyro.conf.arg(name="")]
 _registry = ConstructorRegistry()
 
 
-def run_verb(verb: str, module: str, words: list[str]) -> int:
-    """Run the function ``verb`` of a module of this package on the words of a command line."""
-    function: Any = getattr(importlib.import_module(f"qs3.cli.{module}"), verb)
+def run_verb(verb: str, place: str, text: str, words: list[str]) -> int:
+    """Run the function at ``place``, or one of several, on the words of a command line."""
+    module, _, name = place.partition(".")
+    function: Any = getattr(importlib.import_module(f"qs3.cli.{module}"), name)
     how: dict[str, Any] = {"prog": f"qs3 {verb}", "args": words, "registry": _registry}
+    if isinstance(function, dict):
+        return tyro.extras.subcommand_cli_from_dict(function, description=text, **how)
     if verb == "train":
         from qs3.cli.train import TrainOptions, preset_options
 
