@@ -37,7 +37,7 @@ class ReportOptions:
     """Run to compare with; by default the warm-up, or the source-only run of the same settings."""
     mesh: str = "chair"
     """Mesh file or built-in class whose scan is shown step by step; none leaves it out."""
-    sensor: str = "qs3"
+    sensor: str = "paper"
     """Preset of the sensor for that scan, or your own TOML file."""
     clouds: int = 200
     """Clouds to step through, half of them of each domain."""

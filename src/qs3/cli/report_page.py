@@ -276,16 +276,16 @@ def _summary(run: FoundRun, test: DataRecord | None) -> str:
 
 def _montage(options: "ReportOptions") -> tuple[Any, str, tuple[str, ...]]:
     """A scan step by step, its title, and a note where none can be made here."""
-    from qs3.cli.camera import CameraOptions
-    from qs3.cli.scan import load_named
+    from qs3.meshes.named import load_named
+    from qs3.sensor.settings import CameraSettings
 
     if options.mesh == "none":
         return None, "", ()
     mesh, origin = load_named(options.mesh, 0)
-    camera = CameraOptions(sensor=options.sensor)
-    camera.resolve_sensor()
+    camera = CameraSettings(sensor=options.sensor)
+    camera.make_sensor()
     try:
-        renderer = camera.resolve_renderer()
+        renderer = camera.make_renderer()
     except QS3Error as error:
         print(f"no scan can be made here: {error}", file=sys.stderr)
         return None, "", ("No renderer works where this page was made: no scan is shown.",)

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from qs3.cli.camera import CameraOptions
 from qs3.errors import InputError, UnevenSizesError
+from qs3.sensor.settings import ScanSettings
 
 if TYPE_CHECKING:
     from qs3.io.clouds import PointClouds, UnlabelledClouds
@@ -43,16 +43,14 @@ class ViewOptions:
     """With a run on generated data: the cloud that the network is shown."""
     class_name: str | None = None
     """Show the objects of this class first."""
-    seed: int = 0
-    """With a mesh: seed of the scan, and which draw of a built-in class."""
     up: Literal["z", "y"] | None = None
     """Up axis of a mesh file; by default y for glTF, z for all others."""
     host: str = "127.0.0.1"
     """Address or name to listen on. Anybody who reaches another than 127.0.0.1 sees the data."""
     port: int = 8080
     """Port to listen on; 0 takes a free one."""
-    camera: Annotated[CameraOptions, tyro.conf.arg(name="")] = field(default_factory=CameraOptions)
-    """With a mesh: the simulated camera to start with."""
+    scan: Annotated[ScanSettings, tyro.conf.arg(name="")] = field(default_factory=ScanSettings)
+    """With a mesh: how it is scanned to start with; a built-in class is drawn by the seed too."""
 
 
 def view(options: Annotated[ViewOptions, tyro.conf.arg(name="")]) -> int:
@@ -180,19 +178,17 @@ def _mesh_page(options: ViewOptions, mesh: Any) -> Page:
     from qs3.sensor.presets import SENSORS
     from qs3.viewer import ScanControls, rescan, scan_page
 
-    if options.seed < 0:
-        raise InputError(f"--seed {options.seed}: must not be negative")
-    sensor = options.camera.resolve_sensor()
-    renderer = options.camera.resolve_renderer()
-    how = options.camera.scan_arguments()
+    how = options.scan
+    sensor = how.make_sensor()
+    renderer: Any = how.make_renderer()
     start = ScanControls.of(
         sensor,
-        views=how["views"],
-        view_layout=how["view_layout"],
-        num_points=how["num_points"],
+        views=how.views,
+        view_layout=how.chosen("view_layout"),
+        num_points=how.num_points,
         samples=renderer.samples,
-        crop="box" if how["box_crop"] else "none",
-        seed=options.seed,
+        crop=how.chosen("crop"),
+        seed=how.seed,
     )
     name = Path(options.what).name
 
@@ -200,7 +196,7 @@ def _mesh_page(options: ViewOptions, mesh: Any) -> Page:
         built_in = mesh is None
         shape = shapes.make(options.what, seed=request.draw) if built_in else mesh
         title = f"{name}, draw {request.draw}" if built_in else name
-        return rescan(request, shape, title, renderer, how["size"])
+        return rescan(request, shape, title, renderer, how.chosen("size"))
 
     others = {key: value for key, value in SENSORS.items() if key != sensor.name}
     return partial(
@@ -209,7 +205,7 @@ def _mesh_page(options: ViewOptions, mesh: Any) -> Page:
         sensors={sensor.name: sensor} | others,
         start=start,
         draws=_DRAWS if mesh is None else 0,
-        draw=options.seed if mesh is None else 0,
+        draw=how.seed if mesh is None else 0,
     )
 
 
