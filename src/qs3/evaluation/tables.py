@@ -109,18 +109,20 @@ def average(lines: pd.DataFrame, by: Sequence[str] = LINE) -> pd.DataFrame:
         InputError: where a line has two runs of one seed, or runs of other settings or data.
     """
     means = []
-    for key, runs in lines.groupby(list(by), sort=False, dropna=False):
-        label = " · ".join(str(part) for part in key if part)
-        if runs["seed"].duplicated().any():
+    for _, group in lines.groupby(list(by), sort=False, dropna=False):
+        runs: list[dict[str, Any]] = group.to_dict("records")  # pyright: ignore[reportAssignmentType]
+        line = {name: runs[0][name] for name in by}
+        label = " · ".join(str(part) for part in line.values() if part)
+        if len({run["seed"] for run in runs}) < len(runs):
             raise InputError(f"{label}: two records of one seed; remove one")
-        if runs["alike"].nunique() > 1:
+        if len({run["alike"] for run in runs}) > 1:
             raise InputError(f"{label}: runs differ in settings or data, not in the seed alone")
-        marks = sorted({mark for text in runs["marks"] for mark in text.split(", ") if mark})
+        marks = sorted({mark for run in runs for mark in run["marks"].split(", ") if mark})
         means.append(
-            dict(zip(by, key, strict=True))
-            | {name: mean_sem(runs[name].tolist()) for name in SCORES}
-            | {"seeds": tuple(sorted(runs["seed"])), "marks": ", ".join(marks)}
-            | {name: int(runs[name].sum()) for name in ("trained", "rounds")}
+            line
+            | {name: mean_sem([run[name] for run in runs]) for name in SCORES}
+            | {"seeds": tuple(sorted(run["seed"] for run in runs)), "marks": ", ".join(marks)}
+            | {name: sum(run[name] for run in runs) for name in ("trained", "rounds")}
         )
     columns = dict.fromkeys([*by, *SCORES, "seeds", "marks", "trained", "rounds"])
     return pd.DataFrame(means, columns=list(columns))
@@ -136,24 +138,22 @@ def to_markdown(table: pd.DataFrame) -> str:
         | --- | --- |
         | qbst | 55.0 ± 5.0 (n=2) |
     """
-    rows = [[_text(value).replace("|", "\\|") for value in row] for row in _rows(table)]
-    return "\n".join(
-        f"| {' | '.join(row)} |" for row in [rows[0], ["---"] * len(rows[0]), *rows[1:]]
-    )
+    head, *body = [[_text(value).replace("|", "\\|") for value in row] for row in _rows(table)]
+    return "\n".join(f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *body])
 
 
 def to_latex(table: pd.DataFrame) -> str:
-    """Return a table of text as a LaTeX tabular, its first column to the left.
+    r"""Return a table of text as a LaTeX tabular, its first column to the left.
 
     Example:
         >>> print(to_latex(pd.DataFrame({"method": ["a_b"], "S → D, %": ["–"]})))
-        \\begin{tabular}{lr}
-        \\hline
-        method & S $\\to$ D, \\% \\\\
-        \\hline
-        a\\_b & -- \\\\
-        \\hline
-        \\end{tabular}
+        \begin{tabular}{lr}
+        \hline
+        method & S $\to$ D, \% \\
+        \hline
+        a\_b & -- \\
+        \hline
+        \end{tabular}
     """
     rows = [" & ".join(_text(value).translate(_LATEX) for value in row) for row in _rows(table)]
     head, *body = [row + r" \\" for row in rows]
