@@ -70,7 +70,7 @@ def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
     import tyro
 
     from qs3.cli.demo import demo
-    from qs3.cli.evaluate import evaluate, predict
+    from qs3.cli.evaluate import evaluate_run, predict
     from qs3.cli.export import export
     from qs3.cli.report import report
     from qs3.cli.reproduce import reproduce
@@ -85,7 +85,7 @@ def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
         return train(options)
 
     train_with_preset.__doc__ = train.__doc__
-    verbs |= {"train": train_with_preset, "evaluate": evaluate, "predict": predict}
+    verbs |= {"train": train_with_preset, "evaluate": evaluate_run, "predict": predict}
     verbs |= {"export": export, "reproduce": reproduce, "demo": demo}
     verbs |= {"table": table, "figure": figure}
     verbs["report"] = report

@@ -194,17 +194,16 @@ def _report(folder: Path, settings: DemoSettings) -> tuple[Any, Any, Path]:
     """Score both networks on the target and write the page."""
     from qs3 import shapes
     from qs3.cli import report_parts as parts
-    from qs3.cli.evaluate import make_record
     from qs3.io import load_clouds
     from qs3.report import NamedRecord, Report, score_lines, write_report
-    from qs3.training import load_model
+    from qs3.training import evaluate, load_model
 
     target = load_clouds(folder / "target", num_points=settings.num_points)
     source = load_clouds(folder / "source", num_points=settings.num_points)
     models = {name: load_model(folder / name) for name in ("source-only", "qbst")}
     records, outcomes, answers = [], [], {}
     for name, loaded in models.items():
-        records.append(make_record(folder / name, folder / "target")[0])
+        records.append(evaluate(folder / name, folder / "target"))
         outcome, answers[name] = parts.outcome(name, loaded, target)
         outcomes.append(outcome)
     curves, marks = parts.curves([folder / name for name in models])

@@ -179,10 +179,11 @@ def _clouds(
 
 
 def _seen(run: FoundRun, target: Any) -> list[str]:
-    from qs3.cli.evaluate import caveats
     from qs3.io.clouds import digests
+    from qs3.training.evaluate import caveats
+    from qs3.training.run import read_run
 
-    return caveats(run.told, set(digests(target.points)))
+    return list(caveats(read_run(run.folder), set(digests(target.points))))
 
 
 def _record(

@@ -8,17 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qs3.cli.train import RUN
 from qs3.errors import InputError, QS3Error
 from qs3.evaluation.records import RECORD, DataRecord, RunRecord, read_record
 from qs3.experiments.runs import parse_record_name
-from qs3.files import read_json
 from qs3.store.manifest import MANIFEST
+from qs3.structure import unstructure
 
 if TYPE_CHECKING:
     from qs3.report import NamedRecord
 
-_SETTINGS, _MODEL = "settings.json", "model.safetensors"
+RUN, _SETTINGS, _MODEL = "run.json", "settings.json", "model.safetensors"
 _RECORDS = ("records", "results")
 
 
@@ -40,7 +39,7 @@ class FoundRun:
 
     def data(self, role: str) -> DataRecord | None:
         """What it read as ``source`` or ``target``."""
-        value = self.told["data"].get(role)
+        value = self.told[role]
         return None if value is None else DataRecord(**value)
 
 
@@ -91,19 +90,10 @@ def read_run(folder: Path) -> FoundRun:
     Raises:
         InputError: where it is not finished, or not a run of ``qs3 train``.
     """
-    if not (folder / RUN).is_file() or not (folder / _MODEL).is_file():
-        raise InputError(
-            f"{folder}: the run is not finished; run its qs3 train command again to go on"
-        )
-    told, settings = read_json(folder / RUN), read_json(folder / _SETTINGS)
-    try:
-        run = FoundRun(folder, dict(settings), dict(told))
-        _ = (run.method, told["rounds"], settings["train"]["num_points"])
-        for role in ("source", "target"):
-            run.data(role)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{folder}: not a run of this version of qs3 train ({error})") from error
-    return run
+    from qs3.training.run import read_run as read
+
+    run = read(folder)
+    return FoundRun(folder, dict(run.settings), unstructure(run))
 
 
 def _is_run(folder: Path) -> bool:

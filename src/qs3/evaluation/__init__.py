@@ -14,7 +14,7 @@ from qs3.evaluation.metrics import wilson_interval as wilson_interval
 from qs3.evaluation.records import DataRecord as DataRecord
 from qs3.evaluation.records import RunRecord as RunRecord
 from qs3.evaluation.records import Scores as Scores
-from qs3.evaluation.records import load_records as load_records
+from qs3.evaluation.records import find_records as find_records
 from qs3.evaluation.records import read_record as read_record
 from qs3.evaluation.records import score as score
 from qs3.evaluation.records import write_record as write_record
