@@ -11,7 +11,6 @@ import numpy as np
 import tyro
 
 from qs3.cli.camera import CameraOptions
-from qs3.cli.pictures import montage_view
 from qs3.cli.scene import SceneOptions
 from qs3.errors import InputError
 from qs3.files import claim_folder, sha256, write_bytes, write_json
@@ -46,7 +45,7 @@ def scan(options: Annotated[ScanOptions, tyro.conf.arg(name="")]) -> int:
     """Photograph one mesh: noisy cloud, clean twin, a picture of every stage, and statistics."""
     from qs3.io.ply import write_ply
     from qs3.report.figure import write_png
-    from qs3.report.montage import montage
+    from qs3.report.montage import montage, montage_view
     from qs3.sensor.frames import write_frames
     from qs3.sensor.scan import scan as scan_mesh
 
@@ -73,7 +72,7 @@ def scan(options: Annotated[ScanOptions, tyro.conf.arg(name="")]) -> int:
     )
     sensor = result.sensor
     # Everything is computed before the folder is touched: a fault leaves nothing behind.
-    view, best = montage_view(result, sensor)
+    view, best = montage_view(result)
     title = f"{origin['name']} · sensor {sensor.name} · view {best + 1} of {len(result.views)}"
     figure = montage(view, title)
     record = _record(options.seed, settings, sensor, renderer, origin, result)
