@@ -11,9 +11,8 @@ from qs3.sensor.matching.settings import Method
 from qs3.sensor.materials import MATERIALS, get_material
 from qs3.sensor.presets import Sensor
 from qs3.sensor.scan import Scan, scan
-from qs3.sensor.surroundings import SceneSettings
 from qs3.sensor.views import ViewLayout
-from qs3.viewer.exhibits import STATISTICS, Exhibit
+from qs3.viewer.exhibits import STATISTICS, Exhibit, statistics
 
 SCENES = ("alone", "floor", "wall", "room")
 OWN_MATERIAL = "of the sensor"
@@ -161,9 +160,8 @@ def rescan(
         seed=how.seed,
         size=size,
         num_points=how.num_points,
-        scene=SceneSettings(how.scene),
-        box_crop=how.crop == "box",
-        mask_crop=how.crop == "mask",
+        scene=how.scene,
+        crop=how.crop,
         renderer=dataclasses.replace(renderer, samples=how.samples),
     )
     return exhibit_of(done, name)
@@ -171,11 +169,11 @@ def rescan(
 
 def exhibit_of(done: Scan, name: str, class_name: str = "") -> Exhibit:
     """A scan as something to show."""
-    facts = [("fused points", str(done.fused_points))]
-    for key, (label, form) in STATISTICS.items():
-        known = [value for view in done.views if (value := getattr(view, key)) is not None]
-        if known:
-            facts.append((label, f"{sum(known) / len(known):{form}}"))
+    means = {}
+    for name in STATISTICS:
+        values = [value for view in done.views if (value := getattr(view, name)) is not None]
+        means[name] = sum(values) / len(values) if values else None
+    facts = [("fused points", str(done.fused_points)), *statistics(means)]
     facts.append(("scanned in", f"{sum(done.seconds.values()):.1f} s"))
     return Exhibit(
         name=name,
