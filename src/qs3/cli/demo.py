@@ -1,6 +1,6 @@
 """``qs3 demo``: the whole way on built-in shapes, from CAD models to a report.
 
-A network learns from scans of some draws of the shapes, made by the `qs3` sensor from views all
+A network learns from scans of some draws of the shapes, made by the `paper` sensor from views all
 around. The target is other draws, seen once each by a visibly different sensor. The network is
 then adapted to the target without its labels, and both networks are scored.
 """
@@ -14,7 +14,6 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from qs3.cli.camera import CameraOptions
 from qs3.files import claim_folder, write_json
 
 _MARKER = "demo.json"
@@ -117,7 +116,9 @@ def _generate(folder: Path, settings: DemoSettings, per_class: int, seed: int, *
 
 
 def _renderer(settings: DemoSettings) -> Any:
-    return CameraOptions(samples=settings.samples, variant=settings.variant).resolve_renderer()
+    from qs3.sensor.settings import CameraSettings
+
+    return CameraSettings(samples=settings.samples, variant=settings.variant).make_renderer()
 
 
 def _source(folder: Path, settings: DemoSettings) -> None:
@@ -206,7 +207,7 @@ def _report(folder: Path, settings: DemoSettings) -> tuple[Any, Any, Path]:
         title="qs3 demo: from CAD models to a depth camera",
         summary=(
             f"A {settings.model} was trained on {source.clouds} scans of built-in shapes by the "
-            f"qs3 sensor ({settings.source_views} views around each object), then adapted by "
+            f"paper sensor ({settings.source_views} views around each object), then adapted by "
             f"quasi-balanced self-training to {target.clouds} scans of other shapes by the sensor "
             f"{settings.target_sensor}, which sees each object once in brighter light and with "
             "image noise. No label of the target was used."
@@ -215,12 +216,12 @@ def _report(folder: Path, settings: DemoSettings) -> tuple[Any, Any, Path]:
         settings=dataclasses.asdict(settings) | {"runs": records[1].settings},
         montage=scan_montage(
             shapes.make("chair", seed=settings.seed),
-            get_sensor("qs3"),
+            get_sensor("paper"),
             _renderer(settings),
             settings.source_views,
             settings.seed,
         ),
-        montage_title="chair · sensor qs3",
+        montage_title="chair · sensor paper",
         notes=(
             *page.notes,
             "This is a demonstration on tens of clouds, one seed and a simulated target. It shows "

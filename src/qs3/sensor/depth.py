@@ -16,6 +16,8 @@ from qs3.errors import InputError
 from qs3.geometry import transform_points
 from qs3.sensor.rig import Pose, Region, StereoRig
 
+PrincipalPoint = Literal["true", "released"]
+
 
 @dataclass(frozen=True)
 class DepthSettings:
@@ -27,7 +29,7 @@ class DepthSettings:
     """Depths at or above are dropped."""
     stride: int = 4
     """Every stride-th pixel of the frame is kept, from pixel 0: the ×0.25 nearest resize."""
-    principal_point: Literal["true", "released"] = "true"
+    principal_point: PrincipalPoint = "true"
     """``true`` is (w − 1)/2 of the frame; ``released`` is w/2 of the reduced image, half a pixel
     of the frame and more away from where the optical axis is."""
 

@@ -52,8 +52,8 @@ MATERIALS: dict[str, Material] = {
 }
 
 
-def get_material(name: str) -> Material:
-    """Return the named material.
+def get_material(name: Material | str) -> Material:
+    """Return the named material; a material is returned as it is.
 
     Raises:
         InputError: where there is none; the message lists those there are.
@@ -62,6 +62,8 @@ def get_material(name: str) -> Material:
         >>> get_material("dark").albedo
         0.04
     """
+    if isinstance(name, Material):
+        return name
     if name not in MATERIALS:
         raise InputError(f"material: no {name!r}; choose one of {', '.join(MATERIALS)}")
     return MATERIALS[name]

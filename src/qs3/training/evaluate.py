@@ -105,7 +105,7 @@ def _labelled(
         return load_clouds(
             data, split=split, num_points=num_points, cloud=cloud, class_names=class_names
         )
-    given = RaggedClouds(data.points, data.ids, data.checksum, data.labels, data.class_names)
+    given = RaggedClouds(list(data.points), data.ids, data.checksum, data.labels, data.class_names)
     return replace(given.labelled(num_points, class_names, "data"), origin=data.origin)
 
 

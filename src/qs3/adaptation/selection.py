@@ -5,21 +5,17 @@ Convention:
     a cloud is its most probable class, the first one at ties; its confidence is that probability.
 """
 
+import math
 import warnings
 from collections.abc import Sequence
-from typing import Literal
+from fractions import Fraction
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from qs3.adaptation.names import Selection, SingleClass
+from qs3.adaptation.priors import check_prior, check_probabilities
 from qs3.errors import InputError
-
-Selection = Literal["most-confident", "least-confident"]
-"""End of a class's ranking by confidence that is kept."""
-SingleClass = Literal["keep", "drop"]
-"""What becomes of the confident clouds where all of them have one class (μ = 0)."""
-
-_TOLERANCE = 1e-3
 
 
 class SingleClassWarning(UserWarning):
@@ -105,6 +101,125 @@ def select_quasi_balanced(
     return keep_of_classes(probabilities, confident, most, selection)
 
 
+def select_uniform(
+    probabilities: Float[np.ndarray, "m k"],
+    threshold: float,
+    *,
+    quantile: float = 0.0,
+    inclusive: bool = False,
+) -> Bool[np.ndarray, "m"]:
+    """Select equally many confident clouds of each class.
+
+    Of each class at most q are kept, q the given quantile (rounded down to a count that occurs) of
+    the numbers of confident clouds in the classes that have any. At quantile 0 it is the smallest,
+    and all these classes keep the same number; above, rarer classes keep all that they have.
+
+    Args:
+        probabilities: Class probabilities.
+        threshold: θ, in 0 to 1.
+        quantile: 0 to 1; 1 keeps every confident cloud.
+        inclusive: Whether a confidence equal to θ is enough.
+
+    Raises:
+        InputError: where rows are not probabilities, or a setting is not in 0 to 1.
+
+    Example:
+        >>> p = np.array([0.9, 0.95, 0.85, 0.1])
+        >>> select_uniform(np.stack([p, 1 - p], axis=1), 0.8).tolist()
+        [False, True, False, True]
+    """
+    _check_share("quantile", quantile)
+    confident = select_confident(probabilities, threshold, inclusive=inclusive)
+    counts = count_labels(probabilities, confident)
+    present = counts[counts > 0]
+    most = int(np.quantile(present, quantile, method="lower")) if len(present) else 0
+    return keep_of_classes(probabilities, confident, [most] * len(counts))
+
+
+def select_prior(
+    probabilities: Float[np.ndarray, "m k"],
+    threshold: float,
+    prior: Float[np.ndarray, "k"],
+    *,
+    quantile: float = 0.0,
+    inclusive: bool = False,
+) -> Bool[np.ndarray, "m"]:
+    """Select confident clouds so that their classes are as frequent as a prior says.
+
+    Of the classes with a positive prior π_k and L_k > 0 confident clouds, the ratios L_k / π_k
+    bound the size of a selection that follows the prior; with T their given quantile,
+    ⌈T π_k⌉ clouds of class k are kept, or all L_k where there are fewer. Classes of prior 0 keep
+    none.
+
+    Args:
+        probabilities: Class probabilities.
+        threshold: θ, in 0 to 1.
+        prior: Share of each class; it is divided by its sum.
+        quantile: 0 to 1. At 0 the counts follow the prior, up to rounding; above, classes that the
+            threshold has left too rare keep all that they have and the others more.
+        inclusive: Whether a confidence equal to θ is enough.
+
+    Raises:
+        InputError: where rows are not probabilities, or a setting is unusable.
+
+    Example:
+        >>> p = np.array([0.9, 0.95, 0.85, 0.99, 0.1, 0.2])
+        >>> rows = np.stack([p, 1 - p], axis=1)
+        >>> select_prior(rows, 0.7, np.array([0.5, 0.5])).tolist()
+        [False, True, False, True, True, True]
+    """
+    _check_share("quantile", quantile)
+    share = check_prior("prior", prior, probabilities.shape[1])
+    confident = select_confident(probabilities, threshold, inclusive=inclusive)
+    counts = count_labels(probabilities, confident)
+    use = (counts > 0) & (share > 0)
+    if not use.any():
+        return np.zeros(len(probabilities), dtype=bool)
+    total = float(np.quantile(counts[use] / share[use], quantile, method="lower"))
+    # A product that is an integer but for rounding must not gain one.
+    most = np.ceil(total * share - 1e-9).astype(np.int64)
+    return keep_of_classes(probabilities, confident, most.tolist())
+
+
+def select_quantile(
+    probabilities: Float[np.ndarray, "m k"],
+    threshold: float,
+    share: float = 0.2,
+    *,
+    inclusive: bool = False,
+) -> Bool[np.ndarray, "m"]:
+    """Select the same share of every class: class-balanced self-training (Zou et al., ECCV 2018).
+
+    Of the N_k clouds with pseudo label k, confident or not, the ⌈share · N_k⌉ most confident are
+    kept, so that each class has a threshold of its own; a threshold for all classes may come on
+    top, of which the authors have none (0).
+
+    NOTE: the authors also divide the probabilities by the classes' thresholds before they label;
+    here the labels stay as they are, since a rule only selects.
+
+    Args:
+        probabilities: Class probabilities.
+        threshold: θ, in 0 to 1.
+        share: Part of a class; the authors begin with 0.2 and add 0.05 a round, to 0.5.
+        inclusive: Whether a confidence equal to θ is enough.
+
+    Raises:
+        InputError: where rows are not probabilities, or a setting is not in 0 to 1.
+
+    Example:
+        >>> p = np.array([0.9, 0.6, 0.7, 0.45, 0.3])
+        >>> select_quantile(np.stack([p, 1 - p], axis=1), 0.0, 0.5).tolist()
+        [True, False, True, False, True]
+    """
+    _check_share("share", share)
+    confident = select_confident(probabilities, threshold, inclusive=inclusive)
+    counts = count_labels(probabilities, np.ones(len(probabilities), dtype=bool))
+    # The share is meant as it is written: 0.07 of 100 is 7, not 8.
+    exact = Fraction(str(float(share)))
+    most = [math.ceil(exact * count) for count in counts.tolist()]
+    return keep_of_classes(probabilities, confident, most)
+
+
 def count_labels(
     probabilities: Float[np.ndarray, "m k"], mask: Bool[np.ndarray, "m"]
 ) -> Int[np.ndarray, "k"]:
@@ -149,18 +264,6 @@ def balanced_count(members: int, total: int) -> int:
     return -(-members * (total - members) // total)
 
 
-def check_probabilities(probabilities: Float[np.ndarray, "m k"]) -> None:
-    """Check that rows are probabilities.
-
-    Raises:
-        InputError: where there is no class, a value is not finite or is negative, or a row's sum
-            is not 1 within 0.001.
-    """
-    if probabilities.shape[1] == 0:
-        raise InputError("probabilities have no class")
-    if not np.isfinite(probabilities).all():
-        raise InputError("probabilities hold NaN or infinity; the network has diverged")
-    if (probabilities < -_TOLERANCE).any():
-        raise InputError("probabilities are negative; hand in softmax outputs, not logits")
-    if (np.abs(probabilities.sum(axis=1, dtype=np.float64) - 1.0) > _TOLERANCE).any():
-        raise InputError("probabilities do not sum to 1; hand in softmax outputs, not logits")
+def _check_share(name: str, value: float) -> None:
+    if not 0.0 <= value <= 1.0:
+        raise InputError(f"{name} must be 0 to 1, not {value}")

@@ -10,7 +10,7 @@ import torch
 from qs3.errors import InputError
 from qs3.models import create_model
 from qs3.models.ops import knn
-from qs3.models.reference import load_reference
+from qs3.models.releases import load_reference
 
 
 def textbook(network):

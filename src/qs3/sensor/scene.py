@@ -96,7 +96,7 @@ class SceneSettings:
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class ArrangedScene:
     """Everything before the rig, and from where it is seen."""
 
     bodies: tuple[Body, ...]
@@ -114,7 +114,7 @@ def arrange(
     size: float,
     neighbour: trimesh.Trimesh | None,
     rng: np.random.Generator,
-) -> Surroundings:
+) -> ArrangedScene:
     """Put the object's surroundings about it.
 
     Args:
@@ -165,7 +165,7 @@ def arrange(
         centre = up * ground
         bodies.append(Body(_square(centre, front * half, across * half), settings.floor))
         names.append("floor")
-    return Surroundings(tuple(bodies), tuple(names), tuple(poses))
+    return ArrangedScene(tuple(bodies), tuple(names), tuple(poses))
 
 
 def _on_arc(poses: Sequence[Pose], arc: float) -> list[Pose]:

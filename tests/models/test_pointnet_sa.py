@@ -12,7 +12,7 @@ from torch import nn
 from qs3.errors import InputError
 from qs3.models import PointNetSA, create_model
 from qs3.models.ops import farthest_point_sampling, gather_points
-from qs3.models.sa_node import SANode, fill_nodes
+from qs3.models.pointnet_sa import SANode, fill_nodes
 
 FILE = Path(__file__).parents[2] / "benchmarks" / "reference" / "pointnet_sa.py"
 SPEC = importlib.util.spec_from_file_location("reference_pointnet_sa", FILE)

@@ -1,0 +1,63 @@
+"""What settings check of their own values, in one line that names room and field."""
+
+import functools
+import math
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from qs3.errors import InputError
+
+
+def check_choices(settings: Any, room: str) -> None:
+    """Check that every field that is a choice has one of its values.
+
+    Args:
+        settings: A dataclass; choices are its fields annotated as ``Literal``.
+        room: What the settings are of, for the message.
+
+    Raises:
+        InputError: where one has not.
+    """
+    for name, choices in _choices(type(settings)).items():
+        value = getattr(settings, name)
+        if value not in choices:
+            offer = ", ".join(map(str, choices))
+            raise InputError(f"{room}: no {name} {value!r}; choose one of {offer}")
+
+
+def check_range(
+    settings: Any,
+    room: str,
+    *names: str,
+    low: float | int = 0,
+    high: float | int = math.inf,
+    above: bool = False,
+    below: bool = False,
+) -> None:
+    """Check that numbers are finite and within ``low`` … ``high``.
+
+    Args:
+        settings: A dataclass.
+        room: What the settings are of, for the message.
+        names: Fields.
+        low: Least value.
+        high: Greatest value.
+        above: Whether ``low`` itself is refused.
+        below: Whether ``high`` itself is refused.
+
+    Raises:
+        InputError: where one is not.
+    """
+    for name in names:
+        value = getattr(settings, name)
+        within = low < value if above else low <= value
+        if not (within and (value < high if below else value <= high) and math.isfinite(value)):
+            bound = f"{'above' if above else 'at least'} {low:g}"
+            if high < math.inf:
+                bound += f" and {'below' if below else 'at most'} {high:g}"
+            raise InputError(f"{room}: {name} {value} must be {bound}")
+
+
+@functools.cache
+def _choices(kind: type) -> dict[str, tuple[Any, ...]]:
+    hints = get_type_hints(kind)
+    return {name: get_args(hint) for name, hint in hints.items() if get_origin(hint) is Literal}
