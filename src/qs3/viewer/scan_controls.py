@@ -37,11 +37,11 @@ class Control:
     """Value to begin with; two values make a range."""
     choices: tuple[str, ...] = ()
     """Words to choose from; empty for a slider."""
-    low: float = 0.0
+    low: int | float = 0.0
     """Lowest value of the slider."""
-    high: float = 1.0
+    high: int | float = 1.0
     """Highest value of the slider."""
-    step: float = 1
+    step: int | float = 1
     """Step of the slider; a whole number where its values are."""
 
 
