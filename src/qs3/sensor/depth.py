@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from qs3.errors import InputError
 from qs3.geometry import transform_points
+from qs3.sensor.checks import check_choices, check_range
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 PrincipalPoint = Literal["true", "released"]
@@ -38,12 +39,8 @@ class DepthSettings:
             raise InputError(
                 f"depth: near {self.near} and far {self.far} must be 0 or above and in this order"
             )
-        if self.stride < 1:
-            raise InputError(f"depth: stride {self.stride} must be at least 1")
-        if self.principal_point not in ("true", "released"):
-            raise InputError(
-                f"depth: no principal_point {self.principal_point!r}; choose true or released"
-            )
+        check_range(self, "depth", "stride", low=1)
+        check_choices(self, "depth")
 
 
 def depth_from_disparity(

@@ -1,13 +1,13 @@
 """How an object is scanned: every option once, for `qs3.scan`, data sets and the command line."""
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from qs3.errors import InputError
+from qs3.sensor.checks import check_choices, check_range
 from qs3.sensor.depth import PrincipalPoint
 from qs3.sensor.matching.settings import Method
 from qs3.sensor.materials import Material, get_material
@@ -75,8 +75,9 @@ class CameraSettings:
     }
 
     def __post_init__(self) -> None:
-        if self.samples is not None and self.samples < 1:
-            raise InputError(f"samples: {self.samples} is too few; at least 1 is needed")
+        check_choices(self, "camera")
+        if self.samples is not None:
+            check_range(self, "camera", "samples", low=1)
 
     def make_sensor(self) -> Sensor:
         """The sensor with every change.
@@ -175,16 +176,8 @@ class ScanSettings(CameraSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.preset not in PRESETS:
-            raise InputError(f"preset: no {self.preset!r}; choose one of {', '.join(PRESETS)}")
-        if self.crop not in (None, "box", "mask", "both", "none"):
-            raise InputError(f"crop: no {self.crop!r}; choose box, mask, both or none")
-        for name in ("num_points", "views"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: {getattr(self, name)} is too few; at least 1 is needed")
-        for name in ("box_margin", "seed"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"{name}: {getattr(self, name)} must not be below 0")
+        check_range(self, "scan", "num_points", "views", low=1)
+        check_range(self, "scan", "box_margin", "seed")
 
     def chosen(self, name: str) -> Any:
         """A setting by its name, or the preset's where it is None."""

@@ -12,6 +12,7 @@ import tyro
 
 from qs3.errors import InputError
 from qs3.meshes.classes import POINTDA10, map_labels
+from qs3.sensor.checks import check_range
 from qs3.sensor.presets import settings_dict
 from qs3.sensor.settings import ScanSettings, renderer_dict
 from qs3.store.shards import STATISTICS, CloudRow, DType
@@ -65,11 +66,7 @@ class GenerateSettings(ScanSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("scans_per_mesh", "rows_per_shard"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if self.dtype not in ("float32", "float16"):
-            raise InputError(f"dtype {self.dtype!r}: choose float32 or float16")
+        check_range(self, "data set", "scans_per_mesh", "rows_per_shard", low=1)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, the sensor's and the renderer's settings among them."""
