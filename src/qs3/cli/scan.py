@@ -35,12 +35,11 @@ def scan(
         neighbour: Mesh file or built-in class that stands in front (scene behind) or beside.
         settings: How it is scanned.
     """
-    from qs3.cli.pictures import montage_view
     from qs3.files import claim_folder, write_json
     from qs3.io.ply import write_ply
     from qs3.meshes.named import load_named
     from qs3.report.figure import write_png
-    from qs3.report.montage import montage
+    from qs3.report.montage import montage, montage_view
     from qs3.sensor.frames import write_frames, write_parts
     from qs3.sensor.scan import scan as scan_mesh
 
@@ -54,7 +53,7 @@ def scan(
     settings = dataclasses.replace(settings, renderer=settings.make_renderer())
     result = scan_mesh(shape, settings, neighbour=beside, keep_images=True, full_frames=frames)
     # Everything is computed before the folder is touched: a fault leaves nothing behind.
-    view, best = montage_view(result, result.sensor)
+    view, best = montage_view(result)
     title = f"{origin['name']} · sensor {result.sensor.name} · view {best + 1} of {settings.views}"
     figure = montage(view, title)
     record = _record(settings, origin, result)
