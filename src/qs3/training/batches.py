@@ -13,7 +13,7 @@ from torch import Tensor
 from qs3.adaptation import Batch
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.io.transforms import unit_ball
+from qs3.io.preparation import unit_ball
 from qs3.training.config import TrainSettings
 from qs3.training.thinning import thin
 
@@ -134,7 +134,7 @@ def augment(
     """Turn clouds about z and jitter them, as the settings say, on their device.
 
     Convention:
-        Anticlockwise seen from above, as `qs3.io.transforms.rotate_z`.
+        Anticlockwise seen from above, as `qs3.geometry.rotation_z`.
 
     Args:
         points: Clouds.

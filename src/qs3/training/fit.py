@@ -15,7 +15,7 @@ from qs3.adaptation.names import split_method
 from qs3.errors import InputError, UnevenSizesError
 from qs3.evaluation.records import DataRecord
 from qs3.io.clouds import PointClouds, UnlabelledClouds, digests
-from qs3.io.transforms import unit_ball
+from qs3.io.preparation import unit_ball
 from qs3.models import PointClassifier
 from qs3.training.batches import require_finite, require_unlabelled
 from qs3.training.checkpoint import claim_run, fingerprint, load_model

@@ -55,7 +55,7 @@ def sample_indices(points: Float[np.ndarray, "b n 3"], num_points: int) -> Int[n
 def thin(
     points: Float[np.ndarray, "b n 3"], num_points: int, cache: Path | None = None
 ) -> Float[np.ndarray, "b m 3"]:
-    """Bring clouds to ``num_points`` points each, as `qs3.io.transforms.resample` does.
+    """Bring clouds to ``num_points`` points each, as `qs3.io.preparation.resample` does.
 
     Args:
         points: Clouds, as read.
