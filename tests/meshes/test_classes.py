@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.meshes.classes import POINTDA10, canonical, map_labels, merge_predictions
+from qs3.meshes.classes import POINTDA10, canonical, map_labels
 
 
 @pytest.mark.parametrize(
@@ -48,15 +48,6 @@ def test_a_name_that_both_sides_have_is_not_an_alias():
     names = ["desk", "dresser", "night_stand", "table"]
     mapped, _ = map_labels(names, np.arange(4), to=names)
     assert mapped.tolist() == [0, 1, 2, 3]
-
-
-def test_predictions_merge_after_the_arg_max_and_others_are_wrong():
-    network = ["bed", "desk", "table", "toilet", "sofa"]
-    target = ["bed", "cabinet", "table"]
-    merged = merge_predictions(np.array([0, 1, 2, 3, 4]), network, target)
-    assert merged.tolist() == [0, 2, 2, -1, -1]
-    with pytest.raises(InputError, match="none in common"):
-        merge_predictions(np.array([0]), ["toilet"], target)
 
 
 def test_a_class_comes_before_its_alias_where_a_list_has_both():

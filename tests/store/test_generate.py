@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.io.layouts.contents import MANIFEST, read_store
+from qs3.io.layouts.store import read_ragged
 from qs3.meshes.classes import POINTDA10
 from qs3.store.failures import FAILURES, read_failures
 from qs3.store.generate import (
@@ -21,7 +21,7 @@ from qs3.store.generate import (
 )
 from qs3.store.generate import generate as generate_anywhere
 from qs3.store.info import info
-from qs3.store.manifest import SUMS
+from qs3.store.manifest import MANIFEST, SUMS
 from qs3.store.parts import part_folder
 from qs3.store.scan_item import neighbour_of
 
@@ -59,7 +59,7 @@ def test_one_and_two_workers_write_the_same_bytes(fake, tmp_path):
         )
         assert report == GenerateReport(done=12, skipped=0, failed=3)
     assert content(tmp_path / "1") == content(tmp_path / "2")
-    ids = read_store(tmp_path / "1").ids
+    ids = read_ragged(tmp_path / "1").ids
     assert ids == tuple(f"m{i}#{s}" for i in (0, 2, 3, 4) for s in range(3))
 
 

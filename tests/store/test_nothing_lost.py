@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.io.layouts.contents import read_store
+from qs3.io.load import load_clouds
 from qs3.store.executors import InlineExecutor, LocalExecutor
 from qs3.store.failures import read_failures
 from qs3.store.generate import GenerateReport, GenerateSettings, generate
@@ -516,7 +516,9 @@ def test_half_precision_is_the_nearest_half(fake, tmp_path):
             workers=0,
             progress=False,
         )
-    single, half = (read_store(tmp_path / dtype).points for dtype in ("float32", "float16"))
+    single, half = (
+        load_clouds(tmp_path / dtype, num_points=None).points for dtype in ("float32", "float16")
+    )
     assert half.dtype == np.float32
     np.testing.assert_array_equal(half, single.astype(np.float16).astype(np.float32))
     assert verify(tmp_path / "float16", progress=False) == []

@@ -59,32 +59,3 @@ def map_labels(
             "name the classes to use"
         )
     return mapped[kept], kept
-
-
-def merge_predictions(
-    predictions: Int[np.ndarray, "b"], class_names: Sequence[str], to: Sequence[str]
-) -> Int[np.ndarray, "b"]:
-    """Put a network's answers, after the arg-max, onto the classes of a test set.
-
-    The network keeps all its classes to choose from; an answer that the test set has no class for
-    becomes −1, which every score counts as wrong.
-
-    Args:
-        predictions: Arg-max over the network's classes.
-        class_names: The network's classes.
-        to: Classes of the test set.
-
-    Raises:
-        InputError: where no class of the network is in ``to``.
-
-    Example:
-        >>> merge_predictions(np.array([0, 1, 2]), ["desk", "toilet", "bed"], ["bed", "table"])
-        array([ 1, -1,  0])
-    """
-    positions = _positions(class_names, to)
-    if (positions < 0).all():
-        raise InputError(
-            f"the network's classes ({', '.join(class_names)}) and the data's ({', '.join(to)}) "
-            "have none in common"
-        )
-    return positions[predictions]
