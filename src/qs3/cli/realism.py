@@ -110,13 +110,13 @@ def realism(options: Annotated[RealismOptions, tyro.conf.arg(name="")]) -> int:
 
 def _tests(given: Sequence[str]) -> tuple[str, ...]:
     """The tests asked for, in their order, each once."""
-    from qs3.sensor.realism import EXPECTATIONS
+    from qs3.sensor.realism import LAWS
 
-    unknown = [name for name in given if name.upper() not in EXPECTATIONS]
+    unknown = [name for name in given if name.upper() not in LAWS]
     if unknown:
-        raise InputError(f"--tests {unknown[0]}: no such test; choose of {' '.join(EXPECTATIONS)}")
-    asked = {name.upper() for name in given} or set(EXPECTATIONS)
-    return tuple(name for name in EXPECTATIONS if name in asked)
+        raise InputError(f"--tests {unknown[0]}: no such test; choose of {' '.join(LAWS)}")
+    asked = {name.upper() for name in given} or set(LAWS)
+    return tuple(name for name in LAWS if name in asked)
 
 
 def _earlier(folder: Path, made_by: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
