@@ -35,12 +35,12 @@ def kinect_rows(step: Float[np.ndarray, "n"], sigma: Float[np.ndarray, "n"]) -> 
     squared = np.square(DISTANCES)
     rows, data = [], {"z": DISTANCES}
     for name, short, made, law in (
-        ("step", "step", step, STEP * squared),
-        ("noise σ", "sigma", sigma, SIGMA * squared),
+        ("step", "step", step, STEP),
+        ("noise σ", "sigma", sigma, SIGMA),
     ):
         rows += [
             row(f"{name} at {z:g} m", 1000 * value, 800 * expected, 1200 * expected, "mm")
-            for z, value, expected in zip(DISTANCES, made, law, strict=True)
+            for z, value, expected in zip(DISTANCES, made, law * squared, strict=True)
         ]
-        data |= {f"{short}_mm": 1000 * made, f"{short}_law_mm": 1000 * law}
+        data |= {f"{short}_mm": 1000 * made, f"{short}_law_mm": 1000 * law * squared}
     return rows, data

@@ -93,7 +93,7 @@ class MitsubaRenderer:
     """Longest path: 2 is direct light alone, 3 adds one bounce."""
     indirect: Literal["cached", "path"] = "cached"
     """``cached``: the projector's light by the pixel, all other light from an irradiance cache
-    (:mod:`qs3.sensor.render.jit`), where every surface is rough; else, and with ``path``, plain
+    (:mod:`qs3.sensor.render.cache`), where every surface is rough; else, and with ``path``, plain
     path tracing, with many times the noise at as many rays."""
     cache_cell: int = 4
     """Side in pixels of a cell of the cache."""
