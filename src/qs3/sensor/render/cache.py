@@ -97,7 +97,7 @@ class Camera:
 
     def __init__(self, arrays: Arrays, rig: StereoRig, pose: Pose, region: Region) -> None:
         cx, cy = rig.principal_point
-        self.arrays = arrays
+        self.arrays, self.rig = arrays, rig
         self.origin = [arrays.number(value) for value in pose.position]
         self._turn = [
             [arrays.number(value) for value in row] for row in pose.camera_to_world[:3, :3]
@@ -127,17 +127,19 @@ class Camera:
 class SoftLight(ABC):
     """Soft light on a grid of cells of the left image."""
 
-    def __init__(self, camera: Camera, grid: Region, cell: int, rig: StereoRig, count: Any) -> None:
+    def __init__(
+        self, camera: Camera, grid: Region, cell: int, count: Callable[[int], Any]
+    ) -> None:
         number = camera.arrays.number
         self.camera, self.cell = camera, number(cell)
         self.columns, self.rows = count(grid.width // cell), count(grid.height // cell)
         # Distance off a surface's plane, as a share of the depth, at which light counts half.
-        self._reach = number(2 * cell / rig.focal)
+        self._reach = number(2 * cell / camera.rig.focal)
         self.mean: Any = 0
         """Mean radiance of the cells that show a surface: for surfaces that none shows."""
 
     @abstractmethod
-    def fit(
+    def _fit(
         self, cell: Any, inside: Any, points: Any, normals: Any, limit: Any
     ) -> tuple[Any, Any, Any]:
         """Of a cell: how well it lies on the plane of the points, its light, whether it has any."""
@@ -185,7 +187,7 @@ class SoftLight(ABC):
         for dx, dy, share in taps:
             x, y = corner[0] + dx, corner[1] + dy
             inside = (x >= 0) & (y >= 0) & (x < columns) & (y < rows) & active
-            fit, radiance, filled = self.fit(y * columns + x, inside, points, normals, limit)
+            fit, radiance, filled = self._fit(y * columns + x, inside, points, normals, limit)
             # Even a cell that fits badly counts a little: it is all there is at some edges.
             weight = select(inside & filled, (share + 1e-3) * (fit + 1e-4), 0)
             light, total = light + weight * radiance, total + weight
@@ -198,47 +200,31 @@ class Photographer(ABC):
 
     arrays: Arrays
 
-    def __init__(self, scene: Scene, max_depth: int) -> None:
-        self.scene = scene
-        self.bounces = max_depth - 2
+    def __init__(self, scene: Scene, samples: int, max_depth: int, cache: CacheSettings) -> None:
+        self._scene, self._samples, self._cache = scene, samples, cache
+        self._bounces = max_depth - 2
 
     def photograph(
-        self,
-        rig: StereoRig,
-        pose: Pose,
-        regions: tuple[Region, Region],
-        samples: int,
-        cache: CacheSettings,
-        seed: int,
+        self, rig: StereoRig, pose: Pose, regions: tuple[Region, Region], seed: int
     ) -> list[Float32[np.ndarray, "_ _"]]:
         """Radiance in the two regions of the pair at ``pose``; an empty region stays empty."""
         projector = Camera(self.arrays, rig, rig.projector(pose), rig.full_frame)
-        soft = self.gather(rig, pose, cells(regions[0], cache.cell), projector, cache, seed)
+        grid = cells(regions[0], self._cache.cell)
+        soft = self._gather(Camera(self.arrays, rig, pose, grid), grid, projector, seed)
         images = []
         for position, region in zip((pose, rig.right(pose)), regions, strict=True):
-            shape = max(region.height, 0), max(region.width, 0)
-            if region.empty:
-                images.append(np.zeros(shape, np.float32))
-            else:
+            image = np.zeros(region.shape, np.float32)
+            if not region.empty:
                 camera = Camera(self.arrays, rig, position, region)
-                light = self.expose(camera, region, projector, samples, soft)
-                images.append(np.array(light, dtype=np.float32).reshape(shape))
+                light = self._expose(camera, region, projector, soft)
+                image = np.array(light, dtype=np.float32).reshape(region.shape)
+            images.append(image)
         return images
 
     @abstractmethod
-    def gather(
-        self,
-        rig: StereoRig,
-        pose: Pose,
-        grid: Region,
-        projector: Camera,
-        settings: CacheSettings,
-        seed: int,
-    ) -> SoftLight:
+    def _gather(self, camera: Camera, grid: Region, projector: Camera, seed: int) -> SoftLight:
         """Soft radiance towards the left camera, at one place of the surface in each cell."""
 
     @abstractmethod
-    def expose(
-        self, camera: Camera, region: Region, projector: Camera, samples: int, soft: SoftLight
-    ) -> Any:
+    def _expose(self, camera: Camera, region: Region, projector: Camera, soft: SoftLight) -> Any:
         """Radiance of each pixel of ``region``: rays at the same fixed places in every pixel."""

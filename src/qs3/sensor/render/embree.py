@@ -23,7 +23,7 @@ from qs3.sensor.render.cache import (
     places,
 )
 from qs3.sensor.render.scene import Scene
-from qs3.sensor.rig import Pose, Region, StereoRig
+from qs3.sensor.rig import Region
 
 _OFFSET = 1e-4  # of the scene's size: where a ray that leaves a surface starts, above it
 
@@ -42,11 +42,11 @@ class EmbreePhotographer(Photographer):
         magnify=lambda camera, depth: camera.focal / depth,
     )
 
-    def __init__(self, scene: Scene, max_depth: int) -> None:
+    def __init__(self, scene: Scene, samples: int, max_depth: int, cache: CacheSettings) -> None:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
-        super().__init__(scene, max_depth)
+        super().__init__(scene, samples, max_depth, cache)
         if any(body.material.model != "diffuse" for body in scene.bodies):
             raise InputError("renderer: only diffuse bodies are rendered in this way")
         meshes = [body.mesh for body in scene.bodies]
@@ -64,10 +64,10 @@ class EmbreePhotographer(Photographer):
         )
         self._offset = np.float32(_OFFSET * np.ptp(triangles.reshape(-1, 3), axis=0).max())
 
-    def expose(
-        self, camera: Camera, region: Region, projector: Camera, samples: int, soft: SoftLight
+    def _expose(
+        self, camera: Camera, region: Region, projector: Camera, soft: SoftLight
     ) -> Float32[np.ndarray, "n"]:
-        """Radiance of each pixel of ``region``: rays at the same fixed places in every pixel."""
+        samples = self._samples
         pixels = region.width * region.height
         row, column = _grid(region.height, region.width)
         centre = np.float32(0.5)
@@ -98,18 +98,9 @@ class EmbreePhotographer(Photographer):
         light[shown] += seen[shown] * soft.at(place, facing)
         return light / np.float32(samples)
 
-    def gather(
-        self,
-        rig: StereoRig,
-        pose: Pose,
-        grid: Region,
-        projector: Camera,
-        settings: CacheSettings,
-        seed: int,
-    ) -> "_EmbreeLight":
-        """Soft radiance towards the left camera, at one place of the surface in each cell."""
-        camera = Camera(self.arrays, rig, pose, grid)
-        soft = _EmbreeLight(camera, grid, settings.cell, rig, int)
+    def _gather(self, camera: Camera, grid: Region, projector: Camera, seed: int) -> "_EmbreeLight":
+        settings = self._cache
+        soft = _EmbreeLight(camera, grid, settings.cell, int)
         row, column = _grid(soft.rows, soft.columns)
         triangle = np.full(len(row), -1, np.int32)
         place, facing = np.zeros((len(row), 3), np.float32), np.zeros((len(row), 3), np.float32)
@@ -129,7 +120,7 @@ class EmbreePhotographer(Photographer):
             across = (column[shown] + grid.x // settings.cell).astype(np.uint32)
             place, facing = place[shown], facing[shown]
             turn = _turns(down * 65536 + across, seed)
-            light[shown] = self._gather(
+            light[shown] = self._soft(
                 place, facing, triangle[shown], projector, settings.rays, turn
             )
             whole = self.arrays.whole
@@ -139,7 +130,7 @@ class EmbreePhotographer(Photographer):
             soft.mean = light[shown].mean(dtype=np.float32)
         return soft
 
-    def _gather(
+    def _soft(
         self,
         points: Float32[np.ndarray, "n 3"],
         normals: Float32[np.ndarray, "n 3"],
@@ -157,10 +148,10 @@ class EmbreePhotographer(Photographer):
         light = np.zeros(len(owner), np.float32)
         lane = np.arange(len(owner))
         p, q = p.ravel(), q.ravel()
-        for bounce in range(self.bounces + 1):
+        for bounce in range(self._bounces + 1):
             way = _cosine(up, p, q)
             start = start + self._offset * up
-            if bounce == self.bounces:
+            if bounce == self._bounces:
                 free = ~self._blocked(start, way)
                 light[lane[free]] += beta[free] * self._environment(way[free])
                 break
@@ -206,7 +197,7 @@ class EmbreePhotographer(Photographer):
         return self._embree.run(origins, rays, dists=within, query="OCCLUDED") >= 0
 
     def _environment(self, rays: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n"]:
-        light = self.scene.light
+        light = self._scene.light
         sine = rays[:, 2] / np.sqrt(np.einsum("ij,ij->i", rays, rays))
         high = sine > np.float32(np.sin(np.radians(light.sky_elevation)))
         return np.where(high, np.float32(light.sky + light.ambient), np.float32(light.ambient))
@@ -219,7 +210,7 @@ class EmbreePhotographer(Photographer):
         projector: Camera,
     ) -> Float32[np.ndarray, "n"]:
         """Radiance that diffuse points give back of the projector's light."""
-        scene = self.scene
+        scene = self._scene
         x, y, z = projector.seen(points)
         with np.errstate(divide="ignore", invalid="ignore"):
             u = x / z * np.float32(0.5 / scene.tan_half_width) + np.float32(0.5)
@@ -249,10 +240,9 @@ class _EmbreeLight(SoftLight):
     light: Float32[np.ndarray, "m"]
     filled: Bool[np.ndarray, "m"]
 
-    def fit(
+    def _fit(
         self, cell: Any, inside: Any, points: Any, normals: Any, limit: Any
     ) -> tuple[Any, Any, Any]:
-        """Of a cell: how well it lies on the plane of the points, its light, whether it has any."""
         cell = np.where(inside, cell, 0)
         off = np.einsum("ij,ij->i", self.place[cell] - points, normals) * limit
         along = np.maximum(np.einsum("ij,ij->i", self.facing[cell], normals), 0)

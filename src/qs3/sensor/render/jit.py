@@ -15,8 +15,9 @@ from qs3.sensor.render.cache import (
     SoftLight,
     places,
 )
+from qs3.sensor.render.path import mitsuba_bodies
 from qs3.sensor.render.scene import Scene
-from qs3.sensor.rig import Pose, Region, StereoRig
+from qs3.sensor.rig import Region
 
 
 class JitPhotographer(Photographer):
@@ -25,12 +26,14 @@ class JitPhotographer(Photographer):
     Values that change between images are opaque: literals would compile a kernel each.
     """
 
-    def __init__(self, mi: Any, scene: Scene, shapes: Any, max_depth: int) -> None:
+    def __init__(
+        self, mi: Any, scene: Scene, samples: int, max_depth: int, cache: CacheSettings
+    ) -> None:
         import drjit as dr
 
-        super().__init__(scene, max_depth)
+        super().__init__(scene, samples, max_depth, cache)
         self._mi, self._dr = mi, dr
-        self._shapes = shapes
+        self._shapes = mi.load_dict({"type": "scene", **mitsuba_bodies(mi, scene)})
         self.arrays = Arrays(
             number=self._number,
             whole=mi.Int32,
@@ -84,19 +87,9 @@ class JitPhotographer(Photographer):
         share = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(towards), lit)[0]
         return dr.select(lit, share * slide * self._intensity / squared, 0)
 
-    def gather(
-        self,
-        rig: StereoRig,
-        pose: Pose,
-        grid: Region,
-        projector: Camera,
-        settings: CacheSettings,
-        seed: int,
-    ) -> "_JitLight":
-        """Soft radiance towards the left camera, at one place of the surface in each cell."""
-        mi, dr = self._mi, self._dr
-        camera = Camera(self.arrays, rig, pose, grid)
-        soft = _JitLight(camera, grid, settings.cell, rig, self._count)
+    def _gather(self, camera: Camera, grid: Region, projector: Camera, seed: int) -> "_JitLight":
+        mi, dr, settings = self._mi, self._dr, self._cache
+        soft = _JitLight(camera, grid, settings.cell, self._count)
         count = grid.width // settings.cell * (grid.height // settings.cell)
         index = dr.arange(mi.UInt32, count)
         width, side = soft.columns, soft.cell
@@ -134,8 +127,8 @@ class JitPhotographer(Photographer):
             )
             way = si.to_world(sample.wo)
             ray, beta, alive = si.spawn_ray(way), weight[0], shown & (weight[0] > 0)
-            for bounce in range(self.bounces + 1):
-                last = bounce == self.bounces
+            for bounce in range(self._bounces + 1):
+                last = bounce == self._bounces
                 if last:
                     free = alive & ~self._shapes.ray_test(ray, alive)
                     light += dr.select(free, beta * self._environment(way), 0)
@@ -174,17 +167,14 @@ class JitPhotographer(Photographer):
         dr.eval(soft.place, soft.mean)
         return soft
 
-    def expose(
-        self, camera: Camera, region: Region, projector: Camera, samples: int, soft: SoftLight
-    ) -> Any:
-        """Radiance of each pixel of ``region``: rays at the same fixed places in every pixel."""
+    def _expose(self, camera: Camera, region: Region, projector: Camera, soft: SoftLight) -> Any:
         mi, dr = self._mi, self._dr
         index = dr.arange(mi.UInt32, region.width * region.height)
         width = self._count(region.width)
         row = index // width
         u, v = mi.Float(index - row * width), mi.Float(row)
-        total = self._count(samples)
-        across, down = (mi.Float(np.ascontiguousarray(axis)) for axis in places(samples).T)
+        total = self._count(self._samples)
+        across, down = (mi.Float(np.ascontiguousarray(axis)) for axis in places(self._samples).T)
         none = dr.zeros(mi.Float, region.width * region.height)
 
         def go_on(k: Any, *_: Any) -> Any:
@@ -221,10 +211,9 @@ class _JitLight(SoftLight):
     facing: Any
     """Normal towards the camera of each cell, and 1 where it shows a surface."""
 
-    def fit(
+    def _fit(
         self, cell: Any, inside: Any, points: Any, normals: Any, limit: Any
     ) -> tuple[Any, Any, Any]:
-        """Of a cell: how well it lies on the plane of the points, its light, whether it has any."""
         import drjit as dr
 
         place = dr.gather(type(self.place), self.place, cell, inside)
