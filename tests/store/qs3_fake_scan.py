@@ -148,15 +148,15 @@ def slow_flaky_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRo
 
 def late_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
     """Hang, for a bad item, after its part is written and before the answer is given."""
-    from qs3.store.folder import LocalFolder
+    from qs3.store.folder import Folder
 
-    write = LocalFolder.write
+    write = Folder.write
 
-    def write_and_hang(self: LocalFolder, name: str, data: bytes) -> None:
+    def write_and_hang(self: Folder, name: str, data: bytes) -> None:
         write(self, name, data)
         time.sleep(600)
 
-    LocalFolder.write = write_and_hang if item.id.startswith("bad") else write
+    Folder.write = write_and_hang if item.id.startswith("bad") else write
     return fake_row(item, scan, settings)
 
 

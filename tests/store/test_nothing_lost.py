@@ -274,15 +274,15 @@ def test_a_file_torn_by_a_power_cut_is_swept_away(fake, tmp_path):
 
 def test_a_scan_that_was_made_and_is_gone_is_never_passed_over(fake, tmp_path, monkeypatch):
     """As where machines see two folders under one name."""
-    from qs3.store.folder import LocalFolder
+    from qs3.store.folder import Folder
 
-    write = LocalFolder.write
+    write = Folder.write
 
     def elsewhere(self, name, data):
         if "00001/000002" not in name:
             write(self, name, data)
 
-    monkeypatch.setattr(LocalFolder, "write", elsewhere)
+    monkeypatch.setattr(Folder, "write", elsewhere)
     how = {"scan_one": fake.fake_row, "workers": 0, "progress": False}
     with pytest.raises(InputError, match=r"shard-00001\.parquet: 1 scans that were made are not"):
         generate(work(fake), tmp_path / "out", SETTINGS, **how)
@@ -353,7 +353,7 @@ def threads_here() -> set[int]:
 
 def test_every_state_between_two_writes_is_mended(fake, tmp_path, monkeypatch):
     """Stop after each single write of a run with failures, and go on: always the same end."""
-    from qs3.store.folder import LocalFolder
+    from qs3.store.folder import Folder
 
     class Stop(BaseException):
         """As abrupt as a power cut."""
@@ -362,7 +362,7 @@ def test_every_state_between_two_writes_is_mended(fake, tmp_path, monkeypatch):
     how = {"scan_one": fake.flaky_row, "workers": 0, "progress": False}
     generate(items, tmp_path / "whole", SETTINGS, **how)
     wanted = content(tmp_path / "whole")
-    write, remove = LocalFolder.write, LocalFolder.remove
+    write, remove = Folder.write, Folder.remove
     left = [0]
 
     def counted(change):
@@ -374,8 +374,8 @@ def test_every_state_between_two_writes_is_mended(fake, tmp_path, monkeypatch):
 
         return changed
 
-    monkeypatch.setattr(LocalFolder, "write", counted(write))
-    monkeypatch.setattr(LocalFolder, "remove", counted(remove))
+    monkeypatch.setattr(Folder, "write", counted(write))
+    monkeypatch.setattr(Folder, "remove", counted(remove))
     stops = 0
     for steps in range(1, 100):
         out = tmp_path / f"out{steps}"

@@ -167,7 +167,7 @@ def _executor(options: GenerateOptions) -> Any:
 
 def _dry_run(plan: Any, options: GenerateOptions, part: tuple[int, int]) -> int:
     """Print what the run would make and cost."""
-    from qs3.store.estimate import estimate
+    from qs3.store.plan import estimate
 
     expected = estimate(plan, part, timeout=options.timeout)
     workers = max(_workers(options), 1)
