@@ -85,15 +85,12 @@ def folder_lock(path: Path) -> Iterator[None]:
     handle = _open_lock(file)
     try:
         os.ftruncate(handle, 0)
-        os.write(handle, _holder().encode())
+        os.lseek(handle, 0, os.SEEK_SET)
+        os.write(handle, f"process {os.getpid()} on {socket.gethostname()}".encode())
         yield
     finally:
         file.unlink(missing_ok=True)
         os.close(handle)
-
-
-def _holder() -> str:
-    return f"process {os.getpid()} on {socket.gethostname()}"
 
 
 def _open_lock(file: Path) -> int:

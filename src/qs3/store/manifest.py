@@ -217,10 +217,10 @@ def read_mesh_sums(folder: Folder) -> dict[str, str]:
     if not folder.exists(MESHES):
         return {}
     where = f"{folder}/{MESHES}"
-    try:
-        return structure(parse_json(folder.read(MESHES), where), dict[str, str], where)
-    except InputError as error:
-        raise InputError(f"{error}; delete it") from error
+    sums = parse_json(folder.read(MESHES), where)
+    if not isinstance(sums, dict) or not all(isinstance(value, str) for value in sums.values()):
+        raise InputError(f"{where}: damaged (not one checksum a mesh); delete it")
+    return sums
 
 
 def write_mesh_sums(folder: Folder, sums: Mapping[str, str]) -> None:

@@ -21,7 +21,7 @@ from qs3.files import sha256
 from qs3.io.class_folders import SPLITS, choose_split, list_folder
 from qs3.io.layouts.format import Format
 from qs3.io.ragged import RaggedClouds
-from qs3.meshes.class_names import MODELNET40
+from qs3.meshes.classes import MODELNET40
 
 POINTS = 2048
 _MANY = 100
