@@ -153,7 +153,7 @@ def _trimesh(content: bytes, file_type: str, mesh_points: int, seed: int) -> np.
     # Imported here: point files that are no meshes do without.
     import trimesh
 
-    from qs3.meshes.normalise import sample_surface
+    from qs3.meshes.normalising import sample_surface
 
     loaded = trimesh.load(io.BytesIO(content), file_type=file_type, process=False)
     if isinstance(loaded, trimesh.Trimesh) and len(loaded.faces):
