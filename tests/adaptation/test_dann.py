@@ -11,8 +11,7 @@ from torch import nn
 from qs3.adaptation.coral import CORAL
 from qs3.adaptation.dann import DANN, domain_loss, reversal_coefficient
 from qs3.adaptation.discrepancies import coral, mmd
-from qs3.adaptation.losses import cross_entropy
-from qs3.adaptation.method import Batch
+from qs3.adaptation.method import Batch, cross_entropy
 from qs3.adaptation.mmd import MMD, median_bandwidths
 from qs3.adaptation.source_only import SourceOnly
 from qs3.errors import InputError

@@ -7,9 +7,8 @@ from scipy.spatial import cKDTree
 from qs3.adaptation import Batch
 from qs3.adaptation.deformations import deform_features, deform_voxels
 from qs3.adaptation.defrec import DefRec, ReconstructionHead, reconstruction_loss
-from qs3.adaptation.defrec_pcm import DefRecPCM
-from qs3.adaptation.losses import cross_entropy
-from qs3.adaptation.pcm import PCM, mix_clouds, mixed_cross_entropy
+from qs3.adaptation.method import cross_entropy
+from qs3.adaptation.pcm import PCM, DefRecPCM, mix_clouds, mixed_cross_entropy
 from qs3.errors import InputError
 from qs3.models import Features, create_model
 

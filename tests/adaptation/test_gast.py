@@ -16,7 +16,7 @@ from qs3.adaptation.gast import (
     rotation_loss,
     turn,
 )
-from qs3.adaptation.losses import cross_entropy
+from qs3.adaptation.method import cross_entropy
 from qs3.errors import InputError
 from qs3.models import create_model
 

@@ -6,7 +6,7 @@ import torch
 from scipy import stats
 
 from qs3.adaptation import Batch, pcm
-from qs3.adaptation.losses import cross_entropy
+from qs3.adaptation.method import cross_entropy
 from qs3.adaptation.pcm import (
     PCM,
     draw_share,

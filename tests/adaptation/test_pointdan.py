@@ -9,8 +9,7 @@ import torch
 from torch import nn
 
 from qs3.adaptation.discrepancies import mmd
-from qs3.adaptation.losses import cross_entropy
-from qs3.adaptation.method import Batch
+from qs3.adaptation.method import Batch, cross_entropy
 from qs3.adaptation.normalisation import make_norm
 from qs3.adaptation.pointdan import (
     NodeAttention,

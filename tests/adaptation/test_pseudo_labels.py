@@ -12,7 +12,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from qs3.adaptation.pseudo_labels import (
+from qs3.adaptation.selection import (
     SingleClassWarning,
     balanced_count,
     select_confident,
@@ -168,5 +168,5 @@ def test_settings_are_checked():
 
 
 def test_imports_without_torch():
-    code = "import sys, qs3.adaptation.pseudo_labels; sys.exit('torch' in sys.modules)"
+    code = "import sys, qs3.adaptation.selection; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

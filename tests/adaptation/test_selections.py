@@ -12,12 +12,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.optimize import minimize
 
-from qs3.adaptation.pseudo_labels import select_confident
-from qs3.adaptation.selections import (
-    _check_prior,
+from qs3.adaptation.priors import (
+    check_prior,
     estimate_prior_bbse,
     estimate_prior_em,
     project_to_simplex,
+)
+from qs3.adaptation.selection import (
+    select_confident,
     select_prior,
     select_quantile,
     select_uniform,
@@ -291,9 +293,9 @@ def test_refusals(call, message):
 
 def test_a_prior_needs_the_right_number_of_classes():
     with pytest.raises(InputError, match="prior has 3 classes, not 2"):
-        _check_prior("prior", np.ones(3), 2)
+        check_prior("prior", np.ones(3), 2)
 
 
 def test_imports_without_torch():
-    code = "import sys, qs3.adaptation.selections; sys.exit('torch' in sys.modules)"
+    code = "import sys, qs3.adaptation.priors; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.io.layouts.contents import MANIFEST, info, read_store
+from qs3.io.layouts.contents import MANIFEST, read_store
 from qs3.meshes.classes import POINTDA10
 from qs3.store.failures import read_failures
 from qs3.store.generate import GenerateReport, GenerateSettings, scan_seed
+from qs3.store.info import info
 from qs3.store.manifest import SUMS
 from qs3.store.scan_item import neighbour_of
 
@@ -73,7 +74,7 @@ def test_a_run_that_was_stopped_goes_on_and_ends_the_same(fake, tmp_path):
 
 
 def test_other_settings_or_another_work_list_are_refused(fake, tmp_path):
-    from qs3.sensor.surroundings import SceneSettings
+    from qs3.sensor.scene import SceneSettings
 
     fake.run(items(fake), tmp_path, SETTINGS)
     before = fake.content(tmp_path)
@@ -83,7 +84,7 @@ def test_other_settings_or_another_work_list_are_refused(fake, tmp_path):
         ({"scans_per_mesh": 2}, "scans_per_mesh = 3, not 2"),
         ({"scene": SceneSettings("floor")}, "scene.layout = alone, not floor"),
         ({"randomise": {"light.ambient": (0.0, 0.1)}}, "randomise"),
-        ({"mask_crop": True}, "mask_crop"),
+        ({"crop": "both"}, "mask_crop"),
         ({"box_margin": 0.1}, "box_margin"),
     ]:
         other = dataclasses.replace(SETTINGS, **changed)
@@ -100,7 +101,7 @@ def test_bad_input_leaves_nothing_behind(fake, tmp_path):
         ([], {}, "no mesh to scan"),
         ([fake.FakeItem("a"), fake.FakeItem("a")], {}, "two meshes are called 'a'"),
         ([fake.FakeItem("a", "toilet")], {}, "'toilet'"),
-        (items(fake), {"sensor": "kinect9"}, "no preset 'kinect9'"),
+        (items(fake), {"sensor": "kinect9"}, "no sensor 'kinect9'"),
         (items(fake), {"randomise": {"light.ambiant": (0.0, 0.1)}}, r"light\.ambient"),
     ]:
         with pytest.raises(InputError, match=message):
@@ -128,7 +129,7 @@ def test_a_pattern_picture_is_recorded_by_name_and_content(tmp_path):
 
     picture = tmp_path / "dots.png"
     picture.write_bytes(b"dots")
-    qs3 = get_sensor("qs3")
+    qs3 = get_sensor("paper")
     pattern = dataclasses.replace(qs3.pattern, image=str(picture))
     settings = GenerateSettings(sensor=dataclasses.replace(qs3, pattern=pattern))
     recorded = json.dumps(settings.as_dict())
@@ -160,7 +161,7 @@ def test_neighbours_are_other_objects_drawn_evenly_from_the_scans_own_seed(fake)
 
 
 def test_a_scene_with_a_neighbour_hands_one_to_every_scan(fake, tmp_path):
-    from qs3.sensor.surroundings import SceneSettings
+    from qs3.sensor.scene import SceneSettings
 
     pairs = []
 

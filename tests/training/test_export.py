@@ -15,7 +15,7 @@ from qs3.errors import InputError, MissingExtraError, QS3Error
 from qs3.io.transforms import unit_ball
 from qs3.models import create_model
 from qs3.models.ops import farthest_point_sampling
-from qs3.models.ops.exporting import sample_in_a_loop
+from qs3.models.ops.sampling import sample_in_a_loop
 from qs3.training import TrainSettings, export, predict_probabilities, save_model
 from qs3.training.export import compare, export_run, thin_in_a_graph, unit_ball_in_a_graph
 from qs3.training.thinning import thin

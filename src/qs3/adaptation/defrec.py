@@ -178,7 +178,7 @@ class DefRec(Method):
         weight: w.
         on_source: Whether source clouds are deformed and rebuilt as well.
         dropout: Probability of dropping a hidden unit of the reconstruction head.
-        label_smoothing: ε of `qs3.adaptation.losses.cross_entropy`.
+        label_smoothing: ε of `qs3.adaptation.method.cross_entropy`.
         norm: How the network normalises the two domains.
 
     Raises:

@@ -8,8 +8,7 @@ from torch import Tensor, nn
 
 from qs3.adaptation.curvature import surface
 from qs3.adaptation.deformations import CELLS, deform_cells, pick_cells
-from qs3.adaptation.losses import cross_entropy
-from qs3.adaptation.method import Batch, Domain, Method
+from qs3.adaptation.method import Batch, Domain, Method, cross_entropy
 from qs3.adaptation.normalisation import DomainNorm
 from qs3.adaptation.pcm import draw_share, mix_halves
 from qs3.errors import InputError
@@ -145,7 +144,7 @@ class GAST(Method):
         location_weight: w_l.
         rotation_weight: w_r.
         concentration: γ of λ ~ Beta(γ, γ).
-        label_smoothing: ε of `qs3.adaptation.losses.cross_entropy` on the source.
+        label_smoothing: ε of `qs3.adaptation.method.cross_entropy` on the source.
         norm: How the network normalises the two domains.
 
     Raises:

@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from qs3.adaptation.losses import cross_entropy
 from qs3.adaptation.normalisation import DomainNorm, SharedNorm
 from qs3.errors import InputError
 from qs3.models import Features, PointClassifier, feature_widths
@@ -28,6 +27,25 @@ class Batch(NamedTuple):
     """Numbers of clouds from each of several sets, in order; empty where there is one set."""
 
 
+def cross_entropy(
+    logits: Float[Tensor, "b k"], labels: Int[Tensor, "b"], label_smoothing: float = 0.0
+) -> Float[Tensor, ""]:
+    """Mean cross entropy, in single precision at least.
+
+    Args:
+        logits: Class scores.
+        labels: True classes.
+        label_smoothing: ε of Szegedy et al. (CVPR 2016, §7): the target is 1 − ε at the label plus
+            ε/k everywhere.
+
+    Example:
+        >>> float(cross_entropy(torch.zeros(1, 4), torch.tensor([2])).exp())
+        4.0
+    """
+    logits = logits.float() if logits.dtype in (torch.float16, torch.bfloat16) else logits
+    return torch.nn.functional.cross_entropy(logits, labels, label_smoothing=label_smoothing)
+
+
 class Method(nn.Module, ABC):
     """A way to train a network on a labelled source and, maybe, an unlabelled target.
 
@@ -36,7 +54,7 @@ class Method(nn.Module, ABC):
 
     Args:
         model: The network to train.
-        label_smoothing: ε of `qs3.adaptation.losses.cross_entropy` on the source.
+        label_smoothing: ε of `cross_entropy` on the source.
         norm: How the network normalises the two domains; shared statistics by default.
 
     Raises:

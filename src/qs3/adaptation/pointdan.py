@@ -11,13 +11,12 @@ from torch import Tensor, nn
 
 from qs3.adaptation.discrepancies import classifier_discrepancy, mmd
 from qs3.adaptation.gradient_reversal import reverse_gradient
-from qs3.adaptation.losses import cross_entropy
-from qs3.adaptation.method import Batch, Method
+from qs3.adaptation.method import Batch, Method, cross_entropy
 from qs3.adaptation.normalisation import DomainNorm
 from qs3.errors import InputError
 from qs3.models import Features, PointClassifier, describe_point
 from qs3.models.checks import check_number, check_whole
-from qs3.models.sa_node import SANode, fill_nodes
+from qs3.models.pointnet_sa import SANode, fill_nodes
 
 
 def reversal_coefficient(progress: float) -> float:
@@ -100,8 +99,8 @@ def fresh_head(model: PointClassifier) -> PointClassifier:
 class PointDAN(Method):
     """Local alignment of self-adaptive nodes and global alignment by two classifiers.
 
-    Local: nodes are described by `qs3.models.sa_node.SANode`, each domain's by an attention of its
-    own, and the MMD of the two is minimised. Global: on the target the two classifiers learn to
+    Local: nodes are described by `qs3.models.pointnet_sa.SANode`, each domain's by an attention of
+    its own, and the MMD of the two is minimised. Global: on the target the two classifiers learn to
     disagree and the network, through gradient reversal, to make them agree (Saito et al., CVPR
     2018). ``pointnet-sa`` is the published network and brings its nodes; any other network with
     local features is given a module of nodes over these.

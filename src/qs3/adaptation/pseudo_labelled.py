@@ -4,8 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from qs3.adaptation.losses import cross_entropy
-from qs3.adaptation.method import Batch, Domain, Method
+from qs3.adaptation.method import Batch, Domain, Method, cross_entropy
 from qs3.adaptation.normalisation import DomainNorm
 from qs3.models import PointClassifier
 
@@ -21,7 +20,7 @@ class PseudoLabelled(Method):
         source_weight: Factor of the source's loss in epoch 0; the target's is 1.
         weight_step: Taken off both factors after each epoch (SPST: 0.005).
         epochs: Numbers of the epochs of this training, for ``weight_step``.
-        label_smoothing: ε of `qs3.adaptation.losses.cross_entropy`.
+        label_smoothing: ε of `qs3.adaptation.method.cross_entropy`.
         norm: How the network normalises the two domains.
     """
 

@@ -15,7 +15,7 @@ from scipy.special import xlogy
 
 from qs3.adaptation.clusters import adjusted_mutual_information, k_means
 from qs3.adaptation.density import density_ratio
-from qs3.adaptation.pseudo_labels import check_probabilities
+from qs3.adaptation.priors import check_probabilities
 from qs3.errors import InputError
 
 _BLOCK = 2**22

@@ -171,8 +171,10 @@ def _train(work: "Work") -> None:
 
 
 def _evaluate(work: "Work") -> Any:
-    from qs3.cli.evaluate import make_record
     from qs3.experiments.rows import ORDINARY
+    from qs3.training import evaluate
 
     rated = work.run.row != ORDINARY
-    return make_record(work.out, work.test, work.test_split, work.test_cloud, checkpoints=rated)[0]
+    return evaluate(
+        work.out, work.test, split=work.test_split, cloud=work.test_cloud, checkpoints=rated
+    )

@@ -103,7 +103,7 @@ def make_run(
         >>> from qs3.experiments.scales import SCALES
         >>> run = make_run(SCALES["smoke"], "S-D", "qbst", 0)
         >>> run.method, run.warm_up, run.record
-        ('qs3', 'source-only', 'S-D_qbst_seed-0.json')
+        ('qbst', 'source-only', 'S-D_qbst_seed-0.json')
         >>> make_run(SCALES["smoke"], "S-D", "ordinary", 0, network="rscnn").folder
         'S/ordinary@rscnn/seed-0'
     """
@@ -112,7 +112,7 @@ def make_run(
     if row in (SUPERVISED, ORDINARY):
         method = "source-only"
     elif changes is not None:
-        method = "qs3" if task.startswith("S") else "qbst"
+        method = "qbst"
     base, rule = split_method(method)
     rounds = warm_up = None
     if rule is not None:

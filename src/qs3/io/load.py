@@ -1,11 +1,13 @@
 """One door to every kind of data set: ours, an archive, a folder, any layout that is known."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from qs3.errors import InputError
-from qs3.io.clouds import CloudKind, PointClouds, UnlabelledClouds
+from qs3.io.clouds import CloudKind, Origin, PointClouds, UnlabelledClouds
 from qs3.io.ragged import RaggedClouds
+from qs3.store.folder import open_folder
 
 
 def load_clouds(
@@ -31,7 +33,8 @@ def load_clouds(
         InputError: where the source is none of these, is damaged, has no labels, or has a class
             that is not in ``class_names``.
     """
-    return _read(source, split, cloud).labelled(num_points, class_names, str(source))
+    clouds = _read(source, split, cloud).labelled(num_points, class_names, str(source))
+    return replace(clouds, origin=Origin(open_folder(source).name, split, cloud))
 
 
 def load_unlabelled(
@@ -48,7 +51,8 @@ def load_unlabelled(
     Raises:
         InputError: where the source is no data set or is damaged.
     """
-    return _read(source, split, cloud).unlabelled(num_points, str(source))
+    clouds = _read(source, split, cloud).unlabelled(num_points, str(source))
+    return replace(clouds, origin=Origin(open_folder(source).name, split, cloud))
 
 
 def _read(source: str | Path, split: str | None, cloud: CloudKind) -> RaggedClouds:

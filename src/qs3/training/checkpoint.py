@@ -13,13 +13,12 @@ import torch
 from torch import Tensor
 
 from qs3.errors import InputError
-from qs3.files import holds_something, read_json, write_bytes, write_json
+from qs3.files import holds_something, write_bytes, write_json
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier, create_model
 from qs3.training.config import TrainSettings
+from qs3.training.run import MODEL, SETTINGS, read_settings
 
-SETTINGS = "settings.json"
-MODEL = "model.safetensors"
 FORMAT = 1
 
 
@@ -144,7 +143,7 @@ def claim_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
     if run_dir.exists() and not run_dir.is_dir():
         raise InputError(f"{run_dir}: is a file; name a folder for the run")
     if path.is_file():
-        there, here = _flat(read_json(path)), _flat(wanted)
+        there, here = _flat(read_settings(run_dir)), _flat(wanted)
         for name in sorted(there.keys() | here.keys()):
             if there.get(name) != here.get(name):
                 raise InputError(
@@ -258,7 +257,5 @@ def load_model(run_dir: Path) -> LoadedModel:
         kept = ("model", "model_settings", "num_points")
         settings = {"train": {key: facts[key] for key in kept if key in facts}}
     else:
-        settings = read_json(path.parent / SETTINGS)
-        if not isinstance(settings, dict):
-            raise InputError(f"{path.parent / SETTINGS}: not the settings of a run")
+        settings = read_settings(path.parent)
     return LoadedModel(model.eval(), class_names, settings)

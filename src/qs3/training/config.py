@@ -7,8 +7,7 @@ from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
-from qs3.adaptation.names import Normalisation, RoundRule, Rule
-from qs3.adaptation.pseudo_labels import Selection, SingleClass
+from qs3.adaptation.names import Normalisation, RoundRule, Rule, Selection, SingleClass
 from qs3.errors import InputError
 from qs3.training.schedules import Schedule
 

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from qs3.errors import InputError, MissingExtraError, QS3Error
 from qs3.files import write_bytes
 from qs3.models import PointClassifier
-from qs3.models.ops.exporting import sample_in_a_loop
+from qs3.models.ops.sampling import sample_in_a_loop
 from qs3.training.checkpoint import load_model
 from qs3.training.predict import predict_probabilities
 

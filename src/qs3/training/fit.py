@@ -4,29 +4,33 @@ import contextlib
 import hashlib
 import json
 import logging
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 from qs3.adaptation import method_class
 from qs3.adaptation.names import split_method
-from qs3.errors import InputError
-from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.errors import InputError, UnevenSizesError
+from qs3.evaluation.records import DataRecord
+from qs3.io.clouds import PointClouds, UnlabelledClouds, digests
+from qs3.io.transforms import unit_ball
 from qs3.models import PointClassifier
-from qs3.training.batches import prepare, require_finite, require_unlabelled
-from qs3.training.checkpoint import MODEL, claim_run, fingerprint, load_model
+from qs3.training.batches import require_finite, require_unlabelled
+from qs3.training.checkpoint import claim_run, fingerprint, load_model
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
 from qs3.training.deadline import Deadline
 from qs3.training.distributed import all_devices, make_fabric, threads
 from qs3.training.job import Job, Listeners, fresh_model, make_method, run_job, write_job
 from qs3.training.loop import EpochCallback
 from qs3.training.records import EpochRecord, History
+from qs3.training.run import RUN, Run, read_run, write_run
 from qs3.training.self_training import RoundCallback, RoundRecord
-from qs3.training.validation import Checkpoint, read_checkpoints, split_source
+from qs3.training.thinning import thin
+from qs3.training.validation import Checkpoint, held_out_rows, read_checkpoints
 
 _LOG = logging.getLogger(__name__)
-_Clouds = TypeVar("_Clouds", PointClouds, UnlabelledClouds)
 
 
 @dataclass(frozen=True)
@@ -39,12 +43,18 @@ class FitResult:
     """Epochs before self-training; empty where a given warm-up took their place."""
     rounds: tuple[RoundRecord, ...]
     """Rounds of self-training."""
-    selection: str = "last"
+    selection: str
     """Rule that chose the network among the checkpoints; no label of the target looked at."""
-    checkpoints: tuple[Checkpoint, ...] = ()
+    checkpoints: tuple[Checkpoint, ...]
     """Networks along the way, with what each validator says of them."""
-    adapted: bool = False
+    adapted: bool
     """Whether the target had a part in the weights or in the choice of the network."""
+    source: PointClouds
+    """What was trained on, prepared: the source without its held-out part."""
+    holdout: PointClouds | None
+    """The held-out part of the source, prepared; None where there is none."""
+    target: UnlabelledClouds | None
+    """The target, prepared."""
 
 
 def fit(
@@ -56,6 +66,8 @@ def fit(
     *,
     run_dir: Path,
     warm_up: Path | None = None,
+    preset: str | None = None,
+    supervised: bool = False,
     deadline: Deadline | None = None,
     tensorboard: bool = False,
     on_epoch: EpochCallback | None = None,
@@ -67,8 +79,8 @@ def fit(
     the same bits as if it had never stopped (same devices, at most two, and number of threads).
 
     Args:
-        method: One of `qs3.adaptation.names.MethodName`; ``spst``, ``qbst``, ``qs3`` and
-            ``gast-spst`` end in self-training.
+        method: One of `qs3.adaptation.names.MethodName`; ``spst``, ``qbst`` and ``gast-spst`` end
+            in self-training.
         source: Labelled clouds, as read. A share of ``settings.holdout`` is kept for validators.
         target: Clouds without labels, as read. ``source-only`` takes them for validators and AdaBN
             alone.
@@ -76,10 +88,12 @@ def fit(
         self_training: Settings of the rounds, which follow any method where they are given; a
             method that ends in self-training takes its own preset where they are absent.
         run_dir: Folder of the run: ``settings.json``, ``model.safetensors``, ``history.jsonl``;
-            ``checkpoints/``; the warm-up's own in ``warm-up/``; and, where clouds were thinned,
-            the choice of points.
+            ``checkpoints/``; the warm-up's own in ``warm-up/``; where clouds were subsampled, the
+            choice of points; at the end ``run.json``.
         warm_up: Folder of a finished run on the same classes, whose network takes the place of the
             training before self-training.
+        preset: Name of the rounds' preset, for the record.
+        supervised: Whether the source is the labelled training part of the target, for the record.
         deadline: Time for this call; it stops before an epoch that would end later, but never
             before its first.
         tensorboard: Whether to write event files too, in ``tensorboard/``.
@@ -113,19 +127,12 @@ def fit(
     start, unseen = None, True
     if warm_up is not None:
         start, unseen = _load_warm_up(Path(warm_up), base, source, settings)
+    before = None if warm_up is None else _read_before(Path(warm_up))
     run_dir = Path(run_dir)
-    trained, holdout = _split(source, settings, unseen)
-    _require_judges(settings, rounds_settings, target, holdout)
-    job = Job(
-        base,
-        trained,
-        holdout,
-        target,
-        settings,
-        rounds_settings,
-        run_dir,
-        start,
-    )
+    held = held_out_rows(source.labels, settings)
+    has_holdout = unseen and bool(held.any())
+    _require_judges(settings, rounds_settings, target, has_holdout)
+    job = Job(base, source, None, target, settings, rounds_settings, run_dir, start)
     # What cannot be made must not leave a folder behind that refuses the corrected call.
     make_method(fresh_model(job), job)
     make_fabric(settings)
@@ -143,13 +150,19 @@ def fit(
             "warm_up": None if start is None else weights_fingerprint(start),
         },
     )
-    source = _prepared(source, job)
-    trained, holdout = _split(source, settings, unseen)
+    points = thin(source.points, settings.num_points, run_dir)
+    source_clouds = digests(points)
+    prepared = replace(source, points=unit_ball(points))
+    target_clouds: list[str] = []
+    if target is not None:
+        points = thin(target.points, settings.num_points, run_dir)
+        target_clouds = digests(points)
+        target = replace(target, points=unit_ball(points))
     job = replace(
         job,
-        source=trained,
-        holdout=holdout,
-        target=target and _prepared(target, job),
+        source=prepared.select(~held),
+        holdout=prepared.select(held) if has_holdout else None,
+        target=target,
     )
     with (
         threads(settings),
@@ -159,15 +172,79 @@ def fit(
         model, epochs, rounds = run_job(
             job, fabric, Listeners(history, deadline, on_epoch, on_round)
         )
+    adapted = (
+        needs or settings.normalisation != "shared" or settings.rule not in ("last", "source-val")
+    )
+    rule = None if rounds_settings is None else rounds_settings.rule
+    seconds = {"source": float(sum(epoch.seconds for epoch in epochs))}
+    seconds["rounds"] = float(sum(record.seconds for record in rounds))
+    seconds["total"] = sum(seconds.values())
+    run = Run(
+        method=f"{base}+{rule}" if rule is not None and method == base else method,
+        selection=settings.rule,
+        source=_data(source),
+        target=None if target is None else _data(target),
+        preset=None if rule is None else preset,
+        supervised=supervised,
+        source_clouds=tuple(source_clouds),
+        target_clouds=tuple(target_clouds) if adapted else (),
+        unknown_warm_up=warm_up is not None and before is None,
+        rounds=tuple(asdict(record) for record in rounds),
+        seconds=seconds,
+        folder=run_dir,
+    )
+    write_run(run if before is None else _with_warm_up(run, before))
     return FitResult(
         model=model.eval(),
         history=tuple(epochs),
         rounds=tuple(rounds),
         selection=settings.rule,
         checkpoints=tuple(read_checkpoints(run_dir)),
-        adapted=needs
-        or settings.normalisation != "shared"
-        or settings.rule not in ("last", "source-val"),
+        adapted=adapted,
+        source=job.source,
+        holdout=job.holdout,
+        target=job.target,
+    )
+
+
+def load_whole(load: Callable[..., Any], data: str | Path, num_points: int, **part: Any) -> Any:
+    """Read clouds with all their points, of which `fit` keeps the choice in the run's folder.
+
+    Clouds of several sizes fit no one array: those are subsampled as they are read.
+
+    Args:
+        load: `qs3.io.load_clouds` or `qs3.io.load_unlabelled`.
+        data: What to read.
+        num_points: Points a cloud of the training.
+        part: ``split`` and ``cloud``.
+    """
+    try:
+        return load(data, num_points=None, **part)
+    except UnevenSizesError:
+        return load(data, num_points=num_points, **part)
+
+
+def _data(clouds: PointClouds | UnlabelledClouds) -> DataRecord:
+    return DataRecord.of(clouds.origin, clouds.checksum or fingerprint(clouds), len(clouds))
+
+
+def _read_before(warm_up: Path) -> Run | None:
+    """What a warm-up tells of itself; None where it does not."""
+    return read_run(warm_up) if (warm_up / RUN).is_file() else None
+
+
+def _with_warm_up(run: Run, before: Run) -> Run:
+    """Add what the network has seen in its warm-up, for the marks of its scores."""
+
+    def both(first: Sequence[str], second: Sequence[str]) -> tuple[str, ...]:
+        return tuple(sorted({*first, *second}))
+
+    return replace(
+        run,
+        supervised=run.supervised or before.supervised,
+        source_clouds=both(run.source_clouds, before.source_clouds),
+        target_clouds=both(run.target_clouds, before.target_clouds),
+        unknown_warm_up=before.unknown_warm_up,
     )
 
 
@@ -189,24 +266,11 @@ def _plan(
     return base, self_training
 
 
-def is_finished(run_dir: Path) -> bool:
-    """Whether a run has written its network."""
-    return (Path(run_dir) / MODEL).is_file()
-
-
-def _split(
-    source: PointClouds, settings: TrainSettings, unseen: bool
-) -> tuple[PointClouds, PointClouds | None]:
-    """Return the part to train on, and the held-out one where the warm-up has not seen it."""
-    trained, held = split_source(source, settings)
-    return trained, held if unseen and len(held) else None
-
-
 def _require_judges(
     settings: TrainSettings,
     rounds: SelfTrainingSettings | None,
     target: UnlabelledClouds | None,
-    holdout: PointClouds | None,
+    has_holdout: bool,
 ) -> None:
     """Refuse, before anything is trained, what would lack something in the end.
 
@@ -215,7 +279,7 @@ def _require_judges(
     """
     by_source = settings.rule in ("source-val", "dev")
     bbse = rounds is not None and rounds.rule == "prior" and rounds.prior == "bbse"
-    if holdout is None and (by_source or bbse):
+    if not has_holdout and (by_source or bbse):
         what = f"rule {settings.rule!r}" if by_source else "prior 'bbse'"
         raise InputError(
             f"{what} needs a held-out part of the source that no warm-up has seen; raise holdout "
@@ -275,7 +339,3 @@ def weights_fingerprint(model: PointClassifier) -> str:
         digest.update(name.encode())
         digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()
-
-
-def _prepared(clouds: _Clouds, job: Job) -> _Clouds:
-    return replace(clouds, points=prepare(clouds.points, job.settings.num_points, job.run_dir))

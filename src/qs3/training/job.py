@@ -30,6 +30,7 @@ from qs3.training.loop import EpochCallback, train
 from qs3.training.records import EpochRecord, History
 from qs3.training.self_training import RoundCallback, RoundRecord, self_train
 from qs3.training.validation import (
+    ROUND,
     Validation,
     choose,
     load_checkpoint,
@@ -78,10 +79,6 @@ class Listeners:
 
 NOBODY = Listeners()
 """The further devices tell nobody."""
-
-
-ROUND = "round"
-"""Stage of the checkpoints that self-training makes."""
 
 
 def make_method(model: PointClassifier, job: Job) -> Method:

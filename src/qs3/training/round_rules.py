@@ -6,12 +6,12 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float
 
-from qs3.adaptation import select_confident, select_quasi_balanced
-from qs3.adaptation.selections import (
-    estimate_prior_bbse,
-    estimate_prior_em,
+from qs3.adaptation.priors import estimate_prior_bbse, estimate_prior_em
+from qs3.adaptation.selection import (
+    select_confident,
     select_prior,
     select_quantile,
+    select_quasi_balanced,
     select_uniform,
 )
 from qs3.errors import InputError
