@@ -56,14 +56,6 @@ def rotation_z(angle: float) -> Float[np.ndarray, "3 3"]:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def rotation_xyz(angles: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Rotation by Euler angles: first about x, then y, then z (fixed axes)."""
-    (cx, cy, _), (sx, sy, _) = np.cos(angles), np.sin(angles)
-    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
-    about_y = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
-    return rotation_z(float(angles[2])) @ about_y @ about_x
-
-
 def transform_points(
     matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:

@@ -33,7 +33,7 @@ from qs3.io.layouts.class_folders import choose_split, list_folder
 from qs3.io.layouts.format import SPLITS, Format, labels_as
 from qs3.io.layouts.hdf5_sets import list_parts, named, read_parts, text_lines, write_parts
 from qs3.io.ragged import RaggedClouds
-from qs3.meshes.class_names import MODELNET40
+from qs3.meshes.classes import MODELNET40
 
 CLASSES = tuple(sorted(MODELNET40))
 """ModelNet40's classes in the order of their label."""
