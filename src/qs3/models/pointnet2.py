@@ -150,7 +150,7 @@ class PointNet2(PointClassifier):
             *(PointwiseLayer(c, d, 0.0) for c, d in itertools.pairwise(widths))
         )
         self.classify = ClassifierHead(widths[-1], hidden, num_classes, dropout, 0.0)
-        self.per_point = per_point
+        self.grouping, self.per_point = grouping, per_point
 
     def encode(self, points: Float[Tensor, "b n 3"]) -> Features:
         """Describe each cloud by the maximum over the centres of the second level."""
