@@ -6,10 +6,11 @@ from PIL import Image
 from qs3.errors import InputError
 from qs3.sensor.exposure import ExposureSettings, expose
 from qs3.sensor.matching import MatchingSettings, match, matching_canvas
+from qs3.sensor.materials import Material
 from qs3.sensor.render import Body, LightSettings, Scene
-from qs3.sensor.render.mitsuba import MitsubaRenderer
+from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
 from qs3.sensor.render.raycast import DepthCaster
-from qs3.sensor.rig import Pose, StereoRig
+from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.speckle import PatternSettings, pattern_image
 
 
@@ -157,3 +158,24 @@ def test_user_pattern_reaches_the_scene(tmp_path, shown, small_rig, renderer):
     dark = pattern_image(PatternSettings(image=str(tmp_path / "dark.png")))
     without = renderer.render(scene_of(asymmetric(), dark), small_rig, [POSE], [1])[0]
     assert np.percentile(without.left, 99) < 0.5 * np.percentile(shown.left, 99)
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_mono"])
+def test_light_passes_mitsubas_glass_there_and_back(variant):
+    if not usable(variant):
+        pytest.skip(f"{variant} does not work here: no suitable libLLVM (19 is known to work)")
+    rig = StereoRig(width=160, height=120, focal=220.0, baseline=0.1)
+    level = Pose.looking_at(np.array([0.0, -3.0, 0.0]), np.zeros(3))
+    white = np.ones((8, 8), np.float32)
+    light = LightSettings(sky=0.0, ambient=0.0, sky_elevation=60.0)
+    bodies = (
+        Body(trimesh.creation.box(extents=[2, 0.01, 2]), Material("glass")),
+        Body(trimesh.creation.box(extents=[9, 1, 9]).apply_translation([0, 2, 0])),
+    )
+    renderer = MitsubaRenderer(variant=variant, samples=64, indirect="path")
+    dimmed, plain = (
+        renderer.render(scene, rig, [level], [0], [Region(70, 50, 20, 20)])[0].left.mean()
+        for scene in (Scene(b, light, white, 0.6, 0.6) for b in (bodies, bodies[1:]))
+    )
+    # Two panes, each passed twice; a pane of index 1.5 reflects R = 2F/(1 + F), F = 0.04.
+    assert dimmed / plain == pytest.approx((1 - 0.08 / 1.04) ** 4, abs=0.02)
