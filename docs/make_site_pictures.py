@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import qs3
-from qs3.adaptation.pseudo_labels import balanced_count
+from qs3.adaptation.selection import balanced_count
 from qs3.report.clouds import draw_cloud
 from qs3.report.figure import house_style, write_png
 

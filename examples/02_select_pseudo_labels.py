@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from qs3.adaptation.pseudo_labels import select_confident, select_quasi_balanced
+from qs3.adaptation.selection import select_confident, select_quasi_balanced
 
 rng = np.random.default_rng(0)
 labels = rng.choice(3, size=300, p=[0.7, 0.2, 0.1])

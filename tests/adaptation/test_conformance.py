@@ -16,7 +16,7 @@ from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import create_model
 from qs3.training import SelfTrainingSettings, TrainSettings, fit, load_model
 from qs3.training.job import Job, fresh_model, make_method
-from qs3.training.validation import choose, read_checkpoints, split_source
+from qs3.training.validation import choose, held_out_rows, read_checkpoints
 
 NETWORKS = {
     "dgcnn": {"neighbours": 6, "channels": (8, 8, 16), "embedding": 32, "hidden": (16, 8)},
@@ -339,7 +339,8 @@ def test_a_warm_up_must_be_of_the_method_and_leave_the_held_out_part_unseen(tmp_
 def test_a_held_out_part_takes_of_every_class_and_never_its_last_cloud():
     rare = SOURCE.select(np.flatnonzero((SOURCE.labels < 2) | (np.arange(len(SOURCE)) == 2)))
     for seed in range(5):
-        trained, held = split_source(rare, settings("source-only", holdout=0.5, seed=seed))
+        rows = held_out_rows(rare.labels, settings("source-only", holdout=0.5, seed=seed))
+        trained, held = rare.select(~rows), rare.select(rows)
         assert np.bincount(trained.labels, minlength=3)[2] == 1
         assert np.bincount(held.labels, minlength=3).tolist() == [2, 2, 0]
 

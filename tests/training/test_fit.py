@@ -8,7 +8,7 @@ from qs3.errors import InputError
 from qs3.training import (
     SelfTrainingSettings,
     fit,
-    is_finished,
+    is_run,
     load_model,
     predict_probabilities,
     save_model,
@@ -28,7 +28,7 @@ def test_source_only(source, settings, tmp_path):
     assert len(result.history) == settings.epochs
     assert result.rounds == ()
     assert result.selection == "last"
-    assert is_finished(tmp_path / "run")
+    assert is_run(tmp_path / "run")
     loaded = load_model(tmp_path / "run")
     assert same(loaded.model, result.model)
     assert not loaded.model.training

@@ -8,19 +8,17 @@ import subprocess
 import sys
 import time
 from dataclasses import asdict, replace
-from functools import partial
 
 import numpy as np
 import pytest
 import torch
+from qs3.training.deadline import Deadline
 
 from qs3.adaptation import SourceOnly
-from qs3.cli.train import _whole
 from qs3.errors import InputError, MissingExtraError, QS3Error, UnevenSizesError
-from qs3.io.transforms import stack
-from qs3.training import SelfTrainingSettings, TimeUpError, fit, parse_duration, records
+from qs3.io.preparation import stack
+from qs3.training import SelfTrainingSettings, TimeUpError, fit, load_whole, parse_duration, records
 from qs3.training.checkpoint import new_model
-from qs3.training.deadline import Deadline
 from qs3.training.loop import train
 
 
@@ -161,16 +159,16 @@ def test_deadline_looks_one_epoch_ahead(monkeypatch):
 def test_only_clouds_of_several_sizes_are_read_twice():
     calls = []
 
-    def load(num_points, error):
+    def load(data, num_points, error):
         calls.append(num_points)
         if num_points is None or error is InputError:
             raise error("no")
         return num_points
 
-    assert _whole(partial(load, error=UnevenSizesError), 8) == 8
+    assert load_whole(load, "here", 8, error=UnevenSizesError) == 8
     assert calls == [None, 8]
     with pytest.raises(InputError):
-        _whole(partial(load, error=InputError), 8)
+        load_whole(load, "here", 8, error=InputError)
     assert calls == [None, 8, None]
     with pytest.raises(UnevenSizesError, match="5 to 6 points"):
         stack([np.zeros((5, 3), np.float32), np.zeros((6, 3), np.float32)], None, "here")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.adaptation.pseudo_labels import SingleClassWarning
+from qs3.adaptation.selection import SingleClassWarning
 from qs3.errors import InputError
 from qs3.io.clouds import UnlabelledClouds
 from qs3.training import PRESETS, SelfTrainingSettings, fit, load_model, self_training_preset

@@ -1,40 +1,40 @@
 """Methods of adaptation, their losses, and the rules that select pseudo labels.
 
-`qs3.adaptation.pseudo_labels` needs NumPy only; the methods load PyTorch when first asked for.
+Names, rules and validators need no PyTorch; it loads when a method is first asked for.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
-
-from qs3.adaptation.pseudo_labels import SingleClassWarning as SingleClassWarning
-from qs3.adaptation.pseudo_labels import select_confident as select_confident
-from qs3.adaptation.pseudo_labels import select_quasi_balanced as select_quasi_balanced
 
 if TYPE_CHECKING:
     from qs3.adaptation.factory import create_method as create_method
     from qs3.adaptation.factory import list_methods as list_methods
     from qs3.adaptation.factory import method_class as method_class
-    from qs3.adaptation.losses import cross_entropy as cross_entropy
     from qs3.adaptation.method import Batch as Batch
     from qs3.adaptation.method import Method as Method
+    from qs3.adaptation.method import cross_entropy as cross_entropy
     from qs3.adaptation.pseudo_labelled import PseudoLabelled as PseudoLabelled
+    from qs3.adaptation.selection import SingleClassWarning as SingleClassWarning
+    from qs3.adaptation.selection import select_confident as select_confident
+    from qs3.adaptation.selection import select_quasi_balanced as select_quasi_balanced
     from qs3.adaptation.source_only import SourceOnly as SourceOnly
 
 _LAZY = {
     "create_method": "factory",
     "list_methods": "factory",
     "method_class": "factory",
-    "cross_entropy": "losses",
     "Batch": "method",
     "Method": "method",
+    "cross_entropy": "method",
     "PseudoLabelled": "pseudo_labelled",
+    "SingleClassWarning": "selection",
+    "select_confident": "selection",
+    "select_quasi_balanced": "selection",
     "SourceOnly": "source_only",
 }
 
 
 def __getattr__(name: str) -> Any:
-    """Load a public name that needs PyTorch."""
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from importlib import import_module
-
     return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)

@@ -1,29 +1,15 @@
-"""Methods by name."""
+"""Methods by name; a method's module, and PyTorch, load when it is asked for."""
 
-import inspect
-from collections.abc import Mapping
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from qs3.adaptation.method import Method
-from qs3.adaptation.names import Normalisation
-from qs3.adaptation.normalisation import make_norm
+from qs3.adaptation.names import METHODS, Normalisation
 from qs3.errors import InputError
-from qs3.models import PointClassifier
+from qs3.models.checks import read_settings
 
-_METHODS: Mapping[str, tuple[str, str]] = {
-    "source-only": ("source_only", "SourceOnly"),
-    "dann": ("dann", "DANN"),
-    "mmd": ("mmd", "MMD"),
-    "coral": ("coral", "CORAL"),
-    "pointdan": ("pointdan", "PointDAN"),
-    "defrec": ("defrec", "DefRec"),
-    "pcm": ("pcm", "PCM"),
-    "defrec-pcm": ("defrec_pcm", "DefRecPCM"),
-    "gast": ("gast", "GAST"),
-    "sd": ("self_distillation", "SelfDistillation"),
-}
-"""Module and class of each method."""
+if TYPE_CHECKING:
+    from qs3.adaptation.method import Method
+    from qs3.models import PointClassifier
 
 
 def list_methods() -> tuple[str, ...]:
@@ -33,10 +19,10 @@ def list_methods() -> tuple[str, ...]:
         >>> "source-only" in list_methods()
         True
     """
-    return tuple(_METHODS)
+    return tuple(METHODS)
 
 
-def method_class(name: str) -> type[Method]:
+def method_class(name: str) -> "type[Method]":
     """Return the class of a method.
 
     Raises:
@@ -46,20 +32,20 @@ def method_class(name: str) -> type[Method]:
         >>> method_class("source-only").uses_target
         False
     """
-    if name not in _METHODS:
-        raise InputError(f"unknown method {name!r}; choose one of {', '.join(_METHODS)}")
-    module, kind = _METHODS[name]
+    if name not in METHODS:
+        raise InputError(f"unknown method {name!r}; choose one of {', '.join(METHODS)}")
+    module, kind = METHODS[name].split(".")
     return getattr(import_module(f"qs3.adaptation.{module}"), kind)
 
 
 def create_method(
     name: str,
-    model: PointClassifier,
+    model: "PointClassifier",
     *,
     label_smoothing: float = 0.0,
     normalisation: Normalisation = "shared",
     **settings: Any,
-) -> Method:
+) -> "Method":
     """Make a method around a network; what else it trains is drawn from PyTorch's random state.
 
     Args:
@@ -73,17 +59,9 @@ def create_method(
         InputError: where the name or a setting is unknown, a value is unusable, or the network
             does not give what the method needs.
     """
+    from qs3.adaptation.normalisation import make_norm
+
     kind = method_class(name)
-    fixed = {"self", "model", "label_smoothing", "norm"}
-    known = [key for key in inspect.signature(kind.__init__).parameters if key not in fixed]
-    for key in settings:
-        if key not in known:
-            choice = f"choose from {', '.join(known)}" if known else "it takes none"
-            raise InputError(f"unknown setting {key!r} of method {name}; {choice}")
+    values = read_settings(kind, settings, f"method {name}", ("model", "label_smoothing", "norm"))
     norm = make_norm(normalisation, model)
-    try:
-        return kind(model, label_smoothing=label_smoothing, norm=norm, **settings)
-    except InputError:
-        raise
-    except (TypeError, ValueError) as error:
-        raise InputError(f"settings {settings} do not make method {name}: {error}") from error
+    return kind(model, label_smoothing=label_smoothing, norm=norm, **values)

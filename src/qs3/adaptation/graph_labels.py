@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import sparse
 
-from qs3.adaptation.pseudo_labels import check_probabilities
+from qs3.adaptation.priors import check_probabilities
 from qs3.errors import InputError
 
 _BLOCK = 2**22

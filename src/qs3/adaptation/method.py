@@ -2,19 +2,24 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypedDict
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
-from qs3.adaptation.losses import cross_entropy
 from qs3.adaptation.normalisation import DomainNorm, SharedNorm
 from qs3.errors import InputError
 from qs3.models import Features, PointClassifier, feature_widths
 
 Domain = Literal["source", "target"]
 """Where clouds come from; it decides which batch statistics the network uses."""
+
+Target = Float[Tensor, "b_t n_t 3"] | None
+"""Clouds of the target; None where a method does without."""
+
+Terms = dict[str, Tensor]
+"""Scalar losses by name."""
 
 
 class Batch(NamedTuple):
@@ -28,6 +33,34 @@ class Batch(NamedTuple):
     """Numbers of clouds from each of several sets, in order; empty where there is one set."""
 
 
+def cross_entropy(
+    logits: Float[Tensor, "b k"], labels: Int[Tensor, "b"], label_smoothing: float = 0.0
+) -> Float[Tensor, ""]:
+    """Mean cross entropy, in single precision at least.
+
+    Args:
+        logits: Class scores.
+        labels: True classes.
+        label_smoothing: ε of Szegedy et al. (CVPR 2016, §7): the target is 1 − ε at the label plus
+            ε/k everywhere.
+
+    Example:
+        >>> float(cross_entropy(torch.zeros(1, 4), torch.tensor([2])).exp())
+        4.0
+    """
+    logits = logits.float() if logits.dtype in (torch.float16, torch.bfloat16) else logits
+    return torch.nn.functional.cross_entropy(logits, labels, label_smoothing=label_smoothing)
+
+
+class Shared(TypedDict, total=False):
+    """Settings that every method hands on to `Method`."""
+
+    label_smoothing: float
+    """ε of `cross_entropy` on the source."""
+    norm: DomainNorm | None
+    """How the network normalises the two domains; shared statistics where None."""
+
+
 class Method(nn.Module, ABC):
     """A way to train a network on a labelled source and, maybe, an unlabelled target.
 
@@ -36,7 +69,7 @@ class Method(nn.Module, ABC):
 
     Args:
         model: The network to train.
-        label_smoothing: ε of `qs3.adaptation.losses.cross_entropy` on the source.
+        label_smoothing: ε of `cross_entropy` on the source.
         norm: How the network normalises the two domains; shared statistics by default.
 
     Raises:
@@ -67,13 +100,7 @@ class Method(nn.Module, ABC):
         self.right: Tensor | None = None
 
     @abstractmethod
-    def losses(
-        self,
-        source: Batch,
-        target: Float[Tensor, "b_t n_t 3"] | None,
-        progress: float,
-        generator: torch.Generator,
-    ) -> dict[str, Tensor]:
+    def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return named scalar losses; their sum is minimised, each is logged.
 
         Args:
@@ -84,12 +111,8 @@ class Method(nn.Module, ABC):
         """
 
     def forward(
-        self,
-        source: Batch,
-        target: Float[Tensor, "b_t n_t 3"] | None,
-        progress: float,
-        generator: torch.Generator,
-    ) -> dict[str, Tensor]:
+        self, source: Batch, target: Target, progress: float, generator: Generator
+    ) -> Terms:
         """Return `losses`; a distributed wrapper needs the call to pass through here."""
         self.right = None
         return self.losses(source, target, progress, generator)

@@ -16,13 +16,18 @@ MethodName = Literal[
     "sd",
     "spst",
     "qbst",
-    "qs3",
     "gast-spst",
 ]
-"""Methods of adaptation; the last four end in rounds of self-training (`COMPOSED`)."""
+"""Methods of adaptation; the last three end in rounds of self-training (`COMPOSED`)."""
 
 RoundRule = Literal["qbst", "spst", "uniform", "prior", "quantile"]
 """Which clouds a round of self-training selects."""
+
+Selection = Literal["most-confident", "least-confident"]
+"""End of a class's ranking by confidence that is kept."""
+
+SingleClass = Literal["keep", "drop"]
+"""What becomes of the confident clouds where all of them have one class (μ = 0)."""
 
 Normalisation = Literal["shared", "separate", "adabn", "transnorm"]
 """Batch statistics across domains. shared: running statistics follow both domains as they pass.
@@ -33,14 +38,29 @@ less between the domains weigh more (Wang et al., NeurIPS 2019)."""
 Rule = Literal["last", "source-val", "entropy", "im", "bnm", "snd", "dev", "class-ami"]
 """How the network is chosen among a run's checkpoints; no rule looks at a label of the target."""
 
+METHODS: Mapping[str, str] = {
+    "source-only": "source_only.SourceOnly",
+    "dann": "dann.DANN",
+    "mmd": "mmd.MMD",
+    "coral": "coral.CORAL",
+    "pointdan": "pointdan.PointDAN",
+    "defrec": "defrec.DefRec",
+    "pcm": "pcm.PCM",
+    "defrec-pcm": "pcm.DefRecPCM",
+    "gast": "gast.GAST",
+    "sd": "self_distillation.SelfDistillation",
+}
+"""Module and class of each method that trains by itself."""
+
 COMPOSED: Mapping[str, tuple[str, RoundRule]] = {
     "spst": ("source-only", "spst"),
     "qbst": ("source-only", "qbst"),
-    "qs3": ("source-only", "qbst"),
     "gast-spst": ("gast", "spst"),
 }
-"""Methods that are a warm-up and a rule of self-training; qs3 is qbst on a scanned source."""
+"""Methods that are a warm-up and a rule of self-training."""
 
+OLD_NAMES: Mapping[str, str] = {"qs3": "qbst"}
+"""Names in runs of earlier releases, which told QBST on a scanned source apart."""
 
 WITHOUT_TARGET = ("source-only", "pcm")
 """Methods whose training does without the target; rounds of self-training never do."""

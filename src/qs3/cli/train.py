@@ -4,21 +4,17 @@ import dataclasses
 import json
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
 from qs3.adaptation.names import COMPOSED, WITHOUT_TARGET, MethodName, RoundRule, split_method
-from qs3.errors import InputError, UnevenSizesError
-from qs3.evaluation.records import DataRecord
-from qs3.files import read_json, write_json
+from qs3.errors import InputError
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
 
-RUN = "run.json"
 TIME_UP = 3
 """Exit code where --max-time stopped a run that the same command takes up again."""
 
@@ -146,12 +142,10 @@ def train(options: Annotated[TrainOptions, tyro.conf.arg(name="")]) -> int:
 
 
 def run(options: TrainOptions) -> Any:
-    """Read the data, train, and write what ``evaluate`` needs to make a record."""
+    """Read the data and train."""
     start = time.monotonic()
     from qs3.io import load_clouds, load_unlabelled
-    from qs3.io.clouds import digests
-    from qs3.store.folder import open_folder
-    from qs3.training import Deadline, fit, parse_duration, thin
+    from qs3.training import Deadline, fit, load_whole, parse_duration
 
     seconds = None if options.max_time is None else parse_duration(options.max_time)
     deadline = Deadline(seconds, start)  # reading the data counts
@@ -175,24 +169,23 @@ def run(options: TrainOptions) -> Any:
         },
     )
     points = options.train.num_points
-    source = _whole(
-        partial(
-            load_clouds, options.source, split=options.source_split, cloud=options.source_cloud
-        ),
+    source = load_whole(
+        load_clouds,
+        options.source,
         points,
+        split=options.source_split,
+        cloud=options.source_cloud,
     )
     target = None
     if options.target is not None:
-        target = _whole(
-            partial(
-                load_unlabelled,
-                options.target,
-                split=options.target_split,
-                cloud=options.target_cloud,
-            ),
+        target = load_whole(
+            load_unlabelled,
+            options.target,
             points,
+            split=options.target_split,
+            cloud=options.target_cloud,
         )
-    result = fit(
+    return fit(
         options.method,
         source,
         target,
@@ -200,86 +193,8 @@ def run(options: TrainOptions) -> Any:
         None if rule is None else dataclasses.replace(options.self_training, rule=rule),
         run_dir=options.out,
         warm_up=options.warm_up,
+        preset=options.preset,
+        supervised=options.supervised,
         deadline=deadline,
         tensorboard=options.log == "tensorboard",
     )
-    data = {
-        "source": DataRecord(
-            open_folder(options.source).name,
-            source.checksum,
-            len(source),
-            options.source_split,
-            options.source_cloud,
-        ),
-        "target": None
-        if target is None or options.target is None
-        else DataRecord(
-            open_folder(options.target).name,
-            target.checksum,
-            len(target),
-            options.target_split,
-            options.target_cloud,
-        ),
-    }
-    seconds = {"source": float(sum(epoch.seconds for epoch in result.history))}
-    seconds["rounds"] = float(sum(record.seconds for record in result.rounds))
-    seconds["total"] = sum(seconds.values())
-    write_json(
-        options.out / RUN,
-        {
-            "method": options.method
-            if rule is None or options.method != base
-            else f"{base}+{rule}",
-            "preset": options.preset if rule is not None else None,
-            "selection": result.selection,
-            "data": {
-                name: None if record is None else dataclasses.asdict(record)
-                for name, record in data.items()
-            },
-            **_seen(
-                options,
-                digests(thin(source.points, points, options.out)),
-                digests(thin(target.points, points, options.out))
-                if target is not None and result.adapted
-                else [],
-            ),
-            "rounds": [dataclasses.asdict(record) for record in result.rounds],
-            "seconds": seconds,
-        },
-    )
-    return result
-
-
-def _seen(options: TrainOptions, source: list[str], target: list[str]) -> dict[str, Any]:
-    """What the network has seen in this run or in its warm-up, for the marks of its scores."""
-    seen: dict[str, Any] = {
-        "supervised": options.supervised,
-        "source_clouds": source,
-        "target_clouds": target,
-        "unknown_warm_up": False,
-    }
-    if options.warm_up is None:
-        return seen
-    if not (options.warm_up / RUN).is_file():
-        return seen | {"unknown_warm_up": True}
-    before = read_json(options.warm_up / RUN)
-    try:
-        return {
-            "supervised": bool(before["supervised"]) or options.supervised,
-            "source_clouds": sorted({*before["source_clouds"], *source}),
-            "target_clouds": sorted({*before["target_clouds"], *target}),
-            "unknown_warm_up": bool(before["unknown_warm_up"]),
-        }
-    except (KeyError, TypeError):
-        return seen | {"unknown_warm_up": True}
-
-
-def _whole(load: Callable[..., Any], num_points: int) -> Any:
-    """Read clouds with all their points, which `fit` thins once and keeps the choice of.
-
-    Clouds of several sizes fit no one array: those are thinned as they are read.
-    """
-    try:
-        return load(num_points=None)
-    except UnevenSizesError:
-        return load(num_points=num_points)

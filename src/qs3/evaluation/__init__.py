@@ -1,12 +1,15 @@
 """Scores, records of runs, and tables made from records: NumPy only."""
 
+from qs3.evaluation.compare import CloudComparison as CloudComparison
+from qs3.evaluation.compare import SeedComparison as SeedComparison
+from qs3.evaluation.compare import compare_seeds as compare_seeds
+from qs3.evaluation.compare import mcnemar as mcnemar
 from qs3.evaluation.environment import git_commit as git_commit
 from qs3.evaluation.environment import hardware as hardware
 from qs3.evaluation.environment import versions as versions
 from qs3.evaluation.metrics import MeanSEM as MeanSEM
 from qs3.evaluation.metrics import accuracy as accuracy
 from qs3.evaluation.metrics import class_mean_accuracy as class_mean_accuracy
-from qs3.evaluation.metrics import clopper_pearson_interval as clopper_pearson_interval
 from qs3.evaluation.metrics import confusion_matrix as confusion_matrix
 from qs3.evaluation.metrics import mean_sem as mean_sem
 from qs3.evaluation.metrics import per_class_accuracy as per_class_accuracy
@@ -14,7 +17,7 @@ from qs3.evaluation.metrics import wilson_interval as wilson_interval
 from qs3.evaluation.records import DataRecord as DataRecord
 from qs3.evaluation.records import RunRecord as RunRecord
 from qs3.evaluation.records import Scores as Scores
-from qs3.evaluation.records import load_records as load_records
+from qs3.evaluation.records import find_records as find_records
 from qs3.evaluation.records import read_record as read_record
 from qs3.evaluation.records import score as score
 from qs3.evaluation.records import write_record as write_record

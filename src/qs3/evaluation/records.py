@@ -1,9 +1,9 @@
 """One JSON record a run: everything that a table or a reader needs to trust a number."""
 
-import dataclasses
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from qs3.errors import InputError
+from qs3.errors import InputError, QS3Error
 from qs3.evaluation.metrics import (
     accuracy,
     class_mean_accuracy,
@@ -20,9 +20,15 @@ from qs3.evaluation.metrics import (
     wilson_interval,
 )
 from qs3.files import read_json, write_json
+from qs3.io.clouds import CloudKind, Origin
+from qs3.structure import structure, unstructure
 
 RECORD = "record.json"
-SCHEMA_VERSION = 2
+RECORDS = "records"
+"""Folder of a run's own records."""
+SCHEMA_VERSION = 3
+_FOLDERS = (RECORDS, "results")
+"""Folders whose JSON files are records: a run's own, and those of a grid of runs."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +43,14 @@ class DataRecord:
     """Number of clouds."""
     split: str | None = None
     """Part of the data; None is all of it."""
-    cloud: str = "points"
+    cloud: CloudKind = "points"
     """Which cloud of a generated data set."""
+
+    @classmethod
+    def of(cls, origin: Origin | None, checksum: str, clouds: int) -> "DataRecord":
+        """Return what a record says of clouds; those made in memory are called ``arrays``."""
+        origin = origin or Origin("arrays")
+        return cls(origin.name, checksum, clouds, origin.split, origin.cloud)
 
     @property
     def label(self) -> str:
@@ -110,7 +122,9 @@ class RunRecord:
     accuracy. ``oracle`` among them chose by the labels of the test set: an upper bound."""
     marks: tuple[str, ...] = ()
     """Caveats printed with the number: ``transductive``, ``supervised`` …"""
-    schema: int = field(default=SCHEMA_VERSION)
+    experiment: Mapping[str, str | int | float] | None = None
+    """Place of the run in a grid of runs, by fields; None outside of one."""
+    schema: int = SCHEMA_VERSION
     """Version of these fields."""
 
 
@@ -119,8 +133,8 @@ def count_rounds(records: Iterable[RunRecord]) -> tuple[int, int]:
 
     The others kept too few clouds and left it as it was.
     """
-    rounds = [one for record in records for one in record.rounds]
-    return sum(not one.get("skipped", False) for one in rounds), len(rounds)
+    rounds = [done for record in records for done in record.rounds]
+    return sum(not done.get("skipped", False) for done in rounds), len(rounds)
 
 
 def score(
@@ -172,7 +186,7 @@ def write_record(path: Path, record: RunRecord) -> Path:
     path = Path(path)
     path = path if path.suffix == ".json" else path / RECORD
     try:
-        value = json.loads(json.dumps(dataclasses.asdict(record), allow_nan=False))
+        value = json.loads(json.dumps(unstructure(record), allow_nan=False))
     except (TypeError, ValueError) as error:
         raise InputError(f"{path}: the record is not plain JSON ({error})") from error
     if path.exists():
@@ -184,31 +198,58 @@ def write_record(path: Path, record: RunRecord) -> Path:
 
 
 def read_record(path: Path) -> RunRecord:
-    """Read a record, from its file or the folder of its run.
+    """Read a record, from its file or the folder of its run; an older schema is brought up to date.
 
     Raises:
-        InputError: where it is missing, not JSON, of another schema, or has an unknown, missing
-            or wrongly typed field; the field is named.
+        InputError: where it is missing, not JSON, of an unknown schema, has an unknown, missing or
+            wrongly typed field, or scores that are not those of its confusion matrix.
     """
     path = Path(path)
     path = path / RECORD if path.is_dir() else path
     value = read_json(path)
     schema = value.get("schema") if isinstance(value, dict) else None
-    if schema != SCHEMA_VERSION:
-        raise InputError(f"{path}: record schema {schema}, this version reads {SCHEMA_VERSION}")
-    fields = _fields(path, "", RunRecord, value)
-    for name in ("source", "target", "test"):
-        if fields[name] is not None:
-            fields[name] = DataRecord(**_fields(path, f"{name}.", DataRecord, fields[name]))
-    scores = _fields(path, "scores.", Scores, fields["scores"])
-    for name in ("interval", "class_names", "per_class"):
-        scores[name] = tuple(scores[name])
-    scores["confusion"] = tuple(tuple(row) for row in scores["confusion"])
-    fields["scores"] = Scores(**scores)
-    _check_scores(path, fields["scores"])
-    for name in ("rounds", "marks"):
-        fields[name] = tuple(fields[name])
-    return RunRecord(**fields)
+    if type(schema) is not int or not 1 <= schema <= SCHEMA_VERSION:
+        raise InputError(f"{path}: record schema {schema}, this version reads 1 to 3")
+    for migrate in _MIGRATIONS[schema - 1 :]:
+        value = migrate(value)
+    record = structure(value | {"schema": SCHEMA_VERSION}, RunRecord, path)
+    _check_scores(path, record.scores)
+    return record
+
+
+def _from_1(value: dict[str, Any]) -> dict[str, Any]:
+    return {"choices": {}} | value
+
+
+def _from_2(value: dict[str, Any]) -> dict[str, Any]:
+    settings = value.get("settings")
+    named = {"settings": rename_settings(settings)} if isinstance(settings, dict) else {}
+    return value | named | {"method": rename_method(value.get("method"))}
+
+
+_MIGRATIONS = (_from_1, _from_2)
+"""From each schema to the next."""
+
+
+def rename_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Give a run's settings the names that they have today.
+
+    Example:
+        >>> rename_settings({"method": "qs3", "self_training": {"labeller": "best"}})
+        {'method': 'qbst', 'self_training': {'teacher': 'best'}}
+    """
+    renamed = dict(settings)
+    rounds = renamed.get("self_training")
+    if isinstance(rounds, dict):
+        renamed["self_training"] = {
+            "teacher" if name == "labeller" else name: value for name, value in rounds.items()
+        }
+    return renamed | ({"method": rename_method(settings["method"])} if "method" in settings else {})
+
+
+def rename_method(name: Any) -> Any:
+    """Return a method's name of today: qbst was qs3 where the source was scanned."""
+    return "qbst" if name == "qs3" else name
 
 
 def _check_scores(path: Path, scores: Scores) -> None:
@@ -216,7 +257,7 @@ def _check_scores(path: Path, scores: Scores) -> None:
     k = len(scores.class_names)
     try:
         matrix = np.array(scores.confusion, dtype=np.int64).reshape(k, k + 1)
-    except (TypeError, ValueError):
+    except (ValueError, OverflowError):
         raise InputError(f"{path}: field 'scores.confusion' is no table of counts") from None
     counts, right = matrix.sum(axis=1), matrix[np.arange(k), np.arange(k)]
     total = int(counts.sum())
@@ -232,52 +273,43 @@ def _check_scores(path: Path, scores: Scores) -> None:
             raise InputError(f"{path}: field 'scores.{name}' is not that of 'scores.confusion'")
 
 
-_MAY_BE_NONE = {"target", "source.split", "target.split", "test.split"}
+def find_records(
+    folder: Path, every_json: bool = False
+) -> tuple[list[tuple[Path, RunRecord]], list[str]]:
+    """Find the records below a folder: ``record.json``, ``records/*.json``, ``results/*.json``.
 
+    Args:
+        folder: Where to look; data sets and hidden folders in it are passed over.
+        every_json: Whether every JSON file is taken for a record.
 
-def _fields(path: Path, prefix: str, kind: type, value: Any) -> dict[str, Any]:
-    """Check the names of all fields and the JSON type of each."""
-    if not isinstance(value, dict):
-        raise InputError(f"{path}: {prefix.rstrip('.') or 'the record'} is not an object")
-    names = {f.name: f.type for f in dataclasses.fields(kind)}
-    for name in sorted(set(value) ^ set(names)):
-        state = "unknown" if name in value else "missing"
-        raise InputError(f"{path}: field {prefix + name!r} is {state}")
-    for name, annotation in names.items():
-        expected = _json_types(annotation)
-        given = value[name]
-        if given is None and prefix + name in _MAY_BE_NONE:
-            continue
-        if isinstance(given, bool) or not isinstance(given, expected):
-            raise InputError(
-                f"{path}: field {prefix + name!r} is a {type(given).__name__}, which it cannot be"
-            )
-    return dict(value)
-
-
-def _json_types(annotation: Any) -> tuple[type, ...]:
-    text = str(annotation)
-    if annotation is int:
-        return (int,)
-    if annotation is float:
-        return (int, float)
-    if "tuple" in text:
-        return (list,)
-    if "Mapping" in text or "Record" in text or "Scores" in text:
-        return (dict,)
-    return (str,)
-
-
-def load_records(folder: Path) -> list[RunRecord]:
-    """Read every ``record.json`` under a folder, in the order of their paths.
+    Returns:
+        Paths and records in the order of the paths, and a line for each that cannot be read.
 
     Raises:
-        InputError: where the folder is missing or holds none, or a record is damaged.
+        InputError: where there is no such folder.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
-    paths = sorted(folder.rglob(RECORD))
-    if not paths:
-        raise InputError(f"{folder}: holds no {RECORD}; evaluate a run first")
-    return [read_record(path) for path in paths]
+    records, faults = [], []
+    for place, files in walk(folder):
+        for name in files:
+            if name != RECORD and not (
+                name.endswith(".json") and (every_json or place.name in _FOLDERS)
+            ):
+                continue
+            try:
+                records.append((place / name, read_record(place / name)))
+            except QS3Error as error:
+                faults.append(str(error))
+    return records, faults
+
+
+def walk(folder: Path) -> Iterator[tuple[Path, list[str]]]:
+    """Yield a folder and those below it, with the names of their files, in order; no data sets."""
+    for place, folders, files in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        if "dataset.json" in files:
+            folders.clear()
+        else:
+            yield Path(place), sorted(files)

@@ -12,6 +12,18 @@ CloudKind = Literal["points", "clean", "surface"]
 
 
 @dataclass(frozen=True)
+class Origin:
+    """Which data clouds were read from, for the record of a run."""
+
+    name: str
+    """Last part of the path, never the path."""
+    split: str | None = None
+    """Part of the data; None is all of it."""
+    cloud: CloudKind = "points"
+    """Which cloud of a generated data set."""
+
+
+@dataclass(frozen=True)
 class UnlabelledClouds:
     """Clouds of a target domain. There is no field for a label, so none can reach training."""
 
@@ -21,6 +33,8 @@ class UnlabelledClouds:
     """One name a cloud, in the order of the points; a number, since names may tell the class."""
     checksum: str = ""
     """SHA-256 over what was read, for the record of a run."""
+    origin: Origin | None = None
+    """What was read; None for clouds that were made in memory."""
 
     def __post_init__(self) -> None:
         if len(self.ids) != len(self.points):
@@ -44,6 +58,8 @@ class PointClouds:
     """One name a cloud."""
     checksum: str = ""
     """SHA-256 over what was read, for the record of a run."""
+    origin: Origin | None = None
+    """What was read; None for clouds that were made in memory."""
 
     def __post_init__(self) -> None:
         if not len(self.ids) == len(self.points) == len(self.labels):
@@ -67,11 +83,12 @@ class PointClouds:
             class_names=self.class_names,
             ids=tuple(self.ids[i] for i in index),
             checksum=self.checksum,
+            origin=self.origin,
         )
 
     def without_labels(self) -> UnlabelledClouds:
         """Return the same clouds without labels, nor names, which may tell them."""
-        return UnlabelledClouds(self.points, numbered(len(self)), self.checksum)
+        return UnlabelledClouds(self.points, numbered(len(self)), self.checksum, self.origin)
 
 
 def numbered(count: int) -> tuple[str, ...]:

@@ -1,11 +1,13 @@
 """One door to every kind of data set: ours, an archive, a folder, any layout that is known."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from qs3.errors import InputError
-from qs3.io.clouds import CloudKind, PointClouds, UnlabelledClouds
+from qs3.io.clouds import CloudKind, Origin, PointClouds, UnlabelledClouds
 from qs3.io.ragged import RaggedClouds
+from qs3.store.folder import open_folder
 
 
 def load_clouds(
@@ -31,7 +33,8 @@ def load_clouds(
         InputError: where the source is none of these, is damaged, has no labels, or has a class
             that is not in ``class_names``.
     """
-    return _read(source, split, cloud).labelled(num_points, class_names, str(source))
+    clouds = _read(source, split, cloud).labelled(num_points, class_names, str(source))
+    return replace(clouds, origin=Origin(open_folder(source).name, split, cloud))
 
 
 def load_unlabelled(
@@ -48,30 +51,31 @@ def load_unlabelled(
     Raises:
         InputError: where the source is no data set or is damaged.
     """
-    return _read(source, split, cloud).unlabelled(num_points, str(source))
+    clouds = _read(source, split, cloud).unlabelled(num_points, str(source))
+    return replace(clouds, origin=Origin(open_folder(source).name, split, cloud))
 
 
 def _read(source: str | Path, split: str | None, cloud: CloudKind) -> RaggedClouds:
     path = Path(source)
     remote = isinstance(source, str) and "://" in source
     if remote or (path.is_dir() and (path / "dataset.json").is_file()):
-        from qs3.io.layouts.contents import read_ragged
+        from qs3.io.layouts.store import read_ragged
 
         return read_ragged(source if remote else path, cloud, split)
     if cloud != "points":
         raise InputError(f"{path}: only a data set made by qs3 generate has {cloud!r} clouds")
     if path.suffix.lower() == ".npz":
-        from qs3.io.npz import read_npz
+        from qs3.io.layouts.npz import read_npz
 
         return read_npz(path, split)
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
-    from qs3.io.class_folders import read_folder
-    from qs3.io.detect import is_general, matching, one_of, read_as
+    from qs3.io.detect import is_general, matching, one_of
+    from qs3.io.layouts.class_folders import read_folder
 
     fits = matching(path)
     if path.is_dir() and (not fits or is_general(fits[0])):
         return read_folder(path, split)
     if not fits:
         raise InputError(f"{path}: neither a folder nor an npz archive, nor any known layout")
-    return read_as(one_of(path, fits), path, split)
+    return one_of(path, fits).read(path, split)

@@ -1,16 +1,43 @@
-"""Networks that classify point clouds."""
+"""Networks that classify point clouds; PyTorch loads when one of these names is first used."""
 
-from qs3.models.classifier import Features as Features
-from qs3.models.classifier import PointClassifier as PointClassifier
-from qs3.models.classifier import describe_point as describe_point
-from qs3.models.classifier import feature_widths as feature_widths
-from qs3.models.dgcnn import DGCNN as DGCNN
-from qs3.models.factory import create_model as create_model
-from qs3.models.factory import list_models as list_models
-from qs3.models.pointdan_net import PointNetSA as PointNetSA
-from qs3.models.pointmlp import PointMLPElite as PointMLPElite
-from qs3.models.pointnet import PointNet as PointNet
-from qs3.models.pointnet2 import PointNet2 as PointNet2
-from qs3.models.reference import load_reference as load_reference
-from qs3.models.rscnn import RSCNN as RSCNN
-from qs3.models.simpleview import SimpleView as SimpleView
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from qs3.models.classifier import Features as Features
+    from qs3.models.classifier import PointClassifier as PointClassifier
+    from qs3.models.classifier import describe_point as describe_point
+    from qs3.models.classifier import feature_widths as feature_widths
+    from qs3.models.dgcnn import DGCNN as DGCNN
+    from qs3.models.factory import create_model as create_model
+    from qs3.models.factory import list_models as list_models
+    from qs3.models.pointmlp import PointMLPElite as PointMLPElite
+    from qs3.models.pointnet import PointNet as PointNet
+    from qs3.models.pointnet2 import PointNet2 as PointNet2
+    from qs3.models.pointnet_sa import PointNetSA as PointNetSA
+    from qs3.models.releases import load_reference as load_reference
+    from qs3.models.rscnn import RSCNN as RSCNN
+    from qs3.models.simpleview import SimpleView as SimpleView
+
+_LAZY = {
+    "Features": "classifier",
+    "PointClassifier": "classifier",
+    "describe_point": "classifier",
+    "feature_widths": "classifier",
+    "DGCNN": "dgcnn",
+    "create_model": "factory",
+    "list_models": "factory",
+    "PointMLPElite": "pointmlp",
+    "PointNet": "pointnet",
+    "PointNet2": "pointnet2",
+    "PointNetSA": "pointnet_sa",
+    "load_reference": "releases",
+    "RSCNN": "rscnn",
+    "SimpleView": "simpleview",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)

@@ -1,80 +1,61 @@
-"""Settings of the networks, refused where no network can be made of them."""
+"""Settings of networks and methods: unknown ones, wrong types and useless values are refused."""
 
+import dataclasses
+import inspect
 import math
-from collections.abc import Sequence
-from numbers import Integral, Real
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, get_type_hints
 
 from qs3.errors import InputError
+from qs3.structure import structure
+
+Number = int | float
 
 
-def check_whole(name: str, value: object, least: int = 1, most: int | None = None) -> None:
-    """Raise InputError unless a setting is a whole number within its range.
-
-    Example:
-        >>> check_whole("neighbours", 2.5, 1, 255)
-        Traceback (most recent call last):
-        qs3.errors.InputError: neighbours must be a whole number, 1 to 255, not 2.5
-    """
-    if not _is_whole(value, least, most):
-        raise InputError(f"{name} must be a whole number, {_span(least, most)}, not {value!r}")
-
-
-def check_wholes(
-    name: str,
-    values: object,
-    least: int = 1,
-    most: int | None = None,
-    count: int | None = None,
-    few: int = 1,
-) -> None:
-    """Raise InputError unless a setting is a tuple of whole numbers within their range.
+def read_settings(
+    kind: type, settings: Mapping[str, Any], what: str, fixed: Collection[str]
+) -> dict[str, Any]:
+    """Return settings as a class annotates them; lists, which JSON has, become tuples.
 
     Args:
-        name: The setting.
-        values: Its value.
-        least: Smallest number allowed.
-        most: Largest number allowed, if any.
-        count: How many numbers there must be, if that is fixed.
-        few: How many there must be at least.
+        kind: The class.
+        settings: Arguments of it.
+        what: Its name, for messages.
+        fixed: Parameters that are not settings.
+
+    Raises:
+        InputError: where a setting is unknown or of another type.
     """
-    fits = isinstance(values, tuple | list) and all(_is_whole(v, least, most) for v in values)
-    if fits and isinstance(values, Sequence):
-        fits = len(values) >= few if count is None else len(values) == count
-    if not fits:
-        many = f"{few} or more" if count is None else str(count)
-        span = _span(least, most)
-        raise InputError(f"{name} must be {many} whole numbers, each {span}, not {values!r}")
+    parameters = inspect.signature(kind).parameters.values()
+    choice = [p.name for p in parameters if p.kind is not p.VAR_KEYWORD and p.name not in fixed]
+    for key in settings:
+        if key not in choice:
+            words = f"choose from {', '.join(choice)}" if choice else "it takes none"
+            raise InputError(f"unknown setting {key!r} of {what}; {words}")
+    hints = get_type_hints(kind.__init__)
+    shape = dataclasses.make_dataclass("Settings", [(key, hints[key]) for key in settings])
+    values = structure(dict(settings), shape, f"settings of {what}")
+    return {key: getattr(values, key) for key in settings}
 
 
-def check_number(name: str, value: object, least: float = 0.0, most: float | None = None) -> None:
-    """Raise InputError unless a setting is a number from ``least`` to ``most``.
+def check_range(
+    name: str, value: Number | Sequence[Number], least: Number = 1, most: Number = math.inf
+) -> None:
+    """Raise InputError unless a number, or each of one or more, is in ``least`` to ``most``.
 
-    Without ``most`` it must be larger than ``least``, and finite.
+    Example:
+        >>> check_range("neighbours", 256, 1, 255)
+        Traceback (most recent call last):
+        qs3.errors.InputError: neighbours must be 1 to 255, not 256
     """
-    number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
-    fits = least < number < math.inf if most is None else least <= number <= most
-    if not fits:
-        span = f"larger than {least:g}" if most is None else f"{least:g} to {most:g}"
-        raise InputError(f"{name} must be a number, {span}, not {value!r}")
+    numbers = value if isinstance(value, Sequence) else (value,)
+    if not numbers or not all(least <= number <= most for number in numbers):
+        span = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
+        raise InputError(f"{name} must be {span}, not {value!r}")
 
 
-def check_choice(name: str, value: object, *choices: str) -> None:
-    """Raise InputError unless a setting is one of its choices."""
-    if value not in choices:
-        raise InputError(f"{name} must be {' or '.join(choices)}, not {value!r}")
-
-
-def check_flag(name: str, value: object) -> None:
-    """Raise InputError unless a setting is true or false."""
-    if not isinstance(value, bool):
-        raise InputError(f"{name} must be true or false, not {value!r}")
-
-
-def _is_whole(value: object, least: int, most: int | None) -> bool:
-    if not isinstance(value, Integral) or isinstance(value, bool):
-        return False
-    return least <= int(value) and (most is None or int(value) <= most)
-
-
-def _span(least: int, most: int | None) -> str:
-    return f"at least {least}" if most is None else f"{least} to {most}"
+def check_positive(name: str, value: Number | Sequence[Number]) -> None:
+    """Raise InputError unless a number, or each of one or more, is larger than 0 and finite."""
+    numbers = value if isinstance(value, Sequence) else (value,)
+    if not numbers or not all(0 < number < math.inf for number in numbers):
+        raise InputError(f"{name} must be larger than 0, not {value!r}")

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.models.checks import check_number, check_whole, check_wholes
+from qs3.models.checks import check_range
 
 
 @dataclass(frozen=True)
@@ -101,9 +101,9 @@ class ClassifierHead(nn.Module):
         slope: float,
     ) -> None:
         super().__init__()
-        check_whole("num_classes", num_classes)
-        check_wholes("hidden", hidden, few=0)
-        check_number("dropout", dropout, 0.0, 1.0)
+        check_range("num_classes", num_classes)
+        check_range("hidden", (1, *hidden))
+        check_range("dropout", dropout, 0, 1)
         layers: list[nn.Module] = []
         for depth, width in enumerate(hidden):
             layers += [
@@ -118,6 +118,11 @@ class ClassifierHead(nn.Module):
     def forward(self, pooled: Float[Tensor, "b c"]) -> Float[Tensor, "b k"]:
         """Return the logits."""
         return self.layers(pooled)
+
+
+def normalised(norm: nn.BatchNorm1d, values: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
+    """Return values after batch normalisation over all their dimensions but the last."""
+    return norm(values.flatten(0, -2)).view_as(values)
 
 
 class PointwiseLayer(nn.Module):
@@ -137,6 +142,5 @@ class PointwiseLayer(nn.Module):
 
     def forward(self, points: Float[Tensor, "b n c"]) -> Float[Tensor, "b n d"]:
         """Return the new features of each point."""
-        b, n, _ = points.shape
-        normed = self.norm(self.linear(points).flatten(0, 1))
-        return nn.functional.leaky_relu(normed, self.slope, inplace=True).view(b, n, -1)
+        normed = normalised(self.norm, self.linear(points))
+        return nn.functional.leaky_relu(normed, self.slope, inplace=True)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor, nn
 
-from qs3.models.checks import check_flag, check_whole, check_wholes
+from qs3.models.checks import check_range
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
 from qs3.models.normalisation import update_running, uses_batch
 from qs3.models.ops import flat_indices, knn, neighbour_max, neighbour_sum
@@ -78,8 +78,8 @@ class EdgeConv(nn.Module):
             # Each cloud about its own mean: in evaluation clouds do not mix, not even one of NaN.
             own_mean = neighbour_mean = points.mean(dim=1, keepdim=True)
             scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
-            # W₁ m + (W₂ − W₁) m is W₂ m.
-            shift = scale * (nn.functional.linear(own_mean, second) - norm.running_mean)
+            mean = nn.functional.linear(torch.cat([neighbour_mean, own_mean], dim=2), weight)
+            shift = scale * (mean - norm.running_mean)
         first, second = (scale[:, None] * weight).split(c, dim=1)
         best = neighbour_max(nn.functional.linear(points - neighbour_mean, first), neighbours)
         edge = best + nn.functional.linear(points - own_mean, second, norm.bias)
@@ -156,10 +156,9 @@ class DGCNN(PointClassifier):
         per_point: bool = False,
     ) -> None:
         super().__init__()
-        check_whole("neighbours", neighbours, 1, 255)
-        check_wholes("channels", channels)
-        check_whole("embedding", embedding)
-        check_flag("per_point", per_point)
+        check_range("neighbours", neighbours, 1, 255)
+        check_range("channels", channels)
+        check_range("embedding", embedding)
         self.neighbours = neighbours
         self.per_point = per_point
         widths = (3, *channels)

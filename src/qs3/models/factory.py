@@ -1,31 +1,26 @@
-"""Networks by name."""
+"""Networks by name; a network's module, and PyTorch, load when it is made."""
 
-import inspect
-from collections.abc import Callable
-from functools import partial
-from typing import Any
+from collections.abc import Mapping
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from qs3.errors import InputError
-from qs3.models.checks import check_whole
-from qs3.models.classifier import PointClassifier
-from qs3.models.dgcnn import DGCNN
-from qs3.models.pointdan_net import PointNetSA
-from qs3.models.pointmlp import PointMLPElite
-from qs3.models.pointnet import PointNet
-from qs3.models.pointnet2 import PointNet2
-from qs3.models.rscnn import RSCNN
-from qs3.models.simpleview import SimpleView
+from qs3.models.checks import read_settings
 
-_MODELS: dict[str, Callable[..., PointClassifier]] = {
-    "dgcnn": DGCNN,
-    "pointmlp-elite": PointMLPElite,
-    "pointnet": PointNet,
-    "pointnet-sa": PointNetSA,
-    "pointnet2": PointNet2,
-    "pointnet2-msg": partial(PointNet2, grouping="msg"),
-    "rscnn": RSCNN,
-    "simpleview": SimpleView,
+if TYPE_CHECKING:
+    from qs3.models.classifier import PointClassifier
+
+_MODELS: Mapping[str, tuple[str, str, dict[str, Any]]] = {
+    "dgcnn": ("dgcnn", "DGCNN", {}),
+    "pointmlp-elite": ("pointmlp", "PointMLPElite", {}),
+    "pointnet": ("pointnet", "PointNet", {}),
+    "pointnet-sa": ("pointnet_sa", "PointNetSA", {}),
+    "pointnet2": ("pointnet2", "PointNet2", {}),
+    "pointnet2-msg": ("pointnet2", "PointNet2", {"grouping": "msg"}),
+    "rscnn": ("rscnn", "RSCNN", {}),
+    "simpleview": ("simpleview", "SimpleView", {}),
 }
+"""Module, class and fixed settings of each network."""
 
 
 def list_models() -> tuple[str, ...]:
@@ -38,7 +33,7 @@ def list_models() -> tuple[str, ...]:
     return tuple(_MODELS)
 
 
-def create_model(name: str, num_classes: int, **settings: Any) -> PointClassifier:
+def create_model(name: str, num_classes: int, **settings: Any) -> "PointClassifier":
     """Make a network with fresh weights from PyTorch's current random state.
 
     Args:
@@ -55,24 +50,7 @@ def create_model(name: str, num_classes: int, **settings: Any) -> PointClassifie
     """
     if name not in _MODELS:
         raise InputError(f"unknown model {name!r}; choose one of {', '.join(_MODELS)}")
-    check_whole("num_classes", num_classes)
-    make = _MODELS[name]
-    fixed = {"num_classes", *(make.keywords if isinstance(make, partial) else ())}
-    known = [
-        parameter for parameter in inspect.signature(make).parameters if parameter not in fixed
-    ]
-    for key in settings:
-        if key not in known:
-            raise InputError(f"unknown setting {key!r} of {name}; choose from {', '.join(known)}")
-    values = {key: _tuples(value) for key, value in settings.items()}
-    try:
-        return make(num_classes, **values)
-    except InputError:
-        raise
-    except (TypeError, ValueError) as error:
-        raise InputError(f"settings {settings} do not make a {name}: {error}") from error
-
-
-def _tuples(value: Any) -> Any:
-    """Return tuples for lists, at any depth: JSON has lists only, the networks want tuples."""
-    return tuple(_tuples(part) for part in value) if isinstance(value, list | tuple) else value
+    module, kind, fixed = _MODELS[name]
+    make = getattr(import_module(f"qs3.models.{module}"), kind)
+    values = {"num_classes": num_classes, **settings}
+    return make(**read_settings(make, values, name, fixed), **fixed)

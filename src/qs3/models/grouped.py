@@ -23,9 +23,10 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from qs3.errors import InputError
 from qs3.models.normalisation import FoldedLayer, Moments, uses_batch
 from qs3.models.ops import flat_indices, gather_points, scatter_points
-from qs3.models.ops.exporting import is_exporting
+from qs3.models.ops.gathering import is_exporting
 
 
 class GroupedMLP(nn.Module):
@@ -42,7 +43,7 @@ class GroupedMLP(nn.Module):
     ) -> None:
         super().__init__()
         if len(widths) < 2:
-            raise ValueError(f"at least two layers are needed, not {len(widths)}")
+            raise InputError(f"widths must be two or more, not {widths}")
         ends = (3 + channels, *widths)
         self.layers = nn.ModuleList(FoldedLayer(c, d) for c, d in itertools.pairwise(ends))
         self.features_first = features_first

@@ -8,24 +8,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from qs3.models.checks import check_flag, check_wholes
+from qs3.errors import InputError
+from qs3.models.checks import check_range
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
 from qs3.models.normalisation import FoldedLayer, fold_norm, row_moments, uses_batch
-
-
-def orthogonality(matrix: Float[Tensor, "b c c"]) -> Float[Tensor, ""]:
-    """Return how far matrices are from orthogonal: ‖I − A Aᵀ‖² (Eq. 2), mean over the batch.
-
-    The paper adds 0.001 of it, for the 64 × 64 T-Net alone, to the loss. The shared training loop
-    leaves it out, as the adaptation papers do; a method that wants it reads the matrix by a forward
-    hook on ``feature_transform``.
-
-    Example:
-        >>> float(orthogonality(2.0 * torch.eye(3)[None]))
-        27.0
-    """
-    identity = torch.eye(matrix.shape[1], dtype=matrix.dtype, device=matrix.device)
-    return (identity - matrix @ matrix.transpose(1, 2)).square().sum(dim=(1, 2)).mean()
 
 
 def linear_max(
@@ -201,7 +187,8 @@ class PointNet(PointClassifier):
     """PointNet as published (§4.2, §5.1), with both T-Nets, or the quick form without.
 
     NOTE: the convolutions of the authors' release have biases; before batch normalisation they
-    change nothing, and there are none here. The T-Nets' regulariser is `orthogonality`.
+    change nothing, and there are none here. The paper adds 0.001 ‖I − A Aᵀ‖² (Eq. 2) of the second
+    T-Net to the loss; the shared training loop leaves it out, as the adaptation papers do.
 
     Args:
         num_classes: k.
@@ -229,9 +216,9 @@ class PointNet(PointClassifier):
         per_point: bool = False,
     ) -> None:
         super().__init__()
-        check_wholes("channels", channels, few=3)
-        check_flag("transforms", transforms)
-        check_flag("per_point", per_point)
+        if len(channels) < 3:
+            raise InputError(f"channels must be three or more widths, not {channels}")
+        check_range("channels", channels)
         layers = _shared((3, *channels[:-1]))
         self.early, self.late = layers[:2], layers[2:]
         self.pool = PointwiseMax(*channels[-2:])

@@ -8,16 +8,11 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from qs3.errors import InputError
-from qs3.models.checks import (
-    check_choice,
-    check_flag,
-    check_number,
-    check_whole,
-    check_wholes,
-)
+from qs3.models.checks import check_positive, check_range
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
 from qs3.models.grouped import GroupedMLP
 from qs3.models.ops import (
+    BallOrder,
     ball_query,
     farthest_point_sampling,
     gather_points,
@@ -53,13 +48,17 @@ class SetAbstraction(nn.Module):
         centres: int,
         channels: int,
         scales: tuple[Scale, ...],
-        ball_order: Literal["nearest", "first"],
+        ball_order: BallOrder,
         features_first: bool,
     ) -> None:
         super().__init__()
+        for radius, k, widths in scales:
+            check_positive("radius in scales", radius)
+            check_range("neighbours in scales", k, 1, 255)
+            check_range("widths in scales", widths)
         self.centres = centres
         self.balls = tuple((radius, k) for radius, k, _ in scales)
-        self.ball_order: Literal["nearest", "first"] = ball_order
+        self.ball_order: BallOrder = ball_order
         self.scales = nn.ModuleList(
             GroupedMLP(channels, widths, features_first) for _, _, widths in scales
         )
@@ -122,31 +121,28 @@ class PointNet2(PointClassifier):
     def __init__(
         self,
         num_classes: int,
-        grouping: str = "ssg",
+        grouping: Literal["ssg", "msg"] = "ssg",
         centres: tuple[int, ...] = (512, 128),
         scales: tuple[tuple[Scale, ...], ...] | None = None,
         embedding: tuple[int, ...] = (256, 512, 1024),
         hidden: tuple[int, ...] = (512, 256),
         dropout: float = 0.4,
-        ball_order: str = "nearest",
+        ball_order: BallOrder = "nearest",
         per_point: bool = False,
     ) -> None:
         super().__init__()
-        check_choice("grouping", grouping, "ssg", "msg")
-        check_choice("ball_order", ball_order, "nearest", "first")
-        check_flag("per_point", per_point)
-        order: Literal["nearest", "first"] = "first" if ball_order == "first" else "nearest"
         if scales is None:
             scales = _SSG if grouping == "ssg" else _MSG
-        _check_scales(scales)
-        check_wholes("centres", centres, count=len(scales))
-        check_wholes("embedding", embedding)
+        if not scales or len(centres) != len(scales):
+            raise InputError(f"centres and scales need one value for each level, not {centres}")
+        check_range("centres", centres)
+        check_range("embedding", embedding)
         # The released multi-scale network holds the features before the position.
         features_first = grouping == "msg"
         channels = 0
         levels = []
         for number, level in zip(centres, scales, strict=True):
-            levels.append(SetAbstraction(number, channels, level, order, features_first))
+            levels.append(SetAbstraction(number, channels, level, ball_order, features_first))
             channels = levels[-1].width
         self.levels = nn.ModuleList(levels)
         widths = (3 + channels, *embedding)
@@ -154,7 +150,6 @@ class PointNet2(PointClassifier):
             *(PointwiseLayer(c, d, 0.0) for c, d in itertools.pairwise(widths))
         )
         self.classify = ClassifierHead(widths[-1], hidden, num_classes, dropout, 0.0)
-        self.grouping = grouping
         self.per_point = per_point
 
     def encode(self, points: Float[Tensor, "b n 3"]) -> Features:
@@ -170,20 +165,3 @@ class PointNet2(PointClassifier):
     def head(self, features: Features) -> Float[Tensor, "b k"]:
         """Return the logits."""
         return self.classify(features.pooled)
-
-
-def _check_scales(scales: object) -> None:
-    """Raise InputError where the scales of the levels do not make a network."""
-    fault = "scales must be one or more of (radius, neighbours, widths) for each level"
-    if not isinstance(scales, tuple | list) or not scales:
-        raise InputError(f"{fault}, not {scales!r}")
-    for level in scales:
-        if not isinstance(level, tuple | list) or not level:
-            raise InputError(f"{fault}, not {level!r} for one")
-        for scale in level:
-            if not isinstance(scale, tuple | list) or len(scale) != 3:
-                raise InputError(f"{fault}; one is {scale!r}")
-            radius, k, widths = scale
-            check_number("radius in scales", radius)
-            check_whole("neighbours in scales", k, 1, 255)
-            check_wholes("widths in scales", widths, few=2)

@@ -9,7 +9,7 @@ from torch.autograd.function import once_differentiable
 
 from qs3.models.classifier import PointwiseLayer
 from qs3.models.normalisation import update_running, uses_batch
-from qs3.models.ops.exporting import is_exporting
+from qs3.models.ops.gathering import is_exporting
 
 
 def pooled_layer(

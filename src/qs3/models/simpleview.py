@@ -1,4 +1,4 @@
-"""SimpleView (Goyal et al., ICML 2021): a ResNet on six depth images of the cloud."""
+"""SimpleView (Goyal et al., ICML 2021): ResNet-18 (He et al., CVPR 2016) on six depth images."""
 
 from typing import Literal
 
@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.models.checks import check_choice, check_number, check_whole
+from qs3.models.checks import check_range
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier
-from qs3.models.resnet import ResNet18
+from qs3.models.ops.gathering import in_single_precision
 
 Projection = Literal["orthographic", "perspective"]
 """How points reach a pixel; see `depth_images`."""
@@ -64,8 +64,7 @@ def depth_images(
         >>> image[0].nonzero().tolist(), round(float(image[4, 1, 1]), 4)  # at the top; from above
         ([[0, 1]], 0.4)
     """
-    if points.dtype in (torch.float16, torch.bfloat16):
-        points = points.float()
+    points = in_single_precision(points)
     b = points.shape[0]
     axes = torch.tensor([[a for a, _ in view[1:]] for view in _VIEWS], device=points.device)
     signs = torch.tensor([[s for _, s in view[1:]] for view in _VIEWS], device=points.device)
@@ -93,6 +92,82 @@ def depth_images(
         drawn.scatter_reduce_(0, pixel, depth.reshape(-1), "amin")
         drawn = torch.where(drawn.isinf(), 0.0, drawn)
     return drawn[:-1].view(b, 6, resolution, resolution)
+
+
+def _convolution(channels: int, width: int, size: int, stride: int) -> nn.Conv2d:
+    layer = nn.Conv2d(channels, width, size, stride, padding=size // 2, bias=False)
+    nn.init.kaiming_normal_(layer.weight, mode="fan_out", nonlinearity="relu")
+    return layer
+
+
+class BasicBlock(nn.Module):
+    """Two 3×3 convolutions beside a shortcut (He et al., Fig. 5 left).
+
+    The second normalisation's scale starts at 0, so that the block starts as its shortcut
+    (Goyal et al., 2017, §5.1), as in SimpleView's release.
+
+    Args:
+        channels: Width of the input.
+        width: Width of the output.
+        stride: Stride of the first convolution and, where there is one, of the 1×1 shortcut.
+    """
+
+    def __init__(self, channels: int, width: int, stride: int) -> None:
+        super().__init__()
+        self.first = _convolution(channels, width, 3, stride)
+        self.first_norm = nn.BatchNorm2d(width)
+        self.second = _convolution(width, width, 3, 1)
+        self.second_norm = nn.BatchNorm2d(width)
+        nn.init.zeros_(self.second_norm.weight)
+        self.shortcut = nn.Identity()
+        if stride != 1 or channels != width:
+            self.shortcut = nn.Sequential(
+                _convolution(channels, width, 1, stride), nn.BatchNorm2d(width)
+            )
+        self.relu = nn.ReLU(inplace=True)
+
+    def forward(self, images: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d h2 w2"]:
+        """Return the new channels; a stride of 2 halves height and width, rounded up."""
+        inner = self.relu(self.first_norm(self.first(images)))
+        inner = self.second_norm(self.second(inner))
+        return self.relu(inner.add_(self.shortcut(images)))
+
+
+class ResNet18(nn.Module):
+    """ResNet-18 whose stem keeps the resolution: a 3×3 convolution without stride or pooling.
+
+    NOTE: channels are not laid side by side in memory (``channels_last``), which is up to 1.3 times
+    faster on a CPU: there PyTorch 2.13 sums a batch normalisation's moments one by one in single
+    precision (errors of 3e-4 on 72 images of 128²), and a strided 1×1 convolution of 4 channels
+    writes beyond its buffer.
+
+    Args:
+        channels: Channels of the images.
+        width: Width of the first stage, 64 in the original; the stages have 1, 2, 4 and 8 times it.
+
+    Example:
+        >>> ResNet18(1, 4)(torch.zeros(2, 1, 32, 32)).shape
+        torch.Size([2, 32])
+    """
+
+    def __init__(self, channels: int, width: int) -> None:
+        super().__init__()
+        # The release replaces the stem after it has drawn the weights of all else: PyTorch's own.
+        self.stem = nn.Conv2d(channels, width, 3, padding=1, bias=False)
+        self.norm = nn.BatchNorm2d(width)
+        self.relu = nn.ReLU(inplace=True)
+        blocks = []
+        before = width
+        for stage in range(4):
+            after = width * 2**stage
+            blocks += [BasicBlock(before, after, min(2, stage + 1)), BasicBlock(after, after, 1)]
+            before = after
+        self.blocks = nn.Sequential(*blocks)
+
+    def forward(self, images: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d"]:
+        """Describe each image by the mean over its last feature map."""
+        features = self.relu(self.norm(self.stem(images)))
+        return self.blocks(features).mean(dim=(2, 3))
 
 
 class SimpleView(PointClassifier):
@@ -125,10 +200,8 @@ class SimpleView(PointClassifier):
         dropout: float = 0.5,
     ) -> None:
         super().__init__()
-        check_whole("width", width)
-        check_whole("resolution", resolution, 8, 1024)
-        check_choice("projection", projection, "orthographic", "perspective")
-        check_number("dropout", dropout, 0.0, 1.0)
+        check_range("width", width)
+        check_range("resolution", resolution, 8, 1024)
         self.resolution = resolution
         self.projection: Projection = projection
         self.backbone = ResNet18(1, width)

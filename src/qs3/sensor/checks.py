@@ -2,6 +2,7 @@
 
 import functools
 import math
+import types
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from qs3.errors import InputError
@@ -11,7 +12,7 @@ def check_choices(settings: Any, room: str) -> None:
     """Check that every field that is a choice has one of its values.
 
     Args:
-        settings: A dataclass; choices are its fields annotated as ``Literal``.
+        settings: A dataclass; choices are its fields annotated as ``Literal``, or that or None.
         room: What the settings are of, for the message.
 
     Raises:
@@ -20,7 +21,7 @@ def check_choices(settings: Any, room: str) -> None:
     for name, choices in _choices(type(settings)).items():
         value = getattr(settings, name)
         if value not in choices:
-            offer = ", ".join(map(str, choices))
+            offer = ", ".join(str(choice) for choice in choices if choice is not None)
             raise InputError(f"{room}: no {name} {value!r}; choose one of {offer}")
 
 
@@ -59,5 +60,10 @@ def check_range(
 
 @functools.cache
 def _choices(kind: type) -> dict[str, tuple[Any, ...]]:
-    hints = get_type_hints(kind)
-    return {name: get_args(hint) for name, hint in hints.items() if get_origin(hint) is Literal}
+    choices = {}
+    for name, hint in get_type_hints(kind).items():
+        optional = get_origin(hint) is types.UnionType and type(None) in get_args(hint)
+        inner = get_args(hint)[0] if optional else hint
+        if get_origin(inner) is Literal:
+            choices[name] = get_args(inner) + ((None,) if optional else ())
+    return choices

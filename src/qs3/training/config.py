@@ -7,11 +7,11 @@ from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
-from qs3.adaptation.names import Normalisation, RoundRule, Rule
-from qs3.adaptation.pseudo_labels import Selection, SingleClass
+from qs3.adaptation.names import Normalisation, RoundRule, Rule, Selection, SingleClass
 from qs3.errors import InputError
-from qs3.training.schedules import Schedule
 
+Schedule = Literal["cosine", "plateau"]
+"""A cosine to 0 over the training; or halved where the loss falls no more."""
 Precision = Literal["32-true", "bf16-mixed", "16-mixed", "64-true"]
 """Number formats that Lightning Fabric offers here."""
 Accelerator = Literal["auto", "cpu", "cuda"]
@@ -139,7 +139,7 @@ class SelfTrainingSettings:
     read literally); or in every round the 80 % whose index modulo 10 is below 8."""
     init: Literal["warm-up", "scratch"] = "warm-up"
     """Weights that round 1 starts from; later rounds go on from there."""
-    labeller: Literal["latest", "best"] = "latest"
+    teacher: Literal["latest", "best"] = "latest"
     """Network that gives the pseudo labels: that of the last round, or the one that was best on
     the fifth of the pseudo-labelled clouds that is then held out of the training."""
     source_loss: bool = True
@@ -226,7 +226,7 @@ PRESETS: Mapping[str, SelfTrainingSettings] = {
         inclusive=True,
         pool="split",
         init="scratch",
-        labeller="best",
+        teacher="best",
         source_loss=False,
         schedule="continuous",
         single_class="drop",
@@ -246,7 +246,7 @@ def self_training_preset(name: str, **overrides: Any) -> SelfTrainingSettings:
         InputError: where the preset or a setting is unknown.
 
     Example:
-        >>> self_training_preset("released", rounds=3).labeller
+        >>> self_training_preset("released", rounds=3).teacher
         'best'
     """
     if name not in PRESETS:

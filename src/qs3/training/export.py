@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from qs3.errors import InputError, MissingExtraError, QS3Error
 from qs3.files import write_bytes
 from qs3.models import PointClassifier
-from qs3.models.ops.exporting import sample_in_a_loop
+from qs3.models.ops.sampling import sample_in_a_loop
 from qs3.training.checkpoint import load_model
 from qs3.training.predict import predict_probabilities
 
@@ -63,7 +63,7 @@ class CloudClassifier(nn.Module):
     """A network that takes clouds of any size in any unit, and gives probabilities.
 
     Inside are the steps of `qs3.training.batches.prepare`, in double precision as there: clouds of
-    more than ``num_points`` points are thinned by farthest point sampling from point 0, points of
+    more than ``num_points`` points are subsampled from point 0 on, points of
     smaller ones are repeated in order; then the unit ball.
 
     Convention:
@@ -87,16 +87,16 @@ class CloudClassifier(nn.Module):
 
     def forward(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b k"]:
         """Return the probabilities of the classes."""
-        thinned = thin_in_a_graph(points.double(), self.num_points)
-        logits = self.model(unit_ball_in_a_graph(thinned).float())
+        chosen = subsample_in_a_graph(points.double(), self.num_points)
+        logits = self.model(unit_ball_in_a_graph(chosen).float())
         return torch.softmax(logits.double(), dim=1).float()
 
 
-def thin_in_a_graph(points: Float[Tensor, "b n 3"], num_points: int) -> Float[Tensor, "b m 3"]:
-    """Bring clouds to one size as `qs3.training.thinning.thin`, in one graph for every n.
+def subsample_in_a_graph(points: Float[Tensor, "b n 3"], num_points: int) -> Float[Tensor, "b m 3"]:
+    """Bring clouds to one size as `qs3.training.batches.subsample`, in one graph for every n.
 
     Example:
-        >>> thin_in_a_graph(torch.tensor([[[0.0, 0, 0], [1, 0, 0]]]), 3)[0, :, 0].tolist()
+        >>> subsample_in_a_graph(torch.tensor([[[0.0, 0, 0], [1, 0, 0]]]), 3)[0, :, 0].tolist()
         [0.0, 1.0, 0.0]
     """
     # A tensor, for what depends on the number of points must be computed and not decided.
@@ -110,7 +110,7 @@ def thin_in_a_graph(points: Float[Tensor, "b n 3"], num_points: int) -> Float[Te
 
 
 def unit_ball_in_a_graph(points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
-    """Bring clouds to the unit ball as `qs3.io.transforms.unit_ball`.
+    """Bring clouds to the unit ball as `qs3.io.preparation.unit_ball`.
 
     Example:
         >>> unit_ball_in_a_graph(torch.tensor([[[0.0, 0, 0], [4, 0, 0]]]))[0, :, 0].tolist()

@@ -1,32 +1,41 @@
 """Train and adapt in one call, into a folder from which the call can be taken up again."""
 
 import contextlib
-import hashlib
-import json
 import logging
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 from qs3.adaptation import method_class
 from qs3.adaptation.names import split_method
 from qs3.errors import InputError
-from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.io.clouds import PointClouds, UnlabelledClouds, digests
+from qs3.io.preparation import unit_ball
 from qs3.models import PointClassifier
-from qs3.training.batches import prepare, require_finite, require_unlabelled
-from qs3.training.checkpoint import MODEL, claim_run, fingerprint, load_model
+from qs3.structure import unstructure
+from qs3.training.batches import require_finite, require_unlabelled, subsample
+from qs3.training.checkpoint import load_model, weights_fingerprint
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
-from qs3.training.deadline import Deadline
 from qs3.training.distributed import all_devices, make_fabric, threads
-from qs3.training.job import Job, Listeners, fresh_model, make_method, run_job, write_job
+from qs3.training.history import EpochRecord, History
+from qs3.training.job import Job, fresh_model, make_method, run_job
 from qs3.training.loop import EpochCallback
-from qs3.training.records import EpochRecord, History
+from qs3.training.progress import Deadline
+from qs3.training.run import (
+    RUN,
+    Run,
+    claim_run,
+    data_record,
+    fingerprint,
+    read_run,
+    sum_seconds,
+    write_run,
+)
 from qs3.training.self_training import RoundCallback, RoundRecord
-from qs3.training.validation import Checkpoint, read_checkpoints, split_source
+from qs3.training.validation import Checkpoint, held_out_rows, read_checkpoints
 
 _LOG = logging.getLogger(__name__)
-_Clouds = TypeVar("_Clouds", PointClouds, UnlabelledClouds)
 
 
 @dataclass(frozen=True)
@@ -39,12 +48,18 @@ class FitResult:
     """Epochs before self-training; empty where a given warm-up took their place."""
     rounds: tuple[RoundRecord, ...]
     """Rounds of self-training."""
-    selection: str = "last"
+    selection: str
     """Rule that chose the network among the checkpoints; no label of the target looked at."""
-    checkpoints: tuple[Checkpoint, ...] = ()
+    checkpoints: tuple[Checkpoint, ...]
     """Networks along the way, with what each validator says of them."""
-    adapted: bool = False
+    adapted: bool
     """Whether the target had a part in the weights or in the choice of the network."""
+    source: PointClouds
+    """What was trained on, prepared: the source without its held-out part."""
+    holdout: PointClouds | None
+    """The held-out part of the source, prepared; None where there is none."""
+    target: UnlabelledClouds | None
+    """The target, prepared."""
 
 
 def fit(
@@ -56,6 +71,8 @@ def fit(
     *,
     run_dir: Path,
     warm_up: Path | None = None,
+    preset: str | None = None,
+    supervised: bool = False,
     deadline: Deadline | None = None,
     tensorboard: bool = False,
     on_epoch: EpochCallback | None = None,
@@ -67,8 +84,8 @@ def fit(
     the same bits as if it had never stopped (same devices, at most two, and number of threads).
 
     Args:
-        method: One of `qs3.adaptation.names.MethodName`; ``spst``, ``qbst``, ``qs3`` and
-            ``gast-spst`` end in self-training.
+        method: One of `qs3.adaptation.names.MethodName`; ``spst``, ``qbst`` and ``gast-spst`` end
+            in self-training.
         source: Labelled clouds, as read. A share of ``settings.holdout`` is kept for validators.
         target: Clouds without labels, as read. ``source-only`` takes them for validators and AdaBN
             alone.
@@ -76,10 +93,12 @@ def fit(
         self_training: Settings of the rounds, which follow any method where they are given; a
             method that ends in self-training takes its own preset where they are absent.
         run_dir: Folder of the run: ``settings.json``, ``model.safetensors``, ``history.jsonl``;
-            ``checkpoints/``; the warm-up's own in ``warm-up/``; and, where clouds were thinned,
-            the choice of points.
+            ``checkpoints/``; the warm-up's own in ``warm-up/``; where clouds were subsampled, the
+            choice of points; at the end ``run.json``.
         warm_up: Folder of a finished run on the same classes, whose network takes the place of the
             training before self-training.
+        preset: Name of the rounds' preset, for the record.
+        supervised: Whether the source is the labelled training part of the target, for the record.
         deadline: Time for this call; it stops before an epoch that would end later, but never
             before its first.
         tensorboard: Whether to write event files too, in ``tensorboard/``.
@@ -110,64 +129,92 @@ def fit(
         require_unlabelled(target)
         require_finite(target.points, target.ids, "target: ")
     require_finite(source.points, source.ids, "source: ")
-    start, unseen = None, True
+    weights, before, unseen = None, None, True
     if warm_up is not None:
-        start, unseen = _load_warm_up(Path(warm_up), base, source, settings)
+        warm_up = Path(warm_up)
+        weights, unseen = _check_warm_up(warm_up, base, source, settings)
+        before = read_run(warm_up) if (warm_up / RUN).is_file() else None
     run_dir = Path(run_dir)
-    trained, holdout = _split(source, settings, unseen)
-    _require_judges(settings, rounds_settings, target, holdout)
-    job = Job(
-        base,
-        trained,
-        holdout,
-        target,
-        settings,
-        rounds_settings,
-        run_dir,
-        start,
-    )
+    held = held_out_rows(source.labels, settings)
+    has_holdout = unseen and bool(held.any())
+    _require_judges(settings, rounds_settings, target, has_holdout)
+    job = Job(base, source, None, target, settings, rounds_settings, run_dir, warm_up)
     # What cannot be made must not leave a folder behind that refuses the corrected call.
     make_method(fresh_model(job), job)
     make_fabric(settings)
     history = History(run_dir, tensorboard)
-    claim_run(
-        run_dir,
-        {
-            "method": method,
-            "train": asdict(settings),
-            "self_training": None if rounds_settings is None else asdict(rounds_settings),
-            "selection": settings.rule,
-            "class_names": list(source.class_names),
-            "source": fingerprint(source),
-            "target": None if target is None else fingerprint(target),
-            "warm_up": None if start is None else weights_fingerprint(start),
-        },
-    )
-    source = _prepared(source, job)
-    trained, holdout = _split(source, settings, unseen)
+    claim_run(run_dir, method, source, target, settings, rounds_settings, weights)
+    chosen = subsample(source.points, settings.num_points, run_dir)
+    source_clouds, target_clouds = digests(chosen), []
+    prepared, prepared_target = replace(source, points=unit_ball(chosen)), None
+    if target is not None:
+        chosen = subsample(target.points, settings.num_points, run_dir)
+        target_clouds = digests(chosen)
+        prepared_target = replace(target, points=unit_ball(chosen))
     job = replace(
         job,
-        source=trained,
-        holdout=holdout,
-        target=target and _prepared(target, job),
+        source=prepared.select(~held),
+        holdout=prepared.select(held) if has_holdout else None,
+        target=prepared_target,
     )
     with (
         threads(settings),
         contextlib.closing(history),
-        all_devices(settings, partial(write_job, job)) as fabric,
+        all_devices(settings, partial(run_job, job)) as fabric,
     ):
         model, epochs, rounds = run_job(
-            job, fabric, Listeners(history, deadline, on_epoch, on_round)
+            job,
+            fabric,
+            history=history,
+            deadline=deadline,
+            on_epoch=on_epoch,
+            on_round=on_round,
         )
+    adapted = (
+        needs or settings.normalisation != "shared" or settings.rule not in ("last", "source-val")
+    )
+    if rounds_settings is not None and method == base:
+        method = f"{base}+{rounds_settings.rule}"
+    run = Run(
+        method=method,
+        selection=settings.rule,
+        source=data_record(source),
+        target=None if target is None else data_record(target),
+        source_clouds=tuple(source_clouds),
+        target_clouds=tuple(target_clouds) if adapted else (),
+        unknown_warm_up=warm_up is not None and before is None,
+        rounds=tuple(asdict(record) for record in rounds),
+        seconds=sum_seconds(epochs, rounds),
+        preset=None if rounds_settings is None else preset,
+        supervised=supervised,
+        folder=run_dir,
+    )
+    write_run(run if before is None else _with_warm_up(run, before))
     return FitResult(
         model=model.eval(),
         history=tuple(epochs),
         rounds=tuple(rounds),
         selection=settings.rule,
         checkpoints=tuple(read_checkpoints(run_dir)),
-        adapted=needs
-        or settings.normalisation != "shared"
-        or settings.rule not in ("last", "source-val"),
+        adapted=adapted,
+        source=job.source,
+        holdout=job.holdout,
+        target=job.target,
+    )
+
+
+def _with_warm_up(run: Run, before: Run) -> Run:
+    """Add what the network has seen in its warm-up, for the marks of its scores."""
+
+    def both(first: Sequence[str], second: Sequence[str]) -> tuple[str, ...]:
+        return tuple(sorted({*first, *second}))
+
+    return replace(
+        run,
+        supervised=run.supervised or before.supervised,
+        source_clouds=both(run.source_clouds, before.source_clouds),
+        target_clouds=both(run.target_clouds, before.target_clouds),
+        unknown_warm_up=before.unknown_warm_up,
     )
 
 
@@ -189,24 +236,11 @@ def _plan(
     return base, self_training
 
 
-def is_finished(run_dir: Path) -> bool:
-    """Whether a run has written its network."""
-    return (Path(run_dir) / MODEL).is_file()
-
-
-def _split(
-    source: PointClouds, settings: TrainSettings, unseen: bool
-) -> tuple[PointClouds, PointClouds | None]:
-    """Return the part to train on, and the held-out one where the warm-up has not seen it."""
-    trained, held = split_source(source, settings)
-    return trained, held if unseen and len(held) else None
-
-
 def _require_judges(
     settings: TrainSettings,
     rounds: SelfTrainingSettings | None,
     target: UnlabelledClouds | None,
-    holdout: PointClouds | None,
+    has_holdout: bool,
 ) -> None:
     """Refuse, before anything is trained, what would lack something in the end.
 
@@ -215,7 +249,7 @@ def _require_judges(
     """
     by_source = settings.rule in ("source-val", "dev")
     bbse = rounds is not None and rounds.rule == "prior" and rounds.prior == "bbse"
-    if holdout is None and (by_source or bbse):
+    if not has_holdout and (by_source or bbse):
         what = f"rule {settings.rule!r}" if by_source else "prior 'bbse'"
         raise InputError(
             f"{what} needs a held-out part of the source that no warm-up has seen; raise holdout "
@@ -225,57 +259,43 @@ def _require_judges(
         raise InputError(f"rule {settings.rule!r} needs a target: give unlabelled clouds")
 
 
-def _load_warm_up(
+def _check_warm_up(
     folder: Path, base: str, source: PointClouds, settings: TrainSettings
-) -> tuple[PointClassifier, bool]:
-    """Read the warm-up's network; say whether it has left this run's held-out part unseen.
+) -> tuple[str, bool]:
+    """Return the checksum of a warm-up's weights, and whether the held-out part is new to it.
 
     Raises:
         InputError: where it is one for other classes or settings, or of another method.
     """
-    model, class_names, there = load_model(folder)
+    model, class_names, its = load_model(folder)
     if class_names != source.class_names:
         raise InputError(
             f"{folder}: its classes ({', '.join(class_names)}) are not those of the source "
             f"({', '.join(source.class_names)})"
         )
-    wanted = json.loads(json.dumps(asdict(settings)))
-    trained = there.get("train", {})
+    ours, trained = unstructure(settings), its.get("train", {})
     names = ["model", "model_settings", "num_points"]
     names += ["method_settings"] if "method_settings" in trained else []
     for name in names:
-        if trained.get(name) != wanted[name]:
+        if trained.get(name) != ours[name]:
             raise InputError(
-                f"{folder}: trained with {name} = {trained.get(name)!r}, not "
-                f"{wanted[name]!r}; use the same setting"
+                f"{folder}: trained with {name} = {trained.get(name)!r}, not {ours[name]!r}; use "
+                "the same setting"
             )
-    if there.get("self_training") is not None:
+    if its.get("self_training") is not None:
         raise InputError(f"{folder}: is self-trained itself; name the run before its rounds")
-    method = there.get("method", base)
+    method = its.get("method", base)
     if method != base:
         raise InputError(
             f"{folder}: is a run of method {method}, not {base}; choose method {method} with "
             "self-training after it"
         )
-    same = all(trained.get(name) == wanted[name] for name in ("seed", "holdout"))
-    unseen = same and there.get("source") == fingerprint(source)
+    same = all(trained.get(name) == ours[name] for name in ("seed", "holdout"))
+    unseen = same and its.get("source") == fingerprint(source)
     if not unseen and settings.holdout > 0:
         _LOG.warning(
             "%s: was trained on another part of the source, so that none of it is left to "
             "validate on; same source, seed and holdout would leave one",
             folder,
         )
-    return model, unseen
-
-
-def weights_fingerprint(model: PointClassifier) -> str:
-    """SHA-256 over names and values of a network's weights, by which a warm-up is known."""
-    digest = hashlib.sha256()
-    for name, tensor in sorted(model.state_dict().items()):
-        digest.update(name.encode())
-        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
-
-
-def _prepared(clouds: _Clouds, job: Job) -> _Clouds:
-    return replace(clouds, points=prepare(clouds.points, job.settings.num_points, job.run_dir))
+    return weights_fingerprint(model), unseen

@@ -5,7 +5,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from qs3.models.ops.exporting import is_exporting
+
+def is_exporting() -> bool:
+    """Tell whether a graph is made for elsewhere, which must hold for any number of clouds.
+
+    Blocks of clouds, which save memory here, are not made there. Older PyTorch tells of any
+    tracing alone.
+    """
+    return getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)()
 
 
 def in_single_precision(points: Float[Tensor, "..."]) -> Float[Tensor, "..."]:

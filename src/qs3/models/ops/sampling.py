@@ -1,12 +1,17 @@
-"""Farthest point sampling."""
+"""Farthest point sampling of tensors, one result in three ways.
+
+NumPy on a CPU, where a small step costs a microsecond; PyTorch on other devices; one loop in a
+graph that is exported, which steps written out would fill.
+"""
+
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from qs3.models.ops.exporting import is_exporting, sample_in_a_loop
-from qs3.models.ops.gathering import in_single_precision
+from qs3.models.ops.gathering import in_single_precision, is_exporting
 
 
 @torch.no_grad()
@@ -43,6 +48,21 @@ def farthest_point_sampling(
         chosen = start[:, None].expand(-1, m).clone()
         return sample_in_a_loop(planes, chosen, torch.full_like(start[0], m))
     return _sample(planes, m, start)  # pyright: ignore[reportCallIssue]
+
+
+def nested_samples(points: Float[Tensor, "b n 3"], counts: Sequence[int]) -> list[Tensor]:
+    """Sample farthest first, each level [b m] from the one before; counts must not grow.
+
+    Sampling starts at the point farthest from the mean. Later levels begin at the first point of
+    theirs, and farthest point sampling of samples, from the first of them, is their beginning.
+
+    Example:
+        >>> nested_samples(torch.randn(2, 16, 3), (8, 4))[1][0]
+        tensor([0, 1, 2, 3])
+    """
+    first = farthest_point_sampling(points, counts[0])
+    numbers = torch.arange(counts[0], device=points.device).expand(len(points), -1)
+    return [first, *(numbers[:, :count] for count in counts[1:])]
 
 
 @torch.compiler.disable
@@ -94,3 +114,47 @@ def _sample_in_numpy(
         nearest[cloud, newest] = -1.0
         newest = nearest.argmax(axis=1)
     return np.ascontiguousarray(chosen.T)
+
+
+def sample_in_a_loop(
+    planes: Float[Tensor, "3 b n"],
+    chosen: Int[Tensor, "b m"],
+    end: Int[Tensor, ""],
+    repeat: bool = False,
+) -> Int[Tensor, "b m"]:
+    """Sample farthest points by one loop in the graph, whose last steps may be left out.
+
+    Args:
+        planes: x, y and z of the clouds.
+        chosen: Indices to begin with; the first of each cloud is where sampling starts.
+        end: Where sampling ends; ``chosen`` stays as it is from there on.
+        repeat: Whether a point may be chosen again, once all others lie on chosen ones too.
+
+    Example:
+        >>> planes = torch.tensor([[[0.0, 1.0, 9.0]], [[0.0, 0, 0]], [[0.0, 0, 0]]])
+        >>> sample_in_a_loop(planes, torch.zeros(1, 3, dtype=torch.int64), torch.tensor(2)).tolist()
+        [[0, 2, 0]]
+    """
+    # The public wrapper would first compile both functions, which a debugger's or a checker's
+    # wrapping of them breaks; the operation itself takes them as they are, with all they read.
+    from torch._higher_order_ops.while_loop import while_loop_op
+
+    def goes_on(step, chosen, nearest, planes, end):
+        return step < end
+
+    def choose(step, chosen, nearest, planes, end):
+        newest = chosen.index_select(1, (step - 1).view(1))
+        position = planes.gather(2, newest.expand(3, -1, 1))
+        # One addition after the other, as elsewhere, for the same bits.
+        x, y, z = (planes - position).square().unbind()
+        nearest = torch.minimum(nearest, x + y + z)
+        if not repeat:
+            nearest = nearest.scatter(1, newest, -1.0)
+        farthest = nearest.argmax(dim=1, keepdim=True)
+        column = torch.arange(chosen.shape[1], device=chosen.device)
+        return step + 1, torch.where(column == step, farthest, chosen), nearest
+
+    start = torch.ones((), dtype=torch.int64, device=chosen.device)
+    nearest = torch.full_like(planes[0], torch.inf)
+    carried: tuple = (start, chosen, nearest)
+    return while_loop_op(goes_on, choose, carried, (planes, end))[1]

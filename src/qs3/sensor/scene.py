@@ -1,0 +1,268 @@
+"""What stands around the object: a floor, a wall, a neighbour, or nothing as in the paper.
+
+Convention:
+    World: z up; the object stands about the origin. The first view says where the front is: the
+    wall stands behind the object as that view sees it, the neighbour in front of it or beside it.
+    The scene is one for all views. Where something stands in front or behind, the views stay on
+    an arc about the first one, so that no camera looks at the wall's back; with a floor or a
+    neighbour beside it they go all round as before.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+from qs3.errors import InputError
+from qs3.geometry import invert_rigid, rotation_z, transform_points
+from qs3.sensor.checks import check_range
+from qs3.sensor.materials import Material
+from qs3.sensor.render.raycast import DepthCaster
+from qs3.sensor.render.scene import Body
+from qs3.sensor.rig import Pose, StereoRig
+
+LAYOUTS = ("alone", "floor", "wall", "room", "behind", "beside")
+_SURVEY, _STEPS = 96, 25  # pixels and places at which a neighbour's cover is tried
+_LIFT = 1e-4  # of the object's size between it and the floor: equal planes would flicker
+
+
+@dataclass(frozen=True)
+class SceneSettings:
+    """What stands around the object. Distances are shares of the object's size."""
+
+    layout: str = "alone"
+    """``alone`` (the paper), on a ``floor``, before a ``wall``, in a ``room`` (both), ``behind``
+    a neighbour that hides part of it, or ``beside`` one; joined by + as in ``room+beside``."""
+    floor: Material = field(default_factory=lambda: Material(albedo=0.5))
+    """Surface of the floor."""
+    wall: Material = field(default_factory=lambda: Material(albedo=0.6))
+    """Surface of the wall."""
+    neighbour: Material | None = None
+    """Surface of the neighbour; None is the object's own."""
+    wall_gap: float = 0.3
+    """Between the wall and what stands before it."""
+    neighbour_gap: float = 0.2
+    """Between the object and its neighbour."""
+    neighbour_size: float = 1.0
+    """Size of the neighbour."""
+    cover: float = 0.3
+    """``behind``: share of what the first view sees of the object that the neighbour hides, as
+    near as its shape allows."""
+    extent: float = 20.0
+    """Side of the floor and of the wall."""
+    arc: float = 120.0
+    """Degrees within which the views stay where something stands in front or behind."""
+
+    def __post_init__(self) -> None:
+        unknown = [part for part in self.layout.split("+") if part not in LAYOUTS]
+        if unknown:
+            raise InputError(
+                f"scene: no layout {unknown[0]!r}; choose of {', '.join(LAYOUTS)}, joined by +"
+            )
+        if "alone" in self.parts and len(self.parts) > 1:
+            raise InputError(f"scene: alone does not go with others, as in {self.layout!r}")
+        if {"behind", "beside"} <= self.parts:
+            raise InputError("scene: the neighbour stands in front (behind) or beside, not both")
+        check_range(self, "scene", "wall_gap", "neighbour_gap")
+        check_range(self, "scene", "neighbour_size", "extent", above=True)
+        check_range(self, "scene", "cover", high=1, above=True)
+        check_range(self, "scene", "arc", high=170)
+
+    @property
+    def parts(self) -> frozenset[str]:
+        """The layouts joined in ``layout``, a room as floor and wall.
+
+        Example:
+            >>> sorted(SceneSettings("room+beside").parts)
+            ['beside', 'floor', 'wall']
+        """
+        named = self.layout.split("+")
+        return frozenset(part for part in named if part != "room") | (
+            {"floor", "wall"} if "room" in named else frozenset()
+        )
+
+    @property
+    def needs_neighbour(self) -> bool:
+        """Whether a second mesh is needed."""
+        return bool(self.parts & {"behind", "beside"})
+
+
+@dataclass(frozen=True)
+class ArrangedScene:
+    """Everything before the rig, and from where it is seen."""
+
+    bodies: tuple[Body, ...]
+    """The object first."""
+    names: tuple[str, ...]
+    """What each body is: object, neighbour, floor or wall."""
+    poses: tuple[Pose, ...]
+    """Left camera of each view."""
+
+
+def arrange(
+    settings: SceneSettings,
+    body: Body,
+    poses: Sequence[Pose],
+    size: float,
+    neighbour: trimesh.Trimesh | None,
+    rng: np.random.Generator,
+) -> ArrangedScene:
+    """Put everything else about the object.
+
+    Args:
+        settings: Layout, materials and distances.
+        body: The object, about the origin.
+        poses: Left camera of each view, as drawn for an object alone.
+        size: The object's size in the unit of the scene.
+        neighbour: Another mesh about its own origin, of the size in which it is to stand.
+        rng: Draws the neighbour's turn about z and its side.
+
+    Raises:
+        InputError: where the layout needs a neighbour and there is none, or the other way round.
+    """
+    if settings.needs_neighbour != (neighbour is not None):
+        wanted = (
+            "needs a neighbour: name its mesh (neighbour)"
+            if neighbour is None
+            else "has no neighbour"
+        )
+        raise InputError(f"scene: layout {settings.layout!r} {wanted}")
+    parts = settings.parts
+    if parts & {"wall", "behind"}:
+        poses = _on_arc(poses, np.radians(settings.arc))
+    bodies, names = [body], ["object"]
+    front = _front(poses[0])
+    ground = float(body.mesh.vertices[:, 2].min()) - _LIFT * size
+    if neighbour is not None:
+        turn, side = rng.uniform(0, 2 * np.pi), rng.choice([-1.0, 1.0])
+        turned = neighbour.copy()
+        turned.vertices = turned.vertices @ rotation_z(turn).T
+        place = _before if "behind" in parts else _beside
+        turned.vertices += place(body.mesh, turned, poses[0], side, settings, size)
+        if "floor" in parts:
+            turned.vertices[:, 2] += max(0.0, ground - turned.vertices[:, 2].min())
+        bodies.append(Body(turned, settings.neighbour or body.material))
+        names.append("neighbour")
+    half = settings.extent * size / 2
+    across = np.array([-front[1], front[0], 0.0])
+    up = np.array([0.0, 0.0, 1.0])
+    if "wall" in parts:
+        reach = max(float((body.mesh.vertices @ -front).max()) for body in bodies)
+        centre = -front * (reach + settings.wall_gap * size)
+        if "floor" in parts:  # it stands on the floor
+            centre = centre + up * (ground + half)
+        bodies.append(Body(_square(centre, across * half, up * half), settings.wall))
+        names.append("wall")
+    if "floor" in parts:
+        centre = up * ground
+        bodies.append(Body(_square(centre, front * half, across * half), settings.floor))
+        names.append("floor")
+    return ArrangedScene(tuple(bodies), tuple(names), tuple(poses))
+
+
+def _on_arc(poses: Sequence[Pose], arc: float) -> list[Pose]:
+    """The poses turned about z so that they stand on an arc about the first: 0, +s, −s, +2s, …."""
+    azimuths = [math.atan2(pose.position[1], pose.position[0]) for pose in poses]
+    spread = max(abs(math.remainder(a - azimuths[0], 2 * math.pi)) for a in azimuths)
+    if spread <= arc / 2:  # copies of one pose stay as they are
+        return list(poses)
+    step, turned = arc / len(poses), []
+    for index, (pose, azimuth) in enumerate(zip(poses, azimuths, strict=True)):
+        offset = step * ((index + 1) // 2) * (1 if index % 2 else -1)
+        matrix, rotation = pose.camera_to_world.copy(), rotation_z(azimuths[0] + offset - azimuth)
+        matrix[:3] = rotation @ matrix[:3]
+        turned.append(Pose(matrix))
+    return turned
+
+
+def _front(pose: Pose) -> Float[np.ndarray, "3"]:
+    """Horizontal direction from the object to the camera; from above, the image's downward one."""
+    front = np.array([*pose.position[:2], 0.0])
+    if np.linalg.norm(front) < 1e-3 * np.linalg.norm(pose.position):
+        front = np.array([*pose.camera_to_world[:2, 1], 0.0])
+    return front / np.linalg.norm(front)
+
+
+def _apart(
+    mesh: trimesh.Trimesh, other: trimesh.Trimesh, along: Float[np.ndarray, "3"], gap: float
+) -> float:
+    """Distance along a direction at which a plane with ``gap`` about it parts the two meshes."""
+    return float((mesh.vertices @ along).max() - (other.vertices @ along).min()) + gap
+
+
+def _before(
+    mesh: trimesh.Trimesh,
+    other: trimesh.Trimesh,
+    pose: Pose,
+    side: float,
+    settings: SceneSettings,
+    size: float,
+) -> Float[np.ndarray, "3"]:
+    """Place on the line of sight of ``pose``, moved aside until the wanted share is covered.
+
+    NOTE: it hovers there. A neighbour of the object's height that stood on the ground would hide
+    nothing from a camera that looks down by more than some 40°.
+    """
+    sight = pose.position / np.linalg.norm(pose.position)
+    shift = sight * _apart(mesh, other, sight, settings.neighbour_gap * size)
+    if float(((other.vertices + shift) @ sight).max()) >= np.linalg.norm(pose.position):
+        raise InputError(
+            "scene: no room for a neighbour between the first view's camera and the object; give "
+            "placement a larger radius, or make the neighbour smaller (neighbour_size)"
+        )
+    return shift + pose.camera_to_world[:3, 0] * _aside(mesh, other, shift, pose, side, settings)
+
+
+def _aside(
+    mesh: trimesh.Trimesh,
+    other: trimesh.Trimesh,
+    shift: Float[np.ndarray, "3"],
+    pose: Pose,
+    side: float,
+    settings: SceneSettings,
+) -> float:
+    """How far to move a neighbour along the camera's x axis so that it hides the wanted share."""
+    x, y, z = transform_points(invert_rigid(pose.camera_to_world), np.asarray(mesh.vertices)).T
+    reach = float(np.abs([x / z, y / z]).max())
+    rig = StereoRig(width=_SURVEY, height=_SURVEY, focal=_SURVEY / 2 / reach)
+    seen = DepthCaster(mesh).cast(rig, pose, rig.full_frame).mask
+    moved = other.copy()
+    moved.vertices = moved.vertices + shift
+    caster = DepthCaster(moved)
+    # Far enough to be clear of the object, then inwards until both are in line.
+    width = float(np.ptp((moved.vertices - pose.position) @ pose.camera_to_world[:3, 0]))
+    best, error = 0.0, math.inf
+    for offset in side * np.linspace(width / 2 + reach * float(z.max()), 0.0, _STEPS):
+        # The neighbour moved to the right looks as from a camera moved to the left.
+        hidden = caster.cast(rig, pose.shifted(-offset), rig.full_frame).mask & seen
+        miss = abs(float(hidden.sum()) / max(int(seen.sum()), 1) - settings.cover)
+        if miss < error:
+            best, error = float(offset), miss
+    return best
+
+
+def _beside(
+    mesh: trimesh.Trimesh,
+    other: trimesh.Trimesh,
+    pose: Pose,
+    side: float,
+    settings: SceneSettings,
+    size: float,
+) -> Float[np.ndarray, "3"]:
+    """Place to the left or right of the object, on the same ground."""
+    front = _front(pose)
+    along = side * np.array([-front[1], front[0], 0.0])
+    shift = along * _apart(mesh, other, along, settings.neighbour_gap * size)
+    shift[2] = mesh.vertices[:, 2].min() - other.vertices[:, 2].min()
+    return shift
+
+
+def _square(
+    centre: Float[np.ndarray, "3"], a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]
+) -> trimesh.Trimesh:
+    """A square of two triangles, its normal along a × b."""
+    corners = np.array([centre - a - b, centre + a - b, centre + a + b, centre - a + b])
+    return trimesh.Trimesh(vertices=corners, faces=[[0, 1, 2], [0, 2, 3]], process=False)

@@ -1,0 +1,364 @@
+"""Where floor, wall and neighbour stand, what is seen of the object, and what is refused."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+
+from qs3 import shapes
+from qs3.errors import InputError
+from qs3.meshes import normalise
+from qs3.sensor.depth import DepthSettings
+from qs3.sensor.matching import MatchingSettings
+from qs3.sensor.obstacles import check_views
+from qs3.sensor.presets import Sensor
+from qs3.sensor.render import Body
+from qs3.sensor.render.mitsuba import MitsubaRenderer
+from qs3.sensor.render.raycast import DepthCaster
+from qs3.sensor.rig import Pose, StereoRig
+from qs3.sensor.scan import scan
+from qs3.sensor.scene import LAYOUTS, ArrangedScene, SceneSettings, arrange
+from qs3.sensor.speckle import PatternSettings
+from qs3.sensor.views import Placement, place_views
+
+TINY = Sensor(
+    name="tiny",
+    rig=StereoRig(width=300, height=300, focal=420.0, baseline=0.2),
+    matching=MatchingSettings(num_disparities=64, block_size=9),
+    depth=DepthSettings(stride=1),
+    # As many pixels a cell as `paper` has.
+    pattern=PatternSettings(columns=177, rows=138),
+    placement=Placement(radius=(2.6, 3.0)),
+)
+
+
+def around(layout: str, seed: int = 0, views: int = 5, kind="orbit", **how) -> ArrangedScene:
+    rng = np.random.default_rng(seed)
+    settings = SceneSettings(layout, **how)
+    mesh = normalise(shapes.make("chair", seed=seed))
+    other = normalise(shapes.make("table", seed=seed)) if settings.needs_neighbour else None
+    poses = place_views(views, kind, Placement(), rng)
+    return arrange(settings, Body(mesh), poses, 1.0, other, rng)
+
+
+def azimuths(poses) -> np.ndarray:
+    return np.array([np.arctan2(p.position[1], p.position[0]) for p in poses])
+
+
+def part(made: ArrangedScene, name: str) -> trimesh.Trimesh:
+    return made.bodies[made.names.index(name)].mesh
+
+
+@pytest.mark.parametrize(
+    ("layout", "names"),
+    [
+        ("alone", ["object"]),
+        ("floor", ["object", "floor"]),
+        ("wall", ["object", "wall"]),
+        ("room", ["object", "wall", "floor"]),
+        ("behind", ["object", "neighbour"]),
+        ("beside", ["object", "neighbour"]),
+        ("room+beside", ["object", "neighbour", "wall", "floor"]),
+    ],
+)
+def test_a_layout_holds_what_it_says(layout, names):
+    assert list(around(layout).names) == names
+
+
+def test_an_object_alone_is_seen_from_the_poses_as_drawn():
+    made = around("alone", seed=3)
+    drawn = place_views(5, "orbit", Placement(), np.random.default_rng(3))
+    for pose, expected in zip(made.poses, drawn, strict=True):
+        np.testing.assert_array_equal(pose.camera_to_world, expected.camera_to_world)
+
+
+def test_the_floor_touches_the_object_from_below():
+    made = around("floor")
+    height = part(made, "floor").vertices[:, 2]
+    assert np.ptp(height) == 0
+    assert 0 < part(made, "object").vertices[:, 2].min() - height[0] < 2e-4
+    np.testing.assert_allclose(part(made, "floor").face_normals, [[0, 0, 1]] * 2, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_convention_the_wall_is_behind_everything_as_the_first_view_sees_it(seed):
+    made = around("room+beside", seed=seed)
+    wall = part(made, "wall")
+    normal = wall.face_normals[0]
+    front = made.poses[0].position * [1, 1, 0]
+    np.testing.assert_allclose(normal, front / np.linalg.norm(front), atol=1e-9)
+    gaps = [((part(made, n).vertices - wall.vertices[0]) @ normal).min() for n in made.names[:2]]
+    assert min(gaps) == pytest.approx(0.3, abs=1e-9)
+    # It stands on the floor, and every camera is on its free side, looking at the object.
+    floor = part(made, "floor").vertices[0, 2]
+    assert wall.vertices[:, 2].min() == pytest.approx(floor)
+    for pose in made.poses:
+        assert (pose.position - wall.vertices[0]) @ normal > 1
+        np.testing.assert_allclose(
+            np.cross(pose.camera_to_world[:3, 2], pose.position), 0, atol=1e-9
+        )
+
+
+@pytest.mark.parametrize("layout", ["wall", "room", "behind"])
+def test_views_stay_on_the_arc_and_keep_height_and_distance(layout):
+    free, made = around("alone", seed=2), around(layout, seed=2, arc=100.0)
+    offset = np.degrees(np.angle(np.exp(1j * (azimuths(made.poses) - azimuths(made.poses)[0]))))
+    np.testing.assert_allclose(offset, [0, 20, -20, 40, -40], atol=1e-9)
+    for a, b in zip(free.poses, made.poses, strict=True):
+        assert a.position[2] == pytest.approx(b.position[2])
+        assert np.linalg.norm(a.position) == pytest.approx(np.linalg.norm(b.position))
+
+
+@pytest.mark.parametrize("layout", ["floor", "beside"])
+def test_views_go_all_round_where_nothing_is_in_the_way(layout):
+    offset = np.diff(np.unwrap(azimuths(around(layout).poses)))
+    np.testing.assert_allclose(np.degrees(offset), 72, atol=1e-9)
+
+
+def test_copies_of_one_pose_stay_as_they_are():
+    made, free = around("wall", kind="jitter"), around("alone", kind="jitter")
+    for a, b in zip(made.poses, free.poses, strict=True):
+        np.testing.assert_array_equal(a.camera_to_world, b.camera_to_world)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("name", shapes.CLASSES)
+def test_a_neighbour_in_front_hides_a_part(name, seed):
+    rng = np.random.default_rng(seed)
+    mesh = normalise(shapes.make(name, seed=seed))
+    crate = trimesh.creation.box(extents=[0.9, 0.7, 1.0])
+    poses = place_views(1, "orbit", Placement(), rng)
+    made = arrange(SceneSettings("behind"), Body(mesh), poses, 1.0, crate, rng)
+    check_views(made, Sensor())
+    rig = StereoRig(width=270, height=270, focal=375.0)
+    both = DepthCaster(*(body.mesh for body in made.bodies))
+    seen = both.cast(rig, poses[0], rig.full_frame).mask
+    alone = DepthCaster(mesh).cast(rig, poses[0], rig.full_frame).mask
+    assert not (seen & ~alone).any()
+    assert 1 - seen.sum() / alone.sum() == pytest.approx(0.3, abs=0.1)
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("layout", ["behind", "beside", "room+behind", "floor+beside"])
+def test_nothing_stands_in_anything(layout, seed):
+    made = around(layout, seed=seed)
+    other, mesh = part(made, "neighbour"), part(made, "object")
+    # A plane parts the two: along the line of sight, or sideways.
+    sight = made.poses[0].position / np.linalg.norm(made.poses[0].position)
+    flat = sight * [1, 1, 0]
+    side = np.cross([0, 0, 1], flat / np.linalg.norm(flat))
+    gaps = [
+        max(
+            (other.vertices @ d).min() - (mesh.vertices @ d).max() for d in (sign * sight, sign * e)
+        )
+        for sign in (1, -1)
+        for e in (side,)
+    ]
+    assert max(gaps) > 0.1
+    if "floor" in made.names:
+        assert other.vertices[:, 2].min() >= part(made, "floor").vertices[0, 2] - 1e-9
+    elif layout == "beside":
+        assert other.vertices[:, 2].min() == pytest.approx(mesh.vertices[:, 2].min())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"layout": "kitchen"}, "kitchen.*alone, floor"),
+        ({"layout": "alone+floor"}, "alone"),
+        ({"layout": "behind+beside"}, "not both"),
+        ({"wall_gap": -1.0}, "wall_gap"),
+        ({"neighbour_size": 0.0}, "neighbour_size"),
+        ({"cover": 1.5}, "cover"),
+        ({"arc": 200.0}, "arc"),
+    ],
+)
+def test_impossible_scenes_are_refused(change, message):
+    with pytest.raises(InputError, match=message):
+        SceneSettings(**change)
+
+
+def test_a_neighbour_too_many_or_too_few_is_refused(renderer):
+    box = trimesh.creation.box(extents=[1, 1, 1])
+    with pytest.raises(InputError, match="needs a neighbour"):
+        scan(box, sensor=TINY, scene="behind", renderer=renderer)
+    with pytest.raises(InputError, match="has no neighbour"):
+        scan(box, sensor=TINY, scene="room", neighbour=box, renderer=renderer)
+
+
+def with_placement(**how) -> Sensor:
+    return dataclasses.replace(TINY, placement=Placement(**how))
+
+
+BOX = trimesh.creation.box(extents=[1.0, 0.9, 0.8])
+
+
+@pytest.mark.parametrize(
+    ("sensor", "scene", "message"),
+    [
+        (with_placement(radius=(0.2, 0.2)), "alone", "camera stands inside the object's box"),
+        (with_placement(radius=(0.6, 0.6), elevation=(-60.0, -60.0)), "floor", "under the floor"),
+        (with_placement(radius=(0.9, 0.9)), "behind", "no room for a neighbour"),
+        (
+            dataclasses.replace(
+                TINY,
+                rig=StereoRig(300, 300, 420.0, 0.3, projector_offset=-10.0),
+                pattern=PatternSettings(columns=177, rows=138, tan_half_width=0.2),
+            ),
+            "alone",
+            "past the object",
+        ),
+        (
+            dataclasses.replace(
+                TINY,
+                rig=StereoRig(300, 300, 420.0, 0.25, projector_offset=4.0),
+                placement=Placement(radius=(0.9, 0.9), elevation=(0.0, 0.0)),
+                object_size=2.0,
+            ),
+            "alone",
+            "stands inside the object's box",
+        ),
+    ],
+)
+def test_a_rig_in_the_way_is_refused_before_rendering(sensor, scene, message):
+    class NoRenderer:
+        @property
+        def description(self):
+            return {"name": "none"}
+
+        def render(self, *_, **__):
+            raise AssertionError("rendered all the same")
+
+    other = BOX if "be" in scene else None
+    with pytest.raises(InputError, match=message):
+        scan(BOX, sensor=sensor, scene=scene, neighbour=other, renderer=NoRenderer(), views=1)
+
+
+def test_a_projector_inside_the_object_is_refused():
+    pose = Pose.looking_at(np.array([0.0, -2.0, 0.0]), np.zeros(3))
+    box = trimesh.creation.box(extents=[1, 1, 1]).apply_translation([3.0, -2.0, 0.0])
+    made = ArrangedScene((Body(box),), ("object",), (pose,))
+    sensor = dataclasses.replace(TINY, rig=StereoRig(300, 300, 420.0, 0.3, projector_offset=10.0))
+    with pytest.raises(InputError, match="projector stands inside"):
+        check_views(made, sensor)
+
+
+@pytest.fixture(scope="module")
+def quick() -> MitsubaRenderer:
+    return MitsubaRenderer(variant="scalar_rgb", samples=2)
+
+
+@pytest.fixture(scope="module")
+def scans(quick):
+    chair, table = shapes.make("chair", seed=1), shapes.make("table", seed=2)
+    return {
+        layout: scan(
+            chair,
+            sensor=TINY,
+            views=1,
+            seed=5,
+            num_points=30_000,
+            scene=layout,
+            neighbour=table if "be" in layout else None,
+            crop="none",
+            renderer=quick,
+            full_frames=layout == "room",
+            keep_images=True,
+        )
+        for layout in (*LAYOUTS, "room+beside")
+    }
+
+
+def test_the_clean_twin_is_the_object_alone_in_every_scene(scans):
+    for layout, made in scans.items():
+        exact = trimesh.proximity.closest_point(made.mesh, made.clean[::37])[1]
+        assert exact.max() < 1e-5, layout
+
+
+def test_statistics_are_of_the_object_in_every_scene(scans):
+    for layout, made in scans.items():
+        for view, images in zip(made.views, made.images, strict=True):
+            assert view.object_pixels == images.mask.sum() > 1000
+            assert view.valid_fraction > 0.3, layout
+            assert abs(view.disparity_bias) < 0.15, layout
+            if layout in ("room", "floor", "room+beside"):
+                assert view.ring_fraction is None
+
+
+def test_floor_and_wall_are_measured_where_they_stand(scans):
+    images = scans["room"].images[0]
+    around_it = ~images.silhouette & np.isfinite(images.depth) & np.isfinite(images.true_depth)
+    error = (images.depth - images.true_depth)[around_it]
+    sigma = 3.5**2 * 0.4 / (420 * 0.2)
+    assert abs(np.median(error)) < 0.5 * sigma
+    assert np.median(np.abs(error)) < sigma
+    assert around_it.mean() > 0.3
+
+
+def test_the_neighbour_is_in_the_picture_and_hides_the_object(scans):
+    hidden = [i.mask.sum() for i in scans["behind"].images]
+    free = [i.mask.sum() for i in scans["alone"].images]
+    assert hidden[0] < 0.97 * free[0]
+    images = scans["behind"].images[0]
+    other = np.isfinite(images.true_depth) & ~images.mask
+    assert other.sum() > 500
+    error = (images.depth - images.true_depth)[other & np.isfinite(images.depth)]
+    assert np.abs(np.median(error)) < 0.02
+
+
+def test_shadows_fall_on_the_floor(quick):
+    # The projector shines past the plate; the floor below it is in its shadow.
+    plate = trimesh.creation.box(extents=[1, 1, 0.02])
+    pole = trimesh.creation.box(extents=[0.05, 0.05, 1.0]).apply_translation([0, 0, -0.5])
+    sensor = dataclasses.replace(
+        TINY,
+        rig=StereoRig(300, 300, 300.0, 0.3, projector_offset=5.0),
+        placement=Placement(radius=(3.0, 3.0), elevation=(60.0, 60.0)),
+        light=dataclasses.replace(TINY.light, sky=0.0, ambient=0.001),
+    )
+    mesh = trimesh.util.concatenate([plate, pole])
+    made = scan(mesh, sensor=sensor, views=1, scene="floor", renderer=quick, full_frames=True)
+    images = made.images[0]
+    floor = np.isfinite(images.true_depth) & ~images.mask
+    # True shadow: floor points whose line to the projector meets the object.
+    rows, columns = np.nonzero(floor)
+    from qs3.geometry import rotation_z, transform_points
+
+    z = images.true_depth[rows, columns]
+    cx, cy = sensor.rig.principal_point
+    local = np.stack([(columns - cx) * z / 300, (rows - cy) * z / 300, z], axis=1)
+    points = transform_points(made.poses[0].camera_to_world, local)
+    eye = sensor.rig.projector(made.poses[0]).position
+    turned = made.mesh.copy()
+    turned.vertices = turned.vertices @ rotation_z(made.yaw).T
+    dark = turned.ray.intersects_any(points + 1e-3 * (eye - points), eye - points)
+    grey = images.left[rows, columns].astype(float)
+    assert 300 < dark.sum() < 0.5 * len(dark)
+    # Lit floor is dotted and bright on the mean, the shadow is nearly black.
+    assert grey[dark].mean() < 0.5 * grey[~dark].mean()
+
+
+def test_crops_keep_what_they_say(quick):
+    common = {"sensor": TINY, "views": 1, "seed": 5, "num_points": 40_000, "scene": "floor"}
+    chair = shapes.make("chair", seed=1)
+    counts = {}
+    for name, how in {
+        "none": {"crop": "none"},
+        "margin": {"box_margin": 0.1},
+        "box": {},
+        "mask": {"crop": "mask"},
+        "both": {"crop": "both"},
+    }.items():
+        made = scan(chair, renderer=quick, **common, **how)
+        counts[name] = made.fused_points
+        if name in ("margin", "box", "both"):
+            from qs3.geometry import rotation_z
+
+            turned = made.points.astype(float) @ rotation_z(made.yaw).T
+            corners = made.mesh.vertices @ rotation_z(made.yaw).T
+            margin = how.get("box_margin", 0.0) + 1e-5
+            assert (turned >= corners.min(axis=0) - margin).all()
+            assert (turned <= corners.max(axis=0) + margin).all()
+    assert counts["none"] > counts["margin"] > counts["box"] > counts["both"]
+    assert counts["none"] > counts["mask"] > counts["both"]
