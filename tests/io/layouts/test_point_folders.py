@@ -179,7 +179,7 @@ HOSTILE = {
     "ply rows of nothing": ("a.ply", ply_header(
         "binary_little_endian", f"element void 900000000\nelement vertex 1\n{XYZ}") + bytes(12),
         "lacks the format or a property"),
-    "ply negative": ("a.ply", ply_header("ascii", f"element vertex -1\n{XYZ}"), "cannot be read as ply"),
+    "ply negative": ("a.ply", ply_header("ascii", f"element vertex -1\n{XYZ}"), "read as ply"),
     "ply list": ("a.ply", ply_header(
         "ascii", f"element vertex 2\n{XYZ}\nproperty list int float w") + b"1 2 3 1 2 4 5 6 0",
         "lists in or before"),
