@@ -184,13 +184,6 @@ def test_a_box_is_first_to_before_last_and_cuts_masks_too(taken):
         cut(folder, box=(70, 50, 161, 65))
 
 
-def test_small_objects_are_left_out(taken):
-    folder, _, depth = taken
-    count = int((depth > 0).sum())
-    assert len(cut(folder, cut=CutSettings(min_points=count))) == 1
-    assert not cut(folder, cut=CutSettings(min_points=count + 1))
-
-
 @pytest.mark.parametrize(("fx", "scale"), [(1e-300, None), (1e-9, None), (150.0, 1e30)])
 def test_points_that_no_camera_sees_are_refused(taken, fx, scale):
     folder, _, _ = taken

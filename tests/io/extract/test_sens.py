@@ -159,13 +159,6 @@ def test_damaged_depth_is_refused(tmp_path: Path, blob: bytes) -> None:
         next(frames)
 
 
-def test_wrong_calls(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such file"):
-        read_sens_header(tmp_path / "none.sens")
-    with pytest.raises(InputError, match="at least 1"):
-        next(read_depth_frames(small().write(tmp_path / "a.sens"), every=0))
-
-
 def mutated(content: bytes, rng: np.random.Generator) -> bytes:
     """Change some bytes, or cut, double or drop a part."""
     bad = bytearray(content)
