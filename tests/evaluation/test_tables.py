@@ -4,33 +4,37 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.evaluation.tables import group, markdown
+from qs3.evaluation.tables import average, frame, to_csv, to_markdown
 
 
 def test_runs_that_differ_in_the_seed_are_averaged(with_accuracy):
     values = [0.5, 0.6, 0.8]
     records = [with_accuracy(seed, value) for seed, value in enumerate(values)]
     other = with_accuracy(0, 0.1, method="source-only", target=None, marks=())
-    rows = group([*records, other])
-    assert [row.key[0] for row in rows] == ["qbst", "source-only"]
-    assert rows[0].accuracy.mean == pytest.approx(np.mean(values))
-    assert rows[0].accuracy.sem == pytest.approx(np.std(values, ddof=1) / np.sqrt(3))
-    assert rows[0].seeds == (0, 1, 2)
-    assert rows[0].key[1:] == ("dgcnn", "cad/train", "rooms", "rooms", "last", "transductive")
-    assert rows[1].key[3] == "-"
+    table = average(frame([*records, other]))
+    assert table["method"].tolist() == ["qbst", "source-only"]
+    first = table.iloc[0]
+    assert first["accuracy"].mean == pytest.approx(np.mean(values))
+    assert first["accuracy"].sem == pytest.approx(np.std(values, ddof=1) / np.sqrt(3))
+    assert first["seeds"] == (0, 1, 2)
+    assert first["source":"marks"].tolist() == [
+        "cad/train", "rooms", "rooms", "last", "transductive"
+    ]  # fmt: skip
+    assert table["target"].tolist() == ["rooms", "-"]
 
 
 def test_a_mean_over_unlike_runs_is_refused(with_accuracy, record):
     one, two = with_accuracy(0, 0.5), with_accuracy(1, 0.6)
-    with pytest.raises(InputError, match="one seed"):
-        group([one, one])
-    with pytest.raises(InputError, match="not in the seed alone"):
-        group([one, dataclasses.replace(two, settings={"theta": 0.9})])
-    with pytest.raises(InputError, match="not in the seed alone"):
-        data = dataclasses.replace(record.test, checksum="c" * 64)
-        group([one, dataclasses.replace(two, test=data)])
+    data = dataclasses.replace(record.test, checksum="c" * 64)
+    for other, reason in (
+        (one, "one seed"),
+        (dataclasses.replace(two, settings={"theta": 0.9}), "not in the seed alone"),
+        (dataclasses.replace(two, test=data), "not in the seed alone"),
+    ):
+        with pytest.raises(InputError, match=reason):
+            average(frame([one, other]))
     clean = dataclasses.replace(two, source=dataclasses.replace(two.source, cloud="clean"))
-    assert [row.key[2] for row in group([one, clean])] == ["cad/train", "cad/train (clean)"]
+    assert average(frame([one, clean]))["source"].tolist() == ["cad/train", "cad/train (clean)"]
 
 
 def test_seeds_of_real_runs_lie_deeper(with_accuracy):
@@ -39,17 +43,28 @@ def test_seeds_of_real_runs_lie_deeper(with_accuracy):
 
     one = with_accuracy(0, 0.5, settings=settings(0, "weights of seed 0"))
     two = with_accuracy(1, 0.6, settings=settings(1, "weights of seed 1"))
-    assert group([one, two])[0].seeds == (0, 1)
+    assert average(frame([one, two]))["seeds"].tolist() == [(0, 1)]
     for other in (settings(1, None), settings(1, "weights of seed 1", epochs=4)):
         with pytest.raises(InputError, match="not in the seed alone"):
-            group([one, dataclasses.replace(two, settings=other)])
+            average(frame([one, dataclasses.replace(two, settings=other)]))
 
 
-def test_markdown_shows_mean_error_and_number_of_seeds(with_accuracy):
-    rows = group([with_accuracy(0, 0.5), with_accuracy(1, 0.6)])
-    lines = markdown(rows).splitlines()
-    assert lines[0].endswith("| accuracy % | class-mean accuracy % |")
-    assert "| 55.0 ± 5.0 (n=2) |" in lines[2]
-    assert len({line.count("|") for line in lines}) == 1
-    with pytest.raises(ValueError, match="1 headers"):
-        markdown(rows, ("method",))
+def test_fields_of_an_experiment_make_lines_too(with_accuracy):
+    records = [with_accuracy(seed, 0.5) for seed in (0, 1)]
+    table = average(frame(records, [{"row": "a"}, {"row": "b"}]), ["row"])
+    assert table["row"].tolist() == ["a", "b"] and table["seeds"].tolist() == [(0,), (1,)]
+
+
+def test_each_rule_of_selection_has_a_line(with_accuracy):
+    choice = {"accuracy": 0.25, "class_mean_accuracy": 0.125, "number": 3}
+    table = frame([with_accuracy(0, 0.5, choices={"oracle": choice})], rules=True)
+    assert table["rule"].tolist() == ["chosen (last)", "oracle"]
+    assert table["accuracy"].tolist() == [0.5, 0.25]
+
+
+def test_text_shows_mean_error_and_number_of_seeds(with_accuracy):
+    lines = frame([with_accuracy(0, 1 / 3), with_accuracy(1, 0.6)])
+    head, rule, row = to_markdown(average(lines)[["method", "accuracy"]]).splitlines()
+    assert (head, rule) == ("| method | accuracy |", "| --- | --- |")
+    assert row == "| qbst | 46.7 ± 13.3 (n=2) |"
+    assert to_csv(lines[["seed", "accuracy"]]) == f"seed,accuracy\n0,{1 / 3}\n1,0.6\n"

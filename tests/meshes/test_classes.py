@@ -5,24 +5,18 @@ from qs3.errors import InputError
 from qs3.meshes.classes import POINTDA10, canonical, map_labels
 
 
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        ("Night Stand", "cabinet"),
-        ("night-stand", "cabinet"),
-        ("dresser", "cabinet"),
-        ("desk", "table"),
-        ("Dining_Table", "table"),
-        ("television", "monitor"),
-        ("couch", "sofa"),
-        ("bookcase", "bookshelf"),
-        ("stool", "chair"),
-        ("potted plant", "plant"),
-        ("toilet", "toilet"),
-    ],
-)
-def test_canonical_folds_case_and_follows_aliases(name, expected):
-    assert canonical(name) == expected
+def test_canonical_folds_case_and_follows_aliases():
+    for name, expected in {
+        "Night Stand": "cabinet",
+        "night-stand": "cabinet",
+        "dresser": "cabinet",
+        "Dining_Table": "table",
+        "television": "monitor",
+        "couch": "sofa",
+        "potted plant": "plant",
+        "toilet": "toilet",
+    }.items():
+        assert canonical(name) == expected
 
 
 def test_classes_are_fixed_points_in_the_order_of_pointda10():

@@ -1,16 +1,27 @@
 """A small but complete report, hostile text included."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from qs3.evaluation.metrics import mean_sem
-from qs3.report import Cloud, DataLine, FeatureMap, Outcome, Report, ScoreLine, write_report
+from qs3.evaluation.records import DataRecord, score
+from qs3.report.contents import Cloud, FeatureMap, Report, Scored
+from qs3.report.lines import ScoreLine
 from qs3.report.montage import MontageView
+from qs3.report.page import write_report
 from qs3.report.plots import Curve, SelectionRound
 
 HOSTILE = '</script><script>alert(\'x\')</script><img src="http://example.org/a.png" onerror="b()">'
+
+
+def scored(name: str, matrix: np.ndarray, class_names, paired: bool = False) -> Scored:
+    """A network with this confusion matrix; a column more than classes is none of them."""
+    true, answers = (np.repeat(index.ravel(), matrix.ravel()) for index in np.indices(matrix.shape))
+    answers = np.where(answers < len(class_names), answers, -1)
+    return Scored(name, score(true, answers, class_names), true == answers if paired else None)
 
 
 @pytest.fixture(scope="session")
@@ -32,14 +43,14 @@ def report() -> Report:
         title=f"Title {HOSTILE}",
         summary=f"Summary {HOSTILE}",
         class_names=names,
-        before=Outcome(f"before {HOSTILE}", matrix),
-        after=Outcome(f"after {HOSTILE}", np.array([[10, 0, 0], [0, 10, 0], [0, 1, 9]])),
+        before=scored(f"before {HOSTILE}", matrix, names),
+        after=scored(f"after {HOSTILE}", np.array([[10, 0, 0], [0, 10, 0], [0, 1, 9]]), names),
         command=f"qs3 demo {HOSTILE}",
         settings={"seed": 0, "sensor": {"views": 5, "name": HOSTILE}},
         versions={"qs3": f"0.1.0 {HOSTILE}"},
         montage=MontageView(image, image, 30 / depth, depth, true, cloud, cloud, np.eye(16)),
         montage_title=f"mesh {HOSTILE}",
-        data=(DataLine("source", f"data {HOSTILE}", 30, "0a" * 32),),
+        data={"source": DataRecord(f"data {HOSTILE}", "0a" * 32, 30)},
         clouds={"source": [*clouds, *clouds], f"target {HOSTILE}": clouds},
         maps=(
             FeatureMap(
@@ -58,7 +69,7 @@ def report() -> Report:
                 accuracy=mean_sem([0.5, 0.6]),
                 class_mean_accuracy=mean_sem([0.4, 0.6]),
                 class_names=names,
-                confusion=matrix,
+                confusion=np.pad(matrix, ((0, 0), (0, 1))),
                 seeds=(0, 1),
                 differs=f"theta {HOSTILE}",
                 published="72.4 ± 0.8",
@@ -73,7 +84,6 @@ def report() -> Report:
             SelectionRound(1, 0.8, np.array([5, 0, 3]), np.array([2, 0, 2]), 0.5),
             SelectionRound(2, 0.805, np.array([1, 0, 0]), np.zeros(3, int), None, HOSTILE),
         ),
-        agreement_meaning=f"Agreement {HOSTILE}",
         notes=(f"Note {HOSTILE}",),
     )
 
@@ -84,3 +94,37 @@ def page_path(report, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("report") / "deep" / "report.html"
     write_report(path, report)
     return path
+
+
+@pytest.fixture(scope="session")
+def grid(tmp_path_factory) -> Path:
+    """A folder with a source-only run, one that it warmed up, their data and their records."""
+    from qs3.io import load_clouds, load_unlabelled
+    from qs3.store.manifest import Manifest, write_manifest
+    from qs3.store.shards import CloudRow, write_shard
+    from qs3.training import SelfTrainingSettings, TrainSettings, evaluate, fit
+
+    folder = tmp_path_factory.mktemp("grid")
+    data, rng, names = folder / "shapes", np.random.default_rng(0), ("bed", "chair", "sofa")
+    data.mkdir()
+    rows = []
+    for index in range(12):
+        noisy, clean, surface = rng.normal(size=(3, 32, 3)).astype(np.float32)
+        view, label = np.zeros(32, np.uint8), index % 3
+        rows.append(
+            CloudRow(f"o{index}", f"o{index}", 0, label, names[label], "train", 3, noisy, view,
+                     clean, view, surface)
+        )  # fmt: skip
+    write_manifest(data, Manifest(class_names=names, rows=12, shards=1, settings={}, versions={}))
+    write_shard(data / "shard-00000.parquet", rows)
+    settings = TrainSettings(model="pointnet", num_points=24, epochs=2, batch_size=6, threads=1)
+    source, target = load_clouds(data), load_unlabelled(data)
+    fit("source-only", source, None, settings, run_dir=folder / "first")
+    rounds = SelfTrainingSettings(threshold=0.0, rounds=2, epochs=1)
+    with warnings.catch_warnings():  # a network of two epochs may know one class alone
+        warnings.simplefilter("ignore")
+        fit("qbst", source, target, settings, rounds, run_dir=folder / "second",
+            warm_up=folder / "first")  # fmt: skip
+    for name in ("first", "second"):
+        evaluate(folder / name, data)
+    return folder

@@ -115,6 +115,6 @@ def test_no_global_state_of_pyplot():
     before = dict(matplotlib.rcParams)
     png_bytes(confusion_heatmap(np.eye(2, dtype=int), ("a", "b")), dpi=30)
     assert dict(matplotlib.rcParams) == before
-    code = "import sys, qs3.report, qs3.report; "
+    code = "import sys, qs3.report.page; "
     code += "sys.exit('matplotlib.pyplot' in sys.modules or 'torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,10 +1,8 @@
-"""The viewer: what is shown is right, the last change wins, and nobody else gets in."""
+"""The viewer without its server: what is shown is right, and the last change wins."""
 
-import socket
+import dataclasses
 import threading
 import time
-import urllib.error
-import urllib.request
 
 import numpy as np
 import pytest
@@ -16,23 +14,12 @@ from qs3.report.figure import PALETTE
 from qs3.sensor.presets import SENSORS, Sensor
 from qs3.store.manifest import Manifest, write_manifest
 from qs3.store.shards import CloudRow, write_shard
-from qs3.viewer import (
-    Answers,
-    ArrayExhibits,
-    Exhibit,
-    Rescanner,
-    ScanControls,
-    StoreExhibits,
-    bind,
-    gallery_page,
-    is_loopback,
-    scan_page,
-    serve,
-)
 from qs3.viewer.colouring import by_error, by_height, by_view, round_limit
 from qs3.viewer.display import compose, frame_of, modes
 from qs3.viewer.distance import cloud_distance, mesh_distance, spacing
-from qs3.viewer.serving import allowed, own_names
+from qs3.viewer.exhibits import Answers, Exhibit, StoreExhibits
+from qs3.viewer.rescan import Rescanner
+from qs3.viewer.scan_controls import ScanControls
 
 HOSTILE = "<img src=x onerror=alert(1)>{alert(2)}"
 
@@ -200,11 +187,7 @@ class TestRescanner:
             assert go.wait(10)
             return value
 
-        def show(outcome):
-            shown.append(outcome.result)
-            last.set()
-
-        worker = Rescanner(work, show, delay=0.0)
+        worker = Rescanner(work, lambda value: (shown.append(value), last.set()), delay=0.0)
         worker.ask(1)
         assert begun.wait(10)
         worker.ask(2)
@@ -216,7 +199,7 @@ class TestRescanner:
 
     def test_waits_until_changes_rest(self):
         worked, done = [], threading.Event()
-        worker = Rescanner(worked.append, lambda _: done.set(), delay=0.3)
+        worker = Rescanner(worked.append, lambda _: done.set(), delay=0.1)
         for value in range(5):
             worker.ask(value)
         assert done.wait(10)
@@ -224,35 +207,34 @@ class TestRescanner:
         assert worked == [4]
 
     def test_faults_are_shown_and_the_worker_lives_on(self, caplog):
-        outcomes, more = [], threading.Semaphore(0)
+        shown, faults, more = [], [], threading.Semaphore(0)
 
         def work(value):
             if value == 0:
                 raise InputError("no such thing")
             return value
 
-        def show(outcome):
-            outcomes.append(outcome)
+        def show(value):
+            shown.append(value)
             more.release()
-            if outcome.result == 1:
+            if value == 1:
                 raise RuntimeError("the page broke")
 
-        worker = Rescanner(work, show, delay=0.0)
+        worker = Rescanner(work, show, lambda e: (faults.append(str(e)), more.release()), delay=0.0)
         for value in (0, 1, 2):
             worker.ask(value)
             assert more.acquire(timeout=10)
         worker.close(10.0)
-        assert str(outcomes[0].error) == "no such thing"
-        assert outcomes[0].result is None
-        assert [o.result for o in outcomes[1:]] == [1, 2]
+        assert faults == ["no such thing"]
+        assert shown == [1, 2]
         assert "the page broke" in caplog.text
 
     def test_closed_it_shows_nothing_more(self):
         shown = []
-        worker = Rescanner(lambda x: x, shown.append, delay=0.2)
+        worker = Rescanner(lambda x: x, shown.append, delay=0.05)
         worker.ask(1)
         assert worker.close(10.0)
-        time.sleep(0.3)
+        time.sleep(0.1)
         assert shown == []
 
 
@@ -270,8 +252,6 @@ class TestScanControls:
             "block_size": 11, "num_disparities": 256, "stride": 2, "material": "dark",
         }  # fmt: skip
         for name, value in other.items():
-            import dataclasses
-
             assert dataclasses.replace(ScanControls(), **{name: value}).sensor(base) != base, name
 
     def test_settings_that_make_no_sensor_are_refused(self):
@@ -325,192 +305,3 @@ class TestStore:
         (folder / "shard-00001.parquet").unlink()
         with pytest.raises(InputError, match=r"set: unfinished, 1 of 2 shards"):
             StoreExhibits(folder)
-
-
-@pytest.fixture(scope="module")
-def server():
-    pytest.importorskip("viser", reason="viser is not installed: pip install 'qs3[view]'")
-    listener = bind("127.0.0.1", 0)
-    with serve(listener, "test") as server:
-        yield server, listener.getsockname()[1]
-
-
-class TestServing:
-    def answer(self, port, path="/", **headers):
-        asked = urllib.request.Request(f"http://127.0.0.1:{port}{path}", headers=headers)
-        try:
-            with urllib.request.urlopen(asked, timeout=10) as got:  # noqa: S310
-                return got.status, got.headers, got.read()
-        except urllib.error.HTTPError as error:
-            with error:
-                return error.code, error.headers, error.read()
-
-    def test_hands_out_its_page_and_forbids_it_to_ask_others(self, server):
-        status, headers, body = self.answer(server[1])
-        assert status == 200
-        assert b"viser" in body.lower()
-        policy = headers["Content-Security-Policy"]
-        assert f"ws://127.0.0.1:{server[1]};" in policy
-        assert "http:" not in policy
-        assert "*" not in policy
-
-    @pytest.mark.parametrize(
-        "path",
-        ["/../viser/__init__.py", "/%2e%2e/%2e%2e/__init__.py", "//etc/passwd", "/..%5c__init__.py",
-         "/index.html/../../../__init__.py", "/__init__.py", "/etc/passwd"],
-    )  # fmt: skip
-    def test_reads_no_file_of_the_disk(self, server, path):
-        status, _, body = self.answer(server[1], path)
-        assert status == 404
-        assert body in (b"", b"NOT FOUND")
-
-    def test_is_not_there_on_another_interface(self, server):
-        """Nor on another loopback address: it does not listen on all."""
-        found = socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)
-        others = {str(one[4][0]) for one in found} - {"127.0.0.1"}
-        for address in {"127.0.0.2", *others}:
-            with pytest.raises(OSError, match="refused"):
-                socket.create_connection((address, server[1]), timeout=5)
-        socket.create_connection(("127.0.0.1", server[1]), timeout=5).close()
-
-    def test_other_sites_are_kept_out(self, server):
-        import websockets.sync.client as client
-        from websockets.exceptions import InvalidStatus
-
-        port = server[1]
-        assert self.answer(port, Host="example.org")[0] == 403
-        import viser
-
-        address, protocol = f"ws://127.0.0.1:{port}", f"viser-v{viser.__version__}"
-        for origin in ("https://example.org", "null", f"http://example.org:{port}"):
-            with pytest.raises(InvalidStatus, match="403"):
-                client.connect(address, origin=origin, subprotocols=[protocol])
-        own = f"http://127.0.0.1:{port}"
-        with client.connect(address, origin=own, subprotocols=[protocol], max_size=None) as page:
-            assert len(page.recv(timeout=10)) > 16
-
-    def test_opens_no_tunnel(self, server, monkeypatch):
-        import viser._viser
-
-        monkeypatch.setattr(viser._viser, "ViserTunnel", lambda *_: pytest.fail("a tunnel"))
-        assert server[0].request_share_url() is None
-
-    def test_a_port_in_use_is_named(self, server):
-        with pytest.raises(InputError, match=f"--port {server[1]} on 127.0.0.1: in use"):
-            bind("127.0.0.1", server[1])
-
-    @pytest.mark.parametrize(
-        ("host", "port", "word"),
-        [("no.such.host.invalid", 0, "no.such.host.invalid"), ("192.0.2.1", 0, "192.0.2.1"),
-         ("127.0.0.1", 70000, "70000"), ("127.0.0.1", -1, "-1")],
-    )  # fmt: skip
-    def test_other_faults_are_named(self, host, port, word):
-        with pytest.raises(InputError, match=word):
-            bind(host, port)
-
-    def test_the_port_is_free_again(self):
-        pytest.importorskip("viser", reason="viser is not installed: pip install 'qs3[view]'")
-        listener = bind("127.0.0.1", 0)
-        port = listener.getsockname()[1]
-        with serve(listener, "test"):
-            pass
-        bind("127.0.0.1", port).close()
-
-    @pytest.mark.parametrize(
-        ("host", "origin", "names", "wanted"),
-        [
-            ("127.0.0.1:80", None, None, True),
-            ("[::1]:80", "http://[::1]:80", None, True),
-            ("localhost:80", "http://127.0.0.1:80", None, False),
-            ("192.0.2.1:80", None, None, False),
-            ("evil.org:80", "http://evil.org:80", None, False),
-            ("evil.org:80", "http://evil.org:80", {"mine", "localhost"}, False),
-            ("mine:80", "http://mine:80", {"mine", "localhost"}, True),
-            ("MINE:80", "http://MINE:80", {"mine", "localhost"}, True),
-            ("192.0.2.1:80", "http://192.0.2.1:80", {"mine"}, True),
-            ("[fe80::1]:80", "http://[fe80::1]:80", {"mine"}, True),
-            ("mine:80", "http://evil.org", {"mine"}, False),
-            ("", None, {"mine"}, False),
-            ("localhost.evil.org", None, None, False),
-            (None, None, None, False),
-        ],
-    )
-    def test_who_is_let_in(self, host, origin, names, wanted):
-        assert allowed(host, origin, None if names is None else frozenset(names)) is wanted
-
-    def test_own_names_are_the_machines_and_the_one_given(self, monkeypatch):
-        monkeypatch.setattr(socket, "gethostname", lambda: "Box")
-        monkeypatch.setattr(socket, "getfqdn", lambda: "box.example.net")
-        assert own_names("lab") == {"box", "box.example.net", "lab", "localhost"}
-        assert "" not in own_names("")
-
-    def test_on_every_interface_other_names_are_refused(self):
-        """A site that lets its own name point here would read the data."""
-        pytest.importorskip("viser", reason="viser is not installed: pip install 'qs3[view]'")
-        listener = bind("0.0.0.0", 0)  # noqa: S104
-        port = listener.getsockname()[1]
-        with serve(listener, "test", "lab"):
-            for name, code in (("evil.org", 403), ("lab", 200), (socket.gethostname(), 200)):
-                own = f"{name}:{port}"
-                assert self.answer(port, Host=own, Origin=f"http://{own}")[0] == code
-
-    def test_loopback_is_known(self):
-        hosts = ("127.0.0.1", "::1", "localhost", "0.0.0.0", "::")  # noqa: S104
-        assert [is_loopback(h) for h in hosts] == [
-            True, True, True, False, False
-        ]  # fmt: skip
-
-    def test_pages_show_faults_and_recover(self, server, rng):
-        """The scan page with a scan that fails, then works; a slider asks for the next."""
-        calls, item = threading.Semaphore(0), exhibit(rng)
-
-        def scan(request):
-            calls.release()
-            if request.controls.views == 5:
-                raise InputError("too many views")
-            return item
-
-        gui = server[0].gui
-        with scan_page(
-            server[0], scan, {"qs3": Sensor(), "d435": SENSORS["d435"]}, ScanControls(), 3
-        ) as stage:
-            assert calls.acquire(timeout=10)
-            wait_for(lambda: "too many views" in stage._state.content)
-            handles = {h.label: h for h in gui._gui_input_handle_from_uuid.values()}
-            handles["Views"].value = 2
-            assert calls.acquire(timeout=10)
-            wait_for(lambda: "chair" in stage._text.content)
-            assert stage._state.content == ""
-            handles["Sensor"].value = "d435"
-            assert calls.acquire(timeout=10)
-            now = {h.label: h.value for h in gui._gui_input_handle_from_uuid.values()}
-            assert now["Distance (m)"] == (1.2, 2.0)
-            assert now["Views"] == 2
-        gui.reset()
-
-    def test_gallery_steps_and_filters(self, server, rng):
-        points = rng.normal(size=(4, 6, 3)).astype(np.float32)
-        items = ArrayExhibits(points, ("a0", "b0", "a1", "b1"), ("a", "b", "a", "b"))
-        answers = Answers(np.array([[1.0, 0]] * 4), ("a", "b"), np.array([0, 1, 0, 1]))
-        gui = server[0].gui
-        with gallery_page(server[0], items, answers, "b") as stage:
-            handles = {h.label: h for h in gui._gui_input_handle_from_uuid.values()}
-            wait_for(lambda: "b0" in stage._text.content)
-            assert handles["Object"].max == 2
-            handles["Object"].value = 2
-            wait_for(lambda: "b1" in stage._text.content)
-            handles["Wrong ones only"].value = True
-            wait_for(lambda: "b0" in stage._text.content)
-            handles["Class"].value = "a"
-            wait_for(lambda: "none of this class is wrong" in stage._state.content)
-        gui.reset()
-        with pytest.raises(InputError, match="--class-name c: no object of it; classes here: a, b"):
-            gallery_page(server[0], items, None, "c").__enter__()
-        gui.reset()
-
-
-def wait_for(met, seconds=10.0):
-    end = time.monotonic() + seconds
-    while not met():
-        assert time.monotonic() < end, "did not come about"
-        time.sleep(0.02)

@@ -12,7 +12,9 @@ import cv2
 import numpy as np
 import pytest
 
-from qs3.viewer import ArrayExhibits, bind, gallery_page, serve, url_of
+from qs3.viewer.exhibits import ArrayExhibits
+from qs3.viewer.pages import gallery_page
+from qs3.viewer.serving import serve, url_of
 
 _FLAGS = [
     "--headless",
@@ -108,10 +110,9 @@ def test_page_connects_and_draws_without_a_fault(browser, rng):
     hostile = "<img src=x onerror=\"document.title='run'\">"
     points = rng.uniform(-1, 1, size=(2, 4000, 3)).astype(np.float32)
     items = ArrayExhibits(points, (hostile, "second"), ("bed", hostile))
-    listener = bind("127.0.0.1", 0)
-    with serve(listener, "test") as server, gallery_page(server, items) as stage:
-        stage._mode.value = "height"
-        browser.call("Page.navigate", url=url_of(listener))
+    with serve(0, "test") as server, gallery_page(server, items) as canvas:
+        canvas._mode.value = "height"
+        browser.call("Page.navigate", url=url_of(server))
         until(lambda: server.get_clients())
 
         def drawn():

@@ -5,91 +5,101 @@ a user can mend is one line on standard error and exit code 2; Ctrl-C ends with 
 """
 
 import sys
-from collections.abc import Callable, Sequence
-from typing import Annotated
+from collections.abc import Sequence
+
+VERBS = {
+    "scan": "Photograph one mesh: noisy cloud, clean twin, a picture of every stage.",
+    "sensors": "List the sensors, or show one as TOML to copy and edit.",
+    "realism": "Test a simulated camera against the laws of real ones.",
+    "generate": "Scan many meshes into a data set; resumes, and logs what failed.",
+    "merge": "Put the parts that `qs3 generate --shard i/n` made into one data set.",
+    "info": "Print what a data set holds: counts, sizes, statistics of the sensor, failures.",
+    "verify": "Check a data set: checksums, finite points, labels, seeds, duplicates, counts.",
+    "convert": "Convert a data set into the layout of another.",
+    "extract": "Cut objects out of real scans into a data set.",
+    "train": "Train a classifier, with a method of adaptation to an unlabelled target if asked.",
+    "evaluate": "Score a run: accuracy, class-mean accuracy, confusion matrix.",
+    "predict": "Tell the class of each file and how confident the network is.",
+    "export": "Export a network as ONNX or for PyTorch.",
+    "reproduce": "Make tables and figures anew, with their data and trainings.",
+    "table": "Print a table of the paper, ours beside the published figures.",
+    "figure": "Draw a figure of the paper from records alone.",
+    "report": "Write one self-contained HTML page: pictures, clouds to turn, features, scores, tables.",
+    "view": "Look at data, a run or a mesh in a browser on this machine.",
+    "doctor": "Tell what works on this machine and how to get what does not.",
+    "demo": "Run everything once on built-in shapes: scan, train, adapt, report.",
+}
+"""A line of help for each verb; it is a function of its own module but for those in `ELSEWHERE`."""
+
+ELSEWHERE = {
+    "merge": "store.merge",
+    "info": "store.info",
+    "verify": "store.verify",
+    "evaluate": "evaluate.evaluate_run",
+    "predict": "evaluate.predict",
+    "figure": "table.figure",
+}
+"""Module and function of the other verbs."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one verb; the exit code says how it ended."""
-    import tyro
-
     from qs3.errors import QS3Error
 
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        code = tyro.extras.subcommand_cli_from_dict(
-            _verbs(given),
-            prog="qs3",
-            description="CAD models to a classifier that works on a real depth camera.",
-            args=given,
-        )
+        code = _run(given)
     except QS3Error as error:
         print(f"qs3: {error}", file=sys.stderr)
-        sys.exit(2)
+        code = 2
     except KeyboardInterrupt:
         print("qs3: stopped; run the same command again to go on", file=sys.stderr)
-        sys.exit(130)
+        code = 130
     except BrokenPipeError:
         # The reader of our output went away (`qs3 … | head`): nothing to tell it.
         sys.stderr.close()
-        sys.exit(141)
+        code = 141
     except OSError as error:
         reason = error.strerror or str(error)
         print(f"qs3: {error.filename or 'file system'}: {reason}", file=sys.stderr)
-        sys.exit(2)
-    sys.exit(code or 0)
+        code = 2
+    sys.exit(code)
 
 
-def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
-    """The verbs; only what the one asked for needs is imported, so that a scan starts fast."""
-    from qs3.cli.convert import convert
-    from qs3.cli.doctor import doctor
-    from qs3.cli.extract import extract
-    from qs3.cli.generate import generate
-    from qs3.cli.realism import realism
-    from qs3.cli.scan import scan
-    from qs3.cli.sensors import sensors
-    from qs3.cli.store import info, merge, verify
-    from qs3.cli.view import view
+def _run(given: list[str]) -> int:
+    """Import and run the verb that is asked for, and nothing else: a scan starts fast."""
+    verb, *rest = given or [""]
+    if verb in ("", "-h", "--help"):
+        print(_help(), file=sys.stdout if verb else sys.stderr)
+        return 0 if verb else 2
+    if verb == "--version":
+        from importlib.metadata import version
 
-    verbs: dict[str, Callable[..., int]] = {
-        "scan": scan,
-        "sensors": sensors,
-        "realism": realism,
-        "generate": generate,
-        "merge": merge,
-        "info": info,
-        "verify": verify,
-        "convert": convert,
-        "extract": extract,
-        "view": view,
-        "doctor": doctor,
-    }
-    if given and given[0] in verbs:
-        return verbs
-    import tyro
+        print(f"qs3 {version('qs3')}")
+        return 0
+    if verb not in VERBS:
+        from difflib import get_close_matches
 
-    from qs3.cli.demo import demo
-    from qs3.cli.evaluate import evaluate_run, predict
-    from qs3.cli.export import export
-    from qs3.cli.report import report
-    from qs3.cli.reproduce import reproduce
-    from qs3.cli.table import figure, table
-    from qs3.cli.train import TrainOptions, preset_options, train
+        from qs3.errors import InputError
 
-    defaults = preset_options(given)
+        near = get_close_matches(verb, VERBS) or VERBS
+        raise InputError(f"{verb}: no such verb; did you mean {' or '.join(near)}? See qs3 --help")
+    from qs3.cli.options import run_verb
 
-    def train_with_preset(
-        options: Annotated[TrainOptions, tyro.conf.arg(name="")] = defaults,
-    ) -> int:
-        return train(options)
+    return run_verb(verb, ELSEWHERE.get(verb, f"{verb}.{verb}"), VERBS[verb], rest)
 
-    train_with_preset.__doc__ = train.__doc__
-    verbs |= {"train": train_with_preset, "evaluate": evaluate_run, "predict": predict}
-    verbs |= {"export": export, "reproduce": reproduce, "demo": demo}
-    verbs |= {"table": table, "figure": figure}
-    verbs["report"] = report
-    made = ("scan", "sensors", "realism", "generate", "merge", "info", "verify", "convert")
-    runs = ("train", "evaluate", "predict", "export", "reproduce", "table", "figure", "report")
-    order = (*made, "extract", *runs, "view", "doctor", "demo")
-    return {name: verbs[name] for name in order}
+
+def _help() -> str:
+    width = max(map(len, VERBS))
+    lines = [f"  {verb:{width}}  {text}" for verb, text in VERBS.items()]
+    return "\n".join(
+        [
+            "usage: qs3 [--help] [--version] VERB [OPTIONS]",
+            "",
+            "CAD models to a classifier that works on a real depth camera.",
+            "",
+            *lines,
+            "",
+            "The options of a verb: qs3 VERB --help",
+        ]
+    )

@@ -1,6 +1,6 @@
 """``qs3 demo``: the whole way on built-in shapes, from CAD models to a report.
 
-A network learns from scans of some draws of the shapes, made by the `qs3` sensor from views all
+A network learns from scans of some draws of the shapes, made by the `paper` sensor from views all
 around. The target is other draws, seen once each by a visibly different sensor. The network is
 then adapted to the target without its labels, and both networks are scored.
 """
@@ -14,12 +14,9 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from qs3.cli.camera import CameraOptions
 from qs3.files import claim_folder, write_json
 
 _MARKER = "demo.json"
-_CLOUDS = 100
-"""Clouds of a domain that the page lets turn."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +116,9 @@ def _generate(folder: Path, settings: DemoSettings, per_class: int, seed: int, *
 
 
 def _renderer(settings: DemoSettings) -> Any:
-    return CameraOptions(samples=settings.samples, variant=settings.variant).resolve_renderer()
+    from qs3.sensor.settings import CameraSettings
+
+    return CameraSettings(samples=settings.samples, variant=settings.variant).make_renderer()
 
 
 def _source(folder: Path, settings: DemoSettings) -> None:
@@ -193,60 +192,42 @@ def _train_settings(settings: DemoSettings) -> Any:
 def _report(folder: Path, settings: DemoSettings) -> tuple[Any, Any, Path]:
     """Score both networks on the target and write the page."""
     from qs3 import shapes
-    from qs3.cli import report_parts as parts
-    from qs3.io import load_clouds
-    from qs3.report import NamedRecord, Report, score_lines, write_report
-    from qs3.training import evaluate, load_model
+    from qs3.report.collect import collect, look
+    from qs3.report.montage import scan_montage
+    from qs3.report.page import write_report
+    from qs3.report.settings import ReportSettings
+    from qs3.sensor.presets import get_sensor
+    from qs3.training import evaluate
 
-    target = load_clouds(folder / "target", num_points=settings.num_points)
-    source = load_clouds(folder / "source", num_points=settings.num_points)
-    models = {name: load_model(folder / name) for name in ("source-only", "qbst")}
-    records, outcomes, answers = [], [], {}
-    for name, loaded in models.items():
-        records.append(evaluate(folder / name, folder / "target"))
-        outcome, answers[name] = parts.outcome(name, loaded, target)
-        outcomes.append(outcome)
-    curves, marks = parts.curves([folder / name for name in models])
-    domains = {"source": source, "target": target}
-    last = records[1]
-    report = Report(
+    records = [evaluate(folder / name, folder / "target") for name in ("source-only", "qbst")]
+    source, target = records[1].source, records[1].test
+    page, _ = collect(look(folder), ReportSettings(run=folder / "qbst"))
+    page = dataclasses.replace(
+        page,
         title="qs3 demo: from CAD models to a depth camera",
         summary=(
-            f"A {settings.model} was trained on {len(source)} scans of built-in shapes by the qs3 "
-            f"sensor ({settings.source_views} views around each object), then adapted by "
-            f"quasi-balanced self-training to {len(target)} scans of other shapes by the sensor "
+            f"A {settings.model} was trained on {source.clouds} scans of built-in shapes by the "
+            f"qs3 sensor ({settings.source_views} views around each object), then adapted by "
+            f"quasi-balanced self-training to {target.clouds} scans of other shapes by the sensor "
             f"{settings.target_sensor}, which sees each object once in brighter light and with "
             "image noise. No label of the target was used."
         ),
-        class_names=target.class_names,
-        before=outcomes[0],
-        after=outcomes[1],
         command=f"qs3 demo --out {folder.name}",
-        settings=dataclasses.asdict(settings) | {"runs": last.settings},
-        versions=dict(last.versions),
-        montage=parts.picture_scan(
+        settings=dataclasses.asdict(settings) | {"runs": records[1].settings},
+        montage=scan_montage(
             shapes.make("chair", seed=settings.seed),
-            "qs3",
+            get_sensor("qs3"),
             _renderer(settings),
             settings.source_views,
             settings.seed,
         ),
         montage_title="chair · sensor qs3",
-        data=parts.data_lines({"source": last.source, "target": last.target, "test": last.test}),
-        clouds=parts.show_clouds(domains, _CLOUDS, {"target": answers}),
-        maps=parts.feature_maps(models, domains),
-        scores=score_lines([NamedRecord(record.method, record) for record in records])[0],
-        curves=curves,
-        marks=marks,
-        rounds=parts.rounds(last.rounds),
-        agreement_meaning=parts.AGREEMENT,
         notes=(
-            "Transductive: the network is scored on the clouds that it adapted to; their labels "
-            "served the score alone.",
+            *page.notes,
             "This is a demonstration on tens of clouds, one seed and a simulated target. It shows "
             "that everything runs, not how much a method gains.",
         ),
     )
     path = folder / "report.html"
-    write_report(path, report)
+    write_report(path, page)
     return records[0].scores, records[1].scores, path

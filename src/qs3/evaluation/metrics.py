@@ -1,4 +1,4 @@
-"""Scores of a classifier, and their means and intervals.
+"""Scores of a classifier, their means and intervals.
 
 Convention:
     Labels are 0 to k − 1. A prediction of −1 means "none of these classes" (a network may know
@@ -6,12 +6,11 @@ Convention:
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.special import betaincinv, ndtri, stdtrit
 
 
 @dataclass(frozen=True)
@@ -34,54 +33,6 @@ class MeanSEM:
         """
         spread = "" if self.sem is None else f" ± {scale * self.sem:.{digits}f}"
         return f"{scale * self.mean:.{digits}f}{spread} (n={self.n})"
-
-
-@dataclass(frozen=True)
-class PairedDifference:
-    """Mean difference of two methods over seeds that both ran."""
-
-    mean: float
-    """Arithmetic mean of first minus second."""
-    interval: tuple[float, float] | None
-    """Student's 95 % interval of the mean (ddof = 1); None for a single seed."""
-    n: int
-    """Number of seeds."""
-
-    def format(self, scale: float = 100.0, digits: int = 1) -> str:
-        """Return the value as text, by default in points of a percentage.
-
-        Example:
-            >>> paired_difference({0: 0.6, 1: 0.7}, {0: 0.5, 1: 0.5}).format()
-            '+15.0 points (95 % interval -48.5 to +78.5, n=2)'
-        """
-        value = f"{scale * self.mean:+.{digits}f} points"
-        if self.interval is None:
-            return f"{value} (one seed, no interval)"
-        low, high = (f"{scale * end:+.{digits}f}" for end in self.interval)
-        return f"{value} (95 % interval {low} to {high}, n={self.n})"
-
-
-def paired_difference(
-    first: Mapping[int, float], second: Mapping[int, float]
-) -> PairedDifference | None:
-    """Compare two methods seed by seed; a seed that one of them lacks is left out.
-
-    Args:
-        first: Score by seed.
-        second: Score by seed.
-
-    Returns:
-        First minus second; None where they share no seed.
-    """
-    seeds = sorted(set(first) & set(second))
-    if not seeds:
-        return None
-    values = np.array([first[seed] - second[seed] for seed in seeds])
-    mean, n = float(values.mean()), len(values)
-    if n == 1:
-        return PairedDifference(mean, None, n)
-    half = float(stdtrit(n - 1, 0.975)) * float(values.std(ddof=1)) / math.sqrt(n)
-    return PairedDifference(mean, (mean - half, mean + half), n)
 
 
 def accuracy(labels: Int[np.ndarray, "b"], predictions: Int[np.ndarray, "b"]) -> float:
@@ -188,36 +139,9 @@ def wilson_interval(correct: int, total: int, level: float = 0.95) -> tuple[floa
         >>> [round(x, 3) for x in wilson_interval(16, 32)]
         [0.336, 0.664]
     """
-    _check_counts(correct, total)
-    z = float(ndtri(0.5 + level / 2.0))
-    share = correct / total
-    centre = (share + z * z / (2 * total)) / (1 + z * z / total)
-    half = (
-        z
-        / (1 + z * z / total)
-        * math.sqrt(share * (1 - share) / total + z * z / (4 * total * total))
-    )
-    low = 0.0 if correct == 0 else centre - half
-    high = 1.0 if correct == total else centre + half
-    return low, high
+    from scipy.stats import binomtest  # slow to load, and not needed to read records
 
-
-def clopper_pearson_interval(correct: int, total: int, level: float = 0.95) -> tuple[float, float]:
-    """Clopper and Pearson's interval of an accuracy: its cover is never below ``level``.
-
-    Arguments and errors are those of `wilson_interval`.
-
-    Example:
-        >>> [round(x, 3) for x in clopper_pearson_interval(16, 32)]
-        [0.319, 0.681]
-    """
-    _check_counts(correct, total)
-    tail = (1 - level) / 2
-    low = 0.0 if correct == 0 else float(betaincinv(correct, total - correct + 1, tail))
-    high = 1.0 if correct == total else float(betaincinv(correct + 1, total - correct, 1 - tail))
-    return low, high
-
-
-def _check_counts(correct: int, total: int) -> None:
     if not (total > 0 and 0 <= correct <= total):
         raise ValueError(f"{correct} right of {total} is not a score")
+    interval = binomtest(correct, total).proportion_ci(level, method="wilson")
+    return float(interval.low), float(interval.high)

@@ -1,78 +1,75 @@
-"""Tables made from records, and from nothing else."""
+"""Tables made from records, and from nothing else: a frame of records, means over seeds, text."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import pandas as pd
 
 from qs3.errors import InputError
 from qs3.evaluation.metrics import MeanSEM, mean_sem
-from qs3.evaluation.records import RunRecord
+from qs3.evaluation.records import RunRecord, count_rounds
 
-Metric = Literal["accuracy", "class_mean_accuracy"]
-Key = tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Row:
-    """One line of a table: runs that differ in their seed alone."""
-
-    key: Key
-    """What the runs share."""
-    accuracy: MeanSEM
-    """Accuracy over seeds."""
-    class_mean_accuracy: MeanSEM
-    """Class-mean accuracy over seeds."""
-    seeds: tuple[int, ...]
-    """Seeds of the runs, sorted."""
+SCORES = ("accuracy", "class_mean_accuracy")
+"""Columns of a frame that hold shares of right answers."""
+LINE = ("method", "network", "source", "target", "test", "selection", "marks")
+"""Columns that name a line of a table where no experiment does."""
+_LATEX: Mapping[int, str] = str.maketrans(
+    {
+        "&": r"\&", "%": r"\%", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}", "$": r"\$",
+        "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}",
+        "→": r"$\to$", "θ": r"$\theta$", "₀": r"$_0$", "ε": r"$\varepsilon$", "±": r"$\pm$",
+        "–": "--",
+    }
+)  # fmt: skip
 
 
-def default_key(record: RunRecord) -> Key:
-    """Method, network, source, target, test set, selection rule and marks.
+def frame(
+    records: Sequence[RunRecord],
+    fields: Sequence[Mapping[str, Any]] = (),
+    rules: bool = False,
+) -> pd.DataFrame:
+    """Return one line a record, or one a record and rule of selection.
 
-    Name and part of the data stand for it; a run on the clean or surface clouds of a data set
-    says so.
-    """
-    data = (record.source, record.target, record.test)
-    parts = ["-" if one is None else one.label for one in data]
-    return (record.method, record.model, *parts, record.selection, ", ".join(record.marks))
-
-
-HEADERS: Key = ("method", "network", "source", "target", "test", "selection", "marks")
-
-
-def group(records: Sequence[RunRecord], key: Callable[[RunRecord], Key] = default_key) -> list[Row]:
-    """Average records that share a key, in the order in which the keys first occur.
-
-    Only the seed may differ within a group: a mean over other data or settings would be a
-    number of nothing.
+    Columns: ``fields``, those of `LINE`, ``seed``, ``accuracy``, ``class_mean_accuracy``,
+    ``rounds`` of self-training and how many of them ``trained``, and ``alike``, which is equal for
+    runs that differ in their seed alone. Data are known by name and part; clean or surface clouds
+    of a data set say so.
 
     Args:
         records: Runs.
-        key: What makes a line; the default is `default_key`.
-
-    Raises:
-        InputError: where a group has two runs of one seed, or runs of other settings or data.
+        fields: Columns of each record that come first.
+        rules: Whether each rule that would have chosen a checkpoint has a line too, told by a
+            column ``rule``; the run's own choice is ``chosen (NAME)``.
     """
-    groups: dict[Key, list[RunRecord]] = {}
-    for record in records:
-        groups.setdefault(key(record), []).append(record)
-    rows = []
-    for name, runs in groups.items():
-        label = " · ".join(filter(None, name))
-        if len({run.seed for run in runs}) < len(runs):
-            raise InputError(f"{label}: two records of one seed; remove one")
-        if len({json.dumps(shared(run), sort_keys=True) for run in runs}) > 1:
-            raise InputError(f"{label}: runs differ in settings or data, not in the seed alone")
-        rows.append(
-            Row(
-                key=name,
-                accuracy=mean_sem([run.scores.accuracy for run in runs]),
-                class_mean_accuracy=mean_sem([run.scores.class_mean_accuracy for run in runs]),
-                seeds=tuple(sorted(run.seed for run in runs)),
-            )
-        )
-    return rows
+    lines = []
+    for record, first in zip(records, fields or [{}] * len(records), strict=True):
+        line = dict(first) | _line(record)
+        if rules:
+            lines.append(line | {"rule": f"chosen ({record.selection})"})
+            for rule, choice in record.choices.items():
+                lines.append(line | {"rule": rule} | {name: choice[name] for name in SCORES})
+        else:
+            lines.append(line)
+    return pd.DataFrame(lines)
+
+
+def _line(record: RunRecord) -> dict[str, Any]:
+    data = {"source": record.source, "target": record.target, "test": record.test}
+    trained, rounds = count_rounds([record])
+    return {
+        "method": record.method,
+        "network": record.model,
+        **{name: "-" if part is None else part.label for name, part in data.items()},
+        "selection": record.selection,
+        "marks": ", ".join(record.marks),
+        "seed": record.seed,
+        "accuracy": record.scores.accuracy,
+        "class_mean_accuracy": record.scores.class_mean_accuracy,
+        "trained": trained,
+        "rounds": rounds,
+        "alike": json.dumps(shared(record), sort_keys=True),
+    }
 
 
 def shared(record: RunRecord) -> dict[str, Any]:
@@ -87,35 +84,91 @@ def shared(record: RunRecord) -> dict[str, Any]:
     data = {"source": record.source, "target": record.target, "test": record.test}
     return {
         "settings": settings,
-        "data": {name: one.checksum for name, one in data.items() if one is not None},
+        "data": {name: part.checksum for name, part in data.items() if part is not None},
         "classes": list(record.scores.class_names),
         "model": record.model,
         "method": record.method,
     }
 
 
-def markdown(
-    rows: Sequence[Row],
-    headers: Key = HEADERS,
-    metrics: Sequence[Metric] = ("accuracy", "class_mean_accuracy"),
-) -> str:
-    """Print rows as a Markdown table: per cent, mean ± SEM (ddof = 1) and number of seeds.
+def average(lines: pd.DataFrame, by: Sequence[str] = LINE) -> pd.DataFrame:
+    """Average over seeds what shares its values of ``by``, in the order in which they first occur.
+
+    Only the seed may differ within a line: a mean over other data or settings would be a number of
+    nothing.
+
+    Args:
+        lines: What `frame` returns.
+        by: Columns that make a line.
+
+    Returns:
+        The columns of ``by``; accuracies as `MeanSEM`; ``seeds``, sorted; ``marks`` of any of the
+        runs; rounds and how many of them trained, summed.
 
     Raises:
-        ValueError: where a row's key has another length than the headers.
+        InputError: where a line has two runs of one seed, or runs of other settings or data.
+    """
+    means = []
+    for _, group in lines.groupby(list(by), sort=False, dropna=False):
+        runs: list[dict[str, Any]] = group.to_dict("records")  # pyright: ignore[reportAssignmentType]
+        line = {name: runs[0][name] for name in by}
+        label = " · ".join(str(part) for part in line.values() if part)
+        if len({run["seed"] for run in runs}) < len(runs):
+            raise InputError(f"{label}: two records of one seed; remove one")
+        if len({run["alike"] for run in runs}) > 1:
+            raise InputError(f"{label}: runs differ in settings or data, not in the seed alone")
+        marks = sorted({mark for run in runs for mark in run["marks"].split(", ") if mark})
+        means.append(
+            line
+            | {name: mean_sem([run[name] for run in runs]) for name in SCORES}
+            | {"seeds": tuple(sorted(run["seed"] for run in runs)), "marks": ", ".join(marks)}
+            | {name: sum(run[name] for run in runs) for name in ("trained", "rounds")}
+        )
+    columns = dict.fromkeys([*by, *SCORES, "seeds", "marks", "trained", "rounds"])
+    return pd.DataFrame(means, columns=list(columns))
+
+
+def to_markdown(table: pd.DataFrame) -> str:
+    """Return a table of text as Markdown; two columns may have one heading.
 
     Example:
-        >>> one = mean_sem([0.5, 0.6])
-        >>> print(markdown([Row(("qbst",), one, one, (0, 1))], ("method",), ["accuracy"]))
-        | method | accuracy % |
+        >>> scores = pd.DataFrame({"method": ["qbst"], "accuracy, %": [mean_sem([0.5, 0.6])]})
+        >>> print(to_markdown(scores))
+        | method | accuracy, % |
         | --- | --- |
         | qbst | 55.0 ± 5.0 (n=2) |
     """
-    titles = [*headers, *(f"{name.replace('_', ' ').replace('s m', 's-m')} %" for name in metrics)]
-    lines = [titles, ["---"] * len(titles)]
-    for row in rows:
-        if len(row.key) != len(headers):
-            raise ValueError(f"{len(headers)} headers for a key of {len(row.key)} parts")
-        cells = [cell.replace("|", "\\|") for cell in row.key]
-        lines.append([*cells, *(getattr(row, name).format() for name in metrics)])
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    head, *body = [[_text(value).replace("|", "\\|") for value in row] for row in _rows(table)]
+    return "\n".join(f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *body])
+
+
+def to_latex(table: pd.DataFrame) -> str:
+    r"""Return a table of text as a LaTeX tabular, its first column to the left.
+
+    Example:
+        >>> print(to_latex(pd.DataFrame({"method": ["a_b"], "S → D, %": ["–"]})))
+        \begin{tabular}{lr}
+        \hline
+        method & S $\to$ D, \% \\
+        \hline
+        a\_b & -- \\
+        \hline
+        \end{tabular}
+    """
+    rows = [" & ".join(_text(value).translate(_LATEX) for value in row) for row in _rows(table)]
+    head, *body = [row + r" \\" for row in rows]
+    begin = rf"\begin{{tabular}}{{l{'r' * (table.shape[1] - 1)}}}"
+    return "\n".join([begin, r"\hline", head, r"\hline", *body, r"\hline", r"\end{tabular}"])
+
+
+def to_csv(lines: pd.DataFrame) -> str:
+    """Return a frame as CSV, numbers to the last digit."""
+    return lines.to_csv(index=False, lineterminator="\n")
+
+
+def _rows(table: pd.DataFrame) -> list[list[Any]]:
+    return [list(table.columns), *table.to_numpy(dtype=object).tolist()]
+
+
+def _text(value: Any) -> str:
+    return value.format() if isinstance(value, MeanSEM) else str(value)

@@ -11,7 +11,7 @@ from qs3.errors import InputError, QS3Error
 from qs3.experiments.scales import Scale
 from qs3.meshes import collect
 from qs3.meshes.collections import MeshItem
-from qs3.sensor.surroundings import SceneSettings
+from qs3.sensor.scene import SceneSettings
 from qs3.store.generate import GenerateSettings, generate
 from qs3.store.plan import Plan, make_plan, resolve_renderer
 
@@ -119,7 +119,7 @@ def make_plans(
     common = {
         "meshes": "shapes+cad" if sides.cad else "shapes",
         "num_points": scale.data_points,
-        "renderer": renderer,
+        "renderer": renderer or "mitsuba",
         "rows_per_shard": 32,
     }
     plans = {}
@@ -145,7 +145,7 @@ def _plan(name: str, scale: Scale, sides: Sides) -> tuple[list[MeshItem], dict[s
         return sides.source, source | {"views": int(rest)}
     # As annotated frames are cut: by the object's mask, and by its box with a margin, or a few
     # flying pixels would set the scale of the whole cloud.
-    room = {"sensor": TARGET_SENSOR, "scene": _ROOM, "box_margin": 0.05, "mask_crop": True}
+    room = {"sensor": TARGET_SENSOR, "scene": _ROOM, "box_margin": 0.05, "crop": "both"}
     if name == TARGET:
         return sides.target, room | {"views": 1, "seed": _SEEDS[TARGET]}
     if name == "fused":

@@ -3,7 +3,8 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from qs3.evaluation.metrics import MeanSEM, PairedDifference, mean_sem, paired_difference
+from qs3.evaluation.compare import SeedComparison, compare_seeds
+from qs3.evaluation.metrics import MeanSEM, mean_sem
 from qs3.evaluation.records import RunRecord, count_rounds
 from qs3.experiments.runs import Run
 from qs3.experiments.scales import Scale
@@ -91,12 +92,12 @@ class Grid:
         """Places that wait for runs."""
         return [p for p, cell in self.cells.items() if len(cell.accuracies) < cell.wanted]
 
-    def differences(self) -> list[tuple[str, PairedDifference]]:
+    def differences(self) -> list[tuple[str, SeedComparison]]:
         """Return the comparisons for which there are runs of the same seeds."""
         found = []
         for what, first, second in self.experiment.pairs(self.scale):
             if first in self.cells and second in self.cells:
-                difference = paired_difference(
+                difference = compare_seeds(
                     self.cells[first].accuracies, self.cells[second].accuracies
                 )
                 if difference is not None:

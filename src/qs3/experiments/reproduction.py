@@ -24,10 +24,9 @@ from qs3.experiments.grid import (
 from qs3.experiments.rows import ORDINARY
 from qs3.experiments.runs import Run
 from qs3.experiments.setup import Setup, claim
-from qs3.store.estimate import estimate
 from qs3.store.executors import Executor, InlineExecutor, LocalExecutor
 from qs3.store.manifest import MANIFEST
-from qs3.store.plan import Plan
+from qs3.store.plan import Plan, estimate
 
 
 @runtime_checkable

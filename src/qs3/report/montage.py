@@ -6,9 +6,11 @@ Convention:
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import matplotlib
 import numpy as np
+import trimesh
 from jaxtyping import Float, Shaped, UInt8
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
@@ -20,6 +22,9 @@ from matplotlib.ticker import MaxNLocator
 from qs3.errors import InputError
 from qs3.report.clouds import SIDES, draw_cloud
 from qs3.report.figure import NO_VALUE, house_style, short, without_frame
+from qs3.sensor.presets import Sensor
+from qs3.sensor.scan import Scan, scan
+from qs3.sensor.speckle import pattern_image
 
 _LOST, _EXTRA = "#6e6e6e", "#ddaa33"
 
@@ -48,6 +53,33 @@ class MontageView:
     """Show only columns x0 … x1 − 1 and rows y0 … y1 − 1: (x0, y0, x1, y1)."""
     unit: str = "mesh units"
     """Unit of lengths."""
+
+
+def montage_view(made: Scan) -> tuple[MontageView, int]:
+    """The view that shows most of the object, and its index; the scan has kept its images."""
+    best = int(np.argmax([view.object_pixels for view in made.views]))
+    images = made.images[best]
+    true_depth = np.where(images.mask, images.true_depth, np.nan)  # of the object alone
+    view = MontageView(
+        left=images.left,
+        right=images.right,
+        disparity=images.disparity,
+        depth=images.depth,
+        true_depth=true_depth,
+        cloud=made.points,
+        clean=made.clean,
+        pattern=pattern_image(made.sensor.pattern),
+        box=object_box(true_depth, 20),
+    )
+    return view, best
+
+
+def scan_montage(
+    mesh: trimesh.Trimesh, sensor: Sensor, renderer: Any, views: int = 2, seed: int = 0
+) -> MontageView:
+    """Scan a mesh for the pictures of its best view."""
+    made = scan(mesh, sensor=sensor, views=views, seed=seed, renderer=renderer, keep_images=True)
+    return montage_view(made)[0]
 
 
 def object_box(

@@ -1,17 +1,29 @@
-"""The report of a run as one HTML file that needs no network, no script and no other file."""
+"""The report of a run as one HTML file that needs no network and no other file."""
 
 import base64
 import hashlib
+from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib import resources
 from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
 
 from qs3.files import write_text
-from qs3.report.html import escape, paragraph, section
-from qs3.report.records import Outcome, Report
-from qs3.report.sections import sections
+from qs3.report.clouds import gallery
+from qs3.report.contents import Cloud, Report
+from qs3.report.embedding import feature_map
+from qs3.report.figure import png_bytes
+from qs3.report.montage import montage
+from qs3.report.plots import class_accuracy, confusion_heatmap, selection_counts, training_curves
 from qs3.report.verdict import Verdict, judge
 
-_KIND = {"helped": "helped", "hurt": "hurt", "no clear difference": "unclear"}
+_COLUMNS = 4  # sample clouds of a class
+_POINTS = 1024  # of a cloud that the reader can turn
 
 
 def write_report(path: Path, report: Report) -> Verdict | None:
@@ -20,68 +32,108 @@ def write_report(path: Path, report: Report) -> Verdict | None:
     The same report gives the same bytes: the page holds no time, no host and no path of its own.
 
     Returns:
-        What the numbers say of adaptation; None where there are not two models to compare.
+        What the numbers say of adaptation; None where there are not two networks to compare.
     """
-    verdict = None
-    if report.before is not None and report.after is not None:
-        verdict = judge(report.before, report.after)
-    write_text(Path(path), render(report, verdict))
-    return verdict
+    write_text(Path(path), render(report))
+    return _verdict(report)
 
 
-def render(report: Report, verdict: Verdict | None = None) -> str:
+def render(report: Report) -> str:
     """Return the page as text."""
-    style, script = _asset("page.css"), _asset("viewer.js")
-    # Only this style and this script may act, and nothing may be fetched.
-    policy = (
-        f"default-src 'none'; img-src data:; style-src '{_digest(style)}'; "
-        f"script-src '{_digest(script)}'; base-uri 'none'; form-action 'none'"
-    )
-    parts = [
-        _opening(report, verdict),
-        *sections(report),
-        section("How to make it again", f"<pre><code>{escape(report.command)}</code></pre>"),
-    ]
-    body = "\n".join(part for part in parts if part)
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(report.title)}</title>\n<style>{style}</style>\n</head>\n"
-        f"<body>\n<main>\n{body}\n</main>\n<script>{script}</script>\n</body>\n</html>\n"
+    clouds = [cloud for own in report.clouds.values() for cloud in own]
+    present = {cloud.class_name for cloud in clouds}
+    rules = dict.fromkeys(rule for line in report.scores for rule in line.choices)
+    return _template().render(
+        report=report,
+        verdict=_verdict(report),
+        networks=report.networks,
+        shown=[name for name in report.class_names if name in present],
+        samples=lambda own, title: _samples(own, report.class_names, title),
+        rules=sorted(rules, key=lambda rule: rule == "oracle"),  # that one apart, at the end
     )
 
 
-def _opening(report: Report, verdict: Verdict | None) -> str:
-    notes = "".join(f"<li>{escape(note)}</li>" for note in report.notes)
-    scores = "".join(map(_score, report.outcomes))
-    return "\n".join(
-        [
-            f"<header><h1>{escape(report.title)}</h1>",
-            paragraph(report.summary),
-            "</header>",
-            "" if verdict is None else _verdict(verdict),
-            f'<div class="scores">{scores}</div>' if scores else "",
-            f"<ul>{notes}</ul>" if notes else "",
-        ]
+@cache
+def _template() -> jinja2.Template:
+    environment = jinja2.Environment(
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
     )
+    environment.globals |= {
+        "style": _asset("page.css"),
+        "script": _asset("viewer.js"),
+        "digest": _digest,
+        "png": _png,
+        "flatten": flatten,
+        "encode_points": encode_points,
+        "class_accuracy": class_accuracy,
+        "confusion_heatmap": confusion_heatmap,
+        "feature_map": feature_map,
+        "montage": montage,
+        "selection_counts": selection_counts,
+        "training_curves": training_curves,
+    }
+    return environment.from_string(_asset("page.html.jinja"))
 
 
-def _verdict(verdict: Verdict) -> str:
-    opening, _, rest = verdict.text.partition(": ")
-    return (
-        f'<div class="verdict {_KIND[verdict.finding]}" id="verdict">'
-        f"<p><strong>{escape(opening)}.</strong> {escape(rest[:1].upper() + rest[1:])}</p></div>"
-    )
+def _verdict(report: Report) -> Verdict | None:
+    if report.before is None or report.after is None:
+        return None
+    return judge(report.before, report.after)
 
 
-def _score(outcome: Outcome) -> str:
-    low, high = (100.0 * x for x in outcome.interval)
-    return (
-        f'<div class="score">{escape(outcome.name)}<b>{100.0 * outcome.accuracy:.1f} %</b>'
-        f'<span class="soft">95 % interval {low:.1f} to {high:.1f} %, n = {outcome.total}<br>'
-        f"class mean {100.0 * outcome.class_mean_accuracy:.1f} %</span></div>"
-    )
+def _samples(clouds: Sequence[Cloud], class_names: Sequence[str], title: str) -> Figure:
+    """The first clouds of each class."""
+    classes = {
+        name: [cloud.points for cloud in clouds if cloud.class_name == name][:_COLUMNS]
+        for name in class_names
+    }
+    return gallery(classes, title, _COLUMNS)
+
+
+def _png(figure: Figure, wide: bool) -> str:
+    """A picture in base64; a wide one keeps a readable size on a small screen, where it scrolls."""
+    return base64.b64encode(png_bytes(figure, dpi=110 if wide else 150)).decode("ascii")
+
+
+def encode_points(points: Float[np.ndarray, "n 3"]) -> str:
+    """Return points scaled into the unit ball as base64 of little-endian 16-bit integers.
+
+    Rows that are not finite are left out; of many points evenly spaced rows are kept.
+
+    Example:
+        >>> np.frombuffer(base64.b64decode(encode_points(np.eye(3)[:2])), "<i2").tolist()
+        [23170, -23170, 0, -23170, 23170, 0]
+    """
+    points = np.asarray(points[np.isfinite(points).all(axis=1)], np.float64)
+    if len(points) > _POINTS:
+        points = points[np.linspace(0, len(points) - 1, _POINTS).astype(np.int64)]
+    if len(points):
+        points = points - (points.min(axis=0) + points.max(axis=0)) / 2.0
+        points /= max(float(np.linalg.norm(points, axis=1).max()), 1e-12)
+    whole = np.round(points * 32767).astype("<i2")
+    return base64.b64encode(whole.tobytes()).decode("ascii")
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """Return the leaves of nested mappings as (dotted name, value) in their order.
+
+    Example:
+        >>> flatten({"seed": 1, "sensor": {"views": 5, "names": ("a", "b")}})
+        [('seed', '1'), ('sensor.views', '5'), ('sensor.names', 'a, b')]
+    """
+    leaves: list[tuple[str, str]] = []
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            leaves += flatten(value, f"{prefix}{name}.")
+        elif isinstance(value, list | tuple):
+            leaves.append((f"{prefix}{name}", ", ".join(map(str, value))))
+        else:
+            leaves.append((f"{prefix}{name}", str(value)))
+    return leaves
 
 
 def _asset(name: str) -> str:

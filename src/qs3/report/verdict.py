@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from scipy.stats import binomtest
-
-from qs3.report.records import Outcome
+from qs3.evaluation.compare import mcnemar
+from qs3.report.contents import Scored
 
 Finding = Literal["helped", "no clear difference", "hurt"]
 
@@ -16,60 +15,62 @@ class Verdict:
 
     finding: Finding
     """What the numbers allow to say."""
-    text: str
-    """Paragraph in plain words."""
+    opening: str
+    """The finding in a word or two, without a full stop."""
+    grounds: str
+    """What it rests on, in plain words."""
 
 
-def judge(before: Outcome, after: Outcome) -> Verdict:
-    """Compare two models on the same test clouds.
+def judge(before: Scored, after: Scored) -> Verdict:
+    """Compare two networks on the same test clouds.
 
-    Where it is known which clouds each model had right, an exact sign test on the clouds that
-    changed decides (McNemar's test, exact form; two-sided, 5 %). Otherwise the two 95 % intervals
-    must not overlap.
+    Where it is known which clouds each network had right, McNemar's exact test on the clouds that
+    changed decides (two-sided, 5 %). Otherwise the two 95 % intervals must not overlap.
 
     Example:
         >>> import numpy as np
-        >>> before = Outcome("source-only", np.array([[20, 30], [30, 20]]))
-        >>> judge(before, Outcome("qbst", np.array([[45, 5], [5, 45]]))).finding
+        >>> from qs3.evaluation.records import score
+        >>> labels = np.arange(100) % 2
+        >>> before = Scored("source-only", score(labels, 0 * labels, ["bed", "chair"]))
+        >>> judge(before, Scored("qbst", score(labels, labels, ["bed", "chair"]))).finding
         'helped'
-        >>> judge(before, Outcome("qbst", np.array([[21, 29], [30, 20]]))).finding
+        >>> judge(before, before).finding
         'no clear difference'
     """
-    gain = 100.0 * (after.accuracy - before.accuracy)
-    better = after.correct > before.correct
+    total = before.scores.clouds
+    gain = 100.0 * (after.scores.accuracy - before.scores.accuracy)
     if before.right is not None and after.right is not None:
-        won = int((after.right & ~before.right).sum())
-        lost = int((before.right & ~after.right).sum())
-        p = float(binomtest(won, won + lost).pvalue) if won + lost else 1.0
-        clear = p < 0.05
-        odds = "p < 0.001" if p < 0.001 else f"p = {p:.2g}"
+        change = mcnemar(after.right, before.right)
+        clear = change.p < 0.05
+        odds = "p < 0.001" if change.p < 0.001 else f"p = {change.p:.2g}"
         ground = (
-            f"Of the {before.total} clouds, {won} became right and {lost} became wrong "
-            f"(exact sign test, {odds})."
+            f"Of the {total} clouds, {change.first_only} became right and {change.second_only} "
+            f"became wrong (exact sign test, {odds})."
         )
     else:
-        (low_before, high_before), (low_after, high_after) = before.interval, after.interval
+        low_before, high_before = before.scores.interval
+        low_after, high_after = after.scores.interval
         clear = low_after > high_before or high_after < low_before
         ground = f"The two intervals {'do not overlap' if clear else 'overlap'}."
 
     finding: Finding = "no clear difference"
+    opening = "No clear difference"
+    words = (
+        f"{after.name} and {before.name} differ by {gain:+.1f} points on the target, which "
+        f"{total} clouds cannot tell from chance."
+    )
     if clear:
-        finding = "helped" if better else "hurt"
-    opening = {
-        "helped": f"Adaptation helped: {after.name} is {gain:.1f} points more accurate than "
-        f"{before.name} on the target.",
-        "hurt": f"Adaptation hurt: {after.name} is {-gain:.1f} points less accurate than "
-        f"{before.name} on the target.",
-        "no clear difference": f"No clear difference: {after.name} and {before.name} differ by "
-        f"{gain:+.1f} points on the target, which {before.total} clouds cannot tell from chance.",
-    }[finding]
-    if finding == "no clear difference" and after.correct == before.correct:
-        opening = (
-            f"No clear difference: {after.name} and {before.name} have the same number of the "
-            f"{before.total} target clouds right."
+        finding, way = ("helped", "more") if gain > 0 else ("hurt", "less")
+        opening = f"Adaptation {finding}"
+        words = (
+            f"{after.name} is {abs(gain):.1f} points {way} accurate than {before.name} on the "
+            "target."
         )
-    sentences = [opening, f"{_score(before)}; {_score(after)}.", ground]
-    mean_gain = 100.0 * (after.class_mean_accuracy - before.class_mean_accuracy)
+    elif after.correct == before.correct:
+        words = f"{after.name} and {before.name} have the same number of the {total} target clouds "
+        words += "right."
+    sentences = [words, f"{_score(before)}; {_score(after)}.", ground]
+    mean_gain = 100.0 * (after.scores.class_mean_accuracy - before.scores.class_mean_accuracy)
     if mean_gain * gain < 0:
         sentences.append(
             f"The class-mean accuracy went the other way ({mean_gain:+.1f} points): frequent and "
@@ -79,13 +80,14 @@ def judge(before: Outcome, after: Outcome) -> Verdict:
         "The intervals cover the choice of test clouds, not the randomness of training: another "
         "seed gives other numbers."
     )
-    return Verdict(finding, " ".join(sentences))
+    return Verdict(finding, opening, " ".join(sentences))
 
 
-def _score(outcome: Outcome) -> str:
-    low, high = (100.0 * x for x in outcome.interval)
+def _score(network: Scored) -> str:
+    scores = network.scores
+    low, high = (100.0 * end for end in scores.interval)
     return (
-        f"{outcome.name}: {100.0 * outcome.accuracy:.1f} % of {outcome.total} clouds "
+        f"{network.name}: {100.0 * scores.accuracy:.1f} % of {scores.clouds} clouds "
         f"(95 % interval {low:.1f} to {high:.1f} %), "
-        f"class mean {100.0 * outcome.class_mean_accuracy:.1f} %"
+        f"class mean {100.0 * scores.class_mean_accuracy:.1f} %"
     )

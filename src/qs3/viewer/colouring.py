@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import matplotlib
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 
 from qs3.report.figure import AFTER, NO_VALUE, PALETTE, class_colour
 
@@ -129,22 +129,6 @@ def by_verdict(count: int, right: bool) -> Colouring:
 def plain(count: int, reason: str) -> Colouring:
     """Colour all points grey, and say why."""
     return Colouring(_flat(count, NO_VALUE), reason)
-
-
-def rows_of(
-    labels: Sequence[str], class_name: str | None, wrong: Bool[np.ndarray, "b"] | None = None
-) -> list[int]:
-    """Rows of one class (None: of any), and of those only the wrong ones where these are given.
-
-    Example:
-        >>> rows_of(["bed", "sofa", "bed"], "bed", np.array([False, True, True]))
-        [2]
-    """
-    return [
-        row
-        for row, label in enumerate(labels)
-        if class_name in (None, label) and (wrong is None or wrong[row])
-    ]
 
 
 def _viridis(share: Float[np.ndarray, "n"]) -> UInt8[np.ndarray, "n 3"]:

@@ -84,32 +84,25 @@ def compose(
         facts += answers.facts(row)
         if answers.truth is not None:
             facts += [("this is", "wrong" if answers.wrong[row] else "right")]
+    colouring = plain(len(points), f"{mode}: not known for this cloud")
     if mode == "error":
-        colouring, told = _error(exhibit, kind, limit)
-        facts += told
-    elif mode == "view":
-        known = kind in exhibit.views
-        colouring = by_view(exhibit.views[kind]) if known else _unknown(points, "view")
+        colouring, measured = _error(exhibit, kind, limit, colouring)
+        facts += measured
+    elif mode == "view" and kind in exhibit.views:
+        colouring = by_view(exhibit.views[kind])
     elif mode == "height":
         colouring = by_height(points)
-    elif answers is None:
-        colouring = _unknown(points, mode)
-    elif mode == "predicted class":
+    elif mode == "predicted class" and answers is not None:
         colouring = by_class(len(points), answers.best(row), answers.class_names, mode)
-    elif answers.truth is None:
-        colouring = _unknown(points, mode)
-    else:
+    elif mode == "right or wrong" and answers is not None and answers.truth is not None:
         colouring = by_verdict(len(points), not answers.wrong[row])
     return Display(points, colouring, (*facts, *exhibit.facts))
 
 
-def _unknown(points: np.ndarray, what: str) -> Colouring:
-    return plain(len(points), f"{what}: not known for this cloud")
-
-
 def _error(
-    exhibit: Exhibit, kind: CloudKind, limit: float | None
+    exhibit: Exhibit, kind: CloudKind, limit: float | None, unknown: Colouring
 ) -> tuple[Colouring, list[tuple[str, str]]]:
+    """Colours and facts of the distance to the truth; ``unknown`` where there is no truth."""
     points, unit = exhibit.clouds[kind], exhibit.unit
     facts: list[tuple[str, str]] = []
     if exhibit.mesh is not None and kind != "surface":
@@ -120,7 +113,7 @@ def _error(
         # A distance to a cloud is never below about half its spacing, however good the sensor.
         facts.append(("spacing of the clean twin", f"{spacing(clean):.3g}{unit}"))
     else:
-        return _unknown(points, "error"), facts
+        return unknown, facts
     half, most = np.percentile(distance, [50, 95])
     facts.insert(0, ("error", f"median {half:.3g}{unit}, 95 % below {most:.3g}{unit}"))
     return by_error(distance, truth, limit, unit), facts
@@ -133,8 +126,8 @@ def frame_of(exhibit: Exhibit) -> tuple[Float[np.ndarray, "3"], float]:
     stands right. What is measured and printed stays in the unit of the data.
     """
     best: tuple[CloudKind, ...] = ("clean", "surface", "points")
-    known = next(exhibit.clouds[kind] for kind in best if kind in exhibit.clouds)
-    corners = known if exhibit.mesh is None else exhibit.mesh.vertices
+    cloud = next(exhibit.clouds[kind] for kind in best if kind in exhibit.clouds)
+    corners = cloud if exhibit.mesh is None else exhibit.mesh.vertices
     low, high = np.asarray(corners).min(axis=0), np.asarray(corners).max(axis=0)
     side = float((high - low).max())
     return np.asarray((low + high) / 2, dtype=np.float64), side if side > 0 else 1.0

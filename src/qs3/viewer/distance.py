@@ -60,7 +60,7 @@ def mesh_distance(
         chosen = np.flatnonzero(sizes == size)
         reach = best + radii[chosen].max()
         near = KDTree(middles[chosen]).query_ball_point(points, reach * (1 + 1e-9))
-        counts = np.array([len(found) for found in near])
+        counts = np.array([len(faces) for faces in near])
         ends = np.cumsum(counts)
         start = 0
         while start < len(points):
@@ -68,34 +68,10 @@ def mesh_distance(
             stop = max(int(np.searchsorted(ends, done + _PAIRS, side="right")), start + 1)
             row = np.repeat(np.arange(start, stop), counts[start:stop])
             if len(row):
-                face = chosen[np.concatenate([np.asarray(f, int) for f in near[start:stop]])]
-                np.minimum.at(best, row, _to_triangles(points[row], corners[face]))
+                face = chosen[
+                    np.concatenate([np.asarray(faces, int) for faces in near[start:stop]])
+                ]
+                nearest = trimesh.triangles.closest_point(corners[face], points[row])
+                np.minimum.at(best, row, np.linalg.norm(nearest - points[row], axis=1))
             start = stop
     return best
-
-
-def _to_triangles(
-    points: Float[np.ndarray, "n 3"], corners: Float[np.ndarray, "n 3 3"]
-) -> Float[np.ndarray, "n"]:
-    """Distance of each point to its own triangle: to its face, else to the nearest edge."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    edges = [_to_segments(points, *pair) for pair in ((a, b), (b, c), (c, a))]
-    normal = np.cross(b - a, c - a)
-    length = np.linalg.norm(normal, axis=1)
-    # The foot of the perpendicular lies inside where it is on the inner side of all three edges.
-    inside = length > 0
-    for start, end in ((a, b), (b, c), (c, a)):
-        inside &= np.einsum("ni,ni->n", np.cross(normal, end - start), points - start) >= 0
-    height = np.abs(np.einsum("ni,ni->n", points - a, normal)) / np.where(length > 0, length, 1.0)
-    return np.where(inside, height, np.minimum(np.minimum(edges[0], edges[1]), edges[2]))
-
-
-def _to_segments(
-    points: Float[np.ndarray, "n 3"],
-    start: Float[np.ndarray, "n 3"],
-    end: Float[np.ndarray, "n 3"],
-) -> Float[np.ndarray, "n"]:
-    along = end - start
-    square = np.einsum("ni,ni->n", along, along)
-    share = np.einsum("ni,ni->n", points - start, along) / np.where(square > 0, square, 1.0)
-    return np.linalg.norm(points - start - np.clip(share, 0, 1)[:, None] * along, axis=1)

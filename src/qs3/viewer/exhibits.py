@@ -1,21 +1,20 @@
 """What can be shown: the objects of a data set one by one, or one scan; no viser in here."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import trimesh
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from qs3.errors import InputError
 from qs3.io.clouds import CloudKind, PointClouds, UnlabelledClouds
-from qs3.store.folder import LocalFolder, open_folder
+from qs3.store.folder import open_folder
 from qs3.store.manifest import finished_shards, open_dataset, shard_name
-from qs3.store.shards import flat_clouds, parse_shard, read_shard
+from qs3.store.shards import flat_clouds, load_shard
 
 KINDS: dict[CloudKind, str] = {"points": "noisy", "clean": "clean", "surface": "surface"}
 """The clouds of an object and the names by which the page calls them."""
@@ -51,24 +50,6 @@ class Exhibit:
     """Of its lengths, with a space before it; empty where they have none."""
 
 
-@runtime_checkable
-class Exhibits(Protocol):
-    """Objects in a fixed order."""
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Class of each object; empty where not known."""
-        ...
-
-    def __len__(self) -> int:
-        """Their number."""
-        ...
-
-    def __getitem__(self, row: int) -> Exhibit:
-        """The object at a row."""
-        ...
-
-
 @dataclass(frozen=True)
 class ArrayExhibits:
     """Objects of which there is one cloud each, in memory."""
@@ -83,8 +64,9 @@ class ArrayExhibits:
     @classmethod
     def of(cls, clouds: PointClouds | UnlabelledClouds) -> "ArrayExhibits":
         """The clouds of a data set, with their classes where it has them."""
-        known = isinstance(clouds, PointClouds)
-        labels = [clouds.class_names[i] for i in clouds.labels] if known else [""] * len(clouds)
+        labels = [""] * len(clouds)
+        if isinstance(clouds, PointClouds):
+            labels = [clouds.class_names[i] for i in clouds.labels]
         return cls(clouds.points, clouds.ids, tuple(labels))
 
     def __len__(self) -> int:
@@ -120,7 +102,7 @@ class StoreExhibits:
         labels: list[str] = []
         splits: set[str] = set()
         for shard in shards:
-            table = self._table(shard, ("label", "split"))
+            table = load_shard(self._folder, shard, ("label", "split"))
             columns = (table[name].to_pylist() for name in ("label", "split"))
             for row, (label, part) in enumerate(zip(*columns, strict=True)):
                 splits.add(part)
@@ -130,8 +112,8 @@ class StoreExhibits:
                     places.append((shard, row))
                     labels.append(manifest.class_names[label])
         if not places:
-            there = ", ".join(sorted(filter(None, splits))) or "none"
-            raise InputError(f"{self._folder}: no cloud of split {split!r}; splits: {there}")
+            names = ", ".join(sorted(filter(None, splits))) or "none"
+            raise InputError(f"{self._folder}: no cloud of split {split!r}; splits: {names}")
         self._places, self.labels = places, tuple(labels)
         self._read = lru_cache(maxsize=1)(self._read_shard)
 
@@ -144,39 +126,48 @@ class StoreExhibits:
         shard, place = self._places[row]
         return self._read(shard)[place]
 
-    def _table(self, shard: int, columns: Sequence[str]) -> pa.Table:
-        name = shard_name(shard)
-        if isinstance(self._folder, LocalFolder):
-            return read_shard(self._folder.path / name, columns)  # these alone, not the whole file
-        return parse_shard(self._folder.read(name), f"{self._folder}/{name}", columns)
-
     def _read_shard(self, shard: int) -> list[Exhibit]:
         kinds = tuple(KINDS)
         words = ("id", "class_name", "split", "seed", "drawn", *_VIEWS.values(), *STATISTICS)
-        table = self._table(shard, (*words, *kinds))
+        table = load_shard(self._folder, shard, (*words, *kinds))
         where = f"{self._folder}/{shard_name(shard)}"
-        there: list[CloudKind] = [
-            kind for kind in kinds if len(table[kind].combine_chunks().values)
-        ]
-        clouds = {kind: flat_clouds(table, kind, where) for kind in there}
-        found = []
+        clouds: dict[CloudKind, Any] = {
+            kind: flat_clouds(table, kind, where)
+            for kind in kinds
+            if len(table[kind].combine_chunks().values)
+        }
+        exhibits = []
         for place, row in enumerate(table.select(words).to_pylist()):
-            mine: dict[CloudKind, Any] = {kind: clouds[kind][place] for kind in there}
+            mine: dict[CloudKind, Any] = {kind: clouds[kind][place] for kind in clouds}
             views: dict[CloudKind, Any] = {
                 kind: np.array(row[name], dtype=np.uint8)
                 for kind, name in _VIEWS.items()
                 if kind in mine and len(row[name]) == len(mine[kind])
             }
-            told = [("split", row["split"]), ("seed", str(row["seed"] or ""))]
-            told += [("drawn", row["drawn"].replace("{}", ""))]
-            told += [
-                (label, f"{row[n]:{form}}")
-                for n, (label, form) in STATISTICS.items()
-                if row[n] is not None
-            ]
-            facts = tuple((name, value) for name, value in told if value)
-            found.append(Exhibit(row["id"], row["class_name"], mine, views, None, facts))
-        return found
+            facts = [("split", row["split"]), ("seed", str(row["seed"] or ""))]
+            facts += [("drawn", row["drawn"].replace("{}", ""))]
+            facts += statistics(row)
+            given = tuple(fact for fact in facts if fact[1])
+            exhibits.append(Exhibit(row["id"], row["class_name"], mine, views, None, given))
+        return exhibits
+
+
+def statistics(values: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Statistics of a scan as facts to print; what is not known is left out.
+
+    Example:
+        >>> statistics({"valid_fraction": 0.5, "gross_share": None})
+        [('valid pixels', '50%')]
+    """
+    return [
+        (label, f"{value:{form}}")
+        for name, (label, form) in STATISTICS.items()
+        if (value := values.get(name)) is not None
+    ]
+
+
+Exhibits = ArrayExhibits | StoreExhibits
+"""Objects in a fixed order."""
 
 
 @dataclass(frozen=True)
@@ -208,13 +199,3 @@ class Answers:
         order = np.argsort(-self.probabilities[row], kind="stable")[:count]
         shares = ", ".join(f"{self.class_names[i]} {self.probabilities[row, i]:.1%}" for i in order)
         return ((f"network, of the {KINDS[self.kind]} cloud", shares),)
-
-
-def single(name: str, points: Float32[np.ndarray, "n 3"]) -> ArrayExhibits:
-    """One cloud as a collection.
-
-    Example:
-        >>> len(single("a.xyz", np.zeros((5, 3), np.float32)))
-        1
-    """
-    return ArrayExhibits(points[None], (name,), ("",))

@@ -7,16 +7,10 @@ from typing import Any
 
 from qs3.errors import InputError
 from qs3.sensor.presets import Sensor, sensor_toml
-from qs3.viewer.colouring import rows_of
+from qs3.viewer.canvas import Canvas
 from qs3.viewer.exhibits import Answers, Exhibit, Exhibits
 from qs3.viewer.rescan import Rescanner
-from qs3.viewer.scan_controls import (
-    SCENES,
-    ScanControls,
-    ScanRequest,
-    material_names,
-)
-from qs3.viewer.stage import Stage
+from qs3.viewer.scan_controls import SCENES, ScanControls, ScanRequest, material_names
 
 ALL = "all classes"
 
@@ -32,11 +26,20 @@ class Choice:
     place: int = 0
     """Place among those; one beyond the ends is the nearest end's."""
 
+    def rows(self, exhibits: Exhibits, answers: Answers | None) -> list[int]:
+        """Rows of the objects to choose from."""
+        return [
+            row
+            for row, label in enumerate(exhibits.labels)
+            if self.class_name in (None, label)
+            and not (self.wrong_only and answers is not None and not answers.wrong[row])
+        ]
+
 
 @contextlib.contextmanager
 def gallery_page(
     server: Any, exhibits: Exhibits, answers: Answers | None = None, class_name: str | None = None
-) -> Iterator[Stage]:
+) -> Iterator[Canvas]:
     """Put controls on a server to step through objects, until the block ends.
 
     Args:
@@ -54,36 +57,35 @@ def gallery_page(
             f"--class-name {class_name}: no object of it; classes here: "
             f"{', '.join(classes) or 'not known'}"
         )
-    wrong = None if answers is None or answers.truth is None else answers.wrong
 
-    def rows(choice: Choice) -> list[int]:
-        return rows_of(exhibits.labels, choice.class_name, wrong if choice.wrong_only else None)
+    def count(choice: Choice) -> int:
+        return max(len(choice.rows(exhibits, answers)), 1)
 
     def pick(choice: Choice) -> tuple[Exhibit, int]:
-        there = rows(choice)
-        if not there:
+        rows = choice.rows(exhibits, answers)
+        if not rows:
             raise InputError("no such object: none of this class is wrong")
-        row = there[min(max(choice.place, 0), len(there) - 1)]
+        row = rows[min(max(choice.place, 0), len(rows) - 1)]
         return exhibits[row], row
 
-    gui = server.gui
-    stage = Stage(server, answers)
-    count = max(len(rows(Choice(class_name))), 1)
+    gui, canvas = server.gui, Canvas(server, answers)
+    first = count(Choice(class_name))
     with gui.add_folder("Object"):
         which = gui.add_dropdown(
             "Class", (ALL, *classes), initial_value=class_name or ALL, visible=bool(classes)
         )
-        only = gui.add_checkbox("Wrong ones only", False, visible=wrong is not None)
-        slider = gui.add_slider("Object", 1, count, 1, 1, disabled=count < 2)
+        labelled = answers is not None and answers.truth is not None
+        only = gui.add_checkbox("Wrong ones only", False, visible=labelled)
+        slider = gui.add_slider("Object", 1, first, 1, 1, disabled=first < 2)
         step = gui.add_button_group("Step", ("previous", "next"))
-    stage.add_controls()
-    worker = Rescanner(pick, stage.outcome, delay=0.0)
+    canvas.add_controls()
+    worker = Rescanner(pick, lambda picked: canvas.show(*picked), canvas.fail, delay=0.0)
 
     def choice() -> Choice:
         return Choice(None if which.value == ALL else which.value, only.value, slider.value - 1)
 
     def narrow(_: Any) -> None:
-        most = max(len(rows(choice())), 1)
+        most = count(choice())
         slider.max, slider.disabled = most, most < 2
         slider.value = 1
         worker.ask(choice())
@@ -98,7 +100,7 @@ def gallery_page(
     slider.on_update(lambda _: worker.ask(choice()))
     worker.ask(choice())
     with contextlib.closing(worker):
-        yield stage
+        yield canvas
 
 
 @contextlib.contextmanager
@@ -109,7 +111,7 @@ def scan_page(
     start: ScanControls,
     draws: int = 0,
     draw: int = 0,
-) -> Iterator[Stage]:
+) -> Iterator[Canvas]:
     """Put sliders for the sensor on a server, and scan whenever one moves, until the block ends.
 
     Args:
@@ -120,122 +122,102 @@ def scan_page(
         draws: Number of draws of a built-in shape to step through; 0 for a mesh file.
         draw: The one to start with.
     """
-    gui = server.gui
-    stage = Stage(server)
-    stage.add_controls(mesh=True)
-    sliders = _Sliders(server, sensors, start)
-    with gui.add_folder("Mesh", visible=draws > 0):
-        which = gui.add_slider("Draw of the shape", 0, max(draws - 1, draw, 1), 1, draw)
-    said = {"waiting": "scanning soon …", "working": "scanning …"}
-    worker = Rescanner(
-        lambda request: (scan(request), 0), stage.outcome, tell=lambda state: stage.say(said[state])
-    )
+    gui, canvas = server.gui, Canvas(server)
+    canvas.add_controls(mesh=True)
+    states = {"waiting": "scanning soon …", "working": "scanning …"}
+    worker = Rescanner(scan, canvas.show, canvas.fail, tell=lambda state: canvas.say(states[state]))
 
-    def ask() -> None:
+    def ask(_: Any = None) -> None:
         worker.ask(ScanRequest(sliders.base, sliders.controls(), which.value))
 
-    sliders.build(ask)
-    which.on_update(lambda _: ask())
+    with gui.add_folder("Mesh", visible=draws > 0):
+        which = gui.add_slider("Draw of the shape", 0, max(draws - 1, draw, 1), 1, draw)
+    sliders = _Sliders(gui, sensors, start, ask)
+    which.on_update(ask)
     ask()
     with contextlib.closing(worker):
-        yield stage
+        yield canvas
 
 
 class _Sliders:
     """The settings of the sensor; built anew where another sensor is chosen."""
 
-    def __init__(self, server: Any, sensors: Mapping[str, Sensor], start: ScanControls) -> None:
-        self._server, self._sensors, self._start = server, sensors, start
+    def __init__(
+        self,
+        gui: Any,
+        sensors: Mapping[str, Sensor],
+        start: ScanControls,
+        ask: Callable[[Any], None],
+    ) -> None:
+        self._gui, self._sensors, self._ask = gui, sensors, ask
         self.base = next(iter(sensors.values()))
-        self._handles: dict[str, Any] = {}
-        self._folder: Any = None
-        self._ask: Callable[[], None] = lambda: None
-
-    def build(self, ask: Callable[[], None]) -> None:
-        gui, self._ask = self._server.gui, ask
-        first = next(iter(self._sensors))
         with gui.add_folder("Sensor") as self._place:
-            self._sensor = gui.add_dropdown("Sensor", tuple(self._sensors), initial_value=first)
+            self._sensor = gui.add_dropdown("Sensor", tuple(sensors))
             save = gui.add_button("Save these settings as TOML", hint="for --sensor")
-        self._sensor.on_update(lambda _: self._change())
+        self._sensor.on_update(self._change)
         save.on_click(self._save)
-        self._fill(self._start)
+        self._fill(start)
 
     def controls(self) -> ScanControls:
-        values = {name: handle.value for name, handle in self._handles.items()}
-        return ScanControls(**values)
+        return ScanControls(**{name: handle.value for name, handle in self._handles.items()})
 
-    def _change(self) -> None:
+    def _change(self, event: Any) -> None:
         now = self.controls()
         kept = ("views", "view_layout", "seed", "num_points", "samples", "scene", "crop")
         self.base = self._sensors[self._sensor.value]
         self._folder.remove()
         self._fill(ScanControls.of(self.base, **{name: getattr(now, name) for name in kept}))
-        self._ask()
+        self._ask(event)
 
     def _save(self, event: Any) -> None:
         if event.client is not None:
             sensor = self.controls().sensor(self.base)
-            text = sensor_toml(sensor).encode()
-            event.client.send_file_download(f"{sensor.name}.toml", text)
+            event.client.send_file_download(f"{sensor.name}.toml", sensor_toml(sensor).encode())
 
     def _fill(self, now: ScanControls) -> None:
-        gui, base = self._server.gui, self.base
-        far, size = now.distance[1], base.object_size
-        unit = " (m)" if base.metric else ""
-        with self._place, gui.add_folder("Settings") as self._folder:
+        unit, size = " (m)" if self.base.metric else "", self.base.object_size
+        whole = 1 if now.num_disparities % 16 else 16
+        # Field, label, and either the choices or lowest value, highest value and step.
+        rows: tuple[tuple[Any, ...], ...] = (
+            ("views", "Views", 1, 12, 1),
+            ("view_layout", "Layout of views", ("orbit", "jitter")),
+            ("distance", f"Distance{unit}", 0.05, 2 * now.distance[1], 0.05),
+            ("elevation", "Elevation (°)", -80.0, 80.0, 1.0),
+            ("object_size", f"Object's size{unit}", 0.05, 3 * size, 0.05),
+            ("baseline", f"Baseline{unit}", 0.005, 4 * now.baseline, 0.005),
+            ("projector", "Projector ×", 0.0, 4.0, 0.05),
+            ("room_light", "Other light ×", 0.0, 20.0, 0.1),
+            ("gain", "Gain ×", 0.1, 8.0, 0.1),
+            ("image_noise", "Image noise (grey)", 0.0, 20.0, 0.1),
+            ("method", "Matcher", ("opencv-bm", "zncc")),
+            ("block_size", "Block (px)", 5, 31, 2),
+            ("num_disparities", "Disparities", 16, 512, whole),
+            ("stride", "Pixel stride", 1, 8, 1),
+            ("samples", "Rays a pixel", 1, 64, 1),
+            ("num_points", "Points", 64, 8192, 1),
+            ("material", "Object's surface", material_names()),
+            ("scene", "Scene", SCENES),
+            ("crop", "Crop", ("box", "mask", "both", "none")),
+            ("seed", "Seed", 0, 50, 1),
+        )
+        with self._place, self._gui.add_folder("Settings") as self._folder:
             self._handles = {
-                "views": gui.add_slider("Views", 1, max(12, now.views), 1, now.views),
-                "view_layout": gui.add_dropdown(
-                    "Layout of views", ("orbit", "jitter"), initial_value=now.view_layout
-                ),
-                "distance": _range(gui, f"Distance{unit}", 0.05, 2 * far, 0.05, now.distance),
-                "elevation": _range(gui, "Elevation (°)", -80.0, 80.0, 1.0, now.elevation),
-                "object_size": _slider(
-                    gui, f"Object's size{unit}", 0.05, 3 * size, 0.05, now.object_size
-                ),
-                "baseline": _slider(
-                    gui, f"Baseline{unit}", 0.005, 4 * now.baseline, 0.005, now.baseline
-                ),
-                "projector": _slider(gui, "Projector ×", 0.0, 4.0, 0.05, now.projector),
-                "room_light": _slider(gui, "Other light ×", 0.0, 20.0, 0.1, now.room_light),
-                "gain": _slider(gui, "Gain ×", 0.1, 8.0, 0.1, now.gain),
-                "image_noise": _slider(gui, "Image noise (grey)", 0.0, 20.0, 0.1, now.image_noise),
-                "method": gui.add_dropdown(
-                    "Matcher", ("opencv-bm", "zncc"), initial_value=now.method
-                ),
-                "block_size": gui.add_slider(
-                    "Block (px)", 5, max(31, now.block_size), 2, now.block_size
-                ),
-                "num_disparities": gui.add_slider(
-                    "Disparities",
-                    min(16, now.num_disparities),
-                    max(512, now.num_disparities),
-                    1 if now.num_disparities % 16 else 16,
-                    now.num_disparities,
-                ),
-                "stride": gui.add_slider("Pixel stride", 1, max(8, now.stride), 1, now.stride),
-                "samples": gui.add_slider("Rays a pixel", 1, max(64, now.samples), 1, now.samples),
-                "num_points": gui.add_slider(
-                    "Points", min(64, now.num_points), max(8192, now.num_points), 1, now.num_points
-                ),
-                "material": gui.add_dropdown("Object's surface", material_names()),
-                "scene": gui.add_dropdown("Scene", SCENES, initial_value=now.scene),
-                "crop": gui.add_dropdown(
-                    "Crop", ("box", "mask", "none"), initial_value=now.crop
-                ),
-                "seed": gui.add_slider("Seed", 0, max(50, now.seed), 1, now.seed),
-            }  # fmt: skip
+                name: self._control(getattr(now, name), label, *bounds)
+                for name, label, *bounds in rows
+            }
         for handle in self._handles.values():
-            handle.on_update(lambda _: self._ask())
+            handle.on_update(self._ask)
 
-
-def _slider(gui: Any, name: str, low: float, high: float, step: float, value: float) -> Any:
-    return gui.add_slider(name, float(min(low, value)), float(max(high, value)), step, float(value))
-
-
-def _range(
-    gui: Any, name: str, low: float, high: float, step: float, values: tuple[float, float]
-) -> Any:
-    first, last = map(float, values)
-    return gui.add_multi_slider(name, min(low, first), max(high, last), step, (first, last))
+    def _control(self, value: Any, label: str, *bounds: Any) -> Any:
+        """A dropdown or a slider; a slider's bounds make way for the value it begins with."""
+        if isinstance(bounds[0], tuple):
+            return self._gui.add_dropdown(label, bounds[0], initial_value=value)
+        low, high, step = bounds
+        if isinstance(value, tuple):
+            first, last = map(float, value)
+            return self._gui.add_multi_slider(
+                label, min(low, first), max(high, last), step, (first, last)
+            )
+        kind = type(step)
+        ends = kind(min(low, value)), kind(max(high, value))
+        return self._gui.add_slider(label, *ends, step, kind(value))

@@ -4,27 +4,12 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Generic, Literal, TypeVar
 
 Settings = TypeVar("Settings")
 Result = TypeVar("Result")
 
 _LOG = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Outcome(Generic[Settings, Result]):
-    """What became of the settings that were asked for last."""
-
-    settings: Settings
-    """Those settings."""
-    result: Result | None
-    """What the work gave; None where it failed."""
-    error: Exception | None
-    """Why it failed; None where it did not."""
-    seconds: float
-    """How long it took."""
 
 
 class Rescanner(Generic[Settings, Result]):
@@ -34,10 +19,11 @@ class Rescanner(Generic[Settings, Result]):
     under way is finished, as a renderer cannot be stopped, but never shown.
 
     Example:
-        >>> seen, done = [], threading.Event()
-        >>> worker = Rescanner(lambda x: 2 * x, lambda o: (seen.append(o.result), done.set()), 0.0)
+        >>> results, done = [], threading.Event()
+        >>> show = lambda result: (results.append(result), done.set())
+        >>> worker = Rescanner(lambda x: 2 * x, show, delay=0.0)
         >>> worker.ask(21)
-        >>> done.wait(10), seen
+        >>> done.wait(10), results
         (True, [42])
         >>> worker.close()
         True
@@ -46,7 +32,8 @@ class Rescanner(Generic[Settings, Result]):
     def __init__(
         self,
         work: Callable[[Settings], Result],
-        show: Callable[[Outcome[Settings, Result]], object],
+        show: Callable[[Result], object],
+        fail: Callable[[Exception], object] = lambda error: None,
         delay: float = 0.3,
         tell: Callable[[Literal["waiting", "working"]], object] = lambda state: None,
     ) -> None:
@@ -54,11 +41,13 @@ class Rescanner(Generic[Settings, Result]):
 
         Args:
             work: Turns settings into a result; may raise anything.
-            show: Takes the outcome of the last settings, failed or not; called in the thread.
+            show: Takes the result of the last settings; called in the thread.
+            fail: Takes the fault of the last settings; called in the thread.
             delay: Seconds without a change before the work begins.
             tell: Takes the state when it changes; called in the thread, or in that of `ask`.
         """
-        self._work, self._show, self._tell, self._delay = work, show, tell, delay
+        self._work, self._show, self._fail = work, show, fail
+        self._tell, self._delay = tell, delay
         self._news = threading.Condition()
         self._asked: tuple[int, Settings, float] | None = None
         self._number = 0
@@ -87,17 +76,14 @@ class Rescanner(Generic[Settings, Result]):
         while (asked := self._next()) is not None:
             number, settings = asked
             self._guard(self._tell, "working")
-            begun = time.perf_counter()
-            result, error = None, None
             try:
-                result = self._work(settings)
-            except Exception as caught:
-                error = caught
-            seconds = time.perf_counter() - begun
+                show, outcome = self._show, self._work(settings)
+            except Exception as error:
+                show, outcome = self._fail, error
             with self._news:
                 overtaken = self._closed or number != self._number
             if not overtaken:
-                self._guard(self._show, Outcome(settings, result, error, seconds))
+                self._guard(show, outcome)
 
     def _next(self) -> tuple[int, Settings] | None:
         """Wait for settings that nothing has changed for a while; None when closed."""

@@ -11,9 +11,9 @@ from qs3.sensor.matching.settings import Method
 from qs3.sensor.materials import MATERIALS, get_material
 from qs3.sensor.presets import Sensor
 from qs3.sensor.scan import Scan, scan
-from qs3.sensor.surroundings import SceneSettings
+from qs3.sensor.settings import ScanSettings
 from qs3.sensor.views import ViewLayout
-from qs3.viewer.exhibits import STATISTICS, Exhibit
+from qs3.viewer.exhibits import STATISTICS, Exhibit, statistics
 
 SCENES = ("alone", "floor", "wall", "room")
 OWN_MATERIAL = "of the sensor"
@@ -61,7 +61,7 @@ class ScanControls:
     """Surface of the object by name, or the sensor's own."""
     scene: str = "alone"
     """What stands around the object."""
-    crop: Literal["box", "mask", "none"] = "box"
+    crop: Literal["box", "mask", "both", "none"] = "box"
     """Keep points in the object's box, or pixels that truly show it, or all."""
 
     @classmethod
@@ -135,17 +135,16 @@ def rescan(
     request: ScanRequest,
     mesh: trimesh.Trimesh,
     name: str,
-    renderer: Any,
-    size: Literal["box", "ball"] = "box",
+    settings: ScanSettings,
 ) -> Exhibit:
     """Scan a mesh with the settings of the page.
 
     Args:
-        request: Those settings.
+        request: Sensor and sliders.
         mesh: The object.
         name: What the page calls it.
-        renderer: A renderer whose settings are a frozen dataclass with ``samples``.
-        size: Longest side 1, or the unit ball, times the object's size.
+        settings: What has no slider; its renderer is a frozen dataclass with ``samples``, its
+            sensor is not looked at.
 
     Raises:
         InputError: where the settings make no sensor, or the sensor sees nothing.
@@ -153,29 +152,28 @@ def rescan(
     how = request.controls
     if how.scene not in SCENES:
         raise InputError(f"scene: no {how.scene!r} here; choose one of {', '.join(SCENES)}")
+    renderer: Any = settings.make_renderer()
+    renderer = dataclasses.replace(renderer, samples=how.samples)
     done = scan(
         mesh,
-        sensor=how.sensor(request.sensor),
+        settings.with_sensor(how.sensor(request.sensor), renderer),
         views=how.views,
         view_layout=how.view_layout,
         seed=how.seed,
-        size=size,
         num_points=how.num_points,
-        scene=SceneSettings(how.scene),
-        box_crop=how.crop == "box",
-        mask_crop=how.crop == "mask",
-        renderer=dataclasses.replace(renderer, samples=how.samples),
+        scene=dataclasses.replace(settings.make_scene(), layout=how.scene),
+        crop=how.crop,
     )
     return exhibit_of(done, name)
 
 
 def exhibit_of(done: Scan, name: str, class_name: str = "") -> Exhibit:
     """A scan as something to show."""
-    facts = [("fused points", str(done.fused_points))]
-    for key, (label, form) in STATISTICS.items():
-        known = [value for view in done.views if (value := getattr(view, key)) is not None]
-        if known:
-            facts.append((label, f"{sum(known) / len(known):{form}}"))
+    means = {}
+    for name in STATISTICS:
+        values = [value for view in done.views if (value := getattr(view, name)) is not None]
+        means[name] = sum(values) / len(values) if values else None
+    facts = [("fused points", str(done.fused_points)), *statistics(means)]
     facts.append(("scanned in", f"{sum(done.seconds.values()):.1f} s"))
     return Exhibit(
         name=name,

@@ -14,16 +14,16 @@ from qs3.errors import InputError
 from qs3.io.clouds import CloudKind
 from qs3.io.layouts.format import Format
 from qs3.io.ragged import RaggedClouds
-from qs3.store.folder import Folder, LocalFolder, open_folder
+from qs3.store.folder import Folder, open_folder
 from qs3.store.manifest import (
     Manifest,
     finished_shards,
     open_dataset,
+    package_versions,
     shard_name,
     write_manifest,
     write_sums,
 )
-from qs3.store.versions import package_versions
 
 ROWS_PER_SHARD = 64
 _MANY = 500
@@ -93,15 +93,11 @@ def _read_shard(
 ) -> tuple[list[list[Any]], list[np.ndarray], bytes]:
     """Ids, labels and splits of a shard, one kind of its clouds, and the checksum of all that."""
     # Imported here: listing layouts does without Parquet, which weighs.
-    from qs3.store.shards import flat_clouds, parse_shard, read_shard
+    from qs3.store.shards import flat_clouds, load_shard
 
-    name = shard_name(index)
-    path = f"{folder}/{name}"
+    path = f"{folder}/{shard_name(index)}"
     wanted = ["id", "label", "split", cloud]
-    if isinstance(folder, LocalFolder):
-        table = read_shard(folder.path / name, wanted)  # these columns alone, not the whole file
-    else:
-        table = parse_shard(folder.read(name), path, wanted)
+    table = load_shard(folder, index, wanted)
     columns = [table[column].to_pylist() for column in wanted[:3]]
     if cloud != "points" and len(table) and not len(table[cloud].combine_chunks().values):
         raise InputError(f"{folder}: has no {cloud!r} clouds, only 'points'")
@@ -148,9 +144,9 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
     with bar:
         for index, start in enumerate(starts):
             rows = [_row(clouds, i) for i in range(start, min(start + ROWS_PER_SHARD, count))]
-            sums[shard_name(index)] = put_shard(LocalFolder(root), index, table_of(rows))
+            sums[shard_name(index)] = put_shard(open_folder(root), index, table_of(rows))
             bar.update(len(rows))
-    write_sums(LocalFolder(root), sums)
+    write_sums(open_folder(root), sums)
 
 
 def _row(clouds: RaggedClouds, index: int) -> Any:

@@ -1,4 +1,4 @@
-"""The part of the page that every view shares: the cloud, its colours, the legend, what is told."""
+"""The part that both pages share: the cloud, its colours, the legend and the facts."""
 
 import html
 import logging
@@ -11,14 +11,13 @@ from qs3.errors import QS3Error
 from qs3.io.clouds import CloudKind
 from qs3.viewer.display import compose, frame_of, modes
 from qs3.viewer.exhibits import KINDS, Answers, Exhibit
-from qs3.viewer.rescan import Outcome
 
 _LOG = logging.getLogger(__name__)
 _CAMERA = (-0.9, -1.5, 0.7)
 _BLOCK = '<div style="padding:0.2em 0.9em;font-size:0.85em;line-height:1.45">{}</div>'
 
 
-class Stage:
+class Canvas:
     """Draws one exhibit at a time on a viser server."""
 
     def __init__(self, server: Any, answers: Answers | None = None) -> None:
@@ -57,19 +56,19 @@ class Stage:
         for handle in (self._kind, self._mode, self._limit, self._size, self._mesh):
             handle.on_update(lambda _: self.redraw())
 
-    def take(self, exhibit: Exhibit, row: int = 0) -> None:
-        """Show an exhibit from now on."""
+    def show(self, exhibit: Exhibit, row: int = 0) -> None:
+        """Show an exhibit from now on; ``row`` is its own among the network's answers."""
         with self._lock:
             self._shown = exhibit, row
             self.say("")
             self.redraw()
 
     def say(self, text: str) -> None:
-        """Tell a state, such as that a scan is under way; empty takes it away."""
+        """State what is under way, such as a scan; empty takes it away."""
         self._state.content = _BLOCK.format(f"<i>{html.escape(text)}</i>") if text else ""
 
     def fail(self, error: Exception) -> None:
-        """Tell a fault; it stays until something is shown or told again."""
+        """State a fault; it stays until something is shown or said again."""
         if isinstance(error, QS3Error):
             text = str(error)
         else:
@@ -81,15 +80,8 @@ class Stage:
                 f'<div style="color:#b00020" role="alert"><b>{html.escape(text)}</b>{before}</div>'
             )
 
-    def outcome(self, outcome: Outcome[Any, tuple[Exhibit, int]]) -> None:
-        """Show the exhibit of a worker, or its fault."""
-        if outcome.error is not None:
-            self.fail(outcome.error)
-        elif outcome.result is not None:
-            self.take(*outcome.result)
-
     def redraw(self) -> None:
-        """Draw the exhibit with the look that the controls tell."""
+        """Draw the exhibit with the look that the controls ask for."""
         with self._lock:
             if self._shown is None:
                 return

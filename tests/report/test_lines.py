@@ -8,7 +8,7 @@ import pytest
 from qs3.evaluation import score
 from qs3.evaluation.metrics import mean_sem
 from qs3.evaluation.records import DataRecord, RunRecord
-from qs3.report import NamedRecord, score_lines
+from qs3.report.lines import NamedRecord, score_lines
 
 NAMES = ("bed", "table")
 

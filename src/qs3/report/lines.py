@@ -1,4 +1,4 @@
-"""The table of all records: mean ± SEM over seeds, published values beside them."""
+"""Lines of the table of all records: mean ± SEM over seeds, published values beside them."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,7 @@ from jaxtyping import Int
 
 from qs3.evaluation.metrics import MeanSEM, mean_sem
 from qs3.evaluation.records import RunRecord
-from qs3.evaluation.tables import shared
+from qs3.evaluation.tables import frame
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,21 @@ class NamedRecord:
     published: str = ""
     """What was published for this line."""
 
+    @property
+    def line(self) -> str:
+        """Name of its line: the task, and the method where the task does not say it."""
+        method = self.record.method
+        if not self.task:
+            return method
+        return self.task if self.task.endswith(method) else f"{self.task} ({method})"
+
+    @property
+    def data(self) -> str:
+        """Source → target, and what was scored."""
+        ways = [self.record.source, self.record.target]
+        names = " → ".join(data.label for data in ways if data is not None)
+        return f"{names}; scored on {self.record.test.label}"
+
 
 @dataclass(frozen=True)
 class ScoreLine:
@@ -38,7 +53,7 @@ class ScoreLine:
     data: str
     """Source → target, and what was scored."""
     selection: str
-    """Rule that chose the model."""
+    """Rule that chose the network."""
     accuracy: MeanSEM
     """Accuracy over seeds."""
     class_mean_accuracy: MeanSEM
@@ -46,7 +61,7 @@ class ScoreLine:
     class_names: tuple[str, ...]
     """Classes in the order of the matrix."""
     confusion: Int[np.ndarray, "k columns"]
-    """Counts [true, predicted], summed over seeds."""
+    """Counts [true, predicted], summed over seeds; the last column is none of the classes."""
     seeds: tuple[int, ...]
     """Seeds of the runs, sorted."""
     differs: str = ""
@@ -72,36 +87,34 @@ def score_lines(records: Sequence[NamedRecord]) -> tuple[tuple[ScoreLine, ...], 
         The lines, and a message for each record that had to be left out: another one of its line
         has the same seed and other scores.
     """
-    groups: dict[tuple[str, ...], list[NamedRecord]] = {}
-    for one in records:
-        groups.setdefault(_key(one), []).append(one)
+    fields = [{"line": named.line, "data": named.data, "named": named} for named in records]
+    table = frame([named.record for named in records], fields)
     lines, faults = [], []
-    for runs in groups.values():
-        alike: dict[str, list[NamedRecord]] = {}
-        for one in runs:
-            alike.setdefault(json.dumps(shared(one.record), sort_keys=True), []).append(one)
-        told = _differences([json.loads(text) for text in alike])
-        for differs, kin in zip(told, alike.values(), strict=True):
-            kept: dict[int, NamedRecord] = {}
-            for one in kin:
-                first = kept.setdefault(one.record.seed, one)
-                if first.record.scores != one.record.scores:
+    names = ["line", "network", "data", "selection", "marks"]
+    for _, group in table.groupby(names, sort=False) if records else ():
+        differences = _differences([json.loads(text) for text in group["alike"].unique()])
+        parts = group.groupby("alike", sort=False)["named"]
+        for differs, (_, alike) in zip(differences, parts, strict=True):
+            runs: dict[int, NamedRecord] = {}
+            for named in alike:
+                first = runs.setdefault(named.record.seed, named)
+                if first.record.scores != named.record.scores:
                     faults.append(
-                        f"{one.name}: other scores than {first.name} for the same run and seed "
-                        f"{one.record.seed}; remove one of them"
+                        f"{named.name}: other scores than {first.name} for the same run and seed "
+                        f"{named.record.seed}; remove one of them"
                     )
-            lines.append(_line([kept[seed] for seed in sorted(kept)], differs))
+            lines.append(_line([runs[seed] for seed in sorted(runs)], differs))
     return tuple(lines), tuple(faults)
 
 
 def _line(runs: Sequence[NamedRecord], differs: str) -> ScoreLine:
-    records = [one.record for one in runs]
+    records = [named.record for named in runs]
     first = records[0]
-    rules = dict.fromkeys(rule for record in records for rule in record.choices)
+    rules = [rule for rule in first.choices if all(rule in record.choices for record in records)]
     return ScoreLine(
-        name=_name(runs[0]),
+        name=runs[0].line,
         network=first.model,
-        data=_data(first),
+        data=runs[0].data,
         selection=first.selection,
         accuracy=mean_sem([record.scores.accuracy for record in records]),
         class_mean_accuracy=mean_sem([record.scores.class_mean_accuracy for record in records]),
@@ -109,53 +122,34 @@ def _line(runs: Sequence[NamedRecord], differs: str) -> ScoreLine:
         confusion=np.sum([np.array(record.scores.confusion) for record in records], axis=0),
         seeds=tuple(record.seed for record in records),
         differs=differs,
-        published=next((one.published for one in runs if one.published), ""),
+        published=next((named.published for named in runs if named.published), ""),
         choices={
             rule: mean_sem([float(record.choices[rule]["accuracy"]) for record in records])
             for rule in rules
-            if all(rule in record.choices for record in records)
         },
         marks=first.marks,
     )
 
 
-def _name(one: NamedRecord) -> str:
-    method = one.record.method
-    return (
-        f"{one.task} ({method})"
-        if one.task and not one.task.endswith(method)
-        else (one.task or method)
-    )
-
-
-def _key(one: NamedRecord) -> tuple[str, ...]:
-    record = one.record
-    return (_name(one), record.model, _data(record), record.selection, *record.marks)
-
-
-def _data(record: RunRecord) -> str:
-    ways = [data.label for data in (record.source, record.target) if data is not None]
-    return f"{' → '.join(ways)}; scored on {record.test.label}"
-
-
 def _differences(shared: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What is not the same in all of ``shared``, told for each of them."""
-    flat = [_flat(one) for one in shared]
-    names = sorted({name for one in flat for name in one})
-    odd = [name for name in names if len({one.get(name, "–") for one in flat}) > 1]
-    told = []
-    for one in flat:
+    """What is not the same in all of ``shared``, as text for each of them."""
+    flat = [_flat(values) for values in shared]
+    names = sorted({name for values in flat for name in values})
+    odd = [name for name in names if len({values.get(name, "–") for values in flat}) > 1]
+    texts = []
+    for values in flat:
         parts = []
         for name in odd:
-            value, short = one.get(name, "–"), name.rpartition(".")[2]
+            value, short = values.get(name, "–"), name.rpartition(".")[2]
             if name.startswith("data."):
                 value, short = value.strip('"')[:8], f"{short} data"
             parts.append(f"{short} {value}")
-        told.append(", ".join(parts))
-    return told
+        texts.append(", ".join(parts))
+    return texts
 
 
 def _flat(value: Any, name: str = "") -> dict[str, str]:
+    """Leaves of nested mappings as JSON, by dotted name."""
     if not isinstance(value, Mapping):
         return {name: json.dumps(value)}
     items: dict[str, str] = {}

@@ -1,0 +1,93 @@
+"""Is A better than B? Over the seeds that both ran, or cloud by cloud for two runs."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool
+
+
+@dataclass(frozen=True)
+class SeedComparison:
+    """Mean difference of two methods over seeds that both ran."""
+
+    mean: float
+    """Arithmetic mean of first minus second."""
+    interval: tuple[float, float] | None
+    """Student's 95 % interval of the mean (ddof = 1); None for a single seed."""
+    n: int
+    """Number of seeds."""
+
+    def format(self, scale: float = 100.0, digits: int = 1) -> str:
+        """Return the value as text, by default in points of a percentage.
+
+        Example:
+            >>> compare_seeds({0: 0.6, 1: 0.7}, {0: 0.5, 1: 0.5}).format()
+            '+15.0 points (95 % interval -48.5 to +78.5, n=2)'
+        """
+        value = f"{scale * self.mean:+.{digits}f} points"
+        if self.interval is None:
+            return f"{value} (one seed, no interval)"
+        low, high = (f"{scale * end:+.{digits}f}" for end in self.interval)
+        return f"{value} (95 % interval {low} to {high}, n={self.n})"
+
+
+@dataclass(frozen=True)
+class CloudComparison:
+    """Clouds that one of two networks has right and the other wrong."""
+
+    first_only: int
+    """Number of clouds that the first alone has right."""
+    second_only: int
+    """Number of clouds that the second alone has right."""
+    p: float
+    """Two-sided p-value of such a difference, or a larger one, between equals."""
+
+
+def compare_seeds(first: Mapping[int, float], second: Mapping[int, float]) -> SeedComparison | None:
+    """Compare two methods seed by seed; a seed that one of them lacks is left out.
+
+    Args:
+        first: Score by seed.
+        second: Score by seed.
+
+    Returns:
+        First minus second; None where they share no seed.
+    """
+    from scipy.special import stdtrit  # the quantile of Student's t; scipy.stats loads slowly
+
+    seeds = sorted(set(first) & set(second))
+    if not seeds:
+        return None
+    values = np.array([first[seed] - second[seed] for seed in seeds])
+    mean, n = float(values.mean()), len(values)
+    if n == 1:
+        return SeedComparison(mean, None, n)
+    half = float(stdtrit(n - 1, 0.975)) * float(values.std(ddof=1)) / math.sqrt(n)
+    return SeedComparison(mean, (mean - half, mean + half), n)
+
+
+def mcnemar(
+    first_right: Bool[np.ndarray, "b"], second_right: Bool[np.ndarray, "b"]
+) -> CloudComparison:
+    """Compare two networks on the same clouds: McNemar's test, exact form.
+
+    A sign test on the clouds on which they differ (McNemar, Psychometrika 1947); where there are
+    none, p is 1.
+
+    Args:
+        first_right: Whether the first has each cloud right.
+        second_right: The same of the second, in the same order.
+
+    Example:
+        >>> mcnemar(np.array([True, False, False]), np.array([True, True, True]))
+        CloudComparison(first_only=0, second_only=2, p=0.5)
+    """
+    from scipy.stats import binomtest  # slow to load, and not needed to read records
+
+    first_only = int((first_right & ~second_right).sum())
+    second_only = int((second_right & ~first_right).sum())
+    differing = first_only + second_only
+    p = float(binomtest(first_only, differing).pvalue) if differing else 1.0
+    return CloudComparison(first_only, second_only, p)

@@ -1,0 +1,160 @@
+"""Parts of a page, made from networks, clouds and the history of runs."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int
+
+from qs3.errors import InputError
+from qs3.evaluation.records import score
+from qs3.files import parse_json
+from qs3.io.clouds import PointClouds
+from qs3.report.contents import Cloud, FeatureMap, Scored
+from qs3.report.embedding import embed
+from qs3.report.plots import Curve, SelectionRound
+from qs3.training.batches import prepare
+from qs3.training.checkpoint import LoadedModel
+from qs3.training.predict import describe, predict_probabilities
+from qs3.training.records import HISTORY
+
+_MAPPED = 400  # clouds of a domain on a map: beyond that dots hide one another
+
+
+def score_network(
+    name: str, loaded: LoadedModel, target: PointClouds
+) -> tuple[Scored, Int[np.ndarray, "b"]]:
+    """Score a network on labelled clouds, and return its answers too."""
+    answers = predict_probabilities(loaded.model, target.points).argmax(axis=1)
+    scores = score(target.labels, answers, target.class_names)
+    return Scored(name, scores, answers == target.labels), answers
+
+
+def show_clouds(
+    domains: Mapping[str, PointClouds],
+    count: int,
+    answers: Mapping[str, Mapping[str, Int[np.ndarray, "b"]]],
+) -> dict[str, list[Cloud]]:
+    """Choose up to ``count`` clouds of each domain, evenly over the classes, first ones first.
+
+    Args:
+        domains: Labelled clouds by domain.
+        count: Clouds of a domain.
+        answers: Of a domain, what each network took its clouds for.
+    """
+    shown = {}
+    for domain, clouds in domains.items():
+        names, given = clouds.class_names, answers.get(domain, {})
+        shown[domain] = []
+        for row in even_rows(clouds.labels, count):
+            taken = [f"{names[classes[row]]} ({network})" for network, classes in given.items()]
+            note = f"Taken for {', '.join(taken)}" if taken else ""
+            shown[domain].append(Cloud(clouds.points[row], names[clouds.labels[row]], note))
+    return shown
+
+
+def even_rows(labels: Int[np.ndarray, "b"], count: int) -> list[int]:
+    """Up to ``count`` rows: the first of each class, then the second of each, in rising order.
+
+    Example:
+        >>> even_rows(np.array([0, 0, 0, 1]), 3)
+        [0, 1, 3]
+    """
+    rank = np.zeros(len(labels), np.int64)
+    for label in np.unique(labels):
+        rows = np.flatnonzero(labels == label)
+        rank[rows] = np.arange(len(rows))
+    return sorted(np.lexsort((labels, rank))[:count].tolist())
+
+
+def feature_maps(
+    models: Mapping[str, LoadedModel], domains: Mapping[str, PointClouds]
+) -> tuple[FeatureMap, ...]:
+    """Features of each network on both domains, in the plane; none where clouds are too few."""
+    mapped = {
+        name: clouds.select(np.array(even_rows(clouds.labels, _MAPPED), np.int64))
+        for name, clouds in domains.items()
+    }
+    labels = np.concatenate([clouds.labels for clouds in mapped.values()])
+    kinds = tuple(name for name, clouds in mapped.items() for _ in range(len(clouds)))
+    maps = []
+    for name, loaded in models.items():
+        features = [
+            describe(loaded.model, prepare(clouds.points, clouds.points.shape[1])).features
+            for clouds in mapped.values()
+        ]
+        try:
+            maps.append(FeatureMap(name, embed(np.concatenate(features)), labels, kinds))
+        except InputError:  # a handful of clouds makes no map
+            continue
+    return tuple(maps)
+
+
+def curves(runs: Sequence[Path]) -> tuple[tuple[Curve, ...], tuple[float, ...]]:
+    """Losses and accuracy over the epochs of runs that follow one another, and where rounds begin.
+
+    Raises:
+        InputError: where a history is damaged.
+    """
+    lines: dict[tuple[str, str], tuple[list[float], list[float]]] = {}
+    epoch, marks = 0, []
+    for stage, epochs in (stage for run in runs for stage in _history(run)):
+        if stage == "round":
+            marks.append(epoch + 0.5)
+        for losses, accuracy in epochs:
+            epoch += 1
+            values = {("loss", name): value for name, value in losses.items()}
+            if accuracy is not None:
+                values["accuracy in training", "labelled clouds, augmented"] = accuracy
+            for key, value in values.items():
+                x, y = lines.setdefault(key, ([], []))
+                x.append(float(epoch))
+                y.append(value)
+    drawn = [
+        Curve(name, np.array(x), np.array(y), panel) for (panel, name), (x, y) in lines.items()
+    ]
+    return tuple(drawn), tuple(marks)
+
+
+def _history(run: Path) -> list[tuple[str, list[tuple[dict[str, float], float | None]]]]:
+    """Losses and accuracy of the epochs of each line of a run's history."""
+    path = run / HISTORY
+    if not path.is_file():
+        return []
+    stages = []
+    try:
+        for text in path.read_text(encoding="utf-8").splitlines():
+            line = parse_json(text, path)
+            if line["kind"] == "epoch":
+                stages.append(("epoch", [(line["losses"], line["accuracy"])]))
+            elif line["kind"] == "round":
+                pairs = zip(line["losses"], line["accuracies"], strict=True)
+                stages.append(("round", list(pairs)))
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: not the history of a run ({error})") from error
+    return stages
+
+
+def selection_rounds(
+    rounds: Sequence[Mapping[str, Any]], where: str | Path
+) -> tuple[SelectionRound, ...]:
+    """What each round of self-training selected, from the rounds of a record or a run.
+
+    Raises:
+        InputError: where a round lacks a field.
+    """
+    try:
+        return tuple(
+            SelectionRound(
+                index=done["round"],
+                theta=float(done["theta"]),
+                confident=np.array(done["confident"], np.int64),
+                kept=np.array(done["kept"], np.int64),
+                agreement=done["agreement"],
+                note="skipped: fewer than two a class" if done["skipped"] else "",
+            )
+            for done in rounds
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{where}: not a round of self-training ({error})") from error
