@@ -113,8 +113,8 @@ def test_convention_not_mirrored(room: Room) -> None:
 def test_convention_z_is_up_after_alignment(tmp_path: Path, room: Room) -> None:
     """The back of the chair is up and behind, and the cloud stands over the origin."""
     straight = write_room(tmp_path / "scans", tilt=False, apart=0.03)
-    for one in (room, straight):
-        points = extract(one)[CHAIR].points
+    for place in (room, straight):
+        points = extract(place)[CHAIR].points
         np.testing.assert_allclose(points.min(axis=0)[2], 0.0, atol=1e-6)
         np.testing.assert_allclose(points[:, :2].min(axis=0), -points[:, :2].max(axis=0), atol=1e-5)
         assert 0.88 < points[:, 2].max() < 0.96
@@ -307,9 +307,9 @@ BAD_MASKS = {
 
 @pytest.mark.parametrize("fault", BAD_MASKS)
 def test_a_bad_mask_is_one_line(tmp_path: Path, fault: str) -> None:
-    content, told = BAD_MASKS[fault]
+    content, message = BAD_MASKS[fault]
     path = write_masks(tmp_path / "a.zip", {7: content})
-    with masks_of(path) as masks, pytest.raises(InputError, match=told) as caught:
+    with masks_of(path) as masks, pytest.raises(InputError, match=message) as caught:
         masks.read(7)
     assert "a.zip: instance-filt/7.png" in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -321,8 +321,8 @@ def test_a_zip_bomb_is_not_unpacked(tmp_path: Path) -> None:
         archive.writestr("instance-filt/0.png", bytes(50 * 2**20))
     content = bytearray(path.read_bytes())
     honest = struct.pack("<I", 50 * 2**20)
-    for told in (honest, struct.pack("<I", 2000)):
-        path.write_bytes(content.replace(honest, told))
+    for message in (honest, struct.pack("<I", 2000)):
+        path.write_bytes(content.replace(honest, message))
         tracemalloc.start()
         with (
             masks_of(path) as masks,
@@ -378,28 +378,28 @@ def test_scenes_and_splits(tmp_path: Path) -> None:
     assert [s.id for s in list_scenes(tmp_path, splits={"scene0001_00": "train"})] == [
         "scene0001_00"
     ]
-    one = list_scenes(tmp_path / "scans" / "scene0001_00")
-    assert [s.id for s in one] == ["scene0001_00"]
-    assert pickle.loads(pickle.dumps(one)) == one  # noqa: S301
+    place = list_scenes(tmp_path / "scans" / "scene0001_00")
+    assert [s.id for s in place] == ["scene0001_00"]
+    assert pickle.loads(pickle.dumps(place)) == place  # noqa: S301
 
 
 def test_wrong_scenes_and_splits_are_one_line(tmp_path: Path) -> None:
     (tmp_path / "scene0000_00").mkdir()
-    for root, names, told in (
+    for root, names, message in (
         (tmp_path / "none", None, "no such folder"),
         (tmp_path, ["scene0005_00"], "has no scene"),
         (tmp_path, ["../etc"], "has no scene"),
         (tmp_path, [], "none of the scenes"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             list_scenes(root, names)
     list_file = tmp_path / "list.txt"
-    for content, told in (
+    for content, message in (
         (b"scene0000_00\n../../etc/passwd\n", "line 2 is no scene"),
         (b"\xff\xfe", "no text"),
     ):
         list_file.write_bytes(content)
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             read_splits(list_file)
     list_file.write_text("scene0000_00")
     with pytest.raises(InputError, match="other split"):

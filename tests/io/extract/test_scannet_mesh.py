@@ -113,9 +113,9 @@ BAD = {
 
 @pytest.mark.parametrize("fault", BAD)
 def test_bad_files_are_one_line(tmp_path: Path, fault: str) -> None:
-    name, content, told = BAD[fault]
+    name, content, message = BAD[fault]
     scene = scene_with(tmp_path, name, content)
-    with pytest.raises(InputError, match=told) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         list(cut_mesh_scene(scene, SETTINGS))
     assert str(tmp_path / name) in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -104,9 +104,9 @@ BAD_HEADERS = {
 
 @pytest.mark.parametrize("fault", BAD_HEADERS)
 def test_a_bad_file_is_one_line(tmp_path: Path, fault: str) -> None:
-    sens, told = BAD_HEADERS[fault]
+    sens, message = BAD_HEADERS[fault]
     path = sens.write(tmp_path / "a.sens")
-    with pytest.raises(InputError, match=told) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         list(read_depth_frames(path))
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -38,8 +38,8 @@ def test_a_round_trip_keeps_points_labels_classes_and_splits(tmp_path, source, f
     first, _ = read_clouds(source)
     assert origin == to
     assert other.class_names == back.class_names == POINTDA10
-    assert formats.told(other) == formats.told(first)
-    assert formats.told(back) == formats.told(first)
+    assert formats.content(other) == formats.content(first)
+    assert formats.content(back) == formats.content(first)
     # Names survive as well, whatever lies between.
     assert sorted(back.ids) == sorted(first.ids)
 

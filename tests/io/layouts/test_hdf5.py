@@ -159,8 +159,8 @@ def plugin(file, arrays, folder):
     plist.set_chunk((6, 8, 6))
     plist.set_filter(32001, h5py.h5z.FLAG_OPTIONAL)
     space = h5py.h5s.create_simple((6, 8, 6))
-    found = h5py.h5d.create(file.id, b"data", h5py.h5t.IEEE_F32LE, space, plist)
-    found.write(space, space, arrays["data"])
+    dataset = h5py.h5d.create(file.id, b"data", h5py.h5t.IEEE_F32LE, space, plist)
+    dataset.write(space, space, arrays["data"])
 
 
 def point(value, kind="<f4"):

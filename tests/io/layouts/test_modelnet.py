@@ -98,7 +98,7 @@ def test_what_is_written_is_read_by_the_published_description(tmp_path, rng, for
     write_modelnet_h5(tmp_path / "a", given)
     # h5py alone: files by list, data [b n 3] float32, label [b 1] uint8, names a line each.
     names = (tmp_path / "a" / "shape_names.txt").read_text().split()
-    found = []
+    rows = []
     for part in ("train", "test"):
         for line in (tmp_path / "a" / f"{part}_files.txt").read_text().split():
             assert line.startswith("data/modelnet40_ply_hdf5_2048/ply_data_")
@@ -109,8 +109,8 @@ def test_what_is_written_is_read_by_the_published_description(tmp_path, rng, for
             assert label.shape == (len(data), 1)
             turned = np.stack([data[..., 0], -data[..., 2], data[..., 1]], axis=-1)
             for cloud, row in zip(turned, label[:, 0], strict=True):
-                found.append((names[row], part, np.ascontiguousarray(cloud).tobytes()))
-    assert sorted(found) == formats.told(given)
+                rows.append((names[row], part, np.ascontiguousarray(cloud).tobytes()))
+    assert sorted(rows) == formats.content(given)
 
 
 def test_a_part_of_the_forty_gets_their_labels_and_others_keep_their_own(tmp_path, rng, formats):
@@ -118,13 +118,13 @@ def test_a_part_of_the_forty_gets_their_labels_and_others_keep_their_own(tmp_pat
     write_modelnet_h5(tmp_path / "a", some)
     back = read_modelnet_h5(tmp_path / "a")
     assert back.class_names == CLASSES
-    assert formats.told(back) == formats.told(some)
+    assert formats.content(back) == formats.content(some)
     # PointDA-10's cabinet is none of the forty, nor is it taken for one.
     ten = formats.make_clouds(rng, POINTDA10, num_points=4)
     write_modelnet_h5(tmp_path / "b", ten)
     back = read_modelnet_h5(tmp_path / "b")
     assert back.class_names == POINTDA10
-    assert formats.told(back) == formats.told(ten)
+    assert formats.content(back) == formats.content(ten)
 
 
 def test_what_the_layout_cannot_hold_is_refused(tmp_path, rng, formats):

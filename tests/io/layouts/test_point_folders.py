@@ -45,7 +45,7 @@ def test_what_is_written_reads_back_equal(rng, tmp_path, formats, ending, splits
     clouds = formats.make_clouds(rng, ("Night Stand", "Stühle 1", "bed"), 50, 3, splits)
     write_folder(tmp_path / "set", clouds, ending)
     back = read_folder(tmp_path / "set")
-    assert formats.told(back) == formats.told(clouds)
+    assert formats.content(back) == formats.content(clouds)
     assert back.class_names == ("Night Stand", "Stühle 1", "bed")
     if "test" in splits:
         test = read_folder(tmp_path / "set", "test")
