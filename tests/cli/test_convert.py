@@ -92,7 +92,7 @@ def test_clouds_without_labels_are_told_so(typed, tmp_path):
         (("ARCHIVE", "ARCHIVE", "--to", "ply"), ("clouds.npz", "there already")),
         (("missing", "OUT", "--to", "ply"), ("missing", "no such file or folder")),
         (("missing", "OUT", "--to", "ply", "--from", "depthscannet10"),
-         ("https://github.com/Gorilla-Lab-SCUT/QS3", "expected: Scannet_single_obj_1012_new")),
+         ("https://github.com/Gorilla-Lab-SCUT/QS3", "Scannet_single_obj_1012_new")),
     ],
 )  # fmt: skip
 def test_each_fault_is_one_line_and_leaves_nothing(typed, archive, tmp_path, arguments, words):

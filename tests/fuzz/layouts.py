@@ -76,9 +76,9 @@ def written_as(name: str) -> Callable[[Path], None]:
 
 def read_as(name: str) -> Callable[[Path], Any]:
     def load(path: Path) -> Any:
-        from qs3.io.convert import read_clouds
+        from qs3.io.load import read_clouds
 
-        return read_clouds(path, name, None, "points")
+        return read_clouds(path, origin=name)
 
     return load
 

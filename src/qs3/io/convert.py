@@ -10,9 +10,10 @@ from tqdm import tqdm
 
 from qs3.errors import InputError
 from qs3.io.clouds import CloudKind
-from qs3.io.detect import detect, format_named, require
+from qs3.io.detect import format_named
 from qs3.io.layouts import FORMATS
-from qs3.io.layouts.store import read_ragged, write_store
+from qs3.io.layouts.store import write_store
+from qs3.io.load import read_clouds
 from qs3.io.preparation import resample
 from qs3.io.ragged import RaggedClouds
 from qs3.io.whole import check_free, whole
@@ -59,7 +60,7 @@ def convert(
         kin = [name for name in written if name.startswith(to)] or written
         raise InputError(f"{to}: is only read; written are {', '.join(kin)}")
     check_free(target)
-    clouds, name = read_clouds(source, origin, split, cloud)
+    clouds, name = read_clouds(source, split, cloud, origin)
     if classes is not None:
         clouds = _map_classes(clouds, classes, unmapped, str(source))
     clouds = _plain(clouds, num_points, str(source))
@@ -72,27 +73,6 @@ def convert(
         except InputError as error:
             raise InputError(f"{to}: {error}") from error
     return clouds
-
-
-def read_clouds(
-    source: Path, origin: str | None, split: str | None, cloud: CloudKind
-) -> tuple[RaggedClouds, str]:
-    """Read a data set in its layout, named or found out; also return the layout's name.
-
-    Raises:
-        InputError: where it cannot be read.
-    """
-    source = Path(source)
-    if origin is None:
-        layout = detect(source)
-    else:
-        layout = format_named(origin)
-        require(source, layout)
-    if layout.write is write_store:
-        return read_ragged(source, cloud, split), layout.name
-    if cloud != "points":
-        raise InputError(f"{source}: only a qs3 data set has {cloud!r} clouds")
-    return layout.read(source, split), layout.name
 
 
 def _map_classes(

@@ -1,7 +1,6 @@
 """Which layout a path is in, judged by names, and layouts by name."""
 
 import difflib
-from collections.abc import Sequence
 from pathlib import Path
 
 from qs3.errors import InputError
@@ -14,7 +13,7 @@ _GENERAL = tuple(layout.name for layout in _PLAIN)
 
 
 def detect(path: Path) -> Format:
-    """Return the one readable layout that a path looks like.
+    """Return the one layout that a path looks like; plain folders only where no other fits.
 
     Raises:
         InputError: where the path is missing or empty, or fits no layout or several; they are
@@ -22,15 +21,8 @@ def detect(path: Path) -> Format:
     """
     path = Path(path)
     require(path)
-    return one_of(path, matching(path))
-
-
-def one_of(path: Path, fits: Sequence[Format]) -> Format:
-    """Return the one layout that fits.
-
-    Raises:
-        InputError: where none or several fit.
-    """
+    fits = [layout for layout in FORMATS.values() if layout.detect(path)]
+    fits = [layout for layout in fits if layout.name not in _GENERAL] or fits
     if len(fits) == 1:
         return fits[0]
     if not fits:
@@ -38,17 +30,6 @@ def one_of(path: Path, fits: Sequence[Format]) -> Format:
         raise InputError(f"{path}: looks like no layout that is known; these are: {names}")
     several = "; ".join(f"--from {layout.name}: {layout.layout}" for layout in fits)
     raise InputError(f"{path}: could be several layouts; say which: {several}")
-
-
-def matching(path: Path) -> list[Format]:
-    """Return every readable layout that a path looks like; plain folders only where no other."""
-    fits = [layout for layout in FORMATS.values() if layout.detect(path)]
-    return [layout for layout in fits if not is_general(layout)] or fits
-
-
-def is_general(layout: Format) -> bool:
-    """Whether a layout is a plain folder of point files, whose classes carry any names."""
-    return layout.name in _GENERAL
 
 
 def format_named(name: str) -> Format:

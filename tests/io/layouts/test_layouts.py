@@ -38,7 +38,7 @@ def test_what_is_written_reads_back_equal_and_again_gives_equal_bytes(
         layout.write(tmp_path / run, clouds)
     assert files(tmp_path / "a") == files(tmp_path / "b")
     back = layout.read(tmp_path / "a", None)
-    assert formats.told(back) == formats.told(clouds)
+    assert formats.content(back) == formats.content(clouds)
     assert set(back.class_names) == set(clouds.class_names)
     test = layout.read(tmp_path / "a", "test")
     assert set(test.splits) == {"test"}

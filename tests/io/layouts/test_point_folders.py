@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from qs3.errors import InputError
 from qs3.io.layouts.class_folders import read_folder
 from qs3.io.layouts.point_folders import file_stem, write_folder
-from qs3.io.load import load_clouds, load_unlabelled
+from qs3.io.load import load_unlabelled
 from qs3.io.point_files import WRITTEN_FILES, cloud_bytes, read_cloud
 from qs3.io.ragged import RaggedClouds
 
@@ -45,7 +45,7 @@ def test_what_is_written_reads_back_equal(rng, tmp_path, formats, ending, splits
     clouds = formats.make_clouds(rng, ("Night Stand", "Stühle 1", "bed"), 50, 3, splits)
     write_folder(tmp_path / "set", clouds, ending)
     back = read_folder(tmp_path / "set")
-    assert formats.told(back) == formats.told(clouds)
+    assert formats.content(back) == formats.content(clouds)
     assert back.class_names == ("Night Stand", "Stühle 1", "bed")
     if "test" in splits:
         test = read_folder(tmp_path / "set", "test")
@@ -97,15 +97,6 @@ def test_a_class_that_is_named_train_is_a_class(rng, tmp_path):
         np.save(tmp_path / "train" / part / "a.npy", rng.random((4, 3)))
     assert read_folder(tmp_path).class_names == ("train",)
     assert len(read_folder(tmp_path, "test").ids) == 1
-
-
-def test_both_splits_have_one_list_of_classes(rng, tmp_path):
-    for place in ("axe/train", "hammer/train", "hammer/test"):
-        (tmp_path / place).mkdir(parents=True)
-        np.save(tmp_path / place / "a.npy", rng.random((4, 3)))
-    test = load_clouds(tmp_path, split="test", num_points=4)
-    assert test.class_names == ("axe", "hammer")
-    assert test.labels.tolist() == [1]
 
 
 @settings(max_examples=50, deadline=None)
@@ -179,7 +170,7 @@ HOSTILE = {
     "ply rows of nothing": ("a.ply", ply_header(
         "binary_little_endian", f"element void 900000000\nelement vertex 1\n{XYZ}") + bytes(12),
         "lacks the format or a property"),
-    "ply negative": ("a.ply", ply_header("ascii", f"element vertex -1\n{XYZ}"), "cannot be read as ply"),
+    "ply negative": ("a.ply", ply_header("ascii", f"element vertex -1\n{XYZ}"), "read as ply"),
     "ply list": ("a.ply", ply_header(
         "ascii", f"element vertex 2\n{XYZ}\nproperty list int float w") + b"1 2 3 1 2 4 5 6 0",
         "lists in or before"),
@@ -261,9 +252,8 @@ def fuzzed(rng, content: bytes) -> bytes:
     return bytes(data)
 
 
-@pytest.mark.parametrize("count", [60, pytest.param(1500, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("ending", [*WRITTEN_FILES, ".off", "mesh.ply"])
-def test_mutated_files_give_points_or_one_clear_line(rng, tmp_path, ending, count):
+def test_mutated_files_give_points_or_one_clear_line(rng, tmp_path, ending, count=60):
     points = rng.random((40, 3)).astype(np.float32)
     ball = trimesh.creation.icosphere(subdivisions=1)
     whole = {".off": lambda: ball.export(file_type="off").encode(),

@@ -205,15 +205,15 @@ def test_a_loader_from_the_published_description_reads_what_is_written(tmp_path,
     for part in ("train", "test"):
         own = [row for row, split in enumerate(given.splits) if split == part]
         expected = names_and_points([given.clouds[i] for i in own], [labels[i] for i in own])
-        clouds, found = load_npy_as_published(tmp_path / "a" / "modelnet", part)
-        assert names_and_points(clouds, found) == expected
-        data, found = load_h5_as_published(tmp_path / "b" / "scannet", part)
+        clouds, read_labels = load_npy_as_published(tmp_path / "a" / "modelnet", part)
+        assert names_and_points(clouds, read_labels) == expected
+        data, read_labels = load_h5_as_published(tmp_path / "b" / "scannet", part)
         assert data.dtype == np.float32
         assert data.shape == (len(own), 16, 6)
         assert not data[..., 3:].any()
         # y up in the file: x y z there is x, z, −y here.
         back = np.stack([data[..., 0], -data[..., 2], data[..., 1]], axis=-1)
-        assert names_and_points(back, found) == expected
+        assert names_and_points(back, read_labels) == expected
         # What the field's loader would train on.
         for i, cloud in zip(own, data, strict=True):
             if abs(given.clouds[i]).max() < 1e30:
@@ -231,11 +231,11 @@ def test_a_round_trip_is_equal_and_aligned_gives_unit_balls(tmp_path, given, for
     tub = dataclasses.replace(
         given, class_names=tuple(n.replace("tub", "bathtub") for n in given.class_names)
     )
-    assert formats.told(back) == formats.told(tub)
+    assert formats.content(back) == formats.content(tub)
     assert len(set(back.ids)) == 40
     aligned = BY_NAME["pointda10"].read(tmp_path / "a", None)
     balls = dataclasses.replace(tub, clouds=[unit_ball(c[None])[0] for c in given.clouds])
-    assert formats.told(aligned) == formats.told(balls)
+    assert formats.content(aligned) == formats.content(balls)
 
 
 def test_other_sizes_become_2048(tmp_path, rng):
@@ -262,12 +262,12 @@ def test_a_file_holds_2048_clouds(tmp_path, rng):
         ("train",) * count,
     )
     write_h5(tmp_path / "a", given)
-    found = {}
+    counts = {}
     for path in sorted((tmp_path / "a" / "scannet").iterdir()):
         if path.suffix == ".h5":
             with h5py.File(path) as file:
-                found[path.name] = len(file["label"])
-    assert found == {"train_0.h5": 2048, "train_1.h5": 2048, "train_2.h5": 1}
+                counts[path.name] = len(file["label"])
+    assert counts == {"train_0.h5": 2048, "train_1.h5": 2048, "train_2.h5": 1}
     back = BY_NAME["pointda10-h5"].read(tmp_path / "a", None)
     np.testing.assert_array_equal(back.clouds, given.clouds)
     np.testing.assert_array_equal(back.labels, given.labels)

@@ -47,8 +47,8 @@ def test_the_release_is_read_whole_background_too(tmp_path, rng):
         np.testing.assert_array_equal(read_scanobjectnn(path, "test").clouds, expected[15:])
     names = "bag bin box cabinet chair desk display door shelf table bed pillow sink sofa toilet"
     assert clouds.class_names == tuple(names.split())
-    found = load_clouds(tmp_path, split="train", num_points=None, class_names=CLASSES)
-    np.testing.assert_array_equal(found.points, expected[:15])
+    rows = load_clouds(tmp_path, split="train", num_points=None, class_names=CLASSES)
+    np.testing.assert_array_equal(rows.points, expected[:15])
 
 
 def test_one_file_is_read_alone(tmp_path, rng):
@@ -94,7 +94,7 @@ def test_convention_the_files_are_y_up_and_are_turned_z_up(tmp_path):
 def test_what_is_written_is_read_by_the_published_description(tmp_path, rng, formats):
     given = formats.make_clouds(rng, (*CLASSES[1:], CLASSES[0]), num_points=16, per_part=2)
     write_scanobjectnn(tmp_path / "a", given)
-    found = []
+    rows = []
     for part, name in (("train", "training"), ("test", "test")):
         with h5py.File(tmp_path / "a" / f"{name}_objectdataset.h5", "r") as file:
             data, label = file["data"][:], file["label"][:]
@@ -102,8 +102,8 @@ def test_what_is_written_is_read_by_the_published_description(tmp_path, rng, for
         assert data.shape == (30, 16, 3)
         assert label.shape == (30,)
         for cloud, row in zip(turned(data), label, strict=True):
-            found.append((CLASSES[row], part, np.ascontiguousarray(cloud).tobytes()))
-    assert sorted(found) == formats.told(given)
+            rows.append((CLASSES[row], part, np.ascontiguousarray(cloud).tobytes()))
+    assert sorted(rows) == formats.content(given)
 
 
 def test_aliases_map_and_other_classes_are_named(tmp_path, rng, formats):

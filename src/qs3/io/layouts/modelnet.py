@@ -28,7 +28,7 @@ from tqdm import tqdm
 
 from qs3.errors import InputError
 from qs3.files import sha256, write_text
-from qs3.geometry import y_up_to_z_up, z_up_to_y_up
+from qs3.geometry import y_up_from_z_up, z_up_from_y_up
 from qs3.io.layouts.class_folders import choose_split, list_folder
 from qs3.io.layouts.format import SPLITS, Format, labels_as
 from qs3.io.layouts.hdf5_sets import list_parts, named, read_parts, text_lines, write_parts
@@ -63,9 +63,9 @@ def read_modelnet_h5(path: Path, split: str | None = None) -> RaggedClouds:
     parts = list_parts(root, _FILES, "ply_data_train<i>.h5 or ply_data_test<i>.h5", split)
     names = root / _NAMES
     if names.is_file():
-        return read_parts(parts, _read_names(names), (3,), y_up_to_z_up)
+        return read_parts(parts, _read_names(names), (3,), z_up_from_y_up)
     try:
-        return read_parts(parts, CLASSES, (3,), y_up_to_z_up)
+        return read_parts(parts, CLASSES, (3,), z_up_from_y_up)
     except InputError as error:
         raise InputError(
             f"{error} ({names} is missing, so the classes were taken to be ModelNet40's)"
@@ -120,7 +120,7 @@ def _file_name(split: str, index: int) -> str:
 def _arrays(
     points: Float32[np.ndarray, "b n 3"], labels: Int[np.ndarray, "b"]
 ) -> dict[str, np.ndarray]:
-    data = z_up_to_y_up(points).astype(np.float32)
+    data = y_up_from_z_up(points).astype(np.float32)
     return {"data": data, "label": labels.astype(np.uint8)[:, None]}
 
 
@@ -163,7 +163,7 @@ def read_modelnet_meshes(path: Path, split: str | None = None) -> RaggedClouds:
 def _sample(path: Path, identifier: str) -> Float32[np.ndarray, "n 3"]:
     # Imported here: listing layouts needs no mesh library.
     from qs3.meshes.loading import load_mesh
-    from qs3.meshes.normalise import sample_surface
+    from qs3.meshes.normalising import sample_surface
 
     # Of the id alone: a mesh more or less leaves all other clouds as they were.
     digest = hashlib.sha256(identifier.encode(errors="surrogateescape")).digest()

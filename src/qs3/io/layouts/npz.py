@@ -99,8 +99,8 @@ def _rows(path: Path, arrays: dict[str, np.ndarray], split: str | None, count: i
         return list(range(count))
     train = arrays.get("is_train")
     if train is None or split not in ("train", "test"):
-        known = "no split" if train is None else "train and test"
-        raise InputError(f"{path}: has no split {split!r}; it has {known}")
+        parts = "no split" if train is None else "train and test"
+        raise InputError(f"{path}: has no split {split!r}; it has {parts}")
     chosen = train.astype(bool)
     rows = np.flatnonzero(chosen if split == "train" else ~chosen)
     if not len(rows):

@@ -159,7 +159,7 @@ def _only(ending: str, root: Path) -> bool:
 def _mixed(root: Path) -> bool:
     endings = endings_of(root) & {*POINT_FILES, *_OTHER_DATA}
     single = len(endings) == 1 and endings <= set(WRITTEN_FILES)
-    return bool(endings) and endings <= set(POINT_FILES) and not single
+    return not endings.isdisjoint(POINT_FILES) and not single
 
 
 def _read(endings: Sequence[str], root: Path, split: str | None) -> RaggedClouds:
