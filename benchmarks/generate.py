@@ -23,7 +23,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from qs3.io.layouts.contents import info
+from qs3.store.info import info
 from qs3.meshes import MeshItem, collect
 from qs3.store.executors import Executor, LocalExecutor
 from qs3.store.executors.local import ONE_THREAD

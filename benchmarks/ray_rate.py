@@ -65,7 +65,7 @@ def main() -> None:
         raise SystemExit("the bare rate is measured with Dr.Jit; no libLLVM and no CUDA here")
     mi.set_variant(variant)
     root = Path(os.environ["QS3_SHARED_DATA"]) / "cad"
-    sensor = get_sensor("qs3")
+    sensor = get_sensor("paper")
     print("| mesh | rays a pair | bare Mray/s | renderer Mray/s | share | ms a pair |")
     print("|" + "---|" * 6)
     for folder in sorted(path for path in root.iterdir() if path.is_dir()):

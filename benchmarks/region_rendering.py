@@ -24,7 +24,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=5)
     repeats = parser.parse_args().repeats
-    sensor = get_sensor("qs3")
+    sensor = get_sensor("paper")
     mesh = normalise(shapes.make("chair", seed=1))
     scene = Scene((Body(mesh),), sensor.light, pattern_image(sensor.pattern), 0.625, 0.625)
     poses = [Pose.looking_at(4 * np.array([0.5, -0.7, 0.5]), np.zeros(3))]

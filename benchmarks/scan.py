@@ -40,7 +40,7 @@ from qs3.sensor.statistics import view_statistics
 VIEWS = 5
 CLASSES = ("bathtub", "bed", "bookshelf", "cabinet", "chair")
 CLASSES += ("lamp", "monitor", "plant", "sofa", "table")
-SENSOR = get_sensor("qs3")
+SENSOR = get_sensor("paper")
 
 
 def setups() -> dict[str, dict]:

@@ -32,7 +32,7 @@ def main() -> None:
     renderer = MitsubaRenderer(samples=options.samples)
     print(f"{renderer.variant}, {options.samples} rays a pixel; medians over the views")
     print("| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS))
-    for name in ("qs3", "qs3-800"):
+    for name in ("paper", "qs3-800"):
         sensor = get_sensor(name)
         band = sensor.matching.num_disparities + sensor.matching.block_size // 2
         for mesh in MESHES:

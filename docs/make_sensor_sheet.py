@@ -37,7 +37,7 @@ def cell(title: str, sensor: Sensor, scene: str = "alone") -> UInt8[np.ndarray, 
             seed=4,
             scene=scene,
             neighbour=neighbour,
-            box_crop=False,
+            crop="none",
             renderer=renderer,
             keep_images=True,
         )

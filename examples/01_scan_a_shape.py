@@ -21,4 +21,4 @@ for number, view in enumerate(scan.views):
     print(
         f"view {number}: disparity σ {view.disparity_sigma:.3f} px, valid {view.valid_fraction:.0%}"
     )
-print(f"released sensor: {get_sensor('qs3').rig}")
+print(f"released sensor: {get_sensor('paper').rig}")

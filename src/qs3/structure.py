@@ -7,6 +7,7 @@ out takes the field's default. What a dataclass checks itself (`InputError`) is 
 
 import collections.abc
 import dataclasses
+import difflib
 import functools
 import types
 import typing
@@ -205,7 +206,10 @@ def _reason(error: BaseException, place: str = "") -> str:
         return _reason(error.error, place + error.place)
     if isinstance(error, ForbiddenExtraKeysError):
         name = sorted(map(str, error.extra_fields))[0]
-        return f"field {_joined(place, name)!r} is unknown"
+        names = [field.name for field in dataclasses.fields(error.cl)]
+        near = [_joined(place, other) for other in difflib.get_close_matches(name, names)]
+        hint = f"; did you mean {' or '.join(near)}?" if near else ""
+        return f"field {_joined(place, name)!r} is unknown{hint}"
     if isinstance(error, ClassValidationError):
         noted, others = error.group_exceptions()
         # An unknown key says more than a missing one: it may be a slip of the pen.

@@ -136,14 +136,14 @@ def test_clouds_of_any_size_and_single_files_are_taken(capsys, tmp_path, rng):
 def test_a_mesh_is_scanned_with_the_settings_of_the_page(tmp_path):
     import dataclasses
 
-    from qs3.cli.camera import CameraOptions
     from qs3.cli.view import ViewOptions, prepare
+    from qs3.sensor.settings import ScanSettings
     from qs3.viewer.scan_controls import ScanRequest
 
     shapes.make("table", seed=1).export(tmp_path / "table.ply")
-    camera = CameraOptions(variant="scalar_rgb", samples=1, views=1, num_points=64)
+    settings = ScanSettings(variant="scalar_rgb", samples=1, views=1, num_points=64)
     for what, draws in ((str(tmp_path / "table.ply"), 0), ("table", 100)):
-        given = prepare(ViewOptions(what, camera=camera)).keywords
+        given = prepare(ViewOptions(what, scan=settings)).keywords
         assert given["draws"] == draws
         sensor = next(iter(given["sensors"].values()))
         controls = dataclasses.replace(given["start"], object_size=0.5)

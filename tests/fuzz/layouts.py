@@ -112,7 +112,8 @@ def build_generated(folder: Path) -> None:
 
 
 def load_generated(path: Path) -> Any:
-    from qs3.io.layouts.contents import info, read_store
+    from qs3.io.layouts.contents import read_store
+    from qs3.store.info import info
     from qs3.store.verify import verify
 
     verify(path, progress=False)

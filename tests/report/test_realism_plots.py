@@ -79,7 +79,7 @@ def test_noise_stands_beside_the_law_and_its_slope():
 
 
 def test_lengths_of_a_sensor_without_metres_are_sizes_of_the_object():
-    axes = realism_plot(result("T1"), SENSORS["qs3"]).axes[0]
+    axes = realism_plot(result("T1"), SENSORS["paper"]).axes[0]
     assert "object" in axes.get_xlabel()
     assert "mm" not in axes.get_ylabel()
 

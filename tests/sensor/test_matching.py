@@ -6,16 +6,8 @@ import pytest
 from scipy import ndimage
 
 from qs3.errors import InputError
-from qs3.sensor.matching import (
-    MatchingSettings,
-    match,
-    matching_canvas,
-    matching_margin,
-    zncc_numpy,
-    zncc_torch,
-)
+from qs3.sensor.matching import MatchingSettings, match, matching_canvas, matching_margin, zncc
 from qs3.sensor.matching.filters import drop_small_regions, median_of_valid, quantise
-from qs3.sensor.matching.zncc_blocks import block_statistics
 from qs3.sensor.rig import Region, StereoRig
 
 ZNCC = MatchingSettings("zncc", num_disparities=64, block_size=15, left_band="physical")
@@ -70,14 +62,14 @@ def measured(settings, noise):
 @pytest.mark.parametrize("noise", [0.0, 3.0])
 def test_zncc_is_unbiased_and_halves_the_error_of_block_matching(noise):
     # reference: StereoBM-15 has 0.08 to 0.11 px and a bias of +0.03 px on such dots.
-    zncc, bias, gross, size = measured(ZNCC, noise)
+    error, bias, gross, size = measured(ZNCC, noise)
     block, block_bias, _, block_size = measured(BM, noise)
-    assert zncc <= 0.06
+    assert error <= 0.06
     assert abs(bias) < 0.01
     assert gross < 0.001
     assert size > 0.98 * block_size
     assert 0.07 < block < 0.13
-    assert zncc < 0.65 * block
+    assert error < 0.65 * block
     assert block_bias == pytest.approx(0.03, abs=0.01)
 
 
@@ -105,51 +97,12 @@ def reference_zncc(left, right, settings):
 
 def test_zncc_equals_a_plain_reference_also_at_the_borders():
     left, right = noise_pair((16, 44))
-    settings = dataclasses.replace(PLAIN, num_disparities=16, block_size=7)
+    settings = dataclasses.replace(PLAIN, num_disparities=15, block_size=7)
     expected = reference_zncc(left.astype(float), right.astype(float), settings)
-    found = match(left, right, settings)
-    np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
-    np.testing.assert_allclose(found, expected, atol=2e-5)
-    assert np.isfinite(found).mean() > 0.6
-
-
-@pytest.mark.parametrize("white", [255, 1023])
-@pytest.mark.parametrize("block_size", [5, 9, 15, 31])
-@pytest.mark.parametrize("elements", [2**25, 30000])
-def test_torch_finds_the_same_as_numpy_bit_for_bit(monkeypatch, white, block_size, elements):
-    monkeypatch.setattr(zncc_torch, "ELEMENTS", elements)
-    left, right = dots(11.4, shape=(70, 120), density=0.1, noise=4.0, white=white)
-    blocks = block_statistics(left, right, 40, block_size, 2.0)
-    ours = zncc_numpy.search(blocks, True, True)
-    theirs = zncc_torch.search(blocks, True, True, "cpu")
-    there = (ours.best >> blocks.index_bits) > 0
-    assert there.mean() > 0.9
-    for name in ("best", "before", "after", "second"):
-        np.testing.assert_array_equal(getattr(ours, name)[there], getattr(theirs, name)[there])
-    there = (theirs.right >> blocks.index_bits) > 0
-    np.testing.assert_array_equal(ours.right[there], theirs.right[there])
-
-
-def test_device_auto_falls_back_to_the_cpu_and_cuda_says_what_is_missing():
-    pair = dots(20.3, shape=(40, 120))
-    with pytest.raises(InputError, match="device"):
-        zncc_torch.searcher("tpu")
-    if zncc_torch.available():
-        pytest.skip("CUDA is there: nothing falls back")
-    np.testing.assert_array_equal(match(*pair, ZNCC, "auto"), match(*pair, ZNCC))
-    with pytest.raises(InputError, match="no CUDA device"):
-        match(*pair, ZNCC, "cuda")
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(not zncc_torch.available(), reason="torch sees no CUDA device")
-@pytest.mark.parametrize("white", [255, 1023])
-def test_cuda_matches_as_the_cpu(white):
-    pair = dots(20.3, noise=3.0, white=white)
-    settings = dataclasses.replace(ZNCC, median=3, min_region=20)
-    ours, theirs = match(*pair, settings), match(*pair, settings, "cuda")
-    np.testing.assert_array_equal(np.isnan(ours), np.isnan(theirs))
-    np.testing.assert_allclose(theirs, ours, rtol=0, atol=1e-4)
+    disparity = match(left, right, settings)
+    np.testing.assert_array_equal(np.isnan(disparity), np.isnan(expected))
+    np.testing.assert_allclose(disparity, expected, atol=2e-5)
+    assert np.isfinite(disparity).mean() > 0.6
 
 
 def test_zncc_is_the_same_at_every_call_with_any_threads_and_bands(monkeypatch):
@@ -158,9 +111,9 @@ def test_zncc_is_the_same_at_every_call_with_any_threads_and_bands(monkeypatch):
     expected = match(left, right, settings)
     before = cv2.getNumThreads()
     try:
-        for threads, band in ((1, 64), (3, 64), (2, 17)):
+        for threads, band in ((1, 96), (3, 64), (2, 17)):
             cv2.setNumThreads(threads)
-            monkeypatch.setattr(zncc_numpy, "BAND", band)
+            monkeypatch.setattr(zncc, "BAND", band)
             np.testing.assert_array_equal(match(left, right, settings), expected)
     finally:
         cv2.setNumThreads(before)
@@ -171,9 +124,9 @@ def test_zncc_does_not_see_contrast_or_brightness():
     left, right = dots(20.4)
     left, right = left // 2, right // 2
     expected = match(left, right, PLAIN)
-    found = match(left, right * np.uint8(2), PLAIN)
-    np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
-    np.testing.assert_allclose(found, expected, atol=1e-4)
+    contrasted = match(left, right * np.uint8(2), PLAIN)
+    np.testing.assert_array_equal(np.isnan(contrasted), np.isnan(expected))
+    np.testing.assert_allclose(contrasted, expected, atol=1e-4)
     brighter = match(left + np.uint8(70), right, PLAIN)
     np.testing.assert_allclose(brighter, expected, atol=1e-4)
 
@@ -203,12 +156,12 @@ def test_images_of_the_wrong_kind_are_refused():
 
 
 @pytest.mark.parametrize("method", ["opencv-bm", "zncc"])
-@pytest.mark.parametrize("shift", [4.4, 12.3, 20.3, 40.7])
+@pytest.mark.parametrize("shift", [4.4, 40.7])
 def test_physical_left_band_is_as_wide_as_the_disparity(method, shift):
     settings = dataclasses.replace(ZNCC, method=method)
     disparity = match(*dots(shift, shape=(160, 260), density=0.05, noise=1.0), settings)
-    right_there = np.abs(disparity - shift) < 1
-    first = np.argmax(right_there, axis=1)
+    matched = np.abs(disparity - shift) < 1
+    first = np.argmax(matched, axis=1)
     assert abs(np.median(first) - shift) <= 1
     assert np.mean(np.abs(first - shift) <= 2) > 0.9
     # And nothing is made up in the band.
@@ -233,27 +186,27 @@ def test_physical_band_changes_nothing_to_the_right_of_opencvs():
     )
 
 
-@pytest.mark.parametrize("quantum", [1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32])
 @pytest.mark.parametrize("method", ["opencv-bm", "zncc"])
-def test_disparities_are_exact_multiples_of_the_quantum(method, quantum):
-    left, right = dots(20.3, noise=2.0)
+def test_disparities_are_exact_multiples_of_the_quantum(method):
+    left, right = dots(20.3, shape=(70, 200), noise=2.0)
     free = dataclasses.replace(ZNCC, method=method, median=3)
-    found = match(left, right, dataclasses.replace(free, quantum=quantum))
-    steps = found[np.isfinite(found)] / quantum
-    np.testing.assert_array_equal(steps, np.round(steps))
-    assert len(np.unique(steps)) > 1 or quantum > 1 / 8
     exact = match(left, right, free)
-    assert np.nanmax(np.abs(found - exact)) <= quantum / 2
-    if method == "opencv-bm" and quantum != 1 / 16:
-        biased = dataclasses.replace(free, quantum=quantum, bias_correction=True)
-        steps = match(left, right, biased) / quantum
-        steps = steps[np.isfinite(steps)]
+    for quantum in (1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32):
+        rounded = match(left, right, dataclasses.replace(free, quantum=quantum))
+        steps = rounded[np.isfinite(rounded)] / quantum
         np.testing.assert_array_equal(steps, np.round(steps))
+        assert len(np.unique(steps)) > 1 or quantum > 1 / 8
+        assert np.nanmax(np.abs(rounded - exact)) <= quantum / 2
+        if method == "opencv-bm" and quantum != 1 / 16:
+            biased = dataclasses.replace(free, quantum=quantum, bias_correction=True)
+            steps = match(left, right, biased) / quantum
+            steps = steps[np.isfinite(steps)]
+            np.testing.assert_array_equal(steps, np.round(steps))
 
 
 def test_the_quantum_makes_no_disparity_zero():
-    found = quantise(np.array([[0.04, 0.1, np.nan, 3.1]], np.float32), 1 / 8)
-    np.testing.assert_array_equal(found, [[np.nan, 0.125, np.nan, 3.125]])
+    rounded = quantise(np.array([[0.04, 0.1, np.nan, 3.1]], np.float32), 1 / 8)
+    np.testing.assert_array_equal(rounded, [[np.nan, 0.125, np.nan, 3.125]])
 
 
 @pytest.mark.parametrize("shift", [0.0, 63.0])
@@ -306,13 +259,13 @@ def test_left_right_check_empties_the_occluded_band():
     loose = dataclasses.replace(ZNCC, left_right=0.0, uniqueness=0.0, correlation=0.2)
     checked = dataclasses.replace(loose, left_right=1.0)
     assert np.isfinite(match(left, right, loose)[hidden]).mean() > 0.6
-    found = match(left, right, checked)
-    assert np.isfinite(found[hidden]).mean() < 0.1
+    agreed = match(left, right, checked)
+    assert np.isfinite(agreed[hidden]).mean() < 0.1
     seen = np.s_[10:-10, 235:300]
-    assert np.isfinite(found[seen]).mean() > 0.95
-    assert (np.abs(found - truth)[seen] < 0.3).mean() > 0.95
+    assert np.isfinite(agreed[seen]).mean() > 0.95
+    assert (np.abs(agreed - truth)[seen] < 0.3).mean() > 0.95
     # Depth edges move by no more than half a block.
-    at_edge = found[10:-10, 220 + 8 : 235]
+    at_edge = agreed[10:-10, 220 + 8 : 235]
     assert np.nanmax(np.abs(at_edge - 10.0)) < 1
 
 
@@ -327,8 +280,8 @@ def test_median_takes_only_valid_disparities_and_makes_none_up(side):
     expected = np.full(image.shape, np.nan, np.float32)
     for y, x in np.argwhere(np.isfinite(image)):
         square = image[max(0, y - half) : y + half + 1, max(0, x - half) : x + half + 1]
-        known = np.sort(square[np.isfinite(square)])
-        expected[y, x] = known[(len(known) - 1) // 2]
+        valid = np.sort(square[np.isfinite(square)])
+        expected[y, x] = valid[(len(valid) - 1) // 2]
     np.testing.assert_array_equal(median_of_valid(image, side), expected)
     assert expected[1, 1] == 33.0 or side == 5
 
@@ -369,19 +322,19 @@ METHODS = {
 }
 
 
-@pytest.mark.parametrize("region", REGIONS, ids=str)
 @pytest.mark.parametrize("name", METHODS)
-def test_region_matching_equals_full_frame_matching_bit_for_bit(name, region):
+def test_region_matching_equals_full_frame_matching_bit_for_bit(name):
     left, right = dots(20.3, noise=25.0)
     settings = METHODS[name]
     rig = StereoRig(width=300, height=120, focal=500.0)
     whole = match(left, right, settings)
     assert 0.05 < np.isnan(whole).mean() < 0.95
-    canvas = matching_canvas(region, rig, settings)
-    part = match(left[canvas.slices], right[canvas.slices], settings)
-    y, x = region.y - canvas.y, region.x - canvas.x
-    inner = part[y : y + region.height, x : x + region.width]
-    np.testing.assert_array_equal(inner, whole[region.slices])
+    for region in REGIONS:
+        canvas = matching_canvas(region, rig, settings)
+        part = match(left[canvas.slices], right[canvas.slices], settings)
+        y, x = region.y - canvas.y, region.x - canvas.x
+        inner = part[y : y + region.height, x : x + region.width]
+        np.testing.assert_array_equal(inner, whole[region.slices])
 
 
 def test_the_margin_holds_what_the_filters_reach():
@@ -391,42 +344,36 @@ def test_the_margin_holds_what_the_filters_reach():
 
 
 @pytest.mark.parametrize(
-    ("fault", "says"),
+    "fault",
     [
-        ({"method": "sgm"}, "method"),
-        ({"num_disparities": 50}, "multiple of 16"),
-        ({"num_disparities": 0}, "multiple of 16"),
-        ({"method": "zncc", "num_disparities": 2}, "3…1024"),
-        ({"method": "zncc", "num_disparities": 2000}, "3…1024"),
-        ({"block_size": 8}, "5…255"),
-        ({"block_size": 3}, "5…255"),
-        ({"method": "zncc", "block_size": 33}, "5…31"),
-        ({"left_band": "none"}, "left_band"),
-        ({"quantum": 0.1}, "quantum"),
-        ({"quantum": 1 / 16, "bias_correction": True}, "1/32 or 1/8"),
-        ({"left_right": -1.0}, "left_right"),
-        ({"uniqueness": -0.1}, "uniqueness"),
-        ({"correlation": 1.0}, "correlation"),
-        ({"correlation": float("nan")}, "correlation"),
-        ({"texture": -2.0}, "texture"),
-        ({"median": 4}, "median"),
-        ({"min_region": -1}, "min_region"),
+        {"method": "sgm"},
+        {"num_disparities": 50},
+        {"num_disparities": 0},
+        {"num_disparities": 2, "method": "zncc"},
+        {"num_disparities": 2000, "method": "zncc"},
+        {"block_size": 8},
+        {"block_size": 3},
+        {"block_size": 33, "method": "zncc"},
+        {"left_band": "none"},
+        {"quantum": 0.1},
+        {"quantum": 1 / 16, "bias_correction": True},
+        {"left_right": -1.0},
+        {"uniqueness": -0.1},
+        {"correlation": 1.0},
+        {"correlation": float("nan")},
+        {"texture": -2.0},
+        {"median": 4},
+        {"min_region": -1},
     ],
     ids=str,
 )
-def test_each_faulty_setting_is_named(fault, says):
+def test_each_faulty_setting_is_named(fault):
     # Past the type checks that run in tests only.
     settings = object.__new__(MatchingSettings)
     for name, value in (dataclasses.asdict(MatchingSettings()) | fault).items():
         object.__setattr__(settings, name, value)
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=f"matching: .*{next(iter(fault))}"):
         settings.__post_init__()
-
-
-def test_zncc_takes_any_number_of_disparities():
-    settings = MatchingSettings("zncc", num_disparities=50, block_size=15, left_band="physical")
-    disparity = match(*dots(20.3, shape=(60, 160)), settings)
-    assert np.nanmedian(disparity) == pytest.approx(20.3, abs=0.05)
 
 
 @pytest.mark.parametrize("method", ["opencv-bm", "zncc"])
@@ -445,13 +392,13 @@ def test_block_matching_gives_sixteenths_and_its_correction_takes_off_its_bias()
     for shift in np.arange(20, 21, 1 / 8):
         # New dots each time: the mean over one picture's alone strays by 0.01 px.
         pair = dots(shift, shape=(200, 420), noise=2.0, seed=int(8 * shift))
-        found = match(*pair, BM)[20:-20, 90:-20]
-        steps = found[np.isfinite(found)] * 16
+        rounded = match(*pair, BM)[20:-20, 90:-20]
+        steps = rounded[np.isfinite(rounded)] * 16
         np.testing.assert_array_equal(steps, np.round(steps))
         better = match(*pair, unbiased)[20:-20, 90:-20]
-        near = np.abs(found - shift) < 1
+        near = np.abs(rounded - shift) < 1
         assert near.mean() > 0.95
-        plain.append((found - shift)[near].mean())
+        plain.append((rounded - shift)[near].mean())
         corrected.append((better - shift)[near].mean())
     # reference: +0.029 px from rounding up to 1/16 px.
     assert np.mean(plain) == pytest.approx(0.030, abs=0.008)

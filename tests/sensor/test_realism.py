@@ -151,7 +151,7 @@ def test_t3_wants_the_quantum_itself(quantum, good):
 
 
 def test_t3_knows_where_stereo_bm_puts_its_steps():
-    settings = get_sensor("qs3").matching
+    settings = get_sensor("paper").matching
     assert disparity_grid(settings) == (1 / 16, 0.0)
     shifted = dataclasses.replace(settings, bias_correction=True)
     assert disparity_grid(shifted) == (1 / 16, -1 / 32)
@@ -350,7 +350,7 @@ def test_unknown_tests_are_refused():
 
 
 def test_sweeps_stay_within_what_a_sensor_measures():
-    for name in ("qs3", "d415", "d435", "d455", "kinect-v1"):
+    for name in ("paper", "d415", "d435", "d455", "kinect-v1"):
         sensor = get_sensor(name)
         sweep = distances(sensor, 8)
         assert sweep[0] > sensor.depth.near

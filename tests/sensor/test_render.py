@@ -93,7 +93,7 @@ def test_full_frame_and_region_disparity_agree(small_rig):
 
 def test_region_pipeline_gives_the_bits_of_the_full_frame(renderer):
     # The same rendered pair, matched in its region and in the whole frame of the released rig.
-    sensor = get_sensor("qs3")
+    sensor = get_sensor("paper")
     pair = renderer.render(scene_of(asymmetric()), sensor.rig, [POSE], [1])[0]
     region = sensor.rig.region_of(np.asarray(asymmetric().bounds), POSE, 16)
     canvas = matching_canvas(region, sensor.rig, sensor.matching)

@@ -20,7 +20,7 @@ from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.scan import Scan, scan
 from qs3.sensor.views import Placement
 
-# A quarter of the pixels of `qs3`, with its f·b = 150.
+# A quarter of the pixels of `paper`, with its f·b = 150.
 SMALL = Sensor(
     name="small",
     rig=StereoRig(width=540, height=540, focal=750.0, baseline=0.2),
@@ -126,7 +126,7 @@ def test_box_crop_keeps_to_the_turned_box(scanned):
 
 
 def test_without_the_crop_points_lie_outside_too(renderer):
-    free = scan(asymmetric(), sensor=SMALL, views=1, seed=4, box_crop=False, renderer=renderer)
+    free = scan(asymmetric(), sensor=SMALL, views=1, seed=4, crop="none", renderer=renderer)
     turned = free.points.astype(np.float64) @ rotation_z(free.yaw).T
     bounds = normalise(asymmetric()).vertices @ rotation_z(free.yaw).T
     outside = (turned < bounds.min(axis=0)) | (turned > bounds.max(axis=0))
@@ -145,7 +145,7 @@ def test_same_seed_same_scan_other_seed_other_scan(renderer):
 
 def test_convention_a_step_comes_back_as_high_as_it_was(renderer):
     step = boxes(([0, 0, -0.1], [1, 1, 0.1]), ([0.25, 0, 0.1], [0.5, 1, 0.3]))
-    cloud = scan(step, sensor=SMALL, views=4, seed=1, renderer=renderer, box_crop=False)
+    cloud = scan(step, sensor=SMALL, views=4, seed=1, renderer=renderer, crop="none")
     x, y, z = cloud.points.T
     inner = np.abs(y) < 0.3
     # Normalised: longest side 1 already, box from −0.15 to 0.25 → centred by 0.05.
@@ -207,14 +207,14 @@ def test_an_object_out_of_the_gate_is_refused(renderer):
 
 
 def test_unknown_sensor_and_size_are_refused(renderer):
-    with pytest.raises(InputError, match="no preset 'kinect'"):
+    with pytest.raises(InputError, match="no sensor 'kinect'"):
         scan(asymmetric(), sensor="kinect", renderer=renderer)
     with pytest.raises(InputError, match="num_points"):
         scan(asymmetric(), sensor=SMALL, num_points=0, renderer=renderer)
 
 
 def test_presets_hold_the_released_values():
-    sensor = get_sensor("qs3")
+    sensor = get_sensor("paper")
     assert sensor.rig == StereoRig(1080, 1080, 1500.0, 0.1, 0.5)
     assert (sensor.matching.num_disparities, sensor.matching.block_size) == (160, 19)
     assert sensor.placement.radius == (3.0, 5.0)
@@ -284,7 +284,7 @@ def test_a_view_beyond_the_gate_is_recorded_as_empty(renderer):
             views=4,
             view_layout="jitter",
             seed=2,
-            box_crop=False,
+            crop="none",
             num_points=200,
             renderer=renderer,
             keep_images=True,
@@ -310,7 +310,7 @@ def test_wrong_matches_within_the_gate_make_no_cloud_of_an_object_beyond_it(rend
     )
     far = dataclasses.replace(far, depth=DepthSettings(near=1.0, far=5.7, stride=1))
     with pytest.raises(InputError, match="saw no point"):
-        scan(asymmetric(), sensor=far, views=2, box_crop=False, renderer=renderer)
+        scan(asymmetric(), sensor=far, views=2, crop="none", renderer=renderer)
 
 
 def test_an_object_smaller_than_a_pixel_is_refused(renderer):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.io.layouts.contents import MANIFEST, info, read_store
+from qs3.io.layouts.contents import MANIFEST, read_store
 from qs3.meshes.classes import POINTDA10
 from qs3.store.failures import FAILURES, read_failures
 from qs3.store.generate import (
@@ -20,6 +20,7 @@ from qs3.store.generate import (
     scan_seed,
 )
 from qs3.store.generate import generate as generate_anywhere
+from qs3.store.info import info
 from qs3.store.manifest import SUMS
 from qs3.store.parts import part_folder
 from qs3.store.scan_item import neighbour_of
@@ -171,7 +172,7 @@ def test_bad_input_leaves_nothing_behind(fake, tmp_path):
             generate(work, out, SETTINGS, scan_one=fake.fake_row, progress=False)
     with pytest.raises(InputError, match="workers"):
         generate(items(fake), out, SETTINGS, scan_one=fake.fake_row, workers=-1, progress=False)
-    with pytest.raises(InputError, match="no preset 'kinect9'"):
+    with pytest.raises(InputError, match="no sensor 'kinect9'"):
         bad = dataclasses.replace(SETTINGS, sensor="kinect9")
         generate(items(fake), out, bad, scan_one=fake.fake_row, progress=False)
     assert not out.exists()
@@ -195,7 +196,7 @@ def test_a_pattern_picture_is_recorded_by_name_and_content(tmp_path):
 
     picture = tmp_path / "dots.png"
     picture.write_bytes(b"dots")
-    qs3 = get_sensor("qs3")
+    qs3 = get_sensor("paper")
     pattern = dataclasses.replace(qs3.pattern, image=str(picture))
     settings = GenerateSettings(sensor=dataclasses.replace(qs3, pattern=pattern))
     recorded = json.dumps(settings.as_dict())
@@ -227,7 +228,7 @@ def test_neighbours_are_other_objects_drawn_evenly_from_the_scans_own_seed(fake)
 
 
 def test_a_scene_with_a_neighbour_hands_one_to_every_scan(fake, tmp_path):
-    from qs3.sensor.surroundings import SceneSettings
+    from qs3.sensor.scene import SceneSettings
 
     seen = []
 
@@ -245,12 +246,12 @@ def test_a_scene_with_a_neighbour_hands_one_to_every_scan(fake, tmp_path):
 
 def test_scene_and_ranges_belong_to_the_record(fake, tmp_path):
     generate(items(fake), tmp_path, SETTINGS, scan_one=fake.fake_row, progress=False)
-    from qs3.sensor.surroundings import SceneSettings
+    from qs3.sensor.scene import SceneSettings
 
     for changed, name in [
         ({"scene": SceneSettings("floor")}, "scene.layout = alone, not floor"),
         ({"randomise": {"light.ambient": (0.0, 0.1)}}, "randomise"),
-        ({"mask_crop": True}, "mask_crop"),
+        ({"crop": "both"}, "mask_crop"),
         ({"box_margin": 0.1}, "box_margin"),
     ]:
         other = dataclasses.replace(SETTINGS, **changed)

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.io.layouts.contents import info, read_store
+from qs3.io.layouts.contents import read_store
 from qs3.io.load import load_clouds
 from qs3.store.folder import open_folder
 from qs3.store.generate import GenerateReport, GenerateSettings, generate
+from qs3.store.info import info
 from qs3.store.merge import merge
 from qs3.store.verify import verify
 

@@ -9,13 +9,13 @@ from qs3.errors import InputError
 from qs3.io.layouts.contents import (
     MANIFEST,
     Manifest,
-    info,
     open_dataset,
     read_store,
     shard_path,
     write_manifest,
 )
 from qs3.store.generate import GenerateSettings
+from qs3.store.info import info
 from qs3.store.shards import read_shard, write_shard
 
 SETTINGS = GenerateSettings(num_points=16)

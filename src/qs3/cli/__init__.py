@@ -5,91 +5,100 @@ a user can mend is one line on standard error and exit code 2; Ctrl-C ends with 
 """
 
 import sys
-from collections.abc import Callable, Sequence
-from typing import Annotated
+from collections.abc import Sequence
+
+VERBS = {
+    "scan": (
+        "scan.scan",
+        "Photograph one mesh: noisy cloud, clean twin, a picture of every stage.",
+    ),
+    "sensors": ("sensors.sensors", "List the sensors, or show one as TOML to copy and edit."),
+    "realism": ("realism.realism", "Test a simulated camera against the laws of real ones."),
+    "generate": (
+        "generate.generate",
+        "Scan many meshes into a data set; resumes, and logs what failed.",
+    ),
+    "merge": ("store.merge", "Put the parts of `qs3 generate --shard i/n` into one data set."),
+    "info": ("store.info", "Print what a data set holds: counts, sizes, statistics, failures."),
+    "verify": (
+        "store.verify",
+        "Check a data set: checksums, finite points, labels, seeds, counts.",
+    ),
+    "convert": ("convert.convert", "Convert a data set into the layout of another."),
+    "extract": ("extract.extract", "Cut objects out of real scans into a data set."),
+    "train": ("train.train", "Train a classifier, adapted to clouds without labels if asked."),
+    "evaluate": ("evaluate.evaluate_run", "Score a run on labelled clouds."),
+    "predict": ("evaluate.predict", "Predict the class of clouds in files."),
+    "export": ("export.export", "Write a run's network for programs without qs3."),
+    "reproduce": ("reproduce.reproduce", "Make the paper's tables and figures, or parts of them."),
+    "table": ("table.table", "Print a table of the paper from results."),
+    "figure": ("table.figure", "Draw a figure of the paper from results."),
+    "report": ("report.report", "Write one page about runs, data sets and results."),
+    "view": ("view.view", "Look at data, a run or a mesh in a browser on this machine."),
+    "doctor": ("doctor.doctor", "Tell what works on this machine and how to get what does not."),
+    "demo": ("demo.demo", "Run everything once on built-in shapes: scan, train, adapt, report."),
+}
+"""Where in this package each verb is, and a line of help."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one verb; the exit code says how it ended."""
-    import tyro
-
     from qs3.errors import QS3Error
 
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        code = tyro.extras.subcommand_cli_from_dict(
-            _verbs(given),
-            prog="qs3",
-            description="CAD models to a classifier that works on a real depth camera.",
-            args=given,
-        )
+        code = _run(given)
     except QS3Error as error:
         print(f"qs3: {error}", file=sys.stderr)
-        sys.exit(2)
+        code = 2
     except KeyboardInterrupt:
         print("qs3: stopped; run the same command again to go on", file=sys.stderr)
-        sys.exit(130)
+        code = 130
     except BrokenPipeError:
         # The reader of our output went away (`qs3 … | head`): nothing to tell it.
         sys.stderr.close()
-        sys.exit(141)
+        code = 141
     except OSError as error:
         reason = error.strerror or str(error)
         print(f"qs3: {error.filename or 'file system'}: {reason}", file=sys.stderr)
-        sys.exit(2)
-    sys.exit(code or 0)
+        code = 2
+    sys.exit(code)
 
 
-def _verbs(given: list[str]) -> dict[str, Callable[..., int]]:
-    """The verbs; only what the one asked for needs is imported, so that a scan starts fast."""
-    from qs3.cli.convert import convert
-    from qs3.cli.doctor import doctor
-    from qs3.cli.extract import extract
-    from qs3.cli.generate import generate
-    from qs3.cli.realism import realism
-    from qs3.cli.scan import scan
-    from qs3.cli.sensors import sensors
-    from qs3.cli.store import info, merge, verify
-    from qs3.cli.view import view
+def _run(given: list[str]) -> int:
+    """Import and run the verb that is asked for, and nothing else: a scan starts fast."""
+    verb, *rest = given or [""]
+    if verb in ("", "-h", "--help"):
+        print(_help(), file=sys.stdout if verb else sys.stderr)
+        return 0 if verb else 2
+    if verb == "--version":
+        from importlib.metadata import version
 
-    verbs: dict[str, Callable[..., int]] = {
-        "scan": scan,
-        "sensors": sensors,
-        "realism": realism,
-        "generate": generate,
-        "merge": merge,
-        "info": info,
-        "verify": verify,
-        "convert": convert,
-        "extract": extract,
-        "view": view,
-        "doctor": doctor,
-    }
-    if given and given[0] in verbs:
-        return verbs
-    import tyro
+        print(f"qs3 {version('qs3')}")
+        return 0
+    if verb not in VERBS:
+        from difflib import get_close_matches
 
-    from qs3.cli.demo import demo
-    from qs3.cli.evaluate import evaluate_run, predict
-    from qs3.cli.export import export
-    from qs3.cli.report import report
-    from qs3.cli.reproduce import reproduce
-    from qs3.cli.table import figure, table
-    from qs3.cli.train import TrainOptions, preset_options, train
+        from qs3.errors import InputError
 
-    defaults = preset_options(given)
+        near = get_close_matches(verb, VERBS) or VERBS
+        raise InputError(f"{verb}: no such verb; did you mean {' or '.join(near)}? See qs3 --help")
+    from qs3.cli.options import run_verb
 
-    def train_with_preset(
-        options: Annotated[TrainOptions, tyro.conf.arg(name="")] = defaults,
-    ) -> int:
-        return train(options)
+    return run_verb(verb, *VERBS[verb], rest)
 
-    train_with_preset.__doc__ = train.__doc__
-    verbs |= {"train": train_with_preset, "evaluate": evaluate_run, "predict": predict}
-    verbs |= {"export": export, "reproduce": reproduce, "demo": demo}
-    verbs |= {"table": table, "figure": figure}
-    verbs["report"] = report
-    made = ("scan", "sensors", "realism", "generate", "merge", "info", "verify", "convert")
-    runs = ("train", "evaluate", "predict", "export", "reproduce", "table", "figure", "report")
-    order = (*made, "extract", *runs, "view", "doctor", "demo")
-    return {name: verbs[name] for name in order}
+
+def _help() -> str:
+    width = max(map(len, VERBS))
+    lines = [f"  {verb:{width}}  {text}" for verb, (_, text) in VERBS.items()]
+    return "\n".join(
+        [
+            "usage: qs3 [--help] [--version] VERB [OPTIONS]",
+            "",
+            "CAD models to a classifier that works on a real depth camera.",
+            "",
+            *lines,
+            "",
+            "The options of a verb: qs3 VERB --help",
+        ]
+    )

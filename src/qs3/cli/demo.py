@@ -1,6 +1,6 @@
 """``qs3 demo``: the whole way on built-in shapes, from CAD models to a report.
 
-A network learns from scans of some draws of the shapes, made by the `qs3` sensor from views all
+A network learns from scans of some draws of the shapes, made by the `paper` sensor from views all
 around. The target is other draws, seen once each by a visibly different sensor. The network is
 then adapted to the target without its labels, and both networks are scored.
 """
@@ -14,7 +14,6 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from qs3.cli.camera import CameraOptions
 from qs3.files import claim_folder, write_json
 
 _MARKER = "demo.json"
@@ -117,7 +116,9 @@ def _generate(folder: Path, settings: DemoSettings, per_class: int, seed: int, *
 
 
 def _renderer(settings: DemoSettings) -> Any:
-    return CameraOptions(samples=settings.samples, variant=settings.variant).resolve_renderer()
+    from qs3.sensor.settings import CameraSettings
+
+    return CameraSettings(samples=settings.samples, variant=settings.variant).make_renderer()
 
 
 def _source(folder: Path, settings: DemoSettings) -> None:

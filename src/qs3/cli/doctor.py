@@ -1,34 +1,25 @@
 """``qs3 doctor``: what is here, what is missing, how to get it."""
 
 import importlib.metadata
-import importlib.util
 import json
 import platform
+import re
 from typing import Any
 
 from qs3.errors import QS3Error
 
-_CORE = (
-    "numpy",
-    "scipy",
-    "trimesh",
-    "embreex",
-    "mitsuba",
-    "opencv-python-headless",
-    "pyarrow",
-    "torch",
-    "lightning-fabric",
-    "safetensors",
-    "jaxtyping",
-    "tqdm",
-    "matplotlib",
-    "tyro",
-)
-_EXTRAS = {
-    "ray": ("ray", "data sets made on a cluster"),
-    "view": ("viser", "the interactive viewer"),
-    "track": ("tensorboard", "training curves in TensorBoard"),
-    "export": ("onnx", "models as ONNX"),
+_PURPOSE = {
+    "ray": "qs3 generate --executor ray",
+    "s3": "data sets at s3:// addresses",
+    "gs": "data sets at gs:// addresses",
+    "view": "qs3 view",
+    "track": "qs3 train --log tensorboard",
+    "export": "qs3 export",
+}
+_ADVICE = {
+    "cuda_ad_mono": "needs an NVIDIA GPU whose driver has OptiX",
+    "llvm_ad_mono": "needs a system libLLVM (19 is known to work; on Debian: libllvm19)",
+    "scalar_rgb": "comes with the mitsuba wheel; reinstall it",
 }
 
 
@@ -38,24 +29,20 @@ def doctor(json_output: bool = False) -> int:
     Args:
         json_output: Print JSON in place of text.
     """
-    found = examine()
+    machine = examine()
     if json_output:
-        print(json.dumps(found, indent=2))
+        print(json.dumps(machine, indent=2))
     else:
-        _print(found)
-    return 0 if found["ready"] else 1
+        _print(machine)
+    return 0 if machine["ready"] else 1
 
 
 def examine() -> dict[str, Any]:
     """Look at packages, Mitsuba's variants, Cycles, the device for training and the extras."""
     from qs3.sensor.render.mitsuba import VARIANTS, usable
 
-    packages: dict[str, str | None] = {}
-    for name in _CORE:
-        try:
-            packages[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            packages[name] = None
+    needed = _requirements()
+    packages = {name: _version(name) for name in needed.pop("")}
     variants = {variant: usable(variant) for variant in VARIANTS}
     device = None
     if packages["torch"] is not None:
@@ -70,11 +57,29 @@ def examine() -> dict[str, Any]:
         "cycles": _cycles(),
         "device": device,
         "extras": {
-            extra: importlib.util.find_spec(module) is not None
-            for extra, (module, _) in _EXTRAS.items()
+            extra: all(_version(name) is not None for name in needed.get(extra, ()))
+            for extra in _PURPOSE
         },
         "ready": all(packages.values()) and any(variants.values()),
     }
+
+
+def _requirements() -> dict[str, list[str]]:
+    """Packages that this version of qs3 says it needs, by extra; "" are those of all."""
+    needed: dict[str, list[str]] = {"": []}
+    for line in importlib.metadata.requires("qs3") or ():
+        name = re.match(r"[\w.-]+", line)
+        extra = re.search(r"extra == [\"']([\w-]+)", line)
+        if name:
+            needed.setdefault(extra[1] if extra else "", []).append(name[0])
+    return needed
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 def _cycles() -> dict[str, str]:
@@ -82,32 +87,27 @@ def _cycles() -> dict[str, str]:
     from qs3.sensor.render.cycles import find_cycles
 
     try:
-        found = find_cycles()
+        program = find_cycles()
     except QS3Error as error:
         return {"fault": str(error)}
-    return found or {
+    return program or {
         "fault": "not here; in a checkout, make cycles brings it (or set QS3_BLENDER to a Blender "
         "4.2 or newer)"
     }
 
 
-def _print(found: dict[str, Any]) -> None:
-    print(f"Python {found['python']}")
-    for name, version in found["packages"].items():
+def _print(machine: dict[str, Any]) -> None:
+    print(f"Python {machine['python']}")
+    for name, version in machine["packages"].items():
         print(f"  {'ok     ' if version else 'MISSING'} {name} {version or ''}".rstrip())
         if version is None:
             print(f"          get it with: pip install {name}")
-    advice = {
-        "cuda_ad_mono": "needs an NVIDIA GPU whose driver has OptiX",
-        "llvm_ad_mono": "needs a system libLLVM (19 is known to work; on Debian: libllvm19)",
-        "scalar_rgb": "comes with the mitsuba wheel; reinstall it",
-    }
     print("Renderer (Mitsuba 3, fastest first)")
-    for variant, works in found["renderers"].items():
-        used = "   <- used" if variant == found["renderer"] else ""
-        reason = "" if works else f": {advice[variant]}"
+    for variant, works in machine["renderers"].items():
+        used = "   <- used" if variant == machine["renderer"] else ""
+        reason = "" if works else f": {_ADVICE[variant]}"
         print(f"  {'ok     ' if works else 'absent '} {variant}{reason}{used}")
-    cycles = found["cycles"]
+    cycles = machine["cycles"]
     print("The paper's renderer (--renderer cycles; optional)")
     if "fault" in cycles:
         print(f"  absent  cycles: {cycles['fault']}")
@@ -116,9 +116,11 @@ def _print(found: dict[str, Any]) -> None:
             f"  ok      cycles: Blender {cycles['blender']} (Python {cycles['python']}), "
             f"{cycles['command']}"
         )
-    print(f"Training on: {found['device']}")
-    print("Extras (for commands to come; nothing in this version needs them)")
-    for extra, here in found["extras"].items():
+    print(f"Training on: {machine['device']}")
+    print("Extras (each for what stands beside it, and nothing else)")
+    for extra, here in machine["extras"].items():
         how = "" if here else f": in a checkout, pip install -e '.[{extra}]'"
-        print(f"  {'ok     ' if here else 'absent '} {extra} ({_EXTRAS[extra][1]}){how}")
-    print("Ready." if found["ready"] else "Not ready: mend what is marked MISSING or absent above.")
+        print(f"  {'ok     ' if here else 'absent '} {extra} ({_PURPOSE[extra]}){how}")
+    print(
+        "Ready." if machine["ready"] else "Not ready: mend what is marked MISSING or absent above."
+    )

@@ -28,7 +28,7 @@ class ReportOptions:
     """What to tell."""
     mesh: str = "chair"
     """Mesh file or built-in class whose scan is shown step by step; none leaves it out."""
-    sensor: str = "qs3"
+    sensor: str = "paper"
     """Preset of the sensor for that scan, or your own TOML file."""
     out: Path | None = None
     """The page; report.html in the folder by default."""
@@ -78,17 +78,17 @@ def _published() -> tuple[dict[str, dict[str, str]], str]:
 
 def _with_scan(page: "Report", options: ReportOptions) -> "Report":
     """Add a scan step by step, or a note where none can be made here."""
-    from qs3.cli.camera import CameraOptions
-    from qs3.cli.scan import load_named
+    from qs3.meshes.named import load_named
     from qs3.report.montage import scan_montage
+    from qs3.sensor.settings import CameraSettings
 
     if options.mesh == "none":
         return page
     mesh, origin = load_named(options.mesh, 0)
-    camera = CameraOptions(sensor=options.sensor)
-    sensor = camera.resolve_sensor()
+    camera = CameraSettings(sensor=options.sensor)
+    sensor = camera.make_sensor()
     try:
-        renderer = camera.resolve_renderer()
+        renderer = camera.make_renderer()
     except QS3Error as error:
         print(f"no scan can be made here: {error}", file=sys.stderr)
         note = "No renderer works where this page was made: no scan is shown."

@@ -1,10 +1,11 @@
-"""``qs3 sensors``: the presets, and any of them as a TOML file to copy and edit."""
+"""``qs3 sensors``: the built-in ones, and any of them as a TOML file to copy and edit."""
 
 import sys
 from typing import Annotated, Any, Literal
 
 import tyro
 
+from qs3.cli.text import columns
 from qs3.errors import InputError
 
 
@@ -15,8 +16,8 @@ def sensors(
     """List the sensors, or show one as TOML to copy and edit.
 
     Args:
-        action: list all presets, or show one of them.
-        name: What to show: a preset, or a TOML file, whose every setting is then told.
+        action: list all of them, or show one.
+        name: What to show: a sensor, or a TOML file, whose every setting is then told.
     """
     from qs3.sensor.presets import SENSORS, get_sensor, sensor_toml
 
@@ -29,10 +30,7 @@ def sensors(
         raise InputError(f"sensors list: takes no name; to see it: qs3 sensors show {name}")
     rows = [("name", "pixels", "f (px)", "baseline", "range", "from", "what it is")]
     rows += [_row(sensor) for sensor in SENSORS.values()]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        print("  ".join(cells).rstrip())
+    print(*columns(rows), sep="\n")
     print(
         "range: depths kept; from: distance of the rig to the object's centre; without a unit: in "
         "sizes of the object. Next: qs3 sensors show d435 > my_camera.toml",

@@ -18,8 +18,8 @@ def info(folder: _Folder, as_json: bool = False) -> int:
         folder: Folder of a data set, or an address such as s3://bucket/folder.
         as_json: Print everything, settings and versions too, as one JSON object.
     """
-    from qs3.io.layouts.contents import info as count
     from qs3.store.failures import read_failures
+    from qs3.store.info import info as count
 
     found = count(folder)
     failures = read_failures(folder)

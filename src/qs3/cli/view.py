@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from qs3.cli.camera import CameraOptions
 from qs3.errors import InputError
+from qs3.sensor.settings import ScanSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -38,14 +38,12 @@ class ViewOptions:
     """With a run on generated data: the cloud that the network is shown."""
     class_name: str | None = None
     """Show the objects of this class first."""
-    seed: int = 0
-    """With a mesh: seed of the scan, and which draw of a built-in class."""
     up: Literal["z", "y"] | None = None
     """Up axis of a mesh file; by default y for glTF, z for all others."""
     port: int = 8080
     """Port of 127.0.0.1 to listen on; 0 takes a free one."""
-    camera: Annotated[CameraOptions, tyro.conf.arg(name="")] = field(default_factory=CameraOptions)
-    """With a mesh: the simulated camera to start with."""
+    scan: Annotated[ScanSettings, tyro.conf.arg(name="")] = field(default_factory=ScanSettings)
+    """With a mesh: how it is scanned to start with; a built-in class is drawn by the seed too."""
 
 
 def view(options: Annotated[ViewOptions, tyro.conf.arg(name="")]) -> int:
@@ -93,27 +91,25 @@ def _scan_page(options: ViewOptions, mesh: Any) -> "Callable[[Any], AbstractCont
     from qs3.viewer.pages import scan_page
     from qs3.viewer.scan_controls import ScanControls, rescan
 
-    if options.seed < 0:
-        raise InputError(f"--seed {options.seed}: must not be negative")
-    sensor = options.camera.resolve_sensor()
-    renderer = options.camera.resolve_renderer()
-    how = options.camera.scan_arguments()
+    how = options.scan
+    sensor = how.make_sensor()
+    renderer: Any = how.make_renderer()
     start = ScanControls.of(
         sensor,
-        views=how["views"],
-        view_layout=how["view_layout"],
-        num_points=how["num_points"],
+        views=how.views,
+        view_layout=how.chosen("view_layout"),
+        num_points=how.num_points,
         samples=renderer.samples,
-        crop="box" if how["box_crop"] else "none",
-        seed=options.seed,
+        crop=how.chosen("crop"),
+        seed=how.seed,
     )
     name = Path(options.what).name
 
     def scan(request: "ScanRequest") -> "Exhibit":
         if mesh is not None:
-            return rescan(request, mesh, name, renderer, how["size"])
+            return rescan(request, mesh, name, renderer, how.chosen("size"))
         shape = shapes.make(options.what, seed=request.draw)
-        return rescan(request, shape, f"{name}, draw {request.draw}", renderer, how["size"])
+        return rescan(request, shape, f"{name}, draw {request.draw}", renderer, how.chosen("size"))
 
     others = {key: value for key, value in SENSORS.items() if key != sensor.name}
     return partial(
@@ -122,5 +118,5 @@ def _scan_page(options: ViewOptions, mesh: Any) -> "Callable[[Any], AbstractCont
         sensors={sensor.name: sensor} | others,
         start=start,
         draws=_DRAWS if mesh is None else 0,
-        draw=options.seed if mesh is None else 0,
+        draw=how.seed if mesh is None else 0,
     )

@@ -12,7 +12,7 @@ from qs3.experiments.domains import DataSet
 from qs3.experiments.scales import Scale
 from qs3.meshes import collect
 from qs3.meshes.collections import MeshItem
-from qs3.sensor.surroundings import SceneSettings
+from qs3.sensor.scene import SceneSettings
 from qs3.store.generate import GenerateSettings, generate
 from qs3.store.plan import Plan, make_plan, resolve_renderer
 
@@ -114,7 +114,7 @@ def make_plans(
     common = {
         "meshes": "shapes+cad" if sides.cad else "shapes",
         "num_points": scale.data_points,
-        "renderer": renderer,
+        "renderer": renderer or "mitsuba",
         "rows_per_shard": 32,
     }
     plans = {}
@@ -131,7 +131,7 @@ def _plan(data: DataSet, scale: Scale, sides: Sides) -> tuple[list[MeshItem], Ma
     source = {"views": scale.source_views, "seed": _SEEDS["source"]}
     # As annotated frames are cut: by the object's mask, and by its box with a margin, or a few
     # flying pixels would set the scale of the whole cloud.
-    room = {"sensor": TARGET_SENSOR, "scene": _ROOM, "box_margin": 0.05, "mask_crop": True}
+    room = {"sensor": TARGET_SENSOR, "scene": _ROOM, "box_margin": 0.05, "crop": "both"}
     match data.kind:
         case "source":
             return sides.source, source

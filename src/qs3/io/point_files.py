@@ -1,7 +1,6 @@
 """Point clouds from single files: npy, xyz, txt, ply, pcd, off."""
 
 import io
-import math
 import warnings
 from pathlib import Path
 
@@ -9,8 +8,9 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from qs3.errors import InputError
+from qs3.io.guards import load_npy, reason
 from qs3.io.pcd import parse_pcd, pcd_bytes
-from qs3.io.ply import parse_ply, ply_bytes
+from qs3.io.ply import check_ply, ply_bytes
 
 POINT_FILES = (".npy", ".xyz", ".txt", ".ply", ".pcd", ".off")
 WRITTEN_FILES = (".npy", ".xyz", ".ply", ".pcd")
@@ -42,21 +42,17 @@ def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np
         raise InputError(f"{path}: empty file")
     try:
         if suffix == ".npy":
-            points = _npy(content)
+            points = load_npy(content, _accept)[:, :3]
         elif suffix == ".pcd":
             points = parse_pcd(content)
         elif suffix in (".xyz", ".txt"):
             points = _text(content)
         else:
-            points = parse_ply(content) if suffix == ".ply" else None
-            if points is None:
-                points = _trimesh(content, suffix[1:], mesh_points, seed)
+            points = _trimesh(content, suffix[1:], mesh_points, seed)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:  # parsers of damaged files raise whatever they stumble over
-        lines = str(error).splitlines()
-        reason = lines[0] if lines else type(error).__name__
-        raise InputError(f"{path}: cannot be read as {suffix[1:]} ({reason})") from error
+        raise InputError(f"{path}: cannot be read as {suffix[1:]} ({reason(error)})") from error
     if not len(points):
         raise InputError(f"{path}: holds no point")
     with np.errstate(over="ignore"):
@@ -94,25 +90,11 @@ def cloud_bytes(points: Float[np.ndarray, "n 3"], ending: str) -> bytes:
     raise InputError(f"{ending}: cannot be written; known are {', '.join(WRITTEN_FILES)}")
 
 
-def _npy(content: bytes) -> np.ndarray:
-    handle = io.BytesIO(content)
-    version = np.lib.format.read_magic(handle)
-    readers = {(1, 0): np.lib.format.read_array_header_1_0}
-    readers[2, 0] = np.lib.format.read_array_header_2_0
-    if version not in readers:
-        raise InputError(f"npy version {version[0]}.{version[1]} holds no plain numbers")
-    shape, _, kind = readers[version](handle)
-    if kind.hasobject:
-        raise ValueError("holds pickled objects, which are never loaded")
+def _accept(shape: tuple[int, ...], kind: np.dtype) -> None:
     if len(shape) != 2 or shape[1] < 3 or kind.kind not in "fiu":
         raise InputError(
             f"needs numbers of shape [n, 3] or more columns, not {kind} of shape {list(shape)}"
         )
-    size, there = math.prod(shape) * kind.itemsize, len(content) - handle.tell()
-    if size > there:
-        raise InputError(f"cannot be read as npy (announces {size} bytes, but has {there})")
-    handle.seek(0)
-    return np.load(handle, allow_pickle=False)[:, :3]
 
 
 def _text(content: bytes) -> np.ndarray:
@@ -155,6 +137,8 @@ def _trimesh(content: bytes, file_type: str, mesh_points: int, seed: int) -> np.
 
     from qs3.meshes.normalise import sample_surface
 
+    if file_type == "ply":
+        check_ply(content)
     loaded = trimesh.load(io.BytesIO(content), file_type=file_type, process=False)
     if isinstance(loaded, trimesh.Trimesh) and len(loaded.faces):
         return sample_surface(loaded, mesh_points, np.random.default_rng(seed))

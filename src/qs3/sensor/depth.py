@@ -14,7 +14,10 @@ from jaxtyping import Float
 
 from qs3.errors import InputError
 from qs3.geometry import transform_points
+from qs3.sensor.checks import check_choices, check_range
 from qs3.sensor.rig import Pose, Region, StereoRig
+
+PrincipalPoint = Literal["true", "released"]
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,7 @@ class DepthSettings:
     """Depths at or above are dropped."""
     stride: int = 4
     """Every stride-th pixel of the frame is kept, from pixel 0: the ×0.25 nearest resize."""
-    principal_point: Literal["true", "released"] = "true"
+    principal_point: PrincipalPoint = "true"
     """``true`` is (w − 1)/2 of the frame; ``released`` is w/2 of the reduced image, half a pixel
     of the frame and more away from where the optical axis is."""
 
@@ -36,12 +39,8 @@ class DepthSettings:
             raise InputError(
                 f"depth: near {self.near} and far {self.far} must be 0 or above and in this order"
             )
-        if self.stride < 1:
-            raise InputError(f"depth: stride {self.stride} must be at least 1")
-        if self.principal_point not in ("true", "released"):
-            raise InputError(
-                f"depth: no principal_point {self.principal_point!r}; choose true or released"
-            )
+        check_range(self, "depth", "stride", low=1)
+        check_choices(self, "depth")
 
 
 def depth_from_disparity(

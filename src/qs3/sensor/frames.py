@@ -63,8 +63,7 @@ def write_frames(folder: Path, scan: Scan) -> list[Path]:
     for index, (images, pose) in enumerate(zip(scan.images, scan.poses, strict=True)):
         for name, picture in _pictures(images, scale).items():
             end = "_000000" if name.startswith("mask") else ""
-            data = cv2.imencode(".png", picture)[1].tobytes()
-            write_bytes(scene / name / f"{index:06d}{end}.png", data)
+            _write_picture(scene / name / f"{index:06d}{end}.png", picture)
         world_to_camera = invert_rigid(pose.camera_to_world)
         turn = np.eye(4)
         turn[:3, :3] = rotation_z(scan.yaw)
@@ -88,6 +87,54 @@ def write_frames(folder: Path, scan: Scan) -> list[Path]:
     return [scene / f"scene_{name}.json" for name in written] + sorted(
         path for path in scene.iterdir() if path.is_dir()
     )
+
+
+def write_parts(folder: Path, scan: Scan) -> list[Path]:
+    """Write the object's part of each view: grey pair, depth and camera, for a quick look.
+
+    Depth is in steps of 1/10,000 of the unit, 0 where there is none. Views that do not show the
+    object are left out.
+
+    Returns:
+        The files written.
+    """
+    written: list[Path] = []
+    cx, cy = scan.sensor.rig.principal_point
+    for index, (images, pose) in enumerate(zip(scan.images, scan.poses, strict=True)):
+        if not images.left.size:  # the object is out of this view's sight
+            continue
+        pictures = {
+            "left": images.left,
+            "right": images.right,
+            "depth": _in_steps(images.depth),
+            "true-depth": _in_steps(images.true_depth),
+        }
+        for kind, picture in pictures.items():
+            written.append(folder / f"view-{index}-{kind}.png")
+            _write_picture(written[-1], picture)
+        camera = {
+            "width": images.region.width,
+            "height": images.region.height,
+            "focal": scan.sensor.rig.focal,
+            "principal_point": [cx - images.region.x, cy - images.region.y],
+            "region_of_frame": list(images.region.bounds),
+            "frame": [scan.sensor.rig.width, scan.sensor.rig.height],
+            "baseline": scan.sensor.rig.baseline,
+            "depth_unit": 1e-4,
+            "camera_to_world": pose.camera_to_world.tolist(),
+            "world": "the mesh in its object size, turned about z by yaw (scan.json)",
+        }
+        written.append(folder / f"view-{index}-camera.json")
+        write_json(written[-1], camera)
+    return written
+
+
+def _in_steps(depth: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
+    return np.nan_to_num(np.clip(np.rint(depth * 1e4), 0, 65535)).astype(np.uint16)
+
+
+def _write_picture(path: Path, picture: np.ndarray) -> None:
+    write_bytes(path, cv2.imencode(".png", picture)[1].tobytes())
 
 
 def depth_scale(sensor: Sensor) -> float:

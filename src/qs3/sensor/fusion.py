@@ -3,14 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
-
-
-def inside_box(
-    points: Float[np.ndarray, "n 3"], bounds: Float[np.ndarray, "2 3"]
-) -> Bool[np.ndarray, "n"]:
-    """Whether each point lies in an axis-aligned box, its border included."""
-    return ((points >= bounds[0]) & (points <= bounds[1])).all(axis=1)
+from jaxtyping import Float, UInt8
 
 
 def fuse(
@@ -32,5 +25,5 @@ def fuse(
     view = np.repeat(np.arange(len(clouds)), [len(c) for c in clouds]).astype(np.uint8)
     if bounds is None:
         return points, view
-    keep = inside_box(points, bounds)
+    keep = ((points >= bounds[0]) & (points <= bounds[1])).all(axis=1)  # its border included
     return points[keep], view[keep]

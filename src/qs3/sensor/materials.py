@@ -1,10 +1,10 @@
 """What surfaces do to light: a few parameters that every renderer understands."""
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
 from qs3.errors import InputError
+from qs3.sensor.checks import check_choices, check_range
 
 
 @dataclass(frozen=True)
@@ -23,15 +23,9 @@ class Material:
     """Index of refraction of glass and of a principled surface's coat, above 1."""
 
     def __post_init__(self) -> None:
-        if self.model not in ("diffuse", "principled", "mirror", "glass"):
-            raise InputError(
-                f"material: no model {self.model!r}; choose diffuse, principled, mirror or glass"
-            )
-        for name in ("albedo", "roughness", "metallic"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InputError(f"material: {name} {getattr(self, name)} is not within 0…1")
-        if not 1 < self.ior < math.inf:
-            raise InputError(f"material: ior {self.ior} must be above 1")
+        check_choices(self, "material")
+        check_range(self, "material", "albedo", "roughness", "metallic", high=1)
+        check_range(self, "material", "ior", low=1, above=True)
 
     @property
     def rough(self) -> bool:
@@ -52,8 +46,8 @@ MATERIALS: dict[str, Material] = {
 }
 
 
-def get_material(name: str) -> Material:
-    """Return the named material.
+def get_material(name: Material | str) -> Material:
+    """Return the named material; a material is returned as it is.
 
     Raises:
         InputError: where there is none; the message lists those there are.
@@ -62,6 +56,8 @@ def get_material(name: str) -> Material:
         >>> get_material("dark").albedo
         0.04
     """
+    if isinstance(name, Material):
+        return name
     if name not in MATERIALS:
         raise InputError(f"material: no {name!r}; choose one of {', '.join(MATERIALS)}")
     return MATERIALS[name]

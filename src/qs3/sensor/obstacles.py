@@ -8,10 +8,10 @@ from qs3.errors import InputError
 from qs3.sensor.presets import Sensor
 from qs3.sensor.render.scene import Body
 from qs3.sensor.rig import Pose
-from qs3.sensor.surroundings import Surroundings
+from qs3.sensor.scene import ArrangedScene
 
 
-def check_views(surroundings: Surroundings, sensor: Sensor) -> None:
+def check_views(arranged: ArrangedScene, sensor: Sensor) -> None:
     """Refuse what no camera can stand in or light up, before anything is rendered.
 
     Raises:
@@ -20,17 +20,17 @@ def check_views(surroundings: Surroundings, sensor: Sensor) -> None:
             the object.
     """
     rig = sensor.rig
-    for index, pose in enumerate(surroundings.poses):
+    for index, pose in enumerate(arranged.poses):
         eyes = {"camera": pose, "right camera": rig.right(pose), "projector": rig.projector(pose)}
         for eye, stands in eyes.items():
-            for body, name in zip(surroundings.bodies, surroundings.names, strict=True):
+            for body, name in zip(arranged.bodies, arranged.names, strict=True):
                 if where := _blocked(stands.position, body, name):
                     raise InputError(
                         f"view {index}: the {eye} stands {where}; give placement a larger radius "
                         "or another elevation, or make the object smaller (object_size)"
                     )
     if sensor.light.projector > 0 and not any(
-        _lit(surroundings.bodies[0].mesh, sensor, pose) for pose in surroundings.poses
+        _lit(arranged.bodies[0].mesh, sensor, pose) for pose in arranged.poses
     ):
         raise InputError(
             f"the projector ({rig.projector_offset} baselines from the left camera) throws its "

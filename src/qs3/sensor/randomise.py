@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from qs3.errors import InputError
-from qs3.sensor.materials import MATERIALS, get_material
-from qs3.sensor.presets import Sensor
+from qs3.sensor.materials import MATERIALS
+from qs3.sensor.presets import Sensor, changed
 
 # What a depth camera sees in a home: no mirrors and no glass, of which it sees nothing.
 _COMMON = ("diffuse", "principled", "rough-specular", "glossy-plastic", "metal", "dark")
@@ -42,14 +42,16 @@ def default_ranges(sensor: Sensor) -> dict[str, tuple[Any, ...]]:
 
 
 def resolve_ranges(
-    sensor: Sensor, randomise: Mapping[str, Sequence[Any]] | str | None
+    sensor: Sensor, randomise: Mapping[str, Sequence[Any]] | Sequence[str] | None
 ) -> dict[str, tuple[Any, ...]]:
     """Check the ranges and return them as plain values, in a fixed order.
 
     Args:
         sensor: The sensor whose settings are named.
         randomise: ``(low, high)`` (uniform) or ``(low, high, "log")`` (uniform in the logarithm)
-            by name, and ``material`` a list of names; ``"default"`` is `default_ranges`.
+            by name, and ``material`` a list of names; or such ranges as words:
+            ``light.ambient=0:0.1``, ``exposure.gain=0.5:2:log``, ``material=diffuse,metal``;
+            ``"default"`` is `default_ranges`.
 
     Raises:
         InputError: for a name that is no number of the sensor, a range that is none, or one at
@@ -58,24 +60,23 @@ def resolve_ranges(
     Example:
         >>> resolve_ranges(Sensor(), {"light.ambient": (0, 0.1)})
         {'light.ambient': (0.0, 0.1)}
+        >>> resolve_ranges(Sensor(), ["material=dark,metal", "light.ambient=0:0.1"])
+        {'light.ambient': (0.0, 0.1), 'material': ('dark', 'metal')}
     """
-    if randomise is None:
-        return {}
-    if isinstance(randomise, str):
-        if randomise != "default":
-            raise InputError(f"randomise: no bundle {randomise!r}; there is default")
-        randomise = default_ranges(sensor)
+    if not isinstance(randomise, Mapping):
+        words = [randomise] if isinstance(randomise, str) else list(randomise or ())
+        randomise = default_ranges(sensor) if words == ["default"] else _parsed(words)
     ranges = {name: _range(sensor, name, randomise[name]) for name in sorted(randomise)}
     # Settings check themselves when they are made: each end of each range is tried once.
     for name, values in ranges.items():
         for value in values if name == "material" else values[:2]:
-            _replaced(sensor, name, value)
+            changed(sensor, name, value)
     return ranges
 
 
 def draw(
     sensor: Sensor,
-    randomise: Mapping[str, Sequence[Any]] | str | None,
+    randomise: Mapping[str, Sequence[Any]] | Sequence[str] | None,
     rng: np.random.Generator,
 ) -> tuple[Sensor, dict[str, Any]]:
     """Draw a sensor from ranges.
@@ -111,35 +112,19 @@ def draw(
             value = min(max(math.exp(low + share * (high - low)), values[0]), values[1])
         else:
             value = values[0] + share * (values[1] - values[0])
-        sensor = _replaced(sensor, name, value)
+        sensor = changed(sensor, name, value)
         drawn[name] = value
     return sensor, drawn
 
 
-def parse_ranges(tokens: Sequence[str]) -> dict[str, tuple[Any, ...]] | str | None:
-    """Read ranges from the words of a command line.
-
-    Args:
-        tokens: ``light.ambient=0:0.1``, ``exposure.gain=0.5:2:log``, ``material=diffuse,metal``,
-            or the one word ``default``.
-
-    Raises:
-        InputError: for a word that is none of these.
-
-    Example:
-        >>> parse_ranges(["material=dark,metal", "light.ambient=0:0.1"])
-        {'material': ('dark', 'metal'), 'light.ambient': (0.0, 0.1)}
-    """
-    if not tokens:
-        return None
-    if list(tokens) == ["default"]:
-        return "default"
+def _parsed(words: Sequence[str]) -> dict[str, tuple[Any, ...]]:
+    """Ranges from words such as those of a command line."""
     ranges: dict[str, tuple[Any, ...]] = {}
-    for token in tokens:
-        name, equals, text = token.partition("=")
+    for word in words:
+        name, equals, text = word.partition("=")
         if not equals or name in ranges:
             raise InputError(
-                f"randomise: {token!r} is not understood, or named twice; write "
+                f"randomise: {word!r} is not understood, or named twice; write "
                 "light.ambient=0:0.1, material=diffuse,metal, or default alone"
             )
         if name == "material":
@@ -151,7 +136,7 @@ def parse_ranges(tokens: Sequence[str]) -> dict[str, tuple[Any, ...]] | str | No
         try:
             ranges[name] = (*(float(number) for number in numbers), *log)
         except ValueError:
-            raise InputError(f"randomise: {token!r} has no range such as 0.0:0.1") from None
+            raise InputError(f"randomise: {word!r} has no range such as 0.0:0.1") from None
     return ranges
 
 
@@ -162,14 +147,14 @@ def numbers_of(settings: Any, prefix: str = "") -> dict[str, type]:
         >>> numbers_of(Sensor())["light.ambient"]
         <class 'float'>
     """
-    found: dict[str, type] = {}
+    numbers: dict[str, type] = {}
     for part in dataclasses.fields(settings):
         value, name = getattr(settings, part.name), prefix + part.name
         if dataclasses.is_dataclass(value):
-            found |= numbers_of(value, f"{name}.")
+            numbers |= numbers_of(value, f"{name}.")
         elif part.type is int or part.type is float:
-            found[name] = part.type
-    return found
+            numbers[name] = part.type
+    return numbers
 
 
 def _range(sensor: Sensor, name: str, values: Sequence[Any]) -> tuple[Any, ...]:
@@ -178,11 +163,11 @@ def _range(sensor: Sensor, name: str, values: Sequence[Any]) -> tuple[Any, ...]:
         if not chosen:
             raise InputError(f"randomise: material: name some of {', '.join(MATERIALS)}")
         return tuple(chosen)
-    known = numbers_of(sensor)
-    if name not in known:
-        near = difflib.get_close_matches(name, ["material", *known], n=3, cutoff=0.4)
-        near = near or [other for other in known if other.split(".")[-1] == name.split(".")[-1]]
-        hint = f"did you mean {' or '.join(near)}?" if near else "see: qs3 sensors show qs3"
+    types = numbers_of(sensor)
+    if name not in types:
+        near = difflib.get_close_matches(name, ["material", *types], n=3, cutoff=0.4)
+        near = near or [other for other in types if other.split(".")[-1] == name.split(".")[-1]]
+        hint = f"did you mean {' or '.join(near)}?" if near else "see: qs3 sensors show paper"
         raise InputError(f"randomise: the sensor has no number {name!r}; {hint}")
     plain = [] if isinstance(values, str) else list(values)
     log = plain[2:] == ["log"]
@@ -195,18 +180,8 @@ def _range(sensor: Sensor, name: str, values: Sequence[Any]) -> tuple[Any, ...]:
             f"randomise: {name}: {values!r} is no range; give low and high in this order, and "
             "'log' only where both are above 0"
         )
-    if known[name] is int:
+    if types[name] is int:
         if log or any(number != int(number) for number in numbers):
             raise InputError(f"randomise: {name} takes whole numbers, not {values!r}")
         return int(numbers[0]), int(numbers[1])
     return (float(numbers[0]), float(numbers[1]), *(["log"] if log else []))
-
-
-def _replaced(settings: Any, name: str, value: Any) -> Any:
-    """The settings with one dotted name replaced."""
-    head, _, rest = name.partition(".")
-    if rest:
-        value = _replaced(getattr(settings, head), rest, value)
-    elif head == "material":
-        value = get_material(value)
-    return dataclasses.replace(settings, **{head: value})

@@ -54,7 +54,7 @@ class Plan:
     def arguments(self, position: int, scan: int) -> tuple[Any, ...]:
         """What `scan_item` is handed: object, scan, settings, and a neighbour where one stands."""
         item, settings = self.items[position], self.settings
-        if not settings.scene.needs_neighbour:
+        if not settings.make_scene().needs_neighbour:
             return item, scan, settings
         beside = neighbour_of(item, scan, self.items, settings.seed, position)
         return item, scan, settings, beside
@@ -92,7 +92,7 @@ def make_plan(items: Sequence[Item], settings: GenerateSettings) -> Plan:
         if item.id in seen:
             raise InputError(f"{settings.meshes}: two meshes are called {item.id!r}; rename one")
         seen.add(item.id)
-    if settings.scene.needs_neighbour and len(items) < 2:
+    if settings.make_scene().needs_neighbour and len(items) < 2:
         raise InputError(
             f"{items[0].id}: a scene with a neighbour needs a second mesh to draw from"
         )
@@ -102,12 +102,10 @@ def make_plan(items: Sequence[Item], settings: GenerateSettings) -> Plan:
 
 
 def resolve_renderer(settings: GenerateSettings) -> GenerateSettings:
-    """Choose the default renderer where none is named: the same one for every worker."""
-    if settings.renderer is not None:
-        return settings
-    from qs3.sensor.render.mitsuba import MitsubaRenderer
-
-    return dataclasses.replace(settings, renderer=MitsubaRenderer())
+    """Choose sensor and renderer where they are but named: the same ones for every worker."""
+    return dataclasses.replace(
+        settings, sensor=settings.make_sensor(), renderer=settings.make_renderer()
+    )
 
 
 def work_list_checksum(items: Sequence[Item]) -> str:

@@ -3,15 +3,18 @@
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, runtime_checkable
 
 import numpy as np
+import tyro
 
 from qs3.errors import InputError
 from qs3.meshes.classes import POINTDA10, map_labels
-from qs3.sensor.surroundings import SceneSettings
+from qs3.sensor.checks import check_range
+from qs3.sensor.presets import settings_dict
+from qs3.sensor.settings import ScanSettings, renderer_dict
 from qs3.store.shards import STATISTICS, CloudRow, DType
 
 if TYPE_CHECKING:
@@ -43,72 +46,39 @@ class Item(Protocol):
 
 
 @dataclass(frozen=True)
-class GenerateSettings:
-    """What a data set's bytes depend on, together with the work list."""
+class GenerateSettings(ScanSettings):
+    """What a data set's bytes depend on, together with the work list; ``seed`` is its root seed."""
 
-    meshes: str = "shapes"
+    meshes: Annotated[str, tyro.conf.Suppress] = "shapes"
     """``shapes`` or the name (not the path) of the folder of meshes; a label for the record."""
-    per_class: int | None = None
+    per_class: Annotated[int | None, tyro.conf.Suppress] = None
     """Objects a class; None takes all."""
     scans_per_mesh: int = 1
     """Scans of each object, each from other poses."""
-    sensor: Any = "qs3"
-    """Name of a sensor preset, or a `qs3.sensor.presets.Sensor`."""
-    renderer: Any = None
-    """A picklable renderer; None resolves to the default one before any work is handed out."""
-    views: int = 5
-    """Views fused into a cloud."""
-    view_layout: Literal["orbit", "jitter"] = "orbit"
-    """Poses around the object, or jittered copies of one."""
-    size: Literal["box", "ball"] = "box"
-    """Longest side 1, or the unit ball."""
-    box_crop: bool = True
-    """Keep only points inside the object's box."""
-    box_margin: float = 0.0
-    """That box is larger by this on every side, in the unit of the scene."""
-    mask_crop: bool = False
-    """Keep only pixels that truly show the object."""
-    scene: SceneSettings = field(default_factory=SceneSettings)
-    """What stands around the object; a neighbour is another item of the work list."""
-    randomise: Mapping[str, Sequence[Any]] | str | None = None
-    """Ranges of the sensor's settings drawn anew for each scan; see `qs3.sensor.randomise`."""
-    num_points: int = 2048
-    """Points of each cloud."""
-    classes: tuple[str, ...] = POINTDA10
+    classes: Annotated[tuple[str, ...], tyro.conf.Suppress] = POINTDA10
     """Classes in the order of the label."""
     split: str | None = None
-    """Split of every row; None takes each item's own."""
-    seed: int = 0
-    """Root of all seeds."""
+    """Name of the split of every row, such as train or test; by default each item's own."""
     rows_per_shard: int = 64
-    """Scans a shard."""
+    """Scans in one Parquet file."""
     dtype: DType = "float32"
-    """Type of the coordinates on disk."""
+    """Type of the coordinates on disk; half precision is good to 0.0005 at a size of 1."""
 
     def __post_init__(self) -> None:
-        for name in ("scans_per_mesh", "views", "num_points", "rows_per_shard"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if self.seed < 0:
-            raise InputError(f"seed must not be negative, but is {self.seed}")
-        if self.dtype not in ("float32", "float16"):
-            raise InputError(f"dtype {self.dtype!r}: choose float32 or float16")
+        super().__post_init__()
+        check_range(self, "data set", "scans_per_mesh", "rows_per_shard", low=1)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, the sensor's and the renderer's settings among them."""
-        from qs3.sensor.presets import get_sensor, settings_dict
-        from qs3.sensor.randomise import resolve_ranges
-
-        sensor = get_sensor(self.sensor) if isinstance(self.sensor, str) else self.sensor
-        plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        plain["classes"] = list(self.classes)
-        plain["sensor"] = settings_dict(sensor)
-        plain["scene"] = dataclasses.asdict(self.scene)
-        plain["randomise"] = resolve_ranges(sensor, self.randomise)
-        if self.renderer is not None:
-            names = [f.name for f in dataclasses.fields(self.renderer)]
-            own = {name: getattr(self.renderer, name) for name in names}
-            plain["renderer"] = own | self.renderer.description
+        own = {f.name for f in dataclasses.fields(self)} - {
+            f.name for f in dataclasses.fields(ScanSettings)
+        }
+        plain = super().as_dict() | {name: getattr(self, name) for name in sorted(own)}
+        plain |= {"classes": list(self.classes), "seed": self.seed}
+        plain["sensor"] = settings_dict(self.make_sensor())
+        plain["renderer"] = None
+        if not isinstance(self.renderer, str):
+            plain["renderer"] = renderer_dict(self.renderer)
         return plain
 
 
@@ -167,22 +137,8 @@ def scan_item(
     from qs3.sensor.scan import scan
 
     seed = scan_seed(settings.seed, item.id, scan_index)
-    result = scan(
-        item.load(),
-        sensor=settings.sensor,
-        views=settings.views,
-        view_layout=settings.view_layout,
-        seed=seed,
-        size=settings.size,
-        box_crop=settings.box_crop,
-        box_margin=settings.box_margin,
-        mask_crop=settings.mask_crop,
-        scene=settings.scene,
-        neighbour=None if neighbour is None else neighbour.load(),
-        randomise=settings.randomise,
-        num_points=settings.num_points,
-        renderer=settings.renderer,
-    )
+    beside = None if neighbour is None else neighbour.load()
+    result = scan(item.load(), settings, seed=seed, neighbour=beside)
     # The scan draws from children of `seed`; the key keeps this stream apart from them.
     surface_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0x50BF,)))
     surface = sample_surface(result.mesh, settings.num_points, surface_rng)

@@ -11,7 +11,6 @@ from qs3.sensor.matching.settings import Method
 from qs3.sensor.materials import MATERIALS, get_material
 from qs3.sensor.presets import Sensor
 from qs3.sensor.scan import Scan, scan
-from qs3.sensor.surroundings import SceneSettings
 from qs3.sensor.views import ViewLayout
 from qs3.viewer.exhibits import STATISTICS, Exhibit, statistics
 
@@ -161,9 +160,8 @@ def rescan(
         seed=how.seed,
         size=size,
         num_points=how.num_points,
-        scene=SceneSettings(how.scene),
-        box_crop=how.crop == "box",
-        mask_crop=how.crop == "mask",
+        scene=how.scene,
+        crop=how.crop,
         renderer=dataclasses.replace(renderer, samples=how.samples),
     )
     return exhibit_of(done, name)

@@ -1,6 +1,5 @@
 """Scenes in BOP's layout: one written here by hand, and one that our own scan writes."""
 
-import dataclasses
 import json
 import shutil
 
@@ -12,13 +11,8 @@ from scipy.spatial import cKDTree
 from qs3 import shapes
 from qs3.errors import InputError
 from qs3.geometry import rotation_z
-from qs3.io.extract.bop import (
-    BopSettings,
-    extract_bop,
-    has_world,
-    is_bop,
-    list_bop_frames,
-)
+from qs3.io.extract.bop import class_of, cut_frame, is_bop, list_bop_frames
+from qs3.io.extract.depth import DepthImageSettings
 from qs3.meshes import sample_surface
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.frames import write_frames
@@ -80,9 +74,13 @@ def scene(tmp_path_factory):
     return folder
 
 
-def clouds(source, **more):
-    settings = BopSettings(**more)
-    return [cloud for frame in list_bop_frames(source) for cloud in extract_bop(frame, settings)]
+def clouds(source, frame="world", names=None, **more):
+    settings = DepthImageSettings(**more)
+    return [
+        cloud
+        for image in list_bop_frames(source)
+        for cloud in cut_frame(image, frame, settings, names or {})
+    ]
 
 
 def test_convention_views_meet_in_the_world_and_in_the_models_axes(scene):
@@ -106,12 +104,14 @@ def test_convention_the_cameras_axes_are_upright(scene):
     np.testing.assert_allclose(cloud.points, np.stack([x, z, -y], axis=1), atol=1e-5)
 
 
-def test_classes_come_from_the_table_then_the_option_then_the_model(scene):
-    names = {"obj_000005": "chair"}
-    assert {c.class_name for c in clouds(scene, names=names)} == {"chair"}
-    assert {c.class_name for c in clouds(scene, names={"5": "sofa"}, class_name="x")} == {"sofa"}
-    assert {c.class_name for c in clouds(scene, class_name="x")} == {"x"}
-    assert {c.class_name for c in clouds(scene)} == {"obj_000005"}
+def test_classes_come_from_the_table_then_the_option_then_the_model():
+    for names, given, expected in (
+        ({"obj_000005": "chair"}, "x", "chair"),
+        ({"5": "sofa"}, "x", "sofa"),
+        ({}, "x", "x"),
+        ({}, "", "obj_000005"),
+    ):
+        assert class_of(5, DepthImageSettings(class_name=given), names) == expected
 
 
 def test_a_folder_of_scenes_is_all_its_scenes(scene, tmp_path):
@@ -158,7 +158,7 @@ def test_convention_our_own_frames_lie_on_the_mesh_again(scanned):
     turn = np.eye(4)
     turn[:3, :3] = rotation_z(made.yaw)
     for frame, surface in (("model", mesh), ("world", moved(mesh, turn))):
-        true = clouds(folder, frame=frame, depth="depth_true")
+        true = clouds(folder, frame=frame, depth_folder="depth_true")
         assert len(true) == 2
         for cloud in true:
             # Half a step of 0.1 mm along a ray that is a little longer than the axis.
@@ -185,19 +185,19 @@ def spoil(scene, tmp_path, name, change):
         ("scene_camera.json", lambda v: [v], "not a JSON object"),
         ("scene_camera.json", lambda v: {"../1": v["0"]}, "one entry an image"),
         ("scene_camera.json", lambda v: {"0": v["0"], "00": v["0"]}, "comes twice"),
-        ("scene_camera.json", lambda v: {"0": 3}, "image 0: not a camera"),
-        ("scene_camera.json", lambda v: v["1"].update(depth_scale=None), "depth_scale must be a n"),
+        ("scene_camera.json", lambda v: {"0": 3}, "image 0: not a JSON object"),
+        ("scene_camera.json", lambda v: v["1"].update(depth_scale=None), "depth_scale"),
         ("scene_camera.json", lambda v: v["0"].update(depth_scale=-1), "must be positive"),
         ("scene_camera.json", lambda v: v["0"].update(cam_K=[1, 2]), "cam_K must be 9 numbers"),
         ("scene_camera.json", lambda v: v["0"]["cam_K"].__setitem__(0, 0), "must be positive"),
         ("scene_camera.json", lambda v: v["0"].update(cam_R_w2c=[1] * 9), "is no rotation"),
-        ("scene_camera.json", lambda v: v["0"].update(cam_t_w2c=0), "cam_t_w2c must be 3 numbers"),
+        ("scene_camera.json", lambda v: v["0"].update(cam_t_w2c=0), "cam_t_w2c.*not a list"),
         ("scene_camera.json", lambda v: v["0"].update(width=161), "160×120 pixels, the camera 161"),
         ("scene_camera.json", lambda v: v["0"].update(cam_t_w2c=[1e290, 0, 0]), "beyond 1,000 km"),
         ("scene_gt.json", lambda v: {"0": 5}, "not a list of objects"),
-        ("scene_gt.json", lambda v: {"0": [5]}, "not a list of objects"),
-        ("scene_gt.json", lambda v: {"0": [{}]}, "obj_id must be a whole number"),
-        ("scene_gt.json", lambda v: {"0": [{"obj_id": -1}]}, "obj_id must be a whole number"),
+        ("scene_gt.json", lambda v: {"0": [5]}, "object 0: not a JSON object"),
+        ("scene_gt.json", lambda v: {"0": [{}]}, "obj_id.*missing"),
+        ("scene_gt.json", lambda v: {"0": [{"obj_id": -1}]}, "obj_id -1 is no model"),
         ("scene_gt.json", lambda v: {"0": [{"obj_id": 1}] * 3}, r"000000_000002\.png: no such"),
     ],
 )  # fmt: skip
@@ -221,7 +221,6 @@ def drop(*names):
 
 def test_axes_that_no_file_tells_are_refused(scene, tmp_path):
     source = spoil(scene, tmp_path, "scene_camera.json", drop("cam_R_w2c", "cam_t_w2c"))
-    assert not has_world(list_bop_frames(source))
     with pytest.raises(InputError, match="image 0 has no cam_R_w2c"):
         clouds(source)
     assert len(clouds(source, frame="camera")) == 2
@@ -233,8 +232,7 @@ def test_axes_that_no_file_tells_are_refused(scene, tmp_path):
 def test_folders_of_pictures_are_names_and_no_paths():
     for name in ("../depth", "/etc", ""):
         with pytest.raises(InputError, match="is no folder of a scene"):
-            BopSettings(depth=name)
-    assert dataclasses.replace(BopSettings(), depth="depth_true").depth == "depth_true"
+            DepthImageSettings(depth_folder=name)
 
 
 def fuzz(scene, tmp_path, rng, rounds):

@@ -8,7 +8,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from qs3.errors import InputError
-from qs3.io.extract.boxes import OrientedBox, box_from_heading, inside_box
+from qs3.geometry import rotation_z
+from qs3.io.extract.cut import OrientedBox, inside_box
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -85,9 +86,13 @@ def test_convention_boxes_of_real_objects_cut_them_out_of_one_another(shared_dat
     data = dict(np.load(shared_data / "sunrgbd_objects.npz"))
     offset, boxes = data["offset"], data["bbox"]
 
+    def upright_box(index, heading):
+        # VoteNet counts radians from +x, clockwise seen from above.
+        return OrientedBox(boxes[index, :3], rotation_z(-heading).T, boxes[index, 3:6])
+
     def cloud(index):
         local = data["points"][offset[index] : offset[index + 1]].astype(np.float64)
-        box = box_from_heading(boxes[index, :3], boxes[index, 3:6], boxes[index, 6])
+        box = upright_box(index, boxes[index, 6])
         return box, local @ box.basis + box.centre
 
     every = [cloud(index) for index in range(len(boxes))]
@@ -104,5 +109,5 @@ def test_convention_boxes_of_real_objects_cut_them_out_of_one_another(shared_dat
         assert len(found) == len(chair)
         assert tree.query(chair)[0].max() < 1e-6
         # Turned the other way the boxes do not agree.
-        other = box_from_heading(boxes[index, :3], boxes[index, 3:6], -boxes[index, 6])
+        other = upright_box(index, -boxes[index, 6])
         assert inside_box(table, other).sum() != len(chair)

@@ -1,7 +1,6 @@
 """Objects cut from the raw depth frames of a room that the tests render themselves."""
 
 import dataclasses
-import json
 import pickle
 import struct
 import tracemalloc
@@ -15,17 +14,19 @@ import pytest
 from scipy.spatial import KDTree
 
 from qs3.errors import InputError
-from qs3.io.extract.clouds import ExtractedCloud
-from qs3.io.extract.scannet import (
+from qs3.io.extract.run import ExtractedCloud, OutputSettings
+from qs3.io.extract.scannet import ScanNetSettings, extract_scannet
+from qs3.io.extract.scannet_frames import cut_scene
+from qs3.io.extract.scannet_masks import InstanceMasks, erode
+from qs3.io.extract.scannet_scene import (
     ScanNetScene,
-    ScanNetSettings,
-    dropped_labels,
-    extract_scene,
+    axis_alignment,
+    class_of,
     list_scenes,
+    read_objects,
     read_splits,
 )
-from qs3.io.extract.scannet_masks import InstanceMasks, erode
-from qs3.io.extract.scannet_scene import axis_alignment, class_of, read_objects
+from qs3.io.layouts.contents import open_dataset, read_ragged
 
 from .writers import (
     CHAIR,
@@ -55,7 +56,7 @@ def scene_of(room: Room, split: str = "") -> ScanNetScene:
 
 def extract(room: Room, **changes: object) -> dict[int, ExtractedCloud]:
     settings = dataclasses.replace(SETTINGS, **changes)
-    clouds = extract_scene(scene_of(room), settings)
+    clouds = cut_scene(scene_of(room), settings)
     return {int(cloud.id.rpartition("/")[2]): cloud for cloud in clouds}
 
 
@@ -194,7 +195,7 @@ def test_report_counts(tmp_path: Path) -> None:
     path = room.folder / "scene0000_00_2d-instance-filt.zip"
     write_masks(path, {index: mask for index, mask in room.masks.items() if index != 3})
     report: dict = {}
-    clouds = list(extract_scene(scene_of(room, "test"), SETTINGS, report))
+    clouds = list(cut_scene(scene_of(room, "test"), SETTINGS, report))
     assert report == {
         "frames": 8,
         "read": 8,
@@ -205,13 +206,12 @@ def test_report_counts(tmp_path: Path) -> None:
     }
     assert [cloud.source["frames"] for cloud in clouds] == [6, 6]
     assert {cloud.split for cloud in clouds} == {"test"}
-    assert dropped_labels([scene_of(room)] * 2) == {"floor": 2, "sink": 2}
-    beds = dataclasses.replace(SETTINGS, class_names=("bed",))
-    assert list(extract_scene(scene_of(room), beds, report)) == []
+    beds = dataclasses.replace(SETTINGS, classes=("bed",))
+    assert list(cut_scene(scene_of(room), beds, report)) == []
     assert (report["frames"], report["read"]) == (8, 0)  # no object, so no frame is needed
     assert sum(report["dropped"].values()) == 4
     everything = dataclasses.replace(SETTINGS, min_points=10**6)
-    assert list(extract_scene(scene_of(room), everything, report)) == []
+    assert list(cut_scene(scene_of(room), everything, report)) == []
     assert report["too_small"] == 2
 
 
@@ -232,6 +232,25 @@ def test_memory_does_not_grow_with_the_scene(tmp_path: Path, cut: str, copies: i
     assert peaks[1] < 1.03 * peaks[0] + index, peaks
 
 
+@pytest.mark.parametrize("from_mesh", [False, True])
+def test_both_ways_give_the_rooms_objects_with_their_split(room, tmp_path, from_mesh):
+    (tmp_path / "train.txt").write_text("scene0000_00\n")
+    settings = dataclasses.replace(
+        SETTINGS, from_mesh=from_mesh, splits_train=tmp_path / "train.txt"
+    )
+    output = OutputSettings(str(tmp_path / "out"), num_points=256, workers=0)
+    report = extract_scannet(room.folder.parent, output, settings)
+    assert (report.objects, report.units, report.failed) == (2, 1, 0)
+    clouds = read_ragged(tmp_path / "out")
+    assert {clouds.class_names[label] for label in clouds.labels} == {"chair", "table"}
+    assert set(clouds.splits) == {"train"}
+    assert {len(cloud) for cloud in clouds.clouds} == {256}
+    stored = open_dataset(tmp_path / "out").settings
+    assert stored["from_mesh"] is from_mesh
+    assert str(tmp_path) not in str(stored)
+    assert extract_scannet(room.folder.parent, output, settings).skipped == 1
+
+
 def test_a_scene_without_masks_or_mesh_says_so(tmp_path: Path) -> None:
     room = write_room(tmp_path / "scans", frames=2, mesh=False, masks=False)
     with pytest.raises(InputError, match=r"neither .*instance-filt.zip nor .*_vh_clean_2.ply"):
@@ -248,7 +267,7 @@ def test_a_cut_file_yields_no_object(room: Room, tmp_path: Path) -> None:
         (other / path.name).write_bytes(path.read_bytes())
     (other / "scene0000_00.sens").write_bytes(content[: len(content) * 3 // 4])
     with pytest.raises(InputError, match=r"cut off in frame \d+ of 12"):
-        next(extract_scene(ScanNetScene("scene0000_00", other), SETTINGS))
+        next(cut_scene(ScanNetScene("scene0000_00", other), SETTINGS))
 
 
 # Masks.
@@ -293,10 +312,10 @@ def bomb(width: int, height: int, declared: tuple[int, int] | None = None) -> by
 
 BAD_MASKS = {
     "huge": (bomb(4000, 1000), "4000×1000 pixels; expected 64×48 or 32×24"),
-    "huge and declared": (bomb(4, 4, (2**31 - 1, 2**31 - 1)), "expected 64×48"),
-    "no png": (b"GIF89a" + bytes(40), "no PNG"),
-    "empty": (b"", "no PNG"),
-    "cut": (png(np.zeros((48, 64), np.uint8))[:24], "cut off"),
+    "huge and declared": (bomb(4, 4, (2**31 - 1, 2**31 - 1)), "announces"),
+    "no png": (b"GIF89a" + bytes(40), "not a PNG"),
+    "empty": (b"", "not a PNG"),
+    "cut": (png(np.zeros((48, 64), np.uint8))[:24], "cut off|damaged"),
     "16 bits": (png(np.zeros((48, 64), np.uint16)), "8 bits"),
     "colour": (png(np.zeros((48, 64, 3), np.uint8)), "8 bits"),
     "no pixels": (bomb(64, 48)[:40], "damaged"),
@@ -322,7 +341,10 @@ def test_a_zip_bomb_is_not_unpacked(tmp_path: Path) -> None:
     for told in (honest, struct.pack("<I", 2000)):
         path.write_bytes(content.replace(honest, told))
         tracemalloc.start()
-        with masks_of(path) as masks, pytest.raises(InputError, match=r"unpack to|damaged|no PNG"):
+        with (
+            masks_of(path) as masks,
+            pytest.raises(InputError, match=r"unpack|damaged|not a PNG"),
+        ):
             masks.read(0)
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
@@ -478,12 +500,10 @@ def test_a_bad_alignment_is_one_line(tmp_path: Path, value: str) -> None:
         {"far": float("nan")},
         {"voxel": 0.0},
         {"distance": -1.0},
-        {"max_frames": -1},
-        {"class_names": ()},
+        {"classes": ()},
         {"seed": -1},
     ],
 )
 def test_settings_out_of_range_are_refused(change: dict) -> None:
     with pytest.raises(InputError, match=next(iter(change))):
         ScanNetSettings(**change)
-    json.dumps(dataclasses.asdict(ScanNetSettings()))

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.io.extract.scannet import ScanNetScene, ScanNetSettings, extract_scene
-from qs3.io.extract.scannet_mesh import extract_mesh_scene, read_scene_mesh
-from qs3.io.extract.scannet_scene import read_objects
+from qs3.io.extract.scannet import ScanNetSettings
+from qs3.io.extract.scannet_frames import cut_scene
+from qs3.io.extract.scannet_mesh import cut_mesh_scene, read_scene_mesh
+from qs3.io.extract.scannet_scene import ScanNetScene, read_objects
 
 from .test_sens import mutated
 from .writers import CHAIR, TABLE, Room, write_aggregation, write_mesh, write_room, write_segments
@@ -29,7 +30,7 @@ def scene_of(folder: Path) -> ScanNetScene:
 
 
 def test_clouds_are_vertices_of_their_objects(room: Room) -> None:
-    clouds = list(extract_mesh_scene(scene_of(room.folder), SETTINGS))
+    clouds = list(cut_mesh_scene(scene_of(room.folder), SETTINGS))
     assert [(cloud.id, cloud.class_name, cloud.split) for cloud in clouds] == [
         (f"scene0000_00/{CHAIR}", "chair", "train"),
         (f"scene0000_00/{TABLE}", "table", "train"),
@@ -43,7 +44,7 @@ def test_clouds_are_vertices_of_their_objects(room: Room) -> None:
 
 def test_convention_z_up_and_not_mirrored(room: Room) -> None:
     """The back is up and towards +y, the one arm towards −x; the released clouds swap y and z."""
-    chair = next(extract_mesh_scene(scene_of(room.folder), SETTINGS)).points
+    chair = next(cut_mesh_scene(scene_of(room.folder), SETTINGS)).points
     assert chair[:, 2].min() == pytest.approx(0.0, abs=1e-6)
     assert chair[:, 2].max() == pytest.approx(0.95, abs=0.02)
     np.testing.assert_allclose(chair[:, :2].min(axis=0), -chair[:, :2].max(axis=0), atol=1e-6)
@@ -54,16 +55,16 @@ def test_convention_z_up_and_not_mirrored(room: Room) -> None:
 
 
 def test_seed_and_number_of_points(room: Room) -> None:
-    def chair(**changes: object) -> np.ndarray:
-        settings = dataclasses.replace(SETTINGS, **changes)
-        return next(extract_mesh_scene(scene_of(room.folder), settings)).points
+    def chair(seed: int = 0, num_points: int = 2048) -> np.ndarray:
+        settings = dataclasses.replace(SETTINGS, seed=seed)
+        return next(cut_mesh_scene(scene_of(room.folder), settings, num_points)).points
 
     np.testing.assert_array_equal(chair(), chair())
     assert chair().tobytes() != chair(seed=1).tobytes()
-    whole = chair(mesh_points=10**6)
+    whole = chair(num_points=10**6)
     segments = json.loads((room.folder / SEGS).read_text())["segIndices"]
     assert len(whole) == sum(segment < 30 for segment in segments)
-    assert list(extract_mesh_scene(scene_of(room.folder), ScanNetSettings(min_points=10**6))) == []
+    assert list(cut_mesh_scene(scene_of(room.folder), ScanNetSettings(min_points=10**6))) == []
 
 
 def test_a_shared_segment_goes_to_the_first(tmp_path: Path) -> None:
@@ -94,8 +95,8 @@ HEAD = (
 BAD = {
     "announced": (PLY, HEAD % 10**12 + b"property float z\nend_header\n" + bytes(36), "announces"),
     "no z": (PLY, HEAD % 3 + b"end_header\n" + bytes(24), "x, y and z"),
-    "no ply": (PLY, b"solid", "not a PLY"),
-    "empty": (PLY, b"", "not a PLY"),
+    "no ply": (PLY, b"solid", "read as ply"),
+    "empty": (PLY, b"", "read as ply"),
     "none": (PLY, HEAD % 0 + b"property float z\nend_header\n", "no vertices"),
     "NaN": (
         PLY,
@@ -115,7 +116,7 @@ def test_bad_files_are_one_line(tmp_path: Path, fault: str) -> None:
     name, content, told = BAD[fault]
     scene = scene_with(tmp_path, name, content)
     with pytest.raises(InputError, match=told) as caught:
-        list(extract_mesh_scene(scene, SETTINGS))
+        list(cut_mesh_scene(scene, SETTINGS))
     assert str(tmp_path / name) in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -125,7 +126,7 @@ def test_a_missing_file_is_named(tmp_path: Path, name: str) -> None:
     scene = scene_with(tmp_path, "other", b"")
     (tmp_path / name).unlink()
     with pytest.raises(InputError, match=name):
-        list(extract_mesh_scene(scene, SETTINGS))
+        list(cut_mesh_scene(scene, SETTINGS))
 
 
 def fuzz(folder: Path, count: int) -> int:
@@ -140,7 +141,7 @@ def fuzz(folder: Path, count: int) -> int:
         path = room.folder / names[turn % len(names)]
         content = path.read_bytes()
         path.write_bytes(mutated(content, rng))
-        for extract in (extract_scene, extract_mesh_scene):
+        for extract in (cut_scene, cut_mesh_scene):
             try:
                 list(extract(scene_of(room.folder), settings))
             except InputError as error:

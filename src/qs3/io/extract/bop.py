@@ -9,9 +9,10 @@ Convention:
     OpenCV camera.
 """
 
-import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+import dataclasses
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,22 +21,22 @@ from jaxtyping import Float
 
 from qs3.errors import InputError
 from qs3.geometry import invert_rigid
-from qs3.io.extract.clouds import ExtractedCloud
-from qs3.io.extract.depth import (
-    CutSettings,
-    as_cloud,
-    check_rotation,
-    keep_pixels,
-    lift,
-    turn,
-    upright,
-)
+from qs3.io.extract.cut import as_cloud, check_rotation, keep_pixels, lift, turn, upright
+from qs3.io.extract.depth import DepthImageSettings
 from qs3.io.extract.depth_images import read_depth, read_mask
 from qs3.io.extract.intrinsics import Intrinsics, intrinsics_from_matrix
-from qs3.io.extract.json_files import json_numbers, read_json_file, whole_number
+from qs3.io.extract.run import (
+    ExtractedCloud,
+    ExtractReport,
+    OutputSettings,
+    recorded,
+    run_extract,
+)
+from qs3.io.guards import Numbers, as_array, pick, read_small_json
 
 CAMERAS = "scene_camera.json"
 _TRUTH = "scene_gt.json"
+_MASKS = "mask_visib"
 _LARGEST = 1 << 30
 
 Frame = Literal["world", "camera", "model"]
@@ -72,42 +73,60 @@ class BopFrame:
     """The objects in it."""
 
 
-@dataclass(frozen=True)
-class BopSettings:
-    """What is cut from scenes in BOP's layout."""
-
-    frame: Frame = "world"
-    """Axes of the clouds."""
-    gravity: tuple[float, float, float] = (0.0, 1.0, 0.0)
-    """Downward direction in camera coordinates, for the camera's axes."""
-    depth: str = "depth"
-    """Folder of the depth pictures in a scene."""
-    mask: str = "mask_visib"
-    """Folder of the masks in a scene."""
-    class_name: str = ""
-    """Class of objects that ``names`` does not tell; empty takes obj_000001 and so on."""
-    names: Mapping[str, str] = field(default_factory=dict)
-    """Class by the model: ``obj_000001`` or ``1``."""
-    split: str = ""
-    """Split of every object."""
-    cut: CutSettings = field(default_factory=CutSettings)
-    """Which pixels are kept."""
-
-    def __post_init__(self) -> None:
-        upright(self.gravity)
-        for name in (self.depth, self.mask):
-            if not re.fullmatch(r"\w+", name):
-                raise InputError(f"{name!r} is no folder of a scene; give a name such as depth")
-
-    def class_of(self, obj_id: int) -> str:
-        """Return the class of a model."""
-        model = f"obj_{obj_id:06d}"
-        return self.names.get(model) or self.names.get(str(obj_id)) or self.class_name or model
-
-
 def is_bop(source: Path) -> bool:
     """Whether a folder is a scene in BOP's layout, or holds some."""
     return bool(_scenes(Path(source)))
+
+
+def extract_bop(
+    source: Path, output: OutputSettings, settings: DepthImageSettings, names: Mapping[str, str]
+) -> ExtractReport:
+    """Cut the objects of all images of a scene, or of a folder of scenes, into a data set.
+
+    Args:
+        source: The folder.
+        output: Where the clouds go.
+        settings: What is cut; the scene tells camera, masks and scale, so these are refused.
+        names: Class by the model: ``obj_000001`` or ``1``.
+
+    Raises:
+        InputError: as `qs3.io.extract.depth.extract_depth` does.
+    """
+    told_by_scene = ("intrinsics", "mask", "box", "depth_scale", "instances")
+    for flag in told_by_scene:
+        if getattr(settings, flag):
+            word = flag.replace("_", "-")
+            raise InputError(f"--{word}: a scene in BOP's layout tells it; leave it out")
+    frames = list_bop_frames(source)
+    posed = all(frame.world_to_camera is not None for frame in frames)
+    axes: Frame = "world" if posed else "camera"
+    axes = axes if settings.frame == "auto" else settings.frame
+    objects = [item for frame in frames for item in frame.objects]
+    if not objects:
+        raise InputError(f"{source}: no object in any image ({_TRUTH})")
+    report = run_extract(
+        frames,
+        partial(cut_frame, axes=axes, settings=settings, names=names),
+        output,
+        settings={
+            "extract": "extract_bop",
+            **recorded(settings, *told_by_scene, "depth_folder"),
+            "frame": axes,
+            "depth": settings.depth_folder,
+            "mask": _MASKS,
+            "names": names,
+        },
+        class_names=sorted({class_of(item.obj_id, settings, names) for item in objects}),
+        planned=len(objects),
+        min_points=settings.cut.min_points,
+    )
+    return dataclasses.replace(report, axes=axes if settings.frame == "auto" else "")
+
+
+def class_of(obj_id: int, settings: DepthImageSettings, names: Mapping[str, str]) -> str:
+    """Return the class of a model: by its name or number, else the settings', else its name."""
+    model = f"obj_{obj_id:06d}"
+    return names.get(model) or names.get(str(obj_id)) or settings.class_name or model
 
 
 def list_bop_frames(source: Path) -> list[BopFrame]:
@@ -122,11 +141,6 @@ def list_bop_frames(source: Path) -> list[BopFrame]:
     return [frame for scene in scenes for frame in _frames(scene)]
 
 
-def has_world(frames: Sequence[BopFrame]) -> bool:
-    """Whether all images tell the pose of the world."""
-    return all(frame.world_to_camera is not None for frame in frames)
-
-
 def _scenes(source: Path) -> list[Path]:
     if (source / CAMERAS).is_file():
         return [source]
@@ -135,35 +149,49 @@ def _scenes(source: Path) -> list[Path]:
     return sorted(path.parent for path in source.glob(f"*/{CAMERAS}"))
 
 
+@dataclass(frozen=True)
+class _Camera:
+    """An entry of ``scene_camera.json``."""
+
+    depth_scale: float
+    cam_K: Numbers  # noqa: N815 (BOP's name)
+    width: int | None = None
+    height: int | None = None
+    cam_R_w2c: Numbers | None = None  # noqa: N815
+    cam_t_w2c: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class _Object:
+    """An entry of the lists in ``scene_gt.json``."""
+
+    obj_id: int
+    cam_R_m2c: Numbers | None = None  # noqa: N815
+    cam_t_m2c: tuple[float, float, float] | None = None
+
+
 def _frames(scene: Path) -> Iterator[BopFrame]:
-    cameras, truth = _read(scene / CAMERAS), _read(scene / _TRUTH)
+    cameras, truth = _by_image(scene / CAMERAS), _by_image(scene / _TRUTH)
     for image in sorted(cameras):
+        where = f"{scene / CAMERAS}, image {image}"
+        entry = pick(cameras[image], _Camera, where)
         try:
-            value = cameras[image]
-            if not isinstance(value, dict):
-                raise InputError("not a camera")
-            if "depth_scale" not in value:
-                raise InputError("has no depth_scale")
-            step = json_numbers(value["depth_scale"], 1, "depth_scale")[0]
-            known: dict[str, Any] = {"depth_scale": step / 1000}
-            for key in ("width", "height"):
-                if key in value:
-                    known[key] = whole_number(value[key], key)
-            matrix = np.array(json_numbers(value.get("cam_K"), 9, "cam_K")).reshape(3, 3)
-            camera = intrinsics_from_matrix(matrix, **known)
-            pose = _pose(value, "w2c")
+            camera = intrinsics_from_matrix(
+                as_array(entry.cam_K, (3, 3), "cam_K"),
+                width=entry.width,
+                height=entry.height,
+                depth_scale=entry.depth_scale / 1000,
+            )
+            pose = _pose(entry.cam_R_w2c, entry.cam_t_w2c, "w2c")
         except InputError as error:
-            raise InputError(f"{scene / CAMERAS}, image {image}: {error}") from error
-        try:
-            objects = _objects(truth.get(image, []))
-        except InputError as error:
-            raise InputError(f"{scene / _TRUTH}, image {image}: {error}") from error
+            raise InputError(f"{where}: {error}") from error
+        objects = _objects(truth.get(image, []), f"{scene / _TRUTH}, image {image}")
         name = f"{scene.resolve().name}/{image:06d}"
         yield BopFrame(name, scene, image, camera, pose, objects)
 
 
-def _read(path: Path) -> dict[int, Any]:
-    value = read_json_file(path, _LARGEST)
+def _by_image(path: Path) -> dict[int, Any]:
+    value = read_small_json(path, _LARGEST)
     if not isinstance(value, dict) or not all(
         key.isascii() and key.isdecimal() and len(key) < 10 for key in value
     ):
@@ -174,50 +202,61 @@ def _read(path: Path) -> dict[int, Any]:
     return numbered
 
 
-def _objects(entries: Any) -> tuple[BopObject, ...]:
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise InputError("not a list of objects")
-    return tuple(
-        BopObject(number, whole_number(entry.get("obj_id"), "obj_id"), _pose(entry, "m2c"))
-        for number, entry in enumerate(entries)
-    )
+def _objects(entries: Any, where: str) -> tuple[BopObject, ...]:
+    if not isinstance(entries, list):
+        raise InputError(f"{where}: not a list of objects")
+    objects = []
+    for number, value in enumerate(entries):
+        entry = pick(value, _Object, f"{where}, object {number}")
+        if not 0 <= entry.obj_id < 1 << 31:
+            raise InputError(f"{where}, object {number}: obj_id {entry.obj_id} is no model")
+        try:
+            pose = _pose(entry.cam_R_m2c, entry.cam_t_m2c, "m2c")
+        except InputError as error:
+            raise InputError(f"{where}, object {number}: {error}") from error
+        objects.append(BopObject(number, entry.obj_id, pose))
+    return tuple(objects)
 
 
-def _pose(value: Mapping[str, Any], kind: str) -> Float[np.ndarray, "4 4"] | None:
-    names = f"cam_R_{kind}", f"cam_t_{kind}"
-    if not any(name in value for name in names):
+def _pose(
+    rotation: Numbers | None, shift: tuple[float, ...] | None, kind: str
+) -> Float[np.ndarray, "4 4"] | None:
+    if rotation is None and shift is None:
         return None
+    if rotation is None or shift is None:
+        raise InputError(f"cam_R_{kind} and cam_t_{kind} belong together; one is missing")
     pose = np.eye(4)
-    pose[:3, :3] = np.array(json_numbers(value.get(names[0]), 9, names[0])).reshape(3, 3)
-    pose[:3, 3] = np.array(json_numbers(value.get(names[1]), 3, names[1])) / 1000
-    check_rotation(pose[:3, :3], names[0])
+    pose[:3, :3] = as_array(rotation, (3, 3), f"cam_R_{kind}")
+    pose[:3, 3] = np.array(shift) / 1000
+    check_rotation(pose[:3, :3], f"cam_R_{kind}")
     return pose
 
 
-def extract_bop(frame: BopFrame, settings: BopSettings) -> Iterator[ExtractedCloud]:
+def cut_frame(
+    frame: BopFrame, axes: Frame, settings: DepthImageSettings, names: Mapping[str, str]
+) -> Iterator[ExtractedCloud]:
     """Cut the objects from one image.
 
     Convention:
-        Metres, in the axes that ``settings.frame`` names; the camera's are turned as
-        `depth.upright` says.
+        Metres, in the axes that are named; the camera's are turned as `cut.upright` says.
 
     Raises:
         InputError: where a picture is missing, damaged or of another size, or a pose is missing.
     """
-    path = frame.scene / settings.depth / f"{frame.image:06d}.png"
+    path = frame.scene / settings.depth_folder / f"{frame.image:06d}.png"
     depth = read_depth(path, frame.camera.depth_scale)
     frame.camera.check_size(depth.shape, str(path))
     for item in frame.objects:
         name = f"{frame.image:06d}_{item.number:06d}.png"
-        mask = read_mask(frame.scene / settings.mask / name, depth.shape) != 0
+        mask = read_mask(frame.scene / _MASKS / name, depth.shape) != 0
         local = lift(depth, keep_pixels(depth, mask, settings.cut), frame.camera)
         if len(local) < settings.cut.min_points:
             continue
-        pose = _out_of_camera(frame, item, settings)
+        pose = _out_of_camera(frame, item, axes, settings)
         points = as_cloud(turn(pose[:3, :3], local) + pose[:3, 3], str(path))
         yield ExtractedCloud(
             id=f"{frame.id}/{item.number:06d}",
-            class_name=settings.class_of(item.obj_id),
+            class_name=class_of(item.obj_id, settings, names),
             points=points,
             split=settings.split,
             source={"obj_id": item.obj_id, "points": len(points), "pixels": int(mask.sum())},
@@ -225,15 +264,15 @@ def extract_bop(frame: BopFrame, settings: BopSettings) -> Iterator[ExtractedClo
 
 
 def _out_of_camera(
-    frame: BopFrame, item: BopObject, settings: BopSettings
+    frame: BopFrame, item: BopObject, axes: Frame, settings: DepthImageSettings
 ) -> Float[np.ndarray, "4 4"]:
-    if settings.frame == "camera":
+    if axes == "camera":
         level = np.eye(4)
         level[:3, :3] = upright(settings.gravity)
         return level
-    pose = frame.world_to_camera if settings.frame == "world" else item.to_camera
+    pose = frame.world_to_camera if axes == "world" else item.to_camera
     if pose is None:
-        file, key = (CAMERAS, "w2c") if settings.frame == "world" else (_TRUTH, "m2c")
+        file, key = (CAMERAS, "w2c") if axes == "world" else (_TRUTH, "m2c")
         raise InputError(
             f"{frame.scene / file}: image {frame.image} has no cam_R_{key} and cam_t_{key}; "
             "choose --frame camera"

@@ -1,6 +1,5 @@
 """Depth images and masks from files: 16-bit PNG, TIFF and npy."""
 
-import io
 import math
 from pathlib import Path
 
@@ -8,17 +7,14 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from qs3.errors import InputError
-from qs3.io.extract.image_headers import (
-    ImageHeader,
-    check_pixels,
-    png_header,
-    tiff_header,
-)
+from qs3.io.guards import check_pixels, decode_image, image_header, load_npy, read_small
 
 DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
 """Endings of depth images and of masks."""
 
 MILLIMETRE = 0.001
+_LARGEST = 1 << 30
+_DEPTH_MODES = ("I;16", "I;16B", "I;16L", "I", "F")
 
 
 def read_depth(path: Path, depth_scale: float | None = None) -> Float32[np.ndarray, "h w"]:
@@ -51,21 +47,17 @@ def read_raw(path: Path) -> np.ndarray:
     Raises:
         InputError: as `read_depth`.
     """
-    content, ending = _content(Path(path))
-    try:
-        if ending == ".npy":
-            return _npy(content, "iuf")
-        header = png_header(content) if ending == ".png" else tiff_header(content)
-        if header.channels != 1 or header.kind != "grey":
-            raise InputError("a colour picture, not depth; depth is one grey channel of 16 bits")
-        if header.bits < 16:
+    image, mode = _read(path, "iuf")
+    if mode and mode not in _DEPTH_MODES:
+        if mode in ("1", "L"):
             raise InputError(
-                f"has {header.bits} bits, which is a picture of depth and no measurement; save "
-                "depth as 16-bit PNG in millimetres, TIFF or npy"
+                f"{path}: has 8 bits, which is a picture of depth and no measurement; save depth "
+                "as 16-bit PNG in millimetres, TIFF or npy"
             )
-        return _decode(content, header)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+        raise InputError(
+            f"{path}: a colour picture, not depth; depth is one grey channel of 16 bits"
+        )
+    return image
 
 
 def read_mask(path: Path, shape: tuple[int, ...] | None = None) -> Int32[np.ndarray, "h w"]:
@@ -80,22 +72,14 @@ def read_mask(path: Path, shape: tuple[int, ...] | None = None) -> Int32[np.ndar
     Raises:
         InputError: where the file is missing, damaged or of another size.
     """
-    content, ending = _content(Path(path))
-    try:
-        if ending == ".npy":
-            mask = _npy(content, "iub")
-        else:
-            header = png_header(content) if ending == ".png" else tiff_header(content)
-            mask = _decode(content, header)
-        if mask.ndim == 3:
-            mask = np.asarray(mask[..., :3].any(axis=2))
-        if mask.dtype.kind == "f":
-            raise InputError("holds no whole numbers; a mask needs them")
-        if mask.min() < -(2**31) or mask.max() >= 2**31:
-            raise InputError("holds a number beyond 32 bits")
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    height, width = len(mask), len(mask[0])
+    mask, _ = _read(path, "iub")
+    if mask.ndim == 3:
+        mask = np.asarray(mask[..., :3].any(axis=2))
+    if mask.dtype.kind == "f":
+        raise InputError(f"{path}: holds no whole numbers; a mask needs them")
+    if mask.min() < -(2**31) or mask.max() >= 2**31:
+        raise InputError(f"{path}: holds a number beyond 32 bits")
+    height, width = mask.shape
     if shape is not None and (height, width) != shape[:2]:
         raise InputError(
             f"{path}: is {width}×{height} pixels, the depth image {shape[1]}×{shape[0]}; give the "
@@ -104,50 +88,25 @@ def read_mask(path: Path, shape: tuple[int, ...] | None = None) -> Int32[np.ndar
     return np.asarray(mask, dtype=np.int32)
 
 
-def _content(path: Path) -> tuple[bytes, str]:
+def _read(path: Path, npy_kinds: str) -> tuple[np.ndarray, str]:
+    """The numbers of an image as stored, and Pillow's mode; empty for an npy file."""
+    path = Path(path)
     ending = path.suffix.lower()
     if ending not in DEPTH_FILES:
         raise InputError(f"{path}: not a depth image; known are {', '.join(DEPTH_FILES)}")
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    if path.stat().st_size > 1 << 30:
-        raise InputError(f"{path}: larger than any depth image")
-    return path.read_bytes(), ending
+    content = read_small(path, _LARGEST, "a depth image")
 
+    def accept(shape: tuple[int, ...], kind: np.dtype) -> None:
+        if kind.kind not in npy_kinds or len(shape) != 2:
+            raise InputError(
+                f"holds {kind} of shape {list(shape)}; needed are numbers of shape [h, w]"
+            )
+        check_pixels(shape[1], shape[0])
 
-def _npy(content: bytes, kinds: str) -> np.ndarray:
-    handle = io.BytesIO(content)
     try:
-        version = np.lib.format.read_magic(handle)
-        readers = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }
-        shape, _, kind = readers[version](handle)
-    except Exception as error:  # whatever a damaged header makes NumPy stumble over
-        raise InputError("not an npy file of plain numbers") from error
-    if kind.kind not in kinds or len(shape) != 2:
-        raise InputError(f"holds {kind} of shape {list(shape)}; needed are numbers of shape [h, w]")
-    check_pixels(shape[1], shape[0])
-    size, there = math.prod(shape) * kind.itemsize, len(content) - handle.tell()
-    if size > there:
-        raise InputError(f"cut off: announces {size} bytes but has {there}")
-    handle.seek(0)
-    return np.load(handle, allow_pickle=False)
-
-
-def _decode(content: bytes, header: ImageHeader) -> np.ndarray:
-    # Imported here: npy files need no OpenCV.
-    import cv2
-
-    # Its complaints would stand beside our one line.
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        image = None
-    finally:
-        cv2.utils.logging.setLogLevel(level)
-    if image is None or image.shape[:2] != (header.height, header.width):
-        raise InputError("damaged, or of a kind that OpenCV cannot read")
-    return image
+        if ending == ".npy":
+            return load_npy(content, accept), ""
+        size, mode = image_header(content, "PNG" if ending == ".png" else "TIFF")
+        return decode_image(content, size), mode
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error

@@ -40,7 +40,7 @@ def _finalise(values: UInt64[np.ndarray, "n"]) -> UInt64[np.ndarray, "n"]:
     return z ^ (z >> np.uint64(31))
 
 
-def thin(
+def subsample(
     points: Float[np.ndarray, "n 3"],
     keys: UInt64[np.ndarray, "n"],
     voxel: float,
@@ -50,7 +50,7 @@ def thin(
     """Indices, rising, of one point a voxel, and of at most ``max_points`` voxels.
 
     In each voxel the point of the lowest key stays; of too many voxels those stay whose hash is
-    lowest. Thinning parts first and their union then gives what thinning everything at once gives.
+    lowest. Parts first and their union then gives what everything at once gives.
 
     Args:
         points: The cloud.
@@ -64,7 +64,7 @@ def thin(
 
     Example:
         >>> cloud = np.array([[0.001, 0, 0], [0.002, 0, 0], [0.5, 0, 0]])
-        >>> thin(cloud, np.array([9, 3, 7], dtype=np.uint64), 0.01, 10, seed=0).tolist()
+        >>> subsample(cloud, np.array([9, 3, 7], dtype=np.uint64), 0.01, 10, seed=0).tolist()
         [1, 2]
     """
     # Divided as float64: the voxel of a point must not depend on the array it lies in.
@@ -88,7 +88,7 @@ class ObjectFusion:
     """Gathers the raw points of one object from a stream of frames.
 
     Of the frames that are offered, at most ``max_frames`` stay, chosen uniformly by the hash of
-    their number; each is thinned by itself, so that what is held never passes
+    their number; each is subsampled by itself, so that what is held never passes
     ``max_frames`` × ``max_points`` points however many frames there are. With ``max_frames`` 0 all
     frames are fused, and ``max_points`` points are held.
     """
@@ -102,7 +102,7 @@ class ObjectFusion:
         self.offered = 0
         """Frames offered so far."""
         self.measured = 0
-        """Points in the frames that are held or were fused, before thinning."""
+        """Points in the frames that are held or were fused, before sampling."""
         self._counts: dict[int, int] = {}
 
     @property
@@ -132,7 +132,7 @@ class ObjectFusion:
         if not self.wants(frame):
             return
         place = np.uint64(frame << 32) | pixels.astype(np.uint64)
-        part = self._thinned(points, mix(place, self._seed))
+        part = self._kept(points, mix(place, self._seed))
         if self._max_frames == 0:
             self._used += 1
             self.measured += len(points)
@@ -155,10 +155,10 @@ class ObjectFusion:
     def _rank(self, frame: int) -> int:
         return int(mix(np.array([frame], dtype=np.uint64), self._seed + 1)[0])
 
-    def _thinned(self, points: Float32[np.ndarray, "n 3"], keys: UInt64[np.ndarray, "n"]) -> _Part:
-        kept = thin(points, keys, self._voxel, self._max_points, self._seed)
+    def _kept(self, points: Float32[np.ndarray, "n 3"], keys: UInt64[np.ndarray, "n"]) -> _Part:
+        kept = subsample(points, keys, self._voxel, self._max_points, self._seed)
         return points[kept], keys[kept]
 
     def _union(self, parts: list[_Part]) -> _Part:
         points = np.concatenate([points for points, _ in parts])
-        return self._thinned(points, np.concatenate([keys for _, keys in parts]))
+        return self._kept(points, np.concatenate([keys for _, keys in parts]))

@@ -1,6 +1,7 @@
 """The pinhole camera that took a depth image: its numbers, and the files they come in."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,10 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.errors import InputError
-from qs3.io.extract.json_files import json_numbers, read_json_file, whole_number
+from qs3.io.guards import Numbers, as_array, pick, read_small, read_small_json
 
 _LARGEST = 1 << 20
-_FOUR = ("fx", "fy", "cx", "cy")
 _FORMS = "give fx,fy,cx,cy, a JSON file, or a text file of 3×3 numbers"
 
 
@@ -64,12 +64,12 @@ class Intrinsics:
             )
 
 
-def intrinsics_from_matrix(matrix: Float[np.ndarray, "3 3"], **known: Any) -> Intrinsics:
+def intrinsics_from_matrix(matrix: Float[np.ndarray, "3 3"], **more: Any) -> Intrinsics:
     """Take fx, fy, cx, cy out of a camera matrix K.
 
     Args:
         matrix: Row by row: fx 0 cx, 0 fy cy, 0 0 1.
-        known: ``width``, ``height`` or ``depth_scale``.
+        more: ``width``, ``height`` or ``depth_scale``.
 
     Raises:
         InputError: where it has another form, is transposed or has skew.
@@ -87,7 +87,7 @@ def intrinsics_from_matrix(matrix: Float[np.ndarray, "3 3"], **known: Any) -> In
     if abs(matrix[0, 1]) > 1e-3 or matrix[1, 0]:
         raise InputError(f"camera: K has skew {matrix[0, 1]:g}; rectify the images first")
     fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    return Intrinsics(fx, fy, cx, cy, **known)
+    return Intrinsics(fx, fy, cx, cy, **more)
 
 
 def read_intrinsics(given: str | Path) -> Intrinsics:
@@ -121,49 +121,61 @@ def read_intrinsics(given: str | Path) -> Intrinsics:
 def _from_file(path: Path) -> Intrinsics:
     if not path.is_file():
         raise InputError(f"{path}: no such file; {_FORMS}")
-    if path.stat().st_size > _LARGEST:
-        raise InputError(f"{path}: too long for a camera; {_FORMS}")
     try:
         if path.suffix.lower() == ".json":
-            return _from_json(read_json_file(path, _LARGEST))
-        return _from_numbers([float(word) for word in path.read_text("utf-8").split()])
+            return _from_json(pick(read_small_json(path, _LARGEST), _CameraFile, "camera"))
+        content = read_small(path, _LARGEST, "a camera").decode("utf-8")
+        return _from_numbers([float(word) for word in content.split()])
     except InputError as error:
         message = str(error)
         raise InputError(message if str(path) in message else f"{path}: {message}") from error
-    except (ValueError, UnicodeDecodeError):
+    except ValueError:  # UnicodeDecodeError too
         raise InputError(f"{path}: not a text file of numbers; {_FORMS}") from None
 
 
-def _from_numbers(numbers: list[float]) -> Intrinsics:
+def _from_numbers(numbers: Sequence[float]) -> Intrinsics:
     if len(numbers) == 4:
-        fx, fy, cx, cy = numbers
-        return Intrinsics(fx, fy, cx, cy)
+        return Intrinsics(*numbers)
     if len(numbers) not in (9, 16):
         raise InputError(f"camera: {len(numbers)} numbers instead of 4, 9 or 16")
     side = 3 if len(numbers) == 9 else 4
     return intrinsics_from_matrix(np.array(numbers).reshape(side, side)[:3, :3])
 
 
-def _from_json(value: Any) -> Intrinsics:
-    if not isinstance(value, dict):
-        raise InputError(f"camera: not a JSON object; {_FORMS}")
-    known: dict[str, Any] = {}
-    for key in ("width", "height"):
-        if key in value:
-            known[key] = whole_number(value[key], key)
-    if "depth_scale" in value:
-        known["depth_scale"] = json_numbers(value["depth_scale"], 1, "depth_scale")[0] / 1000
-    elif "depth_unit" in value:
-        known["depth_scale"] = json_numbers(value["depth_unit"], 1, "depth_unit")[0]
-    if "fx" in value:
-        fx, fy, cx, cy = (json_numbers(value.get(key), 1, key)[0] for key in _FOUR)
-        return Intrinsics(fx, fy, cx, cy, **known)
-    if "focal" in value:
-        focal = json_numbers(value["focal"], 1, "focal")[0]
-        cx, cy = json_numbers(value.get("principal_point"), 2, "principal_point")
-        return Intrinsics(focal, focal, cx, cy, **known)
-    for key in ("cam_K", "K", "intrinsic_matrix"):
-        if key in value:
-            matrix = np.array(json_numbers(value[key], 9, key)).reshape(3, 3)
-            return intrinsics_from_matrix(matrix.T if key[0] == "i" else matrix, **known)
+@dataclass(frozen=True)
+class _CameraFile:
+    """What the JSON files of cameras hold, one of its groups in each; see `read_intrinsics`."""
+
+    fx: float | None = None
+    fy: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    focal: float | None = None
+    principal_point: tuple[float, float] | None = None
+    cam_K: Numbers | None = None  # noqa: N815 (BOP's name)
+    K: Numbers | None = None
+    intrinsic_matrix: Numbers | None = None
+    width: int | None = None
+    height: int | None = None
+    depth_scale: float | None = None
+    depth_unit: float | None = None
+
+
+def _from_json(file: _CameraFile) -> Intrinsics:
+    scale = file.depth_unit if file.depth_scale is None else file.depth_scale / 1000
+    more = {"width": file.width, "height": file.height, "depth_scale": scale}
+    if file.fx is not None:
+        if file.fy is None or file.cx is None or file.cy is None:
+            raise InputError("camera: fx, fy, cx and cy belong together; one is missing")
+        return Intrinsics(file.fx, file.fy, file.cx, file.cy, **more)
+    if file.focal is not None:
+        if file.principal_point is None:
+            raise InputError("camera: focal needs principal_point, its column and row")
+        return Intrinsics(file.focal, file.focal, *file.principal_point, **more)
+    for name in ("cam_K", "K"):
+        if (matrix := getattr(file, name)) is not None:
+            return intrinsics_from_matrix(as_array(matrix, (3, 3), name), **more)
+    if file.intrinsic_matrix is not None:
+        turned = as_array(file.intrinsic_matrix, (3, 3), "intrinsic_matrix")
+        return intrinsics_from_matrix(turned.T, **more)
     raise InputError("camera: the JSON file has none of fx, focal, cam_K, K, intrinsic_matrix")

@@ -1,245 +1,175 @@
-"""MATLAB's MAT files of version 5 to 7, as far as tables of a data set need: no objects, no code.
+"""MATLAB's MAT files of version 5 to 7: SciPy reads them, once their announced sizes are held.
 
-Every size that a file announces is held against its bytes before anything is allocated, and a field
-is parsed when it is asked for. Layout: "MAT-File Format", MathWorks, Level 5 MAT-files.
+A cell or struct array of a few bytes may announce billions of elements, a compressed variable may
+unpack to the whole memory, nested cells may overrun the stack, and a wrong type of element ends the
+whole process within SciPy. So the tree of arrays is walked before SciPy sees it. Layout: "MAT-File
+Format", MathWorks, Level 5 MAT-files.
 """
 
+import io
 import math
 import struct
 import zlib
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from qs3.errors import InputError
+from qs3.io.guards import read_small, reason
 
 _LARGEST_FILE = 1 << 30
 _LARGEST_VARIABLE = 1 << 31
 _DEFLATE_AT_BEST = 1032
+_DEEPEST = 16
+_INT32, _UINT32, _MATRIX, _COMPRESSED = 5, 6, 14, 15
 _CELL, _STRUCT, _CHAR = 1, 2, 4
 _NUMBERS = range(6, 16)
-_MATRIX, _COMPRESSED = 14, 15
-_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8",
-          13: "u8"}  # fmt: skip
-_TEXTS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
-_KINDS = {_CELL: "cells", _STRUCT: "struct", _CHAR: "text", **dict.fromkeys(_NUMBERS, "numbers")}
+_SIZES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8}  # bytes, by type of number
+_COMPLEX = 0x0800
+_TEXTS = (1, 2, 4, 16, 17, 18)
 
 
-@dataclass(frozen=True)
-class MatArray:
-    """One array of a MAT file, not yet parsed."""
-
-    where: str
-    """File and variable, for messages."""
-    kind: int
-    """MATLAB's class: 1 cells, 2 struct, 4 text, 6 to 15 numbers."""
-    shape: tuple[int, ...]
-    """Its size along each dimension."""
-    body: memoryview
-    """What follows name and size."""
-    order: str
-    """``<`` or ``>``."""
-
-    @property
-    def count(self) -> int:
-        """Number of its elements."""
-        return math.prod(self.shape)
-
-    def numbers(self, *shape: int) -> Float[np.ndarray, "..."]:
-        """Return its numbers, held against a shape; one row is as good as one column.
-
-        Raises:
-            InputError: where it is no array of numbers of that shape.
-        """
-        if self.kind not in _NUMBERS:
-            self._fail("is not an array of numbers")
-        if self.shape != shape and not (len(shape) == 1 and self._vector(shape[0])):
-            self._fail(f"has shape {list(self.shape)}, not {list(shape)}")
-        kind, data, _ = _element(self.body, 0, self)
-        if kind not in _TYPES or len(data) != self.count * np.dtype(_TYPES[kind]).itemsize:
-            self._fail("is damaged")
-        values = np.frombuffer(data, self.order + _TYPES[kind]).astype(np.float64)
-        return values.reshape(shape, order="F")
-
-    def _vector(self, size: int) -> bool:
-        return len(self.shape) == 2 and self.count == size and 1 in self.shape
-
-    def text(self) -> str:
-        """Return its text; that of its only cell where it is one cell.
-
-        Raises:
-            InputError: where it is no line of text.
-        """
-        if self.kind == _CELL and self.count == 1:
-            return next(self.cells()).text() if len(self.body) < 1 << 16 else self._fail("is long")
-        if self.kind != _CHAR or len([side for side in self.shape if side != 1]) > 1:
-            if self.count == 0:
-                return ""
-            self._fail("is not a line of text")
-        kind, data, _ = _element(self.body, 0, self)
-        coding = _TEXTS.get(kind, "latin-1")
-        if coding[-2:] in ("16", "32"):
-            coding += "-le" if self.order == "<" else "-be"
-        try:
-            return bytes(data).decode(coding)
-        except UnicodeDecodeError:
-            self._fail("is not text")
-
-    def cells(self) -> Iterator["MatArray"]:
-        """Yield the arrays in its cells.
-
-        Raises:
-            InputError: where it has none, or is cut off.
-        """
-        if self.kind != _CELL and self.count:
-            self._fail("is not an array of cells")
-        self._check_count(self.count, self.body)
-        at = 0
-        for index in range(self.count):
-            array, at = _matrix(self.body, at, self, f"{self.where}{{{index + 1}}}")
-            yield array
-
-    def rows(self) -> Iterator[dict[str, "MatArray"]]:
-        """Yield the fields of each element of a struct array; an empty array has none.
-
-        Raises:
-            InputError: where it is no struct array, or is cut off.
-        """
-        if self.kind != _STRUCT:
-            if self.count:
-                self._fail("is not a struct array")
-            return
-        kind, size, at = _element(self.body, 0, self)
-        _, names, at = _element(self.body, at, self)
-        length = struct.unpack(self.order + "i", size)[0] if kind == 5 and len(size) == 4 else 0
-        if not 0 < length <= 64 or len(names) % length:
-            self._fail("has damaged field names")
-        fields = [
-            bytes(names[i : i + length]).split(b"\0")[0].decode("latin-1")
-            for i in range(0, len(names), length)
-        ]
-        self._check_count(self.count * len(fields), self.body[at:])
-        for index in range(self.count if fields else 0):
-            row: dict[str, MatArray] = {}
-            for name in fields:
-                where = f"{self.where}({index + 1}).{name}"
-                row[name], at = _matrix(self.body, at, self, where)
-            yield row
-
-    def _check_count(self, count: int, body: memoryview) -> None:
-        if 8 * count > len(body):
-            self._fail(f"announces {count} elements but has {len(body)} bytes")
-
-    def _fail(self, what: str) -> NoReturn:
-        told = _KINDS.get(self.kind, "an object")
-        raise InputError(f"{self.where} {what} (it is {told} of shape {list(self.shape)})")
-
-
-def read_mat(path: Path, names: tuple[str, ...]) -> dict[str, MatArray]:
-    """Open variables of a MAT file of version 5 to 7.
+def read_mat(path: Path, names: tuple[str, ...]) -> dict[str, Any]:
+    """Read variables of a MAT file of version 5 to 7.
 
     Args:
         path: The file.
-        names: Variables to open; others are passed over.
+        names: Variables to read; others are passed over.
 
     Returns:
-        Those of them that are there.
+        Those of them that are there: a struct array as a list of dicts, numbers as arrays without
+        dimensions of length 1, text as text.
 
     Raises:
-        InputError: where the file is missing, of another version, cut off or damaged.
+        InputError: where the file is missing, of another version, cut off or damaged, announces
+            more than it holds, or has a sparse array, an object or a function in it.
     """
+    # Imported here: other data sets have no MAT files.
+    from scipy.io import loadmat
+
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    if path.stat().st_size > _LARGEST_FILE:
-        raise InputError(f"{path}: more than {_LARGEST_FILE} bytes; save only what is needed")
-    content = path.read_bytes()
+    content = read_small(path, _LARGEST_FILE, "a table of boxes; save only what is needed")
     if content[:10] == b"MATLAB 7.3" or content[512:520] == b"\x89HDF\r\n\x1a\n":
         raise InputError(f"{path}: of version 7.3; in MATLAB, save it anew with '-v7'")
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
     if order is None:
         raise InputError(f"{path}: not a MAT file of version 5 to 7")
-    top = MatArray(str(path), _CELL, (1,), memoryview(content), order)
-    found: dict[str, MatArray] = {}
+    try:
+        _check_file(memoryview(content), order, names)
+        values = loadmat(io.BytesIO(content), variable_names=names, simplify_cells=True)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except Exception as error:  # whatever damage makes SciPy stumble over
+        raise InputError(f"{path}: damaged ({reason(error)})") from error
+    return {name: values[name] for name in names if name in values}
+
+
+def struct_rows(value: Any, where: str) -> list[dict[str, Any]]:
+    """Return the elements of a struct array, arrays in them as lists; an empty array has none.
+
+    Raises:
+        InputError: where it is something else.
+    """
+    rows = [value] if isinstance(value, dict) else value
+    if isinstance(rows, np.ndarray) and rows.size == 0:
+        return []
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise InputError(f"{where}: is not a struct array")
+    return [{name: _plain(inner) for name, inner in row.items()} for row in rows]
+
+
+def _plain(value: Any) -> Any:
+    if not isinstance(value, np.ndarray):
+        return value.item() if isinstance(value, np.generic) else value
+    if value.size == 0 and value.dtype.kind == "U":
+        return ""  # SciPy gives an empty text as an empty array
+    return value.tolist() if value.dtype.kind != "f" else value.astype(np.float64).tolist()
+
+
+def _check_file(content: memoryview, order: str, names: tuple[str, ...]) -> None:
     at = 128
     while at < len(content):
-        kind, data, at = _element(top.body, at, top)
+        kind, data, at = _element(content, at, order)
         if kind == _COMPRESSED:
-            kind, data = _inflated(data, top)
-        if kind != _MATRIX:
-            continue
-        array, name = _parse(data, top, "")
-        if name in names and name not in found:
-            where = f"{path}: {name}"
-            found[name] = MatArray(where, array.kind, array.shape, array.body, order)
-    return found
+            kind, data = _inflated(data, order)
+        if kind == _MATRIX:
+            _check_array(data, order, names)
 
 
-def _element(body: memoryview, at: int, owner: MatArray) -> tuple[int, memoryview, int]:
+def _check_array(data: memoryview, order: str, names: tuple[str, ...] = (), depth: int = 0) -> None:
+    """Hold an array's announced elements, and those of all arrays in it, against its bytes."""
+    if not len(data):
+        return
+    kind, flags, at = _element(data, 0, order)
+    if kind != _UINT32 or len(flags) != 8 or depth > _DEEPEST:
+        raise InputError("damaged")
+    word = struct.unpack_from(order + "I", flags)[0]
+    code = word & 0xFF
+    kind, sizes, at = _element(data, at, order)
+    if kind != _INT32 or not 8 <= len(sizes) <= 128 or len(sizes) % 4:
+        raise InputError("damaged")
+    shape = struct.unpack(f"{order}{len(sizes) // 4}i", sizes)
+    _, name, at = _element(data, at, order)
+    if depth == 0 and bytes(name).decode("latin-1") not in names:
+        return  # SciPy passes it over
+    if code not in (_CELL, _STRUCT, _CHAR, *_NUMBERS):
+        raise InputError("holds a sparse array, an object or a function; save plain tables")
+    count = math.prod(shape)
+    if min(shape) < 0:
+        raise InputError("damaged")
+    if code == _STRUCT:
+        kind, length, at = _element(data, at, order)
+        width = struct.unpack(order + "i", length)[0] if len(length) == 4 else 0
+        _, fields, at = _element(data, at, order)
+        if kind != _INT32 or not 0 < width <= 64 or len(fields) % width:
+            raise InputError("has damaged field names")
+        count *= len(fields) // width
+    least = 8 if code in (_CELL, _STRUCT) else 1
+    if count * least > len(data) - at:
+        raise InputError(f"announces {count} elements but has {len(data) - at} bytes")
+    # SciPy takes types and numbers of elements on trust: what is wrong there ends the process.
+    expected = count if code in (_CELL, _STRUCT) else 2 if word & _COMPLEX else 1
+    elements = 0
+    while at < len(data):
+        kind, inner, at = _element(data, at, order)
+        elements += 1
+        if code in (_CELL, _STRUCT) and kind == _MATRIX:
+            _check_array(inner, order, depth=depth + 1)
+        elif not (code == _CHAR and kind in _TEXTS) and not (
+            code in _NUMBERS and len(inner) == count * _SIZES.get(kind, -1)
+        ):
+            raise InputError("damaged")
+    if elements != expected:
+        raise InputError("damaged")
+
+
+def _element(data: memoryview, at: int, order: str) -> tuple[int, memoryview, int]:
     """Type and bytes of the element at ``at``, and where the next begins."""
-    if at + 8 > len(body):
-        raise InputError(f"{owner.where}: cut off")
-    kind, size = struct.unpack_from(owner.order + "II", body, at)
+    if at + 8 > len(data):
+        raise InputError("cut off")
+    kind, size = struct.unpack_from(order + "II", data, at)
     if kind >> 16:  # up to four bytes within the tag
         kind, size = kind & 0xFFFF, kind >> 16
         start, end = at + 4, at + 8
-        if size > 4:
-            raise InputError(f"{owner.where}: damaged")
     else:
         start = at + 8
         end = start + size if kind == _COMPRESSED else start + -(-size // 8) * 8
-        if start + size > len(body):
-            raise InputError(f"{owner.where}: cut off, or damaged")
-    return kind, body[start : start + size], end
+    if start + size > min(len(data), end):
+        raise InputError("cut off, or damaged")
+    return kind, data[start : start + size], end
 
 
-def _inflated(data: memoryview, owner: MatArray) -> tuple[int, memoryview]:
+def _inflated(data: memoryview, order: str) -> tuple[int, memoryview]:
     """The element in a compressed one, whose announced size bounds what is unpacked."""
     packer = zlib.decompressobj()
-    try:
-        tag = packer.decompress(data, 8)
-        if len(tag) < 8:
-            raise InputError(f"{owner.where}: cut off")
-        kind, size = struct.unpack(owner.order + "II", tag)
-        if size > min(_DEFLATE_AT_BEST * len(data) + 64, _LARGEST_VARIABLE):
-            raise InputError(
-                f"{owner.where}: announces {size} bytes in {len(data)} compressed ones"
-            )
-        content = packer.decompress(packer.unconsumed_tail, size) if size else b""
-    except zlib.error as error:
-        raise InputError(f"{owner.where}: damaged ({error})") from error
+    tag = packer.decompress(data, 8)
+    if len(tag) < 8:
+        raise InputError("cut off")
+    kind, size = struct.unpack(order + "II", tag)
+    if size > min(_DEFLATE_AT_BEST * len(data) + 64, _LARGEST_VARIABLE):
+        raise InputError(f"announces {size} bytes in {len(data)} compressed ones")
+    content = packer.decompress(packer.unconsumed_tail, size) if size else b""
     if len(content) < size:
-        raise InputError(f"{owner.where}: cut off")
+        raise InputError("cut off")
     return kind, memoryview(content)
-
-
-def _matrix(body: memoryview, at: int, owner: MatArray, where: str) -> tuple[MatArray, int]:
-    kind, data, end = _element(body, at, owner)
-    if kind != _MATRIX:
-        raise InputError(f"{where}: damaged")
-    return _parse(data, owner, where)[0], end
-
-
-def _parse(data: memoryview, owner: MatArray, where: str) -> tuple[MatArray, str]:
-    """An array and its name; one of no bytes is empty."""
-    if not len(data):
-        return MatArray(where, 6, (0, 0), data, owner.order), ""
-    kind, flags, at = _element(data, 0, owner)
-    if kind != 6 or len(flags) != 8:
-        raise InputError(f"{where or owner.where}: damaged")
-    code = struct.unpack_from(owner.order + "I", flags)[0] & 0xFF
-    if code not in _KINDS:  # a sparse array, an object, a function: nothing to look into
-        return MatArray(where, code, (), data[:0], owner.order), ""
-    kind, sizes, at = _element(data, at, owner)
-    if kind != 5 or not 8 <= len(sizes) <= 128 or len(sizes) % 4:
-        raise InputError(f"{where or owner.where}: damaged")
-    shape = struct.unpack(f"{owner.order}{len(sizes) // 4}i", sizes)
-    if min(shape) < 0:
-        raise InputError(f"{where or owner.where}: damaged")
-    _, name, at = _element(data, at, owner)
-    label = bytes(name).decode("latin-1")
-    return MatArray(where, code, shape, data[at:], owner.order), label

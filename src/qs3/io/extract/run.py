@@ -3,20 +3,20 @@
 import functools
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float32
 
 from qs3.errors import InputError
-from qs3.io.extract.clouds import ExtractedCloud, Unit
 from qs3.io.transforms import resample
-from qs3.meshes.classes import map_labels
+from qs3.meshes.classes import POINTDA10, map_labels
 from qs3.store.executors import Executor, Failure, InlineExecutor, LocalExecutor, guarded
 from qs3.store.executors.executor import failure_of, stop_if_fatal
 from qs3.store.failures import read_failures, write_failures
 from qs3.store.folder import Folder, open_folder
+from qs3.store.info import info
 from qs3.store.manifest import (
     MANIFEST,
     Manifest,
@@ -29,60 +29,133 @@ from qs3.store.manifest import (
 from qs3.store.progress import progress_bar
 from qs3.store.shards import CloudRow, cloud_alone, put_shard, table_of
 from qs3.store.versions import package_versions
+from qs3.structure import unstructure
+
+
+@dataclass(frozen=True)
+class OutputSettings:
+    """Where the clouds go."""
+
+    out: str
+    """Folder of the data set; run the same command again to go on after a stop."""
+    num_points: int = 2048
+    """Larger clouds are brought to this many by farthest point sampling; smaller ones stay."""
+    workers: int = 1
+    """Processes; 0 does the work in this one. The bytes written do not depend on it."""
+    retry_failed: bool = False
+    """Do again what failed before."""
+
+    def __post_init__(self) -> None:
+        if self.num_points < 1:
+            raise InputError(f"--num-points {self.num_points}: must be at least 1")
+        if self.workers < 0:
+            raise InputError(f"--workers {self.workers}: must be 0 or more")
+
+
+@dataclass(frozen=True)
+class ExtractedCloud:
+    """One object cut from a real scan."""
+
+    id: str
+    """Name, unique in the data set, such as ``scene0000_00/12``."""
+    class_name: str
+    """Name of its class in the data set, or as the source calls it."""
+    points: Float32[np.ndarray, "n 3"]
+    """Its points in metres, z up."""
+    split: str = ""
+    """``train``, ``test`` or empty."""
+    source: Mapping[str, Any] = field(default_factory=dict)
+    """Where it came from (frames used, points before sampling), as plain values."""
+
+
+@runtime_checkable
+class Unit(Protocol):
+    """What is extracted at a time, and lost at a time if the machine stops: a scene, a frame."""
+
+    @property
+    def id(self) -> str:
+        """Unique name."""
+        ...
 
 
 @dataclass(frozen=True)
 class ExtractReport:
-    """What one call of `run_extract` did."""
+    """What one call of `run_extract` did, and what the data set holds after it."""
 
     objects: int
-    """Objects written by this call."""
+    """Objects in the data set."""
     units: int
     """Scenes or frames done by this call."""
     skipped: int
     """Scenes or frames that were finished before."""
     failed: int
-    """Scenes or frames that failed in this call; each is in ``failures.jsonl``."""
+    """Scenes or frames that failed, now or before; each is in ``failures.jsonl``."""
+    planned: int | None = None
+    """Objects that the source announces; None where only cutting tells."""
+    min_points: int = 0
+    """Objects of fewer points were left out."""
+    axes: str = ""
+    """Axes of the clouds, where the source let choose."""
+
+
+def wanted_classes(given: Sequence[str]) -> tuple[str, ...] | None:
+    """The classes to map onto: ``pointda10`` for its ten; None for ``all``, the source's own.
+
+    Raises:
+        InputError: where a class comes twice.
+    """
+    if tuple(given) in (("all",), ()):
+        return None
+    if tuple(given) == ("pointda10",):
+        return POINTDA10
+    if len(set(given)) < len(given):
+        raise InputError(f"--classes {' '.join(given)}: a class comes twice")
+    return tuple(given)
+
+
+def recorded(settings: Any, *leave_out: str) -> dict[str, Any]:
+    """Settings as ``dataset.json`` has them: plain values, null for infinity, which JSON lacks."""
+    plain = json.loads(json.dumps(unstructure(settings)), parse_constant=lambda _: None)
+    return {name: value for name, value in plain.items() if name not in leave_out}
 
 
 def run_extract(
     units: Sequence[Unit],
     extract_one: Callable[[Any], Iterable[ExtractedCloud]],
-    out: str | Path,
+    output: OutputSettings,
     *,
     settings: Mapping[str, Any],
     class_names: Sequence[str],
-    num_points: int = 2048,
-    workers: int = 1,
-    retry_failed: bool = False,
+    planned: int | None = None,
+    min_points: int = 0,
     progress: bool = True,
 ) -> ExtractReport:
-    """Extract the objects of every unit into the data set at ``out``.
+    """Extract the objects of every unit into the data set at ``output.out``.
 
     A unit that fails is logged, and its shard is empty. Run again after a stop, it goes on.
 
     Args:
         units: Scenes or frames, in the order of the shards.
         extract_one: Yields the objects of one unit; a picklable function or partial.
-        out: New or empty folder, or one that the same call began; any address fsspec knows.
+        output: A new or empty folder, or one that the same call began; any address fsspec knows.
         settings: What the rows depend on, plain values; stored in ``dataset.json``.
         class_names: Classes in the order of the label; an object of any other class is a fault.
-        num_points: Larger clouds are thinned to this many; smaller ones stay as they are.
-        workers: Processes; 0 does the work in this one.
-        retry_failed: Do again what failed before.
+        planned: Objects that the source announces, for the report.
+        min_points: Size below which ``extract_one`` leaves objects out, for the report.
         progress: Show a bar on the standard error stream.
 
     Raises:
         InputError: where there is no unit or two have one name, the folder holds something else,
             or a fault lies with the machine and not with a unit.
     """
+    out, num_points = output.out, output.num_points
     names = [unit.id for unit in units]
     if not units:
         raise InputError(f"{out}: nothing to extract from")
     if len(set(names)) < len(names):
         raise InputError(f"{out}: two scenes or frames have one name; rename one")
     folder = open_folder(out)
-    executor = InlineExecutor() if workers == 0 else LocalExecutor(workers)
+    executor = InlineExecutor() if output.workers == 0 else LocalExecutor(output.workers)
     manifest = Manifest(
         settings={**settings, "num_points": num_points, "units": names},
         class_names=tuple(class_names),
@@ -96,7 +169,7 @@ def run_extract(
         failures = {record["shard"]: record for record in read_failures(folder)}
         sums = read_sums(folder)
         settled = {i for i in finished_shards(folder, len(units)) if shard_name(i) in sums}
-        if retry_failed and failures:
+        if output.retry_failed and failures:
             # Forgotten first: a shard that is written anew has another checksum.
             settled -= set(failures)
             sums = {name: sums[name] for name in map(shard_name, sorted(settled))}
@@ -107,14 +180,13 @@ def run_extract(
         todo = [index for index in range(len(units)) if index not in settled]
         text = folder.name if progress else None
         bar = progress_bar(len(units), text, "scene", len(settled))
-        objects = failed = 0
+        objects = 0
 
         def note(index: int, outcome: Any) -> None:
-            nonlocal objects, failed
+            nonlocal objects
             stop_if_fatal(outcome)
             was_logged = failures.pop(index, None) is not None
             if isinstance(outcome, Failure):
-                failed += 1
                 failures[index] = _record(units[index], index, outcome)
                 outcome = _write(folder, index, [])
             if was_logged or index in failures:
@@ -122,7 +194,7 @@ def run_extract(
             objects += outcome[1]
             sums[shard_name(index)] = outcome[0]
             write_sums(folder, sums)
-            bar.set_postfix(objects=objects, failed=failed, refresh=False)
+            bar.set_postfix(objects=objects, failed=len(failures), refresh=False)
             bar.update()
 
         with bar, executor:
@@ -134,7 +206,14 @@ def run_extract(
                 for index, outcome in executor.drain():
                     note(index, outcome)
                 raise
-    return ExtractReport(objects, len(todo), len(settled), failed)
+    return ExtractReport(
+        objects=info(folder)["rows"],
+        units=len(todo),
+        skipped=len(settled),
+        failed=len(failures),
+        planned=planned,
+        min_points=min_points,
+    )
 
 
 def _outcomes(

@@ -1,265 +1,113 @@
-"""DepthScanNet-like clouds: objects of ScanNet fused from raw depth frames.
+"""Objects from ScanNet: fused from its raw depth frames, or from its meshes."""
 
-QS3 tests on objects "taken directly from" ScanNet's depth frames, which keep the sensor's noise;
-how many frames it fused and how it cut objects out is unpublished. What is done here:
-
-1. Every ``every``-th frame with a pose is read; depth beyond ``near`` and ``far`` is left out.
-2. A point belongs to the object whose instance mask (shrunk by ``erode``) it falls on, through the
-   calibration of both cameras. Without masks it belongs to the object of its nearest mesh vertex,
-   if that is within ``distance``.
-3. Of the frames that see ``min_pixels`` of an object, ``max_frames`` drawn at random are fused by
-   their poses: a few frames and the drift between them, as a robot would gather, and not the haze
-   of hundreds.
-4. Each voxel keeps one measured point at random: even density, unaveraged noise (`ObjectFusion`).
-
-Convention:
-    Metres, z up: the scene's axisAlignment where it has one, else the scene's own frame. The box's
-    middle is at x = y = 0 and its lowest point at z = 0; ``source["origin"]`` leads back.
-
-Source: Chen et al., "Quasi-Balanced Self-Training on Noise-Aware Synthesis of Object Point Clouds",
-ECCV 2022; Dai et al., "ScanNet", CVPR 2017.
-"""
-
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing
-from typing import Any
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
 
 from qs3.errors import InputError
-from qs3.io.extract.clouds import ExtractedCloud
-from qs3.io.extract.fuse import ObjectFusion
-from qs3.io.extract.scannet_masks import InstanceMasks, erode
-from qs3.io.extract.scannet_mesh import NO_OBJECT, read_scene_mesh
-from qs3.io.extract.scannet_scene import ScanNetScene as ScanNetScene
-from qs3.io.extract.scannet_scene import (
-    SceneObject,
-    axis_alignment,
-    object_seed,
-    read_objects,
-    rest,
+from qs3.io.extract.run import (
+    ExtractReport,
+    OutputSettings,
+    recorded,
+    run_extract,
+    wanted_classes,
 )
-from qs3.io.extract.scannet_scene import dropped_labels as dropped_labels
-from qs3.io.extract.scannet_scene import list_scenes as list_scenes
-from qs3.io.extract.scannet_scene import read_splits as read_splits
-from qs3.io.extract.scannet_settings import ScanNetSettings as ScanNetSettings
-from qs3.io.extract.sens import SensHeader, read_depth_frames, read_sens_header
-
-_MASKS = "_2d-instance-filt.zip"
-
-Owners = Callable[
-    [int, Float[np.ndarray, "n 3"], Int[np.ndarray, "n"], Float[np.ndarray, "4 4"]],
-    Int[np.ndarray, "n"] | None,
-]
-"""Gives each point of a frame its object: from the frame's number, the points in the depth camera,
-their pixels and the pose; −1 is no object, None that the frame has no mask."""
 
 
-def extract_scene(
-    scene: ScanNetScene,
-    settings: ScanNetSettings,
-    report: dict[str, Any] | None = None,
-) -> Iterator[ExtractedCloud]:
-    """Yield the objects of one scene, fused from its raw depth frames.
+@dataclass(frozen=True)
+class ScanNetSettings:
+    """How objects are cut from scenes of ScanNet."""
 
-    One frame is in memory at a time, and of each object no more than ``max_frames`` ×
-    ``max_points`` points, however long the scene; only the index of the masks' zip file grows, by
-    less than 1 kB a frame. Nothing is yielded before the last frame is read.
+    from_mesh: bool = False
+    """From the fused mesh, as ScanNet10, and not from the depth frames."""
+    scenes: tuple[str, ...] = ()
+    """Only these scenes; all by default."""
+    splits_train: Path | None = None
+    """The list of training scenes, such as scannetv2_train.txt."""
+    splits_test: Path | None = None
+    """The list of test scenes, such as scannetv2_val.txt."""
+    classes: tuple[str, ...] = ("pointda10",)
+    """Classes to map the objects onto, pointda10 for its ten; others are dropped."""
+    every: int = 10
+    """Step between the depth frames that are read; ScanNet has 30 a second."""
+    near: float = 0.4
+    """Smallest depth kept, metres: the Structure sensor's own limit."""
+    far: float = 4.0
+    """Largest depth kept, metres: beyond it the sensor's noise passes 3 cm."""
+    cut: Literal["auto", "masks", "mesh"] = "auto"
+    """By the instance masks of the frames, or by nearness to the annotated mesh; auto takes the
+    masks where the scene has them."""
+    erode: int = 2
+    """Pixels of the depth image by which masks shrink: as far as they miss the depth's edges."""
+    distance: float = 0.05
+    """Largest distance of a point to a mesh vertex of its object, metres. Vertices lie 1 to 2 cm
+    apart and depth noise is 1.5 cm at 3 m: less would cut the noise off."""
+    voxel: float = 0.01
+    """Edge of the voxels that keep one measured point each, metres."""
+    max_points: int = 20_000
+    """Points of an object kept before the data set's own sampling."""
+    max_frames: int = 20
+    """Frames fused to an object, drawn at random from those that see it; 0 fuses all."""
+    min_pixels: int = 200
+    """Pixels of an object that a frame needs to count."""
+    min_points: int = 512
+    """Objects with fewer points are dropped."""
+    seed: int = 0
+    """Seed of every choice."""
+
+    def __post_init__(self) -> None:
+        low = {"every": 1, "erode": 0, "max_points": 1, "max_frames": 0, "min_pixels": 1}
+        for name, least in {**low, "min_points": 1, "seed": 0}.items():
+            if getattr(self, name) < least:
+                raise InputError(f"{name} {getattr(self, name)}: has to be at least {least}")
+        if not 0 <= self.near < self.far < np.inf:
+            raise InputError(f"near {self.near}, far {self.far}: need 0 ≤ near < far, metres")
+        for name in ("distance", "voxel"):
+            if not 1e-4 <= getattr(self, name) <= 1:
+                raise InputError(f"{name} {getattr(self, name)}: has to lie from 0.0001 to 1 m")
+        if wanted_classes(self.classes) is None:
+            raise InputError("--classes all: ScanNet's labels are free words; name the classes")
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """The classes by their names."""
+        return wanted_classes(self.classes) or ()
+
+
+def extract_scannet(root: Path, output: OutputSettings, settings: ScanNetSettings) -> ExtractReport:
+    """Cut the objects of all scenes that are there into a data set.
 
     Args:
-        scene: Needs the ``.sens`` file and the aggregation; the masks, or the mesh with its
-            segments.
-        settings: What is kept.
-        report: Filled, where given: ``frames`` of the file, those ``read``, those
-            ``without_pose`` and ``without_mask``, the objects ``dropped`` by label, and those
-            ``too_small``, which is whole once the last object is yielded.
+        root: A copy of the release, its folder scans, or one scene's folder.
+        output: Where the clouds go.
+        settings: How they are cut.
 
     Raises:
-        InputError: where a file of the scene is missing, damaged or cut off.
+        InputError: where a scene asked for is not there, nothing is left, or as `run_extract`
+            does.
     """
-    objects, dropped = read_objects(scene, settings.class_names)
-    align = axis_alignment(scene)
-    sens = scene.file(".sens")
-    header = read_sens_header(sens)
-    counts = {"frames": header.num_frames, "read": 0, "without_pose": 0, "without_mask": 0}
-    fusions = {
-        item.id: ObjectFusion(
-            settings.voxel,
-            settings.max_points,
-            settings.max_frames,
-            object_seed(settings, scene, item.id),
-        )
-        for item in objects
-    }
-    told = {} if report is None else report
-    told |= {**counts, "too_small": 0, "dropped": dropped}
-    if not objects:
-        return
-    rays = _rays(header)
-    steps = [value * header.depth_shift for value in (settings.near, settings.far)]
-    with ExitStack() as stack:
-        owners = _owners(scene, settings, header, objects, stack)
-        for frame in read_depth_frames(sens, settings.every):
-            counts["read"] += 1
-            if frame.camera_to_world is None:
-                counts["without_pose"] += 1
-                continue
-            flat = frame.steps.reshape(-1)
-            pixels = np.flatnonzero((flat >= max(steps[0], 1)) & (flat <= steps[1]))
-            seen = rays[pixels] * (flat[pixels] / header.depth_shift)[:, None]
-            owner = owners(frame.index, seen, pixels, frame.camera_to_world)
-            if owner is None:
-                counts["without_mask"] += 1
-                continue
-            to_scene = align @ frame.camera_to_world
-            for number, fusion in fusions.items():
-                own = np.flatnonzero(owner == number)
-                if len(own) >= settings.min_pixels:
-                    points = _moved(to_scene, seen[own]).astype(np.float32)
-                    fusion.add(frame.index, points, pixels[own])
-    if counts["without_mask"] and counts["without_mask"] + counts["without_pose"] == counts["read"]:
-        raise InputError(f"{scene.file(_MASKS)}: has no mask of any frame read; it is incomplete")
-    told |= counts
-    for item in objects:
-        fusion = fusions.pop(item.id)
-        cloud = fusion.points()
-        if len(cloud) < settings.min_points:
-            told["too_small"] += 1
-            continue
-        points, origin = rest(cloud)
-        source = {
-            "label": item.label,
-            "frames": fusion.frames,
-            "frames_seen": fusion.offered,
-            "measured": fusion.measured,
-            "origin": origin,
-        }
-        yield ExtractedCloud(f"{scene.id}/{item.id}", item.class_name, points, scene.split, source)
+    from qs3.io.extract.scannet_frames import cut_scene
+    from qs3.io.extract.scannet_mesh import cut_mesh_scene
+    from qs3.io.extract.scannet_scene import list_scenes, read_splits
 
-
-def _rays(header: SensHeader) -> Float[np.ndarray, "n 3"]:
-    """Point at depth 1 of each pixel of the depth camera, row by row."""
-    width, height = header.depth_size
-    v, u = np.mgrid[:height, :width].reshape(2, -1)
-    pixels = np.stack([u, v, np.ones(len(u))], axis=1)
-    return pixels @ np.linalg.inv(header.depth_intrinsic).T
-
-
-def _moved(
-    matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n 3"]:
-    """Matrix times points, written out: no thread is started, and every machine rounds alike."""
-    x, y, z = points.T
-    return np.stack([x * a + y * b + z * c + d for a, b, c, d in matrix[:3]], axis=1)
-
-
-def _owners(
-    scene: ScanNetScene,
-    settings: ScanNetSettings,
-    header: SensHeader,
-    objects: Sequence[SceneObject],
-    stack: ExitStack,
-) -> Owners:
-    masks = scene.file(_MASKS)
-    if settings.cut == "masks" or (settings.cut == "auto" and masks.is_file()):
-        sizes = (header.color_size, header.depth_size)
-        opened = stack.enter_context(closing(InstanceMasks(masks, sizes)))
-        return _by_masks(opened, header, settings.erode)
-    if settings.cut == "auto" and not scene.file("_vh_clean_2.ply").is_file():
-        raise InputError(
-            f"{scene.folder}: has neither {masks.name} nor {scene.id}_vh_clean_2.ply with its "
-            "segments to cut objects out by; download one of them"
-        )
-    return _by_mesh(scene, objects, settings.distance)
-
-
-def _by_masks(masks: InstanceMasks, header: SensHeader, radius: int) -> Owners:
-    """Objects by the mask's pixel that each point falls on."""
-    # A pixel at depth z falls on the homogeneous pixel z · through + shift of the colour image.
-    to_color = header.color_intrinsic @ header.depth_to_color[:3]
-    through = _rays(header) @ to_color[:, :3].T
-    shift = to_color[:, 3]
-    # Cameras apart: what the depth camera sees beside an object may lie behind it for the other.
-    apart = np.linalg.norm(header.depth_to_color[:3, 3]) > 1e-3
-
-    def owners(
-        index: int,
-        seen: Float[np.ndarray, "n 3"],
-        pixels: Int[np.ndarray, "n"],
-        camera_to_world: Float[np.ndarray, "4 4"],
-    ) -> Int[np.ndarray, "n"] | None:
-        mask = masks.read(index)
-        if mask is None:
-            return None
-        height, width = mask.shape
-        mask = erode(mask, round(radius * width / header.depth_size[0]))
-        if (width, height) != header.color_size:
-            return mask.reshape(-1)[pixels].astype(np.int64) - 1
-        moved = through[pixels] * seen[:, 2:] + shift
-        depth = np.maximum(moved[:, 2], 1e-6)
-        u, v = np.rint(moved[:, 0] / depth), np.rint(moved[:, 1] / depth)
-        inside = (moved[:, 2] > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-        owner = np.full(len(seen), NO_OBJECT, dtype=np.int64)
-        rows, columns = v[inside].astype(np.int64), u[inside].astype(np.int64)
-        found = mask[rows, columns].astype(np.int64) - 1
-        if apart:
-            found[_hidden(rows, columns, depth[inside], -(-width // header.depth_size[0]))] = (
-                NO_OBJECT
-            )
-        owner[inside] = found
-        return owner
-
-    return owners
-
-
-def _hidden(
-    rows: Int[np.ndarray, "n"],
-    columns: Int[np.ndarray, "n"],
-    depth: Float[np.ndarray, "n"],
-    cell: int,
-) -> Bool[np.ndarray, "n"]:
-    """Whether points lie a twentieth of their depth behind others at their pixel.
-
-    Args:
-        rows: Row of each point's pixel.
-        columns: Its column.
-        depth: Its depth from that camera.
-        cell: Pixels to an edge of what counts as one place, about the spacing of the points.
-    """
-    # Imported here: scenes cut by their mesh do without.
-    import cv2
-
-    down, across = rows // cell, columns // cell
-    front = np.full((down.max(initial=0) + 1, across.max(initial=0) + 1), np.inf)
-    np.minimum.at(front, (down, across), depth)
-    front = cv2.erode(front, np.ones((3, 3), np.uint8))
-    return depth > 1.05 * front[down, across]
-
-
-def _by_mesh(scene: ScanNetScene, objects: Sequence[SceneObject], distance: float) -> Owners:
-    """Objects by the nearest vertex of the annotated mesh, other objects' and the floor's too."""
-    # Imported here: scenes cut by masks need no k-d tree.
-    from scipy.spatial import KDTree
-
-    mesh = read_scene_mesh(scene, objects)
-    tree = KDTree(mesh.vertices)
-    wanted = mesh.vertices[mesh.owner != NO_OBJECT]
-    low = wanted.min(axis=0, initial=np.inf) - distance
-    high = wanted.max(axis=0, initial=-np.inf) + distance
-
-    def owners(
-        index: int,
-        seen: Float[np.ndarray, "n 3"],
-        pixels: Int[np.ndarray, "n"],
-        camera_to_world: Float[np.ndarray, "4 4"],
-    ) -> Int[np.ndarray, "n"] | None:
-        world = _moved(camera_to_world, seen)
-        owner = np.full(len(seen), NO_OBJECT, dtype=np.int64)
-        near = np.flatnonzero(((world >= low) & (world <= high)).all(axis=1))
-        reach, vertex = map(np.asarray, tree.query(world[near], distance_upper_bound=distance))
-        found = np.isfinite(reach)
-        owner[near[found]] = mesh.owner[vertex[found]]
-        return owner
-
-    return owners
+    splits = read_splits(settings.splits_train, settings.splits_test) or None
+    scenes = list_scenes(root, settings.scenes or None, splits)
+    cut = partial(cut_scene, settings=settings)
+    if settings.from_mesh:
+        cut = partial(cut_mesh_scene, settings=settings, num_points=output.num_points)
+    return run_extract(
+        scenes,
+        cut,
+        output,
+        settings={
+            "extract": "extract_mesh_scene" if settings.from_mesh else "extract_scene",
+            **recorded(settings, "classes", "scenes", "splits_train", "splits_test"),
+            "class_names": list(settings.class_names),
+            "mesh_points": output.num_points,
+        },
+        class_names=settings.class_names,
+        min_points=settings.min_points,
+    )

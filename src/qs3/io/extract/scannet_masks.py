@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from qs3.errors import InputError
+from qs3.io.guards import decode_image, image_header
 
-_PNG = b"\x89PNG\r\n\x1a\n"
 _ZIP_FAULTS = (
     zipfile.BadZipFile,
     zlib.error,
@@ -70,9 +70,6 @@ class InstanceMasks:
         Raises:
             InputError: where it is damaged, of an unexpected size, or no 8-bit grey PNG.
         """
-        # Imported here: scenes cut by their mesh do without.
-        import cv2
-
         name = f"instance-filt/{frame}.png"
         try:
             entry = self._zip.getinfo(name)
@@ -93,23 +90,16 @@ class InstanceMasks:
         except _ZIP_FAULTS as error:
             reason = str(error) or "cut off"
             raise InputError(f"{where} is damaged ({reason}); copy the file again") from error
-        if len(content) > limit or content[:8] != _PNG or content[12:16] != b"IHDR":
-            raise InputError(f"{where} is no PNG image")
-        if len(content) < 26:
-            raise InputError(f"{where} is cut off")
-        width, height, bits, colour = struct.unpack(">IIBB", content[16:26])
-        if (width, height) not in self._sizes:
-            told = " or ".join(f"{w}×{h}" for w, h in dict.fromkeys(self._sizes))
-            raise InputError(f"{where} has {width}×{height} pixels; expected {told}")
-        if (bits, colour) != (8, 0):
-            raise InputError(f"{where} is no grey image of 8 bits")
         try:
-            mask = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-        except cv2.error:
-            mask = None
-        if mask is None or mask.dtype != np.uint8 or mask.shape != (height, width):
-            raise InputError(f"{where} is damaged; copy the file again")
-        return mask
+            size, mode = image_header(content, "PNG")
+            if size not in self._sizes:
+                expected = " or ".join(f"{w}×{h}" for w, h in dict.fromkeys(self._sizes))
+                raise InputError(f"has {size[0]}×{size[1]} pixels; expected {expected}")
+            if mode != "L":
+                raise InputError("is no grey image of 8 bits")
+            return decode_image(content, size)
+        except InputError as error:
+            raise InputError(f"{where}: {error}; copy the file again") from error
 
 
 def erode(mask: UInt8[np.ndarray, "h w"], radius: int) -> UInt8[np.ndarray, "h w"]:

@@ -12,7 +12,6 @@ Convention:
 Source: Qin et al., "PointDAN", NeurIPS 2019 (https://github.com/canqin001/PointDAN).
 """
 
-import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -21,7 +20,8 @@ from jaxtyping import Float, Int
 
 from qs3.errors import InputError
 from qs3.geometry import transform_points
-from qs3.io.extract.clouds import ExtractedCloud
+from qs3.io.extract.run import ExtractedCloud
+from qs3.io.extract.scannet import ScanNetSettings
 from qs3.io.extract.scannet_scene import (
     ScanNetScene,
     SceneObject,
@@ -31,8 +31,7 @@ from qs3.io.extract.scannet_scene import (
     read_segments,
     rest,
 )
-from qs3.io.extract.scannet_settings import ScanNetSettings
-from qs3.io.ply import parse_ply
+from qs3.io.ply import ply_vertices
 
 NO_OBJECT = -1
 
@@ -74,13 +73,15 @@ def read_scene_mesh(scene: ScanNetScene, objects: Sequence[SceneObject]) -> Scen
     return SceneMesh(vertices, owner)
 
 
-def extract_mesh_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[ExtractedCloud]:
+def cut_mesh_scene(
+    scene: ScanNetScene, settings: ScanNetSettings, num_points: int = 2048
+) -> Iterator[ExtractedCloud]:
     """Yield the objects of one scene as vertices of its fused mesh.
 
     Args:
         scene: Needs the mesh, its segments and the aggregation.
-        settings: ``class_names``, ``mesh_points``, ``min_points`` and ``seed`` matter here. Objects
-            of fewer than ``mesh_points`` vertices come whole.
+        settings: ``classes``, ``min_points`` and ``seed`` matter here.
+        num_points: Vertices drawn of an object; one of fewer comes whole.
 
     Raises:
         InputError: where a file of the scene is missing or damaged.
@@ -93,32 +94,22 @@ def extract_mesh_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterat
         if len(own) < settings.min_points:
             continue
         drawn = own
-        if len(own) > settings.mesh_points:
-            rng = np.random.default_rng(object_seed(settings, scene, item.id))
-            drawn = np.sort(rng.choice(own, settings.mesh_points, replace=False))
+        if len(own) > num_points:
+            rng = np.random.default_rng(object_seed(settings.seed, scene, item.id))
+            drawn = np.sort(rng.choice(own, num_points, replace=False))
         points, origin = rest(transform_points(align, mesh.vertices[drawn]))
         source = {"label": item.label, "vertices": len(own), "origin": origin}
         yield ExtractedCloud(f"{scene.id}/{item.id}", item.class_name, points, scene.split, source)
 
 
 def _vertices(scene: ScanNetScene) -> Float[np.ndarray, "n 3"]:
-    # Imported here: scenes cut by masks need no mesh.
-    import trimesh
-
     path = scene.file("_vh_clean_2.ply")
     if not path.is_file():
         raise InputError(f"{path}: no such file; download the scene's decimated mesh")
-    content = path.read_bytes()
     try:
-        # Held against its size first; a mesh's vertices come from trimesh, in the file's order.
-        vertices = parse_ply(content)
-        if vertices is None:
-            loaded = trimesh.load(io.BytesIO(content), file_type="ply", process=False)
-            vertices = np.asarray(getattr(loaded, "vertices", np.zeros((0, 3))), dtype=np.float64)
-    except Exception as error:  # parsers of damaged files raise whatever they stumble over
-        lines = str(error).splitlines()
-        reason = lines[0] if lines else type(error).__name__
-        raise InputError(f"{path}: cannot be read as ply ({reason})") from error
+        vertices = ply_vertices(path.read_bytes())
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
     if not len(vertices) or not (np.abs(vertices) < 1e4).all():
         raise InputError(f"{path}: has no vertices, or some are not finite")
     return vertices

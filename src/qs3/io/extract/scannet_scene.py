@@ -12,10 +12,9 @@ A scene's folder (``scans/scene0000_00`` of the release) holds, of what is read 
 Source: https://github.com/ScanNet/ScanNet (data organisation).
 """
 
-import json
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,8 +23,8 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.errors import InputError
-from qs3.io.extract.scannet_settings import ScanNetSettings
 from qs3.io.extract.sens import is_rigid
+from qs3.io.guards import pick, read_small, read_small_json
 from qs3.meshes.classes import POINTDA10, map_labels
 
 LABELS: Mapping[str, str] = {
@@ -50,6 +49,7 @@ LABELS: Mapping[str, str] = {
 }
 """Free labels of ScanNet's annotators that the common table of class names does not hold."""
 
+_LARGEST = 1 << 30
 _SCENE = re.compile(r"scene\d{4}_\d{2}")
 
 
@@ -100,26 +100,28 @@ def list_scenes(
     if not root.is_dir():
         raise InputError(f"{root}: no such folder; name the one that holds ScanNet's scans")
     if _SCENE.fullmatch(root.resolve().name):
-        found = {root.resolve().name: root}
+        folders = {root.resolve().name: root}
     else:
         below = root / "scans" if (root / "scans").is_dir() else root
-        found = {
+        folders = {
             entry.name: entry
             for entry in below.iterdir()
             if _SCENE.fullmatch(entry.name) and entry.is_dir()
         }
     for name in scenes or ():
-        if name not in found:
+        if name not in folders:
             raise InputError(f"{root}: has no scene {name!r}; its folder is missing")
     chosen = [
         name
-        for name in sorted(found)
+        for name in sorted(folders)
         if (scenes is None or name in scenes) and (splits is None or name in splits)
     ]
     if not chosen:
-        what = "no folder of the form scene0000_00" if not found else "none of the scenes asked for"
+        what = (
+            "no folder of the form scene0000_00" if not folders else "none of the scenes asked for"
+        )
         raise InputError(f"{root}: holds {what}")
-    return [ScanNetScene(name, found[name], (splits or {}).get(name, "")) for name in chosen]
+    return [ScanNetScene(name, folders[name], (splits or {}).get(name, "")) for name in chosen]
 
 
 def read_splits(train: Path | None = None, test: Path | None = None) -> dict[str, str]:
@@ -175,41 +177,30 @@ def read_objects(
         InputError: where the aggregation file is missing or is none.
     """
     path = scene.file(".aggregation.json")
-    groups = _json(path, "segGroups")
     objects: dict[int, SceneObject] = {}
     dropped: Counter[str] = Counter()
-    for place, group in enumerate(groups):
-        try:
-            number, label, segments = group["objectId"], group["label"], group["segments"]
-        except (KeyError, TypeError) as error:
-            raise InputError(
-                f"{path}: entry {place} of segGroups lacks objectId, label or segments"
-            ) from error
-        if not (_is_count(number) and isinstance(label, str) and isinstance(segments, list)) or (
-            not all(_is_count(segment) for segment in segments)
-        ):
-            raise InputError(f"{path}: entry {place} of segGroups is damaged")
-        name = class_of(label, class_names)
+    for place, value in enumerate(_listed(path, "segGroups")):
+        where = f"{path}: entry {place} of segGroups"
+        group = pick(value, _Group, where)
+        if not all(0 <= number < 2**31 for number in (group.objectId, *group.segments)):
+            raise InputError(f"{where}: a number is below 0 or beyond 31 bits")
+        name = class_of(group.label, class_names)
         if name is None:
-            dropped[label] += 1
+            dropped[group.label] += 1
         else:
             # scene0217_00 lists its objects twice: the first stays.
-            objects.setdefault(number, SceneObject(number, label, name, tuple(segments)))
+            item = SceneObject(group.objectId, group.label, name, group.segments)
+            objects.setdefault(item.id, item)
     return [objects[number] for number in sorted(objects)], dict(sorted(dropped.items()))
 
 
-def dropped_labels(
-    scenes: Iterable[ScanNetScene], class_names: Sequence[str] = POINTDA10
-) -> dict[str, int]:
-    """Count the objects, by label, that scenes hold beyond the classes asked for; most first.
+@dataclass(frozen=True)
+class _Group:
+    """An entry of ``segGroups``."""
 
-    Raises:
-        InputError: where an aggregation file is missing or is none.
-    """
-    counts: Counter[str] = Counter()
-    for scene in scenes:
-        counts.update(read_objects(scene, class_names)[1])
-    return dict(counts.most_common())
+    objectId: int  # noqa: N815 (ScanNet's name)
+    label: str
+    segments: tuple[int, ...]
 
 
 def axis_alignment(scene: ScanNetScene) -> Float[np.ndarray, "4 4"]:
@@ -252,36 +243,10 @@ def rest(
     return (points - origin).astype(np.float32), [float(value) for value in origin]
 
 
-def object_seed(settings: ScanNetSettings, scene: ScanNetScene, number: int) -> int:
+def object_seed(seed: int, scene: ScanNetScene, number: int) -> int:
     """Seed of one object's choices, the same in whatever order scenes are done."""
-    words = [settings.seed, *scene.id.encode("utf-8"), number]
+    words = [seed, *scene.id.encode("utf-8"), number]
     return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0])
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**31
-
-
-def _text(path: Path) -> str:
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    try:
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is no text ({error.reason})") from error
-
-
-def _json(path: Path, key: str) -> list[Any]:
-    """The list under ``key`` of a JSON file."""
-    text = _text(path)
-    try:
-        content = json.loads(text)
-    # Besides its own error: a number of thousands of digits, brackets nested without end.
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not a JSON file ({type(error).__name__})") from error
-    if not isinstance(content, dict) or not isinstance(content.get(key), list):
-        raise InputError(f"{path}: has no list {key!r}; it is no annotation of ScanNet")
-    return content[key]
 
 
 def read_segments(scene: ScanNetScene) -> list[Any]:
@@ -290,4 +255,19 @@ def read_segments(scene: ScanNetScene) -> list[Any]:
     Raises:
         InputError: where the file is missing or is none.
     """
-    return _json(scene.file("_vh_clean_2.0.010000.segs.json"), "segIndices")
+    return _listed(scene.file("_vh_clean_2.0.010000.segs.json"), "segIndices")
+
+
+def _listed(path: Path, key: str) -> list[Any]:
+    """The list under ``key`` of a JSON file."""
+    content = read_small_json(path, _LARGEST)
+    if not isinstance(content, dict) or not isinstance(content.get(key), list):
+        raise InputError(f"{path}: has no list {key!r}; it is no annotation of ScanNet")
+    return content[key]
+
+
+def _text(path: Path) -> str:
+    try:
+        return read_small(path, _LARGEST, "a text of ScanNet").decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is no text ({error.reason})") from error

@@ -11,27 +11,70 @@ Convention:
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+import tyro
 from jaxtyping import Float, Float32, UInt16
 
 from qs3.errors import InputError
-from qs3.io.extract.boxes import OrientedBox, inside_box
-from qs3.io.extract.clouds import ExtractedCloud
-from qs3.io.extract.depth import (
+from qs3.io.extract.cut import (
     CutSettings,
+    OrientedBox,
     as_cloud,
     check_rotation,
+    inside_box,
     keep_pixels,
     lift,
     turn,
 )
 from qs3.io.extract.depth_images import read_raw
 from qs3.io.extract.intrinsics import Intrinsics, intrinsics_from_matrix
+from qs3.io.extract.run import (
+    ExtractedCloud,
+    ExtractReport,
+    OutputSettings,
+    recorded,
+    run_extract,
+    wanted_classes,
+)
 
 CAPPED = 8.0
 """Metres; the toolbox moves all that is farther to this depth, here it is no depth."""
+
+DepthKind = Literal["refined", "raw"]
+"""``depth_bfx``, several frames fused and holes filled; or ``depth``, as the camera gave it."""
+
+
+@dataclass(frozen=True)
+class SunRgbdSettings:
+    """What is cut from SUN RGB-D by its oriented boxes."""
+
+    boxes: Path | None = None
+    """SUNRGBDMeta3DBB_v2.mat or a boxes.json; looked for at the root, above it and in the toolbox,
+    then the frames' own annotation3Dfinal/index.json, by default."""
+    splits: Path | None = None
+    """The toolbox's allsplit.mat, which tells train from test."""
+    classes: tuple[str, ...] = ("pointda10",)
+    """Classes to map the objects onto; pointda10 for its ten, all for the annotators' own."""
+    depth: DepthKind = "refined"
+    """depth_bfx (frames fused, holes filled) as the toolbox takes it, or depth as the camera gave
+    it."""
+    margin: float = 0.0
+    """Metres by which each face of a box is moved outwards."""
+    cut: Annotated[CutSettings, tyro.conf.arg(name="")] = field(
+        default_factory=lambda: CutSettings(far=CAPPED)
+    )
+    """Which pixels are kept; there is no mask to erode."""
+
+    def __post_init__(self) -> None:
+        wanted_classes(self.classes)
+        if not abs(self.margin) < 10:
+            raise InputError(f"margin {self.margin:g}: must be metres")
+        if self.cut.erode:
+            raise InputError("erode: boxes have no mask to erode")
 
 
 @dataclass(frozen=True)
@@ -70,20 +113,34 @@ class SunFrame:
     """What is wrong with its files; such a frame fails when it is extracted."""
 
 
-@dataclass(frozen=True)
-class SunSettings:
-    """What is cut from SUN RGB-D."""
+def extract_sunrgbd(root: Path, output: OutputSettings, settings: SunRgbdSettings) -> ExtractReport:
+    """Cut the objects of all frames that are there into a data set.
 
-    margin: float = 0.0
-    """Metres by which each face of a box is moved outwards."""
-    cut: CutSettings = field(default_factory=lambda: CutSettings(far=CAPPED))
-    """Which pixels are kept; there is no mask to erode."""
+    Args:
+        root: The folder ``SUNRGBD`` of the release or the one above it.
+        output: Where the clouds go.
+        settings: What is cut.
 
-    def __post_init__(self) -> None:
-        if not abs(self.margin) < 10:
-            raise InputError(f"margin {self.margin:g}: must be metres")
-        if self.cut.erode:
-            raise InputError("erode: boxes have no mask to erode")
+    Raises:
+        InputError: where nothing is found, a list of boxes is damaged, or as `run_extract` does.
+    """
+    from qs3.io.extract.sunrgbd_lists import list_sunrgbd, rename_to
+
+    classes = wanted_classes(settings.classes)
+    frames = list_sunrgbd(root, settings.boxes, settings.splits, settings.depth, rename_to(classes))
+    boxes = [box for frame in frames for box in frame.boxes]
+    return run_extract(
+        frames,
+        partial(cut_frame, settings=settings),
+        output,
+        settings={
+            "extract": "extract_sunrgbd",
+            **recorded(settings, "boxes", "splits", "classes"),
+        },
+        class_names=classes or sorted({box.class_name for box in boxes}),
+        planned=len(boxes),
+        min_points=settings.cut.min_points,
+    )
 
 
 def decode_depth(raw: UInt16[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
@@ -108,7 +165,7 @@ def sun_camera(matrix: Float[np.ndarray, "3 3"]) -> Intrinsics:
     return Intrinsics(from_one.fx, from_one.fy, from_one.cx - 1, from_one.cy - 1)
 
 
-def extract_sunrgbd(frame: SunFrame, settings: SunSettings) -> Iterator[ExtractedCloud]:
+def cut_frame(frame: SunFrame, settings: SunRgbdSettings) -> Iterator[ExtractedCloud]:
     """Cut the points within each box of one frame; floor and clutter in the box come with them.
 
     Raises:
@@ -136,19 +193,12 @@ def extract_sunrgbd(frame: SunFrame, settings: SunSettings) -> Iterator[Extracte
         points = world[inside_box(world, shape, settings.margin)]
         if len(points) < settings.cut.min_points:
             continue
-        yield ExtractedCloud(
-            id=f"{frame.id}/{box.number:03d}",
-            class_name=box.class_name,
-            points=as_cloud(points, frame.id),
-            split=frame.split,
-            source={"points": len(points), **_plain(shape)},
-        )
-
-
-def _plain(box: OrientedBox) -> dict[str, list[float]]:
-    """The box as numbers, for the row of its object."""
-    return {
-        "centroid": box.centre.tolist(),
-        "basis": box.basis.ravel().tolist(),
-        "coeffs": np.abs(box.half).tolist(),
-    }
+        source = {
+            "points": len(points),
+            "centroid": box.centre.tolist(),
+            "basis": box.basis.ravel().tolist(),
+            "coeffs": np.abs(box.half).tolist(),
+        }
+        cloud = as_cloud(points, frame.id)
+        identifier = f"{frame.id}/{box.number:03d}"
+        yield ExtractedCloud(identifier, box.class_name, cloud, frame.split, source)

@@ -4,8 +4,6 @@ Convention:
     Disparity is u_left − u_right ≥ 0 in pixels of the left image, NaN where there is no match.
 """
 
-from typing import Literal
-
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
@@ -20,28 +18,20 @@ from qs3.sensor.matching.zncc import match_zncc
 Image = UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]
 
 
-def match(
-    left: Image,
-    right: Image,
-    settings: MatchingSettings,
-    device: Literal["cpu", "cuda", "auto"] = "cpu",
-) -> Float32[np.ndarray, "h w"]:
+def match(left: Image, right: Image, settings: MatchingSettings) -> Float32[np.ndarray, "h w"]:
     """Match a rectified pair.
 
     Args:
         left: Grey levels of 8 bits, or of 10 bits in 16, which only ``zncc`` takes.
         right: The same of the other camera.
         settings: The matcher.
-        device: Where ``zncc`` searches: ``cpu`` with NumPy, ``cuda`` with torch, ``auto`` with
-            CUDA where torch sees it. The result is the same. ``opencv-bm`` runs on the CPU.
 
     Returns:
         Disparity in pixels, NaN where the matcher found none. ``opencv-bm`` gives steps of 1/16
         (less 1/32 with ``bias_correction``), ``quantum`` exact multiples of itself.
 
     Raises:
-        InputError: where the images are too small for the search range or have too many bits, or
-            torch sees no CUDA device that was asked for.
+        InputError: where the images are too small for the search range or have too many bits.
     """
     least = settings.num_disparities + settings.block_size
     if left.shape[1] < least or left.shape[0] < settings.block_size:
@@ -50,7 +40,7 @@ def match(
             f"{settings.num_disparities} disparities and a block of {settings.block_size}"
         )
     if settings.method == "zncc":
-        disparity = match_zncc(left, right, settings, device)
+        disparity = match_zncc(left, right, settings)
     elif left.dtype == np.uint8 and right.dtype == np.uint8:
         disparity = match_opencv(left, right, settings)
     else:

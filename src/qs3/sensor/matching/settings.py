@@ -1,18 +1,15 @@
 """The matcher's settings, and how far around a region it looks."""
 
-import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 from qs3.errors import InputError
+from qs3.sensor.checks import check_choices, check_range
 from qs3.sensor.rig import Region, StereoRig
 
 Method = Literal["opencv-bm", "zncc"]
-LeftBand = Literal["opencv", "physical"]
-Median = Literal[0, 3, 5]
 
 QUANTA = (0.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32)
-MOST_DISPARITIES = 1024
 
 
 @dataclass(frozen=True)
@@ -27,7 +24,7 @@ class MatchingSettings:
     """Side of the square window in pixels; odd, 5 to 255 (``zncc``: 5 to 31)."""
     bias_correction: bool = False
     """``opencv-bm``: take 1/32 px off: StereoBM rounds up when it packs its result into 1/16 px."""
-    left_band: LeftBand = "opencv"
+    left_band: Literal["opencv", "physical"] = "opencv"
     """``opencv`` leaves the whole search range at the left border empty; ``physical`` only the
     columns whose match would lie outside the right image, f·b/z wide."""
     quantum: float = 0.0
@@ -44,53 +41,39 @@ class MatchingSettings:
     """``zncc``: least correlation of a match."""
     texture: float = 2.0
     """``zncc``: least standard deviation of either block in grey levels of 255."""
-    median: Median = 0
+    median: Literal[0, 3, 5] = 0
     """``zncc``: side of the median filter over disparities; 0 is none."""
     min_region: int = 0
     """``zncc``: connected regions of fewer pixels are dropped, where neighbours of up to 1 px
     difference are connected; 0 keeps all."""
 
     def __post_init__(self) -> None:
-        _choose("method", self.method, get_args(Method))
-        _choose("left_band", self.left_band, get_args(LeftBand))
-        _choose("median", self.median, get_args(Median))
+        check_choices(self, "matching")
         if self.quantum not in QUANTA:
             raise InputError(
                 f"matching: quantum {self.quantum} is none of 0, 1/2, 1/4, 1/8, 1/16, 1/32"
             )
+        check_range(self, "matching", "correlation", "uniqueness", high=1.0, below=True)
+        check_range(self, "matching", "left_right", "texture", "min_region")
         if self.method == "opencv-bm":
-            self._check_opencv()
-        elif not 3 <= self.num_disparities <= MOST_DISPARITIES:
-            raise InputError(
-                f"matching: num_disparities {self.num_disparities} is not within "
-                f"3…{MOST_DISPARITIES}, as zncc takes it"
-            )
+            if self.num_disparities < 16 or self.num_disparities % 16:
+                raise InputError(
+                    f"matching: num_disparities {self.num_disparities} is not a multiple of 16, as "
+                    "opencv-bm needs it"
+                )
+            if self.bias_correction and self.quantum == 1 / 16:
+                # Every corrected value would lie half way between two multiples.
+                raise InputError(
+                    "matching: quantum 1/16 cannot hold bias_correction's 1/32 px; take 1/32 or "
+                    "1/8, or leave one of the two out"
+                )
+        else:
+            check_range(self, "matching", "num_disparities", low=3, high=1024)
         most = 255 if self.method == "opencv-bm" else 31
         if self.block_size % 2 == 0 or not 5 <= self.block_size <= most:
             raise InputError(
                 f"matching: block_size {self.block_size} is not odd within 5…{most}, as "
                 f"{self.method} takes it"
-            )
-        for name, below in (("correlation", 1.0), ("uniqueness", 1.0)):
-            value = getattr(self, name)
-            if not 0 <= value < below:
-                raise InputError(f"matching: {name} {value} is not within 0…1 (1 excluded)")
-        for name in ("left_right", "texture", "min_region"):
-            value = getattr(self, name)
-            if not 0 <= value < math.inf:
-                raise InputError(f"matching: {name} {value} must not be below 0")
-
-    def _check_opencv(self) -> None:
-        if self.num_disparities < 16 or self.num_disparities % 16:
-            raise InputError(
-                f"matching: num_disparities {self.num_disparities} is not a multiple of 16, as "
-                "opencv-bm needs it"
-            )
-        if self.bias_correction and self.quantum == 1 / 16:
-            # Every corrected value would lie half way between two multiples.
-            raise InputError(
-                "matching: quantum 1/16 cannot hold bias_correction's 1/32 px; take 1/32 or 1/8, "
-                "or leave one of the two out"
             )
 
 
@@ -130,9 +113,3 @@ def _at_least(least: int, start: int, stop: int, end: int) -> tuple[int, int]:
     """Widen start … stop within 0 … end, towards the end first."""
     stop = min(end, max(stop, start + least))
     return max(0, min(start, stop - least)), stop
-
-
-def _choose(name: str, value: object, choices: tuple[object, ...]) -> None:
-    if value not in choices:
-        offer = ", ".join(str(choice) for choice in choices)
-        raise InputError(f"matching: no {name} {value!r}; choose one of {offer}")

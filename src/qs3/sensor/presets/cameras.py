@@ -171,8 +171,8 @@ KINECT_V1 = Sensor(
     placement=Placement(radius=(1.5, 2.5)),
 )
 
-_QS3 = Sensor()
-_QS3_800 = Sensor(
+_PAPER = Sensor()
+_PAPER_800 = Sensor(
     name="qs3-800",
     description="the geometry of the stereo pair in the released code's history",
     rig=StereoRig(width=800, height=800, focal=800 * 50 / 36, baseline=0.2),
@@ -180,11 +180,12 @@ _QS3_800 = Sensor(
 )
 _BRIGHT_ROOM = Sensor(
     name="bright-room",
-    description="the qs3 camera in a brighter room, with a grainy imager",
+    description="the paper's camera in a brighter room, with a grainy imager",
     light=LightSettings(sky=0.8, ambient=0.08),
     exposure=ExposureSettings(gain=0.7, noise=1.0),
 )
 
 SENSORS: dict[str, Sensor] = {
-    sensor.name: sensor for sensor in (_QS3, _QS3_800, _BRIGHT_ROOM, D415, D435, D455, KINECT_V1)
+    sensor.name: sensor
+    for sensor in (_PAPER, _PAPER_800, _BRIGHT_ROOM, D415, D435, D455, KINECT_V1)
 }

@@ -11,7 +11,7 @@ from qs3.files import sha256
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.exposure import ExposureSettings
 from qs3.sensor.matching import MatchingSettings
-from qs3.sensor.materials import Material
+from qs3.sensor.materials import Material, get_material
 from qs3.sensor.render.scene import LightSettings
 from qs3.sensor.rig import StereoRig
 from qs3.sensor.speckle import PatternSettings
@@ -27,9 +27,9 @@ class Sensor:
         6.0
     """
 
-    name: str = "qs3"
+    name: str = "paper"
     """Name in records."""
-    description: str = "the released scanner: the paper's sensor"
+    description: str = "the paper's sensor: the released scanner"
     """One line for lists; not part of records."""
     metric: bool = False
     """Whether the unit of length is the metre; else it is the size of a normalised object."""
@@ -89,6 +89,24 @@ class Sensor:
                 f"{self.matching.num_disparities}; search more, or bring rig.focal, rig.baseline "
                 "and placement into one unit"
             )
+
+
+def changed(settings: Any, name: str, value: Any) -> Any:
+    """The settings with one dotted name replaced; a material may be given by its name.
+
+    Raises:
+        InputError: where the settings refuse the value.
+
+    Example:
+        >>> changed(Sensor(), "light.ambient", 0.1).light.ambient
+        0.1
+    """
+    head, _, rest = name.partition(".")
+    if rest:
+        value = changed(getattr(settings, head), rest, value)
+    elif head == "material":
+        value = get_material(value)
+    return dataclasses.replace(settings, **{head: str(value) if isinstance(value, Path) else value})
 
 
 def settings_dict(sensor: Sensor) -> dict[str, Any]:

@@ -1,29 +1,80 @@
-"""Sensors as TOML: a table for each part, a key for each setting.
+"""Sensors by name, and as TOML: a table for each part, a key for each setting.
 
 Convention:
-    A file gives a whole sensor or only what differs from ``base``, a preset's name; without it,
-    what a file does not give is as ``qs3`` has it. A relative ``pattern.image`` starts at the
+    A file gives a whole sensor or only what differs from ``base``, a built-in sensor; without it,
+    what a file does not give is as ``paper`` has it. A relative ``pattern.image`` starts at the
     file's folder. A whole number stands for a number with a point, not the other way round.
 """
 
 import ast
 import dataclasses
 import difflib
+import functools
 import inspect
+import itertools
 import json
+import logging
 import math
 import tomllib
-import types
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from textwrap import wrap
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any
 
 from qs3.errors import InputError
 from qs3.sensor.presets.cameras import SENSORS
-from qs3.sensor.presets.settings import Sensor
+from qs3.sensor.presets.settings import Sensor, changed
+from qs3.structure import structure, unstructure
 
 _WIDTH = 96
+_FORMER = {"qs3": "paper"}
+"""Sensors that had another name in version 0.1."""
+_log = logging.getLogger(__name__)
+
+
+def get_sensor(name: str) -> Sensor:
+    """Return the built-in sensor of that name, or the one of a TOML file.
+
+    Args:
+        name: A name, or the path of a file that ends in ``.toml``.
+
+    Raises:
+        InputError: where there is none; the message lists those there are. For a file as
+            `load_sensor` does.
+
+    Example:
+        >>> get_sensor("paper").rig.focal
+        1500.0
+    """
+    if name in _FORMER:
+        _note(name)
+        name = _FORMER[name]
+    if name in SENSORS:
+        return SENSORS[name]
+    if name.lower().endswith(".toml"):
+        return load_sensor(Path(name))
+    near = difflib.get_close_matches(name, SENSORS, n=1)
+    hint = f"did you mean {near[0]}? " if near else ""
+    raise InputError(
+        f"no sensor {name!r}; {hint}choose one of {', '.join(SENSORS)}, or name a file "
+        "that ends in .toml"
+    )
+
+
+@functools.cache
+def _note(name: str) -> None:
+    """Say once that a sensor has another name now."""
+    _log.warning("the sensor %s is called %s now", name, _FORMER[name])
+
+
+def sensor_name(name: str) -> str:
+    """Today's name of a built-in sensor; any other name as it is.
+
+    Example:
+        >>> sensor_name("qs3"), sensor_name("d435")
+        ('paper', 'd435')
+    """
+    return _FORMER.get(name, name)
 
 
 def load_sensor(path: Path | str) -> Sensor:
@@ -38,17 +89,24 @@ def load_sensor(path: Path | str) -> Sensor:
     """
     path = Path(path)
     table = _read(path)
+    base = table.pop("base", "paper")
+    if not isinstance(base, str) or base.lower().endswith(".toml"):
+        raise InputError(f"{path}: base: {base!r} is none of {', '.join(SENSORS)}")
     try:
-        base = table.pop("base", "qs3")
-        if not isinstance(base, str) or base not in SENSORS:
-            raise InputError(f"base: no preset {base!r}; {_offer(str(base), SENSORS)}")
-        if "name" not in table:
-            table["name"] = path.stem
-            table.setdefault("description", f"after {base}")
-        sensor = _updated(SENSORS[base], table, "", ("base",))
-        return _with_picture(sensor, path) if "image" in table.get("pattern", {}) else sensor
+        whole = unstructure(get_sensor(base))
     except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise InputError(f"{path}: base: {error}") from None
+    if "name" not in table:
+        whole |= {"name": path.stem, "description": f"after {sensor_name(base)}"}
+    elif isinstance(table["name"], str):
+        table["name"] = sensor_name(table["name"])
+    sensor = structure(_merged(whole, table), Sensor, path)
+    if isinstance(table.get("pattern"), dict) and "image" in table["pattern"]:
+        picture = (path.parent / str(sensor.pattern.image)).resolve()
+        if not picture.is_file():
+            raise InputError(f"{path}: pattern.image: {picture}: no such file")
+        sensor = changed(sensor, "pattern.image", picture)
+    return sensor
 
 
 def sensor_toml(sensor: Sensor) -> str:
@@ -71,80 +129,25 @@ def _read(path: Path) -> dict[str, Any]:
             "(qs3 sensors show d435 > my_camera.toml makes one)"
         )
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"), parse_float=_finite)
     except (ValueError, RecursionError) as error:  # broken TOML, or not UTF-8
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: not a TOML file: {reason}") from None
 
 
-def _updated(settings: Any, table: Mapping[str, Any], prefix: str, others: Iterable[str]) -> Any:
-    """The settings with what ``table`` gives; ``prefix`` is its dotted name, a dot at its end."""
-    hints = get_type_hints(type(settings))
-    values = {}
-    for key, value in table.items():
-        if key not in hints:
-            offer = _offer(key, [*others, *hints], prefix)
-            raise InputError(f"no setting {prefix + key!r}; {offer}")
-        if dataclasses.is_dataclass(hints[key]):
-            if not isinstance(value, dict):
-                raise InputError(f"{prefix}{key} is a table, not {value!r}; write [{prefix}{key}]")
-            values[key] = _updated(getattr(settings, key), value, f"{prefix}{key}.", ())
-        else:
-            values[key] = _typed(value, hints[key], prefix + key)
-    return dataclasses.replace(settings, **values)
+def _finite(text: str) -> float:
+    if not math.isfinite(number := float(text)):
+        raise ValueError(f"{text} is not a finite number")
+    return number
 
 
-def _typed(value: Any, hint: Any, key: str) -> Any:
-    """The value as the type of the field; a bool is no number."""
-    origin = get_origin(hint)
-    if origin is Literal:
-        for choice in get_args(hint):
-            if value == choice and type(value) is type(choice):
-                return choice
-        raise InputError(f"{key} = {_shown(value)}: {_offer(str(value), get_args(hint))}")
-    if origin in (Union, types.UnionType):
-        (hint,) = (part for part in get_args(hint) if part is not type(None))
-        return _typed(value, hint, key)
-    if origin is tuple:
-        parts = get_args(hint)
-        if not isinstance(value, list) or len(value) != len(parts):
-            raise InputError(f"{key} = {_shown(value)}: a list of {len(parts)} values is needed")
-        pairs = enumerate(zip(value, parts, strict=True))
-        return tuple(_typed(one, part, f"{key}[{index}]") for index, (one, part) in pairs)
-    if hint is float and type(value) in (int, float):
-        try:
-            number = float(value)
-        except OverflowError:
-            number = math.inf
-        if math.isfinite(number):
-            return number
-    elif hint is not float and type(value) is hint:
-        return value
-    names = {float: "a finite number", int: "a whole number", bool: "true or false", str: "a text"}
-    raise InputError(f"{key} = {_shown(value)}: {names[hint]} is needed")
-
-
-def _with_picture(sensor: Sensor, path: Path) -> Sensor:
-    picture = (path.parent / str(sensor.pattern.image)).resolve()
-    if not picture.is_file():
-        raise InputError(f"pattern.image: {picture}: no such file")
-    pattern = dataclasses.replace(sensor.pattern, image=str(picture))
-    return dataclasses.replace(sensor, pattern=pattern)
-
-
-def _offer(given: str, known: Iterable[Any], prefix: str = "") -> str:
-    """The nearest of the valid names, or all of them, each with ``prefix`` before it."""
-    names = [str(name) for name in known]
-    near = [prefix + name for name in difflib.get_close_matches(given, names)]
-    if near:
-        return f"did you mean {' or '.join(near)}?"
-    return f"choose one of {', '.join(prefix + name for name in names)}"
-
-
-def _shown(value: Any) -> str:
-    """A value in an error: in one line, not endless."""
-    text = repr(value)
-    return text if len(text) <= 40 else text[:40] + "…"
+def _merged(whole: Mapping[str, Any], table: Mapping[str, Any]) -> dict[str, Any]:
+    """What a file gives over what it leaves out, table by table."""
+    merged = {**whole, **table}
+    for key in whole.keys() & table.keys():
+        if isinstance(whole[key], dict) and isinstance(table[key], dict):
+            merged[key] = _merged(whole[key], table[key])
+    return merged
 
 
 def _lines(settings: Any, name: str) -> list[str]:
@@ -168,7 +171,7 @@ def _written(value: Any) -> str:
         # JSON's escapes are TOML's, but for the one control character that JSON lets through.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007F")
     if isinstance(value, tuple):
-        return f"[{', '.join(_written(one) for one in value)}]"
+        return f"[{', '.join(_written(item) for item in value)}]"
     if isinstance(value, bool):
         return "true" if value else "false"
     return repr(value)
@@ -180,16 +183,10 @@ def _field_docstrings(cls: type) -> dict[str, str]:
         body = ast.parse(inspect.getsource(cls)).body[0]
     except (OSError, TypeError, SyntaxError):
         return {}
-    found: dict[str, str] = {}
-    if not isinstance(body, ast.ClassDef):
-        return found
-    for field, text in zip(body.body, body.body[1:], strict=False):
-        if (
-            isinstance(field, ast.AnnAssign)
-            and isinstance(field.target, ast.Name)
-            and isinstance(text, ast.Expr)
-            and isinstance(text.value, ast.Constant)
-            and isinstance(text.value.value, str)
-        ):
-            found[field.target.id] = " ".join(text.value.value.replace("``", "").split())
-    return found
+    docstrings: dict[str, str] = {}
+    statements = body.body if isinstance(body, ast.ClassDef) else []
+    for field, text in itertools.pairwise(statements):
+        match field, text:
+            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(ast.Constant(str(words))):
+                docstrings[name] = " ".join(words.replace("``", "").split())
+    return docstrings

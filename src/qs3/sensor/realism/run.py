@@ -44,14 +44,16 @@ class RealismSettings:
     seed: int = 0
     """All random steps follow from it."""
     tests: tuple[str, ...] = tuple(TITLES)
-    """T1 to T10, in any order."""
+    """Tests to do, T1 to T10; others may be added to the same folder."""
 
     def __post_init__(self) -> None:
-        unknown = [test for test in self.tests if test not in TITLES]
-        if unknown or not self.tests:
+        asked = {test.upper(): test for test in self.tests}
+        unknown = [test for name, test in asked.items() if name not in TITLES]
+        if unknown or not asked:
             raise InputError(
                 f"tests: no test {unknown[0] if unknown else ''!r}; choose of {', '.join(TITLES)}"
             )
+        object.__setattr__(self, "tests", tuple(test for test in TITLES if test in asked))
         if self.seed < 0:
             raise InputError(f"seed: {self.seed} must not be below 0")
 

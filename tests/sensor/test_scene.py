@@ -18,8 +18,8 @@ from qs3.sensor.render.mitsuba import MitsubaRenderer
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.scan import scan
+from qs3.sensor.scene import LAYOUTS, ArrangedScene, SceneSettings, arrange
 from qs3.sensor.speckle import PatternSettings
-from qs3.sensor.surroundings import LAYOUTS, SceneSettings, Surroundings, arrange
 from qs3.sensor.views import Placement, place_views
 
 TINY = Sensor(
@@ -27,13 +27,13 @@ TINY = Sensor(
     rig=StereoRig(width=300, height=300, focal=420.0, baseline=0.2),
     matching=MatchingSettings(num_disparities=64, block_size=9),
     depth=DepthSettings(stride=1),
-    # As many pixels a cell as `qs3` has.
+    # As many pixels a cell as `paper` has.
     pattern=PatternSettings(columns=177, rows=138),
     placement=Placement(radius=(2.6, 3.0)),
 )
 
 
-def around(layout: str, seed: int = 0, views: int = 5, kind="orbit", **how) -> Surroundings:
+def around(layout: str, seed: int = 0, views: int = 5, kind="orbit", **how) -> ArrangedScene:
     rng = np.random.default_rng(seed)
     settings = SceneSettings(layout, **how)
     mesh = normalise(shapes.make("chair", seed=seed))
@@ -46,7 +46,7 @@ def azimuths(poses) -> np.ndarray:
     return np.array([np.arctan2(p.position[1], p.position[0]) for p in poses])
 
 
-def part(made: Surroundings, name: str) -> trimesh.Trimesh:
+def part(made: ArrangedScene, name: str) -> trimesh.Trimesh:
     return made.bodies[made.names.index(name)].mesh
 
 
@@ -238,7 +238,7 @@ def test_a_rig_in_the_way_is_refused_before_rendering(sensor, scene, message):
 def test_a_projector_inside_the_object_is_refused():
     pose = Pose.looking_at(np.array([0.0, -2.0, 0.0]), np.zeros(3))
     box = trimesh.creation.box(extents=[1, 1, 1]).apply_translation([3.0, -2.0, 0.0])
-    made = Surroundings((Body(box),), ("object",), (pose,))
+    made = ArrangedScene((Body(box),), ("object",), (pose,))
     sensor = dataclasses.replace(TINY, rig=StereoRig(300, 300, 420.0, 0.3, projector_offset=10.0))
     with pytest.raises(InputError, match="projector stands inside"):
         check_views(made, sensor)
@@ -261,7 +261,7 @@ def scans(quick):
             num_points=30_000,
             scene=layout,
             neighbour=table if "be" in layout else None,
-            box_crop=False,
+            crop="none",
             renderer=quick,
             full_frames=layout == "room",
             keep_images=True,
@@ -344,11 +344,11 @@ def test_crops_keep_what_they_say(quick):
     chair = shapes.make("chair", seed=1)
     counts = {}
     for name, how in {
-        "none": {"box_crop": False},
+        "none": {"crop": "none"},
         "margin": {"box_margin": 0.1},
         "box": {},
-        "mask": {"box_crop": False, "mask_crop": True},
-        "both": {"mask_crop": True},
+        "mask": {"crop": "mask"},
+        "both": {"crop": "both"},
     }.items():
         made = scan(chair, renderer=quick, **common, **how)
         counts[name] = made.fused_points

@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from qs3.errors import InputError
 from qs3.geometry import invert_rigid, rotation_z, transform_points
+from qs3.sensor.checks import check_range
 from qs3.sensor.materials import Material
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.render.scene import Body
@@ -30,7 +31,7 @@ _LIFT = 1e-4  # of the object's size between it and the floor: equal planes woul
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """The object's surroundings. Distances are shares of the object's size."""
+    """What stands around the object. Distances are shares of the object's size."""
 
     layout: str = "alone"
     """``alone`` (the paper), on a ``floor``, before a ``wall``, in a ``room`` (both), ``behind``
@@ -65,16 +66,10 @@ class SceneSettings:
             raise InputError(f"scene: alone does not go with others, as in {self.layout!r}")
         if {"behind", "beside"} <= self.parts:
             raise InputError("scene: the neighbour stands in front (behind) or beside, not both")
-        for name in ("wall_gap", "neighbour_gap"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"scene: {name} {getattr(self, name)} must not be below 0")
-        for name in ("neighbour_size", "extent"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InputError(f"scene: {name} {getattr(self, name)} must be above 0")
-        if not 0 < self.cover <= 1:
-            raise InputError(f"scene: cover {self.cover} is not within 0…1")
-        if not 0 <= self.arc <= 170:
-            raise InputError(f"scene: arc {self.arc} is not within 0…170 degrees")
+        check_range(self, "scene", "wall_gap", "neighbour_gap")
+        check_range(self, "scene", "neighbour_size", "extent", above=True)
+        check_range(self, "scene", "cover", high=1, above=True)
+        check_range(self, "scene", "arc", high=170)
 
     @property
     def parts(self) -> frozenset[str]:
@@ -96,7 +91,7 @@ class SceneSettings:
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class ArrangedScene:
     """Everything before the rig, and from where it is seen."""
 
     bodies: tuple[Body, ...]
@@ -114,8 +109,8 @@ def arrange(
     size: float,
     neighbour: trimesh.Trimesh | None,
     rng: np.random.Generator,
-) -> Surroundings:
-    """Put the object's surroundings about it.
+) -> ArrangedScene:
+    """Put everything else about the object.
 
     Args:
         settings: Layout, materials and distances.
@@ -155,7 +150,7 @@ def arrange(
     across = np.array([-front[1], front[0], 0.0])
     up = np.array([0.0, 0.0, 1.0])
     if "wall" in parts:
-        reach = max(float((one.mesh.vertices @ -front).max()) for one in bodies)
+        reach = max(float((body.mesh.vertices @ -front).max()) for body in bodies)
         centre = -front * (reach + settings.wall_gap * size)
         if "floor" in parts:  # it stands on the floor
             centre = centre + up * (ground + half)
@@ -165,7 +160,7 @@ def arrange(
         centre = up * ground
         bodies.append(Body(_square(centre, front * half, across * half), settings.floor))
         names.append("floor")
-    return Surroundings(tuple(bodies), tuple(names), tuple(poses))
+    return ArrangedScene(tuple(bodies), tuple(names), tuple(poses))
 
 
 def _on_arc(poses: Sequence[Pose], arc: float) -> list[Pose]:

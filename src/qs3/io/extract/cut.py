@@ -1,0 +1,217 @@
+"""Which points of a depth image belong to an object: pixels, gravity, oriented boxes.
+
+Convention:
+    A box is its centre, three unit axes as the rows of ``basis``, and half its size along each.
+    Point p is inside where abs(basis_i · (p − centre)) ≤ half_i for all three i, as in SUN RGB-D's
+    toolbox (centroid, basis, coeffs).
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from qs3.errors import InputError
+from qs3.io.extract.intrinsics import Intrinsics
+
+_FARTHEST = 1e6
+
+
+@dataclass(frozen=True)
+class CutSettings:
+    """Which pixels of an object are kept."""
+
+    near: float = 0.0
+    """Depths at or below are dropped, in metres along the optical axis."""
+    far: float = math.inf
+    """Depths at or above are dropped."""
+    erode: int = 0
+    """Pixels by which a mask's edge is moved inwards; the image's own border is no edge."""
+    flying: float = 0.0
+    """Drop pixels with fewer than three of their eight neighbours within this many metres of depth;
+    0 keeps all, as noise is to be kept."""
+    min_points: int = 100
+    """Objects of fewer points are left out."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.near < self.far:
+            raise InputError(
+                f"near {self.near:g} and far {self.far:g} must be 0 or above, in order"
+            )
+        if not 0 <= self.erode <= 100:
+            raise InputError(f"erode {self.erode}: must be from 0 to 100 pixels")
+        if not 0 <= self.flying < math.inf:
+            raise InputError(f"flying {self.flying:g}: must be 0 or metres")
+        if self.min_points < 1:
+            raise InputError(f"min-points {self.min_points}: must be at least 1")
+
+
+def keep_pixels(
+    depth: Float32[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"], settings: CutSettings
+) -> Bool[np.ndarray, "h w"]:
+    """Tell which pixels of a mask give a point: gated, eroded and, if asked for, not flying.
+
+    Args:
+        depth: Metres along the optical axis, NaN where there is none.
+        mask: Pixels of the object.
+        settings: What is dropped.
+    """
+    with np.errstate(invalid="ignore"):
+        keep = mask & (depth > settings.near) & (depth < settings.far)
+    if settings.erode:
+        keep &= _eroded(mask, settings.erode)
+    if settings.flying:
+        keep &= _supported(np.where(keep, depth, np.nan), settings.flying)
+    return keep
+
+
+def _eroded(mask: Bool[np.ndarray, "h w"], pixels: int) -> Bool[np.ndarray, "h w"]:
+    import cv2
+
+    square = np.ones((2 * pixels + 1, 2 * pixels + 1), np.uint8)
+    return cv2.erode(mask.astype(np.uint8), square) > 0
+
+
+def _supported(depth: Float[np.ndarray, "h w"], within: float) -> Bool[np.ndarray, "h w"]:
+    """Whether at least three of the eight neighbours have about the same depth."""
+    height, width = depth.shape
+    padded = np.pad(depth, 1, constant_values=np.nan)
+    count = np.zeros(depth.shape, np.uint8)
+    for row in range(3):
+        for column in range(3):
+            if (row, column) != (1, 1):
+                other = padded[row : row + height, column : column + width]
+                with np.errstate(invalid="ignore"):
+                    count += np.abs(other - depth) <= within
+    return count >= 3
+
+
+def lift(
+    depth: Float32[np.ndarray, "h w"], keep: Bool[np.ndarray, "h w"], camera: Intrinsics
+) -> Float[np.ndarray, "n 3"]:
+    """Lift pixels to points of the camera.
+
+    Convention:
+        OpenCV camera: x right, y down, z forward; pixel (0, 0) is the centre of the top-left one.
+
+    Args:
+        depth: Metres along the optical axis.
+        keep: Pixels to lift; each has a depth.
+        camera: The camera.
+
+    Returns:
+        Points in metres, in row-major order of the pixels.
+
+    Example:
+        >>> camera = Intrinsics(2.0, 2.0, 0.0, 0.0)
+        >>> lift(np.full((1, 2), 4, np.float32), np.ones((1, 2), bool), camera).tolist()
+        [[0.0, 0.0, 4.0], [2.0, 0.0, 4.0]]
+    """
+    v, u = np.nonzero(keep)
+    z = depth[keep].astype(np.float64)
+    with np.errstate(over="ignore"):  # as_cloud refuses what no camera sees
+        x, y = (u - camera.cx) * z / camera.fx, (v - camera.cy) * z / camera.fy
+    return np.stack([x, y, z], axis=1)
+
+
+def as_cloud(points: Float[np.ndarray, "n 3"], where: str) -> Float32[np.ndarray, "n 3"]:
+    """Return points as a cloud of a data set.
+
+    Raises:
+        InputError: where a point is not within 1,000 km, naming ``where``.
+    """
+    if not np.abs(points).max(initial=0.0) < _FARTHEST:
+        raise InputError(f"{where}: a point lies beyond 1,000 km; check camera, depth and pose")
+    return points.astype(np.float32)
+
+
+def turn(
+    rotation: Float[np.ndarray, "3 3"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Rotate points; without BLAS, whose rounding depends on the number of its threads."""
+    with np.errstate(over="ignore", invalid="ignore"):  # as above
+        return np.einsum("ij,nj->ni", rotation, points)
+
+
+def upright(gravity: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Float[np.ndarray, "3 3"]:
+    """Rotation from the OpenCV camera to axes with z up.
+
+    Convention:
+        z is against ``gravity``, exactly; y is the viewing direction as far as it is level (the
+        image's upward direction within a milliradian of straight up or down); x is to the right.
+        A level camera's point (x, y, z) becomes (x, z, −y).
+
+    Args:
+        gravity: Downward direction in camera coordinates, of any length.
+
+    Raises:
+        InputError: where it is zero or not finite.
+
+    Example:
+        >>> (upright() @ [1.0, 2.0, 3.0]).tolist()
+        [1.0, 3.0, -2.0]
+    """
+    down = np.asarray(gravity, dtype=np.float64)
+    length = float(np.linalg.norm(down))
+    if not math.isfinite(length) or length < 1e-9:
+        raise InputError(f"gravity {gravity}: must be a direction in camera coordinates")
+    up = -down / length
+    for ahead in (np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0])):
+        level = ahead - (ahead @ up) * up
+        if np.linalg.norm(level) > 1e-3:
+            break
+    level /= np.linalg.norm(level)
+    return np.stack([np.cross(level, up), level, up]) + 0.0
+
+
+def check_rotation(matrix: Float[np.ndarray, "3 3"], name: str) -> None:
+    """Refuse a matrix that is no rotation.
+
+    Raises:
+        InputError: where its rows are not at right angles, of length 1 and right-handed.
+    """
+    if not np.isfinite(matrix).all() or not (
+        np.abs(matrix @ matrix.T - np.eye(3)).max() < 0.01
+        and math.isclose(float(np.linalg.det(matrix)), 1.0, abs_tol=0.01)
+    ):
+        raise InputError(f"{name} is no rotation")
+
+
+@dataclass(frozen=True)
+class OrientedBox:
+    """A box in any orientation, in metres."""
+
+    centre: Float[np.ndarray, "3"]
+    """Its centre."""
+    basis: Float[np.ndarray, "3 3"]
+    """One unit axis a row."""
+    half: Float[np.ndarray, "3"]
+    """Half its size along each axis; the sign does not matter."""
+
+    def __post_init__(self) -> None:
+        if not all(np.isfinite(part).all() for part in (self.centre, self.basis, self.half)):
+            raise InputError("a number of the box is not finite")
+        lengths = np.linalg.norm(self.basis, axis=1)
+        # Axes of drawn quadrangles are square to each other only about.
+        if abs(lengths - 1).max() > 0.01 or abs(np.linalg.det(self.basis)) < 0.5:
+            raise InputError("the axes of the box are not three unit vectors about at right angles")
+
+
+def inside_box(
+    points: Float[np.ndarray, "n 3"], box: OrientedBox, margin: float = 0.0
+) -> Bool[np.ndarray, "n"]:
+    """Tell which points lie in a box, its faces included.
+
+    Args:
+        points: The points, in the frame of the box.
+        box: The box.
+        margin: Metres by which each face is moved outwards.
+
+    Example:
+        >>> box = OrientedBox(np.zeros(3), np.eye(3), np.array([1.0, 1.0, 0.5]))
+        >>> inside_box(np.array([[0.9, 0.0, 0.4], [0.9, 0.0, 0.6]]), box).tolist()
+        [True, False]
+    """
+    local = np.einsum("nj,ij->ni", points - box.centre, box.basis)
+    return (np.abs(local) <= np.abs(box.half) + margin).all(axis=1)

@@ -1,0 +1,91 @@
+"""The folder of a test of a simulated camera: a record to go on from after a stop, and plots."""
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from qs3.errors import InputError
+from qs3.evaluation import versions
+from qs3.files import claim_folder, read_json, write_json
+from qs3.report.figure import write_png
+from qs3.report.realism import REALISM_PLOTS, realism_plot
+from qs3.sensor.presets import Sensor, sensor_name, settings_dict
+from qs3.sensor.realism import RealismSettings, realism
+from qs3.sensor.render import Renderer
+from qs3.sensor.settings import renderer_dict
+
+RECORD = "realism.json"
+
+
+def test_camera(
+    out: Path,
+    sensor: Sensor,
+    renderer: Renderer,
+    settings: RealismSettings,
+    on_result: Callable[[dict[str, Any], bool], None],
+) -> list[dict[str, Any]]:
+    """Test a camera; results that the folder holds already are taken from it.
+
+    Args:
+        out: New or empty folder, or one of earlier tests of the same camera.
+        sensor: The sensor.
+        renderer: What photographs; its settings are a dataclass.
+        settings: Which tests, how thoroughly.
+        on_result: Called with each result, and whether it was there before.
+
+    Returns:
+        A result for each test of ``settings``, as `qs3.sensor.realism.realism` gives them.
+
+    Raises:
+        InputError: where the folder holds something else, or tests of other settings.
+    """
+    made_by = {
+        "sensor": settings_dict(sensor),
+        "renderer": renderer_dict(renderer),
+        "settings": {"quick": settings.quick, "seed": settings.seed},
+        "versions": versions(),
+    }
+    before = _earlier(Path(out) / RECORD, made_by)
+    results = dict(before)
+    folder = claim_folder(out, RECORD)
+
+    def keep(result: dict[str, Any]) -> None:
+        results[result["id"]] = result
+        if result["id"] not in before:
+            ordered = sorted(results.values(), key=lambda result: int(result["id"][1:]))
+            write_json(folder / RECORD, made_by | {"tests": ordered})
+        on_result(result, result["id"] in before)
+        figure = realism_plot(result, sensor)
+        if figure is not None:
+            write_png(folder / REALISM_PLOTS[result["id"]], figure)
+
+    write_json(folder / RECORD, made_by | {"tests": list(before.values())})
+    return realism(sensor, renderer, settings, done=before, on_result=keep)
+
+
+def _earlier(path: Path, made_by: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Results that lie in the folder, by id, where they are of the same settings."""
+    if not path.is_file():
+        return {}
+    record = read_json(path)
+    if not isinstance(record, dict) or not isinstance(record.get("tests"), list):
+        raise InputError(f"{path}: not a record of qs3 realism; name another folder for --out")
+    if isinstance(record.get("sensor"), dict) and "name" in record["sensor"]:
+        record["sensor"]["name"] = sensor_name(record["sensor"]["name"])
+    now = json.loads(json.dumps(made_by))  # tuples become lists, as in the file
+    for name, value in now.items():
+        if where := _difference(record.get(name), value, name):
+            raise InputError(
+                f"{path}: of other settings ({where}); name another folder for --out, or repeat "
+                "the settings to go on"
+            )
+    return {result["id"]: result for result in record["tests"]}
+
+
+def _difference(old: Any, new: Any, name: str) -> str:
+    """Where two settings differ first: "matching.method was zncc, is opencv-bm"."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        parts = (_difference(old.get(k), new.get(k), f"{name}.{k}") for k in old.keys() | new)
+        return min((part for part in parts if part), default="")
+    return "" if old == new else f"{name} was {old}, is {new}"

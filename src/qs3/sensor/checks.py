@@ -1,0 +1,69 @@
+"""What settings check of their own values, in one line that names room and field."""
+
+import functools
+import math
+import types
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from qs3.errors import InputError
+
+
+def check_choices(settings: Any, room: str) -> None:
+    """Check that every field that is a choice has one of its values.
+
+    Args:
+        settings: A dataclass; choices are its fields annotated as ``Literal``, or that or None.
+        room: What the settings are of, for the message.
+
+    Raises:
+        InputError: where one has not.
+    """
+    for name, choices in _choices(type(settings)).items():
+        value = getattr(settings, name)
+        if value not in choices:
+            offer = ", ".join(str(choice) for choice in choices if choice is not None)
+            raise InputError(f"{room}: no {name} {value!r}; choose one of {offer}")
+
+
+def check_range(
+    settings: Any,
+    room: str,
+    *names: str,
+    low: float | int = 0,
+    high: float | int = math.inf,
+    above: bool = False,
+    below: bool = False,
+) -> None:
+    """Check that numbers are finite and within ``low`` … ``high``.
+
+    Args:
+        settings: A dataclass.
+        room: What the settings are of, for the message.
+        names: Fields.
+        low: Least value.
+        high: Greatest value.
+        above: Whether ``low`` itself is refused.
+        below: Whether ``high`` itself is refused.
+
+    Raises:
+        InputError: where one is not.
+    """
+    for name in names:
+        value = getattr(settings, name)
+        within = low < value if above else low <= value
+        if not (within and (value < high if below else value <= high) and math.isfinite(value)):
+            bound = f"{'above' if above else 'at least'} {low:g}"
+            if high < math.inf:
+                bound += f" and {'below' if below else 'at most'} {high:g}"
+            raise InputError(f"{room}: {name} {value} must be {bound}")
+
+
+@functools.cache
+def _choices(kind: type) -> dict[str, tuple[Any, ...]]:
+    choices = {}
+    for name, hint in get_type_hints(kind).items():
+        optional = get_origin(hint) is types.UnionType and type(None) in get_args(hint)
+        inner = get_args(hint)[0] if optional else hint
+        if get_origin(inner) is Literal:
+            choices[name] = get_args(inner) + ((None,) if optional else ())
+    return choices

@@ -1,0 +1,205 @@
+"""How an object is scanned: every option once, for `qs3.scan`, data sets and the command line."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from qs3.errors import InputError
+from qs3.sensor.checks import check_choices, check_range
+from qs3.sensor.depth import PrincipalPoint
+from qs3.sensor.matching.settings import Method
+from qs3.sensor.materials import Material, get_material
+from qs3.sensor.presets import Sensor, changed, get_sensor
+from qs3.sensor.randomise import resolve_ranges
+from qs3.sensor.render import Renderer
+from qs3.sensor.scene import SceneSettings
+from qs3.sensor.speckle import pattern_image
+from qs3.sensor.views import ViewLayout
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "default": {"size": "box", "view_layout": "orbit", "crop": "box", "principal_point": None},
+    "paper": {"size": "ball", "view_layout": "orbit", "crop": "none", "principal_point": None},
+    "released": {
+        "size": "box",
+        "view_layout": "jitter",
+        "crop": "box",
+        "principal_point": "released",
+    },
+}
+"""Columns of the settings in which the paper's text and its released code part ways."""
+
+
+def renderer_dict(renderer: Renderer) -> dict[str, Any]:
+    """All settings of a renderer and what it says of itself, as plain values for records."""
+    settings: Any = renderer
+    own = dataclasses.asdict(settings) if dataclasses.is_dataclass(settings) else {}
+    return own | renderer.description
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """The simulated camera: a sensor, what is changed about it, and what renders its images."""
+
+    sensor: Sensor | str = "paper"
+    """A sensor by name (qs3 sensors lists them: paper, d435, …) or your own TOML file."""
+    image_noise: float | None = None
+    """Gaussian noise of the images in grey levels of 255; default by sensor."""
+    matching: Method | None = None
+    """OpenCV's block matching, or our own, twice as precise where images are not grainy; default by
+    sensor."""
+    bias_correction: bool = False
+    """Take off the 1/32 px by which OpenCV's block matching rounds up."""
+    pattern: Path | None = None
+    """Your own picture to project in place of the speckle dots."""
+    renderer: Renderer | Literal["mitsuba", "cycles"] = "mitsuba"
+    """mitsuba, or cycles: the paper's renderer, Blender's (`make cycles` brings it)."""
+    samples: int | None = None
+    """Rays a pixel; default by renderer: 4 of mitsuba, 128 of cycles."""
+    indirect: Literal["cached", "path"] = "cached"
+    """Soft light of mitsuba: from an irradiance cache, or by plain path tracing (use 64 samples
+    and more)."""
+    variant: Literal["auto", "cuda_ad_mono", "llvm_ad_mono", "scalar_rgb"] = "auto"
+    """Variant of Mitsuba; auto takes the fastest that works here."""
+    view_transform: Literal["raw", "Standard", "Filmic", "AgX"] = "raw"
+    """Of cycles: raw hands radiance to the sensor's exposure; the others take Blender's own grey
+    levels in its place (the released images have Filmic)."""
+
+    # Where in the sensor each setting that changes it belongs.
+    _CHANGES: ClassVar[Mapping[str, str]] = {
+        "image_noise": "exposure.noise",
+        "matching": "matching.method",
+        "bias_correction": "matching.bias_correction",
+        "pattern": "pattern.image",
+    }
+
+    def __post_init__(self) -> None:
+        check_choices(self, "camera")
+        if self.samples is not None:
+            check_range(self, "camera", "samples", low=1)
+
+    def make_sensor(self) -> Sensor:
+        """The sensor with every change.
+
+        Raises:
+            InputError: where there is no such sensor, or it takes no such value.
+        """
+        sensor = get_sensor(self.sensor) if isinstance(self.sensor, str) else self.sensor
+        for name, place in self._CHANGES.items():
+            value = self.chosen(name)
+            if value is not None and value is not False:
+                sensor = changed(sensor, place, value)
+        if self.pattern is not None:
+            pattern_image(sensor.pattern)  # a picture that cannot be read stops here
+        return sensor
+
+    def chosen(self, name: str) -> Any:
+        """A setting by its name."""
+        return getattr(self, name)
+
+    def make_renderer(self) -> Renderer:
+        """The renderer asked for.
+
+        Raises:
+            QS3Error: where it does not work here, or does not take a setting.
+        """
+        if not isinstance(self.renderer, str):
+            return self.renderer
+        samples: dict[str, Any] = {} if self.samples is None else {"samples": self.samples}
+        if self.renderer == "cycles":
+            from qs3.sensor.render.cycles import CyclesRenderer
+
+            if self.variant != "auto":
+                raise InputError(f"variant: {self.variant} is Mitsuba's; leave it out with cycles")
+            renderer = CyclesRenderer(**samples, view_transform=self.view_transform)
+            _ = renderer.description  # a Blender that is missing or does not start stops here
+            return renderer
+        if self.view_transform != "raw":
+            raise InputError(f"view_transform: {self.view_transform} needs the renderer cycles")
+        from qs3.sensor.render.mitsuba import MitsubaRenderer
+
+        variant = "" if self.variant == "auto" else self.variant
+        return MitsubaRenderer(**samples, variant=variant, indirect=self.indirect)
+
+
+@dataclass(frozen=True)
+class ScanSettings(CameraSettings):
+    """How one object is scanned; what is None is as the preset or the sensor has it."""
+
+    preset: Literal["default", "paper", "released"] = "default"
+    """Which column of the settings in which the paper's text and its code differ."""
+    views: int = 5
+    """Views fused into one cloud."""
+    view_layout: ViewLayout | None = None
+    """orbit around the object (the paper's text), or jitter of one pose as released; default by
+    preset."""
+    size: Literal["box", "ball"] | None = None
+    """Longest side 1 (as released), or the unit ball (the paper's text), times the object size;
+    default by preset."""
+    crop: Literal["box", "mask", "both", "none"] | None = None
+    """Keep points inside the object's box (as released), or pixels that truly show the object, or
+    what is both, or all; default by preset."""
+    box_margin: float = 0.0
+    """Enlarge the box of the crop on every side, in the unit of the scene."""
+    num_points: int = 2048
+    """Points of each cloud after farthest point sampling; where fewer were seen they are repeated
+    in turn."""
+    principal_point: PrincipalPoint | None = None
+    """Where the optical axis is taken to meet the image, as in the sensor's depth.principal_point;
+    default by preset, then by sensor."""
+    object_size: float | None = None
+    """Size of every object, in metres for real cameras; default by sensor."""
+    material: Material | str | None = None
+    """Surface of the object by name: diffuse, principled, rough-specular, glossy-plastic, metal,
+    dark, mirror or glass; default by sensor."""
+    scene: SceneSettings | str = "alone"
+    """alone (the paper), floor, wall, room (both), behind a neighbour or beside one; joined by +
+    as in room+beside."""
+    floor_material: Material | str | None = None
+    """Surface of the floor by name, such as dark; default: diffuse, albedo 0.5."""
+    wall_material: Material | str | None = None
+    """Surface of the wall by name; default: diffuse, albedo 0.6."""
+    randomise: Mapping[str, Sequence[Any]] | Sequence[str] | None = None
+    """Draw settings of the sensor anew for each scan: light.ambient=0:0.1,
+    exposure.gain=0.5:2:log, material=diffuse,metal,dark, or default alone (materials, ambient
+    light, projector, gain)."""
+    seed: int = 0
+    """All random steps follow from it."""
+
+    _CHANGES: ClassVar[Mapping[str, str]] = {
+        **CameraSettings._CHANGES,
+        "principal_point": "depth.principal_point",
+        "object_size": "object_size",
+        "material": "material",
+    }
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_range(self, "scan", "num_points", "views", low=1)
+        check_range(self, "scan", "box_margin", "seed")
+
+    def chosen(self, name: str) -> Any:
+        """A setting by its name, or the preset's where it is None."""
+        value = getattr(self, name)
+        return PRESETS[self.preset].get(name) if value is None else value
+
+    def make_scene(self) -> SceneSettings:
+        """What stands around the object."""
+        scene = SceneSettings(self.scene) if isinstance(self.scene, str) else self.scene
+        surfaces = {"floor": self.floor_material, "wall": self.wall_material}
+        named = {part: get_material(m) for part, m in surfaces.items() if m is not None}
+        return dataclasses.replace(scene, **named)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for records; what the sensor and the renderer say of themselves is apart."""
+        apart = {*(f.name for f in dataclasses.fields(CameraSettings)), *self._CHANGES, "preset"}
+        apart |= {"crop", "floor_material", "wall_material", "seed"}
+        names = [f.name for f in dataclasses.fields(ScanSettings) if f.name not in apart]
+        crop = self.chosen("crop")
+        return {name: self.chosen(name) for name in names} | {
+            "box_crop": crop in ("box", "both"),
+            "mask_crop": crop in ("mask", "both"),
+            "scene": dataclasses.asdict(self.make_scene()),
+            "randomise": resolve_ranges(self.make_sensor(), self.randomise),
+        }
