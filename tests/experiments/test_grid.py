@@ -25,11 +25,6 @@ from qs3.store.executors import Failure
 
 from .conftest import TINY, make_tables
 
-# So small a network may be sure of one class alone, or of none.
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:all .* confident clouds"),
-    pytest.mark.filterwarnings("ignore:.*warm-up.*"),
-]
 S, D, F = Domain("S"), Domain("D"), Domain("F")
 COLUMNS = ("M-D", "S-D", "S-F")
 
