@@ -125,6 +125,11 @@ def make_plans(
     return plans
 
 
+def which_meshes(scale: Scale, shared: Path | None) -> str:
+    """Return ``shapes+cad`` where artists' meshes take part, else ``shapes``."""
+    return "shapes+cad" if choose_meshes(scale, shared).cad else "shapes"
+
+
 def _plan(data: DataSet, scale: Scale, sides: Sides) -> tuple[list[MeshItem], Mapping[str, Any]]:
     """Return the meshes of a data set and the settings that are its own."""
     scored = [item for item in sides.target if item.split == "test"]

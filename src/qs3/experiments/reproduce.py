@@ -17,10 +17,10 @@ from qs3.experiments.setup import Setup, claim
 from qs3.experiments.table import Table
 from qs3.store.executors import Executor, InlineExecutor, LocalExecutor
 from qs3.store.manifest import MANIFEST
+from qs3.store.plan import Plan
 
 if TYPE_CHECKING:
     from qs3.experiments.galleries import Galleries
-    from qs3.store.plan import Plan
 
 
 @dataclass(frozen=True)
@@ -155,13 +155,13 @@ def reproduce(
         InputError: where the folder is for other settings, a record is damaged or not of its run,
             or a run failed; what was made stays made.
     """
-    from qs3.experiments.data import make_data, make_plans
+    from qs3.experiments.data import make_data, make_plans, which_meshes
 
     runs = collect_runs(products)
     drawn = [data for product in products for data in product.sets()]
     plans = make_plans(setup.scale, setup.shared, [*data_sets(runs, setup.own), *drawn])
     if not dry_run:
-        claim(setup, plans)
+        claim(setup, which_meshes(setup.scale, setup.shared))
     left = missing(runs, setup)  # a damaged record stops here, not after hours
     executor = workers.start()  # a missing extra is told before anything is made
     needed = {data.name for data in [*data_sets(left, setup.own), *drawn]}
@@ -215,7 +215,7 @@ def _quiet_workers() -> Iterator[None]:
 
 
 def measure(
-    setup: Setup, left: Sequence[Run], plans: "Mapping[str, Plan]"
+    setup: Setup, left: Sequence[Run], plans: Mapping[str, Plan]
 ) -> tuple[float, dict[str, float]]:
     """Estimate what is left, from a few timed scans and a few timed steps of each kind.
 
@@ -243,10 +243,10 @@ def measure(
     absent = [
         plan for name, plan in plans.items() if not (setup.out / DATA / name / MANIFEST).is_file()
     ]
-    return sum(estimate(plan).seconds for plan in absent), expected
+    return sum((estimate(plan).seconds for plan in absent), 0.0), expected
 
 
-def _size(part: Part | None, plans: "Mapping[str, Plan]") -> int:
+def _size(part: Part | None, plans: Mapping[str, Plan]) -> int:
     """Clouds of a part of a data set; of the user's own the size is unknown: a thousand."""
     if part is None:
         return 0

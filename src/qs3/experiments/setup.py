@@ -4,17 +4,13 @@ import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from qs3.errors import InputError
-from qs3.experiments.domains import DataSet, DomainData, Own, Part, own_data
+from qs3.experiments.domains import DomainData, Own, Part, own_data
 from qs3.experiments.scales import Scale
 from qs3.files import claim_folder, read_json, write_json
 from qs3.io.clouds import CloudKind
 from qs3.structure import structure, unstructure
-
-if TYPE_CHECKING:
-    from qs3.store.plan import Plan
 
 MARKER = "bench.json"
 RESULTS = "results"
@@ -73,15 +69,19 @@ class Marker:
     """Version of these fields in the file."""
 
 
-def claim(setup: Setup, plans: "Mapping[str, Plan]") -> None:
+def claim(setup: Setup, meshes: str) -> None:
     """Write down what the folder is for, or check that it is for the same.
+
+    Args:
+        setup: What it is for.
+        meshes: Which meshes take part.
 
     Raises:
         InputError: where it is for another scale, other threads, meshes or data.
     """
     claim_folder(setup.out, MARKER)
     data = {name: _own_record(own, setup.scale) for name, own in setup.own.items()}
-    wanted = Marker(setup.scale, setup.threads, _meshes(plans, setup), data)
+    wanted = Marker(setup.scale, setup.threads, meshes, data)
     if not (setup.out / MARKER).is_file():
         write_json(setup.out / MARKER, unstructure(wanted))
         return
@@ -145,14 +145,3 @@ def _checksum(part: Part, scale: Scale) -> str:
     assert isinstance(part.data, Path)  # noqa: S101
     points = scale.train.num_points
     return load_clouds(part.data, split=part.split, cloud=part.cloud, num_points=points).checksum
-
-
-def _meshes(plans: "Mapping[str, Plan]", setup: Setup) -> str:
-    """Return which meshes take part; `second` is of shapes always."""
-    meshes = {plan.settings.meshes for name, plan in plans.items() if name != "second"}
-    if meshes:
-        return meshes.pop()
-    from qs3.experiments.data import make_plans
-
-    plan = make_plans(setup.scale, setup.shared, [DataSet("source")])["source"]
-    return plan.settings.meshes
