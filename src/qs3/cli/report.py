@@ -24,7 +24,7 @@ def report(
     sensor: str = "paper",
     out: Path | None = None,
 ) -> int:
-    """Write one self-contained HTML page: pictures, clouds to turn, features, scores, tables.
+    """Write one self-contained HTML page: pictures, clouds, features, scores, tables.
 
     Args:
         folder: Folder of a run, of several runs, or of records alone.

@@ -100,7 +100,8 @@ def with_controls(settings: ScanSettings, values: Mapping[str, Any]) -> ScanSett
     Raises:
         InputError: where they make no sensor, or no scan.
     """
-    sensor, renderer = settings.make_sensor(), settings.make_renderer()
+    sensor = settings.make_sensor()
+    renderer: Any = settings.make_renderer()
     changes = {name: value for name, value in values.items() if name in _SCAN}
     if "samples" in values:
         renderer = dataclasses.replace(renderer, samples=values["samples"])
