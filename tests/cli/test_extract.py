@@ -74,7 +74,8 @@ def test_small_objects_are_told(typed, pictures):
 def test_a_bad_image_fails_alone_and_is_told(typed, pictures):
     png(pictures / "depth" / "1.png", np.ones((40, 60), np.uint8))
     done = typed("extract", "depth", pictures / "depth", "--mask", pictures / "mask", "--out",
-                   pictures / "out", "--intrinsics", "50,50,29,19", "--workers", "0", code=2)  # fmt: skip
+                 pictures / "out", "--intrinsics", "50,50,29,19", "--workers", "0",
+                 code=2)  # fmt: skip
     line = done.stderr.splitlines()[-1]
     assert "1 failed; the first: 1:" in line
     assert "save depth as 16-bit PNG" in line
@@ -147,8 +148,8 @@ def test_our_own_frames_go_in_again(qs3, quick, typed, tmp_path):
     made = qs3("extract", "depth", frames, "--out", tmp_path / "noisy", "--class", "chair")
     assert "axes of the world" in made.stderr
     assert made.stdout.strip() == str(tmp_path / "noisy")
-    typed("extract", "depth", frames, "--out", tmp_path / "true", "--class", "chair", "--workers", "0",
-         "--depth-folder", "depth_true", "--frame", "model")  # fmt: skip
+    typed("extract", "depth", frames, "--out", tmp_path / "true", "--class", "chair", "--workers",
+          "0", "--depth-folder", "depth_true", "--frame", "model")  # fmt: skip
     noisy, true = read_ragged(tmp_path / "noisy"), read_ragged(tmp_path / "true")
     assert noisy.class_names == true.class_names == ("chair",)
     assert len(true.clouds[0]) == 2048
