@@ -6,10 +6,10 @@ import os
 
 import numpy as np
 import pytest
-
-from qs3.cli import reproduce as command
 from qs3.experiments.adaptation_bench import Bench, make_bench
 from qs3.experiments.bench_data import make_plans
+
+from qs3.cli import reproduce as command
 from qs3.experiments.scales import SCALES, Scale
 from qs3.experiments.setup import Setup
 from qs3.store.generate import generate, scan_seed

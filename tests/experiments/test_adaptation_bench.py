@@ -8,16 +8,16 @@ import shutil
 
 import numpy as np
 import pytest
+from qs3.experiments.adaptation_bench import Bench
+from qs3.experiments.bench_data import choose_meshes, side_of
+from qs3.experiments.bench_table import Line, Result, group_results, published
+from qs3.experiments.rows import ABLATIONS, ROWS
 
 from qs3 import shapes
 from qs3.cli.reproduce import ReproduceOptions, reproduce
 from qs3.errors import InputError
 from qs3.evaluation.records import read_record
-from qs3.experiments.adaptation_bench import Bench
-from qs3.experiments.bench_data import choose_meshes, side_of
-from qs3.experiments.bench_table import Line, Result, group_results, published
 from qs3.experiments.cost import Counts, run_seconds
-from qs3.experiments.rows import ABLATIONS, ROWS
 from qs3.experiments.runs import make_grid, make_run
 from qs3.experiments.scales import SCALES
 from qs3.experiments.setup import Setup

@@ -13,6 +13,11 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
+from qs3.experiments.bench_data import make_plans
+from qs3.experiments.catalogue import PartName, TableName
+from qs3.experiments.paper import EXPERIMENTS, PaperTable
+from qs3.experiments.reproduction import collect_runs, reproduce
+from qs3.experiments.rows import ORDINARY, PAPER
 from scipy import stats
 
 from qs3.cli import reproduce as command
@@ -20,16 +25,11 @@ from qs3.cli.table import FigureOptions, TableOptions, figure, table
 from qs3.errors import InputError
 from qs3.evaluation.metrics import paired_difference
 from qs3.evaluation.records import read_record
-from qs3.experiments.bench_data import make_plans
-from qs3.experiments.catalogue import PartName, TableName
 from qs3.experiments.domains import domain, parse_own
 from qs3.experiments.experiment import cell_runs
 from qs3.experiments.figures import draw
 from qs3.experiments.galleries import Galleries
 from qs3.experiments.grid import data_sets, make_run_record, make_work, run_grid
-from qs3.experiments.paper import EXPERIMENTS, PaperTable
-from qs3.experiments.reproduction import collect_runs, reproduce
-from qs3.experiments.rows import ORDINARY, PAPER
 from qs3.experiments.runs import make_run
 from qs3.experiments.scales import SCALES
 from qs3.experiments.setup import Setup, read_setup

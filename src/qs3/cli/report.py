@@ -61,9 +61,9 @@ def report(options: Annotated[ReportOptions, tyro.conf.arg(name="")]) -> int:
 
 def _published() -> tuple[dict[str, dict[str, str]], str]:
     """The paper's accuracies by task and row as text, and where they were printed."""
-    from qs3.experiments.bench_table import published
+    from qs3.experiments.experiment import published
 
-    figures = published()
+    figures = published()["methods"]
     tasks = {
         task: {
             row: f"{value[0]:.1f} ± {value[1]:.1f}"

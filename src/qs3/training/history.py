@@ -45,24 +45,36 @@ class History:
 
     Args:
         run_dir: Folder of the run.
-        tensorboard: Whether to write event files for TensorBoard too, in ``tensorboard/``.
+        tensorboard: Whether to write event files for TensorBoard too, in ``tensorboard/``, a
+            folder a stage.
 
     Raises:
         MissingExtraError: where TensorBoard is asked for and is not installed.
     """
 
     def __init__(self, run_dir: Path, tensorboard: bool = False) -> None:
-        self.path = Path(run_dir) / HISTORY
+        self.folder = Path(run_dir)
         self.lines: list[dict[str, Any]] = []
-        self.board = _Board(Path(run_dir) / TENSORBOARD) if tensorboard else None
+        self.board: Any = None
+        self.make_board: Any = None
+        if tensorboard:
+            try:
+                from torch.utils.tensorboard.writer import SummaryWriter
+            except ImportError as error:
+                raise MissingExtraError("tensorboard", "track") from error
+            self.make_board = SummaryWriter
 
     def training(self, stage: str) -> Log:
         """Return a log for one training; ``stage`` stands in its lines and names its folder."""
+        self.close()
+        shown = 0
 
         def log(epochs: Sequence[EpochRecord]) -> None:
+            nonlocal shown
             self._write(self.lines + self._epochs(stage, epochs))
-            if self.board is not None:
-                self.board.show(stage, epochs)
+            if self.make_board is not None:
+                self._show(stage, epochs[shown:])
+                shown = len(epochs)
 
         return log
 
@@ -71,61 +83,35 @@ class History:
         self.lines += self._epochs(stage, epochs)
         self._write(self.lines)
 
-    def rounds(self, records: Sequence[Any]) -> None:
-        """Keep the rounds so far, in place of what was there of rounds."""
-        self.lines = [line for line in self.lines if line["kind"] != "round"]
-        self.lines += [{"kind": "round", **asdict(record)} for record in records]
-        self._write(self.lines)
-
-    def checkpoints(self, records: Sequence[Any]) -> None:
-        """Keep the checkpoints so far and what the validators say of them, as lines of a kind."""
-        self.lines = [line for line in self.lines if line["kind"] != "checkpoint"]
-        self.lines += [{"kind": "checkpoint", **asdict(record)} for record in records]
+    def put(self, kind: str, records: Sequence[Any]) -> None:
+        """Keep the rounds or checkpoints so far, in place of the lines of that kind."""
+        self.lines = [line for line in self.lines if line["kind"] != kind]
+        self.lines += [{"kind": kind, **asdict(record)} for record in records]
         self._write(self.lines)
 
     def close(self) -> None:
         """Bring TensorBoard's files to disk."""
         if self.board is not None:
             self.board.close()
+        self.board = None
 
     @staticmethod
     def _epochs(stage: str, epochs: Sequence[EpochRecord]) -> list[dict[str, Any]]:
         return [{"kind": "epoch", "stage": stage, **asdict(record)} for record in epochs]
 
     def _write(self, lines: list[dict[str, Any]]) -> None:
-        write_text(self.path, "".join(json.dumps(line) + "\n" for line in lines))
+        write_text(self.folder / HISTORY, "".join(json.dumps(line) + "\n" for line in lines))
 
-
-class _Board:
-    """Event files of TensorBoard, one folder a stage."""
-
-    def __init__(self, folder: Path) -> None:
-        try:
-            from torch.utils.tensorboard.writer import SummaryWriter
-        except ImportError as error:
-            raise MissingExtraError("tensorboard", "track") from error
-        self.make, self.folder = SummaryWriter, folder
-        self.writer: Any = None
-        self.stage, self.shown = "", 0
-
-    def show(self, stage: str, epochs: Sequence[EpochRecord]) -> None:
-        if stage != self.stage:
-            self.close()
+    def _show(self, stage: str, epochs: Sequence[EpochRecord]) -> None:
+        if self.board is None:
             # What an earlier call wrote of this stage is hidden and told again.
-            self.writer = self.make(str(self.folder / stage), purge_step=0)
-            self.stage, self.shown = stage, 0
-        for record in epochs[self.shown :]:
+            self.board = self.make_board(str(self.folder / TENSORBOARD / stage), purge_step=0)
+        for record in epochs:
             values = {f"loss/{name}": value for name, value in record.losses.items()}
             values["learning_rate"] = record.learning_rate
             values["samples_per_second"] = record.samples_per_second
             if record.accuracy is not None:
                 values["accuracy"] = record.accuracy
             for name, value in values.items():
-                self.writer.add_scalar(name, value, record.epoch)
-        self.shown = len(epochs)
-        self.writer.flush()
-
-    def close(self) -> None:
-        if self.writer is not None:
-            self.writer.close()
-        self.writer, self.stage = None, ""
+                self.board.add_scalar(name, value, record.epoch)
+        self.board.flush()

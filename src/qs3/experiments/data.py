@@ -1,13 +1,14 @@
 """Data of the tables: sources, and targets of other meshes under another sensor."""
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from qs3 import shapes
-from qs3.errors import InputError, QS3Error
+from qs3.errors import QS3Error
+from qs3.experiments.domains import DataSet
 from qs3.experiments.scales import Scale
 from qs3.meshes import collect
 from qs3.meshes.collections import MeshItem
@@ -15,13 +16,12 @@ from qs3.sensor.scene import SceneSettings
 from qs3.store.generate import GenerateSettings, generate
 from qs3.store.plan import Plan, make_plan, resolve_renderer
 
-SOURCE, TARGET = "source", "target"
 TARGET_SENSOR = "d435"
 _ROOM = SceneSettings("floor+behind", neighbour_size=0.5)
 _LEAST = 4
 """A class with fewer meshes is made of shapes alone: a mesh on one side would leave none."""
 _FAILED_SHARE = 0.05
-_SEEDS = {SOURCE: 1, TARGET: 2, "held": 3, "fused": 4, "second": 5, "sensor": 6}
+_SEEDS = {"source": 1, "target": 2, "held": 3, "fused": 4, "second": 5, "sensor": 6}
 
 
 @dataclass(frozen=True)
@@ -71,13 +71,13 @@ def choose_meshes(scale: Scale, shared: Path | None) -> Sides:
             "test": scale.target_count(name, scale.test_per_class),
         }
         drawn = {
-            SOURCE: _draws(name, wanted["source"], _SEEDS[SOURCE]),
-            TARGET: _draws(name, wanted["train"] + wanted["test"], _SEEDS[TARGET]),
+            "source": _draws(name, wanted["source"], _SEEDS["source"]),
+            "target": _draws(name, wanted["train"] + wanted["test"], _SEEDS["target"]),
         }
         for side, count in wanted.items():
             made = parts.get((name, side), [])[:count]
             cad += len(made)
-            spare = drawn[SOURCE if side == "source" else TARGET]
+            spare = drawn["source" if side == "source" else "target"]
             filled = made + [spare.pop(0) for _ in range(count - len(made))]
             split = "train" if side == "source" else side
             (source if side == "source" else target).extend(
@@ -91,29 +91,24 @@ def _draws(class_name: str, count: int, seed: int) -> list[MeshItem]:
 
 
 def make_plans(
-    scale: Scale,
-    shared: Path | None,
-    renderer: Any = None,
-    sets: Iterable[str] = (SOURCE, TARGET),
+    scale: Scale, shared: Path | None, sets: Iterable[DataSet], renderer: Any = None
 ) -> dict[str, Plan]:
-    """Return the work lists of data sets.
+    """Return the work lists of data sets, by the names of their folders.
 
     - ``source``: a row has the scan and samples of the surface of the same mesh, so that M and S
       differ in the sensor alone; ``held`` is the same of the meshes that are scored on.
-    - ``jitter``: the source from one side, as the released code scans; ``views-N``: from N sides.
+    - ``jitter``: the source from one side, as the released code scans; ``views``: from a number of
+      sides.
     - ``target``: other meshes on a floor, partly behind another object, one view, another sensor;
       ``fused``: the same from all around.
     - ``second``: further procedural shapes, for their surfaces.
-    - ``sensor-NAME``: source and scored meshes under another sensor, one view.
+    - ``sensor``: source and scored meshes under another sensor, one view.
 
     Args:
         scale: How many.
         shared: Folder with artists' meshes; None takes shapes alone.
+        sets: Which data sets.
         renderer: Renderer; None takes the default.
-        sets: Which of them.
-
-    Raises:
-        InputError: where a name is none of these.
     """
     sides = choose_meshes(scale, shared)
     common = {
@@ -123,49 +118,53 @@ def make_plans(
         "rows_per_shard": 32,
     }
     plans = {}
-    for name in dict.fromkeys(sets):
-        items, own = _plan(name, scale, sides)
+    for data in dict.fromkeys(sets):
+        items, own = _plan(data, scale, sides)
         settings = GenerateSettings(**{**common, **own})
-        plans[name] = make_plan(items, resolve_renderer(settings))
+        plans[data.name] = make_plan(items, resolve_renderer(settings))
     return plans
 
 
-def _plan(name: str, scale: Scale, sides: Sides) -> tuple[list[MeshItem], dict[str, Any]]:
+def _plan(data: DataSet, scale: Scale, sides: Sides) -> tuple[list[MeshItem], Mapping[str, Any]]:
     """Return the meshes of a data set and the settings that are its own."""
-    kind, _, rest = name.partition("-")
     scored = [item for item in sides.target if item.split == "test"]
-    source = {"views": scale.source_views, "seed": _SEEDS[SOURCE]}
-    if name == SOURCE:
-        return sides.source, source
-    if name == "held":
-        return scored, source | {"seed": _SEEDS["held"]}
-    if name == "jitter":
-        return sides.source, source | {"view_layout": "jitter"}
-    if kind == "views" and rest.isdecimal():
-        return sides.source, source | {"views": int(rest)}
+    source = {"views": scale.source_views, "seed": _SEEDS["source"]}
     # As annotated frames are cut: by the object's mask, and by its box with a margin, or a few
     # flying pixels would set the scale of the whole cloud.
     room = {"sensor": TARGET_SENSOR, "scene": _ROOM, "box_margin": 0.05, "crop": "both"}
-    if name == TARGET:
-        return sides.target, room | {"views": 1, "seed": _SEEDS[TARGET]}
-    if name == "fused":
-        return sides.target, room | {"views": scale.source_views, "seed": _SEEDS["fused"]}
-    if name == "second":
-        parts = {"train": scale.source_per_class, "test": scale.test_per_class}
-        items = []
-        for class_name in shapes.CLASSES:
-            drawn = _draws(class_name, sum(parts.values()), _SEEDS["second"])
-            for split, count in parts.items():
-                items += [replace(drawn.pop(0), split=split) for _ in range(count)]
-        return items, {"meshes": "shapes", "views": 1, "seed": _SEEDS["second"]}
-    if kind == "sensor" and rest:
-        # Both sides count their shapes from 0.
-        items = sides.source + [replace(item, id=f"{item.id}-scored") for item in scored]
-        return items, {"sensor": rest, "views": 1, "seed": _SEEDS["sensor"]}
-    raise InputError(f"unknown data set {name!r}")
+    match data.kind:
+        case "source":
+            return sides.source, source
+        case "held":
+            return scored, source | {"seed": _SEEDS["held"]}
+        case "jitter":
+            return sides.source, source | {"view_layout": "jitter"}
+        case "views":
+            return sides.source, source | {"views": data.views}
+        case "target":
+            return sides.target, room | {"views": 1, "seed": _SEEDS["target"]}
+        case "fused":
+            return sides.target, room | {"views": scale.source_views, "seed": _SEEDS["fused"]}
+        case "second":
+            own = {"meshes": "shapes", "views": 1, "seed": _SEEDS["second"]}
+            return _further_shapes(scale), own
+        case "sensor":
+            # Both sides count their shapes from 0.
+            items = sides.source + [replace(item, id=f"{item.id}-scored") for item in scored]
+            return items, {"sensor": data.sensor, "views": 1, "seed": _SEEDS["sensor"]}
 
 
-def make_data(folder: Path, plans: dict[str, Plan], workers: int) -> dict[str, int]:
+def _further_shapes(scale: Scale) -> list[MeshItem]:
+    parts = {"train": scale.source_per_class, "test": scale.test_per_class}
+    items = []
+    for class_name in shapes.CLASSES:
+        drawn = _draws(class_name, sum(parts.values()), _SEEDS["second"])
+        for split, count in parts.items():
+            items += [replace(drawn.pop(0), split=split) for _ in range(count)]
+    return items
+
+
+def make_data(folder: Path, plans: Mapping[str, Plan], workers: int) -> dict[str, int]:
     """Scan data sets below a folder, going on where an earlier call stopped.
 
     Returns:

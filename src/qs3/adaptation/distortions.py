@@ -1,4 +1,4 @@
-"""Views of clouds: random changes of shape that keep the class and the number of points.
+"""Random changes of a cloud's shape that keep its class and its number of points.
 
 Convention:
     Clouds are [b n 3] in the unit ball. Every draw comes from the given generator on the CPU and is

@@ -1,27 +1,23 @@
-"""Laws of the selection rules beyond the paper, and of the estimates of the class prior."""
+"""Laws of the selection: QS³'s Algorithm 1, and the rules beyond the paper."""
 
-import math
-import subprocess
-import sys
+import warnings
+from fractions import Fraction
 from functools import partial
+from math import ceil
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from scipy.optimize import minimize
 
-from qs3.adaptation.priors import (
-    check_prior,
-    estimate_prior_bbse,
-    estimate_prior_em,
-    project_to_simplex,
-)
 from qs3.adaptation.selection import (
+    SingleClassWarning,
+    balanced_count,
     select_confident,
     select_prior,
     select_quantile,
+    select_quasi_balanced,
     select_uniform,
 )
 from qs3.errors import InputError
@@ -33,7 +29,7 @@ shares = st.sampled_from([0.0, 0.07, 0.2, 0.5, 0.9, 1.0])
 @st.composite
 def probabilities(draw, distinct=False):
     """Rows with a chosen top class and a chosen confidence of at least 0.51."""
-    k, m = draw(st.integers(2, 5)), draw(st.integers(0, 40))
+    k, m = draw(st.integers(2, 5)), draw(st.integers(0, 25))
     top = draw(arrays(np.int64, m, elements=st.integers(0, k - 1)))
     grid = draw(
         arrays(np.int64, m, elements=st.integers(0, 490 if distinct else 12), unique=distinct)
@@ -44,12 +40,131 @@ def probabilities(draw, distinct=False):
     return rows
 
 
+def select(rows, threshold, **settings):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SingleClassWarning)
+        return select_quasi_balanced(rows, threshold, **settings)
+
+
+@given(probabilities(), thresholds, st.booleans(), st.sampled_from(["most", "least"]))
+def test_count_of_each_class(rows, threshold, inclusive, end):
+    chosen = select(rows, threshold, selection=f"{end}-confident", inclusive=inclusive)
+    confident = select_confident(rows, threshold, inclusive=inclusive)
+    labels = rows.argmax(axis=1)
+    total = int(confident.sum())
+    one_class = len(set(labels[confident].tolist())) == 1
+    for label in range(rows.shape[1]):
+        members = int((confident & (labels == label)).sum())
+        share = Fraction(members, total) if total else Fraction(0)
+        expected = members if one_class else ceil(members * (1 - share))
+        assert (chosen & (labels == label)).sum() == expected
+
+
+@given(probabilities(), thresholds)
+def test_the_least_confident_are_the_other_end_of_each_class(rows, threshold):
+    chosen = select(rows, threshold, selection="least-confident")
+    dropped = select_confident(rows, threshold) & ~chosen
+    labels, confidence = rows.argmax(axis=1), rows.max(axis=1)
+    for label in range(rows.shape[1]):
+        kept, left = (confidence[mask & (labels == label)] for mask in (chosen, dropped))
+        assert not len(kept) or not len(left) or kept.max() <= left.min()
+
+
+@given(probabilities(), thresholds)
+def test_unconfident_clouds_do_not_matter(rows, threshold):
+    confident = select_confident(rows, threshold)
+    chosen = select(rows, threshold)
+    assert np.array_equal(select(rows[confident], threshold), chosen[confident])
+
+
+@given(st.integers(1, 300), st.integers(0, 300))
+@settings(max_examples=300)
+def test_counts_are_exact(total, members):
+    assume(members <= total)
+    assert balanced_count(members, total) == ceil(members * (1 - Fraction(members, total)))
+
+
+def test_the_floating_point_form_would_be_wrong():
+    assert balanced_count(9, 27) == 6
+    assert ceil(9 * (1 - 9 / 27)) == 7
+
+
+def one_class(m=5):
+    confidence = np.linspace(0.85, 0.95, m)
+    return np.stack([1 - confidence, confidence], axis=1)
+
+
+def test_one_class_is_kept_with_one_warning():
+    with pytest.warns(SingleClassWarning, match="all 5 confident clouds are of class 1") as caught:
+        chosen = select_quasi_balanced(one_class(), 0.8)
+    assert len(caught) == 1
+    assert chosen.all()
+
+
+def test_one_class_can_be_dropped_in_silence():
+    assert not select_quasi_balanced(one_class(), 0.8, single_class="drop").any()
+
+
+def test_nothing_confident_selects_nothing_in_silence():
+    assert not select_quasi_balanced(one_class(), 0.99).any()
+    assert select_quasi_balanced(np.zeros((0, 3)), 0.5).shape == (0,)
+
+
+def test_the_threshold_itself_is_out_unless_inclusive():
+    rows = np.array([[0.75, 0.25], [0.25, 0.75]])
+    assert not select_quasi_balanced(rows, 0.75).any()
+    assert select_quasi_balanced(rows, 0.75, inclusive=True).all()
+
+
+def test_ends_differ():
+    """Six of class 0 and two of class 1: ⌈6 · 2/8⌉ = 2 and ⌈2 · 6/8⌉ = 2 are kept."""
+    confidence = np.array([0.9, 0.95, 0.85, 0.99, 0.81, 0.82, 0.1, 0.1])
+    rows = np.stack([confidence, 1 - confidence], axis=1)
+    most = select_quasi_balanced(rows, 0.8)
+    least = select_quasi_balanced(rows, 0.8, selection="least-confident")
+    assert np.flatnonzero(most).tolist() == [1, 3, 6, 7]
+    assert np.flatnonzero(least).tolist() == [4, 5, 6, 7]
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda p: select_confident(p, 1.2), "threshold must be 0 to 1"),
+        (lambda p: select_uniform(p, 0.5, quantile=1.1), "quantile must be 0 to 1"),
+        (lambda p: select_quantile(p, 0.5, -0.1), "share must be 0 to 1"),
+        (lambda p: select_prior(p, 0.5, np.zeros(2)), "not all zero"),
+        (lambda p: select_prior(p, 0.5, np.array([np.nan, 1.0])), "finite"),
+        (lambda p: select_uniform(2 * p, 0.5), "sum to 1"),
+    ],
+)
+def test_settings_are_checked(call, message):
+    with pytest.raises(InputError, match=message):
+        call(np.array([[0.9, 0.1], [0.3, 0.7]]))
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ([[np.nan, 1.0]], "NaN"),
+        ([[np.inf, 0.0]], "NaN or infinity"),
+        ([[2.0, -1.0]], "negative"),
+        ([[0.5, 0.6]], "sum to 1"),
+        ([[]], "no class"),
+    ],
+)
+def test_rows_must_be_probabilities(rows, message):
+    with pytest.raises(InputError, match=message):
+        select_quasi_balanced(np.array(rows, dtype=np.float64), 0.8)
+
+
 @st.composite
 def rules(draw):
-    """One of the three rules with drawn settings: a function of rows, threshold and prior."""
+    """A rule with drawn settings: a function of rows, threshold and prior."""
     inclusive = draw(st.booleans())
-    name = draw(st.sampled_from(["uniform", "prior", "quantile"]))
+    name = draw(st.sampled_from(["balanced", "uniform", "prior", "quantile"]))
     share = draw(shares)
+    if name == "balanced":
+        return lambda rows, theta, _: select(rows, theta, inclusive=inclusive)
     if name == "uniform":
         return lambda rows, theta, _: select_uniform(
             rows, theta, quantile=share, inclusive=inclusive
@@ -187,115 +302,5 @@ def test_quantile_meets_the_threshold_on_top(rows, threshold, share):
 def test_shares_are_meant_as_written():
     confidence = np.linspace(0.6, 0.9, 100)
     rows = np.stack([confidence, 1 - confidence], axis=1)
-    assert math.ceil(0.07 * 100) == 8
+    assert ceil(0.07 * 100) == 8
     assert select_quantile(rows, 0.0, 0.07).sum() == 7
-
-
-@given(st.integers(2, 6), st.randoms(use_true_random=False))
-def test_bbse_inverts_the_confusion(k, random):
-    rng = np.random.default_rng(random.getrandbits(32))
-    prior = rng.dirichlet(np.ones(k))
-    confusion = rng.integers(0, 5, size=(k, k)) + 40 * np.eye(k, dtype=np.int64)
-    within = confusion / confusion.sum(axis=1, keepdims=True)
-    assert estimate_prior_bbse(confusion, prior @ within) == pytest.approx(prior, abs=1e-9)
-
-
-def test_bbse_is_the_authors_weights_times_the_source_prior():
-    confusion = np.array([[50, 5, 1], [2, 20, 3], [4, 1, 70]])
-    predicted = np.array([0.3, 0.2, 0.5])
-    joint = confusion.T / confusion.sum()
-    source = confusion.sum(axis=1) / confusion.sum()
-    expected = np.linalg.solve(joint, predicted) * source
-    assert (expected > 0).all()
-    assert estimate_prior_bbse(confusion, predicted) == pytest.approx(expected, abs=1e-12)
-
-
-def test_bbse_stays_on_the_simplex():
-    """Predictions that no prior explains, a useless classifier, a class without source."""
-    confusion = np.array([[8, 2], [2, 8]])
-    assert estimate_prior_bbse(confusion, np.array([1.0, 0.0])).tolist() == [1.0, 0.0]
-    useless = estimate_prior_bbse(np.array([[5, 5], [5, 5]]), np.array([30, 70]))
-    assert useless == pytest.approx([0.5, 0.5])
-    absent = np.array([[9, 1, 0], [1, 9, 0], [0, 0, 0]])
-    assert estimate_prior_bbse(absent, np.array([50, 50, 0])) == pytest.approx([0.5, 0.5, 0.0])
-
-
-@given(arrays(np.float64, st.integers(1, 6), elements=st.floats(-3, 3)))
-def test_projection_is_the_nearest_point(values):
-    point = project_to_simplex(values)
-    assert (point >= 0).all()
-    assert point.sum() == pytest.approx(1.0)
-    # First-order condition: no corner lies in a direction that comes nearer.
-    assert ((values - point) @ (np.eye(len(values)) - point).T <= 1e-9).all()
-
-
-def shifted(prior, source_prior, m=4000, seed=0):
-    """Posteriors under the source's prior of a Gaussian each class, drawn by another prior."""
-    rng = np.random.default_rng(seed)
-    k = len(prior)
-    labels = rng.choice(k, size=m, p=prior)
-    values = rng.normal(2.0 * labels, 1.0)
-    joint = np.exp(-0.5 * np.square(values[:, None] - 2.0 * np.arange(k))) * source_prior
-    return joint / joint.sum(axis=1, keepdims=True)
-
-
-def test_em_recovers_a_shifted_prior():
-    prior, source = np.array([0.6, 0.3, 0.1]), np.array([0.2, 0.3, 0.5])
-    rows = shifted(prior, source)
-    assert estimate_prior_em(rows, source) == pytest.approx(prior, abs=0.03)
-    assert np.abs(rows.mean(axis=0) - prior).max() > 0.1  # plain counting does not
-
-
-def test_em_maximises_the_likelihood():
-    source = np.array([0.2, 0.3, 0.5])
-    rows = shifted(np.array([0.5, 0.3, 0.2]), source, m=60)
-
-    def cost(free):
-        prior = np.exp(np.append(free, 0.0))
-        return -np.log((rows / source) @ (prior / prior.sum())).sum()
-
-    free = minimize(cost, np.zeros(2), options={"gtol": 1e-9}).x
-    expected = np.exp(np.append(free, 0.0))
-    found = estimate_prior_em(rows, source, iterations=100_000, tolerance=1e-13)
-    assert found == pytest.approx(expected / expected.sum(), abs=1e-5)
-
-
-@given(probabilities(), st.integers(0, 5))
-def test_em_never_lowers_the_likelihood(rows, steps):
-    assume(len(rows))
-    source = np.full(rows.shape[1], 1 / rows.shape[1])
-
-    def likelihood(count):
-        prior = estimate_prior_em(rows, source, iterations=count, tolerance=0.0)
-        return np.log((rows / source) @ prior).sum()
-
-    assert likelihood(steps + 1) >= likelihood(steps) - 1e-9
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda p: select_uniform(p, 0.5, quantile=1.1), "quantile must be 0 to 1"),
-        (lambda p: select_quantile(p, 0.5, -0.1), "share must be 0 to 1"),
-        (lambda p: select_uniform(p, 1.5), "threshold must be 0 to 1"),
-        (lambda p: select_prior(p, 0.5, np.zeros(2)), "not all zero"),
-        (lambda p: select_prior(p, 0.5, np.array([np.nan, 1.0])), "finite"),
-        (lambda p: select_uniform(2 * p, 0.5), "sum to 1"),
-        (lambda p: estimate_prior_em(p, np.array([0.0, 1.0])), "positive for every class"),
-        (lambda p: estimate_prior_em(p[:0], np.array([0.5, 0.5])), "no clouds"),
-        (lambda p: estimate_prior_bbse(np.zeros((2, 2), np.int64), p[0]), "at least one class"),
-    ],
-)
-def test_refusals(call, message):
-    with pytest.raises(InputError, match=message):
-        call(np.array([[0.9, 0.1], [0.3, 0.7]]))
-
-
-def test_a_prior_needs_the_right_number_of_classes():
-    with pytest.raises(InputError, match="prior has 3 classes, not 2"):
-        check_prior("prior", np.ones(3), 2)
-
-
-def test_imports_without_torch():
-    code = "import sys, qs3.adaptation.priors; sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
