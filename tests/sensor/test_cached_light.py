@@ -149,10 +149,10 @@ def test_stored_pattern_has_no_right_camera(variant):
 
 def test_embree_takes_diffuse_bodies_only():
     with pytest.raises(InputError, match="diffuse"):
-        EmbreePhotographer(corner(MATERIALS["metal"]), 3)
+        EmbreePhotographer(corner(MATERIALS["metal"]), 1, 3, CacheSettings())
 
 
-@pytest.mark.parametrize("kwargs", [{"cell": 0}, {"rays": 0}, {"smoothing": -1}])
+@pytest.mark.parametrize("kwargs", [{"cell": 0}, {"rays": 0}])
 def test_senseless_caches_are_refused(kwargs):
     with pytest.raises(InputError, match="renderer"):
         CacheSettings(**kwargs)

@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from qs3.errors import InputError
-from qs3.geometry import invert_rigid, look_at, rotation_xyz, rotation_z, transform_points
+from qs3.geometry import invert_rigid, look_at, rotation_z, transform_points
 from qs3.sensor.depth import DepthSettings, backproject, depth_from_disparity
 from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.views import Placement, place_views
@@ -33,15 +34,16 @@ def test_look_at_refuses_a_direction_along_up():
 @given(st.floats(-3, 3), st.floats(-3, 3), st.floats(-3, 3))
 def test_rigid_inverse_undoes(a, b, c):
     matrix = np.eye(4)
-    matrix[:3, :3] = rotation_xyz(np.array([a, b, c]))
+    matrix[:3, :3] = Rotation.from_euler("xyz", [a, b, c]).as_matrix()
     matrix[:3, 3] = [a, b, c]
     points = np.array([[1.0, 2.0, 3.0], [-1.0, 0.5, 0.0]])
     back = transform_points(invert_rigid(matrix), transform_points(matrix, points))
     np.testing.assert_allclose(back, points, atol=1e-12)
 
 
-def test_rotation_xyz_is_rotation_z_about_z():
-    np.testing.assert_allclose(rotation_xyz(np.array([0.0, 0.0, 0.7])), rotation_z(0.7))
+def test_rotation_z_is_anticlockwise():
+    expected = Rotation.from_euler("z", 0.7).as_matrix()
+    np.testing.assert_allclose(rotation_z(0.7), expected, atol=1e-15)
 
 
 def test_convention_disparity_is_left_minus_right_and_f_b_over_z():

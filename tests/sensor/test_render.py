@@ -37,7 +37,7 @@ POSE = Pose.looking_at(np.array([2.0, -3.0, 2.0]), np.array([0.1, 0.0, -0.1]))
 def test_convention_true_depth_is_along_the_axis_through_pixel_centres(small_rig):
     plate = trimesh.creation.box(extents=[4, 4, 0.02])
     plate.apply_translation([0, 0, 3.01])  # its near face is at z = 3 of a camera at the origin
-    depth = DepthCaster(plate).depth(small_rig, Pose(np.eye(4)), small_rig.full_frame)
+    depth = DepthCaster(plate).cast(small_rig, Pose(np.eye(4)), small_rig.full_frame).depth
     np.testing.assert_allclose(depth, 3.0, atol=1e-9)
 
 
@@ -45,7 +45,7 @@ def test_true_depth_of_a_tilted_plane_is_the_formula(small_rig):
     slope = 0.4  # z = 3 + slope·x
     corners = np.array([[x, y, 3 + slope * x] for x in (-3.0, 3) for y in (-3.0, 3)])
     plane = trimesh.Trimesh(corners, [[0, 1, 2], [1, 3, 2]], process=False)
-    depth = DepthCaster(plane).depth(small_rig, Pose(np.eye(4)), small_rig.full_frame)
+    depth = DepthCaster(plane).cast(small_rig, Pose(np.eye(4)), small_rig.full_frame).depth
     u = (np.arange(540) - 269.5) / 750
     np.testing.assert_allclose(depth, np.broadcast_to(3 / (1 - slope * u), (540, 540)), rtol=1e-6)
 
@@ -56,7 +56,7 @@ def test_convention_images_lie_on_the_true_silhouette_and_are_not_mirrored(small
     frame = small_rig.full_frame
     for image, camera in zip(pair.canvas(frame), (POSE, small_rig.right(POSE)), strict=True):
         seen = np.abs(image - pair.background) > 1e-4
-        true = np.isfinite(DepthCaster(mesh).depth(small_rig, camera, frame))
+        true = np.isfinite(DepthCaster(mesh).cast(small_rig, camera, frame).depth)
         overlap = (seen & true).sum() / (seen | true).sum()
         assert overlap > 0.97
         assert (seen[:, ::-1] & true).sum() / (seen[:, ::-1] | true).sum() < 0.9

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from qs3.errors import InputError
-from qs3.meshes.class_names import MODELNET40, SHAPENET
+from qs3.meshes.classes import MODELNET40, SHAPENET
 from qs3.meshes.labels_csv import read_labels, read_shapenet_splits
 from qs3.meshes.loading import EXTENSIONS
 from qs3.meshes.walking import MeshFile, entries, ids, is_file, walk

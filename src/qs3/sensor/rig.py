@@ -55,6 +55,11 @@ class Region:
         """Whether there is no pixel in it."""
         return self.width < 1 or self.height < 1
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns, as of an image."""
+        return max(self.height, 0), max(self.width, 0)
+
     def grown(self, margin: int, width: int, height: int) -> "Region":
         """The rectangle with ``margin`` pixels more on every side, cut at the frame's borders."""
         x0, y0 = max(0, self.x - margin), max(0, self.y - margin)

@@ -4,10 +4,10 @@ import numpy as np
 
 from qs3.shapes._dice import Dice
 from qs3.shapes._joinery import legs
-from qs3.shapes._parts import (
+from qs3.shapes._solids import (
     Number,
-    Part,
     Point,
+    Solid,
     at_height,
     ball,
     beam,
@@ -22,7 +22,7 @@ from qs3.shapes._parts import (
 _WALL = 0.006
 
 
-def _shade(dice: Dice, wide: Number, tall: Number, z: Number, sides: int) -> list[Part]:
+def _shade(dice: Dice, wide: Number, tall: Number, z: Number, sides: int) -> list[Solid]:
     """Open shade about the z axis from ``z`` up, with the spokes that carry it at its middle."""
     top = dice.pick(dice.between(0.35, 0.75), dice.between(0.8, 1.0)) * wide
     mid = z + 0.5 * tall
@@ -46,7 +46,7 @@ def _shade(dice: Dice, wide: Number, tall: Number, z: Number, sides: int) -> lis
     return [shade, spoke, ball(0.035, (0, 0, mid + 0.02), 8)]
 
 
-def _foot(dice: Dice, radius: Number) -> list[Part]:
+def _foot(dice: Dice, radius: Number) -> list[Solid]:
     thick = dice.between(0.015, 0.035)
     if dice.chance(0.25):
         return [block((-radius, radius), (-radius, radius), (0, thick))]
@@ -59,7 +59,7 @@ def _foot(dice: Dice, radius: Number) -> list[Part]:
     ]
 
 
-def floor(dice: Dice) -> list[Part]:
+def floor(dice: Dice) -> list[Solid]:
     """Standing lamp with a shade on a post, on a plate or three legs."""
     high, wide, tall = dice.between(1.2, 1.8), dice.between(0.13, 0.26), dice.between(0.18, 0.4)
     post = dice.between(0.009, 0.022) * dice.bulk
@@ -82,7 +82,7 @@ def floor(dice: Dice) -> list[Part]:
     return [*parts, lathe([(post, low), (post, high - 0.5 * tall + 0.01)], max(6, dice.sides // 2))]
 
 
-def arc(dice: Dice) -> list[Part]:
+def arc(dice: Dice) -> list[Solid]:
     """Floor lamp whose bow carries a shade out over a seat."""
     high, reach, wide = dice.between(1.5, 2.0), dice.between(0.6, 1.3), dice.between(0.12, 0.22)
     bar = dice.between(0.009, 0.018) * dice.bulk**0.5
@@ -116,7 +116,7 @@ def arc(dice: Dice) -> list[Part]:
     ]
 
 
-def torchiere(dice: Dice) -> list[Part]:
+def torchiere(dice: Dice) -> list[Solid]:
     """Uplighter: a bowl on a tall post, perhaps with a reading arm."""
     high, post, wide = (
         dice.between(1.55, 1.95),
@@ -146,7 +146,7 @@ def torchiere(dice: Dice) -> list[Part]:
     return parts
 
 
-def table(dice: Dice) -> list[Part]:
+def table(dice: Dice) -> list[Solid]:
     """Table lamp with a turned, square or bulging body under a shade."""
     body, wide, tall = dice.between(0.14, 0.42), dice.between(0.1, 0.24), dice.between(0.12, 0.3)
     high = body + tall * dice.between(0.75, 1.05)
@@ -190,7 +190,7 @@ def table(dice: Dice) -> list[Part]:
     return parts
 
 
-def _bell(dice: Dice, wide: Number, tall: Number) -> Part:
+def _bell(dice: Dice, wide: Number, tall: Number) -> Solid:
     """Reflector that opens downward below the origin."""
     neck = dice.between(0.25, 0.5) * wide
     outer = [
@@ -210,7 +210,7 @@ def _bell(dice: Dice, wide: Number, tall: Number) -> Part:
     return loft(np.stack(rings), cyclic=True)
 
 
-def desk_arm(dice: Dice) -> list[Part]:
+def desk_arm(dice: Dice) -> list[Solid]:
     """Work lamp on a jointed or bent arm."""
     bar, wide = dice.between(0.006, 0.014) * dice.bulk, dice.between(0.05, 0.1)
     lower, upper = dice.between(0.18, 0.4), dice.between(0.16, 0.4)
@@ -248,7 +248,7 @@ def desk_arm(dice: Dice) -> list[Part]:
     return parts
 
 
-def pendant(dice: Dice) -> list[Part]:
+def pendant(dice: Dice) -> list[Solid]:
     """Lamp that hangs from a ceiling rose by a cord."""
     cord, wide = dice.between(0.25, 1.0), dice.between(0.1, 0.3)
     tall = wide * dice.between(0.5, 1.4)
@@ -275,7 +275,7 @@ def pendant(dice: Dice) -> list[Part]:
     ]
 
 
-def ceiling(dice: Dice) -> list[Part]:
+def ceiling(dice: Dice) -> list[Solid]:
     """Saucer, drum or square panel close under the ceiling."""
     wide, deep = dice.between(0.14, 0.32), dice.between(0.06, 0.2)
     if dice.chance(0.2):
@@ -297,7 +297,7 @@ def ceiling(dice: Dice) -> list[Part]:
     return parts
 
 
-def chandelier(dice: Dice) -> list[Part]:
+def chandelier(dice: Dice) -> list[Solid]:
     """Bent arms about a hub, each with a candle or small shade."""
     count, reach, cord = dice.count(3, 8), dice.between(0.22, 0.45), dice.between(0.2, 0.6)
     parts = [
@@ -323,7 +323,7 @@ def chandelier(dice: Dice) -> list[Part]:
     return parts
 
 
-def column(dice: Dice) -> list[Part]:
+def column(dice: Dice) -> list[Solid]:
     """Lantern of paper or cloth: a tall box or cylinder on a foot."""
     high, half = dice.between(0.5, 1.5), dice.between(0.08, 0.17)
     foot = dice.between(0.03, 0.12)
@@ -348,14 +348,4 @@ def column(dice: Dice) -> list[Part]:
     ]
 
 
-FAMILIES = {
-    "floor": floor,
-    "arc": arc,
-    "torchiere": torchiere,
-    "table": table,
-    "desk_arm": desk_arm,
-    "pendant": pendant,
-    "ceiling": ceiling,
-    "chandelier": chandelier,
-    "column": column,
-}
+FAMILIES = (floor, arc, torchiere, table, desk_arm, pendant, ceiling, chandelier, column)

@@ -3,10 +3,11 @@
 import numpy as np
 
 from qs3.shapes._dice import Dice
-from qs3.shapes._parts import (
+from qs3.shapes._solids import (
     Number,
-    Part,
+    Solid,
     Span,
+    around,
     beam,
     bend,
     block,
@@ -15,16 +16,17 @@ from qs3.shapes._parts import (
     loft,
     sheet,
     tube,
+    within,
 )
 
 
-def _screen(dice: Dice, width: Number, high: Number, z: Number, thick: Number) -> list[Part]:
+def _screen(dice: Dice, width: Number, high: Number, z: Number, thick: Number) -> list[Solid]:
     """Flat screen that faces −y with a raised frame and perhaps a hump behind."""
     x, y = (-width / 2, width / 2), (-thick / 2, thick / 2)
     body = (
         block(x, y, (z, z + high))
         if dice.chance(0.6)
-        else cushion(x, y, (z, z + high), 0.4 * thick, steps=dice.steps)
+        else cushion(dice, x, y, (z, z + high), 0.4 * thick)
     )
     parts = [body]
     if dice.chance(0.6):
@@ -62,7 +64,7 @@ def _size(dice: Dice) -> tuple[float, float]:
     )
 
 
-def foot(dice: Dice) -> list[Part]:
+def foot(dice: Dice) -> list[Solid]:
     """Flat screen on one neck and a plate."""
     width, high = _size(dice)
     thick, lift = dice.between(0.02, 0.07), dice.between(0.04, 0.2) * min(1.0, width / 0.6)
@@ -81,7 +83,7 @@ def foot(dice: Dice) -> list[Part]:
         base = [block((-wide / 2, wide / 2), (-0.55 * deep, 0.45 * deep), (0, plate))]
     elif kind == "oval":
         disc = lathe([(1.0, 0), (1.0, plate), (0.6, 1.5 * plate)], max(12, dice.sides))
-        base = [Part(disc.vertices * [wide / 2, deep / 2, 1.0], disc.faces)]
+        base = [Solid(disc.vertices * [wide / 2, deep / 2, 1.0], disc.faces)]
     else:
         base = [
             beam((0, back * 0.6, plate), (s * wide / 2, -0.5 * deep, plate), 0.03, 2 * plate)
@@ -103,7 +105,7 @@ def foot(dice: Dice) -> list[Part]:
     return parts
 
 
-def two_feet(dice: Dice) -> list[Part]:
+def two_feet(dice: Dice) -> list[Solid]:
     """Television on a foot near either end."""
     width = dice.between(0.8, 1.6)
     high, thick, lift = (
@@ -118,26 +120,16 @@ def two_feet(dice: Dice) -> list[Part]:
         if dice.chance(0.5):
             for end in (-deep / 2, deep / 2):
                 parts.append(beam((s * at, end, bar / 2), (s * at, 0, lift + 0.02), bar, bar))
-                parts.append(
-                    block(
-                        (s * at - bar / 2, s * at + bar / 2),
-                        (end - bar / 2, end + bar / 2),
-                        (0, bar),
-                    )
-                )
+                parts.append(block(around(s * at, bar / 2), around(end, bar / 2), (0, bar)))
         else:
             parts += [
-                block((s * at - bar, s * at + bar), (-deep / 2, deep / 2), (0, bar)),
-                block(
-                    (s * at - bar, s * at + bar),
-                    (-0.3 * thick, 0.3 * thick),
-                    (bar / 2, lift + 0.01),
-                ),
+                block(around(s * at, bar), (-deep / 2, deep / 2), (0, bar)),
+                block(around(s * at, bar), (-0.3 * thick, 0.3 * thick), (bar / 2, lift + 0.01)),
             ]
     return parts
 
 
-def curved(dice: Dice) -> list[Part]:
+def curved(dice: Dice) -> list[Solid]:
     """Wide screen bent about its viewer."""
     width, thick = dice.between(0.7, 1.25), dice.between(0.025, 0.05)
     high, lift, radius = (
@@ -163,7 +155,7 @@ def curved(dice: Dice) -> list[Part]:
     return parts
 
 
-def tube_set(dice: Dice) -> list[Part]:
+def tube_set(dice: Dice) -> list[Solid]:
     """Cathode-ray set: a deep box or a cone behind the screen, perhaps on feet."""
     width = dice.between(0.36, 0.8)
     high, deep = width * dice.between(0.62, 0.95), width * dice.between(0.5, 1.0)
@@ -171,17 +163,15 @@ def tube_set(dice: Dice) -> list[Part]:
     x, z = (-width / 2, width / 2), (foot, foot + high)
     shell = dice.between(0.3, 1.0)
     front = (-deep / 2, -deep / 2 + shell * deep)
-    parts = [
-        cushion(x, front, z, 0.02, steps=dice.steps) if dice.chance(0.5) else block(x, front, z)
-    ]
+    parts = [cushion(dice, x, front, z, 0.02) if dice.chance(0.5) else block(x, front, z)]
     edge = dice.between(0.03, 0.07) * width / 0.5
     panel = dice.pick(0.0, 0.0, 0.22 * width)
     proud: Span = (front[0] - dice.between(0.008, 0.03), front[0] + 0.004)
     parts += [
         block((x[0], x[0] + edge), proud, z),
         block((x[1] - edge - panel, x[1]), proud, z),
-        block((x[0] + 0.001, x[1] - 0.001), proud, (z[0], z[0] + edge)),
-        block((x[0] + 0.001, x[1] - 0.001), proud, (z[1] - edge, z[1])),
+        block(within(x, 0.001), proud, (z[0], z[0] + edge)),
+        block(within(x, 0.001), proud, (z[1] - edge, z[1])),
     ]
     if panel > 0:
         for t in (0.35, 0.7):
@@ -212,7 +202,7 @@ def tube_set(dice: Dice) -> list[Part]:
             parts.append(disc.move(0, front[0] + 0.5 * (front[1] - front[0])))
         else:
             parts += [
-                block((px - 0.02, px + 0.02), (py - 0.02, py + 0.02), (0, foot + 0.01))
+                block(around(px, 0.02), around(py, 0.02), (0, foot + 0.01))
                 for px in (-0.36 * width, 0.36 * width)
                 for py in (front[0] + 0.05, front[1] - 0.04)
             ]
@@ -231,7 +221,7 @@ def tube_set(dice: Dice) -> list[Part]:
     return parts
 
 
-def all_in_one(dice: Dice) -> list[Part]:
+def all_in_one(dice: Dice) -> list[Solid]:
     """Screen with a chin on a bent sheet of metal, with or without a keyboard."""
     width, thick = dice.between(0.48, 0.65), dice.between(0.015, 0.05)
     high, lift, tilt = (
@@ -258,18 +248,16 @@ def all_in_one(dice: Dice) -> list[Part]:
     return parts
 
 
-def laptop(dice: Dice) -> list[Part]:
+def laptop(dice: Dice) -> list[Solid]:
     """Portable computer, opened."""
     width, thick = dice.between(0.28, 0.4), dice.between(0.008, 0.022)
     deep, open_by = width * dice.between(0.62, 0.75), dice.between(92, 125)
-    base = cushion(
-        (-width / 2, width / 2), (-deep, 0), (0, 1.3 * thick), 0.3 * thick, steps=dice.steps
-    )
+    base = cushion(dice, (-width / 2, width / 2), (-deep, 0), (0, 1.3 * thick), 0.3 * thick)
     lid = _screen(dice, width, deep, 0.0, 0.7 * thick)[0]
     return [base, lid.turn("x", -(open_by - 90)).move(0, -0.2 * thick, thick * 0.8)]
 
 
-def dual_arm(dice: Dice) -> list[Part]:
+def dual_arm(dice: Dice) -> list[Solid]:
     """Two screens side by side on one stand."""
     width, thick = dice.between(0.45, 0.62), dice.between(0.02, 0.05)
     high, lift, turn = (
@@ -295,7 +283,7 @@ def dual_arm(dice: Dice) -> list[Part]:
     return parts
 
 
-def wall(dice: Dice) -> list[Part]:
+def wall(dice: Dice) -> list[Solid]:
     """Screen with its wall bracket or arm."""
     width, high = _size(dice)
     thick, deep = dice.between(0.03, 0.07), dice.between(0.04, 0.3)
@@ -303,24 +291,15 @@ def wall(dice: Dice) -> list[Part]:
     z = 0.5 * high
     parts = _screen(dice, width, high, 0.0, thick)
     parts += [
-        block((-half, half), (thick / 2 - 0.003, thick / 2 + 0.015), (z - half, z + half)),
+        block((-half, half), (thick / 2 - 0.003, thick / 2 + 0.015), around(z, half)),
         block(
             (-0.6 * half, 0.6 * half),
             (thick / 2 + deep - 0.015, thick / 2 + deep),
-            (z - 1.2 * half, z + 1.2 * half),
+            around(z, 1.2 * half),
         ),
-        block((-0.025, 0.025), (thick / 2, thick / 2 + deep - 0.002), (z - 0.03, z + 0.03)),
+        block((-0.025, 0.025), (thick / 2, thick / 2 + deep - 0.002), around(z, 0.03)),
     ]
     return parts
 
 
-FAMILIES = {
-    "foot": foot,
-    "two_feet": two_feet,
-    "curved": curved,
-    "tube_set": tube_set,
-    "all_in_one": all_in_one,
-    "laptop": laptop,
-    "dual_arm": dual_arm,
-    "wall": wall,
-}
+FAMILIES = (foot, two_feet, curved, tube_set, all_in_one, laptop, dual_arm, wall)

@@ -4,20 +4,10 @@ import numpy as np
 
 from qs3.shapes._dice import Dice
 from qs3.shapes._foliage import crown, leaf, potted
-from qs3.shapes._parts import (
-    Part,
-    Point,
-    at_height,
-    ball,
-    bend,
-    lathe,
-    loft,
-    outline,
-    tube,
-)
+from qs3.shapes._solids import Point, Solid, at_height, ball, bend, lathe, loft, outline, tube
 
 
-def broad_leaf(dice: Dice) -> list[Part]:
+def broad_leaf(dice: Dice) -> list[Solid]:
     """Rosette of broad leaves on stalks."""
     pot, tall = dice.between(0.08, 0.2), dice.between(0.12, 0.32)
     parts, earth = potted(dice, pot, tall)
@@ -47,7 +37,7 @@ def broad_leaf(dice: Dice) -> list[Part]:
     return parts
 
 
-def cactus(dice: Dice) -> list[Part]:
+def cactus(dice: Dice) -> list[Solid]:
     """One or more ribbed columns or balls, perhaps with arms, in a pot."""
     pot = dice.between(0.07, 0.2)
     parts, earth = potted(dice, pot, pot * dice.between(0.7, 1.5))
@@ -85,7 +75,7 @@ def cactus(dice: Dice) -> list[Part]:
     return parts
 
 
-def succulent(dice: Dice) -> list[Part]:
+def succulent(dice: Dice) -> list[Solid]:
     """Low rosette of thick leaves such as an aloe or an agave."""
     pot = dice.between(0.06, 0.18)
     parts, earth = potted(dice, pot, pot * dice.between(0.7, 1.8))
@@ -105,7 +95,7 @@ def succulent(dice: Dice) -> list[Part]:
     return parts
 
 
-def tree(dice: Dice) -> list[Part]:
+def tree(dice: Dice) -> list[Solid]:
     """Small tree: a trunk with a crown."""
     pot, tall = dice.between(0.1, 0.22), dice.between(0.16, 0.35)
     parts, earth = potted(dice, pot, tall)
@@ -122,7 +112,7 @@ def tree(dice: Dice) -> list[Part]:
     return parts + crown(dice, head, size, smooth=dice.chance(0.5))
 
 
-def palm(dice: Dice) -> list[Part]:
+def palm(dice: Dice) -> list[Solid]:
     """Trunk or bare stems with long arching fronds."""
     pot, tall = dice.between(0.1, 0.2), dice.between(0.15, 0.32)
     parts, earth = potted(dice, pot, tall)
@@ -171,7 +161,7 @@ def palm(dice: Dice) -> list[Part]:
     return parts
 
 
-def bush(dice: Dice) -> list[Part]:
+def bush(dice: Dice) -> list[Solid]:
     """Rounded or clipped shrub that hides its pot's rim."""
     pot = dice.between(0.1, 0.22)
     parts, earth = potted(dice, pot, pot * dice.between(1.0, 2.0))
@@ -190,7 +180,7 @@ def bush(dice: Dice) -> list[Part]:
     return parts + crown(dice, (0.0, 0.0, middle), size, smooth=dice.chance(0.6))
 
 
-def sword(dice: Dice) -> list[Part]:
+def sword(dice: Dice) -> list[Solid]:
     """Stiff upright blades such as a snake plant's."""
     pot = dice.between(0.06, 0.16)
     parts, earth = potted(dice, pot, pot * dice.between(1.0, 2.8))
@@ -214,7 +204,7 @@ def sword(dice: Dice) -> list[Part]:
     return parts
 
 
-def grass(dice: Dice) -> list[Part]:
+def grass(dice: Dice) -> list[Solid]:
     """Tuft of many narrow arching blades, or spikes such as a yucca's."""
     pot = dice.between(0.08, 0.18)
     parts, earth = potted(dice, pot, pot * dice.between(0.9, 2.0))
@@ -237,7 +227,7 @@ def grass(dice: Dice) -> list[Part]:
     return parts
 
 
-def trailing(dice: Dice) -> list[Part]:
+def trailing(dice: Dice) -> list[Solid]:
     """Pot whose shoots spill over its rim, perhaps hung by three cords."""
     pot = dice.between(0.09, 0.16)
     parts, earth = potted(dice, pot, pot * dice.between(0.9, 1.5))
@@ -272,14 +262,4 @@ def trailing(dice: Dice) -> list[Part]:
     return parts
 
 
-FAMILIES = {
-    "broad_leaf": broad_leaf,
-    "cactus": cactus,
-    "succulent": succulent,
-    "tree": tree,
-    "palm": palm,
-    "bush": bush,
-    "sword": sword,
-    "grass": grass,
-    "trailing": trailing,
-}
+FAMILIES = (broad_leaf, cactus, succulent, tree, palm, bush, sword, grass, trailing)

@@ -29,7 +29,7 @@ def evaluate(
     split: str | None = None,
     cloud: CloudKind = "points",
     checkpoints: bool = False,
-    experiment: Mapping[str, str | int] | None = None,
+    experiment: Mapping[str, str | int | float] | None = None,
 ) -> RunRecord:
     """Score a run on labelled clouds, and write the record into its folder ``records``.
 

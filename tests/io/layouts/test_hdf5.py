@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
+from qs3.geometry import y_up_from_z_up, z_up_from_y_up
 from qs3.io.layouts import hdf5
-from qs3.io.layouts.axes import y_up_from_z_up, z_up_from_y_up
 from qs3.io.layouts.hdf5 import hdf5_bytes, read_file
 from qs3.io.layouts.hdf5_sets import list_parts, read_parts
 

@@ -213,7 +213,7 @@ def test_a_header_that_announces_too_much_is_refused_before_memory_is_taken(tmp_
     name, content, message = HOSTILE[case]
     (tmp_path / name).write_bytes(content)
     if name.endswith(".off"):
-        import qs3.meshes.normalise  # noqa: F401 (the import itself takes memory)
+        import qs3.meshes.normalising  # noqa: F401 (the import itself takes memory)
     tracemalloc.start()
     try:
         with pytest.raises(InputError, match=message) as caught:

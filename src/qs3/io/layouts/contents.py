@@ -14,14 +14,14 @@ from qs3.errors import InputError
 from qs3.io.clouds import CloudKind, PointClouds
 from qs3.io.ragged import RaggedClouds
 from qs3.io.transforms import stack
-from qs3.store.folder import Folder, LocalFolder, open_folder
+from qs3.store.folder import Folder, open_folder
 from qs3.store.manifest import MANIFEST as MANIFEST
 from qs3.store.manifest import Manifest as Manifest
 from qs3.store.manifest import finished_shards, shard_name
 from qs3.store.manifest import open_dataset as open_dataset
 from qs3.store.manifest import shard_path as shard_path
 from qs3.store.manifest import write_manifest as write_manifest
-from qs3.store.shards import flat_clouds, parse_shard, read_shard
+from qs3.store.shards import flat_clouds, load_shard
 
 _THREADS = min(os.cpu_count() or 1, 8)
 
@@ -88,13 +88,9 @@ def _read_shard(
     folder: Folder, index: int, cloud: CloudKind, manifest: Manifest
 ) -> tuple[list[list[Any]], list[np.ndarray], bytes]:
     """Ids, labels and splits of a shard, one kind of its clouds, and the checksum of all that."""
-    name = shard_name(index)
-    path = f"{folder}/{name}"
+    path = f"{folder}/{shard_name(index)}"
     wanted = ["id", "label", "split", cloud]
-    if isinstance(folder, LocalFolder):
-        table = read_shard(folder.path / name, wanted)  # these columns alone, not the whole file
-    else:
-        table = parse_shard(folder.read(name), path, wanted)
+    table = load_shard(folder, index, wanted)
     columns = [table[column].to_pylist() for column in wanted[:3]]
     if cloud != "points" and len(table) and not len(table[cloud].combine_chunks().values):
         raise InputError(f"{folder}: has no {cloud!r} clouds, only 'points'")

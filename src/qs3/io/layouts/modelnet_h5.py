@@ -23,7 +23,7 @@ from jaxtyping import Float32, Int
 
 from qs3.errors import InputError
 from qs3.files import write_text
-from qs3.io.layouts.axes import y_up_from_z_up, z_up_from_y_up
+from qs3.geometry import y_up_from_z_up, z_up_from_y_up
 from qs3.io.layouts.format import Format
 from qs3.io.layouts.hdf5_sets import (
     list_parts,
@@ -35,7 +35,7 @@ from qs3.io.layouts.hdf5_sets import (
 )
 from qs3.io.ragged import RaggedClouds
 from qs3.io.whole import check_free
-from qs3.meshes.class_names import MODELNET40
+from qs3.meshes.classes import MODELNET40
 
 CLASSES = tuple(sorted(MODELNET40))
 """ModelNet40's classes in the order of their label."""

@@ -21,7 +21,7 @@ from qs3.files import sha256
 from qs3.io.class_folders import SPLITS, choose_split, list_folder
 from qs3.io.layouts.format import Format
 from qs3.io.ragged import RaggedClouds
-from qs3.meshes.class_names import MODELNET40
+from qs3.meshes.classes import MODELNET40
 
 POINTS = 2048
 _MANY = 100
@@ -66,7 +66,7 @@ def read_modelnet_meshes(path: Path, split: str | None = None) -> RaggedClouds:
 def _sample(path: Path, identifier: str) -> Float32[np.ndarray, "n 3"]:
     # Imported here: listing layouts needs no mesh library.
     from qs3.meshes.loading import load_mesh
-    from qs3.meshes.normalise import sample_surface
+    from qs3.meshes.normalising import sample_surface
 
     # Of the id alone: a mesh more or less leaves all other clouds as they were.
     digest = hashlib.sha256(identifier.encode(errors="surrogateescape")).digest()

@@ -31,8 +31,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from qs3.errors import InputError
+from qs3.geometry import y_up_from_z_up, z_up_from_y_up
 from qs3.io.class_folders import SPLITS, choose_split, list_folder, read_files
-from qs3.io.layouts.axes import y_up_from_z_up, z_up_from_y_up
 from qs3.io.layouts.format import Format
 from qs3.io.layouts.hdf5_sets import (
     list_parts,

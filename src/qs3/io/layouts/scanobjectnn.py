@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from qs3.errors import InputError
-from qs3.io.layouts.axes import y_up_from_z_up, z_up_from_y_up
+from qs3.geometry import y_up_from_z_up, z_up_from_y_up
 from qs3.io.layouts.format import Format
 from qs3.io.layouts.hdf5_sets import (
     Part,

@@ -27,10 +27,15 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
     Raises:
         InputError: where the clouds have no labels.
     """
-    from qs3.store.folder import LocalFolder
-    from qs3.store.manifest import Manifest, shard_name, write_manifest, write_sums
+    from qs3.store.folder import open_folder
+    from qs3.store.manifest import (
+        Manifest,
+        package_versions,
+        shard_name,
+        write_manifest,
+        write_sums,
+    )
     from qs3.store.shards import put_shard, table_of
-    from qs3.store.versions import package_versions
 
     if clouds.labels is None:
         raise InputError("clouds without labels make no qs3 data set; put them into class folders")
@@ -50,9 +55,9 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
     with bar:
         for index, start in enumerate(starts):
             rows = [_row(clouds, i) for i in range(start, min(start + ROWS_PER_SHARD, count))]
-            sums[shard_name(index)] = put_shard(LocalFolder(root), index, table_of(rows))
+            sums[shard_name(index)] = put_shard(open_folder(root), index, table_of(rows))
             bar.update(len(rows))
-    write_sums(LocalFolder(root), sums)
+    write_sums(open_folder(root), sums)
 
 
 def _row(clouds: RaggedClouds, index: int) -> Any:

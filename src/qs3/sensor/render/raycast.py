@@ -40,7 +40,7 @@ class DepthCaster:
     Example:
         >>> plate = trimesh.creation.box(extents=[1, 1, 0.5]).apply_translation([0, 0, 2.25])
         >>> rig = StereoRig(width=5, height=3, focal=4.0)
-        >>> DepthCaster(plate).depth(rig, Pose(np.eye(4)), rig.full_frame)[1].tolist()
+        >>> DepthCaster(plate).cast(rig, Pose(np.eye(4)), rig.full_frame).depth[1].tolist()
         [nan, 2.0, 2.0, 2.0, nan]
     """
 
@@ -54,10 +54,6 @@ class DepthCaster:
             triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
         )
         self._body = np.repeat(np.arange(len(meshes)), [len(one.faces) for one in meshes])
-
-    def depth(self, rig: StereoRig, pose: Pose, region: Region) -> Float[np.ndarray, "h w"]:
-        """True depth of the pixels of ``region``."""
-        return self.cast(rig, pose, region).depth
 
     def cast(self, rig: StereoRig, pose: Pose, region: Region, normals: bool = False) -> Cast:
         """Follow a ray through every pixel of ``region``.
