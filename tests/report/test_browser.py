@@ -35,8 +35,8 @@ def test_reader_steps_through_the_clouds_of_a_class(page):
     """All classes at first; the domain with fewer clouds of a class begins anew."""
 
     def shown():
-        captions = page.run("[...document.querySelectorAll('figcaption')].map(f => f.textContent)")
-        captions = [re.sub(r" *Taken.*", "", c, flags=re.S) for c in captions if " of " in c]
+        query = "[...document.querySelectorAll('#viewer figcaption')].map((f) => f.textContent)"
+        captions = [re.sub(r" *Taken.*", "", caption, flags=re.S) for caption in page.run(query)]
         place = page.run("document.querySelector('#viewer output').textContent")
         return [re.sub(r"^target .*: ", "target: ", c, flags=re.S) for c in captions], place
 
