@@ -14,7 +14,6 @@ from qs3.io import load_clouds, load_unlabelled
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import create_model
 from qs3.training import SelfTrainingSettings, TrainSettings, fit, load_model
-from qs3.training.job import Job, fresh_model, make_method
 from qs3.training.validation import choose, held_out_rows, read_checkpoints
 
 NETWORKS = {

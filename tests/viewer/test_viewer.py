@@ -78,19 +78,19 @@ class TestDistance:
 class TestColours:
     def test_views_have_the_palette_and_the_legend_counts_them(self):
         view = np.array([0, 0, 11], dtype=np.uint8)
-        found = by_view(view)
+        colouring = by_view(view)
         expected = [tuple(int(PALETTE[i][k : k + 2], 16) for k in (1, 3, 5)) for i in (0, 0, 1)]
-        assert [tuple(c) for c in found.colours.tolist()] == expected
-        assert found.swatches == (
+        assert [tuple(c) for c in colouring.colours.tolist()] == expected
+        assert colouring.swatches == (
             (PALETTE[0], "view 1 (2 points)"),
             (PALETTE[1], "view 12 (1 point)"),
         )
 
     def test_errors_share_a_scale_and_stop_at_its_end(self):
-        found = by_error(np.array([0.0, 0.5, 1.0, 9.0]), "the mesh", 1.0, " m")
-        low, middle, high, beyond = found.colours.tolist()
+        colouring = by_error(np.array([0.0, 0.5, 1.0, 9.0]), "the mesh", 1.0, " m")
+        low, middle, high, beyond = colouring.colours.tolist()
         assert high == beyond != middle != low
-        assert found.ends == ("0 m", "1 m and more")
+        assert colouring.ends == ("0 m", "1 m and more")
         assert low == [68, 1, 84]  # viridis begins dark violet
 
     def test_height_of_a_flat_cloud_is_one_colour(self):
@@ -305,10 +305,10 @@ class TestStore:
         return folder
 
     def test_objects_come_with_all_their_clouds(self, folder):
-        found = StoreExhibits(folder)
-        assert len(found) == 3
-        assert found.labels == ("bed", "chair", "chair")
-        last = found[2]
+        exhibits = StoreExhibits(folder)
+        assert len(exhibits) == 3
+        assert exhibits.labels == ("bed", "chair", "chair")
+        last = exhibits[2]
         assert last.name == "o2"
         assert {kind: len(cloud) for kind, cloud in last.clouds.items()} == {
             "points": 7, "clean": 7, "surface": 7
@@ -319,8 +319,8 @@ class TestStore:
         from qs3.io import load_clouds
 
         clouds = load_clouds(folder, split="train", num_points=5)
-        found = StoreExhibits(folder, "train")
-        assert tuple(found[i].name for i in range(len(found))) == clouds.ids
+        exhibits = StoreExhibits(folder, "train")
+        assert tuple(exhibits[i].name for i in range(len(exhibits))) == clouds.ids
 
     def test_faults_name_the_folder(self, folder):
         with pytest.raises(InputError, match="no cloud of split 'val'; splits: test, train"):

@@ -56,8 +56,8 @@ def test_reads_no_file_of_the_disk(server, path):
 
 def test_is_not_there_on_another_interface(server):
     """Nor on another loopback address: it does not listen on all."""
-    found = socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)
-    others = {str(address[4][0]) for address in found} - {"127.0.0.1"}
+    addresses = socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)
+    others = {str(address[4][0]) for address in addresses} - {"127.0.0.1"}
     for address in {"127.0.0.2", *others}:
         with pytest.raises(OSError, match="refused"):
             socket.create_connection((address, server.get_port()), timeout=5)

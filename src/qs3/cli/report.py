@@ -24,7 +24,9 @@ def report(
     sensor: str = "paper",
     out: Path | None = None,
 ) -> int:
-    """Write one self-contained HTML page: pictures, clouds to turn, features, scores, tables.
+    """Write one self-contained HTML page.
+
+    It holds pictures of a scan, clouds to turn, curves, features, scores and tables.
 
     Args:
         folder: Folder of a run, of several runs, or of records alone.

@@ -33,9 +33,8 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 def renderer_dict(renderer: Renderer) -> dict[str, Any]:
     """All settings of a renderer and what it says of itself, as plain values for records."""
-    settings: Any = renderer
-    own = dataclasses.asdict(settings) if dataclasses.is_dataclass(settings) else {}
-    return own | renderer.description
+    settings: Any = renderer  # a dataclass
+    return dataclasses.asdict(settings) | renderer.description
 
 
 @dataclass(frozen=True)

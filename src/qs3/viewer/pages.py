@@ -1,7 +1,6 @@
 """The two pages: objects to step through, and a mesh that is scanned live."""
 
 import contextlib
-import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -166,7 +165,7 @@ class _Sliders:
     def _change(self, event: Any) -> None:
         values = self.values()
         base = with_controls(self.base, {name: values[name] for name in self._KEPT})
-        self.base = dataclasses.replace(base, sensor=self._sensors[self._sensor.value])
+        self.base = base.with_sensor(self._sensors[self._sensor.value], base.make_renderer())
         self._folder.remove()
         self._fill()
         self._ask(event)

@@ -51,20 +51,9 @@ def resolve(settings: ScanSettings) -> ScanSettings:
     Raises:
         QS3Error: where there is no such sensor, or the renderer does not work here.
     """
-    return dataclasses.replace(
-        settings,
-        sensor=settings.make_sensor(),
-        renderer=settings.make_renderer(),
-        view_layout=settings.chosen("view_layout"),
-        crop=settings.chosen("crop"),
-        # The sensor has these now.
-        image_noise=None,
-        matching=None,
-        bias_correction=False,
-        pattern=None,
-        object_size=None,
-        material=None,
-    )
+    made = settings.with_sensor(settings.make_sensor(), settings.make_renderer())
+    chosen = {name: settings.chosen(name) for name in ("view_layout", "crop")}
+    return dataclasses.replace(made, **chosen)
 
 
 def make_controls(settings: ScanSettings) -> tuple[Control, ...]:
@@ -111,7 +100,8 @@ def with_controls(settings: ScanSettings, values: Mapping[str, Any]) -> ScanSett
     Raises:
         InputError: where they make no sensor, or no scan.
     """
-    sensor, renderer = settings.make_sensor(), settings.make_renderer()
+    sensor = settings.make_sensor()
+    renderer: Any = settings.make_renderer()
     changes = {name: value for name, value in values.items() if name in _SCAN}
     if "samples" in values:
         renderer = dataclasses.replace(renderer, samples=values["samples"])
@@ -123,9 +113,8 @@ def with_controls(settings: ScanSettings, values: Mapping[str, Any]) -> ScanSett
             places |= {} if value == OWN_MATERIAL else {name: get_material(value)}
         elif name not in changes and name != "samples":
             places[name] = value
-    return dataclasses.replace(
-        settings, sensor=_replaced(sensor, places), renderer=renderer, **changes
-    )
+    made = settings.with_sensor(_replaced(sensor, places), renderer)
+    return dataclasses.replace(made, **changes)
 
 
 def _read(sensor: Sensor, place: str) -> float:
