@@ -68,8 +68,11 @@ def test_every_record_is_of_a_run_of_a_table():
 def add_field(kind: type, to: Any, monkeypatch: pytest.MonkeyPatch) -> type:
     """Add a setting to a dataclass, as a later version may."""
     wider = dataclasses.make_dataclass(
-        kind.__name__, [("novelty", float, dataclasses.field(default=0.5))], bases=(kind,), frozen=True
-    )  # fmt: skip
+        kind.__name__,
+        [("novelty", float, dataclasses.field(default=0.5))],
+        bases=(kind,),
+        frozen=True,
+    )
     wider.__module__ = kind.__module__
     for module in to:
         monkeypatch.setattr(module, kind.__name__, wider)
