@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from qs3.io import load_unlabelled
-from qs3.io.layouts.contents import open_dataset, read_ragged
+from qs3.io.layouts.store import read_ragged
+from qs3.store.manifest import open_dataset
 
 
 def png(path, image):

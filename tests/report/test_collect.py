@@ -187,4 +187,4 @@ def test_data_without_twins_are_read_whatever_the_record_says(grid, tmp_path):
 )  # fmt: skip
 def test_settings_that_cannot_be_meant_are_refused(given, word):
     with pytest.raises(InputError, match=word):
-        ReportSettings(**given).require_sound()
+        ReportSettings(**given)

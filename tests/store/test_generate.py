@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.io.layouts.contents import MANIFEST, read_store
+from qs3.io.layouts.store import read_ragged
 from qs3.meshes.classes import POINTDA10
 from qs3.store.failures import read_failures
 from qs3.store.generate import GenerateReport, GenerateSettings, scan_seed
@@ -32,7 +32,7 @@ def test_processes_and_none_write_the_same_bytes(fake, tmp_path):
         report = fake.run(items(fake, bad=[1]), out, SETTINGS, row=fake.flaky_row, workers=workers)
         assert report == GenerateReport(done=12, skipped=0, failed=3)
     assert fake.content(tmp_path / "0") == fake.content(tmp_path / "2")
-    assert read_store(out).ids == tuple(f"m{i}#{s}" for i in (0, 2, 3, 4) for s in range(3))
+    assert read_ragged(out).ids == tuple(f"m{i}#{s}" for i in (0, 2, 3, 4) for s in range(3))
     for data in fake.content(out).values():  # nothing of the machine is inside
         assert str(tmp_path).encode() not in data
         assert os.uname().nodename.encode() not in data

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qs3.io.layouts.contents import read_store
+from qs3.io.layouts.store import read_ragged
 
 PAGE = Path(__file__).parents[2] / "docs" / "data.md"
 
@@ -50,9 +50,9 @@ def made(request, fake, tmp_path):
 
 
 def test_our_reader(made):
-    ours = read_store(made.folder)
-    made.equals(ours.ids, ours.labels, ours.points)
-    assert ours.points.dtype == np.float32
+    ours = read_ragged(made.folder)
+    made.equals(ours.ids, ours.labels, np.stack(ours.clouds))
+    assert ours.clouds[0].dtype == np.float32
 
 
 def test_pandas(made):

@@ -14,7 +14,7 @@ import pytest
 
 from qs3.errors import InputError
 from qs3.files import folder_lock
-from qs3.io.layouts.contents import read_store
+from qs3.io.layouts.store import read_ragged
 from qs3.store.executors import InlineExecutor, LocalExecutor
 from qs3.store.failures import read_failures
 from qs3.store.folder import Folder
@@ -175,7 +175,7 @@ def test_objects_that_hang_or_crash_fail_alone(fake, tmp_path):
     assert "SIGSEGV" in failures["crashes#0"][1]
     assert "exit code 9" in failures["exits#0"][1]
     alone = [item for item in items if item.id.startswith("m")]
-    assert read_store(tmp_path).ids == tuple(f"{item.id}#0" for item in alone)
+    assert read_ragged(tmp_path).ids == tuple(f"{item.id}#0" for item in alone)
     assert verify(tmp_path, progress=False) == []
 
 
@@ -407,7 +407,7 @@ def test_half_precision_is_the_nearest_half(fake, tmp_path):
     for dtype in ("float32", "float16"):
         settings = dataclasses.replace(fake.SETTINGS, dtype=dtype)
         fake.run(fake.work(ROWS), tmp_path / dtype, settings)
-    single, half = (read_store(tmp_path / dtype).points for dtype in ("float32", "float16"))
+    single, half = (read_ragged(tmp_path / dtype).points for dtype in ("float32", "float16"))
     assert half.dtype == np.float32
     np.testing.assert_array_equal(half, single.astype(np.float16).astype(np.float32))
     assert verify(tmp_path / "float16", progress=False) == []

@@ -24,7 +24,7 @@ VERBS = {
     "reproduce": "Make tables and figures anew, with their data and trainings.",
     "table": "Print a table of the paper, ours beside the published figures.",
     "figure": "Draw a figure of the paper from records alone.",
-    "report": "Write one self-contained HTML page.",
+    "report": "Write one self-contained HTML page: pictures, clouds, features, scores, tables.",
     "view": "Look at data, a run or a mesh in a browser on this machine.",
     "doctor": "Tell what works on this machine and how to get what does not.",
     "demo": "Run everything once on built-in shapes: scan, train, adapt, report.",

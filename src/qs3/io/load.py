@@ -59,23 +59,23 @@ def _read(source: str | Path, split: str | None, cloud: CloudKind) -> RaggedClou
     path = Path(source)
     remote = isinstance(source, str) and "://" in source
     if remote or (path.is_dir() and (path / "dataset.json").is_file()):
-        from qs3.io.layouts.contents import read_ragged
+        from qs3.io.layouts.store import read_ragged
 
         return read_ragged(source if remote else path, cloud, split)
     if cloud != "points":
         raise InputError(f"{path}: only a data set made by qs3 generate has {cloud!r} clouds")
     if path.suffix.lower() == ".npz":
-        from qs3.io.npz import read_npz
+        from qs3.io.layouts.npz import read_npz
 
         return read_npz(path, split)
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
-    from qs3.io.class_folders import read_folder
-    from qs3.io.detect import is_general, matching, one_of, read_as
+    from qs3.io.detect import is_general, matching, one_of
+    from qs3.io.layouts.class_folders import read_folder
 
     fits = matching(path)
     if path.is_dir() and (not fits or is_general(fits[0])):
         return read_folder(path, split)
     if not fits:
         raise InputError(f"{path}: neither a folder nor an npz archive, nor any known layout")
-    return read_as(one_of(path, fits), path, split)
+    return one_of(path, fits).read(path, split)

@@ -26,7 +26,8 @@ from qs3.io.extract.scannet_scene import (
     read_objects,
     read_splits,
 )
-from qs3.io.layouts.contents import open_dataset, read_ragged
+from qs3.io.layouts.store import read_ragged
+from qs3.store.manifest import open_dataset
 
 from .writers import (
     CHAIR,

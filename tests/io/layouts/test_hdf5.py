@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.geometry import y_up_from_z_up, z_up_from_y_up
+from qs3.geometry import y_up_to_z_up, z_up_to_y_up
 from qs3.io.layouts import hdf5
 from qs3.io.layouts.hdf5 import hdf5_bytes, read_file
 from qs3.io.layouts.hdf5_sets import list_parts, read_parts
@@ -250,7 +250,7 @@ def test_damaged_bytes_are_read_or_refused_in_one_line(tmp_path, arrays, compres
         file.create_dataset("label", data=arrays["label"])
     whole = (tmp_path / "a.h5").read_bytes()
     ends = []
-    for seed in range(400):
+    for seed in range(200):
         rng = np.random.default_rng(seed)
         damaged = bytearray(whole)
         for place in rng.integers(len(whole), size=rng.integers(1, 30)):
@@ -263,7 +263,7 @@ def test_damaged_bytes_are_read_or_refused_in_one_line(tmp_path, arrays, compres
         except InputError as error:
             assert "\n" not in str(error)
             ends.append("refused")
-    assert ends.count("refused") > 40
+    assert ends.count("refused") > 20
 
 
 def test_parts_are_listed_in_order(tmp_path, arrays):
@@ -328,13 +328,13 @@ def test_a_list_that_is_no_text_is_refused(tmp_path):
 def test_convention_y_up_turns_to_z_up_and_back():
     # x to the right, y up, z to the viewer, as OpenGL has them.
     right, up, near = np.eye(3)
-    turned = z_up_from_y_up(np.stack([right, up, near]))
+    turned = y_up_to_z_up(np.stack([right, up, near]))
     assert turned.tolist() == [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
     assert np.linalg.det(turned) == 1  # a turn, no mirror
-    np.testing.assert_array_equal(y_up_from_z_up(turned), np.eye(3))
+    np.testing.assert_array_equal(z_up_to_y_up(turned), np.eye(3))
 
 
 def test_turning_rounds_nothing(rng, formats):
     cloud = formats.hard_floats(rng, 500)
-    assert z_up_from_y_up(y_up_from_z_up(cloud)).tobytes() == cloud.tobytes()
-    assert y_up_from_z_up(z_up_from_y_up(cloud)).tobytes() == cloud.tobytes()
+    assert y_up_to_z_up(z_up_to_y_up(cloud)).tobytes() == cloud.tobytes()
+    assert z_up_to_y_up(y_up_to_z_up(cloud)).tobytes() == cloud.tobytes()

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from qs3.errors import InputError
-from qs3.io.transforms import resample
+from qs3.io.preparation import resample
 from qs3.meshes.classes import POINTDA10, map_labels
 from qs3.store.executors import Executor, Failure, InlineExecutor, LocalExecutor, guarded
 from qs3.store.executors.executor import failure_of, stop_if_fatal

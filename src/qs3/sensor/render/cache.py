@@ -79,7 +79,7 @@ def cells(region: Region, cell: int) -> Region:
 class Arrays:
     """What NumPy and Dr.Jit do alike under different names, on arrays of single precision."""
 
-    number: Callable[[float], Any]
+    number: Callable[[float | int], Any]
     """A scalar."""
     whole: Callable[[Any], Any]
     """As signed whole numbers."""

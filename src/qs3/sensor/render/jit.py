@@ -59,7 +59,7 @@ class JitPhotographer(Photographer):
         self._ambient = self._number(light.ambient)
         self._sky_z = self._number(np.sin(np.radians(light.sky_elevation)))
 
-    def _number(self, value: float) -> Any:
+    def _number(self, value: float | int) -> Any:
         return self._dr.opaque(self._mi.Float, float(value))
 
     def _count(self, value: int) -> Any:

@@ -46,14 +46,14 @@ class DepthCaster:
 
     def __init__(self, mesh: trimesh.Trimesh, *others: trimesh.Trimesh) -> None:
         meshes = (mesh, *others)
-        triangles = np.concatenate([np.asarray(one.triangles, np.float64) for one in meshes])
+        triangles = np.concatenate([np.asarray(body.triangles, np.float64) for body in meshes])
         self._embree = EmbreeScene()
         TriangleMesh(self._embree, triangles.astype(np.float32))
         self._corner = triangles[:, 0]
         self._normal = np.cross(
             triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
         )
-        self._body = np.repeat(np.arange(len(meshes)), [len(one.faces) for one in meshes])
+        self._body = np.repeat(np.arange(len(meshes)), [len(body.faces) for body in meshes])
 
     def cast(self, rig: StereoRig, pose: Pose, region: Region, normals: bool = False) -> Cast:
         """Follow a ray through every pixel of ``region``.
