@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from qs3.files import write_bytes
 from qs3.meshes.classes import POINTDA10
+from qs3.store.folder import Folder
 from qs3.store.generate import GenerateReport, GenerateSettings, Item, generate, scan_seed
 from qs3.store.shards import CloudRow
 
@@ -98,14 +100,21 @@ def slow_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
 
 
 def deadly_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
-    """Hang, crash or end the process, by the name of the object."""
+    """Hang, crash or end the process, or hang once the row is written, by the object's name."""
     if item.id.startswith("hangs"):
         ctypes.PyDLL(None).sleep(600)  # the interpreter locked, as by a parser written in C
     if item.id.startswith("crashes"):
         os.kill(os.getpid(), signal.SIGSEGV)
     if item.id.startswith("exits"):
         os._exit(9)
+    if item.id.startswith("late"):
+        Folder.write = _write_and_hang
     return fake_row(item, scan, settings)
+
+
+def _write_and_hang(folder: Folder, name: str, data: bytes) -> None:
+    write_bytes(folder.path / name, data)
+    time.sleep(600)
 
 
 def marked_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
@@ -146,20 +155,6 @@ def crash_with_lock_row(item: Item, scan: int, settings: GenerateSettings) -> Cl
 def slow_flaky_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
     time.sleep(0.25)
     return flaky_row(item, scan, settings)
-
-
-def late_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
-    """Hang, for a bad item, after its part is written and before the answer is given."""
-    from qs3.store.folder import Folder
-
-    write = Folder.write
-
-    def write_and_hang(self: Folder, name: str, data: bytes) -> None:
-        write(self, name, data)
-        time.sleep(600)
-
-    Folder.write = write_and_hang if item.id.startswith("bad") else write
-    return fake_row(item, scan, settings)
 
 
 def slow_deadly_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:

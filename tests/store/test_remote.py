@@ -83,7 +83,7 @@ def test_a_run_into_memory_is_stopped_resumed_and_equal(fake, tmp_path, memory):
 def test_a_folder_of_something_else_is_refused(fake, memory):
     open_folder(memory).write("thesis.txt", b"mine")
     with pytest.raises(InputError, match="holds something else"):
-        generate(items(fake), memory, SETTINGS, scan_one=fake.fake_row, workers=0, progress=False)
+        fake.run(items(fake), memory)
     assert set(content(memory)) == {"thesis.txt"}
 
 

@@ -1,4 +1,5 @@
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from qs3.store.generate import GenerateSettings
 from qs3.store.info import info
 from qs3.store.manifest import MANIFEST, Manifest, open_dataset, shard_path, write_manifest
 from qs3.store.shards import read_shard, write_shard
+from qs3.structure import unstructure
 
 SETTINGS = GenerateSettings(num_points=16)
 
@@ -174,6 +176,17 @@ def test_a_folder_without_manifest_and_another_schema_are_refused(fake, tmp_path
     path.write_text(path.read_text().replace('"schema": 3', '"schema": 7'))
     with pytest.raises(InputError, match="schema 7"):
         open_dataset(tmp_path)
+
+
+def test_a_data_set_begun_under_the_sensors_former_name_goes_on(fake, tmp_path):
+    make(tmp_path, fake)
+    now = open_dataset(tmp_path)
+    now = dataclasses.replace(now, settings={"sensor": {"name": "paper", "metric": False}})
+    path = tmp_path / MANIFEST
+    former = {"sensor": {"name": "qs3", "metric": False}}
+    path.write_text(json.dumps(unstructure(now) | {"settings": former}))
+    assert open_dataset(tmp_path) == now
+    write_manifest(tmp_path, now)
 
 
 def test_info_counts(fake, tmp_path):

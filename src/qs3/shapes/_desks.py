@@ -36,13 +36,8 @@ def desk(dice: Dice) -> list[Solid]:
             dice, corners(x, y, 0.05 + inset), under + 0.004, 0.045 * dice.bulk**0.7, "square"
         )
     if dice.chance(0.5):
-        parts.append(
-            block(
-                within(x, inset),
-                (y[1] - inset - 0.03, y[1] - inset - 0.01),
-                (dice.between(0.1, 0.6) * under, under + 0.003),
-            )
-        )
+        z = (dice.between(0.1, 0.6) * under, under + 0.003)
+        parts.append(block(within(x, inset), (y[1] - inset - 0.03, y[1] - inset - 0.01), z))
     if dice.chance(0.12):
         shelf = height + dice.between(0.12, 0.3)
         parts += carcass(within(x, 0.02), (y[1] - 0.25, y[1] - 0.01), (height - 0.003, shelf), 0.02)

@@ -31,15 +31,11 @@ def wing(dice: Dice) -> list[Solid]:
     seat, high, arm = dice.between(0.4, 0.48), dice.between(0.95, 1.18), dice.between(0.55, 0.66)
     thick, foot = dice.between(0.09, 0.14), dice.between(0.08, 0.2)
     x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    run = (y[0], y[1] - thick + 0.02)
     parts = [
         cushion(dice, within(x, 0.03), (y[0] + 0.03, y[1]), (foot, seat - 0.08), 0.03),
         cushion(
-            dice,
-            (x[0] + thick - 0.02, x[1] - thick + 0.02),
-            (y[0], y[1] - thick + 0.02),
-            (seat - 0.1, seat),
-            0.04,
-            0.02,
+            dice, (x[0] + thick - 0.02, x[1] - thick + 0.02), run, (seat - 0.1, seat), 0.04, 0.02
         ),
     ]
     parts.append(cushion(dice, within(x, thick / 2), (y[1] - thick, y[1]), (foot, high), 0.05))
@@ -48,15 +44,8 @@ def wing(dice: Dice) -> list[Solid]:
         side = sorted((s * (width / 2 - thick), s * width / 2))
         span = (side[0], side[1])
         parts.append(cushion(dice, span, (y[0] + 0.04, y[1] - 0.02), (foot, arm), 0.04))
-        parts.append(
-            cushion(
-                dice,
-                span,
-                (y[1] - reach, y[1] - 0.02),
-                (arm - 0.06, high - dice.between(0.02, 0.12)),
-                0.045,
-            )
-        )
+        z = (arm - 0.06, high - dice.between(0.02, 0.12))
+        parts.append(cushion(dice, span, (y[1] - reach, y[1] - 0.02), z, 0.045))
     return parts + legs(dice, corners(x, y, 0.07), foot + 0.01, dice.between(0.04, 0.06))
 
 
@@ -92,21 +81,13 @@ def lounge(dice: Dice) -> list[Solid]:
     seat_pad = cushion(
         dice, (-inner, inner), (-depth / 2, depth / 2 - 0.05), (base, base + pad), 0.03, 0.01
     )
-    back = cushion(
-        dice,
-        (-inner, inner),
-        (depth / 2 - 0.05 - pad, depth / 2 - 0.05),
-        (base, base + dice.between(0.5, 0.7)),
-        0.035,
-    )
+    z = (base, base + dice.between(0.5, 0.7))
+    back = cushion(dice, (-inner, inner), (depth / 2 - 0.05 - pad, depth / 2 - 0.05), z, 0.035)
     pivot = (0.0, depth / 2 - 0.05, base)
     parts += [seat_pad.turn("x", -slope, pivot), back.turn("x", -lean, pivot)]
+    heights = (base - 0.02, base + 0.04)
     parts.append(
-        block(
-            (-inner - 0.01, inner + 0.01),
-            (depth / 2 - 0.09, depth / 2 - 0.03),
-            (base - 0.02, base + 0.04),
-        )
+        block((-inner - 0.01, inner + 0.01), (depth / 2 - 0.09, depth / 2 - 0.03), heights)
     )
     return parts
 

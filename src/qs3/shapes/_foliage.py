@@ -55,12 +55,8 @@ def potted(dice: Dice, radius: Number, tall: Number) -> tuple[list[Solid], float
             splay=0.02,
         )
     if dice.chance(0.15) and kind != "legs":
-        parts.append(
-            lathe(
-                [(foot * 1.1, 0.0), (foot * 1.4, 0.02), (foot * 1.3, 0.02), (foot * 0.9, 0.012)],
-                dice.sides,
-            )
-        )
+        section = [(foot * 1.1, 0.0), (foot * 1.4, 0.02), (foot * 1.3, 0.02), (foot * 0.9, 0.012)]
+        parts.append(lathe(section, dice.sides))
     return parts, earth
 
 

@@ -87,13 +87,8 @@ def carcass(
     if bottom:
         parts.append(block(within(x, board / 2), y, (z[0], z[0] + board)))
     if back:
-        parts.append(
-            block(
-                within(x, board / 2),
-                (y[1] - board / 2, y[1]),
-                (z[0] + board / 2 if bottom else z[0], z[1] - board / 2),
-            )
-        )
+        heights = (z[0] + board / 2 if bottom else z[0], z[1] - board / 2)
+        parts.append(block(within(x, board / 2), (y[1] - board / 2, y[1]), heights))
     return parts
 
 
@@ -107,13 +102,8 @@ def handle(dice: Dice, style: str, x: Number, y: Number, z: Number, upright: boo
     ends = [(0.0, -half), (0.0, half)] if upright else [(-half, 0.0), (half, 0.0)]
     if style == "plate":
         (ax, az), (bx, bz) = ends
-        return [
-            block(
-                (x + ax - 0.012, x + bx + 0.012),
-                (y - 0.025, y + 0.002),
-                (z + az - 0.012, z + bz + 0.012),
-            )
-        ]
+        heights = (z + az - 0.012, z + bz + 0.012)
+        return [block((x + ax - 0.012, x + bx + 0.012), (y - 0.025, y + 0.002), heights)]
     path = [
         (x + ends[0][0], y + 0.002, z + ends[0][1]),
         (x + ends[0][0], y - 0.03, z + ends[0][1]),

@@ -246,6 +246,12 @@ def sheet(grid: Float[np.ndarray, "r c 3"], thickness: Number) -> Solid:
     return loft(np.concatenate([grid + normal, (grid - normal)[:, ::-1]], axis=1), cap="zip")
 
 
+def curved_wall(plan: Float[np.ndarray, "n 2"], z: Span, thickness: Number) -> Solid:
+    """Upright wall of even thickness along a curve of the ground plane."""
+    rows = [at_height(plan, height) for height in np.linspace(*z, 3)]
+    return sheet(np.stack(rows, axis=1), thickness)
+
+
 def ribbon(
     path: Float[np.ndarray, "n 3"], across: Float[np.ndarray, "n 3"], thickness: Number
 ) -> Solid:

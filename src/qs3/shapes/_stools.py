@@ -25,15 +25,9 @@ def _stool_top(dice: Dice, width: Number, z: Number) -> list[Solid]:
     if kind == "square":
         return [block((-width / 2, width / 2), (-width / 2, width / 2), (z - thick, z))]
     if kind == "pad":
+        heights = (z - thick - 0.02, z)
         return [
-            cushion(
-                dice,
-                (-width / 2, width / 2),
-                (-width / 2, width / 2),
-                (z - thick - 0.02, z),
-                0.03,
-                0.01,
-            )
+            cushion(dice, (-width / 2, width / 2), (-width / 2, width / 2), heights, 0.03, 0.01)
         ]
     sides = 8 if kind == "low_poly" else max(16, dice.sides)
     return [slab(outline(width * 1.05, width * 1.05, sides, phase=0.5), (z - thick, z))]
@@ -66,25 +60,15 @@ def bar_stool(dice: Dice) -> list[Solid]:
     rung = dice.between(0.15, 0.35)
     if dice.chance(0.4):
         plate = dice.between(0.19, 0.25)
-        parts.append(
-            lathe(
-                [(plate, 0), (plate, 0.012), (0.04, 0.035), (0.028, 0.06), (0.028, high - 0.01)],
-                max(12, dice.sides),
-            )
-        )
+        profile = [(plate, 0), (plate, 0.012), (0.04, 0.035), (0.028, 0.06), (0.028, high - 0.01)]
+        parts.append(lathe(profile, max(12, dice.sides)))
         if dice.chance(0.6):
             ring = 0.15
-            parts.append(
-                tube(
-                    [
-                        (ring * np.cos(a), ring * np.sin(a), rung)
-                        for a in np.linspace(0, 2 * np.pi, 17)[:-1]
-                    ],
-                    0.011,
-                    6,
-                    closed=True,
-                )
-            )
+            path = [
+                (ring * np.cos(a), ring * np.sin(a), rung)
+                for a in np.linspace(0, 2 * np.pi, 17)[:-1]
+            ]
+            parts.append(tube(path, 0.011, 6, closed=True))
             parts.append(beam((-ring, 0, rung), (ring, 0, rung), 0.02, 0.015))
     else:
         leg = dice.between(0.025, 0.045) * dice.bulk**0.8
@@ -107,12 +91,8 @@ def bar_stool(dice: Dice) -> list[Solid]:
                 block(around(s * half, 0.012), around(half, 0.012), (high - 0.04, high + 0.25))
                 for s in (-1, 1)
             ]
-            parts += [
-                *back,
-                block(
-                    (-half - 0.012, half + 0.012), around(half, 0.014), (high + 0.14, high + 0.26)
-                ),
-            ]
+            z = (high + 0.14, high + 0.26)
+            parts += [*back, block((-half - 0.012, half + 0.012), around(half, 0.014), z)]
     return parts
 
 
@@ -141,11 +121,8 @@ def bench(dice: Dice) -> list[Solid]:
             )
         )
     if dice.chance(0.4):
-        parts.append(
-            cushion(
-                dice, within(x, 0.02), (y[0] + 0.02, y[1] - 0.04), (seat - 0.01, seat + 0.05), 0.02
-            )
-        )
+        z = (seat - 0.01, seat + 0.05)
+        parts.append(cushion(dice, within(x, 0.02), (y[0] + 0.02, y[1] - 0.04), z, 0.02))
     if dice.chance(0.65):
         back, tilt, rest = dice.between(0.32, 0.5), dice.between(0, 14), []
         for s in (-1, 1):

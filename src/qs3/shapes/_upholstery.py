@@ -39,13 +39,8 @@ def upholstered(dice: Dice, width: Number, seats: int, lean: Number | None = Non
         parts.append(cushion(dice, span, run, (base - 0.01, seat), max(soft, 0.02), plump))
         if loose:
             thick = dice.between(0.1, 0.18)
-            pad = cushion(
-                dice,
-                span,
-                (run[1] - thick, run[1] + 0.03),
-                (seat - 0.02, high + dice.between(-0.06, 0.05)),
-                max(soft, 0.03),
-            )
+            z = (seat - 0.02, high + dice.between(-0.06, 0.05))
+            pad = cushion(dice, span, (run[1] - thick, run[1] + 0.03), z, max(soft, 0.03))
             parts.append(pad.turn("x", -lean, (0, y[1], base)))
     if dice.chance(0.35):
         parts += _throw_pillows(dice, inner, run[1] - 0.18 * loose, seat)

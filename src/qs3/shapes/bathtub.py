@@ -108,13 +108,8 @@ def built_in(dice: Dice) -> list[Solid]:
         outer = [outer[0], outer[-1]]
     parts = [_tub(outer, inner, (length, width), (40.0, dice.pick(3.0, 5.0, 12.0, 40.0)), 64)]
     if dice.chance(0.2):
-        parts.append(
-            block(
-                (length / 2 - 0.03, length / 2),
-                (-width / 2, width / 2),
-                (high - 0.01, high + dice.between(0.2, 0.5)),
-            )
-        )
+        z = (high - 0.01, high + dice.between(0.2, 0.5))
+        parts.append(block((length / 2 - 0.03, length / 2), (-width / 2, width / 2), z))
     return parts + _maybe_tap(dice, length, high, rim=wall)
 
 

@@ -78,13 +78,8 @@ def boxspring(dice: Dice) -> list[Solid]:
         )
     over = dice.pick(0.0, 0.0, dice.between(0.05, 0.5))
     if dice.chance(0.9):
-        parts += headboard(
-            dice,
-            within(x, -over),
-            y[1] - 0.003,
-            (dice.pick(0.0, foot), foot + box + thick + dice.between(0.15, 0.8)),
-            0.05,
-        )
+        heights = (dice.pick(0.0, foot), foot + box + thick + dice.between(0.15, 0.8))
+        parts += headboard(dice, within(x, -over), y[1] - 0.003, heights, 0.05)
     if over > 0.35:
         for s in (-1, 1):
             near, far = s * (width / 2 - 0.01), s * (width / 2 + over)
@@ -167,13 +162,8 @@ def sled(dice: Dice) -> list[Solid]:
         )
         half = np.stack([np.full(9, width / 2 + 0.04), 0 * t, 0 * t], axis=1)
         parts.append(ribbon(path, half, board))
-        parts.append(
-            tube(
-                [(x[0] - 0.05, path[-1, 1], high), (x[1] + 0.05, path[-1, 1], high)],
-                dice.between(0.03, 0.06),
-                max(8, dice.sides),
-            )
-        )
+        line = [(x[0] - 0.05, path[-1, 1], high), (x[1] + 0.05, path[-1, 1], high)]
+        parts.append(tube(line, dice.between(0.03, 0.06), max(8, dice.sides)))
     for px in (x[0] - 0.035, x[1]):
         parts.append(block((px, px + 0.035), within(y, -0.03), (0.12, base + 0.05)))
     parts.append(block(within(x, -0.002), within(y, -0.03), (base - 0.05, base)))
@@ -203,14 +193,8 @@ def metal(dice: Dice) -> list[Solid]:
         for px in np.linspace(x[0], x[1], dice.count(4, 9))[1:-1]:
             parts.append(tube([(float(px), py, base), (float(px), py, high)], 0.5 * bar, 6))
         if dice.chance(0.3):
-            parts.append(
-                lathe(
-                    [(0.0, high), (0.03, high + 0.03), (0.0, high + 0.06)],
-                    8,
-                    x[0] + 0.4 * width,
-                    py,
-                ).move(0, 0, -0.015)
-            )
+            profile = [(0.0, high), (0.03, high + 0.03), (0.0, high + 0.06)]
+            parts.append(lathe(profile, 8, x[0] + 0.4 * width, py).move(0, 0, -0.015))
     for px in x:
         parts.append(tube([(px, y[0], base), (px, y[1], base)], bar, dice.sides))
     parts.append(block((x[0], x[1]), (y[0], y[1]), (base - 0.02, base + 0.01)))

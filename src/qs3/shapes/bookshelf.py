@@ -42,13 +42,9 @@ def _backed(dice: Dice, doors: bool) -> list[Solid]:
             continue
         for a, b in pairwise(bays):
             span = (float(a) + board / 2 + 0.005, float(b) - board / 2 - 0.005)
+            inner = (y[0] + 0.01, y[1] - board / 2)
             parts += _fill(
-                dice,
-                span,
-                (y[0] + 0.01, y[1] - board / 2),
-                float(level) + board,
-                float(levels[1] - levels[0]) - board,
-                share,
+                dice, span, inner, float(level) + board, float(levels[1] - levels[0]) - board, share
             )
     if doors:
         parts += fronts(
@@ -116,12 +112,9 @@ def ladder(dice: Dice) -> list[Solid]:
         parts.append(beam((px, -depth / 2, 0), (px, depth / 2 - bar, high), bar, bar))
         if rear:
             parts.append(beam((px, depth / 2, 0), (px, depth / 2, high), bar, bar))
+            heights = (high - 0.03, high)
             parts.append(
-                block(
-                    around(px, bar / 2),
-                    (depth / 2 - 1.6 * bar, depth / 2 + bar / 2),
-                    (high - 0.03, high),
-                )
+                block(around(px, bar / 2), (depth / 2 - 1.6 * bar, depth / 2 + bar / 2), heights)
             )
     share = dice.pick(0.0, dice.between(0.3, 1.0))
     levels = np.linspace(dice.between(0.12, 0.3), high - dice.between(0.05, 0.2), rows)
@@ -131,14 +124,8 @@ def ladder(dice: Dice) -> list[Solid]:
         span = (front, depth / 2)
         parts.append(block((-width / 2 + 0.002, width / 2 - 0.002), span, (z, z + board)))
         if span[1] - span[0] > 0.14 and z < levels[-1]:
-            parts += _fill(
-                dice,
-                (-width / 2 + bar, width / 2 - bar),
-                (span[0] + bar, span[1] - 0.02),
-                z + board,
-                0.3,
-                share,
-            )
+            inner = (span[0] + bar, span[1] - 0.02)
+            parts += _fill(dice, (-width / 2 + bar, width / 2 - bar), inner, z + board, 0.3, share)
     return parts
 
 
@@ -166,14 +153,8 @@ def corner(dice: Dice) -> list[Solid]:
     share = dice.pick(0.0, dice.between(0.3, 0.9))
     room = high / rows - board
     for level in np.linspace(0.0, high - board, rows + 1)[:-1]:
-        parts += _fill(
-            dice,
-            (depth + 0.02, run - board),
-            (-depth + 0.01, -board),
-            float(level) + board,
-            room,
-            share,
-        )
+        inner = (-depth + 0.01, -board)
+        parts += _fill(dice, (depth + 0.02, run - board), inner, float(level) + board, room, share)
     return parts + ends
 
 
@@ -198,13 +179,8 @@ def cubes(dice: Dice) -> list[Solid]:
             parts += carcass((a - board / 2, b + board / 2), y, (c, d + board), board, back)
             kind = dice.pick("open", "open", "open", "box")
             if kind == "box" and share > 0:
-                parts.append(
-                    block(
-                        (a + board / 2 + 0.01, b - board / 2 - 0.01),
-                        (y[0] + 0.01, y[1] - board),
-                        (c + board - 0.002, d - 0.04),
-                    )
-                )
+                x = (a + board / 2 + 0.01, b - board / 2 - 0.01)
+                parts.append(block(x, (y[0] + 0.01, y[1] - board), (c + board - 0.002, d - 0.04)))
             else:
                 parts += _fill(
                     dice,
@@ -255,13 +231,8 @@ def wall_board(dice: Dice) -> list[Solid]:
     if count > 1:
         for s in (-1, 1):
             px = s * (width / 2 - inset)
-            parts.append(
-                block(
-                    around(px, wide / 2),
-                    (y[1] - 0.02, y[1]),
-                    (0.0, drop + (count - 1) * step + 0.1),
-                )
-            )
+            heights = (0.0, drop + (count - 1) * step + 0.1)
+            parts.append(block(around(px, wide / 2), (y[1] - 0.02, y[1]), heights))
     return parts
 
 
@@ -275,11 +246,8 @@ def rack(dice: Dice) -> list[Solid]:
     for level in np.linspace(0.1, high - 0.08, rows):
         if dice.chance(0.3):
             for py in np.linspace(y[0] + 0.04, y[1] - 0.04, 4):
-                parts.append(
-                    block(
-                        within(x, board / 2), around(py, 0.015), (float(level), float(level) + 0.02)
-                    )
-                )
+                z = (float(level), float(level) + 0.02)
+                parts.append(block(within(x, board / 2), around(py, 0.015), z))
         else:
             shelf = block(
                 within(x, board / 2), within(y, 0.02), (float(level), float(level) + 0.8 * board)

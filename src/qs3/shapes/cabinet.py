@@ -25,21 +25,11 @@ def _body(dice: Dice, x: Span, y: Span, z: Span) -> tuple[list[Solid], Span]:
         )
     elif foot > 0:
         thick = min(dice.between(0.035, 0.06) * dice.bulk, 0.25 * (y[1] - y[0]))
-        parts += legs(
-            dice,
-            corners(x, y, thick / 2 + 0.005),
-            foot + 0.005,
-            thick,
-            dice.pick("square", "tapered", "cone", "square"),
-        )
+        style = dice.pick("square", "tapered", "cone", "square")
+        parts += legs(dice, corners(x, y, thick / 2 + 0.005), foot + 0.005, thick, style)
     if dice.chance(0.12):
-        parts.append(
-            block(
-                within(x, -over),
-                (y[1] - 0.02, y[1] + 0.3 * over),
-                (z[1] - 0.002, z[1] + dice.between(0.03, 0.12)),
-            )
-        )
+        heights = (z[1] - 0.002, z[1] + dice.between(0.03, 0.12))
+        parts.append(block(within(x, -over), (y[1] - 0.02, y[1] + 0.3 * over), heights))
     return parts, (z[0] + foot + 0.01, z[1] - top - 0.005)
 
 
@@ -73,24 +63,13 @@ def open_nightstand(dice: Dice) -> list[Solid]:
     x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
     over = dice.pick(0.0, 0.02)
     parts = [block(within(x, -over), within(y, -over), (high - thick, high))]
-    parts += legs(
-        dice,
-        corners(x, y, post / 2),
-        high - thick / 2,
-        post,
-        dice.pick("square", "square", "tapered"),
-    )
+    style = dice.pick("square", "square", "tapered")
+    parts += legs(dice, corners(x, y, post / 2), high - thick / 2, post, style)
     box = dice.between(0.3, 0.62) * high
     inner, front = within(x, post * 0.5), y[0] + 0.01
     parts.append(block(inner, (front, y[1] - 0.01), (high - thick - box, high - thick / 2)))
-    parts += fronts(
-        dice,
-        within(x, post),
-        (high - thick - box + 0.01, high - thick - 0.005),
-        front,
-        1,
-        dice.count(1, 2),
-    )
+    heights = (high - thick - box + 0.01, high - thick - 0.005)
+    parts += fronts(dice, within(x, post), heights, front, 1, dice.count(1, 2))
     if dice.chance(0.7):
         z = dice.between(0.06, 0.16)
         parts.append(block(inner, within(y, 0.2 * post), (z, z + thick)))
@@ -167,13 +146,9 @@ def tv_bench(dice: Dice) -> list[Solid]:
             parts.append(
                 block((a + 0.005, b - 0.005), within(y, 0.01), (foot + 0.005, high - 0.005))
             )
+            heights = (foot + board / 2, high - board / 2)
             parts += fronts(
-                dice,
-                (a + 0.005, b - 0.005),
-                (foot + board / 2, high - board / 2),
-                y[0] + 0.01,
-                1,
-                dice.pick(1, 1, 2),
+                dice, (a + 0.005, b - 0.005), heights, y[0] + 0.01, 1, dice.pick(1, 1, 2)
             )
         elif dice.chance(0.6):
             z = (foot + high) / 2
@@ -241,15 +216,8 @@ def hutch(dice: Dice) -> list[Solid]:
     x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
     parts, free = _body(dice, x, y, (0.0, low))
     drawers = dice.pick(0.0, 0.3) * (free[1] - free[0])
-    parts += fronts(
-        dice,
-        within(x, 0.01),
-        (free[0], free[1] - drawers),
-        y[0],
-        max(1, round(width / 0.45)),
-        1,
-        "door",
-    )
+    heights = (free[0], free[1] - drawers)
+    parts += fronts(dice, within(x, 0.01), heights, y[0], max(1, round(width / 0.45)), 1, "door")
     if drawers > 0:
         parts += fronts(
             dice, within(x, 0.01), (free[1] - drawers, free[1]), y[0], dice.count(1, 2), 1
@@ -263,12 +231,9 @@ def hutch(dice: Dice) -> list[Solid]:
             block(within(x, board / 2), (back[0] + 0.005, back[1] - 0.002), (z, z + board))
         )
         if dice.chance(0.3):
+            run = (back[0] + 0.02, back[1] - 0.03)
             parts += knick_knacks(
-                dice,
-                within(x, 0.05),
-                (back[0] + 0.02, back[1] - 0.03),
-                z + board,
-                0.6 * (high - low) / (rows + 1),
+                dice, within(x, 0.05), run, z + board, 0.6 * (high - low) / (rows + 1)
             )
     if dice.chance(0.3):
         parts.append(block(within(x, -0.02), (back[0] - 0.02, back[1]), (high - 0.01, high + 0.04)))

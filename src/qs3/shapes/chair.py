@@ -92,36 +92,17 @@ def four_legs(dice: Dice) -> list[Solid]:
         apron = dice.between(0.04, 0.08)
         inset = leg / 2
         for s in (-1, 1):
-            parts.append(
-                block(
-                    within(x, inset),
-                    around(s * (depth / 2 - leg / 2), 0.01),
-                    (seat - thick - apron, seat - 0.01),
-                )
-            )
-            parts.append(
-                block(
-                    around(s * (width / 2 - leg / 2), 0.01),
-                    within(y, inset),
-                    (seat - thick - apron, seat - 0.01),
-                )
-            )
+            heights = (seat - thick - apron, seat - 0.01)
+            parts.append(block(within(x, inset), around(s * (depth / 2 - leg / 2), 0.01), heights))
+            parts.append(block(around(s * (width / 2 - leg / 2), 0.01), within(y, inset), heights))
     if dice.chance(0.3) and splay == 0.0:
         height = dice.between(0.1, 0.25)
         for px, _ in spots[::2]:
             parts.append(beam((px, spots[0][1], height), (px, spots[1][1], height), 0.02, 0.02))
         parts.append(beam((spots[0][0], 0, height), (spots[2][0], 0, height), 0.02, 0.02))
     if dice.chance(0.4):
-        parts.append(
-            cushion(
-                dice,
-                within(x, 0.01),
-                (y[0] + 0.01, y[1] - 0.03),
-                (seat - 0.01, seat + dice.between(0.02, 0.07)),
-                0.025,
-                0.01,
-            )
-        )
+        z = (seat - 0.01, seat + dice.between(0.02, 0.07))
+        parts.append(cushion(dice, within(x, 0.01), (y[0] + 0.01, y[1] - 0.03), z, 0.025, 0.01))
     post = max(thick, 0.028)
     rest = _backrest(dice, width - post, y[1] - post / 2, (seat - thick, seat + back), post)
     tilt = dice.between(0, 14)
@@ -144,17 +125,13 @@ def _star_base(dice: Dice, height: Number) -> list[Solid]:
     """Star of four to six feet with a gas spring up to ``height``."""
     feet, reach, castor = dice.count(4, 6), dice.between(0.26, 0.34), dice.chance(0.7)
     level = 0.06 if castor else 0.02
-    parts = [
-        lathe(
-            [
-                (0.035, level - 0.015),
-                (0.035, level + 0.07),
-                (0.02, level + 0.08),
-                (0.02, height + 0.005),
-            ],
-            max(dice.sides, 8),
-        )
+    profile = [
+        (0.035, level - 0.015),
+        (0.035, level + 0.07),
+        (0.02, level + 0.08),
+        (0.02, height + 0.005),
     ]
+    parts = [lathe(profile, max(dice.sides, 8))]
     for i in range(feet):
         turn = 360 * i / feet + 18
         parts.append(
@@ -194,15 +171,8 @@ def swivel(dice: Dice) -> list[Solid]:
         ),
     ]
     if dice.chance(0.2):
-        rest.append(
-            cushion(
-                dice,
-                (-0.13, 0.13),
-                (y[1] - pad, y[1] + 0.01),
-                (seat + gap + tall - 0.01, seat + gap + tall + 0.14),
-                0.03,
-            )
-        )
+        z = (seat + gap + tall - 0.01, seat + gap + tall + 0.14)
+        rest.append(cushion(dice, (-0.13, 0.13), (y[1] - pad, y[1] + 0.01), z, 0.03))
     tilt = dice.between(0, 14)
     parts += [part.turn("x", -tilt, (0, y[1], seat)) for part in rest]
     parts.append(
@@ -212,23 +182,14 @@ def swivel(dice: Dice) -> list[Solid]:
         rise, run = dice.between(0.16, 0.24), dice.between(0.2, 0.3)
         for s in (-1, 1):
             out = s * (width / 2 + 0.02)
-            parts.append(
-                cushion(
-                    dice,
-                    around(out, 0.035),
-                    (-run / 2, run / 2),
-                    (seat + rise - 0.03, seat + rise),
-                    0.012,
-                )
-            )
-            path = bend(
-                [
-                    (s * (width / 2 - 0.08), 0, seat - thick / 2),
-                    (out, 0, seat - thick / 2),
-                    (out, 0, seat + rise - 0.01),
-                ],
-                0.05,
-            )
+            heights = (seat + rise - 0.03, seat + rise)
+            parts.append(cushion(dice, around(out, 0.035), (-run / 2, run / 2), heights, 0.012))
+            route = [
+                (s * (width / 2 - 0.08), 0, seat - thick / 2),
+                (out, 0, seat - thick / 2),
+                (out, 0, seat + rise - 0.01),
+            ]
+            path = bend(route, 0.05)
             parts.append(tube(path, 0.015 * dice.bulk**0.5, 6))
     return parts
 
@@ -259,11 +220,8 @@ def cantilever(dice: Dice) -> list[Solid]:
         parts.append(tube(bend(path, dice.between(0.04, 0.1)), bar, dice.sides))
     parts.append(tube([(-width / 2, r, bar), (width / 2, r, bar)], bar, dice.sides))
     thick = dice.between(0.02, 0.06)
-    parts.append(
-        cushion(
-            dice, (-width / 2, width / 2), (f, r - 0.02), (seat - 0.03, seat - 0.03 + thick), 0.015
-        )
-    )
+    z = (seat - 0.03, seat - 0.03 + thick)
+    parts.append(cushion(dice, (-width / 2, width / 2), (f, r - 0.02), z, 0.015))
     low = dice.between(0.0, 0.2)
     rest = cushion(
         dice,

@@ -108,12 +108,8 @@ def arc(dice: Dice) -> list[Solid]:
     foot = lathe(
         [(dice.between(0.16, 0.22), 0), (0.16, dice.between(0.03, 0.07))], max(12, dice.sides)
     )
-    return [
-        tube(path, bar, 8),
-        tube(np.stack([end, [end[0], 0, low - 0.02]]), bar * 0.8, 6),
-        shade.move(float(end[0])),
-        foot,
-    ]
+    line = np.stack([end, [end[0], 0, low - 0.02]])
+    return [tube(path, bar, 8), tube(line, bar * 0.8, 6), shade.move(float(end[0])), foot]
 
 
 def torchiere(dice: Dice) -> list[Solid]:
@@ -217,16 +213,13 @@ def desk_arm(dice: Dice) -> list[Solid]:
     parts = _foot(dice, dice.between(0.07, 0.12))
     if dice.chance(0.35):
         high = lower + 0.6 * upper
-        path = bend(
-            [
-                (0, 0, 0.01),
-                (0, 0, high),
-                (upper * 0.7, 0, high + 0.02),
-                (upper * 0.8, 0, high - 0.1),
-            ],
-            0.2,
-            8,
-        )
+        route = [
+            (0, 0, 0.01),
+            (0, 0, high),
+            (upper * 0.7, 0, high + 0.02),
+            (upper * 0.8, 0, high - 0.1),
+        ]
+        path = bend(route, 0.2, 8)
         end, tilt = path[-1], -15.0
         parts.append(tube(path, bar, 8))
     else:
@@ -268,11 +261,8 @@ def pendant(dice: Dice) -> list[Solid]:
     else:
         head, low = [lathe([(wide, -0.03), (wide, 0.0), (0.1 * wide, 0.04)], dice.sides)], 0.0
     rose = dice.between(0.04, 0.07)
-    return [
-        *head,
-        lathe([(0.005, low), (0.005, cord)], 6),
-        lathe([(rose * 0.6, cord - 0.02), (rose, cord), (rose, cord + 0.02)], max(8, dice.sides)),
-    ]
+    profile = [(rose * 0.6, cord - 0.02), (rose, cord), (rose, cord + 0.02)]
+    return [*head, lathe([(0.005, low), (0.005, cord)], 6), lathe(profile, max(8, dice.sides))]
 
 
 def ceiling(dice: Dice) -> list[Solid]:
@@ -288,12 +278,8 @@ def ceiling(dice: Dice) -> list[Solid]:
     e = dice.between(0.6, 1.6)
     profile = [(wide * np.cos(a) ** e, deep + deep * np.sin(a)) for a in angle]
     parts = [lathe([*profile, (wide, deep + 0.01), (0.6 * wide, deep + 0.02)], max(dice.sides, 8))]
-    parts.append(
-        lathe(
-            [(dice.between(0.4, 0.9) * wide, deep), (0.5 * wide, deep + dice.between(0.03, 0.12))],
-            dice.sides,
-        )
-    )
+    section = [(dice.between(0.4, 0.9) * wide, deep), (0.5 * wide, deep + dice.between(0.03, 0.12))]
+    parts.append(lathe(section, dice.sides))
     return parts
 
 

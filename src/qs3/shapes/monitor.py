@@ -11,6 +11,7 @@ from qs3.shapes._solids import (
     beam,
     bend,
     block,
+    curved_wall,
     cushion,
     lathe,
     loft,
@@ -95,13 +96,8 @@ def foot(dice: Dice) -> list[Solid]:
         (-neck / 2, neck / 2), (rear - 0.02, rear + 0.01), (plate * 0.5, lift + 0.55 * high)
     )
     parts = [*screen, *base, post]
-    parts.append(
-        block(
-            (-neck * 0.8, neck * 0.8),
-            (-0.01, rear + 0.005),
-            (lift + 0.25 * high, lift + 0.4 * high),
-        )
-    )
+    z = (lift + 0.25 * high, lift + 0.4 * high)
+    parts.append(block((-neck * 0.8, neck * 0.8), (-0.01, rear + 0.005), z))
     return parts
 
 
@@ -138,15 +134,10 @@ def curved(dice: Dice) -> list[Solid]:
         dice.between(1.0, 2.0),
     )
     a = np.linspace(-0.5, 0.5, 13) * width / radius
-    grid = np.stack(
-        [
-            np.stack([radius * np.sin(a), radius * (np.cos(a) - 1), np.full(13, z)], axis=1)
-            for z in np.linspace(lift, lift + high, 3)
-        ]
-    )
+    plan = np.stack([radius * np.sin(a), radius * (np.cos(a) - 1)], axis=1)
     deep, wide = dice.between(0.18, 0.28), width * dice.between(0.25, 0.5)
     parts = [
-        sheet(grid.swapaxes(0, 1), thick),
+        curved_wall(plan, (lift, lift + high), thick),
         block((-0.05, 0.05), (0.0, 0.05), (0.005, lift + 0.55 * high)),
     ]
     for s in (-1, 1):
@@ -185,12 +176,9 @@ def tube_set(dice: Dice) -> list[Solid]:
             for s, yy in ((1.0, front[1] - 0.003), (shrink, deep / 2))
         ]
         parts.append(loft(np.stack(rings)))
+        heights = (0.0, foot + 0.5 * high)
         parts.append(
-            block(
-                (-0.2 * width, 0.2 * width),
-                (front[1] - 0.01, deep / 2 - 0.01),
-                (0.0, foot + 0.5 * high),
-            )
+            block((-0.2 * width, 0.2 * width), (front[1] - 0.01, deep / 2 - 0.01), heights)
         )
     if foot > 0:
         if dice.chance(0.5):
@@ -208,16 +196,11 @@ def tube_set(dice: Dice) -> list[Solid]:
             ]
     if dice.chance(0.15):
         for s in (-1, 1):
-            parts.append(
-                tube(
-                    [
-                        (0, 0.5 * (front[0] + front[1]), z[1] - 0.01),
-                        (s * 0.5 * width, front[1] - 0.03, z[1] + 0.6 * high),
-                    ],
-                    0.005,
-                    6,
-                )
-            )
+            path = [
+                (0, 0.5 * (front[0] + front[1]), z[1] - 0.01),
+                (s * 0.5 * width, front[1] - 0.03, z[1] + 0.6 * high),
+            ]
+            parts.append(tube(path, 0.005, 6))
     return parts
 
 
@@ -234,14 +217,12 @@ def all_in_one(dice: Dice) -> list[Solid]:
     ]
     deep, half, sheet_thick = dice.between(0.16, 0.24), dice.between(0.07, 0.12), 0.008
     lean = np.tan(np.radians(tilt))
-    path = bend(
-        [
-            (0, -deep / 2, sheet_thick / 2),
-            (0, deep / 2 + 0.05, sheet_thick / 2),
-            (0, 0.4 * (lift + high * 0.4) * lean + thick * 0.4, lift + 0.4 * high),
-        ],
-        0.03,
-    )
+    route = [
+        (0, -deep / 2, sheet_thick / 2),
+        (0, deep / 2 + 0.05, sheet_thick / 2),
+        (0, 0.4 * (lift + high * 0.4) * lean + thick * 0.4, lift + 0.4 * high),
+    ]
+    path = bend(route, 0.03)
     wide = np.stack([np.full(3, -half), np.zeros(3), np.zeros(3)], axis=1)[:1]
     grid = np.stack([path + s * wide for s in (-1, 0, 1)], axis=1)
     parts.append(sheet(grid, sheet_thick))
@@ -290,13 +271,10 @@ def wall(dice: Dice) -> list[Solid]:
     half = min(0.25 * high, 0.12)
     z = 0.5 * high
     parts = _screen(dice, width, high, 0.0, thick)
+    heights = around(z, 1.2 * half)
     parts += [
         block((-half, half), (thick / 2 - 0.003, thick / 2 + 0.015), around(z, half)),
-        block(
-            (-0.6 * half, 0.6 * half),
-            (thick / 2 + deep - 0.015, thick / 2 + deep),
-            around(z, 1.2 * half),
-        ),
+        block((-0.6 * half, 0.6 * half), (thick / 2 + deep - 0.015, thick / 2 + deep), heights),
         block((-0.025, 0.025), (thick / 2, thick / 2 + deep - 0.002), around(z, 0.03)),
     ]
     return parts

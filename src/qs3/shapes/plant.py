@@ -24,16 +24,8 @@ def broad_leaf(dice: Dice) -> list[Solid]:
         ]
         parts.append(tube(stalk, 0.005, 5))
         size = dice.between(0.12, 0.3) * (0.5 + high)
-        parts.append(
-            leaf(
-                tip,
-                a,
-                dice.between(10, 60),
-                size,
-                size * dice.between(0.4, 0.7),
-                dice.between(30, 110),
-            )
-        )
+        rise, wide = dice.between(10, 60), size * dice.between(0.4, 0.7)
+        parts.append(leaf(tip, a, rise, size, wide, dice.between(30, 110)))
     return parts
 
 
@@ -102,13 +94,8 @@ def tree(dice: Dice) -> list[Solid]:
     high, size = dice.between(0.3, 1.1), dice.between(0.14, 0.36)
     lean = dice.between(-0.08, 0.08)
     head = (lean, 0.0, earth + high)
-    parts.append(
-        tube(
-            [(0, 0, earth - 0.02), (-0.4 * lean, 0.02, earth + 0.5 * high), head],
-            [0.02, 0.016, 0.012],
-            7,
-        )
-    )
+    path = [(0, 0, earth - 0.02), (-0.4 * lean, 0.02, earth + 0.5 * high), head]
+    parts.append(tube(path, [0.02, 0.016, 0.012], 7))
     return parts + crown(dice, head, size, smooth=dice.chance(0.5))
 
 
@@ -118,46 +105,24 @@ def palm(dice: Dice) -> list[Solid]:
     parts, earth = potted(dice, pot, tall)
     high, count = dice.pick(0.02, dice.between(0.2, 0.9)), dice.count(7, 14)
     head = (0.0, 0.0, earth + high)
-    parts.append(
-        lathe(
-            [(0.03, earth - 0.02), (0.022, earth + 0.5 * high), (0.03, earth + high + 0.01)],
-            max(6, dice.sides // 2),
-        )
-    )
+    profile = [(0.03, earth - 0.02), (0.022, earth + 0.5 * high), (0.03, earth + high + 0.01)]
+    parts.append(lathe(profile, max(6, dice.sides // 2)))
     long = dice.between(0.35, 0.75)
     feathered = dice.chance(0.5)
     for i in range(count):
         a, rise = 360 * i / count + dice.between(-12, 12), dice.between(35, 80)
         droop = dice.between(60, 130)
-        parts.append(
-            leaf(
-                head,
-                a,
-                rise,
-                long,
-                long * (0.05 if feathered else dice.between(0.1, 0.22)),
-                droop,
-                0.006,
-            )
-        )
+        wide = long * (0.05 if feathered else dice.between(0.1, 0.22))
+        parts.append(leaf(head, a, rise, long, wide, droop, 0.006))
         if feathered:
             t = np.radians(rise - droop * np.arange(1, 7) / 6)
             out, up = np.cumsum(long / 6 * np.cos(t)), np.cumsum(long / 6 * np.sin(t))
             c, s = np.cos(np.radians(a)), np.sin(np.radians(a))
             for j in range(1, 6):
                 spot = (float(out[j] * c), float(out[j] * s), head[2] + float(up[j]))
-                for side in (-1, 1):
-                    parts.append(
-                        leaf(
-                            spot,
-                            a + side * 60,
-                            float(np.degrees(t[j])) + 5,
-                            long * 0.28,
-                            0.025,
-                            40,
-                            0.005,
-                        )
-                    )
+                slope = float(np.degrees(t[j])) + 5
+                for turn in (a - 60, a + 60):
+                    parts.append(leaf(spot, turn, slope, long * 0.28, 0.025, 40, 0.005))
     return parts
 
 
@@ -168,12 +133,8 @@ def bush(dice: Dice) -> list[Solid]:
     size = pot * dice.between(1.0, 1.7)
     if dice.chance(0.25):
         high = size * dice.between(2.0, 4.0)
-        parts.append(
-            lathe(
-                [(0.6 * size, earth - 0.01), (size, earth + 0.15 * high), (0.0, earth + high)],
-                dice.sides,
-            )
-        )
+        profile = [(0.6 * size, earth - 0.01), (size, earth + 0.15 * high), (0.0, earth + high)]
+        parts.append(lathe(profile, dice.sides))
         return parts
     middle = earth + 0.75 * size
     parts.append(tube([(0, 0, earth - 0.01), (0, 0, middle)], 0.012, 6))
@@ -190,17 +151,8 @@ def sword(dice: Dice) -> list[Solid]:
         off = pot * dice.between(0.0, 0.45)
         start = (off * np.cos(np.radians(a)), off * np.sin(np.radians(a)), earth - 0.01)
         long = high * dice.between(0.55, 1.0)
-        parts.append(
-            leaf(
-                start,
-                a,
-                dice.between(68, 88),
-                long,
-                dice.between(0.03, 0.08) * (0.5 + high),
-                dice.between(-8, 12),
-                0.006,
-            )
-        )
+        rise, wide = dice.between(68, 88), dice.between(0.03, 0.08) * (0.5 + high)
+        parts.append(leaf(start, a, rise, long, wide, dice.between(-8, 12), 0.006))
     return parts
 
 
@@ -214,16 +166,8 @@ def grass(dice: Dice) -> list[Solid]:
         off = pot * dice.between(0.0, 0.5)
         start = (off * np.cos(np.radians(a)), off * np.sin(np.radians(a)), earth - 0.008)
         droop = dice.between(0, 25) if stiff else dice.between(40, 130)
-        parts.append(
-            leaf(
-                start,
-                a,
-                dice.between(25, 88),
-                high * dice.between(0.6, 1.0),
-                dice.between(0.012, 0.03),
-                droop,
-            )
-        )
+        rise, long = dice.between(25, 88), high * dice.between(0.6, 1.0)
+        parts.append(leaf(start, a, rise, long, dice.between(0.012, 0.03), droop))
     return parts
 
 
@@ -252,13 +196,8 @@ def trailing(dice: Dice) -> list[Solid]:
         top = earth + dice.between(0.4, 0.7)
         for k in range(3):
             a = np.radians(120 * k + 30)
-            parts.append(
-                tube(
-                    [(0.7 * pot * np.cos(a), 0.7 * pot * np.sin(a), earth - 0.01), (0, 0, top)],
-                    0.004,
-                    5,
-                )
-            )
+            line = [(0.7 * pot * np.cos(a), 0.7 * pot * np.sin(a), earth - 0.01), (0, 0, top)]
+            parts.append(tube(line, 0.004, 5))
     return parts
 
 

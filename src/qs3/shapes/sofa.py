@@ -13,8 +13,8 @@ from qs3.shapes._solids import (
     around,
     beam,
     block,
+    curved_wall,
     cushion,
-    sheet,
     tube,
     within,
 )
@@ -158,15 +158,9 @@ def chesterfield(dice: Dice) -> list[Solid]:
     parts.append(tube([(x[0], cy, high - r), (x[1], cy, high - r)], r, max(10, dice.sides)))
     edges = np.linspace(x[0] + wall - 0.01, x[1] - wall + 0.01, dice.count(2, 3) + 1)
     for a, b in pairwise(edges):
+        z = (seat - 0.13, seat)
         parts.append(
-            cushion(
-                dice,
-                (float(a), float(b) - 0.003),
-                (y[0], y[1] - wall + 0.01),
-                (seat - 0.13, seat),
-                0.04,
-                0.02,
-            )
+            cushion(dice, (float(a), float(b) - 0.003), (y[0], y[1] - wall + 0.01), z, 0.04, 0.02)
         )
     return parts + legs(dice, corners(x, y, 0.09), foot + 0.01, 0.06)
 
@@ -184,24 +178,15 @@ def slab(dice: Dice) -> list[Solid]:
         parts.append(block((x[0], x[0] + wall) if s < 0 else (x[1] - wall, x[1]), y, (foot, arm)))
     edges = np.linspace(x[0] + wall if -1 in sides else x[0], x[1] - wall, dice.count(1, 3) + 1)
     for a, b in pairwise(edges):
+        z = (foot + 0.05, seat)
         parts.append(
-            cushion(
-                dice,
-                (float(a), float(b) - 0.004),
-                (y[0], y[1] - wall + 0.003),
-                (foot + 0.05, seat),
-                0.025,
-                0.01,
-            )
+            cushion(dice, (float(a), float(b) - 0.004), (y[0], y[1] - wall + 0.003), z, 0.025, 0.01)
         )
         if dice.chance(0.5):
+            run = (y[1] - wall - 0.13, y[1] - wall + 0.01)
             parts.append(
                 cushion(
-                    dice,
-                    (float(a) + 0.02, float(b) - 0.02),
-                    (y[1] - wall - 0.13, y[1] - wall + 0.01),
-                    (seat - 0.02, high + 0.06),
-                    0.04,
+                    dice, (float(a) + 0.02, float(b) - 0.02), run, (seat - 0.02, high + 0.06), 0.04
                 )
             )
     if dice.chance(0.3):
@@ -224,18 +209,10 @@ def curved(dice: Dice) -> list[Solid]:
     depth, seat, foot = dice.between(0.75, 0.95), dice.between(0.38, 0.46), dice.pick(0.0, 0.1)
     back, high = dice.between(0.14, 0.24), dice.between(0.7, 0.85)
     angle = np.radians(np.linspace(90 - sweep, 90 + sweep, 17))
-
-    def arc(radius: Number, z: Span, thick: Number) -> Solid:
-        grid = np.stack(
-            [
-                np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(17, h)], axis=1)
-                for h in np.linspace(*z, 3)
-            ]
-        )
-        return sheet(grid.swapaxes(0, 1), thick)
-
+    arc = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     middle = outer - depth / 2
-    parts = [arc(middle, (foot, seat), depth), arc(outer - back / 2, (foot, high), back)]
+    rest = curved_wall((outer - back / 2) * arc, (foot, high), back)
+    parts = [curved_wall(middle * arc, (foot, seat), depth), rest]
     if foot > 0:
         spots = [
             (radius * np.cos(a), radius * np.sin(a))

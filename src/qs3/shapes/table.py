@@ -121,30 +121,22 @@ def pedestal(dice: Dice) -> list[Solid]:
             block((-r, r), (-r, r), (0.01, height - thick / 2)),
         ]
     elif foot == "plate":
-        parts.append(
-            lathe(
-                [
-                    (reach, 0),
-                    (reach, 0.02 * dice.bulk),
-                    (r, 0.04 * dice.bulk),
-                    (r, height - thick / 2),
-                ],
-                dice.sides,
-            )
-        )
+        profile = [
+            (reach, 0),
+            (reach, 0.02 * dice.bulk),
+            (r, 0.04 * dice.bulk),
+            (r, height - thick / 2),
+        ]
+        parts.append(lathe(profile, dice.sides))
     else:
         waist = dice.between(0.25, 0.7)
-        parts.append(
-            lathe(
-                [
-                    (reach, 0),
-                    (r, waist * height),
-                    (r, 0.8 * height),
-                    (min(reach, 0.3 * width), height - thick / 2),
-                ],
-                dice.sides,
-            )
-        )
+        section = [
+            (reach, 0),
+            (r, waist * height),
+            (r, 0.8 * height),
+            (min(reach, 0.3 * width), height - thick / 2),
+        ]
+        parts.append(lathe(section, dice.sides))
     return parts
 
 
@@ -175,13 +167,8 @@ def trestle(dice: Dice) -> list[Solid]:
                         bar,
                     )
                 )
-            parts.append(
-                block(
-                    around(x, bar / 2),
-                    (-half * 0.9, half * 0.9),
-                    (under - bar * 0.7, under + 0.003),
-                )
-            )
+            heights = (under - bar * 0.7, under + 0.003)
+            parts.append(block(around(x, bar / 2), (-half * 0.9, half * 0.9), heights))
             z = under * (0.5 if style == "X" else dice.between(0.3, 0.5))
             run = 0.04 if style == "X" else half + (spread - half) * z / under
             parts.append(block(around(x, bar / 2), (-run, run), around(z, bar / 2)))
@@ -248,12 +235,8 @@ def coffee(dice: Dice) -> list[Solid]:
             block((spots[0][0], spots[2][0]), (spots[0][1], spots[1][1]), (z, z + 0.7 * thick))
         )
     else:
-        parts += _apron(
-            (spots[0][0], spots[2][0]),
-            (spots[0][1], spots[1][1]),
-            (height - thick - 0.07, height - thick / 2),
-            0.03,
-        )
+        heights = (height - thick - 0.07, height - thick / 2)
+        parts += _apron((spots[0][0], spots[2][0]), (spots[0][1], spots[1][1]), heights, 0.03)
     return parts
 
 
@@ -301,12 +284,9 @@ def panel(dice: Dice) -> list[Solid]:
             for s in (-1, 1)
         ]
         if dice.chance(0.5):
+            z = (dice.between(0.0, 0.6) * height, height - thick / 2)
             parts.append(
-                block(
-                    (x[0] + inset + thick / 2, x[1] - inset - thick / 2),
-                    (-0.015, 0.015),
-                    (dice.between(0.0, 0.6) * height, height - thick / 2),
-                )
+                block((x[0] + inset + thick / 2, x[1] - inset - thick / 2), (-0.015, 0.015), z)
             )
         return parts
     bar = dice.between(0.012, 0.03) * dice.bulk**0.5

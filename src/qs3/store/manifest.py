@@ -1,6 +1,7 @@
 """What lies beside the shards: ``dataset.json``, ``SHA256SUMS`` and ``meshes.json``."""
 
 import concurrent.futures
+import dataclasses
 import hashlib
 import json
 import platform
@@ -22,6 +23,8 @@ MESHES = "meshes.json"
 SCHEMA_VERSION = 3
 _READABLE = (1, 2, 3)  # 2 has the column `drawn`; 3 checksums, half precision, unknown row counts
 _LARGEST = 10**9  # rows and shards; what is planned is counted through
+
+_FORMER_SENSORS = {"qs3": "paper"}
 
 _PACKAGES = (
     "qs3",
@@ -142,7 +145,16 @@ def open_dataset(where: str | Path | Folder) -> Manifest:
         raise InputError(
             f"{path}: schema {schema}, this version reads up to {SCHEMA_VERSION}; make it again"
         )
-    return structure(value, Manifest, path)
+    return _renamed(structure(value, Manifest, path))
+
+
+def _renamed(manifest: Manifest) -> Manifest:
+    """Call what earlier versions recorded by its name of today."""
+    sensor = manifest.settings.get("sensor")
+    if not isinstance(sensor, Mapping) or sensor.get("name") not in _FORMER_SENSORS:
+        return manifest
+    sensor = {**sensor, "name": _FORMER_SENSORS[sensor["name"]]}
+    return dataclasses.replace(manifest, settings={**manifest.settings, "sensor": sensor})
 
 
 def shard_name(index: int) -> str:

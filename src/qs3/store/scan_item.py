@@ -174,5 +174,5 @@ def _split(item: Item, settings: GenerateSettings) -> str:
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
-    measured = [value for value in values if value is not None]
-    return float(np.mean(measured)) if measured else None
+    numbers = [value for value in values if value is not None]
+    return float(np.mean(numbers)) if numbers else None
