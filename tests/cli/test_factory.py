@@ -8,7 +8,7 @@ import pytest
 def few(quick):
     """The flags of a data set of four scans in two shards."""
     return ("--classes", "chair", "sofa", "--per-class", 2, "--rows-per-shard", 2,
-            "--num-points", 64, "--meshes", "shapes", *quick)  # fmt: skip
+            "--num-points", 64, "--meshes", "shapes", "--workers", 0, *quick)  # fmt: skip
 
 
 @pytest.fixture
