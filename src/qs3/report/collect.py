@@ -9,7 +9,7 @@ from qs3.errors import InputError, QS3Error
 from qs3.evaluation.environment import versions
 from qs3.evaluation.records import DataRecord, RunRecord, find_records
 from qs3.io.clouds import PointClouds, digests
-from qs3.io.transforms import unit_ball
+from qs3.io.preparation import unit_ball
 from qs3.report import parts
 from qs3.report.contents import Report, Scored
 from qs3.report.lines import NamedRecord, score_lines
