@@ -28,7 +28,7 @@ from pathlib import Path
 import torch
 
 from qs3.adaptation import PseudoLabelled, list_methods
-from qs3.adaptation.chamfer import chamfer
+from qs3.adaptation.defrec import chamfer
 from qs3.adaptation.method import Batch
 from qs3.evaluation import hardware, versions
 from qs3.experiments.cost import Step

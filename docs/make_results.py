@@ -11,6 +11,7 @@ import shutil
 from pathlib import Path
 
 from qs3.experiments.paper import EXPERIMENTS, PaperTable
+
 from qs3.experiments.setup import MARKER, read_setup
 from qs3.files import write_bytes, write_text
 

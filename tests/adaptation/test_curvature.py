@@ -23,37 +23,39 @@ def turned_plane(rng, n=200):
 
 def test_plane(rng):
     plane, normal = turned_plane(rng)
-    found = surface(plane)
-    assert float(found.curvature.max()) < 1e-14
-    torch.testing.assert_close((found.normals[0] @ normal).abs(), torch.ones(200).double())
+    estimate = surface(plane)
+    assert float(estimate.curvature.max()) < 1e-14
+    torch.testing.assert_close((estimate.normals[0] @ normal).abs(), torch.ones(200).double())
 
 
 def test_plane_in_single_precision_far_away(rng):
     plane, normal = turned_plane(rng)
-    found = surface((plane + 10).float())
-    assert found.normals.dtype == torch.float32
-    assert float(found.curvature.max()) < 1e-10
-    assert float((found.normals[0].double() @ normal).abs().min()) > 1 - 1e-6
+    estimate = surface((plane + 10).float())
+    assert estimate.normals.dtype == torch.float32
+    assert float(estimate.curvature.max()) < 1e-10
+    assert float((estimate.normals[0].double() @ normal).abs().min()) > 1 - 1e-6
 
 
 def test_sphere_has_outward_normals_and_even_curvature(rng):
     points = sphere(rng, 3000)
-    found = surface(points)
-    cosine = (found.normals * points).sum(dim=2)
+    estimate = surface(points)
+    cosine = (estimate.normals * points).sum(dim=2)
     assert float(cosine.min()) > 0.97
     # A cap that holds the share s of a sphere, s = 32/3000: z is even over a height of 2 s.
     height = 2 * 32 / 3000
     expected = (height**2 / 12) / (height**2 / 12 + height - height**2 / 3)
-    assert float(found.curvature.median()) == pytest.approx(expected, rel=0.25)
+    assert float(estimate.curvature.median()) == pytest.approx(expected, rel=0.25)
     # Scale does not matter; a smaller share of a sphere is flatter.
-    torch.testing.assert_close(surface(7 * points).curvature, found.curvature)
+    torch.testing.assert_close(surface(7 * points).curvature, estimate.curvature)
     assert float(surface(points, 8).curvature.median()) < 0.5 * expected
 
 
 def test_against_a_loop(rng):
     points = torch.from_numpy(rng.normal(size=(2, 60, 3)))
-    found = surface(points, 12)
-    for cloud, normals, shares in zip(points.numpy(), *map(torch.Tensor.numpy, found), strict=True):
+    estimate = surface(points, 12)
+    for cloud, normals, shares in zip(
+        points.numpy(), *map(torch.Tensor.numpy, estimate), strict=True
+    ):
         for i, point in enumerate(cloud):
             near = cloud[np.argsort(((cloud - point) ** 2).sum(axis=1))[:12]]
             values, vectors = np.linalg.eigh(np.cov(near.T))
@@ -85,42 +87,42 @@ def test_closed_form_against_the_iterative_one(rng):
 
 @pytest.mark.parametrize("n", [1, 2, 3, 7])
 def test_few_points(rng, n):
-    found = surface(torch.from_numpy(rng.normal(size=(2, n, 3))))
-    torch.testing.assert_close(found.normals.norm(dim=2), torch.ones(2, n).double())
-    assert torch.isfinite(found.curvature).all()
+    estimate = surface(torch.from_numpy(rng.normal(size=(2, n, 3))))
+    torch.testing.assert_close(estimate.normals.norm(dim=2), torch.ones(2, n).double())
+    assert torch.isfinite(estimate.curvature).all()
     if n <= 3:
-        assert float(found.curvature.max()) < 1e-12
+        assert float(estimate.curvature.max()) < 1e-12
 
 
 @pytest.mark.parametrize("direction", [[1 / 3, 2 / 3, -2 / 3], [0.0, 1.0, 0.0]])
 def test_line(rng, direction):
     direction = torch.tensor(direction, dtype=torch.float64)
     line = torch.from_numpy(rng.normal(size=50))[:, None] * direction
-    found = surface(line[None])
-    assert not found.curvature.any()
-    assert float((found.normals @ direction).abs().max()) < 1e-6
-    torch.testing.assert_close(found.normals.norm(dim=2), torch.ones(1, 50).double())
+    estimate = surface(line[None])
+    assert not estimate.curvature.any()
+    assert float((estimate.normals @ direction).abs().max()) < 1e-6
+    torch.testing.assert_close(estimate.normals.norm(dim=2), torch.ones(1, 50).double())
 
 
 def test_all_points_equal():
-    found = surface(torch.full((2, 40, 3), 0.3))
-    assert not found.curvature.any()
-    assert torch.equal(found.normals.abs(), torch.tensor([0.0, 0, 1]).expand(2, 40, 3))
+    estimate = surface(torch.full((2, 40, 3), 0.3))
+    assert not estimate.curvature.any()
+    assert torch.equal(estimate.normals.abs(), torch.tensor([0.0, 0, 1]).expand(2, 40, 3))
 
 
 def test_all_eigenvalues_equal():
     corners = torch.cartesian_prod(*3 * [torch.tensor([-1.0, 1.0])])[None]
-    found = surface(corners)
-    torch.testing.assert_close(found.curvature, torch.full((1, 8), 1 / 3))
-    assert torch.equal(found.normals[0, :, 2], corners[0, :, 2])
+    estimate = surface(corners)
+    torch.testing.assert_close(estimate.curvature, torch.full((1, 8), 1 / 3))
+    assert torch.equal(estimate.normals[0, :, 2], corners[0, :, 2])
 
 
 def test_blocks_do_not_change_it(rng, monkeypatch):
     points = torch.from_numpy(rng.normal(size=(3, 50, 3))).float()
     whole = surface(points)
     monkeypatch.setattr(module, "_BLOCK", 3 * 32 * 7)
-    for one, other in zip(surface(points), whole, strict=True):
-        assert torch.equal(one, other)
+    for part, same in zip(surface(points), whole, strict=True):
+        assert torch.equal(part, same)
 
 
 def test_settings_are_checked():

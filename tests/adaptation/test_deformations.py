@@ -8,7 +8,6 @@ from qs3.adaptation.deformations import (
     DEFORMATIONS,
     cell_centres,
     cells,
-    deform_cells,
     deform_features,
     deform_radius,
     deform_split,
@@ -130,12 +129,6 @@ def test_voxels_collapse_one_whole_cell_to_its_centre():
         z = (out[mask] - cell_centres()[cell]) / SIGMA
         assert float(z.mean().abs()) < 5 / z.numel() ** 0.5
         assert float(z.std()) == pytest.approx(1, abs=5 / (2 * z.numel()) ** 0.5)
-
-
-def test_a_given_cell_collapses():
-    points = ball(2, 500)
-    moved = deform_cells(points, torch.tensor([13, 4]), seeded()).moved
-    assert torch.equal(moved, cells(points) == torch.tensor([[13], [4]]))
 
 
 def test_radius_collapses_a_ball_to_its_seed():

@@ -1,18 +1,18 @@
 """DefRec: what is rebuilt, what it costs, and that a network can learn it; alone and with PCM."""
 
+from typing import get_args
+
 import pytest
 import torch
 from scipy.spatial import cKDTree
 
 from qs3.adaptation import Batch
-from qs3.adaptation.deformations import deform_features, deform_voxels
+from qs3.adaptation.deformations import Deformation, deform_features, deform_voxels
 from qs3.adaptation.defrec import DefRec, ReconstructionHead, reconstruction_loss
 from qs3.adaptation.method import cross_entropy
 from qs3.adaptation.pcm import PCM, DefRecPCM, mix_clouds, mixed_cross_entropy
-from qs3.errors import InputError
 from qs3.models import Features, create_model
 
-KINDS = ["voxels", "radius", "features", "split", "gradient", "lambertian"]
 both = pytest.mark.parametrize("method_class", [DefRec, DefRecPCM])
 
 
@@ -41,8 +41,8 @@ def test_loss_is_twenty_times_chamfer_over_moved_points(rng):
     total = 0.0
     for p, o, mask in zip(predicted, original, moved, strict=True):
         p, o = p[mask].numpy(), o[mask].numpy()
-        there, back = cKDTree(o).query(p)[0], cKDTree(p).query(o)[0]
-        total += (there**2).mean() + (back**2).mean()
+        forth, back = cKDTree(o).query(p)[0], cKDTree(p).query(o)[0]
+        total += (forth**2).mean() + (back**2).mean()
     assert float(reconstruction_loss(predicted, original, moved)) == pytest.approx(20 * total / 3)
 
 
@@ -52,12 +52,12 @@ def test_head_is_that_of_joined_features():
     head = ReconstructionHead(5, 7, 0.0).eval()
     features = Features(pooled=torch.randn(2, 7), local=torch.randn(2, 9, 5))
     moved = torch.rand(2, 9, generator=seeded()) < 0.5
-    found = head(features, moved)
+    places = head(features, moved)
     assert features.local is not None
     joined = torch.cat([features.local, features.pooled[:, None].expand(-1, 9, -1)], dim=2)
     weight = torch.cat([head.local.weight, head.pooled.weight], dim=1)
     expected = head.layers((joined @ weight.t()).flatten(0, 1)).view(2, 9, 3)
-    torch.testing.assert_close(found, expected * moved[:, :, None], atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(places, expected * moved[:, :, None], atol=1e-6, rtol=1e-5)
     assert [layer.out_features for layer in head.modules() if isinstance(layer, torch.nn.Linear)][
         1:
     ] == [256, 256, 128, 3]
@@ -95,31 +95,6 @@ def test_on_source_adds_a_term(method_class):
     names = set(method(make_batch(), make_target(), 0.0, seeded()))
     assert names - {"source", "pcm"} == {"defrec_source", "defrec_target"}
     assert method_class.uses_target and method_class.needs_local
-
-
-@both
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("sizes", [(4, 60, 3, 50), (2, 3, 4, 2), (2, 70, 2, 20)])
-def test_every_deformation_trains_every_parameter(method_class, kind, sizes):
-    b, n, b_t, n_t = sizes
-    method = method_class(make_model("dgcnn"), deformation=kind, on_source=True)
-    batch, target = make_batch(b, n), make_target(b_t, n_t)
-    if n_t == 20:
-        target[:] = 0.25
-        batch.points[:] = -0.5
-    sum(method(batch, target, 0.0, seeded()).values()).backward()
-    for parameter in method.parameters():
-        assert parameter.grad is not None
-        assert torch.isfinite(parameter.grad).all()
-
-
-@both
-def test_the_generator_alone_decides(method_class):
-    method = method_class(make_model(), dropout=0.0).eval()
-    batch, target = make_batch(), make_target()
-    first, again, other = (method(batch, target, 0.0, seeded(s)) for s in (1, 1, 2))
-    torch.testing.assert_close(first, again, rtol=0, atol=0)
-    assert first["defrec_target"] != other["defrec_target"]
 
 
 def test_only_the_deformed_cloud_enters_the_network(monkeypatch):
@@ -177,12 +152,11 @@ def test_it_learns_to_rebuild():
     assert float(value.detach()) < 0.2 * nothing
 
 
-def test_settings_are_checked():
-    with pytest.raises(InputError, match="unknown deformation 'volume'; choose one of voxels, rad"):
-        DefRec(make_model(), deformation="volume")
-    with pytest.raises(InputError, match="weight must be a number, 0 to 1, not 2"):
-        DefRecPCM(make_model(), weight=2.0)
-    with pytest.raises(InputError, match="concentration"):
-        DefRecPCM(make_model(), concentration=-1.0)
-    with pytest.raises(InputError, match="DefRec needs features of single points"):
-        DefRec(create_model("simpleview", 3))
+@pytest.mark.parametrize("kind", get_args(Deformation))
+@pytest.mark.parametrize(("n", "n_t"), [(60, 50), (3, 2)])
+def test_every_deformation_trains_every_parameter(kind, n, n_t):
+    method = DefRec(make_model("dgcnn"), deformation=kind, on_source=True)
+    sum(method(make_batch(4, n), make_target(3, n_t), 0.0, seeded()).values()).backward()
+    for parameter in method.parameters():
+        assert parameter.grad is not None
+        assert torch.isfinite(parameter.grad).all()

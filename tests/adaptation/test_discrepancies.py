@@ -9,14 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 
-from qs3.adaptation.discrepancies import (
-    classifier_discrepancy,
-    coral,
-    mmd,
-    squared_distances,
-)
-from qs3.adaptation.gradient_reversal import reverse_gradient
-from qs3.adaptation.mmd import FACTORS, median_bandwidths
+from qs3.adaptation.coral import coral
+from qs3.adaptation.dann import reverse_gradient
+from qs3.adaptation.mmd import FACTORS, median_bandwidths, mmd, squared_distances
+from qs3.adaptation.pointdan import classifier_discrepancy
 from qs3.errors import InputError
 
 SIGMAS = (0.3, 1.0, 4.0)
@@ -92,8 +88,8 @@ def test_bandwidths_follow_the_median_and_pass_no_gradient():
     x, y = samples()
     squared = np.sort(pdist(np.concatenate([x, y]), "sqeuclidean"))
     median = squared[(len(squared) - 1) // 2]  # of an even number the lower one
-    given_ = torch.from_numpy(x).requires_grad_()
-    sigmas = median_bandwidths(given_, torch.from_numpy(y))
+    sample = torch.from_numpy(x).requires_grad_()
+    sigmas = median_bandwidths(sample, torch.from_numpy(y))
     assert not sigmas.requires_grad
     expected = np.sqrt(median * np.array(FACTORS) / 2)
     np.testing.assert_allclose(sigmas.numpy(), expected, rtol=1e-9)

@@ -1,10 +1,13 @@
+import math
+
 import numpy as np
 import pytest
 import torch
 from scipy.special import log_softmax
 
 import qs3.adaptation
-from qs3.adaptation import Batch, Method, SourceOnly, cross_entropy
+from qs3.adaptation import Batch, Method, SourceOnly, create_method, cross_entropy
+from qs3.errors import InputError
 from qs3.models import create_model
 
 
@@ -59,6 +62,42 @@ def test_default_parameter_group_holds_every_trainable_parameter():
 def test_method_is_abstract():
     with pytest.raises(TypeError, match="losses"):
         Method(create_model("pointnet", 2))  # pyright: ignore[reportAbstractUsage]
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "message"),
+    [
+        ("dan", {}, "unknown method 'dan'; choose one of source-only, dann"),
+        ("source-only", {"wait": 1}, "unknown setting 'wait' of method source-only; it takes none"),
+        ("defrec", {"wait": 1}, "unknown setting 'wait' of method defrec; choose from deform"),
+        (
+            "mmd",
+            {"biased": "yes"},
+            "settings of method mmd: field .biased.: .yes. is not true or f",
+        ),
+        ("coral", {"layer": "last"}, "field .layer.: .last. is none of logits"),
+        ("dann", {"hidden": [0]}, "hidden must be at least 1"),
+        ("dann", {"gamma": 0.0}, "gamma must be larger than 0"),
+        ("dann", {"domain_weight": -1.0}, "domain_weight must be 0 to 1e"),
+        ("mmd", {"factors": []}, "factors must be larger than 0"),
+        ("pointdan", {"bandwidths": (1.0, 0.0)}, "bandwidths must be larger than 0"),
+        ("pointdan", {"node_weight": math.nan}, "node_weight must be 0 to 1e"),
+        ("pointdan", {"neighbours": 256}, "neighbours must be 1 to 255"),
+        ("defrec", {"deformation": "volume"}, "'volume' is none of voxels, radius"),
+        ("defrec-pcm", {"weight": 2.0}, "weight must be 0 to 1, not 2.0"),
+        ("pcm", {"concentration": 0.0}, "concentration must be larger than 0"),
+        ("gast", {"rotation": False, "location": False}, "both off; choose source-only"),
+        ("gast", {"rotation_weight": 0.0}, "rotation_weight must be larger than 0"),
+        ("sd", {"decay": 1.0}, "decay must be 0 to below 1"),
+        ("sd", {"scale": [1.5, 0.7]}, "scale must be two bounds in order"),
+        ("sd", {"scale": [1.5]}, "field .scale.: a list of 1, not of 2"),
+        ("sd", {"target_keep": 1.1}, "target_keep must be 0 to 1"),
+        ("sd", {"student_temperature": math.inf}, "student_temperature must be larger than 0"),
+    ],
+)
+def test_unusable_settings_are_named(name, settings, message):
+    with pytest.raises(InputError, match=message):
+        create_method(name, create_model("pointnet", 3, channels=(8, 8, 16)), **settings)
 
 
 def test_unknown_name_of_the_package():

@@ -15,7 +15,6 @@ from qs3.adaptation.pcm import (
     mixed_cross_entropy,
     sample_spread,
 )
-from qs3.errors import InputError
 from qs3.models import create_model
 from qs3.models.ops import farthest_point_sampling
 
@@ -40,9 +39,9 @@ def make_method(**settings):
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.5, 0.987, 1.0])
 def test_points_come_from_the_two_clouds_in_their_share(share):
     first, second = clouds(), clouds() + 10
-    mixed, told = mix_halves(first, second, share, seeded())
+    mixed, left = mix_halves(first, second, share, seeded())
     assert mixed.shape == first.shape
-    assert told == round(share * 40) / 40
+    assert left == round(share * 40) / 40
     for cloud, a, b in zip(mixed, first, second, strict=True):
         of_a, of_b = (set(rows(cloud)) & set(rows(part)) for part in (a, b))
         assert len(of_a) == round(share * 40)
@@ -86,13 +85,6 @@ def test_one_share_a_batch_is_drawn_from_the_beta_distribution():
         law = stats.beta(concentration, concentration).cdf
         assert stats.kstest(drawn, law).pvalue > 1e-3
     assert stats.kstest(drawn, stats.uniform.cdf).pvalue < 1e-3
-
-
-def test_the_generator_alone_decides():
-    points, labels = clouds(), torch.arange(5)
-    first, again, other = (mix_clouds(points, labels, seeded(s)) for s in (1, 1, 2))
-    assert torch.equal(first.points, again.points) and first.share == again.share
-    assert not torch.equal(first.points, other.points) and first.share != other.share
 
 
 @pytest.mark.parametrize("points", [clouds(2, 1), clouds(2, 2), torch.full((3, 20, 3), 0.2)])
@@ -140,9 +132,3 @@ def test_the_larger_part_decides_what_counts_as_right(monkeypatch, share):
     method(Batch(clouds(4), labels), None, 0.0, seeded())
     assert method.right is not None
     assert int(method.right) == 4 - int(right)
-
-
-def test_it_needs_no_target_and_checks_its_setting():
-    assert not PCM.uses_target and not PCM.needs_local
-    with pytest.raises(InputError, match="concentration must be a number, larger than 0, not 0"):
-        make_method(concentration=0.0)

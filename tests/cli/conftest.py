@@ -110,7 +110,7 @@ def store(qs3, tmp_path_factory):
     """Ten built-in shapes, scanned once each by the command."""
     folder = tmp_path_factory.mktemp("data") / "shapes"
     qs3("generate", "--meshes", "shapes", "--per-class", 1, "--out", folder, "--seed", 5,
-        "--num-points", 128, *QUICK)  # fmt: skip
+        "--num-points", 128, "--workers", 0, *QUICK)  # fmt: skip
     return folder
 
 

@@ -1,20 +1,19 @@
-"""A bench so small that its grid takes seconds: blobs in place of scans, a narrow PointNet."""
+"""A grid so small that it takes seconds: blobs in place of scans, narrow networks."""
 
-import dataclasses
-import json
 import os
+import shutil
 
 import numpy as np
 import pytest
 
-from qs3.cli import reproduce as command
-from qs3.experiments.adaptation_bench import Bench, make_bench
-from qs3.experiments.bench_data import make_plans
+from qs3.experiments.data import make_plans
+from qs3.experiments.grid import data_sets
+from qs3.experiments.reproduce import Workers, collect_runs, products, reproduce
 from qs3.experiments.scales import SCALES, Scale
-from qs3.experiments.setup import Setup
+from qs3.experiments.setup import Setup, claim
 from qs3.store.generate import generate, scan_seed
 from qs3.store.shards import CloudRow
-from qs3.training import TrainSettings
+from qs3.training.config import TrainSettings
 
 TINY = Scale(
     name="smoke",
@@ -36,20 +35,14 @@ TINY = Scale(
     ),
     rounds={"threshold": 0.0, "rounds": 2, "epochs": 1},
     tasks=("M-D", "S-D"),
-    networks={
-        "pointnet2": {
-            "centres": (8, 4),
-            "scales": (((0.5, 4, (8, 8)),), ((1.0, 4, (8, 8)),)),
-            "embedding": (16,),
-        },
-        "dgcnn": {"neighbours": 4, "channels": (8, 8), "embedding": 16, "hidden": (8,)},
-    },
+    networks={"dgcnn": {"neighbours": 4, "channels": (8, 8), "embedding": 16, "hidden": (8,)}},
     fused_views=(1, 2),
     thetas=(0.0, 0.2),
-    steps=(0.0, 0.1),
+    steps=(0.1,),
     sensors=("qs3", "d435"),
     pointda10=("ordinary", "qbst-paper"),
 )
+WORKERS = Workers(workers=1)
 
 
 def blob_row(item, scan, settings, neighbour=None):
@@ -79,50 +72,39 @@ def blob_row(item, scan, settings, neighbour=None):
     )
 
 
-@pytest.fixture
-def tiny():
-    return TINY
+def make_tables(out, names, rows=(), columns=(), seeds=(0, 1), tell=lambda line: None, **changes):
+    """Reproduce some tables at the tiny scale; blobs stand for the scans."""
+    setup = Setup(out, TINY, seeds=seeds, threads=1, **changes)
+    parts = products(names, setup, rows, columns)
+    sets = [*data_sets(collect_runs(parts), setup.own), *(d for p in parts for d in p.sets())]
+    plans = make_plans(TINY, None, sets)
+    claim(setup, plans)
+    for name, plan in plans.items():
+        if not (out / "data" / name).exists():
+            generate(
+                plan.items, out / "data" / name, plan.settings, scan_one=blob_row, workers=0,
+                progress=False,
+            )  # fmt: skip
+    return reproduce(parts, setup, WORKERS, tell)
+
+
+@pytest.fixture(scope="session")
+def whole(tmp_path_factory):
+    """Some tables, made once: of networks, of QBST as the paper has it, of the bench."""
+    out = tmp_path_factory.mktemp("experiments") / "whole"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("QS3_SHARED_DATA", raising=False)
+        make_tables(out, ["ordinary"], columns=("M-D", "S-D", "S-F"))
+        make_tables(out, ["thresholds"], seeds=(0,))
+        rows = ("supervised", "source-only", "qbst")
+        make_tables(out, ["adaptation-bench"], rows, ("S-D",), seeds=(0,))
+    return out
 
 
 @pytest.fixture
-def make(tmp_path):
-    """Make a bench on ready data and return its table; keeps what it told."""
-
-    class Make:
-        train = staticmethod(command._train)
-        evaluate = staticmethod(command._evaluate)
-
-        def __init__(self):
-            self.told = []
-
-        def data(self, out, sets=("source", "target")):
-            if not out.exists():
-                for name, plan in make_plans(TINY, None, sets=sets).items():
-                    folder = out / "data" / name
-                    generate(
-                        plan.items, folder, plan.settings, scan_one=blob_row, workers=0,
-                        progress=False,
-                    )  # fmt: skip
-                marker = {"scale": dataclasses.asdict(TINY), "threads": 1, "meshes": "shapes"}
-                marker["data"] = {}
-                (out / "bench.json").write_text(json.dumps(marker), encoding="utf-8")
-
-        def bench(self, out, **changes):
-            told = {"rows": ("source-only", "qbst"), "tasks": ("S-D",), "seeds": (0,)}
-            told |= changes
-            rows, tasks = told.pop("rows"), told.pop("tasks")
-            setup = Setup(out, TINY, **({"threads": 1, "workers": 1} | told))
-            return Bench("adaptation-bench", setup, rows, tasks)
-
-        def __call__(self, out, **changes):
-            self.data(out)
-            self.told.clear()
-            bench = self.bench(out, **{k: v for k, v in changes.items() if k != "name"})
-            if "name" in changes:
-                bench = dataclasses.replace(bench, name=changes["name"])
-            return make_bench(bench, self.train, self.evaluate, self.told.append)
-
-    return Make()
+def finished(whole, tmp_path):
+    """A copy that a test may spoil."""
+    return shutil.copytree(whole, tmp_path / "copy")
 
 
 @pytest.fixture

@@ -5,9 +5,9 @@ import re
 from pathlib import Path
 
 import pytest
+from qs3.experiments.paper import EXPERIMENTS, PaperTable
 
 from qs3.experiments.figures import draw
-from qs3.experiments.paper import EXPERIMENTS, PaperTable
 from qs3.experiments.setup import read_setup
 
 ROOT = Path(__file__).parents[2]

@@ -18,7 +18,7 @@ from qs3.sensor.render.mitsuba import MitsubaRenderer
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.scan import scan
-from qs3.sensor.scene import LAYOUTS, ArrangedScene, SceneSettings, arrange
+from qs3.sensor.scene import ArrangedScene, SceneSettings, arrange
 from qs3.sensor.speckle import PatternSettings
 from qs3.sensor.views import Placement, place_views
 
@@ -81,7 +81,7 @@ def test_the_floor_touches_the_object_from_below():
     np.testing.assert_allclose(part(made, "floor").face_normals, [[0, 0, 1]] * 2, atol=1e-12)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_convention_the_wall_is_behind_everything_as_the_first_view_sees_it(seed):
     made = around("room+beside", seed=seed)
     wall = part(made, "wall")
@@ -122,9 +122,8 @@ def test_copies_of_one_pose_stay_as_they_are():
         np.testing.assert_array_equal(a.camera_to_world, b.camera_to_world)
 
 
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("name", shapes.CLASSES)
-def test_a_neighbour_in_front_hides_a_part(name, seed):
+def test_a_neighbour_in_front_hides_a_part(name, seed=1):
     rng = np.random.default_rng(seed)
     mesh = normalise(shapes.make(name, seed=seed))
     crate = trimesh.creation.box(extents=[0.9, 0.7, 1.0])
@@ -139,7 +138,7 @@ def test_a_neighbour_in_front_hides_a_part(name, seed):
     assert 1 - seen.sum() / alone.sum() == pytest.approx(0.3, abs=0.1)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("layout", ["behind", "beside", "room+behind", "floor+beside"])
 def test_nothing_stands_in_anything(layout, seed):
     made = around(layout, seed=seed)
@@ -266,7 +265,7 @@ def scans(quick):
             full_frames=layout == "room",
             keep_images=True,
         )
-        for layout in (*LAYOUTS, "room+beside")
+        for layout in ("alone", "room", "behind", "room+beside")
     }
 
 
@@ -282,7 +281,7 @@ def test_statistics_are_of_the_object_in_every_scene(scans):
             assert view.object_pixels == images.mask.sum() > 1000
             assert view.valid_fraction > 0.3, layout
             assert abs(view.disparity_bias) < 0.15, layout
-            if layout in ("room", "floor", "room+beside"):
+            if layout in ("room", "room+beside"):
                 assert view.ring_fraction is None
 
 

@@ -399,8 +399,7 @@ def test_half_precision_is_the_nearest_half(fake, tmp_path):
     for dtype in ("float32", "float16"):
         settings = dataclasses.replace(fake.SETTINGS, dtype=dtype)
         fake.run(fake.work(ROWS), tmp_path / dtype, settings)
-    clouds = [read_ragged(tmp_path / dtype).clouds for dtype in ("float32", "float16")]
-    single, half = map(np.stack, clouds)
+    single, half = (np.stack(read_ragged(tmp_path / d).clouds) for d in ("float32", "float16"))
     assert half.dtype == np.float32
     np.testing.assert_array_equal(half, single.astype(np.float16).astype(np.float32))
     assert verify(tmp_path / "float16", progress=False) == []

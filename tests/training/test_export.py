@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from qs3.training.thinning import thin
 
 from qs3.errors import InputError, MissingExtraError, QS3Error
 from qs3.io.preparation import unit_ball
@@ -18,7 +19,6 @@ from qs3.models.ops import farthest_point_sampling
 from qs3.models.ops.sampling import sample_in_a_loop
 from qs3.training import TrainSettings, export, predict_probabilities, save_model
 from qs3.training.export import compare, export_run, thin_in_a_graph, unit_ball_in_a_graph
-from qs3.training.thinning import thin
 
 _SUITE = Path(__file__).parents[1] / "models" / "test_models.py"
 _SPEC = importlib.util.spec_from_file_location("suite_of_models", _SUITE)

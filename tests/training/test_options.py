@@ -12,13 +12,13 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 import torch
+from qs3.training.deadline import Deadline
 
 from qs3.adaptation import SourceOnly
 from qs3.errors import InputError, MissingExtraError, QS3Error, UnevenSizesError
 from qs3.io.preparation import stack
 from qs3.training import SelfTrainingSettings, TimeUpError, fit, load_whole, parse_duration, records
 from qs3.training.checkpoint import new_model
-from qs3.training.deadline import Deadline
 from qs3.training.loop import train
 
 

@@ -1,6 +1,5 @@
 """The viewer without its server: what is shown is right, and the last change wins."""
 
-import dataclasses
 import threading
 import time
 
@@ -11,7 +10,9 @@ import trimesh
 from qs3 import shapes
 from qs3.errors import InputError
 from qs3.report.figure import PALETTE
-from qs3.sensor.presets import SENSORS, Sensor
+from qs3.sensor.presets import SENSORS
+from qs3.sensor.render.mitsuba import MitsubaRenderer
+from qs3.sensor.settings import ScanSettings
 from qs3.store.manifest import Manifest, write_manifest
 from qs3.store.shards import CloudRow, write_shard
 from qs3.viewer.colouring import by_error, by_height, by_view, round_limit
@@ -19,7 +20,7 @@ from qs3.viewer.display import compose, frame_of, modes
 from qs3.viewer.distance import cloud_distance, mesh_distance, spacing
 from qs3.viewer.exhibits import Answers, Exhibit, StoreExhibits
 from qs3.viewer.rescan import Rescanner
-from qs3.viewer.scan_controls import ScanControls
+from qs3.viewer.scan_controls import make_controls, resolve, with_controls
 
 HOSTILE = "<img src=x onerror=alert(1)>{alert(2)}"
 
@@ -238,25 +239,47 @@ class TestRescanner:
         assert shown == []
 
 
+def values_of(settings: ScanSettings) -> dict:
+    return {control.name: control.value for control in make_controls(settings)}
+
+
 class TestScanControls:
     @pytest.mark.parametrize("name", SENSORS)
-    def test_sliders_left_alone_change_no_sensor(self, name):
-        base = SENSORS[name]
-        assert ScanControls.of(base).sensor(base) == base
+    def test_controls_left_alone_change_nothing(self, name):
+        start = resolve(ScanSettings(sensor=name, renderer=MitsubaRenderer(variant="scalar_rgb")))
+        same = with_controls(start, values_of(start))
+        assert same == start
+        assert same.make_sensor() == SENSORS[name]
 
-    def test_every_slider_of_the_sensor_does_something(self):
-        base = Sensor()
+    def test_every_control_does_something(self):
+        start = resolve(ScanSettings(renderer=MitsubaRenderer(variant="scalar_rgb")))
         other = {
-            "distance": (2.5, 3.0), "elevation": (10.0, 20.0), "object_size": 1.5, "baseline": 0.2,
-            "projector": 2.0, "room_light": 0.0, "gain": 0.5, "image_noise": 3.0, "method": "zncc",
-            "block_size": 11, "num_disparities": 256, "stride": 2, "material": "dark",
+            "views": 2, "view_layout": "jitter", "num_points": 64, "scene": "floor", "crop": "none",
+            "seed": 1, "samples": 2, "placement.radius": (2.5, 3.0), "object_size": 1.5,
+            "placement.elevation": (10.0, 20.0), "rig.baseline": 0.2, "projector": 2.0,
+            "room light": 0.0, "gain": 0.5, "exposure.noise": 3.0, "matching.method": "zncc",
+            "matching.block_size": 11, "matching.num_disparities": 256, "depth.stride": 2,
+            "material": "dark",
         }  # fmt: skip
+        assert set(other) == set(values_of(start))
         for name, value in other.items():
-            assert dataclasses.replace(ScanControls(), **{name: value}).sensor(base) != base, name
+            assert with_controls(start, {name: value}) != start, name
 
-    def test_settings_that_make_no_sensor_are_refused(self):
+    def test_what_the_command_line_changes_is_where_a_control_begins(self):
+        renderer = MitsubaRenderer(variant="scalar_rgb", samples=7)
+        start = resolve(ScanSettings(image_noise=2.0, preset="released", renderer=renderer))
+        values = values_of(start)
+        assert (values["exposure.noise"], values["view_layout"], values["samples"]) == (
+            2.0, "jitter", 7
+        )  # fmt: skip
+        assert with_controls(start, {"exposure.noise": 0.0}).make_sensor().exposure.noise == 0
+
+    def test_settings_are_changed_at_once_and_those_that_make_no_sensor_are_refused(self):
+        start = resolve(ScanSettings(renderer=MitsubaRenderer(variant="scalar_rgb")))
+        few = {"matching.num_disparities": 16}
         with pytest.raises(InputError, match=r"beyond matching\.num_disparities"):
-            ScanControls(num_disparities=16).sensor(Sensor())
+            with_controls(start, few)
+        with_controls(start, few | {"rig.baseline": 0.005})
 
 
 class TestStore:

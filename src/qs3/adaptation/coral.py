@@ -1,19 +1,47 @@
 """CORAL: both domains with one covariance (Deep CORAL: Sun & Saenko, ECCV 2016 workshops)."""
 
-from typing import Literal, get_args
+from typing import Literal, Unpack
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Generator, Tensor
 
-from qs3.adaptation.discrepancies import coral
-from qs3.adaptation.method import Batch, Method
-from qs3.adaptation.normalisation import DomainNorm
+from qs3.adaptation.method import Batch, Method, Shared, Target, Terms
+from qs3.errors import InputError
 from qs3.models import PointClassifier
-from qs3.models.checks import check_choice, check_number
+from qs3.models.checks import check_range
 
 Layer = Literal["logits", "pooled"]
 """What has its covariance matched: the scores, as published, or the head's input."""
+
+
+def coral(x: Float[Tensor, "b c"], y: Float[Tensor, "m c"]) -> Float[Tensor, ""]:
+    """Distance of the covariances: |C_x − C_y|²_F / 4c² (Sun & Saenko, ECCV 2016 W, eq. 1).
+
+    C is the unbiased covariance over the rows (eqs. 2 and 3); in single precision at least.
+
+    Args:
+        x: One sample, a row a cloud.
+        y: The other.
+
+    Raises:
+        InputError: where a sample has fewer than two rows.
+
+    Example:
+        >>> float(coral(torch.tensor([[-1.0], [1.0]]), torch.zeros(2, 1)))  # variances 2 and 0
+        1.0
+    """
+    if min(len(x), len(y)) < 2:
+        raise InputError(f"coral needs samples of 2 or more, not {len(x)} and {len(y)}")
+    dtype = torch.promote_types(x.dtype, torch.float32)
+    with torch.autocast(x.device.type, enabled=False):
+        difference = _covariance(x.to(dtype)) - _covariance(y.to(dtype))
+        return difference.square().sum() / (4 * x.shape[1] ** 2)
+
+
+def _covariance(x: Float[Tensor, "b c"]) -> Float[Tensor, "c c"]:
+    centred = x - x.mean(dim=0)
+    return centred.t() @ centred / (len(x) - 1)
 
 
 class CORAL(Method):
@@ -27,8 +55,7 @@ class CORAL(Method):
         model: The network to train.
         coral_weight: Factor of the distance, λ of the paper (eq. 6).
         layer: Whose covariance is matched.
-        label_smoothing: ε on the source.
-        norm: How the network normalises the two domains.
+        shared: Label smoothing and normalisation, as of `Method`.
 
     Raises:
         InputError: where a setting is unusable.
@@ -42,30 +69,22 @@ class CORAL(Method):
         *,
         coral_weight: float = 1.0,
         layer: Layer = "logits",
-        label_smoothing: float = 0.0,
-        norm: DomainNorm | None = None,
+        **shared: Unpack[Shared],
     ) -> None:
-        super().__init__(model, label_smoothing=label_smoothing, norm=norm)
-        check_number("coral_weight", coral_weight, 0.0, 1e6)
-        check_choice("layer", layer, *get_args(Layer))
+        super().__init__(model, **shared)
+        check_range("coral_weight", coral_weight, 0, 1e6)
         self.coral_weight, self.layer = coral_weight, layer
 
-    def losses(
-        self,
-        source: Batch,
-        target: Float[Tensor, "b_t n_t 3"] | None,
-        progress: float,
-        generator: torch.Generator,
-    ) -> dict[str, Tensor]:
+    def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of the source and the distance of the covariances."""
         assert target is not None  # noqa: S101
-        here = self.features(source.points, "source")
-        there = self.features(target, "target")
-        logits = self.head(here, "source")
+        of_source = self.features(source.points, "source")
+        of_target = self.features(target, "target")
+        logits = self.head(of_source, "source")
         if self.layer == "logits":
-            distance = coral(logits, self.head(there, "target"))
+            distance = coral(logits, self.head(of_target, "target"))
         else:
-            distance = coral(here.pooled, there.pooled)
+            distance = coral(of_source.pooled, of_target.pooled)
         return {
             "source": self.classification(logits, source),
             "coral": self.coral_weight * distance,

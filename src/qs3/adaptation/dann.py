@@ -2,16 +2,44 @@
 
 import itertools
 import math
+from typing import Unpack
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
-from qs3.adaptation.gradient_reversal import reverse_gradient
-from qs3.adaptation.method import Batch, Method
-from qs3.adaptation.normalisation import DomainNorm
+from qs3.adaptation.method import Batch, Method, Shared, Target, Terms
 from qs3.models import PointClassifier, feature_widths
-from qs3.models.checks import check_number, check_wholes
+from qs3.models.checks import check_positive, check_range
+
+
+def reverse_gradient(x: Float[Tensor, "*shape"], coefficient: float) -> Float[Tensor, "*shape"]:
+    """Return ``x``; its gradient is multiplied by −coefficient (Ganin & Lempitsky, ICML 2015).
+
+    What comes after minimises a loss while what comes before maximises it, in one backward pass.
+
+    Args:
+        x: Features, of any shape and type.
+        coefficient: λ; with 0 nothing before learns from what comes after.
+
+    Example:
+        >>> x = torch.tensor([3.0], requires_grad=True)
+        >>> reverse_gradient(x, 0.5).square().backward()
+        >>> x.grad
+        tensor([-3.])
+    """
+    return _Reverse.apply(x, coefficient)
+
+
+class _Reverse(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x: Tensor, coefficient: float) -> Tensor:
+        ctx.coefficient = coefficient
+        return x.view_as(x)
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return gradient * -ctx.coefficient, None
 
 
 def reversal_coefficient(progress: float, gamma: float = 10.0) -> float:
@@ -58,8 +86,7 @@ class DANN(Method):
         hidden: Widths of the discriminator's hidden layers.
         gamma: γ of `reversal_coefficient`.
         domain_weight: Factor of the domain loss.
-        label_smoothing: ε on the source.
-        norm: How the network normalises the two domains.
+        shared: Label smoothing and normalisation, as of `Method`.
 
     Raises:
         InputError: where a setting is unusable.
@@ -74,13 +101,12 @@ class DANN(Method):
         hidden: tuple[int, ...] = (1024, 1024),
         gamma: float = 10.0,
         domain_weight: float = 1.0,
-        label_smoothing: float = 0.0,
-        norm: DomainNorm | None = None,
+        **shared: Unpack[Shared],
     ) -> None:
-        super().__init__(model, label_smoothing=label_smoothing, norm=norm)
-        check_wholes("hidden", hidden, few=0)
-        check_number("gamma", gamma)
-        check_number("domain_weight", domain_weight, 0.0, 1e6)
+        super().__init__(model, **shared)
+        check_range("hidden", (1, *hidden))
+        check_positive("gamma", gamma)
+        check_range("domain_weight", domain_weight, 0, 1e6)
         self.gamma, self.domain_weight = gamma, domain_weight
         layers: list[nn.Module] = []
         widths = (feature_widths(model).pooled, *hidden)
@@ -88,23 +114,17 @@ class DANN(Method):
             layers += [nn.Linear(c, d), nn.ReLU()]
         self.discriminator = nn.Sequential(*layers, nn.Linear(widths[-1], 1))
 
-    def losses(
-        self,
-        source: Batch,
-        target: Float[Tensor, "b_t n_t 3"] | None,
-        progress: float,
-        generator: torch.Generator,
-    ) -> dict[str, Tensor]:
+    def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of the source and the domain loss of both."""
         assert target is not None  # noqa: S101
-        here = self.features(source.points, "source")
-        there = self.features(target, "target")
+        of_source = self.features(source.points, "source")
+        of_target = self.features(target, "target")
         coefficient = reversal_coefficient(progress, self.gamma)
         scores = [
             self.discriminator(reverse_gradient(features.pooled, coefficient))[:, 0]
-            for features in (here, there)
+            for features in (of_source, of_target)
         ]
         return {
-            "source": self.classification(self.head(here, "source"), source),
+            "source": self.classification(self.head(of_source, "source"), source),
             "domain": self.domain_weight * domain_loss(*scores),
         }

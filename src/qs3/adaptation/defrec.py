@@ -1,22 +1,109 @@
 """Deformation reconstruction, DefRec (Achituve et al., WACV 2021)."""
 
-from typing import cast, get_args
+from typing import Unpack, cast
 
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from jaxtyping import Bool, Float, Int
+from torch import Generator, Tensor, nn
 
-from qs3.adaptation.chamfer import chamfer
 from qs3.adaptation.deformations import DEFORMATIONS, Deformation, Deformed, deform_features
-from qs3.adaptation.method import Batch, Domain, Method
-from qs3.adaptation.normalisation import DomainNorm
-from qs3.errors import InputError
+from qs3.adaptation.method import Batch, Domain, Method, Shared, Target, Terms
 from qs3.models import Features, PointClassifier, feature_widths
-from qs3.models.checks import check_flag, check_number
+from qs3.models.checks import check_range
 from qs3.models.ops import gather_points
 
 _SCALE = 20.0
 """Factor of the released code, which brings the distance to the size of a cross entropy."""
+
+
+_BLOCK = 2**18
+"""Distances held at a time on a CPU: they fit its cache."""
+_CUDA_BLOCK = 2**26
+"""The same on a GPU."""
+
+
+def chamfer(
+    x: Float[Tensor, "b n 3"],
+    y: Float[Tensor, "b m 3"],
+    x_mask: Bool[Tensor, "b n"] | None = None,
+    y_mask: Bool[Tensor, "b m"] | None = None,
+) -> Float[Tensor, "b"]:
+    """Symmetric squared Chamfer distance of each pair of clouds, over masked points only.
+
+    mean_i min_j |x_i − y_j|² + mean_j min_i |x_i − y_j|² (Fan et al., CVPR 2017, with means in
+    place of sums). Nearest neighbours are found without a gradient, a block of distances at a
+    time; the gradient passes through the n + m pairs alone. No [b n m] tensor ever exists.
+
+    Args:
+        x: Clouds.
+        y: Clouds to compare with, one each.
+        x_mask: Points of ``x`` that count; all where None.
+        y_mask: Points of ``y`` that count; all where None.
+
+    Returns:
+        One distance a pair; 0 where one of the two has no point that counts.
+
+    Example:
+        >>> x, y = torch.zeros(1, 2, 3), torch.ones(1, 1, 3)
+        >>> chamfer(x, y)
+        tensor([6.])
+    """
+    with torch.autocast(x.device.type, enabled=False):
+        dtype = torch.promote_types(torch.promote_types(x.dtype, y.dtype), torch.float32)
+        x, x_valid = _compact(x.to(dtype), x_mask)
+        y, y_valid = _compact(y.to(dtype), y_mask)
+        if 0 in (x.shape[1], y.shape[1]):
+            return (x.sum(dim=(1, 2)) + y.sum(dim=(1, 2))) * 0.0
+        of_x, of_y = _nearest(x, y, y_valid), _nearest(y, x, x_valid)
+        both = x_valid.any(dim=1) & y_valid.any(dim=1)
+        forth = _mean_square(x, gather_points(y, of_x), x_valid & both[:, None])
+        back = _mean_square(y, gather_points(x, of_y), y_valid & both[:, None])
+    return forth + back
+
+
+def _compact(points: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Bring the masked points of each cloud to its front and cut off what no cloud fills."""
+    if mask is None:
+        return points, torch.ones(points.shape[:2], dtype=torch.bool, device=points.device)
+    most = int(mask.sum(dim=1).amax()) if mask.numel() else 0
+    order = (~mask).to(torch.uint8).argsort(dim=1, stable=True)[:, :most]
+    return gather_points(points, order), mask.gather(1, order)
+
+
+def _mean_square(points: Tensor, partners: Tensor, valid: Tensor) -> Tensor:
+    # Excluded pairs are replaced, not multiplied by 0, so that none of their gradient is left.
+    square = (points - partners).square().sum(dim=2)
+    return square.where(valid, 0.0).sum(dim=1) / valid.sum(dim=1).clamp_min(1)
+
+
+@torch.no_grad()
+def _nearest(
+    queries: Float[Tensor, "b n 3"], points: Float[Tensor, "b m 3"], valid: Bool[Tensor, "b m"]
+) -> Int[Tensor, "b n"]:
+    """Return the valid point nearest to each query, each cloud from its own.
+
+    Distances come from differences, which a far origin or a wild prediction does not harm.
+    """
+    b, n, _ = queries.shape
+    m = points.shape[1]
+    nearest = torch.zeros((b, n), dtype=torch.int64, device=queries.device)
+    columns = points.transpose(1, 2).contiguous()
+    budget = _CUDA_BLOCK if queries.is_cuda else _BLOCK
+    clouds = max(1, budget // (n * m))
+    rows = n if clouds > 1 else max(1, min(n, budget // m))
+    for first in range(0, b, clouds):
+        cloud = slice(first, first + clouds)
+        absent = ~valid[cloud, None]
+        for start in range(0, n, rows):
+            here = queries[cloud, start : start + rows]
+            total = here[:, :, 0, None] - columns[cloud, None, 0]
+            total.mul_(total)
+            for axis in (1, 2):
+                difference = here[:, :, axis, None] - columns[cloud, None, axis]
+                total.add_(difference.mul_(difference))
+            total.masked_fill_(absent, torch.inf)
+            nearest[cloud, start : start + rows] = total.min(dim=2).indices
+    return nearest
 
 
 def reconstruction_loss(
@@ -65,9 +152,9 @@ class ReconstructionHead(nn.Module):
         row = moved.flatten().nonzero()[:, 0]
         of_points = gather_points(local.reshape(1, b * n, e), row[None])
         of_clouds = gather_points(self.pooled(features.pooled)[None], row[None] // n)
-        found = self.layers((self.local(of_points) + of_clouds)[0])
-        nowhere = torch.zeros((b * n, 3), dtype=found.dtype, device=found.device)
-        return nowhere.index_put((row,), found).view(b, n, 3)
+        places = self.layers((self.local(of_points) + of_clouds)[0])
+        nowhere = torch.zeros((b * n, 3), dtype=places.dtype, device=places.device)
+        return nowhere.index_put((row,), places).view(b, n, 3)
 
 
 def _finish(width: int, dropout: float) -> tuple[nn.Module, ...]:
@@ -91,21 +178,15 @@ class Reconstruction(nn.Module):
     def __init__(
         self,
         model: PointClassifier,
-        deformation: str,
+        deformation: Deformation,
         weight: float,
         on_source: bool,
         dropout: float,
     ) -> None:
         super().__init__()
-        if deformation not in get_args(Deformation):
-            raise InputError(
-                f"unknown deformation {deformation!r}; choose one of "
-                f"{', '.join(get_args(Deformation))}"
-            )
-        check_number("weight", weight, 0.0, 1.0)
-        check_flag("on_source", on_source)
-        check_number("dropout", dropout, 0.0, 1.0)
-        self.deformation = deformation
+        check_range("weight", weight, 0, 1)
+        check_range("dropout", dropout, 0, 1)
+        self.deformation: Deformation = deformation
         self.weight = weight
         self.on_source = on_source
         widths = feature_widths(model)
@@ -116,8 +197,8 @@ class Reconstruction(nn.Module):
         method: Method,
         source: Float[Tensor, "b n 3"],
         target: Float[Tensor, "b_t n_t 3"],
-        generator: torch.Generator,
-    ) -> dict[str, Tensor]:
+        generator: Generator,
+    ) -> Terms:
         """Return the weighted loss of each domain that is deformed."""
         terms = {}
         if self.on_source:
@@ -125,9 +206,7 @@ class Reconstruction(nn.Module):
         terms["defrec_target"] = self._loss(method, target, "target", generator)
         return terms
 
-    def _loss(
-        self, method: Method, points: Tensor, domain: Domain, generator: torch.Generator
-    ) -> Tensor:
+    def _loss(self, method: Method, points: Tensor, domain: Domain, generator: Generator) -> Tensor:
         deformed = self.deform(method, points, domain, generator)
         predicted = self.head(method.features(deformed.points, domain), deformed.moved)
         return self.weight * reconstruction_loss(predicted, points, deformed.moved)
@@ -137,7 +216,7 @@ class Reconstruction(nn.Module):
         method: Method,
         points: Float[Tensor, "b n 3"],
         domain: Domain,
-        generator: torch.Generator,
+        generator: Generator,
     ) -> Deformed:
         """Return deformed clouds of a domain."""
         if self.deformation != "features":
@@ -178,8 +257,7 @@ class DefRec(Method):
         weight: w.
         on_source: Whether source clouds are deformed and rebuilt as well.
         dropout: Probability of dropping a hidden unit of the reconstruction head.
-        label_smoothing: ε of `qs3.adaptation.method.cross_entropy`.
-        norm: How the network normalises the two domains.
+        shared: Label smoothing and normalisation, as of `Method`.
 
     Raises:
         InputError: where a setting is not usable, or the network has no local features.
@@ -192,23 +270,16 @@ class DefRec(Method):
         self,
         model: PointClassifier,
         *,
-        deformation: str = "voxels",
+        deformation: Deformation = "voxels",
         weight: float = 0.2,
         on_source: bool = False,
         dropout: float = 0.5,
-        label_smoothing: float = 0.0,
-        norm: DomainNorm | None = None,
+        **shared: Unpack[Shared],
     ) -> None:
-        super().__init__(model, label_smoothing=label_smoothing, norm=norm)
+        super().__init__(model, **shared)
         self.rebuild = Reconstruction(model, deformation, weight, on_source, dropout)
 
-    def losses(
-        self,
-        source: Batch,
-        target: Float[Tensor, "b_t n_t 3"] | None,
-        progress: float,
-        generator: torch.Generator,
-    ) -> dict[str, Tensor]:
+    def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of the source and the distance of rebuilt parts."""
         assert target is not None  # noqa: S101
         cross_entropy = self.classification(self.logits(source.points, "source"), source)

@@ -1,11 +1,14 @@
-"""How much more frequent features are in the target than in the source (NumPy and SciPy only)."""
+"""How much more frequent features are in the target than in the source (no PyTorch)."""
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import minimize
-from scipy.special import expit
 
 from qs3.errors import InputError
+
+if TYPE_CHECKING:
+    from sklearn.linear_model import LogisticRegression
 
 _LARGEST_LOG_RATIO = 30.0
 """Log density ratios are cut here; beyond, the two domains do not overlap in any case."""
@@ -50,13 +53,15 @@ def density_ratio(
     both = np.concatenate([source, target]).astype(np.float64)
     mean, spread = both.mean(axis=0), both.std(axis=0)
     use = spread > 1e-9 * np.maximum(1.0, np.abs(mean))
+    if not use.any():
+        return np.ones(len(points))
     both = (both[:, use] - mean[use]) / spread[use]
-    is_target = np.repeat([0.0, 1.0], [len(source), len(target)])
+    is_target = np.repeat([0, 1], [len(source), len(target)])
     if strength is None:
         strength = _choose(both, is_target, seed)
-    weights = _fit(both, is_target, strength, np.zeros(both.shape[1] + 1))
-    there = (points[:, use] - mean[use]) / spread[use]
-    log_ratio = there @ weights[1:] + weights[0] + np.log(len(source) / len(target))
+    classifier = _fit(both, is_target, strength)
+    log_ratio = classifier.decision_function((points[:, use] - mean[use]) / spread[use])
+    log_ratio = log_ratio + np.log(len(source) / len(target))
     return np.exp(np.clip(log_ratio, -_LARGEST_LOG_RATIO, _LARGEST_LOG_RATIO))
 
 
@@ -64,27 +69,20 @@ def _choose(rows: np.ndarray, is_target: np.ndarray, seed: int) -> float:
     """Return the penalty of the least log loss on a held-out third."""
     held_out = np.zeros(len(rows), dtype=bool)
     held_out[np.random.default_rng(seed).permutation(len(rows))[: len(rows) // 3]] = True
-    train, test = (rows[~held_out], is_target[~held_out]), (rows[held_out], is_target[held_out])
-    weights, best, least = np.zeros(rows.shape[1] + 1), _STRENGTHS[0], np.inf
-    for strength in _STRENGTHS:
-        weights = _fit(*train, strength * len(train[0]), weights)
-        score = test[0] @ weights[1:] + weights[0]
-        loss = float((np.logaddexp(0.0, score) - test[1] * score).sum())
-        if loss >= least:
-            break
-        best, least = strength, loss
+    train = (rows[~held_out], is_target[~held_out])
+    best, least = _STRENGTHS[0], np.inf
+    if len(np.unique(train[1])) == 2 and held_out.any():
+        for strength in _STRENGTHS:
+            score = _fit(*train, strength * len(train[0])).decision_function(rows[held_out])
+            loss = float((np.logaddexp(0.0, score) - is_target[held_out] * score).sum())
+            if loss >= least:
+                break
+            best, least = strength, loss
     return best * len(rows)
 
 
-def _fit(rows: np.ndarray, is_target: np.ndarray, strength: float, start: np.ndarray) -> np.ndarray:
-    """Return the constant and the weights of the penalised logistic regression."""
+def _fit(rows: np.ndarray, is_target: np.ndarray, strength: float) -> "LogisticRegression":
+    from sklearn.linear_model import LogisticRegression
 
-    def objective(weights: np.ndarray) -> tuple[float, np.ndarray]:
-        score = rows @ weights[1:] + weights[0]
-        value = (np.logaddexp(0.0, score) - is_target * score).sum()
-        error = expit(score) - is_target
-        slope = np.concatenate([[error.sum()], rows.T @ error + strength * weights[1:]])
-        return float(value + 0.5 * strength * weights[1:] @ weights[1:]), slope
-
-    options = {"maxiter": 500, "ftol": 1e-12, "gtol": 1e-6}
-    return minimize(objective, start, jac=True, method="L-BFGS-B", options=options).x
+    inverse = 1 / strength if strength else np.inf
+    return LogisticRegression(C=inverse, tol=1e-7, max_iter=2000).fit(rows, is_target)

@@ -1,11 +1,11 @@
 """Methods by name; a method's module, and PyTorch, load when it is asked for."""
 
-import inspect
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from qs3.adaptation.names import METHODS, Normalisation
 from qs3.errors import InputError
+from qs3.models.checks import read_settings
 
 if TYPE_CHECKING:
     from qs3.adaptation.method import Method
@@ -62,16 +62,6 @@ def create_method(
     from qs3.adaptation.normalisation import make_norm
 
     kind = method_class(name)
-    fixed = {"self", "model", "label_smoothing", "norm"}
-    choice = [key for key in inspect.signature(kind.__init__).parameters if key not in fixed]
-    for key in settings:
-        if key not in choice:
-            words = f"choose from {', '.join(choice)}" if choice else "it takes none"
-            raise InputError(f"unknown setting {key!r} of method {name}; {words}")
+    values = read_settings(kind, settings, f"method {name}", ("model", "label_smoothing", "norm"))
     norm = make_norm(normalisation, model)
-    try:
-        return kind(model, label_smoothing=label_smoothing, norm=norm, **settings)
-    except InputError:
-        raise
-    except (TypeError, ValueError) as error:
-        raise InputError(f"settings {settings} do not make method {name}: {error}") from error
+    return kind(model, label_smoothing=label_smoothing, norm=norm, **values)

@@ -1,19 +1,18 @@
 """Geometry-aware self-training, GAST (Zou et al., ICCV 2021): its two self-supervised tasks."""
 
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Unpack
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
 from qs3.adaptation.curvature import surface
 from qs3.adaptation.deformations import CELLS, deform_cells, pick_cells
-from qs3.adaptation.method import Batch, Domain, Method, cross_entropy
-from qs3.adaptation.normalisation import DomainNorm
+from qs3.adaptation.method import Batch, Domain, Method, Shared, Target, Terms, cross_entropy
 from qs3.adaptation.pcm import draw_share, mix_halves
 from qs3.errors import InputError
 from qs3.models import PointClassifier, feature_widths
-from qs3.models.checks import check_flag, check_number
+from qs3.models.checks import check_positive
 
 _TURNS = 4
 """Quarter turns that the rotation task tells apart."""
@@ -55,7 +54,7 @@ def turn(
 
 
 def mix_rotations(
-    points: Float[Tensor, "b n 3"], generator: torch.Generator, concentration: float = 1.0
+    points: Float[Tensor, "b n 3"], generator: Generator, concentration: float = 1.0
 ) -> MixedRotation:
     """Mix each cloud turned about x with itself turned about y.
 
@@ -144,8 +143,7 @@ class GAST(Method):
         location_weight: w_l.
         rotation_weight: w_r.
         concentration: γ of λ ~ Beta(γ, γ).
-        label_smoothing: ε of `qs3.adaptation.method.cross_entropy` on the source.
-        norm: How the network normalises the two domains.
+        shared: Label smoothing and normalisation, as of `Method`.
 
     Raises:
         InputError: where a setting is not usable, or both tasks are off.
@@ -165,19 +163,15 @@ class GAST(Method):
         location_weight: float = 0.5,
         rotation_weight: float = 0.2,
         concentration: float = 1.0,
-        label_smoothing: float = 0.0,
-        norm: DomainNorm | None = None,
+        **shared: Unpack[Shared],
     ) -> None:
-        super().__init__(model, label_smoothing=label_smoothing, norm=norm)
-        flags = {"rotation": rotation, "location": location, "on_source": on_source}
-        for name, flag in (flags | {"curvature": curvature}).items():
-            check_flag(name, flag)
+        super().__init__(model, **shared)
         if not (rotation or location):
             raise InputError("rotation and location are both off; choose source-only instead")
-        check_number("classification_weight", classification_weight)
-        check_number("location_weight", location_weight)
-        check_number("rotation_weight", rotation_weight)
-        check_number("concentration", concentration)
+        check_positive("classification_weight", classification_weight)
+        check_positive("location_weight", location_weight)
+        check_positive("rotation_weight", rotation_weight)
+        check_positive("concentration", concentration)
         self.on_source = on_source
         self.curvature = curvature
         self.classification_weight = classification_weight
@@ -189,13 +183,7 @@ class GAST(Method):
         self.turned_x = nn.Linear(pooled, _TURNS) if rotation else None
         self.turned_y = nn.Linear(pooled, _TURNS) if rotation else None
 
-    def losses(
-        self,
-        source: Batch,
-        target: Float[Tensor, "b_t n_t 3"] | None,
-        progress: float,
-        generator: torch.Generator,
-    ) -> dict[str, Tensor]:
+    def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of the source and the loss of each task in each domain."""
         assert target is not None  # noqa: S101
         supervised = self.classification(self.logits(source.points, "source"), source)
@@ -204,9 +192,7 @@ class GAST(Method):
             terms |= self._tasks(source.points, "source", generator)
         return terms | self._tasks(target, "target", generator)
 
-    def _tasks(
-        self, points: Tensor, domain: Domain, generator: torch.Generator
-    ) -> dict[str, Tensor]:
+    def _tasks(self, points: Tensor, domain: Domain, generator: Generator) -> Terms:
         terms = {}
         if self.locate is not None:
             located = pick_cells(points, _LEAST, generator)

@@ -2,11 +2,11 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypedDict
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
 from qs3.adaptation.normalisation import DomainNorm, SharedNorm
 from qs3.errors import InputError
@@ -14,6 +14,12 @@ from qs3.models import Features, PointClassifier, feature_widths
 
 Domain = Literal["source", "target"]
 """Where clouds come from; it decides which batch statistics the network uses."""
+
+Target = Float[Tensor, "b_t n_t 3"] | None
+"""Clouds of the target; None where a method does without."""
+
+Terms = dict[str, Tensor]
+"""Scalar losses by name."""
 
 
 class Batch(NamedTuple):
@@ -44,6 +50,15 @@ def cross_entropy(
     """
     logits = logits.float() if logits.dtype in (torch.float16, torch.bfloat16) else logits
     return torch.nn.functional.cross_entropy(logits, labels, label_smoothing=label_smoothing)
+
+
+class Shared(TypedDict, total=False):
+    """Settings that every method hands on to `Method`."""
+
+    label_smoothing: float
+    """ε of `cross_entropy` on the source."""
+    norm: DomainNorm | None
+    """How the network normalises the two domains; shared statistics where None."""
 
 
 class Method(nn.Module, ABC):
@@ -85,13 +100,7 @@ class Method(nn.Module, ABC):
         self.right: Tensor | None = None
 
     @abstractmethod
-    def losses(
-        self,
-        source: Batch,
-        target: Float[Tensor, "b_t n_t 3"] | None,
-        progress: float,
-        generator: torch.Generator,
-    ) -> dict[str, Tensor]:
+    def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return named scalar losses; their sum is minimised, each is logged.
 
         Args:
@@ -102,12 +111,8 @@ class Method(nn.Module, ABC):
         """
 
     def forward(
-        self,
-        source: Batch,
-        target: Float[Tensor, "b_t n_t 3"] | None,
-        progress: float,
-        generator: torch.Generator,
-    ) -> dict[str, Tensor]:
+        self, source: Batch, target: Target, progress: float, generator: Generator
+    ) -> Terms:
         """Return `losses`; a distributed wrapper needs the call to pass through here."""
         self.right = None
         return self.losses(source, target, progress, generator)

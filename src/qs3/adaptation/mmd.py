@@ -1,21 +1,93 @@
 """MMD: one distribution of pooled features in both domains (DAN: Long et al., ICML 2015)."""
 
+from collections.abc import Sequence
+from typing import Unpack
+
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Generator, Tensor
 
-from qs3.adaptation.discrepancies import mmd, squared_distances
-from qs3.adaptation.method import Batch, Method
-from qs3.adaptation.normalisation import DomainNorm
+from qs3.adaptation.method import Batch, Method, Shared, Target, Terms
 from qs3.errors import InputError
 from qs3.models import PointClassifier
-from qs3.models.checks import check_flag, check_number
+from qs3.models.checks import check_positive, check_range
 
 FACTORS = tuple(2.0 ** (step / 2) for step in range(-16, 17))
 """DAN's kernels: 2⁻⁸ to 2⁸ times the median squared distance, in steps of √2 (§4.1)."""
 
 _LEAST = 1e-12
 """Smallest squared distance; all features are equal below it."""
+
+
+def mmd(
+    x: Float[Tensor, "b c"],
+    y: Float[Tensor, "m c"],
+    bandwidths: Sequence[float] | Float[Tensor, "s"],
+    biased: bool = True,
+) -> Float[Tensor, ""]:
+    """Squared maximum mean discrepancy with a sum of Gaussian kernels.
+
+    k(u, v) = Σ_σ exp(−|u − v|² / 2σ²), and MMD² = mean k(x, x') + mean k(y, y') − 2 mean k(x, y)
+    (Gretton et al., JMLR 2012: eq. 5 biased, eq. 3 unbiased).
+
+    Args:
+        x: One sample.
+        y: The other.
+        bandwidths: σ of each kernel, in the unit of the features.
+        biased: Whether a row's pair with itself counts; then the value is never negative. Without,
+            its expectation is 0 for samples of one distribution.
+
+    Raises:
+        InputError: where a sample is empty, or has a single row and the estimate is unbiased.
+
+    Example:
+        >>> one, other = torch.zeros(2, 1), torch.full((2, 1), 2.0)
+        >>> round(float(mmd(one, other, [1.0])), 4)  # 2 − 2 exp(−2)
+        1.7293
+    """
+    least = 1 if biased else 2
+    if min(len(x), len(y)) < least:
+        raise InputError(f"mmd needs samples of {least} or more, not {len(x)} and {len(y)}")
+    kernel = _gaussians(squared_distances(x, y), bandwidths)
+    b = len(x)
+    within = 0.0
+    for square in (kernel[:b, :b], kernel[b:, b:]):
+        count = len(square)
+        if biased:
+            within = within + square.mean()
+        else:
+            within = within + (square.sum() - square.diagonal().sum()) / (count * (count - 1))
+    dtype = torch.promote_types(x.dtype, torch.float32)
+    return (within - 2 * kernel[:b, b:].mean()).to(dtype)
+
+
+def squared_distances(x: Float[Tensor, "b c"], y: Float[Tensor, "m c"]) -> Float[Tensor, "b+m b+m"]:
+    """Return |u − v|² for all pairs of the rows of x, then y; in double precision.
+
+    |u|² + |v|² − 2u·v loses half of the digits; in double precision more than single ones remain,
+    and no [b m c] tensor is made.
+
+    Example:
+        >>> squared_distances(torch.tensor([[0.0, 0.0]]), torch.tensor([[3.0, 4.0]])).tolist()
+        [[0.0, 25.0], [25.0, 0.0]]
+    """
+    with torch.autocast(x.device.type, enabled=False):
+        rows = torch.cat([x.double(), y.double()])
+        rows = rows - rows.mean(dim=0).detach()
+        length = rows.square().sum(dim=1)
+        total = length[:, None] + length - 2 * rows @ rows.t()
+        # Rounding can leave a hair below zero, and off zero for a row and itself.
+        return total.clamp_min(0.0).fill_diagonal_(0.0)
+
+
+def _gaussians(
+    squared: Float[Tensor, "n n"], bandwidths: Sequence[float] | Float[Tensor, "s"]
+) -> Float[Tensor, "n n"]:
+    """Return Σ_σ exp(−d²/2σ²)."""
+    total = torch.zeros_like(squared)
+    for sigma in bandwidths:
+        total = total + torch.exp(squared / (-2 * sigma**2))
+    return total
 
 
 def median_bandwidths(
@@ -53,9 +125,8 @@ class MMD(Method):
         mmd_weight: Factor of the discrepancy, λ of DAN (eq. 4).
         factors: Kernels, as multiples of the median squared distance of the batches; see
             `median_bandwidths`.
-        biased: See `qs3.adaptation.discrepancies.mmd`.
-        label_smoothing: ε on the source.
-        norm: How the network normalises the two domains.
+        biased: See `mmd`.
+        shared: Label smoothing and normalisation, as of `Method`.
 
     Raises:
         InputError: where a setting is unusable.
@@ -70,32 +141,21 @@ class MMD(Method):
         mmd_weight: float = 1.0,
         factors: tuple[float, ...] = FACTORS,
         biased: bool = True,
-        label_smoothing: float = 0.0,
-        norm: DomainNorm | None = None,
+        **shared: Unpack[Shared],
     ) -> None:
-        super().__init__(model, label_smoothing=label_smoothing, norm=norm)
-        check_number("mmd_weight", mmd_weight, 0.0, 1e6)
-        check_flag("biased", biased)
-        if not factors:
-            raise InputError("factors must be one number or more")
-        for factor in factors:
-            check_number("each of factors", factor)
+        super().__init__(model, **shared)
+        check_range("mmd_weight", mmd_weight, 0, 1e6)
+        check_positive("factors", factors)
         self.mmd_weight, self.factors, self.biased = mmd_weight, tuple(factors), biased
 
-    def losses(
-        self,
-        source: Batch,
-        target: Float[Tensor, "b_t n_t 3"] | None,
-        progress: float,
-        generator: torch.Generator,
-    ) -> dict[str, Tensor]:
+    def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of the source and the discrepancy, mean over the kernels."""
         assert target is not None  # noqa: S101
-        here = self.features(source.points, "source")
-        there = self.features(target, "target")
-        bandwidths = median_bandwidths(here.pooled, there.pooled, self.factors)
-        distance = mmd(here.pooled, there.pooled, bandwidths, self.biased) / len(self.factors)
+        of_source = self.features(source.points, "source")
+        of_target = self.features(target, "target")
+        bandwidths = median_bandwidths(of_source.pooled, of_target.pooled, self.factors)
+        distance = mmd(of_source.pooled, of_target.pooled, bandwidths, self.biased)
         return {
-            "source": self.classification(self.head(here, "source"), source),
-            "mmd": self.mmd_weight * distance,
+            "source": self.classification(self.head(of_source, "source"), source),
+            "mmd": self.mmd_weight * (distance / len(self.factors)),
         }

@@ -1,17 +1,17 @@
 """Point cloud mixup, PCM, alone and with DefRec (Achituve et al., WACV 2021)."""
 
-from typing import NamedTuple
+from typing import NamedTuple, Unpack
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Generator, Tensor
 
+from qs3.adaptation.deformations import Deformation
 from qs3.adaptation.defrec import Reconstruction
-from qs3.adaptation.method import Batch, Method, cross_entropy
-from qs3.adaptation.normalisation import DomainNorm
+from qs3.adaptation.method import Batch, Method, Shared, Target, Terms, cross_entropy
 from qs3.models import PointClassifier
-from qs3.models.checks import check_number
+from qs3.models.checks import check_positive
 from qs3.models.ops import farthest_point_sampling, gather_points
 
 
@@ -26,7 +26,7 @@ class Mixed(NamedTuple):
     """λ: part of the points that come from the first."""
 
 
-def draw_share(concentration: float, generator: torch.Generator) -> float:
+def draw_share(concentration: float, generator: Generator) -> float:
     """Draw λ from Beta(a, a).
 
     Args:
@@ -43,7 +43,7 @@ def draw_share(concentration: float, generator: torch.Generator) -> float:
 
 
 def sample_spread(
-    points: Float[Tensor, "b n 3"], m: int, generator: torch.Generator
+    points: Float[Tensor, "b n 3"], m: int, generator: Generator
 ) -> Float[Tensor, "b m 3"]:
     """Sample m farthest points of each cloud from a random start; none where m is 0."""
     start = torch.randint(points.shape[1], (len(points),), generator=generator).to(points.device)
@@ -56,7 +56,7 @@ def mix_halves(
     first: Float[Tensor, "b n 3"],
     second: Float[Tensor, "b n 3"],
     share: float,
-    generator: torch.Generator,
+    generator: Generator,
 ) -> tuple[Float[Tensor, "b n 3"], float]:
     """Join round(λ n) farthest points of each first cloud and n − round(λ n) of its second.
 
@@ -79,7 +79,7 @@ def mix_halves(
 def mix_clouds(
     points: Float[Tensor, "b n 3"],
     labels: Int[Tensor, "b"],
-    generator: torch.Generator,
+    generator: Generator,
     concentration: float = 1.0,
 ) -> Mixed:
     """Mix each cloud of a batch with one drawn from the same batch.
@@ -125,7 +125,7 @@ def mixed_cross_entropy(
 
 
 def mixed_classification(
-    method: Method, batch: Batch, generator: torch.Generator, concentration: float
+    method: Method, batch: Batch, generator: Generator, concentration: float
 ) -> Float[Tensor, ""]:
     """Return PCM's loss on the source, and let the method count what the network had right.
 
@@ -148,8 +148,7 @@ class PCM(Method):
     Args:
         model: The network to train.
         concentration: γ of λ ~ Beta(γ, γ); 1 is the paper's.
-        label_smoothing: ε of `qs3.adaptation.method.cross_entropy`.
-        norm: How the network normalises the two domains.
+        shared: Label smoothing and normalisation, as of `Method`.
 
     Raises:
         InputError: where ``concentration`` is not larger than 0.
@@ -160,20 +159,13 @@ class PCM(Method):
         model: PointClassifier,
         *,
         concentration: float = 1.0,
-        label_smoothing: float = 0.0,
-        norm: DomainNorm | None = None,
+        **shared: Unpack[Shared],
     ) -> None:
-        super().__init__(model, label_smoothing=label_smoothing, norm=norm)
-        check_number("concentration", concentration)
+        super().__init__(model, **shared)
+        check_positive("concentration", concentration)
         self.concentration = concentration
 
-    def losses(
-        self,
-        source: Batch,
-        target: Float[Tensor, "b_t n_t 3"] | None,
-        progress: float,
-        generator: torch.Generator,
-    ) -> dict[str, Tensor]:
+    def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of mixed source clouds."""
         return {"pcm": mixed_classification(self, source, generator, self.concentration)}
 
@@ -192,8 +184,7 @@ class DefRecPCM(Method):
         on_source: Whether source clouds are deformed and rebuilt as well.
         dropout: Probability of dropping a hidden unit of the reconstruction head.
         concentration: γ of λ ~ Beta(γ, γ); 1 is the paper's.
-        label_smoothing: ε of `qs3.adaptation.method.cross_entropy`.
-        norm: How the network normalises the two domains.
+        shared: Label smoothing and normalisation, as of `Method`.
 
     Raises:
         InputError: where a setting is not usable, or the network has no local features.
@@ -206,26 +197,19 @@ class DefRecPCM(Method):
         self,
         model: PointClassifier,
         *,
-        deformation: str = "voxels",
+        deformation: Deformation = "voxels",
         weight: float = 0.2,
         on_source: bool = False,
         dropout: float = 0.5,
         concentration: float = 1.0,
-        label_smoothing: float = 0.0,
-        norm: DomainNorm | None = None,
+        **shared: Unpack[Shared],
     ) -> None:
-        super().__init__(model, label_smoothing=label_smoothing, norm=norm)
-        check_number("concentration", concentration)
+        super().__init__(model, **shared)
+        check_positive("concentration", concentration)
         self.concentration = concentration
         self.rebuild = Reconstruction(model, deformation, weight, on_source, dropout)
 
-    def losses(
-        self,
-        source: Batch,
-        target: Float[Tensor, "b_t n_t 3"] | None,
-        progress: float,
-        generator: torch.Generator,
-    ) -> dict[str, Tensor]:
+    def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of mixed source clouds and the distance of rebuilt parts."""
         assert target is not None  # noqa: S101
         mixed = mixed_classification(self, source, generator, self.concentration)

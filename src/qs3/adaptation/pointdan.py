@@ -4,18 +4,17 @@ import copy
 import math
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import Unpack
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
-from qs3.adaptation.discrepancies import classifier_discrepancy, mmd
-from qs3.adaptation.gradient_reversal import reverse_gradient
-from qs3.adaptation.method import Batch, Method, cross_entropy
-from qs3.adaptation.normalisation import DomainNorm
-from qs3.errors import InputError
+from qs3.adaptation.dann import reverse_gradient
+from qs3.adaptation.method import Batch, Method, Shared, Target, Terms, cross_entropy
+from qs3.adaptation.mmd import mmd
 from qs3.models import Features, PointClassifier, describe_point
-from qs3.models.checks import check_number, check_whole
+from qs3.models.checks import check_positive, check_range
 from qs3.models.pointnet_sa import SANode, fill_nodes
 
 
@@ -27,6 +26,21 @@ def reversal_coefficient(progress: float) -> float:
         [0.0, 0.707, 1.0]
     """
     return math.sin(0.5 * math.pi * progress)
+
+
+def classifier_discrepancy(p1: Float[Tensor, "b k"], p2: Float[Tensor, "b k"]) -> Float[Tensor, ""]:
+    """Mean |p₁ − p₂| over clouds and classes (Saito et al., CVPR 2018, eq. 2).
+
+    Args:
+        p1: Class probabilities of one classifier.
+        p2: Those of the other, of the same clouds.
+
+    Example:
+        >>> float(classifier_discrepancy(torch.tensor([[1.0, 0.0]]), torch.tensor([[0.5, 0.5]])))
+        0.5
+    """
+    dtype = torch.promote_types(p1.dtype, torch.float32)
+    return (p1.to(dtype) - p2.to(dtype)).abs().mean()
 
 
 class NodeAttention(nn.Module):
@@ -67,8 +81,8 @@ def head_parameters(model: PointClassifier) -> list[nn.Parameter]:
     with torch.enable_grad():
         total = model.head(features).sum()
     model.train(training)
-    found = torch.autograd.grad(total, parameters, allow_unused=True)
-    return [p for p, gradient in zip(parameters, found, strict=True) if gradient is not None]
+    gradients = torch.autograd.grad(total, parameters, allow_unused=True)
+    return [p for p, gradient in zip(parameters, gradients, strict=True) if gradient is not None]
 
 
 def fresh_head(model: PointClassifier) -> PointClassifier:
@@ -130,8 +144,7 @@ class PointDAN(Method):
         reduction: Bottleneck of the attention.
         classifier_rate: Learning rate of the classifiers over that of everything else; published
             are 2e-4 and 1e-4.
-        label_smoothing: ε on the source.
-        norm: How the network normalises the two domains.
+        shared: Label smoothing and normalisation, as of `Method`.
 
     Raises:
         InputError: where a setting is unusable or the network has no local features.
@@ -154,59 +167,47 @@ class PointDAN(Method):
         node_width: int = 64,
         reduction: int = 8,
         classifier_rate: float = 2.0,
-        label_smoothing: float = 0.0,
-        norm: DomainNorm | None = None,
+        **shared: Unpack[Shared],
     ) -> None:
-        super().__init__(model, label_smoothing=label_smoothing, norm=norm)
-        weights = {"discrepancy_weight": discrepancy_weight, "node_weight": node_weight}
-        for name, value in weights.items():
-            check_number(name, value, 0.0, 1e6)
-        if not bandwidths:
-            raise InputError("bandwidths must be one number or more")
-        for sigma in bandwidths:
-            check_number("each of bandwidths", sigma)
-        check_number("classifier_rate", classifier_rate)
-        check_number("source_weight", source_weight)
-        check_whole("reduction", reduction)
+        super().__init__(model, **shared)
+        check_range("discrepancy_weight", discrepancy_weight, 0, 1e6)
+        check_range("node_weight", node_weight, 0, 1e6)
+        check_positive("bandwidths", bandwidths)
+        check_positive("classifier_rate", classifier_rate)
+        check_positive("source_weight", source_weight)
+        check_range("reduction", reduction)
         self.source_weight = source_weight
         self.discrepancy_weight, self.node_weight = discrepancy_weight, node_weight
         self.bandwidths, self.classifier_rate = tuple(bandwidths), classifier_rate
         self.second = fresh_head(model)
-        seen = describe_point(model)
-        given, local = seen.nodes, seen.local
-        assert local is not None  # noqa: S101
-        self.sa_node = (
-            SANode(local.shape[2], node_width, nodes, neighbours, radius, steered=True)
-            if given is None
-            else None
-        )
-        width = nodes * node_width if given is None else given[0].numel()
+        described = describe_point(model)
+        assert described.local is not None  # noqa: S101
+        channels = described.local.shape[2]
+        if described.nodes is None:
+            self.sa_node = SANode(channels, node_width, nodes, neighbours, radius, steered=True)
+            width = nodes * node_width
+        else:
+            self.sa_node, width = None, described.nodes[0].numel()
         self.attention = nn.ModuleDict(
             {domain: NodeAttention(width, reduction) for domain in ("source", "target")}
         )
 
-    def losses(
-        self,
-        source: Batch,
-        target: Float[Tensor, "b_t n_t 3"] | None,
-        progress: float,
-        generator: torch.Generator,
-    ) -> dict[str, Tensor]:
+    def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of both classifiers, their negated discrepancy, the MMD."""
         assert target is not None  # noqa: S101
-        here = self.features(source.points, "source")
-        there = self.features(target, "target")
-        first = self.classification(self.head(here, "source"), source)
-        second = cross_entropy(self.second.head(here), source.labels, self.label_smoothing)
-        pooled = reverse_gradient(there.pooled, reversal_coefficient(progress))
-        reversed_ = replace(there, pooled=pooled)
+        of_source = self.features(source.points, "source")
+        of_target = self.features(target, "target")
+        first = self.classification(self.head(of_source, "source"), source)
+        second = cross_entropy(self.second.head(of_source), source.labels, self.label_smoothing)
+        pooled = reverse_gradient(of_target.pooled, reversal_coefficient(progress))
+        turned = replace(of_target, pooled=pooled)
         probabilities = [
             logits.float().softmax(dim=1)
-            for logits in (self.head(reversed_, "target"), self.second.head(reversed_))
+            for logits in (self.head(turned, "target"), self.second.head(turned))
         ]
         nodes = [
-            self.attention["source"](self.nodes(source.points, here)),
-            self.attention["target"](self.nodes(target, there)),
+            self.attention["source"](self.nodes(source.points, of_source)),
+            self.attention["target"](self.nodes(target, of_target)),
         ]
         return {
             "source": self.source_weight * (first + second),
@@ -225,8 +226,8 @@ class PointDAN(Method):
     def parameter_groups(self, learning_rate: float) -> Iterable[dict]:
         """Return everything but the classifiers, then these with their own rate."""
         classifiers = [*head_parameters(self.model), *self.second.parameters()]
-        known = {id(p) for p in classifiers}
-        others = [p for p in self.parameters() if p.requires_grad and id(p) not in known]
+        apart = {id(p) for p in classifiers}
+        others = [p for p in self.parameters() if p.requires_grad and id(p) not in apart]
         return [
             {"params": others, "lr": learning_rate},
             {"params": classifiers, "lr": self.classifier_rate * learning_rate},

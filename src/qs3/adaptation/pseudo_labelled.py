@@ -1,11 +1,11 @@
 """Training on pseudo labels of the target, with or without the source beside them."""
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
+from typing import Unpack
 
-from qs3.adaptation.method import Batch, Domain, Method, cross_entropy
-from qs3.adaptation.normalisation import DomainNorm
+import torch
+from torch import Generator, Tensor
+
+from qs3.adaptation.method import Batch, Domain, Method, Shared, Target, Terms, cross_entropy
 from qs3.models import PointClassifier
 
 
@@ -20,8 +20,7 @@ class PseudoLabelled(Method):
         source_weight: Factor of the source's loss in epoch 0; the target's is 1.
         weight_step: Taken off both factors after each epoch (SPST: 0.005).
         epochs: Numbers of the epochs of this training, for ``weight_step``.
-        label_smoothing: ε of `qs3.adaptation.method.cross_entropy`.
-        norm: How the network normalises the two domains.
+        shared: Label smoothing and normalisation, as of `Method`.
     """
 
     def __init__(
@@ -31,19 +30,12 @@ class PseudoLabelled(Method):
         source_weight: float = 1.0,
         weight_step: float = 0.0,
         epochs: range = range(1),
-        label_smoothing: float = 0.0,
-        norm: DomainNorm | None = None,
+        **shared: Unpack[Shared],
     ) -> None:
-        super().__init__(model, label_smoothing=label_smoothing, norm=norm)
+        super().__init__(model, **shared)
         self.source_weight, self.weight_step, self.epochs = source_weight, weight_step, epochs
 
-    def losses(
-        self,
-        source: Batch,
-        target: Float[Tensor, "b_t n_t 3"] | None,
-        progress: float,
-        generator: torch.Generator,
-    ) -> dict[str, Tensor]:
+    def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the weighted cross entropies, ``pseudo`` and ``source``."""
         count = source.parts[0] if source.parts else len(source.labels)
         done = min(int(progress * len(self.epochs) + 1e-9), len(self.epochs) - 1)

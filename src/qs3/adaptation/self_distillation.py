@@ -2,17 +2,17 @@
 
 import copy
 import math
+from typing import Unpack
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Generator, Tensor
 
-from qs3.adaptation import views
-from qs3.adaptation.method import Batch, Domain, Method
-from qs3.adaptation.normalisation import DomainNorm
+from qs3.adaptation import distortions
+from qs3.adaptation.method import Batch, Domain, Method, Shared, Target, Terms
 from qs3.errors import InputError
 from qs3.models import PointClassifier
-from qs3.models.checks import check_number
+from qs3.models.checks import check_positive, check_range
 
 _ELASTIC = ((0.2, 0.4), (0.8, 1.6))
 """Grain and strength of the strong view's two elastic distortions, as in the released code."""
@@ -32,8 +32,8 @@ def distillation_loss(
     the feature; no gradient goes to the teacher.
 
     Args:
-        student: Pooled features of the strong views.
-        teacher: Pooled features of the weak views.
+        student: Pooled features of the strong distortions.
+        teacher: Pooled features of the weak distortions.
         student_temperature: τ_s.
         teacher_temperature: τ_t; below τ_s it sharpens.
 
@@ -62,7 +62,7 @@ class SelfDistillation(Method):
     running statistics are a moving average of the student's. The loss is the source's cross entropy
     on strong views plus ``weight · ramp · distillation_loss`` on the pooled features of both
     domains, mean over all clouds. Weak view: jitter. Strong view: two elastic distortions, scaling,
-    jitter, and a plane cut (`qs3.adaptation.views`). After step t the average moves by
+    jitter, and a plane cut (`qs3.adaptation.distortions`). After step t the average moves by
     1 − min(decay, 1 − 1/(t + 1)) towards the student, so that it begins as the plain mean.
 
     `result` is the student, as the released code evaluates it: the teacher lags behind by a
@@ -96,8 +96,7 @@ class SelfDistillation(Method):
         tilt: Standard deviation of small turns in the strong view, in radians; 0 leaves them out,
             as the released code does.
         sigma: Standard deviation of the jitter of both views, cut at five times it.
-        label_smoothing: ε of the cross entropy on the source.
-        norm: How the network normalises the two domains; the teacher does alike.
+        shared: Label smoothing and normalisation, as of `Method`.
 
     Raises:
         InputError: where a setting is unusable.
@@ -119,32 +118,23 @@ class SelfDistillation(Method):
         scale: tuple[float, float] = (0.7, 1.5),
         tilt: float = 0.0,
         sigma: float = 0.01,
-        label_smoothing: float = 0.0,
-        norm: DomainNorm | None = None,
+        **shared: Unpack[Shared],
     ) -> None:
-        super().__init__(model, label_smoothing=label_smoothing, norm=norm)
-        for name, value in {
-            "weight": weight,
-            "distortion": distortion,
-            "tilt": tilt,
-            "sigma": sigma,
-        }.items():
-            check_number(name, value, 0.0, _LARGEST)
-        for name, value in {
-            "source_keep": source_keep,
-            "target_keep": target_keep,
-            "student_temperature": student_temperature,
-            "teacher_temperature": teacher_temperature,
-        }.items():
-            check_number(name, value)
-        if max(source_keep, target_keep) > 1.0:
-            raise InputError(
-                f"source_keep and target_keep are at most 1, not {source_keep} and {target_keep}"
-            )
+        super().__init__(model, **shared)
+        check_range("weight", weight, 0, _LARGEST)
+        check_range("distortion", distortion, 0, _LARGEST)
+        check_range("tilt", tilt, 0, _LARGEST)
+        check_range("sigma", sigma, 0, _LARGEST)
+        check_positive("student_temperature", student_temperature)
+        check_positive("teacher_temperature", teacher_temperature)
+        check_positive("scale", scale)
+        for name, keep in (("source_keep", source_keep), ("target_keep", target_keep)):
+            check_positive(name, keep)
+            check_range(name, keep, 0, 1)
         if not 0.0 <= decay < 1.0:
             raise InputError(f"decay must be 0 to below 1, not {decay}")
-        if not 0.0 < scale[0] <= scale[1] < math.inf:
-            raise InputError(f"scale must be two positive bounds in order, not {scale}")
+        if scale[0] > scale[1]:
+            raise InputError(f"scale must be two bounds in order, not {scale}")
         self.weight, self.decay = weight, decay
         self.temperatures = (student_temperature, teacher_temperature)
         self.keep = {"source": source_keep, "target": target_keep}
@@ -154,30 +144,20 @@ class SelfDistillation(Method):
         self.teacher.requires_grad_(False)
         self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
 
-    def losses(
-        self,
-        source: Batch,
-        target: Float[Tensor, "b_t n_t 3"] | None,
-        progress: float,
-        generator: torch.Generator,
-    ) -> dict[str, Tensor]:
+    def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of the source's strong views, and the distillation."""
         assert target is not None  # noqa: S101
         self.teacher.eval()
-        goals, found = [], []
-        logits = None
-        domains: tuple[tuple[Domain, Tensor], ...] = (
-            ("source", source.points),
-            ("target", target),
-        )
+        goals, pooled, logits = [], [], None
+        domains: tuple[tuple[Domain, Tensor], ...] = (("source", source.points), ("target", target))
         for domain, points in domains:
             goals.append(self._describe(self._weak(points, generator), domain))
             features = self.features(self._strong(points, domain, generator), domain)
-            found.append(features.pooled)
+            pooled.append(features.pooled)
             if domain == "source":
                 logits = self.head(features, domain)
         assert logits is not None  # noqa: S101
-        distance = distillation_loss(torch.cat(found), torch.cat(goals), *self.temperatures)
+        distance = distillation_loss(torch.cat(pooled), torch.cat(goals), *self.temperatures)
         return {
             "source": self.classification(logits, source),
             "distillation": self.weight * ramp(progress) * distance,
@@ -203,17 +183,17 @@ class SelfDistillation(Method):
         with self.teacher_norm.of(domain):
             return self.teacher.encode(points).pooled
 
-    def _weak(self, points: Tensor, generator: torch.Generator) -> Tensor:
-        return views.jitter(points, generator, self.sigma, 5 * self.sigma)
+    def _weak(self, points: Tensor, generator: Generator) -> Tensor:
+        return distortions.jitter(points, generator, self.sigma, 5 * self.sigma)
 
-    def _strong(self, points: Tensor, domain: Domain, generator: torch.Generator) -> Tensor:
+    def _strong(self, points: Tensor, domain: Domain, generator: Generator) -> Tensor:
         if self.tilt > 0:
-            points = views.tilt(points, generator, self.tilt, 3 * self.tilt)
+            points = distortions.tilt(points, generator, self.tilt, 3 * self.tilt)
         if self.distortion > 0:
             for grain, strength in _ELASTIC:
-                points = views.elastic(points, generator, grain, self.distortion * strength)
-        points = views.rescale(points, generator, *self.scale)
-        points = views.jitter(points, generator, self.sigma, 5 * self.sigma)
+                points = distortions.elastic(points, generator, grain, self.distortion * strength)
+        points = distortions.rescale(points, generator, *self.scale)
+        points = distortions.jitter(points, generator, self.sigma, 5 * self.sigma)
         if self.keep[domain] < 1:
-            points = views.occlude(points, generator, self.keep[domain])
+            points = distortions.occlude(points, generator, self.keep[domain])
         return points

@@ -1,10 +1,8 @@
 """Training on labelled clouds alone: the row without adaptation, and the *Supervised* row."""
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
+from torch import Generator
 
-from qs3.adaptation.method import Batch, Method
+from qs3.adaptation.method import Batch, Method, Target, Terms
 
 
 class SourceOnly(Method):
@@ -13,12 +11,6 @@ class SourceOnly(Method):
     With the target's labelled training part as its source it is the paper's *Supervised*.
     """
 
-    def losses(
-        self,
-        source: Batch,
-        target: Float[Tensor, "b_t n_t 3"] | None,
-        progress: float,
-        generator: torch.Generator,
-    ) -> dict[str, Tensor]:
+    def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of the source batch."""
         return {"source": self.classification(self.logits(source.points), source)}

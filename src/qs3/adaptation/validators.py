@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import xlogy
 
-from qs3.adaptation.clusters import adjusted_mutual_information, k_means
 from qs3.adaptation.density import density_ratio
 from qs3.adaptation.priors import check_probabilities
 from qs3.errors import InputError
@@ -182,7 +181,8 @@ def class_ami(
 ) -> float:
     """Return the agreement of predicted classes with clusters (Musgrave et al., 2208.07360).
 
-    Adjusted mutual information (arithmetic mean) of the predictions and of k-means clusters. Where
+    Adjusted mutual information (arithmetic mean) of the predictions and of scikit-learn's k-means
+    clusters, the best of four starts; no more clusters than distinct features. Where
     all clouds are predicted one class the score is 0, whatever the clusters.
 
     Args:
@@ -199,10 +199,19 @@ def class_ami(
         >>> round(class_ami(points, np.array([1, 1, 0, 0]), 2), 12)
         1.0
     """
+    from sklearn.cluster import KMeans
+    from sklearn.metrics import adjusted_mutual_info_score
+
     rows = _check_features(features, "features")
+    if k < 1:
+        raise InputError(f"k must be at least 1, not {k}")
     if len(np.unique(predicted)) < 2:
         return 0.0
-    return adjusted_mutual_information(k_means(rows, k, seed), predicted)
+    rows = rows - rows.mean(axis=0)
+    k = min(k, len(np.unique(rows, axis=0)))
+    means = KMeans(k, n_init=4, random_state=seed)  # pyright: ignore[reportArgumentType]
+    clusters = means.fit_predict(rows)
+    return float(adjusted_mutual_info_score(clusters, predicted))
 
 
 def source_accuracy(probabilities: Float[np.ndarray, "v k"], labels: Int[np.ndarray, "v"]) -> float:
@@ -219,9 +228,24 @@ def source_accuracy(probabilities: Float[np.ndarray, "v k"], labels: Int[np.ndar
     return float(np.mean(probabilities.argmax(axis=1) == labels))
 
 
-def validate(observation: Observation) -> dict[str, float | None]:
-    """Return every score of a network; None where the observation lacks what a score needs."""
-    return {name: score(observation) for name, score in VALIDATORS.items()}
+def _plogp(probabilities: np.ndarray) -> np.ndarray:
+    """Return Σ_c p ln p of each row, in double precision."""
+    p = np.maximum(probabilities.astype(np.float64), 0.0)
+    return xlogy(p, p).sum(axis=1)
+
+
+def _check(probabilities: np.ndarray) -> None:
+    if len(probabilities) == 0:
+        raise InputError("there are no clouds to score")
+    check_probabilities(probabilities)
+
+
+def _check_features(features: np.ndarray, what: str) -> np.ndarray:
+    if len(features) == 0:
+        raise InputError(f"{what}: there are no clouds to score")
+    if not np.isfinite(features).all():
+        raise InputError(f"{what} hold NaN or infinity; the network has diverged")
+    return features.astype(np.float64)
 
 
 def _source_val(seen: Observation) -> float | None:
@@ -257,21 +281,6 @@ VALIDATORS: Mapping[str, Callable[[Observation], float | None]] = MappingProxyTy
 """Every label-free score by its name; ``last`` needs none, and the oracle is not one of them."""
 
 
-def _plogp(probabilities: np.ndarray) -> np.ndarray:
-    """Return Σ_c p ln p of each row, in double precision."""
-    p = np.maximum(probabilities.astype(np.float64), 0.0)
-    return xlogy(p, p).sum(axis=1)
-
-
-def _check(probabilities: np.ndarray) -> None:
-    if len(probabilities) == 0:
-        raise InputError("there are no clouds to score")
-    check_probabilities(probabilities)
-
-
-def _check_features(features: np.ndarray, what: str) -> np.ndarray:
-    if len(features) == 0:
-        raise InputError(f"{what}: there are no clouds to score")
-    if not np.isfinite(features).all():
-        raise InputError(f"{what} hold NaN or infinity; the network has diverged")
-    return features.astype(np.float64)
+def validate(observation: Observation) -> dict[str, float | None]:
+    """Return every score of a network; None where the observation lacks what a score needs."""
+    return {name: score(observation) for name, score in VALIDATORS.items()}

@@ -207,7 +207,7 @@ def _report(folder: Path, settings: DemoSettings) -> tuple[Any, Any, Path]:
         title="qs3 demo: from CAD models to a depth camera",
         summary=(
             f"A {settings.model} was trained on {source.clouds} scans of built-in shapes by the "
-            f"qs3 sensor ({settings.source_views} views around each object), then adapted by "
+            f"paper sensor ({settings.source_views} views around each object), then adapted by "
             f"quasi-balanced self-training to {target.clouds} scans of other shapes by the sensor "
             f"{settings.target_sensor}, which sees each object once in brighter light and with "
             "image noise. No label of the target was used."
@@ -216,12 +216,12 @@ def _report(folder: Path, settings: DemoSettings) -> tuple[Any, Any, Path]:
         settings=dataclasses.asdict(settings) | {"runs": records[1].settings},
         montage=scan_montage(
             shapes.make("chair", seed=settings.seed),
-            get_sensor("qs3"),
+            get_sensor("paper"),
             _renderer(settings),
             settings.source_views,
             settings.seed,
         ),
-        montage_title="chair · sensor qs3",
+        montage_title="chair · sensor paper",
         notes=(
             *page.notes,
             "This is a demonstration on tens of clouds, one seed and a simulated target. It shows "

@@ -17,7 +17,7 @@ def sensors(
 
     Args:
         action: list all of them, or show one.
-        name: What to show: a sensor, or a TOML file, whose every setting is then told.
+        name: What to show: a sensor, or a TOML file, then in full.
     """
     from qs3.sensor.presets import SENSORS, get_sensor, sensor_toml
 

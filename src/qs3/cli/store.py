@@ -1,4 +1,4 @@
-"""``qs3 info``, ``qs3 verify`` and ``qs3 merge``: look after data sets that are there."""
+"""``qs3 info``, ``qs3 verify`` and ``qs3 merge``: look after finished data sets."""
 
 import json
 import sys
@@ -21,46 +21,47 @@ def info(folder: _Folder, as_json: bool = False) -> int:
     from qs3.store.failures import read_failures
     from qs3.store.info import info as count
 
-    found = count(folder)
+    contents = count(folder)
     failures = read_failures(folder)
     if as_json:
-        print(json.dumps({**found, "failures": failures}, indent=2, ensure_ascii=False))
+        print(json.dumps({**contents, "failures": failures}, indent=2, ensure_ascii=False))
         return 0
-    for line in _lines(found):
+    for line in _lines(contents):
         print(line)
     for record in failures[:5]:
         print(f"  {record['id']}: {record['reason']}")
     if len(failures) > 5:
         print(f"  and {len(failures) - 5} more in failures.jsonl")
-    if found["shards"] < found["shards_planned"]:
+    if contents["shards"] < contents["shards_planned"]:
         print(f"unfinished: run the same command again to go on with {folder}", file=sys.stderr)
     return 0
 
 
-def _lines(found: dict[str, Any]) -> list[str]:
-    planned = "" if found["rows_planned"] is None else f" of {found['rows_planned']} planned"
-    points = " to ".join(str(size) for size in dict.fromkeys(found["points"])) or "no"
+def _lines(contents: dict[str, Any]) -> list[str]:
+    planned = "" if contents["rows_planned"] is None else f" of {contents['rows_planned']} planned"
+    points = " to ".join(str(size) for size in dict.fromkeys(contents["points"])) or "no"
     lines = [
-        f"{found['rows']} clouds{planned}, of {found['objects']} objects",
-        f"{found['shards']} of {found['shards_planned']} shards, {found['bytes'] / 1e6:.1f} MB",
+        f"{contents['rows']} clouds{planned}, of {contents['objects']} objects",
+        f"{contents['shards']} of {contents['shards_planned']} shards, "
+        f"{contents['bytes'] / 1e6:.1f} MB",
         f"{points} points a cloud",
-        "classes: " + _counts(found["classes"]),
+        "classes: " + _counts(contents["classes"]),
     ]
-    if any(found["splits"]):
-        lines.append("splits: " + _counts(found["splits"]))
+    if any(contents["splits"]):
+        lines.append("splits: " + _counts(contents["splits"]))
     names = {
         "valid_fraction": ("valid pixels of the object", "{:.1%}"),
         "disparity_bias": ("disparity bias, px", "{:+.3f}"),
         "disparity_sigma": ("disparity σ, px", "{:.3f}"),
         "gross_share": ("gross errors", "{:.2%}"),
     }
-    for name, value in found["statistics"].items():
+    for name, value in contents["statistics"].items():
         label, form = names[name]
         lines.append(f"{label} (median): {form.format(value)}")
-    sensor = found["settings"].get("sensor")
+    sensor = contents["settings"].get("sensor")
     if isinstance(sensor, dict) and "name" in sensor:
         lines.append(f"sensor: {sensor['name']}")
-    lines.append(f"failed: {found['failed']}")
+    lines.append(f"failed: {contents['failed']}")
     return lines
 
 

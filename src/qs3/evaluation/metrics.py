@@ -24,15 +24,15 @@ class MeanSEM:
     n: int
     """Number of values."""
 
-    def format(self, scale: float = 100.0, digits: int = 1) -> str:
-        """Return the value as text, by default in per cent.
+    def format(self, scale: float = 100.0, digits: int = 1, count: bool = True) -> str:
+        """Return the value as text, by default in per cent and with the number of values.
 
         Example:
             >>> mean_sem([0.5, 0.6]).format()
             '55.0 ± 5.0 (n=2)'
         """
         spread = "" if self.sem is None else f" ± {scale * self.sem:.{digits}f}"
-        return f"{scale * self.mean:.{digits}f}{spread} (n={self.n})"
+        return f"{scale * self.mean:.{digits}f}{spread}" + f" (n={self.n})" * count
 
 
 def accuracy(labels: Int[np.ndarray, "b"], predictions: Int[np.ndarray, "b"]) -> float:

@@ -122,7 +122,7 @@ class RunRecord:
     accuracy. ``oracle`` among them chose by the labels of the test set: an upper bound."""
     marks: tuple[str, ...] = ()
     """Caveats printed with the number: ``transductive``, ``supervised`` …"""
-    experiment: Mapping[str, str | int] | None = None
+    experiment: Mapping[str, str | int | float] | None = None
     """Place of the run in a grid of runs, by fields; None outside of one."""
     schema: int = SCHEMA_VERSION
     """Version of these fields."""

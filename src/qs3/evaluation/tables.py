@@ -79,7 +79,8 @@ def shared(record: RunRecord) -> dict[str, Any]:
         settings["train"] = {k: v for k, v in settings["train"].items() if k != "seed"}
     # A warm-up is known by its weights, which follow from the seed; so do the held-out clouds.
     settings["warm_up"] = settings.get("warm_up") is not None
-    for name in ("source", "target"):  # checksums of the clouds, told by the data below
+    # Checksums of the clouds, told by the data below; and a name for the settings of the rounds.
+    for name in ("source", "target", "preset"):
         settings.pop(name, None)
     data = {"source": record.source, "target": record.target, "test": record.test}
     return {
@@ -109,6 +110,8 @@ def average(lines: pd.DataFrame, by: Sequence[str] = LINE) -> pd.DataFrame:
         InputError: where a line has two runs of one seed, or runs of other settings or data.
     """
     means = []
+    if lines.empty:
+        lines = pd.DataFrame(columns=list(by))
     for _, group in lines.groupby(list(by), sort=False, dropna=False):
         runs: list[dict[str, Any]] = group.to_dict("records")  # pyright: ignore[reportAssignmentType]
         line = {name: runs[0][name] for name in by}

@@ -74,13 +74,13 @@ def step_seconds(runs: Iterable[Run], settings: TrainSettings, steps: int = 2) -
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)
     try:
-        found = {}
+        seconds = {}
         for name in methods_of(runs):
             few = replace(settings, num_points=64, batch_size=4)
             Step(name, few, device_of(settings))()
             step = Step(name, settings, device_of(settings))
-            found[name] = statistics.median(step() for _ in range(steps))
-        return found
+            seconds[name] = statistics.median(step() for _ in range(steps))
+        return seconds
     finally:
         torch.set_num_threads(threads)
 
@@ -99,7 +99,7 @@ class Counts:
 
 def methods_of(runs: Iterable[Run]) -> list[str]:
     """Return the methods whose steps a grid takes, each once."""
-    return list(dict.fromkeys(["source-only", *(split_method(run.method)[0] for run in runs)]))
+    return list(dict.fromkeys(["source-only", *(split_method(run.kind.method)[0] for run in runs)]))
 
 
 def run_seconds(
@@ -114,14 +114,14 @@ def run_seconds(
         only_scores: Whether its network is there, and nothing but its scores is missing.
     """
     settings = run.train
-    base = split_method(run.method)[0]
+    base = split_method(run.kind.method)[0]
     size = settings.batch_size
     trained = counts.source - int(settings.holdout * counts.source)
     looks = 1
     seconds = 0.0
     if only_scores:
         return counts.test / size * _PASS * steps["source-only"]
-    if run.warm_up is None:
+    if not run.kind.warm_up:
         batches = count_batches(trained, size)
         if method_class(base).uses_target:
             batches = max(batches, count_batches(counts.target, size))

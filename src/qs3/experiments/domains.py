@@ -6,8 +6,9 @@ own folders take them with ``--data``.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from qs3.errors import InputError
 from qs3.io.clouds import CloudKind
@@ -16,91 +17,153 @@ from qs3.store.manifest import MANIFEST
 REAL = "sunrgbd_objects.npz"
 REAL_CLOUDS = 32
 """Objects in that file."""
-VIEWS, SENSOR = "V", "A."
-"""Domains whose name goes on: V3 is the source in three views, A.d435 one sensor's scans."""
+DATA = "data"
+"""Folder of the data sets that are made here, in that of a reproduction."""
+Kind = Literal["M", "S", "D", "F", "N", "C", "J", "R", "V", "A"]
+"""M: samples of the meshes' surfaces; S: scans of the same meshes by the simulated sensor; D: scans
+of other meshes by another sensor; F: their fusion without noise; N: surfaces of further meshes; J
+and C: scans from one side with and without noise; V: scans from a number of views; A: scans by a
+named sensor; R: real objects."""
 
 
 @dataclass(frozen=True)
 class Domain:
-    """Clouds to train on and clouds to score on."""
+    """A source or a target of the tables."""
+
+    kind: Kind
+    """Which clouds."""
+    views: int = 0
+    """Number of fused views, of kind V."""
+    sensor: str = ""
+    """Preset of the sensor, of kind A."""
+
+    def __str__(self) -> str:
+        """Return its name in folders and files, which nothing reads back.
+
+        Example:
+            >>> str(Domain("V", views=3)), str(Domain("A", sensor="kinect-v1"))
+            ('V3', 'A.kinect_v1')
+        """
+        return f"{self.kind}{self.views or ''}{'.' * bool(self.sensor)}{self.sensor}".replace(
+            "-", "_"
+        )
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """A data set that is made here; `qs3.experiments.data.make_plans` says of what."""
+
+    kind: Literal["source", "held", "jitter", "views", "target", "fused", "second", "sensor"]
+    """Which meshes, and from where they are seen."""
+    views: int = 0
+    """Number of fused views, of ``views``."""
+    sensor: str = ""
+    """Preset of the sensor, of ``sensor``."""
+
+    @property
+    def name(self) -> str:
+        """Name of its folder."""
+        return "-".join(str(part) for part in (self.kind, self.views, self.sensor) if part)
+
+
+@dataclass(frozen=True)
+class Part:
+    """Clouds that a run reads."""
+
+    data: DataSet | Path
+    """Made here, or a path of the user's; the real objects are a file of the shared folder."""
+    split: str | None
+    """Part of the data; None takes all."""
+    cloud: CloudKind
+    """Which cloud of a generated data set."""
+
+    def locate(self, out: Path, shared: Path | None) -> Path:
+        """Return where the clouds lie.
+
+        Args:
+            out: Folder of the reproduction.
+            shared: Folder with the real objects.
+
+        Raises:
+            InputError: where they are real objects that are not at hand.
+        """
+        if isinstance(self.data, DataSet):
+            return out / DATA / self.data.name
+        if self.data != Path(REAL):
+            return self.data
+        if shared is None or not (shared / REAL).is_file():
+            raise InputError(
+                f"domain R needs {REAL}; set QS3_SHARED_DATA to the folder that has it, or choose "
+                "--tasks without R"
+            )
+        return shared / REAL
+
+
+@dataclass(frozen=True)
+class DomainData:
+    """What a domain is made of."""
 
     title: str
     """What tables and pictures call it; docs/reproduction.md tells the rest."""
-    train: str
-    """Data set made here, or a path of the user's, to train on or to adapt to."""
-    test: str
-    """The same, to score on."""
-    cloud: CloudKind = "points"
-    """Which cloud of a generated data set."""
-    train_split: str | None = "train"
-    """Part of the first."""
-    test_split: str | None = "test"
-    """Part of the second."""
+    train: Part
+    """Clouds to train on or to adapt to."""
+    test: Part | None
+    """Clouds to score on."""
     stands_for: str = ""
     """Data set of the paper whose place it takes; empty where it takes none."""
     own: bool = False
-    """Whether both are paths of the user's."""
+    """Whether it is the user's."""
 
 
-_MADE: Mapping[str, Domain] = {
-    "M": Domain("M: surface samples", "source", "held", cloud="surface", stands_for="ModelNet10"),
-    "S": Domain("S: scans", "source", "held", stands_for="SpeckleNet10"),
-    "D": Domain(
-        "D: one view, other sensor",
-        "target",
-        "target",
-        stands_for="DepthScanNet10",
-    ),
-    "F": Domain(
-        "F: fusion without noise",
-        "fused",
-        "fused",
-        cloud="clean",
-        stands_for="ScanNet10 (S*)",
-    ),
-    "N": Domain(
-        "N: surface samples of other meshes", "second", "second", "surface", stands_for="ShapeNet10"
-    ),
-    "C": Domain("C: one-sided, without noise", "jitter", "", cloud="clean"),
-    "J": Domain("J: one-sided scans", "jitter", ""),
-    "R": Domain("R: real SUN RGB-D objects", REAL, REAL, train_split=None, test_split=None),
+Own = Mapping[str, DomainData]
+"""The user's data sets, by the kind of domain whose place they take."""
+
+
+def _made(
+    title: str,
+    train: DataSet,
+    test: DataSet | None,
+    cloud: CloudKind = "points",
+    stands_for: str = "",
+) -> DomainData:
+    test_part = None if test is None else Part(test, "test", cloud)
+    return DomainData(title, Part(train, "train", cloud), test_part, stands_for)
+
+
+_SOURCE, _HELD, _TARGET = DataSet("source"), DataSet("held"), DataSet("target")
+_FUSED, _SECOND, _JITTER = DataSet("fused"), DataSet("second"), DataSet("jitter")
+_REAL = Part(Path(REAL), None, "points")
+_MADE: Mapping[str, DomainData] = {
+    "M": _made("M: surface samples", _SOURCE, _HELD, "surface", "ModelNet10"),
+    "S": _made("S: scans", _SOURCE, _HELD, stands_for="SpeckleNet10"),
+    "D": _made("D: one view, other sensor", _TARGET, _TARGET, stands_for="DepthScanNet10"),
+    "F": _made("F: fusion without noise", _FUSED, _FUSED, "clean", "ScanNet10 (S*)"),
+    "N": _made("N: surface samples of other meshes", _SECOND, _SECOND, "surface", "ShapeNet10"),
+    "C": _made("C: one-sided, without noise", _JITTER, None, "clean"),
+    "J": _made("J: one-sided scans", _JITTER, None),
+    "R": DomainData("R: real SUN RGB-D objects", _REAL, _REAL),
 }
 
 
-def domain(name: str, own: Mapping[str, Domain] | None = None) -> Domain:
-    """Return a domain by its name; the user's own come first.
-
-    Raises:
-        InputError: where there is no such domain.
+def data_of(domain: Domain, own: Own | None = None) -> DomainData:
+    """Return what a domain is made of; the user's own come first.
 
     Example:
-        >>> domain("V3").train, domain("A.kinect_v1").test
-        ('views-3', 'sensor-kinect-v1')
+        >>> data_of(Domain("V", views=3)).title
+        'scans from 3 views'
     """
-    if own and name in own:
-        return own[name]
-    if name in _MADE:
-        return _MADE[name]
-    if name.startswith(SENSOR):
-        sensor = name.removeprefix(SENSOR).replace("_", "-")
-        return Domain(f"scans by {sensor}", f"sensor-{sensor}", f"sensor-{sensor}")
-    if name.startswith(VIEWS) and name.removeprefix(VIEWS).isdecimal():
-        count = int(name.removeprefix(VIEWS))
-        return Domain(f"scans from {count} view{'s' * (count > 1)}", f"views-{count}", "")
-    raise InputError(f"unknown domain {name!r}; choose from {', '.join(_MADE)}")
+    if own and domain.kind in own:
+        return own[domain.kind]
+    if domain.kind == "A":
+        scans = DataSet("sensor", sensor=domain.sensor)
+        return _made(f"scans by {domain.sensor}", scans, scans)
+    if domain.kind == "V":
+        title = f"scans from {domain.views} view{'s' * (domain.views > 1)}"
+        return _made(title, DataSet("views", views=domain.views), None)
+    return _MADE[domain.kind]
 
 
-def sensor_domain(sensor: str) -> str:
-    """Return the name of the domain of a sensor's scans; a hyphen parts source and target.
-
-    Example:
-        >>> sensor_domain("kinect-v1")
-        'A.kinect_v1'
-    """
-    return SENSOR + sensor.replace("-", "_")
-
-
-def parse_own(given: Sequence[str]) -> dict[str, Domain]:
+def parse_own(given: Sequence[str]) -> dict[str, DomainData]:
     """Read the user's data sets: ``NAME=PATH``, or ``NAME=PATH:TRAIN:TEST`` with two parts of it.
 
     Raises:
@@ -109,53 +172,31 @@ def parse_own(given: Sequence[str]) -> dict[str, Domain]:
     Example:
         >>> import tempfile
         >>> folder = tempfile.mkdtemp()
-        >>> parse_own([f"D={folder}"])["D"].test_split
+        >>> parse_own([f"D={folder}"])["D"].test.split
         'test'
     """
-    found: dict[str, Domain] = {}
+    own: dict[str, DomainData] = {}
     for text in given:
-        name, equals, rest = text.partition("=")
+        kind, equals, rest = text.partition("=")
         path, train, test = rest, "train", "test"
         if not Path(path).exists() and rest.count(":") > 1:
             path, train, test = rest.rsplit(":", 2)
-        if not equals or not path or name in found:
+        if not equals or not path or kind in own:
             raise InputError(f"--data {text}: say each domain once, as NAME=PATH[:TRAIN:TEST]")
-        if name not in _MADE:
+        if kind not in _MADE:
             raise InputError(f"--data {text}: the domains are {', '.join(_MADE)}")
         if not Path(path).exists():
             raise InputError(f"--data {text}: {path} is not there; name a folder or a file")
         whole = Path(path).resolve()
         # Samples of surfaces are one of the clouds of what `qs3 generate` makes.
-        cloud = _MADE[name].cloud if (whole / MANIFEST).is_file() else "points"
-        found[name] = own_domain(name, str(whole), cloud, train or None, test or None)
-    return found
+        cloud = _MADE[kind].train.cloud if (whole / MANIFEST).is_file() else "points"
+        own[kind] = own_data(kind, whole, cloud, train or None, test or None)
+    return own
 
 
-def own_domain(
-    name: str, path: str, cloud: CloudKind, train_split: str | None, test_split: str | None
-) -> Domain:
-    """Return a domain whose clouds are the user's.
-
-    Args:
-        name: Domain whose place they take.
-        path: Where they are.
-        cloud: Which cloud of a generated data set.
-        train_split: Part to train on or to adapt to; None takes all.
-        test_split: Part to score on; None takes all.
-
-    Raises:
-        InputError: where there is no such domain.
-    """
-    if name not in _MADE:
-        raise InputError(f"unknown domain {name!r}; choose from {', '.join(_MADE)}")
-    return replace(
-        _MADE[name],
-        title=f"{name}: {Path(path).name}",
-        train=path,
-        test=path,
-        cloud=cloud,
-        train_split=train_split,
-        test_split=test_split,
-        stands_for="",
-        own=True,
-    )
+def own_data(
+    kind: str, path: Path, cloud: CloudKind, train_split: str | None, test_split: str | None
+) -> DomainData:
+    """Return a domain whose clouds are the user's: one data set with two parts."""
+    train, test = (Part(path, split, cloud) for split in (train_split, test_split))
+    return DomainData(f"{kind}: {path.name}", train, test, own=True)

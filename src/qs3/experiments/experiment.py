@@ -1,172 +1,159 @@
-"""What an experiment is: a grid of cells, each of them runs that differ in their seed alone."""
+"""What an experiment is: a grid of runs as fields, beside the figures that were published."""
 
+import functools
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.resources import files
+from typing import Any
 
-from qs3.evaluation.compare import SeedComparison, compare_seeds
-from qs3.evaluation.metrics import MeanSEM, mean_sem
-from qs3.evaluation.records import RunRecord, count_rounds
-from qs3.experiments.runs import Run
-from qs3.experiments.scales import Scale
+from qs3.errors import InputError
+from qs3.experiments import TABLES
+from qs3.experiments.domains import Domain, Kind
+from qs3.experiments.runs import SUPERVISED, Run, make_run
+from qs3.experiments.scales import NETWORKS, Scale
 
-Named = tuple[tuple[str, str], ...]
-"""Keys with their headings, in order."""
 Place = tuple[str, str]
 """Key of the row and key of the column of a cell."""
+Published = tuple[float, float | None]
+"""Mean and standard error in per cent; PointDA-10's have none."""
+Pair = tuple[str, str, str]
+"""What is compared, and the keys of two rows or columns: first minus second, rows in every column
+and columns in every row."""
+_TITLES = {
+    "pointnet2": "PointNet++",
+    "dgcnn": "DGCNN",
+    "rscnn": "RS-CNN",
+    "simpleview": "SimpleView",
+}
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A row or a column of a table."""
+
+    key: str
+    """Its name on the command line and in the CSV file."""
+    title: str
+    """What readers see."""
+    fields: Mapping[str, Any] = field(default_factory=dict)
+    """What all its runs have: arguments of `qs3.experiments.runs.make_run`."""
+    axis: str = ""
+    """Of a column in a figure of lines: the name of the axis that it stands on."""
+    number: float = 0.0
+    """Where it stands on that axis."""
+
+
+Headings = tuple[Heading, ...]
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """A table or figure of the paper, or one that it lacks."""
+    """A table or figure of the paper, or one that it lacks: a run of each row in each column."""
 
-    name: str
-    """Name on the command line, and of its files."""
     title: str
     """Heading."""
-    source: str
-    """Where the paper has it, and what its figures are."""
-    rows: Callable[[Scale], Named]
+    rows: Callable[[Scale], Headings]
     """Lines of the table."""
-    columns: Callable[[Scale], Named]
-    """Columns."""
-    run: Callable[[Scale, str, str, int, int | None], Run | None]
-    """The run of (scale, row, column, seed, threads); None where the table has no such cell."""
-    published: Mapping[Place, tuple[float, float | None]] = field(default_factory=dict)
-    """The paper's mean and standard error in per cent, by row and column."""
-    pairs: Callable[[Scale], Sequence[tuple[str, Place, Place]]] = lambda scale: ()
-    """Comparisons over seeds: what is compared, first cell, second cell."""
+    columns: Callable[[Scale], Headings]
+    """Columns; those with an axis make a figure of lines, the others one of bars."""
+    fields: Mapping[str, Any] = field(default_factory=dict)
+    """What all runs have, beside what their row and column say."""
+    source: str = ""
+    """Where the paper has it, where it prints no figures."""
+    published: str = ""
+    """Printed figures: a table of ``published.toml``."""
+    published_as: Mapping[str, str] = field(default_factory=dict)
+    """Published names of our rows, where they are others."""
+    pairs: Callable[[Scale], Sequence[Pair]] = lambda scale: ()
+    """Comparisons over seeds."""
     notes: tuple[str, ...] = ()
     """What a reader must know."""
     corner: str = "network"
     """Heading of the first column."""
-    made: tuple[str, ...] = ()
+    made: tuple[Kind, ...] = ()
     """Domains that no data of the user can take the place of, since others are made beside them."""
-    lines: tuple[tuple[str, str], ...] = ()
-    """Panels of a figure of lines: beginning of the columns' keys and name of the axis; without
-    them the figure has bars."""
-
-
-@dataclass(frozen=True)
-class Cell:
-    """The runs of a row and a column."""
-
-    accuracies: Mapping[int, float]
-    """Accuracy by seed."""
-    class_means: Mapping[int, float]
-    """Class-mean accuracy by seed."""
-    published: tuple[float, float | None] | None
-    """The paper's mean and standard error, in per cent."""
-    marks: tuple[str, ...] = ()
-    """Caveats of its runs, such as ``transductive``, or that rounds of them were skipped."""
-    wanted: int = 1
-    """Runs that it waits for in all; 0 where the table has no such cell."""
+    usual: Callable[[Scale], Sequence[str]] = lambda scale: ()
+    """Keys of the columns that are made where none is asked for; empty makes all."""
+    rules: bool = False
+    """Whether it tells, further, the score by every rule of selection, and what rounds kept."""
 
     @property
-    def accuracy(self) -> MeanSEM | None:
-        """Mean accuracy over seeds; None without a run."""
-        return mean_sem(list(self.accuracies.values())) if self.accuracies else None
+    def paper(self) -> str:
+        """Where its figures were published."""
+        return self.source or published()[self.published]["source"]
 
-    @property
-    def class_mean(self) -> MeanSEM | None:
-        """Mean class-mean accuracy over seeds; None without a run."""
-        return mean_sem(list(self.class_means.values())) if self.class_means else None
+    def published_cell(self, row: str, column: str) -> Published | None:
+        """Return the paper's figures of a cell.
 
+        Example:
+            >>> load_experiment("uda").published_cell("qbst-paper", "S-D")
+            (72.4, 0.8)
+        """
+        rows = published()[self.published].get(column, {}) if self.published else {}
+        value = rows.get(self.published_as.get(row, row))
+        return None if value is None else (value[0], value[1] if len(value) > 1 else None)
 
-@dataclass(frozen=True)
-class Grid:
-    """A table with its numbers."""
+    def run(
+        self, scale: Scale, row: Heading, column: Heading, seed: int, threads: int | None
+    ) -> Run | None:
+        """Return the run of a cell; None where it has none.
 
-    experiment: Experiment
-    """What it is."""
-    scale: Scale
-    """How large."""
-    rows: Named
-    """Lines."""
-    columns: Named
-    """Columns."""
-    cells: Mapping[Place, Cell]
-    """Every place of it."""
-
-    @property
-    def empty(self) -> list[Place]:
-        """Places that wait for runs."""
-        return [p for p, cell in self.cells.items() if len(cell.accuracies) < cell.wanted]
-
-    def differences(self) -> list[tuple[str, SeedComparison]]:
-        """Return the comparisons for which there are runs of the same seeds."""
-        found = []
-        for what, first, second in self.experiment.pairs(self.scale):
-            if first in self.cells and second in self.cells:
-                difference = compare_seeds(
-                    self.cells[first].accuracies, self.cells[second].accuracies
-                )
-                if difference is not None:
-                    found.append((what, difference))
-        return found
+        Real objects have no supervised row: there are none to spare for a training.
+        """
+        fields = {**self.fields, **row.fields, **column.fields}
+        if fields["row"] == SUPERVISED and fields["target"].kind == "R":
+            return None
+        return make_run(scale, **fields, seed=seed, threads=threads)
 
 
-def cell_runs(
-    experiment: Experiment,
-    scale: Scale,
-    seeds: Sequence[int],
-    threads: int | None = None,
-    rows: Sequence[str] = (),
-    columns: Sequence[str] = (),
-) -> dict[Place, list[Run]]:
-    """Return the runs of each cell, in order of the seeds.
+def load_experiment(name: str) -> Experiment:
+    """Return the experiment of a file of `qs3.experiments.tables`.
 
-    Args:
-        experiment: The experiment.
-        scale: Its size.
-        seeds: Seeds of the trainings.
-        threads: CPU threads of a training.
-        rows: Keys of lines to take; empty takes all.
-        columns: Keys of columns to take; empty takes all.
+    Raises:
+        InputError: where there is no such file.
     """
-    found: dict[Place, list[Run]] = {}
-    for row, _ in experiment.rows(scale):
-        for column, _ in experiment.columns(scale):
-            if (rows and row not in rows) or (columns and column not in columns):
-                continue
-            runs = [experiment.run(scale, row, column, seed, threads) for seed in seeds]
-            found[row, column] = [run for run in runs if run is not None]
-    return found
+    if name not in TABLES:
+        raise InputError(f"unknown table {name!r}; choose from {', '.join(TABLES)}")
+    return import_module(f"qs3.experiments.tables.{name.replace('-', '_')}").EXPERIMENT
 
 
-def _marks(records: Sequence[RunRecord]) -> tuple[str, ...]:
-    marks = sorted({mark for record in records for mark in record.marks})
-    trained, rounds = count_rounds(records)
-    if trained < rounds:
-        # Such a cell says more of the network before the rounds than of them.
-        marks.append(f"{rounds - trained} of {rounds} rounds skipped, confident clouds too few")
-    return tuple(marks)
+def networks(scale: Scale) -> Headings:
+    """Return the paper's networks as lines of a table."""
+    names = [name for name in NETWORKS if name in scale.networks]
+    return tuple(Heading(name, _TITLES[name], {"network": name}) for name in names)
 
 
-def fill(
-    experiment: Experiment,
-    scale: Scale,
-    cells: Mapping[Place, Sequence[Run]],
-    records: Mapping[str, RunRecord],
-) -> Grid:
-    """Put the scores of records into the cells of a table.
+def tasks(*pairs: tuple[Kind, Kind]) -> Headings:
+    """Return pairs of source and target as columns.
 
-    Args:
-        experiment: The experiment.
-        scale: Its size.
-        cells: Runs of each cell.
-        records: Record of each run that has one, by its name.
+    Example:
+        >>> [(column.key, column.title) for column in tasks(("M", "D"), ("S", "F"))]
+        [('M-D', 'M → D'), ('S-F', 'S → F')]
     """
-    wanted = set(cells)
-    rows = tuple(r for r in experiment.rows(scale) if any(r[0] == p[0] for p in wanted))
-    columns = tuple(c for c in experiment.columns(scale) if any(c[0] == p[1] for p in wanted))
-    filled = {}
-    for place, runs in cells.items():
-        there = {run.seed: records[run.record] for run in runs if run.record in records}
-        filled[place] = Cell(
-            accuracies={seed: one.scores.accuracy for seed, one in there.items()},
-            class_means={seed: one.scores.class_mean_accuracy for seed, one in there.items()},
-            published=experiment.published.get(place),
-            marks=_marks(list(there.values())),
-            wanted=len(runs),
+    return tuple(
+        Heading(
+            f"{source}-{target}",
+            f"{source} → {target}",
+            {"source": Domain(source), "target": Domain(target)},
         )
-    return Grid(experiment, scale, rows, columns, filled)
+        for source, target in pairs
+    )
+
+
+def lines(titles: Mapping[str, str]) -> Headings:
+    """Return rows of `qs3.experiments.runs.ROWS` as lines of a table, by their titles."""
+    return tuple(Heading(row, title, {"row": row}) for row, title in titles.items())
+
+
+@functools.cache
+def published() -> Mapping[str, Any]:
+    """Return all published figures: by table, column and row mean and standard error in per cent.
+
+    Example:
+        >>> published()["methods"]["S-D"]["qbst"]
+        [72.4, 0.8]
+    """
+    text = files("qs3.experiments").joinpath("published.toml").read_text(encoding="utf-8")
+    return tomllib.loads(text)

@@ -11,22 +11,21 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int
 
-from qs3.experiments.domains import Domain, domain
-from qs3.experiments.grid import DATA
+from qs3.experiments import GALLERIES
+from qs3.experiments.domains import DataSet, Domain, Kind, data_of
 from qs3.experiments.runs import Run
 from qs3.experiments.setup import Setup
 from qs3.io import load_clouds
 from qs3.report.clouds import gallery, samples_per_class
 from qs3.report.figure import write_png
 
-GALLERIES = "galleries"
-_DOMAINS = ("M", "S", "D", "F")
+_DOMAINS: tuple[Kind, ...] = ("M", "S", "D", "F")
 _PER_CLASS = 4
 
 
 @dataclass(frozen=True)
 class Galleries:
-    """Pictures of the domains; one of the parts of `qs3.experiments.reproduction`."""
+    """Pictures of the domains; one of the parts of `qs3.experiments.reproduce`."""
 
     setup: Setup
     """Where and how large."""
@@ -37,30 +36,26 @@ class Galleries:
         """Return no runs."""
         return []
 
-    def sets(self) -> list[str]:
+    def sets(self) -> list[DataSet]:
         """Return the data sets that are shown."""
-        found = (domain(name, self.setup.own) for name in _DOMAINS)
-        return [one.train for one in found if not one.own]
+        shown = [data_of(Domain(kind), self.setup.own).train.data for kind in _DOMAINS]
+        return [data for data in shown if isinstance(data, DataSet)]
 
     def write(self) -> Path:
         """Draw each domain, and return the folder of the pictures."""
         folder = self.setup.out / self.name
-        for name in _DOMAINS:
-            one = domain(name, self.setup.own)
+        for kind in _DOMAINS:
+            data = data_of(Domain(kind), self.setup.own)
             clouds = load_clouds(
-                _place(one, self.setup.out),
-                split=one.train_split,
-                cloud=one.cloud,
+                data.train.locate(self.setup.out, self.setup.shared),
+                split=data.train.split,
+                cloud=data.train.cloud,
                 num_points=self.setup.scale.train.num_points,
             )
-            shown = clouds if one.own else clouds.select(_procedural(clouds.ids))
+            shown = clouds if data.own else clouds.select(_procedural(clouds.ids))
             samples = samples_per_class(shown.points, shown.labels, shown.class_names, _PER_CLASS)
-            write_png(folder / f"{name}.png", gallery(samples, one.title))
+            write_png(folder / f"{kind}.png", gallery(samples, data.title))
         return folder
-
-
-def _place(one: Domain, out: Path) -> Path:
-    return Path(one.train) if one.own else out / DATA / one.train
 
 
 def _procedural(ids: tuple[str, ...]) -> Int[np.ndarray, "s"]:

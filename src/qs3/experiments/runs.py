@@ -1,55 +1,108 @@
-"""The grid: which runs make a table."""
+"""Runs as fields: what each trains, on what, and where its record lies."""
 
-import contextlib
-import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal
 
-from qs3.adaptation.names import MethodName, split_method
+from qs3.adaptation.names import MethodName
 from qs3.errors import InputError
-from qs3.experiments.rows import ABLATIONS, ORDINARY, PAPER, ROWS, STEP, SUPERVISED, THETA
-from qs3.experiments.scales import Scale, Task
+from qs3.experiments.domains import Domain, Own, Part, data_of
+from qs3.experiments.scales import Scale
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
 
-_RECORD_NAME = re.compile(r"(?P<task>[^-]+-.+)_(?P<label>[^_]+)_seed-(?P<seed>\d+)\.json")
+SUPERVISED = "supervised"
+"""Row of the network that is trained on the labelled training part of the target."""
+ORDINARY = "ordinary"
+"""Row of a network that is trained on the source and sees no cloud of the target: one training
+serves all test sets."""
+PAPER = "qbst-paper"
+"""Row of QBST as the paper's text has it (preset ``paper``)."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """How the networks of a line of a table are trained."""
+
+    method: MethodName = "source-only"
+    """Method of adaptation."""
+    preset: Literal["default", "spst", "paper"] = "default"
+    """Settings of the rounds of self-training."""
+    warm_up: str = ""
+    """Row whose network self-training starts from; empty without rounds."""
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of the rounds that differ from the preset."""
+
+
+_QBST = Row("qbst", warm_up="source-only")
+ROWS: Mapping[str, Row] = {
+    SUPERVISED: Row(),
+    "source-only": Row(),
+    "pointdan": Row("pointdan"),
+    "defrec": Row("defrec"),
+    "defrec-pcm": Row("defrec-pcm"),
+    "gast": Row("gast"),
+    "gast-spst": Row("gast-spst", "spst", "gast"),
+    "qbst": _QBST,
+    "dann": Row("dann"),
+    "mmd": Row("mmd"),
+    "coral": Row("coral"),
+    "sd": Row("sd"),
+    "spst": Row("spst", "spst", "source-only"),
+    "qbst-least-confident": replace(_QBST, changes={"selection": "least-confident"}),
+    "qbst-scratch": replace(_QBST, changes={"init": "scratch"}),
+    "qbst-best-labeller": replace(_QBST, changes={"teacher": "best"}),
+    "qbst-no-source-loss": replace(_QBST, changes={"source_loss": False}),
+    ORDINARY: Row(),
+    # The paper's tables have one training of the source alone for all targets.
+    PAPER: Row("qbst", "paper", ORDINARY),
+}
+"""Every line by name."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One training of the grid with its scores."""
+    """One training of a grid with its scores."""
 
-    task: str
-    """Source and target, or source and test set: names of `qs3.experiments.domains`."""
+    source: Domain
+    """Whose labels it learns."""
+    target: Domain
+    """What it is adapted to, or the test set alone; on its test part the run is scored."""
     row: str
-    """Line of the table."""
+    """How it is trained: one of `ROWS`."""
     seed: int
     """Root of all random steps."""
-    method: MethodName
-    """Method of adaptation."""
     train: TrainSettings
     """How the network is trained."""
     self_training: SelfTrainingSettings | None = None
     """How it trains itself; None without rounds."""
-    warm_up: str | None = None
-    """Row whose network self-training starts from."""
     network: str = ""
     """Network of the tables of networks; "" is that of the bench."""
+    changes: Mapping[str, float] = field(default_factory=dict)
+    """Settings of the rounds in which it differs from its row."""
 
     @property
-    def source(self) -> str:
-        """Name of the source."""
-        return self.task.partition("-")[0]
+    def kind(self) -> Row:
+        """How networks of its row are trained."""
+        return ROWS[self.row]
 
     @property
-    def target(self) -> str:
-        """Name of the target, on whose test part the run is scored."""
-        return self.task.partition("-")[2]
+    def fields(self) -> dict[str, str | int | float]:
+        """What the run is known by in its record, beside its settings; what is empty is left out.
 
-    @property
-    def learns_from(self) -> str:
-        """Name of the domain whose labels it learns: the target's own for the supervised row."""
-        return self.target if self.row == SUPERVISED else self.source
+        Example:
+            >>> from qs3.experiments.scales import SCALES
+            >>> make_run(SCALES["smoke"], Domain("V", views=3), Domain("D"), "ordinary").fields
+            {'source': 'V', 'source_views': 3, 'target': 'D', 'row': 'ordinary', 'seed': 0}
+        """
+        values: dict[str, Any] = {}
+        for name, domain in (("source", self.source), ("target", self.target)):
+            kind, *rest = asdict(domain).items()
+            values |= {name: kind[1]} | {f"{name}_{key}": value for key, value in rest}
+        values |= {"row": self.row, "network": self.network}
+        return {name: value for name, value in values.items() if value} | {
+            "seed": self.seed,
+            **self.changes,
+        }
 
     @property
     def sees_target(self) -> bool:
@@ -57,144 +110,92 @@ class Run:
         return self.row not in (SUPERVISED, ORDINARY)
 
     @property
-    def label(self) -> str:
-        """Row and, where it is not the bench's, network."""
-        return f"{self.row}@{self.network}" if self.network else self.row
-
-    @property
     def folder(self) -> str:
         """Folder of the run below that of all runs."""
-        place = self.source if self.row == ORDINARY else self.task
-        return f"{place}/{self.label}/seed-{self.seed}"
+        place = str(self.source) if self.row == ORDINARY else self._task
+        return f"{place}/{self._label}/seed-{self.seed}"
 
     @property
-    def record(self) -> str:
-        """Name of the record among the results."""
-        return f"{self.task}_{self.label}_seed-{self.seed}.json"
+    def name(self) -> str:
+        """Name of its record; people read it, the program compares it and takes nothing from it."""
+        return f"{self._task}_{self._label}_seed-{self.seed}"
 
+    @property
+    def _task(self) -> str:
+        # Of the supervised row the source has always been written S.
+        return f"{'S' if self.row == SUPERVISED else self.source}-{self.target}"
 
-def parse_record_name(name: str) -> tuple[str, str, int] | None:
-    """Return task, label and seed of a record's file name; None where it is no such name.
+    @property
+    def _label(self) -> str:
+        words = {"threshold": "theta"}
+        changed = [f"{words.get(name, name)}-{value:g}" for name, value in self.changes.items()]
+        label = "-".join([self.kind.method, *changed]) if changed else self.row
+        return f"{label}@{self.network}" if self.network else label
 
-    Example:
-        >>> parse_record_name("A.kinect_v1-A.d435_ordinary@dgcnn_seed-0.json")
-        ('A.kinect_v1-A.d435', 'ordinary@dgcnn', 0)
-        >>> parse_record_name("test-0a1b.json") is None
-        True
-    """
-    found = _RECORD_NAME.fullmatch(name)
-    return None if found is None else (found["task"], found["label"], int(found["seed"]))
+    def parts(self, own: Own | None = None) -> tuple[Part, Part | None, Part]:
+        """Return the clouds to learn from, to adapt to (None where it sees none), to score on.
+
+        Raises:
+            InputError: where the target has no clouds to score on.
+        """
+        learnt, target = data_of(self.source, own), data_of(self.target, own)
+        if target.test is None:
+            raise InputError(f"task {self._task}: {self.target} has no clouds to score on")
+        return learnt.train, target.train if self.sees_target else None, target.test
 
 
 def make_run(
     scale: Scale,
-    task: str,
+    source: Domain,
+    target: Domain,
     row: str,
-    seed: int,
+    seed: int = 0,
     threads: int | None = None,
     network: str = "",
+    **changes: float,
 ) -> Run:
-    """Return the run of a line of a table.
+    """Return the run of a cell of a table.
+
+    Args:
+        scale: How large.
+        source: Whose labels it learns; for the supervised row the target's own take its place.
+        target: What it is adapted to and scored on.
+        row: How it is trained: one of `ROWS`.
+        seed: Root of all random steps.
+        threads: CPU threads.
+        network: Network of the tables of networks; "" is that of the bench.
+        changes: Settings of the rounds that differ from the row's; those that do not are left out,
+            so that a cell with the row's own value is one training with the table of methods.
 
     Raises:
         InputError: where the row or the network is unknown.
 
     Example:
         >>> from qs3.experiments.scales import SCALES
-        >>> run = make_run(SCALES["smoke"], "S-D", "qbst", 0)
-        >>> run.method, run.warm_up, run.record
-        ('qbst', 'source-only', 'S-D_qbst_seed-0.json')
-        >>> make_run(SCALES["smoke"], "S-D", "ordinary", 0, network="rscnn").folder
-        'S/ordinary@rscnn/seed-0'
+        >>> run = make_run(SCALES["smoke"], Domain("S"), Domain("D"), PAPER, threshold=0.3)
+        >>> run.name, run.folder, run.self_training.pool
+        ('S-D_qbst-theta-0.3_seed-0', 'S-D/qbst-theta-0.3/seed-0', 'shrinking')
     """
-    changes, preset = _changes(row)
-    method: Any = row
-    if row in (SUPERVISED, ORDINARY):
-        method = "source-only"
-    elif changes is not None:
-        method = "qbst"
-    base, rule = split_method(method)
-    rounds = warm_up = None
-    if rule is not None:
-        wanted = "spst" if rule == "spst" else preset
-        rounds = replace(PRESETS[wanted], **{**scale.rounds, **(changes or {})})
-        # The paper's tables have one training of the source alone for all targets.
-        warm_up = ORDINARY if preset == "paper" else base
+    if row not in ROWS:
+        raise InputError(f"unknown row {row!r}; choose from {', '.join(ROWS)}")
+    kind = ROWS[row]
     train = scale.train_with(threads, seed, network)
     if row == ORDINARY:
         # No target that checkpoints could be rated on; the last network is taken.
         train = replace(train, validate_every=0)
-    return Run(
-        task=task,
-        row=row,
-        seed=seed,
-        method=method,
-        train=train,
-        self_training=rounds,
-        warm_up=warm_up,
-        network=network,
-    )
+    rounds = None
+    if kind.warm_up:
+        usual = replace(PRESETS[kind.preset], **{**scale.rounds, **kind.changes})
+        changes = {name: value for name, value in changes.items() if getattr(usual, name) != value}
+        rounds = replace(PRESETS[kind.preset], **{**scale.rounds, **kind.changes, **changes})
+    source = target if row == SUPERVISED else source
+    return Run(source, target, row, seed, train, rounds, network, changes)
 
 
-def _changes(row: str) -> tuple[Mapping[str, Any] | None, str]:
-    """Return what a row of QBST changes (None for other rows), and in which preset."""
-    if row == PAPER:
-        return {}, "paper"
-    for prefix, name in ((THETA, "threshold"), (STEP, "step")):
-        if row.startswith(prefix):
-            with contextlib.suppress(ValueError):
-                return {name: float(row.removeprefix(prefix))}, "paper"
-    if row in ABLATIONS:
-        return ABLATIONS[row], "default"
-    if row not in (*ROWS, ORDINARY):
-        raise InputError(
-            f"unknown row {row!r}; choose from {', '.join((*ROWS, *ABLATIONS, ORDINARY, PAPER))}"
-        )
-    return None, "default"
-
-
-def make_grid(
-    scale: Scale,
-    rows: Sequence[str],
-    tasks: Iterable[Task],
-    seeds: Sequence[int],
-    threads: int | None = None,
-) -> list[Run]:
-    """Return the runs of some rows, a warm-up before the runs that start from it.
-
-    A seed is finished before the next begins. The supervised row is one for all tasks on D; real
-    objects have none, as there are none to spare for a training.
-
-    Raises:
-        InputError: where a row, a task or a seed comes twice, or a row is unknown.
-
-    Example:
-        >>> from qs3.experiments.scales import SCALES
-        >>> [run.row for run in make_grid(SCALES["smoke"], ["qbst"], ["S-D"], [0])]
-        ['source-only', 'qbst']
-    """
-    tasks = list(tasks)
-    for name, given in {"methods": rows, "tasks": tasks, "seeds": seeds}.items():
-        if not given or len(set(given)) < len(given):
-            raise InputError(f"--{name} {' '.join(map(str, given))}: name each once, at least one")
-    runs: dict[str, Run] = {}
-    for seed in seeds:
-        for task in tasks:
-            for row in rows:
-                if row == SUPERVISED:
-                    place: str = "S-D"
-                    if task.endswith("R"):
-                        continue
-                else:
-                    place = task
-                for run in with_warm_up(scale, make_run(scale, place, row, seed, threads)):
-                    runs.setdefault(run.record, run)
-    return list(runs.values())
-
-
-def with_warm_up(scale: Scale, run: Run) -> list[Run]:
-    """Return the run, after the one that it starts from if there is such a one."""
-    if run.warm_up is None:
-        return [run]
+def warm_up_of(scale: Scale, run: Run) -> Run | None:
+    """Return the run that self-training starts from; None without rounds."""
+    row = run.kind.warm_up
+    if not row:
+        return None
     threads, network = run.train.threads, run.network
-    return [make_run(scale, run.task, run.warm_up, run.seed, threads, network), run]
+    return make_run(scale, run.source, run.target, row, run.seed, threads, network)

@@ -2,17 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, get_args
+from typing import Any
 
 from qs3.errors import InputError
-from qs3.experiments.rows import NETWORKS, ORDINARY, PAPER
+from qs3.experiments import ScaleName
 from qs3.training.config import PRESETS, TrainSettings
 
-Task = Literal["M-D", "S-D", "M-R", "S-R"]
-"""Source and target of the bench, by the names of `qs3.experiments.domains`. M: samples of the
-meshes' surfaces; S: scans of the same meshes by the simulated sensor; D: scans of other meshes by
-another simulated sensor; R: real objects."""
-
+NETWORKS = ("pointnet2", "dgcnn", "rscnn", "simpleview")
+"""The paper's networks, in the order of its table."""
 _FLOOR_OBJECTS, _FLOOR_POINTS = 40, 512
 
 
@@ -40,8 +37,8 @@ class Scale:
     """How networks are trained; the seed is a run's own."""
     rounds: Mapping[str, Any] = field(default_factory=dict)
     """Settings of self-training that differ from the preset of its rule."""
-    tasks: tuple[Task, ...] = get_args(Task)
-    """Tasks of the bench by default."""
+    tasks: tuple[str, ...] = ("M-D", "S-D", "M-R", "S-R")
+    """Columns of the bench of adaptation by default."""
     networks: Mapping[str, Mapping[str, Any]] = field(
         default_factory=lambda: {name: {} for name in NETWORKS}
     )
@@ -57,14 +54,14 @@ class Scale:
     sensors: tuple[str, ...] = ("qs3", "d435", "kinect-v1")
     """Presets that are trained and tested on."""
     pointda10: tuple[str, ...] = (
-        ORDINARY,
+        "ordinary",
         "dann",
         "pointdan",
         "defrec",
         "defrec-pcm",
         "gast",
         "gast-spst",
-        PAPER,
+        "qbst-paper",
     )
     """Rows of the six tasks of PointDA-10."""
 
@@ -93,11 +90,11 @@ class Scale:
         own = {"model": network, "model_settings": self.networks[network], **self.ordinary}
         return replace(self.train, seed=seed, threads=threads, **own)
 
-    def rounds_told(self) -> str:
+    def describe_rounds(self) -> str:
         """Say where self-training is not the paper's; empty where it is.
 
         Example:
-            >>> SCALES["smoke"].rounds_told()
+            >>> SCALES["smoke"].describe_rounds()
             'Self-training here: threshold 0.4, rounds 3, epochs 2 (paper: 0.8, 10, 10).'
         """
         if not self.rounds:
@@ -140,7 +137,7 @@ _SIMPLEVIEW: Mapping[str, Any] = {
 """SimpleView's protocol of training, which the paper's main table follows. Below ``small`` there
 are too few epochs for a plateau to be seen."""
 
-SCALES: Mapping[str, Scale] = {
+SCALES: Mapping[ScaleName, Scale] = {
     # One seed of M-D and S-D takes about a quarter of an hour on one core.
     "smoke": Scale(
         name="smoke",
@@ -165,7 +162,7 @@ SCALES: Mapping[str, Scale] = {
         fused_views=(1, 2, 4, 8),
         thetas=(0.3, 0.4, 0.5),
         steps=(0.0, 0.005, 0.02),
-        pointda10=(ORDINARY, "pointdan", PAPER),
+        pointda10=("ordinary", "pointdan", "qbst-paper"),
     ),
     # Networks that learn something, in a few hours of one core; below the floor all the same.
     "laptop": Scale(
@@ -190,7 +187,7 @@ SCALES: Mapping[str, Scale] = {
         fused_views=(1, 2, 3, 5, 8),
         thetas=(0.5, 0.6, 0.7, 0.8),
         steps=(0.0, 0.005, 0.02),
-        pointda10=(ORDINARY, "pointdan", PAPER),
+        pointda10=("ordinary", "pointdan", "qbst-paper"),
     ),
     "small": Scale(
         name="small",

@@ -1,24 +1,24 @@
 """What a folder of a reproduction is for, and the file in it that says so."""
 
-import dataclasses
-import json
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING
 
 from qs3.errors import InputError
-from qs3.experiments.bench_data import make_plans
-from qs3.experiments.domains import Domain, own_domain
-from qs3.experiments.grid import RESULTS
-from qs3.experiments.runs import parse_record_name
+from qs3.experiments.domains import DataSet, DomainData, Own, Part, own_data
 from qs3.experiments.scales import Scale
 from qs3.files import claim_folder, read_json, write_json
-from qs3.io import load_clouds
 from qs3.io.clouds import CloudKind
-from qs3.store.plan import Plan
+from qs3.structure import structure, unstructure
+
+if TYPE_CHECKING:
+    from qs3.store.plan import Plan
 
 MARKER = "bench.json"
+RESULTS = "results"
+"""Folder of the records, in that of a reproduction."""
 
 
 @dataclass(frozen=True)
@@ -33,45 +33,77 @@ class Setup:
     """Seeds of the trainings; the data are the same for all."""
     threads: int | None = None
     """CPU threads of a training."""
-    workers: int = 2
-    """Processes that scan, and that train where no device is named."""
-    devices: tuple[str, ...] = ()
-    """GPUs, by index: each makes one run at a time."""
-    executor: Literal["local", "ray"] = "local"
-    """Where runs are made: here, or on a Ray cluster that sees the same folders."""
-    address: str = "auto"
-    """Of the Ray cluster's head; ``auto`` is this machine's, ``local`` starts one here."""
     shared: Path | None = None
     """Folder with artists' meshes and real objects; None takes procedural shapes alone."""
-    own: Mapping[str, Domain] = field(default_factory=dict)
+    own: Own = field(default_factory=dict)
     """The user's data sets."""
 
 
-def claim(setup: Setup, plans: Mapping[str, Plan]) -> None:
+@dataclass(frozen=True)
+class OwnRecord:
+    """A data set of the user's, as the marker keeps it."""
+
+    name: str
+    """Last part of its path."""
+    cloud: CloudKind
+    """Which cloud of a generated data set."""
+    train_split: str | None
+    """Part to train on."""
+    test_split: str | None
+    """Part to score on."""
+    train: str
+    """Checksum of the first."""
+    test: str
+    """Checksum of the second."""
+
+
+@dataclass(frozen=True)
+class Marker:
+    """What must not change in a folder."""
+
+    scale: Scale
+    """Size."""
+    threads: int | None
+    """CPU threads of a training."""
+    meshes: str
+    """``shapes``, or ``shapes+cad`` where artists' meshes take part."""
+    data: Mapping[str, OwnRecord]
+    """The user's data sets."""
+    version: int = 1
+    """Version of these fields in the file."""
+
+
+def claim(setup: Setup, plans: "Mapping[str, Plan]") -> None:
     """Write down what the folder is for, or check that it is for the same.
 
     Raises:
         InputError: where it is for another scale, other threads, meshes or data.
     """
     claim_folder(setup.out, MARKER)
-    wanted = json.loads(
-        json.dumps(
-            {
-                "scale": dataclasses.asdict(setup.scale),
-                "threads": setup.threads,
-                "meshes": _meshes(plans, setup),
-                "data": {name: _own_data(one, setup.scale) for name, one in setup.own.items()},
-            }
-        )
-    )
-    path = setup.out / MARKER
-    if not path.is_file():
-        write_json(path, wanted)
+    data = {name: _own_record(own, setup.scale) for name, own in setup.own.items()}
+    wanted = Marker(setup.scale, setup.threads, _meshes(plans, setup), data)
+    if not (setup.out / MARKER).is_file():
+        write_json(setup.out / MARKER, unstructure(wanted))
         return
-    there: Any = read_json(path)
-    for name, value in wanted.items():
-        if not isinstance(there, dict) or there.get(name) != value:
+    before = unstructure(read_marker(setup.out))
+    for name, value in unstructure(wanted).items():
+        if before[name] != value:
             raise InputError(f"{setup.out}: holds a bench of another {name}; name another --out")
+
+
+def read_marker(folder: Path) -> Marker:
+    """Read what a folder is for; a setting that it does not name has its default.
+
+    Raises:
+        InputError: where the folder was not made by ``qs3 reproduce``, or by another version.
+    """
+    path = folder / MARKER
+    if not path.is_file():
+        raise InputError(f"{folder}: has no {MARKER}; name a folder that qs3 reproduce made")
+    marker = structure(read_json(path), Marker, path)
+    if marker.version != 1:
+        raise InputError(f"{path}: version {marker.version}, this qs3 reads version 1")
+    return marker
 
 
 def read_setup(folder: Path) -> Setup:
@@ -80,70 +112,47 @@ def read_setup(folder: Path) -> Setup:
     Raises:
         InputError: where the folder was not made by ``qs3 reproduce``, or by another version.
     """
-    from qs3.experiments.scales import SCALES
-
-    if not (folder / MARKER).is_file():
-        raise InputError(f"{folder}: has no {MARKER}; name a folder that qs3 reproduce made")
-    there: Any = read_json(folder / MARKER)
-    if not _is_marker(there):
-        raise InputError(f"{folder / MARKER}: is not what qs3 reproduce writes")
-    scale = SCALES.get(str(there["scale"].get("name")))
-    if scale is None or json.loads(json.dumps(dataclasses.asdict(scale))) != there["scale"]:
-        raise InputError(f"{folder / MARKER}: is of a scale that this version does not have")
-    own = {}
-    for name, one in there["data"].items():
-        own[name] = own_domain(
-            name, one["name"], one["cloud"], one["train_split"], one["test_split"]
-        )
-    names = [parse_record_name(path.name) for path in (folder / RESULTS).glob("*.json")]
-    seeds = tuple(sorted({name[2] for name in names if name is not None}))
-    return Setup(
-        out=folder, scale=scale, seeds=seeds or (0, 1, 2), threads=there["threads"], own=own
-    )
-
-
-def _is_marker(value: Any) -> bool:
-    if not isinstance(value, dict) or set(value) != {"scale", "threads", "meshes", "data"}:
-        return False
-    threads, data = value["threads"], value["data"]
-    return (
-        isinstance(value["scale"], dict)
-        and (threads is None or type(threads) is int)
-        and isinstance(data, dict)
-        and all(isinstance(one, dict) and set(one) == _OWN_FIELDS for one in data.values())
-        and all(
-            isinstance(one["name"], str)
-            and one["cloud"] in get_args(CloudKind)
-            and all(isinstance(one[part] or "", str) for part in ("train_split", "test_split"))
-            for one in data.values()
-        )
-    )
-
-
-def _own_data(one: Domain, scale: Scale) -> dict[str, Any]:
-    """Return what the user's domain is known by; reading it tells early what is wrong with it."""
-    sums = [
-        load_clouds(
-            one.train, split=split, cloud=one.cloud, num_points=scale.train.num_points
-        ).checksum
-        for split in (one.train_split, one.test_split)
-    ]
-    return {
-        "name": Path(one.train).name,
-        "cloud": one.cloud,
-        "train_split": one.train_split,
-        "test_split": one.test_split,
-        "train": sums[0],
-        "test": sums[1],
+    marker = read_marker(folder)
+    own = {
+        kind: own_data(kind, Path(data.name), data.cloud, data.train_split, data.test_split)
+        for kind, data in marker.data.items()
     }
+    seeds: set[int] = set()
+    for path in (folder / RESULTS).glob("*.json"):
+        # A damaged record is told by the table that needs it.
+        with contextlib.suppress(InputError, KeyError, TypeError):
+            seeds.add(int(read_json(path)["seed"]))
+    return Setup(folder, marker.scale, tuple(sorted(seeds)) or (0, 1, 2), marker.threads, own=own)
 
 
-_OWN_FIELDS = {"name", "cloud", "train_split", "test_split", "train", "test"}
+def _own_record(own: DomainData, scale: Scale) -> OwnRecord:
+    """Return what the user's data are known by; reading them tells early what is wrong."""
+    train, test = own.train, own.test
+    assert test is not None and isinstance(train.data, Path)  # noqa: S101
+    return OwnRecord(
+        name=train.data.name,
+        cloud=train.cloud,
+        train_split=train.split,
+        test_split=test.split,
+        train=_checksum(train, scale),
+        test=_checksum(test, scale),
+    )
 
 
-def _meshes(plans: Mapping[str, Plan], setup: Setup) -> str:
+def _checksum(part: Part, scale: Scale) -> str:
+    from qs3.io import load_clouds
+
+    assert isinstance(part.data, Path)  # noqa: S101
+    points = scale.train.num_points
+    return load_clouds(part.data, split=part.split, cloud=part.cloud, num_points=points).checksum
+
+
+def _meshes(plans: "Mapping[str, Plan]", setup: Setup) -> str:
     """Return which meshes take part; `second` is of shapes always."""
-    found = {plan.settings.meshes for name, plan in plans.items() if name != "second"}
-    if found:
-        return found.pop()
-    return make_plans(setup.scale, setup.shared, sets=["source"])["source"].settings.meshes
+    meshes = {plan.settings.meshes for name, plan in plans.items() if name != "second"}
+    if meshes:
+        return meshes.pop()
+    from qs3.experiments.data import make_plans
+
+    plan = make_plans(setup.scale, setup.shared, [DataSet("source")])["source"]
+    return plan.settings.meshes

@@ -1,5 +1,6 @@
 """Settings of networks and methods: unknown ones, wrong types and useless values are refused."""
 
+import dataclasses
 import inspect
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -7,6 +8,8 @@ from typing import Any, get_type_hints
 
 from qs3.errors import InputError
 from qs3.structure import structure
+
+Number = int | float
 
 
 def read_settings(
@@ -25,18 +28,18 @@ def read_settings(
     """
     parameters = inspect.signature(kind).parameters.values()
     choice = [p.name for p in parameters if p.kind is not p.VAR_KEYWORD and p.name not in fixed]
-    hints = get_type_hints(kind.__init__)
-    values = {}
-    for key, value in settings.items():
+    for key in settings:
         if key not in choice:
             words = f"choose from {', '.join(choice)}" if choice else "it takes none"
             raise InputError(f"unknown setting {key!r} of {what}; {words}")
-        values[key] = structure(value, hints[key], f"setting {key} of {what}")
-    return values
+    hints = get_type_hints(kind.__init__)
+    shape = dataclasses.make_dataclass("Settings", [(key, hints[key]) for key in settings])
+    values = structure(dict(settings), shape, f"settings of {what}")
+    return {key: getattr(values, key) for key in settings}
 
 
 def check_range(
-    name: str, value: float | Sequence[float], least: float = 1, most: float = math.inf
+    name: str, value: Number | Sequence[Number], least: Number = 1, most: Number = math.inf
 ) -> None:
     """Raise InputError unless a number, or each of one or more, is in ``least`` to ``most``.
 
@@ -51,7 +54,7 @@ def check_range(
         raise InputError(f"{name} must be {span}, not {value!r}")
 
 
-def check_positive(name: str, value: float | Sequence[float]) -> None:
+def check_positive(name: str, value: Number | Sequence[Number]) -> None:
     """Raise InputError unless a number, or each of one or more, is larger than 0 and finite."""
     numbers = value if isinstance(value, Sequence) else (value,)
     if not numbers or not all(0 < number < math.inf for number in numbers):

@@ -89,7 +89,8 @@ def _named(
     path: Path, record: RunRecord, published: Mapping[str, Mapping[str, str]]
 ) -> NamedRecord:
     place = record.experiment or {}
-    task, row = (str(place.get(name, "")) for name in ("task", "row"))
+    task = "-".join(str(place[name]) for name in ("source", "target") if name in place)
+    row = str(place.get("row", ""))
     figure = published.get(task, {}).get(row, "")
     return NamedRecord(str(path), record, f"{task} {row}".strip(), figure)
 

@@ -3,7 +3,7 @@
 import functools
 import math
 import types
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from qs3.errors import InputError
 
@@ -62,7 +62,8 @@ def check_range(
 def _choices(kind: type) -> dict[str, tuple[Any, ...]]:
     choices = {}
     for name, hint in get_type_hints(kind).items():
-        optional = get_origin(hint) is types.UnionType and type(None) in get_args(hint)
+        union = get_origin(hint) in (Union, types.UnionType)
+        optional = union and type(None) in get_args(hint)
         inner = get_args(hint)[0] if optional else hint
         if get_origin(inner) is Literal:
             choices[name] = get_args(inner) + ((None,) if optional else ())

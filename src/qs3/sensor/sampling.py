@@ -6,6 +6,9 @@ from scipy.spatial import KDTree
 
 from qs3.errors import InputError
 
+_TOGETHER = 2**15
+"""Points of the clouds that are sampled together: few enough to stay in a core's cache."""
+
 
 def farthest_point_sample(
     points: Float[np.ndarray, "n 3"], num_points: int, start: int = 0
@@ -56,6 +59,48 @@ def farthest_point_sample(
             x, y, z = (columns[axis][near] - centre[axis] for axis in range(3))
             nearest[near] = np.minimum(nearest[near], x * x + y * y + z * z)
         index = int(nearest.argmax())
+    return chosen
+
+
+def farthest_point_samples(
+    clouds: Float[np.ndarray, "b n 3"], num_points: int
+) -> Int[np.ndarray, "b m"]:
+    """Farthest point samples of many clouds of one size, each from its point 0.
+
+    Equal to `farthest_point_sample` cloud by cloud, with its ties, and two to three times as fast
+    for clouds of a few thousand points, as each step serves many clouds.
+
+    Raises:
+        InputError: where the clouds have fewer points than asked for, or a point is not finite.
+
+    Example:
+        >>> farthest_point_samples(np.array([[[0.0, 0, 0], [1, 0, 0], [3, 0, 0]]]), 2).tolist()
+        [[0, 2]]
+    """
+    b, n, _ = clouds.shape
+    if not 1 <= num_points <= n:
+        raise InputError(f"cannot sample {num_points} points of a cloud of {n}")
+    if not np.isfinite(clouds).all():
+        raise InputError("cannot sample a cloud with a point that is not finite")
+    chosen = np.zeros((b, num_points), dtype=np.int64)
+    together = max(1, _TOGETHER // n)
+    for first in range(0, b, together):
+        part = clouds[first : first + together].astype(np.float64)
+        x, y, z = np.ascontiguousarray(part.transpose(2, 0, 1))
+        cloud = np.arange(len(part))
+        nearest = np.full(x.shape, np.inf)
+        distance, square = np.zeros(x.shape), np.zeros(x.shape)
+        last = np.zeros(len(part), dtype=np.int64)
+        for step in range(1, num_points):
+            np.subtract(x, x[cloud, last, None], out=distance)
+            np.multiply(distance, distance, out=distance)
+            for axis in (y, z):
+                np.subtract(axis, axis[cloud, last, None], out=square)
+                np.multiply(square, square, out=square)
+                np.add(distance, square, out=distance)
+            np.minimum(nearest, distance, out=nearest)
+            last = nearest.argmax(axis=1)
+            chosen[first : first + together, step] = last
     return chosen
 
 

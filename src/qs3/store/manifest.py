@@ -98,7 +98,11 @@ def check_same(where: str, present: Manifest, wanted: Manifest) -> None:
     Raises:
         InputError: naming ``where`` and the first setting that differs.
     """
+    from qs3.sensor.presets import sensor_name
+
     old, new = unstructure(present), unstructure(wanted)
+    if isinstance(sensor := old["settings"].get("sensor"), dict) and "name" in sensor:
+        sensor["name"] = sensor_name(sensor["name"])  # a data set that version 0.1 began
     for key in ("schema", "settings", "class_names", "rows", "shards"):
         difference = _difference(key, old[key], new[key])
         if difference is not None:

@@ -1,34 +1,79 @@
-"""The training loop, self-training in rounds, checkpoints and predictions."""
+"""The training loop, self-training in rounds, runs and their scores, predictions.
 
-from qs3.training.batches import prepare as prepare
-from qs3.training.checkpoint import LoadedModel as LoadedModel
-from qs3.training.checkpoint import load_model as load_model
-from qs3.training.checkpoint import save_model as save_model
-from qs3.training.config import PRESETS as PRESETS
-from qs3.training.config import SelfTrainingSettings as SelfTrainingSettings
-from qs3.training.config import TrainSettings as TrainSettings
-from qs3.training.config import self_training_preset as self_training_preset
-from qs3.training.deadline import Deadline as Deadline
-from qs3.training.deadline import TimeUpError as TimeUpError
-from qs3.training.deadline import parse_duration as parse_duration
-from qs3.training.estimators import QBST as QBST
-from qs3.training.estimators import SPST as SPST
-from qs3.training.estimators import Adapter as Adapter
-from qs3.training.evaluate import evaluate as evaluate
-from qs3.training.evaluate import record_path as record_path
-from qs3.training.fit import FitResult as FitResult
-from qs3.training.fit import fit as fit
-from qs3.training.fit import load_whole as load_whole
-from qs3.training.loop import train as train
-from qs3.training.predict import predict_probabilities as predict_probabilities
-from qs3.training.records import EpochRecord as EpochRecord
-from qs3.training.run import Run as Run
-from qs3.training.run import find_runs as find_runs
-from qs3.training.run import is_run as is_run
-from qs3.training.run import read_run as read_run
-from qs3.training.self_training import RoundRecord as RoundRecord
-from qs3.training.self_training import self_train as self_train
-from qs3.training.thinning import thin as thin
-from qs3.training.validation import Checkpoint as Checkpoint
-from qs3.training.validation import adapt_statistics as adapt_statistics
-from qs3.training.validation import read_checkpoints as read_checkpoints
+Settings and the folders of runs need no PyTorch; it loads when a training is first asked for.
+"""
+
+import sys
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from qs3.training.batches import load_whole as load_whole
+    from qs3.training.batches import prepare as prepare
+    from qs3.training.batches import subsample as subsample
+    from qs3.training.checkpoint import LoadedModel as LoadedModel
+    from qs3.training.checkpoint import load_model as load_model
+    from qs3.training.checkpoint import save_model as save_model
+    from qs3.training.config import PRESETS as PRESETS
+    from qs3.training.config import SelfTrainingSettings as SelfTrainingSettings
+    from qs3.training.config import TrainSettings as TrainSettings
+    from qs3.training.config import self_training_preset as self_training_preset
+    from qs3.training.estimators import QBST as QBST
+    from qs3.training.estimators import SPST as SPST
+    from qs3.training.estimators import Adapter as Adapter
+    from qs3.training.evaluate import evaluate as evaluate
+    from qs3.training.evaluate import record_path as record_path
+    from qs3.training.fit import FitResult as FitResult
+    from qs3.training.fit import fit as fit
+    from qs3.training.history import EpochRecord as EpochRecord
+    from qs3.training.loop import train as train
+    from qs3.training.predict import predict_probabilities as predict_probabilities
+    from qs3.training.progress import Deadline as Deadline
+    from qs3.training.progress import TimeUpError as TimeUpError
+    from qs3.training.progress import parse_duration as parse_duration
+    from qs3.training.run import Run as Run
+    from qs3.training.run import find_runs as find_runs
+    from qs3.training.run import is_run as is_run
+    from qs3.training.run import read_run as read_run
+    from qs3.training.self_training import RoundRecord as RoundRecord
+    from qs3.training.self_training import self_train as self_train
+    from qs3.training.validation import Checkpoint as Checkpoint
+    from qs3.training.validation import adapt_statistics as adapt_statistics
+    from qs3.training.validation import read_checkpoints as read_checkpoints
+
+_MODULES = {
+    "batches": "load_whole prepare subsample",
+    "checkpoint": "LoadedModel load_model save_model",
+    "config": "PRESETS SelfTrainingSettings TrainSettings self_training_preset",
+    "estimators": "QBST SPST Adapter",
+    "evaluate": "evaluate record_path",
+    "fit": "FitResult fit",
+    "history": "EpochRecord",
+    "loop": "train",
+    "predict": "predict_probabilities",
+    "progress": "Deadline TimeUpError parse_duration",
+    "run": "Run find_runs is_run read_run",
+    "self_training": "RoundRecord self_train",
+    "validation": "Checkpoint adapt_statistics read_checkpoints",
+}
+
+
+_WHERE = {name: module for module, names in _MODULES.items() for name in names.split()}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _WHERE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_WHERE[name]}"), name)
+
+
+class _Package(ModuleType):
+    """Keeps `fit` and `evaluate` the functions, when the modules of these names are imported."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name in _WHERE and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

@@ -1,21 +1,23 @@
 """From clouds in memory to batches on the device."""
 
+import hashlib
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt
 from torch import Tensor
 
 from qs3.adaptation import Batch
-from qs3.errors import InputError
+from qs3.errors import InputError, UnevenSizesError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.preparation import unit_ball
+from qs3.sensor.sampling import farthest_point_samples
+from qs3.training.checkpoint import read_tensors, write_tensors
 from qs3.training.config import TrainSettings
-from qs3.training.thinning import thin
 
 _SHARE_OF_MEMORY = 0.25
 """Part of a GPU's free memory that the clouds may take; the network needs the rest."""
@@ -61,19 +63,83 @@ def name_few(names: Sequence[str]) -> str:
     return f"cloud{'s' if len(names) > 1 else ''} {', '.join(names[:4])}{more}"
 
 
+def load_whole(load: Callable[..., Any], data: str | Path, num_points: int, **part: Any) -> Any:
+    """Read clouds with all their points; `qs3.training.fit` subsamples them and keeps the choice.
+
+    Clouds of several sizes fit no one array: those are subsampled as they are read.
+
+    Args:
+        load: `qs3.io.load_clouds` or `qs3.io.load_unlabelled`.
+        data: What to read.
+        num_points: Points a cloud of the training.
+        part: ``split`` and ``cloud``.
+    """
+    try:
+        return load(data, num_points=None, **part)
+    except UnevenSizesError:
+        return load(data, num_points=num_points, **part)
+
+
 def prepare(points: np.ndarray, num_points: int, cache: Path | None = None) -> np.ndarray:
-    """Thin clouds [b n 3] to ``num_points`` points each and bring them to the unit ball.
+    """Subsample clouds [b n 3] to ``num_points`` points each and bring them to the unit ball.
 
     Args:
         points: Clouds, as read.
         num_points: Points a cloud.
-        cache: Folder that keeps the choice of points; see `qs3.training.thinning.thin`.
+        cache: Folder that keeps the choice of points; see `subsample`.
 
     Example:
         >>> prepare(np.random.default_rng(0).normal(size=(2, 50, 3)), 16).shape
         (2, 16, 3)
     """
-    return unit_ball(thin(points, num_points, cache))
+    return unit_ball(subsample(points, num_points, cache))
+
+
+def subsample(
+    points: Float[np.ndarray, "b n 3"], num_points: int, cache: Path | None = None
+) -> Float[np.ndarray, "b m 3"]:
+    """Bring clouds to ``num_points`` points each, as `qs3.io.preparation.resample` does.
+
+    Args:
+        points: Clouds, as read.
+        num_points: Points a cloud. Fewer points than that are repeated in order.
+        cache: Folder where the choice is kept (``subsample-<checksum>.safetensors``), so that a
+            resumed run need not make it again. A file there that is damaged, or belongs to other
+            clouds, is made anew.
+
+    Example:
+        >>> subsample(np.zeros((2, 50, 3)), 16).shape
+        (2, 16, 3)
+    """
+    b, n, _ = points.shape
+    if n == num_points or not b:
+        return points
+    if n < num_points:
+        return points[:, np.arange(num_points) % n]
+    path, index = None, None
+    if cache is not None:
+        key = hashlib.sha256(f"{points.shape} {points.dtype} {num_points}".encode())
+        key.update(np.ascontiguousarray(points).tobytes())
+        path = Path(cache) / f"subsample-{key.hexdigest()[:16]}.safetensors"
+        index = _read_choice(path, (b, num_points), n)
+    if index is None:
+        index = farthest_point_samples(points, num_points).astype(np.min_scalar_type(n - 1))
+        if path is not None:
+            digest = hashlib.sha256(index.tobytes()).hexdigest()
+            write_tensors(path, {"index": torch.from_numpy(index)}, {"sha256": digest})
+    return np.take_along_axis(points, index[:, :, None].astype(np.int64), axis=1)
+
+
+def _read_choice(path: Path, shape: tuple[int, int], n: int) -> UInt[np.ndarray, "b m"] | None:
+    """Return the indices that were kept, or None where they are absent or unsound."""
+    try:
+        tensors, facts = read_tensors(path)
+        index = tensors["index"].numpy()
+    except (InputError, KeyError):
+        return None
+    sound = index.shape == shape and index.dtype == np.min_scalar_type(n - 1)
+    sound = sound and facts.get("sha256") == hashlib.sha256(index.tobytes()).hexdigest()
+    return index if sound else None
 
 
 class Share(NamedTuple):

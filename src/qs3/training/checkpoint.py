@@ -1,4 +1,4 @@
-"""Weights and training states as safetensors with JSON; nothing is ever unpickled."""
+"""Weights as safetensors with JSON: nothing is ever unpickled; and the seeds of all draws."""
 
 import hashlib
 import json
@@ -10,11 +10,10 @@ import numpy as np
 import safetensors
 import safetensors.torch
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from qs3.errors import InputError
-from qs3.files import holds_something, write_bytes, write_json
-from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.files import write_bytes
 from qs3.models import PointClassifier, create_model
 from qs3.training.config import TrainSettings
 from qs3.training.run import MODEL, SETTINGS, read_settings
@@ -75,7 +74,7 @@ def read_facts(path: Path) -> dict[str, Any]:
     return facts
 
 
-def load_tensors_into(module: torch.nn.Module, tensors: Mapping[str, Tensor], where: Path) -> None:
+def load_tensors_into(module: nn.Module, tensors: Mapping[str, Tensor], where: Path) -> None:
     """Set a module's parameters and buffers.
 
     Raises:
@@ -118,51 +117,6 @@ def without_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tens
     """
     start = f"{prefix}/"
     return {name[len(start) :]: v for name, v in tensors.items() if name.startswith(start)}
-
-
-def fingerprint(clouds: PointClouds | UnlabelledClouds) -> str:
-    """SHA-256 over points, and labels and class names where there are any."""
-    digest = hashlib.sha256(str(clouds.points.shape).encode())
-    digest.update(np.ascontiguousarray(clouds.points, dtype=np.float32).tobytes())
-    if isinstance(clouds, PointClouds):
-        digest.update(np.ascontiguousarray(clouds.labels, dtype=np.int64).tobytes())
-        digest.update("\0".join(clouds.class_names).encode())
-    return digest.hexdigest()
-
-
-def claim_run(run_dir: Path, settings: Mapping[str, Any]) -> None:
-    """Write a run's settings to its folder, or check that they are the ones already there.
-
-    Raises:
-        InputError: where the folder is a file, holds something else, or a run of other settings;
-            the first setting that differs is named.
-    """
-    run_dir = Path(run_dir)
-    wanted = json.loads(json.dumps(settings, allow_nan=False))
-    path = run_dir / SETTINGS
-    if run_dir.exists() and not run_dir.is_dir():
-        raise InputError(f"{run_dir}: is a file; name a folder for the run")
-    if path.is_file():
-        there, here = _flat(read_settings(run_dir)), _flat(wanted)
-        for name in sorted(there.keys() | here.keys()):
-            if there.get(name) != here.get(name):
-                raise InputError(
-                    f"{run_dir}: holds a run with {name} = {there.get(name)!r}, not "
-                    f"{here.get(name)!r}; name another folder or use its settings"
-                )
-        return
-    if holds_something(run_dir):
-        raise InputError(f"{run_dir}: holds something else (no {SETTINGS}); name a new folder")
-    write_json(path, wanted)
-
-
-def _flat(value: Any, name: str = "") -> dict[str, Any]:
-    if not isinstance(value, dict):
-        return {name: value}
-    items: dict[str, Any] = {}
-    for key, inner in value.items():
-        items |= _flat(inner, f"{name}.{key}" if name else key)
-    return items
 
 
 def seed_sequence(seed: int, *path: int) -> np.random.SeedSequence:
@@ -214,15 +168,15 @@ def save_model(
     Returns:
         The file.
     """
-    told = dict(facts or {}) | {
+    path = Path(run_dir) / name
+    own = {
         "format": FORMAT,
         "class_names": list(class_names),
         "model": settings.model,
         "model_settings": dict(settings.model_settings),
         "num_points": settings.num_points,
     }
-    path = Path(run_dir) / name
-    write_tensors(path, model.state_dict(), told)
+    write_tensors(path, model.state_dict(), {**(facts or {}), **own})
     return path
 
 
@@ -253,9 +207,18 @@ def load_model(run_dir: Path) -> LoadedModel:
     except (KeyError, TypeError) as error:
         raise InputError(f"{path}: does not say which network it holds ({error})") from error
     load_tensors_into(model, tensors, path)
-    if not (path.parent / SETTINGS).is_file():
+    if (path.parent / SETTINGS).is_file():
+        settings = read_settings(path.parent)
+    else:
         kept = ("model", "model_settings", "num_points")
         settings = {"train": {key: facts[key] for key in kept if key in facts}}
-    else:
-        settings = read_settings(path.parent)
     return LoadedModel(model.eval(), class_names, settings)
+
+
+def weights_fingerprint(model: PointClassifier) -> str:
+    """SHA-256 over names and values of a network's weights, by which a warm-up is known."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(model.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()

@@ -9,12 +9,15 @@ import tyro
 
 from qs3.adaptation.names import Normalisation, RoundRule, Rule, Selection, SingleClass
 from qs3.errors import InputError
-from qs3.training.schedules import Schedule
 
+Schedule = Literal["cosine", "plateau"]
+"""A cosine to 0 over the training; or halved where the loss falls no more."""
 Precision = Literal["32-true", "bf16-mixed", "16-mixed", "64-true"]
 """Number formats that Lightning Fabric offers here."""
 Accelerator = Literal["auto", "cpu", "cuda"]
 """Where a training can compute."""
+PresetName = Literal["default", "spst", "paper", "released"]
+"""Whole columns of settings: our defaults, SPST's, QS³'s text, QS³'s released code."""
 Prior = Literal["em", "bbse"]
 """Estimates of the target's class shares."""
 
@@ -138,7 +141,7 @@ class SelfTrainingSettings:
     read literally); or in every round the 80 % whose index modulo 10 is below 8."""
     init: Literal["warm-up", "scratch"] = "warm-up"
     """Weights that round 1 starts from; later rounds go on from there."""
-    labeller: Literal["latest", "best"] = "latest"
+    teacher: Literal["latest", "best"] = "latest"
     """Network that gives the pseudo labels: that of the last round, or the one that was best on
     the fifth of the pseudo-labelled clouds that is then held out of the training."""
     source_loss: bool = True
@@ -225,13 +228,13 @@ PRESETS: Mapping[str, SelfTrainingSettings] = {
         inclusive=True,
         pool="split",
         init="scratch",
-        labeller="best",
+        teacher="best",
         source_loss=False,
         schedule="continuous",
         single_class="drop",
     ),
 }
-"""Whole columns of settings: our defaults, SPST's, QS³'s text, QS³'s released code."""
+"""The settings of each preset."""
 
 
 def self_training_preset(name: str, **overrides: Any) -> SelfTrainingSettings:
@@ -245,7 +248,7 @@ def self_training_preset(name: str, **overrides: Any) -> SelfTrainingSettings:
         InputError: where the preset or a setting is unknown.
 
     Example:
-        >>> self_training_preset("released", rounds=3).labeller
+        >>> self_training_preset("released", rounds=3).teacher
         'best'
     """
     if name not in PRESETS:

@@ -1,47 +1,53 @@
 """One training on several devices of this machine: processes, and how they meet.
 
-The calling process is device 0. The others are started afresh (``python -m qs3.training.worker``),
-which works from a command, a script without a main guard, a notebook and a test alike. They meet
-over a file and talk over the loopback interface alone.
+The calling process is device 0. The others are started afresh, from a command, a script without a
+main guard, a notebook and a test alike: Lightning's launchers need such a guard, or make the
+calling process wait while another one trains. They meet over a file and talk over the loopback
+interface alone.
 """
 
 import contextlib
 import functools
 import logging
+import multiprocessing
 import os
+import signal
 import socket
-import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+import types
+from collections.abc import Callable, Iterable, Iterator
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from lightning_fabric import Fabric
-from lightning_fabric.plugins.environments.cluster_environment import ClusterEnvironment
+from lightning_fabric.plugins.environments.lightning import LightningEnvironment
 from lightning_fabric.strategies.ddp import DDPStrategy
 from lightning_fabric.utilities.exceptions import MisconfigurationException
-from torch import Tensor, distributed, nn
+from torch import Tensor, distributed
 
 from qs3.errors import InputError, QS3Error
 from qs3.training.config import TrainSettings
+from qs3.training.progress import TimeUpError
 
 _LOG = logging.getLogger(__name__)
-_MEETING = "meeting"
-READY = "ready"
-"""File that a process makes when it has read its job; its rank follows."""
 _GRACE = 60.0
 """Seconds that this process gets to notice by itself that another one has died."""
+
+Work = Callable[[Fabric], Any]
+"""What every device does; it must be picklable for several."""
 
 
 def make_fabric(settings: TrainSettings, rank: int = 0) -> Fabric:
     """Return the device and number format of the settings.
 
     Args:
-        settings: What to compute on. Several devices compute together inside of `join` only.
+        settings: What to compute on. Several devices compute together inside of `all_devices` only.
         rank: Number of this process's device.
 
     Raises:
@@ -68,76 +74,53 @@ def make_fabric(settings: TrainSettings, rank: int = 0) -> Fabric:
             f"accelerator {settings.accelerator!r} with devices = {count}: {reason}"
         ) from error
     if settings.precision == "bf16-mixed" and fabric.device.type == "cpu" and not has_bf16_units():
-        _tell_of_slow_bf16()
+        _warn_of_slow_bf16()
     return fabric
 
 
 def has_bf16_units() -> bool:
     """Whether this CPU multiplies bfloat16 in hardware; true where PyTorch does not tell."""
-    told = getattr(torch.cpu, "get_capabilities", dict)()
-    if told.get("architecture") != "x86_64":
+    capabilities = getattr(torch.cpu, "get_capabilities", dict)()
+    if capabilities.get("architecture") != "x86_64":
         return True
-    return bool(told.get("avx512_bf16") or told.get("amx_bf16"))
+    return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
 
 
 @functools.cache
-def _tell_of_slow_bf16() -> None:
+def _warn_of_slow_bf16() -> None:
     _LOG.warning(
         "bf16-mixed on a CPU without bf16 units is slower than 32-true, with coarser rounding"
     )
 
 
-class _OneMachine(ClusterEnvironment):
+class _OneMachine(LightningEnvironment):
     """Tells Fabric that somebody else starts the processes, all of them here."""
 
     def __init__(self, rank: int, world: int) -> None:
         super().__init__()
-        self._rank, self._world = rank, world
+        self._global_rank, self._world_size = rank, world
+        self._main_port = 0  # never used: the group is made before Fabric looks for one
 
     @property
     def creates_processes_externally(self) -> bool:
         return True
 
-    @property
-    def main_address(self) -> str:
-        return "127.0.0.1"
-
-    @property
-    def main_port(self) -> int:
-        return 0  # never used: the group is made before Fabric looks for one
-
-    @staticmethod
-    def detect() -> bool:
-        return False
-
-    def world_size(self) -> int:
-        return self._world
-
-    def set_world_size(self, size: int) -> None:
-        self._world = size
-
-    def global_rank(self) -> int:
-        return self._rank
-
-    def set_global_rank(self, rank: int) -> None:
-        self._rank = rank
-
     def local_rank(self) -> int:
-        return self._rank
+        return self._global_rank
 
     def node_rank(self) -> int:
         return 0
 
 
 @contextlib.contextmanager
-def join(settings: TrainSettings, rank: int, folder: Path) -> Iterator[Fabric]:
+def _joined(settings: TrainSettings, rank: int, folder: str) -> Iterator[Fabric]:
     """Compute together with the other processes that join over the same folder."""
     if distributed.is_initialized():
         raise InputError("this process computes in a group already; set devices to 1")
     fabric = make_fabric(settings, rank)
     cuda = fabric.device.type == "cuda"
     with _environment(_loopback()):
-        meeting = str(Path(folder) / _MEETING)
+        meeting = str(Path(folder) / "meeting")
         store = distributed.FileStore(meeting, settings.devices)  # pyright: ignore[reportPrivateImportUsage]
         distributed.init_process_group(
             "nccl" if cuda else "gloo",
@@ -157,35 +140,31 @@ def _loopback() -> dict[str, str]:
     """Variables that keep the talk off the network; the number of threads is ours to set."""
     names = [name for _, name in socket.if_nameindex()] if hasattr(socket, "if_nameindex") else []
     loop = [name for name in names if name in ("lo", "lo0")]
-    there = {"GLOO_SOCKET_IFNAME": loop[0], "NCCL_SOCKET_IFNAME": loop[0]} if loop else {}
-    return there | {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
+    talk = {"GLOO_SOCKET_IFNAME": loop[0], "NCCL_SOCKET_IFNAME": loop[0]} if loop else {}
+    return talk | {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
 
 
 @contextlib.contextmanager
 def _environment(changes: dict[str, str]) -> Iterator[None]:
     """Set environment variables for a while."""
     names = (*changes, "MASTER_ADDR", "MASTER_PORT")
-    before = {name: os.environ.get(name) for name in names}
+    before = {name: os.environ[name] for name in names if name in os.environ}
     os.environ.update(changes)
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        for name in names:
+            os.environ.pop(name, None)
+        os.environ.update(before)
 
 
 @contextlib.contextmanager
-def all_devices(settings: TrainSettings, write_job: Callable[[Path], None]) -> Iterator[Fabric]:
+def all_devices(settings: TrainSettings, work: Work) -> Iterator[Fabric]:
     """Compute on all devices of the settings; this process is the first of them.
 
     Args:
         settings: How many devices, and which.
-        write_job: Writes what the other processes need into a folder; called for several devices
-            only. Its files are deleted as soon as all have read them, so that a kill leaves no
-            clouds behind.
+        work: What the others do; the caller does the same with the devices that it is handed.
 
     Raises:
         InputError: where a device is not there.
@@ -194,24 +173,21 @@ def all_devices(settings: TrainSettings, write_job: Callable[[Path], None]) -> I
     if settings.devices == 1:
         yield make_fabric(settings)
         return
-    with tempfile.TemporaryDirectory(prefix="qs3-") as name:
-        folder = Path(name)
-        write_job(folder)
-        files = list(folder.iterdir())
-        others = [_Other(rank, folder) for rank in range(1, settings.devices)]
+    with tempfile.TemporaryDirectory(prefix="qs3-") as folder:
+        others: list[_Other] = []
         try:
+            with _no_main():
+                for rank in range(1, settings.devices):
+                    others.append(_Other(rank, folder, settings, work))
             for other in others:
                 other.wait_until_ready()
-            for file in files:
-                with contextlib.suppress(OSError):  # Windows deletes no file that is mapped
-                    file.unlink()
-            with join(settings, 0, folder) as fabric:
+            with _joined(settings, 0, folder) as fabric:
                 if fabric.device.type == "cuda":
                     threading.Thread(target=_watch, args=(others,), daemon=True).start()
                 yield fabric
             for other in others:
-                other.process.wait(_GRACE)
-        except (RuntimeError, subprocess.TimeoutExpired) as error:
+                other.process.join(_GRACE)
+        except RuntimeError as error:
             fault = _fault(others)
             if fault is None:
                 raise
@@ -221,50 +197,82 @@ def all_devices(settings: TrainSettings, write_job: Callable[[Path], None]) -> I
                 other.end()
 
 
+@contextlib.contextmanager
+def _no_main() -> Iterator[None]:
+    """Hide the caller's script, which a process that is started would run once more."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = types.ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
+
+
 class _Other:
     """A process that computes on another device."""
 
-    def __init__(self, rank: int, folder: Path) -> None:
-        self.rank, self.wanted = rank, True
-        self.said, self.ready = folder / f"stderr-{rank}", folder / f"{READY}-{rank}"
-        paths = os.pathsep.join(path or os.getcwd() for path in sys.path)  # noqa: PTH109
-        with self.said.open("wb") as stderr:
-            # Its standard input is a lifeline: it ends when this process does.
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "qs3.training.worker", str(rank), str(folder)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.DEVNULL,
-                stderr=stderr,
-                env=os.environ | {"PYTHONPATH": paths},
-            )
+    def __init__(self, rank: int, folder: str, settings: TrainSettings, work: Work) -> None:
+        self.rank, self.wanted, self.reason = rank, True, ""
+        context = multiprocessing.get_context("spawn")
+        self.ear, mouth = context.Pipe(duplex=False)
+        arguments = (mouth, rank, folder, settings, work)
+        self.process = context.Process(target=_do, args=arguments, daemon=True)
+        self.process.start()
+        mouth.close()
 
     def wait_until_ready(self) -> None:
-        while not self.ready.exists():
-            fault = self.fault()
-            if fault is not None:
-                raise QS3Error(fault)
-            time.sleep(0.02)
+        wait([self.ear, self.process.sentinel])
+        fault = self.fault()
+        if fault is not None:
+            raise QS3Error(fault)
 
     def end(self) -> None:
         self.wanted = False
         self.process.kill()
-        self.process.wait()
-        if self.process.stdin is not None:
-            self.process.stdin.close()
+        self.process.join()
+        self.ear.close()
 
     def fault(self) -> str | None:
         """How it failed; None where it did not."""
-        code = self.process.poll()
-        if not self.wanted or code is None or code == 0:
+        with contextlib.suppress(EOFError, OSError):
+            while self.wanted and self.ear.poll():
+                self.reason = self.ear.recv()
+        code = self.process.exitcode
+        if not self.wanted or not code:
             return None
         how = f"was killed (signal {-code})" if code < 0 else f"failed (code {code})"
-        lines = self.said.read_text("utf-8", "replace").split("\n") if self.said.exists() else []
-        last = next((line for line in reversed(lines) if line.strip()), "")
-        told = f": {last}" if last and code > 0 else ""
+        reason = f": {self.reason}" if self.reason and code > 0 else ""
         return (
-            f"the process of device {self.rank} {how}{told}; run the same again to go on after the "
-            "last finished epoch"
+            f"the process of device {self.rank} {how}{reason}; run the same again to go on after "
+            "the last finished epoch"
         )
+
+
+def _do(mouth: Connection, rank: int, folder: str, settings: TrainSettings, work: Work) -> None:
+    """Work on one further device, with the processes that meet in the folder."""
+    # Ctrl-C reaches every process of a terminal: the first decides, and ends this one.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_the_first, daemon=True).start()
+    silence = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):  # the first process talks
+        os.dup2(silence, stream)
+    mouth.send("")
+    try:
+        with threads(settings), _joined(settings, rank, folder) as fabric:
+            work(fabric)
+    except TimeUpError:
+        return
+    except Exception as error:
+        reason = str(error) if isinstance(error, QS3Error) else f"{type(error).__name__}: {error}"
+        mouth.send(" ".join(reason.split()))
+        sys.exit(2)
+
+
+def _end_with_the_first() -> None:
+    first = multiprocessing.parent_process()
+    assert first is not None  # noqa: S101
+    first.join()
+    os._exit(1)
 
 
 def _fault(others: list[_Other]) -> str | None:
@@ -294,16 +302,11 @@ def _watch(others: list[_Other]) -> None:
         time.sleep(0.5)
 
 
-def make_equal(tensors: list[Tensor], fabric: Fabric) -> None:
+def make_equal(tensors: Iterable[Tensor], fabric: Fabric) -> None:
     """Give every device the first one's values."""
     if fabric.world_size > 1:
         for tensor in tensors:
-            distributed.broadcast(tensor, 0)
-
-
-def make_module_equal(module: nn.Module, fabric: Fabric) -> None:
-    """Give every device the first one's parameters and buffers, running statistics included."""
-    make_equal([tensor.detach() for tensor in module.state_dict().values()], fabric)
+            distributed.broadcast(tensor.detach(), 0)
 
 
 def gather_rows(rows: np.ndarray, mine: slice, count: int, fabric: Fabric) -> np.ndarray:

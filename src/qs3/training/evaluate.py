@@ -10,15 +10,15 @@ from typing import Any
 from qs3.adaptation.validators import VALIDATORS
 from qs3.errors import InputError
 from qs3.evaluation.environment import git_commit, hardware, versions
-from qs3.evaluation.records import RECORDS, DataRecord, RunRecord, Scores, score, write_record
+from qs3.evaluation.records import RECORDS, RunRecord, Scores, score, write_record
 from qs3.io import load_clouds
 from qs3.io.clouds import CloudKind, PointClouds, digests
 from qs3.io.preparation import unit_ball
 from qs3.io.ragged import RaggedClouds
 from qs3.structure import unstructure
-from qs3.training.checkpoint import LoadedModel, fingerprint, load_model
+from qs3.training.checkpoint import LoadedModel, load_model
 from qs3.training.predict import predict_probabilities
-from qs3.training.run import Run, read_run
+from qs3.training.run import Run, data_record, read_run
 from qs3.training.validation import ROUND, choose, load_checkpoint, read_checkpoints
 
 
@@ -29,7 +29,7 @@ def evaluate(
     split: str | None = None,
     cloud: CloudKind = "points",
     checkpoints: bool = False,
-    experiment: Mapping[str, str | int] | None = None,
+    experiment: Mapping[str, str | int | float] | None = None,
 ) -> RunRecord:
     """Score a run on labelled clouds, and write the record into its folder ``records``.
 
@@ -58,7 +58,7 @@ def evaluate(
         settings=loaded.settings | {"preset": made.preset},
         source=made.source,
         target=made.target,
-        test=DataRecord.of(test.origin, test.checksum or fingerprint(test), len(test)),
+        test=data_record(test),
         seed=train["seed"],
         selection=made.selection,
         scores=_scores(loaded, test),

@@ -63,7 +63,7 @@ class CloudClassifier(nn.Module):
     """A network that takes clouds of any size in any unit, and gives probabilities.
 
     Inside are the steps of `qs3.training.batches.prepare`, in double precision as there: clouds of
-    more than ``num_points`` points are thinned by farthest point sampling from point 0, points of
+    more than ``num_points`` points are subsampled from point 0 on, points of
     smaller ones are repeated in order; then the unit ball.
 
     Convention:
@@ -87,16 +87,16 @@ class CloudClassifier(nn.Module):
 
     def forward(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b k"]:
         """Return the probabilities of the classes."""
-        thinned = thin_in_a_graph(points.double(), self.num_points)
-        logits = self.model(unit_ball_in_a_graph(thinned).float())
+        chosen = subsample_in_a_graph(points.double(), self.num_points)
+        logits = self.model(unit_ball_in_a_graph(chosen).float())
         return torch.softmax(logits.double(), dim=1).float()
 
 
-def thin_in_a_graph(points: Float[Tensor, "b n 3"], num_points: int) -> Float[Tensor, "b m 3"]:
-    """Bring clouds to one size as `qs3.training.thinning.thin`, in one graph for every n.
+def subsample_in_a_graph(points: Float[Tensor, "b n 3"], num_points: int) -> Float[Tensor, "b m 3"]:
+    """Bring clouds to one size as `qs3.training.batches.subsample`, in one graph for every n.
 
     Example:
-        >>> thin_in_a_graph(torch.tensor([[[0.0, 0, 0], [1, 0, 0]]]), 3)[0, :, 0].tolist()
+        >>> subsample_in_a_graph(torch.tensor([[[0.0, 0, 0], [1, 0, 0]]]), 3)[0, :, 0].tolist()
         [0.0, 1.0, 0.0]
     """
     # A tensor, for what depends on the number of points must be computed and not decided.

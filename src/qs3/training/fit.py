@@ -1,33 +1,38 @@
 """Train and adapt in one call, into a folder from which the call can be taken up again."""
 
 import contextlib
-import hashlib
-import json
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from qs3.adaptation import method_class
 from qs3.adaptation.names import split_method
-from qs3.errors import InputError, UnevenSizesError
-from qs3.evaluation.records import DataRecord
+from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds, digests
 from qs3.io.preparation import unit_ball
 from qs3.models import PointClassifier
-from qs3.training.batches import require_finite, require_unlabelled
-from qs3.training.checkpoint import claim_run, fingerprint, load_model
+from qs3.structure import unstructure
+from qs3.training.batches import require_finite, require_unlabelled, subsample
+from qs3.training.checkpoint import load_model, weights_fingerprint
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
-from qs3.training.deadline import Deadline
 from qs3.training.distributed import all_devices, make_fabric, threads
-from qs3.training.job import Job, Listeners, fresh_model, make_method, run_job, write_job
+from qs3.training.history import EpochRecord, History
+from qs3.training.job import Job, fresh_model, make_method, run_job
 from qs3.training.loop import EpochCallback
-from qs3.training.records import EpochRecord, History
-from qs3.training.run import RUN, Run, read_run, write_run
+from qs3.training.progress import Deadline
+from qs3.training.run import (
+    RUN,
+    Run,
+    claim_run,
+    data_record,
+    fingerprint,
+    read_run,
+    sum_seconds,
+    write_run,
+)
 from qs3.training.self_training import RoundCallback, RoundRecord
-from qs3.training.thinning import thin
 from qs3.training.validation import Checkpoint, held_out_rows, read_checkpoints
 
 _LOG = logging.getLogger(__name__)
@@ -124,73 +129,64 @@ def fit(
         require_unlabelled(target)
         require_finite(target.points, target.ids, "target: ")
     require_finite(source.points, source.ids, "source: ")
-    start, unseen = None, True
+    weights, before, unseen = None, None, True
     if warm_up is not None:
-        start, unseen = _load_warm_up(Path(warm_up), base, source, settings)
-    before = None if warm_up is None else _read_before(Path(warm_up))
+        warm_up = Path(warm_up)
+        weights, unseen = _check_warm_up(warm_up, base, source, settings)
+        before = read_run(warm_up) if (warm_up / RUN).is_file() else None
     run_dir = Path(run_dir)
     held = held_out_rows(source.labels, settings)
     has_holdout = unseen and bool(held.any())
     _require_judges(settings, rounds_settings, target, has_holdout)
-    job = Job(base, source, None, target, settings, rounds_settings, run_dir, start)
+    job = Job(base, source, None, target, settings, rounds_settings, run_dir, warm_up)
     # What cannot be made must not leave a folder behind that refuses the corrected call.
     make_method(fresh_model(job), job)
     make_fabric(settings)
     history = History(run_dir, tensorboard)
-    claim_run(
-        run_dir,
-        {
-            "method": method,
-            "train": asdict(settings),
-            "self_training": None if rounds_settings is None else asdict(rounds_settings),
-            "selection": settings.rule,
-            "class_names": list(source.class_names),
-            "source": fingerprint(source),
-            "target": None if target is None else fingerprint(target),
-            "warm_up": None if start is None else weights_fingerprint(start),
-        },
-    )
-    points = thin(source.points, settings.num_points, run_dir)
-    source_clouds = digests(points)
-    prepared = replace(source, points=unit_ball(points))
-    target_clouds: list[str] = []
+    claim_run(run_dir, method, source, target, settings, rounds_settings, weights)
+    chosen = subsample(source.points, settings.num_points, run_dir)
+    source_clouds, target_clouds = digests(chosen), []
+    prepared, prepared_target = replace(source, points=unit_ball(chosen)), None
     if target is not None:
-        points = thin(target.points, settings.num_points, run_dir)
-        target_clouds = digests(points)
-        target = replace(target, points=unit_ball(points))
+        chosen = subsample(target.points, settings.num_points, run_dir)
+        target_clouds = digests(chosen)
+        prepared_target = replace(target, points=unit_ball(chosen))
     job = replace(
         job,
         source=prepared.select(~held),
         holdout=prepared.select(held) if has_holdout else None,
-        target=target,
+        target=prepared_target,
     )
     with (
         threads(settings),
         contextlib.closing(history),
-        all_devices(settings, partial(write_job, job)) as fabric,
+        all_devices(settings, partial(run_job, job)) as fabric,
     ):
         model, epochs, rounds = run_job(
-            job, fabric, Listeners(history, deadline, on_epoch, on_round)
+            job,
+            fabric,
+            history=history,
+            deadline=deadline,
+            on_epoch=on_epoch,
+            on_round=on_round,
         )
     adapted = (
         needs or settings.normalisation != "shared" or settings.rule not in ("last", "source-val")
     )
-    rule = None if rounds_settings is None else rounds_settings.rule
-    seconds = {"source": float(sum(epoch.seconds for epoch in epochs))}
-    seconds["rounds"] = float(sum(record.seconds for record in rounds))
-    seconds["total"] = sum(seconds.values())
+    if rounds_settings is not None and method == base:
+        method = f"{base}+{rounds_settings.rule}"
     run = Run(
-        method=f"{base}+{rule}" if rule is not None and method == base else method,
+        method=method,
         selection=settings.rule,
-        source=_data(source),
-        target=None if target is None else _data(target),
-        preset=None if rule is None else preset,
-        supervised=supervised,
+        source=data_record(source),
+        target=None if target is None else data_record(target),
         source_clouds=tuple(source_clouds),
         target_clouds=tuple(target_clouds) if adapted else (),
         unknown_warm_up=warm_up is not None and before is None,
         rounds=tuple(asdict(record) for record in rounds),
-        seconds=seconds,
+        seconds=sum_seconds(epochs, rounds),
+        preset=None if rounds_settings is None else preset,
+        supervised=supervised,
         folder=run_dir,
     )
     write_run(run if before is None else _with_warm_up(run, before))
@@ -205,32 +201,6 @@ def fit(
         holdout=job.holdout,
         target=job.target,
     )
-
-
-def load_whole(load: Callable[..., Any], data: str | Path, num_points: int, **part: Any) -> Any:
-    """Read clouds with all their points, of which `fit` keeps the choice in the run's folder.
-
-    Clouds of several sizes fit no one array: those are subsampled as they are read.
-
-    Args:
-        load: `qs3.io.load_clouds` or `qs3.io.load_unlabelled`.
-        data: What to read.
-        num_points: Points a cloud of the training.
-        part: ``split`` and ``cloud``.
-    """
-    try:
-        return load(data, num_points=None, **part)
-    except UnevenSizesError:
-        return load(data, num_points=num_points, **part)
-
-
-def _data(clouds: PointClouds | UnlabelledClouds) -> DataRecord:
-    return DataRecord.of(clouds.origin, clouds.checksum or fingerprint(clouds), len(clouds))
-
-
-def _read_before(warm_up: Path) -> Run | None:
-    """What a warm-up tells of itself; None where it does not."""
-    return read_run(warm_up) if (warm_up / RUN).is_file() else None
 
 
 def _with_warm_up(run: Run, before: Run) -> Run:
@@ -289,53 +259,43 @@ def _require_judges(
         raise InputError(f"rule {settings.rule!r} needs a target: give unlabelled clouds")
 
 
-def _load_warm_up(
+def _check_warm_up(
     folder: Path, base: str, source: PointClouds, settings: TrainSettings
-) -> tuple[PointClassifier, bool]:
-    """Read the warm-up's network; say whether it has left this run's held-out part unseen.
+) -> tuple[str, bool]:
+    """Return the checksum of a warm-up's weights, and whether the held-out part is new to it.
 
     Raises:
         InputError: where it is one for other classes or settings, or of another method.
     """
-    model, class_names, there = load_model(folder)
+    model, class_names, its = load_model(folder)
     if class_names != source.class_names:
         raise InputError(
             f"{folder}: its classes ({', '.join(class_names)}) are not those of the source "
             f"({', '.join(source.class_names)})"
         )
-    wanted = json.loads(json.dumps(asdict(settings)))
-    trained = there.get("train", {})
+    ours, trained = unstructure(settings), its.get("train", {})
     names = ["model", "model_settings", "num_points"]
     names += ["method_settings"] if "method_settings" in trained else []
     for name in names:
-        if trained.get(name) != wanted[name]:
+        if trained.get(name) != ours[name]:
             raise InputError(
-                f"{folder}: trained with {name} = {trained.get(name)!r}, not "
-                f"{wanted[name]!r}; use the same setting"
+                f"{folder}: trained with {name} = {trained.get(name)!r}, not {ours[name]!r}; use "
+                "the same setting"
             )
-    if there.get("self_training") is not None:
+    if its.get("self_training") is not None:
         raise InputError(f"{folder}: is self-trained itself; name the run before its rounds")
-    method = there.get("method", base)
+    method = its.get("method", base)
     if method != base:
         raise InputError(
             f"{folder}: is a run of method {method}, not {base}; choose method {method} with "
             "self-training after it"
         )
-    same = all(trained.get(name) == wanted[name] for name in ("seed", "holdout"))
-    unseen = same and there.get("source") == fingerprint(source)
+    same = all(trained.get(name) == ours[name] for name in ("seed", "holdout"))
+    unseen = same and its.get("source") == fingerprint(source)
     if not unseen and settings.holdout > 0:
         _LOG.warning(
             "%s: was trained on another part of the source, so that none of it is left to "
             "validate on; same source, seed and holdout would leave one",
             folder,
         )
-    return model, unseen
-
-
-def weights_fingerprint(model: PointClassifier) -> str:
-    """SHA-256 over names and values of a network's weights, by which a warm-up is known."""
-    digest = hashlib.sha256()
-    for name, tensor in sorted(model.state_dict().items()):
-        digest.update(name.encode())
-        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
+    return weights_fingerprint(model), unseen

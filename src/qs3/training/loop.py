@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from lightning_fabric import Fabric
-from torch import Tensor
+from torch import Tensor, nn
 
 from qs3.adaptation import Method
 from qs3.errors import InputError, QS3Error
@@ -24,17 +24,18 @@ from qs3.training.batches import (
 )
 from qs3.training.checkpoint import load_optimiser, optimiser_tensors, seed_sequence
 from qs3.training.config import TrainSettings
-from qs3.training.deadline import Deadline, TimeUpError
-from qs3.training.distributed import make_equal, make_fabric, make_module_equal
-from qs3.training.ema import Average
-from qs3.training.progress import Progress
-from qs3.training.records import EpochRecord, Log
+from qs3.training.distributed import make_equal, make_fabric
+from qs3.training.history import EpochRecord, Log
+from qs3.training.progress import Deadline, Progress, TimeUpError
 from qs3.training.schedules import cosine, plateau
-from qs3.training.state import CHECKPOINT as CHECKPOINT
-from qs3.training.state import Observer, TrainingState
+from qs3.training.state import TrainingState, averaged, make_average
 
 EpochCallback = Callable[[EpochRecord, Method], None]
 """Called after each epoch; an exception ends the training, which then resumes after this epoch."""
+
+
+Observer = Callable[[Method, int], None]
+"""Looks at the network after each epoch, on every device, before the checkpoint is written."""
 
 
 def train(
@@ -50,6 +51,7 @@ def train(
     first_epoch: int = 0,
     optimiser_state: Mapping[str, Tensor] | None = None,
     observer: Observer | None = None,
+    beside: nn.Module | None = None,
     on_epoch: EpochCallback | None = None,
     log: Log | None = None,
     deadline: Deadline | None = None,
@@ -76,7 +78,8 @@ def train(
         steps_per_epoch: Optimiser steps an epoch, in place of one pass.
         first_epoch: Place on the cosine of this training's first epoch.
         optimiser_state: Adam's state at the start, in place of zeros.
-        observer: Watches the network; its tensors go into the checkpoint.
+        observer: Looks at the network after each epoch.
+        beside: A module that the observer keeps up to date; it goes into the checkpoint too.
         on_epoch: Called after each epoch on the first device, when its checkpoint is written.
         log: Is handed the epochs so far, on the first device.
         deadline: Ends the training before an epoch that would end too late.
@@ -111,8 +114,8 @@ def train(
     wrapped, wrapped_optimiser = fabric.setup(method, optimiser)
     if optimiser_state:
         load_optimiser(optimiser, optimiser_state)
-    average = None if settings.ema_decay is None else Average(method, settings.ema_decay)
-    state = TrainingState(method, optimiser, average, observer, stream, fabric)
+    average = None if settings.ema_decay is None else make_average(method, settings.ema_decay)
+    state = TrainingState(method, optimiser, average, beside, stream, fabric)
     history = state.resume(run_dir)
     if log is not None:
         log(history)
@@ -152,11 +155,13 @@ def train(
                     batch = make_batch(labelled, rows, settings, augmentation, share)
                     bar.watch(batch)
                     other = [next(order) for order in others]
-                    seen = None
+                    points = None
                     if unlabelled is not None:
                         other = [index % len(unlabelled) for index in other]
-                        seen = make_batch([unlabelled], other, settings, augmentation, share).points
-                    losses = wrapped(batch, seen, (epoch * steps + step) / total, generator)
+                        points = make_batch(
+                            [unlabelled], other, settings, augmentation, share
+                        ).points
+                    losses = wrapped(batch, points, (epoch * steps + step) / total, generator)
                     count = sum(map(len, rows))
                     value = bar.measure(losses, count)
                     where = f"epoch {epoch}, batch {step}"
@@ -174,7 +179,7 @@ def train(
                     wrapped_optimiser.step()
                     method.after_step()
                     if average is not None:
-                        average.update()
+                        average.update_parameters(method)
                     bar.step()
             record = EpochRecord(
                 epoch=epoch,
@@ -185,11 +190,22 @@ def train(
                 samples_per_second=bar.rate(),
             )
             history.append(record)
-            _finish_epoch(state, history, run_dir, log, on_epoch)
+            make_equal(method.state_dict().values(), fabric)
+            if average is not None:
+                make_equal(average.state_dict().values(), fabric)
+            if observer is not None:
+                with averaged(method, average):
+                    observer(method, epoch)
+            state.write(run_dir, history)
+            if log is not None:
+                log(history)
+            if on_epoch is not None:
+                with averaged(method, average):
+                    on_epoch(record, method)
             if deadline is not None:
                 deadline.note(bar.seconds())
     if average is not None:
-        average.settle()
+        method.load_state_dict(average.module.state_dict())
     return history, {k: v.clone() for k, v in optimiser_tensors(optimiser).items()}
 
 
@@ -226,29 +242,6 @@ def _stop_in_time(deadline: Deadline | None, fabric: Fabric, where: str) -> None
             f"stopped after {minutes:.1f} minutes, before {where}, as the next epoch would not end "
             "in time; run the same again to go on"
         )
-
-
-def _finish_epoch(
-    state: TrainingState,
-    history: list[EpochRecord],
-    run_dir: Path | None,
-    log: Log | None,
-    on_epoch: EpochCallback | None,
-) -> None:
-    """Let everybody see the epoch's network, and write it down."""
-    make_module_equal(state.method, state.fabric)
-    average = state.average
-    if average is not None:
-        make_equal(list(average.tensors().values()), state.fabric)
-    if state.observer is not None:
-        with nullcontext() if average is None else average.shown():
-            state.observer.after_epoch(state.method, history[-1].epoch)
-    state.write(run_dir, history)
-    if log is not None:
-        log(history)
-    if on_epoch is not None:
-        with nullcontext() if average is None else average.shown():
-            on_epoch(history[-1], state.method)
 
 
 def _require_finite(

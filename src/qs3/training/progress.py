@@ -1,6 +1,7 @@
-"""The bar that shows how a training goes, and the sums behind its numbers."""
+"""How far a training is: the bar, the sums behind its numbers, and the time that is left."""
 
 import os
+import re
 import sys
 import time
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from qs3.adaptation import Batch, Method
+from qs3.errors import InputError, QS3Error
 
 _FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
 
@@ -79,9 +81,9 @@ class Progress:
         values = [term.detach().float() * mine for term in losses.values()]
         right = self.method.right
         right = torch.full_like(values[0], torch.nan) if right is None else right
-        told = self.fabric.all_reduce(torch.stack([*values, right.to(values[0])]), reduce_op="sum")
-        assert isinstance(told, Tensor)  # noqa: S101
-        *terms, hits = told.tolist()
+        sums = self.fabric.all_reduce(torch.stack([*values, right.to(values[0])]), reduce_op="sum")
+        assert isinstance(sums, Tensor)  # noqa: S101
+        *terms, hits = sums.tolist()
         for name, value in zip(losses, terms, strict=True):
             self.sums[name] = self.sums.get(name, 0.0) + value / clouds
         self.steps += 1
@@ -116,3 +118,54 @@ class Progress:
     def rate(self) -> float:
         """Labelled clouds a second in this epoch."""
         return self.seen / max(self.seconds(), 1e-9)
+
+
+class TimeUpError(QS3Error):
+    """The time that a training was given is used up; the same call goes on where it stopped."""
+
+
+def parse_duration(text: str) -> float:
+    """Read hours, minutes and seconds, and return seconds.
+
+    Raises:
+        InputError: where the text is not such a time, or is zero.
+
+    Example:
+        >>> parse_duration("01:30:00")
+        5400.0
+    """
+    match = re.fullmatch(r"(\d+):([0-5]\d):([0-5]\d)", text, flags=re.ASCII)
+    hours, minutes, seconds = (0, 0, 0) if match is None else map(int, match.groups())
+    total = 3600.0 * hours + 60.0 * minutes + seconds
+    if total == 0:
+        raise InputError(f"max-time {text!r}: give hours, minutes and seconds, such as 00:30:00")
+    return total
+
+
+class Deadline:
+    """Tells before each epoch whether it will still end in time.
+
+    The first epoch of a call always runs, so that every call gets on.
+
+    Args:
+        seconds: Time for the whole call; None sets no limit.
+        start: When the call began, by ``time.monotonic()``; now where it is not given.
+    """
+
+    def __init__(self, seconds: float | None = None, start: float | None = None) -> None:
+        self.start = time.monotonic() if start is None else start
+        self.seconds, self.longest = seconds, 0.0
+
+    def passed(self) -> bool:
+        """Whether another epoch as long as the longest so far would end too late."""
+        if self.seconds is None or self.longest == 0.0:
+            return False
+        return time.monotonic() - self.start + self.longest > self.seconds
+
+    def note(self, seconds: float) -> None:
+        """Note how long an epoch took."""
+        self.longest = max(self.longest, seconds, 1e-9)
+
+    def elapsed(self) -> float:
+        """Seconds since the call began."""
+        return time.monotonic() - self.start

@@ -1,14 +1,19 @@
-"""The folder of a run: what it holds when it is finished, and where runs lie."""
+"""The folder of a run: its settings, what is told of it when it is finished, where runs lie."""
 
-from collections.abc import Mapping
+import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from qs3.errors import InputError
 from qs3.evaluation.records import DataRecord, rename_method, rename_settings, walk
-from qs3.files import read_json, write_json
+from qs3.files import holds_something, read_json, write_json
+from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.structure import structure, unstructure
+from qs3.training.config import SelfTrainingSettings, TrainSettings
 
 RUN = "run.json"
 SETTINGS = "settings.json"
@@ -28,10 +33,6 @@ class Run:
     """Labelled data of the training."""
     target: DataRecord | None
     """Unlabelled data of the training; None where there was none."""
-    preset: str | None
-    """Preset of the rounds; None without rounds, or where the caller named none."""
-    supervised: bool
-    """Whether its source is the labelled training part of the target, in it or its warm-up."""
     source_clouds: tuple[str, ...]
     """Checksums of the labelled clouds that the network or its warm-up has seen."""
     target_clouds: tuple[str, ...]
@@ -42,6 +43,10 @@ class Run:
     """What each round of self-training did."""
     seconds: Mapping[str, float]
     """Wall-clock seconds: ``source``, ``rounds``, ``total``."""
+    preset: str | None = None
+    """Preset of the rounds; None without rounds, or where the caller named none."""
+    supervised: bool = False
+    """Whether its source, or its warm-up's, is the labelled training part of the target."""
     schema: int = SCHEMA_VERSION
     """Version of these fields in the file."""
     folder: Path = Path()
@@ -53,9 +58,8 @@ class Run:
 def write_run(run: Run) -> None:
     """Write ``run.json`` into the run's folder."""
     value = unstructure(run)
-    write_json(
-        run.folder / RUN, {n: v for n, v in value.items() if n not in ("folder", "settings")}
-    )
+    del value["folder"], value["settings"]
+    write_json(run.folder / RUN, value)
 
 
 def read_run(folder: Path) -> Run:
@@ -66,10 +70,12 @@ def read_run(folder: Path) -> Run:
     """
     folder = Path(folder)
     path = folder / RUN
+    if not is_run(folder):
+        raise InputError(f"{folder}: no {RUN} here; not a run of qs3")
     if not path.is_file() or not (folder / MODEL).is_file():
-        if not is_run(folder):
-            raise InputError(f"{folder}: no {RUN} here; not a run of qs3")
-        raise InputError(f"{folder}: the run is not finished; run its qs3 train command again")
+        raise InputError(
+            f"{folder}: the run is not finished; run its qs3 train command again to go on"
+        )
     value = read_json(path)
     schema = value.get("schema", 1) if isinstance(value, dict) else None
     if schema not in (1, SCHEMA_VERSION):
@@ -77,8 +83,8 @@ def read_run(folder: Path) -> Run:
     value = dict(value)
     if schema == 1:
         data = value.pop("data", None)
-        data = data if isinstance(data, dict) else {}
-        value |= data | {"method": rename_method(value.get("method")), "schema": SCHEMA_VERSION}
+        value |= data if isinstance(data, dict) else {}
+        value |= {"method": rename_method(value.get("method")), "schema": SCHEMA_VERSION}
     settings = read_settings(folder)
     return structure(value | {"folder": folder, "settings": settings}, Run, path)
 
@@ -89,9 +95,10 @@ def read_settings(folder: Path) -> dict[str, Any]:
     Raises:
         InputError: where they are missing or not an object.
     """
-    value = read_json(Path(folder) / SETTINGS)
+    path = Path(folder) / SETTINGS
+    value = read_json(path)
     if not isinstance(value, dict):
-        raise InputError(f"{Path(folder) / SETTINGS}: not the settings of a run")
+        raise InputError(f"{path}: not the settings of a run")
     return rename_settings(value)
 
 
@@ -111,3 +118,86 @@ def find_runs(folder: Path) -> list[Path]:
         if not inside and (SETTINGS in files or RUN in files):
             runs.append(place)
     return runs
+
+
+def claim_run(
+    run_dir: Path,
+    method: str,
+    source: PointClouds,
+    target: UnlabelledClouds | None,
+    settings: TrainSettings,
+    rounds: SelfTrainingSettings | None,
+    warm_up: str | None,
+) -> None:
+    """Write a run's settings to its folder, or check that they are the ones already there.
+
+    Args:
+        run_dir: The folder.
+        method: Name of the method.
+        source: Labelled clouds, by whose checksum a run is known again; so of the target.
+        target: Unlabelled clouds.
+        settings: How to train.
+        rounds: How to train oneself.
+        warm_up: Checksum of the weights that the run starts from.
+
+    Raises:
+        InputError: where the folder is a file, holds something else, or a run of other settings;
+            the first setting that differs is named.
+    """
+    wanted = {
+        "method": method,
+        "train": unstructure(settings),
+        "self_training": None if rounds is None else unstructure(rounds),
+        "selection": settings.rule,
+        "class_names": list(source.class_names),
+        "source": fingerprint(source),
+        "target": None if target is None else fingerprint(target),
+        "warm_up": warm_up,
+    }
+    if run_dir.exists() and not run_dir.is_dir():
+        raise InputError(f"{run_dir}: is a file; name a folder for the run")
+    if (run_dir / SETTINGS).is_file():
+        theirs, ours = _flat(read_settings(run_dir)), _flat(wanted)
+        for name in sorted(theirs.keys() | ours.keys()):
+            if theirs.get(name) != ours.get(name):
+                raise InputError(
+                    f"{run_dir}: holds a run with {name} = {theirs.get(name)!r}, not "
+                    f"{ours.get(name)!r}; name another folder or use its settings"
+                )
+        return
+    if holds_something(run_dir):
+        raise InputError(f"{run_dir}: holds something else (no {SETTINGS}); name a new folder")
+    write_json(run_dir / SETTINGS, wanted)
+
+
+def _flat(value: Any, name: str = "") -> dict[str, Any]:
+    if not isinstance(value, dict):
+        return {name: value}
+    items: dict[str, Any] = {}
+    for key, inner in value.items():
+        items |= _flat(inner, f"{name}.{key}" if name else key)
+    return items
+
+
+def fingerprint(clouds: PointClouds | UnlabelledClouds) -> str:
+    """SHA-256 over points, and labels and class names where there are any."""
+    digest = hashlib.sha256(str(clouds.points.shape).encode())
+    digest.update(np.ascontiguousarray(clouds.points, dtype=np.float32).tobytes())
+    if isinstance(clouds, PointClouds):
+        digest.update(np.ascontiguousarray(clouds.labels, dtype=np.int64).tobytes())
+        digest.update("\0".join(clouds.class_names).encode())
+    return digest.hexdigest()
+
+
+def data_record(clouds: PointClouds | UnlabelledClouds) -> DataRecord:
+    """Return what a record says of clouds."""
+    return DataRecord.of(clouds.origin, clouds.checksum or fingerprint(clouds), len(clouds))
+
+
+def sum_seconds(epochs: Sequence[Any], rounds: Sequence[Any]) -> dict[str, float]:
+    """Return the seconds of a run, from the records of its epochs and rounds."""
+    seconds = {
+        "source": float(sum(epoch.seconds for epoch in epochs)),
+        "rounds": float(sum(record.seconds for record in rounds)),
+    }
+    return seconds | {"total": sum(seconds.values())}

@@ -2,10 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import Literal
-
-Schedule = Literal["cosine", "plateau"]
-"""A cosine to 0 over the training; or halved where the loss falls no more."""
 
 
 def cosine(epoch: int, period: int) -> float:

@@ -1,13 +1,15 @@
-"""The checkpoint of a training: what it needs to go on as if it had never stopped."""
+"""What changes while a method trains, and its checkpoint: to go on as if it had never stopped."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from lightning_fabric import Fabric
-from torch import Tensor
+from torch import nn
+from torch.optim.swa_utils import AveragedModel
 
 from qs3.adaptation import Method
 from qs3.errors import InputError
@@ -20,39 +22,67 @@ from qs3.training.checkpoint import (
     without_prefix,
     write_tensors,
 )
-from qs3.training.ema import Average
-from qs3.training.records import EpochRecord
+from qs3.training.history import EpochRecord
 
 CHECKPOINT = "checkpoint.safetensors"
 
 
-@runtime_checkable
-class Observer(Protocol):
-    """Watches the network over the epochs and keeps tensors that a resumed training needs."""
+def make_average(module: nn.Module, decay: float) -> AveragedModel:
+    """Return an exponential moving average of a module's parameters and buffers over its steps.
 
-    def after_epoch(self, method: Method, epoch: int) -> None:
-        """Look at the network after an epoch."""
+    It begins at the module's state. After step t it moves by 1 − d towards the module, d =
+    min(decay, (1 + t)/(10 + t)): the first steps, far from where the training ends, are soon
+    forgotten. Running statistics of batch normalisation are averaged like weights; integers (its
+    count of batches) are copied.
 
-    def tensors(self) -> dict[str, Tensor]:
-        """Return what to store in the checkpoint."""
-        ...
+    Example:
+        >>> layer = nn.Linear(1, 1)
+        >>> average = make_average(layer, 0.9)
+        >>> average.update_parameters(layer)
+        >>> torch.equal(average.module.weight, layer.weight)
+        True
+    """
 
-    def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take back what `tensors` returned."""
+    def move(averages: Any, values: Any, count: Any) -> None:
+        step = int(count)  # the beginning is counted as the first value
+        share = 1.0 - min(decay, (1 + step) / (10 + step))
+        for mean, value in zip(averages, values, strict=True):
+            if mean.is_floating_point():
+                mean.lerp_(value, share)
+            else:
+                mean.copy_(value)
+
+    average = AveragedModel(module, multi_avg_fn=move, use_buffers=True)
+    average.update_parameters(module)
+    return average
+
+
+@contextmanager
+def averaged(module: nn.Module, average: AveragedModel | None) -> Iterator[None]:
+    """Let a module hold its average, if there is one, for a while."""
+    if average is None:
+        yield
+        return
+    own = {name: tensor.detach().clone() for name, tensor in module.state_dict().items()}
+    module.load_state_dict(average.module.state_dict())
+    try:
+        yield
+    finally:
+        module.load_state_dict(own)
 
 
 @dataclass(frozen=True)
 class TrainingState:
-    """What changes while a method trains."""
+    """What changes while a method trains: enough to go on as if it had never stopped."""
 
     method: Method
     """Networks and whatever else is trained."""
     optimiser: torch.optim.Optimizer
     """Adam."""
-    average: Average | None
+    average: AveragedModel | None
     """Moving average of the method."""
-    observer: Observer | None
-    """Looks on after each epoch."""
+    beside: nn.Module | None
+    """A network that is kept beside the method's."""
     stream: tuple[int, ...]
     """Numbers of this training's random draws; a checkpoint of another stream is not for it."""
     fabric: Fabric
@@ -64,14 +94,11 @@ class TrainingState:
             return
         tensors = prefixed("method", self.method.state_dict())
         tensors |= prefixed("optimiser", optimiser_tensors(self.optimiser))
-        if self.average is not None:
-            tensors |= prefixed("average", self.average.tensors())
-        if self.observer is not None:
-            tensors |= prefixed("observer", self.observer.tensors())
+        for name, module in self._further().items():
+            tensors |= prefixed(name, module.state_dict())
         facts = {
             "stream": list(self.stream),
             "history": [asdict(record) for record in history],
-            "averaged": None if self.average is None else self.average.steps,
             "scale": self.fabric.strategy.precision.state_dict(),
         }
         write_tensors(Path(folder) / CHECKPOINT, tensors, facts)
@@ -95,11 +122,13 @@ class TrainingState:
             history = [EpochRecord(**record) for record in facts["history"]]
             load_tensors_into(self.method, without_prefix("method", tensors), path)
             load_optimiser(self.optimiser, without_prefix("optimiser", tensors))
-            if self.average is not None:
-                self.average.load(without_prefix("average", tensors), facts["averaged"])
-            if self.observer is not None:
-                self.observer.load(without_prefix("observer", tensors))
+            for name, module in self._further().items():
+                load_tensors_into(module, without_prefix(name, tensors), path)
             self.fabric.strategy.precision.load_state_dict(facts["scale"])
         except (KeyError, TypeError) as error:
             raise InputError(f"{path}: not a checkpoint of this version; delete it") from error
         return history
+
+    def _further(self) -> dict[str, nn.Module]:
+        modules = {"average": self.average, "beside": self.beside}
+        return {name: module for name, module in modules.items() if module is not None}

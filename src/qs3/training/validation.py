@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Int
 from lightning_fabric import Fabric
-from torch import Tensor
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from qs3.adaptation import Method
@@ -77,11 +76,15 @@ class Validation:
         self.holdout, self.target = holdout, target
         self.class_names = source.class_names
 
-    def of(self, stage: str, epochs: int) -> "EpochWatch | None":
-        """Return the observer of one training; None where there is nothing to look at."""
-        if not self.settings.validate_every:
-            return None
-        return EpochWatch(self, stage, epochs)
+    def after_epoch(self, stage: str, method: Method, epoch: int) -> None:
+        """Make a checkpoint where one is due."""
+        done, every = epoch + 1, self.settings.validate_every
+        if every and (done == self.settings.epochs or done % every == 0):
+            copied = copy.deepcopy(method)  # the training goes on from its own statistics
+            copied.norm.settle()
+            model = copied.result()
+            self.adapt(model)
+            self.look(stage, done, model)
 
     def look(self, stage: str, number: int, model: PointClassifier) -> None:
         """Measure a network and keep its weights."""
@@ -97,9 +100,9 @@ class Validation:
         )
         if self.fabric.is_global_zero:
             values = self._values(target, holdout, source)
-            told = {"stage": stage, "number": number, "validators": values}
+            facts = {"stage": stage, "number": number, "validators": values}
             name = f"{CHECKPOINTS}/{stage}-{number:04d}.safetensors"
-            save_model(self.run_dir, model, self.class_names, self.settings, name=name, facts=told)
+            save_model(self.run_dir, model, self.class_names, self.settings, name=name, facts=facts)
         self.fabric.barrier()
 
     def _values(
@@ -132,34 +135,6 @@ class Validation:
         """Compute batch statistics anew over the target where the settings ask for AdaBN."""
         if self.settings.normalisation == "adabn" and self.target is not None:
             adapt_statistics(model, self.target.points, self.settings.batch_size)
-
-    def settled(self, method: Method) -> PointClassifier:
-        """Return the network that a method would end with now, apart from the method."""
-        copied = copy.deepcopy(method)
-        copied.norm.settle()
-        model = copied.result()
-        self.adapt(model)
-        return model
-
-
-class EpochWatch:
-    """Looks at the network after some epochs of one training."""
-
-    def __init__(self, validation: Validation, stage: str, epochs: int) -> None:
-        self.validation, self.stage, self.epochs = validation, stage, epochs
-
-    def after_epoch(self, method: Method, epoch: int) -> None:
-        """Make a checkpoint where one is due."""
-        done = epoch + 1
-        if done == self.epochs or done % self.validation.settings.validate_every == 0:
-            self.validation.look(self.stage, done, self.validation.settled(method))
-
-    def tensors(self) -> dict[str, Tensor]:
-        """Nothing: the files are the state."""
-        return {}
-
-    def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Nothing to take back."""
 
 
 @torch.no_grad()
@@ -210,7 +185,7 @@ def read_checkpoints(run_dir: Path, stage: str | None = None) -> list[Checkpoint
     Raises:
         InputError: where a file is damaged or not one of ours.
     """
-    found = []
+    checkpoints = []
     for path in (Path(run_dir) / CHECKPOINTS).glob("*.safetensors"):
         facts = read_facts(path)
         try:
@@ -223,8 +198,8 @@ def read_checkpoints(run_dir: Path, stage: str | None = None) -> list[Checkpoint
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"{path}: not a checkpoint of a run ({error}); delete it") from error
         if stage in (None, checkpoint.stage):
-            found.append(checkpoint)
-    return sorted(found, key=lambda one: (one.stage, one.number))
+            checkpoints.append(checkpoint)
+    return sorted(checkpoints, key=lambda made: (made.stage, made.number))
 
 
 def choose(checkpoints: Sequence[Checkpoint], rule: str) -> Checkpoint:
@@ -234,8 +209,8 @@ def choose(checkpoints: Sequence[Checkpoint], rule: str) -> Checkpoint:
         InputError: where there is none, or the validator has said nothing.
 
     Example:
-        >>> told = [{"im": 0.2}, {"im": 0.4}, {"im": 0.4}]
-        >>> made = [Checkpoint("round", i, values, "") for i, values in enumerate(told)]
+        >>> scores = [{"im": 0.2}, {"im": 0.4}, {"im": 0.4}]
+        >>> made = [Checkpoint("round", i, values, "") for i, values in enumerate(scores)]
         >>> choose(made, "im").number, choose(made, "last").number
         (1, 2)
     """

@@ -1,0 +1,182 @@
+"""Data of the tables: sources, and targets of other meshes under another sensor."""
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from qs3 import shapes
+from qs3.errors import QS3Error
+from qs3.experiments.domains import DataSet
+from qs3.experiments.scales import Scale
+from qs3.meshes import collect
+from qs3.meshes.collections import MeshItem
+from qs3.sensor.scene import SceneSettings
+from qs3.store.generate import GenerateSettings, generate
+from qs3.store.plan import Plan, make_plan, resolve_renderer
+
+TARGET_SENSOR = "d435"
+_ROOM = SceneSettings("floor+behind", neighbour_size=0.5)
+_LEAST = 4
+"""A class with fewer meshes is made of shapes alone: a mesh on one side would leave none."""
+_FAILED_SHARE = 0.05
+_SEEDS = {"source": 1, "target": 2, "held": 3, "fused": 4, "second": 5, "sensor": 6}
+
+
+@dataclass(frozen=True)
+class Sides:
+    """The meshes of both domains."""
+
+    source: list[MeshItem]
+    """To learn from."""
+    target: list[MeshItem]
+    """To adapt to (split ``train``) and to score on (``test``)."""
+    cad: int
+    """How many of them are artists' meshes, not procedural shapes."""
+
+
+def side_of(file_name: str) -> str:
+    """Return ``source``, ``train`` or ``test``: half, a quarter and a quarter, by name alone.
+
+    Example:
+        >>> [side_of(f"{name}.ply") for name in ("a", "b", "d")]
+        ['test', 'train', 'source']
+    """
+    byte = hashlib.sha256(file_name.encode("utf-8")).digest()[0]
+    return "source" if byte < 128 else "train" if byte < 192 else "test"
+
+
+def choose_meshes(scale: Scale, shared: Path | None) -> Sides:
+    """Return the meshes of both domains, filled up with procedural shapes.
+
+    Args:
+        scale: How many.
+        shared: Folder with artists' meshes in ``cad``; None takes shapes alone.
+    """
+    parts: dict[tuple[str, str], list[MeshItem]] = {}
+    folder = None if shared is None else shared / "cad"
+    if folder is not None and folder.is_dir():
+        files = collect(folder, classes="pointda10")
+        counts = {name: sum(item.class_name == name for item in files) for name in shapes.CLASSES}
+        for item in files:
+            if counts[item.class_name] >= _LEAST:
+                assert item.path is not None  # noqa: S101
+                parts.setdefault((item.class_name, side_of(item.path.name)), []).append(item)
+    source, target, cad = [], [], 0
+    for name in shapes.CLASSES:
+        wanted = {
+            "source": scale.source_per_class,
+            "train": scale.target_count(name, scale.target_per_class),
+            "test": scale.target_count(name, scale.test_per_class),
+        }
+        drawn = {
+            "source": _draws(name, wanted["source"], _SEEDS["source"]),
+            "target": _draws(name, wanted["train"] + wanted["test"], _SEEDS["target"]),
+        }
+        for side, count in wanted.items():
+            made = parts.get((name, side), [])[:count]
+            cad += len(made)
+            spare = drawn["source" if side == "source" else "target"]
+            filled = made + [spare.pop(0) for _ in range(count - len(made))]
+            split = "train" if side == "source" else side
+            (source if side == "source" else target).extend(
+                replace(item, split=split) for item in filled
+            )
+    return Sides(source, target, cad)
+
+
+def _draws(class_name: str, count: int, seed: int) -> list[MeshItem]:
+    return collect("shapes", per_class=count, seed=seed, classes=[class_name])
+
+
+def make_plans(
+    scale: Scale, shared: Path | None, sets: Iterable[DataSet], renderer: Any = None
+) -> dict[str, Plan]:
+    """Return the work lists of data sets, by the names of their folders.
+
+    - ``source``: a row has the scan and samples of the surface of the same mesh, so that M and S
+      differ in the sensor alone; ``held`` is the same of the meshes that are scored on.
+    - ``jitter``: the source from one side, as the released code scans; ``views``: from a number of
+      sides.
+    - ``target``: other meshes on a floor, partly behind another object, one view, another sensor;
+      ``fused``: the same from all around.
+    - ``second``: further procedural shapes, for their surfaces.
+    - ``sensor``: source and scored meshes under another sensor, one view.
+
+    Args:
+        scale: How many.
+        shared: Folder with artists' meshes; None takes shapes alone.
+        sets: Which data sets.
+        renderer: Renderer; None takes the default.
+    """
+    sides = choose_meshes(scale, shared)
+    common = {
+        "meshes": "shapes+cad" if sides.cad else "shapes",
+        "num_points": scale.data_points,
+        "renderer": renderer or "mitsuba",
+        "rows_per_shard": 32,
+    }
+    plans = {}
+    for data in dict.fromkeys(sets):
+        items, own = _plan(data, scale, sides)
+        settings = GenerateSettings(**{**common, **own})
+        plans[data.name] = make_plan(items, resolve_renderer(settings))
+    return plans
+
+
+def _plan(data: DataSet, scale: Scale, sides: Sides) -> tuple[list[MeshItem], Mapping[str, Any]]:
+    """Return the meshes of a data set and the settings that are its own."""
+    scored = [item for item in sides.target if item.split == "test"]
+    source = {"views": scale.source_views, "seed": _SEEDS["source"]}
+    # As annotated frames are cut: by the object's mask, and by its box with a margin, or a few
+    # flying pixels would set the scale of the whole cloud.
+    room = {"sensor": TARGET_SENSOR, "scene": _ROOM, "box_margin": 0.05, "crop": "both"}
+    match data.kind:
+        case "source":
+            return sides.source, source
+        case "held":
+            return scored, source | {"seed": _SEEDS["held"]}
+        case "jitter":
+            return sides.source, source | {"view_layout": "jitter"}
+        case "views":
+            return sides.source, source | {"views": data.views}
+        case "target":
+            return sides.target, room | {"views": 1, "seed": _SEEDS["target"]}
+        case "fused":
+            return sides.target, room | {"views": scale.source_views, "seed": _SEEDS["fused"]}
+        case "second":
+            own = {"meshes": "shapes", "views": 1, "seed": _SEEDS["second"]}
+            return _further_shapes(scale), own
+        case "sensor":
+            # Both sides count their shapes from 0.
+            items = sides.source + [replace(item, id=f"{item.id}-scored") for item in scored]
+            return items, {"sensor": data.sensor, "views": 1, "seed": _SEEDS["sensor"]}
+
+
+def _further_shapes(scale: Scale) -> list[MeshItem]:
+    parts = {"train": scale.source_per_class, "test": scale.test_per_class}
+    items = []
+    for class_name in shapes.CLASSES:
+        drawn = _draws(class_name, sum(parts.values()), _SEEDS["second"])
+        for split, count in parts.items():
+            items += [replace(drawn.pop(0), split=split) for _ in range(count)]
+    return items
+
+
+def make_data(folder: Path, plans: Mapping[str, Plan], workers: int) -> dict[str, int]:
+    """Scan data sets below a folder, going on where an earlier call stopped.
+
+    Returns:
+        Objects of each that could not be scanned, and are absent.
+
+    Raises:
+        QS3Error: where those are more than one in twenty.
+    """
+    failed = {}
+    for name, plan in plans.items():
+        report = generate(plan.items, folder / name, plan.settings, workers=workers, timeout=900.0)
+        failed[name] = report.failed
+        if report.failed > _FAILED_SHARE * plan.rows:
+            raise QS3Error(f"{folder / name}/failures.jsonl: {report.failed} scans failed")
+    return failed

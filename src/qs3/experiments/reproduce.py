@@ -1,0 +1,255 @@
+"""Makes tables anew: data, runs, records, then the tables from the records alone."""
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, Union
+
+from qs3.errors import InputError
+from qs3.experiments import GALLERIES
+from qs3.experiments.domains import DATA, REAL, REAL_CLOUDS, DataSet, Domain, Part
+from qs3.experiments.experiment import load_experiment
+from qs3.experiments.grid import Tell, data_sets, missing, run_grid
+from qs3.experiments.runs import Run
+from qs3.experiments.setup import Setup, claim
+from qs3.experiments.table import Table
+from qs3.store.executors import Executor, InlineExecutor, LocalExecutor
+from qs3.store.manifest import MANIFEST
+
+if TYPE_CHECKING:
+    from qs3.experiments.galleries import Galleries
+    from qs3.store.plan import Plan
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Who does the work."""
+
+    workers: int = 2
+    """Processes that scan, and that train where no device is named."""
+    devices: tuple[str, ...] = ()
+    """GPUs by index; each makes one run at a time, in a process of its own."""
+    executor: Literal["local", "ray"] = "local"
+    """Where runs are made: here, or on a Ray cluster whose machines all see --out."""
+    address: str = "auto"
+    """Of the Ray cluster's head; auto is the one that this machine belongs to, local starts one."""
+
+    def __post_init__(self) -> None:
+        if self.workers < 1:
+            raise InputError(f"--workers {self.workers}: must be at least 1")
+        for device in self.devices:
+            if not device.isdecimal():
+                raise InputError(f"--devices {device}: name GPUs by index, such as 0 1")
+
+    @property
+    def at_once(self) -> int:
+        """Runs at a time."""
+        return len(self.devices) or self.workers
+
+    def start(self) -> Executor:
+        """Return what makes the runs.
+
+        Raises:
+            MissingExtraError: where Ray is asked for and absent.
+        """
+        if self.executor == "ray":
+            from qs3.store.executors.ray_cluster import RayExecutor
+
+            return RayExecutor(self.address, gpus=1.0 if self.devices else 0.0)
+        if self.devices:
+            # A process sees the GPU that it was started with: each run has its own.
+            return LocalExecutor(len(self.devices), calls_per_process=1)
+        return LocalExecutor(self.workers) if self.workers > 1 else InlineExecutor()
+
+
+Product = Union[Table, "Galleries"]
+"""What can be made: its runs and data sets, and its files from the records."""
+
+
+def products(
+    names: Sequence[str], setup: Setup, rows: Sequence[str] = (), columns: Sequence[str] = ()
+) -> list[Product]:
+    """Return what is to be made.
+
+    Args:
+        names: Tables and ``galleries``.
+        setup: Where and how large.
+        rows: Lines of the tables; empty takes all.
+        columns: Columns; empty takes the usual ones whose data are at hand.
+
+    Raises:
+        InputError: where something is named twice, or a line or column is in none of the tables.
+    """
+    given = {"names": names, "methods": rows, "tasks": columns, "seeds": setup.seeds}
+    for option, values in given.items():
+        if len(set(values)) < len(values):
+            raise InputError(f"--{option} {' '.join(map(str, values))}: name each once")
+    if not setup.seeds:
+        raise InputError("--seeds: name at least one")
+    made: list[Product] = []
+    known: dict[str, set[str]] = {"methods": set(), "tasks": set()}
+    for name in names:
+        if name == GALLERIES:
+            from qs3.experiments.galleries import Galleries
+
+            made.append(Galleries(setup))
+            continue
+        experiment = load_experiment(name)
+        known["methods"] |= {row.key for row in experiment.rows(setup.scale)}
+        known["tasks"] |= {column.key for column in experiment.columns(setup.scale)}
+        made.append(Table(name, setup, tuple(rows), tuple(columns) or _at_hand(name, setup)))
+    for option, keys in known.items():
+        for key in given[option]:
+            if key not in keys:
+                raise InputError(f"--{option} {key}: choose from {', '.join(sorted(keys))}")
+    return made
+
+
+def _at_hand(name: str, setup: Setup) -> tuple[str, ...]:
+    """Return the usual columns, those on real objects only where there are any."""
+    real = setup.shared is not None and (setup.shared / REAL).is_file()
+    columns = Table(name, setup).headings()[1]
+    return tuple(
+        column.key
+        for column in columns
+        if real or column.fields.get("target", Domain("D")).kind != "R"
+    )
+
+
+def collect_runs(products: Sequence[Product]) -> list[Run]:
+    """Return the runs of all products, each once.
+
+    Raises:
+        InputError: where two products mean different runs by one name.
+    """
+    runs: dict[str, Run] = {}
+    for product in products:
+        for run in product.runs():
+            if runs.setdefault(run.name, run) != run:
+                raise InputError(f"{product.name}: its run {run.name} is another one elsewhere")
+    return list(runs.values())
+
+
+def reproduce(
+    products: Sequence[Product],
+    setup: Setup,
+    workers: Workers,
+    tell: Tell,
+    dry_run: bool = False,
+) -> list[Path]:
+    """Make data, runs and tables, whatever of them is missing.
+
+    Args:
+        products: What to make.
+        setup: Where and how large.
+        workers: Who makes it.
+        tell: Is told how it goes.
+        dry_run: Only tell what is to do and how long it takes; nothing is written.
+
+    Returns:
+        The main file of each product that was made.
+
+    Raises:
+        InputError: where the folder is for other settings, a record is damaged or not of its run,
+            or a run failed; what was made stays made.
+    """
+    from qs3.experiments.data import make_data, make_plans
+
+    runs = collect_runs(products)
+    drawn = [data for product in products for data in product.sets()]
+    plans = make_plans(setup.scale, setup.shared, [*data_sets(runs, setup.own), *drawn])
+    if not dry_run:
+        claim(setup, plans)
+    left = missing(runs, setup)  # a damaged record stops here, not after hours
+    executor = workers.start()  # a missing extra is told before anything is made
+    needed = {data.name for data in [*data_sets(left, setup.own), *drawn]}
+    plans = {name: plan for name, plan in plans.items() if name in needed}
+    scanning, expected = measure(setup, left, plans)
+    names = ", ".join(product.name for product in products)
+    scans = ", ".join(f"{plan.rows} scans of the {name}" for name, plan in plans.items())
+    seconds = scanning + sum(expected.values())
+    tell(
+        f"{names}, scale {setup.scale.name}: {scans}; {len(runs)} runs, {len(left)} of them "
+        f"missing; about {seconds / workers.at_once / 3600:.2f} hours here, "
+        f"{scanning / workers.at_once / 3600:.2f} of them for scans ({workers.at_once} at a time)"
+    )
+    if dry_run:
+        return []
+    if len(left) < len(runs):
+        tell(f"{len(runs) - len(left)} of {len(runs)} runs are there already")
+    for name, count in make_data(setup.out / DATA, plans, workers.workers).items():
+        if count:
+            tell(f"{name}: {count} scans failed and are absent")
+    failed: list[str] = []
+    if left:
+        # A cluster gives a run its GPU itself.
+        devices = () if workers.executor == "ray" else workers.devices
+        at_once = max(len(workers.devices), workers.workers)
+        with _quiet_workers():
+            failed = run_grid(left, setup, tell, expected, executor, devices, at_once)
+    paths = []
+    for product in products:
+        try:
+            paths.append(product.write())
+        except InputError as error:
+            failed.append(str(error))
+    if failed:
+        raise InputError(f"{'; '.join(failed)}; mend that and run the same command again")
+    return paths
+
+
+@contextmanager
+def _quiet_workers() -> Iterator[None]:
+    """Start processes without progress bars: several would write over one another."""
+    before = os.environ.get("TQDM_DISABLE")
+    os.environ["TQDM_DISABLE"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["TQDM_DISABLE"]
+        else:
+            os.environ["TQDM_DISABLE"] = before
+
+
+def measure(
+    setup: Setup, left: Sequence[Run], plans: "Mapping[str, Plan]"
+) -> tuple[float, dict[str, float]]:
+    """Estimate what is left, from a few timed scans and a few timed steps of each kind.
+
+    Returns:
+        Seconds on one core or device: of all scans, and of each run by its name.
+    """
+    from qs3.experiments.cost import Counts, run_seconds, step_seconds
+    from qs3.store.plan import estimate
+
+    steps = {
+        network: step_seconds(
+            [run for run in left if run.network == network],
+            setup.scale.train_with(setup.threads, network=network),
+        )
+        for network in dict.fromkeys(run.network for run in left)
+    }
+    expected, trained = {}, set()
+    for run in left:
+        source, target, test = (_size(part, plans) for part in run.parts(setup.own))
+        # One training of the source alone serves several test sets.
+        again = run.folder in trained
+        trained.add(run.folder)
+        counts = Counts(source, target, test)
+        expected[run.name] = run_seconds(run, counts, steps[run.network], only_scores=again)
+    absent = [
+        plan for name, plan in plans.items() if not (setup.out / DATA / name / MANIFEST).is_file()
+    ]
+    return sum(estimate(plan).seconds for plan in absent), expected
+
+
+def _size(part: Part | None, plans: "Mapping[str, Plan]") -> int:
+    """Clouds of a part of a data set; of the user's own the size is unknown: a thousand."""
+    if part is None:
+        return 0
+    if isinstance(part.data, DataSet):
+        return sum(item.split == part.split for item in plans[part.data.name].items)
+    return REAL_CLOUDS if part.data == Path(REAL) else 1000

@@ -1,0 +1,27 @@
+"""What each switch of QBST is worth, S → D; all else as in the bench of adaptation.
+
+Not in the paper, whose text and released code differ in these switches (`qs3.training.config`).
+Command: ``qs3 reproduce adaptation-ablation --out DIR`` (``--dry-run`` prints counts and hours).
+"""
+
+from qs3.experiments.experiment import Experiment, lines, tasks
+
+_ROWS = (
+    "qbst",
+    "qbst-least-confident",
+    "qbst-scratch",
+    "qbst-best-labeller",
+    "qbst-no-source-loss",
+)
+
+EXPERIMENT = Experiment(
+    title="Ablation of QBST",
+    rows=lambda scale: lines({row: row for row in _ROWS}),
+    columns=lambda scale: tasks(("S", "D")),
+    published="methods",
+    pairs=lambda scale: [(f"{row} over qbst", row, "qbst") for row in _ROWS[1:]],
+    corner="method",
+    made=("M", "S", "D", "R"),
+    rules=True,
+)
+"""A row of the bench and its variants."""

@@ -1,0 +1,43 @@
+"""The bench of adaptation: every method on scans and on surfaces, by every rule of selection.
+
+Paper: main table of adaptation methods of QS³ (ECCV 2022), whose figures stand beside ours.
+Command: ``qs3 reproduce adaptation-bench --out DIR`` (``--dry-run`` prints counts and hours).
+"""
+
+from qs3.experiments.experiment import Experiment, lines, tasks
+from qs3.experiments.runs import SUPERVISED
+
+_ROWS = (
+    SUPERVISED,
+    "source-only",
+    "pointdan",
+    "defrec",
+    "defrec-pcm",
+    "gast",
+    "gast-spst",
+    "qbst",
+    # The paper's table lacks these.
+    "dann",
+    "mmd",
+    "coral",
+    "sd",
+    "spst",
+)
+_PAIRS = (
+    ("S over M on D", "S-D", "M-D"),
+    ("S over M on R", "S-R", "M-R"),
+    *((f"QBST over {row}", "qbst", row) for row in _ROWS if row not in (SUPERVISED, "qbst")),
+)
+
+EXPERIMENT = Experiment(
+    title="Adaptation bench",
+    rows=lambda scale: lines({row: row for row in _ROWS}),
+    columns=lambda scale: tasks(("M", "D"), ("S", "D"), ("M", "R"), ("S", "R")),
+    published="methods",
+    pairs=lambda scale: _PAIRS,
+    corner="method",
+    made=("M", "S", "D", "R"),
+    usual=lambda scale: scale.tasks,
+    rules=True,
+)
+"""Every method that there is."""

@@ -1,0 +1,30 @@
+"""How much of the gain is noise, and how much is missing surface?
+
+Not in the paper, which compares whole surfaces with noisy one-sided scans and cannot tell them
+apart. Here: samples of the whole surface; the noise-free one-sided twins; the noisy one-sided scans
+(the released code's five poses of one side); noisy scans from all around.
+Command: ``qs3 reproduce partiality --out DIR`` (``--dry-run`` prints the hours on this machine).
+"""
+
+from qs3.experiments.domains import Domain
+from qs3.experiments.experiment import Experiment, Heading, networks
+from qs3.experiments.runs import ORDINARY
+
+_COLUMNS = (
+    Heading("M", "whole surface", {"source": Domain("M")}),
+    Heading("C", "one side, clean", {"source": Domain("C")}),
+    Heading("J", "one side, noisy", {"source": Domain("J")}),
+    Heading("S", "all around, noisy", {"source": Domain("S")}),
+)
+_PAIRS = (("missing surface", "C", "M"), ("noise, one side", "J", "C"), ("orbit", "S", "J"))
+
+EXPERIMENT = Experiment(
+    title="Partiality control: scored on D",
+    source="not in the paper",
+    rows=networks,
+    columns=lambda scale: _COLUMNS,
+    fields={"row": ORDINARY, "target": Domain("D")},
+    pairs=lambda scale: _PAIRS,
+    made=("M", "S", "C", "J"),
+)
+"""A control that the paper lacks."""

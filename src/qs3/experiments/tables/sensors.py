@@ -1,0 +1,45 @@
+"""Does a classifier trained on one sensor's scans work on another's?
+
+Not in the paper. One view of the same meshes by each sensor; scored on other meshes.
+Command: ``qs3 reproduce sensors --out DIR`` (``--dry-run`` prints the hours on this machine).
+"""
+
+import itertools
+
+from qs3.experiments.domains import Domain
+from qs3.experiments.experiment import Experiment, Heading, Headings, Pair
+from qs3.experiments.runs import ORDINARY
+from qs3.experiments.scales import Scale
+
+
+def _rows(scale: Scale) -> Headings:
+    return tuple(
+        Heading(name, f"trained on {name}", {"source": Domain("A", sensor=name)})
+        for name in scale.sensors
+    )
+
+
+def _columns(scale: Scale) -> Headings:
+    return tuple(
+        Heading(name, f"scored on {name}", {"target": Domain("A", sensor=name)})
+        for name in scale.sensors
+    )
+
+
+def _pairs(scale: Scale) -> list[Pair]:
+    return [
+        (f"trained on {name} over {other}", name, other)
+        for name, other in itertools.combinations(scale.sensors, 2)
+    ]
+
+
+EXPERIMENT = Experiment(
+    title="Transfer between sensors",
+    source="not in the paper",
+    rows=_rows,
+    columns=_columns,
+    fields={"row": ORDINARY},
+    pairs=_pairs,
+    corner="DGCNN",
+)
+"""A table that the paper lacks."""

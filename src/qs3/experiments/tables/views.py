@@ -1,0 +1,38 @@
+"""How many fused views make the best source?
+
+Paper: QS³ (ECCV 2022), supplement, Fig. 1: accuracy of S→D over the number of fused views, four
+networks. The figure has no printed numbers: more views are better, and the paper takes five.
+Command: ``qs3 reproduce views --out DIR`` (``--dry-run`` prints the hours on this machine).
+"""
+
+from qs3.experiments.domains import Domain
+from qs3.experiments.experiment import Experiment, Heading, Headings, Pair, networks
+from qs3.experiments.runs import ORDINARY
+from qs3.experiments.scales import Scale
+
+
+def _columns(scale: Scale) -> Headings:
+    columns = []
+    for count in scale.fused_views:
+        source = Domain("S") if count == scale.source_views else Domain("V", views=count)
+        fields = {"source": source}
+        columns.append(Heading(str(count), str(count), fields, axis="fused views", number=count))
+    return tuple(columns)
+
+
+def _pairs(scale: Scale) -> list[Pair]:
+    first, last = str(scale.fused_views[0]), str(scale.fused_views[-1])
+    return [(f"{last} views over {first}", last, first)]
+
+
+EXPERIMENT = Experiment(
+    title="Number of fused views, S → D",
+    source="QS³, ECCV 2022, supplement, Fig. 1: a figure without printed numbers; it rises with "
+    "the number of views",
+    rows=networks,
+    columns=_columns,
+    fields={"row": ORDINARY, "target": Domain("D")},
+    pairs=_pairs,
+    made=("S",),
+)
+"""The supplement's Fig. 1."""

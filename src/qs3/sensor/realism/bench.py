@@ -1,0 +1,186 @@
+"""Photographs of flat targets with the chain of a scan: render, expose, match, depth.
+
+Convention:
+    The left camera stands at the world's origin and looks along +y, the image's top towards +z.
+    Targets are placed by their distance along y.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from qs3.sensor.lens import blur_reach
+from qs3.sensor.matching import matching_canvas
+from qs3.sensor.materials import Material
+from qs3.sensor.presets import Sensor
+from qs3.sensor.render import Body, Renderer, Scene
+from qs3.sensor.render.raycast import DepthCaster
+from qs3.sensor.rig import Pose, Region, StereoRig
+from qs3.sensor.speckle import pattern_image
+from qs3.sensor.view import Clock, ViewImages, take_view
+
+VIEW = Pose.looking_at(np.zeros(3), np.array([0.0, 1.0, 0.0]))
+"""The pose of the left camera."""
+
+ALBEDO = 0.6
+"""Of the walls: in the near infrared about that of white paint."""
+
+_REACH = 12.0  # half the side of a wall, in its distances: it fills every frame
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A sensor under test and what photographs for it."""
+
+    sensor: Sensor
+    """The sensor."""
+    renderer: Renderer
+    """What photographs."""
+    seed: int = 0
+    """Seed of the first photograph of a test; the others count on from it."""
+    quick: bool = False
+    """Fewer targets and smaller parts of the frame."""
+
+    @property
+    def rig(self) -> StereoRig:
+        """The sensor's rig."""
+        return self.sensor.rig
+
+    def shoot(
+        self,
+        bodies: Sequence[Body],
+        region: Region,
+        index: int = 0,
+        noise: int | None = None,
+        focus: Region | None = None,
+    ) -> ViewImages:
+        """Photograph ``bodies`` and measure ``region`` of the left frame.
+
+        Args:
+            bodies: What stands before the camera; the first is the object.
+            region: Part of the left frame that is wanted.
+            index: Number of the photograph, for its seed.
+            noise: The same for the image noise; ``index`` by default.
+            focus: What auto-exposure looks at; ``region`` by default.
+        """
+        sensor, rig, pattern = self.sensor, self.rig, self.sensor.pattern
+        focus = focus or region
+        x0, y0, x1, y1 = matching_canvas(region, rig, sensor.matching).bounds
+        left, top, right, bottom = focus.bounds
+        x0, y0, x1, y1 = min(x0, left), min(y0, top), max(x1, right), max(y1, bottom)
+        wide = Region(x0, y0, x1 - x0, y1 - y0)
+        wide = wide.grown(blur_reach(sensor.exposure.psf), rig.width, rig.height)
+        opening = pattern.tan_half_width, pattern.tan_half_height
+        scene = Scene(tuple(bodies), sensor.light, pattern_image(pattern), *opening)
+        pair = self.renderer.render(scene, rig, [VIEW], [self.seed + index], regions=[wide])[0]
+        rng = np.random.default_rng(self.seed + (index if noise is None else noise))
+        caster = DepthCaster(*(body.mesh for body in bodies))
+        return take_view(pair, sensor, region, focus, [caster], rng, Clock())
+
+    def refined(self, samples: int) -> "Bench":
+        """The bench with more rays a pixel and longer paths, where the renderer has such settings.
+
+        Mirrors and glass are path traced: they need both.
+        """
+        renderer: Any = self.renderer
+        least = {"samples": samples, "max_depth": 8}
+        raised = {n: max(v, getattr(renderer, n)) for n, v in least.items() if hasattr(renderer, n)}
+        if not raised:
+            return self
+        return dataclasses.replace(self, renderer=dataclasses.replace(renderer, **raised))
+
+
+def painted(mesh: trimesh.Trimesh, albedo: float = ALBEDO) -> Body:
+    """A matt body."""
+    return Body(mesh, Material(albedo=albedo))
+
+
+def wall(distance: float, degrees: float = 0.0) -> trimesh.Trimesh:
+    """A wall that meets the optical axis at ``distance`` and fills the frame.
+
+    Args:
+        distance: Along the optical axis.
+        degrees: Turn about the vertical; its right side goes away from the camera.
+    """
+    side = 2 * _REACH * distance
+    return plate((0.0, distance), side, side, degrees)
+
+
+def plate(
+    place: tuple[float, float], width: float, height: float, degrees: float = 0.0
+) -> trimesh.Trimesh:
+    """A rectangle at ``place`` (x and y) at the camera's height, that faces it but for a turn."""
+    angle = np.radians(degrees)
+    across = np.array([np.cos(angle), np.sin(angle), 0.0]) * width / 2
+    up = np.array([0.0, 0.0, height / 2])
+    centre = np.array([*place, 0.0])
+    corners = np.array(
+        [centre - across - up, centre + across - up, centre + across + up, centre - across + up]
+    )
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+
+
+def central(rig: StereoRig, wide: float, high: float, left: int = 0) -> Region:
+    """The middle of the frame right of column ``left``.
+
+    Args:
+        rig: Supplies the frame.
+        wide: Share of the columns right of ``left``.
+        high: Share of the rows.
+        left: Columns left out, such as the band that has no match.
+
+    Example:
+        >>> central(StereoRig(width=100, height=50), 0.4, 0.2)
+        Region(x=30, y=20, width=40, height=10)
+    """
+    width, height = round((rig.width - left) * wide), round(rig.height * high)
+    return Region(left + (rig.width - left - width) // 2, (rig.height - height) // 2, width, height)
+
+
+def distances(sensor: Sensor, count: int) -> list[float]:
+    """Distances of a sweep, even on a logarithmic scale: 0.4 to 3 m, as far as it can be measured.
+
+    The near end is the depth gate's or the search range's, the far end is half the depth gate's.
+
+    Example:
+        >>> [round(z, 2) for z in distances(Sensor(), 3)]  # disparities to 160 of f·b = 150
+        [1.05, 1.77, 3.0]
+    """
+    reach = float(sensor.rig.disparity(1.0)) / (sensor.matching.num_disparities - 4)
+    near = max(0.4 if sensor.metric else 0.0, 1.05 * sensor.depth.near, reach)
+    return [float(z) for z in np.geomspace(near, max(sensor.depth.far / 2, 1.2 * near), count)]
+
+
+def middle(sensor: Sensor) -> float:
+    """The distance half way through a sweep."""
+    near, far = distances(sensor, 2)
+    return float(np.sqrt(near * far))
+
+
+def wall_region(
+    sensor: Sensor, distance: float, share: float = 0.8, high: float | None = None
+) -> Region:
+    """The middle of what can be measured of a wall: right of the left band f·b/z.
+
+    Args:
+        sensor: The sensor.
+        distance: Of the wall.
+        share: Share of the columns.
+        high: Share of the rows; ``share`` by default.
+    """
+    left = int(np.ceil(sensor.rig.disparity(distance)))
+    if sensor.matching.left_band == "opencv":
+        left = sensor.matching.num_disparities + sensor.matching.block_size // 2
+    return central(sensor.rig, share, share if high is None else high, left)
+
+
+def shoot_wall(
+    bench: Bench, distance: float, share: float, index: int = 0, high: float | None = None
+) -> ViewImages:
+    """Photograph a facing wall; ``share`` and ``high`` are those of `wall_region`."""
+    region = wall_region(bench.sensor, distance, share, high)
+    return bench.shoot([painted(wall(distance))], region, index)

@@ -1,0 +1,144 @@
+"""How far the points of a scanned object lie off its faces, beside the law (T10).
+
+An error δ of disparity moves a point along its ray by z²·δ/(f·b) of depth. With r the ray of
+length 1 along the optical axis and n the face's unit normal, the point is then |r·n|·z²·δ/(f·b)
+off the face. With the sub-pixel RMS σ_d that T1 measures on a facing wall at the same distance, a
+point's distance from its face divided by |r·n|·z²·σ_d/(f·b) has median 0 and a median absolute
+deviation (MAD) of 1/1.4826, if its noise is that of the wall.
+"""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float
+
+from qs3 import shapes
+from qs3.geometry import rotation_z
+from qs3.meshes import normalise
+from qs3.sensor.realism.bench import VIEW, Bench, painted
+from qs3.sensor.realism.rows import Judged, row
+from qs3.sensor.realism.walls import wall_metrics
+from qs3.sensor.render.raycast import DepthCaster
+from qs3.sensor.rig import StereoRig
+from qs3.sensor.view import ViewImages
+
+MOST_DEGREES = 60.0
+_TILT = 25.0  # degrees by which the object is looked down upon
+_GOLDEN = 0.381966  # of a full turn: any number of turns is spread evenly
+_BINS = np.arange(-5.0, 5.01, 0.25)
+
+
+def scanned(bench: Bench) -> Judged:
+    """T10: a cabinet from many sides over the placement's distances, and walls there.
+
+    Errors are alike within a block of the matcher, so that a view has but a few dozen independent
+    ones: the median needs many views to come out at 0.
+    """
+    sensor, count = bench.sensor, 12 if bench.quick else 16
+    near, far = sensor.placement.radius
+    half = 0.9 * sensor.object_size
+    walls = np.geomspace(max(near - half, 1.05 * sensor.depth.near), far + half, 3)
+    # The middle of the frame, where the object is: the metric divides by the length of the ray.
+    sigma = [wall_metrics(bench, z, 0.3).sub_pixel for z in walls.tolist()]
+    parts = []
+    for index in range(count):
+        distance = near + (far - near) * (index + 0.5) / count
+        view = shoot_object(bench, distance, 360 * _GOLDEN * index, index)
+        parts.append(off_faces(view, bench.rig, sensor.matching.block_size, walls, sigma))
+    ratio, cosine = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return scan_rows(ratio, cosine)
+
+
+def shoot_object(bench: Bench, distance: float, turn: float, index: int) -> ViewImages:
+    """Photograph a cabinet of the sensor's object size, looked down upon; with normals.
+
+    Args:
+        bench: The sensor.
+        distance: Of the object's middle.
+        turn: Of the object about its vertical, in degrees.
+        index: Number of the photograph.
+    """
+    mesh = normalise(shapes.make("cabinet", seed=1), "box")
+    points = np.asarray(mesh.vertices) * bench.sensor.object_size
+    tilt = np.radians(_TILT)
+    lean = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    points = points @ rotation_z(np.radians(turn)).T @ lean.T + np.array([0.0, distance, 0.0])
+    body = painted(trimesh.Trimesh(points, mesh.faces, process=False))
+    region = bench.rig.region_of(np.asarray(body.mesh.bounds), VIEW, 16)
+    cast = DepthCaster(body.mesh).cast(bench.rig, VIEW, region, normals=True)
+    return dataclasses.replace(bench.shoot([body], region, index), normals=cast.normals)
+
+
+def off_faces(
+    view: ViewImages,
+    rig: StereoRig,
+    block: int,
+    walls: Float[np.ndarray, "w"],
+    sigma: list[float],
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Signed distances from the faces in units of the law, of points well inside a face.
+
+    Args:
+        view: A photograph, with normals.
+        rig: Supplies focal length, baseline and principal point.
+        block: The matcher's block: within half of it a pixel's neighbours must show its face.
+        walls: Distances at which the noise on a wall is known.
+        sigma: The sub-pixel RMS there.
+
+    Returns:
+        Distance over expected deviation, positive away from the camera; cosine of the view angle.
+    """
+    cx, cy = rig.principal_point
+    y, x = np.indices(view.depth.shape)
+    x, y = (view.region.x + x - cx) / rig.focal, (view.region.y + y - cy) / rig.focal
+    ray, normals = np.stack([x, y, np.ones(x.shape)], axis=-1), np.asarray(view.normals)
+    slope = np.abs(np.einsum("ijk,ijk->ij", ray, normals))
+    cosine = slope / np.linalg.norm(ray, axis=-1)
+    kept = inside_faces(view, ray, block // 2 + 2) & np.isfinite(view.depth)
+    kept &= cosine > np.cos(np.radians(MOST_DEGREES))
+    z = view.true_depth[kept]
+    law = z**2 * np.interp(z, walls, sigma) / (rig.focal * rig.baseline)
+    # Both the distance and the law have the factor |r·n|.
+    return (view.depth[kept] - z) * slope[kept] / (law * slope[kept]), cosine[kept]
+
+
+def inside_faces(
+    view: ViewImages, ray: Float[np.ndarray, "h w 3"], reach: int
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels around which all pixels within ``reach`` show the same plane."""
+    normals = np.asarray(view.normals)
+    offset = np.einsum("ijk,ijk->ij", ray, normals) * view.true_depth
+    plane = np.concatenate([normals, offset[..., None]], axis=-1)
+    plane = np.where(np.isfinite(plane), plane, 1e3).astype(np.float32)
+    square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    apart = cv2.dilate(plane, square) - cv2.erode(plane, square)
+    return (np.abs(apart).max(axis=-1) < 1e-4) & view.mask
+
+
+def scan_rows(ratio: Float[np.ndarray, "n"], cosine: Float[np.ndarray, "n"]) -> Judged:
+    """Judge signed distances in units of the law.
+
+    Args:
+        ratio: Distance over expected deviation of each point.
+        cosine: Cosine of its view angle.
+    """
+    if len(ratio) < 100:
+        return [row("points", float(len(ratio)), 100.0)], {"distance": [], "share": []}
+    median = float(np.median(ratio))
+    mad = float(np.median(np.abs(ratio - median)))
+    counts, _ = np.histogram(ratio, _BINS)
+    angle = np.degrees(np.arccos(np.clip(cosine, 0, 1)))
+    rows = [
+        row("|median| over MAD", abs(median) / mad, None, 0.2, strict=True),
+        row("1.4826 MAD over the law", 1.4826 * mad, 0.75, 1.25),
+        row("points", float(len(ratio))),
+    ]
+    for low in range(0, int(MOST_DEGREES), 15):
+        part = ratio[(angle >= low) & (angle < low + 15)]
+        if len(part) >= 100:
+            spread = 1.4826 * np.median(np.abs(part - np.median(part)))
+            rows.append(row(f"the same, seen at {low} … {low + 15}°", spread))
+    data = {"distance": (_BINS[:-1] + _BINS[1:]) / 2, "share": counts / len(ratio)}
+    return rows, data

@@ -1,0 +1,117 @@
+"""What a training tells of itself: epochs, kept in ``history.jsonl`` and, if asked, TensorBoard."""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from qs3.errors import MissingExtraError
+from qs3.files import write_text
+
+HISTORY = "history.jsonl"
+TENSORBOARD = "tensorboard"
+
+
+@dataclass(frozen=True)
+class EpochRecord:
+    """What one epoch did."""
+
+    epoch: int
+    """Count from 0."""
+    losses: Mapping[str, float]
+    """Mean of each loss over the steps."""
+    learning_rate: float
+    """Adam's learning rate in this epoch."""
+    seconds: float
+    """Wall-clock seconds."""
+    accuracy: float | None = None
+    """Share of the labelled clouds, augmented, that the network in training had right; None where
+    a method does not call the network on them."""
+    samples_per_second: float = 0.0
+    """Labelled clouds a second, over all devices."""
+
+
+Log = Callable[[Sequence[EpochRecord]], None]
+"""Is handed all epochs of a training so far: at its start, resumed or not, and after each epoch."""
+
+
+class History:
+    """Writes ``history.jsonl``: a line an epoch, a checkpoint and a round of self-training.
+
+    A line of an epoch names its stage: the method, ``warm-up`` or ``round-3``. Epochs of a
+    round that is not done have a line each; then the round's own line takes their place. The file
+    is written anew, whole, at every change: it is never torn, and a resumed run repeats no line.
+
+    Args:
+        run_dir: Folder of the run.
+        tensorboard: Whether to write event files for TensorBoard too, in ``tensorboard/``, a
+            folder a stage.
+
+    Raises:
+        MissingExtraError: where TensorBoard is asked for and is not installed.
+    """
+
+    def __init__(self, run_dir: Path, tensorboard: bool = False) -> None:
+        self.folder = Path(run_dir)
+        self.lines: list[dict[str, Any]] = []
+        self.board: Any = None
+        self.make_board: Any = None
+        if tensorboard:
+            try:
+                from torch.utils.tensorboard.writer import SummaryWriter
+            except ImportError as error:
+                raise MissingExtraError("tensorboard", "track") from error
+            self.make_board = SummaryWriter
+
+    def training(self, stage: str) -> Log:
+        """Return a log for one training; ``stage`` stands in its lines and names its folder."""
+        self.close()
+        shown = 0
+
+        def log(epochs: Sequence[EpochRecord]) -> None:
+            nonlocal shown
+            self._write(self.lines + self._epochs(stage, epochs))
+            if self.make_board is not None:
+                self._show(stage, epochs[shown:])
+                shown = len(epochs)
+
+        return log
+
+    def source(self, stage: str, epochs: Sequence[EpochRecord]) -> None:
+        """Keep the epochs on the source."""
+        self.lines += self._epochs(stage, epochs)
+        self._write(self.lines)
+
+    def put(self, kind: str, records: Sequence[Any]) -> None:
+        """Keep the rounds or checkpoints so far, in place of the lines of that kind."""
+        self.lines = [line for line in self.lines if line["kind"] != kind]
+        self.lines += [{"kind": kind, **asdict(record)} for record in records]
+        self._write(self.lines)
+
+    def close(self) -> None:
+        """Bring TensorBoard's files to disk."""
+        if self.board is not None:
+            self.board.close()
+        self.board = None
+
+    @staticmethod
+    def _epochs(stage: str, epochs: Sequence[EpochRecord]) -> list[dict[str, Any]]:
+        return [{"kind": "epoch", "stage": stage, **asdict(record)} for record in epochs]
+
+    def _write(self, lines: list[dict[str, Any]]) -> None:
+        write_text(self.folder / HISTORY, "".join(json.dumps(line) + "\n" for line in lines))
+
+    def _show(self, stage: str, epochs: Sequence[EpochRecord]) -> None:
+        if self.board is None:
+            # What an earlier call wrote of this stage is hidden and told again.
+            self.board = self.make_board(str(self.folder / TENSORBOARD / stage), purge_step=0)
+        for record in epochs:
+            values = {f"loss/{name}": value for name, value in record.losses.items()}
+            values["learning_rate"] = record.learning_rate
+            values["samples_per_second"] = record.samples_per_second
+            if record.accuracy is not None:
+                values["accuracy"] = record.accuracy
+            for name, value in values.items():
+                self.board.add_scalar(name, value, record.epoch)
+        self.board.flush()

@@ -1,0 +1,272 @@
+"""Runs are made once, in their order, and taken up again after a stop or a fault."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from qs3.cli.reproduce import ReproduceOptions
+from qs3.cli.reproduce import reproduce as command
+from qs3.errors import InputError
+from qs3.evaluation.records import read_record
+from qs3.experiments import grid
+from qs3.experiments.domains import Domain, parse_own
+from qs3.experiments.grid import make_record, run_grid
+from qs3.experiments.reproduce import Workers, products, reproduce
+from qs3.experiments.runs import ORDINARY, PAPER, make_run
+from qs3.experiments.setup import Setup, read_setup
+from qs3.experiments.table import Table
+from qs3.store.executors import Failure
+
+from .conftest import TINY, make_tables
+
+# So small a network may be sure of one class alone, or of none.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:all .* confident clouds"),
+    pytest.mark.filterwarnings("ignore:.*warm-up.*"),
+]
+S, D, F = Domain("S"), Domain("D"), Domain("F")
+COLUMNS = ("M-D", "S-D", "S-F")
+
+
+def comparable(folder):
+    records = {path.name: read_record(path) for path in sorted((folder / "results").iterdir())}
+    return {
+        name: (run.scores, run.choices, [{**done, "seconds": 0} for done in run.rounds])
+        for name, run in records.items()
+    }
+
+
+def counting(monkeypatch):
+    """Count the runs that are made."""
+    made: list[str] = []
+
+    def make(run, setup, device=""):
+        made.append(run.name)
+        return make_record(run, setup, device)
+
+    monkeypatch.setattr(grid, "make_record", make)
+    return made
+
+
+def test_only_what_is_missing_is_made_again_and_with_the_same_numbers(finished, whole, monkeypatch):
+    lost = "S-D_qbst_seed-0"
+    (finished / "results" / f"{lost}.json").unlink()
+    shutil.rmtree(finished / "runs/S-D/qbst/seed-0")
+    made, told = counting(monkeypatch), []
+    rows = ("supervised", "source-only", "qbst")
+    make_tables(finished, ["adaptation-bench"], rows, ("S-D",), (0,), told.append)
+    assert made == [lost]
+    assert "2 of 3 runs are there already" in told[1]
+    assert comparable(finished) == comparable(whole)
+    for kind in ("md", "csv", "tex", "png"):
+        name = f"adaptation-bench.{kind}"
+        assert (finished / name).read_bytes() == (whole / name).read_bytes()
+
+
+def test_a_stop_between_training_and_record_loses_nothing(finished, whole, monkeypatch):
+    shutil.rmtree(finished / "results")
+
+    def stop(run, setup, device=""):
+        if run.target == F:
+            raise KeyboardInterrupt
+        return make_record(run, setup, device)
+
+    monkeypatch.setattr(grid, "make_record", stop)
+    with pytest.raises(KeyboardInterrupt):
+        make_tables(finished, ["ordinary"], columns=COLUMNS)
+    assert len(list((finished / "results").iterdir())) == 2
+    monkeypatch.setattr(grid, "make_record", make_record)
+    make_tables(finished, ["ordinary"], columns=COLUMNS)
+    found, wanted = comparable(finished), comparable(whole)
+    assert len(found) == 6 and found == {name: wanted[name] for name in found}
+
+
+def test_a_folder_of_other_settings_is_refused(finished):
+    setup = Setup(finished, TINY, seeds=(0,), threads=2)
+    with pytest.raises(InputError, match="another threads"):
+        reproduce(products(["ordinary"], setup), setup, Workers(), print)
+
+
+def test_a_dry_run_tells_counts_and_hours_and_writes_nothing(small_scales, finished, capsys):
+    shutil.rmtree(finished / "runs")
+    shutil.rmtree(finished / "results")
+    before = sorted(finished.rglob("*"))
+    options = ReproduceOptions(
+        ("adaptation-bench",), finished, "smoke", dry_run=True, methods=("qbst",)
+    )
+    assert command(options) == 0
+    said = capsys.readouterr().out
+    # Two tasks, three seeds, and a warm-up each.
+    assert re.search(r"30 scans of the source, 48 scans of the target; 12 runs, 12 of", said)
+    assert re.search(r"about \d+\.\d\d hours", said)
+    assert sorted(finished.rglob("*")) == before
+
+
+def test_galleries_show_procedural_shapes_alone(finished):
+    make_tables(finished, ["galleries"], seeds=(0,))
+    names = sorted(path.name for path in (finished / "galleries").iterdir())
+    assert names == ["D.png", "F.png", "M.png", "S.png"]
+
+
+def test_data_of_the_user_takes_a_domain_s_place(whole, tmp_path):
+    data, out = whole / "data", tmp_path / "own"
+    own = parse_own([f"D={data / 'target'}", f"M={data / 'source'}:train:"])
+    assert own["D"].stands_for == "" and own["M"].train.cloud == "surface"
+    make_tables(out, ["ordinary"], ("dgcnn",), ("M-D",), (0,), own=own)
+    text = (out / "ordinary.md").read_text()
+    assert "D: target" in text and "Stand-ins" not in text
+    for changed, said in (
+        (f"D={data / 'target'}:train:train", "another data"),
+        (f"D={data / 'source'}", "no cloud of split 'test'"),
+    ):
+        with pytest.raises(InputError, match=said):
+            changes = {"own": own | parse_own([changed])}
+            make_tables(out, ["ordinary"], ("dgcnn",), ("M-D",), (0,), **changes)
+    again = read_setup(out)
+    assert again.own["D"].train.cloud == "points" and again.seeds == (0,)
+    filled = Table("ordinary", again, ("dgcnn",), ("M-D",)).read()
+    assert filled.faults == () and filled.waiting == []
+
+
+class Inline:
+    """An executor that ends calls in the opposite order."""
+
+    def __init__(self, fail=""):
+        self.calls, self.order, self.fail = [], [], fail
+        self.most = 0
+
+    @property
+    def ahead(self):
+        return 9
+
+    def submit(self, key, function, *arguments):
+        self.calls.append((key, function, arguments))
+        self.most = max(self.most, len(self.calls))
+
+    def next(self):
+        key, function, arguments = self.calls.pop()  # the last first
+        self.order.append(key)
+        if key == self.fail:
+            return key, Failure("ProcessDied", "no memory left")
+        return key, function(*arguments)
+
+    def drain(self):
+        return []
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        return None
+
+
+RUNS = [
+    make_run(TINY, S, D, ORDINARY, 0, 1),
+    make_run(TINY, S, F, ORDINARY, 0, 1),
+    make_run(TINY, S, D, PAPER, 0, 1),
+    make_run(TINY, S, D, ORDINARY, 0, 1, network="dgcnn"),
+]
+NAMES = [run.name for run in RUNS]
+
+
+def run_all(out, executor, **options):
+    setup = Setup(out, TINY)
+    return run_grid(RUNS, setup, lambda line: None, dict.fromkeys(NAMES, 1.0), executor, **options)
+
+
+@pytest.fixture
+def ready_made(whole, monkeypatch):
+    record = read_record(whole / "results" / "S-D_ordinary_seed-0.json")
+    monkeypatch.setattr(grid, "make_record", lambda run, setup, device: record)
+
+
+def test_a_warm_up_is_waited_for_and_a_folder_has_one_run_at_a_time(ready_made, tmp_path):
+    executor = Inline()
+    assert run_all(tmp_path, executor, at_once=3) == []
+    assert sorted(executor.order) == sorted(NAMES)
+    assert executor.most == 2  # the source's training, and the other network's
+    places = [executor.order.index(name) for name in NAMES[:3]]
+    assert places == sorted(places)
+
+
+def test_a_failed_run_is_named_and_what_others_made_stays(ready_made, tmp_path):
+    failed = run_all(tmp_path, Inline(fail=NAMES[0]), at_once=2)
+    assert failed[0] == "S/ordinary/seed-0: ProcessDied: no memory left"
+    # What shares its folder and what starts from it cannot be made either.
+    assert [line.partition(":")[0] for line in failed[1:]] == [
+        "S/ordinary/seed-0", "S-D/qbst-paper/seed-0"
+    ]  # fmt: skip
+    assert [path.stem for path in (tmp_path / "results").iterdir()] == [NAMES[3]]
+
+
+def test_each_device_has_one_run_at_a_time(whole, tmp_path, monkeypatch):
+    record = read_record(whole / "results" / "S-D_ordinary_seed-0.json")
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    executor, seen = Inline(), []
+
+    def make(run, setup, device):
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "7,8,3")  # a new process has the scheduler's
+        grid._see_alone(device)
+        seen.append(os.environ["CUDA_VISIBLE_DEVICES"])
+        return record
+
+    monkeypatch.setattr(grid, "make_record", make)
+    assert run_all(tmp_path, executor, devices=("2", "0")) == []
+    assert set(seen) == {"3", "7"} and executor.most == 2
+
+
+def test_a_device_that_is_not_there_is_told(tmp_path):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CUDA_VISIBLE_DEVICES", "")
+        with pytest.raises(InputError, match="--devices 4: no such GPU"):
+            make_record(RUNS[0], Setup(tmp_path, TINY), "4")
+    for options in ({"devices": ("x",)}, {"workers": 0}):
+        with pytest.raises(InputError):
+            Workers(**options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [Workers(2), Workers(2, executor="ray", address="local")])
+def test_several_at_once_give_the_same_numbers(finished, whole, workers):
+    if workers.executor == "ray":
+        pytest.importorskip("ray")
+    for name in ("runs", "results"):
+        shutil.rmtree(finished / name)
+    setup = Setup(finished, TINY, seeds=(0,), threads=1)
+    reproduce(products(["thresholds"], setup), setup, workers, print)
+    found, wanted = comparable(finished), comparable(whole)
+    assert len(found) == 8 and found == {name: wanted[name] for name in found}
+
+
+_KILLED = """
+import runpy, sys
+from pathlib import Path
+conftest = runpy.run_path({conftest!r})
+conftest["make_tables"](Path(sys.argv[1]), ["thresholds"], seeds=(0,))
+"""
+
+
+@pytest.mark.slow
+def test_killed_at_any_time_it_goes_on_with_the_same_numbers(finished, whole):
+    for name in ("runs", "results"):
+        shutil.rmtree(finished / name)
+    script = _KILLED.format(conftest=str(Path(__file__).parent / "conftest.py"))
+    kept: set[str] = set()
+    for count in (1, 4, 8):
+        with subprocess.Popen([sys.executable, "-c", script, str(finished)]) as running:
+            while running.poll() is None and len(list(finished.glob("results/*.json"))) < count:
+                time.sleep(0.01)
+            if count < 8:
+                running.kill()
+        found = {path.name for path in finished.glob("results/*.json")}
+        assert kept <= found
+        kept = found
+    assert running.returncode == 0
+    found, wanted = comparable(finished), comparable(whole)
+    assert len(found) == 8 and found == {name: wanted[name] for name in found}

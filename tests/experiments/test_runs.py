@@ -1,0 +1,201 @@
+"""Which runs make a table: their fields, their data, and the figures beside them."""
+
+import dataclasses
+
+import pytest
+
+from qs3 import shapes
+from qs3.errors import InputError
+from qs3.experiments import TABLES
+from qs3.experiments.cost import Counts, run_seconds
+from qs3.experiments.data import choose_meshes, make_plans, side_of
+from qs3.experiments.domains import Domain, data_of, parse_own
+from qs3.experiments.experiment import load_experiment, published
+from qs3.experiments.grid import data_sets
+from qs3.experiments.reproduce import collect_runs, products
+from qs3.experiments.runs import ORDINARY, PAPER, ROWS, SUPERVISED, make_run, warm_up_of
+from qs3.experiments.scales import SCALES
+from qs3.experiments.setup import Setup
+
+from .conftest import TINY
+
+S, D, R = Domain("S"), Domain("D"), Domain("R")
+
+
+@pytest.mark.parametrize("scale", SCALES.values(), ids=SCALES)
+def test_every_cell_has_its_data_and_its_work_list(scale, tmp_path):
+    runs = collect_runs(products(TABLES, Setup(tmp_path, scale, seeds=(0,))))
+    sets = data_sets(runs)
+    assert {data.kind for data in sets} == {
+        "source", "held", "target", "fused", "jitter", "second", "views", "sensor"
+    }  # fmt: skip
+    assert {d.views for d in sets} - {0} == {*scale.fused_views} - {scale.source_views}
+    assert {d.sensor for d in sets} - {""} == {*scale.sensors}
+    made: set[str] = set()
+    for run in runs:
+        before = warm_up_of(scale, run)
+        assert before is None or before.folder in made
+        made.add(run.folder)
+    few = dataclasses.replace(scale, source_per_class=1, target_per_class=1, test_per_class=1)
+    plans = make_plans(few, None, sets, renderer="none")
+    assert len(plans) == len(sets) and all(plan.rows for plan in plans.values())
+
+
+def test_a_run_is_known_by_its_fields():
+    sensors = (Domain("A", sensor="kinect-v1"), Domain("A", sensor="d435"))
+    run = make_run(TINY, *sensors, ORDINARY, seed=3)
+    assert run.fields == {
+        "source": "A", "source_sensor": "kinect-v1", "target": "A", "target_sensor": "d435",
+        "row": "ordinary", "seed": 3,
+    }  # fmt: skip
+    assert [part.data.name for part in run.parts() if part] == ["sensor-kinect-v1", "sensor-d435"]
+    theta = make_run(TINY, S, D, PAPER, threshold=0.2)
+    assert theta.fields["threshold"] == theta.self_training.threshold == 0.2
+    # The row's own value is one training with the table of methods.
+    assert make_run(TINY, S, D, PAPER, threshold=0.0) == make_run(TINY, S, D, PAPER)
+    # Trained on the target's own labels, the supervised row is one for all sources.
+    assert make_run(TINY, S, D, SUPERVISED) == make_run(TINY, Domain("M"), D, SUPERVISED)
+    with pytest.raises(InputError, match="unknown row"):
+        make_run(TINY, S, D, "nobody")
+
+
+def test_runs_have_the_settings_of_their_row():
+    paper = make_run(TINY, S, D, PAPER)
+    assert paper.self_training.pool == "shrinking" and paper.self_training.init == "scratch"
+    assert warm_up_of(TINY, paper) == make_run(TINY, S, D, ORDINARY)
+    base = make_run(TINY, S, D, "qbst").self_training
+    for name, row in ROWS.items():
+        if row.changes:
+            changed = dataclasses.replace(base, **row.changes)
+            assert make_run(TINY, S, D, name).self_training == changed != base
+    assert warm_up_of(TINY, make_run(TINY, S, D, "gast-spst")).row == "gast"
+
+
+def test_real_objects_must_be_at_hand_and_have_no_supervised_row(tmp_path):
+    setup = Setup(tmp_path, dataclasses.replace(TINY, tasks=("S-D", "S-R")), seeds=(0,))
+    bench = products(["adaptation-bench"], setup)
+    assert {run.target for run in collect_runs(bench)} == {D}
+    asked = products(["adaptation-bench"], setup, columns=["S-R"])
+    with pytest.raises(InputError, match="QS3_SHARED_DATA"):
+        collect_runs(asked)
+    assert asked[0].cells()[SUPERVISED, "S-R"] == []
+
+
+def test_the_paper_s_cells_have_their_published_figures():
+    for name, row, column, figures in (
+        ("ordinary", "dgcnn", "S-D", (64.0, 1.0)),
+        ("uda", PAPER, "S-D", (72.4, 0.8)),
+        ("uda", ORDINARY, "M-D", (46.7, 1.4)),
+        ("uda", SUPERVISED, "S-F", (78.7, 0.8)),
+        ("uda", SUPERVISED, "S-D", None),
+        ("real2sim", "simpleview", "D-M", (69.4, 1.3)),
+        ("pointda10", "dann", "F-N", (71.6, None)),
+        ("adaptation-bench", "qbst", "S-D", (72.4, 0.8)),
+        ("views", "dgcnn", "1", None),
+    ):
+        assert load_experiment(name).published_cell(row, column) == figures
+    for name in ("ordinary", "real2sim", "pointda10", "uda"):
+        experiment, scale = load_experiment(name), SCALES["paper"]
+        rows = {experiment.published_as.get(r.key, r.key) for r in experiment.rows(scale)}
+        columns = {column.key for column in experiment.columns(scale)}
+        for column in columns & set(published()[experiment.published]):
+            assert set(published()[experiment.published][column]) <= rows
+
+
+@pytest.mark.parametrize(
+    ("names", "rows", "columns", "seeds", "said"),
+    [
+        (["ordinary"], ["typo"], [], (0,), "--methods typo: choose from dgcnn"),
+        (["ordinary"], [], ["typo"], (0,), "--tasks typo: choose from"),
+        (["ordinary", "ordinary"], [], [], (0,), "name each once"),
+        (["ordinary"], [], [], (0, 0), "name each once"),
+        (["ordinary"], [], [], (), "at least one"),
+        (["typo"], [], [], (0,), "unknown table"),
+        (["ordinary", "views"], ["dgcnn"], ["1"], (0,), "its columns are M-D"),
+    ],
+)
+def test_what_no_table_has_is_refused(names, rows, columns, seeds, said, tmp_path):
+    setup = Setup(tmp_path, TINY, seeds=seeds)
+    with pytest.raises(InputError, match=said):
+        collect_runs(products(names, setup, rows, columns))
+
+
+def test_small_is_at_the_floor_and_smoke_below():
+    assert not SCALES["small"].smoke
+    assert SCALES["smoke"].smoke
+    few = dataclasses.replace(SCALES["small"], source_per_class=44)
+    assert few.smoke  # a tenth is held out: 39.6 are trained on
+
+
+def test_no_mesh_is_on_both_sides(shared_data):
+    scale = dataclasses.replace(TINY, source_per_class=30, target_per_class=15)
+    for folder in (None, shared_data):
+        sides = choose_meshes(scale, folder)
+        key = [item.path or (item.class_name, item.shape_seed) for item in sides.source]
+        other = [item.path or (item.class_name, item.shape_seed) for item in sides.target]
+        assert len({*key, *other}) == len(key) + len(other)
+        for name in shapes.CLASSES:
+            assert sum(item.class_name == name for item in sides.source) == 30
+        assert (sides.cad > 60) == (folder is not None)
+    for item in sides.source + sides.target:
+        if item.path is not None:
+            assert item.class_name != "bathtub"  # one mesh alone
+            side = side_of(item.path.name)
+            assert (item in sides.source) == (side == "source")
+            assert item.split == ("train" if side == "source" else side)
+
+
+def test_the_target_has_rooms_frequent_classes():
+    target = choose_meshes(TINY, None).target
+    counts = {
+        (name, split): sum(i.class_name == name and i.split == split for i in target)
+        for name in ("chair", "lamp")
+        for split in ("train", "test")
+    }
+    assert list(counts.values()) == [4, 4, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["D"], "NAME=PATH"),
+        (["D=nowhere-at-all"], "not there"),
+        (["Q=."], "the domains are"),
+        (["D=.", "D=."], "each domain once"),
+        (["D=.:train"], "not there"),
+    ],
+)
+def test_data_of_the_user_that_cannot_be_is_refused(given, said):
+    with pytest.raises(InputError, match=said):
+        parse_own(given)
+
+
+def test_a_path_through_a_link_and_a_name_of_ours_are_the_user_s(tmp_path):
+    (tmp_path / "target").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "target")
+    own = parse_own([f"S={tmp_path / 'link'}"])
+    run = make_run(TINY, S, D, ORDINARY)
+    source, _, test = run.parts(own)
+    assert source.locate(tmp_path, None) == (tmp_path / "target").resolve()
+    assert test.locate(tmp_path, None) == tmp_path / "data" / "target"  # not the user's
+    assert [data.name for data in data_sets([run], own)] == ["target"]
+    with pytest.raises(InputError, match="partiality: compares S"):
+        products(["partiality"], Setup(tmp_path, TINY, own=own))
+    with pytest.raises(InputError, match="no clouds to score on"):
+        make_run(TINY, S, Domain("J"), ORDINARY).parts()
+    assert data_of(S, own).stands_for == "" and data_of(D, own).stands_for
+
+
+def test_hours_follow_the_number_of_steps():
+    steps = {"source-only": 1.0, "dann": 3.0}
+    scale = dataclasses.replace(TINY, train=dataclasses.replace(TINY.train, epochs=10))
+    counts = Counts(source=40, target=64, test=16)  # 36 trained on: 3 batches; 4 of the target
+    looks = 10 * (40 + 64 + 16) / 16 / 3
+    seconds = {
+        row: run_seconds(make_run(scale, S, D, row), counts, steps)
+        for row in ("source-only", "dann", "qbst")
+    }
+    assert seconds["source-only"] == pytest.approx(30 + looks)
+    assert seconds["dann"] == pytest.approx(10 * 4 * 3 + looks)
+    # Two rounds of an epoch, on both domains.
+    assert seconds["qbst"] == pytest.approx(2 * 4 * 2 + 4 * 120 / 16 / 3)

@@ -1,0 +1,39 @@
+"""What a folder is for: its marker lives on as settings are added, and damage is told."""
+
+import json
+
+import pytest
+
+from qs3.errors import InputError
+from qs3.experiments.scales import SCALES
+from qs3.experiments.setup import read_setup
+
+from .conftest import TINY
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"data": []},
+        {"data": {"D": ["a", "points"]}},
+        {"threads": "a"},
+        {"scale": {"name": 3}},
+        {"more": 1},
+        {"version": 9},
+    ],
+)
+def test_a_damaged_marker_is_told(whole, tmp_path, damage):
+    value = json.loads((whole / "bench.json").read_text())
+    (tmp_path / "bench.json").write_text(json.dumps(value | damage))
+    with pytest.raises(InputError, match=r"bench\.json"):
+        read_setup(tmp_path)
+
+
+def test_a_folder_without_a_marker_is_told(tmp_path):
+    with pytest.raises(InputError, match=r"has no bench\.json"):
+        read_setup(tmp_path)
+
+
+def test_a_folder_keeps_its_scale_whatever_becomes_of_ours(whole):
+    assert read_setup(whole).scale.train.num_points == TINY.train.num_points
+    assert read_setup(whole).scale != SCALES["smoke"]

@@ -1,0 +1,210 @@
+"""A table's numbers are those of its records; what is no record of it is refused by name."""
+
+import csv
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from qs3.cli.table import TableOptions, figure, table
+from qs3.errors import InputError
+from qs3.evaluation.records import read_record
+from qs3.experiments.figures import picture
+from qs3.experiments.scales import SCALES
+from qs3.experiments.setup import Setup, read_setup
+from qs3.experiments.table import Table
+from qs3.experiments.text import FORMATS, markdown
+
+COLUMNS = ("M-D", "S-D", "S-F")
+
+
+def change(path, *fields, value):
+    """Change a field of a record."""
+    whole = json.loads(path.read_text())
+    inner = whole
+    for name in fields[:-1]:
+        inner = inner[name]
+    inner[fields[-1]] = value
+    path.write_text(json.dumps(whole))
+
+
+def read(folder, name, **changes):
+    return dataclasses.replace(Table(name, read_setup(folder)), **changes).read()
+
+
+def record(folder, name):
+    return read_record(folder / "results" / f"{name}.json")
+
+
+def test_numbers_are_those_of_the_records(whole):
+    text = markdown(read(whole, "ordinary", columns=COLUMNS))
+    assert text.startswith("# *smoke* — Networks without adaptation")
+    assert "**Stand-ins, made here**" in text and "ScanNet10 (S*)" in text
+    line = ["DGCNN"]
+    for task, paper in zip(COLUMNS, ("46.7 ± 1.4", "64.0 ± 1.0", "51.1 ± 1.2"), strict=True):
+        scores = [record(whole, f"{task}_ordinary@dgcnn_seed-{seed}").scores for seed in (0, 1)]
+        values = 100 * np.array([score.accuracy for score in scores])
+        sem = values.std(ddof=1) / np.sqrt(2)
+        line += [f"{values.mean():.1f} ± {sem:.1f} (n=2)", paper]
+    assert f"| {' | '.join(line)} |" in text
+    rows = list(csv.DictReader((whole / "ordinary.csv").open()))
+    assert len(rows) == 3 * 2
+    for row in rows:
+        name = f"{row['column']}_ordinary@{row['row']}_seed-{row['seed']}"
+        assert float(row["accuracy"]) == record(whole, name).scores.accuracy
+    assert (whole / "ordinary.tex").read_text().count(r"\\") == 2
+
+
+def test_the_bench_tells_every_rule_and_what_rounds_kept(whole):
+    rows = list(csv.DictReader((whole / "adaptation-bench.csv").open()))
+    text = (whole / "adaptation-bench.md").read_text()
+    for row in ("source-only", "qbst"):
+        run = record(whole, f"S-D_{row}_seed-0")
+        by_rule = {line["rule"]: float(line["accuracy"]) for line in rows if line["row"] == row}
+        chosen = {rule: choice["accuracy"] for rule, choice in run.choices.items()}
+        assert by_rule == chosen | {"chosen (last)": run.scores.accuracy}
+        cells = [
+            f"{100 * chosen[rule]:.1f}" for rule in (*sorted(chosen.keys() - {"oracle"}), "oracle")
+        ]
+        line = next(
+            x for x in text.split("checkpoint")[1].splitlines() if x.startswith(f"| {row} ")
+        )
+        shown = line.strip("| ").split(" | ")[1:]
+        assert sorted(shown[:-1]) == sorted(cells[:-1]) and shown[-1] == cells[-1]
+    kept = run.rounds[-1]
+    cells = [*(f"{count:.1f}" for count in kept["kept"])]
+    cells.append(f"{sum(kept['kept']):.1f} of {sum(kept['confident']):.1f}")
+    assert f"| qbst | {' | '.join(cells)} | " in text
+    assert "oracle \\*" in text and "an upper bound, not a rule" in text
+
+
+def test_differences_are_paired_over_seeds(whole):
+    filled = read(whole, "ordinary", columns=COLUMNS)
+    (what, difference), *_ = filled.differences()
+    assert what == "S over M on D, DGCNN"
+    first, second = (
+        [record(whole, f"{task}_ordinary@dgcnn_seed-{seed}").scores.accuracy for seed in (0, 1)]
+        for task in ("S-D", "M-D")
+    )
+    assert difference.mean == pytest.approx(np.mean(np.subtract(first, second)))
+    assert f"- {what}: {difference.format()}" in (whole / "ordinary.md").read_text()
+
+
+def test_one_training_of_a_source_serves_all_targets(whole):
+    records = [record(whole, f"{task}_ordinary@dgcnn_seed-0") for task in ("S-D", "S-F")]
+    assert records[0].source == records[1].source and records[0].target is None
+    assert [run.test.cloud for run in records] == ["points", "clean"]
+    assert records[0].seconds == records[1].seconds
+    settings = json.loads((whole / "runs/S-D/qbst/seed-0/settings.json").read_text())
+    assert settings["warm_up"] is not None
+    assert not (whole / "runs/S-D/qbst/seed-0/warm-up").exists()
+
+
+def test_records_of_thresholds_have_their_fields_and_settings(whole):
+    theta, step = (
+        record(whole, f"{name}_seed-0") for name in ("S-D_qbst-theta-0.2", "M-D_qbst-step-0.1")
+    )
+    assert theta.settings["self_training"]["threshold"] == theta.experiment["threshold"] == 0.2
+    assert step.settings["self_training"]["step"] == step.experiment["step"] == 0.1
+    assert step.settings["self_training"]["threshold"] == 0.0  # the scale's
+
+
+def test_cells_that_wait_show_the_command(finished, capsys):
+    for path in (finished / "results").glob("S-F_ordinary@dgcnn_*"):
+        path.unlink()
+    assert table(TableOptions("ordinary", finished, tasks=COLUMNS)) == 0
+    said = capsys.readouterr().out
+    assert "1 cells wait for runs" in said
+    assert "    qs3 reproduce ordinary --out copy --scale smoke --seeds 0 1\n" in said
+    assert next(line for line in said.splitlines() if line.startswith("| DGCNN")).count("…") == 1
+
+
+def test_damaged_and_foreign_records_are_refused_and_the_rest_shown(finished, capsys):
+    results = finished / "results"
+    (results / "S-D_ordinary@dgcnn_seed-0.json").write_text("{")
+    shutil.copy(
+        results / "S-D_ordinary@dgcnn_seed-1.json", results / "M-D_ordinary@dgcnn_seed-1.json"
+    )
+    change(results / "S-F_ordinary@dgcnn_seed-1.json", "test", "checksum", value="0")
+    assert table(TableOptions("ordinary", finished, tasks=COLUMNS)) == 1
+    out, err = capsys.readouterr()
+    refused = [line for line in err.splitlines() if "refused" in line]
+    assert len(refused) == 3
+    for name, why in (
+        ("S-D_ordinary@dgcnn_seed-0", "not a JSON file"),
+        ("M-D_ordinary@dgcnn_seed-1", "source differs"),
+        ("S-F_ordinary@dgcnn_seed-1", "other data (test F)"),
+    ):
+        assert sum(name in line and why in line for line in refused) == 1
+    assert "(n=1)" in out
+
+
+@pytest.mark.parametrize(
+    ("fields", "value", "said"),
+    [
+        (["seed"], "0", "'seed'"),
+        (["seed"], 7, "seed differs"),
+        (["method"], "spst", "method differs"),
+        (["settings", "train", "epochs"], 5, "train differs"),
+        (["settings", "train", "epoch"], 4, "epoch"),
+        (["settings", "self_training"], None, "self_training differs"),
+        (["marks"], ["supervised"], "supervised differs"),
+        (["test", "split"], "train", "test differs"),
+        (["source", "cloud"], "clean", "source differs"),
+        (["experiment", "row"], "spst", "experiment differs"),
+        (["extra"], 1, "'extra' is unknown"),
+    ],
+)
+def test_a_record_of_another_run_is_told_with_what_differs(finished, fields, value, said):
+    path = finished / "results" / "S-D_qbst_seed-0.json"
+    change(path, *fields, value=value)
+    filled = read(finished, "adaptation-bench", rows=("qbst",), columns=("S-D",))
+    (fault,) = filled.faults
+    assert str(path) in fault and said in fault and not filled.records
+
+
+def test_a_mean_over_runs_of_other_networks_is_refused(finished):
+    change(
+        finished / "results" / "S-D_ordinary@dgcnn_seed-1.json",
+        "settings", "class_names", value=["chair"],
+    )  # fmt: skip
+    with pytest.raises(InputError, match="not in the seed alone"):
+        markdown(read(finished, "ordinary", columns=COLUMNS))
+
+
+def test_caveats_of_runs_stand_below_the_table(finished):
+    results = finished / "results"
+    change(results / "S-D_ordinary@dgcnn_seed-0.json", "marks", value=["training clouds"])
+    filled = read(finished, "ordinary", columns=COLUMNS)
+    assert "- training clouds: DGCNN on S → D" in FORMATS["md"](filled)
+    assert "% training clouds: DGCNN on S → D" in FORMATS["tex"](filled)
+    assert FORMATS["csv"](filled).count("training clouds") == 2
+    path = results / "M-D_qbst-theta-0.2_seed-0.json"
+    rounds = [
+        done | {"skipped": n == 1} for n, done in enumerate(json.loads(path.read_text())["rounds"])
+    ]
+    change(path, "rounds", value=rounds)
+    text = markdown(read(finished, "thresholds"))
+    assert "- 1 of 2 rounds skipped, confident clouds too few: QBST, M → D on θ₀ = 0.2" in text
+    assert "Self-training here: threshold 0.0, rounds 2, epochs 1 (paper: 0.8, 10, 10)." in text
+
+
+def test_figures_are_the_same_bytes_each_time(whole, tmp_path, capsys):
+    filled = read(whole, "thresholds")
+    assert picture(filled, "png") == picture(filled, "png")
+    assert (whole / "ordinary.png").read_bytes()[1:4] == b"PNG"
+    path = tmp_path / "bars.svg"
+    assert figure(TableOptions("ordinary", whole), path) == 0
+    assert "S → D" in path.read_text()
+    assert capsys.readouterr().out.split() == [str(path)]
+    for name in ("a.jpg", "a"):
+        with pytest.raises(InputError, match=r"\.png or \.svg"):
+            figure(TableOptions("ordinary", whole), tmp_path / name)
+
+
+def test_the_text_tells_how_the_table_s_own_networks_were_trained(tmp_path):
+    text = markdown(Table("ordinary", Setup(tmp_path, SCALES["paper"], seeds=(0,))).read())
+    assert "1000 epochs, batches of 32, schedule plateau" in text
+    assert "418 objects a class of M and S" in text

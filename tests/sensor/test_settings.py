@@ -1,0 +1,77 @@
+"""Settings of a scan: presets, changes of the sensor, records."""
+
+import dataclasses
+from typing import Literal
+
+import pytest
+import trimesh
+
+from qs3.errors import InputError
+from qs3.sensor.checks import check_choices
+from qs3.sensor.materials import get_material
+from qs3.sensor.presets import SENSORS
+from qs3.sensor.scan import scan
+from qs3.sensor.scene import SceneSettings
+from qs3.sensor.settings import PRESETS, CameraSettings, ScanSettings
+
+
+def test_a_preset_is_a_whole_column_and_what_is_given_beside_it_wins():
+    released = ScanSettings(preset="released")
+    column = {name: released.chosen(name) for name in PRESETS["released"]}
+    assert column == PRESETS["released"]
+    assert released.make_sensor().depth.principal_point == "released"
+    assert released.as_dict()["view_layout"] == "jitter"
+    beside = ScanSettings(preset="released", view_layout="orbit", principal_point="true")
+    assert beside.chosen("view_layout") == "orbit"
+    assert beside.make_sensor() == SENSORS["paper"]
+    assert ScanSettings(preset="paper").as_dict()["box_crop"] is False
+
+
+def test_changes_go_where_they_belong_in_the_sensor():
+    changes = {"image_noise": 2.0, "matching": "opencv-bm", "object_size": 0.5, "material": "dark"}
+    sensor, base = ScanSettings(sensor="d435", **changes).make_sensor(), SENSORS["d435"]
+    assert sensor.exposure == dataclasses.replace(base.exposure, noise=2.0)
+    assert sensor.matching == dataclasses.replace(base.matching, method="opencv-bm")
+    assert (sensor.object_size, sensor.material) == (0.5, get_material("dark"))
+
+
+def test_a_scene_by_name_takes_surfaces_by_name():
+    settings = ScanSettings(scene="room", floor_material="dark")
+    assert settings.make_scene() == SceneSettings("room", floor=get_material("dark"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"num_points": 0}, "num_points 0"),
+        ({"samples": 0}, "samples 0"),
+        ({"seed": -1}, "seed -1"),
+    ],
+)
+def test_settings_are_checked(changes, message):
+    with pytest.raises(InputError, match=message):
+        ScanSettings(**changes)
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    word: Literal["a", "b"] | None = None
+
+
+def test_a_choice_may_be_left_open_but_not_be_another_word():
+    check_choices(Choice(), "room")
+    check_choices(Choice("b"), "room")
+    with pytest.raises(InputError, match="no word 'c'; choose one of a, b"):
+        check_choices(Choice("c"), "room")  # pyright: ignore[reportArgumentType]
+
+
+def test_a_renderer_refuses_what_is_anothers():
+    with pytest.raises(InputError, match="variant: scalar_rgb is Mitsuba's"):
+        CameraSettings(renderer="cycles", variant="scalar_rgb").make_renderer()
+    with pytest.raises(InputError, match="view_transform: Filmic needs"):
+        CameraSettings(view_transform="Filmic").make_renderer()
+
+
+def test_a_keyword_that_is_no_setting_is_refused():
+    with pytest.raises(TypeError, match="viwes"):
+        scan(trimesh.creation.box(), viwes=3)
