@@ -13,7 +13,7 @@ from qs3.meshes.classes import POINTDA10
 from qs3.store.failures import read_failures
 from qs3.store.generate import GenerateReport, GenerateSettings, scan_seed
 from qs3.store.info import info
-from qs3.store.manifest import SUMS
+from qs3.store.manifest import MANIFEST, SUMS
 from qs3.store.scan_item import neighbour_of
 
 SETTINGS = GenerateSettings(num_points=16, scans_per_mesh=3, rows_per_shard=4)
