@@ -56,31 +56,6 @@ def rotation_z(angle: float) -> Float[np.ndarray, "3 3"]:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def z_up_from_y_up(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """Turn y-up points so that z is up.
-
-    Convention:
-        (x, y, z) → (x, −z, y): +90° about x for columns, R·p; the same as the rows' product
-        p·R with the matrix of −90°, as released loaders write it, since p·R = (Rᵀ·pᵀ)ᵀ. Signs and
-        places change only, so no coordinate is rounded.
-
-    Example:
-        >>> z_up_from_y_up(np.array([[1.0, 2.0, 3.0]])).tolist()
-        [[1.0, -3.0, 2.0]]
-    """
-    return np.stack([points[..., 0], -points[..., 2], points[..., 1]], axis=-1)
-
-
-def y_up_from_z_up(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """Undo `z_up_from_y_up`: (x, y, z) → (x, z, −y).
-
-    Example:
-        >>> y_up_from_z_up(np.array([[1.0, -3.0, 2.0]])).tolist()
-        [[1.0, 2.0, 3.0]]
-    """
-    return np.stack([points[..., 0], points[..., 2], -points[..., 1]], axis=-1)
-
-
 def transform_points(
     matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
@@ -94,3 +69,28 @@ def invert_rigid(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     inverse[:3, :3] = matrix[:3, :3].T
     inverse[:3, 3] = -matrix[:3, :3].T @ matrix[:3, 3]
     return inverse
+
+
+def y_up_to_z_up(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """Turn y-up points so that z is up, exactly.
+
+    Convention:
+        (x, y, z) → (x, −z, y): +90° about x for columns, R·p; the same as the rows' product
+        p·R with the matrix of −90°, as released loaders write it, since p·R = (Rᵀ·pᵀ)ᵀ. Signs and
+        places change only, so no coordinate is rounded.
+
+    Example:
+        >>> y_up_to_z_up(np.array([[1.0, 2.0, 3.0]])).tolist()
+        [[1.0, -3.0, 2.0]]
+    """
+    return np.stack([points[..., 0], -points[..., 2], points[..., 1]], axis=-1)
+
+
+def z_up_to_y_up(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """Undo `y_up_to_z_up`: (x, y, z) → (x, z, −y).
+
+    Example:
+        >>> z_up_to_y_up(np.array([[1.0, -3.0, 2.0]])).tolist()
+        [[1.0, 2.0, 3.0]]
+    """
+    return np.stack([points[..., 0], points[..., 2], -points[..., 1]], axis=-1)

@@ -74,6 +74,7 @@ def pcd_compressed() -> bytes:
         ("a.txt", text("\t").replace(b"\n", b"\r\n")),
         ("a.ply", ply("ascii")),
         ("a.ply", ply("binary_little_endian")),
+        ("a.ply", ply("binary_little_endian") + b"\n"),
         ("ascii.pcd", pcd_ascii()),
         ("binary.pcd", pcd_binary()),
         ("compressed.pcd", pcd_compressed()),

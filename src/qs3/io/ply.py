@@ -68,7 +68,7 @@ def ply_vertices(content: bytes) -> Float[np.ndarray, "n 3"]:
     # Imported here: point files of other kinds need no mesh library.
     import trimesh
 
-    check_ply(content)
+    content = checked_ply(content)
     try:
         loaded = trimesh.load(io.BytesIO(content), file_type="ply", process=False)
     except Exception as error:  # parsers of damaged files raise whatever they stumble over
@@ -76,8 +76,11 @@ def ply_vertices(content: bytes) -> Float[np.ndarray, "n 3"]:
     return np.asarray(getattr(loaded, "vertices", np.zeros((0, 3))), dtype=np.float64)
 
 
-def check_ply(content: bytes) -> None:
+def checked_ply(content: bytes) -> bytes:
     """Hold what a PLY file's header announces against the size of the file.
+
+    Returns:
+        The file, without what may follow its last row (trimesh takes that for damage).
 
     Raises:
         InputError: where it is no PLY file, announces more than it has, or has no vertices with
@@ -89,7 +92,7 @@ def check_ply(content: bytes) -> None:
         raise InputError("cannot be read as ply (its first line is not ply)")
     if not end:
         raise InputError("cannot be read as ply (no end_header line)")
-    form, needed, announced = "", 0, []
+    form, needed, announced, lists = "", 0, [], False
     properties: dict[str, list[str]] = {}
     for words in lines[1:]:
         try:
@@ -101,6 +104,7 @@ def check_ply(content: bytes) -> None:
             elif words[:1] == ["property"]:
                 name, count = announced[-1]
                 is_list = words[1] == "list"
+                lists |= is_list and count > 0
                 if is_list and count and "vertex" not in [other for other, _ in announced[:-1]]:
                     raise InputError("has lists in or before its vertices; save it without")
                 properties[name].append(words[4 if is_list else 2])
@@ -120,3 +124,5 @@ def check_ply(content: bytes) -> None:
     columns = properties.get("vertex", [])
     if not {"x", "y", "z"} <= set(columns) or len(set(columns)) < len(columns):
         raise InputError("its vertices need the properties x, y and z, each property once")
+    begin = len(head) + len(end) + (2 if content[len(head) + len(end) :].startswith(b"\r\n") else 1)
+    return content if form == "ascii" or lists else content[: begin + needed]

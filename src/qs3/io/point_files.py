@@ -10,7 +10,7 @@ from jaxtyping import Float, Float32
 from qs3.errors import InputError
 from qs3.io.guards import load_npy, reason
 from qs3.io.pcd import parse_pcd, pcd_bytes
-from qs3.io.ply import check_ply, ply_bytes
+from qs3.io.ply import checked_ply, ply_bytes
 
 POINT_FILES = (".npy", ".xyz", ".txt", ".ply", ".pcd", ".off")
 WRITTEN_FILES = (".npy", ".xyz", ".ply", ".pcd")
@@ -138,7 +138,7 @@ def _trimesh(content: bytes, file_type: str, mesh_points: int, seed: int) -> np.
     from qs3.meshes.normalising import sample_surface
 
     if file_type == "ply":
-        check_ply(content)
+        content = checked_ply(content)
     loaded = trimesh.load(io.BytesIO(content), file_type=file_type, process=False)
     if isinstance(loaded, trimesh.Trimesh) and len(loaded.faces):
         return sample_surface(loaded, mesh_points, np.random.default_rng(seed))

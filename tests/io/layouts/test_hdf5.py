@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.geometry import y_up_from_z_up, z_up_from_y_up
+from qs3.geometry import y_up_to_z_up, z_up_to_y_up
 from qs3.io.layouts import hdf5
 from qs3.io.layouts.hdf5 import hdf5_bytes, read_file
 from qs3.io.layouts.hdf5_sets import list_parts, read_parts
@@ -328,13 +328,13 @@ def test_a_list_that_is_no_text_is_refused(tmp_path):
 def test_convention_y_up_turns_to_z_up_and_back():
     # x to the right, y up, z to the viewer, as OpenGL has them.
     right, up, near = np.eye(3)
-    turned = z_up_from_y_up(np.stack([right, up, near]))
+    turned = y_up_to_z_up(np.stack([right, up, near]))
     assert turned.tolist() == [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
     assert np.linalg.det(turned) == 1  # a turn, no mirror
-    np.testing.assert_array_equal(y_up_from_z_up(turned), np.eye(3))
+    np.testing.assert_array_equal(z_up_to_y_up(turned), np.eye(3))
 
 
 def test_turning_rounds_nothing(rng, formats):
     cloud = formats.hard_floats(rng, 500)
-    assert z_up_from_y_up(y_up_from_z_up(cloud)).tobytes() == cloud.tobytes()
-    assert y_up_from_z_up(z_up_from_y_up(cloud)).tobytes() == cloud.tobytes()
+    assert y_up_to_z_up(z_up_to_y_up(cloud)).tobytes() == cloud.tobytes()
+    assert z_up_to_y_up(y_up_to_z_up(cloud)).tobytes() == cloud.tobytes()

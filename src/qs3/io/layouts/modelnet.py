@@ -28,7 +28,7 @@ from tqdm import tqdm
 
 from qs3.errors import InputError
 from qs3.files import sha256, write_text
-from qs3.geometry import y_up_from_z_up, z_up_from_y_up
+from qs3.geometry import y_up_to_z_up, z_up_to_y_up
 from qs3.io.layouts.class_folders import choose_split, list_folder
 from qs3.io.layouts.format import SPLITS, Format, labels_as
 from qs3.io.layouts.hdf5_sets import list_parts, named, read_parts, text_lines, write_parts
@@ -63,9 +63,9 @@ def read_modelnet_h5(path: Path, split: str | None = None) -> RaggedClouds:
     parts = list_parts(root, _FILES, "ply_data_train<i>.h5 or ply_data_test<i>.h5", split)
     names = root / _NAMES
     if names.is_file():
-        return read_parts(parts, _read_names(names), (3,), z_up_from_y_up)
+        return read_parts(parts, _read_names(names), (3,), y_up_to_z_up)
     try:
-        return read_parts(parts, CLASSES, (3,), z_up_from_y_up)
+        return read_parts(parts, CLASSES, (3,), y_up_to_z_up)
     except InputError as error:
         raise InputError(
             f"{error} ({names} is missing, so the classes were taken to be ModelNet40's)"
@@ -120,7 +120,7 @@ def _file_name(split: str, index: int) -> str:
 def _arrays(
     points: Float32[np.ndarray, "b n 3"], labels: Int[np.ndarray, "b"]
 ) -> dict[str, np.ndarray]:
-    data = y_up_from_z_up(points).astype(np.float32)
+    data = z_up_to_y_up(points).astype(np.float32)
     return {"data": data, "label": labels.astype(np.uint8)[:, None]}
 
 

@@ -31,7 +31,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from qs3.errors import InputError
-from qs3.geometry import y_up_from_z_up, z_up_from_y_up
+from qs3.geometry import y_up_to_z_up, z_up_to_y_up
 from qs3.io.layouts.format import SPLITS, Format, labels_as
 from qs3.io.layouts.hdf5_sets import list_parts, named, read_parts, same_size, write_parts
 from qs3.io.layouts.point_folders import write_folder
@@ -107,7 +107,7 @@ def _prepare(
         short = ORIGINAL_POINTS - len(cloud)
         return np.pad(cloud, ((0, short), (0, 0))) if domain == "shapenet" else cloud
     if domain == "scannet" or (domain == "shapenet" and label != _PLANT):
-        cloud = z_up_from_y_up(cloud)
+        cloud = y_up_to_z_up(cloud)
     return cloud if protocol == "upright" else unit_ball(cloud[None])[0]
 
 
@@ -203,7 +203,7 @@ def _file_name(split: str, index: int) -> str:
 
 def _h5_arrays(points: Float32[np.ndarray, "b n 3"], labels: np.ndarray) -> dict[str, np.ndarray]:
     data = np.zeros((*points.shape[:2], 6), dtype=np.float32)
-    data[..., :3] = y_up_from_z_up(points)
+    data[..., :3] = z_up_to_y_up(points)
     return {"data": data, "label": labels.astype(np.int32)}
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from qs3.errors import InputError
-from qs3.geometry import y_up_from_z_up, z_up_from_y_up
+from qs3.geometry import y_up_to_z_up, z_up_to_y_up
 from qs3.io.layouts.format import Format, labels_as
 from qs3.io.layouts.hdf5_sets import Part, choose, named, read_parts, write_parts
 from qs3.io.ragged import RaggedClouds
@@ -61,7 +61,7 @@ def read_scanobjectnn(path: Path, split: str | None = None) -> RaggedClouds:
         if match is None:
             raise InputError(f"{file}: is not called training_objectdataset*.h5 or test_*")
         parts.append(Part(file, _SPLITS[match[1]]))
-    return read_parts(choose(path, parts, split), CLASSES, (3,), z_up_from_y_up)
+    return read_parts(choose(path, parts, split), CLASSES, (3,), y_up_to_z_up)
 
 
 def _one_variant(folder: Path) -> list[Path]:
@@ -109,7 +109,7 @@ def _file_name(split: str, index: int) -> str:
 def _arrays(
     points: Float32[np.ndarray, "b n 3"], labels: Int[np.ndarray, "b"]
 ) -> dict[str, np.ndarray]:
-    data = y_up_from_z_up(points).astype(np.float32)
+    data = z_up_to_y_up(points).astype(np.float32)
     return {"data": data, "label": labels.astype(np.int32)}
 
 
