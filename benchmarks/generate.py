@@ -23,12 +23,12 @@ import tempfile
 import time
 from pathlib import Path
 
-from qs3.store.info import info
 from qs3.meshes import MeshItem, collect
 from qs3.store.executors import Executor, LocalExecutor
 from qs3.store.executors.local import ONE_THREAD
 from qs3.store.failures import read_failures
 from qs3.store.generate import generate
+from qs3.store.info import info
 from qs3.store.plan import resolve_renderer
 from qs3.store.scan_item import GenerateSettings, scan_item
 

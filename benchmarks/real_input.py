@@ -12,10 +12,9 @@ from the records. Finished runs are not repeated.
 import argparse
 from pathlib import Path
 
-from qs3.cli.evaluate import make_record
-from qs3.cli.train import RUN, TrainOptions, run
 from qs3.evaluation import mean_sem
-from qs3.training import TrainSettings, self_training_preset
+from qs3.io import load_clouds, load_unlabelled
+from qs3.training import TrainSettings, evaluate, fit, load_whole, self_training_preset
 
 CLOUDS = {"S": "points", "C": "clean", "M": "surface"}
 
@@ -40,35 +39,29 @@ def main() -> None:
             seed=seed,
             threads=options.threads,
         )
-        plans = {
-            f"source-only, {name}": TrainOptions(
-                source=str(options.data),
-                out=options.runs / f"{name}-{seed}",
-                source_cloud=cloud,  # pyright: ignore[reportArgumentType]
-                train=settings,
-            )
-            for name, cloud in CLOUDS.items()
-        }
-        for preset in ("default", "paper"):
-            plans[f"QBST, S, {preset}"] = TrainOptions(
-                source=str(options.data),
-                out=options.runs / f"qbst-{preset}-{seed}",
-                method="qbst",
-                target=str(options.real),
-                warm_up=options.runs / f"S-{seed}",
-                preset=preset,
-                train=settings,
-                self_training=self_training_preset(preset),
-            )
-        for name, plan in plans.items():
-            if not (plan.out / RUN).is_file():
-                run(plan)
-            record, _ = make_record(plan.out, options.real)
+        count = options.num_points
+        for name in (*CLOUDS, "default", "paper"):
+            rounds = name not in CLOUDS
+            run = options.runs / (f"qbst-{name}-{seed}" if rounds else f"{name}-{seed}")
+            if not (run / "run.json").is_file():
+                cloud = "points" if rounds else CLOUDS[name]
+                fit(
+                    "qbst" if rounds else "source-only",
+                    load_whole(load_clouds, options.data, count, cloud=cloud),
+                    load_whole(load_unlabelled, options.real, count) if rounds else None,
+                    settings,
+                    self_training_preset(name) if rounds else None,
+                    run_dir=run,
+                    warm_up=options.runs / f"S-{seed}" if rounds else None,
+                    preset=name if rounds else None,
+                )
+            record = evaluate(run, options.real)
             scores = record.scores
-            results.setdefault(name, []).append((scores.accuracy, scores.class_mean_accuracy))
+            title = f"QBST, S, {name}" if rounds else f"source-only, {name}"
+            results.setdefault(title, []).append((scores.accuracy, scores.class_mean_accuracy))
             kept = [sum(r["kept"]) for r in record.rounds]
             note = f", kept by round {kept}" if kept else ""
-            print(f"{name}, seed {seed}: {scores.accuracy:.1%}{note}", flush=True)
+            print(f"{title}, seed {seed}: {scores.accuracy:.1%}{note}", flush=True)
     print("\n| training | accuracy | class mean | n |\n|---|---|---|---|")
     for name, rows in results.items():
         cells = []

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3 import shapes
-from qs3.cli.evaluate import describe
+from qs3.cli.evaluate import scores_text
 from qs3.evaluation import score
 from qs3.io.clouds import PointClouds
 from qs3.meshes import collect, normalise, sample_surface
@@ -49,7 +49,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         model = fit("source-only", source, None, settings, run_dir=Path(folder) / "run").model
     answers = predict_probabilities(model, test.points).argmax(axis=1)
-    print(describe(score(test.labels, answers, test.class_names)))
+    print(scores_text(score(test.labels, answers, test.class_names)))
 
 
 if __name__ == "__main__":

@@ -182,9 +182,7 @@ def test_the_located_cell_is_the_distorted_one(monkeypatch):
         return features(points, domain)
 
     monkeypatch.setattr(method, "features", spy)
-    monkeypatch.setattr(
-        gast, "location_loss", lambda *args: named.append(args[1]) or loss(*args)
-    )
+    monkeypatch.setattr(gast, "location_loss", lambda *args: named.append(args[1]) or loss(*args))
     target = make_target(20, 400)
     method(make_batch(), target, 0.0, seeded())
     moved = (seen[0] != target).any(dim=2)

@@ -70,7 +70,11 @@ def test_method_is_abstract():
         ("dan", {}, "unknown method 'dan'; choose one of source-only, dann"),
         ("source-only", {"wait": 1}, "unknown setting 'wait' of method source-only; it takes none"),
         ("defrec", {"wait": 1}, "unknown setting 'wait' of method defrec; choose from deform"),
-        ("mmd", {"biased": "yes"}, "settings of method mmd: field .biased.: .yes. is not true or f"),
+        (
+            "mmd",
+            {"biased": "yes"},
+            "settings of method mmd: field .biased.: .yes. is not true or f",
+        ),
         ("coral", {"layer": "last"}, "field .layer.: .last. is none of logits"),
         ("dann", {"hidden": [0]}, "hidden must be at least 1"),
         ("dann", {"gamma": 0.0}, "gamma must be larger than 0"),

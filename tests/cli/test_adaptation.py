@@ -4,11 +4,13 @@ import json
 
 import numpy as np
 import pytest
+import tyro
 
-from qs3.cli.train import parse_settings, preset_name
+from qs3.cli.train import TrainOptions, _note_old_name, parse_settings, preset_options
 from qs3.errors import InputError
 from qs3.evaluation import read_record
 from qs3.meshes.classes import POINTDA10
+from qs3.training import PRESETS
 
 QUICK = ("--model", "pointnet", "--model-set", "channels=[8, 8, 16]", "hidden=[8]", "--num-points",
          64, "--batch-size", 5, "--threads", 1, "--accelerator", "cpu", "--epochs", 2,
@@ -75,24 +77,6 @@ def test_source_only_looks_at_a_target_without_learning_from_it(qs3, store, sour
     assert weights[0] == weights[1]
 
 
-def test_what_a_warm_up_has_seen_marks_the_score(qs3, store, tmp_path):
-    warm, adapted = tmp_path / "warm", tmp_path / "adapted"
-    qs3("train", "--source", store, "--supervised", "--out", warm, *QUICK)
-    rounds = ("--self-training.rounds", 1, "--self-training.epochs", 1)
-    qs3("train", "--source", store, "--target", store, "--method", "qbst", "--warm-up", warm,
-        "--out", adapted, *rounds, *QUICK)  # fmt: skip
-    qs3("evaluate", adapted, "--data", store)
-    record = read_record(next((adapted / "records").glob("*.json")))
-    assert record.marks == ("transductive", "supervised", "training clouds")
-    (warm / "run.json").unlink()
-    other = tmp_path / "other"
-    qs3("train", "--source", store, "--target", store, "--method", "qbst", "--warm-up", warm,
-        "--out", other, *rounds, *QUICK)  # fmt: skip
-    qs3("evaluate", other, "--data", store)
-    record = read_record(next((other / "records").glob("*.json")))
-    assert "warm-up of unknown origin" in record.marks
-
-
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -137,7 +121,17 @@ def test_settings_are_json_or_words():
     ],
 )
 def test_a_preset_follows_the_method(arguments, preset):
-    assert preset_name(arguments) == preset
+    chosen = preset_options(arguments)
+    assert chosen.preset == preset
+    assert chosen.self_training == PRESETS[preset]
+
+
+def test_a_method_of_an_earlier_release_is_taken_with_a_note(capsys):
+    _note_old_name.cache_clear()
+    words = ["--source", "a", "--out", "b", "--method", "qs3"]
+    options = tyro.cli(TrainOptions, args=words, default=preset_options(words))
+    assert options.method == "qbst"
+    assert capsys.readouterr().err.count("--method qs3 is qbst now") == 1
 
 
 def test_labels_of_the_target_may_be_anything(qs3, store, tmp_path):

@@ -31,5 +31,5 @@ def test_two_devices_write_and_say_everything_once(qs3, store, tmp_path):
     assert [json.loads(line)["epoch"] for line in lines] == [0, 1, 2]
     names = {path.name.split("-")[0] for path in (tmp_path / "run").iterdir()}
     assert names == {"checkpoint.safetensors", "checkpoints", "history.jsonl", "model.safetensors",
-                     "run.json", "settings.json", "thinned"}  # fmt: skip
+                     "run.json", "settings.json", "subsample"}  # fmt: skip
     qs3("evaluate", tmp_path / "run", "--data", store)

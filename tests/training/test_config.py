@@ -14,7 +14,7 @@ TABLE = {
     "inclusive": (False, False, True),
     "pool": ("all", "shrinking", "split"),
     "init": ("warm-up", "scratch", "scratch"),
-    "labeller": ("latest", "latest", "best"),
+    "teacher": ("latest", "latest", "best"),
     "source_loss": (True, False, False),
     "schedule": ("per-round", "per-round", "continuous"),
     "single_class": ("keep", "drop", "drop"),

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from qs3.training.thinning import thin
 
 from qs3.errors import InputError, MissingExtraError, QS3Error
 from qs3.io.transforms import unit_ball
@@ -18,7 +17,8 @@ from qs3.models import create_model
 from qs3.models.ops import farthest_point_sampling
 from qs3.models.ops.sampling import sample_in_a_loop
 from qs3.training import TrainSettings, export, predict_probabilities, save_model
-from qs3.training.export import compare, export_run, thin_in_a_graph, unit_ball_in_a_graph
+from qs3.training.batches import subsample
+from qs3.training.export import compare, export_run, subsample_in_a_graph, unit_ball_in_a_graph
 
 _SUITE = Path(__file__).parents[1] / "models" / "test_models.py"
 _SPEC = importlib.util.spec_from_file_location("suite_of_models", _SUITE)
@@ -81,16 +81,16 @@ def check(model, run):
 @pytest.mark.parametrize("b", [1, 3])
 def test_thinning_in_a_graph_takes_the_same_points(n, b):
     points = clouds(b, n)
-    found = thin_in_a_graph(torch.from_numpy(points).double(), M)
-    assert np.array_equal(found.numpy(), thin(points, M).astype(np.float64))
+    found = subsample_in_a_graph(torch.from_numpy(points).double(), M)
+    assert np.array_equal(found.numpy(), subsample(points, M).astype(np.float64))
 
 
 def test_thinning_in_a_graph_breaks_ties_and_repeats_points_alike():
     grid = np.stack(np.meshgrid(*[np.arange(5.0)] * 3), axis=-1).reshape(1, -1, 3)
     few = np.repeat(grid[:, :7], 20, axis=1)
     for points in (grid.astype(np.float32), few.astype(np.float32)):
-        found = thin_in_a_graph(torch.from_numpy(points).double(), M)
-        assert np.array_equal(found.numpy(), thin(points, M).astype(np.float64))
+        found = subsample_in_a_graph(torch.from_numpy(points).double(), M)
+        assert np.array_equal(found.numpy(), subsample(points, M).astype(np.float64))
 
 
 def test_unit_ball_in_a_graph_is_that_of_training():

@@ -13,7 +13,8 @@ from qs3.training import (
     predict_probabilities,
     save_model,
 )
-from qs3.training.checkpoint import MODEL, fingerprint, new_model, read_tensors, write_tensors
+from qs3.training.checkpoint import new_model, read_tensors, write_tensors
+from qs3.training.run import MODEL, fingerprint
 
 ROUNDS = SelfTrainingSettings(rounds=1, epochs=1, threshold=0.4)
 

@@ -9,9 +9,10 @@ from qs3.adaptation import Method, SourceOnly
 from qs3.errors import InputError, QS3Error
 from qs3.training.batches import batches, count_batches, prepare
 from qs3.training.checkpoint import new_model
-from qs3.training.loop import CHECKPOINT, train
+from qs3.training.loop import train
 from qs3.training.predict import predict_probabilities
 from qs3.training.schedules import cosine
+from qs3.training.state import CHECKPOINT
 
 
 class Stop(Exception):  # noqa: N818

@@ -16,9 +16,16 @@ import torch
 from qs3.adaptation import SourceOnly
 from qs3.errors import InputError, MissingExtraError, QS3Error, UnevenSizesError
 from qs3.io.transforms import stack
-from qs3.training import SelfTrainingSettings, TimeUpError, fit, load_whole, parse_duration, records
+from qs3.training import (
+    Deadline,
+    SelfTrainingSettings,
+    TimeUpError,
+    fit,
+    history,
+    load_whole,
+    parse_duration,
+)
 from qs3.training.checkpoint import new_model
-from qs3.training.deadline import Deadline
 from qs3.training.loop import train
 
 
@@ -32,7 +39,7 @@ def same(a, b):
 
 
 def told(run_dir):
-    return [json.loads(line) for line in (run_dir / records.HISTORY).read_text().splitlines()]
+    return [json.loads(line) for line in (run_dir / history.HISTORY).read_text().splitlines()]
 
 
 @pytest.mark.parametrize("norm", [1e-3, 1e6])
@@ -311,13 +318,13 @@ def test_killed_in_the_middle_of_an_epoch_is_uninterrupted(source, target, setti
              json.dumps([asdict(settings), asdict(rounds)])],
             stderr=subprocess.DEVNULL,
         )  # fmt: skip
-        while not (cut / records.HISTORY).exists() or len(told(cut)) < lines:
+        while not (cut / history.HISTORY).exists() or len(told(cut)) < lines:
             assert process.poll() is None
             time.sleep(0.005)
         time.sleep(0.02)
         os.kill(process.pid, how)
         assert process.wait() != 0
-    assert len(list(cut.glob("thinned-*"))) == 2
+    assert len(list(cut.glob("subsample-*"))) == 2
     result = fit(*arguments, run_dir=cut)
     assert same(whole.model, result.model)
     assert plain(told(cut)) == plain(told(tmp_path / "whole"))

@@ -73,7 +73,8 @@ def test_improves_or_keeps_an_easy_target(source, target, settings, warm, tmp_pa
 
 
 def test_the_type_of_the_target_has_no_labels():
-    assert {f.name for f in dataclasses.fields(UnlabelledClouds)} == {"points", "ids", "checksum"}
+    names = {f.name for f in dataclasses.fields(UnlabelledClouds)}
+    assert names == {"points", "ids", "checksum", "origin"}
 
 
 def test_labels_of_the_target_cannot_matter(source, target, settings, warm, tmp_path):
@@ -99,8 +100,14 @@ def test_a_labelled_target_is_refused(source, target, settings, warm, tmp_path):
         fit("qbst", source, target, settings, ROUNDS, run_dir=tmp_path / "run", warm_up=warm)
 
 
-@pytest.mark.parametrize("preset", sorted(PRESETS))
-@pytest.mark.parametrize("where", ["warm-up", "middle of round 2", "between rounds"])
+@pytest.mark.parametrize(
+    ("preset", "where"),
+    [
+        ("default", "warm-up"),
+        *((preset, "middle of round 2") for preset in sorted(PRESETS)),
+        ("released", "between rounds"),
+    ],
+)
 def test_resumed_is_uninterrupted(source, target, settings, tmp_path, preset, where):
     settings = replace(settings, epochs=12, seed=1)
     # From scratch, a shrinking pool is too small here to go on; `released` covers that start.
@@ -256,7 +263,7 @@ def test_pool_split_leaves_a_fifth_aside(domains, settings):
 
 
 @pytest.mark.parametrize(
-    ("count", "labeller", "devices", "skipped"),
+    ("count", "teacher", "devices", "skipped"),
     [
         (8, "best", 1, False),
         (7, "latest", 4, True),
@@ -266,11 +273,11 @@ def test_pool_split_leaves_a_fifth_aside(domains, settings):
     ],
 )
 def test_the_limit_is_two_a_device_without_those_held_out(
-    domains, settings, monkeypatch, count, labeller, devices, skipped
+    domains, settings, monkeypatch, count, teacher, devices, skipped
 ):
     """The settings' number of devices counts; here one device computes for all of them."""
     source, target = domains
-    rounds = replace(ROUNDS, rounds=1, labeller=labeller)
+    rounds = replace(ROUNDS, rounds=1, teacher=teacher)
     trained = []
 
     def train(method, clouds, *arguments, **options):
@@ -321,18 +328,18 @@ def test_continuous_schedule_rises_again_in_round_two(domains, settings):
     assert rates["continuous"] == pytest.approx([1.0, 0.5, 0.0, 0.5, 1.0, 0.5])
 
 
-def test_best_labeller_holds_a_fifth_out(domains, settings):
-    _, records = one_round(domains, settings, labeller="best", rounds=2, source_loss=False)
+def test_best_teacher_holds_a_fifth_out(domains, settings):
+    _, records = one_round(domains, settings, teacher="best", rounds=2, source_loss=False)
     assert all(0 <= record.held_out <= 1 for record in records)
     assert records[0].held_out <= records[1].held_out
     _, records = one_round(domains, settings, rounds=1)
     assert records[0].held_out is None
 
 
-def test_best_labeller_labels_with_the_warm_up_until_it_is_beaten(domains, settings, monkeypatch):
+def test_best_teacher_labels_with_the_warm_up_until_it_is_beaten(domains, settings, monkeypatch):
     """With a score that never rises, every round gets the warm-up's pseudo labels."""
     monkeypatch.setattr("qs3.training.self_training.accuracy", lambda labels, predictions: 0.0)
-    _, records = one_round(domains, settings, labeller="best", rounds=3)
+    _, records = one_round(domains, settings, teacher="best", rounds=3)
     assert [record.agreement for record in records] == [None, 1.0, 1.0]
 
 

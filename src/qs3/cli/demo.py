@@ -144,36 +144,31 @@ def _target(folder: Path, settings: DemoSettings) -> None:
 
 
 def _train(folder: Path, settings: DemoSettings) -> None:
-    from qs3.cli.train import TrainOptions, run
+    from qs3.io import load_clouds
+    from qs3.training import fit, load_whole
 
-    run(
-        TrainOptions(
-            source=str(folder / "source"),
-            out=folder / "source-only",
-            train=_train_settings(settings),
-        )
-    )
+    source = load_whole(load_clouds, folder / "source", settings.num_points)
+    fit("source-only", source, None, _train_settings(settings), run_dir=folder / "source-only")
 
 
 def _adapt(folder: Path, settings: DemoSettings) -> None:
-    from qs3.cli.train import TrainOptions, run
-    from qs3.training import self_training_preset
+    from qs3.io import load_clouds, load_unlabelled
+    from qs3.training import fit, load_whole, self_training_preset
 
-    run(
-        TrainOptions(
-            source=str(folder / "source"),
-            out=folder / "qbst",
-            method="qbst",
-            target=str(folder / "target"),
-            warm_up=folder / "source-only",
-            train=_train_settings(settings),
-            self_training=self_training_preset(
-                "default",
-                threshold=settings.threshold,
-                rounds=settings.rounds,
-                epochs=settings.round_epochs,
-            ),
-        )
+    fit(
+        "qbst",
+        load_whole(load_clouds, folder / "source", settings.num_points),
+        load_whole(load_unlabelled, folder / "target", settings.num_points),
+        _train_settings(settings),
+        self_training_preset(
+            "default",
+            threshold=settings.threshold,
+            rounds=settings.rounds,
+            epochs=settings.round_epochs,
+        ),
+        run_dir=folder / "qbst",
+        warm_up=folder / "source-only",
+        preset="default",
     )
 
 
@@ -207,7 +202,7 @@ def _report(folder: Path, settings: DemoSettings) -> tuple[Any, Any, Path]:
         title="qs3 demo: from CAD models to a depth camera",
         summary=(
             f"A {settings.model} was trained on {source.clouds} scans of built-in shapes by the "
-            f"qs3 sensor ({settings.source_views} views around each object), then adapted by "
+            f"paper's sensor ({settings.source_views} views around each object), then adapted by "
             f"quasi-balanced self-training to {target.clouds} scans of other shapes by the sensor "
             f"{settings.target_sensor}, which sees each object once in brighter light and with "
             "image noise. No label of the target was used."
@@ -216,12 +211,12 @@ def _report(folder: Path, settings: DemoSettings) -> tuple[Any, Any, Path]:
         settings=dataclasses.asdict(settings) | {"runs": records[1].settings},
         montage=scan_montage(
             shapes.make("chair", seed=settings.seed),
-            get_sensor("qs3"),
+            get_sensor("paper"),
             _renderer(settings),
             settings.source_views,
             settings.seed,
         ),
-        montage_title="chair · sensor qs3",
+        montage_title="chair · sensor paper",
         notes=(
             *page.notes,
             "This is a demonstration on tens of clouds, one seed and a simulated target. It shows "

@@ -5,13 +5,15 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
+from qs3.cli.options import Flat
 from qs3.errors import InputError
 from qs3.evaluation.records import Scores
+from qs3.io.clouds import CloudKind
 from qs3.structure import unstructure
 
 
@@ -25,7 +27,7 @@ class EvaluateOptions:
     """Labelled clouds: a folder that qs3 generate made, a folder of class folders, an npz file."""
     split: str | None = None
     """Part of the data, such as test; all of it by default."""
-    cloud: Literal["points", "clean", "surface"] = "points"
+    cloud: CloudKind = "points"
     """Of generated data: noisy scans, their clean twins, or samples of the whole surface."""
     checkpoints: bool = False
     """Score every checkpoint too, and tell which one each validator would have chosen; apart from
@@ -46,7 +48,7 @@ class PredictOptions:
     """Print JSON with the probability of every class in place of text."""
 
 
-def evaluate_run(options: Annotated[EvaluateOptions, tyro.conf.arg(name="")]) -> int:
+def evaluate_run(options: Flat[EvaluateOptions]) -> int:
     """Score a run: accuracy, class-mean accuracy, confusion matrix; leaves a record in the run."""
     from qs3.training import evaluate, record_path
 
@@ -60,25 +62,25 @@ def evaluate_run(options: Annotated[EvaluateOptions, tyro.conf.arg(name="")]) ->
     if options.json:
         print(json.dumps(unstructure(record), indent=2))
     else:
-        print(describe(record.scores, record.marks))
+        print(scores_text(record.scores, record.marks))
         if record.choices:
-            print(describe_choices(record.choices))
+            print(choices_text(record.choices))
     print(f"record: {record_path(options.run, record)}", file=sys.stderr)
     return 0
 
 
-def describe_choices(choices: Mapping[str, Mapping[str, Any]]) -> str:
+def choices_text(choices: Mapping[str, Mapping[str, Any]]) -> str:
     """What each rule would have chosen, as text."""
     lines = [f"\n{'chosen by':<14}{'checkpoint':<18}{'accuracy':>10}{'class mean':>12}"]
-    for rule, one in choices.items():
-        where = f"{one['stage']} {one['number']}"
+    for rule, choice in choices.items():
+        where = f"{choice['stage']} {choice['number']}"
         name = "oracle *" if rule == "oracle" else rule
-        mean = f"{one['accuracy']:>10.1%}{one['class_mean_accuracy']:>12.1%}"
+        mean = f"{choice['accuracy']:>10.1%}{choice['class_mean_accuracy']:>12.1%}"
         lines.append(f"{name:<14}{where:<18}{mean}")
     return "\n".join([*lines, "* looks at the labels of this data: an upper bound"])
 
 
-def describe(scores: Scores, marks: Sequence[str] = ()) -> str:
+def scores_text(scores: Scores, marks: Sequence[str] = ()) -> str:
     """Scores as text: accuracies, recall of each class, confusion matrix."""
     low, high = scores.interval
     lines = [
@@ -100,7 +102,7 @@ def describe(scores: Scores, marks: Sequence[str] = ()) -> str:
     return "\n".join(lines)
 
 
-def predict(options: Annotated[PredictOptions, tyro.conf.arg(name="")]) -> int:
+def predict(options: Flat[PredictOptions]) -> int:
     """Tell the class of each file and how confident the network is."""
     from qs3.io import read_cloud
     from qs3.io.transforms import stack
@@ -109,14 +111,14 @@ def predict(options: Annotated[PredictOptions, tyro.conf.arg(name="")]) -> int:
     if not options.files:
         raise InputError("name one or more files of points after the run")
     loaded = load_model(options.run)
-    points = loaded.settings["train"]["num_points"]
+    num_points = loaded.settings["train"]["num_points"]
     clouds = [read_cloud(path) for path in options.files]
-    found: list[dict[str, Any]] = []
+    answers: list[dict[str, Any]] = []
     for path, cloud in zip(options.files, clouds, strict=True):
-        batch = stack([cloud], points, str(path))
+        batch = stack([cloud], num_points, str(path))
         shares = predict_probabilities(loaded.model, batch)[0]
         best = int(np.argmax(shares))
-        found.append(
+        answers.append(
             {
                 "file": str(path),
                 "class": loaded.class_names[best],
@@ -125,8 +127,8 @@ def predict(options: Annotated[PredictOptions, tyro.conf.arg(name="")]) -> int:
             }
         )
     if options.json:
-        print(json.dumps(found, indent=2))
+        print(json.dumps(answers, indent=2))
     else:
-        for row in found:
+        for row in answers:
             print(f"{row['file']}\t{row['class']}\t{row['confidence']:.3f}")
     return 0

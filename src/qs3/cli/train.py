@@ -1,26 +1,68 @@
 """``qs3 train``: a classifier from labelled clouds, adapted to unlabelled ones if asked."""
 
-import dataclasses
+import functools
 import json
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import tyro
+from tyro.constructors import PrimitiveConstructorSpec
 
 from qs3.adaptation.names import COMPOSED, WITHOUT_TARGET, MethodName, RoundRule, split_method
+from qs3.cli.options import Flat
 from qs3.errors import InputError
-from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
+from qs3.evaluation.records import rename_method
+from qs3.io.clouds import CloudKind
+from qs3.training.config import PRESETS, PresetName, SelfTrainingSettings, TrainSettings
 
 TIME_UP = 3
 """Exit code where --max-time stopped a run that the same command takes up again."""
 
 
-@dataclass(frozen=True)
-class TrainOptions:
+@functools.cache
+def _note_old_name(name: str) -> None:
+    print(f"--method {name} is {rename_method(name)} now, on whatever source", file=sys.stderr)
+
+
+def _method(words: list[str]) -> str:
+    name = rename_method(words[0])
+    if name not in get_args(MethodName):
+        raise ValueError(f"{name!r} is none of {', '.join(get_args(MethodName))}")
+    if name != words[0]:
+        _note_old_name(words[0])
+    return name
+
+
+_METHOD = PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="{" + ",".join(get_args(MethodName)) + "}",
+    instance_from_str=_method,
+    is_instance=lambda value: value in get_args(MethodName),
+    str_from_instance=lambda name: [name],
+)
+"""How a method is named; names of earlier releases are taken too."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choices:
+    """What settings of self-training are in force before any of them is given by itself."""
+
+    method: Annotated[MethodName, _METHOD] = "source-only"
+    """How the target takes part; spst, qbst and gast-spst end in rounds of self-training."""
+    rounds_rule: Annotated[RoundRule | None, tyro.conf.arg(name="self-training")] = None
+    """Rounds of self-training after the method, by this rule: --method gast --self-training
+    qbst."""
+    preset: PresetName | None = None
+    """Settings of the self-training: ours (default), GAST's SPST (the default of that rule), QS³'s
+    text (paper), or its released code (released). A setting given beside it wins."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions(Choices):
     """Train a classifier on labelled clouds; most methods adapt it to clouds without labels."""
 
     source: str
@@ -28,11 +70,6 @@ class TrainOptions:
     layout that qs3 convert --list tells."""
     out: Path
     """Folder of the run; run the same command again to go on after a stop."""
-    method: MethodName = "source-only"
-    """How the target takes part; spst, qbst, qs3 and gast-spst end in rounds of self-training."""
-    rounds_rule: Annotated[RoundRule | None, tyro.conf.arg(name="self-training")] = None
-    """Rounds of self-training after the method, by this rule: --method gast --self-training
-    qbst."""
     target: str | None = None
     """Clouds of the target; labels that lie there are dropped unused. source-only takes them for
     validators and AdaBN alone."""
@@ -40,9 +77,9 @@ class TrainOptions:
     """Part of the source, such as train; all of it by default."""
     target_split: str | None = None
     """Part of the target."""
-    source_cloud: Literal["points", "clean", "surface"] = "points"
+    source_cloud: CloudKind = "points"
     """Of generated data: noisy scans, their clean twins, or samples of the whole surface."""
-    target_cloud: Literal["points", "clean", "surface"] = "points"
+    target_cloud: CloudKind = "points"
     """The same of the target."""
     supervised: bool = False
     """Mark the run as supervised: its source is the labelled training part of the target."""
@@ -57,52 +94,33 @@ class TrainOptions:
     would end later, with exit code 3; the same command goes on."""
     log: Literal["jsonl", "tensorboard"] = "jsonl"
     """history.jsonl is always written; tensorboard adds event files in OUT/tensorboard."""
-    preset: Literal["default", "spst", "paper", "released"] = "default"
-    """Settings of the self-training: ours, GAST's SPST (the default of that rule), QS³'s text, or
-    its released code."""
-    train: Annotated[TrainSettings, tyro.conf.arg(name="")] = field(default_factory=TrainSettings)
+    train: Flat[TrainSettings] = field(default_factory=TrainSettings)
     """How the network is trained."""
     self_training: SelfTrainingSettings = field(default_factory=SelfTrainingSettings)
-    """How rounds of self-training select and train; --preset sets a whole column."""
+    """How rounds of self-training select and train."""
 
 
-def preset_options(arguments: list[str]) -> TrainOptions:
-    """The defaults of ``qs3 train`` under the preset that the command line names.
+def preset_options(words: Sequence[str]) -> TrainOptions:
+    """Return the defaults of ``qs3 train`` under what a command line chooses.
 
     A preset sets the defaults of all self-training settings, so that one given beside it wins and
     the help shows what is in force. SPST has its own.
-    """
-    preset = PRESETS.get(preset_name(arguments), PRESETS["default"])
-    rule: Any = _given(arguments, "--self-training", _own_rule(arguments) or preset.rule)
-    if rule in get_args(RoundRule):
-        preset = dataclasses.replace(preset, rule=rule)
-    return TrainOptions(source=tyro.MISSING, out=tyro.MISSING, self_training=preset)
-
-
-def preset_name(arguments: Sequence[str]) -> str:
-    """The preset in force: the one that is given, or that of the rule of self-training.
 
     Example:
-        >>> preset_name(["--method", "gast-spst"]), preset_name(["--method=qbst"])
-        ('spst', 'default')
+        >>> chosen = preset_options(["--method", "gast-spst", "--self-training.rounds", "2"])
+        >>> chosen.preset, chosen.self_training.weight_step
+        ('spst', 0.005)
     """
-    rule = _given(arguments, "--self-training", _own_rule(arguments))
-    return _given(arguments, "--preset", "spst" if rule == "spst" else "default")
-
-
-def _own_rule(arguments: Sequence[str]) -> str:
-    """The rule of self-training that the method brings, or nothing."""
-    return COMPOSED.get(_given(arguments, "--method", "source-only"), ("", ""))[1]
-
-
-def _given(arguments: Sequence[str], option: str, default: str) -> str:
-    value = default
-    for index, argument in enumerate(arguments):
-        if argument == option and index + 1 < len(arguments):
-            value = arguments[index + 1]
-        elif argument.startswith(f"{option}="):
-            value = argument.partition("=")[2]
-    return value
+    chosen, _ = tyro.cli(Choices, args=list(words), return_unknown_args=True, add_help=False)
+    rule = chosen.rounds_rule or COMPOSED.get(chosen.method, ("", None))[1]
+    preset = chosen.preset or ("spst" if rule == "spst" else "default")
+    rounds = PRESETS[preset]
+    return TrainOptions(
+        source=tyro.MISSING,
+        out=tyro.MISSING,
+        preset=preset,
+        self_training=rounds if rule is None else replace(rounds, rule=rule),
+    )
 
 
 def parse_settings(option: str, given: Sequence[str]) -> dict[str, Any]:
@@ -115,40 +133,25 @@ def parse_settings(option: str, given: Sequence[str]) -> dict[str, Any]:
         >>> parse_settings("--model-set", ["k=10", "grouping=msg", "hidden=[64, 32]"])
         {'k': 10, 'grouping': 'msg', 'hidden': [64, 32]}
     """
-    found: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
     for pair in given:
         name, equals, value = pair.partition("=")
-        if not equals or not name or name in found:
+        if not equals or not name or name in settings:
             raise InputError(f"{option} {pair}: give each setting once, as name=value")
         try:
-            found[name] = json.loads(value)
+            settings[name] = json.loads(value)
         except ValueError:
-            found[name] = value
-    return found
+            settings[name] = value
+    return settings
 
 
-def train(options: Annotated[TrainOptions, tyro.conf.arg(name="")]) -> int:
+def train(options: Flat[TrainOptions]) -> int:
     """Train a classifier, with a method of adaptation to an unlabelled target if asked."""
-    from qs3.training.deadline import TimeUpError
-
-    try:
-        run(options)
-    except TimeUpError as stop:
-        print(f"qs3: {stop}", file=sys.stderr)
-        return TIME_UP
-    print(options.out)
-    print(f"Next: qs3 evaluate {options.out} --data DATA", file=sys.stderr)
-    return 0
-
-
-def run(options: TrainOptions) -> Any:
-    """Read the data and train."""
-    start = time.monotonic()
+    start = time.monotonic()  # reading the data counts
     from qs3.io import load_clouds, load_unlabelled
-    from qs3.training import Deadline, fit, load_whole, parse_duration
+    from qs3.training import Deadline, TimeUpError, fit, load_whole, parse_duration
 
     seconds = None if options.max_time is None else parse_duration(options.max_time)
-    deadline = Deadline(seconds, start)  # reading the data counts
     try:
         base, rule = split_method(options.method, options.rounds_rule)
     except ValueError as error:
@@ -157,44 +160,34 @@ def run(options: TrainOptions) -> Any:
         raise InputError(f"--method {options.method} has no rounds to set; add --self-training")
     if options.target is None and (rule is not None or base not in WITHOUT_TARGET):
         raise InputError(f"method {options.method} needs --target: unlabelled clouds")
-    settings = dataclasses.replace(
+    settings = replace(
         options.train,
-        model_settings={
-            **options.train.model_settings,
-            **parse_settings("--model-set", options.model_set),
-        },
-        method_settings={
-            **options.train.method_settings,
-            **parse_settings("--method-set", options.method_set),
-        },
+        model_settings=parse_settings("--model-set", options.model_set),
+        method_settings=parse_settings("--method-set", options.method_set),
     )
-    points = options.train.num_points
-    source = load_whole(
-        load_clouds,
-        options.source,
-        points,
-        split=options.source_split,
-        cloud=options.source_cloud,
-    )
+    part = {"split": options.source_split, "cloud": options.source_cloud}
+    source = load_whole(load_clouds, options.source, settings.num_points, **part)
     target = None
     if options.target is not None:
-        target = load_whole(
-            load_unlabelled,
-            options.target,
-            points,
-            split=options.target_split,
-            cloud=options.target_cloud,
+        part = {"split": options.target_split, "cloud": options.target_cloud}
+        target = load_whole(load_unlabelled, options.target, settings.num_points, **part)
+    try:
+        fit(
+            options.method,
+            source,
+            target,
+            settings,
+            None if rule is None else options.self_training,
+            run_dir=options.out,
+            warm_up=options.warm_up,
+            preset=options.preset,
+            supervised=options.supervised,
+            deadline=Deadline(seconds, start),
+            tensorboard=options.log == "tensorboard",
         )
-    return fit(
-        options.method,
-        source,
-        target,
-        settings,
-        None if rule is None else dataclasses.replace(options.self_training, rule=rule),
-        run_dir=options.out,
-        warm_up=options.warm_up,
-        preset=options.preset,
-        supervised=options.supervised,
-        deadline=deadline,
-        tensorboard=options.log == "tensorboard",
-    )
+    except TimeUpError as stop:
+        print(f"qs3: {stop}", file=sys.stderr)
+        return TIME_UP
+    print(options.out)
+    print(f"Next: qs3 evaluate {options.out} --data DATA", file=sys.stderr)
+    return 0

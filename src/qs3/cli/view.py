@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from qs3.errors import InputError
 from qs3.sensor.settings import ScanSettings
 
 if TYPE_CHECKING:

@@ -9,8 +9,7 @@ from qs3.evaluation.records import DataRecord
 from qs3.io import load_clouds
 from qs3.io.clouds import PointClouds
 from qs3.store.manifest import MANIFEST
-from qs3.training.checkpoint import load_model
-from qs3.training.checkpoint import weights_fingerprint
+from qs3.training.checkpoint import load_model, weights_fingerprint
 from qs3.training.run import MODEL, Run, is_run
 
 _LEVELS = 5

@@ -16,8 +16,8 @@ from qs3.report.embedding import embed
 from qs3.report.plots import Curve, SelectionRound
 from qs3.training.batches import prepare
 from qs3.training.checkpoint import LoadedModel
-from qs3.training.predict import describe, predict_probabilities
 from qs3.training.history import HISTORY
+from qs3.training.predict import describe, predict_probabilities
 
 _MAPPED = 400  # clouds of a domain on a map: beyond that dots hide one another
 

@@ -16,6 +16,8 @@ Precision = Literal["32-true", "bf16-mixed", "16-mixed", "64-true"]
 """Number formats that Lightning Fabric offers here."""
 Accelerator = Literal["auto", "cpu", "cuda"]
 """Where a training can compute."""
+PresetName = Literal["default", "spst", "paper", "released"]
+"""Whole columns of settings: our defaults, SPST's, QS³'s text, QS³'s released code."""
 Prior = Literal["em", "bbse"]
 """Estimates of the target's class shares."""
 
@@ -232,7 +234,7 @@ PRESETS: Mapping[str, SelfTrainingSettings] = {
         single_class="drop",
     ),
 }
-"""Whole columns of settings: our defaults, SPST's, QS³'s text, QS³'s released code."""
+"""The settings of each preset."""
 
 
 def self_training_preset(name: str, **overrides: Any) -> SelfTrainingSettings:

@@ -1,22 +1,21 @@
 """Methods with scikit-learn's conventions: ``QBST(model="dgcnn").fit(source, target)``.
 
 Constructors only keep what they are given; `fit` does the work and leaves attributes with an
-underscore at their end. `get_params` and `set_params` follow scikit-learn, so that its ``clone``
-takes these estimators; scikit-learn itself is not needed.
+underscore at their end.
 """
 
 import contextlib
-import inspect
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from jaxtyping import Float
+from sklearn.base import BaseEstimator, ClassifierMixin
 
-from qs3.adaptation.names import COMPOSED, split_method
+from qs3.adaptation.names import split_method
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
@@ -26,7 +25,7 @@ from qs3.training.predict import predict_probabilities
 _Adapter = TypeVar("_Adapter", bound="Adapter")
 
 
-class Adapter:
+class Adapter(ClassifierMixin, BaseEstimator):
     """A classifier of clouds, trained on a labelled source and adapted to an unlabelled target.
 
     Args:
@@ -50,8 +49,6 @@ class Adapter:
         {'epochs': 50}
     """
 
-    _estimator_type: ClassVar[str] = "classifier"
-
     model_: Any
     classes_: np.ndarray
     result_: FitResult
@@ -73,45 +70,12 @@ class Adapter:
         self.run_dir = run_dir
         self.random_state = random_state
 
-    @classmethod
-    def _names(cls) -> list[str]:
-        return [name for name in inspect.signature(cls.__init__).parameters if name != "self"]
-
-    def get_params(self, deep: bool = True) -> dict[str, Any]:
-        """Return the constructor's arguments; ``deep`` changes nothing here."""
-        del deep
-        return {name: getattr(self, name) for name in self._names()}
-
-    def set_params(self: _Adapter, **params: Any) -> _Adapter:
-        """Change some of the constructor's arguments.
-
-        Raises:
-            InputError: where a name is unknown.
-        """
-        for name, value in params.items():
-            if name not in self._names():
-                raise InputError(
-                    f"unknown parameter {name!r} of {type(self).__name__}; choose from "
-                    f"{', '.join(self._names())}"
-                )
-            setattr(self, name, value)
-        return self
-
     def __sklearn_tags__(self) -> Any:
-        """What scikit-learn asks an estimator about; only it calls this."""
-        from sklearn.utils import ClassifierTags, InputTags, Tags, TargetTags
-
-        return Tags(
-            estimator_type="classifier",
-            target_tags=TargetTags(required=False),
-            classifier_tags=ClassifierTags(),
-            input_tags=InputTags(two_d_array=False, three_d_array=True),
-        )
-
-    def __repr__(self) -> str:
-        defaults = inspect.signature(type(self).__init__).parameters
-        given = {k: v for k, v in self.get_params().items() if v != defaults[k].default}
-        return f"{type(self).__name__}({', '.join(f'{k}={v!r}' for k, v in given.items())})"
+        """What scikit-learn asks an estimator about."""
+        tags = super().__sklearn_tags__()
+        tags.target_tags.required = False
+        tags.input_tags.two_d_array, tags.input_tags.three_d_array = False, True
+        return tags
 
     def fit(
         self: _Adapter, source: PointClouds, target: UnlabelledClouds | None = None
@@ -126,39 +90,28 @@ class Adapter:
             InputError: where a setting is unknown or arguments do not go together.
         """
         train = dict(self.train or {})
-        for name in ("model", "seed"):
+        for name, parameter in {"model": "model", "seed": "random_state"}.items():
             if name in train:
-                where = {"model": "model", "seed": "random_state"}[name]
-                raise InputError(f"give {name} as the parameter {where}, not in train")
-        settings = TrainSettings(
-            **_known(TrainSettings, "train", train), model=self.model, seed=self.random_state
-        )
+                raise InputError(f"give {name} as the parameter {parameter}, not in train")
+        settings = _changed(TrainSettings(), "train", train)
+        settings = replace(settings, model=self.model, seed=self.random_state)
+        method, rounds = self._plan()
         with contextlib.ExitStack() as stack:
             folder = self.run_dir
             if folder is None:
-                folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="qs3-"))
-            self.result_ = fit(
-                self.method,
-                source,
-                target,
-                settings,
-                self._rounds(),
-                run_dir=Path(folder) / "run" if self.run_dir is None else Path(folder),
-            )
+                folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="qs3-")) + "/run"
+            self.result_ = fit(method, source, target, settings, rounds, run_dir=Path(folder))
         self.model_ = self.result_.model
         self.classes_ = np.array(source.class_names)
         self._num_points = settings.num_points
         return self
 
-    def _rounds(self) -> SelfTrainingSettings | None:
+    def _plan(self) -> tuple[str, SelfTrainingSettings | None]:
+        """The method, and the settings of the rounds that follow it."""
         if self.self_training is None:
-            return None
-        given = _known(SelfTrainingSettings, "self_training", self.self_training)
-        if self.method in COMPOSED:
-            given.setdefault("rule", split_method(self.method)[1])
-        preset = PRESETS["spst" if given.get("rule") == "spst" else "default"]
-        kept = {field.name: getattr(preset, field.name) for field in fields(preset)}
-        return SelfTrainingSettings(**kept | given)
+            return self.method, None
+        _, rule = split_method(self.method)
+        return self.method, _rounds(self.self_training, rule)
 
     def predict_proba(
         self, clouds: PointClouds | UnlabelledClouds | Float[np.ndarray, "b n 3"]
@@ -184,7 +137,7 @@ class Adapter:
         probabilities = self.predict_proba(clouds)
         return self.classes_[probabilities.argmax(axis=1)]
 
-    def score(self, clouds: PointClouds, y: Sequence[str] | None = None) -> float:
+    def score(self, clouds: PointClouds, y: Sequence[str] | None = None) -> float:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return the accuracy on labelled clouds; for testing, never for choosing.
 
         Args:
@@ -223,32 +176,21 @@ class QBST(Adapter):
         run_dir: str | Path | None = None,
         random_state: int = 0,
     ) -> None:
-        super().__init__(
-            warm_up,
-            model,
-            self_training=self_training,
-            train=train,
-            run_dir=run_dir,
-            random_state=random_state,
-        )
+        self.model = model
+        self.warm_up = warm_up
+        self.self_training = self_training
+        self.train = train
+        self.run_dir = run_dir
+        self.random_state = random_state
 
-    @property
-    def warm_up(self) -> str:
-        """Method before the rounds."""
-        return self.method
-
-    @warm_up.setter
-    def warm_up(self, value: str) -> None:
-        self.method = value
-
-    def _rounds(self) -> SelfTrainingSettings | None:
-        given = dict(self.self_training or {})
-        if given.setdefault("rule", self.rule) != self.rule:
+    def _plan(self) -> tuple[str, SelfTrainingSettings | None]:
+        rounds = _rounds(self.self_training or {}, self.rule)
+        if rounds.rule != self.rule:
             raise InputError(
-                f"{type(self).__name__} selects by {self.rule}; for rule {given['rule']!r} use "
+                f"{type(self).__name__} selects by {self.rule}; for rule {rounds.rule!r} use "
                 "Adapter with self_training"
             )
-        return Adapter(self.warm_up, self_training=given)._rounds()
+        return self.warm_up, rounds
 
 
 class SPST(QBST):
@@ -266,9 +208,17 @@ class SPST(QBST):
     rule: ClassVar[str] = "spst"
 
 
-def _known(kind: type, what: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    known = [field.name for field in fields(kind)]
+def _rounds(given: Mapping[str, Any], rule: str | None) -> SelfTrainingSettings:
+    """Settings of rounds: those given, the others from the preset of the rule."""
+    own = {} if rule is None else {"rule": rule}
+    given = own | dict(given)
+    preset = PRESETS["spst" if given.get("rule") == "spst" else "default"]
+    return _changed(preset, "self_training", given)
+
+
+def _changed(settings: Any, what: str, given: Mapping[str, Any]) -> Any:
+    names = [field.name for field in fields(settings)]
     for name in given:
-        if name not in known:
-            raise InputError(f"unknown setting {name!r} in {what}; choose from {', '.join(known)}")
-    return dict(given)
+        if name not in names:
+            raise InputError(f"unknown setting {name!r} in {what}; choose from {', '.join(names)}")
+    return replace(settings, **given)

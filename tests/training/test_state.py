@@ -7,25 +7,24 @@ from torch import nn
 
 from qs3.adaptation import SourceOnly
 from qs3.training.checkpoint import new_model
-from qs3.training.ema import Average
 from qs3.training.loop import train
+from qs3.training.state import averaged, make_average
 
 
 def test_average_is_the_weighted_sum_of_all_states():
-    """Against the closed form, with PyTorch's own averaging as the rule for what is a buffer."""
     module = nn.Sequential(nn.Linear(3, 2), nn.BatchNorm1d(2)).double()
-    average = Average(module, 0.6)
+    average = make_average(module, 0.6)
     states = [copy.deepcopy(module.state_dict())]
     for step in range(5):
         with torch.no_grad():
             for parameter in module.parameters():
                 parameter.add_(torch.full_like(parameter, 0.1 * (step + 1)))
         module(torch.full((4, 3), float(step)).double() + torch.eye(4, 3).double())
-        average.update()
+        average.update_parameters(module)
         states.append(copy.deepcopy(module.state_dict()))
     decays = [min(0.6, (1 + t) / (10 + t)) for t in range(1, 6)]
     assert decays[0] == 2 / 11 and decays[-1] == 0.4
-    for name, kept in average.tensors().items():
+    for name, kept in average.module.state_dict().items():
         if not kept.is_floating_point():
             assert torch.equal(kept, states[-1][name])
             continue
@@ -37,16 +36,14 @@ def test_average_is_the_weighted_sum_of_all_states():
 
 def test_shown_is_put_back_even_after_a_fault():
     module = nn.Linear(1, 1)
-    average = Average(module, 0.9)
+    average = make_average(module, 0.9)
     start = copy.deepcopy(module.state_dict())
     with torch.no_grad():
         module.weight.add_(1)
-    with pytest.raises(KeyError), average.shown():
+    with pytest.raises(KeyError), averaged(module, average):
         assert torch.equal(module.weight, start["weight"])
         raise KeyError
     assert torch.equal(module.weight, start["weight"] + 1)
-    average.settle()
-    assert torch.equal(module.weight, start["weight"])
 
 
 def test_training_returns_the_average_of_its_steps(source, settings):

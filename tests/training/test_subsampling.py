@@ -3,10 +3,10 @@ import pytest
 
 from qs3.errors import InputError
 from qs3.io.transforms import resample, unit_ball
-from qs3.sensor.sampling import farthest_point_sample
-from qs3.training import thinning
-from qs3.training.batches import prepare
-from qs3.training.thinning import sample_indices, thin
+from qs3.sensor import sampling
+from qs3.sensor.sampling import farthest_point_sample, farthest_point_samples
+from qs3.training import batches
+from qs3.training.batches import prepare, subsample
 
 
 @pytest.fixture
@@ -21,43 +21,43 @@ def clouds(rng):
 
 def test_indices_are_those_of_one_cloud_after_another(clouds, monkeypatch):
     expected = np.stack([farthest_point_sample(cloud, 120) for cloud in clouds])
-    assert np.array_equal(sample_indices(clouds, 120), expected)
-    monkeypatch.setattr(thinning, "_TOGETHER", 700)  # two clouds at a time
-    assert np.array_equal(sample_indices(clouds, 120), expected)
+    assert np.array_equal(farthest_point_samples(clouds, 120), expected)
+    monkeypatch.setattr(sampling, "_TOGETHER", 700)  # two clouds at a time
+    assert np.array_equal(farthest_point_samples(clouds, 120), expected)
 
 
 @pytest.mark.parametrize("count", [1, 64, 299, 300, 301, 650])
-def test_thinned_and_normalised_is_what_evaluation_reads(clouds, count):
-    """`load_clouds` thins cloud by cloud, then the network gets the unit ball."""
+def test_subsampled_and_normalised_is_what_evaluation_reads(clouds, count):
+    """`load_clouds` subsamples cloud by cloud, then the network gets the unit ball."""
     expected = np.stack([resample(cloud, count) for cloud in clouds])
-    assert np.array_equal(thin(clouds, count), expected)
+    assert np.array_equal(subsample(clouds, count), expected)
     assert np.array_equal(prepare(clouds, count), unit_ball(expected))
 
 
 def test_choice_is_made_once(clouds, tmp_path, monkeypatch):
-    first = thin(clouds, 50, tmp_path)
+    first = subsample(clouds, 50, tmp_path)
     assert [path.suffix for path in tmp_path.iterdir()] == [".safetensors"]
 
     def forbidden(points, num_points):
         raise AssertionError("made again")
 
-    monkeypatch.setattr(thinning, "sample_indices", forbidden)
-    assert np.array_equal(thin(clouds, 50, tmp_path), first)
+    monkeypatch.setattr(batches, "farthest_point_samples", forbidden)
+    assert np.array_equal(subsample(clouds, 50, tmp_path), first)
     for other, count in ((clouds, 51), (clouds + 1, 50), (clouds[:4], 50)):
         with pytest.raises(AssertionError, match="made again"):
-            thin(other, count, tmp_path)
+            subsample(other, count, tmp_path)
 
 
 @pytest.mark.parametrize("damage", [lambda b: b"", lambda b: b[:-7], lambda b: b[:-1] + b"\x07"])
 def test_damaged_choice_is_made_again(clouds, tmp_path, damage):
-    first = thin(clouds, 50, tmp_path)
+    first = subsample(clouds, 50, tmp_path)
     (path,) = tmp_path.iterdir()
     path.write_bytes(damage(path.read_bytes()))
-    assert np.array_equal(thin(clouds, 50, tmp_path), first)
-    assert np.array_equal(thin(clouds, 50, tmp_path), first)
+    assert np.array_equal(subsample(clouds, 50, tmp_path), first)
+    assert np.array_equal(subsample(clouds, 50, tmp_path), first)
 
 
 def test_point_that_is_not_finite(clouds):
     clouds[1, 7, 2] = np.nan
     with pytest.raises(InputError, match="not finite"):
-        thin(clouds, 50)
+        subsample(clouds, 50)

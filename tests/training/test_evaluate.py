@@ -1,0 +1,128 @@
+"""Runs and their scores: made in Python by any way, and by an earlier release."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from qs3.errors import InputError
+from qs3.evaluation import read_record
+from qs3.training import (
+    QBST,
+    SelfTrainingSettings,
+    evaluate,
+    find_runs,
+    fit,
+    is_run,
+    read_run,
+    record_path,
+    save_model,
+    self_train,
+)
+from qs3.training.batches import prepare
+from qs3.training.checkpoint import new_model
+from qs3.training.run import claim_run
+
+ROUNDS = SelfTrainingSettings(rounds=1, epochs=1, threshold=0.34)
+pytestmark = pytest.mark.filterwarnings("ignore::qs3.adaptation.selection.SingleClassWarning")
+
+
+def test_a_fitted_run_is_scored_on_any_clouds(source, target, settings, tmp_path):
+    arguments = ("dann", source, target.without_labels(), replace(settings, validate_every=2))
+    result = fit(*arguments, ROUNDS, run_dir=tmp_path / "run", preset="default", supervised=True)
+    run = read_run(tmp_path / "run")
+    assert (run.method, run.preset, run.selection) == ("dann+qbst", "default", "last")
+    assert (run.source.name, run.source.clouds) == ("arrays", 24)
+    assert len(run.rounds) == 1
+    assert run.seconds["total"] == pytest.approx(run.seconds["source"] + run.seconds["rounds"])
+    assert len(result.source) == 24
+    assert result.target.points.shape == (30, 64, 3)
+
+    record = evaluate(tmp_path / "run", target, checkpoints=True, experiment={"row": "dann"})
+    assert read_record(record_path(tmp_path / "run", record)) == record
+    assert record.marks == ("transductive", "supervised")
+    assert record.experiment == {"row": "dann"}
+    assert record.scores.accuracy == record.choices["last"]["accuracy"]
+    best = max(choice["accuracy"] for choice in record.choices.values())
+    assert record.choices["oracle"]["accuracy"] == best
+
+    order = np.array([2, 0, 1])  # other numbers for the same names
+    names = tuple(np.array(target.class_names)[np.argsort(order)])
+    other = replace(target, labels=order[target.labels], class_names=names)
+    assert evaluate(tmp_path / "run", other).scores == record.scores
+    with pytest.raises(InputError, match="sofa"):
+        evaluate(tmp_path / "run", replace(target, class_names=("ball", "disc", "sofa")))
+
+
+def test_self_training_and_estimators_leave_runs(source, target, settings, tmp_path):
+    ready = [
+        replace(clouds, points=prepare(clouds.points, 64))
+        for clouds in (source, target.without_labels())
+    ]
+    model = new_model(settings, 3, 0)
+    self_train(model, *ready, settings, ROUNDS, run_dir=tmp_path / "a" / "loop")
+    train = {name: getattr(settings, name) for name in ("model_settings", "num_points", "threads")}
+    small = {"epochs": 1, "batch_size": 8, "accelerator": "cpu"}
+    made = QBST("pointnet", train=train | small, self_training={"rounds": 1, "epochs": 1},
+                run_dir=tmp_path / "b")  # fmt: skip
+    made.fit(source, target.without_labels())
+    assert find_runs(tmp_path) == [tmp_path / "a" / "loop", tmp_path / "b"]
+    record = evaluate(tmp_path / "a" / "loop", target)
+    assert record.method == "qbst"
+    assert record.marks == ("transductive", "warm-up of unknown origin")
+    assert evaluate(tmp_path / "b", target).scores.accuracy == made.score(target)
+
+
+def test_a_warm_ups_clouds_count_as_seen(source, target, settings, tmp_path):
+    fit("source-only", target, None, settings, run_dir=tmp_path / "warm", supervised=True)
+    arguments = ("qbst", source, target.without_labels(), settings, ROUNDS)
+    fit(*arguments, run_dir=tmp_path / "run", warm_up=tmp_path / "warm")
+    marks = ("transductive", "supervised", "training clouds")
+    assert evaluate(tmp_path / "run", target).marks == marks
+    (tmp_path / "warm" / "run.json").unlink()
+    fit(*arguments, run_dir=tmp_path / "other", warm_up=tmp_path / "warm")
+    assert "warm-up of unknown origin" in evaluate(tmp_path / "other", target).marks
+
+
+def test_an_unfinished_run_is_told_from_none(source, settings, tmp_path):
+    with pytest.raises(InputError, match="not a run of qs3"):
+        read_run(tmp_path)
+    claim_run(tmp_path, "source-only", source, None, settings, None, None)
+    assert is_run(tmp_path)
+    with pytest.raises(InputError, match="not finished"):
+        read_run(tmp_path)
+
+
+def test_a_run_of_an_earlier_release_is_read(source, target, settings, tmp_path):
+    """As 0.1.0 wrote it: ``run.json`` without a schema, method qs3, a labeller."""
+    claim_run(tmp_path, "qbst", source, target.without_labels(), settings, ROUNDS, None)
+    save_model(tmp_path, new_model(settings, 3, 0), source.class_names, settings)
+    value = json.loads((tmp_path / "settings.json").read_text())
+    value["self_training"]["labeller"] = value["self_training"].pop("teacher")
+    value["method"] = "qs3"
+    (tmp_path / "settings.json").write_text(json.dumps(value))
+    data = {"name": "store", "checksum": "ab", "clouds": 24, "split": "train", "cloud": "points"}
+    old = {
+        "method": "qs3",
+        "preset": "default",
+        "selection": "last",
+        "data": {"source": data, "target": data | {"split": None}},
+        "supervised": False,
+        "source_clouds": ["0f"],
+        "target_clouds": [],
+        "unknown_warm_up": False,
+        "rounds": [{"round": 1, "theta": 0.34, "skipped": False, "kept": [1, 2, 3]}],
+        "seconds": {"source": 1.5, "rounds": 0.5, "total": 2.0},
+    }
+    (tmp_path / "run.json").write_text(json.dumps(old))
+    run = read_run(tmp_path)
+    assert (run.method, run.source.split, run.target.split) == ("qbst", "train", None)
+    assert run.settings["self_training"]["teacher"] == "latest"
+    record = evaluate(tmp_path, target)
+    assert (record.method, record.source.clouds, record.marks) == ("qbst", 24, ())
+    # and the same call goes on with it
+    claim_run(tmp_path, "qbst", source, target.without_labels(), settings, ROUNDS, None)
+    (tmp_path / "run.json").write_text(json.dumps(old | {"colour": "red"}))
+    with pytest.raises(InputError, match=r"run\.json.*'colour' is unknown"):
+        read_run(tmp_path)
