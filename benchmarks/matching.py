@@ -5,7 +5,7 @@ steps of 1/16, grey noise added to both, 8 bits, 64 disparities, thresholds as b
 figures are over all pixels away from the border: total RMS and bias of the errors below 1 px,
 locking (half the range of the mean error over the fractional shifts), outliers (errors of 1 px and
 above) and valid pixels as shares; then the least seconds of three for one pair as a scan of the
-`qs3` sensor matches it, 760 × 520 pixels and 160 disparities.
+`paper` sensor matches it, 760 × 520 pixels and 160 disparities.
 
     python benchmarks/matching.py [--density 0.025] [--sigma 0.8] [--device cpu] [--threads 1]
 """

@@ -21,8 +21,8 @@ import trimesh
 
 from qs3 import shapes
 from qs3.meshes import normalise
-from qs3.sensor.render import Body, LightSettings, Renderer, Scene
-from qs3.sensor.render.cycles import CyclesRenderer, worker_process
+from qs3.sensor.render import Body, LightSettings, Renderer, Scene, _worker_process
+from qs3.sensor.render.cycles import CyclesRenderer
 from qs3.sensor.render.mitsuba import MitsubaRenderer
 from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.speckle import PatternSettings, pattern_image
@@ -71,6 +71,11 @@ def watch(renderer: Renderer, count: int, process: Callable[[], int | None]) -> 
     verdict = "pass" if passed else "MISS"
     print(f"  growth {growth:+.1%}: {verdict} at {GOAL:.0%}; {seconds:.2f} s an object")
     return passed
+
+
+def worker_process() -> int | None:
+    """Process id of this process's worker of Cycles between two calls, or None."""
+    return next((worker.pid for worker in _worker_process._idle.values()), None)
 
 
 def main() -> None:

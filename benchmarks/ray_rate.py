@@ -20,7 +20,8 @@ from qs3.sensor.presets import get_sensor
 from qs3.sensor.render import Body, Scene
 from qs3.sensor.render.cache import CacheSettings
 from qs3.sensor.render.embree import EmbreePhotographer
-from qs3.sensor.render.mitsuba import MitsubaRenderer, _mesh, best_variant
+from qs3.sensor.render.mitsuba import MitsubaRenderer, best_variant
+from qs3.sensor.render.path import mitsuba_bodies
 from qs3.sensor.render.scene import photographed_region
 from qs3.sensor.speckle import pattern_image
 from qs3.sensor.views import place_views
@@ -77,10 +78,10 @@ def main() -> None:
         pose = place_views(1, "orbit", sensor.placement, np.random.default_rng(0))[0]
         cameras = (pose, sensor.rig.right(pose))
         regions = [photographed_region(scene, sensor.rig, camera) for camera in cameras]
-        counted = EmbreePhotographer(scene, 3)
+        counted = EmbreePhotographer(scene, options.samples, 3, CacheSettings())
         counted._embree = counter = Counter(counted._embree)
-        counted.photograph(sensor.rig, pose, tuple(regions), options.samples, CacheSettings(), 0)
-        shapes = mi.load_dict({"type": "scene", "body": _mesh(mi, scene.bodies[0])})
+        counted.photograph(sensor.rig, pose, tuple(regions), 0)
+        shapes = mi.load_dict({"type": "scene", **mitsuba_bodies(mi, scene)})
         renderer = MitsubaRenderer(variant=variant, samples=options.samples)
         rates, ours = [], []
         for _ in range(options.repeats):

@@ -27,10 +27,9 @@ from qs3.sensor.exposure import expose_pair
 from qs3.sensor.lens import blur_reach
 from qs3.sensor.matching import match, matching_canvas
 from qs3.sensor.presets import get_sensor
-from qs3.sensor.realism.checks_wall import wall_region
+from qs3.sensor.realism import LAWS
+from qs3.sensor.realism.bench import VIEW, painted, wall, wall_region
 from qs3.sensor.realism.metrics import plane_metrics
-from qs3.sensor.realism.results import TITLES
-from qs3.sensor.realism.stage import VIEW, painted, wall
 from qs3.sensor.render import Scene
 from qs3.sensor.render.mitsuba import MitsubaRenderer
 from qs3.sensor.speckle import pattern_image
@@ -97,7 +96,7 @@ def realism_table(records: list[Record]) -> str:
     """One row a test, one column a record."""
     lines = ["| test | " + " | ".join(map(heading, records)) + " |"]
     lines.append("|" + "---|" * (len(records) + 1))
-    for test, title in TITLES.items():
+    for test, (title, _) in LAWS.items():
         results = [next((t for t in r["tests"] if t["id"] == test), None) for r in records]
         seen = [judged(result) if result else {} for result in results]
         names = list(dict.fromkeys(name for one in seen for name in one))

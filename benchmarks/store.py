@@ -5,7 +5,7 @@
 The same clouds are written in every form, ours with the noisy cloud alone and as `qs3 generate`
 writes it, with the clean twin and the surface beside it. Measured, medians after one warm-up,
 turns of all forms interleaved: the whole set into one array; single clouds and batches of 32 at
-random. What each whole reading does: ours is `read_store`, which checks every page's checksum and
+random. What each whole reading does: ours is `read_ragged`, which checks every page's checksum and
 every label, refuses points that are not finite, sums all up by SHA-256 and uses up to 8 threads;
 npy and HDF5 just read, on one thread; Zarr uses its own threads. Our store has no access by row: a
 random cloud costs the reading of that column of its shard (64 rows) by pyarrow, with no checks.
@@ -25,8 +25,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import zarr
 
-from qs3.io.layouts.contents import read_store, shard_path
-from qs3.store.manifest import Manifest, write_manifest
+from qs3.io.layouts.store import read_ragged
+from qs3.store.manifest import Manifest, shard_path, write_manifest
 from qs3.store.shards import CloudRow, DType, write_shard
 
 ROWS = 64
@@ -73,7 +73,7 @@ def write_store(folder: Path, clouds: np.ndarray, dtype: DType, whole: bool) -> 
 
     def read(rows: np.ndarray | None) -> np.ndarray:
         if rows is None:
-            return read_store(folder).points
+            return np.stack(read_ragged(folder).clouds)
         found = np.zeros((len(rows), *clouds.shape[1:]), np.float32)
         for shard in np.unique(rows // ROWS):
             column = pq.read_table(shard_path(folder, int(shard)), columns=["points"])["points"]

@@ -63,12 +63,12 @@ def pipeline() -> Figure:
 def quasi_balanced() -> Figure:
     """The count that Algorithm 1 keeps of a class, among a thousand confident clouds."""
     total = 1000
-    there = np.arange(0, total + 1)
-    kept = [balanced_count(int(n), total) if n else 0 for n in there]
+    confident = np.arange(0, total + 1)
+    kept = [balanced_count(int(n), total) if n else 0 for n in confident]
     figure = Figure(figsize=(6, 3.4), layout="constrained", facecolor="white")
     axis: Axes = figure.subplots()
-    axis.plot(there, there, color="0.6", linestyle="--", label="SPST: all of them")
-    axis.plot(there, kept, color="C0", label="QBST: ⌈L_k (1 − L_k/L)⌉")
+    axis.plot(confident, confident, color="0.6", linestyle="--", label="SPST: all of them")
+    axis.plot(confident, kept, color="C0", label="QBST: ⌈L_k (1 − L_k/L)⌉")
     axis.set_xlabel("clouds of the class over θ, L_k, of L = 1,000")
     axis.set_ylabel("kept")
     axis.set_xlim(0, total)

@@ -127,8 +127,8 @@ def test_every_public_package_has_its_page():
 
 ASK = """
 import json, site_hooks
-from qs3.cli import _verbs
-verbs = list(_verbs([]))
+from qs3.cli import VERBS
+verbs = list(VERBS)
 asked = [verb for verb in verbs if verb != "extract"]
 asked += ["extract scannet", "extract sunrgbd", "extract depth"]
 told = {v: site_hooks.options_of(site_hooks.help_of(v.split())) for v in asked}

@@ -12,7 +12,7 @@ import pytest
         "qs3",
         "qs3.sensor.scan",
         "qs3.store.generate",
-        "qs3.io.layouts.contents",
+        "qs3.io.layouts.store",
         "qs3.evaluation",
         "qs3.adaptation.factory",
         "qs3.adaptation.validators",

@@ -1,17 +1,25 @@
-"""Files written whole or not at all, and checksums."""
+"""Files written whole or not at all, fresh temporary folders, locks, strict JSON, checksums."""
 
 import contextlib
+import glob
 import hashlib
 import json
 import os
 import re
+import secrets
+import shutil
+import socket
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from qs3.errors import InputError
 
-_LEFT_OVER = re.compile(r"\..+\.\d+\.tmp(\.\w+)?$")
+LOCK = ".lock"
+"""Name of the file that tells who writes into a folder; it is there only meanwhile."""
+
+_LEFT_OVER = re.compile(r"\..+\.(\d+|[0-9a-f]{8})\.tmp(\.\w+)?$")
 
 
 @contextlib.contextmanager
@@ -22,25 +30,111 @@ def atomic_path(path: Path) -> Iterator[Path]:
     the old one or the whole new one. On an exception the temporary file is removed.
 
     Example:
-        >>> import tempfile
-        >>> target = Path(tempfile.mkdtemp()) / "a.txt"
-        >>> with atomic_path(target) as temporary:
-        ...     _ = temporary.write_text("whole")
-        >>> target.read_text()
+        >>> with temporary_folder(Path(tempfile.gettempdir()) / "example") as folder:
+        ...     with atomic_path(folder / "a.txt") as temporary:
+        ...         _ = temporary.write_text("whole")
+        ...     (folder / "a.txt").read_text()
         'whole'
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp{path.suffix}")
+    # A random name: nobody can have put a link there to lead the write elsewhere.
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp{path.suffix}")
     try:
         yield temporary
-        with temporary.open("rb") as handle:
-            os.fsync(handle.fileno())
+        sync_entry(temporary)
         temporary.replace(path)
         with contextlib.suppress(OSError):  # some file systems sync no folders
             sync_entry(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def temporary_folder(path: Path) -> Iterator[Path]:
+    """Yield a fresh folder beside ``path``, removed with all that is in it at the end.
+
+    Its name is random: no folder that is there already is taken for it, and no link followed. It
+    holds nothing but its lock. What a killed process left behind for the same ``path`` is removed.
+    """
+    path = Path(path).absolute()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for entry in path.parent.glob(f".{glob.escape(path.name)}.????????.tmp"):
+        if (entry / LOCK).is_file() and not entry.is_symlink():
+            with contextlib.suppress(InputError), folder_lock(entry):  # nobody's any more
+                shutil.rmtree(entry, ignore_errors=True)
+    folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
+    try:
+        with folder_lock(folder):
+            yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def folder_lock(path: Path) -> Iterator[None]:
+    """Keep a second process from writing into a folder; a killed one lets go.
+
+    The system's own lock on the file ``.lock``, which names process and machine. Where a file
+    system has none, that name decides: a process of this machine that has ended lets go.
+
+    Raises:
+        InputError: where another process holds it; process and machine are named.
+    """
+    file = Path(path) / LOCK
+    handle = _open_lock(file)
+    try:
+        os.ftruncate(handle, 0)
+        os.lseek(handle, 0, os.SEEK_SET)
+        os.write(handle, f"process {os.getpid()} on {socket.gethostname()}".encode())
+        yield
+    finally:
+        file.unlink(missing_ok=True)
+        os.close(handle)
+
+
+def _open_lock(file: Path) -> int:
+    """Open and lock a file that nobody else holds."""
+    while True:
+        handle = os.open(file, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
+        try:
+            holder = os.read(handle, 200).decode(errors="replace")
+            if not _locked(handle, holder):
+                raise InputError(
+                    f"{file.parent}: another qs3 is writing into this folder"
+                    f"{f' ({holder})' if holder else ''}; wait for it, or name another one"
+                )
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(handle), file.stat()):
+                    return handle
+        except BaseException:
+            os.close(handle)
+            raise
+        os.close(handle)  # it was let go, and its file removed, since we opened it
+
+
+def _locked(handle: int, holder: str) -> bool:
+    """Lock an open file; False where ``holder`` or somebody else has it."""
+    try:
+        import fcntl
+
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except ImportError:  # Windows
+        return True
+    except OSError:  # a file system without locks
+        process, _, machine = holder.removeprefix("process ").partition(" on ")
+        if machine != socket.gethostname() or not process.isdigit():
+            return not holder
+        try:
+            os.kill(int(process), 0)
+        except ProcessLookupError:
+            return True
+        except PermissionError:
+            return False
+        return int(process) == os.getpid()  # ours since it was started: that one has ended
+    return True
 
 
 def sync_entry(path: Path) -> None:
@@ -67,7 +161,13 @@ def write_text(path: Path, text: str) -> None:
 
 def write_json(path: Path, value: Any) -> None:
     """Write ``value`` as indented JSON atomically; NaN and infinity are refused (not JSON)."""
-    write_text(path, json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+    write_bytes(path, json_bytes(value))
+
+
+def json_bytes(value: Any) -> bytes:
+    """Return ``value`` as indented JSON; NaN and infinity are refused (not JSON)."""
+    text = json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False)
+    return f"{text}\n".encode()
 
 
 def read_json(path: Path) -> Any:
@@ -113,7 +213,7 @@ def sha256(path: Path) -> str:
 
 def holds_something(path: Path) -> bool:
     """Whether ``path`` is a folder with content, left-overs of an interrupted write aside."""
-    return path.is_dir() and any(not _LEFT_OVER.match(entry.name) for entry in path.iterdir())
+    return path.is_dir() and any(not _is_left_over(entry.name) for entry in path.iterdir())
 
 
 def remove_left_overs(path: Path) -> None:
@@ -121,6 +221,10 @@ def remove_left_overs(path: Path) -> None:
     for entry in Path(path).iterdir():
         if _LEFT_OVER.match(entry.name) and entry.is_file():
             entry.unlink()
+
+
+def _is_left_over(name: str) -> bool:
+    return name == LOCK or bool(_LEFT_OVER.match(name))
 
 
 def claim_folder(path: Path, marker: str) -> Path:

@@ -56,12 +56,29 @@ def rotation_z(angle: float) -> Float[np.ndarray, "3 3"]:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def rotation_xyz(angles: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Rotation by Euler angles: first about x, then y, then z (fixed axes)."""
-    (cx, cy, _), (sx, sy, _) = np.cos(angles), np.sin(angles)
-    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
-    about_y = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
-    return rotation_z(float(angles[2])) @ about_y @ about_x
+def z_up_from_y_up(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """Turn y-up points so that z is up.
+
+    Convention:
+        (x, y, z) → (x, −z, y): +90° about x for columns, R·p; the same as the rows' product
+        p·R with the matrix of −90°, as released loaders write it, since p·R = (Rᵀ·pᵀ)ᵀ. Signs and
+        places change only, so no coordinate is rounded.
+
+    Example:
+        >>> z_up_from_y_up(np.array([[1.0, 2.0, 3.0]])).tolist()
+        [[1.0, -3.0, 2.0]]
+    """
+    return np.stack([points[..., 0], -points[..., 2], points[..., 1]], axis=-1)
+
+
+def y_up_from_z_up(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """Undo `z_up_from_y_up`: (x, y, z) → (x, z, −y).
+
+    Example:
+        >>> y_up_from_z_up(np.array([[1.0, -3.0, 2.0]])).tolist()
+        [[1.0, 2.0, 3.0]]
+    """
+    return np.stack([points[..., 0], points[..., 2], -points[..., 1]], axis=-1)
 
 
 def transform_points(

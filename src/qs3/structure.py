@@ -138,10 +138,10 @@ def _path(value: Any, _: Any) -> Path:
 
 
 def _word(value: Any, kind: Any) -> Any:
-    known = get_args(kind)
+    words = get_args(kind)
     # By type too: True equals 1.
-    if not any(type(value) is type(word) and value == word for word in known):
-        raise TypeError(f"{_short(value)} is none of {', '.join(map(str, known))}")
+    if not any(type(value) is type(word) and value == word for word in words):
+        raise TypeError(f"{_short(value)} is none of {', '.join(map(str, words))}")
     return value
 
 
@@ -149,7 +149,8 @@ def _union(converter: Converter, value: Any, kind: Any) -> Any:
     if value is None and type(None) in get_args(kind):
         return None
     fault: Exception | None = None
-    for member in (one for one in get_args(kind) if one is not type(None)):
+    members = [member for member in get_args(kind) if member is not type(None)]
+    for member in members:
         try:
             return converter.structure(value, member)
         except Exception as error:
@@ -213,7 +214,7 @@ def _reason(error: BaseException, place: str = "") -> str:
     if isinstance(error, ClassValidationError):
         noted, others = error.group_exceptions()
         # An unknown key says more than a missing one: it may be a slip of the pen.
-        extra = [one for one in others if isinstance(one, ForbiddenExtraKeysError)]
+        extra = [inner for inner in others if isinstance(inner, ForbiddenExtraKeysError)]
         if extra:
             return _reason(extra[0], place)
         if noted:

@@ -1,6 +1,12 @@
 """Every verb, as the README has it, on the smallest input that means something."""
 
+import ast
 import json
+import re
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import version
 from pathlib import Path
 
 import cv2
@@ -8,8 +14,84 @@ import numpy as np
 import pytest
 import trimesh
 
+import qs3.cli
+from qs3.cli import ELSEWHERE, VERBS, doctor
+from qs3.sensor.settings import ScanSettings
 
-def test_scan_writes_what_it_says(qs3, quick, tmp_path):
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_the_table_of_verbs_says_what_each_verb_says_of_itself(verb):
+    module, _, name = ELSEWHERE.get(verb, f"{verb}.{verb}").partition(".")
+    tree = ast.parse((Path(qs3.cli.__file__).parent / f"{module}.py").read_text(encoding="utf-8"))
+    functions = {f.name: f for f in tree.body if isinstance(f, ast.FunctionDef)}
+    if verb == "extract":  # a function for each source
+        assert {"scannet", "sunrgbd", "depth"} <= functions.keys()
+        return
+    assert (ast.get_docstring(functions[name]) or "").startswith(VERBS[verb].rstrip("."))
+
+
+def test_help_and_version_import_no_verb():
+    code = "import sys, qs3.cli; qs3.cli._run(sys.argv[1:]); print(sorted(sys.modules))"
+    for option in ("--help", "--version"):
+        done = subprocess.run([sys.executable, "-c", code, option], capture_output=True, text=True)
+        for module in ("tyro", "numpy", "torch", "qs3.cli.scan", "qs3.errors"):
+            assert f"'{module}'" not in done.stdout
+    assert f"qs3 {version('qs3')}\n" in done.stdout
+
+
+def test_every_verb_explains_itself(typed):
+    text = typed("--help").stdout
+    assert re.findall(r"^  (\w+)  ", text, re.M) == list(VERBS)
+    for verb in ("scan", "generate", "realism", "convert", "extract", "doctor"):
+        assert f"usage: qs3 {verb}" in typed(verb, "--help").stdout
+
+
+def test_a_verb_that_is_not_there_offers_the_nearest(typed):
+    assert "did you mean scan" in typed.refuses("scann", "chair")
+    assert "usage: qs3" in typed(code=2).stderr
+
+
+@pytest.mark.parametrize("module", ["scan", "generate", "sensors", "realism", "extract"])
+def test_help_of_a_scan_brings_no_torch_and_no_renderer(module):
+    code = (
+        f"import sys, qs3.cli.{module}; sys.exit(bool({{'torch', 'mitsuba'}} & {{*sys.modules}}))"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "changes"),
+    [
+        ([], {}),
+        (["--preset", "paper", "--size", "box"], {"preset": "paper", "size": "box"}),
+        (["--preset", "released"], {"preset": "released"}),
+        (
+            ["--sensor", "d435", "--matching", "opencv-bm", "--material", "dark", "--crop", "mask",
+             "--randomise", "light.ambient=0:0.1", "material=dark,metal", "--object-size", "0.5"],
+            {"sensor": "d435", "matching": "opencv-bm", "material": "dark", "crop": "mask",
+             "randomise": ["light.ambient=0:0.1", "material=dark,metal"], "object_size": 0.5},
+        ),
+    ],
+)  # fmt: skip
+def test_options_mean_what_the_settings_mean_in_python(typed, monkeypatch, words, changes):
+    asked = []
+
+    def scan(_, settings, **__):
+        asked.append(settings)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("qs3.sensor.scan.scan", scan)
+    typed("scan", "chair", "--out", "x", "--variant", "scalar_rgb", *words, code=130)
+    settings = ScanSettings(variant="scalar_rgb", **changes)
+    assert asked[0].as_dict() == settings.as_dict()
+    assert asked[0].make_sensor() == settings.make_sensor()
+    released = asked[0].make_sensor().depth.principal_point == "released"
+    assert released == (changes.get("preset") == "released")
+
+
+def test_scan_writes_what_it_says_and_the_same_bytes_again(qs3, quick, tmp_path):
     out = tmp_path / "chair"
     done = qs3("scan", "chair", "--out", out, "--seed", 2, "--save-images", *quick)
     names = {p.name for p in out.iterdir()}
@@ -39,41 +121,22 @@ def test_scan_writes_what_it_says(qs3, quick, tmp_path):
     assert np.abs(np.median(error)) < 0.02
     montage = cv2.imread(str(out / "montage.png"))
     assert min(montage.shape[:2]) > 600
-
-
-def test_scan_again_gives_the_same_bytes(qs3, quick, tmp_path):
-    for name in ("a", "b"):
-        qs3("scan", "table", "--out", tmp_path / name, "--seed", 9, *quick)
+    qs3("scan", "chair", "--out", tmp_path / "again", "--seed", 2, *quick)
     for file in ("cloud.ply", "clean.ply", "montage.png"):
-        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+        assert (tmp_path / "again" / file).read_bytes() == (out / file).read_bytes()
 
 
-def test_presets_set_their_columns_and_a_setting_beside_them_wins(qs3, tmp_path):
-    common = ("--variant", "scalar_rgb", "--samples", "1", "--views", "1")
-    qs3("scan", "sofa", "--out", tmp_path / "r", "--preset", "released", *common)
-    record = json.loads((tmp_path / "r" / "scan.json").read_text())
-    assert record["settings"]["view_layout"] == "jitter"
-    assert record["settings"]["box_crop"] is True
-    assert record["sensor"]["depth"]["principal_point"] == "released"
-    qs3("scan", "sofa", "--out", tmp_path / "p", "--preset", "paper", "--size", "box", *common)
-    record = json.loads((tmp_path / "p" / "scan.json").read_text())
-    assert record["settings"]["size"] == "box"
-    assert record["settings"]["box_crop"] is False
-
-
-def test_generate_is_byte_identical_with_two_workers(qs3, quick, store, tmp_path):
+def test_generate_is_byte_identical_with_two_workers_and_does_nothing_again(
+    qs3, quick, store, tmp_path
+):
+    flags = ("--meshes", "shapes", "--per-class", 1, "--seed", 5, "--num-points", 128, *quick)
     out = tmp_path / "again"
-    qs3("generate", "--meshes", "shapes", "--per-class", 1, "--out", out, "--seed", 5,
-        "--num-points", 128, "--workers", 2, *quick)  # fmt: skip
+    qs3("generate", *flags, "--out", out, "--workers", 2)
     ours, theirs = ({p.name: p.read_bytes() for p in f.iterdir()} for f in (out, store))
     assert ours == theirs
     assert any(name.endswith(".parquet") for name in ours)
-
-
-def test_generate_again_does_nothing(qs3, quick, store):
     before = {p.name: p.stat().st_mtime_ns for p in store.glob("*.parquet")}
-    done = qs3("generate", "--meshes", "shapes", "--per-class", 1, "--out", store, "--seed", 5,
-               "--num-points", 128, *quick)  # fmt: skip
+    done = qs3("generate", *flags, "--out", store)
     assert "0 scans written, 10 were there before" in done.stderr
     assert {p.name: p.stat().st_mtime_ns for p in store.glob("*.parquet")} == before
 
@@ -102,59 +165,51 @@ def test_train_evaluate_predict(qs3, run, store, tmp_path):
     assert record["marks"] == ["training clouds"]
     assert record["source"]["checksum"] == record["test"]["checksum"]
     assert sum(map(sum, record["scores"]["confusion"])) == 10
-    text = qs3("evaluate", run, "--data", store).stdout
-    assert f"{record['scores']['accuracy']:.1%}" in text
-    assert "class-mean" in text
-
     rng = np.random.default_rng(0)
     np.save(tmp_path / "a.npy", rng.standard_normal((500, 3)))
     np.savetxt(tmp_path / "b.xyz", rng.standard_normal((20, 3)))
     done = qs3("predict", run, tmp_path / "a.npy", tmp_path / "b.xyz", "--json")
-    found = json.loads(done.stdout)
-    assert [row["file"] for row in found] == [str(tmp_path / n) for n in ("a.npy", "b.xyz")]
-    for row in found:
+    rows = json.loads(done.stdout)
+    assert [row["file"] for row in rows] == [str(tmp_path / n) for n in ("a.npy", "b.xyz")]
+    for row in rows:
         assert sum(row["probabilities"].values()) == pytest.approx(1.0)
         assert row["confidence"] == max(row["probabilities"].values())
-    lines = qs3("predict", run, tmp_path / "a.npy").stdout.splitlines()
-    assert lines[0].split("\t")[1] == found[0]["class"]
 
 
-def test_qbst_with_each_preset(qs3, run, store, tmp_path):
-    for preset in ("default", "paper", "released"):
-        out = tmp_path / preset
-        qs3("train", "--source", store, "--target", store, "--method", "qbst", "--warm-up", run,
-            "--preset", preset, "--self-training.rounds", 2, "--self-training.epochs", 1,
-            "--self-training.threshold", 0.1, "--model", "pointnet", "--num-points", 64,
-            "--epochs", 2, "--batch-size", 5, "--threads", 1, "--out", out)  # fmt: skip
-        record = json.loads(qs3("evaluate", out, "--data", store, "--json").stdout)
-        assert record["settings"]["preset"] == preset
-        assert [r["theta"] for r in record["rounds"]] == [0.1, pytest.approx(0.105)]
-        assert "transductive" in record["marks"]
-        expected = "least-confident" if preset == "released" else "most-confident"
-        assert record["settings"]["self_training"]["selection"] == expected
+def test_qbst_with_a_preset(qs3, run, store, tmp_path):
+    qs3("train", "--source", store, "--target", store, "--method", "qbst", "--warm-up", run,
+        "--preset", "released", "--self-training.rounds", 2, "--self-training.epochs", 1,
+        "--self-training.threshold", 0.1, "--model", "pointnet", "--num-points", 64,
+        "--epochs", 2, "--batch-size", 5, "--threads", 1, "--out", tmp_path / "run")  # fmt: skip
+    record = json.loads(qs3("evaluate", tmp_path / "run", "--data", store, "--json").stdout)
+    assert record["settings"]["preset"] == "released"
+    assert [r["theta"] for r in record["rounds"]] == [0.1, pytest.approx(0.105)]
+    assert "transductive" in record["marks"]
+    assert record["settings"]["self_training"]["selection"] == "least-confident"
 
 
 def test_doctor_tells_what_is_here(qs3):
-    found = json.loads(qs3("doctor", "--json-output").stdout)
-    assert found["ready"] is True
-    assert found["renderers"]["scalar_rgb"] is True
-    text = qs3("doctor").stdout
-    assert "Ready." in text
-    for extra, here in found["extras"].items():
-        assert here or f".[{extra}]" in text
+    machine = json.loads(qs3("doctor", "--json-output").stdout)
+    assert machine["ready"] is True
+    assert machine["renderers"]["scalar_rgb"] is True
+    assert {"numpy", "torch", "mitsuba"} <= machine["packages"].keys()
 
 
-VERBS = (
-    *("scan", "sensors", "realism", "generate", "merge", "info", "verify", "convert", "extract"),
-    *("train", "evaluate", "predict", "doctor", "demo"),
-)
-
-
-def test_every_verb_explains_itself(qs3):
-    text = qs3("--help").stdout
-    for verb in VERBS:
-        assert verb in text
-        assert "usage: qs3" in qs3(verb, "--help").stdout
+def test_doctor_knows_every_extra_that_a_user_may_want(capsys):
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    assert set(doctor._PURPOSE) == set(extras) - {"cycles", "dev", "docs"}
+    machine = {"python": "3", "packages": {"numpy": None}, "renderers": {}, "renderer": None,
+               "cycles": {"fault": "not here"}, "device": "CPU", "ready": False,
+               "extras": {"ray": False, "view": True}}  # fmt: skip
+    doctor._print(machine)
+    text = capsys.readouterr().out
+    assert "pip install numpy" in text
+    assert (
+        "absent  ray (qs3 generate --executor ray): in a checkout, pip install -e '.[ray]'" in text
+    )
+    assert "ok      view (qs3 view)\n" in text
 
 
 def test_a_demo_of_the_smallest_size(qs3, tmp_path):
@@ -173,6 +228,3 @@ def test_a_demo_of_the_smallest_size(qs3, tmp_path):
     assert "qbst" in page
     again = qs3("demo", "--out", out, *size)
     assert again.stdout == done.stdout
-
-
-ROOT = Path(__file__).parents[2]

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 import qs3.cli.report as cli
-from qs3.cli.report import ReportOptions, command_of
-from qs3.errors import InputError
+from qs3.cli.report import command_of
 from qs3.report.settings import ReportSettings
 
 
@@ -54,8 +53,7 @@ def test_what_is_left_out_is_told_and_the_rest_is_on_the_page(capsys, grid, tmp_
     shutil.copytree(grid, tmp_path / "grid")
     bad = tmp_path / "grid" / "first" / "records" / "extra.json"
     bad.write_text("{")
-    options = ReportOptions(tmp_path / "grid", ReportSettings(clouds=0), mesh="none")
-    assert cli.report(options) == 1
+    assert cli.report(tmp_path / "grid", ReportSettings(clouds=0), mesh="none") == 1
     printed = capsys.readouterr()
     assert printed.out == f"{tmp_path / 'grid' / 'report.html'}\n"
     assert f"qs3: left out: {bad}" in printed.err
@@ -64,9 +62,8 @@ def test_what_is_left_out_is_told_and_the_rest_is_on_the_page(capsys, grid, tmp_
 
 def test_refusals_are_one_line_and_leave_no_page(qs3, grid, tmp_path):
     assert "no such folder" in qs3.refuses("report", tmp_path / "none")
-    for given in ({"out": tmp_path}, {"settings": ReportSettings(cloud="clean")}):
-        with pytest.raises(InputError):
-            cli.report(ReportOptions(grid, mesh="none", **given))
+    assert "--out" in qs3.refuses("report", grid, "--out", tmp_path)
+    assert "--cloud goes with --data" in qs3.refuses("report", grid, "--cloud", "clean")
     assert not list(tmp_path.rglob("*.html"))
     assert not (grid / "report.html").exists()
 
@@ -80,10 +77,9 @@ def test_published_figures_are_text_by_task_and_row():
 def test_the_command_on_the_page_has_every_option_that_was_given():
     settings = ReportSettings("my scans", "test", "clean", "s3://key@host/set", "train",
                               "surface", Path("runs/a"), Path("../b"), 20)  # fmt: skip
-    given = ReportOptions(Path("/me/runs"), settings, "none", "my.toml", Path("/me/page.html"))
-    assert command_of(given) == (
+    assert command_of(Path("/me/runs"), settings, "none", "my.toml") == (
         "qs3 report runs --data 'my scans' --split test --cloud clean --source set "
         "--source-split train --source-cloud surface --run runs/a --before ../b --clouds 20 "
         "--mesh none --sensor my.toml"
     )
-    assert command_of(ReportOptions(Path("runs"))) == "qs3 report runs"
+    assert command_of(Path("runs"), ReportSettings()) == "qs3 report runs"

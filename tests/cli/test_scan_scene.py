@@ -1,14 +1,11 @@
-"""``qs3 scan`` and ``qs3 generate`` with surroundings, randomisation and frames."""
+"""``qs3 scan`` and ``qs3 generate`` with a scene, randomisation and frames."""
 
 import json
 
 import cv2
 import numpy as np
 import pyarrow.parquet as pq
-import pytest
 import trimesh
-
-from qs3.cli import main
 
 
 def test_scan_writes_frames_of_a_scene_and_records_it(qs3, quick, tmp_path):
@@ -16,7 +13,7 @@ def test_scan_writes_frames_of_a_scene_and_records_it(qs3, quick, tmp_path):
     done = qs3("scan", "chair", "--out", out, "--seed", 2, "--scene", "floor+beside", "--neighbour",
                "table", "--crop", "mask", "--frames", "--randomise", "light.ambient=0.02:0.08",
                "material=diffuse,dark", "--floor-material", "dark", "--num-points", 64,
-               *quick)  # fmt: skip
+               "--object-size", 0.5, *quick)  # fmt: skip
     assert str(out / "frames") in done.stdout
     record = json.loads((out / "scan.json").read_text())
     assert record["settings"]["scene"]["layout"] == "floor+beside"
@@ -27,6 +24,9 @@ def test_scan_writes_frames_of_a_scene_and_records_it(qs3, quick, tmp_path):
     assert 0.02 <= record["drawn"]["light.ambient"] <= 0.08
     assert record["drawn"]["material"] in ("diffuse", "dark")
     assert record["sensor"]["light"]["ambient"] == record["drawn"]["light.ambient"]
+    assert record["sensor"]["object_size"] == 0.5
+    cloud = trimesh.load(out / "clean.ply")
+    assert np.ptp(np.asarray(cloud.vertices), axis=0).max() <= 0.5 + 1e-6
     scene = out / "frames" / "000000"
     assert {path.name for path in scene.glob("*.json")} == {
         "scene_camera.json", "scene_gt.json", "scene_gt_info.json"
@@ -34,48 +34,6 @@ def test_scan_writes_frames_of_a_scene_and_records_it(qs3, quick, tmp_path):
     mask = cv2.imread(str(scene / "mask_visib" / "000000_000000.png"), cv2.IMREAD_UNCHANGED)
     assert mask.shape == (1080, 1080)
     assert (mask > 0).sum() == record["views"][0]["object_pixels"]
-
-
-def test_object_size_scales_the_cloud(qs3, quick, tmp_path):
-    out = tmp_path / "scan"
-    qs3("scan", "table", "--out", out, "--object-size", 0.5, "--num-points", 64, *quick)
-    record = json.loads((out / "scan.json").read_text())
-    assert record["sensor"]["object_size"] == 0.5
-    cloud = trimesh.load(out / "clean.ply")
-    assert 0.4 < np.ptp(np.asarray(cloud.vertices), axis=0).max() <= 0.5 + 1e-6
-
-
-@pytest.mark.parametrize(
-    ("arguments", "word"),
-    [
-        (("scan", "chair", "--scene", "behind"), "neighbour"),
-        (("scan", "chair", "--scene", "attic"), "attic"),
-        (("scan", "chair", "--neighbour", "toaster", "--scene", "behind"), "toaster"),
-        (("scan", "chair", "--neighbour", "table"), "has no neighbour"),
-        (("scan", "chair", "--wall-material", "velvet", "--scene", "wall"), "velvet"),
-        (("scan", "chair", "--box-margin", "-1"), "box_margin"),
-        (("scan", "chair", "--object-size", "0"), "object-size"),
-        (("scan", "chair", "--object-size", "12"), "inside the object's box"),
-        (("scan", "chair", "--randomise", "light.ambiant=0:1"), "light.ambient"),
-        (("generate", "--meshes", "shapes", "--randomise", "wild"), "wild"),
-        (("generate", "--meshes", "shapes", "--scene", "attic"), "attic"),
-        (
-            ("generate", "--meshes", "shapes", "--classes", "chair", "--per-class", "1", "--scene",
-             "beside"),
-            "second mesh",
-        ),
-    ],
-)  # fmt: skip
-def test_faults_are_one_line(capsys, quick, tmp_path, arguments, word):
-    with pytest.raises(SystemExit) as caught:
-        main([*arguments, "--out", str(tmp_path / "out"), *quick])
-    assert caught.value.code == 2
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert told.err.startswith("qs3: ")
-    assert told.err.count("\n") == 1
-    assert word in told.err
-    assert not (tmp_path / "out").exists()
 
 
 def test_generate_draws_neighbours_and_settings_and_records_them(qs3, quick, tmp_path):

@@ -12,6 +12,13 @@ import pytest
 
 from qs3 import shapes
 from qs3.cli import main
+from qs3.cli.view import _scan_page
+from qs3.io import load_clouds
+from qs3.io.ply import write_ply
+from qs3.sensor.settings import ScanSettings
+from qs3.training import load_model, predict_probabilities
+from qs3.viewer.opening import open_exhibits, open_mesh
+from qs3.viewer.scan_controls import with_controls
 
 pytest.importorskip("viser", reason="viser is not installed: pip install 'qs3[view]'")
 
@@ -41,10 +48,10 @@ def run(tmp_path):
 def refusal(capsys, *arguments):
     with pytest.raises(SystemExit) as ended:
         main(["view", *map(str, arguments), "--port", "0"])
-    told = capsys.readouterr()
+    printed = capsys.readouterr()
     assert ended.value.code == 2
-    assert told.out == ""  # no address: there is nothing to open
-    lines = told.err.splitlines()
+    assert printed.out == ""  # no address: there is nothing to open
+    lines = printed.err.splitlines()
     assert len(lines) == 1
     assert lines[0].startswith("qs3: ")
     return lines[0]
@@ -64,7 +71,7 @@ def test_faults_are_one_line(capsys, archive, run, tmp_path):
     assert "--data goes with a run" in refusal(capsys, archive, "--data", archive)
     assert "--data goes with a run" in refusal(capsys, "chair", "--data", archive)
     assert "nosuch" in refusal(capsys, "chair", "--sensor", "nosuch")
-    assert "--seed -1" in refusal(capsys, "chair", "--seed", -1)
+    assert "seed -1" in refusal(capsys, "chair", "--seed", -1)
     (tmp_path / "bad.obj").write_text("nonsense")
     assert "bad.obj" in refusal(capsys, tmp_path / "bad.obj")
     (tmp_path / "bad.ply").write_text("nonsense")
@@ -87,9 +94,9 @@ def test_a_port_in_use_is_named(capsys, archive):
         with pytest.raises(SystemExit) as ended:
             main(["view", str(archive), "--port", str(port)])
     assert ended.value.code == 2
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert f"--port {port}: Address already in use" in told.err
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert f"--port {port}: Address already in use" in printed.err
 
 
 def test_without_viser_the_extra_is_named(capsys, monkeypatch, archive):
@@ -98,56 +105,40 @@ def test_without_viser_the_extra_is_named(capsys, monkeypatch, archive):
 
 
 def test_a_run_answers_for_each_cloud_and_labels_are_only_shown(run, archive, tmp_path):
-    from qs3.cli.view import ViewOptions, prepare
-    from qs3.io import load_clouds
-    from qs3.training import load_model, predict_probabilities
-
-    given = prepare(ViewOptions(str(run), data=str(archive))).keywords
     clouds = load_clouds(archive, num_points=16)
     expected = predict_probabilities(load_model(run).model, clouds.points)
-    np.testing.assert_allclose(given["answers"].probabilities, expected, atol=1e-6)
-    assert given["answers"].truth.tolist() == [0, 1, 0, 1]
-    assert given["exhibits"].labels == ("bed", "chair", "bed", "chair")
+    exhibits, answers = open_exhibits(str(run), str(archive), None, "points")
+    np.testing.assert_allclose(answers.probabilities, expected, atol=1e-6)
+    assert answers.truth.tolist() == [0, 1, 0, 1]
+    assert exhibits.labels == ("bed", "chair", "bed", "chair")
 
     np.savez(tmp_path / "bare.npz", points=clouds.points)
-    given = prepare(ViewOptions(str(run), data=str(tmp_path / "bare.npz"))).keywords
-    assert given["answers"].truth is None
+    _, answers = open_exhibits(str(run), str(tmp_path / "bare.npz"), None, "points")
+    assert answers.truth is None
 
 
 def test_clouds_of_any_size_and_single_files_are_taken(capsys, tmp_path, rng):
-    from qs3.cli.view import ViewOptions, prepare
-
     folder = tmp_path / "scans"
     folder.mkdir()
     for count in (10, 20):
         np.savetxt(folder / f"{count}.xyz", rng.normal(size=(count, 3)))
-    given = prepare(ViewOptions(str(folder))).keywords
-    assert given["exhibits"].points.shape == (2, 2048, 3)
+    exhibits, _ = open_exhibits(str(folder), None, None, "points")
+    assert exhibits.points.shape == (2, 2048, 3)
     assert "several sizes" in capsys.readouterr().err
-    given = prepare(ViewOptions(str(folder / "10.xyz"))).keywords
-    assert given["exhibits"][0].clouds["points"].shape == (10, 3)
-    from qs3.io.ply import write_ply
-
     write_ply(folder / "cloud.ply", rng.normal(size=(7, 3)))
-    given = prepare(ViewOptions(str(folder / "cloud.ply"))).keywords
-    assert given["exhibits"][0].clouds["points"].shape == (7, 3)
+    for name, count in (("10.xyz", 10), ("cloud.ply", 7)):
+        assert open_mesh(str(folder / name), None) is None
+        exhibits, _ = open_exhibits(str(folder / name), None, None, "points")
+        assert exhibits[0].clouds["points"].shape == (count, 3)
 
 
 def test_a_mesh_is_scanned_with_the_settings_of_the_page(tmp_path):
-    import dataclasses
-
-    from qs3.cli.view import ViewOptions, prepare
-    from qs3.sensor.settings import ScanSettings
-    from qs3.viewer.scan_controls import ScanRequest
-
     shapes.make("table", seed=1).export(tmp_path / "table.ply")
-    settings = ScanSettings(variant="scalar_rgb", samples=1, views=1, num_points=64)
+    camera = ScanSettings(variant="scalar_rgb", samples=1, views=1, num_points=64, seed=3)
     for what, draws in ((str(tmp_path / "table.ply"), 0), ("table", 100)):
-        given = prepare(ViewOptions(what, scan=settings)).keywords
-        assert given["draws"] == draws
-        sensor = next(iter(given["sensors"].values()))
-        controls = dataclasses.replace(given["start"], object_size=0.5)
-        item = given["scan"](ScanRequest(sensor, controls))
+        page = _scan_page(what, None, None, camera).keywords
+        assert page["draws"] == draws
+        item = page["scan"](with_controls(page["start"], {"object_size": 0.5}), 1)
         assert item.clouds["points"].shape == (64, 3)
         assert np.ptp(item.mesh.vertices, axis=0).max() == pytest.approx(0.5)
         assert np.isin(item.views["points"], 0).all()

@@ -76,9 +76,9 @@ def written_as(name: str) -> Callable[[Path], None]:
 
 def read_as(name: str) -> Callable[[Path], Any]:
     def load(path: Path) -> Any:
-        from qs3.io.convert import read_clouds
+        from qs3.io.load import read_clouds
 
-        return read_clouds(path, name, None, "points")
+        return read_clouds(path, origin=name)
 
     return load
 
@@ -89,8 +89,7 @@ def layout(name: str) -> Layout:
 
 def build_generated(folder: Path) -> None:
     """A data set as ``generate`` makes it, every kind of cloud filled."""
-    from qs3.io.layouts.contents import shard_path
-    from qs3.store.manifest import Manifest, write_manifest
+    from qs3.store.manifest import Manifest, shard_path, write_manifest
     from qs3.store.shards import CloudRow, write_shard
 
     rng = np.random.default_rng(1)
@@ -112,13 +111,13 @@ def build_generated(folder: Path) -> None:
 
 
 def load_generated(path: Path) -> Any:
-    from qs3.io.layouts.contents import read_store
+    from qs3.io.layouts.store import read_ragged
     from qs3.store.info import info
     from qs3.store.verify import verify
 
     verify(path, progress=False)
     info(path)
-    return [read_store(path, cloud) for cloud in ("points", "clean", "surface")]
+    return [read_ragged(path, cloud) for cloud in ("points", "clean", "surface")]
 
 
 def build_npz(folder: Path) -> None:
@@ -155,7 +154,7 @@ def load_meshes(path: Path) -> Any:
 LAYOUTS: dict[str, Layout] = {
     "generated": Layout(build_generated, load_generated),
     "npz": Layout(build_npz, load_any, "clouds.npz"),
-    **{name: layout(name) for name in ("qs3", "ply", "pcd", "npy", "xyz", *POINTS)},
+    **{name: layout(name) for name in ("store", "ply", "pcd", "npy", "xyz", *POINTS)},
     **{
         f"mesh-{e}": Layout(build_meshes(e), load_meshes)
         for e in ("off", "obj", "ply", "stl", "glb")

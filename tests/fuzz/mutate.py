@@ -94,10 +94,10 @@ def _repeat(data: bytes, rng: np.random.Generator) -> bytes:
 
 def _word(data: bytes, rng: np.random.Generator) -> bytes:
     """Replace one number or name of a text."""
-    found = list(re.finditer(rb"[-+.\w]+", data[:65536]))
-    if not found:
+    words = list(re.finditer(rb"[-+.\w]+", data[:65536]))
+    if not words:
         return _flip(data, rng)
-    at = found[int(rng.integers(len(found)))]
+    at = words[int(rng.integers(len(words)))]
     word = _WORDS[int(rng.integers(len(_WORDS)))]
     return data[: at.start()] + word + data[at.end() :]
 

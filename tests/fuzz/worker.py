@@ -51,20 +51,20 @@ def main() -> None:
         victim = damaged / files[int(rng.integers(len(files)))]
         victim.write_bytes(mutate(victim.read_bytes(), rng))
         print(json.dumps({"sample": sample}), flush=True)
-        told = {"sample": sample, "file": str(files and victim.relative_to(damaged))}
+        line = {"sample": sample, "file": str(files and victim.relative_to(damaged))}
         signal.alarm(SECONDS)
         try:
             layout.load(layout.path(damaged))
-            told["end"] = "read"
+            line["end"] = "read"
         except QS3Error as error:
             lines = str(error).splitlines()
-            told |= {"end": "refused", "lines": len(lines), "message": str(error)[:200]}
+            line |= {"end": "refused", "lines": len(lines), "message": str(error)[:200]}
         except TooLongError:
-            told |= {"end": f"took over {SECONDS} s"}
+            line |= {"end": f"took over {SECONDS} s"}
         except BaseException as error:
-            told |= {"end": f"{type(error).__name__}: {error}"[:300]}
+            line |= {"end": f"{type(error).__name__}: {error}"[:300]}
         signal.alarm(0)
-        print(json.dumps(told), flush=True)
+        print(json.dumps(line), flush=True)
 
 
 if __name__ == "__main__":

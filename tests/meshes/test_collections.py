@@ -9,13 +9,6 @@ from qs3 import shapes
 from qs3.errors import InputError
 from qs3.meshes import collect
 
-TRIANGLE = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
-
-
-def put(path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(TRIANGLE)
-
 
 def test_shapes_are_ten_classes_with_own_seeds() -> None:
     items = collect("shapes", per_class=5)
@@ -38,49 +31,28 @@ def test_fewer_shapes_are_a_part_of_more() -> None:
     assert few == collect("shapes", per_class=9, classes=["sofa"])[:2]
 
 
-def test_class_folders(tmp_path: Path) -> None:
-    for name in ("chair/b.off", "chair/a.off", "table/c.OFF", "table/notes.txt", ".git/x.off"):
-        put(tmp_path / name)
-    items = collect(tmp_path)
+def test_class_folders(tree) -> None:
+    root = tree("chair/b.off", "chair/a.off", "table/c.OFF", "table/notes.txt", ".git/x.off")
+    items = collect(root)
     assert [item.id for item in items] == ["chair/a", "chair/b", "table/c"]
     assert [item.class_name for item in items] == ["chair", "chair", "table"]
     assert {item.split for item in items} == {""}
     assert len(items[0].load().faces) == 1
-    assert [item.id for item in collect(str(tmp_path), classes=["table"])] == ["table/c"]
-    with pytest.raises(InputError, match=r"no class 'sofa'.*chair, table"):
-        collect(tmp_path, classes=["sofa"])
+    assert [item.id for item in collect(str(root), classes=["table"])] == ["table/c"]
 
 
-def test_modelnet_layout(tmp_path: Path) -> None:
-    for name in ("night_stand/train/n_1.off", "night_stand/test/n_2.off", "bed/train/b_1.off"):
-        put(tmp_path / name)
-    items = collect(tmp_path)
-    assert [(item.id, item.class_name, item.split) for item in items] == [
-        ("bed/train/b_1", "bed", "train"),
-        ("night_stand/test/n_2", "night_stand", "test"),
-        ("night_stand/train/n_1", "night_stand", "train"),
-    ]
-    assert [item.id for item in collect(tmp_path, split="test")] == ["night_stand/test/n_2"]
-    with pytest.raises(InputError, match="split 'val'"):
-        collect(tmp_path, split="val")
-
-
-def test_flat_folder_and_clashing_names(tmp_path: Path) -> None:
-    for name in ("a.off", "b.off", "b.obj", "b.ply"):
-        put(tmp_path / name)
-    items = collect(tmp_path)
-    assert [item.id for item in items] == ["a", "b.obj", "b.off", "b.ply"]
-    assert {item.class_name for item in items} == {""}
-
-
-def test_bad_sources(tmp_path: Path) -> None:
+def test_bad_sources(tree, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds no mesh"):
         collect(tmp_path)
     with pytest.raises(InputError, match="no such folder"):
         collect(tmp_path / "none")
-    put(tmp_path / "a.off")
+    root = tree("chair/train/a.off")
     with pytest.raises(InputError, match="is a file"):
-        collect(tmp_path / "a.off")
+        collect(root / "chair/train/a.off")
+    with pytest.raises(InputError, match="split 'val'"):
+        collect(root, split="val")
+    with pytest.raises(InputError, match=r"no class 'sofa'.*chair"):
+        collect(root, classes=["sofa"])
     with pytest.raises(InputError, match="unknown"):
         collect("shapes", classes=["piano"])
     with pytest.raises(InputError, match="at least 1"):

@@ -39,10 +39,11 @@ def test_objaverse_layout(tree, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["sub/a.off", "./sub//a.off", "sub\\a.off", "sub/a", "a.off", "a"])
-@pytest.mark.parametrize("file", ["file", " Path", "UID", "id", "name"])
-def test_every_way_to_name_a_mesh(tree, tmp_path: Path, name: str, file: str) -> None:
-    for head in ("class", "label", "category", "class_name"):
-        labels = put(tmp_path / "l.csv", f"split,{head},{file}\n test ,chair,{name}\n\n")
+def test_every_way_to_name_a_mesh(tree, tmp_path: Path, name: str) -> None:
+    heads = [(file, "class") for file in ("file", " Path", "UID", "id", "name")]
+    heads += [("file", kind) for kind in ("label", "category", "class_name")]
+    for file, kind in heads:
+        labels = put(tmp_path / "l.csv", f"split,{kind},{file}\n test ,chair,{name}\n\n")
         assert listed(collect(tree("sub/a.off"), labels=labels)) == [("sub/a", "chair", "test")]
 
 
@@ -156,7 +157,7 @@ def test_damaged_tables_end_in_a_clear_line_or_in_meshes_of_the_root(
     tokens = [b"..", b"/", b"\\", b'"', b",", b"\n", b"\0", b"\xff", b"\xef\xbb\xbf", b"a" * 300]
     ids = {item.id for item in collect(root)}
     refused = 0
-    for _ in range(400):
+    for _ in range(100):
         data = bytearray(valid)
         for _ in range(rng.integers(1, 4)):
             at = int(rng.integers(len(data)))
@@ -168,4 +169,4 @@ def test_damaged_tables_end_in_a_clear_line_or_in_meshes_of_the_root(
         except InputError as error:
             refused += 1
             assert "\n" not in str(error)
-    assert 100 < refused < 400
+    assert 25 < refused < 100

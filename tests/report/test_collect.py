@@ -62,8 +62,10 @@ def test_one_run_alone_has_no_before_and_after(grid, tmp_path):
 def test_records_alone_make_tables_and_no_clouds(grid, tmp_path):
     for name, row in (("first", "source-only"), ("second", "qbst")):
         record = read_record(records_of(grid / name)[0])
-        place = {"source": "S", "target": "D", "row": row, "seed": 0}
-        write_record(tmp_path / f"{row}.json", dataclasses.replace(record, experiment=place))
+        place = {"source": "S", "target": "D", "row": row, "seed": 0} if row == "qbst" else None
+        record = dataclasses.replace(record, experiment=place)
+        # An older record has no fields: its file's name alone tells them.
+        write_record(tmp_path / f"S-D_{row}_seed-0.json", record)
     published = {"S-D": {"qbst": "72.4 ± 0.8"}}
     report, _ = collect(look(tmp_path, published), ReportSettings())
     assert [network.name for network in report.networks] == ["source-only", "qbst"]
@@ -187,4 +189,4 @@ def test_data_without_twins_are_read_whatever_the_record_says(grid, tmp_path):
 )  # fmt: skip
 def test_settings_that_cannot_be_meant_are_refused(given, word):
     with pytest.raises(InputError, match=word):
-        ReportSettings(**given).require_sound()
+        ReportSettings(**given)

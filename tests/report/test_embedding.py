@@ -3,7 +3,6 @@ import pytest
 
 from qs3.errors import InputError
 from qs3.report.embedding import embed, feature_map
-from qs3.report.figure import png_bytes
 
 
 @pytest.fixture(scope="module")
@@ -25,14 +24,8 @@ def test_neighbours_stay_neighbours(clusters):
 
 
 def test_same_features_give_the_same_bits(clusters):
-    features, labels = clusters
-    first, second = embed(features), embed(features.copy())
-    assert first.tobytes() == second.tobytes()
-    domains = ("source",) * 30 + ("target",) * 30
-    one, two = (
-        png_bytes(feature_map(p, labels, domains, ("a", "b", "c"))) for p in (first, second)
-    )
-    assert one == two
+    features, _ = clusters
+    assert embed(features).tobytes() == embed(features.copy()).tobytes()
 
 
 @pytest.mark.parametrize(

@@ -90,8 +90,8 @@ def test_task_and_published_value_follow_their_record():
 
 
 def test_rule_that_one_seed_lacks_has_no_mean():
-    def choices(**found: float) -> dict[str, dict[str, float]]:
-        return {name: {"accuracy": value} for name, value in found.items()}
+    def choices(**values: float) -> dict[str, dict[str, float]]:
+        return {name: {"accuracy": value} for name, value in values.items()}
 
     first = make(0, choices=choices(last=0.5, im=0.6))
     second = make(1, choices=choices(last=0.7))

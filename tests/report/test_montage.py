@@ -1,5 +1,4 @@
 import dataclasses
-import io
 
 import matplotlib
 import numpy as np
@@ -103,7 +102,7 @@ def test_a_scan_that_saw_nothing_is_drawn_too(view):
         pattern=None,
         box=object_box(nothing),
     )
-    assert len(png_bytes(montage(blind), dpi=40)) > 1000
+    assert len(png_bytes(montage(blind), dpi=20)) > 1000
 
 
 def test_large_pattern_shows_its_middle(view):
@@ -130,10 +129,9 @@ def test_object_box_holds_the_object_and_no_more(view):
 
 
 def test_bytes_depend_on_the_view_alone(view, tmp_path):
-    first = png_bytes(montage(view, "a"), dpi=50)
+    first = png_bytes(montage(view, "a"), dpi=20)
     with matplotlib.rc_context({"font.size": 30, "axes.facecolor": "red", "savefig.dpi": 10}):
-        assert png_bytes(montage(view, "a"), dpi=50) == first
+        assert png_bytes(montage(view, "a"), dpi=20) == first
     assert not any(word in first for word in (b"Software", b"matplotlib", b"tIME", b"Creation"))
-    write_png(tmp_path / "new" / "montage.png", montage(view, "b"), dpi=50)
-    assert (tmp_path / "new" / "montage.png").read_bytes() != first
-    assert imread(io.BytesIO(first), format="png").shape[1] == 600
+    write_png(tmp_path / "new" / "a.png", Figure(figsize=(2, 1)), dpi=50)
+    assert imread(tmp_path / "new" / "a.png").shape[:2] == (50, 100)

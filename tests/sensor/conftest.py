@@ -6,7 +6,7 @@ from qs3.sensor.rig import StereoRig
 
 @pytest.fixture(scope="session")
 def renderer() -> MitsubaRenderer:
-    return MitsubaRenderer(variant="scalar_rgb", samples=8)
+    return MitsubaRenderer(variant="scalar_rgb", samples=4)
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
 from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.speckle import PatternSettings, pattern_image
 
-RIG = StereoRig(width=200, height=160, focal=260.0, baseline=0.1)
+RIG = StereoRig(width=120, height=96, focal=156.0, baseline=0.1)
 POSE = Pose.looking_at(np.array([2.0, 1.0, 1.6]), np.zeros(3))
 CORNER = trimesh.util.concatenate(
     [
@@ -55,33 +55,25 @@ def smooth(image):
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("max_depth", [2, 3])
 def test_convention_cached_light_is_path_traced_light(variant, max_depth):
-    scene = corner()
-    cached = pair(scene, variant, samples=16, cache_rays=128, max_depth=max_depth)
+    scene, frame = corner(), [RIG.full_frame]
+    cached = pair(scene, variant, frame, samples=16, cache_rays=128, max_depth=max_depth)
     spp = 256 if variant.startswith("llvm") else 64
-    traced = pair(scene, variant, samples=spp, max_depth=max_depth, indirect="path")
+    traced = pair(scene, variant, frame, samples=spp, max_depth=max_depth, indirect="path")
     for ours, theirs in ((cached.left, traced.left), (cached.right, traced.right)):
         assert ours.shape == theirs.shape
         assert ours.mean() == pytest.approx(theirs.mean(), rel=0.005)
         error = smooth(ours) - smooth(theirs)
         assert np.sqrt((error**2).mean()) < 0.03 * smooth(theirs).max()
+        shift, _ = cv2.phaseCorrelate(ours.astype(np.float64), theirs.astype(np.float64))
+        assert np.abs(shift).max() < 0.05
 
 
-@pytest.mark.parametrize("samples", [1, 2, 4, 7, 16, 64])
+@pytest.mark.parametrize("samples", [1, 4, 7, 64])
 def test_rays_of_a_pixel_form_a_latin_square_about_its_centre(samples):
     steps = (np.arange(samples) + 0.5) / samples
     for axis in places(samples).T:
         np.testing.assert_allclose(np.sort(axis), steps, rtol=1e-6)
         assert axis.mean() == pytest.approx(0.5, abs=1e-6)
-
-
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_pictures_lie_where_those_of_the_path_lie(variant):
-    scene = corner()
-    cached = pair(scene, variant, [Region(0, 0, 200, 160)], samples=4).left
-    spp = 256 if variant.startswith("llvm") else 64
-    traced = pair(scene, variant, [Region(0, 0, 200, 160)], samples=spp, indirect="path").left
-    shift, _ = cv2.phaseCorrelate(cached.astype(np.float64), traced.astype(np.float64))
-    assert np.abs(shift).max() < 0.03
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -100,15 +92,15 @@ def test_both_implementations_agree():
     scene = corner()
     jit = pair(scene, "llvm_ad_mono", samples=4, cache_rays=512)
     embree = pair(scene, "scalar_rgb", samples=4, cache_rays=512)
-    for one, other in ((jit.left, embree.left), (jit.right, embree.right)):
-        assert np.median(np.abs(one - other)) < 2e-3
-        assert (np.abs(one - other) > 0.05).mean() < 0.005
+    for ours, theirs in ((jit.left, embree.left), (jit.right, embree.right)):
+        assert np.median(np.abs(ours - theirs)) < 2e-3
+        assert (np.abs(ours - theirs) > 0.05).mean() < 0.005
 
 
 @needs_llvm
 def test_rough_principled_surfaces_are_cached_and_agree_with_the_path():
     scene = corner(Material("principled", roughness=0.5))
-    cached = pair(scene, "llvm_ad_mono", samples=16, cache_rays=128).right
+    cached = pair(scene, "llvm_ad_mono", samples=16, cache_cell=2, cache_rays=128).right
     traced = pair(scene, "llvm_ad_mono", samples=256, indirect="path").right
     assert cached.mean() == pytest.approx(traced.mean(), rel=0.01)
 
@@ -122,7 +114,7 @@ def test_same_seed_same_bits_and_another_seed_other_light(variant):
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_a_region_is_cut_out_of_the_frame(variant):
-    part = Region(61, 43, 70, 50)
+    part = Region(37, 26, 60, 44)
     scene = corner()
     whole = pair(scene, variant, [RIG.full_frame], samples=2)
     some = pair(scene, variant, [part], samples=2)
@@ -132,10 +124,10 @@ def test_a_region_is_cut_out_of_the_frame(variant):
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("name", ["mirror", "glossy-plastic", "glass"])
+@pytest.mark.parametrize("name", ["glossy-plastic", "glass"])
 def test_shiny_surfaces_are_path_traced_whatever_the_setting(variant, name):
     scene = corner(MATERIALS[name])
-    cached, traced = (pair(scene, variant, samples=4, indirect=how) for how in ("cached", "path"))
+    cached, traced = (pair(scene, variant, samples=1, indirect=how) for how in ("cached", "path"))
     assert np.array_equal(cached.left, traced.left)
 
 
@@ -149,19 +141,13 @@ def test_stored_pattern_has_no_right_camera(variant):
 
 def test_embree_takes_diffuse_bodies_only():
     with pytest.raises(InputError, match="diffuse"):
-        EmbreePhotographer(corner(MATERIALS["metal"]), 3)
+        EmbreePhotographer(corner(MATERIALS["metal"]), 1, 3, CacheSettings())
 
 
-@pytest.mark.parametrize("kwargs", [{"cell": 0}, {"rays": 0}, {"smoothing": -1}])
-def test_senseless_caches_are_refused(kwargs):
-    with pytest.raises(InputError, match="renderer"):
-        CacheSettings(**kwargs)
-
-
-@pytest.mark.parametrize("kwargs", [{"samples": 0}, {"max_depth": 1}, {"cache_cell": 0}])
-def test_senseless_renderers_are_refused(kwargs):
-    with pytest.raises(InputError, match="renderer"):
-        MitsubaRenderer(variant="scalar_rgb", **kwargs)
+@pytest.mark.parametrize("name", ["samples", "max_depth", "cache_cell", "cache_rays"])
+def test_senseless_renderers_are_refused(name):
+    with pytest.raises(InputError, match=f"renderer: {name}"):
+        MitsubaRenderer(variant="scalar_rgb", **{name: 0})
 
 
 @needs_llvm

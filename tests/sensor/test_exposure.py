@@ -59,7 +59,7 @@ def test_responses_are_monotone_from_black_to_white(response, bits):
     assert (grey[0, 0], grey[0, -1]) == (0, 2**bits - 1)
 
 
-@pytest.mark.parametrize("exponent", [1.0, 1.8, 2.2])
+@pytest.mark.parametrize("exponent", [1.0, 2.2])
 def test_gamma_is_a_power(exponent):
     light = np.linspace(0, 1, 300)[None]
     settings = ExposureSettings(response="gamma", gamma=exponent, bits=10)
@@ -157,9 +157,9 @@ def test_draws_are_needed_where_noise_is():
 
 
 def test_equal_seeds_give_equal_bytes():
-    one, same, other = (exposed(textured(), EVERYTHING, seed) for seed in (1, 1, 2))
-    assert all(a.tobytes() == b.tobytes() for a, b in zip(one, same, strict=True))
-    assert all((a != b).any() for a, b in zip(one, other, strict=True))
+    first, same, other = (exposed(textured(), EVERYTHING, seed) for seed in (1, 1, 2))
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(first, same, strict=True))
+    assert all((a != b).any() for a, b in zip(first, other, strict=True))
 
 
 def test_nothing_is_drawn_where_nothing_is_random():
@@ -171,9 +171,9 @@ def test_nothing_is_drawn_where_nothing_is_random():
 
 
 def test_a_rig_of_one_camera_has_no_right_image():
-    one = dataclasses.replace(RIG, projector_offset=1.0, second="pattern")
+    single = dataclasses.replace(RIG, projector_offset=1.0, second="pattern")
     pair = textured()
-    left, right = exposed(pair, EVERYTHING, rig=one)
+    left, right = exposed(pair, EVERYTHING, rig=single)
     assert right.size == 0
     np.testing.assert_array_equal(left, exposed(pair, EVERYTHING)[0])
 
@@ -182,7 +182,7 @@ def test_a_rig_of_one_camera_has_no_right_image():
 
 
 @pytest.mark.parametrize("response", ["film", "linear", "gamma"])
-@pytest.mark.parametrize("scale", [0.01, 1.0, 40.0])
+@pytest.mark.parametrize("scale", [0.01, 40.0])
 def test_auto_exposure_brings_the_percentile_to_its_share(response, scale):
     settings = ExposureSettings(response=response, auto=0.6)
     left, _ = exposed(textured(scale=scale), settings)
@@ -193,12 +193,12 @@ def test_auto_exposure_brings_the_percentile_to_its_share(response, scale):
 @pytest.mark.parametrize("response", ["film", "linear", "gamma"])
 def test_auto_exposure_makes_the_radiances_scale_immaterial(response):
     settings = dataclasses.replace(EVERYTHING, response=response)
-    found = [exposed(textured(scale=scale), settings) for scale in (1.0, 8.0, 10.0)]
-    for one, eight, ten in zip(*found, strict=True):
-        np.testing.assert_array_equal(one, eight)  # a power of two rounds alike
+    pairs = [exposed(textured(scale=scale), settings) for scale in (1.0, 8.0, 10.0)]
+    for plain, eight, ten in zip(*pairs, strict=True):
+        np.testing.assert_array_equal(plain, eight)  # a power of two rounds alike
         # Ten does not: single precision may tip a level that lies at one half.
-        assert np.abs(one.astype(int) - ten).max() <= 1
-        assert (one != ten).mean() < 1e-3
+        assert np.abs(plain.astype(int) - ten).max() <= 1
+        assert (plain != ten).mean() < 1e-3
 
 
 def test_both_cameras_have_one_gain():
@@ -246,7 +246,7 @@ def test_auto_exposure_of_nothing_is_defined(focus):
 # The lens
 
 
-@pytest.mark.parametrize("psf", [0.3, 0.5, 1.0, 2.5])
+@pytest.mark.parametrize("psf", [0.3, 1.0, 2.5])
 def test_blur_keeps_energy_and_has_the_stated_second_moment(psf):
     point = np.zeros((81, 91), np.float32)
     point[40, 45] = 1.0
@@ -266,7 +266,7 @@ def test_blurs_add_their_variances():
     np.testing.assert_allclose(twice[8:-8, 8:-8], once[8:-8, 8:-8], atol=1e-4)
 
 
-@pytest.mark.parametrize("psf", [0.5, 1.2, 3.0])
+@pytest.mark.parametrize("psf", [0.5, 3.0])
 def test_blur_solves_the_heat_equation_on_the_pixels(psf):
     image = np.random.default_rng(0).random((80, 90), dtype=np.float32)
     down, across = (
@@ -298,48 +298,45 @@ def test_vignetting_is_cos4_of_the_angle_from_the_axis():
     assert some[0][80, 0] == round(1023 * 0.8 * (0.6 + 0.4 * 0.25))
 
 
-@pytest.mark.parametrize(
-    "canvas",
-    [
+@pytest.mark.parametrize("bits", [8, 10])
+def test_grey_levels_do_not_depend_on_the_canvas(bits):
+    settings = dataclasses.replace(EVERYTHING, bits=bits)
+    whole = exposed(textured(), settings)
+    for canvas in (
         Region(60, 50, 40, 31),
         Region(0, 0, 33, 27),
         Region(150, 100, 51, 61),
         Region(1, 40, 199, 3),
         Region(77, 80, 1, 1),
-    ],
-)
-@pytest.mark.parametrize("bits", [8, 10])
-def test_grey_levels_do_not_depend_on_the_canvas(canvas, bits):
-    settings = dataclasses.replace(EVERYTHING, bits=bits)
-    whole, part = exposed(textured(), settings), exposed(textured(), settings, canvas=canvas)
-    for full, cut in zip(whole, part, strict=True):
-        np.testing.assert_array_equal(cut, full[canvas.slices])
+    ):
+        part = exposed(textured(), settings, canvas=canvas)
+        for full, cut in zip(whole, part, strict=True):
+            np.testing.assert_array_equal(cut, full[canvas.slices])
 
 
 # Settings
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
+    "fault",
     [
-        ("gamma", 0.0),
-        ("gain", 0.0),
-        ("gain", float("inf")),
-        ("auto", 1.0),
-        ("auto", -0.1),
-        ("max_gain", -1.0),
-        ("psf", -0.5),
-        ("psf", float("nan")),
-        ("vignetting", 1.5),
-        ("speckle", -1.0),
-        ("noise", -1.0),
-        ("noise", float("nan")),
-        ("offset", 300.0),
+        {"gamma": 0.0},
+        {"gain": float("inf")},
+        {"auto": 1.0},
+        {"auto": -0.1},
+        {"max_gain": -1.0},
+        {"psf": -0.5},
+        {"psf": float("nan")},
+        {"vignetting": 1.5},
+        {"speckle": -1.0},
+        {"noise": float("nan")},
+        {"offset": 300.0},
     ],
+    ids=str,
 )
-def test_settings_are_checked(name, value):
-    with pytest.raises(InputError, match=f"exposure: {name}") as caught:
-        ExposureSettings(**{name: value})
+def test_settings_are_checked(fault):
+    with pytest.raises(InputError, match=f"exposure: {next(iter(fault))}") as caught:
+        ExposureSettings(**fault)
     assert "\n" not in str(caught.value)
 
 
@@ -353,9 +350,9 @@ def test_choices_are_checked(name, value):
 
 def test_a_scan_of_whole_frames_has_the_same_grey_levels(renderer):
     sensor = Sensor(
-        rig=StereoRig(360, 300, 400.0),
+        rig=StereoRig(240, 200, 267.0),
         exposure=EVERYTHING,
-        matching=MatchingSettings(num_disparities=32, block_size=9),
+        matching=MatchingSettings(num_disparities=16, block_size=9),
     )
     plate = trimesh.creation.box(extents=[1, 0.3, 0.02])
     part, whole = (

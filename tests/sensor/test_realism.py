@@ -8,37 +8,42 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.sensor.presets import get_sensor
-from qs3.sensor.realism import EXPECTATIONS, RealismSettings, realism
-from qs3.sensor.realism.checks_edges import band_rows, edge_rows, shadow_rows
-from qs3.sensor.realism.checks_kinect import DISTANCES, depth_step, kinect_rows, plane_sigma
-from qs3.sensor.realism.checks_scan import inside_faces, off_faces, scan_rows
-from qs3.sensor.realism.checks_surfaces import clear_rows, fall_rows
-from qs3.sensor.realism.checks_wall import (
+from qs3.sensor.presets import Sensor, get_sensor
+from qs3.sensor.realism import LAWS, RealismSettings, realism
+from qs3.sensor.realism.bench import distances
+from qs3.sensor.realism.edges import band_rows, edge_rows, shadow_rows
+from qs3.sensor.realism.faces import inside_faces, off_faces, scan_rows
+from qs3.sensor.realism.kinect import DISTANCES, kinect_rows
+from qs3.sensor.realism.metrics import (
+    camera_points,
+    depth_step,
+    fit_plane,
+    plane_metrics,
+    plane_sigma,
+)
+from qs3.sensor.realism.rows import row
+from qs3.sensor.realism.surfaces import clear_rows, fall_rows
+from qs3.sensor.realism.walls import (
     bias_rows,
     disparity_grid,
-    distances,
     noise_rows,
     phases,
     repeats_rows,
     steps_rows,
 )
-from qs3.sensor.realism.metrics import camera_points, fit_plane, plane_metrics
-from qs3.sensor.realism.results import row
-from qs3.sensor.realism.run import CHECKS
-from qs3.sensor.realism.stage import Shot
 from qs3.sensor.rig import StereoRig
+from qs3.sensor.view import ViewImages
 
 RIG = StereoRig(width=200, height=160, focal=430.0, baseline=0.05)
 Z = (0.4, 0.7, 1.2, 2.0, 3.0)
 
 
 def passed(rows) -> bool:
-    return all(one["passed"] for one in rows if one["passed"] is not None)
+    return not missed(rows)
 
 
 def missed(rows) -> list[str]:
-    return [one["what"] for one in rows if one["passed"] is False]
+    return [figure["what"] for figure in rows if figure["passed"] is False]
 
 
 def wall_disparity(z, sigma, rng, rig=RIG, quantum=1 / 32, bias=0.0):
@@ -102,8 +107,6 @@ def test_a_wall_that_nothing_was_seen_of_has_no_metrics():
     [
         (lambda z: 0.07, []),
         (lambda z: 0.15, ["least sub-pixel RMS", "greatest sub-pixel RMS"]),
-        (lambda z: 0.02, ["least sub-pixel RMS", "greatest sub-pixel RMS"]),
-        (lambda z: 0.07 * z**0.3, ["log-log slope of RMS over distance"]),
         (lambda z: 0.07 * z**-0.3, ["log-log slope of RMS over distance"]),
     ],
 )
@@ -197,7 +200,7 @@ def test_t4_sees_the_shadow_through_a_fattened_edge_and_not_right_of_the_plate()
 @pytest.mark.parametrize(("grow", "good"), [(0, True), (8, True), (9, False), (12, False)])
 def test_t5_measures_fattening_on_both_sides(grow, good):
     rows, data = edge_rows(edge_scene(grow=grow), (60, 119), 36.0, 21.5, 17)
-    assert [one["measured"] for one in rows[:2]] == [grow, grow]
+    assert [figure["measured"] for figure in rows[:2]] == [grow, grow]
     assert passed(rows) is good
     near = np.asarray(data["near_share"])
     assert near[np.asarray(data["offset"]) < 0].min() == 1
@@ -283,13 +286,13 @@ def test_t8_wants_the_measured_steps_and_noise(sigma, quantum, good):
 
 def test_t9_wants_repetition_and_change():
     rng = np.random.default_rng(5)
-    one, other = (wall_depth(1.0, 0.06, rng) for _ in range(2))
-    one[0] = np.nan
-    assert passed(repeats_rows(one, one.copy(), other))
-    assert not passed(repeats_rows(one, one.copy(), one.copy()))  # noise changes nothing
-    again = one.copy()
+    first, other = (wall_depth(1.0, 0.06, rng) for _ in range(2))
+    first[0] = np.nan
+    assert passed(repeats_rows(first, first.copy(), other))
+    assert not passed(repeats_rows(first, first.copy(), first.copy()))  # noise changes nothing
+    again = first.copy()
     again[5, 5] += 1e-9
-    assert not passed(repeats_rows(one, again, other))
+    assert not passed(repeats_rows(first, again, other))
 
 
 # T10
@@ -316,15 +319,17 @@ def test_t10_measures_faces_in_units_of_the_law():
     depth = RIG.focal * RIG.baseline / (RIG.disparity(true) + noise)
     normals = np.zeros((*true.shape, 3))
     normals[..., 2] = -1
-    shot = Shot(RIG.full_frame, np.zeros(true.shape, np.uint8), noise.astype(np.float32), depth,
-                true, np.zeros(true.shape, np.int64), normals)  # fmt: skip
-    ratio, cosine = off_faces(shot, RIG, 17, np.array([1.0, 2.0]), [sigma, sigma])
+    grey = np.zeros(true.shape, np.uint8)
+    shown = np.ones(true.shape, bool)
+    view = ViewImages(RIG.full_frame, grey, grey, noise.astype(np.float32), depth, true, shown,
+                      normals=normals)  # fmt: skip
+    ratio, cosine = off_faces(view, RIG, 17, np.array([1.0, 2.0]), [sigma, sigma])
     assert passed(scan_rows(ratio, cosine)[0])
-    assert not passed(scan_rows(*off_faces(shot, RIG, 17, np.array([1.0, 2.0]), [0.04, 0.04]))[0])
+    assert not passed(scan_rows(*off_faces(view, RIG, 17, np.array([1.0, 2.0]), [0.04, 0.04]))[0])
     # No pixel near the edge between the faces.
     ray = np.ones((*true.shape, 3))
     ray[..., :2] = 0
-    kept = inside_faces(shot, ray, 10)
+    kept = inside_faces(view, ray, 10)
     assert not kept[:, 90:110].any()
     assert kept[20:140, 20:89].all()
 
@@ -339,9 +344,8 @@ def test_a_row_tells_its_bounds_in_words():
     assert row("a", 0.2, -0.2, 0.2, strict=True)["passed"] is False
 
 
-def test_every_test_has_a_sentence_and_a_check():
-    assert list(EXPECTATIONS) == [f"T{i}" for i in range(1, 11)]
-    assert set(CHECKS) == set(EXPECTATIONS)
+def test_there_are_ten_laws_in_order():
+    assert list(LAWS) == [f"T{i}" for i in range(1, 11)]
 
 
 def test_unknown_tests_are_refused():
@@ -364,34 +368,45 @@ def test_plane_fit_tells_the_normal():
     assert offset == pytest.approx(1 / math.sqrt(2))
 
 
-def test_results_are_plain_and_those_that_are_there_stay(renderer):
+@pytest.fixture(scope="module")
+def small() -> Sensor:
+    """The D435's optics on a small chip: what is far is still measured, and a test is quick."""
     sensor = get_sensor("d435")
-    there = {"T1": {"id": "T1", "passed": True, "rows": [], "data": {}, "seconds": 1.0}}
-    told = []
-    made = realism(
-        sensor, renderer, RealismSettings(quick=True, tests=("T1", "T3", "T8")),
-        done=there, on_result=told.append, progress=False,
-    )  # fmt: skip
-    assert made[0] is there["T1"]
-    assert [one["id"] for one in made] == ["T1", "T3", "T8"] == [one["id"] for one in told]
-    assert made[1]["passed"] is True
-    assert made[2]["passed"] is None
-    assert "Kinect" in made[2]["why"]
-    assert json.loads(json.dumps(made)) == made
-
-
-def test_a_sensor_without_steps_and_one_without_noise_are_told(renderer):
-    sensor = get_sensor("d435")
-    free = dataclasses.replace(
+    return dataclasses.replace(
         sensor,
-        matching=dataclasses.replace(sensor.matching, quantum=0.0),
-        exposure=dataclasses.replace(sensor.exposure, noise=0.0, speckle=0.0),
+        rig=dataclasses.replace(sensor.rig, width=200, height=150, focal=215.0),
+        matching=dataclasses.replace(sensor.matching, num_disparities=32, block_size=15),
+        depth=dataclasses.replace(sensor.depth, near=0.5, far=3.0),
     )
-    made = realism(free, renderer, RealismSettings(tests=("T3", "T9")), progress=False)
-    assert [one["passed"] for one in made] == [None, None]
+
+
+def test_results_are_plain_and_those_that_are_there_stay(renderer, small):
+    before = {"T1": {"id": "T1", "passed": True, "rows": [], "data": {}, "seconds": 1.0}}
+    handed = []
+    results = realism(
+        small, renderer, RealismSettings(quick=True, tests=("T1", "t3", "T8")),
+        done=before, on_result=handed.append, progress=False,
+    )  # fmt: skip
+    assert results[0] is before["T1"]
+    assert [result["id"] for result in results] == ["T1", "T3", "T8"]
+    assert handed == results
+    assert results[1]["passed"] is True
+    assert results[2]["passed"] is None
+    assert "Kinect" in results[2]["why"]
+    assert json.loads(json.dumps(results)) == results
+
+
+def test_a_sensor_without_steps_and_one_without_noise_are_told(renderer, small):
+    free = dataclasses.replace(
+        small,
+        matching=dataclasses.replace(small.matching, quantum=0.0),
+        exposure=dataclasses.replace(small.exposure, noise=0.0, speckle=0.0),
+    )
+    results = realism(free, renderer, RealismSettings(tests=("T3", "T9")), progress=False)
+    assert [result["passed"] for result in results] == [None, None]
 
 
 @pytest.mark.slow
 def test_the_d435_passes_all_tests(renderer):
-    for one in realism(get_sensor("d435"), renderer, RealismSettings(quick=True), progress=False):
-        assert one["passed"] is not False, one
+    for result in realism(get_sensor("d435"), renderer, RealismSettings(quick=True)):
+        assert result["passed"] is not False, result

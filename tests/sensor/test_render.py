@@ -6,11 +6,11 @@ from PIL import Image
 from qs3.errors import InputError
 from qs3.sensor.exposure import ExposureSettings, expose
 from qs3.sensor.matching import MatchingSettings, match, matching_canvas
-from qs3.sensor.presets import get_sensor
+from qs3.sensor.materials import Material
 from qs3.sensor.render import Body, LightSettings, Scene
 from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
 from qs3.sensor.render.raycast import DepthCaster
-from qs3.sensor.rig import Pose, StereoRig
+from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.speckle import PatternSettings, pattern_image
 
 
@@ -37,7 +37,7 @@ POSE = Pose.looking_at(np.array([2.0, -3.0, 2.0]), np.array([0.1, 0.0, -0.1]))
 def test_convention_true_depth_is_along_the_axis_through_pixel_centres(small_rig):
     plate = trimesh.creation.box(extents=[4, 4, 0.02])
     plate.apply_translation([0, 0, 3.01])  # its near face is at z = 3 of a camera at the origin
-    depth = DepthCaster(plate).depth(small_rig, Pose(np.eye(4)), small_rig.full_frame)
+    depth = DepthCaster(plate).cast(small_rig, Pose(np.eye(4)), small_rig.full_frame).depth
     np.testing.assert_allclose(depth, 3.0, atol=1e-9)
 
 
@@ -45,18 +45,22 @@ def test_true_depth_of_a_tilted_plane_is_the_formula(small_rig):
     slope = 0.4  # z = 3 + slope·x
     corners = np.array([[x, y, 3 + slope * x] for x in (-3.0, 3) for y in (-3.0, 3)])
     plane = trimesh.Trimesh(corners, [[0, 1, 2], [1, 3, 2]], process=False)
-    depth = DepthCaster(plane).depth(small_rig, Pose(np.eye(4)), small_rig.full_frame)
+    depth = DepthCaster(plane).cast(small_rig, Pose(np.eye(4)), small_rig.full_frame).depth
     u = (np.arange(540) - 269.5) / 750
     np.testing.assert_allclose(depth, np.broadcast_to(3 / (1 - slope * u), (540, 540)), rtol=1e-6)
 
 
-def test_convention_images_lie_on_the_true_silhouette_and_are_not_mirrored(small_rig, renderer):
-    mesh = asymmetric()
-    pair = renderer.render(scene_of(mesh), small_rig, [POSE], [1])[0]
+@pytest.fixture(scope="module")
+def shown(small_rig, renderer):
+    """The asymmetric thing, photographed."""
+    return renderer.render(scene_of(asymmetric()), small_rig, [POSE], [1])[0]
+
+
+def test_convention_images_lie_on_the_true_silhouette_and_are_not_mirrored(shown, small_rig):
     frame = small_rig.full_frame
-    for image, camera in zip(pair.canvas(frame), (POSE, small_rig.right(POSE)), strict=True):
-        seen = np.abs(image - pair.background) > 1e-4
-        true = np.isfinite(DepthCaster(mesh).depth(small_rig, camera, frame))
+    for image, camera in zip(shown.canvas(frame), (POSE, small_rig.right(POSE)), strict=True):
+        seen = np.abs(image - shown.background) > 1e-4
+        true = np.isfinite(DepthCaster(asymmetric()).cast(small_rig, camera, frame).depth)
         overlap = (seen & true).sum() / (seen | true).sum()
         assert overlap > 0.97
         assert (seen[:, ::-1] & true).sum() / (seen[:, ::-1] | true).sum() < 0.9
@@ -66,11 +70,11 @@ def test_region_rendering_shows_what_full_frame_rendering_shows(small_rig):
     mesh = asymmetric()
     images = []
     for full_frame in (False, True):
-        renderer = MitsubaRenderer(variant="scalar_rgb", samples=16, full_frame=full_frame)
+        renderer = MitsubaRenderer(variant="scalar_rgb", samples=4, full_frame=full_frame)
         pair = renderer.render(scene_of(mesh), small_rig, [POSE], [3])[0]
         images.append(pair.canvas(small_rig.full_frame))
     for part, whole in zip(*images, strict=True):
-        # Only the noise of the ray sampling differs; a shift of one pixel is far worse.
+        # Only the noise of the soft light differs; a shift of one pixel is far worse.
         difference = np.abs(part - whole).mean()
         for axis in (0, 1):
             for step in (-1, 1):
@@ -78,33 +82,19 @@ def test_region_rendering_shows_what_full_frame_rendering_shows(small_rig):
         assert part.mean() == pytest.approx(whole.mean(), rel=2e-3)
 
 
-def test_full_frame_and_region_disparity_agree(small_rig):
-    mesh = asymmetric()
-    disparity = []
-    for full_frame in (False, True):
-        renderer = MitsubaRenderer(variant="scalar_rgb", samples=16, full_frame=full_frame)
-        pair = renderer.render(scene_of(mesh), small_rig, [POSE], [3])[0]
-        grey = [expose(i, ExposureSettings()) for i in pair.canvas(small_rig.full_frame)]
-        disparity.append(match(*grey, MatchingSettings(num_disparities=80)))
-    both = np.isfinite(disparity[0]) & np.isfinite(disparity[1])
-    assert both.sum() > 0.9 * np.isfinite(disparity[1]).sum()
-    assert np.abs(np.median((disparity[0] - disparity[1])[both])) <= 1 / 16
-
-
-def test_region_pipeline_gives_the_bits_of_the_full_frame(renderer):
-    # The same rendered pair, matched in its region and in the whole frame of the released rig.
-    sensor = get_sensor("paper")
-    pair = renderer.render(scene_of(asymmetric()), sensor.rig, [POSE], [1])[0]
-    region = sensor.rig.region_of(np.asarray(asymmetric().bounds), POSE, 16)
-    canvas = matching_canvas(region, sensor.rig, sensor.matching)
-    assert canvas.width * canvas.height < 0.7 * 1080**2
+def test_region_pipeline_gives_the_bits_of_the_full_frame(shown, small_rig):
+    # The same rendered pair, matched in its region and in the whole frame.
+    settings = MatchingSettings(num_disparities=80)
+    region = small_rig.region_of(np.asarray(asymmetric().bounds), POSE, 16)
+    canvas = matching_canvas(region, small_rig, settings)
+    assert canvas.width * canvas.height < 0.8 * 540**2
     whole, part = (
-        match(*(expose(i, sensor.exposure) for i in pair.canvas(where)), sensor.matching)
-        for where in (sensor.rig.full_frame, canvas)
+        match(*(expose(image, ExposureSettings()) for image in shown.canvas(where)), settings)
+        for where in (small_rig.full_frame, canvas)
     )
     y, x = region.y - canvas.y, region.x - canvas.x
     inner = part[y : y + region.height, x : x + region.width]
-    assert np.isfinite(inner).sum() > 50_000
+    assert np.isfinite(inner).sum() > 10_000
     np.testing.assert_array_equal(inner, whole[region.slices])
 
 
@@ -158,52 +148,34 @@ def test_a_variant_is_set_again_after_another(renderer):
     assert mitsuba.variant() == "scalar_rgb"
 
 
-def test_equal_seeds_give_equal_images_and_others_do_not(small_rig, renderer):
-    images = [
-        renderer.render(scene_of(asymmetric()), small_rig, [POSE], [seed])[0] for seed in (5, 5, 6)
-    ]
-    np.testing.assert_array_equal(images[0].left, images[1].left)
-    np.testing.assert_array_equal(images[0].right, images[1].right)
-    assert (images[0].left != images[2].left).any()
+def test_each_pose_needs_a_seed(small_rig, renderer):
     with pytest.raises(ValueError, match="seeds"):
         renderer.render(scene_of(asymmetric()), small_rig, [POSE], [1, 2])
 
 
-def test_llvm_shows_what_the_scalar_variant_shows(small_rig):
-    if not usable("llvm_ad_mono"):
-        pytest.skip("llvm_ad_mono does not work here: no suitable libLLVM (19 is known to work)")
-    means = []
-    for variant in ("scalar_rgb", "llvm_ad_mono"):
-        # One process keeps to one variant, hence the child processes.
-        means.append(render_in_child(variant))
-    np.testing.assert_allclose(means[0], means[1], rtol=0.01)
-
-
-def render_in_child(variant: str) -> list[float]:
-    import json
-    import subprocess
-    import sys
-    from pathlib import Path
-
-    code = (
-        "import sys, json, numpy as np; sys.path.insert(0, sys.argv[1]);"
-        "from test_render import *;"
-        "r = MitsubaRenderer(variant=sys.argv[2], samples=16);"
-        "p = r.render(scene_of(asymmetric()), StereoRig(540, 540, 750.0), [POSE], [1])[0];"
-        "print(json.dumps([float(x) for i in (p.left, p.right) for x in "
-        "[i.mean(), i[: len(i) // 2].mean(), i[:, : i.shape[1] // 2].mean()]]))"
-    )
-    here = str(Path(__file__).parent)
-    out = subprocess.run(
-        [sys.executable, "-c", code, here, variant], capture_output=True, text=True, check=True
-    )
-    return json.loads(out.stdout)
-
-
-def test_user_pattern_reaches_the_scene(tmp_path, small_rig, renderer):
+def test_user_pattern_reaches_the_scene(tmp_path, shown, small_rig, renderer):
     Image.new("L", (64, 64), 0).save(tmp_path / "dark.png")
     dark = pattern_image(PatternSettings(image=str(tmp_path / "dark.png")))
-    mesh = asymmetric()
-    with_dots = renderer.render(scene_of(mesh), small_rig, [POSE], [0])[0]
-    without = renderer.render(scene_of(mesh, dark), small_rig, [POSE], [0])[0]
-    assert np.percentile(without.left, 99) < 0.5 * np.percentile(with_dots.left, 99)
+    without = renderer.render(scene_of(asymmetric(), dark), small_rig, [POSE], [1])[0]
+    assert np.percentile(without.left, 99) < 0.5 * np.percentile(shown.left, 99)
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_mono"])
+def test_light_passes_mitsubas_glass_there_and_back(variant):
+    if not usable(variant):
+        pytest.skip(f"{variant} does not work here: no suitable libLLVM (19 is known to work)")
+    rig = StereoRig(width=160, height=120, focal=220.0, baseline=0.1)
+    level = Pose.looking_at(np.array([0.0, -3.0, 0.0]), np.zeros(3))
+    white = np.ones((8, 8), np.float32)
+    light = LightSettings(sky=0.0, ambient=0.0, sky_elevation=60.0)
+    bodies = (
+        Body(trimesh.creation.box(extents=[2, 0.01, 2]), Material("glass")),
+        Body(trimesh.creation.box(extents=[9, 1, 9]).apply_translation([0, 2, 0])),
+    )
+    renderer = MitsubaRenderer(variant=variant, samples=64, indirect="path")
+    dimmed, plain = (
+        renderer.render(scene, rig, [level], [0], [Region(70, 50, 20, 20)])[0].left.mean()
+        for scene in (Scene(b, light, white, 0.6, 0.6) for b in (bodies, bodies[1:]))
+    )
+    # Two panes, each passed twice; a pane of index 1.5 reflects R = 2F/(1 + F), F = 0.04.
+    assert dimmed / plain == pytest.approx((1 - 0.08 / 1.04) ** 4, abs=0.02)

@@ -17,7 +17,7 @@ from qs3.sensor.stored import stored_pattern
 SPOTS = PatternSettings(columns=270, rows=168, kind="spots", spot_size=0.7)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 7])
+@pytest.mark.parametrize("seed", [0, 7])
 def test_pattern_has_one_dot_in_nine_and_none_adjacent(seed):
     dots = speckle_pattern(633, 495, seed)
     assert dots.sum() == 633 * 495 // 9
@@ -58,7 +58,7 @@ def test_dots_stay_the_same_for_ever(size, digest):
 # Spots
 
 
-@pytest.mark.parametrize(("columns", "rows", "seed"), [(270, 168, 0), (270, 168, 5), (633, 495, 1)])
+@pytest.mark.parametrize(("columns", "rows", "seed"), [(270, 168, 5), (633, 495, 1)])
 def test_every_tile_has_one_spot_and_none_is_near_another(columns, rows, seed):
     places = spot_places(columns, rows, seed)
     assert len(places) == (columns // 3) * (rows // 3)
@@ -77,8 +77,8 @@ def test_two_spots_are_spread_as_rejection_spreads_them():
     drawn = 3 * rng.random((20000, 2, 2)) + [[0, 0], [3, 0]]  # two tiles side by side
     wanted = np.linalg.norm(drawn[:, 0] - drawn[:, 1], axis=1)
     wanted = wanted[wanted >= 1.5]
-    found = [np.linalg.norm(np.diff(spot_places(6, 3, seed), axis=0)) for seed in range(200)]
-    _, chance = stats.ks_2samp(found, wanted)
+    apart = [np.linalg.norm(np.diff(spot_places(6, 3, seed), axis=0)) for seed in range(100)]
+    _, chance = stats.ks_2samp(apart, wanted)
     assert chance > 0.01
 
 
@@ -116,26 +116,25 @@ def self_correlation(image):
     image = image - image.mean()
     ones = np.ones_like(image)
     both = signal.fftconvolve(ones, ones[::-1, ::-1])
-    found = signal.fftconvolve(image, image[::-1, ::-1]) / (both * image.var())
-    (h, w), (y, x) = image.shape, np.indices(found.shape)
+    likeness = signal.fftconvolve(image, image[::-1, ::-1]) / (both * image.var())
+    (h, w), (y, x) = image.shape, np.indices(likeness.shape)
     y, x = y - (h - 1), x - (w - 1)
     inner = (np.abs(y) <= h / 2) & (np.abs(x) <= w / 2)
-    return found[inner], np.hypot(y, x)[inner]
+    return likeness[inner], np.hypot(y, x)[inner]
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_spots_are_like_themselves_at_no_distance(seed):
-    coarse = PatternSettings(columns=270, rows=168, kind="spots", spot_size=1.3, seed=seed)
+def test_spots_are_like_themselves_at_no_distance():
+    coarse = PatternSettings(columns=270, rows=168, kind="spots", spot_size=1.3, seed=1)
     image = pattern_image(coarse)
     cells = image.shape[1] / 270
-    found, distance = self_correlation(image)
-    assert found[distance == 0] == pytest.approx(1)
-    assert np.abs(found[distance > 3 * cells]).max() < 0.05
+    likeness, distance = self_correlation(image)
+    assert likeness[distance == 0] == pytest.approx(1)
+    assert np.abs(likeness[distance > 3 * cells]).max() < 0.05
     # The bound tells something: along a grid without the jitter it is broken at once.
     middles = np.zeros((168, 270), np.float32)
     middles[1::3, 1::3] = 1
-    found, distance = self_correlation(middles)
-    assert found[distance > 3].max() > 0.9
+    likeness, distance = self_correlation(middles)
+    assert likeness[distance > 3].max() > 0.9
 
 
 def test_spots_are_gaussian_of_the_stated_width():
@@ -155,7 +154,7 @@ def test_spots_follow_their_seed():
     assert (spot_places(30, 30, 4) != spot_places(30, 30, 5)).any()
 
 
-@pytest.mark.parametrize("spot_size", [0.3, 0.7, 1.2, 2.0])
+@pytest.mark.parametrize("spot_size", [0.3, 2.0])
 def test_pictures_of_spots_are_fine_enough_and_not_too_large(spot_size):
     image = pattern_image(PatternSettings(columns=300, rows=90, kind="spots", spot_size=spot_size))
     assert max(image.shape) <= 4096
@@ -192,8 +191,9 @@ def test_spots_too_fine_for_any_picture_are_refused():
 # The stored pattern
 
 
-@pytest.mark.parametrize("indirect", ["cached", "path"])
-@pytest.mark.parametrize("kind", ["tiles", "spots"])
+@pytest.mark.parametrize(
+    ("kind", "indirect"), [("tiles", "cached"), ("spots", "cached"), ("tiles", "path")]
+)
 def test_convention_stored_pattern_is_what_the_projector_throws(kind, indirect):
     rig = StereoRig(240, 180, 300.0, 0.2, projector_offset=1.0, second="pattern")
     depth, shift = 3.0, 20  # f·b/z
@@ -203,7 +203,7 @@ def test_convention_stored_pattern_is_what_the_projector_throws(kind, indirect):
     wall = trimesh.creation.box(extents=[20, 20, 0.2]).apply_translation([0, 0, depth + 0.1])
     light = LightSettings(projector=10.0, sky=0.0, sky_elevation=90.0, ambient=0.03)
     scene = Scene((Body(wall),), light, pattern_image(pattern), 0.6, 0.45)
-    renderer = MitsubaRenderer(variant="scalar_rgb", samples=8, indirect=indirect)
+    renderer = MitsubaRenderer(variant="scalar_rgb", samples=4, indirect=indirect)
     pair = renderer.render(scene, rig, [Pose(np.eye(4))], [0])[0]
     seen = pair.canvas(rig.full_frame)[0][20:-20, 40:-20].astype(float)
     stored = stored_pattern(rig, pattern, rig.full_frame).astype(float)

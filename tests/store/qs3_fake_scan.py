@@ -11,9 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from qs3.files import write_bytes
 from qs3.meshes.classes import POINTDA10
-from qs3.store.generate import GenerateSettings, Item, scan_seed
+from qs3.store.folder import Folder
+from qs3.store.generate import GenerateReport, GenerateSettings, Item, generate, scan_seed
 from qs3.store.shards import CloudRow
+
+SETTINGS = GenerateSettings(num_points=16, rows_per_shard=4)
 
 _sync = os.fsync
 
@@ -26,6 +30,23 @@ class FakeItem:
 
     def load(self):
         raise AssertionError("a fake has no mesh")
+
+
+def work(count: int, bad: tuple[int, ...] = ()) -> list[FakeItem]:
+    """A work list of chairs, some of them bad."""
+    return [FakeItem(f"bad{i}" if i in bad else f"m{i}") for i in range(count)]
+
+
+def run(items, out, settings=SETTINGS, *, row=None, **how) -> GenerateReport:
+    """Generate in this process where nothing else is said: these scans cost nothing."""
+    how = {"workers": 0, "progress": False} | how
+    return generate(items, out, settings, scan_one=row or fake_row, **how)
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """Every file of a folder, whatever its depth."""
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 def fake_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
@@ -56,12 +77,6 @@ def flaky_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
     return fake_row(item, scan, settings)
 
 
-def deadly_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
-    if item.id.startswith("bad"):
-        os._exit(9)
-    return fake_row(item, scan, settings)
-
-
 def unavailable_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
     raise ModuleNotFoundError("No module named 'nowhere'")
 
@@ -84,17 +99,22 @@ def slow_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
     return fake_row(item, scan, settings)
 
 
-def hanging_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
-    """Hang in C with the interpreter locked, as a parser written in C does."""
-    if item.id.startswith("bad"):
-        ctypes.PyDLL(None).sleep(600)
-    return fake_row(item, scan, settings)
-
-
-def crashing_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
-    if item.id.startswith("bad"):
+def deadly_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    """Hang, crash or end the process, or hang once the row is written, by the object's name."""
+    if item.id.startswith("hangs"):
+        ctypes.PyDLL(None).sleep(600)  # the interpreter locked, as by a parser written in C
+    if item.id.startswith("crashes"):
         os.kill(os.getpid(), signal.SIGSEGV)
+    if item.id.startswith("exits"):
+        os._exit(9)
+    if item.id.startswith("late"):
+        Folder.write = _write_and_hang
     return fake_row(item, scan, settings)
+
+
+def _write_and_hang(folder: Folder, name: str, data: bytes) -> None:
+    write_bytes(folder.path / name, data)
+    time.sleep(600)
 
 
 def marked_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
@@ -102,15 +122,6 @@ def marked_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
     if item.id.startswith("bad") and Path(os.environ["QS3_FAKE_MARKER"]).exists():
         raise ValueError(f"{item.id} is broken")
     return fake_row(item, scan, settings)
-
-
-def crash_once_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
-    """Take the process along the first time that a bad item is scanned."""
-    marker = Path(os.environ["QS3_FAKE_MARKER"])
-    if item.id.startswith("bad") and not marker.exists():
-        marker.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return slow_row(item, scan, settings)
 
 
 def crash_in_write_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
@@ -131,7 +142,7 @@ def _sync_and_die(handle: int) -> None:
 def crash_with_lock_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
     """Take the process along, the first time, with the lock that all workers share held."""
     marker = Path(os.environ["QS3_FAKE_MARKER"])
-    if item.id.startswith("bad") and not marker.exists():
+    if item.id.startswith("hangs") and not marker.exists():
         frame: Any = sys._getframe()
         while "channel" not in frame.f_locals:
             frame = frame.f_back
@@ -146,20 +157,6 @@ def slow_flaky_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRo
     return flaky_row(item, scan, settings)
 
 
-def late_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
-    """Hang, for a bad item, after its part is written and before the answer is given."""
-    from qs3.store.folder import LocalFolder
-
-    write = LocalFolder.write
-
-    def write_and_hang(self: LocalFolder, name: str, data: bytes) -> None:
-        write(self, name, data)
-        time.sleep(600)
-
-    LocalFolder.write = write_and_hang if item.id.startswith("bad") else write
-    return fake_row(item, scan, settings)
-
-
-def slow_hanging_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+def slow_deadly_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
     time.sleep(0.4)
-    return hanging_row(item, scan, settings)
+    return deadly_row(item, scan, settings)

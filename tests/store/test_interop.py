@@ -9,10 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qs3.io.layouts.contents import read_store
-from qs3.store.generate import GenerateSettings, generate
+from qs3.io.layouts.store import read_ragged
 
-SETTINGS = GenerateSettings(num_points=16, rows_per_shard=4)
 PAGE = Path(__file__).parents[2] / "docs" / "data.md"
 
 
@@ -35,30 +33,26 @@ class Made:
         assert list(labels) == self.labels
         rows = [np.asarray(cloud) for cloud in clouds]
         assert {row.dtype for row in rows} <= {self.points.dtype, np.dtype(np.float32)}
-        there = np.stack(rows).reshape(self.points.shape).astype(np.float32)
+        read = np.stack(rows).reshape(self.points.shape).astype(np.float32)
         wanted = self.points.astype(np.float32)
-        np.testing.assert_array_equal(there.view(np.uint32), wanted.view(np.uint32))
-
-
-def work_and_settings(fake, dtype):
-    work = [fake.FakeItem(f"m{i}", ("chair", "sofa")[i % 2]) for i in range(10)]
-    return work, dataclasses.replace(SETTINGS, dtype=dtype)
+        np.testing.assert_array_equal(read.view(np.uint32), wanted.view(np.uint32))
 
 
 @pytest.fixture(params=["float32", "float16"])
 def made(request, fake, tmp_path):
-    work, settings = work_and_settings(fake, request.param)
+    work = [fake.FakeItem(f"m{i}", ("chair", "sofa")[i % 2]) for i in range(10)]
+    settings = dataclasses.replace(fake.SETTINGS, dtype=request.param)
     folder = tmp_path / "set"
-    generate(work, folder, settings, scan_one=fake.fake_row, workers=0, progress=False)
+    fake.run(work, folder, settings)
     rows = [fake.fake_row(item, 0, settings) for item in work]
     points = np.stack([row.points for row in rows]).astype(request.param)
     return Made(folder, [row.id for row in rows], [row.label for row in rows], points)
 
 
 def test_our_reader(made):
-    ours = read_store(made.folder)
-    made.equals(ours.ids, ours.labels, ours.points)
-    assert ours.points.dtype == np.float32
+    ours = read_ragged(made.folder)
+    made.equals(ours.ids, ours.labels, np.stack(ours.clouds))
+    assert ours.clouds[0].dtype == np.float32
 
 
 def test_pandas(made):
@@ -123,19 +117,7 @@ def test_sha256sum_checks_it(made):
     assert "shard-00001.parquet: FAILED" in subprocess.run(command, **how).stdout
 
 
-def test_worker_processes_write_the_same_bytes_as_none(fake, tmp_path):
-    work, settings = work_and_settings(fake, "float16")
-    for workers in (0, 2):
-        out = tmp_path / str(workers)
-        generate(work, out, settings, scan_one=fake.fake_row, workers=workers, progress=False)
-    alone, two = (
-        {path.name: path.read_bytes() for path in (tmp_path / name).iterdir() if path.is_file()}
-        for name in ("0", "2")
-    )
-    assert {*alone} == {*(f"shard-0000{i}.parquet" for i in range(3)), "dataset.json", "SHA256SUMS"}
-    assert alone == two
-
-
+@pytest.mark.parametrize("made", ["float16"], indirect=True)
 def test_the_page_about_data_works(made, tmp_path, monkeypatch):
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setenv("HF_HOME", str(tmp_path / "hf"))

@@ -11,7 +11,7 @@ import pytest
 
 from qs3.errors import InputError
 from qs3.store.failures import read_failures
-from qs3.store.generate import GenerateReport, GenerateSettings, generate
+from qs3.store.generate import GenerateReport
 
 pytest.importorskip("ray", reason="needs the extra ray")
 
@@ -19,13 +19,7 @@ from qs3.store.executors.ray_cluster import RayExecutor
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
 
-SETTINGS = GenerateSettings(num_points=16, rows_per_shard=4)
 ROWS = 60
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    files = (path for path in folder.rglob("*") if path.is_file())
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 @pytest.fixture
@@ -51,8 +45,8 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 def whole(fake, folder: Path) -> dict[str, bytes]:
     work = [fake.FakeItem("bad" if i == 7 else f"m{i}") for i in range(ROWS)]
-    generate(work, folder, SETTINGS, scan_one=fake.flaky_row, workers=0, progress=False)
-    return content(folder)
+    fake.run(work, folder, row=fake.flaky_row)
+    return fake.content(folder)
 
 
 @pytest.mark.slow
@@ -70,36 +64,28 @@ def test_a_node_killed_half_way_changes_no_byte(fake, tmp_path, cluster):
     killer = threading.Thread(target=kill_one)
     killer.start()
     work = [fake.FakeItem("bad" if i == 7 else f"m{i}") for i in range(ROWS)]
-    report = generate(
-        work, out, SETTINGS, scan_one=fake.slow_flaky_row, executor=RayExecutor(), progress=False
-    )
+    report = fake.run(work, out, row=fake.slow_flaky_row, executor=RayExecutor())
     killer.join()
     assert ROWS // 8 <= seen[0] < ROWS // 4 - 1, "the node was not killed half-way"
     assert len(cluster.list_all_nodes()) == 2
     assert report == GenerateReport(done=ROWS - 1, skipped=0, failed=1)
-    assert content(out) == whole(fake, tmp_path / "whole")
+    assert fake.content(out) == whole(fake, tmp_path / "whole")
 
 
 @pytest.mark.slow
 def test_on_a_cluster_too_what_hangs_or_crashes_fails_alone(fake, tmp_path, cluster):
-    for row, kind in (("hanging_row", "Timeout"), ("deadly_row", "ProcessDied")):
-        work = [fake.FakeItem("bad" if i == 2 else f"m{i}") for i in range(6)]
-        report = generate(
-            work,
-            tmp_path / row,
-            SETTINGS,
-            scan_one=getattr(fake, row),
-            executor=RayExecutor(timeout=12.0 if kind == "Timeout" else None, retries=1),
-            progress=False,
-        )
+    for name, kind in (("hangs", "Timeout"), ("exits", "ProcessDied")):
+        work = [fake.FakeItem(name if i == 2 else f"m{i}") for i in range(6)]
+        executor = RayExecutor(timeout=12.0 if kind == "Timeout" else None, retries=1)
+        report = fake.run(work, tmp_path / name, row=fake.deadly_row, executor=executor)
         assert report == GenerateReport(done=5, skipped=0, failed=1)
-        assert [record["error"] for record in read_failures(tmp_path / row)] == [kind]
+        assert [record["error"] for record in read_failures(tmp_path / name)] == [kind]
 
 
 @pytest.mark.slow
 def test_what_hangs_is_stopped_while_others_go_on(fake, tmp_path, cluster):
     """A cluster that is never idle still looks at what has run too long."""
-    work = [fake.FakeItem("bad" if i == 0 else f"m{i}") for i in range(240)]
+    work = [fake.FakeItem("hangs" if i == 0 else f"m{i}") for i in range(240)]
     order: list[str] = []
 
     class Watched(RayExecutor):
@@ -108,40 +94,20 @@ def test_what_hangs_is_stopped_while_others_go_on(fake, tmp_path, cluster):
             order.append(type(outcome).__name__)
             return key, outcome
 
-    report = generate(
-        work,
-        tmp_path / "out",
-        SETTINGS,
-        scan_one=fake.slow_hanging_row,
-        executor=Watched(timeout=8.0, retries=1),
-        progress=False,
-    )
+    executor = Watched(timeout=8.0, retries=1)
+    report = fake.run(work, tmp_path / "out", row=fake.slow_deadly_row, executor=executor)
     assert report == GenerateReport(done=239, skipped=0, failed=1)
     assert order.index("Failure") < len(order) - 30
 
 
 def test_gpus_that_are_not_there_are_refused(fake, tmp_path, cluster):
     with pytest.raises(InputError, match="no GPU at this moment"):
-        generate(
-            [fake.FakeItem("m")],
-            tmp_path / "out",
-            SETTINGS,
-            scan_one=fake.fake_row,
-            executor=RayExecutor(gpus=0.25),
-            progress=False,
-        )
+        fake.run([fake.FakeItem("m")], tmp_path / "out", executor=RayExecutor(gpus=0.25))
 
 
 def test_an_address_without_a_cluster_is_told(fake, tmp_path):
     with pytest.raises(InputError, match="no Ray cluster answers there"):
-        generate(
-            [fake.FakeItem("m")],
-            tmp_path / "out",
-            SETTINGS,
-            scan_one=fake.fake_row,
-            executor=RayExecutor("auto"),
-            progress=False,
-        )
+        fake.run([fake.FakeItem("m")], tmp_path / "out", executor=RayExecutor("auto"))
 
 
 @pytest.mark.parametrize("how", [{"timeout": 0.0}, {"gpus": -1.0}, {"retries": -1}])

@@ -7,15 +7,13 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.io.layouts.contents import read_store
+from qs3.io.layouts.store import read_ragged
 from qs3.io.load import load_clouds
 from qs3.store.folder import open_folder
-from qs3.store.generate import GenerateReport, GenerateSettings, generate
+from qs3.store.generate import GenerateReport
 from qs3.store.info import info
 from qs3.store.merge import merge
 from qs3.store.verify import verify
-
-SETTINGS = GenerateSettings(num_points=16, rows_per_shard=4)
 
 
 def items(fake, count=10):
@@ -23,8 +21,8 @@ def items(fake, count=10):
 
 
 def whole(fake, folder: Path) -> dict[str, bytes]:
-    generate(items(fake), folder, SETTINGS, scan_one=fake.flaky_row, workers=0, progress=False)
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
+    fake.run(items(fake), folder, row=fake.flaky_row)
+    return fake.content(folder)
 
 
 def content(url: str) -> dict[str, bytes]:
@@ -67,41 +65,32 @@ def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 def test_a_run_into_memory_is_stopped_resumed_and_equal(fake, tmp_path, memory):
     with pytest.raises(KeyboardInterrupt):
-        generate(
-            items(fake), memory, SETTINGS, scan_one=fake.Interrupting(5), workers=0, progress=False
-        )
+        fake.run(items(fake), memory, row=fake.Interrupting(5))
     assert any(name.startswith(".parts/") for name in content(memory))
-    report = generate(
-        items(fake), memory, SETTINGS, scan_one=fake.flaky_row, workers=0, progress=False
-    )
+    report = fake.run(items(fake), memory, row=fake.flaky_row)
     assert report == GenerateReport(done=4, skipped=5, failed=1)
     assert content(memory) == whole(fake, tmp_path / "whole")
     assert verify(memory, progress=False) == []
     assert info(memory)["rows"] == 9
-    np.testing.assert_array_equal(read_store(memory).points, read_store(tmp_path / "whole").points)
     np.testing.assert_array_equal(
-        load_clouds(memory, num_points=None).points, read_store(memory).points
+        read_ragged(memory).clouds, read_ragged(tmp_path / "whole").clouds
+    )
+    np.testing.assert_array_equal(
+        load_clouds(memory, num_points=None).points, read_ragged(memory).clouds
     )
 
 
 def test_a_folder_of_something_else_is_refused(fake, memory):
     open_folder(memory).write("thesis.txt", b"mine")
     with pytest.raises(InputError, match="holds something else"):
-        generate(items(fake), memory, SETTINGS, scan_one=fake.fake_row, workers=0, progress=False)
+        fake.run(items(fake), memory)
     assert set(content(memory)) == {"thesis.txt"}
 
 
 def test_processes_write_to_an_object_store_themselves(fake, tmp_path, bucket):
     for part in range(2):
-        generate(
-            items(fake),
-            f"{bucket}-{part}",
-            SETTINGS,
-            scan_one=fake.flaky_row,
-            workers=1,
-            shard=(part, 2),
-            progress=False,
-        )
+        how = {"workers": 1, "shard": (part, 2)}
+        fake.run(items(fake), f"{bucket}-{part}", row=fake.flaky_row, **how)
     merge([f"{bucket}-0", f"{bucket}-1"], bucket, progress=False)
     wanted = whole(fake, tmp_path / "whole")
     assert content(bucket) == wanted
@@ -112,7 +101,7 @@ def test_processes_write_to_an_object_store_themselves(fake, tmp_path, bucket):
 
 def test_a_store_that_cannot_be_reached_is_told_in_one_line(fake):
     with pytest.raises(InputError, match="nowhere://a"):
-        generate(items(fake), "nowhere://a/b", SETTINGS, scan_one=fake.fake_row, workers=0)
+        fake.run(items(fake), "nowhere://a/b")
 
 
 def test_a_missing_package_is_named_with_its_extra(fake, monkeypatch):
@@ -122,4 +111,4 @@ def test_a_missing_package_is_named_with_its_extra(fake, monkeypatch):
 
     monkeypatch.setitem(sys.modules, "gcsfs", None)
     with pytest.raises(MissingExtraError, match=r"gcsfs is not installed.*\[gs\]"):
-        generate(items(fake), "gs://a/b", SETTINGS, scan_one=fake.fake_row, workers=0)
+        fake.run(items(fake), "gs://a/b")

@@ -1,4 +1,5 @@
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -6,17 +7,13 @@ import pyarrow.parquet as pq
 import pytest
 
 from qs3.errors import InputError
-from qs3.io.layouts.contents import (
-    MANIFEST,
-    Manifest,
-    open_dataset,
-    read_store,
-    shard_path,
-    write_manifest,
-)
+from qs3.io.layouts.store import read_ragged
+from qs3.io.load import load_clouds
 from qs3.store.generate import GenerateSettings
 from qs3.store.info import info
+from qs3.store.manifest import MANIFEST, Manifest, open_dataset, shard_path, write_manifest
 from qs3.store.shards import read_shard, write_shard
+from qs3.structure import unstructure
 
 SETTINGS = GenerateSettings(num_points=16)
 
@@ -46,8 +43,8 @@ def make(folder: Path, fake, shards=2) -> list:
 def test_what_is_written_comes_back(fake, tmp_path):
     made = make(tmp_path, fake)
     for cloud in ("points", "clean", "surface"):
-        read = read_store(tmp_path, cloud)
-        np.testing.assert_array_equal(read.points, np.stack([getattr(r, cloud) for r in made]))
+        read = read_ragged(tmp_path, cloud)
+        np.testing.assert_array_equal(read.clouds, [getattr(r, cloud) for r in made])
         assert read.labels.tolist() == [r.label for r in made]
         assert read.ids == tuple(r.id for r in made)
 
@@ -83,39 +80,33 @@ def test_an_empty_shard_is_a_shard(tmp_path):
     assert read_shard(tmp_path / "a").num_rows == 0
 
 
-def test_split_classes_and_size_are_chosen(fake, tmp_path):
-    made = make(tmp_path, fake)
-    train = read_store(tmp_path, split="train", num_points=5)
+def test_split_and_size_are_chosen(fake, tmp_path):
+    make(tmp_path, fake)
+    train = load_clouds(tmp_path, split="train", num_points=5)
     assert train.points.shape == (3, 5, 3)
     assert train.ids == ("m0#0", "m2#0", "m4#0")
-    some = read_store(tmp_path, classes=["sofa", "bed"])
-    assert some.class_names == ("sofa", "bed")
-    assert some.labels.tolist() == [1, 0, 1, 0]
-    assert some.ids == tuple(r.id for r in made if r.class_name != "chair")
     with pytest.raises(InputError, match="no cloud of split 'dev'; splits: test, train"):
-        read_store(tmp_path, split="dev")
-    with pytest.raises(InputError, match="no class 'toilet'"):
-        read_store(tmp_path, classes=["toilet"])
+        read_ragged(tmp_path, split="dev")
 
 
 def test_an_unfinished_data_set_is_not_taken_for_a_whole_one(fake, tmp_path):
     make(tmp_path, fake)
     shard_path(tmp_path, 1).unlink()
     with pytest.raises(InputError, match="unfinished, 1 of 2 shards"):
-        read_store(tmp_path)
-    assert len(read_store(tmp_path, partial=True)) == 4
+        read_ragged(tmp_path)
+    assert len(read_ragged(tmp_path, partial=True).ids) == 4
 
 
 def test_the_checksum_follows_the_bytes(fake, tmp_path):
     made = make(tmp_path, fake)
-    before = read_store(tmp_path).checksum
-    assert read_store(tmp_path, num_points=8).checksum == before  # of what was read, not made
-    assert read_store(tmp_path, "clean").checksum != before
+    before = read_ragged(tmp_path).checksum
+    assert load_clouds(tmp_path, num_points=8).checksum == before  # of what was read, not made
+    assert read_ragged(tmp_path, "clean").checksum != before
     other = dataclasses.replace(made[5], label=1 - made[5].label % 2)
     write_shard(shard_path(tmp_path, 1), [made[4], other])
-    assert read_store(tmp_path).checksum != before
+    assert read_ragged(tmp_path).checksum != before
     write_shard(shard_path(tmp_path, 1), made[4:][::-1])
-    assert read_store(tmp_path).checksum != before
+    assert read_ragged(tmp_path).checksum != before
 
 
 @pytest.mark.parametrize("damage", ["cut", "text", "empty", "bits"])
@@ -133,7 +124,7 @@ def test_a_damaged_shard_is_named(fake, tmp_path, damage):
         }[damage]
     )
     with pytest.raises(InputError, match=r"shard-00001\.parquet: damaged") as caught:
-        read_store(tmp_path)
+        read_ragged(tmp_path)
     assert "\n" not in str(caught.value)
 
 
@@ -142,7 +133,7 @@ def test_a_foreign_parquet_file_is_refused(fake, tmp_path):
     table = read_shard(shard_path(tmp_path, 0)).drop_columns(["clean"])
     pq.write_table(table, shard_path(tmp_path, 0))
     with pytest.raises(InputError, match="other columns"):
-        read_store(tmp_path)
+        read_ragged(tmp_path)
 
 
 def test_points_that_are_not_finite_are_refused(fake, tmp_path):
@@ -150,8 +141,8 @@ def test_points_that_are_not_finite_are_refused(fake, tmp_path):
     bad = dataclasses.replace(made[0], points=np.full((16, 3), np.nan, dtype=np.float32))
     write_shard(shard_path(tmp_path, 0), [bad])
     with pytest.raises(InputError, match="points of 'm0#0'"):
-        read_store(tmp_path)
-    assert len(read_store(tmp_path, "clean")) == 3
+        read_ragged(tmp_path)
+    assert len(read_ragged(tmp_path, "clean").ids) == 3
 
 
 def test_other_settings_are_refused_by_name(fake, tmp_path):
@@ -187,6 +178,17 @@ def test_a_folder_without_manifest_and_another_schema_are_refused(fake, tmp_path
         open_dataset(tmp_path)
 
 
+def test_a_data_set_begun_under_the_sensors_former_name_goes_on(fake, tmp_path):
+    make(tmp_path, fake)
+    now = open_dataset(tmp_path)
+    now = dataclasses.replace(now, settings={"sensor": {"name": "paper", "metric": False}})
+    path = tmp_path / MANIFEST
+    former = {"sensor": {"name": "qs3", "metric": False}}
+    path.write_text(json.dumps(unstructure(now) | {"settings": former}))
+    assert open_dataset(tmp_path) == now
+    write_manifest(tmp_path, now)
+
+
 def test_info_counts(fake, tmp_path):
     make(tmp_path, fake)
     counts = info(tmp_path)
@@ -207,7 +209,7 @@ def test_a_data_set_of_schema_1_still_reads(fake, tmp_path):
     manifest = tmp_path / MANIFEST
     manifest.write_text(manifest.read_text().replace('"schema": 3', '"schema": 1'))
     assert open_dataset(tmp_path).schema == 1
-    np.testing.assert_array_equal(read_store(tmp_path).points, [row.points for row in made])
+    np.testing.assert_array_equal(read_ragged(tmp_path).clouds, [row.points for row in made])
     assert read_shard(shard_path(tmp_path, 0), ["drawn", "id"])["drawn"].to_pylist() == ["{}"] * 4
     assert read_shard(shard_path(tmp_path, 0)).column_names[-1] == "drawn"
     assert info(tmp_path)["rows"] == 4

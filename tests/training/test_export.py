@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from qs3.errors import InputError, MissingExtraError, QS3Error
-from qs3.io.transforms import unit_ball
+from qs3.io.preparation import unit_ball
 from qs3.models import create_model
 from qs3.models.ops import farthest_point_sampling
 from qs3.models.ops.sampling import sample_in_a_loop

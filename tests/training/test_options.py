@@ -15,7 +15,7 @@ import torch
 
 from qs3.adaptation import SourceOnly
 from qs3.errors import InputError, MissingExtraError, QS3Error, UnevenSizesError
-from qs3.io.transforms import stack
+from qs3.io.preparation import stack
 from qs3.training import (
     Deadline,
     SelfTrainingSettings,

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.io.transforms import resample, unit_ball
+from qs3.io.preparation import resample, unit_ball
 from qs3.sensor import sampling
 from qs3.sensor.sampling import farthest_point_sample, farthest_point_samples
 from qs3.training import batches

@@ -1,6 +1,5 @@
 """The viewer without its server: what is shown is right, and the last change wins."""
 
-import dataclasses
 import threading
 import time
 
@@ -11,7 +10,9 @@ import trimesh
 from qs3 import shapes
 from qs3.errors import InputError
 from qs3.report.figure import PALETTE
-from qs3.sensor.presets import SENSORS, Sensor
+from qs3.sensor.presets import SENSORS
+from qs3.sensor.render.mitsuba import MitsubaRenderer
+from qs3.sensor.settings import ScanSettings
 from qs3.store.manifest import Manifest, write_manifest
 from qs3.store.shards import CloudRow, write_shard
 from qs3.viewer.colouring import by_error, by_height, by_view, round_limit
@@ -19,7 +20,7 @@ from qs3.viewer.display import compose, frame_of, modes
 from qs3.viewer.distance import cloud_distance, mesh_distance, spacing
 from qs3.viewer.exhibits import Answers, Exhibit, StoreExhibits
 from qs3.viewer.rescan import Rescanner
-from qs3.viewer.scan_controls import ScanControls
+from qs3.viewer.scan_controls import make_controls, resolve, with_controls
 
 HOSTILE = "<img src=x onerror=alert(1)>{alert(2)}"
 
@@ -77,19 +78,19 @@ class TestDistance:
 class TestColours:
     def test_views_have_the_palette_and_the_legend_counts_them(self):
         view = np.array([0, 0, 11], dtype=np.uint8)
-        found = by_view(view)
+        colouring = by_view(view)
         expected = [tuple(int(PALETTE[i][k : k + 2], 16) for k in (1, 3, 5)) for i in (0, 0, 1)]
-        assert [tuple(c) for c in found.colours.tolist()] == expected
-        assert found.swatches == (
+        assert [tuple(c) for c in colouring.colours.tolist()] == expected
+        assert colouring.swatches == (
             (PALETTE[0], "view 1 (2 points)"),
             (PALETTE[1], "view 12 (1 point)"),
         )
 
     def test_errors_share_a_scale_and_stop_at_its_end(self):
-        found = by_error(np.array([0.0, 0.5, 1.0, 9.0]), "the mesh", 1.0, " m")
-        low, middle, high, beyond = found.colours.tolist()
+        colouring = by_error(np.array([0.0, 0.5, 1.0, 9.0]), "the mesh", 1.0, " m")
+        low, middle, high, beyond = colouring.colours.tolist()
         assert high == beyond != middle != low
-        assert found.ends == ("0 m", "1 m and more")
+        assert colouring.ends == ("0 m", "1 m and more")
         assert low == [68, 1, 84]  # viridis begins dark violet
 
     def test_height_of_a_flat_cloud_is_one_colour(self):
@@ -238,25 +239,47 @@ class TestRescanner:
         assert shown == []
 
 
+def values_of(settings: ScanSettings) -> dict:
+    return {control.name: control.value for control in make_controls(settings)}
+
+
 class TestScanControls:
     @pytest.mark.parametrize("name", SENSORS)
-    def test_sliders_left_alone_change_no_sensor(self, name):
-        base = SENSORS[name]
-        assert ScanControls.of(base).sensor(base) == base
+    def test_controls_left_alone_change_nothing(self, name):
+        start = resolve(ScanSettings(sensor=name, renderer=MitsubaRenderer(variant="scalar_rgb")))
+        same = with_controls(start, values_of(start))
+        assert same == start
+        assert same.make_sensor() == SENSORS[name]
 
-    def test_every_slider_of_the_sensor_does_something(self):
-        base = Sensor()
+    def test_every_control_does_something(self):
+        start = resolve(ScanSettings(renderer=MitsubaRenderer(variant="scalar_rgb")))
         other = {
-            "distance": (2.5, 3.0), "elevation": (10.0, 20.0), "object_size": 1.5, "baseline": 0.2,
-            "projector": 2.0, "room_light": 0.0, "gain": 0.5, "image_noise": 3.0, "method": "zncc",
-            "block_size": 11, "num_disparities": 256, "stride": 2, "material": "dark",
+            "views": 2, "view_layout": "jitter", "num_points": 64, "scene": "floor", "crop": "none",
+            "seed": 1, "samples": 2, "placement.radius": (2.5, 3.0), "object_size": 1.5,
+            "placement.elevation": (10.0, 20.0), "rig.baseline": 0.2, "projector": 2.0,
+            "room light": 0.0, "gain": 0.5, "exposure.noise": 3.0, "matching.method": "zncc",
+            "matching.block_size": 11, "matching.num_disparities": 256, "depth.stride": 2,
+            "material": "dark",
         }  # fmt: skip
+        assert set(other) == set(values_of(start))
         for name, value in other.items():
-            assert dataclasses.replace(ScanControls(), **{name: value}).sensor(base) != base, name
+            assert with_controls(start, {name: value}) != start, name
 
-    def test_settings_that_make_no_sensor_are_refused(self):
+    def test_what_the_command_line_changes_is_where_a_control_begins(self):
+        renderer = MitsubaRenderer(variant="scalar_rgb", samples=7)
+        start = resolve(ScanSettings(image_noise=2.0, preset="released", renderer=renderer))
+        values = values_of(start)
+        assert (values["exposure.noise"], values["view_layout"], values["samples"]) == (
+            2.0, "jitter", 7
+        )  # fmt: skip
+        assert with_controls(start, {"exposure.noise": 0.0}).make_sensor().exposure.noise == 0
+
+    def test_settings_are_changed_at_once_and_those_that_make_no_sensor_are_refused(self):
+        start = resolve(ScanSettings(renderer=MitsubaRenderer(variant="scalar_rgb")))
+        few = {"matching.num_disparities": 16}
         with pytest.raises(InputError, match=r"beyond matching\.num_disparities"):
-            ScanControls(num_disparities=16).sensor(Sensor())
+            with_controls(start, few)
+        with_controls(start, few | {"rig.baseline": 0.005})
 
 
 class TestStore:
@@ -282,10 +305,10 @@ class TestStore:
         return folder
 
     def test_objects_come_with_all_their_clouds(self, folder):
-        found = StoreExhibits(folder)
-        assert len(found) == 3
-        assert found.labels == ("bed", "chair", "chair")
-        last = found[2]
+        exhibits = StoreExhibits(folder)
+        assert len(exhibits) == 3
+        assert exhibits.labels == ("bed", "chair", "chair")
+        last = exhibits[2]
         assert last.name == "o2"
         assert {kind: len(cloud) for kind, cloud in last.clouds.items()} == {
             "points": 7, "clean": 7, "surface": 7
@@ -296,8 +319,8 @@ class TestStore:
         from qs3.io import load_clouds
 
         clouds = load_clouds(folder, split="train", num_points=5)
-        found = StoreExhibits(folder, "train")
-        assert tuple(found[i].name for i in range(len(found))) == clouds.ids
+        exhibits = StoreExhibits(folder, "train")
+        assert tuple(exhibits[i].name for i in range(len(exhibits))) == clouds.ids
 
     def test_faults_name_the_folder(self, folder):
         with pytest.raises(InputError, match="no cloud of split 'val'; splits: test, train"):

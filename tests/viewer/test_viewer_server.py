@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.sensor.presets import SENSORS, Sensor
+from qs3.sensor.render.mitsuba import MitsubaRenderer
+from qs3.sensor.settings import ScanSettings
 from qs3.viewer.exhibits import Answers, ArrayExhibits, Exhibit
 from qs3.viewer.pages import gallery_page, scan_page
-from qs3.viewer.scan_controls import ScanControls
+from qs3.viewer.scan_controls import resolve
 from qs3.viewer.serving import require_free, serve, tunnel_of, url_of
 
 viser = pytest.importorskip("viser", reason="viser is not installed: pip install 'qs3[view]'")
@@ -55,8 +56,8 @@ def test_reads_no_file_of_the_disk(server, path):
 
 def test_is_not_there_on_another_interface(server):
     """Nor on another loopback address: it does not listen on all."""
-    found = socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)
-    others = {str(address[4][0]) for address in found} - {"127.0.0.1"}
+    addresses = socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)
+    others = {str(address[4][0]) for address in addresses} - {"127.0.0.1"}
     for address in {"127.0.0.2", *others}:
         with pytest.raises(OSError, match="refused"):
             socket.create_connection((address, server.get_port()), timeout=5)
@@ -93,14 +94,14 @@ def test_scan_page_shows_faults_and_recovers(server, rng):
     calls = threading.Semaphore(0)
     item = Exhibit("a", "chair", {"points": rng.normal(size=(9, 3)).astype(np.float32)})
 
-    def scan(request):
+    def scan(settings, draw):
         calls.release()
-        if request.controls.views == 5:
+        if settings.views == 5:
             raise InputError("too many views")
         return item
 
-    sensors = {"own": Sensor(), "d435": SENSORS["d435"]}
-    with scan_page(server, scan, sensors, ScanControls(), 3) as canvas:
+    start = resolve(ScanSettings(renderer=MitsubaRenderer(variant="scalar_rgb")))
+    with scan_page(server, scan, start, 3) as canvas:
         assert calls.acquire(timeout=10)
         wait_for(lambda: "too many views" in canvas._state.content)
         controls(server)["Views"].value = 2

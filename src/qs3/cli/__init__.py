@@ -8,37 +8,38 @@ import sys
 from collections.abc import Sequence
 
 VERBS = {
-    "scan": (
-        "scan.scan",
-        "Photograph one mesh: noisy cloud, clean twin, a picture of every stage.",
-    ),
-    "sensors": ("sensors.sensors", "List the sensors, or show one as TOML to copy and edit."),
-    "realism": ("realism.realism", "Test a simulated camera against the laws of real ones."),
-    "generate": (
-        "generate.generate",
-        "Scan many meshes into a data set; resumes, and logs what failed.",
-    ),
-    "merge": ("store.merge", "Put the parts of `qs3 generate --shard i/n` into one data set."),
-    "info": ("store.info", "Print what a data set holds: counts, sizes, statistics, failures."),
-    "verify": (
-        "store.verify",
-        "Check a data set: checksums, finite points, labels, seeds, counts.",
-    ),
-    "convert": ("convert.convert", "Convert a data set into the layout of another."),
-    "extract": ("extract.extract", "Cut objects out of real scans into a data set."),
-    "train": ("train.train", "Train a classifier, adapted to clouds without labels if asked."),
-    "evaluate": ("evaluate.evaluate_run", "Score a run on labelled clouds."),
-    "predict": ("evaluate.predict", "Predict the class of clouds in files."),
-    "export": ("export.export", "Write a run's network for programs without qs3."),
-    "reproduce": ("reproduce.reproduce", "Make the paper's tables and figures, or parts of them."),
-    "table": ("table.table", "Print a table of the paper from results."),
-    "figure": ("table.figure", "Draw a figure of the paper from results."),
-    "report": ("report.report", "Write one page about runs, data sets and results."),
-    "view": ("view.view", "Look at data, a run or a mesh in a browser on this machine."),
-    "doctor": ("doctor.doctor", "Tell what works on this machine and how to get what does not."),
-    "demo": ("demo.demo", "Run everything once on built-in shapes: scan, train, adapt, report."),
+    "scan": "Photograph one mesh: noisy cloud, clean twin, a picture of every stage.",
+    "sensors": "List the sensors, or show one as TOML to copy and edit.",
+    "realism": "Test a simulated camera against the laws of real ones.",
+    "generate": "Scan many meshes into a data set; resumes, and logs what failed.",
+    "merge": "Put the parts that `qs3 generate --shard i/n` made into one data set.",
+    "info": "Print what a data set holds: counts, sizes, statistics of the sensor, failures.",
+    "verify": "Check a data set: checksums, finite points, labels, seeds, duplicates, counts.",
+    "convert": "Convert a data set into the layout of another.",
+    "extract": "Cut objects out of real scans into a data set.",
+    "train": "Train a classifier, with a method of adaptation to an unlabelled target if asked.",
+    "evaluate": "Score a run: accuracy, class-mean accuracy, confusion matrix.",
+    "predict": "Tell the class of each file and how confident the network is.",
+    "export": "Export a network as ONNX or for PyTorch.",
+    "reproduce": "Make tables and figures anew, with their data and trainings.",
+    "table": "Print a table of the paper, ours beside the published figures.",
+    "figure": "Draw a figure of the paper from records alone.",
+    "report": "Write one self-contained HTML page: pictures, clouds, features, scores, tables.",
+    "view": "Look at data, a run or a mesh in a browser on this machine.",
+    "doctor": "Tell what works on this machine and how to get what does not.",
+    "demo": "Run everything once on built-in shapes: scan, train, adapt, report.",
 }
-"""Where in this package each verb is, and a line of help."""
+"""A line of help for each verb; it is a function of its own module but for those in `ELSEWHERE`."""
+
+ELSEWHERE = {
+    "merge": "store.merge",
+    "info": "store.info",
+    "verify": "store.verify",
+    "evaluate": "evaluate.evaluate_run",
+    "predict": "evaluate.predict",
+    "figure": "table.figure",
+}
+"""Module and function of the other verbs."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -85,12 +86,12 @@ def _run(given: list[str]) -> int:
         raise InputError(f"{verb}: no such verb; did you mean {' or '.join(near)}? See qs3 --help")
     from qs3.cli.options import run_verb
 
-    return run_verb(verb, *VERBS[verb], rest)
+    return run_verb(verb, ELSEWHERE.get(verb, f"{verb}.{verb}"), VERBS[verb], rest)
 
 
 def _help() -> str:
     width = max(map(len, VERBS))
-    lines = [f"  {verb:{width}}  {text}" for verb, (_, text) in VERBS.items()]
+    lines = [f"  {verb:{width}}  {text}" for verb, text in VERBS.items()]
     return "\n".join(
         [
             "usage: qs3 [--help] [--version] VERB [OPTIONS]",

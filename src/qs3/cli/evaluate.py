@@ -105,7 +105,7 @@ def scores_text(scores: Scores, marks: Sequence[str] = ()) -> str:
 def predict(options: Flat[PredictOptions]) -> int:
     """Tell the class of each file and how confident the network is."""
     from qs3.io import read_cloud
-    from qs3.io.transforms import stack
+    from qs3.io.preparation import stack
     from qs3.training import load_model, predict_probabilities
 
     if not options.files:

@@ -138,7 +138,7 @@ def _executor(name: str, workers: int, timeout: float, address: str, gpus_per_sc
 
 def _dry_run(plan: Any, part: tuple[int, int], timeout: float, workers: int | None) -> int:
     """Print what the run would make and cost; without ``workers`` for one of any machine."""
-    from qs3.store.estimate import estimate
+    from qs3.store.plan import estimate
 
     expected = estimate(plan, part, timeout=timeout)
     for name, objects in expected.objects.items():

@@ -8,7 +8,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-from qs3.store.versions import package_versions
+from qs3.store.manifest import package_versions
 
 
 def versions() -> dict[str, str]:

@@ -223,7 +223,7 @@ def measure(
         Seconds on one core or device: of all scans, and of each run by its name.
     """
     from qs3.experiments.cost import Counts, run_seconds, step_seconds
-    from qs3.store.estimate import estimate
+    from qs3.store.plan import estimate
 
     steps = {
         network: step_seconds(

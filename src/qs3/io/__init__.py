@@ -13,4 +13,3 @@ from qs3.io.point_files import read_cloud as read_cloud
 from qs3.meshes.classes import POINTDA10 as POINTDA10
 from qs3.meshes.classes import canonical as canonical
 from qs3.meshes.classes import map_labels as map_labels
-from qs3.meshes.classes import merge_predictions as merge_predictions

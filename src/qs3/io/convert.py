@@ -10,11 +10,12 @@ from tqdm import tqdm
 
 from qs3.errors import InputError
 from qs3.io.clouds import CloudKind
-from qs3.io.detect import detect, format_named, read_as, require
+from qs3.io.detect import format_named
 from qs3.io.layouts import FORMATS
 from qs3.io.layouts.store import write_store
+from qs3.io.load import read_clouds
+from qs3.io.preparation import resample
 from qs3.io.ragged import RaggedClouds
-from qs3.io.transforms import resample
 from qs3.io.whole import check_free, whole
 from qs3.meshes.classes import map_labels
 
@@ -42,7 +43,7 @@ def convert(
         origin: Name of the layout of ``source``; None finds it out.
         split: ``train`` or ``test`` only; None takes all.
         cloud: Which cloud of a data set of ours.
-        num_points: Points a cloud, by `transforms.resample`; None keeps what is there.
+        num_points: Points a cloud, by `preparation.resample`; None keeps what is there.
         classes: Classes to map the labels onto, by the table of aliases; None keeps them.
         unmapped: What to do with clouds of a class that is not in ``classes``.
 
@@ -55,11 +56,11 @@ def convert(
     """
     layout = format_named(to)
     if layout.write is None:
-        written = [name for name, known in FORMATS.items() if known.write is not None]
+        written = [other.name for other in FORMATS.values() if other.write is not None]
         kin = [name for name in written if name.startswith(to)] or written
         raise InputError(f"{to}: is only read; written are {', '.join(kin)}")
     check_free(target)
-    clouds, name = read_clouds(source, origin, split, cloud)
+    clouds, name = read_clouds(source, split, cloud, origin)
     if classes is not None:
         clouds = _map_classes(clouds, classes, unmapped, str(source))
     clouds = _plain(clouds, num_points, str(source))
@@ -72,29 +73,6 @@ def convert(
         except InputError as error:
             raise InputError(f"{to}: {error}") from error
     return clouds
-
-
-def read_clouds(
-    source: Path, origin: str | None, split: str | None, cloud: CloudKind
-) -> tuple[RaggedClouds, str]:
-    """Read a data set in its layout, named or found out; also return the layout's name.
-
-    Raises:
-        InputError: where it cannot be read.
-    """
-    source = Path(source)
-    if origin is None:
-        layout = detect(source)
-    else:
-        layout = format_named(origin)
-        require(source, origin)
-    if layout.write is write_store:
-        from qs3.io.layouts.contents import read_ragged
-
-        return read_ragged(source, cloud, split), layout.name
-    if cloud != "points":
-        raise InputError(f"{source}: only a qs3 data set has {cloud!r} clouds")
-    return read_as(layout, source, split), layout.name
 
 
 def _map_classes(
@@ -127,7 +105,7 @@ def _plain(clouds: RaggedClouds, num_points: int | None, where: str) -> RaggedCl
         raise InputError(f"--num-points {num_points}: must be at least 1")
     if not clouds.clouds:
         raise InputError(f"{where}: holds no cloud")
-    result = []
+    prepared = []
     count = len(clouds.clouds)
     slow = num_points is not None and count > _MANY
     for cloud, name in tqdm(
@@ -141,5 +119,5 @@ def _plain(clouds: RaggedClouds, num_points: int | None, where: str) -> RaggedCl
             points = np.asarray(cloud, dtype=np.float32)
         if not len(points) or not np.isfinite(points).all():
             raise InputError(f"{where}: cloud {name!r} is empty, or a point of it is not finite")
-        result.append(points if num_points is None else resample(points, num_points))
-    return dataclasses.replace(clouds, clouds=result)
+        prepared.append(points if num_points is None else resample(points, num_points))
+    return dataclasses.replace(clouds, clouds=prepared)

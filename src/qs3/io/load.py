@@ -6,6 +6,8 @@ from pathlib import Path
 
 from qs3.errors import InputError
 from qs3.io.clouds import CloudKind, Origin, PointClouds, UnlabelledClouds
+from qs3.io.detect import detect, format_named, require
+from qs3.io.layouts.store import read_ragged
 from qs3.io.ragged import RaggedClouds
 from qs3.store.folder import open_folder
 
@@ -33,7 +35,7 @@ def load_clouds(
         InputError: where the source is none of these, is damaged, has no labels, or has a class
             that is not in ``class_names``.
     """
-    clouds = _read(source, split, cloud).labelled(num_points, class_names, str(source))
+    clouds = read_clouds(source, split, cloud)[0].labelled(num_points, class_names, str(source))
     return replace(clouds, origin=Origin(open_folder(source).name, split, cloud))
 
 
@@ -51,31 +53,37 @@ def load_unlabelled(
     Raises:
         InputError: where the source is no data set or is damaged.
     """
-    clouds = _read(source, split, cloud).unlabelled(num_points, str(source))
+    clouds = read_clouds(source, split, cloud)[0].unlabelled(num_points, str(source))
     return replace(clouds, origin=Origin(open_folder(source).name, split, cloud))
 
 
-def _read(source: str | Path, split: str | None, cloud: CloudKind) -> RaggedClouds:
-    path = Path(source)
-    remote = isinstance(source, str) and "://" in source
-    if remote or (path.is_dir() and (path / "dataset.json").is_file()):
-        from qs3.io.layouts.contents import read_ragged
+def read_clouds(
+    source: str | Path,
+    split: str | None = None,
+    cloud: CloudKind = "points",
+    origin: str | None = None,
+) -> tuple[RaggedClouds, str]:
+    """Read a data set as its files have it; also return the name of its layout.
 
-        return read_ragged(source if remote else path, cloud, split)
+    Args:
+        source: What to read; see `load_clouds`.
+        split: Part to read; None takes all.
+        cloud: Which cloud of a generated data set.
+        origin: Name of the layout; None finds it out.
+
+    Raises:
+        InputError: where it cannot be read.
+    """
+    if isinstance(source, str) and "://" in source:
+        return read_ragged(source, cloud, split), "store"
+    path = Path(source)
+    if origin is None:
+        layout = detect(path)
+    else:
+        layout = format_named(origin)
+        require(path, layout)
+    if layout.name == "store":
+        return read_ragged(path, cloud, split), layout.name
     if cloud != "points":
         raise InputError(f"{path}: only a data set made by qs3 generate has {cloud!r} clouds")
-    if path.suffix.lower() == ".npz":
-        from qs3.io.npz import read_npz
-
-        return read_npz(path, split)
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder")
-    from qs3.io.class_folders import read_folder
-    from qs3.io.detect import is_general, matching, one_of, read_as
-
-    fits = matching(path)
-    if path.is_dir() and (not fits or is_general(fits[0])):
-        return read_folder(path, split)
-    if not fits:
-        raise InputError(f"{path}: neither a folder nor an npz archive, nor any known layout")
-    return read_as(one_of(path, fits), path, split)
+    return layout.read(path, split), layout.name

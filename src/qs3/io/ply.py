@@ -101,9 +101,13 @@ def check_ply(content: bytes) -> None:
             elif words[:1] == ["property"]:
                 name, count = announced[-1]
                 is_list = words[1] == "list"
+                if is_list and count and "vertex" not in [other for other, _ in announced[:-1]]:
+                    raise InputError("has lists in or before its vertices; save it without")
                 properties[name].append(words[4 if is_list else 2])
                 # Of a list at least its length; in text at least a digit and a gap.
                 needed += count * (2 if form == "ascii" else _SIZES[words[2 if is_list else 1]])
+        except InputError:
+            raise
         except (IndexError, KeyError, ValueError) as error:
             line = " ".join(words)[:60]
             raise InputError(f"cannot be read as ply (header line {line!r})") from error

@@ -135,7 +135,7 @@ def _trimesh(content: bytes, file_type: str, mesh_points: int, seed: int) -> np.
     # Imported here: point files that are no meshes do without.
     import trimesh
 
-    from qs3.meshes.normalise import sample_surface
+    from qs3.meshes.normalising import sample_surface
 
     if file_type == "ply":
         check_ply(content)

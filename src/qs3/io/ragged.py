@@ -9,7 +9,7 @@ from jaxtyping import Int
 
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds, digests, numbered
-from qs3.io.transforms import stack
+from qs3.io.preparation import stack
 from qs3.meshes.classes import POINTDA10, map_labels
 
 

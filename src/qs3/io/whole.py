@@ -7,8 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from qs3.errors import InputError
-from qs3.files import holds_something, sync_entry
-from qs3.store.folder import LocalFolder
+from qs3.files import LOCK, folder_lock, holds_something, sync_entry
 
 
 @contextmanager
@@ -37,7 +36,7 @@ def whole(path: Path) -> Iterator[Path]:
     path = check_free(path)
     hidden = path.with_name(f".{path.name}.unfinished")
     hidden.mkdir(parents=True, exist_ok=True)
-    with LocalFolder(hidden).locked():
+    with folder_lock(hidden):
         try:
             _clear(hidden)
             temporary = hidden / path.name
@@ -65,6 +64,8 @@ def check_free(path: Path) -> Path:
 
 def _clear(folder: Path) -> None:
     for entry in folder.iterdir():
+        if entry.name == LOCK:
+            continue
         if entry.is_dir() and not entry.is_symlink():
             shutil.rmtree(entry)
         else:

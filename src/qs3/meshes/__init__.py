@@ -1,10 +1,33 @@
-"""Meshes: read from files, brought to one size, or made on the spot."""
+"""Meshes: read from files, brought to one size, or made on the spot.
 
-from qs3.meshes.class_names import POINTDA10 as POINTDA10
-from qs3.meshes.class_names import canonical as canonical
-from qs3.meshes.collections import MeshItem as MeshItem
-from qs3.meshes.collections import collect as collect
-from qs3.meshes.loading import EXTENSIONS as EXTENSIONS
-from qs3.meshes.loading import load_mesh as load_mesh
-from qs3.meshes.normalise import normalise as normalise
-from qs3.meshes.normalise import sample_surface as sample_surface
+Names of classes load alone; trimesh comes with the first name that needs it.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from qs3.meshes.classes import POINTDA10 as POINTDA10
+from qs3.meshes.classes import canonical as canonical
+
+if TYPE_CHECKING:
+    from qs3.meshes.collections import MeshItem as MeshItem
+    from qs3.meshes.collections import collect as collect
+    from qs3.meshes.loading import EXTENSIONS as EXTENSIONS
+    from qs3.meshes.loading import load_mesh as load_mesh
+    from qs3.meshes.normalising import normalise as normalise
+    from qs3.meshes.normalising import sample_surface as sample_surface
+
+_LAZY = {
+    "MeshItem": "collections",
+    "collect": "collections",
+    "EXTENSIONS": "loading",
+    "load_mesh": "loading",
+    "normalise": "normalising",
+    "sample_surface": "normalising",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)

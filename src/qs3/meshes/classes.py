@@ -1,5 +1,10 @@
-"""The merging of labels by the one table of class names and aliases, `qs3.meshes.class_names`."""
+"""Names of classes, their aliases, and labels put from one list of classes onto another.
 
+Convention:
+    The ten classes of PointDA-10 in alphabetical order are the common tongue of all data sets.
+"""
+
+import re
 from collections.abc import Sequence
 from typing import Literal
 
@@ -7,20 +12,104 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from qs3.errors import InputError
-from qs3.meshes.class_names import POINTDA10 as POINTDA10
-from qs3.meshes.class_names import canonical as canonical
+
+POINTDA10: tuple[str, ...] = (
+    "bathtub",
+    "bed",
+    "bookshelf",
+    "cabinet",
+    "chair",
+    "lamp",
+    "monitor",
+    "plant",
+    "sofa",
+    "table",
+)
+
+_ALIASES: dict[str, tuple[str, ...]] = {
+    "bathtub": ("bath", "bath_tub", "tub"),
+    "bookshelf": ("shelf", "bookcase", "book_shelf", "shelves"),
+    "cabinet": (
+        "night_stand",
+        "nightstand",
+        "bedside_table",
+        "dresser",
+        "wardrobe",
+        "cupboard",
+        "chest_of_drawers",
+        "file_cabinet",
+        "filing_cabinet",
+    ),
+    "chair": (
+        "armchair",
+        "arm_chair",
+        "office_chair",
+        "swivel_chair",
+        "stool",
+        "bar_stool",
+        "barstool",
+        "bench",
+    ),
+    "lamp": ("floor_lamp", "desk_lamp", "table_lamp", "light"),
+    "monitor": ("television", "tv", "tv_monitor", "tvmonitor", "display", "screen"),
+    "plant": ("potted_plant", "pottedplant", "house_plant", "houseplant"),
+    "sofa": ("couch", "settee", "loveseat"),
+    "table": ("desk", "dining_table", "diningtable", "coffee_table", "side_table", "end_table"),
+}
+_CANONICAL = {alias: name for name, aliases in _ALIASES.items() for alias in aliases}
 
 
-def _positions(names: Sequence[str], to: Sequence[str]) -> Int[np.ndarray, "k"]:
-    """Position in ``to`` of each name, −1 where it is in none: as it is, else by the table.
+def canonical(name: str) -> str:
+    """Fold case, spaces and hyphens, and replace an alias by its class of PointDA-10.
 
-    A list may hold a class beside its alias (ScanObjectNN: table and desk): the class comes first.
+    A name that is in no row of the table comes back folded.
+
+    Example:
+        >>> canonical("Night Stand"), canonical("TV-monitor"), canonical("toilet")
+        ('cabinet', 'monitor', 'toilet')
     """
-    exact = {name: position for position, name in enumerate(to)}
-    merged = {canonical(name): position for position, name in reversed(list(enumerate(to)))}
-    known = [(name, canonical(name)) for name in names]
-    rows = [exact.get(n, exact.get(folded, merged.get(folded, -1))) for n, folded in known]
-    return np.array(rows, dtype=np.int64)
+    folded = re.sub(r"[\s_-]+", "_", name.strip().lower())
+    return _CANONICAL.get(folded, folded)
+
+
+_MODELNET40 = """
+airplane bathtub bed bench bookshelf bottle bowl car chair cone cup curtain desk door dresser
+flower_pot glass_box guitar keyboard lamp laptop mantel monitor night_stand person piano plant
+radio range_hood sink sofa stairs stool table tent toilet tv_stand vase wardrobe xbox
+"""
+MODELNET40: frozenset[str] = frozenset(_MODELNET40.split())
+"""Folders of ModelNet40; ModelNet10's are among them."""
+
+POINTDA10_OF_MODELNET: dict[str, str] = {
+    "night_stand" if name == "cabinet" else name: name for name in POINTDA10
+}
+"""ModelNet40's share of PointDA-10: ten folders, of which only night_stand gets another name.
+
+4,183 meshes to train on and 856 to test on; Qin et al., PointDAN, NeurIPS 2019.
+"""
+
+_SHAPENET = """
+02691156 airplane  02747177 ashcan  02773838 bag  02801938 basket  02808440 bathtub  02818832 bed
+02828884 bench  02843684 birdhouse  02871439 bookshelf  02876657 bottle  02880940 bowl
+02924116 bus  02933112 cabinet  02942699 camera  02946921 can  02954340 cap  02958343 car
+02992529 cellular_telephone  03001627 chair  03046257 clock  03085013 computer_keyboard
+03207941 dishwasher  03211117 display  03261776 earphone  03325088 faucet  03337140 file
+03467517 guitar  03513137 helmet  03593526 jar  03624134 knife  03636649 lamp  03642806 laptop
+03691459 loudspeaker  03710193 mailbox  03759954 microphone  03761084 microwave
+03790512 motorcycle  03797390 mug  03928116 piano  03938244 pillow  03948459 pistol  03991062 pot
+04004475 printer  04074963 remote_control  04090263 rifle  04099429 rocket  04225987 skateboard
+04256520 sofa  04330267 stove  04379243 table  04401088 telephone  04460130 tower  04468005 train
+04530566 vessel  04554684 washer
+"""
+SHAPENET: dict[str, str] = dict(zip(_SHAPENET.split()[::2], _SHAPENET.split()[1::2], strict=True))
+"""ShapeNetCore's 55 synsets: WordNet 3.0 offset → the synset's first name."""
+
+POINTDA10_OF_SHAPENET: dict[str, str] = {
+    "display": "monitor",
+    "pot": "plant",
+    **{name: name for name in POINTDA10 if name not in ("monitor", "plant")},
+}
+"""ShapeNetCore's share of PointDA-10, by the names of ``SHAPENET``; pot is a flowerpot's synset."""
 
 
 def map_labels(
@@ -61,30 +150,13 @@ def map_labels(
     return mapped[kept], kept
 
 
-def merge_predictions(
-    predictions: Int[np.ndarray, "b"], class_names: Sequence[str], to: Sequence[str]
-) -> Int[np.ndarray, "b"]:
-    """Put a network's answers, after the arg-max, onto the classes of a test set.
+def _positions(names: Sequence[str], to: Sequence[str]) -> Int[np.ndarray, "k"]:
+    """Position in ``to`` of each name, −1 where it is in none: as it is, else by the table.
 
-    The network keeps all its classes to choose from; an answer that the test set has no class for
-    becomes −1, which every score counts as wrong.
-
-    Args:
-        predictions: Arg-max over the network's classes.
-        class_names: The network's classes.
-        to: Classes of the test set.
-
-    Raises:
-        InputError: where no class of the network is in ``to``.
-
-    Example:
-        >>> merge_predictions(np.array([0, 1, 2]), ["desk", "toilet", "bed"], ["bed", "table"])
-        array([ 1, -1,  0])
+    A list may hold a class beside its alias (ScanObjectNN: table and desk): the class comes first.
     """
-    positions = _positions(class_names, to)
-    if (positions < 0).all():
-        raise InputError(
-            f"the network's classes ({', '.join(class_names)}) and the data's ({', '.join(to)}) "
-            "have none in common"
-        )
-    return positions[predictions]
+    exact = {name: position for position, name in enumerate(to)}
+    merged = {canonical(name): position for position, name in reversed(list(enumerate(to)))}
+    folded = [(name, canonical(name)) for name in names]
+    rows = [exact.get(n, exact.get(fold, merged.get(fold, -1))) for n, fold in folded]
+    return np.array(rows, dtype=np.int64)

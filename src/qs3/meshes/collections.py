@@ -10,9 +10,19 @@ import trimesh
 
 from qs3 import shapes
 from qs3.errors import InputError
+from qs3.meshes.classes import (
+    POINTDA10,
+    POINTDA10_OF_MODELNET,
+    POINTDA10_OF_SHAPENET,
+    canonical,
+)
 from qs3.meshes.loading import load_mesh
-from qs3.meshes.selections import POINTDA10_CHOICE, chosen_names, rename
-from qs3.meshes.trees import read_tree
+from qs3.meshes.trees import Leaf, read_tree
+
+POINTDA10_CHOICE = "pointda10"
+"""The choice that takes PointDA-10's ten classes and gives them its names."""
+
+_MOST_NAMES = 60
 
 
 @dataclass(frozen=True)
@@ -64,7 +74,7 @@ def collect(
         per_class: Number of draws of each class; for shapes only.
         seed: Another seed gives other draws; for shapes only.
         classes: Keep these classes only; ``"pointda10"`` keeps and renames the ten classes of
-            PointDA-10, see ``rename``; None keeps all.
+            PointDA-10, by ModelNet's and ShapeNet's own lists or else by aliases; None keeps all.
         split: Keep this split only; None keeps all. Shapes have no split.
         labels: A CSV that names the class of each mesh, and its split if there is one, see
             ``read_labels``; meshes without a row are left out.
@@ -77,7 +87,7 @@ def collect(
         >>> [item.id for item in collect("shapes", per_class=2, classes=["chair"])]
         ['shapes/chair/000000', 'shapes/chair/000001']
     """
-    names = chosen_names(classes)
+    names = _chosen_names(classes)
     if str(source) == "shapes":
         if labels is not None:
             raise InputError(f"labels {labels}: shapes have their own classes; leave it out")
@@ -110,9 +120,58 @@ def _draws(per_class: int, seed: int, classes: Sequence[str] | None) -> list[Mes
 def _files(root: Path, classes: Sequence[str] | None, labels: Path | None) -> list[MeshItem]:
     leaves = read_tree(root, labels)
     own = [leaf.class_name for leaf in leaves]
-    names = own if classes is None else rename(leaves, classes, str(root))
+    names = own if classes is None else _rename(leaves, classes, str(root))
     return [
         MeshItem(leaf.id, name, leaf.split, root / leaf.relative, None, leaf.up)
         for name, leaf in zip(names, leaves, strict=True)
         if name is not None
     ]
+
+
+def _chosen_names(classes: str | Sequence[str] | None) -> tuple[str, ...] | None:
+    """Bring a choice of classes into one form: a tuple of names, or None for all."""
+    if classes is None:
+        return None
+    names = (classes,) if isinstance(classes, str) else tuple(classes)
+    if not names:
+        raise InputError("classes: name at least one")
+    if POINTDA10_CHOICE in names and len(names) > 1:
+        raise InputError(f"classes {', '.join(names)}: {POINTDA10_CHOICE} stands for ten; alone")
+    return names
+
+
+def _rename(leaves: Sequence[Leaf], classes: Sequence[str], source: str) -> list[str | None]:
+    """New class name of each mesh; None where it is not chosen.
+
+    Of ModelNet ``pointda10`` are exactly ten folders (night_stand becomes cabinet; dresser,
+    wardrobe, desk, bench, stool and tv_stand stay out), of ShapeNet ten synsets (display becomes
+    monitor, pot becomes plant), of anything else whatever ``canonical`` maps onto them. Any of
+    the ten may be missing. Other choices are names as they stand in the collection.
+    """
+    have = {(leaf.layout, leaf.class_name) for leaf in leaves}
+    if tuple(classes) == (POINTDA10_CHOICE,):
+        names = {key: _of_pointda10(*key) for key in have}
+        if not any(names.values()):
+            raise InputError(f"{source}: none of PointDA-10's ten classes; {_listed(have)}")
+    else:
+        for name in classes:
+            if name not in {own for _, own in have}:
+                raise InputError(f"{source}: no class {name!r}; {_listed(have)}")
+        names = {key: key[1] if key[1] in classes else None for key in have}
+    return [names[leaf.layout, leaf.class_name] for leaf in leaves]
+
+
+def _of_pointda10(layout: str, name: str) -> str | None:
+    if layout == "modelnet":
+        return POINTDA10_OF_MODELNET.get(name)
+    if layout == "shapenet":
+        return POINTDA10_OF_SHAPENET.get(name)
+    return canonical(name) if canonical(name) in POINTDA10 else None
+
+
+def _listed(have: set[tuple[str, str]]) -> str:
+    names = sorted({name for _, name in have if name})
+    if not names:
+        return "its meshes lie flat, without classes"
+    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    return f"it has {', '.join(names[:_MOST_NAMES])}{more}"

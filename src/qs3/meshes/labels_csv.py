@@ -98,13 +98,13 @@ def _names(relative: str) -> set[str]:
 def _find(name: str, named: dict[str, list[MeshFile]], root: Path, where: str) -> MeshFile:
     # What is in the table was found below the root, so only other names can lead out of it.
     plain = name if name in named else _plain(name, root, where)
-    found = named.get(plain, [])
-    exact = [file for file in found if file.relative == plain]
-    if len(exact or found) == 1:
-        return (exact or found)[0]
-    if found:
-        some = " and ".join(sorted(file.relative for file in found)[:2])
-        raise InputError(f"{where}: {name!r} is {len(found)} files, such as {some}; give the path")
+    files = named.get(plain, [])
+    exact = [file for file in files if file.relative == plain]
+    if len(exact or files) == 1:
+        return (exact or files)[0]
+    if files:
+        some = " and ".join(sorted(file.relative for file in files)[:2])
+        raise InputError(f"{where}: {name!r} is {len(files)} files, such as {some}; give the path")
     raise InputError(f"{where}: {name!r} is no mesh below {root}")
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from trimesh.resolvers import Resolver
 
 from qs3.errors import InputError
+from qs3.geometry import z_up_from_y_up
 
 EXTENSIONS: tuple[str, ...] = (".off", ".obj", ".ply", ".stl", ".glb", ".gltf")
 """Endings of the files that ``load_mesh`` reads."""
@@ -80,7 +81,7 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> trimesh.Trimes
     vertices, faces = _read_off(path) if ending == ".off" else _read_with_trimesh(path, ending)
     vertices, faces = _checked(path, vertices, faces)
     if up == "y" or (up is None and ending in _Y_UP):
-        vertices = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], axis=1)
+        vertices = z_up_from_y_up(vertices)
     return trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from qs3.errors import InputError
-from qs3.meshes.class_names import MODELNET40, SHAPENET
+from qs3.meshes.classes import MODELNET40, SHAPENET
 from qs3.meshes.labels_csv import read_labels, read_shapenet_splits
 from qs3.meshes.loading import EXTENSIONS
 from qs3.meshes.walking import MeshFile, entries, ids, is_file, walk
@@ -85,7 +85,7 @@ def _synsets(root: Path) -> frozenset[str]:
 
 
 def _shapenet(root: Path, synsets: frozenset[str]) -> list[Leaf]:
-    found: dict[tuple[str, str], str] = {}
+    files: dict[tuple[str, str], str] = {}
     for synset in synsets:
         models = [(entry.name, _model(Path(entry.path))) for entry in entries(root / synset)]
         inside = {(synset, name): file for name, file in models if file}
@@ -95,9 +95,9 @@ def _shapenet(root: Path, synsets: frozenset[str]) -> list[Leaf]:
                 f"<id>/{' or <id>/'.join(_SHAPENET_FILES)}; bring them into that form, or rename "
                 "the folder (its meshes are then taken to be z up)"
             )
-        found |= inside
+        files |= inside
     table = root / "all.csv"
-    splits = read_shapenet_splits(table, found.keys()) if table.is_file() else {}
+    splits = read_shapenet_splits(table, files.keys()) if table.is_file() else {}
     return [
         Leaf(
             f"{synset}/{name}/{file}".removesuffix(".obj"),
@@ -107,7 +107,7 @@ def _shapenet(root: Path, synsets: frozenset[str]) -> list[Leaf]:
             "y",
             "shapenet",
         )
-        for (synset, name), file in found.items()
+        for (synset, name), file in files.items()
     ]
 
 

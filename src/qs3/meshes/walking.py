@@ -26,8 +26,8 @@ def entries(folder: str | Path) -> list[os.DirEntry[str]]:
         InputError: where it cannot be read.
     """
     try:
-        with os.scandir(folder) as found:
-            return [entry for entry in found if not entry.name.startswith(".")]
+        with os.scandir(folder) as listing:
+            return [entry for entry in listing if not entry.name.startswith(".")]
     except OSError as error:
         raise InputError(f"{folder}: cannot be listed ({error.strerror})") from error
 
@@ -43,7 +43,7 @@ def walk(root: Path, skip: Container[str] = ()) -> list[MeshFile]:
         InputError: where a folder cannot be read, or a link that is named like a mesh leads
             nowhere (a disk that is not there, say).
     """
-    found: list[MeshFile] = []
+    meshes: list[MeshFile] = []
     # Of each folder still to be listed: its path below the root with a closing slash, whether a
     # link leads there, and the real paths from the root down to it, in which a circle shows.
     left: list[tuple[str, bool, tuple[str, ...]]] = [("", False, (os.path.realpath(root),))]
@@ -58,8 +58,8 @@ def walk(root: Path, skip: Container[str] = ()) -> list[MeshFile]:
                 if real not in above:
                     left.append((f"{prefix}{entry.name}/", linked or is_link, (*above, real)))
             elif is_mesh(entry.name) and is_file(entry):
-                found.append(MeshFile(prefix + entry.name, linked or is_link))
-    return found
+                meshes.append(MeshFile(prefix + entry.name, linked or is_link))
+    return meshes
 
 
 def is_mesh(name: str) -> bool:

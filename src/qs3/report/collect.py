@@ -1,5 +1,6 @@
 """What a page tells about the runs and records of a folder."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,7 +10,7 @@ from qs3.errors import InputError, QS3Error
 from qs3.evaluation.environment import versions
 from qs3.evaluation.records import DataRecord, RunRecord, find_records
 from qs3.io.clouds import PointClouds, digests
-from qs3.io.transforms import unit_ball
+from qs3.io.preparation import unit_ball
 from qs3.report import parts
 from qs3.report.contents import Report, Scored
 from qs3.report.lines import NamedRecord, score_lines
@@ -19,6 +20,7 @@ from qs3.training.checkpoint import LoadedModel, load_model
 from qs3.training.evaluate import caveats
 from qs3.training.run import RUN, Run, find_runs, read_run
 
+_OLD_NAME = re.compile(r"([^-]+-.+)_([^_]+)_seed-\d+")
 _MEANING = {
     "transductive": "Transductive: the network adapted to clouds that it is scored on; their "
     "labels served the score alone.",
@@ -88,9 +90,12 @@ def look(folder: Path, published: Mapping[str, Mapping[str, str]] | None = None)
 def _named(
     path: Path, record: RunRecord, published: Mapping[str, Mapping[str, str]]
 ) -> NamedRecord:
+    """A record with its line of an experiment; of an older one its file's name alone tells it."""
     place = record.experiment or {}
     task = "-".join(str(place[name]) for name in ("source", "target") if name in place)
     row = str(place.get("row", ""))
+    if record.experiment is None and (old := _OLD_NAME.fullmatch(path.stem)):
+        task, row = old.groups()
     figure = published.get(task, {}).get(row, "")
     return NamedRecord(str(path), record, f"{task} {row}".strip(), figure)
 

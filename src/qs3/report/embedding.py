@@ -45,15 +45,15 @@ def embed(features: Float[np.ndarray, "b c"], seed: int = 0) -> Float[np.ndarray
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(limits=1):
-        found = TSNE(
+        positions = TSNE(
             init="pca",
             perplexity=min(30.0, (len(features) - 1) / 3.0),
             random_state=seed,
             n_jobs=1,
         ).fit_transform(features)
-    placed = found.astype(np.float64)
-    placed -= placed.mean(axis=0)
-    return placed / max(float(np.linalg.norm(placed, axis=1).max()), 1e-12)
+    positions = positions.astype(np.float64)
+    positions -= positions.mean(axis=0)
+    return positions / max(float(np.linalg.norm(positions, axis=1).max()), 1e-12)
 
 
 @house_style

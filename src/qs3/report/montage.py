@@ -214,8 +214,8 @@ def _error(
     unit: str,
 ) -> None:
     """Signed error over a map of the pixels where it does not exist, by the reason."""
-    known = error[np.isfinite(error)]
-    high = max(float(np.quantile(np.abs(known), 0.95)), 1e-9) if len(known) else 1.0
+    errors = error[np.isfinite(error)]
+    high = max(float(np.quantile(np.abs(errors), 0.95)), 1e-9) if len(errors) else 1.0
     reason = np.zeros(error.shape)
     reason[np.isfinite(true) & ~np.isfinite(depth)] = 1
     reason[np.isfinite(depth) & ~np.isfinite(true)] = 2
@@ -238,21 +238,21 @@ def _error(
 def _histogram(
     axes: Axes, error: Float[np.ndarray, "h w"], true: Float[np.ndarray, "h w"], unit: str
 ) -> None:
-    known = error[np.isfinite(error)]
+    errors = error[np.isfinite(error)]
     axes.set_title("distribution of the error")
     axes.set_yticks([])
     axes.spines["left"].set_visible(False)
     axes.tick_params(labelsize=8)
-    if not len(known):
+    if not len(errors):
         axes.set_xticks([])
         axes.set_xlabel("no pixel has both depths", fontsize=9)
         return
-    median = float(np.median(known))
-    sigma = 1.4826 * float(np.median(np.abs(known - median)))
-    reach = max(4.0 * sigma, float(np.quantile(np.abs(known), 0.95)), 1e-9)
-    axes.hist(np.clip(known, -reach, reach), bins=60, range=(-reach, reach), color="#332288")
+    median = float(np.median(errors))
+    sigma = 1.4826 * float(np.median(np.abs(errors - median)))
+    reach = max(4.0 * sigma, float(np.quantile(np.abs(errors), 0.95)), 1e-9)
+    axes.hist(np.clip(errors, -reach, reach), bins=60, range=(-reach, reach), color="#332288")
     axes.axvline(0.0, color="black", linewidth=0.8)
-    seen = 100.0 * len(known) / max(int(np.isfinite(true).sum()), 1)
+    seen = 100.0 * len(errors) / max(int(np.isfinite(true).sum()), 1)
     text = f"depth − true depth [{unit}]\nmedian {median:+.2g}, robust σ {sigma:.2g}\n"
     axes.set_xlabel(text + f"{seen:.0f} % of the object seen", fontsize=9)
     axes.locator_params(axis="x", nbins=5)
@@ -261,9 +261,9 @@ def _histogram(
 def _colour_bar(
     axes: Axes, shown: AxesImage, values: Float[np.ndarray, "h w"], limits: tuple[float, float]
 ) -> None:
-    known = values[np.isfinite(values)]
-    below = bool(len(known)) and float(known.min()) < limits[0]
-    above = bool(len(known)) and float(known.max()) > limits[1]
+    finite = values[np.isfinite(values)]
+    below = bool(len(finite)) and float(finite.min()) < limits[0]
+    above = bool(len(finite)) and float(finite.max()) > limits[1]
     extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[below, above]
     bar = axes.figure.colorbar(shown, cax=axes.inset_axes((1.03, 0.0, 0.05, 1.0)), extend=extend)
     bar.ax.tick_params(labelsize=8)
@@ -273,10 +273,10 @@ def _colour_bar(
 
 def _limits(values: Float[np.ndarray, "h w"], percent: float) -> tuple[float, float]:
     """Range of the finite values without ``percent`` at either end, never empty."""
-    known = values[np.isfinite(values)]
-    if not len(known):
+    finite = values[np.isfinite(values)]
+    if not len(finite):
         return 0.0, 1.0
-    low, high = (float(x) for x in np.percentile(known, [percent, 100.0 - percent]))
+    low, high = (float(x) for x in np.percentile(finite, [percent, 100.0 - percent]))
     return (low, high) if high > low else (low - 0.5, high + 0.5)
 
 

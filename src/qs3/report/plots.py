@@ -219,12 +219,12 @@ def class_accuracy(
         (-0.2, before, names[0], BEFORE),
         (0.2, after, names[1], AFTER),
     ):
-        known = np.nan_to_num(values, nan=0.0)
-        axes.barh(rows + offset, 100.0 * known, 0.38, color=colour, label=short(name, 24))
+        lengths = np.nan_to_num(values, nan=0.0)
+        axes.barh(rows + offset, 100.0 * lengths, 0.38, color=colour, label=short(name, 24))
         for row, value in zip(rows, values, strict=True):
             text = "no cloud" if np.isnan(value) else f"{100.0 * value:.0f}"
             if not (np.isnan(value) and offset > 0):
-                axes.text(100.0 * known[row] + 1, row + offset, text, va="center", fontsize=8.5)
+                axes.text(100.0 * lengths[row] + 1, row + offset, text, va="center", fontsize=8.5)
     axes.set_yticks(rows, [f"{short(n)} ({c})" for n, c in zip(class_names, counts, strict=True)])
     axes.invert_yaxis()
     axes.set_xlim(0, 108)

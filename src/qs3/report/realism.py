@@ -49,13 +49,18 @@ def realism_plot(result: _Result, sensor: Sensor) -> Figure | None:
 def rms_plot(result: _Result, sensor: Sensor) -> Figure:
     """RMS about the wall's plane against distance (T1), with the law and the fitted slope."""
     z, rms = _series(result, "z"), _series(result, "rms_mm")
-    figure, (axes,) = _figure(1)
+    figure, axes = _plot(
+        sensor,
+        "noise of a facing wall",
+        _length("distance", "m", sensor),
+        _length("RMS about the plane", "mm", sensor),
+    )
     reach = np.geomspace(z.min() / 1.1, z.max() * 1.1, 50)
     law = 1000 * LAW_PIXELS * reach**2 / (sensor.rig.focal * sensor.rig.baseline)
     axes.plot(reach, law, "--", color=_LAW, label=f"law: {LAW_PIXELS} px · z²/(f·b)")
-    known = rms > 0
-    if known.sum() > 1:
-        slope, start = np.polyfit(np.log(z[known]), np.log(rms[known]), 1)
+    positive = rms > 0
+    if positive.sum() > 1:
+        slope, start = np.polyfit(np.log(z[positive]), np.log(rms[positive]), 1)
         fitted = np.exp(start) * reach**slope
         axes.plot(reach, fitted, "-", color=NO_VALUE, label=f"fit: slope {slope:.2f}")
     axes.plot(z, rms, "o", color=_MEASURED, label="measured")
@@ -65,9 +70,6 @@ def rms_plot(result: _Result, sensor: Sensor) -> Figure:
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(NullFormatter())
-    axes.set_xlabel(_length("distance", "m", sensor))
-    axes.set_ylabel(_length("RMS about the plane", "mm", sensor))
-    axes.set_title(f"{sensor.name}: noise of a facing wall")
     axes.legend(loc="upper left")
     return figure
 
@@ -77,7 +79,12 @@ def bias_plot(result: _Result, sensor: Sensor) -> Figure:
     """Mean error of disparity against its fraction of a pixel (T2), with the median's bounds."""
     fraction, bias = _series(result, "fraction"), _series(result, "bias")
     order = np.argsort(fraction)
-    figure, (axes,) = _figure(1)
+    figure, axes = _plot(
+        sensor,
+        "bias over a pixel",
+        "fraction of the true disparity [px]",
+        "error of disparity [px]",
+    )
     axes.axhspan(-0.01, 0.01, color=_SECOND, alpha=0.25, label="bounds of the median")
     axes.plot(
         fraction[order], bias[order], "o-", color=_MEASURED, markersize=4, label="mean of a wall"
@@ -87,9 +94,6 @@ def bias_plot(result: _Result, sensor: Sensor) -> Figure:
         axes.axhline(median, color=_LAW, linestyle="--", label=f"median of all: {median:+.4f} px")
     reach = 1.3 * max(0.02, float(np.nanmax(np.abs(bias), initial=0.0)))
     axes.set(xlim=(0, 1), ylim=(-reach, reach))
-    axes.set_xlabel("fraction of the true disparity [px]")
-    axes.set_ylabel("error of disparity [px]")
-    axes.set_title(f"{sensor.name}: bias over a pixel")
     figure.legend(loc="outside lower center", fontsize=9, ncols=2)
     return figure
 
@@ -99,7 +103,8 @@ def edge_plot(result: _Result, sensor: Sensor) -> Figure:
     """What is measured across the edge of a plate before a wall (T5), half a block marked."""
     offset = _series(result, "offset")
     half = sensor.matching.block_size / 2
-    figure, (axes,) = _figure(1)
+    across = "pixels from the true edge (left: on the plate)"
+    figure, axes = _plot(sensor, "profile of an edge", across, "share of the rows")
     axes.axvspan(-half, half, color=_SECOND, alpha=0.2, label="± half a block")
     axes.axvline(0, color="black", linewidth=0.8)
     axes.plot(
@@ -113,9 +118,6 @@ def edge_plot(result: _Result, sensor: Sensor) -> Figure:
         label="depth in between",
     )
     axes.set(xlim=(offset.min(), offset.max()), ylim=(-0.03, 1.05))
-    axes.set_xlabel("pixels from the true edge (left: on the plate)")
-    axes.set_ylabel("share of the rows")
-    axes.set_title(f"{sensor.name}: profile of an edge")
     figure.legend(loc="outside lower center", fontsize=9, ncols=3)
     return figure
 
@@ -123,7 +125,8 @@ def edge_plot(result: _Result, sensor: Sensor) -> Figure:
 @house_style
 def fill_plot(result: _Result, sensor: Sensor) -> Figure:
     """Fill rate against albedo and against the angle of incidence (T6)."""
-    figure, (left, right) = _figure(2)
+    figure = Figure(figsize=(1.4 * _WIDTH, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
     left.plot(_series(result, "albedo"), _series(result, "fill_albedo"), "o-", color=_MEASURED)
     left.set_xscale("log")
     left.invert_xaxis()
@@ -145,7 +148,8 @@ def fill_plot(result: _Result, sensor: Sensor) -> Figure:
 def steps_plot(result: _Result, sensor: Sensor) -> Figure:
     """Depth steps and noise against distance (T8), with the measured law of the real camera."""
     z = _series(result, "z")
-    figure, (axes,) = _figure(1)
+    x, y = _length("distance", "m", sensor), _length("step, σ", "mm", sensor)
+    figure, axes = _plot(sensor, "steps and noise", x, y)
     for name, what, colour, mark in (
         ("step", "step of depth", _MEASURED, "o"),
         ("sigma", "noise σ", _LAW, "s"),
@@ -156,9 +160,6 @@ def steps_plot(result: _Result, sensor: Sensor) -> Figure:
         measured = _series(result, f"{name}_mm")
         axes.plot(z, measured, mark, color=colour, label=f"{what}: measured")
     axes.set_ylim(bottom=0)
-    axes.set_xlabel(_length("distance", "m", sensor))
-    axes.set_ylabel(_length("step, σ", "mm", sensor))
-    axes.set_title(f"{sensor.name}: steps and noise")
     axes.legend(loc="upper left")
     return figure
 
@@ -168,14 +169,12 @@ def distances_plot(result: _Result, sensor: Sensor) -> Figure:
     """Distances of scanned points from the surface in units of the law's σ (T10)."""
     distance, share = _series(result, "distance"), _series(result, "share")
     width = float(np.median(np.diff(distance))) if len(distance) > 1 else 1.0
-    figure, (axes,) = _figure(1)
+    across = "distance from the surface, in σ of the law"
+    figure, axes = _plot(sensor, "a scanned object", across, "share of the points")
     axes.bar(distance, share, width, color=_SECOND, label="measured")
     x = np.linspace(distance.min() - width / 2, distance.max() + width / 2, 200)
     normal = width * np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
     axes.plot(x, normal, "--", color=_LAW, label="the law: Gaussian of σ = 1")
-    axes.set_xlabel("distance from the surface, in σ of the law")
-    axes.set_ylabel("share of the points")
-    axes.set_title(f"{sensor.name}: a scanned object")
     figure.legend(loc="outside lower center", fontsize=9, ncols=2)
     return figure
 
@@ -190,9 +189,11 @@ _DRAW: dict[str, Callable[[_Result, Sensor], Figure]] = {
 }
 
 
-def _figure(panels: int) -> tuple[Figure, list[Axes]]:
-    figure = Figure(figsize=(_WIDTH * (1.0 if panels == 1 else 1.4), 3.6), layout="constrained")
-    return figure, list(figure.subplots(1, panels, squeeze=False, sharey=True)[0])
+def _plot(sensor: Sensor, title: str, x: str, y: str) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(_WIDTH, 3.6), layout="constrained")
+    axes = figure.subplots()
+    axes.set(title=f"{sensor.name}: {title}", xlabel=x, ylabel=y)
+    return figure, axes
 
 
 def _series(result: _Result, name: str) -> Float[np.ndarray, "n"]:

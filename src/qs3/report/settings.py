@@ -32,12 +32,7 @@ class ReportSettings:
     clouds: int = 200
     """Clouds to step through, half of them of each domain."""
 
-    def require_sound(self) -> None:
-        """Refuse what cannot be meant.
-
-        Raises:
-            InputError: where a part of clouds is named without the clouds, or a number is negative.
-        """
+    def __post_init__(self) -> None:
         if self.clouds < 0:
             raise InputError(f"--clouds {self.clouds}: must not be negative")
         for name, place, parts in (

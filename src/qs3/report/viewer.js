@@ -3,7 +3,7 @@
 (() => {
   const holder = document.getElementById("viewer");
   if (!holder) return;
-  const select = holder.querySelector("select"), told = holder.querySelector("output");
+  const select = holder.querySelector("select"), counter = holder.querySelector("output");
   const names = [...select.options].slice(1).map((option) => option.textContent);
   let yaw = 0.5, pitch = 0.35, waiting = false, at = 0;
 
@@ -24,13 +24,13 @@
 
   // What the buttons step through: class and number; the domain with fewer clouds begins anew.
   function steps() {
-    const found = [];
+    const places = [];
     names.forEach((_, kind) => {
       if (select.value !== "" && Number(select.value) !== kind) return;
       const most = Math.max(...domains.map((domain) => domain.items[kind].length));
-      for (let number = 0; number < most; number++) found.push([kind, number]);
+      for (let number = 0; number < most; number++) places.push([kind, number]);
     });
-    return found;
+    return places;
   }
 
   // Clouds are decoded when it is their turn: two hundred of them at once would take a phone long.
@@ -52,7 +52,7 @@
     const all = steps();
     at = (place + all.length) % all.length;
     const [kind, number] = all[at];
-    told.textContent = `${at + 1} of ${all.length}`;
+    counter.textContent = `${at + 1} of ${all.length}`;
     for (const domain of domains) {
       const own = domain.items[kind], item = own[number % own.length];
       domain.cloud = item ? decode(item) : null;

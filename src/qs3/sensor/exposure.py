@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Float32, Shaped, UInt8, UInt16
 
-from qs3.errors import InputError
+from qs3.sensor.checks import check_choices, check_range
 from qs3.sensor.lens import blur, blur_reach, vignette
 from qs3.sensor.render.scene import StereoPair
 from qs3.sensor.rig import Region, StereoRig
@@ -56,28 +56,13 @@ class ExposureSettings:
     """Bits of a pixel."""
 
     def __post_init__(self) -> None:
-        if self.response not in ("film", "linear", "gamma"):
-            raise InputError(
-                f"exposure: no response {self.response!r}; choose film, linear or gamma"
-            )
-        for name in ("gamma", "gain"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InputError(f"exposure: {name} {getattr(self, name)} must be above 0")
-        for name in ("max_gain", "speckle", "noise"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"exposure: {name} {getattr(self, name)} must not be below 0")
-        if not 0 <= self.auto < 1:
-            raise InputError(
-                f"exposure: auto {self.auto} is a share of white: from 0 (off) to below 1"
-            )
-        if not 0 <= self.psf <= 20:
-            raise InputError(f"exposure: psf {self.psf} is in pixels and within 0…20")
-        if not 0 <= self.vignetting <= 1:
-            raise InputError(f"exposure: vignetting {self.vignetting} is a share: within 0…1")
-        if not -255 <= self.offset <= 255:
-            raise InputError(f"exposure: offset {self.offset} is in grey levels of 255")
-        if self.bits not in (8, 10):
-            raise InputError(f"exposure: {self.bits} bits; choose 8 or 10")
+        check_choices(self, "exposure")
+        check_range(self, "exposure", "gamma", "gain", above=True)
+        check_range(self, "exposure", "max_gain", "speckle", "noise")
+        check_range(self, "exposure", "auto", high=1.0, below=True)
+        check_range(self, "exposure", "psf", high=20.0)
+        check_range(self, "exposure", "vignetting", high=1.0)
+        check_range(self, "exposure", "offset", low=-255.0, high=255.0)
 
 
 def expose_pair(
@@ -107,21 +92,21 @@ def expose_pair(
         has no second camera.
     """
     gain = 1.0 if pair.display else automatic_gain(pair, focus, rig, settings)
-    made = []
-    for side in (0, 1):
-        if side == 1 and rig.second == "pattern":
-            made.append(_quantised(np.zeros((0, 0), np.float32), settings))
-            continue
+    shape = rig.full_frame.shape
+
+    def side(index: int) -> Grey:
         speckle = noise = None
-        shape = (rig.height, rig.width)
         if settings.speckle > 0:
             speckle = rng.standard_gamma(settings.speckle, shape, np.float32)[canvas.slices]
             speckle = speckle / np.float32(settings.speckle)
         if settings.noise > 0:
             noise = rng.standard_normal(shape, np.float32)[canvas.slices]
-        light = _through_lens(pair, side, canvas, rig, settings)
-        made.append(expose(light, settings, noise, speckle, gain, pair.display))
-    return made[0], made[1]
+        light = _through_lens(pair, index, canvas, rig, settings)
+        return expose(light, settings, noise, speckle, gain, pair.display)
+
+    if rig.second == "pattern":
+        return side(0), _quantised(np.zeros((0, 0), np.float32), settings)
+    return side(0), side(1)
 
 
 def expose(

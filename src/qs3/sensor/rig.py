@@ -6,7 +6,6 @@ Convention:
     top-left pixel. Disparity is u_left − u_right ≥ 0. The left camera is the reference.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,6 +14,7 @@ from jaxtyping import Float
 
 from qs3.errors import InputError
 from qs3.geometry import invert_rigid, look_at, transform_points
+from qs3.sensor.checks import check_choices, check_range
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,11 @@ class Region:
     def empty(self) -> bool:
         """Whether there is no pixel in it."""
         return self.width < 1 or self.height < 1
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns, as of an image."""
+        return max(self.height, 0), max(self.width, 0)
 
     def grown(self, margin: int, width: int, height: int) -> "Region":
         """The rectangle with ``margin`` pixels more on every side, cut at the frame's borders."""
@@ -98,20 +103,10 @@ class StereoRig:
     place would see it, which then stands at 1 (Kinect v1)."""
 
     def __post_init__(self) -> None:
-        if min(self.width, self.height) < 1 or not (
-            0 < self.focal < math.inf and 0 < self.baseline < math.inf
-        ):
-            raise InputError(
-                f"rig: width {self.width}, height {self.height}, focal {self.focal} and baseline "
-                f"{self.baseline} must be positive"
-            )
-        if self.second not in ("camera", "pattern"):
-            raise InputError(f"rig: no second image {self.second!r}; choose camera or pattern")
-        if not -10 <= self.projector_offset <= 10:
-            raise InputError(
-                f"rig: projector_offset {self.projector_offset} is in baselines from the left "
-                "camera: 0.5 is half way to the right one"
-            )
+        check_choices(self, "rig")
+        check_range(self, "rig", "width", "height", low=1)
+        check_range(self, "rig", "focal", "baseline", above=True)
+        check_range(self, "rig", "projector_offset", low=-10.0, high=10.0)
         if self.second == "pattern" and self.projector_offset != 1:
             raise InputError("rig: with the stored pattern as second image projector_offset is 1")
 
@@ -159,21 +154,12 @@ class StereoRig:
             The rectangle, cut at the image's borders; the whole image where the box reaches
             behind the camera; an empty rectangle (width or height 0) where none of it is seen.
         """
-        corners = np.array(
-            [
-                [bounds[i, 0], bounds[j, 1], bounds[k, 2]]
-                for i in (0, 1)
-                for j in (0, 1)
-                for k in (0, 1)
-            ]
-        )
+        corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), axis=-1).reshape(8, 3)
         pixels, depth = self.project(corners, camera)
         if depth.min() <= 1e-6:
             return self.full_frame
         low = np.floor(pixels.min(axis=0)).astype(int) - margin
         high = np.ceil(pixels.max(axis=0)).astype(int) + margin + 1
-        x0, y0 = max(0, low[0]), max(0, low[1])
-        x1, y1 = min(self.width, high[0]), min(self.height, high[1])
-        if x0 >= x1 or y0 >= y1:
-            return Region(0, 0, 0, 0)
-        return Region(int(x0), int(y0), int(x1 - x0), int(y1 - y0))
+        x, y = np.maximum(low, 0).tolist()
+        x1, y1 = np.minimum(high, (self.width, self.height)).tolist()
+        return Region(x, y, x1 - x, y1 - y) if x < x1 and y < y1 else Region(0, 0, 0, 0)

@@ -33,9 +33,8 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 def renderer_dict(renderer: Renderer) -> dict[str, Any]:
     """All settings of a renderer and what it says of itself, as plain values for records."""
-    settings: Any = renderer
-    own = dataclasses.asdict(settings) if dataclasses.is_dataclass(settings) else {}
-    return own | renderer.description
+    settings: Any = renderer  # a dataclass
+    return dataclasses.asdict(settings) | renderer.description
 
 
 @dataclass(frozen=True)
@@ -178,6 +177,14 @@ class ScanSettings(CameraSettings):
         super().__post_init__()
         check_range(self, "scan", "num_points", "views", low=1)
         check_range(self, "scan", "box_margin", "seed")
+
+    def with_sensor(self, sensor: Sensor, renderer: Renderer) -> "ScanSettings":
+        """The same scan by another sensor, which is taken as it is: no setting changes it."""
+        defaults = {f.name: f.default for f in dataclasses.fields(self) if f.name in self._CHANGES}
+        point = sensor.depth.principal_point
+        return dataclasses.replace(
+            self, **defaults | {"principal_point": point}, sensor=sensor, renderer=renderer
+        )
 
     def chosen(self, name: str) -> Any:
         """A setting by its name, or the preset's where it is None."""

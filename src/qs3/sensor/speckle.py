@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from qs3.errors import InputError
+from qs3.sensor.checks import check_choices, check_range
 
 _TILE = 3  # one dot in each 3×3 tile of cells: the density of 1 in 9
 _LEAST_DISTANCE = 1.5  # cells between two spots; the middle of a tile has it from all other tiles
@@ -46,15 +47,10 @@ class PatternSettings:
     """Path of a grey picture to project in place of the dots; white is full power."""
 
     def __post_init__(self) -> None:
-        if self.kind not in ("tiles", "spots"):
-            raise InputError(f"pattern: no kind {self.kind!r}; choose tiles or spots")
-        for name in ("tan_half_width", "tan_half_height"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InputError(f"pattern: {name} {getattr(self, name)} must be above 0")
-        if self.seed < 0:
-            raise InputError(f"pattern: seed {self.seed} must not be below 0")
-        if not 0 < self.spot_size <= 2:
-            raise InputError(f"pattern: spot_size {self.spot_size} must be above 0 and up to 2")
+        check_choices(self, "pattern")
+        check_range(self, "pattern", "tan_half_width", "tan_half_height", above=True)
+        check_range(self, "pattern", "seed")
+        check_range(self, "pattern", "spot_size", high=2.0, above=True)
         if self.image is None:
             _check_cells(self.columns, self.rows)
 

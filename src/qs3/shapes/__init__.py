@@ -5,28 +5,17 @@ Convention:
     middle lies over the origin; its front looks toward −y.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 import trimesh
 
 from qs3.errors import InputError
-from qs3.shapes import (
-    bathtub,
-    bed,
-    bookshelf,
-    cabinet,
-    chair,
-    lamp,
-    monitor,
-    plant,
-    sofa,
-    table,
-)
+from qs3.shapes import bathtub, bed, bookshelf, cabinet, chair, lamp, monitor, plant, sofa, table
 from qs3.shapes._dice import Dice
-from qs3.shapes._parts import Part, assemble
+from qs3.shapes._solids import Solid, assemble
 
-_FAMILIES: dict[str, Mapping[str, Callable[[Dice], list[Part]]]] = {
+_FAMILIES: dict[str, tuple[Callable[[Dice], list[Solid]], ...]] = {
     "bathtub": bathtub.FAMILIES,
     "bed": bed.FAMILIES,
     "bookshelf": bookshelf.FAMILIES,
@@ -55,7 +44,7 @@ def families(class_name: str) -> tuple[str, ...]:
     """
     if class_name not in _FAMILIES:
         raise InputError(f"class {class_name!r} is unknown; choose one of {', '.join(CLASSES)}")
-    return tuple(_FAMILIES[class_name])
+    return tuple(family.__name__ for family in _FAMILIES[class_name])
 
 
 def make(class_name: str, seed: int = 0, family: str | None = None) -> trimesh.Trimesh:
@@ -89,7 +78,8 @@ def make(class_name: str, seed: int = 0, family: str | None = None) -> trimesh.T
     rng = np.random.default_rng(np.random.SeedSequence([seed, CLASSES.index(class_name)]))
     drawn = names[int(rng.integers(len(names)))]
     mirrored = bool(rng.integers(2))
-    mesh = assemble(_FAMILIES[class_name][family or drawn](Dice(rng)))
+    build = _FAMILIES[class_name][names.index(family or drawn)]
+    mesh = assemble(build(Dice(rng)))
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     vertices = vertices - [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]

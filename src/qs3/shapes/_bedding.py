@@ -5,15 +5,7 @@ from itertools import pairwise
 import numpy as np
 
 from qs3.shapes._dice import Dice
-from qs3.shapes._parts import (
-    Number,
-    Part,
-    Span,
-    block,
-    cushion,
-    pillow,
-    ribbon,
-)
+from qs3.shapes._solids import Number, Solid, Span, around, block, cushion, pillow, ribbon, within
 
 
 def bed_size(dice: Dice) -> tuple[float, float]:
@@ -22,10 +14,10 @@ def bed_size(dice: Dice) -> tuple[float, float]:
     return width, dice.between(1.9, 2.15)
 
 
-def bedding(dice: Dice, x: Span, y: Span, z: Number, thick: Number) -> list[Part]:
+def bedding(dice: Dice, x: Span, y: Span, z: Number, thick: Number) -> list[Solid]:
     """Mattress on ``z`` with pillows at its head (+y) and perhaps a blanket."""
     top = z + thick
-    parts = [cushion(x, y, (z - 0.003, top), dice.between(0.02, 0.06), 0.01, dice.steps)]
+    parts = [cushion(dice, x, y, (z - 0.003, top), dice.between(0.02, 0.06), 0.01)]
     width = x[1] - x[0]
     count = 1 if width < 1.15 else 2
     if dice.chance(0.9):
@@ -35,7 +27,7 @@ def bedding(dice: Dice, x: Span, y: Span, z: Number, thick: Number) -> list[Part
                 half, deep = dice.between(0.3, 0.42) * width / count, dice.between(0.16, 0.24)
                 rise = dice.between(0.08, 0.16)
                 if dice.chance(0.3):
-                    pad = cushion((-half, half), (-deep, deep), (0, rise), 0.05, 0.01, dice.steps)
+                    pad = cushion(dice, (-half, half), (-deep, deep), (0, rise), 0.05, 0.01)
                 else:
                     pad = pillow((-half, half), (-deep, deep), (0, rise))
                 lean = dice.between(0, 12) + (25 if row else 0)
@@ -50,17 +42,13 @@ def bedding(dice: Dice, x: Span, y: Span, z: Number, thick: Number) -> list[Part
         cover = (y[0] - over, y[0] + dice.between(0.3, 0.75) * (y[1] - y[0]))
         drop = top - dice.between(0.4, 1.1) * thick
         blanket = cushion(
-            (x[0] - over, x[1] + over),
-            cover,
-            (drop, top + dice.between(0.02, 0.05)),
-            0.03,
-            steps=dice.steps,
+            dice, within(x, -over), cover, (drop, top + dice.between(0.02, 0.05)), 0.03
         )
         parts.append(blanket)
     return parts
 
 
-def headboard(dice: Dice, x: Span, y: Number, z: Span, thick: Number) -> list[Part]:
+def headboard(dice: Dice, x: Span, y: Number, z: Span, thick: Number) -> list[Solid]:
     style = dice.pick("board", "board", "padded", "slats", "posts", "arch")
     low, high = z
     if style == "board":
@@ -69,9 +57,7 @@ def headboard(dice: Dice, x: Span, y: Number, z: Span, thick: Number) -> list[Pa
         count = dice.pick(1, 2, 3, 5)
         edges = np.linspace(*x, count + 1)
         return [
-            cushion(
-                (float(a) - 0.002, float(b) + 0.002), (y, y + 2 * thick), z, 0.03, steps=dice.steps
-            )
+            cushion(dice, (float(a) - 0.002, float(b) + 0.002), (y, y + 2 * thick), z, 0.03)
             for a, b in pairwise(edges)
         ]
     if style == "arch":
@@ -81,21 +67,15 @@ def headboard(dice: Dice, x: Span, y: Number, z: Span, thick: Number) -> list[Pa
         return [ribbon(path, np.stack([half, 0 * u, 0 * u], axis=1), thick).move((x[0] + x[1]) / 2)]
     post = max(thick, 0.05) * dice.between(1.0, 1.8)
     parts = [
-        block((px - post / 2, px + post / 2), (y, y + post), (low, high + dice.between(0.0, 0.08)))
-        for px in (x[0] + post / 2, x[1] - post / 2)
+        block(around(px, post / 2), (y, y + post), (low, high + dice.between(0.0, 0.08)))
+        for px in within(x, post / 2)
     ]
     mid = y + thick / 3 - 0.003
     if style == "posts":
-        return [*parts, block(x, (mid - thick / 3, mid + thick / 3), (low, high - 0.03))]
+        return [*parts, block(x, around(mid, thick / 3), (low, high - 0.03))]
     rail = dice.between(0.06, 0.12)
-    parts.append(block(x, (mid - thick / 2, mid + thick / 2), (high - rail, high)))
-    parts.append(block(x, (mid - thick / 2, mid + thick / 2), (low, low + rail)))
+    parts.append(block(x, around(mid, thick / 2), (high - rail, high)))
+    parts.append(block(x, around(mid, thick / 2), (low, low + rail)))
     for px in np.linspace(x[0] + 0.12, x[1] - 0.12, dice.count(3, 9)):
-        parts.append(
-            block(
-                (float(px) - 0.015, float(px) + 0.015),
-                (y - 0.002, mid + 0.01),
-                (low, high - rail / 2),
-            )
-        )
+        parts.append(block(around(px, 0.015), (y - 0.002, mid + 0.01), (low, high - rail / 2)))
     return parts

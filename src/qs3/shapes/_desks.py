@@ -4,14 +4,10 @@ import numpy as np
 
 from qs3.shapes._dice import Dice
 from qs3.shapes._joinery import carcass, corners, fronts, legs
-from qs3.shapes._parts import (
-    Part,
-    block,
-    sheet,
-)
+from qs3.shapes._solids import Solid, block, sheet, within
 
 
-def desk(dice: Dice) -> list[Part]:
+def desk(dice: Dice) -> list[Solid]:
     """Desk with drawers on one or both sides, panels or legs."""
     width, depth, height = dice.between(1.0, 1.9), dice.between(0.5, 0.8), dice.between(0.7, 0.78)
     thick = dice.between(0.02, 0.04) * dice.bulk
@@ -24,13 +20,13 @@ def desk(dice: Dice) -> list[Part]:
         outer = s * (width / 2 - inset)
         if s > 0 or both:
             span = (min(outer, outer - s * unit), max(outer, outer - s * unit))
-            parts.append(block(span, (y[0] + inset, y[1] - inset), (floor, under + 0.003)))
+            parts.append(block(span, within(y, inset), (floor, under + 0.003)))
             parts += fronts(
                 dice, span, (floor + 0.02, under - 0.01), y[0] + inset, 1, dice.count(1, 4)
             )
         elif dice.chance(0.4):
             span = (min(outer, outer - s * thick), max(outer, outer - s * thick))
-            parts.append(block(span, (y[0] + inset, y[1] - inset), (0, under + 0.003)))
+            parts.append(block(span, within(y, inset), (0, under + 0.003)))
         else:
             leg = dice.between(0.035, 0.06) * dice.bulk**0.7
             spots = [(outer - s * leg / 2, y[0] + leg), (outer - s * leg / 2, y[1] - leg)]
@@ -40,22 +36,15 @@ def desk(dice: Dice) -> list[Part]:
             dice, corners(x, y, 0.05 + inset), under + 0.004, 0.045 * dice.bulk**0.7, "square"
         )
     if dice.chance(0.5):
-        parts.append(
-            block(
-                (x[0] + inset, x[1] - inset),
-                (y[1] - inset - 0.03, y[1] - inset - 0.01),
-                (dice.between(0.1, 0.6) * under, under + 0.003),
-            )
-        )
+        z = (dice.between(0.1, 0.6) * under, under + 0.003)
+        parts.append(block(within(x, inset), (y[1] - inset - 0.03, y[1] - inset - 0.01), z))
     if dice.chance(0.12):
         shelf = height + dice.between(0.12, 0.3)
-        parts += carcass(
-            (x[0] + 0.02, x[1] - 0.02), (y[1] - 0.25, y[1] - 0.01), (height - 0.003, shelf), 0.02
-        )
+        parts += carcass(within(x, 0.02), (y[1] - 0.25, y[1] - 0.01), (height - 0.003, shelf), 0.02)
     return parts
 
 
-def writing_desk(dice: Dice) -> list[Part]:
+def writing_desk(dice: Dice) -> list[Solid]:
     """Slim desk or console whose flat drawers hang under the top, on four legs."""
     width, depth, height = dice.between(0.8, 1.4), dice.between(0.38, 0.65), dice.between(0.7, 0.8)
     thick, leg = 0.02 * dice.bulk, dice.between(0.03, 0.05) * dice.bulk**0.7
@@ -63,8 +52,8 @@ def writing_desk(dice: Dice) -> list[Part]:
     x, y, under = (-width / 2, width / 2), (-depth / 2, depth / 2), height - thick
     inset = leg / 2 + 0.01
     parts = [block(x, y, (under, height))]
-    span = (x[0] + inset, x[1] - inset)
-    parts.append(block(span, (y[0] + inset, y[1] - inset), (under - box, under + 0.003)))
+    span = within(x, inset)
+    parts.append(block(span, within(y, inset), (under - box, under + 0.003)))
     parts += fronts(
         dice, span, (under - box + 0.01, under - 0.005), y[0] + inset, dice.count(1, 3), 1
     )
@@ -72,7 +61,7 @@ def writing_desk(dice: Dice) -> list[Part]:
     return parts
 
 
-def corner_desk(dice: Dice) -> list[Part]:
+def corner_desk(dice: Dice) -> list[Solid]:
     """L-shaped desk."""
     width, run, depth = dice.between(1.2, 1.8), dice.between(1.1, 1.7), dice.between(0.45, 0.7)
     height, thick = dice.between(0.7, 0.78), dice.between(0.025, 0.045) * dice.bulk
@@ -113,7 +102,7 @@ def corner_desk(dice: Dice) -> list[Part]:
     return parts
 
 
-def counter(dice: Dice) -> list[Part]:
+def counter(dice: Dice) -> list[Solid]:
     """Reception counter, straight or bent into an arc."""
     height, depth = dice.between(0.72, 1.1), dice.between(0.45, 0.75)
     thick = dice.between(0.03, 0.06)
@@ -122,9 +111,9 @@ def counter(dice: Dice) -> list[Part]:
         x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
         return [
             block(x, y, (height - thick, height)),
-            block((x[0] + 0.03, x[1] - 0.03), (y[0] + 0.04, y[0] + 0.08), (0, height - thick / 2)),
+            block(within(x, 0.03), (y[0] + 0.04, y[0] + 0.08), (0, height - thick / 2)),
             *(
-                block((px, px + 0.03), (y[0] + 0.05, y[1] - 0.05), (0, height - thick / 2))
+                block((px, px + 0.03), within(y, 0.05), (0, height - thick / 2))
                 for px in (x[0] + 0.03, x[1] - 0.06)
             ),
         ]

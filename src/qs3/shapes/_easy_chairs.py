@@ -4,8 +4,9 @@ import numpy as np
 
 from qs3.shapes._dice import Dice
 from qs3.shapes._joinery import corners, legs
-from qs3.shapes._parts import (
-    Part,
+from qs3.shapes._solids import (
+    Solid,
+    around,
     at_height,
     beam,
     block,
@@ -14,79 +15,53 @@ from qs3.shapes._parts import (
     outline,
     pillow,
     sheet,
+    within,
 )
 from qs3.shapes._upholstery import upholstered
 
 
-def armchair(dice: Dice) -> list[Part]:
+def armchair(dice: Dice) -> list[Solid]:
     """Upholstered easy chair."""
     return upholstered(dice, dice.between(0.66, 1.08), 1)
 
 
-def wing(dice: Dice) -> list[Part]:
+def wing(dice: Dice) -> list[Solid]:
     """High armchair whose back has wings."""
     width, depth = dice.between(0.68, 0.84), dice.between(0.66, 0.82)
     seat, high, arm = dice.between(0.4, 0.48), dice.between(0.95, 1.18), dice.between(0.55, 0.66)
     thick, foot = dice.between(0.09, 0.14), dice.between(0.08, 0.2)
     x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    run = (y[0], y[1] - thick + 0.02)
     parts = [
+        cushion(dice, within(x, 0.03), (y[0] + 0.03, y[1]), (foot, seat - 0.08), 0.03),
         cushion(
-            (x[0] + 0.03, x[1] - 0.03),
-            (y[0] + 0.03, y[1]),
-            (foot, seat - 0.08),
-            0.03,
-            steps=dice.steps,
-        ),
-        cushion(
-            (x[0] + thick - 0.02, x[1] - thick + 0.02),
-            (y[0], y[1] - thick + 0.02),
-            (seat - 0.1, seat),
-            0.04,
-            0.02,
-            dice.steps,
+            dice, (x[0] + thick - 0.02, x[1] - thick + 0.02), run, (seat - 0.1, seat), 0.04, 0.02
         ),
     ]
-    parts.append(
-        cushion(
-            (x[0] + thick / 2, x[1] - thick / 2),
-            (y[1] - thick, y[1]),
-            (foot, high),
-            0.05,
-            steps=dice.steps,
-        )
-    )
+    parts.append(cushion(dice, within(x, thick / 2), (y[1] - thick, y[1]), (foot, high), 0.05))
     reach = dice.between(0.16, 0.3)
     for s in (-1, 1):
         side = sorted((s * (width / 2 - thick), s * width / 2))
         span = (side[0], side[1])
-        parts.append(cushion(span, (y[0] + 0.04, y[1] - 0.02), (foot, arm), 0.04, steps=dice.steps))
-        parts.append(
-            cushion(
-                span,
-                (y[1] - reach, y[1] - 0.02),
-                (arm - 0.06, high - dice.between(0.02, 0.12)),
-                0.045,
-                steps=dice.steps,
-            )
-        )
+        parts.append(cushion(dice, span, (y[0] + 0.04, y[1] - 0.02), (foot, arm), 0.04))
+        z = (arm - 0.06, high - dice.between(0.02, 0.12))
+        parts.append(cushion(dice, span, (y[1] - reach, y[1] - 0.02), z, 0.045))
     return parts + legs(dice, corners(x, y, 0.07), foot + 0.01, dice.between(0.04, 0.06))
 
 
-def recliner(dice: Dice) -> list[Part]:
+def recliner(dice: Dice) -> list[Solid]:
     """Reclining lounge chair with its footrest out."""
     parts = upholstered(dice, dice.between(0.75, 1.0), 1, lean=dice.between(12, 28))
     box = parts[0].vertices
     half, front, low = box[:, 0].max() * 0.72, box[:, 1].min(), box[:, 2].max()
     run, thick = dice.between(0.3, 0.5), dice.between(0.06, 0.1)
-    rest = cushion(
-        (-half, half), (front - run, front + 0.06), (low - thick, low), 0.03, steps=dice.steps
-    )
+    rest = cushion(dice, (-half, half), (front - run, front + 0.06), (low - thick, low), 0.03)
     # The footrest hangs down, but not as far as the floor.
     steepest = float(np.degrees(np.arcsin(np.clip((low - thick - 0.04) / run, 0.0, 0.42))))
     return [*parts, rest.turn("x", dice.between(0, 1) * steepest, (0, front, low))]
 
 
-def lounge(dice: Dice) -> list[Part]:
+def lounge(dice: Dice) -> list[Solid]:
     """Open frame of wood with a seat and a back cushion."""
     width, depth, seat = dice.between(0.6, 0.76), dice.between(0.6, 0.75), dice.between(0.34, 0.42)
     arm, bar = dice.between(0.54, 0.64), dice.between(0.025, 0.05) * dice.bulk**0.5
@@ -98,34 +73,26 @@ def lounge(dice: Dice) -> list[Part]:
         parts += [
             beam((x, front, 0), (x, front, arm), bar, bar),
             beam((x, rear, 0), (x, rear, arm), bar, bar),
-            block((x - bar, x + bar), (front - bar, rear + bar), (arm - 0.01, arm + 0.02)),
+            block(around(x, bar), (front - bar, rear + bar), (arm - 0.01, arm + 0.02)),
             beam((x, front, seat - 0.1), (x, rear, seat - 0.12), bar, bar),
         ]
     inner, base = width / 2 - bar * 0.6, seat - 0.11
     pad = dice.between(0.08, 0.14)
     seat_pad = cushion(
-        (-inner, inner), (-depth / 2, depth / 2 - 0.05), (base, base + pad), 0.03, 0.01, dice.steps
+        dice, (-inner, inner), (-depth / 2, depth / 2 - 0.05), (base, base + pad), 0.03, 0.01
     )
-    back = cushion(
-        (-inner, inner),
-        (depth / 2 - 0.05 - pad, depth / 2 - 0.05),
-        (base, base + dice.between(0.5, 0.7)),
-        0.035,
-        steps=dice.steps,
-    )
+    z = (base, base + dice.between(0.5, 0.7))
+    back = cushion(dice, (-inner, inner), (depth / 2 - 0.05 - pad, depth / 2 - 0.05), z, 0.035)
     pivot = (0.0, depth / 2 - 0.05, base)
     parts += [seat_pad.turn("x", -slope, pivot), back.turn("x", -lean, pivot)]
+    heights = (base - 0.02, base + 0.04)
     parts.append(
-        block(
-            (-inner - 0.01, inner + 0.01),
-            (depth / 2 - 0.09, depth / 2 - 0.03),
-            (base - 0.02, base + 0.04),
-        )
+        block((-inner - 0.01, inner + 0.01), (depth / 2 - 0.09, depth / 2 - 0.03), heights)
     )
     return parts
 
 
-def tub(dice: Dice) -> list[Part]:
+def tub(dice: Dice) -> list[Solid]:
     """Round tub chair whose back runs into its arms."""
     width, depth = dice.between(0.6, 0.85), dice.between(0.56, 0.78)
     seat, foot = dice.between(0.38, 0.46), dice.between(0.04, 0.2)

@@ -4,10 +4,10 @@ import numpy as np
 
 from qs3.shapes._dice import Dice
 from qs3.shapes._joinery import corners, legs
-from qs3.shapes._parts import (
+from qs3.shapes._solids import (
     Number,
-    Part,
     Point,
+    Solid,
     at_height,
     ball,
     lathe,
@@ -18,7 +18,7 @@ from qs3.shapes._parts import (
 )
 
 
-def potted(dice: Dice, radius: Number, tall: Number) -> tuple[list[Part], float]:
+def potted(dice: Dice, radius: Number, tall: Number) -> tuple[list[Solid], float]:
     """Pot filled with earth, and the height of the earth."""
     foot = radius * dice.between(0.55, 0.95)
     wall = max(0.008, 0.08 * radius) * dice.bulk**0.5
@@ -55,12 +55,8 @@ def potted(dice: Dice, radius: Number, tall: Number) -> tuple[list[Part], float]
             splay=0.02,
         )
     if dice.chance(0.15) and kind != "legs":
-        parts.append(
-            lathe(
-                [(foot * 1.1, 0.0), (foot * 1.4, 0.02), (foot * 1.3, 0.02), (foot * 0.9, 0.012)],
-                dice.sides,
-            )
-        )
+        section = [(foot * 1.1, 0.0), (foot * 1.4, 0.02), (foot * 1.3, 0.02), (foot * 0.9, 0.012)]
+        parts.append(lathe(section, dice.sides))
     return parts, earth
 
 
@@ -72,7 +68,7 @@ def leaf(
     width: Number,
     droop: Number,
     thick: Number = 0.004,
-) -> Part:
+) -> Solid:
     """Leaf from ``start``: leaves at ``rise`` degrees above level and bends down by ``droop``."""
     t = np.linspace(0, 1, 7)
     angle = np.radians(rise - droop * t)
@@ -89,7 +85,7 @@ def leaf(
     return ribbon(path, across, thick)
 
 
-def crown(dice: Dice, centre: Point, size: Number, smooth: bool) -> list[Part]:
+def crown(dice: Dice, centre: Point, size: Number, smooth: bool) -> list[Solid]:
     """Crown of foliage: overlapping balls, or many leaves about a core."""
     x, y, z = centre
     if smooth:

@@ -5,14 +5,25 @@ from collections.abc import Sequence
 import numpy as np
 
 from qs3.shapes._dice import Dice
-from qs3.shapes._parts import Number, Part, Span, beam, block, cushion, lathe, tube
+from qs3.shapes._solids import (
+    Number,
+    Solid,
+    Span,
+    around,
+    beam,
+    block,
+    cushion,
+    lathe,
+    tube,
+    within,
+)
 
 LEGS = ("square", "tapered", "round", "cone", "turned")
 
 
 def corners(x: Span, y: Span, inset: Number) -> list[tuple[float, float]]:
     """Four spots ``inset`` inside a rectangle."""
-    return [(px, py) for px in (x[0] + inset, x[1] - inset) for py in (y[0] + inset, y[1] - inset)]
+    return [(px, py) for px in within(x, inset) for py in within(y, inset)]
 
 
 def legs(
@@ -22,7 +33,7 @@ def legs(
     thick: Number,
     style: str | None = None,
     splay: Number = 0.0,
-) -> list[Part]:
+) -> list[Solid]:
     """Legs from the floor up to ``top`` at each spot, leaning outward by ``splay`` metres."""
     style = style or dice.pick(*LEGS)
     waist = dice.between(0.5, 0.7)
@@ -57,7 +68,7 @@ def legs(
             ring = lathe([(radii[0], 0.0), (radii[1], top)], dice.sides)
             lean = (ring.vertices[:, 2:] / top) * (drop[1] - drop[0])[None, :2] + drop[0, :2]
             parts.append(
-                Part(
+                Solid(
                     np.column_stack([ring.vertices[:, :2] + lean, ring.vertices[:, 2]]), ring.faces
                 )
             )
@@ -66,27 +77,22 @@ def legs(
 
 def carcass(
     x: Span, y: Span, z: Span, board: Number, back: bool = True, bottom: bool = True
-) -> list[Part]:
+) -> list[Solid]:
     """Box of boards, open at the front (−y)."""
     parts = [
         block((x[0], x[0] + board), y, z),
         block((x[1] - board, x[1]), y, z),
-        block((x[0] + board / 2, x[1] - board / 2), y, (z[1] - board, z[1])),
+        block(within(x, board / 2), y, (z[1] - board, z[1])),
     ]
     if bottom:
-        parts.append(block((x[0] + board / 2, x[1] - board / 2), y, (z[0], z[0] + board)))
+        parts.append(block(within(x, board / 2), y, (z[0], z[0] + board)))
     if back:
-        parts.append(
-            block(
-                (x[0] + board / 2, x[1] - board / 2),
-                (y[1] - board / 2, y[1]),
-                (z[0] + board / 2 if bottom else z[0], z[1] - board / 2),
-            )
-        )
+        heights = (z[0] + board / 2 if bottom else z[0], z[1] - board / 2)
+        parts.append(block(within(x, board / 2), (y[1] - board / 2, y[1]), heights))
     return parts
 
 
-def handle(dice: Dice, style: str, x: Number, y: Number, z: Number, upright: bool) -> list[Part]:
+def handle(dice: Dice, style: str, x: Number, y: Number, z: Number, upright: bool) -> list[Solid]:
     """Handle on a front whose face lies at ``y`` (it sticks out toward −y)."""
     if style == "knob":
         r = dice.between(0.01, 0.022)
@@ -96,13 +102,8 @@ def handle(dice: Dice, style: str, x: Number, y: Number, z: Number, upright: boo
     ends = [(0.0, -half), (0.0, half)] if upright else [(-half, 0.0), (half, 0.0)]
     if style == "plate":
         (ax, az), (bx, bz) = ends
-        return [
-            block(
-                (x + ax - 0.012, x + bx + 0.012),
-                (y - 0.025, y + 0.002),
-                (z + az - 0.012, z + bz + 0.012),
-            )
-        ]
+        heights = (z + az - 0.012, z + bz + 0.012)
+        return [block((x + ax - 0.012, x + bx + 0.012), (y - 0.025, y + 0.002), heights)]
     path = [
         (x + ends[0][0], y + 0.002, z + ends[0][1]),
         (x + ends[0][0], y - 0.03, z + ends[0][1]),
@@ -121,7 +122,7 @@ def fronts(
     rows: int,
     kind: str = "drawer",
     style: str | None = None,
-) -> list[Part]:
+) -> list[Solid]:
     """A grid of doors or drawer fronts on a face at ``y``, each with its handle."""
     style = style or dice.pick("knob", "bar", "plate", "none")
     gap, thick = dice.between(0.003, 0.012), dice.between(0.01, 0.025)
@@ -160,7 +161,7 @@ def fronts(
     return parts
 
 
-def books(dice: Dice, x: Span, y: Span, z: Number, room: Number) -> list[Part]:
+def books(dice: Dice, x: Span, y: Span, z: Number, room: Number) -> list[Solid]:
     """A row of upright books on a board whose top is at ``z``, ``room`` metres below the next."""
     parts, at = [], x[0] + dice.between(0.0, 0.03)
     end = x[1] - dice.between(0.0, 0.5) * (x[1] - x[0])
@@ -175,7 +176,7 @@ def books(dice: Dice, x: Span, y: Span, z: Number, room: Number) -> list[Part]:
         at += thick + (dice.between(0.02, 0.1) if dice.chance(0.1) else 0.0)
 
 
-def knick_knacks(dice: Dice, x: Span, y: Span, z: Number, room: Number = 0.5) -> list[Part]:
+def knick_knacks(dice: Dice, x: Span, y: Span, z: Number, room: Number = 0.5) -> list[Solid]:
     """A few things that lie about on a top at ``z``: books, a box, a vase, a potted cactus."""
     width, parts = x[1] - x[0], []
     count = max(1, min(4, int(width / 0.28)))
@@ -194,7 +195,7 @@ def knick_knacks(dice: Dice, x: Span, y: Span, z: Number, room: Number = 0.5) ->
                 parts.append(book.turn("z", dice.between(-25, 25)).move(cx, middle))
                 level += rise - 0.001
         elif kind == "box":
-            box = cushion((-half, half), (-half, half), (z - 0.002, z + tall), 0.01, steps=1)
+            box = cushion(dice, (-half, half), (-half, half), (z - 0.002, z + tall), 0.01, steps=1)
             parts.append(box.turn("z", dice.between(0, 90)).move(cx, middle))
         elif kind == "vase":
             shape = [
@@ -210,7 +211,7 @@ def knick_knacks(dice: Dice, x: Span, y: Span, z: Number, room: Number = 0.5) ->
             profile = [(half * r, z - 0.002 + tall * h) for r, h in shape]
             parts.append(lathe(profile, dice.sides, cx, middle))
         elif kind == "row":
-            parts += books(dice, (cx - half, cx + half), (middle - half, middle + half), z, tall)
+            parts += books(dice, around(cx, half), around(middle, half), z, tall)
         else:
             frame = block((-half, half), (-0.01, 0.01), (-0.004, tall))
             parts.append(frame.turn("x", dice.between(-12, -4)).move(cx, middle, z))

@@ -4,9 +4,10 @@ import numpy as np
 
 from qs3.shapes._dice import Dice
 from qs3.shapes._joinery import corners, legs
-from qs3.shapes._parts import (
+from qs3.shapes._solids import (
     Number,
-    Part,
+    Solid,
+    around,
     beam,
     block,
     cushion,
@@ -14,35 +15,32 @@ from qs3.shapes._parts import (
     outline,
     slab,
     tube,
+    within,
 )
 
 
-def _stool_top(dice: Dice, width: Number, z: Number) -> list[Part]:
+def _stool_top(dice: Dice, width: Number, z: Number) -> list[Solid]:
     thick = dice.between(0.025, 0.05) * dice.bulk
     kind = dice.pick("round", "square", "pad", "low_poly")
     if kind == "square":
         return [block((-width / 2, width / 2), (-width / 2, width / 2), (z - thick, z))]
     if kind == "pad":
+        heights = (z - thick - 0.02, z)
         return [
-            cushion(
-                (-width / 2, width / 2),
-                (-width / 2, width / 2),
-                (z - thick - 0.02, z),
-                0.03,
-                0.01,
-                dice.steps,
-            )
+            cushion(dice, (-width / 2, width / 2), (-width / 2, width / 2), heights, 0.03, 0.01)
         ]
     sides = 8 if kind == "low_poly" else max(16, dice.sides)
     return [slab(outline(width * 1.05, width * 1.05, sides, phase=0.5), (z - thick, z))]
 
 
-def stool(dice: Dice) -> list[Part]:
+def stool(dice: Dice) -> list[Solid]:
     """Low stool without a back, or a pouffe."""
     width, high = dice.between(0.32, 0.5), dice.between(0.3, 0.52)
     if dice.chance(0.12):
         side, soft = (-width / 2, width / 2), dice.between(0.05, 0.12)
-        return [cushion(side, side, (0.0, min(high, 0.9 * width)), soft, 0.02, max(3, dice.steps))]
+        return [
+            cushion(dice, side, side, (0.0, min(high, 0.9 * width)), soft, 0.02, max(3, dice.steps))
+        ]
     leg = dice.between(0.03, 0.05) * dice.bulk**1.2
     inset = 0.16 * width
     spots = corners((-width / 2, width / 2), (-width / 2, width / 2), inset)
@@ -55,32 +53,22 @@ def stool(dice: Dice) -> list[Part]:
     )
 
 
-def bar_stool(dice: Dice) -> list[Part]:
+def bar_stool(dice: Dice) -> list[Solid]:
     """High stool on four legs with a ring or rungs, or on one post with a plate."""
     width, high = dice.between(0.32, 0.42), dice.between(0.58, 0.82)
     parts = _stool_top(dice, width, high)
     rung = dice.between(0.15, 0.35)
     if dice.chance(0.4):
         plate = dice.between(0.19, 0.25)
-        parts.append(
-            lathe(
-                [(plate, 0), (plate, 0.012), (0.04, 0.035), (0.028, 0.06), (0.028, high - 0.01)],
-                max(12, dice.sides),
-            )
-        )
+        profile = [(plate, 0), (plate, 0.012), (0.04, 0.035), (0.028, 0.06), (0.028, high - 0.01)]
+        parts.append(lathe(profile, max(12, dice.sides)))
         if dice.chance(0.6):
             ring = 0.15
-            parts.append(
-                tube(
-                    [
-                        (ring * np.cos(a), ring * np.sin(a), rung)
-                        for a in np.linspace(0, 2 * np.pi, 17)[:-1]
-                    ],
-                    0.011,
-                    6,
-                    closed=True,
-                )
-            )
+            path = [
+                (ring * np.cos(a), ring * np.sin(a), rung)
+                for a in np.linspace(0, 2 * np.pi, 17)[:-1]
+            ]
+            parts.append(tube(path, 0.011, 6, closed=True))
             parts.append(beam((-ring, 0, rung), (ring, 0, rung), 0.02, 0.015))
     else:
         leg = dice.between(0.025, 0.045) * dice.bulk**0.8
@@ -100,25 +88,15 @@ def bar_stool(dice: Dice) -> list[Part]:
                 )
         if dice.chance(0.2):
             back = [
-                block(
-                    (s * half - 0.012, s * half + 0.012),
-                    (half - 0.012, half + 0.012),
-                    (high - 0.04, high + 0.25),
-                )
+                block(around(s * half, 0.012), around(half, 0.012), (high - 0.04, high + 0.25))
                 for s in (-1, 1)
             ]
-            parts += [
-                *back,
-                block(
-                    (-half - 0.012, half + 0.012),
-                    (half - 0.014, half + 0.014),
-                    (high + 0.14, high + 0.26),
-                ),
-            ]
+            z = (high + 0.14, high + 0.26)
+            parts += [*back, block((-half - 0.012, half + 0.012), around(half, 0.014), z)]
     return parts
 
 
-def bench(dice: Dice) -> list[Part]:
+def bench(dice: Dice) -> list[Solid]:
     """Bench for one or several, with or without a back."""
     width, depth, seat = dice.between(0.7, 1.5), dice.between(0.34, 0.5), dice.between(0.4, 0.48)
     thick, leg = 0.03 * dice.bulk, dice.between(0.04, 0.06) * dice.bulk**0.7
@@ -143,22 +121,13 @@ def bench(dice: Dice) -> list[Part]:
             )
         )
     if dice.chance(0.4):
-        parts.append(
-            cushion(
-                (x[0] + 0.02, x[1] - 0.02),
-                (y[0] + 0.02, y[1] - 0.04),
-                (seat - 0.01, seat + 0.05),
-                0.02,
-                steps=dice.steps,
-            )
-        )
+        z = (seat - 0.01, seat + 0.05)
+        parts.append(cushion(dice, within(x, 0.02), (y[0] + 0.02, y[1] - 0.04), z, 0.02))
     if dice.chance(0.65):
         back, tilt, rest = dice.between(0.32, 0.5), dice.between(0, 14), []
         for s in (-1, 1):
             px = s * abs(spots[0][0])
-            rest.append(
-                block((px - leg / 2, px + leg / 2), (y[1] - leg, y[1]), (seat - thick, seat + back))
-            )
+            rest.append(block(around(px, leg / 2), (y[1] - leg, y[1]), (seat - thick, seat + back)))
         for level in np.linspace(seat + 0.12, seat + back - 0.08, dice.count(1, 4)):
             rest.append(
                 block(x, (y[1] - leg * 0.8, y[1] - leg * 0.8 + 0.025), (level, level + 0.08))
@@ -174,10 +143,6 @@ def bench(dice: Dice) -> list[Part]:
                     )
                 )
                 parts.append(
-                    block(
-                        (px - 0.02, px + 0.02),
-                        (y[0] + 0.01, y[0] + 0.05),
-                        (seat - 0.02, seat + 0.2),
-                    )
+                    block(around(px, 0.02), (y[0] + 0.01, y[0] + 0.05), (seat - 0.02, seat + 0.2))
                 )
     return parts

@@ -6,10 +6,10 @@ import numpy as np
 
 from qs3.shapes._dice import Dice
 from qs3.shapes._joinery import corners, legs
-from qs3.shapes._parts import Number, Part, Span, cushion, pillow, tube
+from qs3.shapes._solids import Number, Solid, Span, cushion, pillow, tube, within
 
 
-def upholstered(dice: Dice, width: Number, seats: int, lean: Number | None = None) -> list[Part]:
+def upholstered(dice: Dice, width: Number, seats: int, lean: Number | None = None) -> list[Solid]:
     """Base, back, two arms and cushions: an armchair with one seat, a sofa with more.
 
     The first part is the base.
@@ -23,22 +23,10 @@ def upholstered(dice: Dice, width: Number, seats: int, lean: Number | None = Non
     x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
     base = seat - dice.between(0.1, 0.18)
     parts = [
-        cushion(
-            (x[0] + 0.01, x[1] - 0.01),
-            (y[0] + 0.02, y[1] - 0.01),
-            (foot, base),
-            min(soft, 0.03),
-            steps=dice.steps,
-        )
+        cushion(dice, within(x, 0.01), (y[0] + 0.02, y[1] - 0.01), (foot, base), min(soft, 0.03))
     ]
     lean = dice.pick(0.0, dice.between(2, 14)) if lean is None else lean
-    rest = cushion(
-        (x[0] + side * 0.5, x[1] - side * 0.5),
-        (y[1] - back, y[1]),
-        (foot + 0.03, high),
-        soft,
-        steps=dice.steps,
-    )
+    rest = cushion(dice, within(x, side * 0.5), (y[1] - back, y[1]), (foot + 0.03, high), soft)
     parts.append(rest.turn("x", -lean, (0, y[1], base)))
     parts += _arms(dice, x, (y[0] + dice.pick(0.0, 0.05), y[1] - 0.01), (foot, arm), side, soft)
     inner = (x[0] + side - 0.005, x[1] - side + 0.005)
@@ -48,16 +36,11 @@ def upholstered(dice: Dice, width: Number, seats: int, lean: Number | None = Non
     loose = dice.chance(0.7)
     for a, b in pairwise(edges):
         span = (float(a) + 0.002, float(b) - 0.002)
-        parts.append(cushion(span, run, (base - 0.01, seat), max(soft, 0.02), plump, dice.steps))
+        parts.append(cushion(dice, span, run, (base - 0.01, seat), max(soft, 0.02), plump))
         if loose:
             thick = dice.between(0.1, 0.18)
-            pad = cushion(
-                span,
-                (run[1] - thick, run[1] + 0.03),
-                (seat - 0.02, high + dice.between(-0.06, 0.05)),
-                max(soft, 0.03),
-                steps=dice.steps,
-            )
+            z = (seat - 0.02, high + dice.between(-0.06, 0.05))
+            pad = cushion(dice, span, (run[1] - thick, run[1] + 0.03), z, max(soft, 0.03))
             parts.append(pad.turn("x", -lean, (0, y[1], base)))
     if dice.chance(0.35):
         parts += _throw_pillows(dice, inner, run[1] - 0.18 * loose, seat)
@@ -72,31 +55,31 @@ def upholstered(dice: Dice, width: Number, seats: int, lean: Number | None = Non
     return parts
 
 
-def _arms(dice: Dice, x: Span, y: Span, z: Span, side: Number, soft: Number) -> list[Part]:
+def _arms(dice: Dice, x: Span, y: Span, z: Span, side: Number, soft: Number) -> list[Solid]:
     style = dice.pick("square", "square", "rolled", "sloped")
     parts = []
     for s, span in ((-1, (x[0], x[0] + side)), (1, (x[1] - side, x[1]))):
         top = z[1]
         if style == "rolled":
             r = max(0.6 * side, 0.07)
-            parts.append(cushion(span, y, (z[0], top - r * 0.8), min(soft, 0.03), steps=dice.steps))
+            parts.append(cushion(dice, span, y, (z[0], top - r * 0.8), min(soft, 0.03)))
             cx = (span[0] + span[1]) / 2 + s * 0.15 * side
             parts.append(
                 tube([(cx, y[0] - 0.01, top - r), (cx, y[1], top - r)], r, max(8, dice.sides))
             )
         else:
-            arm = cushion(span, y, (z[0], top), soft, steps=dice.steps)
+            arm = cushion(dice, span, y, (z[0], top), soft)
             if style == "sloped":
                 v = arm.vertices.copy()
                 fall = dice.between(0.1, 0.35) * (top - z[0])
                 share = (v[:, 1] - y[0]) / (y[1] - y[0])
                 v[:, 2] -= fall * (1 - share) * (v[:, 2] - z[0]) / (top - z[0])
-                arm = Part(v, arm.faces)
+                arm = Solid(v, arm.faces)
             parts.append(arm)
     return parts
 
 
-def _throw_pillows(dice: Dice, x: Span, y: Number, z: Number) -> list[Part]:
+def _throw_pillows(dice: Dice, x: Span, y: Number, z: Number) -> list[Solid]:
     half, parts = dice.between(0.17, 0.23), []
     spots = [x[0] + half, x[1] - half, (x[0] + x[1]) / 2]
     if x[1] - x[0] < 4.2 * half:

@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.shapes._dice import Dice
-from qs3.shapes._parts import (
+from qs3.shapes._solids import (
     Number,
-    Part,
     Point,
+    Solid,
     Span,
     at_height,
     ball,
@@ -33,7 +33,7 @@ def _tub(
     exponents: Span,
     sides: int,
     rim: Rim | None = None,
-) -> Part:
+) -> Solid:
     """Vessel lofted up its outside and down its inside.
 
     Args:
@@ -73,7 +73,7 @@ def _hollow(dice: Dice, high: Number, rim: Span, deep: Number) -> list[tuple[flo
     ]
 
 
-def _tap(dice: Dice, x: Number, y: Number, z: Number, toward: Number) -> list[Part]:
+def _tap(dice: Dice, x: Number, y: Number, z: Number, toward: Number) -> list[Solid]:
     """Tap with two handles that stands at (x, y, z) and spouts toward the direction in degrees."""
     rise, run = dice.between(0.08, 0.2), dice.between(0.08, 0.16)
     spout = bend([(0, 0, -0.01), (0, 0, rise), (run, 0, rise), (run, 0, rise - 0.05)], 0.05)
@@ -87,11 +87,11 @@ def _tap(dice: Dice, x: Number, y: Number, z: Number, toward: Number) -> list[Pa
 
 def _maybe_tap(
     dice: Dice, length: Number, z: Number, share: Number = 0.5, rim: Number = 0.05
-) -> list[Part]:
+) -> list[Solid]:
     return _tap(dice, length / 2 - rim / 2, 0.0, z, 180) if dice.chance(share) else []
 
 
-def built_in(dice: Dice) -> list[Part]:
+def built_in(dice: Dice) -> list[Solid]:
     """Box with a hollow, to stand against walls."""
     length, width, high = _size(dice)
     high = min(high, 0.6)
@@ -108,17 +108,12 @@ def built_in(dice: Dice) -> list[Part]:
         outer = [outer[0], outer[-1]]
     parts = [_tub(outer, inner, (length, width), (40.0, dice.pick(3.0, 5.0, 12.0, 40.0)), 64)]
     if dice.chance(0.2):
-        parts.append(
-            block(
-                (length / 2 - 0.03, length / 2),
-                (-width / 2, width / 2),
-                (high - 0.01, high + dice.between(0.2, 0.5)),
-            )
-        )
+        z = (high - 0.01, high + dice.between(0.2, 0.5))
+        parts.append(block((length / 2 - 0.03, length / 2), (-width / 2, width / 2), z))
     return parts + _maybe_tap(dice, length, high, rim=wall)
 
 
-def plain(dice: Dice) -> list[Part]:
+def plain(dice: Dice) -> list[Solid]:
     """Modern tub of thin straight walls."""
     length, width, high = _size(dice)
     wall, e = dice.between(0.02, 0.05), dice.pick(4.0, 8.0, 30.0, 40.0)
@@ -131,7 +126,7 @@ def plain(dice: Dice) -> list[Part]:
     return parts + _maybe_tap(dice, length, high, 0.4, wall)
 
 
-def oval(dice: Dice) -> list[Part]:
+def oval(dice: Dice) -> list[Solid]:
     """Freestanding oval tub."""
     length, width, high = _size(dice)
     foot, waist = dice.between(0.6, 0.9), dice.between(0.8, 1.02)
@@ -152,7 +147,7 @@ def oval(dice: Dice) -> list[Part]:
     return parts
 
 
-def _standing_tap(x: Number, high: Number) -> list[Part]:
+def _standing_tap(x: Number, high: Number) -> list[Solid]:
     path = bend(
         [(x, 0, 0.0), (x, 0, high + 0.25), (x - 0.22, 0, high + 0.25), (x - 0.22, 0, high + 0.15)],
         0.06,
@@ -164,7 +159,7 @@ def _standing_tap(x: Number, high: Number) -> list[Part]:
     ]
 
 
-def _footed(dice: Dice, rim: Rim | None) -> list[Part]:
+def _footed(dice: Dice, rim: Rim | None) -> list[Solid]:
     length, width, high = _size(dice)
     lift, wall, e = dice.between(0.08, 0.17), dice.between(0.02, 0.04), dice.between(2.1, 3.2)
     belly = high - lift
@@ -202,12 +197,12 @@ def _footed(dice: Dice, rim: Rim | None) -> list[Part]:
     return parts
 
 
-def clawfoot(dice: Dice) -> list[Part]:
+def clawfoot(dice: Dice) -> list[Solid]:
     """Rolled-rim tub on four feet."""
     return _footed(dice, None)
 
 
-def slipper(dice: Dice) -> list[Part]:
+def slipper(dice: Dice) -> list[Solid]:
     """Tub with one or both ends raised, on feet or on a plinth."""
     rise, both = dice.between(0.1, 0.25), dice.chance(0.3)
 
@@ -224,7 +219,7 @@ def slipper(dice: Dice) -> list[Part]:
     return [_tub(outer, inner, (length, width), (e, e), max(24, 2 * dice.sides), rim)]
 
 
-def corner(dice: Dice) -> list[Part]:
+def corner(dice: Dice) -> list[Solid]:
     """Quarter-round or five-sided tub for a corner, with a broad shelf."""
     side, high = dice.between(1.2, 1.6), dice.between(0.46, 0.6)
     cut = dice.between(0.4, 0.6) * side
@@ -260,7 +255,7 @@ def corner(dice: Dice) -> list[Part]:
     return parts
 
 
-def whirlpool(dice: Dice) -> list[Part]:
+def whirlpool(dice: Dice) -> list[Solid]:
     """Round or square tub for several, perhaps with a step."""
     size, high, rim = dice.between(1.3, 2.0), dice.between(0.5, 0.85), dice.between(0.08, 0.16)
     e = dice.pick(2.0, 6.0, 40.0)
@@ -280,12 +275,4 @@ def whirlpool(dice: Dice) -> list[Part]:
     return parts
 
 
-FAMILIES = {
-    "built_in": built_in,
-    "plain": plain,
-    "oval": oval,
-    "clawfoot": clawfoot,
-    "slipper": slipper,
-    "corner": corner,
-    "whirlpool": whirlpool,
-}
+FAMILIES = (built_in, plain, oval, clawfoot, slipper, corner, whirlpool)

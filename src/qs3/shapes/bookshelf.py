@@ -6,10 +6,10 @@ import numpy as np
 
 from qs3.shapes._dice import Dice
 from qs3.shapes._joinery import books, carcass, corners, fronts, knick_knacks, legs
-from qs3.shapes._parts import Number, Part, Span, beam, block
+from qs3.shapes._solids import Number, Solid, Span, around, beam, block, within
 
 
-def _fill(dice: Dice, x: Span, y: Span, z: Number, room: Number, share: Number) -> list[Part]:
+def _fill(dice: Dice, x: Span, y: Span, z: Number, room: Number, share: Number) -> list[Solid]:
     """Books or knick-knacks on one board, with probability ``share``."""
     if room < 0.12 or x[1] - x[0] < 0.12 or not dice.chance(share):
         return []
@@ -18,7 +18,7 @@ def _fill(dice: Dice, x: Span, y: Span, z: Number, room: Number, share: Number) 
     return knick_knacks(dice, x, y, z, 0.8 * room)
 
 
-def _backed(dice: Dice, doors: bool) -> list[Part]:
+def _backed(dice: Dice, doors: bool) -> list[Solid]:
     width = dice.pick(dice.between(0.35, 0.7), dice.between(0.6, 1.2), dice.between(1.1, 1.8))
     depth, high = dice.between(0.2, 0.4), dice.between(0.9, 2.3)
     board = dice.between(0.016, 0.03) * dice.bulk
@@ -30,33 +30,21 @@ def _backed(dice: Dice, doors: bool) -> list[Part]:
         x[0] + board / 2, x[1] - board / 2, 1 + max(1, round(width / dice.between(0.5, 1.0)))
     )
     for px in bays[1:-1]:
-        parts.append(
-            block((float(px) - board / 2, float(px) + board / 2), y, (foot, high - board / 2))
-        )
+        parts.append(block(around(px, board / 2), y, (foot, high - board / 2)))
     rows = max(2, round((high - foot) / dice.between(0.25, 0.45)))
     shut = foot + (dice.between(0.2, 0.4) * (high - foot) if doors else 0.0)
     levels = np.linspace(foot, high - board, rows + 1)
     for i, level in enumerate(levels[:-1]):
         if i:
             z = float(level)
-            parts.append(
-                block(
-                    (x[0] + board / 2, x[1] - board / 2),
-                    (y[0] + 0.004, y[1] - 0.002),
-                    (z, z + board),
-                )
-            )
+            parts.append(block(within(x, board / 2), (y[0] + 0.004, y[1] - 0.002), (z, z + board)))
         if level < shut:
             continue
         for a, b in pairwise(bays):
             span = (float(a) + board / 2 + 0.005, float(b) - board / 2 - 0.005)
+            inner = (y[0] + 0.01, y[1] - board / 2)
             parts += _fill(
-                dice,
-                span,
-                (y[0] + 0.01, y[1] - board / 2),
-                float(level) + board,
-                float(levels[1] - levels[0]) - board,
-                share,
+                dice, span, inner, float(level) + board, float(levels[1] - levels[0]) - board, share
             )
     if doors:
         parts += fronts(
@@ -64,30 +52,26 @@ def _backed(dice: Dice, doors: bool) -> list[Part]:
         )
     if foot > 0:
         if dice.chance(0.5):
-            parts.append(
-                block((x[0] + 0.01, x[1] - 0.01), (y[0] + 0.02, y[1] - 0.01), (0, foot + board / 2))
-            )
+            parts.append(block(within(x, 0.01), (y[0] + 0.02, y[1] - 0.01), (0, foot + board / 2)))
         else:
             parts += legs(dice, corners(x, y, 0.035), foot + board / 2, 0.04)
     if dice.chance(0.2):
         over = dice.between(0.01, 0.04)
-        parts.append(
-            block((x[0] - over, x[1] + over), (y[0] - over, y[1]), (high - 0.002, high + 0.03))
-        )
+        parts.append(block(within(x, -over), (y[0] - over, y[1]), (high - 0.002, high + 0.03)))
     return parts
 
 
-def backed(dice: Dice) -> list[Part]:
+def backed(dice: Dice) -> list[Solid]:
     """Bookcase with sides and mostly a back, empty or filled."""
     return _backed(dice, doors=False)
 
 
-def with_doors(dice: Dice) -> list[Part]:
+def with_doors(dice: Dice) -> list[Solid]:
     """Bookcase whose lowest part is shut by doors."""
     return _backed(dice, doors=True)
 
 
-def open_frame(dice: Dice) -> list[Part]:
+def open_frame(dice: Dice) -> list[Solid]:
     """Boards between four or six uprights, seen through from all sides."""
     width, depth, high = dice.between(0.5, 1.5), dice.between(0.25, 0.42), dice.between(0.7, 2.1)
     post, board = dice.between(0.02, 0.05) * dice.bulk**0.7, dice.between(0.018, 0.03) * dice.bulk
@@ -98,13 +82,11 @@ def open_frame(dice: Dice) -> list[Part]:
     share = dice.pick(0.0, 0.0, dice.between(0.3, 1.0))
     for i, level in enumerate(levels):
         z = float(level)
-        parts.append(
-            block((x[0] + 0.005, x[1] - 0.005), (y[0] + 0.005, y[1] - 0.005), (z, z + board))
-        )
+        parts.append(block(within(x, 0.005), within(y, 0.005), (z, z + board)))
         if i < rows - 1:
             room = float(levels[1] - levels[0]) - board
             parts += _fill(
-                dice, (x[0] + post, x[1] - post), (y[0] + post, y[1] - 0.01), z + board, room, share
+                dice, within(x, post), (y[0] + post, y[1] - 0.01), z + board, room, share
             )
     if dice.chance(0.4):
         a, b = float(levels[0]) + board / 2, float(levels[-1]) + board / 2
@@ -119,7 +101,7 @@ def open_frame(dice: Dice) -> list[Part]:
     return parts
 
 
-def ladder(dice: Dice) -> list[Part]:
+def ladder(dice: Dice) -> list[Solid]:
     """Leaning shelf whose boards grow deeper towards the floor."""
     width, depth, high = dice.between(0.5, 0.9), dice.between(0.35, 0.55), dice.between(1.4, 2.0)
     bar, board = dice.between(0.025, 0.045), dice.between(0.018, 0.03) * dice.bulk
@@ -130,12 +112,9 @@ def ladder(dice: Dice) -> list[Part]:
         parts.append(beam((px, -depth / 2, 0), (px, depth / 2 - bar, high), bar, bar))
         if rear:
             parts.append(beam((px, depth / 2, 0), (px, depth / 2, high), bar, bar))
+            heights = (high - 0.03, high)
             parts.append(
-                block(
-                    (px - bar / 2, px + bar / 2),
-                    (depth / 2 - 1.6 * bar, depth / 2 + bar / 2),
-                    (high - 0.03, high),
-                )
+                block(around(px, bar / 2), (depth / 2 - 1.6 * bar, depth / 2 + bar / 2), heights)
             )
     share = dice.pick(0.0, dice.between(0.3, 1.0))
     levels = np.linspace(dice.between(0.12, 0.3), high - dice.between(0.05, 0.2), rows)
@@ -145,18 +124,12 @@ def ladder(dice: Dice) -> list[Part]:
         span = (front, depth / 2)
         parts.append(block((-width / 2 + 0.002, width / 2 - 0.002), span, (z, z + board)))
         if span[1] - span[0] > 0.14 and z < levels[-1]:
-            parts += _fill(
-                dice,
-                (-width / 2 + bar, width / 2 - bar),
-                (span[0] + bar, span[1] - 0.02),
-                z + board,
-                0.3,
-                share,
-            )
+            inner = (span[0] + bar, span[1] - 0.02)
+            parts += _fill(dice, (-width / 2 + bar, width / 2 - bar), inner, z + board, 0.3, share)
     return parts
 
 
-def corner(dice: Dice) -> list[Part]:
+def corner(dice: Dice) -> list[Solid]:
     """Two bookcases that meet at a right angle."""
     run, down, depth = dice.between(0.6, 1.4), dice.between(0.6, 1.4), dice.between(0.25, 0.38)
     high, board, rows = (
@@ -180,18 +153,12 @@ def corner(dice: Dice) -> list[Part]:
     share = dice.pick(0.0, dice.between(0.3, 0.9))
     room = high / rows - board
     for level in np.linspace(0.0, high - board, rows + 1)[:-1]:
-        parts += _fill(
-            dice,
-            (depth + 0.02, run - board),
-            (-depth + 0.01, -board),
-            float(level) + board,
-            room,
-            share,
-        )
+        inner = (-depth + 0.01, -board)
+        parts += _fill(dice, (depth + 0.02, run - board), inner, float(level) + board, room, share)
     return parts + ends
 
 
-def cubes(dice: Dice) -> list[Part]:
+def cubes(dice: Dice) -> list[Solid]:
     """Grid of square bays, complete or stepped."""
     columns, rows = dice.count(1, 5), dice.count(1, 5)
     if columns == 1:
@@ -212,13 +179,8 @@ def cubes(dice: Dice) -> list[Part]:
             parts += carcass((a - board / 2, b + board / 2), y, (c, d + board), board, back)
             kind = dice.pick("open", "open", "open", "box")
             if kind == "box" and share > 0:
-                parts.append(
-                    block(
-                        (a + board / 2 + 0.01, b - board / 2 - 0.01),
-                        (y[0] + 0.01, y[1] - board),
-                        (c + board - 0.002, d - 0.04),
-                    )
-                )
+                x = (a + board / 2 + 0.01, b - board / 2 - 0.01)
+                parts.append(block(x, (y[0] + 0.01, y[1] - board), (c + board - 0.002, d - 0.04)))
             else:
                 parts += _fill(
                     dice,
@@ -231,7 +193,7 @@ def cubes(dice: Dice) -> list[Part]:
     return parts
 
 
-def wall_board(dice: Dice) -> list[Part]:
+def wall_board(dice: Dice) -> list[Solid]:
     """One to three boards on brackets for the wall, with things on them."""
     width, depth = dice.between(0.4, 1.4), dice.between(0.18, 0.32)
     board, drop = dice.between(0.025, 0.045) * dice.bulk, dice.between(0.1, 0.2)
@@ -246,7 +208,7 @@ def wall_board(dice: Dice) -> list[Part]:
         parts.append(block(x, y, (z, z + board)))
         for s in (-1, 1):
             px = s * (width / 2 - inset)
-            span = (px - wide / 2, px + wide / 2)
+            span = around(px, wide / 2)
             if count == 1:
                 reach = dice.between(0.5, 0.95) * depth
                 parts += [
@@ -263,23 +225,18 @@ def wall_board(dice: Dice) -> list[Part]:
                 )
         if dice.chance(share):
             if dice.chance(0.5):
-                parts += books(dice, (x[0] + 0.02, x[1] - 0.02), y, z + board, 0.32)
+                parts += books(dice, within(x, 0.02), y, z + board, 0.32)
             else:
-                parts += knick_knacks(dice, (x[0] + 0.02, x[1] - 0.02), y, z + board, 0.35)
+                parts += knick_knacks(dice, within(x, 0.02), y, z + board, 0.35)
     if count > 1:
         for s in (-1, 1):
             px = s * (width / 2 - inset)
-            parts.append(
-                block(
-                    (px - wide / 2, px + wide / 2),
-                    (y[1] - 0.02, y[1]),
-                    (0.0, drop + (count - 1) * step + 0.1),
-                )
-            )
+            heights = (0.0, drop + (count - 1) * step + 0.1)
+            parts.append(block(around(px, wide / 2), (y[1] - 0.02, y[1]), heights))
     return parts
 
 
-def rack(dice: Dice) -> list[Part]:
+def rack(dice: Dice) -> list[Solid]:
     """Low rack between two side boards, its shelves level or sloping to show what lies on them."""
     width, depth, high = dice.between(0.6, 1.2), dice.between(0.25, 0.38), dice.between(0.4, 1.0)
     board, rows = dice.between(0.018, 0.035) * dice.bulk, dice.count(2, 4)
@@ -289,18 +246,11 @@ def rack(dice: Dice) -> list[Part]:
     for level in np.linspace(0.1, high - 0.08, rows):
         if dice.chance(0.3):
             for py in np.linspace(y[0] + 0.04, y[1] - 0.04, 4):
-                parts.append(
-                    block(
-                        (x[0] + board / 2, x[1] - board / 2),
-                        (float(py) - 0.015, float(py) + 0.015),
-                        (float(level), float(level) + 0.02),
-                    )
-                )
+                z = (float(level), float(level) + 0.02)
+                parts.append(block(within(x, board / 2), around(py, 0.015), z))
         else:
             shelf = block(
-                (x[0] + board / 2, x[1] - board / 2),
-                (y[0] + 0.02, y[1] - 0.02),
-                (float(level), float(level) + 0.8 * board),
+                within(x, board / 2), within(y, 0.02), (float(level), float(level) + 0.8 * board)
             )
             parts.append(shelf.turn("x", slope, (0, 0, float(level))))
     if dice.chance(0.4):
@@ -308,13 +258,4 @@ def rack(dice: Dice) -> list[Part]:
     return parts
 
 
-FAMILIES = {
-    "backed": backed,
-    "with_doors": with_doors,
-    "open_frame": open_frame,
-    "ladder": ladder,
-    "corner": corner,
-    "cubes": cubes,
-    "wall_board": wall_board,
-    "rack": rack,
-}
+FAMILIES = (backed, with_doors, open_frame, ladder, corner, cubes, wall_board, rack)

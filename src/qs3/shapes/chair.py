@@ -5,10 +5,11 @@ import numpy as np
 from qs3.shapes._dice import Dice
 from qs3.shapes._easy_chairs import armchair, lounge, recliner, tub, wing
 from qs3.shapes._joinery import corners, legs
-from qs3.shapes._parts import (
+from qs3.shapes._solids import (
     Number,
-    Part,
+    Solid,
     Span,
+    around,
     beam,
     bend,
     block,
@@ -17,11 +18,12 @@ from qs3.shapes._parts import (
     ribbon,
     sheet,
     tube,
+    within,
 )
 from qs3.shapes._stools import bar_stool, bench, stool
 
 
-def _backrest(dice: Dice, width: Number, y: Number, z: Span, thick: Number) -> list[Part]:
+def _backrest(dice: Dice, width: Number, y: Number, z: Span, thick: Number) -> list[Solid]:
     """Backrest that stands upright on the seat's rear edge, to be tilted as one piece."""
     style = dice.pick("panel", "panel", "slats", "ladder", "frame", "round", "pad")
     low, high = z
@@ -29,22 +31,15 @@ def _backrest(dice: Dice, width: Number, y: Number, z: Span, thick: Number) -> l
     if style == "pad":
         pad = (low + 0.25 * (high - low), high)
         posts = [
-            block(
-                (s * 0.6 * half - 0.012, s * 0.6 * half + 0.012),
-                (y - 0.012, y + 0.012),
-                (low, pad[0] + 0.05),
-            )
+            block(around(s * 0.6 * half, 0.012), around(y, 0.012), (low, pad[0] + 0.05))
             for s in (-1, 1)
         ]
-        return [
-            *posts,
-            cushion((-half, half), (y - 0.7 * thick, y + 0.7 * thick), pad, 0.05, steps=dice.steps),
-        ]
+        return [*posts, cushion(dice, (-half, half), around(y, 0.7 * thick), pad, 0.05)]
     if style == "panel":
-        board = (y - thick / 2, y + thick / 2)
+        board = around(y, thick / 2)
         if dice.chance(0.5):
             return [block((-half, half), board, z)]
-        return [cushion((-half, half), (y - thick, y + thick), z, thick, steps=dice.steps)]
+        return [cushion(dice, (-half, half), around(y, thick), z, thick)]
     if style == "round":
         arch = [
             (half * np.cos(a), y, low + (high - low) * np.sin(a) ** 0.8)
@@ -61,33 +56,24 @@ def _backrest(dice: Dice, width: Number, y: Number, z: Span, thick: Number) -> l
         parts = [tube(arch, thick / 2, dice.sides)]
         for x in np.linspace(-0.6, 0.6, dice.count(2, 5)) * half:
             top = low + (high - low) * (1 - (x / half) ** 2) ** 0.4
-            parts.append(block((x - 0.009, x + 0.009), (y - 0.009, y + 0.009), (low - 0.01, top)))
+            parts.append(block(around(x, 0.009), around(y, 0.009), (low - 0.01, top)))
         return parts
-    posts = [
-        block((s * half - thick / 2, s * half + thick / 2), (y - thick / 2, y + thick / 2), z)
-        for s in (-1, 1)
-    ]
+    posts = [block(around(s * half, thick / 2), around(y, thick / 2), z) for s in (-1, 1)]
     rail = dice.between(0.05, 0.1)
-    bars = [block((-half, half), (y - 0.35 * thick, y + 0.35 * thick), (high - rail, high))]
+    bars = [block((-half, half), around(y, 0.35 * thick), (high - rail, high))]
     if style == "ladder":
         for level in np.linspace(low + 0.12, high - rail - 0.08, dice.count(1, 4)):
-            bars.append(
-                block(
-                    (-half, half), (y - 0.3 * thick, y + 0.3 * thick), (level, level + 0.6 * rail)
-                )
-            )
+            bars.append(block((-half, half), around(y, 0.3 * thick), (level, level + 0.6 * rail)))
     elif style == "slats":
         for x in np.linspace(-0.65, 0.65, dice.count(2, 6)) * half:
-            bars.append(
-                block((x - 0.012, x + 0.012), (y - 0.008, y + 0.008), (low - 0.01, high - 0.01))
-            )
+            bars.append(block(around(x, 0.012), around(y, 0.008), (low - 0.01, high - 0.01)))
     elif dice.chance(0.6):
         inner = (low + 0.06, high - rail + 0.01)
-        bars.append(block((-half, half), (y - 0.25 * thick, y + 0.25 * thick), inner))
+        bars.append(block((-half, half), around(y, 0.25 * thick), inner))
     return posts + bars
 
 
-def four_legs(dice: Dice) -> list[Part]:
+def four_legs(dice: Dice) -> list[Solid]:
     """Dining chair on four legs."""
     width, depth = dice.between(0.38, 0.52), dice.between(0.38, 0.52)
     seat, back = dice.between(0.42, 0.5), dice.between(0.36, 0.66)
@@ -97,7 +83,7 @@ def four_legs(dice: Dice) -> list[Part]:
     parts = [
         block(x, y, top)
         if dice.chance(0.5)
-        else cushion(x, y, (seat - thick - 0.02, seat), 0.03, steps=dice.steps)
+        else cushion(dice, x, y, (seat - thick - 0.02, seat), 0.03)
     ]
     splay = dice.pick(0.0, 0.0, dice.between(0.01, 0.05))
     spots = corners(x, y, leg / 2 + dice.pick(0.0, 0.02))
@@ -106,36 +92,17 @@ def four_legs(dice: Dice) -> list[Part]:
         apron = dice.between(0.04, 0.08)
         inset = leg / 2
         for s in (-1, 1):
-            parts.append(
-                block(
-                    (x[0] + inset, x[1] - inset),
-                    (s * (depth / 2 - leg / 2) - 0.01, s * (depth / 2 - leg / 2) + 0.01),
-                    (seat - thick - apron, seat - 0.01),
-                )
-            )
-            parts.append(
-                block(
-                    (s * (width / 2 - leg / 2) - 0.01, s * (width / 2 - leg / 2) + 0.01),
-                    (y[0] + inset, y[1] - inset),
-                    (seat - thick - apron, seat - 0.01),
-                )
-            )
+            heights = (seat - thick - apron, seat - 0.01)
+            parts.append(block(within(x, inset), around(s * (depth / 2 - leg / 2), 0.01), heights))
+            parts.append(block(around(s * (width / 2 - leg / 2), 0.01), within(y, inset), heights))
     if dice.chance(0.3) and splay == 0.0:
         height = dice.between(0.1, 0.25)
         for px, _ in spots[::2]:
             parts.append(beam((px, spots[0][1], height), (px, spots[1][1], height), 0.02, 0.02))
         parts.append(beam((spots[0][0], 0, height), (spots[2][0], 0, height), 0.02, 0.02))
     if dice.chance(0.4):
-        parts.append(
-            cushion(
-                (x[0] + 0.01, x[1] - 0.01),
-                (y[0] + 0.01, y[1] - 0.03),
-                (seat - 0.01, seat + dice.between(0.02, 0.07)),
-                0.025,
-                0.01,
-                dice.steps,
-            )
-        )
+        z = (seat - 0.01, seat + dice.between(0.02, 0.07))
+        parts.append(cushion(dice, within(x, 0.01), (y[0] + 0.01, y[1] - 0.03), z, 0.025, 0.01))
     post = max(thick, 0.028)
     rest = _backrest(dice, width - post, y[1] - post / 2, (seat - thick, seat + back), post)
     tilt = dice.between(0, 14)
@@ -149,30 +116,22 @@ def four_legs(dice: Dice) -> list[Part]:
                 beam((side, y[0] + 0.03, seat + arm), (side, y[1] + lean, seat + arm), 0.04, 0.025)
             )
             parts.append(
-                block(
-                    (side - 0.012, side + 0.012),
-                    (y[0] + 0.05, y[0] + 0.08),
-                    (seat - 0.02, seat + arm),
-                )
+                block(around(side, 0.012), (y[0] + 0.05, y[0] + 0.08), (seat - 0.02, seat + arm))
             )
     return parts
 
 
-def _star_base(dice: Dice, height: Number) -> list[Part]:
+def _star_base(dice: Dice, height: Number) -> list[Solid]:
     """Star of four to six feet with a gas spring up to ``height``."""
     feet, reach, castor = dice.count(4, 6), dice.between(0.26, 0.34), dice.chance(0.7)
     level = 0.06 if castor else 0.02
-    parts = [
-        lathe(
-            [
-                (0.035, level - 0.015),
-                (0.035, level + 0.07),
-                (0.02, level + 0.08),
-                (0.02, height + 0.005),
-            ],
-            max(dice.sides, 8),
-        )
+    profile = [
+        (0.035, level - 0.015),
+        (0.035, level + 0.07),
+        (0.02, level + 0.08),
+        (0.02, height + 0.005),
     ]
+    parts = [lathe(profile, max(dice.sides, 8))]
     for i in range(feet):
         turn = 360 * i / feet + 18
         parts.append(
@@ -189,38 +148,31 @@ def _star_base(dice: Dice, height: Number) -> list[Part]:
     return parts
 
 
-def swivel(dice: Dice) -> list[Part]:
+def swivel(dice: Dice) -> list[Solid]:
     """Office chair that turns on a star base."""
     width, depth = dice.between(0.44, 0.54), dice.between(0.42, 0.52)
     seat, thick = dice.between(0.42, 0.54), dice.between(0.04, 0.1)
     x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
     parts = _star_base(dice, seat - thick)
-    parts.append(cushion(x, y, (seat - thick, seat), dice.between(0.02, 0.05), 0.01, dice.steps))
+    parts.append(cushion(dice, x, y, (seat - thick, seat), dice.between(0.02, 0.05), 0.01))
     tall, gap = dice.between(0.35, 0.75), dice.between(0.02, 0.16)
     pad = dice.between(0.03, 0.08)
     bw = width * dice.between(0.75, 1.0) / 2
     rest = [
         cushion(
+            dice,
             (-bw, bw),
             (y[1] - pad, y[1] + 0.01),
             (seat + gap, seat + gap + tall),
             dice.between(0.02, 0.2) if dice.chance(0.2) else pad / 2,
-            steps=dice.steps,
         ),
         block(
             (-0.04, 0.04), (y[1] - 0.005, y[1] + 0.02), (seat - thick / 2, seat + gap + tall / 2)
         ),
     ]
     if dice.chance(0.2):
-        rest.append(
-            cushion(
-                (-0.13, 0.13),
-                (y[1] - pad, y[1] + 0.01),
-                (seat + gap + tall - 0.01, seat + gap + tall + 0.14),
-                0.03,
-                steps=dice.steps,
-            )
-        )
+        z = (seat + gap + tall - 0.01, seat + gap + tall + 0.14)
+        rest.append(cushion(dice, (-0.13, 0.13), (y[1] - pad, y[1] + 0.01), z, 0.03))
     tilt = dice.between(0, 14)
     parts += [part.turn("x", -tilt, (0, y[1], seat)) for part in rest]
     parts.append(
@@ -230,28 +182,19 @@ def swivel(dice: Dice) -> list[Part]:
         rise, run = dice.between(0.16, 0.24), dice.between(0.2, 0.3)
         for s in (-1, 1):
             out = s * (width / 2 + 0.02)
-            parts.append(
-                cushion(
-                    (out - 0.035, out + 0.035),
-                    (-run / 2, run / 2),
-                    (seat + rise - 0.03, seat + rise),
-                    0.012,
-                    steps=dice.steps,
-                )
-            )
-            path = bend(
-                [
-                    (s * (width / 2 - 0.08), 0, seat - thick / 2),
-                    (out, 0, seat - thick / 2),
-                    (out, 0, seat + rise - 0.01),
-                ],
-                0.05,
-            )
+            heights = (seat + rise - 0.03, seat + rise)
+            parts.append(cushion(dice, around(out, 0.035), (-run / 2, run / 2), heights, 0.012))
+            route = [
+                (s * (width / 2 - 0.08), 0, seat - thick / 2),
+                (out, 0, seat - thick / 2),
+                (out, 0, seat + rise - 0.01),
+            ]
+            path = bend(route, 0.05)
             parts.append(tube(path, 0.015 * dice.bulk**0.5, 6))
     return parts
 
 
-def cantilever(dice: Dice) -> list[Part]:
+def cantilever(dice: Dice) -> list[Solid]:
     """Chair on two bent runners that spring from the front."""
     width, depth, seat = (
         dice.between(0.42, 0.54),
@@ -277,28 +220,21 @@ def cantilever(dice: Dice) -> list[Part]:
         parts.append(tube(bend(path, dice.between(0.04, 0.1)), bar, dice.sides))
     parts.append(tube([(-width / 2, r, bar), (width / 2, r, bar)], bar, dice.sides))
     thick = dice.between(0.02, 0.06)
-    parts.append(
-        cushion(
-            (-width / 2, width / 2),
-            (f, r - 0.02),
-            (seat - 0.03, seat - 0.03 + thick),
-            0.015,
-            steps=dice.steps,
-        )
-    )
+    z = (seat - 0.03, seat - 0.03 + thick)
+    parts.append(cushion(dice, (-width / 2, width / 2), (f, r - 0.02), z, 0.015))
     low = dice.between(0.0, 0.2)
     rest = cushion(
+        dice,
         (-width / 2 - bar / 2, width / 2 + bar / 2),
         (r - 0.02, r - 0.02 + thick),
         (seat + low, seat + back + 0.02),
         0.015,
-        steps=dice.steps,
     )
     parts.append(rest.turn("x", -np.degrees(np.arctan2(lean, back)), (0, r, seat)))
     return parts
 
 
-def shell(dice: Dice) -> list[Part]:
+def shell(dice: Dice) -> list[Solid]:
     """Moulded shell on thin legs, on a star base, or running down to the floor in an S."""
     width, depth, seat = dice.between(0.44, 0.6), dice.between(0.42, 0.54), dice.between(0.42, 0.47)
     back, thick = dice.between(0.32, 0.5), dice.between(0.012, 0.03) * dice.bulk**0.5
@@ -353,17 +289,17 @@ def shell(dice: Dice) -> list[Part]:
     return parts
 
 
-FAMILIES = {
-    "four_legs": four_legs,
-    "swivel": swivel,
-    "armchair": armchair,
-    "wing": wing,
-    "recliner": recliner,
-    "lounge": lounge,
-    "cantilever": cantilever,
-    "shell": shell,
-    "stool": stool,
-    "bar_stool": bar_stool,
-    "bench": bench,
-    "tub": tub,
-}
+FAMILIES = (
+    four_legs,
+    swivel,
+    armchair,
+    wing,
+    recliner,
+    lounge,
+    cantilever,
+    shell,
+    stool,
+    bar_stool,
+    bench,
+    tub,
+)

@@ -4,10 +4,10 @@ import numpy as np
 
 from qs3.shapes._dice import Dice
 from qs3.shapes._joinery import legs
-from qs3.shapes._parts import (
+from qs3.shapes._solids import (
     Number,
-    Part,
     Point,
+    Solid,
     at_height,
     ball,
     beam,
@@ -22,7 +22,7 @@ from qs3.shapes._parts import (
 _WALL = 0.006
 
 
-def _shade(dice: Dice, wide: Number, tall: Number, z: Number, sides: int) -> list[Part]:
+def _shade(dice: Dice, wide: Number, tall: Number, z: Number, sides: int) -> list[Solid]:
     """Open shade about the z axis from ``z`` up, with the spokes that carry it at its middle."""
     top = dice.pick(dice.between(0.35, 0.75), dice.between(0.8, 1.0)) * wide
     mid = z + 0.5 * tall
@@ -46,7 +46,7 @@ def _shade(dice: Dice, wide: Number, tall: Number, z: Number, sides: int) -> lis
     return [shade, spoke, ball(0.035, (0, 0, mid + 0.02), 8)]
 
 
-def _foot(dice: Dice, radius: Number) -> list[Part]:
+def _foot(dice: Dice, radius: Number) -> list[Solid]:
     thick = dice.between(0.015, 0.035)
     if dice.chance(0.25):
         return [block((-radius, radius), (-radius, radius), (0, thick))]
@@ -59,7 +59,7 @@ def _foot(dice: Dice, radius: Number) -> list[Part]:
     ]
 
 
-def floor(dice: Dice) -> list[Part]:
+def floor(dice: Dice) -> list[Solid]:
     """Standing lamp with a shade on a post, on a plate or three legs."""
     high, wide, tall = dice.between(1.2, 1.8), dice.between(0.13, 0.26), dice.between(0.18, 0.4)
     post = dice.between(0.009, 0.022) * dice.bulk
@@ -82,7 +82,7 @@ def floor(dice: Dice) -> list[Part]:
     return [*parts, lathe([(post, low), (post, high - 0.5 * tall + 0.01)], max(6, dice.sides // 2))]
 
 
-def arc(dice: Dice) -> list[Part]:
+def arc(dice: Dice) -> list[Solid]:
     """Floor lamp whose bow carries a shade out over a seat."""
     high, reach, wide = dice.between(1.5, 2.0), dice.between(0.6, 1.3), dice.between(0.12, 0.22)
     bar = dice.between(0.009, 0.018) * dice.bulk**0.5
@@ -108,15 +108,11 @@ def arc(dice: Dice) -> list[Part]:
     foot = lathe(
         [(dice.between(0.16, 0.22), 0), (0.16, dice.between(0.03, 0.07))], max(12, dice.sides)
     )
-    return [
-        tube(path, bar, 8),
-        tube(np.stack([end, [end[0], 0, low - 0.02]]), bar * 0.8, 6),
-        shade.move(float(end[0])),
-        foot,
-    ]
+    line = np.stack([end, [end[0], 0, low - 0.02]])
+    return [tube(path, bar, 8), tube(line, bar * 0.8, 6), shade.move(float(end[0])), foot]
 
 
-def torchiere(dice: Dice) -> list[Part]:
+def torchiere(dice: Dice) -> list[Solid]:
     """Uplighter: a bowl on a tall post, perhaps with a reading arm."""
     high, post, wide = (
         dice.between(1.55, 1.95),
@@ -146,7 +142,7 @@ def torchiere(dice: Dice) -> list[Part]:
     return parts
 
 
-def table(dice: Dice) -> list[Part]:
+def table(dice: Dice) -> list[Solid]:
     """Table lamp with a turned, square or bulging body under a shade."""
     body, wide, tall = dice.between(0.14, 0.42), dice.between(0.1, 0.24), dice.between(0.12, 0.3)
     high = body + tall * dice.between(0.75, 1.05)
@@ -190,7 +186,7 @@ def table(dice: Dice) -> list[Part]:
     return parts
 
 
-def _bell(dice: Dice, wide: Number, tall: Number) -> Part:
+def _bell(dice: Dice, wide: Number, tall: Number) -> Solid:
     """Reflector that opens downward below the origin."""
     neck = dice.between(0.25, 0.5) * wide
     outer = [
@@ -210,23 +206,20 @@ def _bell(dice: Dice, wide: Number, tall: Number) -> Part:
     return loft(np.stack(rings), cyclic=True)
 
 
-def desk_arm(dice: Dice) -> list[Part]:
+def desk_arm(dice: Dice) -> list[Solid]:
     """Work lamp on a jointed or bent arm."""
     bar, wide = dice.between(0.006, 0.014) * dice.bulk, dice.between(0.05, 0.1)
     lower, upper = dice.between(0.18, 0.4), dice.between(0.16, 0.4)
     parts = _foot(dice, dice.between(0.07, 0.12))
     if dice.chance(0.35):
         high = lower + 0.6 * upper
-        path = bend(
-            [
-                (0, 0, 0.01),
-                (0, 0, high),
-                (upper * 0.7, 0, high + 0.02),
-                (upper * 0.8, 0, high - 0.1),
-            ],
-            0.2,
-            8,
-        )
+        route = [
+            (0, 0, 0.01),
+            (0, 0, high),
+            (upper * 0.7, 0, high + 0.02),
+            (upper * 0.8, 0, high - 0.1),
+        ]
+        path = bend(route, 0.2, 8)
         end, tilt = path[-1], -15.0
         parts.append(tube(path, bar, 8))
     else:
@@ -248,7 +241,7 @@ def desk_arm(dice: Dice) -> list[Part]:
     return parts
 
 
-def pendant(dice: Dice) -> list[Part]:
+def pendant(dice: Dice) -> list[Solid]:
     """Lamp that hangs from a ceiling rose by a cord."""
     cord, wide = dice.between(0.25, 1.0), dice.between(0.1, 0.3)
     tall = wide * dice.between(0.5, 1.4)
@@ -268,14 +261,11 @@ def pendant(dice: Dice) -> list[Part]:
     else:
         head, low = [lathe([(wide, -0.03), (wide, 0.0), (0.1 * wide, 0.04)], dice.sides)], 0.0
     rose = dice.between(0.04, 0.07)
-    return [
-        *head,
-        lathe([(0.005, low), (0.005, cord)], 6),
-        lathe([(rose * 0.6, cord - 0.02), (rose, cord), (rose, cord + 0.02)], max(8, dice.sides)),
-    ]
+    profile = [(rose * 0.6, cord - 0.02), (rose, cord), (rose, cord + 0.02)]
+    return [*head, lathe([(0.005, low), (0.005, cord)], 6), lathe(profile, max(8, dice.sides))]
 
 
-def ceiling(dice: Dice) -> list[Part]:
+def ceiling(dice: Dice) -> list[Solid]:
     """Saucer, drum or square panel close under the ceiling."""
     wide, deep = dice.between(0.14, 0.32), dice.between(0.06, 0.2)
     if dice.chance(0.2):
@@ -288,16 +278,12 @@ def ceiling(dice: Dice) -> list[Part]:
     e = dice.between(0.6, 1.6)
     profile = [(wide * np.cos(a) ** e, deep + deep * np.sin(a)) for a in angle]
     parts = [lathe([*profile, (wide, deep + 0.01), (0.6 * wide, deep + 0.02)], max(dice.sides, 8))]
-    parts.append(
-        lathe(
-            [(dice.between(0.4, 0.9) * wide, deep), (0.5 * wide, deep + dice.between(0.03, 0.12))],
-            dice.sides,
-        )
-    )
+    section = [(dice.between(0.4, 0.9) * wide, deep), (0.5 * wide, deep + dice.between(0.03, 0.12))]
+    parts.append(lathe(section, dice.sides))
     return parts
 
 
-def chandelier(dice: Dice) -> list[Part]:
+def chandelier(dice: Dice) -> list[Solid]:
     """Bent arms about a hub, each with a candle or small shade."""
     count, reach, cord = dice.count(3, 8), dice.between(0.22, 0.45), dice.between(0.2, 0.6)
     parts = [
@@ -323,7 +309,7 @@ def chandelier(dice: Dice) -> list[Part]:
     return parts
 
 
-def column(dice: Dice) -> list[Part]:
+def column(dice: Dice) -> list[Solid]:
     """Lantern of paper or cloth: a tall box or cylinder on a foot."""
     high, half = dice.between(0.5, 1.5), dice.between(0.08, 0.17)
     foot = dice.between(0.03, 0.12)
@@ -348,14 +334,4 @@ def column(dice: Dice) -> list[Part]:
     ]
 
 
-FAMILIES = {
-    "floor": floor,
-    "arc": arc,
-    "torchiere": torchiere,
-    "table": table,
-    "desk_arm": desk_arm,
-    "pendant": pendant,
-    "ceiling": ceiling,
-    "chandelier": chandelier,
-    "column": column,
-}
+FAMILIES = (floor, arc, torchiere, table, desk_arm, pendant, ceiling, chandelier, column)

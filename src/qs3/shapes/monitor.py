@@ -3,28 +3,31 @@
 import numpy as np
 
 from qs3.shapes._dice import Dice
-from qs3.shapes._parts import (
+from qs3.shapes._solids import (
     Number,
-    Part,
+    Solid,
     Span,
+    around,
     beam,
     bend,
     block,
+    curved_wall,
     cushion,
     lathe,
     loft,
     sheet,
     tube,
+    within,
 )
 
 
-def _screen(dice: Dice, width: Number, high: Number, z: Number, thick: Number) -> list[Part]:
+def _screen(dice: Dice, width: Number, high: Number, z: Number, thick: Number) -> list[Solid]:
     """Flat screen that faces −y with a raised frame and perhaps a hump behind."""
     x, y = (-width / 2, width / 2), (-thick / 2, thick / 2)
     body = (
         block(x, y, (z, z + high))
         if dice.chance(0.6)
-        else cushion(x, y, (z, z + high), 0.4 * thick, steps=dice.steps)
+        else cushion(dice, x, y, (z, z + high), 0.4 * thick)
     )
     parts = [body]
     if dice.chance(0.6):
@@ -62,7 +65,7 @@ def _size(dice: Dice) -> tuple[float, float]:
     )
 
 
-def foot(dice: Dice) -> list[Part]:
+def foot(dice: Dice) -> list[Solid]:
     """Flat screen on one neck and a plate."""
     width, high = _size(dice)
     thick, lift = dice.between(0.02, 0.07), dice.between(0.04, 0.2) * min(1.0, width / 0.6)
@@ -81,7 +84,7 @@ def foot(dice: Dice) -> list[Part]:
         base = [block((-wide / 2, wide / 2), (-0.55 * deep, 0.45 * deep), (0, plate))]
     elif kind == "oval":
         disc = lathe([(1.0, 0), (1.0, plate), (0.6, 1.5 * plate)], max(12, dice.sides))
-        base = [Part(disc.vertices * [wide / 2, deep / 2, 1.0], disc.faces)]
+        base = [Solid(disc.vertices * [wide / 2, deep / 2, 1.0], disc.faces)]
     else:
         base = [
             beam((0, back * 0.6, plate), (s * wide / 2, -0.5 * deep, plate), 0.03, 2 * plate)
@@ -93,17 +96,12 @@ def foot(dice: Dice) -> list[Part]:
         (-neck / 2, neck / 2), (rear - 0.02, rear + 0.01), (plate * 0.5, lift + 0.55 * high)
     )
     parts = [*screen, *base, post]
-    parts.append(
-        block(
-            (-neck * 0.8, neck * 0.8),
-            (-0.01, rear + 0.005),
-            (lift + 0.25 * high, lift + 0.4 * high),
-        )
-    )
+    z = (lift + 0.25 * high, lift + 0.4 * high)
+    parts.append(block((-neck * 0.8, neck * 0.8), (-0.01, rear + 0.005), z))
     return parts
 
 
-def two_feet(dice: Dice) -> list[Part]:
+def two_feet(dice: Dice) -> list[Solid]:
     """Television on a foot near either end."""
     width = dice.between(0.8, 1.6)
     high, thick, lift = (
@@ -118,26 +116,16 @@ def two_feet(dice: Dice) -> list[Part]:
         if dice.chance(0.5):
             for end in (-deep / 2, deep / 2):
                 parts.append(beam((s * at, end, bar / 2), (s * at, 0, lift + 0.02), bar, bar))
-                parts.append(
-                    block(
-                        (s * at - bar / 2, s * at + bar / 2),
-                        (end - bar / 2, end + bar / 2),
-                        (0, bar),
-                    )
-                )
+                parts.append(block(around(s * at, bar / 2), around(end, bar / 2), (0, bar)))
         else:
             parts += [
-                block((s * at - bar, s * at + bar), (-deep / 2, deep / 2), (0, bar)),
-                block(
-                    (s * at - bar, s * at + bar),
-                    (-0.3 * thick, 0.3 * thick),
-                    (bar / 2, lift + 0.01),
-                ),
+                block(around(s * at, bar), (-deep / 2, deep / 2), (0, bar)),
+                block(around(s * at, bar), (-0.3 * thick, 0.3 * thick), (bar / 2, lift + 0.01)),
             ]
     return parts
 
 
-def curved(dice: Dice) -> list[Part]:
+def curved(dice: Dice) -> list[Solid]:
     """Wide screen bent about its viewer."""
     width, thick = dice.between(0.7, 1.25), dice.between(0.025, 0.05)
     high, lift, radius = (
@@ -146,15 +134,10 @@ def curved(dice: Dice) -> list[Part]:
         dice.between(1.0, 2.0),
     )
     a = np.linspace(-0.5, 0.5, 13) * width / radius
-    grid = np.stack(
-        [
-            np.stack([radius * np.sin(a), radius * (np.cos(a) - 1), np.full(13, z)], axis=1)
-            for z in np.linspace(lift, lift + high, 3)
-        ]
-    )
+    plan = np.stack([radius * np.sin(a), radius * (np.cos(a) - 1)], axis=1)
     deep, wide = dice.between(0.18, 0.28), width * dice.between(0.25, 0.5)
     parts = [
-        sheet(grid.swapaxes(0, 1), thick),
+        curved_wall(plan, (lift, lift + high), thick),
         block((-0.05, 0.05), (0.0, 0.05), (0.005, lift + 0.55 * high)),
     ]
     for s in (-1, 1):
@@ -163,7 +146,7 @@ def curved(dice: Dice) -> list[Part]:
     return parts
 
 
-def tube_set(dice: Dice) -> list[Part]:
+def tube_set(dice: Dice) -> list[Solid]:
     """Cathode-ray set: a deep box or a cone behind the screen, perhaps on feet."""
     width = dice.between(0.36, 0.8)
     high, deep = width * dice.between(0.62, 0.95), width * dice.between(0.5, 1.0)
@@ -171,17 +154,15 @@ def tube_set(dice: Dice) -> list[Part]:
     x, z = (-width / 2, width / 2), (foot, foot + high)
     shell = dice.between(0.3, 1.0)
     front = (-deep / 2, -deep / 2 + shell * deep)
-    parts = [
-        cushion(x, front, z, 0.02, steps=dice.steps) if dice.chance(0.5) else block(x, front, z)
-    ]
+    parts = [cushion(dice, x, front, z, 0.02) if dice.chance(0.5) else block(x, front, z)]
     edge = dice.between(0.03, 0.07) * width / 0.5
     panel = dice.pick(0.0, 0.0, 0.22 * width)
     proud: Span = (front[0] - dice.between(0.008, 0.03), front[0] + 0.004)
     parts += [
         block((x[0], x[0] + edge), proud, z),
         block((x[1] - edge - panel, x[1]), proud, z),
-        block((x[0] + 0.001, x[1] - 0.001), proud, (z[0], z[0] + edge)),
-        block((x[0] + 0.001, x[1] - 0.001), proud, (z[1] - edge, z[1])),
+        block(within(x, 0.001), proud, (z[0], z[0] + edge)),
+        block(within(x, 0.001), proud, (z[1] - edge, z[1])),
     ]
     if panel > 0:
         for t in (0.35, 0.7):
@@ -195,12 +176,9 @@ def tube_set(dice: Dice) -> list[Part]:
             for s, yy in ((1.0, front[1] - 0.003), (shrink, deep / 2))
         ]
         parts.append(loft(np.stack(rings)))
+        heights = (0.0, foot + 0.5 * high)
         parts.append(
-            block(
-                (-0.2 * width, 0.2 * width),
-                (front[1] - 0.01, deep / 2 - 0.01),
-                (0.0, foot + 0.5 * high),
-            )
+            block((-0.2 * width, 0.2 * width), (front[1] - 0.01, deep / 2 - 0.01), heights)
         )
     if foot > 0:
         if dice.chance(0.5):
@@ -212,26 +190,21 @@ def tube_set(dice: Dice) -> list[Part]:
             parts.append(disc.move(0, front[0] + 0.5 * (front[1] - front[0])))
         else:
             parts += [
-                block((px - 0.02, px + 0.02), (py - 0.02, py + 0.02), (0, foot + 0.01))
+                block(around(px, 0.02), around(py, 0.02), (0, foot + 0.01))
                 for px in (-0.36 * width, 0.36 * width)
                 for py in (front[0] + 0.05, front[1] - 0.04)
             ]
     if dice.chance(0.15):
         for s in (-1, 1):
-            parts.append(
-                tube(
-                    [
-                        (0, 0.5 * (front[0] + front[1]), z[1] - 0.01),
-                        (s * 0.5 * width, front[1] - 0.03, z[1] + 0.6 * high),
-                    ],
-                    0.005,
-                    6,
-                )
-            )
+            path = [
+                (0, 0.5 * (front[0] + front[1]), z[1] - 0.01),
+                (s * 0.5 * width, front[1] - 0.03, z[1] + 0.6 * high),
+            ]
+            parts.append(tube(path, 0.005, 6))
     return parts
 
 
-def all_in_one(dice: Dice) -> list[Part]:
+def all_in_one(dice: Dice) -> list[Solid]:
     """Screen with a chin on a bent sheet of metal, with or without a keyboard."""
     width, thick = dice.between(0.48, 0.65), dice.between(0.015, 0.05)
     high, lift, tilt = (
@@ -244,32 +217,28 @@ def all_in_one(dice: Dice) -> list[Part]:
     ]
     deep, half, sheet_thick = dice.between(0.16, 0.24), dice.between(0.07, 0.12), 0.008
     lean = np.tan(np.radians(tilt))
-    path = bend(
-        [
-            (0, -deep / 2, sheet_thick / 2),
-            (0, deep / 2 + 0.05, sheet_thick / 2),
-            (0, 0.4 * (lift + high * 0.4) * lean + thick * 0.4, lift + 0.4 * high),
-        ],
-        0.03,
-    )
+    route = [
+        (0, -deep / 2, sheet_thick / 2),
+        (0, deep / 2 + 0.05, sheet_thick / 2),
+        (0, 0.4 * (lift + high * 0.4) * lean + thick * 0.4, lift + 0.4 * high),
+    ]
+    path = bend(route, 0.03)
     wide = np.stack([np.full(3, -half), np.zeros(3), np.zeros(3)], axis=1)[:1]
     grid = np.stack([path + s * wide for s in (-1, 0, 1)], axis=1)
     parts.append(sheet(grid, sheet_thick))
     return parts
 
 
-def laptop(dice: Dice) -> list[Part]:
+def laptop(dice: Dice) -> list[Solid]:
     """Portable computer, opened."""
     width, thick = dice.between(0.28, 0.4), dice.between(0.008, 0.022)
     deep, open_by = width * dice.between(0.62, 0.75), dice.between(92, 125)
-    base = cushion(
-        (-width / 2, width / 2), (-deep, 0), (0, 1.3 * thick), 0.3 * thick, steps=dice.steps
-    )
+    base = cushion(dice, (-width / 2, width / 2), (-deep, 0), (0, 1.3 * thick), 0.3 * thick)
     lid = _screen(dice, width, deep, 0.0, 0.7 * thick)[0]
     return [base, lid.turn("x", -(open_by - 90)).move(0, -0.2 * thick, thick * 0.8)]
 
 
-def dual_arm(dice: Dice) -> list[Part]:
+def dual_arm(dice: Dice) -> list[Solid]:
     """Two screens side by side on one stand."""
     width, thick = dice.between(0.45, 0.62), dice.between(0.02, 0.05)
     high, lift, turn = (
@@ -295,32 +264,20 @@ def dual_arm(dice: Dice) -> list[Part]:
     return parts
 
 
-def wall(dice: Dice) -> list[Part]:
+def wall(dice: Dice) -> list[Solid]:
     """Screen with its wall bracket or arm."""
     width, high = _size(dice)
     thick, deep = dice.between(0.03, 0.07), dice.between(0.04, 0.3)
     half = min(0.25 * high, 0.12)
     z = 0.5 * high
     parts = _screen(dice, width, high, 0.0, thick)
+    heights = around(z, 1.2 * half)
     parts += [
-        block((-half, half), (thick / 2 - 0.003, thick / 2 + 0.015), (z - half, z + half)),
-        block(
-            (-0.6 * half, 0.6 * half),
-            (thick / 2 + deep - 0.015, thick / 2 + deep),
-            (z - 1.2 * half, z + 1.2 * half),
-        ),
-        block((-0.025, 0.025), (thick / 2, thick / 2 + deep - 0.002), (z - 0.03, z + 0.03)),
+        block((-half, half), (thick / 2 - 0.003, thick / 2 + 0.015), around(z, half)),
+        block((-0.6 * half, 0.6 * half), (thick / 2 + deep - 0.015, thick / 2 + deep), heights),
+        block((-0.025, 0.025), (thick / 2, thick / 2 + deep - 0.002), around(z, 0.03)),
     ]
     return parts
 
 
-FAMILIES = {
-    "foot": foot,
-    "two_feet": two_feet,
-    "curved": curved,
-    "tube_set": tube_set,
-    "all_in_one": all_in_one,
-    "laptop": laptop,
-    "dual_arm": dual_arm,
-    "wall": wall,
-}
+FAMILIES = (foot, two_feet, curved, tube_set, all_in_one, laptop, dual_arm, wall)

@@ -4,20 +4,10 @@ import numpy as np
 
 from qs3.shapes._dice import Dice
 from qs3.shapes._foliage import crown, leaf, potted
-from qs3.shapes._parts import (
-    Part,
-    Point,
-    at_height,
-    ball,
-    bend,
-    lathe,
-    loft,
-    outline,
-    tube,
-)
+from qs3.shapes._solids import Point, Solid, at_height, ball, bend, lathe, loft, outline, tube
 
 
-def broad_leaf(dice: Dice) -> list[Part]:
+def broad_leaf(dice: Dice) -> list[Solid]:
     """Rosette of broad leaves on stalks."""
     pot, tall = dice.between(0.08, 0.2), dice.between(0.12, 0.32)
     parts, earth = potted(dice, pot, tall)
@@ -34,20 +24,12 @@ def broad_leaf(dice: Dice) -> list[Part]:
         ]
         parts.append(tube(stalk, 0.005, 5))
         size = dice.between(0.12, 0.3) * (0.5 + high)
-        parts.append(
-            leaf(
-                tip,
-                a,
-                dice.between(10, 60),
-                size,
-                size * dice.between(0.4, 0.7),
-                dice.between(30, 110),
-            )
-        )
+        rise, wide = dice.between(10, 60), size * dice.between(0.4, 0.7)
+        parts.append(leaf(tip, a, rise, size, wide, dice.between(30, 110)))
     return parts
 
 
-def cactus(dice: Dice) -> list[Part]:
+def cactus(dice: Dice) -> list[Solid]:
     """One or more ribbed columns or balls, perhaps with arms, in a pot."""
     pot = dice.between(0.07, 0.2)
     parts, earth = potted(dice, pot, pot * dice.between(0.7, 1.5))
@@ -85,7 +67,7 @@ def cactus(dice: Dice) -> list[Part]:
     return parts
 
 
-def succulent(dice: Dice) -> list[Part]:
+def succulent(dice: Dice) -> list[Solid]:
     """Low rosette of thick leaves such as an aloe or an agave."""
     pot = dice.between(0.06, 0.18)
     parts, earth = potted(dice, pot, pot * dice.between(0.7, 1.8))
@@ -105,92 +87,61 @@ def succulent(dice: Dice) -> list[Part]:
     return parts
 
 
-def tree(dice: Dice) -> list[Part]:
+def tree(dice: Dice) -> list[Solid]:
     """Small tree: a trunk with a crown."""
     pot, tall = dice.between(0.1, 0.22), dice.between(0.16, 0.35)
     parts, earth = potted(dice, pot, tall)
     high, size = dice.between(0.3, 1.1), dice.between(0.14, 0.36)
     lean = dice.between(-0.08, 0.08)
     head = (lean, 0.0, earth + high)
-    parts.append(
-        tube(
-            [(0, 0, earth - 0.02), (-0.4 * lean, 0.02, earth + 0.5 * high), head],
-            [0.02, 0.016, 0.012],
-            7,
-        )
-    )
+    path = [(0, 0, earth - 0.02), (-0.4 * lean, 0.02, earth + 0.5 * high), head]
+    parts.append(tube(path, [0.02, 0.016, 0.012], 7))
     return parts + crown(dice, head, size, smooth=dice.chance(0.5))
 
 
-def palm(dice: Dice) -> list[Part]:
+def palm(dice: Dice) -> list[Solid]:
     """Trunk or bare stems with long arching fronds."""
     pot, tall = dice.between(0.1, 0.2), dice.between(0.15, 0.32)
     parts, earth = potted(dice, pot, tall)
     high, count = dice.pick(0.02, dice.between(0.2, 0.9)), dice.count(7, 14)
     head = (0.0, 0.0, earth + high)
-    parts.append(
-        lathe(
-            [(0.03, earth - 0.02), (0.022, earth + 0.5 * high), (0.03, earth + high + 0.01)],
-            max(6, dice.sides // 2),
-        )
-    )
+    profile = [(0.03, earth - 0.02), (0.022, earth + 0.5 * high), (0.03, earth + high + 0.01)]
+    parts.append(lathe(profile, max(6, dice.sides // 2)))
     long = dice.between(0.35, 0.75)
     feathered = dice.chance(0.5)
     for i in range(count):
         a, rise = 360 * i / count + dice.between(-12, 12), dice.between(35, 80)
         droop = dice.between(60, 130)
-        parts.append(
-            leaf(
-                head,
-                a,
-                rise,
-                long,
-                long * (0.05 if feathered else dice.between(0.1, 0.22)),
-                droop,
-                0.006,
-            )
-        )
+        wide = long * (0.05 if feathered else dice.between(0.1, 0.22))
+        parts.append(leaf(head, a, rise, long, wide, droop, 0.006))
         if feathered:
             t = np.radians(rise - droop * np.arange(1, 7) / 6)
             out, up = np.cumsum(long / 6 * np.cos(t)), np.cumsum(long / 6 * np.sin(t))
             c, s = np.cos(np.radians(a)), np.sin(np.radians(a))
             for j in range(1, 6):
                 spot = (float(out[j] * c), float(out[j] * s), head[2] + float(up[j]))
-                for side in (-1, 1):
-                    parts.append(
-                        leaf(
-                            spot,
-                            a + side * 60,
-                            float(np.degrees(t[j])) + 5,
-                            long * 0.28,
-                            0.025,
-                            40,
-                            0.005,
-                        )
-                    )
+                slope = float(np.degrees(t[j])) + 5
+                for turn in (a - 60, a + 60):
+                    parts.append(leaf(spot, turn, slope, long * 0.28, 0.025, 40, 0.005))
     return parts
 
 
-def bush(dice: Dice) -> list[Part]:
+def bush(dice: Dice) -> list[Solid]:
     """Rounded or clipped shrub that hides its pot's rim."""
     pot = dice.between(0.1, 0.22)
     parts, earth = potted(dice, pot, pot * dice.between(1.0, 2.0))
     size = pot * dice.between(1.0, 1.7)
     if dice.chance(0.25):
         high = size * dice.between(2.0, 4.0)
-        parts.append(
-            lathe(
-                [(0.6 * size, earth - 0.01), (size, earth + 0.15 * high), (0.0, earth + high)],
-                dice.sides,
-            )
-        )
+        profile = [(0.6 * size, earth - 0.01), (size, earth + 0.15 * high), (0.0, earth + high)]
+        parts.append(lathe(profile, dice.sides))
         return parts
     middle = earth + 0.75 * size
     parts.append(tube([(0, 0, earth - 0.01), (0, 0, middle)], 0.012, 6))
     return parts + crown(dice, (0.0, 0.0, middle), size, smooth=dice.chance(0.6))
 
 
-def sword(dice: Dice) -> list[Part]:
+def sword(dice: Dice) -> list[Solid]:
     """Stiff upright blades such as a snake plant's."""
     pot = dice.between(0.06, 0.16)
     parts, earth = potted(dice, pot, pot * dice.between(1.0, 2.8))
@@ -200,21 +151,12 @@ def sword(dice: Dice) -> list[Part]:
         off = pot * dice.between(0.0, 0.45)
         start = (off * np.cos(np.radians(a)), off * np.sin(np.radians(a)), earth - 0.01)
         long = high * dice.between(0.55, 1.0)
-        parts.append(
-            leaf(
-                start,
-                a,
-                dice.between(68, 88),
-                long,
-                dice.between(0.03, 0.08) * (0.5 + high),
-                dice.between(-8, 12),
-                0.006,
-            )
-        )
+        rise, wide = dice.between(68, 88), dice.between(0.03, 0.08) * (0.5 + high)
+        parts.append(leaf(start, a, rise, long, wide, dice.between(-8, 12), 0.006))
     return parts
 
 
-def grass(dice: Dice) -> list[Part]:
+def grass(dice: Dice) -> list[Solid]:
     """Tuft of many narrow arching blades, or spikes such as a yucca's."""
     pot = dice.between(0.08, 0.18)
     parts, earth = potted(dice, pot, pot * dice.between(0.9, 2.0))
@@ -224,20 +166,12 @@ def grass(dice: Dice) -> list[Part]:
         off = pot * dice.between(0.0, 0.5)
         start = (off * np.cos(np.radians(a)), off * np.sin(np.radians(a)), earth - 0.008)
         droop = dice.between(0, 25) if stiff else dice.between(40, 130)
-        parts.append(
-            leaf(
-                start,
-                a,
-                dice.between(25, 88),
-                high * dice.between(0.6, 1.0),
-                dice.between(0.012, 0.03),
-                droop,
-            )
-        )
+        rise, long = dice.between(25, 88), high * dice.between(0.6, 1.0)
+        parts.append(leaf(start, a, rise, long, dice.between(0.012, 0.03), droop))
     return parts
 
 
-def trailing(dice: Dice) -> list[Part]:
+def trailing(dice: Dice) -> list[Solid]:
     """Pot whose shoots spill over its rim, perhaps hung by three cords."""
     pot = dice.between(0.09, 0.16)
     parts, earth = potted(dice, pot, pot * dice.between(0.9, 1.5))
@@ -262,24 +196,9 @@ def trailing(dice: Dice) -> list[Part]:
         top = earth + dice.between(0.4, 0.7)
         for k in range(3):
             a = np.radians(120 * k + 30)
-            parts.append(
-                tube(
-                    [(0.7 * pot * np.cos(a), 0.7 * pot * np.sin(a), earth - 0.01), (0, 0, top)],
-                    0.004,
-                    5,
-                )
-            )
+            line = [(0.7 * pot * np.cos(a), 0.7 * pot * np.sin(a), earth - 0.01), (0, 0, top)]
+            parts.append(tube(line, 0.004, 5))
     return parts
 
 
-FAMILIES = {
-    "broad_leaf": broad_leaf,
-    "cactus": cactus,
-    "succulent": succulent,
-    "tree": tree,
-    "palm": palm,
-    "bush": bush,
-    "sword": sword,
-    "grass": grass,
-    "trailing": trailing,
-}
+FAMILIES = (broad_leaf, cactus, succulent, tree, palm, bush, sword, grass, trailing)

@@ -6,76 +6,61 @@ import numpy as np
 
 from qs3.shapes._dice import Dice
 from qs3.shapes._joinery import corners, legs
-from qs3.shapes._parts import Number, Part, Span, beam, block, cushion, sheet, tube
+from qs3.shapes._solids import (
+    Number,
+    Solid,
+    Span,
+    around,
+    beam,
+    block,
+    curved_wall,
+    cushion,
+    tube,
+    within,
+)
 from qs3.shapes._upholstery import upholstered
 
 
-def straight(dice: Dice) -> list[Part]:
+def straight(dice: Dice) -> list[Solid]:
     """Sofa for two to four."""
     seats = dice.pick(2, 2, 3, 3, 4)
     return upholstered(dice, seats * dice.between(0.52, 0.72) + dice.between(0.25, 0.5), seats)
 
 
-def _module(dice: Dice, x: Span, y: Span, look: dict[str, float], backs: str) -> list[Part]:
-    """Block of a sectional: base, seat cushion, and a back on each named side (n e w s)."""
-    seat, high, back, soft = look["seat"], look["high"], look["back"], look["soft"]
-    parts = [cushion(x, y, (look["foot"], seat - 0.12), min(soft, 0.02), steps=dice.steps)]
-    a, b = [x[0], x[1]], [y[0], y[1]]
-    for name in backs:
-        if name == "n":
-            parts.append(
-                cushion(x, (y[1] - back, y[1]), (look["foot"], high), soft, steps=dice.steps)
-            )
-            b[1] = y[1] - back + 0.01
-        elif name == "e":
-            parts.append(
-                cushion((x[1] - back, x[1]), y, (look["foot"], high), soft, steps=dice.steps)
-            )
-            a[1] = x[1] - back + 0.01
-        elif name == "w":
-            parts.append(
-                cushion((x[0], x[0] + back), y, (look["foot"], high), soft, steps=dice.steps)
-            )
-            a[0] = x[0] + back - 0.01
-        else:
-            parts.append(
-                cushion(x, (y[0], y[0] + back), (look["foot"], look["arm"]), soft, steps=dice.steps)
-            )
-            b[0] = y[0] + back - 0.01
-    parts.append(
-        cushion(
-            (a[0], a[1]),
-            (b[0], b[1]),
-            (seat - 0.13, seat),
-            max(soft, 0.02),
-            look["plump"],
-            dice.steps,
-        )
-    )
+def _module(
+    dice: Dice, x: Span, y: Span, look: dict[str, float], *, rear: bool, right: bool
+) -> list[Solid]:
+    """Block of a sectional: base, seat cushion, and a back at the rear, at the right or both."""
+    seat, back, soft = look["seat"], look["back"], look["soft"]
+    wall = (look["foot"], look["high"])
+    parts = [cushion(dice, x, y, (look["foot"], seat - 0.12), min(soft, 0.02))]
+    a, b = x, y
+    if rear:
+        parts.append(cushion(dice, x, (y[1] - back, y[1]), wall, soft))
+        b = (y[0], y[1] - back + 0.01)
+    if right:
+        parts.append(cushion(dice, (x[1] - back, x[1]), y, wall, soft))
+        a = (x[0], x[1] - back + 0.01)
+    parts.append(cushion(dice, a, b, (seat - 0.13, seat), max(soft, 0.02), look["plump"]))
     if dice.chance(look["loose"]):
-        z = (seat - 0.02, high + look["proud"])
-        if "n" in backs:
-            parts.append(
-                cushion(
-                    (a[0] + 0.01, a[1] - 0.01),
-                    (b[1] - 0.14, b[1] + 0.02),
-                    z,
-                    0.04,
-                    steps=dice.steps,
-                )
-            )
-        if "e" in backs:
-            parts.append(
-                cushion(
-                    (a[1] - 0.14, a[1] + 0.02),
-                    (b[0] + 0.01, b[1] - 0.01),
-                    z,
-                    0.04,
-                    steps=dice.steps,
-                )
-            )
+        z = (seat - 0.02, look["high"] + look["proud"])
+        if rear:
+            parts.append(cushion(dice, within(a, 0.01), (b[1] - 0.14, b[1] + 0.02), z, 0.04))
+        if right:
+            parts.append(cushion(dice, (a[1] - 0.14, a[1] + 0.02), within(b, 0.01), z, 0.04))
     if look["foot"] > 0:
         parts += legs(dice, corners(x, y, 0.06), look["foot"] + 0.01, 0.04, "square")
+    return parts
+
+
+def _row(
+    dice: Dice, seats: int, unit: Number, depth: Number, look: dict[str, float]
+) -> list[Solid]:
+    """Modules with a back at the rear, from x = 0 to the left."""
+    parts = []
+    for i in range(seats):
+        x1 = -i * unit + 0.004
+        parts += _module(dice, (x1 - unit - 0.004, x1), (0.0, depth), look, rear=True, right=False)
     return parts
 
 
@@ -94,79 +79,63 @@ def _look(dice: Dice) -> dict[str, float]:
     }
 
 
-def corner(dice: Dice) -> list[Part]:
+def corner(dice: Dice) -> list[Solid]:
     """L-shaped sectional with its corner at the rear right."""
     look, unit, depth = _look(dice), dice.between(0.55, 0.85), dice.between(0.75, 1.0)
     along, down = dice.count(1, 3), dice.count(1, 3)
-    parts = _module(dice, (0.0, depth), (0.0, depth), look, "ne")
-    for i in range(along):
-        x1 = -i * unit + 0.004
-        parts += _module(dice, (x1 - unit - 0.004, x1), (0.0, depth), look, "n")
+    parts = _module(dice, (0.0, depth), (0.0, depth), look, rear=True, right=True)
+    parts += _row(dice, along, unit, depth, look)
     for i in range(down):
         y1 = -i * unit + 0.004
-        parts += _module(dice, (0.0, depth), (y1 - unit - 0.004, y1), look, "e")
+        parts += _module(dice, (0.0, depth), (y1 - unit - 0.004, y1), look, rear=False, right=True)
     if dice.chance(0.6):
         arm, side = (look["foot"], look["arm"]), look["back"]
-        left = -along * unit + 0.004
-        parts.append(
-            cushion((left - side, left + 0.01), (0.0, depth), arm, look["soft"], steps=dice.steps)
-        )
-        front = -down * unit + 0.004
-        parts.append(
-            cushion((0.0, depth), (front - side, front + 0.01), arm, look["soft"], steps=dice.steps)
-        )
+        left, front = -along * unit + 0.004, -down * unit + 0.004
+        parts += [
+            cushion(dice, (left - side, left + 0.01), (0.0, depth), arm, look["soft"]),
+            cushion(dice, (0.0, depth), (front - side, front + 0.01), arm, look["soft"]),
+        ]
     return parts
 
 
-def chaise(dice: Dice) -> list[Part]:
+def chaise(dice: Dice) -> list[Solid]:
     """Sofa whose one seat runs out into a couch to lie on."""
     look, unit, depth = _look(dice), dice.between(0.58, 0.8), dice.between(0.8, 1.0)
     seats, run = dice.count(1, 3), dice.between(0.45, 0.9)
-    parts = []
-    for i in range(seats):
-        x1 = -i * unit + 0.004
-        parts += _module(dice, (x1 - unit - 0.004, x1), (0.0, depth), look, "n")
-    parts += _module(dice, (0.0, unit), (-run, depth), look, "n")
+    parts = _row(dice, seats, unit, depth, look)
+    parts += _module(dice, (0.0, unit), (-run, depth), look, rear=True, right=False)
     arm, side = (look["foot"], look["arm"]), look["back"]
     left = -seats * unit + 0.004
-    parts.append(
-        cushion((left - side, left + 0.01), (0.0, depth), arm, look["soft"], steps=dice.steps)
-    )
+    parts.append(cushion(dice, (left - side, left + 0.01), (0.0, depth), arm, look["soft"]))
     if dice.chance(0.6):
-        parts.append(
-            cushion((unit - 0.01, unit + side), (0.0, depth), arm, look["soft"], steps=dice.steps)
-        )
+        parts.append(cushion(dice, (unit - 0.01, unit + side), (0.0, depth), arm, look["soft"]))
     return parts
 
 
-def daybed(dice: Dice) -> list[Part]:
+def daybed(dice: Dice) -> list[Solid]:
     """Chaise longue: a couch with one raised end."""
     width, depth, seat = dice.between(1.5, 1.9), dice.between(0.65, 0.85), dice.between(0.36, 0.45)
     foot, thick = dice.between(0.1, 0.2), dice.between(0.1, 0.16)
     x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
-    parts = [cushion(x, y, (foot, seat), 0.04, 0.02, dice.steps)]
+    parts = [cushion(dice, x, y, (foot, seat), 0.04, 0.02)]
     head = cushion(
-        (x[0], x[0] + thick),
-        y,
-        (foot + 0.05, seat + dice.between(0.25, 0.45)),
-        0.05,
-        steps=dice.steps,
+        dice, (x[0], x[0] + thick), y, (foot + 0.05, seat + dice.between(0.25, 0.45)), 0.05
     )
     parts.append(head.turn("y", -dice.between(5, 25), (x[0], 0, foot + 0.05)))
     if dice.chance(0.5):
         parts.append(
             cushion(
+                dice,
                 (x[0], x[0] + dice.between(0.5, 0.9) * width),
                 (y[1] - 0.12, y[1]),
                 (foot + 0.05, seat + dice.between(0.18, 0.35)),
                 0.05,
-                steps=dice.steps,
             )
         )
     return parts + legs(dice, corners(x, y, 0.08), foot + 0.02, 0.05)
 
 
-def chesterfield(dice: Dice) -> list[Part]:
+def chesterfield(dice: Dice) -> list[Solid]:
     """Low roll all round: arms as high as the back."""
     width, depth, seat = dice.between(1.4, 2.3), dice.between(0.8, 0.98), dice.between(0.4, 0.48)
     high, r, foot = (
@@ -177,13 +146,7 @@ def chesterfield(dice: Dice) -> list[Part]:
     wall = r * dice.between(1.0, 1.6)
     x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
     parts = [
-        cushion(
-            (x[0] + 0.01, x[1] - 0.01),
-            (y[0] + 0.03, y[1] - 0.01),
-            (foot, seat - 0.12),
-            0.02,
-            steps=dice.steps,
-        ),
+        cushion(dice, within(x, 0.01), (y[0] + 0.03, y[1] - 0.01), (foot, seat - 0.12), 0.02),
         block(x, (y[1] - wall, y[1]), (foot, high - r)),
     ]
     for s in (-1, 1):
@@ -195,20 +158,14 @@ def chesterfield(dice: Dice) -> list[Part]:
     parts.append(tube([(x[0], cy, high - r), (x[1], cy, high - r)], r, max(10, dice.sides)))
     edges = np.linspace(x[0] + wall - 0.01, x[1] - wall + 0.01, dice.count(2, 3) + 1)
     for a, b in pairwise(edges):
+        z = (seat - 0.13, seat)
         parts.append(
-            cushion(
-                (float(a), float(b) - 0.003),
-                (y[0], y[1] - wall + 0.01),
-                (seat - 0.13, seat),
-                0.04,
-                0.02,
-                dice.steps,
-            )
+            cushion(dice, (float(a), float(b) - 0.003), (y[0], y[1] - wall + 0.01), z, 0.04, 0.02)
         )
     return parts + legs(dice, corners(x, y, 0.09), foot + 0.01, 0.06)
 
 
-def slab(dice: Dice) -> list[Part]:
+def slab(dice: Dice) -> list[Solid]:
     """Thin modern sofa: a tray with even walls on skids or pegs."""
     width, depth, seat = dice.between(1.4, 2.4), dice.between(0.72, 0.95), dice.between(0.34, 0.42)
     wall, foot = dice.between(0.05, 0.11), dice.between(0.06, 0.2)
@@ -221,58 +178,41 @@ def slab(dice: Dice) -> list[Part]:
         parts.append(block((x[0], x[0] + wall) if s < 0 else (x[1] - wall, x[1]), y, (foot, arm)))
     edges = np.linspace(x[0] + wall if -1 in sides else x[0], x[1] - wall, dice.count(1, 3) + 1)
     for a, b in pairwise(edges):
+        z = (foot + 0.05, seat)
         parts.append(
-            cushion(
-                (float(a), float(b) - 0.004),
-                (y[0], y[1] - wall + 0.003),
-                (foot + 0.05, seat),
-                0.025,
-                0.01,
-                dice.steps,
-            )
+            cushion(dice, (float(a), float(b) - 0.004), (y[0], y[1] - wall + 0.003), z, 0.025, 0.01)
         )
         if dice.chance(0.5):
+            run = (y[1] - wall - 0.13, y[1] - wall + 0.01)
             parts.append(
                 cushion(
-                    (float(a) + 0.02, float(b) - 0.02),
-                    (y[1] - wall - 0.13, y[1] - wall + 0.01),
-                    (seat - 0.02, high + 0.06),
-                    0.04,
-                    steps=dice.steps,
+                    dice, (float(a) + 0.02, float(b) - 0.02), run, (seat - 0.02, high + 0.06), 0.04
                 )
             )
     if dice.chance(0.3):
         for s in (-1, 1):
             px = s * (width / 2 - 0.15)
             parts += [
-                block((px - 0.02, px + 0.02), y, (0, 0.03)),
+                block(around(px, 0.02), y, (0, 0.03)),
                 *(
-                    block((px - 0.02, px + 0.02), (py - 0.02, py + 0.02), (0.01, foot + 0.01))
-                    for py in (y[0] + 0.1, y[1] - 0.1)
+                    block(around(px, 0.02), around(py, 0.02), (0.01, foot + 0.01))
+                    for py in within(y, 0.1)
                 ),
             ]
         return parts
     return parts + legs(dice, corners(x, y, 0.1), foot + 0.01, 0.04)
 
 
-def curved(dice: Dice) -> list[Part]:
+def curved(dice: Dice) -> list[Solid]:
     """Bow-shaped sofa."""
     outer, sweep = dice.between(1.1, 1.7), dice.between(45, 75)
     depth, seat, foot = dice.between(0.75, 0.95), dice.between(0.38, 0.46), dice.pick(0.0, 0.1)
     back, high = dice.between(0.14, 0.24), dice.between(0.7, 0.85)
     angle = np.radians(np.linspace(90 - sweep, 90 + sweep, 17))
-
-    def arc(radius: Number, z: Span, thick: Number) -> Part:
-        grid = np.stack(
-            [
-                np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(17, h)], axis=1)
-                for h in np.linspace(*z, 3)
-            ]
-        )
-        return sheet(grid.swapaxes(0, 1), thick)
-
+    arc = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     middle = outer - depth / 2
-    parts = [arc(middle, (foot, seat), depth), arc(outer - back / 2, (foot, high), back)]
+    rest = curved_wall((outer - back / 2) * arc, (foot, high), back)
+    parts = [curved_wall(middle * arc, (foot, seat), depth), rest]
     if foot > 0:
         spots = [
             (radius * np.cos(a), radius * np.sin(a))
@@ -283,36 +223,25 @@ def curved(dice: Dice) -> list[Part]:
     return parts
 
 
-def futon(dice: Dice) -> list[Part]:
+def futon(dice: Dice) -> list[Solid]:
     """Folded mattress on a frame of slats, or a sofa without arms."""
     width, depth, seat = dice.between(1.3, 2.0), dice.between(0.7, 0.9), dice.between(0.34, 0.44)
     thick, lean, tall = dice.between(0.12, 0.2), dice.between(8, 24), dice.between(0.4, 0.55)
     x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
     base = seat - thick
-    parts = [cushion(x, y, (base, seat), 0.05, 0.02, dice.steps)]
-    pad = cushion(x, (y[1] - thick, y[1]), (base, base + thick + tall), 0.05, steps=dice.steps)
+    parts = [cushion(dice, x, y, (base, seat), 0.05, 0.02)]
+    pad = cushion(dice, x, (y[1] - thick, y[1]), (base, base + thick + tall), 0.05)
     parts.append(pad.turn("x", -lean, (0, y[1], base)))
-    parts.append(
-        block((x[0] + 0.03, x[1] - 0.03), (y[0] + 0.03, y[1] - 0.01), (base - 0.05, base + 0.02))
-    )
+    parts.append(block(within(x, 0.03), (y[0] + 0.03, y[1] - 0.01), (base - 0.05, base + 0.02)))
     parts += legs(dice, corners(x, y, 0.06), base - 0.02, dice.between(0.04, 0.07))
     if dice.chance(0.5):
         arm = seat + dice.between(0.12, 0.2)
         for s in (-1, 1):
             px = s * (width / 2 + 0.02)
             parts.append(beam((px, y[0], arm), (px, y[1], arm), 0.07, 0.03))
-            for py in (y[0] + 0.05, y[1] - 0.05):
-                parts.append(block((px - 0.025, px + 0.025), (py - 0.025, py + 0.025), (0, arm)))
+            for py in within(y, 0.05):
+                parts.append(block(around(px, 0.025), around(py, 0.025), (0, arm)))
     return parts
 
 
-FAMILIES = {
-    "straight": straight,
-    "corner": corner,
-    "chaise": chaise,
-    "daybed": daybed,
-    "chesterfield": chesterfield,
-    "slab": slab,
-    "curved": curved,
-    "futon": futon,
-}
+FAMILIES = (straight, corner, chaise, daybed, chesterfield, slab, curved, futon)

@@ -7,10 +7,11 @@ import numpy as np
 from qs3.shapes._desks import corner_desk, counter, desk, writing_desk
 from qs3.shapes._dice import Dice
 from qs3.shapes._joinery import corners, fronts, legs
-from qs3.shapes._parts import (
+from qs3.shapes._solids import (
     Number,
-    Part,
+    Solid,
     Span,
+    around,
     beam,
     bend,
     block,
@@ -18,6 +19,7 @@ from qs3.shapes._parts import (
     outline,
     slab,
     tube,
+    within,
 )
 
 
@@ -36,22 +38,22 @@ def _size(dice: Dice) -> tuple[float, float, float]:
     return dice.between(0.4, 0.7), dice.between(0.4, 0.6), dice.between(0.4, 0.65)
 
 
-def _top(dice: Dice, width: Number, depth: Number, height: Number, thick: Number) -> Part:
+def _top(dice: Dice, width: Number, depth: Number, height: Number, thick: Number) -> Solid:
     exponent = dice.pick(2.0, 2.6, 6.0, 0.0, 0.0, 0.0, 0.0)
     if exponent == 0.0:
         return block((-width / 2, width / 2), (-depth / 2, depth / 2), (height - thick, height))
     return slab(outline(width, depth, max(16, dice.sides), exponent), (height - thick, height))
 
 
-def _apron(x: Span, y: Span, z: Span, thick: Number = 0.02) -> list[Part]:
+def _apron(x: Span, y: Span, z: Span, thick: Number = 0.02) -> list[Solid]:
     """Four boards under a top, between the legs."""
     return [
-        *(block(x, (v - thick / 2, v + thick / 2), z) for v in y),
-        *(block((v - thick / 2, v + thick / 2), y, z) for v in x),
+        *(block(x, around(v, thick / 2), z) for v in y),
+        *(block(around(v, thick / 2), y, z) for v in x),
     ]
 
 
-def four_legs(dice: Dice) -> list[Part]:
+def four_legs(dice: Dice) -> list[Solid]:
     """Top on four legs, with or without an apron, stretchers or a cloth."""
     width, depth, height = _size(dice)
     thick = dice.between(0.018, 0.04) * dice.bulk
@@ -87,23 +89,12 @@ def four_legs(dice: Dice) -> list[Part]:
         parts.append(block(*inner, (z, z + 0.8 * thick)))
     if dice.chance(0.08) and not round_top:
         fall, over = dice.between(0.1, 0.3) * height, 0.012
-        parts += _apron(
-            (x[0] - over, x[1] + over),
-            (y[0] - over, y[1] + over),
-            (height - fall, height + 0.004),
-            0.03,
-        )
-        parts.append(
-            block(
-                (x[0] - over, x[1] + over),
-                (y[0] - over, y[1] + over),
-                (height - 0.004, height + 0.006),
-            )
-        )
+        parts += _apron(within(x, -over), within(y, -over), (height - fall, height + 0.004), 0.03)
+        parts.append(block(within(x, -over), within(y, -over), (height - 0.004, height + 0.006)))
     return parts
 
 
-def pedestal(dice: Dice) -> list[Part]:
+def pedestal(dice: Dice) -> list[Solid]:
     """Top on one post with a plate, a drum or spider feet."""
     width = dice.between(0.45, 1.3)
     height = dice.pick(dice.between(0.68, 0.78), dice.between(0.42, 0.6), dice.between(0.95, 1.1))
@@ -130,34 +121,26 @@ def pedestal(dice: Dice) -> list[Part]:
             block((-r, r), (-r, r), (0.01, height - thick / 2)),
         ]
     elif foot == "plate":
-        parts.append(
-            lathe(
-                [
-                    (reach, 0),
-                    (reach, 0.02 * dice.bulk),
-                    (r, 0.04 * dice.bulk),
-                    (r, height - thick / 2),
-                ],
-                dice.sides,
-            )
-        )
+        profile = [
+            (reach, 0),
+            (reach, 0.02 * dice.bulk),
+            (r, 0.04 * dice.bulk),
+            (r, height - thick / 2),
+        ]
+        parts.append(lathe(profile, dice.sides))
     else:
         waist = dice.between(0.25, 0.7)
-        parts.append(
-            lathe(
-                [
-                    (reach, 0),
-                    (r, waist * height),
-                    (r, 0.8 * height),
-                    (min(reach, 0.3 * width), height - thick / 2),
-                ],
-                dice.sides,
-            )
-        )
+        section = [
+            (reach, 0),
+            (r, waist * height),
+            (r, 0.8 * height),
+            (min(reach, 0.3 * width), height - thick / 2),
+        ]
+        parts.append(lathe(section, dice.sides))
     return parts
 
 
-def trestle(dice: Dice) -> list[Part]:
+def trestle(dice: Dice) -> list[Solid]:
     """Top on two trestles: A-shaped, X-shaped or a broad post on a foot."""
     width, depth, height = dice.between(1.0, 2.2), dice.between(0.6, 1.0), dice.between(0.45, 0.78)
     thick, bar = dice.between(0.02, 0.05) * dice.bulk, dice.between(0.04, 0.08) * dice.bulk**0.7
@@ -168,17 +151,9 @@ def trestle(dice: Dice) -> list[Part]:
         x = s * (width / 2 - inset)
         if style == "post":
             parts += [
-                block((x - bar / 2, x + bar / 2), (-half, half), (0, bar)),
-                block(
-                    (x - bar / 2, x + bar / 2),
-                    (-half * 0.35, half * 0.35),
-                    (bar / 2, under + 0.005),
-                ),
-                block(
-                    (x - bar / 2, x + bar / 2),
-                    (-half * 0.8, half * 0.8),
-                    (under - bar, under + 0.005),
-                ),
+                block(around(x, bar / 2), (-half, half), (0, bar)),
+                block(around(x, bar / 2), (-half * 0.35, half * 0.35), (bar / 2, under + 0.005)),
+                block(around(x, bar / 2), (-half * 0.8, half * 0.8), (under - bar, under + 0.005)),
             ]
         else:
             spread = half if style == "X" else half * 0.25
@@ -192,16 +167,11 @@ def trestle(dice: Dice) -> list[Part]:
                         bar,
                     )
                 )
-            parts.append(
-                block(
-                    (x - bar / 2, x + bar / 2),
-                    (-half * 0.9, half * 0.9),
-                    (under - bar * 0.7, under + 0.003),
-                )
-            )
+            heights = (under - bar * 0.7, under + 0.003)
+            parts.append(block(around(x, bar / 2), (-half * 0.9, half * 0.9), heights))
             z = under * (0.5 if style == "X" else dice.between(0.3, 0.5))
             run = 0.04 if style == "X" else half + (spread - half) * z / under
-            parts.append(block((x - bar / 2, x + bar / 2), (-run, run), (z - bar / 2, z + bar / 2)))
+            parts.append(block(around(x, bar / 2), (-run, run), around(z, bar / 2)))
     if dice.chance(0.6) or style == "post":
         z = under * dice.between(0.35, 0.5)
         if style == "X":
@@ -209,14 +179,12 @@ def trestle(dice: Dice) -> list[Part]:
         elif style == "A":
             z = under - bar / 2
         parts.append(
-            block(
-                (-width / 2 + inset, width / 2 - inset), (-0.02, 0.02), (z - bar / 2, z + bar / 2)
-            )
+            block((-width / 2 + inset, width / 2 - inset), (-0.02, 0.02), around(z, bar / 2))
         )
     return parts
 
 
-def coffee(dice: Dice) -> list[Part]:
+def coffee(dice: Dice) -> list[Solid]:
     """Low table: drawer box, shelf below, drum, block or two nested tops."""
     width, depth = dice.between(0.7, 1.4), dice.between(0.45, 0.85)
     height, thick = dice.between(0.28, 0.48), dice.between(0.025, 0.05) * dice.bulk
@@ -233,11 +201,7 @@ def coffee(dice: Dice) -> list[Part]:
     top = block(x, y, (height - thick, height))
     if kind == "box":
         over = dice.between(0.01, 0.06)
-        body = (
-            (x[0] + over, x[1] - over),
-            (y[0] + over, y[1] - over),
-            (dice.pick(0.0, 0.06), height - thick / 2),
-        )
+        body = (within(x, over), within(y, over), (dice.pick(0.0, 0.06), height - thick / 2))
         parts = [top, block(*body)]
         if body[2][0] > 0:
             parts += legs(dice, corners(body[0], body[1], 0.05), 0.07, 0.05, "square")
@@ -258,7 +222,7 @@ def coffee(dice: Dice) -> list[Part]:
             *(block((px, px + board), y, (0, height - thick / 2)) for px in (x[0], x[1] - board)),
         ]
         shelf = dice.between(0.05, 0.5) * height
-        return [*parts, block((x[0] + board / 2, x[1] - board / 2), y, (shelf, shelf + board))]
+        return [*parts, block(within(x, board / 2), y, (shelf, shelf + board))]
     leg = dice.between(0.04, 0.08) * dice.bulk**0.8
     spots = corners(x, y, leg / 2 + dice.pick(0.0, 0.03))
     parts = [
@@ -271,16 +235,12 @@ def coffee(dice: Dice) -> list[Part]:
             block((spots[0][0], spots[2][0]), (spots[0][1], spots[1][1]), (z, z + 0.7 * thick))
         )
     else:
-        parts += _apron(
-            (spots[0][0], spots[2][0]),
-            (spots[0][1], spots[1][1]),
-            (height - thick - 0.07, height - thick / 2),
-            0.03,
-        )
+        heights = (height - thick - 0.07, height - thick / 2)
+        parts += _apron((spots[0][0], spots[2][0]), (spots[0][1], spots[1][1]), heights, 0.03)
     return parts
 
 
-def folding(dice: Dice) -> list[Part]:
+def folding(dice: Dice) -> list[Solid]:
     """Camping or garden table on crossed legs."""
     width, depth, height = dice.between(0.6, 1.4), dice.between(0.5, 0.8), dice.between(0.55, 0.75)
     thick, bar = dice.between(0.018, 0.035) * dice.bulk, dice.between(0.025, 0.05) * dice.bulk**0.7
@@ -304,7 +264,7 @@ def folding(dice: Dice) -> list[Part]:
     return [*parts, beam((0, y[0] + 0.05, under / 2), (0, y[1] - 0.05, under / 2), 0.02, 0.02)]
 
 
-def panel(dice: Dice) -> list[Part]:
+def panel(dice: Dice) -> list[Solid]:
     """Waterfall table of boards, on two panel ends, or on bent sled frames."""
     width, depth, height = dice.between(0.8, 1.9), dice.between(0.4, 0.9), dice.between(0.32, 0.78)
     thick = dice.between(0.02, 0.05) * dice.bulk
@@ -324,12 +284,9 @@ def panel(dice: Dice) -> list[Part]:
             for s in (-1, 1)
         ]
         if dice.chance(0.5):
+            z = (dice.between(0.0, 0.6) * height, height - thick / 2)
             parts.append(
-                block(
-                    (x[0] + inset + thick / 2, x[1] - inset - thick / 2),
-                    (-0.015, 0.015),
-                    (dice.between(0.0, 0.6) * height, height - thick / 2),
-                )
+                block((x[0] + inset + thick / 2, x[1] - inset - thick / 2), (-0.015, 0.015), z)
             )
         return parts
     bar = dice.between(0.012, 0.03) * dice.bulk**0.5
@@ -349,15 +306,15 @@ def panel(dice: Dice) -> list[Part]:
     return parts
 
 
-FAMILIES = {
-    "four_legs": four_legs,
-    "pedestal": pedestal,
-    "trestle": trestle,
-    "desk": desk,
-    "writing_desk": writing_desk,
-    "corner_desk": corner_desk,
-    "coffee": coffee,
-    "folding": folding,
-    "panel": panel,
-    "counter": counter,
-}
+FAMILIES = (
+    four_legs,
+    pedestal,
+    trestle,
+    desk,
+    writing_desk,
+    corner_desk,
+    coffee,
+    folding,
+    panel,
+    counter,
+)

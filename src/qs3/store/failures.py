@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from qs3.errors import InputError
+from qs3.files import parse_json
 from qs3.store.folder import Folder, open_folder
 
 FAILURES = "failures.jsonl"
@@ -36,12 +37,13 @@ def read_failures(where: str | Path | Folder) -> list[dict[str, Any]]:
     if not folder.exists(FAILURES):
         return []
     try:
-        lines = folder.read(FAILURES).decode("utf-8").removesuffix("\n").split("\n")
-        records = sorted((json.loads(line) for line in lines), key=lambda record: record["id"])
+        lines = folder.read(FAILURES).removesuffix(b"\n").split(b"\n")
+        records = [parse_json(line, f"line {n}") for n, line in enumerate(lines, start=1)]
         # Logs of earlier versions have no row.
-        return [record | {"row": int(record.get("row", 0))} for record in records]
-    except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        records = [record | {"row": int(record.get("row", 0))} for record in records]
+        return sorted(records, key=lambda record: record["id"])
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"{folder}/{FAILURES}: damaged ({error}); delete it and run the same "
-            "command again with --retry-failed"
+            f"{folder}/{FAILURES}: damaged ({error}); delete it and run the same command again "
+            "with --retry-failed"
         ) from error

@@ -5,21 +5,61 @@ process that makes a scan writes it down at once (`qs3.store.parts`); a shard is
 when all its scans are there. An object that fails is logged and absent.
 """
 
+import functools
+import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from qs3.errors import InputError
-from qs3.store.executors import Executor, InlineExecutor, LocalExecutor
-from qs3.store.folder import open_folder
-from qs3.store.generation import GenerateReport as GenerateReport
-from qs3.store.generation import Generation
-from qs3.store.manifest import MANIFEST, write_manifest
-from qs3.store.plan import make_plan, resolve_renderer
+from qs3.store.executors import Executor, Failure, InlineExecutor, LocalExecutor, outcomes
+from qs3.store.failures import read_failures, write_failures
+from qs3.store.folder import PARTS, Folder, open_folder
+from qs3.store.manifest import (
+    MANIFEST,
+    changed_meshes,
+    finished_shards,
+    mesh_sums,
+    read_mesh_sums,
+    read_sums,
+    shard_name,
+    write_manifest,
+    write_mesh_sums,
+    write_sums,
+)
+from qs3.store.parts import (
+    Place,
+    finish_shard,
+    part_folder,
+    read_failure,
+    scan_to_part,
+    write_failure,
+    written_parts,
+)
+from qs3.store.plan import Plan, make_plan, resolve_renderer
+from qs3.store.progress import progress_bar
 from qs3.store.scan_item import GenerateSettings as GenerateSettings
 from qs3.store.scan_item import Item as Item
 from qs3.store.scan_item import scan_item as scan_item
 from qs3.store.scan_item import scan_seed as scan_seed
-from qs3.store.shards import CloudRow
+from qs3.store.shards import CloudRow, load_shard
+
+_KILLED = ("ProcessDied", "Timeout")
+_TOO_MANY = 50
+_SUMS_EVERY = 5.0  # seconds; the whole file is written anew each time
+
+
+@dataclass(frozen=True)
+class GenerateReport:
+    """What one call of `generate` did, in scans."""
+
+    done: int
+    """Scanned and written by this call."""
+    skipped: int
+    """Finished before."""
+    failed: int
+    """Failed in this call; each is in ``failures.jsonl``."""
 
 
 def generate(
@@ -70,17 +110,196 @@ def generate(
     manifest = plan.manifest()
     folder = open_folder(out)
     folder.claim(MANIFEST)
-    mine = range(index, plan.shards, count)
-    with folder.locked():
-        try:
+    try:
+        with folder.locked():
             write_manifest(folder, manifest)
-            run = Generation(plan, folder, executor, scan_one)
-            run.look()
+            run = _Run(plan, folder, scan_one)
+            mine = range(index, plan.shards, count)
             run.check_meshes(mine)
-            run.prepare(mine, retry_failed)
-            return run.work(f"{folder.name}: scans" if progress else None)
-        except OSError as error:
+            run.list_work(mine, retry_failed)
+            return run.work(executor, f"{folder.name}: scans" if progress else None)
+    except OSError as error:
+        raise InputError(
+            f"{folder}: cannot be written to ({error.strerror or error}); mend that and run "
+            "the same command again, nothing is lost"
+        ) from error
+
+
+class _Run:
+    """One call of `generate`: what is there, what is to do, what failed."""
+
+    def __init__(self, plan: Plan, folder: Folder, scan_one: Callable[..., CloudRow]) -> None:
+        """Look at what earlier calls left."""
+        self.plan, self.folder, self.scan_one = plan, folder, scan_one
+        self.parts = written_parts(folder)
+        """Rows that lie beside the shards, and the files' names."""
+        self.settled = set(finished_shards(folder, plan.shards))
+        """Shards that are put together, or all but."""
+        self.sums = read_sums(folder)
+        """Checksums of the shards."""
+        self.sums_written, self.sums_time = dict(self.sums), time.monotonic()
+        self.failures = {Place(r["shard"], r["row"]): r for r in read_failures(folder)}
+        """What failed, now or before."""
+        self.log_is_behind = bool(self.parts)
+        """Whether ``failures.jsonl`` may lack something."""
+        for place, name in self.parts.items():
+            if name.endswith(".json"):
+                self.failures[place] = plan.failure_record(place, read_failure(folder, name))
+            else:
+                self.failures.pop(place, None)
+        self.todo: list[Place] = []
+        """Rows to scan; the next is the last."""
+        self.awaited: dict[int, set[Place]] = {}
+        """Rows that each unfinished shard waits for."""
+        self.complete: list[int] = []
+        """Shards that wait for nothing more."""
+        self.total = self.done = self.failed = 0
+        self.failed_in_a_row: set[str] = set()
+        """Objects that failed since the last that did not."""
+
+    def check_meshes(self, mine: Sequence[int]) -> None:
+        """Refuse a mesh that is not the one that was scanned; one that failed may be mended."""
+        noted = read_mesh_sums(self.folder)
+        now = mesh_sums(self.plan.items_of(mine))
+        changed = set(changed_meshes(noted, now))
+        if changed:
+            scanned = {place for shard in self.settled for place in self.plan.places(shard)}
+            for place in sorted((scanned | set(self.parts)) - set(self.failures)):
+                name = self.plan.work(place)[0].id
+                if name in changed:
+                    raise InputError(
+                        f"{name}: the mesh has changed since it was scanned into {self.folder}; "
+                        "name another folder, or put the old file back"
+                    )
+        if not now.items() <= noted.items():
+            write_mesh_sums(self.folder, noted | now)
+
+    def list_work(self, mine: Sequence[int], retry_failed: bool) -> None:
+        """List the rows to scan and the shards to put together."""
+        for shard in mine:
+            places = list(self.plan.places(shard))
+            self.total += len(places)
+            if shard not in self.settled:
+                again = self.failures if retry_failed else {}
+                lost = [p for p in places if p not in self.parts or p in again]
+            else:
+                # Parts beside a finished shard: an earlier call was stopped before it tidied up.
+                unsettled = shard_name(shard) not in self.sums or any(
+                    place.shard == shard for place in self.parts
+                )
+                absent = self._absent_rows(shard, places) if retry_failed or unsettled else []
+                lost = absent if retry_failed else []
+                if not lost and not unsettled:
+                    continue
+            self.todo += lost
+            self.awaited[shard] = set(lost)
+        self.todo.reverse()
+        self.complete = [shard for shard, lost in self.awaited.items() if not lost][::-1]
+
+    def _absent_rows(self, shard: int, places: Sequence[Place]) -> list[Place]:
+        """Rows that a finished shard lacks; failures of rows that it has are forgotten."""
+        present = set(load_shard(self.folder, shard, ["id"])["id"].to_pylist())
+        self.log_is_behind = True
+        absent = [place for place in places if self.plan.row_id(place) not in present]
+        for place in set(places) - set(absent):
+            self.failures.pop(place, None)
+        return [place for place in absent if not self.parts.get(place, "").endswith(".parquet")]
+
+    def work(self, executor: Executor, text: str | None) -> GenerateReport:
+        """Do what is to do; ``text`` stands before the bar."""
+        skipped = self.total - len(self.todo)
+        bar = progress_bar(self.total, text, "scan", skipped)
+        with bar, executor:
+            try:
+                for key, outcome in outcomes(executor, self._next_call):
+                    if isinstance(key, Place):
+                        self._scanned(key, outcome)
+                        bar.set_postfix(failed=self.failed, refresh=False)
+                        bar.update()
+                    else:
+                        self._finished(key, outcome)
+            except KeyboardInterrupt:
+                bar.set_description("finishing what is under way (Ctrl-C again: not even that)")
+                executor.drain()
+                raise
+            finally:
+                self._write_sums()
+        if not written_parts(self.folder):
+            self.folder.remove(PARTS)
+        return GenerateReport(done=self.done, skipped=skipped, failed=self.failed)
+
+    def _next_call(self) -> tuple[Any, ...] | None:
+        """Key, function and arguments of what is to be done next."""
+        if self.complete:
+            shard = self.complete.pop()
+            self._log_failures(shard)
+            return shard, finish_shard, *self._finish_arguments(shard)
+        if not self.todo:
+            return None
+        place = self.todo.pop()
+        arguments = self.plan.arguments(*self.plan.position(place))
+        call = functools.partial(self.scan_one, *arguments)
+        return place, scan_to_part, self.folder, place, self.plan.settings.dtype, call
+
+    def _scanned(self, place: Place, outcome: Failure | None) -> None:
+        self.awaited[place.shard].discard(place)
+        if not self.awaited[place.shard]:
+            self.complete.append(place.shard)
+        if outcome is not None and outcome.kind in _KILLED:
+            # It may have been stopped when its row was written and the answer was not yet here.
+            outcome = None if self.folder.exists(f"{place.stem}.parquet") else outcome
+        if outcome is None:
+            self.done += 1
+            self.failed_in_a_row.clear()
+            self.log_is_behind |= self.failures.pop(place, None) is not None
+            return
+        self.failed += 1
+        self.log_is_behind = True
+        self.failures[place] = self.plan.failure_record(place, outcome)
+        if outcome.kind in _KILLED:  # it could not write this itself
+            write_failure(self.folder, place, outcome)
+        self.failed_in_a_row.add(self.plan.work(place)[0].id)
+        if len(self.failed_in_a_row) >= _TOO_MANY:
             raise InputError(
-                f"{folder}: cannot be written to ({error.strerror or error}); mend that and run "
-                "the same command again, nothing is lost"
-            ) from error
+                f"{_TOO_MANY} objects in a row failed, the last with: {outcome.reason}; if the "
+                "fault is the machine's, mend it and add --retry-failed; if it is theirs, run the "
+                "same command again to go on past them"
+            )
+
+    def _log_failures(self, shard: int) -> None:
+        """Log before the shard is there: afterwards nobody would ask why a row is missing."""
+        self.settled.add(shard)
+        if self.log_is_behind:
+            records = {
+                place: r for place, r in self.failures.items() if place.shard in self.settled
+            }
+            write_failures(self.folder, records.values())
+            self.log_is_behind = len(records) < len(self.failures)
+
+    def _finish_arguments(self, shard: int) -> tuple[Any, ...]:
+        places = list(self.plan.places(shard))
+        order = [self.plan.row_id(place) for place in places]
+        failed = [self.plan.row_id(place) for place in places if place in self.failures]
+        return self.folder, shard, self.plan.settings.dtype, order, failed
+
+    def _finished(self, shard: int, outcome: str | Failure) -> None:
+        if isinstance(outcome, Failure) and outcome.kind in _KILLED:
+            outcome = finish_shard(*self._finish_arguments(shard))
+        name = shard_name(shard)
+        if isinstance(outcome, Failure):
+            raise InputError(f"{self.folder}/{name}: {outcome.reason}")
+        if not self.folder.exists(name):
+            raise InputError(
+                f"{self.folder}/{name}: was written, but is not there; do all processes see one "
+                "and the same folder? Mend that and run the same command again"
+            )
+        self.sums[name] = outcome
+        if time.monotonic() - self.sums_time > _SUMS_EVERY:
+            self._write_sums()
+        self.folder.remove(part_folder(shard))
+
+    def _write_sums(self) -> None:
+        """Note the checksums; a shard without one is simply put together again."""
+        if self.sums != self.sums_written:
+            write_sums(self.folder, self.sums)
+        self.sums_written, self.sums_time = dict(self.sums), time.monotonic()

@@ -9,7 +9,7 @@ import numpy as np
 from qs3.store.failures import read_failures
 from qs3.store.folder import Folder, open_folder
 from qs3.store.manifest import finished_shards, open_dataset, shard_name
-from qs3.store.shards import STATISTICS, parse_shard
+from qs3.store.shards import STATISTICS, load_shard
 
 
 def info(where: str | Path | Folder) -> dict[str, Any]:
@@ -34,10 +34,9 @@ def info(where: str | Path | Folder) -> dict[str, Any]:
     shards = finished_shards(folder, manifest.shards)
     total = 0
     for index in shards:
-        content = folder.read(shard_name(index))
-        total += len(content)
+        total += folder.size(shard_name(index))
         wanted = ["object", "class_name", "split", "points", *STATISTICS]
-        table = parse_shard(content, f"{folder}/{shard_name(index)}", wanted)
+        table = load_shard(folder, index, wanted)
         for name in table["class_name"].to_pylist():
             classes[name] = classes.get(name, 0) + 1
         splits.update(table["split"].to_pylist())

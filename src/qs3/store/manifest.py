@@ -1,20 +1,41 @@
-"""``dataset.json`` and ``SHA256SUMS``: what a data set is made of, and the checksums of it."""
+"""What lies beside the shards: ``dataset.json``, ``SHA256SUMS`` and ``meshes.json``."""
 
+import concurrent.futures
 import dataclasses
+import hashlib
 import json
+import platform
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from qs3.errors import InputError
+from qs3.files import json_bytes, parse_json, sha256
 from qs3.store.folder import Folder, open_folder
+from qs3.structure import structure, unstructure
 
 MANIFEST = "dataset.json"
 SUMS = "SHA256SUMS"
+MESHES = "meshes.json"
 SCHEMA_VERSION = 3
 _READABLE = (1, 2, 3)  # 2 has the column `drawn`; 3 checksums, half precision, unknown row counts
+_LARGEST = 10**9  # rows and shards; what is planned is counted through
+
+_FORMER_SENSORS = {"qs3": "paper"}
+
+_PACKAGES = (
+    "qs3",
+    "mitsuba",
+    "numpy",
+    "opencv-python-headless",
+    "pyarrow",
+    "scipy",
+    "torch",
+    "trimesh",
+)
 
 
 @dataclass(frozen=True)
@@ -34,9 +55,28 @@ class Manifest:
     schema: int = SCHEMA_VERSION
     """Version of the columns."""
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values, as in the JSON file."""
-        return {**dataclasses.asdict(self), "class_names": list(self.class_names)}
+    def __post_init__(self) -> None:
+        for name, count in (("rows", self.rows or 0), ("shards", self.shards)):
+            if not 0 <= count < _LARGEST:
+                raise InputError(f"{name} must be from 0 to {_LARGEST}, not {count}")
+
+
+def package_versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that a result depends on, by name.
+
+    Read from the packages' metadata; nothing is imported.
+
+    Example:
+        >>> sorted(package_versions())[:2]
+        ['mitsuba', 'numpy']
+    """
+    versions = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return versions
 
 
 def write_manifest(where: str | Path | Folder, manifest: Manifest) -> None:
@@ -48,43 +88,45 @@ def write_manifest(where: str | Path | Folder, manifest: Manifest) -> None:
     folder = open_folder(where)
     if folder.exists(MANIFEST):
         check_same(str(folder), open_dataset(folder), manifest)
-        return
-    text = json.dumps(manifest.as_dict(), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-    folder.write(MANIFEST, text.encode("utf-8"))
+    else:
+        folder.write(MANIFEST, json_bytes(unstructure(manifest)))
 
 
-def check_same(where: str, there: Manifest, wanted: Manifest) -> None:
+def check_same(where: str, present: Manifest, wanted: Manifest) -> None:
     """Refuse a data set of other settings than those wanted; warn where versions differ.
 
     Raises:
         InputError: naming ``where`` and the first setting that differs.
     """
-    old, new = (json.loads(json.dumps(one.as_dict())) for one in (there, wanted))
+    from qs3.sensor.presets import sensor_name
+
+    old, new = unstructure(present), unstructure(wanted)
+    if isinstance(sensor := old["settings"].get("sensor"), dict) and "name" in sensor:
+        sensor["name"] = sensor_name(sensor["name"])  # a data set that version 0.1 began
     for key in ("schema", "settings", "class_names", "rows", "shards"):
-        name, was, now = _difference(key, old[key], new[key])
-        if name:
+        difference = _difference(key, old[key], new[key])
+        if difference is not None:
+            name, was, now = difference
             raise InputError(
                 f"{where}: made with {name.removeprefix('settings.')} = {was}, not {now}; "
                 "name another folder, or use the same settings"
             )
-    for package in sorted({*there.versions} & {*wanted.versions}):
-        if there.versions[package] != wanted.versions[package]:
+    for package in sorted({*present.versions} & {*wanted.versions}):
+        if present.versions[package] != wanted.versions[package]:
             warnings.warn(
-                f"{where}: begun with {package} {there.versions[package]}, going on with "
+                f"{where}: begun with {package} {present.versions[package]}, going on with "
                 f"{wanted.versions[package]}: rows may differ from those of one version",
                 stacklevel=2,
             )
 
 
-def _difference(name: str, old: Any, new: Any) -> tuple[str, Any, Any]:
-    """Name and both values of the first setting that differs; an empty name where none does."""
+def _difference(name: str, old: Any, new: Any) -> tuple[str, Any, Any] | None:
+    """Name and both values of the first setting that differs."""
     if isinstance(old, Mapping) and isinstance(new, Mapping):
-        for key in sorted({*old, *new}):
-            found = _difference(f"{name}.{key}", old.get(key), new.get(key))
-            if found[0]:
-                return found
-        return "", None, None
-    return ("", None, None) if old == new else (name, old, new)
+        keys = sorted({*old, *new})
+        inner = (_difference(f"{name}.{key}", old.get(key), new.get(key)) for key in keys)
+        return next(filter(None, inner), None)
+    return None if old == new else (name, old, new)
 
 
 def open_dataset(where: str | Path | Folder) -> Manifest:
@@ -97,34 +139,22 @@ def open_dataset(where: str | Path | Folder) -> Manifest:
     if not folder.exists(MANIFEST):
         raise InputError(f"{folder}: not a qs3 data set (no {MANIFEST})")
     path = f"{folder}/{MANIFEST}"
-    try:
-        value = json.loads(folder.read(MANIFEST).decode("utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: not a JSON file ({error})") from error
-    names = {field.name for field in dataclasses.fields(Manifest)}
-    if not isinstance(value, dict) or set(value) != names or not _well_typed(value):
-        raise InputError(f"{path}: not the description of a qs3 data set; make it again")
-    if value["schema"] not in _READABLE:
+    value = parse_json(folder.read(MANIFEST), path)
+    schema = value.get("schema") if isinstance(value, dict) else None
+    if schema is not None and schema not in _READABLE:
         raise InputError(
-            f"{path}: schema {value['schema']}, this version reads up to {SCHEMA_VERSION}; make "
-            "it again"
+            f"{path}: schema {schema}, this version reads up to {SCHEMA_VERSION}; make it again"
         )
-    return Manifest(**{**value, "class_names": tuple(value["class_names"])})
+    return _renamed(structure(value, Manifest, path))
 
 
-def _well_typed(value: Mapping[str, Any]) -> bool:
-    def count(number: Any) -> bool:
-        return type(number) is int and 0 <= number < 10**9
-
-    names = value["class_names"]
-    return (
-        isinstance(value["settings"], dict)
-        and isinstance(value["versions"], dict)
-        and isinstance(names, list)
-        and all(isinstance(name, str) for name in names)
-        and (value["rows"] is None or count(value["rows"]))
-        and count(value["shards"])
-    )
+def _renamed(manifest: Manifest) -> Manifest:
+    """Call what earlier versions recorded by its name of today."""
+    sensor = manifest.settings.get("sensor")
+    if not isinstance(sensor, Mapping) or sensor.get("name") not in _FORMER_SENSORS:
+        return manifest
+    sensor = {**sensor, "name": _FORMER_SENSORS[sensor["name"]]}
+    return dataclasses.replace(manifest, settings={**manifest.settings, "sensor": sensor})
 
 
 def shard_name(index: int) -> str:
@@ -144,8 +174,8 @@ def shard_path(folder: Path, index: int) -> Path:
 
 def finished_shards(folder: Folder, count: int) -> list[int]:
     """Indices of the shards, of ``count`` planned, that are there."""
-    there = set(folder.names())
-    return [index for index in range(count) if shard_name(index) in there]
+    names = set(folder.names())
+    return [index for index in range(count) if shard_name(index) in names]
 
 
 def write_sums(folder: Folder, sums: Mapping[str, str]) -> None:
@@ -169,3 +199,53 @@ def read_sums(folder: Folder) -> dict[str, str]:
             raise InputError(f"{folder}/{SUMS}: damaged line {line[:80]!r}; delete the file")
         sums[name] = digest
     return sums
+
+
+def mesh_sums(items: Iterable[Any]) -> dict[str, str]:
+    """Return the SHA-256 of every mesh's file, by the mesh's id; shapes have none.
+
+    A file that cannot be read has none either: its scan will fail, and say why.
+    """
+    paths = {item.id: getattr(item, "path", None) for item in items}
+    files = {name: Path(path) for name, path in paths.items() if path is not None}
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        sums = dict(zip(files, pool.map(_mesh_sum, files.values()), strict=True))
+    return {name: digest for name, digest in sums.items() if digest}
+
+
+def _mesh_sum(path: Path) -> str:
+    """Checksum of a mesh file; of a glTF in text, with the buffers that lie beside it."""
+    try:
+        if path.suffix.lower() != ".gltf":
+            return sha256(path)
+        parts = [path, *sorted(path.parent.glob("*.bin"))]
+        return hashlib.sha256("".join(map(sha256, parts)).encode()).hexdigest()
+    except OSError:
+        return ""
+
+
+def read_mesh_sums(folder: Folder) -> dict[str, str]:
+    """Return the checksums of the meshes that were scanned; none where all are shapes.
+
+    Raises:
+        InputError: where ``meshes.json`` is damaged.
+    """
+    if not folder.exists(MESHES):
+        return {}
+    where = f"{folder}/{MESHES}"
+    sums = parse_json(folder.read(MESHES), where)
+    if not isinstance(sums, dict) or not all(isinstance(value, str) for value in sums.values()):
+        raise InputError(f"{where}: damaged (not one checksum a mesh); delete it")
+    return sums
+
+
+def write_mesh_sums(folder: Folder, sums: Mapping[str, str]) -> None:
+    """Write ``meshes.json``, one line a mesh; none where no mesh is a file."""
+    if sums:
+        text = json.dumps(dict(sorted(sums.items())), indent=0, ensure_ascii=False)
+        folder.write(MESHES, f"{text}\n".encode())
+
+
+def changed_meshes(noted: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """Ids of the meshes whose files are not those that were noted."""
+    return [name for name, digest in now.items() if noted.get(name, digest) != digest]

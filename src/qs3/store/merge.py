@@ -1,27 +1,28 @@
 """Parts of one data set, made on several machines, put into one folder."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
-
-from tqdm import tqdm
 
 from qs3.errors import InputError
 from qs3.store.failures import read_failures, write_failures
 from qs3.store.folder import Folder, open_folder
 from qs3.store.manifest import (
     MANIFEST,
+    changed_meshes,
     check_same,
     finished_shards,
     open_dataset,
+    read_mesh_sums,
     read_sums,
     shard_name,
     write_manifest,
+    write_mesh_sums,
     write_sums,
 )
-from qs3.store.mesh_sums import changed_meshes, read_mesh_sums, write_mesh_sums
+from qs3.store.progress import progress_bar
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,48 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True
     manifest = open_dataset(folders[0])
     for folder in folders[1:]:
         check_same(str(folder), open_dataset(folder), manifest)
+    meshes = _meshes(folders)
     sums = [read_sums(folder) for folder in folders]
+    holders = _holders(folders, manifest.shards)
+    target = open_folder(out)
+    target.claim(MANIFEST)
+    copied = 0
+    with target.locked():
+        write_manifest(target, manifest)
+        done = read_sums(target)
+        present = set(finished_shards(target, manifest.shards))
+        _check_unchanged(target, [shard_name(index) for index in present], done, sums)
+        write_mesh_sums(target, meshes)
+        failures: dict[str, dict[str, Any]] = {}
+        for folder in folders:
+            failures |= {record["id"]: record for record in read_failures(folder)}
+        write_failures(target, failures.values())
+        text = "merge" if progress else None
+        for index in progress_bar(manifest.shards, text, "shard", items=range(manifest.shards)):
+            name = shard_name(index)
+            expected = {sums[holder][name] for holder in holders[index] if name in sums[holder]}
+            if len(expected) > 1:
+                between = " and ".join(str(folders[holder]) for holder in holders[index])
+                raise InputError(f"{name} differs between {between}")
+            if index in present and {done.get(name)} == expected:
+                continue
+            source = folders[holders[index][0]]
+            content = source.read(name)
+            digest = sha256(content).hexdigest()
+            if expected and {digest} != expected:
+                raise InputError(
+                    f"{source}/{name}: damaged, its checksum is not the one in SHA256SUMS; delete "
+                    "it and run that part again"
+                )
+            target.write(name, content)
+            done[name] = digest
+            write_sums(target, done)
+            copied += 1
+    return MergeReport(copied, manifest.shards - copied, len(failures))
+
+
+def _meshes(folders: Sequence[Folder]) -> dict[str, str]:
+    """Checksums of the meshes of all parts; refuse parts that were made from other files."""
     meshes: dict[str, str] = {}
     for folder in folders:
         own = read_mesh_sums(folder)
@@ -66,72 +108,36 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True
                 f"{', '.join(changed[:5])}{' …' if len(changed) > 5 else ''}; run these parts again"
             )
         meshes |= own
-    held = _holders(folders, manifest.shards)
-    missing = [index for index in range(manifest.shards) if index not in held]
+    return meshes
+
+
+def _holders(folders: Sequence[Folder], shards: int) -> dict[int, list[int]]:
+    """For each shard the parts, by their position, that have it; refuse where none has one."""
+    holders: dict[int, list[int]] = {}
+    for position, folder in enumerate(folders):
+        for index in finished_shards(folder, shards):
+            holders.setdefault(index, []).append(position)
+    missing = [index for index in range(shards) if index not in holders]
     if missing:
-        some = ", ".join(str(index) for index in missing[:8]) + (" …" if len(missing) > 8 else "")
+        some = ", ".join(map(str, missing[:8])) + (" …" if len(missing) > 8 else "")
         raise InputError(
-            f"{len(missing)} of {manifest.shards} shards are in none of the {len(parts)} parts "
+            f"{len(missing)} of {shards} shards are in none of the {len(folders)} parts "
             f"(numbers {some}); finish those parts first"
         )
-    target = open_folder(out)
-    target.claim(MANIFEST)
-    copied = 0
-    with target.locked():
-        if target.exists(MANIFEST):
-            check_same(str(target), open_dataset(target), manifest)
-            _check_unchanged(target, manifest.shards, sums)
-        write_manifest(target, manifest)
-        write_mesh_sums(target, meshes)
-        failures: dict[str, dict[str, Any]] = {}
-        for folder in folders:
-            failures |= {record["id"]: record for record in read_failures(folder)}
-        write_failures(target, failures.values())
-        done = read_sums(target)
-        there = set(finished_shards(target, manifest.shards))
-        indices = tqdm(range(manifest.shards), desc="merge", unit="shard", disable=not progress)
-        for index in indices:
-            name = shard_name(index)
-            expected = {sums[part][name] for part in held[index] if name in sums[part]}
-            if len(expected) > 1:
-                raise InputError(f"{name} differs between {_named(folders, held[index])}")
-            if index in there and {done.get(name)} == expected:
-                continue
-            content = folders[held[index][0]].read(name)
-            digest = sha256(content).hexdigest()
-            if expected and {digest} != expected:
-                raise InputError(
-                    f"{folders[held[index][0]]}/{name}: damaged, its checksum is not the one in "
-                    "SHA256SUMS; delete it and run that part again"
-                )
-            target.write(name, content)
-            done[name] = digest
-            write_sums(target, done)
-            copied += 1
-    return MergeReport(copied, manifest.shards - copied, len(failures))
+    return holders
 
 
-def _check_unchanged(target: Folder, shards: int, sums: Sequence[dict[str, str]]) -> None:
+def _check_unchanged(
+    target: Folder,
+    present: Sequence[str],
+    done: Mapping[str, str],
+    sums: Sequence[Mapping[str, str]],
+) -> None:
     """Refuse to write over shards that an earlier merge brought and somebody then changed."""
-    there = read_sums(target)
-    for index in finished_shards(target, shards):
-        name = shard_name(index)
+    for name in present:
         given = {part[name] for part in sums if name in part}
-        if name in there and given and there[name] not in given:
+        if name in done and given and done[name] not in given:
             raise InputError(
                 f"{target}/{name}: is neither part's any more, failed scans were made up for here "
                 "or there; merge into a new folder"
             )
-
-
-def _holders(folders: Sequence[Folder], shards: int) -> dict[int, list[int]]:
-    """For each shard the parts, by their position, that have it."""
-    held: dict[int, list[int]] = {}
-    for position, folder in enumerate(folders):
-        for index in finished_shards(folder, shards):
-            held.setdefault(index, []).append(position)
-    return held
-
-
-def _named(folders: Sequence[Folder], positions: Sequence[int]) -> str:
-    return " and ".join(str(folders[position]) for position in positions)

@@ -7,6 +7,7 @@ the same bytes.
 """
 
 import json
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,10 +19,20 @@ from qs3.store.executors import Failure, guarded
 from qs3.store.executors.executor import failure_of
 from qs3.store.folder import PARTS, Folder
 from qs3.store.manifest import shard_name
-from qs3.store.shards import DType, empty_table, parse_shard, put_shard, shard_bytes, table_of
+from qs3.store.shards import (
+    DType,
+    empty_table,
+    load_shard,
+    parse_shard,
+    put_shard,
+    shard_bytes,
+    table_of,
+)
+
+_PART = re.compile(rf"{re.escape(PARTS)}/(\d+)/(\d+)\.(parquet|json)")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, order=True)
 class Place:
     """Where a row belongs."""
 
@@ -41,18 +52,14 @@ def part_folder(shard: int) -> str:
     return f"{PARTS}/{shard:05d}"
 
 
-def parts_there(folder: Folder, shard: int | None = None) -> dict[Place, str]:
+def written_parts(folder: Folder, shard: int | None = None) -> dict[Place, str]:
     """Return the names of all parts, or of those of a shard, by place; of two, the row's."""
-    found: dict[Place, str] = {}
+    parts: dict[Place, str] = {}
     for name in folder.names(PARTS if shard is None else part_folder(shard)):
-        words = name.removeprefix(f"{PARTS}/").split("/")
-        stem, _, ending = words[-1].partition(".")
-        if len(words) == 2 and stem.isdigit() and words[0].isdigit():
-            if ending == "parquet":
-                found[Place(int(words[0]), int(stem))] = name
-            elif ending == "json":
-                found.setdefault(Place(int(words[0]), int(stem)), name)
-    return found
+        match = _PART.fullmatch(name)
+        if match and (match[3] == "parquet" or Place(int(match[1]), int(match[2])) not in parts):
+            parts[Place(int(match[1]), int(match[2]))] = name
+    return parts
 
 
 def scan_to_part(
@@ -95,12 +102,7 @@ def finish_shard(
 ) -> str:
     """Put the parts of a shard together, with the rows that the shard has already.
 
-    Args:
-        folder: Folder of the data set.
-        shard: Index of the shard.
-        dtype: Type of the coordinates.
-        order: Ids of all rows of the shard, in order.
-        failed: Ids of those that failed; they are absent from the result.
+    ``order`` has the ids of all its rows, ``failed`` those that will be absent.
 
     Returns:
         SHA-256 of the shard, in hexadecimal.
@@ -112,15 +114,14 @@ def finish_shard(
     tables = [empty_table(dtype)]
     name = shard_name(shard)
     if folder.exists(name):
-        tables.append(parse_shard(folder.read(name), f"{folder}/{name}"))
-    parts = [part for part in parts_there(folder, shard).values() if part.endswith(".parquet")]
+        tables.append(load_shard(folder, shard))
+    parts = [part for part in written_parts(folder, shard).values() if part.endswith(".parquet")]
     for part, content in folder.read_many(parts).items():
         tables.append(parse_shard(content, f"{folder}/{part}"))
     table = pa.concat_tables(tables)
     # A row may be in both where an earlier call was stopped here: they are the same.
     position = {identifier: row for row, identifier in enumerate(table["id"].to_pylist())}
-    known = {*position, *failed}
-    lost = [identifier for identifier in order if identifier not in known]
+    lost = [i for i in order if i not in position and i not in failed]
     if lost:
         raise InputError(
             f"{folder}/{name}: {len(lost)} scans that were made are not there, such as {lost[0]}; "

@@ -1,8 +1,10 @@
-"""The work list of a data set: which scan of which mesh belongs where, in a fixed order."""
+"""The work list of a data set: which scan of which mesh belongs where, and what it will take."""
 
+import collections
 import dataclasses
 import hashlib
 import json
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,10 +13,11 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.meshes.classes import map_labels
-from qs3.store.manifest import Manifest
+from qs3.store.executors import Failure, LocalExecutor
+from qs3.store.manifest import Manifest, package_versions
 from qs3.store.parts import Place
-from qs3.store.scan_item import GenerateSettings, Item, neighbour_of, row_id
-from qs3.store.versions import package_versions
+from qs3.store.scan_item import GenerateSettings, Item, neighbour_of, row_id, scan_item
+from qs3.store.shards import DType, shard_bytes, table_of
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,20 @@ class Plan:
         """Name of a row."""
         return row_id(*self.work(place))
 
+    def failure_record(self, place: Place, failure: Failure) -> dict[str, Any]:
+        """What the log of failures says of a row."""
+        item, scan = self.work(place)
+        return {
+            "id": row_id(item, scan),
+            "object": item.id,
+            "scan": scan,
+            "class_name": item.class_name,
+            "shard": place.shard,
+            "row": place.row,
+            "error": failure.kind,
+            "reason": failure.reason,
+        }
+
     def manifest(self) -> Manifest:
         """What ``dataset.json`` will say."""
         return Manifest(
@@ -87,11 +104,9 @@ def make_plan(items: Sequence[Item], settings: GenerateSettings) -> Plan:
     """
     if not items:
         raise InputError(f"{settings.meshes}: no mesh to scan")
-    seen: set[str] = set()
-    for item in items:
-        if item.id in seen:
-            raise InputError(f"{settings.meshes}: two meshes are called {item.id!r}; rename one")
-        seen.add(item.id)
+    for name, times in collections.Counter(item.id for item in items).items():
+        if times > 1:
+            raise InputError(f"{settings.meshes}: two meshes are called {name!r}; rename one")
     if settings.make_scene().needs_neighbour and len(items) < 2:
         raise InputError(
             f"{items[0].id}: a scene with a neighbour needs a second mesh to draw from"
@@ -116,3 +131,73 @@ def work_list_checksum(items: Sequence[Item]) -> str:
         line += [getattr(item, name, None) for name in ("shape_seed", "up")]
         digest.update(json.dumps(line).encode("utf-8") + b"\n")
     return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Counts, and costs measured on a few scans of the list."""
+
+    objects: dict[str, int]
+    """Objects by class, and by split where there are splits."""
+    rows: int
+    """Scans in all."""
+    part_rows: int
+    """Scans of the part asked for."""
+    bytes: float
+    """Size of the part's shards."""
+    seconds: float
+    """Time of the part with one worker."""
+    measured: int
+    """Scans that this was measured on."""
+
+
+def estimate(
+    plan: Plan, part: tuple[int, int] = (0, 1), scans: int = 3, timeout: float | None = None
+) -> Estimate:
+    """Scan a few objects, spread over the list, and multiply.
+
+    Args:
+        plan: The work.
+        part: ``(i, n)``, as in `generate`.
+        timeout: Seconds that one scan may take; None waits for ever.
+        scans: Objects to scan, one after another in one worker, after one more to warm up.
+
+    Raises:
+        InputError: where none of them can be scanned.
+    """
+    objects: collections.Counter[str] = collections.Counter()
+    for item in plan.items:
+        objects[" ".join(filter(None, (item.class_name, item.split)))] += 1
+    chosen = np.linspace(0, len(plan.items) - 1, min(scans, len(plan.items))).astype(int).tolist()
+    sizes: list[int] = []
+    seconds: list[float] = []
+    failure: Failure | None = None
+    with LocalExecutor(1, timeout) as executor:
+        for index in [chosen[0], *chosen]:  # the first scan of a process compiles and loads
+            executor.submit(index, _timed, plan.arguments(index, 0), plan.settings.dtype)
+            outcome = executor.next()[1]
+            if isinstance(outcome, Failure):
+                failure = outcome
+            else:
+                seconds.append(outcome[0])
+                sizes.append(outcome[1])
+    if not sizes:
+        raise InputError(
+            f"none of {len(chosen)} scans tried succeeded: {failure and failure.reason}"
+        )
+    rows = sum(len(list(plan.places(shard))) for shard in range(part[0], plan.shards, part[1]))
+    kept = slice(1, None) if len(seconds) > 1 else slice(None)
+    return Estimate(
+        objects=dict(sorted(objects.items())),
+        rows=plan.rows,
+        part_rows=rows,
+        bytes=rows * float(np.mean(sizes)),
+        seconds=rows * float(np.mean(seconds[kept])),
+        measured=len(seconds[kept]),
+    )
+
+
+def _timed(arguments: tuple[Any, ...], dtype: DType) -> tuple[float, int]:
+    start = time.perf_counter()
+    size = len(shard_bytes(table_of([scan_item(*arguments)], dtype)))
+    return time.perf_counter() - start, size

@@ -1,6 +1,7 @@
 """One kind of progress bar: rate and time left, on the standard error stream."""
 
 import sys
+from collections.abc import Iterable
 from typing import Any
 
 from tqdm import tqdm
@@ -8,9 +9,19 @@ from tqdm import tqdm
 _IN_A_LOG = 10.0  # seconds between two lines where nobody watches
 
 
-def progress_bar(total: int, text: str | None, unit: str, initial: int = 0) -> "tqdm[Any]":
-    """Return a bar; ``text`` None shows none. In a log file it writes every ten seconds at most."""
+def progress_bar(
+    total: int,
+    text: str | None,
+    unit: str,
+    initial: int = 0,
+    items: Iterable[Any] | None = None,
+) -> "tqdm[Any]":
+    """Return a bar; ``text`` None shows none. In a log file it writes every ten seconds at most.
+
+    It is moved by hand, or by going through it where it has ``items``.
+    """
     return tqdm(
+        items,
         total=total,
         initial=initial,
         desc=text,

@@ -192,6 +192,18 @@ def read_shard(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
     return _read(path, str(path), columns)
 
 
+def load_shard(folder: Folder, index: int, columns: Sequence[str] | None = None) -> pa.Table:
+    """Read shard ``index`` of a data set, or some of its columns: from a disk these alone.
+
+    Raises:
+        InputError: as `read_shard` does.
+    """
+    name = shard_name(index)
+    if folder.path is not None:
+        return read_shard(folder.path / name, columns)
+    return parse_shard(folder.read(name), f"{folder}/{name}", columns)
+
+
 def parse_shard(content: bytes, where: str, columns: Sequence[str] | None = None) -> pa.Table:
     """Read a shard from its bytes; ``where`` names it in messages.
 

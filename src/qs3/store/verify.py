@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from tqdm import tqdm
 
 from qs3.errors import InputError
+from qs3.files import LOCK
 from qs3.store.failures import FAILURES, read_failures
-from qs3.store.folder import Folder, open_folder
+from qs3.store.folder import PARTS, Folder, open_folder
 from qs3.store.manifest import (
     MANIFEST,
+    MESHES,
     SUMS,
     Manifest,
     finished_shards,
@@ -22,8 +23,7 @@ from qs3.store.manifest import (
     read_sums,
     shard_name,
 )
-from qs3.store.mesh_sums import MESHES
-from qs3.store.parts import PARTS
+from qs3.store.progress import progress_bar
 from qs3.store.scan_item import scan_seed
 from qs3.store.shards import parse_shard
 
@@ -58,14 +58,14 @@ def verify(where: str | Path, *, progress: bool = True) -> list[str]:
     folder = open_folder(where)
     manifest = open_dataset(folder)
     sums, failures = read_sums(folder), read_failures(folder)
-    there = finished_shards(folder, manifest.shards)
-    faults = list(_files(folder, manifest, there, sums))
+    present = finished_shards(folder, manifest.shards)
+    faults = list(_files(folder, manifest, present, sums))
     seen = _Seen()
-    for index in tqdm(there, desc="verify", unit="shard", disable=not progress):
+    for index in progress_bar(len(present), "verify" if progress else None, "shard", items=present):
         faults += _shard(folder, index, manifest, sums, seen)
     lost = [record for record in failures if record["id"] in seen.ids]
     faults += [f"{FAILURES}: {r['id']} is logged as failed, and is there" for r in lost]
-    complete = len(there) == manifest.shards and manifest.rows is not None
+    complete = len(present) == manifest.shards and manifest.rows is not None
     if complete and seen.rows + len(failures) != manifest.rows:
         faults.append(
             f"{MANIFEST}: {manifest.rows} rows planned, but {seen.rows} are there and "
@@ -75,24 +75,25 @@ def verify(where: str | Path, *, progress: bool = True) -> list[str]:
 
 
 def _files(
-    folder: Folder, manifest: Manifest, there: list[int], sums: dict[str, str]
+    folder: Folder, manifest: Manifest, present: list[int], sums: dict[str, str]
 ) -> Iterator[str]:
-    missing = sorted(set(range(manifest.shards)) - set(there))
+    missing = sorted(set(range(manifest.shards)) - set(present))
     if missing:
         yield (
             f"{len(missing)} of {manifest.shards} shards are missing, the first "
             f"{shard_name(missing[0])}: unfinished, run the same command again"
         )
-    known = {MANIFEST, SUMS, FAILURES, MESHES} | {shard_name(index) for index in there}
+    shards = {shard_name(index) for index in present}
+    ours = {MANIFEST, SUMS, FAILURES, MESHES, LOCK} | shards
     for name in folder.names():
-        if name not in known and not name.startswith(f"{PARTS}/"):
+        if name not in ours and not name.startswith(f"{PARTS}/"):
             yield f"{name}: does not belong here"
     if manifest.schema < 3:
         yield f"{SUMS}: absent, this data set is of an earlier version; its bytes are unproven"
     else:
-        for name in sorted(known - {MANIFEST, SUMS, FAILURES, MESHES} - set(sums)):
+        for name in sorted(shards - set(sums)):
             yield f"{SUMS}: has no checksum of {name}"
-    for name in sorted(set(sums) - known):
+    for name in sorted(set(sums) - shards):
         yield f"{SUMS}: names {name}, which is not there"
 
 

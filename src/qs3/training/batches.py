@@ -14,7 +14,7 @@ from torch import Tensor
 from qs3.adaptation import Batch
 from qs3.errors import InputError, UnevenSizesError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.io.transforms import unit_ball
+from qs3.io.preparation import unit_ball
 from qs3.sensor.sampling import farthest_point_samples
 from qs3.training.checkpoint import read_tensors, write_tensors
 from qs3.training.config import TrainSettings
@@ -98,7 +98,7 @@ def prepare(points: np.ndarray, num_points: int, cache: Path | None = None) -> n
 def subsample(
     points: Float[np.ndarray, "b n 3"], num_points: int, cache: Path | None = None
 ) -> Float[np.ndarray, "b m 3"]:
-    """Bring clouds to ``num_points`` points each, as `qs3.io.transforms.resample` does.
+    """Bring clouds to ``num_points`` points each, as `qs3.io.preparation.resample` does.
 
     Args:
         points: Clouds, as read.

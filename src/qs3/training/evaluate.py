@@ -13,8 +13,8 @@ from qs3.evaluation.environment import git_commit, hardware, versions
 from qs3.evaluation.records import RECORDS, RunRecord, Scores, score, write_record
 from qs3.io import load_clouds
 from qs3.io.clouds import CloudKind, PointClouds, digests
+from qs3.io.preparation import unit_ball
 from qs3.io.ragged import RaggedClouds
-from qs3.io.transforms import unit_ball
 from qs3.structure import unstructure
 from qs3.training.checkpoint import LoadedModel, load_model
 from qs3.training.predict import predict_probabilities

@@ -110,7 +110,7 @@ def subsample_in_a_graph(points: Float[Tensor, "b n 3"], num_points: int) -> Flo
 
 
 def unit_ball_in_a_graph(points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
-    """Bring clouds to the unit ball as `qs3.io.transforms.unit_ball`.
+    """Bring clouds to the unit ball as `qs3.io.preparation.unit_ball`.
 
     Example:
         >>> unit_ball_in_a_graph(torch.tensor([[[0.0, 0, 0], [4, 0, 0]]]))[0, :, 0].tolist()

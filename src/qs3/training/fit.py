@@ -11,7 +11,7 @@ from qs3.adaptation import method_class
 from qs3.adaptation.names import split_method
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds, digests
-from qs3.io.transforms import unit_ball
+from qs3.io.preparation import unit_ball
 from qs3.models import PointClassifier
 from qs3.structure import unstructure
 from qs3.training.batches import require_finite, require_unlabelled, subsample

@@ -1,21 +1,20 @@
 """What can be shown: the objects of a data set one by one, or one scan; no viser in here."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import trimesh
 from jaxtyping import Float, Int, UInt8
 
 from qs3.errors import InputError
 from qs3.io.clouds import CloudKind, PointClouds, UnlabelledClouds
-from qs3.store.folder import LocalFolder, open_folder
+from qs3.store.folder import open_folder
 from qs3.store.manifest import finished_shards, open_dataset, shard_name
-from qs3.store.shards import flat_clouds, parse_shard, read_shard
+from qs3.store.shards import flat_clouds, load_shard
 
 KINDS: dict[CloudKind, str] = {"points": "noisy", "clean": "clean", "surface": "surface"}
 """The clouds of an object and the names by which the page calls them."""
@@ -103,7 +102,7 @@ class StoreExhibits:
         labels: list[str] = []
         splits: set[str] = set()
         for shard in shards:
-            table = self._table(shard, ("label", "split"))
+            table = load_shard(self._folder, shard, ("label", "split"))
             columns = (table[name].to_pylist() for name in ("label", "split"))
             for row, (label, part) in enumerate(zip(*columns, strict=True)):
                 splits.add(part)
@@ -127,16 +126,10 @@ class StoreExhibits:
         shard, place = self._places[row]
         return self._read(shard)[place]
 
-    def _table(self, shard: int, columns: Sequence[str]) -> pa.Table:
-        name = shard_name(shard)
-        if isinstance(self._folder, LocalFolder):
-            return read_shard(self._folder.path / name, columns)  # these alone, not the whole file
-        return parse_shard(self._folder.read(name), f"{self._folder}/{name}", columns)
-
     def _read_shard(self, shard: int) -> list[Exhibit]:
         kinds = tuple(KINDS)
         words = ("id", "class_name", "split", "seed", "drawn", *_VIEWS.values(), *STATISTICS)
-        table = self._table(shard, (*words, *kinds))
+        table = load_shard(self._folder, shard, (*words, *kinds))
         where = f"{self._folder}/{shard_name(shard)}"
         clouds: dict[CloudKind, Any] = {
             kind: flat_clouds(table, kind, where)

@@ -68,7 +68,7 @@ def open_exhibits(
     if _is_store(what):
         return StoreExhibits(what, split), None
     try:
-        clouds = _read(what, split)
+        clouds = _read(what, split, num_points=None)
     except UnevenSizesError:
         text = f"{what}: clouds of several sizes, shown with {_SHOWN_POINTS} points each\n"
         sys.stderr.write(text)

@@ -1,16 +1,17 @@
 """The two pages: objects to step through, and a mesh that is scanned live."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 from qs3.errors import InputError
-from qs3.sensor.presets import Sensor, sensor_toml
+from qs3.sensor.presets import SENSORS, sensor_toml
+from qs3.sensor.settings import ScanSettings
 from qs3.viewer.canvas import Canvas
 from qs3.viewer.exhibits import Answers, Exhibit, Exhibits
 from qs3.viewer.rescan import Rescanner
-from qs3.viewer.scan_controls import SCENES, ScanControls, ScanRequest, material_names
+from qs3.viewer.scan_controls import Control, make_controls, with_controls
 
 ALL = "all classes"
 
@@ -106,33 +107,36 @@ def gallery_page(
 @contextlib.contextmanager
 def scan_page(
     server: Any,
-    scan: Callable[[ScanRequest], Exhibit],
-    sensors: Mapping[str, Sensor],
-    start: ScanControls,
+    scan: Callable[[ScanSettings, int], Exhibit],
+    start: ScanSettings,
     draws: int = 0,
-    draw: int = 0,
 ) -> Iterator[Canvas]:
     """Put sliders for the sensor on a server, and scan whenever one moves, until the block ends.
 
     Args:
         server: A `viser.ViserServer`.
-        scan: Scans the mesh.
-        sensors: Those to choose from; the first is the one to start with.
-        start: Settings to start with.
-        draws: Number of draws of a built-in shape to step through; 0 for a mesh file.
-        draw: The one to start with.
+        scan: Scans the mesh with settings; takes the draw of a built-in shape too.
+        start: Settings to start with, from `resolve`.
+        draws: Number of draws of a built-in shape to step through, from that of the seed; 0 for a
+            mesh file.
     """
     gui, canvas = server.gui, Canvas(server)
     canvas.add_controls(mesh=True)
     states = {"waiting": "scanning soon …", "working": "scanning …"}
-    worker = Rescanner(scan, canvas.show, canvas.fail, tell=lambda state: canvas.say(states[state]))
+
+    def work(asked: tuple[ScanSettings, dict[str, Any], int]) -> Exhibit:
+        settings, values, draw = asked
+        return scan(with_controls(settings, values), draw)
+
+    worker = Rescanner(work, canvas.show, canvas.fail, tell=lambda state: canvas.say(states[state]))
 
     def ask(_: Any = None) -> None:
-        worker.ask(ScanRequest(sliders.base, sliders.controls(), which.value))
+        worker.ask((sliders.base, sliders.values(), which.value))
 
+    draw = start.seed if draws else 0
     with gui.add_folder("Mesh", visible=draws > 0):
         which = gui.add_slider("Draw of the shape", 0, max(draws - 1, draw, 1), 1, draw)
-    sliders = _Sliders(gui, sensors, start, ask)
+    sliders = _Sliders(gui, start, ask)
     which.on_update(ask)
     ask()
     with contextlib.closing(worker):
@@ -142,82 +146,50 @@ def scan_page(
 class _Sliders:
     """The settings of the sensor; built anew where another sensor is chosen."""
 
-    def __init__(
-        self,
-        gui: Any,
-        sensors: Mapping[str, Sensor],
-        start: ScanControls,
-        ask: Callable[[Any], None],
-    ) -> None:
-        self._gui, self._sensors, self._ask = gui, sensors, ask
-        self.base = next(iter(sensors.values()))
+    _KEPT = ("views", "view_layout", "seed", "num_points", "samples", "scene", "crop")
+
+    def __init__(self, gui: Any, start: ScanSettings, ask: Callable[[Any], None]) -> None:
+        self._gui, self._ask, self.base = gui, ask, start
+        own = start.make_sensor()
+        self._sensors = {own.name: own} | {n: s for n, s in SENSORS.items() if n != own.name}
         with gui.add_folder("Sensor") as self._place:
-            self._sensor = gui.add_dropdown("Sensor", tuple(sensors))
+            self._sensor = gui.add_dropdown("Sensor", tuple(self._sensors))
             save = gui.add_button("Save these settings as TOML", hint="for --sensor")
         self._sensor.on_update(self._change)
         save.on_click(self._save)
-        self._fill(start)
+        self._fill()
 
-    def controls(self) -> ScanControls:
-        return ScanControls(**{name: handle.value for name, handle in self._handles.items()})
+    def values(self) -> dict[str, Any]:
+        return {name: handle.value for name, handle in self._handles.items()}
 
     def _change(self, event: Any) -> None:
-        now = self.controls()
-        kept = ("views", "view_layout", "seed", "num_points", "samples", "scene", "crop")
-        self.base = self._sensors[self._sensor.value]
+        values = self.values()
+        base = with_controls(self.base, {name: values[name] for name in self._KEPT})
+        self.base = base.with_sensor(self._sensors[self._sensor.value], base.make_renderer())
         self._folder.remove()
-        self._fill(ScanControls.of(self.base, **{name: getattr(now, name) for name in kept}))
+        self._fill()
         self._ask(event)
 
     def _save(self, event: Any) -> None:
         if event.client is not None:
-            sensor = self.controls().sensor(self.base)
+            sensor = with_controls(self.base, self.values()).make_sensor()
             event.client.send_file_download(f"{sensor.name}.toml", sensor_toml(sensor).encode())
 
-    def _fill(self, now: ScanControls) -> None:
-        unit, size = " (m)" if self.base.metric else "", self.base.object_size
-        whole = 1 if now.num_disparities % 16 else 16
-        # Field, label, and either the choices or lowest value, highest value and step.
-        rows: tuple[tuple[Any, ...], ...] = (
-            ("views", "Views", 1, 12, 1),
-            ("view_layout", "Layout of views", ("orbit", "jitter")),
-            ("distance", f"Distance{unit}", 0.05, 2 * now.distance[1], 0.05),
-            ("elevation", "Elevation (°)", -80.0, 80.0, 1.0),
-            ("object_size", f"Object's size{unit}", 0.05, 3 * size, 0.05),
-            ("baseline", f"Baseline{unit}", 0.005, 4 * now.baseline, 0.005),
-            ("projector", "Projector ×", 0.0, 4.0, 0.05),
-            ("room_light", "Other light ×", 0.0, 20.0, 0.1),
-            ("gain", "Gain ×", 0.1, 8.0, 0.1),
-            ("image_noise", "Image noise (grey)", 0.0, 20.0, 0.1),
-            ("method", "Matcher", ("opencv-bm", "zncc")),
-            ("block_size", "Block (px)", 5, 31, 2),
-            ("num_disparities", "Disparities", 16, 512, whole),
-            ("stride", "Pixel stride", 1, 8, 1),
-            ("samples", "Rays a pixel", 1, 64, 1),
-            ("num_points", "Points", 64, 8192, 1),
-            ("material", "Object's surface", material_names()),
-            ("scene", "Scene", SCENES),
-            ("crop", "Crop", ("box", "mask", "none")),
-            ("seed", "Seed", 0, 50, 1),
-        )
+    def _fill(self) -> None:
         with self._place, self._gui.add_folder("Settings") as self._folder:
-            self._handles = {
-                name: self._control(getattr(now, name), label, *bounds)
-                for name, label, *bounds in rows
-            }
+            self._handles = {c.name: self._add(c) for c in make_controls(self.base)}
         for handle in self._handles.values():
             handle.on_update(self._ask)
 
-    def _control(self, value: Any, label: str, *bounds: Any) -> Any:
-        """A dropdown or a slider; a slider's bounds make way for the value it begins with."""
-        if isinstance(bounds[0], tuple):
-            return self._gui.add_dropdown(label, bounds[0], initial_value=value)
-        low, high, step = bounds
+    def _add(self, control: Control) -> Any:
+        """A dropdown or a slider; the slider's ends make way for the value it begins with."""
+        label, value, step = control.label, control.value, control.step
+        if control.choices:
+            return self._gui.add_dropdown(label, control.choices, initial_value=value)
         if isinstance(value, tuple):
             first, last = map(float, value)
-            return self._gui.add_multi_slider(
-                label, min(low, first), max(high, last), step, (first, last)
-            )
+            ends = min(float(control.low), first), max(float(control.high), last)
+            return self._gui.add_multi_slider(label, *ends, step, (first, last))
         kind = type(step)
-        ends = kind(min(low, value)), kind(max(high, value))
+        ends = kind(min(control.low, value)), kind(max(control.high, value))
         return self._gui.add_slider(label, *ends, step, kind(value))

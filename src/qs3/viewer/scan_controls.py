@@ -1,196 +1,165 @@
-"""The sensor settings that the page has sliders for, and the scan they ask for; no viser here."""
+"""The settings that the page of a live scan has sliders for, and the scan; no viser in here."""
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import trimesh
 
-from qs3.errors import InputError
-from qs3.sensor.matching.settings import Method
 from qs3.sensor.materials import MATERIALS, get_material
 from qs3.sensor.presets import Sensor
 from qs3.sensor.scan import Scan, scan
-from qs3.sensor.views import ViewLayout
+from qs3.sensor.settings import ScanSettings
 from qs3.viewer.exhibits import STATISTICS, Exhibit, statistics
 
-SCENES = ("alone", "floor", "wall", "room")
 OWN_MATERIAL = "of the sensor"
+_SCENES = ("alone", "floor", "wall", "room")
+_SCAN = ("views", "view_layout", "num_points", "scene", "crop", "seed")
+"""Fields of `ScanSettings` that have a control; ``samples`` is the renderer's."""
+_FACTORS = {
+    "projector": ("light.projector",),
+    "room light": ("light.sky", "light.ambient"),
+    "gain": ("exposure.gain",),
+}
+"""Controls that multiply what the sensor has."""
 
 
 @dataclass(frozen=True)
-class ScanControls:
-    """Settings of a scan as the page's sliders have them."""
+class Control:
+    """A slider or a choice of the page."""
 
-    views: int = 5
-    """Views fused."""
-    view_layout: ViewLayout = "orbit"
-    """Around the object, or copies of one pose."""
-    seed: int = 0
-    """Of the scan: poses, noise, sampling."""
-    num_points: int = 2048
-    """Points of the cloud."""
-    samples: int = 4
-    """Rays a pixel of the renderer."""
-    distance: tuple[float, float] = (3.0, 5.0)
-    """Nearest and farthest camera, from the object's middle."""
-    elevation: tuple[float, float] = (20.0, 50.0)
-    """Lowest and highest camera, in degrees."""
-    object_size: float = 1.0
-    """Size of the object in the unit of the scene."""
-    baseline: float = 0.1
-    """Between the two cameras, in the unit of the scene."""
-    projector: float = 1.0
-    """Light of the projector, times the sensor's."""
-    room_light: float = 1.0
-    """All other light, times the sensor's."""
-    gain: float = 1.0
-    """Of the imager, times the sensor's."""
-    image_noise: float = 0.0
-    """Gaussian noise of the images, in grey levels of 255."""
-    method: Method = "opencv-bm"
-    """The matcher."""
-    block_size: int = 19
-    """Side of its window in pixels; odd."""
-    num_disparities: int = 160
-    """Disparities searched."""
-    stride: int = 4
-    """Every stride-th pixel becomes a point."""
-    material: str = OWN_MATERIAL
-    """Surface of the object by name, or the sensor's own."""
-    scene: str = "alone"
-    """What stands around the object."""
-    crop: Literal["box", "mask", "none"] = "box"
-    """Keep points in the object's box, or pixels that truly show it, or all."""
-
-    @classmethod
-    def of(cls, sensor: Sensor, **settings: Any) -> "ScanControls":
-        """The settings that a sensor has, the others as given.
-
-        Example:
-            >>> ScanControls.of(Sensor(), views=3).block_size
-            19
-        """
-        return cls(
-            **settings,
-            distance=sensor.placement.radius,
-            elevation=sensor.placement.elevation,
-            object_size=sensor.object_size,
-            baseline=sensor.rig.baseline,
-            image_noise=sensor.exposure.noise,
-            method=sensor.matching.method,
-            block_size=sensor.matching.block_size,
-            num_disparities=sensor.matching.num_disparities,
-            stride=sensor.depth.stride,
-        )
-
-    def sensor(self, base: Sensor) -> Sensor:
-        """A sensor with these settings; what has no slider is as ``base`` has it.
-
-        Raises:
-            InputError: where the settings make no sensor.
-        """
-        replace, light = dataclasses.replace, base.light
-        return replace(
-            base,
-            object_size=self.object_size,
-            rig=replace(base.rig, baseline=self.baseline),
-            light=replace(
-                light,
-                projector=light.projector * self.projector,
-                sky=light.sky * self.room_light,
-                ambient=light.ambient * self.room_light,
-            ),
-            exposure=replace(
-                base.exposure, gain=base.exposure.gain * self.gain, noise=self.image_noise
-            ),
-            matching=replace(
-                base.matching,
-                method=self.method,
-                block_size=self.block_size,
-                num_disparities=self.num_disparities,
-            ),
-            depth=replace(base.depth, stride=self.stride),
-            placement=replace(base.placement, radius=self.distance, elevation=self.elevation),
-            material=base.material
-            if self.material == OWN_MATERIAL
-            else get_material(self.material),
-        )
+    name: str
+    """Field of the scan, dotted name of a sensor's setting, or name of a factor."""
+    label: str
+    """What the page calls it."""
+    value: Any
+    """Value to begin with; two values make a range."""
+    choices: tuple[str, ...] = ()
+    """Words to choose from; empty for a slider."""
+    low: int | float = 0.0
+    """Lowest value of the slider."""
+    high: int | float = 1.0
+    """Highest value of the slider."""
+    step: int | float = 1
+    """Step of the slider; a whole number where its values are."""
 
 
-@dataclass(frozen=True)
-class ScanRequest:
-    """Everything that a scan follows from."""
-
-    sensor: Sensor
-    """The sensor that the sliders started from."""
-    controls: ScanControls
-    """The sliders."""
-    draw: int = 0
-    """Which draw of a built-in shape."""
-
-
-def rescan(
-    request: ScanRequest,
-    mesh: trimesh.Trimesh,
-    name: str,
-    renderer: Any,
-    size: Literal["box", "ball"] = "box",
-) -> Exhibit:
-    """Scan a mesh with the settings of the page.
-
-    Args:
-        request: Those settings.
-        mesh: The object.
-        name: What the page calls it.
-        renderer: A renderer whose settings are a frozen dataclass with ``samples``.
-        size: Longest side 1, or the unit ball, times the object's size.
+def resolve(settings: ScanSettings) -> ScanSettings:
+    """The settings with sensor and renderer made, so that a control can change each of their own.
 
     Raises:
-        InputError: where the settings make no sensor, or the sensor sees nothing.
+        QS3Error: where there is no such sensor, or the renderer does not work here.
     """
-    how = request.controls
-    if how.scene not in SCENES:
-        raise InputError(f"scene: no {how.scene!r} here; choose one of {', '.join(SCENES)}")
-    done = scan(
-        mesh,
-        sensor=how.sensor(request.sensor),
-        views=how.views,
-        view_layout=how.view_layout,
-        seed=how.seed,
-        size=size,
-        num_points=how.num_points,
-        scene=how.scene,
-        crop=how.crop,
-        renderer=dataclasses.replace(renderer, samples=how.samples),
+    made = settings.with_sensor(settings.make_sensor(), settings.make_renderer())
+    chosen = {name: settings.chosen(name) for name in ("view_layout", "crop")}
+    return dataclasses.replace(made, **chosen)
+
+
+def make_controls(settings: ScanSettings) -> tuple[Control, ...]:
+    """The controls of a scan; ``settings`` come from `resolve`."""
+    sensor, renderer = settings.make_sensor(), settings.make_renderer()
+    unit = " (m)" if sensor.metric else ""
+    size, far = sensor.object_size, sensor.placement.radius[1]
+    matching, baseline = sensor.matching, sensor.rig.baseline
+    whole = 1 if matching.num_disparities % 16 else 16
+    scenes = tuple(dict.fromkeys((*_SCENES, str(settings.scene))))
+    return (
+        Control("views", "Views", settings.views, (), 1, 12),
+        Control("view_layout", "Layout of views", settings.view_layout, ("orbit", "jitter")),
+        Control(
+            "placement.radius", f"Distance{unit}", sensor.placement.radius, (), 0.05, 2 * far, 0.05
+        ),
+        Control(
+            "placement.elevation", "Elevation (°)", sensor.placement.elevation, (), -80, 80, 1.0
+        ),
+        Control("object_size", f"Object's size{unit}", size, (), 0.05, 3 * size, 0.05),
+        Control("rig.baseline", f"Baseline{unit}", baseline, (), 0.005, 4 * baseline, 0.005),
+        Control("projector", "Projector ×", 1.0, (), 0.0, 4.0, 0.05),
+        Control("room light", "Other light ×", 1.0, (), 0.0, 20.0, 0.1),
+        Control("gain", "Gain ×", 1.0, (), 0.1, 8.0, 0.1),
+        Control("exposure.noise", "Image noise (grey)", sensor.exposure.noise, (), 0.0, 20.0, 0.1),
+        Control("matching.method", "Matcher", matching.method, ("opencv-bm", "zncc")),
+        Control("matching.block_size", "Block (px)", matching.block_size, (), 5, 31, 2),
+        Control(
+            "matching.num_disparities", "Disparities", matching.num_disparities, (), 16, 512, whole
+        ),
+        Control("depth.stride", "Pixel stride", sensor.depth.stride, (), 1, 8),
+        Control("samples", "Rays a pixel", getattr(renderer, "samples", 1), (), 1, 64),
+        Control("num_points", "Points", settings.num_points, (), 64, 8192),
+        Control("material", "Object's surface", OWN_MATERIAL, (OWN_MATERIAL, *MATERIALS)),
+        Control("scene", "Scene", str(settings.scene), scenes),
+        Control("crop", "Crop", settings.crop, ("box", "mask", "both", "none")),
+        Control("seed", "Seed", settings.seed, (), 0, 50),
     )
-    return exhibit_of(done, name)
 
 
-def exhibit_of(done: Scan, name: str, class_name: str = "") -> Exhibit:
+def with_controls(settings: ScanSettings, values: Mapping[str, Any]) -> ScanSettings:
+    """The settings with values of controls by name; what has no control stays.
+
+    Raises:
+        InputError: where they make no sensor, or no scan.
+    """
+    sensor = settings.make_sensor()
+    renderer: Any = settings.make_renderer()
+    changes = {name: value for name, value in values.items() if name in _SCAN}
+    if "samples" in values:
+        renderer = dataclasses.replace(renderer, samples=values["samples"])
+    places: dict[str, Any] = {}
+    for name, value in values.items():
+        if name in _FACTORS:
+            places |= {place: value * _read(sensor, place) for place in _FACTORS[name]}
+        elif name == "material":
+            places |= {} if value == OWN_MATERIAL else {name: get_material(value)}
+        elif name not in changes and name != "samples":
+            places[name] = value
+    made = settings.with_sensor(_replaced(sensor, places), renderer)
+    return dataclasses.replace(made, **changes)
+
+
+def _read(sensor: Sensor, place: str) -> float:
+    section, _, name = place.partition(".")
+    return getattr(getattr(sensor, section), name)
+
+
+def _replaced(sensor: Sensor, places: Mapping[str, Any]) -> Sensor:
+    """Replace all at once: a sensor that is half changed may be none."""
+    sections: dict[str, dict[str, Any]] = {}
+    for place, value in places.items():
+        section, _, name = place.partition(".")
+        sections.setdefault(section, {})[name] = value
+    made = {
+        section: values[""]
+        if "" in values
+        else dataclasses.replace(getattr(sensor, section), **values)
+        for section, values in sections.items()
+    }
+    return dataclasses.replace(sensor, **made)
+
+
+def rescan(settings: ScanSettings, mesh: trimesh.Trimesh, name: str) -> Exhibit:
+    """Scan a mesh, and hand it back as something to show.
+
+    Raises:
+        InputError: where the sensor sees nothing of it.
+    """
+    return exhibit_of(scan(mesh, settings), name)
+
+
+def exhibit_of(made: Scan, name: str) -> Exhibit:
     """A scan as something to show."""
     means = {}
-    for name in STATISTICS:
-        values = [value for view in done.views if (value := getattr(view, name)) is not None]
-        means[name] = sum(values) / len(values) if values else None
-    facts = [("fused points", str(done.fused_points)), *statistics(means)]
-    facts.append(("scanned in", f"{sum(done.seconds.values()):.1f} s"))
+    for statistic in STATISTICS:
+        values = [v for view in made.views if (v := getattr(view, statistic)) is not None]
+        means[statistic] = sum(values) / len(values) if values else None
+    facts = [("fused points", str(made.fused_points)), *statistics(means)]
+    facts.append(("scanned in", f"{sum(made.seconds.values()):.1f} s"))
     return Exhibit(
         name=name,
-        class_name=class_name,
-        clouds={"points": done.points, "clean": done.clean},
-        views={"points": done.view, "clean": done.clean_view},
-        mesh=done.mesh,
+        class_name="",
+        clouds={"points": made.points, "clean": made.clean},
+        views={"points": made.view, "clean": made.clean_view},
+        mesh=made.mesh,
         facts=tuple(facts),
-        unit=" m" if done.sensor.metric else "",
+        unit=" m" if made.sensor.metric else "",
     )
-
-
-def material_names() -> tuple[str, ...]:
-    """Names for the page's choice of the object's surface.
-
-    Example:
-        >>> "dark" in material_names()
-        True
-    """
-    return (OWN_MATERIAL, *MATERIALS)

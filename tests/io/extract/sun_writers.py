@@ -77,9 +77,9 @@ def write_sunrgbd(root: Path) -> None:
         (folder / "extrinsics").mkdir(exist_ok=True)
         (folder / "extrinsics" / "20140101.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0")
         (folder / "extrinsics" / "20150101.txt").write_text("\n".join(lines), encoding="utf-8")
-        found = truth(index)
-        write_annotation(folder, found)
-        boxes = [("wall", found), ("sofa_chair", found), ("toilet", found)]
+        tight = truth(index)
+        write_annotation(folder, tight)
+        boxes = [("wall", tight), ("sofa_chair", tight), ("toilet", tight)]
         table[name] = [
             {"class": word, **{key: value.tolist() for key, value in what.items()}}
             for word, what in boxes[1:]
@@ -98,15 +98,15 @@ def meta_row(name: str, matrix, camera_to_world, boxes) -> dict:
     turned_axes = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     entries = [
         {
-            "basis": found["basis"],
-            "coeffs": found["coeffs"][None] * [1, -1, 1],
-            "centroid": found["centroid"][None],
+            "basis": tight["basis"],
+            "coeffs": tight["coeffs"][None] * [1, -1, 1],
+            "centroid": tight["centroid"][None],
             "classname": word,
             "sequenceName": f"SUNRGBD/{name}",
             "orientation": np.ones((1, 3)),
             "label": 1,
         }
-        for word, found in boxes
+        for word, tight in boxes
     ]
     return {
         "sequenceName": f"SUNRGBD/{name}",
@@ -118,10 +118,10 @@ def meta_row(name: str, matrix, camera_to_world, boxes) -> dict:
     }
 
 
-def write_annotation(folder: Path, found: dict) -> None:
+def write_annotation(folder: Path, tight: dict) -> None:
     """The box as the annotators' tool wrote it: four corners from above, y down."""
-    (x, y, z), (a, b, height) = found["centroid"], found["coeffs"]
-    first, second = found["basis"][:2]
+    (x, y, z), (a, b, height) = tight["centroid"], tight["coeffs"]
+    first, second = tight["basis"][:2]
     corners = np.array([-a * first - b * second, a * first - b * second,
                         a * first + b * second, -a * first + b * second])  # fmt: skip
     polygon = {

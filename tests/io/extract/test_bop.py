@@ -85,14 +85,14 @@ def clouds(source, frame="world", names=None, **more):
 
 def test_convention_views_meet_in_the_world_and_in_the_models_axes(scene):
     for frame, mesh in (("world", moved(thing(), PLACE)), ("model", thing())):
-        found = clouds(scene, frame=frame)
-        assert [cloud.id for cloud in found] == ["000042/000000/000000", "000042/000001/000000"]
-        for cloud in found:
+        cut = clouds(scene, frame=frame)
+        assert [cloud.id for cloud in cut] == ["000042/000000/000000", "000042/000001/000000"]
+        for cloud in cut:
             assert cloud.points.dtype == np.float32
             assert len(cloud.points) > 1000
             # A twentieth of a millimetre along a ray that is at most 1.2 times its depth.
             assert off_surface(mesh, cloud.points[::7]).max() < 0.00005 * 1.2
-        mirrored = found[0].points[::7] * [-1, 1, 1]
+        mirrored = cut[0].points[::7] * [-1, 1, 1]
         assert off_surface(mesh, mirrored).max() > 0.05
 
 
@@ -180,7 +180,7 @@ def spoil(scene, tmp_path, name, change):
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "told"),
+    ("name", "change", "message"),
     [
         ("scene_camera.json", lambda v: [v], "not a JSON object"),
         ("scene_camera.json", lambda v: {"../1": v["0"]}, "one entry an image"),
@@ -201,9 +201,9 @@ def spoil(scene, tmp_path, name, change):
         ("scene_gt.json", lambda v: {"0": [{"obj_id": 1}] * 3}, r"000000_000002\.png: no such"),
     ],
 )  # fmt: skip
-def test_damaged_scenes_are_refused_by_name(scene, tmp_path, name, change, told):
+def test_damaged_scenes_are_refused_by_name(scene, tmp_path, name, change, message):
     source = spoil(scene, tmp_path, name, change)
-    with pytest.raises(InputError, match=told) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         clouds(source)
     assert "scene" in str(caught.value)
     assert "\n" not in str(caught.value)

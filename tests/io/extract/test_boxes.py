@@ -105,8 +105,8 @@ def test_convention_boxes_of_real_objects_cut_them_out_of_one_another(shared_dat
         assert data["frame"][index] == data["frame"][7]
         assert inside_box(chair, table_box).all()
         # As many points, and the same ones to the rounding of the file.
-        found = table[inside_box(table, box, margin=1e-6)]
-        assert len(found) == len(chair)
+        cut = table[inside_box(table, box, margin=1e-6)]
+        assert len(cut) == len(chair)
         assert tree.query(chair)[0].max() < 1e-6
         # Turned the other way the boxes do not agree.
         other = upright_box(index, -boxes[index, 6])

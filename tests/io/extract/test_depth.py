@@ -184,13 +184,6 @@ def test_a_box_is_first_to_before_last_and_cuts_masks_too(taken):
         cut(folder, box=(70, 50, 161, 65))
 
 
-def test_small_objects_are_left_out(taken):
-    folder, _, depth = taken
-    count = int((depth > 0).sum())
-    assert len(cut(folder, cut=CutSettings(min_points=count))) == 1
-    assert not cut(folder, cut=CutSettings(min_points=count + 1))
-
-
 @pytest.mark.parametrize(("fx", "scale"), [(1e-300, None), (1e-9, None), (150.0, 1e30)])
 def test_points_that_no_camera_sees_are_refused(taken, fx, scale):
     folder, _, _ = taken
@@ -228,7 +221,7 @@ def test_every_way_to_tell_a_camera(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("0,140,77,61", "must be positive"),
         ("-150,140,77,61", "must be positive"),
@@ -237,13 +230,13 @@ def test_every_way_to_tell_a_camera(tmp_path):
         ("absent.json", "no such file"),
     ],
 )
-def test_bad_cameras_on_the_command_line(text, told):
-    with pytest.raises(InputError, match=told):
+def test_bad_cameras_on_the_command_line(text, message):
+    with pytest.raises(InputError, match=message):
         read_intrinsics(text)
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "told"),
+    ("name", "text", "message"),
     [
         ("a.json", "[1, 2", "not a JSON file"),
         ("a.json", "[1, 2]", "not a JSON object"),
@@ -268,10 +261,10 @@ def test_bad_cameras_on_the_command_line(text, told):
         ("a.txt", "\0\0", "not a text file of numbers"),
     ],
 )  # fmt: skip
-def test_bad_camera_files_are_refused_by_name(tmp_path, name, text, told):
+def test_bad_camera_files_are_refused_by_name(tmp_path, name, text, message):
     path = tmp_path / name
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=told) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         read_intrinsics(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -334,10 +327,10 @@ BAD_IMAGES = {
 
 @pytest.mark.parametrize("name", BAD_IMAGES)
 def test_bad_images_are_refused_by_name(tmp_path, name, capfd):
-    content, told = BAD_IMAGES[name]
+    content, message = BAD_IMAGES[name]
     path = tmp_path / name
     path.write_bytes(content)
-    with pytest.raises(InputError, match=told) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         read_depth(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -364,8 +357,8 @@ def test_a_folder_goes_with_a_folder_of_masks(tmp_path):
     (tmp_path / "masks").mkdir()
     for name in ("a.png", "b.tif", "c.png"):
         (tmp_path / "masks" / name).write_bytes(b"")
-    found = list_depth_images(tmp_path, tmp_path / "masks")
-    assert [(image.id, image.mask.name) for image in found] == [
+    images = list_depth_images(tmp_path, tmp_path / "masks")
+    assert [(image.id, image.mask.name) for image in images] == [
         ("a", "a.png"), ("b", "b.tif"), ("c", "c.png"),
     ]  # fmt: skip
     with pytest.raises(InputError, match="one mask for 3 depth images"):
@@ -384,7 +377,7 @@ def test_a_folder_goes_with_a_folder_of_masks(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("a,b\n1,2\n", "name,class"),
         ("", "name,class"),
@@ -396,9 +389,9 @@ def test_a_folder_goes_with_a_folder_of_masks(tmp_path):
         ('name,class\n"a,chair\n', "not a CSV"),
     ],
 )
-def test_bad_tables_of_classes_are_refused(tmp_path, text, told):
+def test_bad_tables_of_classes_are_refused(tmp_path, text, message):
     (tmp_path / "names.csv").write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         read_names(tmp_path / "names.csv")
 
 

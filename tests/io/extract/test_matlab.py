@@ -89,10 +89,10 @@ BAD = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_hostile_files_are_refused_in_one_line(tmp_path, name):
-    content, told = BAD[name]
+    content, message = BAD[name]
     path = tmp_path / "bad.mat"
     path.write_bytes(content)
-    with pytest.raises(InputError, match=told) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         read_mat(path, ("SUNRGBDMeta",))
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -39,9 +39,9 @@ def clouds(frames, **more):
 
 
 def test_convention_points_stand_on_the_thing_in_the_world_and_not_mirrored(root):
-    found = clouds(list_sunrgbd(root, rename=CHAIR))
-    assert [cloud.id for cloud in found] == [f"{FRAMES[0]}/000", f"{FRAMES[1]}/000"]
-    for index, cloud in enumerate(found):
+    cut = clouds(list_sunrgbd(root, rename=CHAIR))
+    assert [cloud.id for cloud in cut] == [f"{FRAMES[0]}/000", f"{FRAMES[1]}/000"]
+    for index, cloud in enumerate(cut):
         assert cloud.class_name == "chair"
         assert len(cloud.points) > 500
         mesh = placed(index)
@@ -115,7 +115,7 @@ def test_one_bad_frame_fails_alone(bare):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         (lambda f: (f / "intrinsics.txt").unlink(), "intrinsics.txt: no such file"),
         (lambda f: (f / "intrinsics.txt").write_text("1 2 3"), "3 numbers instead of 9"),
@@ -129,16 +129,16 @@ def test_one_bad_frame_fails_alone(bare):
         (lambda f: [p.unlink() for p in (f / "extrinsics").iterdir()], "extrinsics"),
     ],
 )
-def test_damaged_frames_are_refused_by_name(bare, change, told):
+def test_damaged_frames_are_refused_by_name(bare, change, message):
     change(bare / FRAMES[0])
-    with pytest.raises(InputError, match=told) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         clouds(list_sunrgbd(bare, rename=CHAIR))
     assert "NYU0001" in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("[]", "not a JSON object"),
         ('{"../kv1": []}', "leads outside"),
@@ -154,15 +154,15 @@ def test_damaged_frames_are_refused_by_name(bare, change, told):
         ('{"absent": []}', "no frame"),
     ],
 )  # fmt: skip
-def test_bad_lists_of_boxes_are_refused(root, tmp_path, text, told):
+def test_bad_lists_of_boxes_are_refused(root, tmp_path, text, message):
     (tmp_path / "bad.json").write_text(text)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         list_sunrgbd(root, tmp_path / "bad.json", rename=CHAIR)
 
 
 def test_a_skew_box_fails_its_frame(root, tmp_path):
-    found = {key: value.tolist() for key, value in truth(0).items()}
-    entry = {"class": "chair", **found, "basis": [1, 0, 0, 1, 0, 0, 0, 0, 1]}
+    cut = {key: value.tolist() for key, value in truth(0).items()}
+    entry = {"class": "chair", **cut, "basis": [1, 0, 0, 1, 0, 0, 0, 0, 1]}
     (tmp_path / "boxes.json").write_text(json.dumps({FRAMES[0]: [entry]}))
     with pytest.raises(InputError, match="NYU0001, object 0: the axes"):
         clouds(list_sunrgbd(root, tmp_path / "boxes.json", rename=CHAIR))

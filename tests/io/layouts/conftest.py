@@ -36,7 +36,7 @@ def hard_floats(rng, count):
     return values
 
 
-def told(clouds):
+def content(clouds):
     """What a cloud is, whatever its place and id: class, split and bytes of its points."""
     names = [clouds.class_names[label] for label in clouds.labels]
     splits = clouds.splits or ("",) * len(names)
@@ -49,4 +49,4 @@ def formats():
     """The helpers of this file."""
     import types
 
-    return types.SimpleNamespace(make_clouds=make_clouds, hard_floats=hard_floats, told=told)
+    return types.SimpleNamespace(make_clouds=make_clouds, hard_floats=hard_floats, content=content)

@@ -1,4 +1,3 @@
-import json
 import os
 import signal
 import subprocess
@@ -9,23 +8,16 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.io.convert import convert, read_clouds
-from qs3.io.layouts import FORMATS, xyz_trees
-from qs3.io.layouts.contents import open_dataset, read_ragged
+from qs3.io.convert import convert
 from qs3.io.layouts.point_folders import write_folder
-from qs3.io.layouts.store import ROWS_PER_SHARD, write_store
+from qs3.io.layouts.store import read_ragged
+from qs3.io.load import read_clouds
 from qs3.io.ragged import RaggedClouds
 from qs3.io.whole import whole
 from qs3.meshes.classes import POINTDA10
+from qs3.store.manifest import open_dataset
 
-PLAIN = ("qs3", "ply", "pcd", "npy", "xyz", "specklenet10", "depthscannet10")
-# Layouts whose classes or sizes the clouds of this file do not have.
-_OTHER_CLASSES = ("graspnet", "scanobjectnn")
-EXACT = tuple(
-    name
-    for name, layout in FORMATS.items()
-    if layout.write is not None and not name.startswith(_OTHER_CLASSES)
-)
+PLAIN = ("store", "ply", "pcd", "npy", "xyz", "specklenet10", "depthscannet10")
 
 
 @pytest.fixture
@@ -38,60 +30,29 @@ def source(rng, tmp_path, formats):
 
 @pytest.mark.parametrize("to", PLAIN)
 def test_a_round_trip_keeps_points_labels_classes_and_splits(tmp_path, source, formats, to):
-    written = convert(source, tmp_path / "there", to)
+    written = convert(source, tmp_path / "other", to)
     assert len(written.ids) == 20
-    convert(tmp_path / "there", tmp_path / "back", "npy")
-    there, origin = read_clouds(tmp_path / "there", None, None, "points")
-    back, _ = read_clouds(tmp_path / "back", None, None, "points")
-    first, _ = read_clouds(source, None, None, "points")
+    convert(tmp_path / "other", tmp_path / "back", "npy")
+    other, origin = read_clouds(tmp_path / "other")
+    back, _ = read_clouds(tmp_path / "back")
+    first, _ = read_clouds(source)
     assert origin == to
-    assert there.class_names == back.class_names == POINTDA10
-    assert formats.told(there) == formats.told(first)
-    assert formats.told(back) == formats.told(first)
+    assert other.class_names == back.class_names == POINTDA10
+    assert formats.content(other) == formats.content(first)
+    assert formats.content(back) == formats.content(first)
     # Names survive as well, whatever lies between.
     assert sorted(back.ids) == sorted(first.ids)
 
 
-@pytest.mark.parametrize("to", EXACT)
-def test_whatever_is_written_reads_back_equal_when_its_layout_is_named(tmp_path, rng, formats, to):
-    clouds = formats.make_clouds(rng, num_points=2048)
-    write_folder(tmp_path / "source", clouds, ".npy")
-    convert(tmp_path / "source", tmp_path / "there", to)
-    there, _ = read_clouds(tmp_path / "there", to, None, "points")
-    assert formats.told(there) == formats.told(clouds)
-
-
-def test_equal_input_gives_equal_bytes(tmp_path, source):
-    for to in EXACT:
-        for run in ("a", "b"):
-            convert(source, tmp_path / run / to, to)
-    files = [path for path in sorted((tmp_path / "a").rglob("*")) if path.is_file()]
-    assert len(files) > 100
-    for path in files:
-        assert (tmp_path / "b" / path.relative_to(tmp_path / "a")).read_bytes() == path.read_bytes()
-
-
 def test_a_store_tells_where_it_comes_from(tmp_path, source):
-    convert(source, tmp_path / "store", "qs3", split="test")
+    convert(source, tmp_path / "store", "store", split="test")
     manifest = open_dataset(tmp_path / "store")
-    first, _ = read_clouds(source, None, "test", "points")
+    first, _ = read_clouds(source, "test")
     assert manifest.settings == {"kind": "converted", "from": "npy", "checksum": first.checksum}
     assert set(read_ragged(tmp_path / "store").splits) == {"test"}
+    assert str(tmp_path) not in (tmp_path / "store" / "dataset.json").read_text()
     with pytest.raises(InputError, match="has no 'clean' clouds"):
         convert(tmp_path / "store", tmp_path / "no", "ply", cloud="clean")
-
-
-def test_a_store_of_several_shards_keeps_its_order(rng, tmp_path):
-    count = 2 * ROWS_PER_SHARD + 3
-    clouds = [np.full((2, 3), i, dtype=np.float32) for i in range(count)]
-    ids = tuple(f"row {i}" for i in range(count))
-    labels = np.arange(count) % 2
-    write_store(tmp_path / "a", RaggedClouds(clouds, ids, "", labels, ("bed", "sofa")))
-    assert len(list((tmp_path / "a").glob("shard-*.parquet"))) == 3
-    back = read_ragged(tmp_path / "a")
-    assert back.ids == ids
-    assert [int(cloud[0, 0]) for cloud in back.clouds] == list(range(count))
-    np.testing.assert_array_equal(back.labels, labels)
 
 
 def test_clouds_without_labels_go_into_folders_only(rng, tmp_path):
@@ -99,7 +60,7 @@ def test_clouds_without_labels_go_into_folders_only(rng, tmp_path):
     write_folder(tmp_path / "flat", bare, ".ply")
     assert convert(tmp_path / "flat", tmp_path / "b", "pcd").labels is None
     assert [path.name for path in (tmp_path / "b").iterdir()] == ["x.pcd"]
-    for to in ("qs3", "specklenet10", "graspnetpc10-real-kinect"):
+    for to in ("store", "specklenet10", "graspnetpc10-real-kinect"):
         with pytest.raises(InputError, match=f"{to}: .*labels"):
             convert(tmp_path / "flat", tmp_path / "c", to)
     with pytest.raises(InputError, match="has no labels to map"):
@@ -117,7 +78,7 @@ def test_classes_are_mapped_dropped_or_named(rng, tmp_path, formats):
     assert kept.class_names == POINTDA10
     assert sorted(path.name for path in (tmp_path / "b").iterdir()) == ["cabinet", "table"]
     assert len(kept.ids) == len(kept.splits) == 4
-    named = convert(tmp_path / "a", tmp_path / "c", "qs3", classes=("toilet", "table", "cabinet"))
+    named = convert(tmp_path / "a", tmp_path / "c", "store", classes=("toilet", "table", "cabinet"))
     assert sorted(named.labels.tolist()) == [0, 0, 1, 1, 2, 2]
     assert open_dataset(tmp_path / "c").class_names == ("toilet", "table", "cabinet")
     with pytest.raises(InputError, match="no cloud is of any of sofa"):
@@ -148,10 +109,10 @@ def test_coordinates_beyond_float32_are_refused(tmp_path):
     ("options", "message"),
     [
         ({"to": "ply2"}, "'ply2' is no known layout.*did you mean ply"),
-        ({"to": "npz"}, "npz: is only read; written are qs3, "),
+        ({"to": "npz"}, "npz: is only read; written are store, "),
         ({"to": "pointda10"}, "is only read; written are pointda10-npy, pointda10-h5$"),
         ({"to": "ply", "origin": "nyp"}, "'nyp' is no known layout"),
-        ({"to": "ply", "cloud": "clean"}, "only a qs3 data set has 'clean' clouds"),
+        ({"to": "ply", "cloud": "clean"}, "has 'clean' clouds"),
         ({"to": "ply", "split": "dev"}, "no split 'dev'"),
         ({"to": "ply", "origin": "graspnetpc10-real-kinect"}, "no cloud in"),
     ],
@@ -235,16 +196,3 @@ def test_a_killed_run_leaves_no_half_data_set_and_the_next_one_clears_up(tmp_pat
     convert(source, target, "xyz")
     assert not hidden.exists()
     assert len(list(target.rglob("*.xyz"))) == 20
-
-
-def test_every_layout_that_is_written_is_read_too():
-    for layout in FORMATS.values():
-        assert layout.read is not None, layout.name
-    assert {layout.name for layout in xyz_trees.FORMATS} <= set(FORMATS)
-
-
-def test_the_settings_of_a_store_are_plain_json(tmp_path, source):
-    convert(source, tmp_path / "store", "qs3")
-    told = json.loads((tmp_path / "store" / "dataset.json").read_text())
-    assert told["rows"] == 20
-    assert str(tmp_path) not in json.dumps(told)

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
+from qs3.geometry import y_up_from_z_up, z_up_from_y_up
 from qs3.io.layouts import hdf5
-from qs3.io.layouts.axes import y_up_from_z_up, z_up_from_y_up
 from qs3.io.layouts.hdf5 import hdf5_bytes, read_file
 from qs3.io.layouts.hdf5_sets import list_parts, read_parts
 
@@ -159,8 +159,8 @@ def plugin(file, arrays, folder):
     plist.set_chunk((6, 8, 6))
     plist.set_filter(32001, h5py.h5z.FLAG_OPTIONAL)
     space = h5py.h5s.create_simple((6, 8, 6))
-    found = h5py.h5d.create(file.id, b"data", h5py.h5t.IEEE_F32LE, space, plist)
-    found.write(space, space, arrays["data"])
+    dataset = h5py.h5d.create(file.id, b"data", h5py.h5t.IEEE_F32LE, space, plist)
+    dataset.write(space, space, arrays["data"])
 
 
 def point(value, kind="<f4"):
@@ -250,7 +250,7 @@ def test_damaged_bytes_are_read_or_refused_in_one_line(tmp_path, arrays, compres
         file.create_dataset("label", data=arrays["label"])
     whole = (tmp_path / "a.h5").read_bytes()
     ends = []
-    for seed in range(400):
+    for seed in range(200):
         rng = np.random.default_rng(seed)
         damaged = bytearray(whole)
         for place in rng.integers(len(whole), size=rng.integers(1, 30)):
@@ -263,7 +263,7 @@ def test_damaged_bytes_are_read_or_refused_in_one_line(tmp_path, arrays, compres
         except InputError as error:
             assert "\n" not in str(error)
             ends.append("refused")
-    assert ends.count("refused") > 40
+    assert ends.count("refused") > 20
 
 
 def test_parts_are_listed_in_order(tmp_path, arrays):

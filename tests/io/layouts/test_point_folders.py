@@ -5,13 +5,13 @@ import tracemalloc
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.errors import InputError
-from qs3.io.class_folders import read_folder
+from qs3.io.layouts.class_folders import read_folder
 from qs3.io.layouts.point_folders import file_stem, write_folder
-from qs3.io.load import load_clouds, load_unlabelled
+from qs3.io.load import load_unlabelled
 from qs3.io.point_files import WRITTEN_FILES, cloud_bytes, read_cloud
 from qs3.io.ragged import RaggedClouds
 
@@ -45,7 +45,7 @@ def test_what_is_written_reads_back_equal(rng, tmp_path, formats, ending, splits
     clouds = formats.make_clouds(rng, ("Night Stand", "Stühle 1", "bed"), 50, 3, splits)
     write_folder(tmp_path / "set", clouds, ending)
     back = read_folder(tmp_path / "set")
-    assert formats.told(back) == formats.told(clouds)
+    assert formats.content(back) == formats.content(clouds)
     assert back.class_names == ("Night Stand", "Stühle 1", "bed")
     if "test" in splits:
         test = read_folder(tmp_path / "set", "test")
@@ -99,15 +99,7 @@ def test_a_class_that_is_named_train_is_a_class(rng, tmp_path):
     assert len(read_folder(tmp_path, "test").ids) == 1
 
 
-def test_both_splits_have_one_list_of_classes(rng, tmp_path):
-    for place in ("axe/train", "hammer/train", "hammer/test"):
-        (tmp_path / place).mkdir(parents=True)
-        np.save(tmp_path / place / "a.npy", rng.random((4, 3)))
-    test = load_clouds(tmp_path, split="test", num_points=4)
-    assert test.class_names == ("axe", "hammer")
-    assert test.labels.tolist() == [1]
-
-
+@settings(max_examples=50, deadline=None)
 @given(st.text(max_size=300), st.sampled_from(["", "chair", "chair/train"]))
 def test_no_id_leads_outside_or_makes_no_file(identifier, folder):
     stem = file_stem(identifier, folder)
@@ -177,8 +169,8 @@ HOSTILE = {
     ) + bytes(60), "announces 1 vertex, 900000000 face"),
     "ply rows of nothing": ("a.ply", ply_header(
         "binary_little_endian", f"element void 900000000\nelement vertex 1\n{XYZ}") + bytes(12),
-        "void has no property"),
-    "ply negative": ("a.ply", ply_header("ascii", f"element vertex -1\n{XYZ}"), "header line"),
+        "lacks the format or a property"),
+    "ply negative": ("a.ply", ply_header("ascii", f"element vertex -1\n{XYZ}"), "read as ply"),
     "ply list": ("a.ply", ply_header(
         "ascii", f"element vertex 2\n{XYZ}\nproperty list int float w") + b"1 2 3 1 2 4 5 6 0",
         "lists in or before"),
@@ -187,7 +179,7 @@ HOSTILE = {
     "ply no z": ("a.ply", ply_header("ascii", "element vertex 2\nproperty float x") + b"1\n2\n",
                  "properties x, y and z"),
     "ply words": ("a.ply", ply_header("ascii", f"element vertex 1\n{XYZ}") + b"11111111",
-                  "too few numbers"),
+                  "cannot be read as ply"),
     "ply endless header": ("a.ply", b"ply\n" + (b"comment ".ljust(60) + b"\n") * 20_000,
                            "no end_header"),
     "pcd of 10 GB": ("a.pcd", b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\n"
@@ -213,7 +205,7 @@ def test_a_header_that_announces_too_much_is_refused_before_memory_is_taken(tmp_
     name, content, message = HOSTILE[case]
     (tmp_path / name).write_bytes(content)
     if name.endswith(".off"):
-        import qs3.meshes.normalise  # noqa: F401 (the import itself takes memory)
+        import qs3.meshes.normalising  # noqa: F401 (the import itself takes memory)
     tracemalloc.start()
     try:
         with pytest.raises(InputError, match=message) as caught:
@@ -260,9 +252,8 @@ def fuzzed(rng, content: bytes) -> bytes:
     return bytes(data)
 
 
-@pytest.mark.parametrize("count", [60, pytest.param(1500, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("ending", [*WRITTEN_FILES, ".off", "mesh.ply"])
-def test_mutated_files_give_points_or_one_clear_line(rng, tmp_path, ending, count):
+def test_mutated_files_give_points_or_one_clear_line(rng, tmp_path, ending, count=60):
     points = rng.random((40, 3)).astype(np.float32)
     ball = trimesh.creation.icosphere(subdivisions=1)
     whole = {".off": lambda: ball.export(file_type="off").encode(),

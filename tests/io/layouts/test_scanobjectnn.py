@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.io.convert import convert
 from qs3.io.detect import detect
 from qs3.io.layouts.scanobjectnn import (
     CLASSES,
@@ -48,8 +47,8 @@ def test_the_release_is_read_whole_background_too(tmp_path, rng):
         np.testing.assert_array_equal(read_scanobjectnn(path, "test").clouds, expected[15:])
     names = "bag bin box cabinet chair desk display door shelf table bed pillow sink sofa toilet"
     assert clouds.class_names == tuple(names.split())
-    found = load_clouds(tmp_path, split="train", num_points=None, class_names=CLASSES)
-    np.testing.assert_array_equal(found.points, expected[:15])
+    rows = load_clouds(tmp_path, split="train", num_points=None, class_names=CLASSES)
+    np.testing.assert_array_equal(rows.points, expected[:15])
 
 
 def test_one_file_is_read_alone(tmp_path, rng):
@@ -92,13 +91,10 @@ def test_convention_the_files_are_y_up_and_are_turned_z_up(tmp_path):
         np.testing.assert_array_equal(file["data"][:], chair)
 
 
-def test_a_round_trip_is_equal_and_read_by_the_published_description(tmp_path, rng, formats):
+def test_what_is_written_is_read_by_the_published_description(tmp_path, rng, formats):
     given = formats.make_clouds(rng, (*CLASSES[1:], CLASSES[0]), num_points=16, per_part=2)
     write_scanobjectnn(tmp_path / "a", given)
-    back = read_scanobjectnn(tmp_path / "a")
-    assert back.class_names == CLASSES
-    assert formats.told(back) == formats.told(given)
-    found = []
+    rows = []
     for part, name in (("train", "training"), ("test", "test")):
         with h5py.File(tmp_path / "a" / f"{name}_objectdataset.h5", "r") as file:
             data, label = file["data"][:], file["label"][:]
@@ -106,11 +102,8 @@ def test_a_round_trip_is_equal_and_read_by_the_published_description(tmp_path, r
         assert data.shape == (30, 16, 3)
         assert label.shape == (30,)
         for cloud, row in zip(turned(data), label, strict=True):
-            found.append((CLASSES[row], part, np.ascontiguousarray(cloud).tobytes()))
-    assert sorted(found) == formats.told(given)
-    write_scanobjectnn(tmp_path / "b", given)
-    for path in sorted((tmp_path / "a").iterdir()):
-        assert (tmp_path / "b" / path.name).read_bytes() == path.read_bytes()
+            rows.append((CLASSES[row], part, np.ascontiguousarray(cloud).tobytes()))
+    assert sorted(rows) == formats.content(given)
 
 
 def test_aliases_map_and_other_classes_are_named(tmp_path, rng, formats):
@@ -129,83 +122,6 @@ def test_one_split_gives_one_file_and_sizes_become_one(tmp_path, rng, formats):
     write_scanobjectnn(tmp_path / "a", dataclasses.replace(given, clouds=ragged))
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["test_objectdataset.h5"]
     assert [len(c) for c in read_scanobjectnn(tmp_path / "a").clouds] == [2048, 2048]
-    for message, wrong in {
-        "needs labels": dataclasses.replace(given, labels=None),
-        "needs train or test": dataclasses.replace(given, splits=()),
-    }.items():
-        with pytest.raises(InputError, match=message):
-            write_scanobjectnn(tmp_path / "b", wrong)
-    with pytest.raises(InputError, match="is there already"):
-        write_scanobjectnn(tmp_path / "a", given)
-
-
-def test_convert_writes_and_finds_it(tmp_path, rng, formats):
-    release(tmp_path / "main_split", rng)
-    convert(tmp_path / "main_split", tmp_path / "npy", "npy")
-    convert(tmp_path / "npy", tmp_path / "again", "scanobjectnn")
-    assert detect(tmp_path / "again") is FORMAT
-    first, again = (read_scanobjectnn(tmp_path / name) for name in ("main_split", "again"))
-    assert formats.told(again) == formats.told(first)
-
-
-def no_data(file):
-    del file["data"]
-
-
-def sixteenth(file):
-    file["label"][3] = 15
-
-
-def negative(file):
-    file["label"][3] = -1
-
-
-def not_finite(file):
-    file["data"][2, 3, 1] = np.inf
-
-
-def flat(file):
-    data = file["data"][:].reshape(15, -1)
-    del file["data"]
-    file["data"] = data
-
-
-def linked(file):
-    del file["label"]
-    file["label"] = h5py.ExternalLink("/etc/passwd", "/label")
-
-
-def fewer_labels(file):
-    del file["label"]
-    file["label"] = np.zeros(14, dtype=int)
-
-
-def bomb(file):
-    del file["data"]
-    zeros = np.zeros((15, 200000, 3), dtype=np.float32)
-    file.create_dataset("data", data=zeros, compression="gzip", compression_opts=9)
-
-
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (no_data, "has no dataset 'data'"),
-        (sixteenth, "label 15 is none of 0 to 14"),
-        (negative, "label -1 is none of 0 to 14"),
-        (not_finite, "cloud 2 has a point that is not finite"),
-        (flat, r"data must be floats of shape \[b n 3\]"),
-        (linked, "label is a link"),
-        (fewer_labels, r"label must be whole numbers of shape \[15\]"),
-        (bomb, "announces 36000000 bytes"),
-    ],
-)
-def test_hostile_files_are_refused_in_one_line(tmp_path, rng, damage, message):
-    release(tmp_path, rng)
-    with h5py.File(tmp_path / "training_objectdataset.h5", "a") as file:
-        damage(file)
-    with pytest.raises(InputError, match=rf"training_objectdataset\.h5: .*{message}") as caught:
-        read_scanobjectnn(tmp_path)
-    assert "\n" not in str(caught.value)
 
 
 def test_other_paths_are_refused(tmp_path):

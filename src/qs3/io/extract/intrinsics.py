@@ -135,7 +135,8 @@ def _from_file(path: Path) -> Intrinsics:
 
 def _from_numbers(numbers: Sequence[float]) -> Intrinsics:
     if len(numbers) == 4:
-        return Intrinsics(*numbers)
+        fx, fy, cx, cy = numbers
+        return Intrinsics(fx, fy, cx, cy)
     if len(numbers) not in (9, 16):
         raise InputError(f"camera: {len(numbers)} numbers instead of 4, 9 or 16")
     side = 3 if len(numbers) == 9 else 4

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from qs3.errors import InputError
-from qs3.io.transforms import resample
+from qs3.io.preparation import resample
 from qs3.meshes.classes import POINTDA10, map_labels
 from qs3.store.executors import Executor, Failure, InlineExecutor, LocalExecutor, guarded
 from qs3.store.executors.executor import failure_of, stop_if_fatal
@@ -21,6 +21,7 @@ from qs3.store.manifest import (
     MANIFEST,
     Manifest,
     finished_shards,
+    package_versions,
     read_sums,
     shard_name,
     write_manifest,
@@ -28,7 +29,6 @@ from qs3.store.manifest import (
 )
 from qs3.store.progress import progress_bar
 from qs3.store.shards import CloudRow, cloud_alone, put_shard, table_of
-from qs3.store.versions import package_versions
 from qs3.structure import unstructure
 
 

@@ -22,7 +22,6 @@ ECCV 2022; Dai et al., "ScanNet", CVPR 2017.
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -53,11 +52,7 @@ Owners = Callable[
 their pixels and the pose; −1 is no object, None that the frame has no mask."""
 
 
-def cut_scene(
-    scene: ScanNetScene,
-    settings: ScanNetSettings,
-    report: dict[str, Any] | None = None,
-) -> Iterator[ExtractedCloud]:
+def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[ExtractedCloud]:
     """Yield the objects of one scene, fused from its raw depth frames.
 
     One frame is in memory at a time, and of each object no more than ``max_frames`` ×
@@ -68,18 +63,14 @@ def cut_scene(
         scene: Needs the ``.sens`` file and the aggregation; the masks, or the mesh with its
             segments.
         settings: What is kept.
-        report: Filled, where given: ``frames`` of the file, those ``read``, those
-            ``without_pose`` and ``without_mask``, the objects ``dropped`` by label, and those
-            ``too_small``, which is whole once the last object is yielded.
 
     Raises:
         InputError: where a file of the scene is missing, damaged or cut off.
     """
-    objects, dropped = read_objects(scene, settings.class_names)
+    objects = read_objects(scene, settings.class_names)
     align = axis_alignment(scene)
     sens = scene.file(".sens")
     header = read_sens_header(sens)
-    counts = {"frames": header.num_frames, "read": 0, "without_pose": 0, "without_mask": 0}
     fusions = {
         item.id: ObjectFusion(
             settings.voxel,
@@ -89,40 +80,36 @@ def cut_scene(
         )
         for item in objects
     }
-    report = {} if report is None else report
-    report |= {**counts, "too_small": 0, "dropped": dropped}
     if not objects:
         return
     rays = _rays(header)
+    unmasked, masked = 0, 0
     steps = [value * header.depth_shift for value in (settings.near, settings.far)]
     with ExitStack() as stack:
         owners = _owners(scene, settings, header, objects, stack)
         for frame in read_depth_frames(sens, settings.every):
-            counts["read"] += 1
             if frame.camera_to_world is None:
-                counts["without_pose"] += 1
                 continue
             flat = frame.steps.reshape(-1)
             pixels = np.flatnonzero((flat >= max(steps[0], 1)) & (flat <= steps[1]))
             seen = rays[pixels] * (flat[pixels] / header.depth_shift)[:, None]
             owner = owners(frame.index, seen, pixels, frame.camera_to_world)
             if owner is None:
-                counts["without_mask"] += 1
+                unmasked += 1
                 continue
+            masked += 1
             to_scene = align @ frame.camera_to_world
             for number, fusion in fusions.items():
                 own = np.flatnonzero(owner == number)
                 if len(own) >= settings.min_pixels:
                     points = _moved(to_scene, seen[own]).astype(np.float32)
                     fusion.add(frame.index, points, pixels[own])
-    if counts["without_mask"] and counts["without_mask"] + counts["without_pose"] == counts["read"]:
+    if unmasked and not masked:
         raise InputError(f"{scene.file(_MASKS)}: has no mask of any frame read; it is incomplete")
-    report |= counts
     for item in objects:
         fusion = fusions.pop(item.id)
         cloud = fusion.points()
         if len(cloud) < settings.min_points:
-            report["too_small"] += 1
             continue
         points, origin = rest(cloud)
         source = {

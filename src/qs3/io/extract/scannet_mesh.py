@@ -86,7 +86,7 @@ def cut_mesh_scene(
     Raises:
         InputError: where a file of the scene is missing or damaged.
     """
-    objects, _ = read_objects(scene, settings.class_names)
+    objects = read_objects(scene, settings.class_names)
     align = axis_alignment(scene)
     mesh = read_scene_mesh(scene, objects)
     for item in objects:

@@ -13,7 +13,6 @@ Source: https://github.com/ScanNet/ScanNet (data organisation).
 """
 
 import re
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -165,33 +164,25 @@ def class_of(label: str, class_names: Sequence[str] = POINTDA10) -> str | None:
     return None
 
 
-def read_objects(
-    scene: ScanNetScene, class_names: Sequence[str] = POINTDA10
-) -> tuple[list[SceneObject], dict[str, int]]:
-    """Read the annotated objects of a scene.
-
-    Returns:
-        The objects in a class asked for, and how many were dropped of each other label.
+def read_objects(scene: ScanNetScene, class_names: Sequence[str] = POINTDA10) -> list[SceneObject]:
+    """Read the annotated objects of a scene that are in a class asked for.
 
     Raises:
         InputError: where the aggregation file is missing or is none.
     """
     path = scene.file(".aggregation.json")
     objects: dict[int, SceneObject] = {}
-    dropped: Counter[str] = Counter()
     for place, value in enumerate(_listed(path, "segGroups")):
         where = f"{path}: entry {place} of segGroups"
         group = pick(value, _Group, where)
         if not all(0 <= number < 2**31 for number in (group.objectId, *group.segments)):
             raise InputError(f"{where}: a number is below 0 or beyond 31 bits")
         name = class_of(group.label, class_names)
-        if name is None:
-            dropped[group.label] += 1
-        else:
+        if name is not None:
             # scene0217_00 lists its objects twice: the first stays.
             item = SceneObject(group.objectId, group.label, name, group.segments)
             objects.setdefault(item.id, item)
-    return [objects[number] for number in sorted(objects)], dict(sorted(dropped.items()))
+    return [objects[number] for number in sorted(objects)]
 
 
 @dataclass(frozen=True)

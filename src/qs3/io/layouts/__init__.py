@@ -1,16 +1,6 @@
-"""Readers and writers of the data sets of this field, one file a layout."""
+"""Readers and writers of the data sets of this field, one file a data set or a kin of them."""
 
-from qs3.io.layouts import (
-    archive,
-    graspnet,
-    modelnet_h5,
-    modelnet_meshes,
-    point_folders,
-    pointda10,
-    scanobjectnn,
-    store,
-    xyz_trees,
-)
+from qs3.io.layouts import modelnet, npz, point_folders, pointda10, scanobjectnn, store, trees
 from qs3.io.layouts.format import Format as Format
 
 FORMATS: dict[str, Format] = {
@@ -18,13 +8,14 @@ FORMATS: dict[str, Format] = {
     for layout in (
         store.FORMAT,
         *pointda10.FORMATS,
-        modelnet_meshes.FORMAT,
-        modelnet_h5.FORMAT,
+        *modelnet.FORMATS,
         scanobjectnn.FORMAT,
-        *xyz_trees.FORMATS,
-        *graspnet.FORMATS,
+        *trees.FORMATS,
         *point_folders.FORMATS,
-        archive.FORMAT,
+        npz.FORMAT,
     )
 }
 """Every layout by its name; the imports that weigh happen where a layout is read or written."""
+
+FORMER_NAMES = {"qs3": "store"}
+"""Names that a layout had before, still taken."""

@@ -1,10 +1,17 @@
-"""What a reader and writer of one data set layout is."""
+"""What a reader and writer of one data set layout is, and what several of them check."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Int
+
+from qs3.errors import InputError
 from qs3.io.ragged import RaggedClouds
+from qs3.meshes.classes import map_labels
+
+SPLITS = ("train", "test")
 
 
 @dataclass(frozen=True)
@@ -17,7 +24,23 @@ class Format:
     """The layout in one line, for messages: what lies where."""
     detect: Callable[[Path], bool]
     """Whether a path looks like this layout; judges by names, reads no content."""
-    read: Callable[[Path, str | None], RaggedClouds] | None = None
-    """Read a path, all of it or one split; None where it is only written."""
+    read: Callable[[Path, str | None], RaggedClouds]
+    """Read a path, all of it or one split."""
     write: Callable[[Path, RaggedClouds], None] | None = None
     """Write clouds to a new path; None where it is only read."""
+    page: str = ""
+    """Where the data set is got, which no command can fetch; empty for layouts of anybody's."""
+
+
+def labels_as(clouds: RaggedClouds, class_names: Sequence[str]) -> Int[np.ndarray, "b"]:
+    """Return labels that index ``class_names``, found by name or alias.
+
+    Raises:
+        InputError: where there are no labels, a class is none of the names, or a cloud is of
+            neither train nor test.
+    """
+    if clouds.labels is None:
+        raise InputError("this layout needs labels, and the clouds have none")
+    if not clouds.splits or any(split not in SPLITS for split in clouds.splits):
+        raise InputError("this layout needs train or test for every cloud, and some have neither")
+    return map_labels(clouds.class_names, clouds.labels, class_names)[0]

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from qs3.errors import InputError
+from qs3.io.guards import reason
 
 MOST_BYTES = 4 * 2**30
 """Largest announced size of one dataset."""
@@ -72,8 +73,7 @@ def read_file(
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:  # the library raises whatever it stumbles over
-        lines = str(error).splitlines() or [type(error).__name__]
-        raise InputError(f"{path}: cannot be read as HDF5 ({lines[0]})") from error
+        raise InputError(f"{path}: cannot be read as HDF5 ({reason(error)})") from error
     return points, labels
 
 
@@ -83,19 +83,19 @@ def _dataset(file: Any, name: str, size: int) -> Any:
 
     link = file.get(name, getlink=True)
     if link is None:
-        there = ", ".join(ascii(other) for other in itertools.islice(file, 5))
-        raise InputError(f"has no dataset {name!r}, only {there[:200] or 'none'}")
+        others = ", ".join(ascii(other) for other in itertools.islice(file, 5))
+        raise InputError(f"has no dataset {name!r}, only {others[:200] or 'none'}")
     if not isinstance(link, h5py.HardLink):
         raise InputError(f"{name} is a link, which may lead to another file; links are not read")
-    found = file[name]
-    if not isinstance(found, h5py.Dataset):
+    dataset = file[name]
+    if not isinstance(dataset, h5py.Dataset):
         raise InputError(f"{name} is no dataset")
-    if found.is_virtual or found.external:
+    if dataset.is_virtual or dataset.external:
         raise InputError(f"{name} lies in another file, which is not read")
-    if found.shape is None or found.dtype.kind not in "fiu" or found.dtype.itemsize > 8:
-        raise InputError(f"{name} holds {found.dtype}, no plain numbers")
-    _check_size(found, name, size)
-    return found
+    if dataset.shape is None or dataset.dtype.kind not in "fiu" or dataset.dtype.itemsize > 8:
+        raise InputError(f"{name} holds {dataset.dtype}, no plain numbers")
+    _check_size(dataset, name, size)
+    return dataset
 
 
 def _check_size(dataset: Any, name: str, size: int) -> None:

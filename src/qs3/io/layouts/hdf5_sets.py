@@ -2,6 +2,7 @@
 
 import hashlib
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +12,11 @@ from jaxtyping import Float32, Int
 
 from qs3.errors import InputError
 from qs3.files import sha256, write_bytes, write_text
-from qs3.io.class_folders import SPLITS
+from qs3.io.guards import read_small
+from qs3.io.layouts.format import SPLITS
 from qs3.io.layouts.hdf5 import hdf5_bytes, read_file
+from qs3.io.preparation import stack
 from qs3.io.ragged import RaggedClouds
-from qs3.io.transforms import stack
-from qs3.meshes.classes import map_labels
 
 CLOUDS_A_FILE = 2048
 POINTS = 2048
@@ -39,7 +40,6 @@ def read_parts(
     class_names: Sequence[str],
     columns: Sequence[int],
     turn: Callable[[np.ndarray], np.ndarray] | None = None,
-    salt: str = "",
 ) -> RaggedClouds:
     """Read files one after another; a cloud's id is ``<file>/<row>``.
 
@@ -47,13 +47,12 @@ def read_parts(
         parts: The files, no two of one name.
         class_names: Names that the labels index.
         columns: Numbers of columns that ``data`` may have; those after the third are dropped.
-        turn: What is done to each cloud.
-        salt: Goes into the checksum, to tell apart what was read in different ways.
+        turn: What is done to the clouds.
 
     Raises:
         InputError: where a file is damaged, has other datasets, or a label has no class.
     """
-    digest = hashlib.sha256(salt.encode())
+    digest = hashlib.sha256()
     clouds: list[np.ndarray] = []
     ids: list[str] = []
     labels: list[np.ndarray] = []
@@ -61,7 +60,7 @@ def read_parts(
     for part in parts:
         points, numbers = read_file(part.path, columns, len(class_names))
         digest.update(f"{part.path.name} {sha256(part.path)}\n".encode(errors="surrogateescape"))
-        clouds += [cloud if turn is None else turn(cloud) for cloud in points]
+        clouds += list(points if turn is None else turn(points))
         ids += [f"{part.path.stem}/{row:05d}" for row in range(len(points))]
         labels.append(numbers)
         splits += [part.split] * len(points)
@@ -75,7 +74,7 @@ def read_parts(
     )
 
 
-def list_parts(root: Path, pattern: str, told: str, split: str | None) -> list[Part]:
+def list_parts(root: Path, pattern: str, names: str, split: str | None) -> list[Part]:
     """List the files of a folder: by ``<split>_files.txt`` where that lies there, else by names.
 
     Of a line only the name after the last slash counts, since released lists give the path on the
@@ -84,7 +83,7 @@ def list_parts(root: Path, pattern: str, told: str, split: str | None) -> list[P
     Args:
         root: The folder.
         pattern: Names of the files, with the groups split and number.
-        told: The same for the message.
+        names: The same for the message.
         split: ``train`` or ``test``; None takes both.
 
     Raises:
@@ -93,17 +92,15 @@ def list_parts(root: Path, pattern: str, told: str, split: str | None) -> list[P
     """
     if not root.is_dir():
         raise InputError(f"{root}: no such folder")
-    found = {
-        part: _from_list(root, root / f"{part}_files.txt") or _from_names(root, pattern, part)
-        for part in SPLITS
-    }
-    parts = [Part(path, part) for part in SPLITS for path in found[part]]
+    parts = []
+    for part in SPLITS:
+        listed = _from_list(root, root / f"{part}_files.txt")
+        parts += [Part(path, part) for path in listed or _from_names(root, pattern, part)]
     if not parts:
-        raise InputError(f"{root}: holds no {told}")
-    names = [part.path.name for part in parts]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{root}: {twice} is listed twice")
+        raise InputError(f"{root}: holds no {names}")
+    counts = Counter(part.path.name for part in parts)
+    if twice := [name for name, count in counts.items() if count > 1]:
+        raise InputError(f"{root}: {twice[0]} is listed twice")
     return choose(root, parts, split)
 
 
@@ -115,15 +112,15 @@ def choose(where: Path, parts: Sequence[Part], split: str | None) -> list[Part]:
     """
     chosen = [part for part in parts if split in (None, part.split)]
     if not chosen:
-        known = ", ".join(sorted({part.split for part in parts}))
-        raise InputError(f"{where}: has no split {split!r}, only {known}")
+        others = ", ".join(sorted({part.split for part in parts}))
+        raise InputError(f"{where}: has no split {split!r}, only {others}")
     return chosen
 
 
 def _from_list(root: Path, path: Path) -> list[Path]:
     if not path.is_file():
         return []
-    found = []
+    paths = []
     for line in text_lines(path):
         steps = re.split(r"[/\\]", line)
         inside_names = ".." not in steps and steps[0] != "" and ":" not in line
@@ -132,8 +129,8 @@ def _from_list(root: Path, path: Path) -> list[Path]:
         inside = root / steps[-1]
         if not inside.resolve().is_relative_to(root.resolve()):
             raise InputError(f"{inside}: leads out of its folder; put the file itself there")
-        found.append(inside)
-    return found
+        paths.append(inside)
+    return paths
 
 
 def _from_names(root: Path, pattern: str, split: str) -> list[Path]:
@@ -148,11 +145,9 @@ def text_lines(path: Path) -> list[str]:
     Raises:
         InputError: where it is long or not UTF-8.
     """
-    if path.stat().st_size > _LONGEST_LIST:
-        raise InputError(f"{path}: too long for a list of names")
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        lines = read_small(path, _LONGEST_LIST, "a list of names").decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
         raise InputError(f"{path}: no text in UTF-8") from error
     return [line.strip() for line in lines if line.strip()]
 
@@ -168,20 +163,6 @@ def _names(root: Path) -> list[str]:
         return sorted(entry.name for entry in root.iterdir())
     except OSError:
         return []
-
-
-def mapped_labels(clouds: RaggedClouds, class_names: Sequence[str]) -> Int[np.ndarray, "b"]:
-    """Return labels that index ``class_names``, found by name or alias.
-
-    Raises:
-        InputError: where there are no labels, a class is none of the names, or a cloud is of
-            neither train nor test.
-    """
-    if clouds.labels is None:
-        raise InputError("this layout needs labels, and the clouds have none")
-    if not clouds.splits or any(split not in SPLITS for split in clouds.splits):
-        raise InputError("this layout needs train or test for every cloud, and some have neither")
-    return map_labels(clouds.class_names, clouds.labels, class_names)[0]
 
 
 def same_size(clouds: RaggedClouds) -> Float32[np.ndarray, "b n 3"]:

@@ -15,8 +15,8 @@ from pathlib import Path
 from tqdm import tqdm
 
 from qs3.errors import InputError
-from qs3.io.class_folders import SPLITS, read_folder
-from qs3.io.layouts.format import Format
+from qs3.io.layouts.class_folders import read_folder
+from qs3.io.layouts.format import SPLITS, Format
 from qs3.io.point_files import POINT_FILES, WRITTEN_FILES, cloud_bytes
 from qs3.io.ragged import RaggedClouds
 
@@ -143,14 +143,12 @@ def _free(name: str, taken: set[str]) -> str:
 
 def endings_of(root: Path) -> set[str]:
     """Return the endings of all files down to ``<class>/<split>/*``, hidden ones aside."""
-    found: set[str] = set()
-    if not root.is_dir():
-        return found
+    endings: set[str] = set()
     for folder, inner, files in os.walk(root, followlinks=True):
         depth = len(Path(folder).relative_to(root).parts)
         inner[:] = [name for name in inner if not name.startswith(".") and depth < _DEPTH - 1]
-        found.update(Path(name).suffix.lower() for name in files if not name.startswith("."))
-    return found
+        endings.update(Path(name).suffix.lower() for name in files if not name.startswith("."))
+    return endings
 
 
 def _only(ending: str, root: Path) -> bool:
@@ -159,9 +157,9 @@ def _only(ending: str, root: Path) -> bool:
 
 
 def _mixed(root: Path) -> bool:
-    found = endings_of(root) & {*POINT_FILES, *_OTHER_DATA}
-    single = len(found) == 1 and found <= set(WRITTEN_FILES)
-    return bool(found) and found <= set(POINT_FILES) and not single
+    endings = endings_of(root) & {*POINT_FILES, *_OTHER_DATA}
+    single = len(endings) == 1 and endings <= set(WRITTEN_FILES)
+    return not endings.isdisjoint(POINT_FILES) and not single
 
 
 def _read(endings: Sequence[str], root: Path, split: str | None) -> RaggedClouds:

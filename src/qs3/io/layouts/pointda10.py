@@ -23,30 +23,22 @@ protocol: Achituve et al., "Self-Supervised Learning for Domain Adaptation on Po
 
 import dataclasses
 import hashlib
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float, Float32
 
 from qs3.errors import InputError
-from qs3.io.class_folders import SPLITS, choose_split, list_folder, read_files
-from qs3.io.layouts.axes import y_up_from_z_up, z_up_from_y_up
-from qs3.io.layouts.format import Format
-from qs3.io.layouts.hdf5_sets import (
-    list_parts,
-    mapped_labels,
-    named,
-    read_parts,
-    same_size,
-    write_parts,
-)
+from qs3.geometry import y_up_from_z_up, z_up_from_y_up
+from qs3.io.layouts.format import SPLITS, Format, labels_as
+from qs3.io.layouts.hdf5_sets import list_parts, named, read_parts, same_size, write_parts
 from qs3.io.layouts.point_folders import write_folder
+from qs3.io.layouts.trees import read_ten_classes
+from qs3.io.preparation import unit_ball
 from qs3.io.ragged import RaggedClouds
-from qs3.io.transforms import unit_ball
-from qs3.io.whole import check_free
-from qs3.meshes.classes import POINTDA10, map_labels
+from qs3.meshes.classes import POINTDA10
 
 Protocol = Literal["aligned", "original", "upright", "raw"]
 """What is done to the clouds as they are stored; see `read_pointda10`."""
@@ -95,31 +87,14 @@ def read_pointda10(
             list_parts(root, _FILES, "train_<i>.h5 or test_<i>.h5", split), POINTDA10, (3, 6)
         )
     else:
-        clouds = _read_tree(root, split)
+        clouds = read_ten_classes(root, split, ".npy")
     labels = [] if clouds.labels is None else clouds.labels.tolist()
-    result = [
+    prepared = [
         _prepare(cloud, protocol, domain, label)
         for cloud, label in zip(clouds.clouds, labels, strict=True)
     ]
-    told = hashlib.sha256(f"{domain} {protocol} {clouds.checksum}".encode()).hexdigest()
-    return dataclasses.replace(clouds, clouds=result, checksum=told)
-
-
-def validation_rows(count: int) -> Bool[np.ndarray, "b"]:
-    """Mark the rows that the field holds back from a domain's train part for validation.
-
-    Those whose index modulo 10 is 8 or 9, one in five; the test part is left whole. The index
-    counts the train part alone, in the order in which `read_pointda10` gives it with
-    ``split="train"`` (classes and file names sorted; .h5 files in turn), as the field's loaders do.
-
-    Args:
-        count: Clouds of the train part.
-
-    Example:
-        >>> validation_rows(12).nonzero()[0].tolist()
-        [8, 9]
-    """
-    return np.arange(count) % 10 >= 8
+    checksum = hashlib.sha256(f"{domain} {protocol} {clouds.checksum}".encode()).hexdigest()
+    return dataclasses.replace(clouds, clouds=prepared, checksum=checksum)
 
 
 def _prepare(
@@ -134,21 +109,6 @@ def _prepare(
     if domain == "scannet" or (domain == "shapenet" and label != _PLANT):
         cloud = z_up_from_y_up(cloud)
     return cloud if protocol == "upright" else unit_ball(cloud[None])[0]
-
-
-def _read_tree(root: Path, split: str | None) -> RaggedClouds:
-    files = list_folder(root, (".npy",))
-    for file in files:
-        if file.split not in SPLITS or not file.class_name:
-            raise InputError(f"{file.path}: lies outside <class>/<train|test>/ of this layout")
-    files = choose_split(root, files, split)
-    names = sorted({file.class_name for file in files})
-    try:
-        positions, _ = map_labels(names, np.arange(len(names)))
-    except InputError as error:
-        raise InputError(f"{root}: {error}") from error
-    clouds = read_files(root, files, names)
-    return dataclasses.replace(clouds, labels=positions[clouds.labels], class_names=POINTDA10)
 
 
 def _domain(path: Path, domain: Domain | None) -> tuple[Path, Domain]:
@@ -204,10 +164,10 @@ def write_npy(path: Path, clouds: RaggedClouds) -> None:
         clouds: What to write.
 
     Raises:
-        InputError: where the path is taken, there are no labels, a class is none of the ten, or a
+        InputError: where there are no labels, a class is none of the ten, or a
             cloud is of neither train nor test.
     """
-    labels = mapped_labels(clouds, POINTDA10)
+    labels = labels_as(clouds, POINTDA10)
     points = same_size(clouds)
     root = _own_folder(path, "modelnet")
     for name in POINTDA10:
@@ -222,7 +182,7 @@ def write_h5(path: Path, clouds: RaggedClouds) -> None:
 
     ``data`` is float32 with black for colour; 2,048 clouds a file. Each cloud is stored as
     (x, z, −y), which is turned back without rounding: read as ``upright``, clouds, labels and
-    splits are equal; as ``aligned`` they are `transforms.unit_ball` of the clouds, to the bit.
+    splits are equal; as ``aligned`` they are `preparation.unit_ball` of the clouds, to the bit.
     Sizes as in `write_npy`; the order within a split is kept, the ids are not.
 
     Args:
@@ -232,7 +192,7 @@ def write_h5(path: Path, clouds: RaggedClouds) -> None:
     Raises:
         InputError: as `write_npy` does.
     """
-    labels = mapped_labels(clouds, POINTDA10)
+    labels = labels_as(clouds, POINTDA10)
     root = _own_folder(path, "scannet")
     write_parts(root, clouds, labels, _file_name, _h5_arrays, listed="./")
 
@@ -243,59 +203,57 @@ def _file_name(split: str, index: int) -> str:
 
 def _h5_arrays(points: Float32[np.ndarray, "b n 3"], labels: np.ndarray) -> dict[str, np.ndarray]:
     data = np.zeros((*points.shape[:2], 6), dtype=np.float32)
-    for row, cloud in enumerate(points):
-        data[row, :, :3] = y_up_from_z_up(cloud)
+    data[..., :3] = y_up_from_z_up(points)
     return {"data": data, "label": labels.astype(np.int32)}
 
 
 def _own_folder(path: Path, domain: Domain) -> Path:
-    path = check_free(path)
     return path if path.name == domain else path / domain
-
-
-def _read(protocol: Protocol, path: Path, split: str | None) -> RaggedClouds:
-    return read_pointda10(path, split, protocol)
-
-
-def _never(path: Path) -> bool:
-    return False
 
 
 _LAYOUT = "modelnet/ or shapenet/ with <class>/<train|test>/*.npy, or scannet/<train|test>_*.h5"
 
+
+def _format(
+    name: str,
+    protocol: Protocol,
+    layout: str,
+    write: Callable[[Path, RaggedClouds], None] | None = None,
+) -> Format:
+    return Format(
+        name=name,
+        layout=layout,
+        # One layout is found out; its files read in other ways, and the writers' own readers, are
+        # chosen by --from alone.
+        detect=_detect if name == "pointda10" else lambda path: False,
+        read=lambda path, split: read_pointda10(path, split, protocol),
+        write=write,
+        page="https://drive.google.com/file/d/1-LfJWL5geF9h0Z2QpdTL0n4lShy8wy2J (PointDA_data.zip)",
+    )
+
+
 FORMATS = (
-    Format(
-        name="pointda10",
-        layout=f"a domain of PointDA-10, turned z up, in the unit ball: {_LAYOUT}",
-        detect=_detect,
-        read=partial(_read, "aligned"),
+    _format(
+        "pointda10",
+        "aligned",
+        f"a domain of PointDA-10, turned z up, in the unit ball: {_LAYOUT}",
     ),
-    # The same files read in other ways, and the writers' own readers: only --from chooses these.
-    Format(
-        name="pointda10-original",
-        layout=f"the same as PointDAN read it, not turned, the first 1,024 points: {_LAYOUT}",
-        detect=_never,
-        read=partial(_read, "original"),
+    _format(
+        "pointda10-original",
+        "original",
+        f"the same as PointDAN read it, not turned, the first 1,024 points: {_LAYOUT}",
     ),
-    Format(
-        name="pointda10-raw",
-        layout=f"the same as stored: {_LAYOUT}",
-        detect=_never,
-        read=partial(_read, "raw"),
+    _format("pointda10-raw", "raw", f"the same as stored: {_LAYOUT}"),
+    _format(
+        "pointda10-npy",
+        "upright",
+        "the same, turned z up but not scaled; written as modelnet/<class>/<train|test>/*.npy",
+        write_npy,
     ),
-    Format(
-        name="pointda10-npy",
-        layout="the same, turned z up but not scaled; written as "
-        "modelnet/<class>/<train|test>/*.npy",
-        detect=_never,
-        read=partial(_read, "upright"),
-        write=write_npy,
-    ),
-    Format(
-        name="pointda10-h5",
-        layout="the same, turned z up but not scaled; written as scannet/<train|test>_*.h5",
-        detect=_never,
-        read=partial(_read, "upright"),
-        write=write_h5,
+    _format(
+        "pointda10-h5",
+        "upright",
+        "the same, turned z up but not scaled; written as scannet/<train|test>_*.h5",
+        write_h5,
     ),
 )

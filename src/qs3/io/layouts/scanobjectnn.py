@@ -26,35 +26,14 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from qs3.errors import InputError
-from qs3.io.layouts.axes import y_up_from_z_up, z_up_from_y_up
-from qs3.io.layouts.format import Format
-from qs3.io.layouts.hdf5_sets import (
-    Part,
-    choose,
-    mapped_labels,
-    named,
-    read_parts,
-    write_parts,
-)
+from qs3.geometry import y_up_from_z_up, z_up_from_y_up
+from qs3.io.layouts.format import Format, labels_as
+from qs3.io.layouts.hdf5_sets import Part, choose, named, read_parts, write_parts
 from qs3.io.ragged import RaggedClouds
-from qs3.io.whole import check_free
 
 CLASSES = (
-    "bag",
-    "bin",
-    "box",
-    "cabinet",
-    "chair",
-    "desk",
-    "display",
-    "door",
-    "shelf",
-    "table",
-    "bed",
-    "pillow",
-    "sink",
-    "sofa",
-    "toilet",
+    *("bag", "bin", "box", "cabinet", "chair", "desk", "display", "door"),
+    *("shelf", "table", "bed", "pillow", "sink", "sofa", "toilet"),
 )
 """The classes in the order of their label."""
 
@@ -86,15 +65,15 @@ def read_scanobjectnn(path: Path, split: str | None = None) -> RaggedClouds:
 
 
 def _one_variant(folder: Path) -> list[Path]:
-    found = sorted(file for file in folder.iterdir() if re.fullmatch(_FILES, file.name))
-    variants = sorted({file.name.partition("_")[2] for file in found})
+    files = sorted(file for file in folder.iterdir() if re.fullmatch(_FILES, file.name))
+    variants = sorted({file.name.partition("_")[2] for file in files})
     if len(variants) > 1:
         raise InputError(
             f"{folder}: holds several variants ({', '.join(variants)}); name one file, or put one "
             "pair into a folder of its own"
         )
-    if found:
-        return found[::-1]  # training before test
+    if files:
+        return files[::-1]  # training before test
     inner = [folder / name for name in _FOLDERS if named(folder / name, _FILES)]
     if len(inner) == 1:
         return _one_variant(inner[0])
@@ -115,13 +94,12 @@ def write_scanobjectnn(path: Path, clouds: RaggedClouds) -> None:
         clouds: What to write.
 
     Raises:
-        InputError: where the path is taken, there are no labels, a class is none of the fifteen,
+        InputError: where there are no labels, a class is none of the fifteen,
             or a cloud is of neither train nor test.
     """
-    labels = mapped_labels(clouds, CLASSES)
-    root = check_free(path)
-    root.mkdir(parents=True, exist_ok=True)
-    write_parts(root, clouds, labels, _file_name, _arrays, most=None)
+    labels = labels_as(clouds, CLASSES)
+    path.mkdir(parents=True, exist_ok=True)
+    write_parts(path, clouds, labels, _file_name, _arrays, most=None)
 
 
 def _file_name(split: str, index: int) -> str:
@@ -131,8 +109,8 @@ def _file_name(split: str, index: int) -> str:
 def _arrays(
     points: Float32[np.ndarray, "b n 3"], labels: Int[np.ndarray, "b"]
 ) -> dict[str, np.ndarray]:
-    data = np.stack([y_up_from_z_up(cloud) for cloud in points])
-    return {"data": data.astype(np.float32), "label": labels.astype(np.int32)}
+    data = y_up_from_z_up(points).astype(np.float32)
+    return {"data": data, "label": labels.astype(np.int32)}
 
 
 def _detect(path: Path) -> bool:
@@ -147,4 +125,5 @@ FORMAT = Format(
     detect=_detect,
     read=read_scanobjectnn,
     write=write_scanobjectnn,
+    page="https://hkust-vgd.github.io/scanobjectnn (with a form)",
 )

@@ -1,5 +1,9 @@
-"""Our own data set, a folder of Parquet shards, as a layout to convert from and to."""
+"""Our own data set: clouds out of and into a folder of Parquet shards with ``dataset.json``."""
 
+import concurrent.futures
+import hashlib
+import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -7,11 +11,104 @@ import numpy as np
 from tqdm import tqdm
 
 from qs3.errors import InputError
+from qs3.io.clouds import CloudKind
 from qs3.io.layouts.format import Format
 from qs3.io.ragged import RaggedClouds
+from qs3.store.folder import Folder, open_folder
+from qs3.store.manifest import (
+    Manifest,
+    finished_shards,
+    open_dataset,
+    package_versions,
+    shard_name,
+    write_manifest,
+    write_sums,
+)
 
 ROWS_PER_SHARD = 64
 _MANY = 500
+_THREADS = min(os.cpu_count() or 1, 8)
+
+
+def read_ragged(
+    where: str | Path | Folder,
+    cloud: CloudKind = "points",
+    split: str | None = None,
+    partial: bool = False,
+) -> RaggedClouds:
+    """Read one kind of cloud of a data set, each in its own size.
+
+    Args:
+        where: Folder of the data set, or the address of one.
+        cloud: ``points`` (noisy), ``clean`` or ``surface``.
+        split: Rows of this split only.
+        partial: Accept a data set whose making has not finished.
+
+    Raises:
+        InputError: where the folder is not a data set, is unfinished or damaged, or has no such
+            rows or clouds.
+    """
+    folder = open_folder(where)
+    manifest = open_dataset(folder)
+    shards = finished_shards(folder, manifest.shards)
+    if len(shards) < manifest.shards and not partial:
+        raise InputError(
+            f"{folder}: unfinished, {len(shards)} of {manifest.shards} shards; run the same "
+            "command again"
+        )
+    ids: list[str] = []
+    labels: list[int] = []
+    parts: list[str] = []
+    clouds: list[np.ndarray] = []
+    splits: set[str] = set()
+    digest = hashlib.sha256()
+    # Reading, unpacking and hashing leave the interpreter's lock: threads share the work.
+    with concurrent.futures.ThreadPoolExecutor(_THREADS) as pool:
+        read = pool.map(lambda index: _read_shard(folder, index, cloud, manifest), shards)
+        for columns, scanned, checksum in read:
+            digest.update(checksum)
+            splits.update(columns[2])
+            for identifier, label, part, points in zip(*columns, scanned, strict=True):
+                if split in (None, part):
+                    ids.append(identifier)
+                    labels.append(label)
+                    parts.append(part)
+                    clouds.append(points)
+    if not clouds:
+        named = ", ".join(sorted(filter(None, splits))) or "none"
+        missing = "no cloud" if split is None else f"no cloud of split {split!r}; splits: {named}"
+        raise InputError(f"{folder}: {missing}")
+    return RaggedClouds(
+        clouds=clouds,
+        ids=tuple(ids),
+        checksum=digest.hexdigest(),
+        labels=np.array(labels, dtype=np.int64),
+        class_names=manifest.class_names,
+        splits=tuple(parts),
+    )
+
+
+def _read_shard(
+    folder: Folder, index: int, cloud: CloudKind, manifest: Manifest
+) -> tuple[list[list[Any]], list[np.ndarray], bytes]:
+    """Ids, labels and splits of a shard, one kind of its clouds, and the checksum of all that."""
+    # Imported here: listing layouts does without Parquet, which weighs.
+    from qs3.store.shards import flat_clouds, load_shard
+
+    path = f"{folder}/{shard_name(index)}"
+    wanted = ["id", "label", "split", cloud]
+    table = load_shard(folder, index, wanted)
+    columns = [table[column].to_pylist() for column in wanted[:3]]
+    if cloud != "points" and len(table) and not len(table[cloud].combine_chunks().values):
+        raise InputError(f"{folder}: has no {cloud!r} clouds, only 'points'")
+    for identifier, label in zip(columns[0], columns[1], strict=True):
+        if not 0 <= label < len(manifest.class_names):
+            raise InputError(f"{path}: label {label} of {identifier!r} has no class name")
+    scanned = flat_clouds(table, cloud, path)
+    digest = hashlib.sha256(json.dumps(columns).encode("utf-8"))
+    for points in scanned:
+        digest.update(points.data)
+    return columns, scanned, digest.digest()
 
 
 def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> None:
@@ -27,10 +124,7 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
     Raises:
         InputError: where the clouds have no labels.
     """
-    from qs3.store.folder import LocalFolder
-    from qs3.store.manifest import Manifest, shard_name, write_manifest, write_sums
     from qs3.store.shards import put_shard, table_of
-    from qs3.store.versions import package_versions
 
     if clouds.labels is None:
         raise InputError("clouds without labels make no qs3 data set; put them into class folders")
@@ -50,9 +144,9 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
     with bar:
         for index, start in enumerate(starts):
             rows = [_row(clouds, i) for i in range(start, min(start + ROWS_PER_SHARD, count))]
-            sums[shard_name(index)] = put_shard(LocalFolder(root), index, table_of(rows))
+            sums[shard_name(index)] = put_shard(open_folder(root), index, table_of(rows))
             bar.update(len(rows))
-    write_sums(LocalFolder(root), sums)
+    write_sums(open_folder(root), sums)
 
 
 def _row(clouds: RaggedClouds, index: int) -> Any:
@@ -73,20 +167,10 @@ def _utf8(text: str) -> str:
     return text.encode("utf-8", errors="backslashreplace").decode("utf-8")
 
 
-def _detect(path: Path) -> bool:
-    return (path / "dataset.json").is_file()
-
-
-def _read(path: Path, split: str | None) -> RaggedClouds:
-    from qs3.io.layouts.contents import read_ragged
-
-    return read_ragged(path, "points", split)
-
-
 FORMAT = Format(
-    name="qs3",
+    name="store",
     layout="our own data set: dataset.json and shard-*.parquet in one folder",
-    detect=_detect,
-    read=_read,
+    detect=lambda path: (path / "dataset.json").is_file(),
+    read=lambda path, split: read_ragged(path, "points", split),
     write=write_store,
 )

@@ -5,6 +5,7 @@ z; the lowest and highest 0.5 % of z are left out before the errors are formed.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,3 +93,52 @@ def plane_metrics(
         sub_pixel=float(np.sqrt(np.mean(pixels**2))),
         z_accuracy=float(on_axis - distance + np.median(error)) / distance,
     )
+
+
+def averaged(metrics: Sequence[PlaneMetrics]) -> PlaneMetrics:
+    """Means of fill and z accuracy, root mean squares of the two RMS.
+
+    Example:
+        >>> averaged([PlaneMetrics(1.0, 3.0, 0.3, 0.0), PlaneMetrics(0.5, 4.0, 0.4, 0.0)]).fill
+        0.75
+    """
+    fill, rms, pixels, accuracy = np.array(
+        [(m.fill, m.rms, m.sub_pixel, m.z_accuracy) for m in metrics]
+    ).T
+    return PlaneMetrics(
+        float(fill.mean()),
+        float(np.sqrt(np.mean(rms**2))),
+        float(np.sqrt(np.mean(pixels**2))),
+        float(accuracy.mean()),
+    )
+
+
+def depth_step(depth: Float[np.ndarray, "h w"], distance: float) -> float:
+    """The smallest difference of neighbouring depth levels around ``distance``.
+
+    Of the ten levels nearest to it; each difference is brought to ``distance`` by the square law.
+
+    Example:
+        >>> levels = 43.5 / np.arange(42.0, 45.0, 1 / 8)  # f·b = 43.5
+        >>> round(depth_step(levels[None], 1.0), 6)  # 1/8 px: 1/(8·43.5)
+        0.002874
+    """
+    levels = np.unique(depth[np.isfinite(depth)])
+    nearest = np.sort(levels[np.argsort(np.abs(levels - distance), kind="stable")[:10]])
+    if len(nearest) < 2:
+        return math.nan
+    return float((np.diff(nearest) / (nearest[1:] * nearest[:-1])).min() * distance**2)
+
+
+def plane_sigma(points: Float[np.ndarray, "n 3"], distance: float) -> float:
+    """Standard deviation of z about the fitted plane, brought to ``distance`` by the square law.
+
+    The highest and lowest 0.5 % of the errors are left out, as `plane_metrics` does.
+    """
+    if len(points) < 200:
+        return math.nan
+    normal, offset = fit_plane(points)
+    error = (points @ normal - offset) / normal[2]
+    error = np.sort(error * (distance / (points[:, 2] - error)) ** 2)
+    out = len(error) // 200
+    return float(error[out : len(error) - out].std())

@@ -3,36 +3,15 @@
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from tqdm import tqdm
 
 from qs3.errors import InputError
 from qs3.sensor.presets import Sensor
-from qs3.sensor.realism import (
-    checks_edges,
-    checks_kinect,
-    checks_scan,
-    checks_surfaces,
-    checks_wall,
-)
-from qs3.sensor.realism.results import TITLES
-from qs3.sensor.realism.stage import Stage
+from qs3.sensor.realism.bench import Bench
+from qs3.sensor.realism.laws import LAWS
+from qs3.sensor.realism.rows import plain
 from qs3.sensor.render import Renderer
-
-CHECKS: dict[str, Callable[[Stage, int, bool], dict[str, Any]]] = {
-    "T1": checks_wall.noise,
-    "T2": checks_wall.bias,
-    "T3": checks_wall.steps,
-    "T4": checks_edges.bands,
-    "T5": checks_edges.edges,
-    "T6": checks_surfaces.fill,
-    "T7": checks_surfaces.clear,
-    "T8": checks_kinect.kinect,
-    "T9": checks_wall.repeats,
-    "T10": checks_scan.scanned,
-}
-"""What photographs and judges each test: stage, seed, quick."""
 
 
 @dataclass(frozen=True)
@@ -43,17 +22,17 @@ class RealismSettings:
     """Fewer targets and smaller parts of the frame; the bounds stay."""
     seed: int = 0
     """All random steps follow from it."""
-    tests: tuple[str, ...] = tuple(TITLES)
+    tests: tuple[str, ...] = tuple(LAWS)
     """Tests to do, T1 to T10; others may be added to the same folder."""
 
     def __post_init__(self) -> None:
         asked = {test.upper(): test for test in self.tests}
-        unknown = [test for name, test in asked.items() if name not in TITLES]
+        unknown = [test for name, test in asked.items() if name not in LAWS]
         if unknown or not asked:
             raise InputError(
-                f"tests: no test {unknown[0] if unknown else ''!r}; choose of {', '.join(TITLES)}"
+                f"tests: no test {unknown[0] if unknown else ''!r}; choose of {', '.join(LAWS)}"
             )
-        object.__setattr__(self, "tests", tuple(test for test in TITLES if test in asked))
+        object.__setattr__(self, "tests", tuple(test for test in LAWS if test in asked))
         if self.seed < 0:
             raise InputError(f"seed: {self.seed} must not be below 0")
 
@@ -82,15 +61,28 @@ def realism(
         ``passed`` (None where it does not apply, with ``why``), ``rows`` (``what``, ``measured``,
         ``expected``, ``unit``, ``passed``), ``data`` (curves) and ``seconds``.
     """
-    stage, results = Stage(sensor, renderer), []
-    for test in tqdm(settings.tests, desc=f"realism of {sensor.name}", disable=not progress):
-        if done and test in done:
-            one = done[test]
-        else:
-            start = time.perf_counter()
-            one = CHECKS[test](stage, settings.seed, settings.quick)
-            one["seconds"] = round(time.perf_counter() - start, 3)
-        results.append(one)
+    bench, results = Bench(sensor, renderer, settings.seed, settings.quick), []
+    for name in tqdm(settings.tests, desc=f"realism of {sensor.name}", disable=not progress):
+        result = (done or {}).get(name) or run_test(name, bench)
+        results.append(result)
         if on_result is not None:
-            on_result(one)
+            on_result(result)
     return results
+
+
+def run_test(name: str, bench: Bench) -> dict:
+    """A test's result: it passes where every figure with bounds does; None where none has any."""
+    start = time.perf_counter()
+    title, test = LAWS[name]
+    judged = test(bench)
+    rows, data = ([], {}) if isinstance(judged, str) else judged
+    verdicts = [row["passed"] for row in rows if row["passed"] is not None]
+    result = {
+        "id": name,
+        "title": title,
+        "passed": all(verdicts) if verdicts else None,
+        "rows": rows,
+        "data": {curve: plain(values) for curve, values in data.items()},
+        "seconds": round(time.perf_counter() - start, 3),
+    }
+    return result | {"why": judged} if isinstance(judged, str) else result

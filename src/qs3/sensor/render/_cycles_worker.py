@@ -110,8 +110,6 @@ class Studio:
         self.bpy.data.images.remove(image)
         return self._load(path, 4, 4).item(0)
 
-    # ------------------------------------------------------------------ things that stay
-
     def _object(self, name, data):
         thing = self.bpy.data.objects.new(name, data)
         self.scene.collection.objects.link(thing)
@@ -166,7 +164,8 @@ class Studio:
         """
         light = self.spot.data
         _set(light, shadow_soft_size=0.0, spot_blend=0.0, use_shadow=True)
-        _set_if_there(light, use_soft_falloff=False)
+        if hasattr(light, "use_soft_falloff"):  # not every version of Blender has it
+            light.use_soft_falloff = False
         light.cycles.use_multiple_importance_sampling = False
         light.use_nodes = True
         graph = _Graph(light.node_tree)
@@ -203,8 +202,6 @@ class Studio:
         background = graph.add("ShaderNodeBackground", white, total)
         graph.add("ShaderNodeOutputWorld", background.outputs[0])
         _set(world.cycles, sampling_method="MANUAL", sample_map_resolution=512)
-
-    # ------------------------------------------------------------------ things that change
 
     def _set_projector(self, pattern, light):
         tangents = light["tan_half_width"], light["tan_half_height"]
@@ -411,13 +408,6 @@ def _inputs(node, **values):
 def _set(thing, **values):
     for name, value in values.items():
         setattr(thing, name, value)
-
-
-def _set_if_there(thing, **values):
-    """Set the properties that not every version of Blender has."""
-    for name, value in values.items():
-        if hasattr(thing, name):
-            setattr(thing, name, value)
 
 
 def _processors():

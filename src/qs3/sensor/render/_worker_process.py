@@ -191,13 +191,6 @@ def borrow(command: tuple[str, ...], objects: int) -> Iterator[Worker]:
         spare.close()
 
 
-def idle_process(command: tuple[str, ...]) -> int | None:
-    """Process id of the child that waits for its next object, or None."""
-    with _lock:
-        worker = _idle.get(command)
-    return None if worker is None else worker.pid
-
-
 def close_workers() -> None:
     """End every child of this process that renders nothing at the moment."""
     with _lock:

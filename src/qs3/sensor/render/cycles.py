@@ -18,11 +18,13 @@ import numpy as np
 from jaxtyping import Float32
 
 from qs3.errors import InputError, MissingExtraError
+from qs3.sensor.checks import check_choices, check_range
 from qs3.sensor.render._worker_process import RenderError as RenderError
-from qs3.sensor.render._worker_process import Worker, borrow, idle_process
-from qs3.sensor.render.scene import Scene, StereoPair, photographed_region, refuse_sky
+from qs3.sensor.render._worker_process import Worker, borrow
+from qs3.sensor.render.scene import Scene, StereoPair, view_regions
 from qs3.sensor.rig import Pose, Region, StereoRig
 
+_QUALITY = ("samples", "max_bounces", "pixel_filter", "view_transform")
 _WORKER = Path(__file__).with_name("_cycles_worker.py")
 
 
@@ -84,20 +86,10 @@ class CyclesRenderer:
     """Seconds that one image may take before its worker counts as hung."""
 
     def __post_init__(self) -> None:
-        choices = {
-            "pixel_filter": ("box", "blackman-harris"),
-            "view_transform": ("raw", "Standard", "Filmic", "AgX"),
-        }
-        for name, allowed in choices.items():
-            if getattr(self, name) not in allowed:
-                raise InputError(
-                    f"renderer: no {name} {getattr(self, name)!r}; choose {', '.join(allowed)}"
-                )
-        for name, lowest in {"samples": 1, "max_bounces": 0, "objects_per_worker": 0}.items():
-            if getattr(self, name) < lowest:
-                raise InputError(f"renderer: {name} {getattr(self, name)} is below {lowest}")
-        if not self.timeout > 0:
-            raise InputError(f"renderer: timeout {self.timeout} must be above 0 seconds")
+        check_choices(self, "renderer")
+        check_range(self, "renderer", "samples", low=1)
+        check_range(self, "renderer", "max_bounces", "objects_per_worker")
+        check_range(self, "renderer", "timeout", above=True)
 
     @property
     def description(self) -> dict[str, str]:
@@ -108,9 +100,8 @@ class CyclesRenderer:
             RenderError: where it does not start.
         """
         versions = _versions(_command())
-        return {"name": "cycles", "version": versions["blender"], "variant": "cpu"} | {
-            "python": versions["python"]
-        }
+        names = {"name": "cycles", "version": versions["blender"], "variant": "cpu"}
+        return names | {"python": versions["python"]}
 
     def render(
         self,
@@ -129,39 +120,26 @@ class CyclesRenderer:
                 fresh one.
             ValueError: where there is not one seed (and region, if given) for each pose.
         """
-        if len(poses) != len(seeds) or (regions is not None and len(regions) != len(poses)):
-            raise ValueError(f"{len(poses)} poses and {len(seeds)} seeds, or too few regions")
-        shots, layout = [], []
-        for index, (pose, seed) in enumerate(zip(poses, seeds, strict=True)):
-            sides = []
-            given = None if regions is None else regions[index]
-            for side, camera in enumerate((pose, rig.right(pose))):
-                region = self._region(scene, rig, camera, side, given)
-                sides.append(region)
-                if not region.empty:
-                    # Two streams that never meet: the left camera's seeds are even.
-                    shots.append(_shot(rig, pose, camera, region, (2 * seed + side) % 2**31))
-            if sides[0] != rig.full_frame and scene.alone:
-                refuse_sky(rig, pose, scene.light)
-            layout.append((pose, *sides))
+        views = view_regions(scene, rig, poses, seeds, regions, self.full_frame)
+        shots = [
+            # Two streams that never meet: the left camera's seeds are even.
+            _shot(rig, pose, camera, region, (2 * seed + side) % 2**31)
+            for pose, seed, parts in zip(poses, seeds, views, strict=True)
+            for side, (camera, region) in enumerate(
+                zip((pose, rig.right(pose)), parts, strict=True)
+            )
+            if not region.empty
+        ]
         with borrow(_command(), self.objects_per_worker) as worker:
             images, background = self._ask(worker, scene, rig, shots)
-        done = iter(images)
+        rendered, display = iter(images), self.view_transform != "raw"
         pairs = []
-        display = self.view_transform != "raw"
-        for pose, *sides in layout:
-            left, right = (_empty(region) if region.empty else next(done) for region in sides)
-            pairs.append(StereoPair(left, right, sides[0], sides[1], background, pose, display))
+        for pose, parts in zip(poses, views, strict=True):
+            left, right = (
+                np.zeros(part.shape, np.float32) if part.empty else next(rendered) for part in parts
+            )
+            pairs.append(StereoPair(left, right, *parts, background, pose, display))
         return pairs
-
-    def _region(
-        self, scene: Scene, rig: StereoRig, camera: Pose, side: int, given: Region | None
-    ) -> Region:
-        if side == 1 and rig.second == "pattern":
-            return Region(0, 0, 0, 0)
-        if self.full_frame:
-            return rig.full_frame
-        return photographed_region(scene, rig, camera) if given is None else given
 
     def _ask(
         self, worker: Worker, scene: Scene, rig: StereoRig, shots: list[dict[str, Any]]
@@ -175,22 +153,14 @@ class CyclesRenderer:
         for index, shot in enumerate(shots):
             shot["file"] = str(worker.folder / f"image-{index}.npy")
         light = {name: float(value) for name, value in vars(scene.light).items()}
+        light |= {name: getattr(scene, name) for name in ("tan_half_width", "tan_half_height")}
         worker.send(
             {
                 "scene": str(worker.folder / "scene.npz"),
                 "materials": [vars(body.material) for body in scene.bodies],
-                "light": light
-                | {
-                    "tan_half_width": scene.tan_half_width,
-                    "tan_half_height": scene.tan_half_height,
-                },
+                "light": light,
                 "rig": {"width": rig.width, "height": rig.height, "focal": rig.focal},
-                "quality": {
-                    "samples": self.samples,
-                    "max_bounces": self.max_bounces,
-                    "pixel_filter": self.pixel_filter,
-                    "view_transform": self.view_transform,
-                },
+                "quality": {name: getattr(self, name) for name in _QUALITY},
                 "shots": shots,
             }
         )
@@ -219,12 +189,6 @@ def find_cycles() -> dict[str, str]:
     return {"command": command[0], **_versions(command)}
 
 
-def worker_process() -> int | None:
-    """Process id of this process's worker between two calls, or None where none runs."""
-    command = interpreter()
-    return None if command is None else idle_process(command)
-
-
 def _command() -> tuple[str, ...]:
     command = interpreter()
     if command is None:
@@ -250,7 +214,3 @@ def _shot(rig: StereoRig, pose: Pose, camera: Pose, region: Region, seed: int) -
         "region": [region.x, region.y, region.width, region.height],
         "seed": seed,
     }
-
-
-def _empty(region: Region) -> Float32[np.ndarray, "h w"]:
-    return np.zeros((max(0, region.height), max(0, region.width)), dtype=np.float32)

@@ -1,30 +1,52 @@
-"""The irradiance cache of the Dr.Jit photographer in NumPy, on Embree's rays, for diffuse bodies.
+"""The irradiance cache with NumPy, on Embree's rays, for diffuse bodies.
 
 For machines without a system libLLVM: Mitsuba's plain variant spends most of its time where a
 few coherent rays through Embree do the same.
 """
 
-from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32, UInt32
+from jaxtyping import Bool, Float32, Int32, UInt32
 
 from qs3.errors import InputError
-from qs3.sensor.render.cache import GOLDEN, R2, TRIES, CacheSettings, cells, places
+from qs3.sensor.render.cache import (
+    GOLDEN,
+    R2,
+    TRIES,
+    Arrays,
+    CacheSettings,
+    Camera,
+    Photographer,
+    SoftLight,
+    places,
+)
 from qs3.sensor.render.scene import Scene
-from qs3.sensor.rig import Pose, Region, StereoRig
+from qs3.sensor.rig import Region
 
 _OFFSET = 1e-4  # of the scene's size: where a ray that leaves a surface starts, above it
 
 
-class EmbreePhotographer:
-    """Photographs one scene of diffuse bodies; holds its geometry and pattern."""
+class EmbreePhotographer(Photographer):
+    """Holds the geometry of diffuse bodies as arrays."""
 
-    def __init__(self, scene: Scene, max_depth: int) -> None:
+    arrays = Arrays(
+        number=np.float32,
+        whole=lambda values: np.asarray(values).astype(np.int32),
+        floor=np.floor,
+        clip=np.clip,
+        select=np.where,
+        # Contiguous, and no product of matrices: its threads cost more.
+        away=lambda points, origin: np.ascontiguousarray((points - np.array(origin)).T),
+        magnify=lambda camera, depth: camera.focal / depth,
+    )
+
+    def __init__(self, scene: Scene, samples: int, max_depth: int, cache: CacheSettings) -> None:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
+        super().__init__(scene, samples, max_depth, cache)
         if any(body.material.model != "diffuse" for body in scene.bodies):
             raise InputError("renderer: only diffuse bodies are rendered in this way")
         meshes = [body.mesh for body in scene.bodies]
@@ -41,53 +63,23 @@ class EmbreePhotographer:
             [len(mesh.faces) for mesh in meshes],
         )
         self._offset = np.float32(_OFFSET * np.ptp(triangles.reshape(-1, 3), axis=0).max())
-        self._scene = scene
-        self._bounces = max_depth - 2
-
-    def photograph(
-        self,
-        rig: StereoRig,
-        pose: Pose,
-        regions: tuple[Region, Region],
-        samples: int,
-        cache: CacheSettings,
-        seed: int,
-    ) -> list[Float32[np.ndarray, "_ _"]]:
-        """Radiance in the two regions of the pair at ``pose``; an empty region stays empty."""
-        projector = rig.projector(pose)
-        gathered = self._gather(rig, pose, regions[0], projector, cache, seed)
-        images = []
-        for camera, region in zip((pose, rig.right(pose)), regions, strict=True):
-            if region.empty:
-                image = np.zeros((max(region.height, 0), max(region.width, 0)), np.float32)
-            else:
-                image = self._expose(rig, camera, region, projector, samples, gathered)
-            images.append(image)
-        return images
 
     def _expose(
-        self,
-        rig: StereoRig,
-        camera: Pose,
-        region: Region,
-        projector: Pose,
-        samples: int,
-        cache: "_Cache",
-    ) -> Float32[np.ndarray, "h w"]:
+        self, camera: Camera, region: Region, projector: Camera, soft: SoftLight
+    ) -> Float32[np.ndarray, "n"]:
+        samples = self._samples
         pixels = region.width * region.height
         row, column = _grid(region.height, region.width)
-        origin = camera.position.astype(np.float32)
         centre = np.float32(0.5)
-        light = self._environment(
-            _directions(rig, camera, region, column + centre, row + centre)
-        ) * np.float32(samples)
+        light = self._environment(_rays(camera, column + centre, row + centre)) * np.float32(
+            samples
+        )
         background = light / np.float32(samples)
         seen = np.zeros(pixels, np.float32)
         place, facing = np.zeros((pixels, 3), np.float32), np.zeros((pixels, 3), np.float32)
         lane = np.arange(pixels)
         for k, (a, b) in enumerate(places(samples)):
-            rays = _directions(rig, camera, region, column[lane] + a, row[lane] + b)
-            triangle, points, normals = self._meet(np.tile(origin, (len(rays), 1)), rays)
+            triangle, points, normals = self._look(camera, column[lane] + a, row[lane] + b)
             met = triangle >= 0
             hit = lane[met]
             direct = self._from_projector(points, normals, triangle[met], projector)
@@ -103,65 +95,47 @@ class EmbreePhotographer:
         shown = np.flatnonzero(seen)
         place, facing = place[shown] / seen[shown, None], facing[shown]
         facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), np.float32(1e-6))
-        light[shown] += seen[shown] * cache.at(place, facing)
-        return (light / np.float32(samples)).reshape(region.height, region.width)
+        light[shown] += seen[shown] * soft.at(place, facing)
+        return light / np.float32(samples)
 
-    def _gather(
-        self,
-        rig: StereoRig,
-        pose: Pose,
-        region: Region,
-        projector: Pose,
-        settings: CacheSettings,
-        seed: int,
-    ) -> "_Cache":
-        grid = cells(region, settings.cell)
-        columns, rows = grid.width // settings.cell, grid.height // settings.cell
-        row, column = _grid(rows, columns)
-        found = np.full(columns * rows, -1, np.int32)
-        place, facing = np.zeros((len(found), 3), np.float32), np.zeros((len(found), 3), np.float32)
-        origin = pose.position.astype(np.float32)
+    def _gather(self, camera: Camera, grid: Region, projector: Camera, seed: int) -> "_EmbreeLight":
+        settings = self._cache
+        soft = _EmbreeLight(camera, grid, settings.cell, int)
+        row, column = _grid(soft.rows, soft.columns)
+        triangle = np.full(len(row), -1, np.int32)
+        place, facing = np.zeros((len(row), 3), np.float32), np.zeros((len(row), 3), np.float32)
         for k in range(TRIES):
-            left = np.flatnonzero(found < 0)
-            x, y = ((0.5 + k * step) % 1 for step in R2)
-            u = (column[left] + np.float32(x)) * np.float32(settings.cell)
-            v = (row[left] + np.float32(y)) * np.float32(settings.cell)
-            rays = _directions(rig, pose, grid, u, v)
-            triangle, points, normals = self._meet(np.tile(origin, (len(rays), 1)), rays)
-            hit = left[triangle >= 0]
-            found[hit] = triangle[triangle >= 0]
-            place[hit], facing[hit] = points, normals
-        shown = np.flatnonzero(found >= 0)
-        light = np.zeros(len(found), np.float32)
+            left = np.flatnonzero(triangle < 0)
+            x, y = (np.float32((0.5 + k * step) % 1) for step in R2)
+            u, v = (column[left] + x) * soft.cell, (row[left] + y) * soft.cell
+            met, points, normals = self._look(camera, u, v)
+            hit = left[met >= 0]
+            triangle[hit], place[hit], facing[hit] = met[met >= 0], points, normals
+        shown = np.flatnonzero(triangle >= 0)
+        light = np.zeros(len(triangle), np.float32)
+        soft.place, soft.facing, soft.light, soft.filled = place, facing, light, triangle >= 0
         if len(shown):
             # By the cell's place in the frame, whatever the region.
-            down, across = (
-                row[shown] + grid.y // settings.cell,
-                column[shown] + grid.x // settings.cell,
-            )
-            turn = _turns(down.astype(np.uint32) * 65536 + across.astype(np.uint32), seed)
+            down = (row[shown] + grid.y // settings.cell).astype(np.uint32)
+            across = (column[shown] + grid.x // settings.cell).astype(np.uint32)
+            place, facing = place[shown], facing[shown]
+            turn = _turns(down * 65536 + across, seed)
             light[shown] = self._soft(
-                place[shown], facing[shown], found[shown], projector, settings.rays, turn
+                place, facing, triangle[shown], projector, settings.rays, turn
             )
-        cache = _Cache(rig, pose, grid, settings.cell, place, facing, light, found >= 0)
-        if settings.smoothing > 0:
-            around = range(-settings.smoothing, settings.smoothing + 1)
-            taps = [(x, y, np.float32(1)) for y in around for x in around]
-            light[shown] = cache.average(
-                place[shown],
-                facing[shown],
-                column[shown].astype(np.int32),
-                row[shown].astype(np.int32),
-                taps,
+            whole = self.arrays.whole
+            light[shown] = soft.smooth(
+                place, facing, whole(column[shown]), whole(row[shown]), light[shown]
             )
-        return cache
+            soft.mean = light[shown].mean(dtype=np.float32)
+        return soft
 
     def _soft(
         self,
         points: Float32[np.ndarray, "n 3"],
         normals: Float32[np.ndarray, "n 3"],
         triangle: Int32[np.ndarray, "n"],
-        projector: Pose,
+        projector: Camera,
         rays: int,
         turn: Float32[np.ndarray, "2 n"],
     ) -> Float32[np.ndarray, "n"]:
@@ -192,6 +166,12 @@ class EmbreePhotographer:
             p = (ray * np.float32(R2[0]) + y * np.float32(3.7) + np.float32(bounce * 0.37)) % 1
             q = (ray * np.float32(R2[1]) + x * np.float32(5.3) + np.float32(bounce * 0.71)) % 1
         return light.reshape(len(points), rays).mean(axis=1)
+
+    def _look(
+        self, camera: Camera, u: Float32[np.ndarray, "n"], v: Float32[np.ndarray, "n"]
+    ) -> tuple[Int32[np.ndarray, "n"], Float32[np.ndarray, "m 3"], Float32[np.ndarray, "m 3"]]:
+        """What `_meet` says of a camera's rays."""
+        return self._meet(np.tile(np.array(camera.origin), (len(u), 1)), _rays(camera, u, v))
 
     def _meet(
         self, origins: Float32[np.ndarray, "n 3"], rays: Float32[np.ndarray, "n 3"]
@@ -227,18 +207,18 @@ class EmbreePhotographer:
         points: Float32[np.ndarray, "n 3"],
         normals: Float32[np.ndarray, "n 3"],
         triangle: Int32[np.ndarray, "n"],
-        projector: Pose,
+        projector: Camera,
     ) -> Float32[np.ndarray, "n"]:
         """Radiance that diffuse points give back of the projector's light."""
         scene = self._scene
-        x, y, z = _seen_from(projector, points)
+        x, y, z = projector.seen(points)
         with np.errstate(divide="ignore", invalid="ignore"):
             u = x / z * np.float32(0.5 / scene.tan_half_width) + np.float32(0.5)
             v = y / z * np.float32(0.5 / scene.tan_half_height) + np.float32(0.5)
             lit = np.flatnonzero((z > 0) & (u > 0) & (u < 1) & (v > 0) & (v < 1))
         slide = _bilinear(scene.pattern, u[lit], v[lit])
         lit, slide = lit[slide > 0], slide[slide > 0]
-        towards = np.float32(projector.position) - points[lit]
+        towards = np.array(projector.origin) - points[lit]
         squared = np.einsum("ij,ij->i", towards, towards)
         cosine = np.einsum("ij,ij->i", normals[lit], towards) / np.sqrt(squared)
         front = cosine > 0
@@ -252,101 +232,27 @@ class EmbreePhotographer:
         return light
 
 
-class _Cache:
-    """Soft light on a grid of cells of the left image."""
+class _EmbreeLight(SoftLight):
+    """Cells as arrays, row by row."""
 
-    def __init__(
-        self,
-        rig: StereoRig,
-        pose: Pose,
-        grid: Region,
-        cell: int,
-        place: Float32[np.ndarray, "m 3"],
-        facing: Float32[np.ndarray, "m 3"],
-        light: Float32[np.ndarray, "m"],
-        filled: Bool[np.ndarray, "m"],
-    ) -> None:
-        self._pose = pose
-        cx, cy = rig.principal_point
-        self._focal = np.float32(rig.focal)
-        self._corner = (np.float32(grid.x - cx - 0.5), np.float32(grid.y - cy - 0.5))
-        self._cell = np.float32(cell)
-        self._columns, self._rows = grid.width // cell, grid.height // cell
-        self._reach = np.float32(2 * cell / rig.focal)
-        self._place, self._facing, self._light, self._filled = place, facing, light, filled
+    place: Float32[np.ndarray, "m 3"]
+    facing: Float32[np.ndarray, "m 3"]
+    light: Float32[np.ndarray, "m"]
+    filled: Bool[np.ndarray, "m"]
 
-    def at(
-        self, points: Float32[np.ndarray, "n 3"], normals: Float32[np.ndarray, "n 3"]
-    ) -> Float32[np.ndarray, "n"]:
-        """Radiance at surface points, between the four cells around."""
-        x, y, depth = _seen_from(self._pose, points)
-        scale = self._focal / depth
-        x = (x * scale - self._corner[0]) / self._cell - np.float32(0.5)
-        y = (y * scale - self._corner[1]) / self._cell - np.float32(0.5)
-        # The right camera may see a little beyond the left region: the border cell stands there.
-        x, y = np.clip(x, 0, self._columns - 1), np.clip(y, 0, self._rows - 1)
-        x0, y0 = np.floor(x), np.floor(y)
-        fx, fy = x - x0, y - y0
-        taps = [
-            (0, 0, (1 - fx) * (1 - fy)),
-            (1, 0, fx * (1 - fy)),
-            (0, 1, (1 - fx) * fy),
-            (1, 1, fx * fy),
-        ]
-        return self.average(points, normals, x0.astype(np.int32), y0.astype(np.int32), taps)
-
-    def average(
-        self,
-        points: Float32[np.ndarray, "n 3"],
-        normals: Float32[np.ndarray, "n 3"],
-        column: Int32[np.ndarray, "n"],
-        row: Int32[np.ndarray, "n"],
-        taps: Sequence[tuple[int, int, Float[np.ndarray, "n"] | np.float32]],
-    ) -> Float32[np.ndarray, "n"]:
-        """Mean radiance of neighbouring cells, by how well they lie on the surface's plane."""
-        _, _, depth = _seen_from(self._pose, points)
-        limit = 1 / (self._reach * depth)
-        light, total = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
-        for dx, dy, share in taps:
-            x, y = column + np.int32(dx), row + np.int32(dy)
-            inside = (x >= 0) & (y >= 0) & (x < self._columns) & (y < self._rows)
-            cell = np.where(inside, y * np.int32(self._columns) + x, 0)
-            inside &= self._filled[cell]
-            off = np.einsum("ij,ij->i", self._place[cell] - points, normals) * limit
-            along = np.maximum(np.einsum("ij,ij->i", self._facing[cell], normals), 0)
-            # Even a cell that fits badly counts a little: it is all there is at some edges.
-            weight = (share + np.float32(1e-3)) * (along**4 / (1 + off**4) + np.float32(1e-4))
-            weight = np.where(inside, weight, 0)
-            light += weight * self._light[cell]
-            total += weight
-        mean = self._light[self._filled].mean(dtype=np.float32) if self._filled.any() else 0
-        return np.where(total > 0, light / np.maximum(total, np.float32(1e-30)), mean)
+    def _fit(
+        self, cell: Any, inside: Any, points: Any, normals: Any, limit: Any
+    ) -> tuple[Any, Any, Any]:
+        cell = np.where(inside, cell, 0)
+        off = np.einsum("ij,ij->i", self.place[cell] - points, normals) * limit
+        along = np.maximum(np.einsum("ij,ij->i", self.facing[cell], normals), 0)
+        return along**4 / (1 + off**4), self.light[cell], self.filled[cell]
 
 
-def _directions(
-    rig: StereoRig,
-    camera: Pose,
-    region: Region,
-    u: Float32[np.ndarray, "n"],
-    v: Float32[np.ndarray, "n"],
+def _rays(
+    camera: Camera, u: Float32[np.ndarray, "n"], v: Float32[np.ndarray, "n"]
 ) -> Float32[np.ndarray, "n 3"]:
-    """Rays of length 1 along the optical axis; pixel i of the region reaches from i to i + 1."""
-    cx, cy = rig.principal_point
-    x = (u + np.float32(region.x - cx - 0.5)) * np.float32(1 / rig.focal)
-    y = (v + np.float32(region.y - cy - 0.5)) * np.float32(1 / rig.focal)
-    turn = camera.camera_to_world[:3, :3].astype(np.float32)
-    return np.stack([turn[i, 0] * x + turn[i, 1] * y + turn[i, 2] for i in range(3)], axis=1)
-
-
-def _seen_from(
-    camera: Pose, points: Float32[np.ndarray, "n 3"]
-) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"], Float32[np.ndarray, "n"]]:
-    """Points in a camera's axes; written out, because threads of a matrix product cost more."""
-    away = points - camera.position.astype(np.float32)
-    x, y, z = (np.ascontiguousarray(column) for column in away.T)
-    turn = camera.camera_to_world[:3, :3].astype(np.float32)
-    across, down, ahead = (x * t[0] + y * t[1] + z * t[2] for t in turn.T)
-    return across, down, ahead
+    return np.stack(camera.rays(u, v), axis=1)
 
 
 def _grid(rows: int, columns: int) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"]]:

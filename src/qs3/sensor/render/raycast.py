@@ -40,24 +40,20 @@ class DepthCaster:
     Example:
         >>> plate = trimesh.creation.box(extents=[1, 1, 0.5]).apply_translation([0, 0, 2.25])
         >>> rig = StereoRig(width=5, height=3, focal=4.0)
-        >>> DepthCaster(plate).depth(rig, Pose(np.eye(4)), rig.full_frame)[1].tolist()
+        >>> DepthCaster(plate).cast(rig, Pose(np.eye(4)), rig.full_frame).depth[1].tolist()
         [nan, 2.0, 2.0, 2.0, nan]
     """
 
     def __init__(self, mesh: trimesh.Trimesh, *others: trimesh.Trimesh) -> None:
         meshes = (mesh, *others)
-        triangles = np.concatenate([np.asarray(one.triangles, np.float64) for one in meshes])
+        triangles = np.concatenate([np.asarray(body.triangles, np.float64) for body in meshes])
         self._embree = EmbreeScene()
         TriangleMesh(self._embree, triangles.astype(np.float32))
         self._corner = triangles[:, 0]
         self._normal = np.cross(
             triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
         )
-        self._body = np.repeat(np.arange(len(meshes)), [len(one.faces) for one in meshes])
-
-    def depth(self, rig: StereoRig, pose: Pose, region: Region) -> Float[np.ndarray, "h w"]:
-        """True depth of the pixels of ``region``."""
-        return self.cast(rig, pose, region).depth
+        self._body = np.repeat(np.arange(len(meshes)), [len(body.faces) for body in meshes])
 
     def cast(self, rig: StereoRig, pose: Pose, region: Region, normals: bool = False) -> Cast:
         """Follow a ray through every pixel of ``region``.

@@ -1,6 +1,5 @@
 """The scene, the stereo pair and the protocol that a renderer keeps."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
@@ -10,6 +9,7 @@ import trimesh
 from jaxtyping import Float32
 
 from qs3.errors import InputError
+from qs3.sensor.checks import check_range
 from qs3.sensor.materials import Material
 from qs3.sensor.rig import Pose, Region, StereoRig
 
@@ -34,9 +34,7 @@ class LightSettings:
     """Radiance from every direction: the released world grey, and the images' background."""
 
     def __post_init__(self) -> None:
-        for name in ("projector", "sky", "ambient"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"light: {name} {getattr(self, name)} must not be below 0")
+        check_range(self, "light", "projector", "sky", "ambient")
 
 
 @dataclass(frozen=True)
@@ -82,12 +80,38 @@ def photographed_region(scene: Scene, rig: StereoRig, camera: Pose) -> Region:
     return rig.region_of(np.asarray(scene.mesh.bounds), camera, 2)
 
 
-def refuse_sky(rig: StereoRig, pose: Pose, light: LightSettings) -> None:
-    """Refuse a view that has the sky in it: what is not rendered is filled with the ground.
+def view_regions(
+    scene: Scene,
+    rig: StereoRig,
+    poses: Sequence[Pose],
+    seeds: Sequence[int],
+    regions: Sequence[Region] | None,
+    full_frame: bool,
+) -> list[tuple[Region, Region]]:
+    """What each view's two cameras photograph: the right one nothing where the rig has none.
 
     Raises:
-        InputError: where a ray of the frame's rim rises above the sky's lower edge.
+        InputError: where a camera sees the sky past a lone object.
+        ValueError: where there is not one seed (and region, if given) for each pose.
     """
+    if len(poses) != len(seeds) or (regions is not None and len(regions) != len(poses)):
+        raise ValueError(f"{len(poses)} poses and {len(seeds)} seeds, or too few regions")
+    views = []
+    for index, pose in enumerate(poses):
+        if full_frame:
+            left = right = rig.full_frame
+        elif regions is not None:
+            left = right = regions[index]
+        else:
+            left, right = (photographed_region(scene, rig, p) for p in (pose, rig.right(pose)))
+        if left != rig.full_frame and scene.alone:
+            _refuse_sky(rig, pose, scene.light)
+        views.append((left, Region(0, 0, 0, 0) if rig.second == "pattern" else right))
+    return views
+
+
+def _refuse_sky(rig: StereoRig, pose: Pose, light: LightSettings) -> None:
+    """Refuse a view that has the sky in it: what is not rendered is filled with the ground."""
     (cx, cy), (x, y) = rig.principal_point, (rig.width - 1, rig.height - 1)
     rim = np.array([[u - cx, v - cy, rig.focal] for u in (0, cx, x) for v in (0, cy, y)])
     rays = rim @ pose.camera_to_world[:3, :3].T

@@ -1,7 +1,7 @@
 """What every executor does, and what a task that did not end well hands back."""
 
 import errno
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -54,6 +54,32 @@ class Executor(Protocol):
     def __exit__(self, *exception: object) -> None:
         """Stop at once whatever still runs."""
         ...
+
+
+def outcomes(
+    executor: Executor, next_call: Callable[[], tuple[Any, ...] | None]
+) -> Iterator[tuple[Any, Any]]:
+    """Keep an executor busy; yield key and outcome of each call, as they end.
+
+    Args:
+        executor: Entered already.
+        next_call: Returns key, function and arguments of one more call, or None where there is
+            none at this moment; asked again after every outcome.
+
+    Raises:
+        InputError: where a call failed as every other must.
+    """
+    under_way = 0
+    while True:
+        while under_way < executor.ahead and (call := next_call()) is not None:
+            executor.submit(*call)
+            under_way += 1
+        if not under_way:
+            return
+        key, outcome = executor.next()
+        under_way -= 1
+        stop_if_fatal(outcome)
+        yield key, outcome
 
 
 def guarded(function: Callable[..., Any], *arguments: Any) -> Any:

@@ -3,6 +3,7 @@
 import concurrent.futures
 import contextlib
 import ctypes
+import dataclasses
 import multiprocessing
 import os
 import signal
@@ -98,35 +99,31 @@ class LocalExecutor:
         Raises:
             InputError: where no worker process can start.
         """
-        while True:
-            done, _ = concurrent.futures.wait(self._calls, return_when="FIRST_COMPLETED")
-            future = next(iter(done))
-            call = self._calls.pop(future)
-            outcome = self._outcome(future, call)
-            if not isinstance(outcome, _Again):
-                return call.key, outcome
-
-    def _outcome(self, future: Any, call: _Call) -> Any:
         from concurrent.futures.process import BrokenProcessPool
 
         from pebble import ProcessExpired
 
-        try:
-            value = future.result()
-        except concurrent.futures.TimeoutError:
-            return Failure("Timeout", f"took over {self._timeout:g} s and was stopped")
-        except ProcessExpired as error:
-            if call.retried:
-                return Failure("ProcessDied", f"its process died twice ({_how(error.exitcode)})")
-            self._schedule(_Call(call.key, call.function, call.arguments, retried=True))
-            return _Again()
-        except BrokenProcessPool as error:
-            self._restart(call, error)
-            return _Again()
-        except Exception as error:  # its value could not come back; no other's will
-            return Failure(type(error).__name__, str(error), fatal=True)
-        self._broken = 0
-        return value
+        while True:
+            done, _ = concurrent.futures.wait(self._calls, return_when="FIRST_COMPLETED")
+            future = next(iter(done))
+            call = self._calls.pop(future)
+            try:
+                value = future.result()
+            except concurrent.futures.TimeoutError:
+                value = Failure("Timeout", f"took over {self._timeout:g} s and was stopped")
+            except ProcessExpired as error:
+                if not call.retried:
+                    self._schedule(dataclasses.replace(call, retried=True))
+                    continue
+                value = Failure("ProcessDied", f"its process died twice ({_how(error.exitcode)})")
+            except BrokenProcessPool as error:
+                self._restart(call, error)
+                continue
+            except Exception as error:  # its value could not come back; no other's will
+                value = Failure(type(error).__name__, str(error), fatal=True)
+            else:
+                self._broken = 0
+            return call.key, value
 
     def _restart(self, call: _Call, error: Exception) -> None:
         """Start a new pool where one broke as a whole: a worker died before its first call."""
@@ -189,10 +186,6 @@ class LocalExecutor:
     def __exit__(self, *exception: object) -> None:
         """Stop the processes, at once where calls are left."""
         self._close(at_once=bool(self._calls))
-
-
-class _Again:
-    """The call was handed over once more."""
 
 
 def _how(code: int) -> str:

@@ -12,19 +12,16 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Float32, Int, Shaped
 
-from qs3.sensor.depth import depth_from_disparity
-from qs3.sensor.exposure import expose_pair
 from qs3.sensor.lens import blur_reach
-from qs3.sensor.matching import match, matching_canvas
+from qs3.sensor.matching import matching_canvas
 from qs3.sensor.materials import Material
 from qs3.sensor.presets import Sensor
 from qs3.sensor.render import Body, Renderer, Scene
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.speckle import pattern_image
-from qs3.sensor.stored import stored_pattern
+from qs3.sensor.view import Clock, ViewImages, take_view
 
 VIEW = Pose.looking_at(np.zeros(3), np.array([0.0, 1.0, 0.0]))
 """The pose of the left camera."""
@@ -36,33 +33,17 @@ _REACH = 12.0  # half the side of a wall, in its distances: it fills every frame
 
 
 @dataclass(frozen=True)
-class Shot:
-    """One photograph of a target, all pictures of the same part of the left frame."""
-
-    region: Region
-    """That part."""
-    left: Shaped[np.ndarray, "h w"]
-    """Exposed left image."""
-    disparity: Float32[np.ndarray, "h w"]
-    """Disparity in pixels, NaN where none."""
-    depth: Float[np.ndarray, "h w"]
-    """Depth after the gate, NaN where none."""
-    true_depth: Float[np.ndarray, "h w"]
-    """Depth of the z-buffer, NaN where nothing is."""
-    body: Int[np.ndarray, "h w"]
-    """Index of the body that the pixel shows, −1 where none."""
-    normals: Float[np.ndarray, "h w 3"]
-    """Normals in the camera's axes, towards the camera."""
-
-
-@dataclass(frozen=True)
-class Stage:
+class Bench:
     """A sensor under test and what photographs for it."""
 
     sensor: Sensor
     """The sensor."""
     renderer: Renderer
     """What photographs."""
+    seed: int = 0
+    """Seed of the first photograph of a test; the others count on from it."""
+    quick: bool = False
+    """Fewer targets and smaller parts of the frame."""
 
     @property
     def rig(self) -> StereoRig:
@@ -73,67 +54,44 @@ class Stage:
         self,
         bodies: Sequence[Body],
         region: Region,
-        seed: int = 0,
-        noise_seed: int | None = None,
+        index: int = 0,
+        noise: int | None = None,
         focus: Region | None = None,
-    ) -> Shot:
+    ) -> ViewImages:
         """Photograph ``bodies`` and measure ``region`` of the left frame.
 
         Args:
-            bodies: What stands before the camera.
+            bodies: What stands before the camera; the first is the object.
             region: Part of the left frame that is wanted.
-            seed: Seed of the renderer.
-            noise_seed: Seed of the image noise; ``seed`` by default.
+            index: Number of the photograph, for its seed.
+            noise: The same for the image noise; ``index`` by default.
             focus: What auto-exposure looks at; ``region`` by default.
         """
-        sensor, rig = self.sensor, self.rig
-        canvas = matching_canvas(region, rig, sensor.matching)
+        sensor, rig, pattern = self.sensor, self.rig, self.sensor.pattern
         focus = focus or region
-        x0, y0 = min(canvas.x, focus.x), min(canvas.y, focus.y)
-        x1 = max(canvas.x + canvas.width, focus.x + focus.width)
-        y1 = max(canvas.y + canvas.height, focus.y + focus.height)
+        x0, y0, x1, y1 = matching_canvas(region, rig, sensor.matching).bounds
+        left, top, right, bottom = focus.bounds
+        x0, y0, x1, y1 = min(x0, left), min(y0, top), max(x1, right), max(y1, bottom)
         wide = Region(x0, y0, x1 - x0, y1 - y0)
         wide = wide.grown(blur_reach(sensor.exposure.psf), rig.width, rig.height)
-        thrown = sensor.pattern
-        scene = Scene(
-            tuple(bodies),
-            sensor.light,
-            pattern_image(thrown),
-            thrown.tan_half_width,
-            thrown.tan_half_height,
-        )
-        pair = self.renderer.render(scene, rig, [VIEW], [seed], regions=[wide])[0]
-        rng = np.random.default_rng(seed if noise_seed is None else noise_seed)
-        left, right = expose_pair(pair, canvas, focus, rig, sensor.exposure, rng)
-        if rig.second == "pattern":
-            right = stored_pattern(rig, thrown, canvas, sensor.exposure.bits)
-        x, y = region.x - canvas.x, region.y - canvas.y
-        inner = slice(y, y + region.height), slice(x, x + region.width)
-        disparity = match(left, right, sensor.matching)[inner]
-        cast = DepthCaster(*(body.mesh for body in bodies)).cast(rig, VIEW, region, normals=True)
-        return Shot(
-            region=region,
-            left=left[inner],
-            disparity=disparity,
-            depth=depth_from_disparity(disparity, rig, sensor.depth),
-            true_depth=cast.depth,
-            body=cast.body,
-            normals=np.asarray(cast.normals),
-        )
+        opening = pattern.tan_half_width, pattern.tan_half_height
+        scene = Scene(tuple(bodies), sensor.light, pattern_image(pattern), *opening)
+        pair = self.renderer.render(scene, rig, [VIEW], [self.seed + index], regions=[wide])[0]
+        rng = np.random.default_rng(self.seed + (index if noise is None else noise))
+        caster = DepthCaster(*(body.mesh for body in bodies))
+        return take_view(pair, sensor, region, focus, [caster], rng, Clock())
 
-    def refined(self, samples: int) -> "Stage":
-        """The stage with more rays a pixel and longer paths, where the renderer has such settings.
+    def refined(self, samples: int) -> "Bench":
+        """The bench with more rays a pixel and longer paths, where the renderer has such settings.
 
         Mirrors and glass are path traced: they need both.
         """
-        settings = self.renderer
-        if not dataclasses.is_dataclass(settings):
-            return self
+        renderer: Any = self.renderer
         least = {"samples": samples, "max_depth": 8}
-        names = {field.name for field in dataclasses.fields(settings)} & set(least)
-        raised = {name: max(least[name], getattr(settings, name)) for name in names}
-        finer: Any = dataclasses.replace(settings, **raised)
-        return Stage(self.sensor, finer)
+        raised = {n: max(v, getattr(renderer, n)) for n, v in least.items() if hasattr(renderer, n)}
+        if not raised:
+            return self
+        return dataclasses.replace(self, renderer=dataclasses.replace(renderer, **raised))
 
 
 def painted(mesh: trimesh.Trimesh, albedo: float = ALBEDO) -> Body:
@@ -181,3 +139,48 @@ def central(rig: StereoRig, wide: float, high: float, left: int = 0) -> Region:
     """
     width, height = round((rig.width - left) * wide), round(rig.height * high)
     return Region(left + (rig.width - left - width) // 2, (rig.height - height) // 2, width, height)
+
+
+def distances(sensor: Sensor, count: int) -> list[float]:
+    """Distances of a sweep, even on a logarithmic scale: 0.4 to 3 m, as far as it can be measured.
+
+    The near end is the depth gate's or the search range's, the far end is half the depth gate's.
+
+    Example:
+        >>> [round(z, 2) for z in distances(Sensor(), 3)]  # disparities to 160 of f·b = 150
+        [1.05, 1.77, 3.0]
+    """
+    reach = float(sensor.rig.disparity(1.0)) / (sensor.matching.num_disparities - 4)
+    near = max(0.4 if sensor.metric else 0.0, 1.05 * sensor.depth.near, reach)
+    return [float(z) for z in np.geomspace(near, max(sensor.depth.far / 2, 1.2 * near), count)]
+
+
+def middle(sensor: Sensor) -> float:
+    """The distance half way through a sweep."""
+    near, far = distances(sensor, 2)
+    return float(np.sqrt(near * far))
+
+
+def wall_region(
+    sensor: Sensor, distance: float, share: float = 0.8, high: float | None = None
+) -> Region:
+    """The middle of what can be measured of a wall: right of the left band f·b/z.
+
+    Args:
+        sensor: The sensor.
+        distance: Of the wall.
+        share: Share of the columns.
+        high: Share of the rows; ``share`` by default.
+    """
+    left = int(np.ceil(sensor.rig.disparity(distance)))
+    if sensor.matching.left_band == "opencv":
+        left = sensor.matching.num_disparities + sensor.matching.block_size // 2
+    return central(sensor.rig, share, share if high is None else high, left)
+
+
+def shoot_wall(
+    bench: Bench, distance: float, share: float, index: int = 0, high: float | None = None
+) -> ViewImages:
+    """Photograph a facing wall; ``share`` and ``high`` are those of `wall_region`."""
+    region = wall_region(bench.sensor, distance, share, high)
+    return bench.shoot([painted(wall(distance))], region, index)

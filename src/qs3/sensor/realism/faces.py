@@ -7,7 +7,7 @@ point's distance from its face divided by |r·n|·z²·σ_d/(f·b) has median 0 
 deviation (MAD) of 1/1.4826, if its noise is that of the wall.
 """
 
-from typing import Any
+import dataclasses
 
 import cv2
 import numpy as np
@@ -17,60 +17,62 @@ from jaxtyping import Bool, Float
 from qs3 import shapes
 from qs3.geometry import rotation_z
 from qs3.meshes import normalise
-from qs3.sensor.realism.checks_wall import Plain, wall_metrics
-from qs3.sensor.realism.results import Row, result, row
-from qs3.sensor.realism.stage import VIEW, Shot, Stage, painted
+from qs3.sensor.realism.bench import VIEW, Bench, painted
+from qs3.sensor.realism.rows import Judged, row
+from qs3.sensor.realism.walls import wall_metrics
+from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import StereoRig
+from qs3.sensor.view import ViewImages
 
 MOST_DEGREES = 60.0
-_VIEWS = {True: 12, False: 16}
 _TILT = 25.0  # degrees by which the object is looked down upon
 _GOLDEN = 0.381966  # of a full turn: any number of turns is spread evenly
 _BINS = np.arange(-5.0, 5.01, 0.25)
 
 
-def scanned(stage: Stage, seed: int, quick: bool) -> Plain:
-    """T10: photograph a cabinet from many sides over the placement's distances, and walls there.
+def scanned(bench: Bench) -> Judged:
+    """T10: a cabinet from many sides over the placement's distances, and walls there.
 
     Errors are alike within a block of the matcher, so that a view has but a few dozen independent
     ones: the median needs many views to come out at 0.
     """
-    near, far = stage.sensor.placement.radius
-    half = 0.9 * stage.sensor.object_size
-    walls = np.geomspace(max(near - half, 1.05 * stage.sensor.depth.near), far + half, 3)
+    sensor, count = bench.sensor, 12 if bench.quick else 16
+    near, far = sensor.placement.radius
+    half = 0.9 * sensor.object_size
+    walls = np.geomspace(max(near - half, 1.05 * sensor.depth.near), far + half, 3)
     # The middle of the frame, where the object is: the metric divides by the length of the ray.
-    sigma = [wall_metrics(stage, z, 0.3, seed).sub_pixel for z in walls.tolist()]
-    count = _VIEWS[quick]
+    sigma = [wall_metrics(bench, z, 0.3).sub_pixel for z in walls.tolist()]
     parts = []
     for index in range(count):
         distance = near + (far - near) * (index + 0.5) / count
-        shot = shoot_object(stage, distance, 360 * _GOLDEN * index, seed + index)
-        parts.append(off_faces(shot, stage.rig, stage.sensor.matching.block_size, walls, sigma))
+        view = shoot_object(bench, distance, 360 * _GOLDEN * index, index)
+        parts.append(off_faces(view, bench.rig, sensor.matching.block_size, walls, sigma))
     ratio, cosine = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return result("T10", *scan_rows(ratio, cosine))
+    return scan_rows(ratio, cosine)
 
 
-def shoot_object(stage: Stage, distance: float, turn: float, seed: int) -> Shot:
-    """Photograph a cabinet of the sensor's object size, looked down upon.
+def shoot_object(bench: Bench, distance: float, turn: float, index: int) -> ViewImages:
+    """Photograph a cabinet of the sensor's object size, looked down upon; with normals.
 
     Args:
-        stage: The sensor.
+        bench: The sensor.
         distance: Of the object's middle.
         turn: Of the object about its vertical, in degrees.
-        seed: Of image and noise.
+        index: Number of the photograph.
     """
     mesh = normalise(shapes.make("cabinet", seed=1), "box")
-    points = np.asarray(mesh.vertices) * stage.sensor.object_size
+    points = np.asarray(mesh.vertices) * bench.sensor.object_size
     tilt = np.radians(_TILT)
     lean = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
     points = points @ rotation_z(np.radians(turn)).T @ lean.T + np.array([0.0, distance, 0.0])
     body = painted(trimesh.Trimesh(points, mesh.faces, process=False))
-    region = stage.rig.region_of(np.asarray(body.mesh.bounds), VIEW, 16)
-    return stage.shoot([body], region, seed)
+    region = bench.rig.region_of(np.asarray(body.mesh.bounds), VIEW, 16)
+    cast = DepthCaster(body.mesh).cast(bench.rig, VIEW, region, normals=True)
+    return dataclasses.replace(bench.shoot([body], region, index), normals=cast.normals)
 
 
 def off_faces(
-    shot: Shot,
+    view: ViewImages,
     rig: StereoRig,
     block: int,
     walls: Float[np.ndarray, "w"],
@@ -79,7 +81,7 @@ def off_faces(
     """Signed distances from the faces in units of the law, of points well inside a face.
 
     Args:
-        shot: A photograph.
+        view: A photograph, with normals.
         rig: Supplies focal length, baseline and principal point.
         block: The matcher's block: within half of it a pixel's neighbours must show its face.
         walls: Distances at which the noise on a wall is known.
@@ -89,40 +91,33 @@ def off_faces(
         Distance over expected deviation, positive away from the camera; cosine of the view angle.
     """
     cx, cy = rig.principal_point
-    y, x = np.indices(shot.depth.shape)
-    ray = np.stack(
-        [
-            (shot.region.x + x - cx) / rig.focal,
-            (shot.region.y + y - cy) / rig.focal,
-            np.ones(shot.depth.shape),
-        ],
-        axis=-1,
-    )
-    slope = np.abs(np.einsum("ijk,ijk->ij", ray, shot.normals))
+    y, x = np.indices(view.depth.shape)
+    x, y = (view.region.x + x - cx) / rig.focal, (view.region.y + y - cy) / rig.focal
+    ray, normals = np.stack([x, y, np.ones(x.shape)], axis=-1), np.asarray(view.normals)
+    slope = np.abs(np.einsum("ijk,ijk->ij", ray, normals))
     cosine = slope / np.linalg.norm(ray, axis=-1)
-    kept = inside_faces(shot, ray, block // 2 + 2) & np.isfinite(shot.depth)
+    kept = inside_faces(view, ray, block // 2 + 2) & np.isfinite(view.depth)
     kept &= cosine > np.cos(np.radians(MOST_DEGREES))
-    z = shot.true_depth[kept]
+    z = view.true_depth[kept]
     law = z**2 * np.interp(z, walls, sigma) / (rig.focal * rig.baseline)
     # Both the distance and the law have the factor |r·n|.
-    return (shot.depth[kept] - z) * slope[kept] / (law * slope[kept]), cosine[kept]
+    return (view.depth[kept] - z) * slope[kept] / (law * slope[kept]), cosine[kept]
 
 
 def inside_faces(
-    shot: Shot, ray: Float[np.ndarray, "h w 3"], reach: int
+    view: ViewImages, ray: Float[np.ndarray, "h w 3"], reach: int
 ) -> Bool[np.ndarray, "h w"]:
     """Pixels around which all pixels within ``reach`` show the same plane."""
-    offset = np.einsum("ijk,ijk->ij", ray, shot.normals) * shot.true_depth
-    plane = np.concatenate([shot.normals, offset[..., None]], axis=-1)
+    normals = np.asarray(view.normals)
+    offset = np.einsum("ijk,ijk->ij", ray, normals) * view.true_depth
+    plane = np.concatenate([normals, offset[..., None]], axis=-1)
     plane = np.where(np.isfinite(plane), plane, 1e3).astype(np.float32)
     square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     apart = cv2.dilate(plane, square) - cv2.erode(plane, square)
-    return (np.abs(apart).max(axis=-1) < 1e-4) & (shot.body >= 0)
+    return (np.abs(apart).max(axis=-1) < 1e-4) & view.mask
 
 
-def scan_rows(
-    ratio: Float[np.ndarray, "n"], cosine: Float[np.ndarray, "n"]
-) -> tuple[list[Row], dict[str, Any]]:
+def scan_rows(ratio: Float[np.ndarray, "n"], cosine: Float[np.ndarray, "n"]) -> Judged:
     """Judge signed distances in units of the law.
 
     Args:

@@ -6,6 +6,8 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.files import sha256
+from qs3.io.guards import reason
+from qs3.io.layouts.format import Format
 from qs3.io.ragged import RaggedClouds
 
 
@@ -33,8 +35,9 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
             wanted = ("points", "offset", "label", "class_names", "is_train", "name")
             arrays = {name: archive[name] for name in wanted if name in archive.files}
     except Exception as error:  # a damaged zip file raises whatever its reader stumbles over
-        lines = str(error).splitlines() or [type(error).__name__]
-        raise InputError(f"{path}: not a NumPy archive of plain arrays ({lines[0]})") from error
+        raise InputError(
+            f"{path}: not a NumPy archive of plain arrays ({reason(error)})"
+        ) from error
     clouds = _clouds(path, arrays)
     count = len(clouds)
     for name in ("label", "is_train", "name"):
@@ -96,10 +99,18 @@ def _rows(path: Path, arrays: dict[str, np.ndarray], split: str | None, count: i
         return list(range(count))
     train = arrays.get("is_train")
     if train is None or split not in ("train", "test"):
-        known = "no split" if train is None else "train and test"
-        raise InputError(f"{path}: has no split {split!r}; it has {known}")
+        parts = "no split" if train is None else "train and test"
+        raise InputError(f"{path}: has no split {split!r}; it has {parts}")
     chosen = train.astype(bool)
     rows = np.flatnonzero(chosen if split == "train" else ~chosen)
     if not len(rows):
         raise InputError(f"{path}: split {split!r} is empty")
     return rows.tolist()
+
+
+FORMAT = Format(
+    name="npz",
+    layout="one NumPy archive with points [b n 3], label, class_names, is_train and name",
+    detect=lambda path: path.suffix.lower() == ".npz" and path.is_file(),
+    read=read_npz,
+)

@@ -8,6 +8,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
+from qs3.shapes._dice import Dice
+
 Number = int | float
 """So that a plain 0 may stand for 0.0 where arguments are checked at run time."""
 Span = tuple[Number, Number]
@@ -15,7 +17,7 @@ Point = tuple[Number, Number, Number]
 
 
 @dataclass(frozen=True)
-class Part:
+class Solid:
     """One closed solid."""
 
     vertices: Float[np.ndarray, "n 3"]
@@ -23,13 +25,13 @@ class Part:
     faces: Int[np.ndarray, "m 3"]
     """Corners of each triangle, anticlockwise seen from outside."""
 
-    def move(self, x: Number = 0.0, y: Number = 0.0, z: Number = 0.0) -> "Part":
+    def move(self, x: Number = 0.0, y: Number = 0.0, z: Number = 0.0) -> "Solid":
         """Return the part shifted."""
-        return Part(self.vertices + np.array([x, y, z], dtype=float), self.faces)
+        return Solid(self.vertices + np.array([x, y, z], dtype=float), self.faces)
 
     def turn(
         self, axis: Literal["x", "y", "z"], degrees: Number, about: Point = (0.0, 0.0, 0.0)
-    ) -> "Part":
+    ) -> "Solid":
         """Return the part turned about an axis through ``about``, anticlockwise seen from +axis."""
         c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
         i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
@@ -37,10 +39,10 @@ class Part:
         matrix[i, i] = matrix[j, j] = c
         matrix[i, j], matrix[j, i] = -s, s
         centre = np.array(about, dtype=float)
-        return Part((self.vertices - centre) @ matrix.T + centre, self.faces)
+        return Solid((self.vertices - centre) @ matrix.T + centre, self.faces)
 
 
-def assemble(parts: Sequence[Part]) -> trimesh.Trimesh:
+def assemble(parts: Sequence[Solid]) -> trimesh.Trimesh:
     """Put parts into one mesh; each keeps its own vertices."""
     counts = np.cumsum([0] + [len(part.vertices) for part in parts])
     vertices = np.concatenate([part.vertices for part in parts])
@@ -50,7 +52,7 @@ def assemble(parts: Sequence[Part]) -> trimesh.Trimesh:
 
 def loft(
     rings: Float[np.ndarray, "r c 3"], cyclic: bool = False, cap: Literal["fan", "zip"] = "fan"
-) -> Part:
+) -> Solid:
     """Solid between successive rings of as many points each, closed at both ends.
 
     Args:
@@ -80,7 +82,7 @@ def loft(
     return _closed(vertices, np.concatenate(faces))
 
 
-def _closed(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> Part:
+def _closed(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> Solid:
     """Weld points that coincide, drop the faces that vanish with them, turn the rest outward."""
     _, first, weld = np.unique(
         np.round(vertices, 7), axis=0, return_index=True, return_inverse=True
@@ -92,7 +94,7 @@ def _closed(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -
     faces = faces[distinct]
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     inside_out = (a * np.cross(b, c)).sum() < 0
-    return Part(vertices, faces[:, ::-1] if inside_out else faces)
+    return Solid(vertices, faces[:, ::-1] if inside_out else faces)
 
 
 def outline(
@@ -110,19 +112,38 @@ def at_height(polygon: Float[np.ndarray, "n 2"], z: Number) -> Float[np.ndarray,
     return np.column_stack([polygon, np.full(len(polygon), z)])
 
 
-def slab(polygon: Float[np.ndarray, "n 2"], z: Span) -> Part:
+def around(middle: Number, half: Number) -> Span:
+    """Reach ``half`` to either side of ``middle``."""
+    return (middle - half, middle + half)
+
+
+def within(span: Span, by: Number) -> Span:
+    """Take ``by`` off both ends of a span; a negative one makes it longer."""
+    return (span[0] + by, span[1] - by)
+
+
+def slab(polygon: Float[np.ndarray, "n 2"], z: Span) -> Solid:
     """Upright prism over a polygon that is star-shaped about its mean."""
     return loft(np.stack([at_height(polygon, z[0]), at_height(polygon, z[1])]))
 
 
-def block(x: Span, y: Span, z: Span) -> Part:
+def block(x: Span, y: Span, z: Span) -> Solid:
     """Box along the axes."""
     corners = np.array([(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])], dtype=float)
     return slab(corners, z)
 
 
-def cushion(x: Span, y: Span, z: Span, radius: Number, crown: Number = 0.0, steps: int = 3) -> Part:
+def cushion(
+    dice: Dice,
+    x: Span,
+    y: Span,
+    z: Span,
+    radius: Number,
+    crown: Number = 0.0,
+    steps: int | None = None,
+) -> Solid:
     """Box with edges rounded to ``radius`` and a top swollen by ``crown``; 1 step is a bevel."""
+    steps = dice.steps if steps is None else steps
     low, high = np.array([x[0], y[0], z[0]], float), np.array([x[1], y[1], z[1]], float)
     half = (high - low) / 2
     r = min(radius, 0.98 * half.min())
@@ -143,7 +164,7 @@ def cushion(x: Span, y: Span, z: Span, radius: Number, crown: Number = 0.0, step
     return loft(np.stack(rings) + (low + high) / 2)
 
 
-def pillow(x: Span, y: Span, z: Span, sides: int = 8) -> Part:
+def pillow(x: Span, y: Span, z: Span, sides: int = 8) -> Solid:
     """Soft pillow: thick in the middle, thin at the rim."""
     u = np.linspace(-1, 1, sides + 1)
     a, b = np.meshgrid(u, u, indexing="ij")
@@ -156,7 +177,7 @@ def pillow(x: Span, y: Span, z: Span, sides: int = 8) -> Part:
     return loft(rings * half + middle, cap="zip")
 
 
-def lathe(profile: Sequence[Span], sides: int = 16, x: Number = 0.0, y: Number = 0.0) -> Part:
+def lathe(profile: Sequence[Span], sides: int = 16, x: Number = 0.0, y: Number = 0.0) -> Solid:
     """Turn a profile of (radius, z) about the vertical through (x, y).
 
     A vessel's profile runs up the outside and down the inside to radius 0.
@@ -165,7 +186,7 @@ def lathe(profile: Sequence[Span], sides: int = 16, x: Number = 0.0, y: Number =
     return loft(np.stack(rings) + np.array([x, y, 0.0]))
 
 
-def ball(radius: Number, centre: Point, sides: int = 12, squash: Number = 1.0) -> Part:
+def ball(radius: Number, centre: Point, sides: int = 12, squash: Number = 1.0) -> Solid:
     """Sphere, or with ``squash`` ≠ 1 one whose height is scaled."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, max(4, sides // 2 + 1))
     profile = [
@@ -179,7 +200,7 @@ def tube(
     radius: Number | Sequence[Number],
     sides: int = 8,
     closed: bool = False,
-) -> Part:
+) -> Solid:
     """Round bar along a path, its ring of ``sides`` corners carried along without twist."""
     points = np.asarray(path, dtype=float)
     if closed:
@@ -199,7 +220,7 @@ def tube(
     return loft(np.stack(rings), cyclic=closed)
 
 
-def beam(start: Point, end: Point, width: Number, depth: Number, taper: Number = 1.0) -> Part:
+def beam(start: Point, end: Point, width: Number, depth: Number, taper: Number = 1.0) -> Solid:
     """Straight bar of rectangular section: ``width`` along x where it can be, ``depth`` across.
 
     An upright beam has its ends cut level, so that a splayed leg stands flat on the floor.
@@ -217,7 +238,7 @@ def beam(start: Point, end: Point, width: Number, depth: Number, taper: Number =
     return loft(np.stack([a + square @ frame, b + taper * (square @ frame)]))
 
 
-def sheet(grid: Float[np.ndarray, "r c 3"], thickness: Number) -> Part:
+def sheet(grid: Float[np.ndarray, "r c 3"], thickness: Number) -> Solid:
     """Solid of even thickness about a curved surface given as a grid of points."""
     normal = np.cross(np.gradient(grid, axis=0), np.gradient(grid, axis=1))
     length = np.linalg.norm(normal, axis=2, keepdims=True)
@@ -225,9 +246,15 @@ def sheet(grid: Float[np.ndarray, "r c 3"], thickness: Number) -> Part:
     return loft(np.concatenate([grid + normal, (grid - normal)[:, ::-1]], axis=1), cap="zip")
 
 
+def curved_wall(plan: Float[np.ndarray, "n 2"], z: Span, thickness: Number) -> Solid:
+    """Upright wall of even thickness along a curve of the ground plane."""
+    rows = [at_height(plan, height) for height in np.linspace(*z, 3)]
+    return sheet(np.stack(rows, axis=1), thickness)
+
+
 def ribbon(
     path: Float[np.ndarray, "n 3"], across: Float[np.ndarray, "n 3"], thickness: Number
-) -> Part:
+) -> Solid:
     """Strip along ``path`` that reaches ``across`` to either side of it."""
     return sheet(np.stack([path - across, path, path + across], axis=1), thickness)
 

@@ -11,10 +11,10 @@ from tqdm import tqdm
 
 from qs3.errors import InputError
 from qs3.files import sha256
+from qs3.io.layouts.format import SPLITS
 from qs3.io.point_files import POINT_FILES, read_cloud
 from qs3.io.ragged import RaggedClouds
 
-SPLITS = ("train", "test")
 _MANY = 500
 
 
@@ -66,52 +66,47 @@ def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudF
     """
     if not root.is_dir():
         raise InputError(f"{root}: no such folder")
-    flat = [CloudFile(path, "", "") for path in _files(root, endings)]
     folders = _folders(root)
-    found = _split_first(folders, endings) or _class_first(folders, endings)
-    if flat and found:
+    flat = [CloudFile(path, "", "") for path in _files(root, endings)]
+    deeper = _split_first(folders, endings) or _class_first(folders, endings)
+    files = [*flat, *deeper]
+    loose = [file.path for file in files if not file.class_name]
+    if (flat and deeper) or 0 < len(loose) < len(files):
         raise InputError(
-            f"{root}: has clouds both in class folders and beside them ({flat[0].path.name}); "
-            "move either away"
+            f"{loose[0].parent}: has clouds both in class folders and beside them "
+            f"({loose[0].name}); move either away"
         )
-    if not flat and not found:
+    if not files:
         raise InputError(
             f"{root}: no cloud found; known are {', '.join(endings)} in it, in <class>/ or in "
             "<class>/<train|test>/"
         )
-    return flat or found
+    return files
 
 
 def _class_first(folders: list[Path], endings: Sequence[str]) -> list[CloudFile]:
-    found = []
+    files = []
     for folder in folders:
-        found += [CloudFile(path, folder.name, "") for path in _files(folder, endings)]
-        for part in SPLITS:
-            files = _files(folder / part, endings)
-            found += [CloudFile(path, folder.name, part) for path in files]
-    return found
+        files += [CloudFile(path, folder.name, "") for path in _files(folder, endings)]
+        for split in SPLITS:
+            paths = _files(folder / split, endings)
+            files += [CloudFile(path, folder.name, split) for path in paths]
+    return files
 
 
 def _split_first(folders: list[Path], endings: Sequence[str]) -> list[CloudFile]:
     """The files below train and test, where there is no other folder; none where that is not so."""
-    if not folders or any(folder.name not in SPLITS for folder in folders):
+    if any(folder.name not in SPLITS for folder in folders):
         return []
-    found = []
+    files = []
     for folder in folders:
-        below = _folders(folder)
-        if any(inner.name in SPLITS for inner in below):
+        inner = _folders(folder)
+        if any(path.name in SPLITS for path in inner):
             return []  # a class that is named train
-        found += [CloudFile(path, "", folder.name) for path in _files(folder, endings)]
-        for inner in below:
-            files = _files(inner, endings)
-            found += [CloudFile(path, inner.name, folder.name) for path in files]
-    if len({bool(file.class_name) for file in found}) > 1:
-        loose = next(file.path for file in found if not file.class_name)
-        raise InputError(
-            f"{loose.parent}: has clouds both in class folders and beside them ({loose.name}); "
-            "move either away"
-        )
-    return found
+        files += [CloudFile(path, "", folder.name) for path in _files(folder, endings)]
+        for path in inner:
+            files += [CloudFile(file, path.name, folder.name) for file in _files(path, endings)]
+    return files
 
 
 def choose_split(root: Path, files: Sequence[CloudFile], split: str | None) -> list[CloudFile]:

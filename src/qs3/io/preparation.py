@@ -1,7 +1,6 @@
-"""Transforms of point clouds, vectorised over the batch.
+"""The one way of clouds into a network: one number of points, the unit ball.
 
-Convention:
-    z is up. Every function returns new float32 arrays and leaves its input as it was.
+Every function returns new float32 arrays and leaves its input as it was.
 """
 
 from collections.abc import Sequence
@@ -29,44 +28,12 @@ def unit_ball(points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n 3"]:
     return np.where(flat, 0.0, centred / np.where(flat, 1.0, radius)).astype(np.float32)
 
 
-def rotate_z(
-    points: Float[np.ndarray, "b n 3"], rng: np.random.Generator
-) -> Float[np.ndarray, "b n 3"]:
-    """Turn each cloud about the z axis by its own angle, uniform over the full circle.
-
-    Convention:
-        Anticlockwise seen from above, as `qs3.geometry.rotation_z`.
-    """
-    angle = rng.uniform(0.0, 2.0 * np.pi, size=(len(points), 1))
-    c, s = np.cos(angle), np.sin(angle)
-    x, y, z = np.moveaxis(points, 2, 0)
-    return np.stack([c * x - s * y, s * x + c * y, z], axis=2).astype(np.float32)
-
-
-def jitter(
-    points: Float[np.ndarray, "b n 3"],
-    rng: np.random.Generator,
-    sigma: float = 0.01,
-    clip: float = 0.02,
-) -> Float[np.ndarray, "b n 3"]:
-    """Move each coordinate by Gaussian noise, clipped.
-
-    Args:
-        points: Clouds.
-        rng: Source of the noise.
-        sigma: Standard deviation before clipping, in the units of the points.
-        clip: Largest move along one axis, same units.
-    """
-    noise = np.clip(rng.normal(0.0, sigma, size=points.shape), -clip, clip)
-    return (points + noise).astype(np.float32)
-
-
 def resample(
     cloud: Float[np.ndarray, "n 3"], num_points: int, rng: np.random.Generator | None = None
 ) -> Float[np.ndarray, "m 3"]:
     """Bring one cloud to exactly ``num_points`` points.
 
-    More points than that are thinned by farthest point sampling; fewer are repeated in order.
+    Of more points a farthest point sample is taken; fewer are repeated in order.
 
     Args:
         cloud: The cloud; returned as it is where it has the right size.
@@ -80,7 +47,7 @@ def resample(
         >>> resample(np.array([[0.0, 0, 0], [1, 0, 0]]), 3)[:, 0].tolist()
         [0.0, 1.0, 0.0]
     """
-    # Imported here: the transforms of training need no k-d tree.
+    # Imported here: the unit ball needs no k-d tree.
     from qs3.sensor.sampling import farthest_point_sample
 
     count = len(cloud)

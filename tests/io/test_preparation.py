@@ -2,10 +2,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from qs3.errors import InputError
-from qs3.io.transforms import jitter, resample, rotate_z, stack, unit_ball
+from qs3.io.preparation import resample, stack, unit_ball
 
 
 @given(seed=st.integers(0, 10**6), scale=st.floats(1e-3, 1e3), shift=st.floats(-100, 100))
@@ -26,26 +25,6 @@ def test_unit_ball_of_equal_points_is_zero(value):
     ball = unit_ball(points)
     assert not ball[0].any()
     assert np.linalg.norm(ball[1], axis=1).max() == pytest.approx(1)
-
-
-def test_rotate_z_turns_each_cloud_by_its_own_angle_anticlockwise(rng):
-    points = rng.normal(size=(4, 10, 3))
-    seed = 5
-    angles = np.random.default_rng(seed).uniform(0, 2 * np.pi, size=4)
-    turned = rotate_z(points, np.random.default_rng(seed))
-    for cloud, angle, result in zip(points, angles, turned, strict=True):
-        expected = Rotation.from_euler("z", angle).apply(cloud)
-        np.testing.assert_allclose(result, expected, atol=1e-6)
-    assert len(set(angles)) == 4
-
-
-def test_jitter_has_the_stated_spread_and_limit(rng):
-    points = np.ones((10, 2000, 3), dtype=np.float32)
-    moved = jitter(points, rng, sigma=0.01, clip=1.0) - 1
-    assert moved.std() == pytest.approx(0.01, rel=0.02)
-    clipped = jitter(points, rng, sigma=0.01, clip=0.005) - 1
-    assert np.abs(clipped).max() == pytest.approx(0.005, abs=1e-6)
-    assert (points == 1).all()
 
 
 def test_resample_repeats_in_turn_or_takes_the_farthest_points(rng):

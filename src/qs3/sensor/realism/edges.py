@@ -1,70 +1,71 @@
 """A plate before a wall: bands without a match (T4) and what happens at the edges (T5)."""
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float
 
-from qs3.sensor.realism.checks_wall import Plain, distances
-from qs3.sensor.realism.results import Row, result, row
-from qs3.sensor.realism.stage import Shot, Stage, painted, plate, wall
+from qs3.sensor.realism.bench import Bench, distances, painted, plate, wall
+from qs3.sensor.realism.rows import Judged, Row, row
 from qs3.sensor.render import Body
 from qs3.sensor.rig import Region
+from qs3.sensor.view import ViewImages
 
+NEAR = 1.0
+"""Pixels of disparity within which a match is one of a surface."""
 _ROWS = 96  # of the strips that are measured
-_NEAR = 1.0  # pixels of disparity within which a match is one of a surface
 
 
-def edge_distances(stage: Stage) -> tuple[float, float]:
+def edge_distances(bench: Bench) -> tuple[float, float]:
     """Where plate and wall stand: 0.6 m and 1 m, or farther in the same ratio.
 
     The plate is at least 1.2 times as far as the nearest that the sensor measures.
     """
-    nearest = distances(stage.sensor, 2)[0]
-    near = max(0.6 if stage.sensor.metric else 0.0, 1.2 * nearest)
+    nearest = distances(bench.sensor, 2)[0]
+    near = max(0.6 if bench.sensor.metric else 0.0, 1.2 * nearest)
     return near, near / 0.6
 
 
-def strip(stage: Stage, left: int, right: int) -> Region:
+def before_wall(bench: Bench) -> tuple[Body, Body]:
+    """A plate, 0.15 of the frame's width to either side of its middle, before a wall."""
+    near, far = edge_distances(bench)
+    width = 2 * 0.15 * bench.rig.width * near / bench.rig.focal
+    sheet = plate((0.0, near), width, 2 * near * bench.rig.height / bench.rig.focal)
+    return painted(sheet), painted(wall(far))
+
+
+def _strip(bench: Bench, left: int, right: int) -> Region:
     """Columns ``left`` to ``right`` − 1 of a few rows about the middle of the frame."""
-    rig, rows = stage.rig, min(_ROWS, stage.rig.height)
+    rig, rows = bench.rig, min(_ROWS, bench.rig.height)
     left, right = max(0, left), min(rig.width, right)
     return Region(left, (rig.height - rows) // 2, right - left, rows)
 
 
-def before_wall(stage: Stage, front: Body | None = None, half: float = 0.15) -> tuple[Body, Body]:
-    """A plate, ``half`` of the frame's width to either side of its middle, before a wall."""
-    near, far = edge_distances(stage)
-    width = 2 * half * stage.rig.width * near / stage.rig.focal
-    sheet = plate((0.0, near), width, 2 * near * stage.rig.height / stage.rig.focal)
-    return front or painted(sheet), painted(wall(far))
-
-
-def shoot_edges(stage: Stage, seed: int) -> tuple[Shot, float, float]:
-    """Photograph a plate before a wall: the shot, and the disparities of the two."""
-    near, far = edge_distances(stage)
-    close, distant = float(stage.rig.disparity(near)), float(stage.rig.disparity(far))
-    block, middle = stage.sensor.matching.block_size, stage.rig.width / 2
-    reach = int(0.15 * stage.rig.width + (close - distant) + 4 * block)
-    region = strip(stage, int(middle - reach), int(middle + reach))
-    return stage.shoot(before_wall(stage), region, seed), close, distant
+def _shoot_edges(bench: Bench) -> tuple[ViewImages, float, float, tuple[int, int]]:
+    """A plate before a wall: both disparities, the plate's first and last column."""
+    near, far = (float(bench.rig.disparity(z)) for z in edge_distances(bench))
+    block, middle = bench.sensor.matching.block_size, bench.rig.width / 2
+    reach = int(0.15 * bench.rig.width + (near - far) + 4 * block)
+    view = bench.shoot(before_wall(bench), _strip(bench, int(middle - reach), int(middle + reach)))
+    front = np.flatnonzero(view.mask.any(axis=0))
+    return view, near, far, (int(front[0]), int(front[-1]))
 
 
 # T4
 
 
-def bands(stage: Stage, seed: int, quick: bool) -> Plain:
-    """T4: the band at the left border of a wall and the shadow left of a plate."""
-    matching = stage.sensor.matching
-    band = []
+def bands(bench: Bench) -> Judged:
+    """T4: the band at the left border of a wall and the shadow left of a plate.
+
+    Expected are f·b/z ± 1 px and f·b·(1/z₁ − 1/z₂) ± half a block: geometry of a stereo pair.
+    """
+    matching, rows = bench.sensor.matching, []
     if matching.left_band == "physical":
-        for index, z in enumerate(distances(stage.sensor, 2 if quick else 4)):
-            region = strip(stage, 0, int(stage.rig.disparity(z)) + 4 * matching.block_size)
-            shot = stage.shoot([painted(wall(z))], region, seed + index)
-            band += band_rows(shot.disparity, float(stage.rig.disparity(z)), f"at {z:.2f} m")
-    shot, near, far = shoot_edges(stage, seed)
-    first = int(np.flatnonzero((shot.body == 0).any(axis=0))[0])
-    return result("T4", band + shadow_rows(shot.disparity, first, near, far, matching.block_size))
+        for index, z in enumerate(distances(bench.sensor, 2 if bench.quick else 4)):
+            expected = float(bench.rig.disparity(z))
+            region = _strip(bench, 0, int(expected) + 4 * matching.block_size)
+            view = bench.shoot([painted(wall(z))], region, index)
+            rows += band_rows(view.disparity, expected, f"at {z:.2f} m")
+    view, near, far, (first, _) = _shoot_edges(bench)
+    return rows + shadow_rows(view.disparity, first, near, far, matching.block_size), {}
 
 
 def band_rows(disparity: Float[np.ndarray, "h w"], expected: float, where: str = "") -> list[Row]:
@@ -96,18 +97,12 @@ def shadow_rows(
         far: The wall's disparity.
         block: The matcher's block.
     """
-    behind = (np.abs(disparity[:, :first] - far) < _NEAR).mean(axis=0) >= 0.5
+    behind = (np.abs(disparity[:, :first] - far) < NEAR).mean(axis=0) >= 0.5
     width = float(np.argmax(behind[::-1])) if behind.any() else float("nan")
-    shadow = near - far
-    inside = disparity[:, max(0, first - round(shadow)) : first]
+    least, most = max(0.0, near - far - block / 2), near - far + block / 2
+    inside = disparity[:, max(0, first - round(near - far)) : first]
     return [
-        row(
-            "shadow left of an edge",
-            width,
-            max(0.0, shadow - block / 2),
-            shadow + block / 2,
-            "px",
-        ),
+        row("shadow left of an edge", width, least, most, "px"),
         row("share of it without a match", np.isnan(inside).mean()),
     ]
 
@@ -115,14 +110,13 @@ def shadow_rows(
 # T5
 
 
-def edges(stage: Stage, seed: int, quick: bool) -> Plain:
-    """T5: the left and right edge of a plate before a wall."""
-    shot, near, far = shoot_edges(stage, seed)
-    front = np.flatnonzero((shot.body == 0).any(axis=0))
-    sides = int(front[0]), int(front[-1])
-    return result(
-        "T5", *edge_rows(shot.disparity, sides, near, far, stage.sensor.matching.block_size)
-    )
+def edges(bench: Bench) -> Judged:
+    """T5: the left and right edge of a plate before a wall.
+
+    It looks wider than it is by at most half a block at either edge: geometry of block matching.
+    """
+    view, near, far, sides = _shoot_edges(bench)
+    return edge_rows(view.disparity, sides, near, far, bench.sensor.matching.block_size)
 
 
 def edge_rows(
@@ -131,7 +125,7 @@ def edge_rows(
     near: float,
     far: float,
     block: int,
-) -> tuple[list[Row], dict[str, Any]]:
+) -> Judged:
     """Judge how far a plate reaches beyond its true edges.
 
     Args:
@@ -146,26 +140,27 @@ def edge_rows(
         the share of rows with the plate's depth and with one between plate and wall.
     """
     reach = 2 * block
+    wide = ((0, 0), (reach, reach))
+    padded = np.pad(disparity.astype(np.float64), wide, constant_values=np.nan)
     outward = {
-        "left": _window(disparity, sides[0] - reach, sides[0] + reach)[:, ::-1],
-        "right": _window(disparity, sides[1] + 1 - reach, sides[1] + 1 + reach),
+        "left": padded[:, sides[0] : sides[0] + 2 * reach][:, ::-1],
+        "right": padded[:, sides[1] + 1 : sides[1] + 1 + 2 * reach],
     }
     rows = []
     for side, part in outward.items():
         grown = np.median(fattening(part, near, reach))
         rows.append(row(f"fattening of the {side} edge", grown, -block / 2, block / 2, "px"))
     both = np.concatenate(list(outward.values()))
-    between = (both > far + _NEAR) & (both < near - _NEAR)
+    between = (both > far + NEAR) & (both < near - NEAR)
     around = slice(reach - block, reach + block)
     valid = np.isfinite(both[:, around]).sum()
     flying = between[:, around].sum() / valid if valid else np.nan
     rows.append(row("flying points within a block of the edges", 100 * flying, unit="%"))
-    data: dict[str, Any] = {
+    return rows, {
         "offset": np.arange(-reach, reach) + 0.5,
-        "near_share": (np.abs(both - near) < _NEAR).mean(axis=0),
+        "near_share": (np.abs(both - near) < NEAR).mean(axis=0),
         "between_share": between.mean(axis=0),
     }
-    return rows, data
 
 
 def fattening(part: Float[np.ndarray, "h w"], near: float, edge: int) -> Float[np.ndarray, "h"]:
@@ -183,14 +178,6 @@ def fattening(part: Float[np.ndarray, "h w"], near: float, edge: int) -> Float[n
         >>> fattening(np.array([[9.0, 9.0, 9.0, 2.0], [9.0, 2.0, 2.0, 2.0]]), 9.0, 2).tolist()
         [1.0, -1.0]
     """
-    plated = np.abs(part - near) < _NEAR
+    plated = np.abs(part - near) < NEAR
     last = part.shape[1] - 1 - plated[:, ::-1].argmax(axis=1)
     return np.where(plated.any(axis=1), last + 1.0 - edge, -float(edge))
-
-
-def _window(image: Float[np.ndarray, "h w"], start: int, stop: int) -> Float[np.ndarray, "h w2"]:
-    """Columns ``start`` to ``stop`` − 1, NaN where the image has none."""
-    made = np.full((image.shape[0], stop - start), np.nan)
-    low, high = max(0, start), min(image.shape[1], stop)
-    made[:, low - start : high - start] = image[:, low:high]
-    return made

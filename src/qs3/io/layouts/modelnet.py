@@ -1,0 +1,215 @@
+"""ModelNet: 2,048 points a mesh in HDF5, and the meshes themselves as samples of their surface.
+
+HDF5, the download that most networks are trained on: ``ply_data_<train|test><i>.h5`` with ``data``
+[b 2048 3] float32 and ``label`` [b 1] uint8, ``shape_names.txt`` with a class a line in the order
+of the label, ``train_files.txt`` and ``test_files.txt``. Other datasets (``normal``, ``faceId``)
+and files (``*_id2file.json``) are passed over. Meshes: ``<class>/<train|test>/*.off``. To scan
+these with a sensor, and so get what a camera would see of them, use `qs3.store.generate` instead.
+
+Convention:
+    y is up in the HDF5 files: the code released with them turns clouds about y "along up
+    direction". They are turned z up by (x, y, z) → (x, −z, y) and written back by the inverse. The
+    meshes are z up and are read as they are; sizes and places are the files' own.
+
+    NOTE: that y is up is known; which way the release turned ModelNet's z-up meshes is not told
+    anywhere, so that a cloud may come back turned about z against its mesh.
+
+Source: Wu et al., "3D ShapeNets", CVPR 2015; Qi et al., "PointNet", CVPR 2017
+(https://github.com/charlesq34/pointnet).
+"""
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Int
+from tqdm import tqdm
+
+from qs3.errors import InputError
+from qs3.files import sha256, write_text
+from qs3.geometry import y_up_from_z_up, z_up_from_y_up
+from qs3.io.layouts.class_folders import choose_split, list_folder
+from qs3.io.layouts.format import SPLITS, Format, labels_as
+from qs3.io.layouts.hdf5_sets import list_parts, named, read_parts, text_lines, write_parts
+from qs3.io.ragged import RaggedClouds
+from qs3.meshes.classes import MODELNET40
+
+CLASSES = tuple(sorted(MODELNET40))
+"""ModelNet40's classes in the order of their label."""
+
+_FILES = r"ply_data_(train|test)_?(\d+)\.h5"
+_NAMES = "shape_names.txt"
+# The released lists name their files so, and some loaders open just that.
+_LISTED = "data/modelnet40_ply_hdf5_2048/"
+_MOST_CLASSES = 256
+_MESH_POINTS = 2048
+_MANY = 100
+_PAGE = "http://modelnet.cs.princeton.edu/ModelNet40.zip"
+
+
+def read_modelnet_h5(path: Path, split: str | None = None) -> RaggedClouds:
+    """Read the folder.
+
+    Args:
+        path: Folder of the .h5 files.
+        split: ``train`` or ``test``; None takes both.
+
+    Raises:
+        InputError: where there is no such file or split, a file is bad, or a label has no name;
+            without ``shape_names.txt`` the names are ModelNet40's.
+    """
+    root = Path(path)
+    parts = list_parts(root, _FILES, "ply_data_train<i>.h5 or ply_data_test<i>.h5", split)
+    names = root / _NAMES
+    if names.is_file():
+        return read_parts(parts, _read_names(names), (3,), z_up_from_y_up)
+    try:
+        return read_parts(parts, CLASSES, (3,), z_up_from_y_up)
+    except InputError as error:
+        raise InputError(
+            f"{error} ({names} is missing, so the classes were taken to be ModelNet40's)"
+        ) from error
+
+
+def _read_names(path: Path) -> list[str]:
+    names = text_lines(path)
+    if not 0 < len(set(names)) == len(names):
+        raise InputError(f"{path}: needs one class name a line, none twice")
+    return names
+
+
+def write_modelnet_h5(path: Path, clouds: RaggedClouds) -> None:
+    """Write the folder; read back, clouds, class names and splits are equal.
+
+    Where all classes are among ModelNet40's, labels are those of the forty; other classes keep
+    their own labels, and ``shape_names.txt`` tells their names. Where the clouds have one size it
+    is kept; otherwise all are brought to 2,048 points. The order within a split is kept, the ids
+    are not.
+
+    Args:
+        path: New or empty folder.
+        clouds: What to write.
+
+    Raises:
+        InputError: where there are no labels, more than 256 classes, a class
+            whose name fits no line, or a cloud of neither train nor test.
+    """
+    names = _names(clouds.class_names)
+    labels = labels_as(clouds, names)
+    path.mkdir(parents=True, exist_ok=True)
+    write_text(path / _NAMES, "".join(f"{name}\n" for name in names))
+    write_parts(path, clouds, labels, _file_name, _arrays, listed=_LISTED)
+
+
+def _names(class_names: Sequence[str]) -> Sequence[str]:
+    if MODELNET40.issuperset(class_names):
+        return CLASSES
+    for name in class_names:
+        if name != name.strip() or not name.isprintable() or not name:
+            raise InputError(f"class {name!r} cannot stand in a line of {_NAMES}; rename it")
+    if len(class_names) > _MOST_CLASSES or len(set(class_names)) < len(class_names):
+        raise InputError(f"this layout holds {_MOST_CLASSES} classes at most, none named twice")
+    return class_names
+
+
+def _file_name(split: str, index: int) -> str:
+    return f"ply_data_{split}{index}.h5"
+
+
+def _arrays(
+    points: Float32[np.ndarray, "b n 3"], labels: Int[np.ndarray, "b"]
+) -> dict[str, np.ndarray]:
+    data = y_up_from_z_up(points).astype(np.float32)
+    return {"data": data, "label": labels.astype(np.uint8)[:, None]}
+
+
+def read_modelnet_meshes(path: Path, split: str | None = None) -> RaggedClouds:
+    """Sample the meshes of a tree, one after another; only their samples stay in memory.
+
+    Args:
+        path: Folder of the classes.
+        split: ``train`` or ``test``; None takes both.
+
+    Raises:
+        InputError: where there is no mesh or split, a class is none of ModelNet40's, or a mesh is
+            bad.
+    """
+    root = Path(path)
+    files = list_folder(root, (".off",))
+    for file in files:
+        if file.class_name not in MODELNET40 or file.split not in SPLITS:
+            raise InputError(
+                f"{file.path}: is not in <class>/<train|test>/ of a class of ModelNet40"
+            )
+    names = sorted({file.class_name for file in files})
+    files = choose_split(root, files, split)
+    digest = hashlib.sha256(b"surface")
+    clouds, ids = [], []
+    for file in tqdm(files, "read", unit="mesh", disable=None if len(files) > _MANY else True):
+        ids.append(file.path.relative_to(root).as_posix())
+        digest.update(f"{ids[-1]} {sha256(file.path)}\n".encode(errors="surrogateescape"))
+        clouds.append(_sample(file.path, ids[-1]))
+    return RaggedClouds(
+        clouds=clouds,
+        ids=tuple(ids),
+        checksum=digest.hexdigest(),
+        labels=np.array([names.index(file.class_name) for file in files], dtype=np.int64),
+        class_names=tuple(names),
+        splits=tuple(file.split for file in files),
+    )
+
+
+def _sample(path: Path, identifier: str) -> Float32[np.ndarray, "n 3"]:
+    # Imported here: listing layouts needs no mesh library.
+    from qs3.meshes.loading import load_mesh
+    from qs3.meshes.normalising import sample_surface
+
+    # Of the id alone: a mesh more or less leaves all other clouds as they were.
+    digest = hashlib.sha256(identifier.encode(errors="surrogateescape")).digest()
+    rng = np.random.default_rng(np.frombuffer(digest, dtype="<u4"))
+    mesh = load_mesh(path)
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            points = sample_surface(mesh, _MESH_POINTS, rng)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    if not np.isfinite(points).all():
+        raise InputError(f"{path}: its coordinates are too large")
+    return points
+
+
+def _detect_meshes(path: Path) -> bool:
+    try:
+        inner = [entry for entry in path.iterdir() if entry.is_dir() and entry.name[0] not in "._"]
+        return bool(inner) and all(_is_class(entry) for entry in inner)
+    except OSError:  # no folder, or one that cannot be listed
+        return False
+
+
+def _is_class(folder: Path) -> bool:
+    parts = [folder / part for part in SPLITS]
+    return folder.name in MODELNET40 and any(_has_mesh(part) for part in parts)
+
+
+def _has_mesh(folder: Path) -> bool:
+    return folder.is_dir() and any(entry.suffix.lower() == ".off" for entry in folder.iterdir())
+
+
+FORMATS = (
+    Format(
+        name="modelnet-off",
+        layout="ModelNet's meshes as clouds of their surface: <class>/<train|test>/*.off",
+        detect=_detect_meshes,
+        read=read_modelnet_meshes,
+        page=_PAGE,
+    ),
+    Format(
+        name="modelnet40-h5",
+        layout="ModelNet as HDF5: ply_data_<train|test>*.h5 with data and label, shape_names.txt",
+        detect=lambda path: named(path, _FILES),
+        read=read_modelnet_h5,
+        write=write_modelnet_h5,
+        page=_PAGE,
+    ),
+)

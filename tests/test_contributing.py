@@ -1,0 +1,42 @@
+"""CONTRIBUTING's tables of files are what the code asks for: an example of each is followed."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SECTIONS = re.findall(
+    r"^### (Add [^\n]+)\n+Example: (\w+)\.\n+((?:\|.*\n)+)",
+    (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"),
+    re.MULTILINE,
+)
+# Who lists things of all kinds by choice: tables of runs, texts of help.
+BY_CHOICE = ("src/qs3/experiments/",)
+LIMITS = {"sensor": 2, "network": 5, "method": 4, "layout of data sets": 4, "table or figure": 3}
+
+
+@pytest.mark.parametrize(("title", "example", "table"), SECTIONS, ids=[s[0] for s in SECTIONS])
+def test_a_new_thing_touches_the_files_that_are_listed(title, example, table):
+    listed = {
+        path.replace("<name>", example)
+        for path in re.findall(r"^\| `([^`]+)`", table, re.MULTILINE)
+    }
+    for path in listed:
+        assert (ROOT / path).is_file()
+    word = re.compile(rf"\b{example}\b", re.IGNORECASE)
+    mentioning = {
+        str(path.relative_to(ROOT))
+        for path in (ROOT / "src").rglob("*.py")
+        if word.search(path.read_text(encoding="utf-8"))
+    }
+    unlisted = {path for path in mentioning - listed if not path.startswith(BY_CHOICE)}
+    assert not unlisted
+    assert listed <= mentioning | {path for path in listed if example in path}
+
+
+def test_there_are_few_of_them():
+    counts = {title.removeprefix("Add a "): table.count("\n| `src") for title, _, table in SECTIONS}
+    assert counts.keys() == LIMITS.keys()
+    for name, count in counts.items():
+        assert 0 < count <= LIMITS[name]

@@ -1,0 +1,121 @@
+"""Laws of reading settings from plain values: strict, one line a fault, and back again."""
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pytest
+
+from qs3.errors import InputError
+from qs3.structure import structure, unstructure
+
+
+@dataclass(frozen=True)
+class Inner:
+    share: float
+    word: Literal["a", "b", 1] = "a"
+
+    def __post_init__(self) -> None:
+        if self.share > 1:
+            raise InputError(f"share must be at most 1, not {self.share}")
+
+
+@dataclass(frozen=True)
+class Outer:
+    count: int
+    inner: Inner
+    pair: tuple[int, str] = (1, "x")
+    many: tuple[Inner, ...] = ()
+    items: Sequence[float] = ()
+    table: Mapping[str, Inner] = field(default_factory=dict)
+    either: int | str | None = None
+    noted: Annotated[tuple[int, ...], "a note"] = ()
+    path: Path = Path()
+    flag: bool = False
+    anything: Any = None
+
+
+PLAIN = {
+    "count": 3,
+    "inner": {"share": 0.5, "word": 1},
+    "pair": [2, "y"],
+    "many": [{"share": 0.25, "word": "b"}],
+    "items": [1.0, 2.5],
+    "table": {"left": {"share": 1.0, "word": "a"}},
+    "either": "text",
+    "noted": [1, 2],
+    "path": "a/b",
+    "flag": True,
+    "anything": {"free": [1, None]},
+}
+
+
+def test_there_and_back_is_the_same() -> None:
+    made = structure(PLAIN, Outer, "a.json")
+    assert made.many[0] == Inner(0.25, "b")
+    assert made.path == Path("a/b")
+    assert made.noted == (1, 2)
+    assert unstructure(made) == PLAIN
+    assert json.loads(json.dumps(unstructure(made))) == PLAIN
+
+
+def test_what_is_left_out_takes_its_default_and_whole_numbers_are_numbers() -> None:
+    made = structure({"count": 1, "inner": {"share": 1}}, Outer, "a.json")
+    assert made == Outer(1, Inner(1.0))
+    assert type(made.inner.share) is float
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"coutn": 1}, "field 'coutn' is unknown; did you mean count?"),
+        ({"inner": {"share": 1, "wrod": 2}}, "field 'inner.wrod' is unknown"),
+        ({"inner": {}}, "field 'inner.share' is missing"),
+        ({"inner": []}, "field 'inner': [] is not a table of settings"),
+        ({"count": True}, "field 'count': True is not a whole number"),
+        ({"count": 1.0}, "field 'count': 1.0 is not a whole number"),
+        ({"count": "1"}, "field 'count': '1' is not a whole number"),
+        ({"flag": 1}, "field 'flag': 1 is not true or false"),
+        ({"inner": {"share": "1"}}, "field 'inner.share': '1' is not a number"),
+        ({"inner": {"share": True}}, "field 'inner.share': True is not a number"),
+        ({"inner": {"share": 2}}, "field 'inner': share must be at most 1, not 2.0"),
+        ({"inner": {"share": 1, "word": True}}, "field 'inner.word': True is none of a, b, 1"),
+        ({"pair": [1]}, "field 'pair': a list of 1, not of 2"),
+        ({"pair": [1, 2]}, "field 'pair[1]': 2 is not text"),
+        ({"noted": [1, "x"]}, "field 'noted[1]': 'x' is not a whole number"),
+        ({"items": "12"}, "field 'items': '12' is not a list"),
+        ({"many": [{"share": 1}, {"share": None}]}, "field 'many[1].share': None is not a number"),
+        ({"table": {"left": {"sha": 1}}}, "field 'table.left.sha' is unknown"),
+        ({"table": []}, "field 'table': [] is not a table"),
+        ({"either": 1.5}, "field 'either': 1.5 is not a whole number"),
+        ({"path": 3}, "field 'path': 3 is not a path"),
+        ({"count": 10**5000}, None),
+    ],
+)
+def test_a_fault_is_one_line_that_names_file_and_field(
+    change: dict[str, Any], message: str | None
+) -> None:
+    if message is None:  # a whole number of any length is one, and is told in short where it fails
+        assert structure(PLAIN | change, Outer, "a.json").count == change["count"]
+        return
+    with pytest.raises(InputError) as caught:
+        structure(PLAIN | change, Outer, "a.json")
+    assert str(caught.value).startswith(f"a.json: {message}")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_key_and_another_kind_of_value_are_told() -> None:
+    with pytest.raises(InputError, match=r"a\.json: field 'count' is missing"):
+        structure({"inner": {"share": 1}}, Outer, "a.json")
+    with pytest.raises(InputError, match=r"a\.json: 7 is not a table of settings"):
+        structure(7, Outer, "a.json")
+    with pytest.raises(InputError, match=r"^a\.json: share must be at most 1, not 3\.0$"):
+        structure({"share": 3.0}, Inner, "a.json")
+
+
+def test_every_field_of_a_frozen_dataclass_comes_back() -> None:
+    made = structure(PLAIN, Outer, "a.json")
+    assert {f.name for f in dataclasses.fields(made)} == set(unstructure(made))
