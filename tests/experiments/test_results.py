@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -65,33 +66,27 @@ def test_every_record_is_of_a_run_of_a_table():
         assert names == {path.stem for path in RECORDS if path.parts[-3] == folder}
 
 
-def add_field(kind: type, to: Any, monkeypatch: pytest.MonkeyPatch) -> type:
-    """Add a setting to a dataclass, as a later version may."""
-    wider = dataclasses.make_dataclass(
-        kind.__name__,
-        [("novelty", float, dataclasses.field(default=0.5))],
-        bases=(kind,),
-        frozen=True,
-    )
-    wider.__module__ = kind.__module__
-    for module in to:
-        monkeypatch.setattr(module, kind.__name__, wider)
-    return wider
+def wider(kind: type, modules: Sequence[Any], patch: pytest.MonkeyPatch, **types: type) -> type:
+    """Add a setting to a dataclass, as a later version may; its modules see the wider one."""
+    fields = [(name, inner, dataclasses.field()) for name, inner in types.items()]
+    if kind is scales.Scale:  # a default goes on standing where there is one
+        fields = [(name, inner, dataclasses.field(default=None)) for name, inner in types.items()]
+    fields.append(("novelty", float, dataclasses.field(default=0.5)))
+    made = dataclasses.make_dataclass(kind.__name__, fields, bases=(kind,), frozen=True)
+    for module in modules:
+        patch.setattr(module, kind.__name__, made)
+    return made
 
 
 def test_a_setting_that_is_added_leaves_all_records_readable(monkeypatch):
-    train = add_field(config.TrainSettings, (config, runs, grid, scales), monkeypatch)
-    rounds = add_field(config.SelfTrainingSettings, (config, runs, grid), monkeypatch)
-    scale = add_field(scales.Scale, (scales, setup), monkeypatch)
-    monkeypatch.setattr(scale, "__annotations__", scales.Scale.__annotations__ | {"train": train})
+    train = wider(config.TrainSettings, (config, grid, scales), monkeypatch)
+    rounds = wider(config.SelfTrainingSettings, (config, grid), monkeypatch)
+    scale = wider(scales.Scale, (scales, setup), monkeypatch, train=train)
+    wider(setup.Marker, (setup,), monkeypatch, scale=scale)
     presets = {
         name: rounds(**structure.unstructure(preset)) for name, preset in config.PRESETS.items()
     }
     monkeypatch.setattr(runs, "PRESETS", presets)
-    marker = dataclasses.make_dataclass(
-        "Marker", [("scale", scale)], bases=(setup.Marker,), frozen=True
-    )
-    monkeypatch.setattr(setup, "Marker", marker)
     count = 0
     for folder in ("bench", "laptop", "smoke"):
         place = read_setup(ROOT / "results" / folder)

@@ -32,11 +32,11 @@ if TYPE_CHECKING:
     from qs3.training.progress import Deadline as Deadline
     from qs3.training.progress import TimeUpError as TimeUpError
     from qs3.training.progress import parse_duration as parse_duration
+    from qs3.training.rounds import RoundRecord as RoundRecord
     from qs3.training.run import Run as Run
     from qs3.training.run import find_runs as find_runs
     from qs3.training.run import is_run as is_run
     from qs3.training.run import read_run as read_run
-    from qs3.training.self_training import RoundRecord as RoundRecord
     from qs3.training.self_training import self_train as self_train
     from qs3.training.validation import Checkpoint as Checkpoint
     from qs3.training.validation import adapt_statistics as adapt_statistics
@@ -53,8 +53,9 @@ _MODULES = {
     "loop": "train",
     "predict": "predict_probabilities",
     "progress": "Deadline TimeUpError parse_duration",
+    "rounds": "RoundRecord",
     "run": "Run find_runs is_run read_run",
-    "self_training": "RoundRecord self_train",
+    "self_training": "self_train",
     "validation": "Checkpoint adapt_statistics read_checkpoints",
 }
 

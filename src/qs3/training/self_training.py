@@ -3,44 +3,30 @@
 import copy
 import logging
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 from lightning_fabric import Fabric
-from torch import Tensor, nn
+from torch import Tensor
 
 from qs3.adaptation import Method, PseudoLabelled
 from qs3.adaptation.graph_labels import refine_probabilities
 from qs3.adaptation.normalisation import make_norm
-from qs3.adaptation.priors import estimate_prior_bbse, estimate_prior_em
-from qs3.adaptation.selection import (
-    select_confident,
-    select_prior,
-    select_quantile,
-    select_quasi_balanced,
-    select_uniform,
-)
+from qs3.adaptation.selection import select_confident
 from qs3.errors import InputError
-from qs3.evaluation.metrics import accuracy, confusion_matrix
+from qs3.evaluation.metrics import accuracy
 from qs3.io.clouds import PointClouds, UnlabelledClouds, digests
 from qs3.models import PointClassifier
-from qs3.structure import structure
 from qs3.training.batches import require_finite, require_unlabelled
 from qs3.training.checkpoint import (
     derived_seed,
-    load_tensors_into,
     new_model,
-    prefixed,
-    read_tensors,
     save_model,
     weights_fingerprint,
-    without_prefix,
-    write_tensors,
 )
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.distributed import make_fabric
@@ -48,6 +34,8 @@ from qs3.training.history import EpochRecord, History
 from qs3.training.loop import EpochCallback, train
 from qs3.training.predict import Description, describe, predict_probabilities
 from qs3.training.progress import Deadline
+from qs3.training.rounds import RoundRecord, Rounds, begin_rounds, write_rounds
+from qs3.training.rules import Select, make_rule
 from qs3.training.run import Run, claim_run, data_record, sum_seconds, write_run
 from qs3.training.state import CHECKPOINT
 from qs3.training.validation import adapt_statistics
@@ -58,74 +46,10 @@ STREAM = 1
 """Sets the random draws of the rounds apart from those of the warm-up."""
 
 
-@dataclass(frozen=True)
-class RoundRecord:
-    """What one round of self-training did."""
-
-    round: int
-    """Count from 1."""
-    theta: float
-    """Threshold of this round; 0 for rule ``quantile``."""
-    pool: int
-    """Clouds to select from."""
-    confident: tuple[int, ...]
-    """Clouds of the pool over the threshold, by pseudo label."""
-    kept: tuple[int, ...]
-    """Clouds that the rule kept, by pseudo label."""
-    agreement: float | None
-    """Share of the target whose pseudo label is that of the round before; None in round 1."""
-    skipped: bool
-    """Whether too few clouds were kept to train on (fewer than 2 a class or 2 a device, without
-    those held out), so that the network stayed as it was."""
-    single_class: bool
-    """Whether all confident clouds had one class."""
-    held_out: float | None
-    """Best accuracy so far on held-out pseudo labels; None without a ``best`` teacher."""
-    losses: tuple[Mapping[str, float], ...]
-    """Mean losses of each epoch."""
-    seconds: float
-    """Wall-clock seconds of the run that finished the round."""
-    accuracies: tuple[float | None, ...] = ()
-    """Of each epoch, as in `EpochRecord`: on the pseudo labels and the source together."""
-    learning_rates: tuple[float, ...] = ()
-    """Adam's learning rate in each epoch."""
-
-
 RoundCallback = Callable[[RoundRecord, PointClassifier], None]
 """Called after each round, when its state is written."""
 Look = Callable[[int, PointClassifier], None]
 """Called on every device after each round, before its state is written."""
-Select = Callable[[Float[np.ndarray, "m k"], float], Bool[np.ndarray, "m"]]
-"""A rule that selects among clouds by their probabilities and θ."""
-
-
-class Best(nn.Module):
-    """The network that was best on held-out pseudo labels, over all rounds."""
-
-    score: Tensor
-
-    def __init__(self, model: PointClassifier) -> None:
-        super().__init__()
-        self.model = copy.deepcopy(model)
-        self.register_buffer("score", torch.zeros((), dtype=torch.float64))
-
-
-@dataclass
-class State:
-    """What one round hands on to the next."""
-
-    latest: PointClassifier
-    """Network of the last round, Φ."""
-    best: Best | None
-    """Network that labels where the teacher is the ``best`` one."""
-    pool: Int[np.ndarray, "p"]
-    """Clouds of the target to select from."""
-    labels: Int[np.ndarray, "m"] | None = None
-    """Pseudo labels of the last round; None before the first."""
-    optimiser: dict[str, Tensor] = field(default_factory=dict)
-    """Adam's state, for a schedule that goes on over the rounds."""
-    records: list[RoundRecord] = field(default_factory=list)
-    """What the rounds so far did."""
 
 
 def self_train(
@@ -233,7 +157,7 @@ def run_rounds(
         raise InputError("the target has no cloud; give unlabelled clouds")
     require_finite(target.points, target.ids, "target: ")
     path = None if run_dir is None else Path(run_dir) / STATE
-    state = _begin(model, len(target), rounds, fabric, path)
+    state = begin_rounds(model, len(target), rounds, fabric, path)
     classes = len(source.class_names)
     say = partial(_say, settings=settings, rounds=rounds, target=target, fabric=fabric)
     if history is not None:
@@ -307,7 +231,7 @@ def run_rounds(
         if look is not None:
             look(number, state.latest)
         if path is not None and fabric.is_global_zero:
-            _write(path, state)
+            write_rounds(path, state)
             (path.parent / CHECKPOINT).unlink(missing_ok=True)
         fabric.barrier()
         if history is not None:
@@ -317,29 +241,8 @@ def run_rounds(
     return state.latest, state.records
 
 
-def _begin(
-    model: PointClassifier,
-    count: int,
-    rounds: SelfTrainingSettings,
-    fabric: Fabric,
-    path: Path | None,
-) -> State:
-    """The state before the first round, or after the last one that was written."""
-    latest = copy.deepcopy(model)
-    fabric.to_device(latest)
-    best = Best(latest) if rounds.teacher == "best" else None
-    if best is not None:
-        fabric.to_device(best)
-    index = np.arange(count)
-    state = State(latest, best, index[index % 10 < 8] if rounds.pool == "split" else index)
-    if path is not None and path.is_file():
-        _read(path, state)
-    fabric.barrier()  # the first device must not write before all have read
-    return state
-
-
 def _say(
-    state: State,
+    state: Rounds,
     points: np.ndarray,
     settings: TrainSettings,
     rounds: SelfTrainingSettings,
@@ -361,67 +264,6 @@ def _label(said: Description, rounds: SelfTrainingSettings) -> Float[np.ndarray,
     return refine_probabilities(said.features, said.probabilities)
 
 
-def make_rule(
-    rounds: SelfTrainingSettings,
-    number: int,
-    labels: Int[np.ndarray, "s"],
-    held: tuple[np.ndarray, np.ndarray] | None,
-) -> Select:
-    """Return the rule that selects in one round.
-
-    Args:
-        rounds: Which rule, and its numbers.
-        number: Count of the round, from 1.
-        labels: Classes of the source's clouds, for the prior that EM starts from.
-        held: Classes and probabilities of the held-out part of the source, for BBSE.
-
-    Raises:
-        InputError: where BBSE has no held-out part.
-    """
-    if rounds.rule == "spst":
-        return partial(select_confident, inclusive=rounds.inclusive)
-    if rounds.rule == "uniform":
-        return partial(select_uniform, quantile=rounds.quantile, inclusive=rounds.inclusive)
-    if rounds.rule == "quantile":
-        # Rounded: 0.2 + 2 · 0.05 is a little over 0.3, which would keep one cloud more.
-        portion = min(1.0, round(rounds.portion + (number - 1) * rounds.portion_step, 12))
-        return lambda probabilities, _: select_quantile(probabilities, 0.0, portion)
-    if rounds.rule == "prior":
-        return lambda probabilities, theta: select_prior(
-            probabilities,
-            theta,
-            _prior(rounds, probabilities, labels, held),
-            quantile=rounds.quantile,
-            inclusive=rounds.inclusive,
-        )
-    return partial(
-        select_quasi_balanced,
-        selection=rounds.selection,
-        inclusive=rounds.inclusive,
-        single_class=rounds.single_class,
-    )
-
-
-def _prior(
-    rounds: SelfTrainingSettings,
-    probabilities: np.ndarray,
-    labels: np.ndarray,
-    held: tuple[np.ndarray, np.ndarray] | None,
-) -> Float[np.ndarray, "k"]:
-    k = probabilities.shape[1]
-    if rounds.prior == "em":
-        # A class that the source lacks has no share to start from; a trace lets EM find it.
-        counts = np.maximum(np.bincount(labels, minlength=k), 1e-3)
-        return estimate_prior_em(probabilities, counts / counts.sum())
-    if held is None:
-        raise InputError("prior = 'bbse' needs a held-out part of the source; set holdout above 0")
-    truth, answers = held
-    return estimate_prior_bbse(
-        confusion_matrix(truth, answers.argmax(axis=1), k),
-        np.bincount(probabilities.argmax(axis=1), minlength=k),
-    )
-
-
 def _too_few(number: int, count: int, classes: int, devices: int) -> bool:
     least = 2 * max(classes, devices)
     if count < least:
@@ -434,7 +276,7 @@ def _too_few(number: int, count: int, classes: int, devices: int) -> bool:
 
 
 def _train_round(
-    state: State,
+    state: Rounds,
     number: int,
     chosen: Int[np.ndarray, "c"],
     labels: Int[np.ndarray, "c"],
@@ -505,28 +347,3 @@ def _train_round(
     method.norm.settle()
     state.optimiser = optimiser if continuous else {}
     return epochs
-
-
-def _write(path: Path, state: State) -> None:
-    assert state.labels is not None  # noqa: S101
-    tensors = prefixed("latest", state.latest.state_dict())
-    tensors |= prefixed("optimiser", state.optimiser)
-    if state.best is not None:
-        tensors |= prefixed("best", state.best.state_dict())
-    tensors["pool"] = torch.from_numpy(state.pool)
-    tensors["labels"] = torch.from_numpy(state.labels)
-    write_tensors(path, tensors, {"records": [asdict(record) for record in state.records]})
-
-
-def _read(path: Path, state: State) -> None:
-    tensors, facts = read_tensors(path)
-    try:
-        state.pool, state.labels = tensors["pool"].numpy(), tensors["labels"].numpy()
-        records = facts["records"]
-    except KeyError as error:
-        raise InputError(f"{path}: not a state of this version; delete the run") from error
-    state.records = [structure(record, RoundRecord, path) for record in records]
-    state.optimiser = without_prefix("optimiser", tensors)
-    load_tensors_into(state.latest, without_prefix("latest", tensors), path)
-    if state.best is not None:
-        load_tensors_into(state.best, without_prefix("best", tensors), path)

@@ -12,12 +12,14 @@ from qs3.experiments.scales import Scale
 
 
 def _columns(scale: Scale) -> Headings:
-    columns = []
-    for count in scale.fused_views:
-        source = Domain("S") if count == scale.source_views else Domain("V", views=count)
-        fields = {"source": source}
-        columns.append(Heading(str(count), str(count), fields, axis="fused views", number=count))
-    return tuple(columns)
+    sources = {
+        count: Domain("S") if count == scale.source_views else Domain("V", views=count)
+        for count in scale.fused_views
+    }
+    return tuple(
+        Heading(str(count), str(count), {"source": source}, "fused views", float(count))
+        for count, source in sources.items()
+    )
 
 
 def _pairs(scale: Scale) -> list[Pair]:
