@@ -1,4 +1,4 @@
-"""Time and memory of every network against its textbook form in benchmarks/reference/.
+"""Time and memory of the networks against their textbook forms in benchmarks/reference/.
 
 Run:  python benchmarks/models.py                     the table, on the GPU where there is one
       python benchmarks/models.py --quick             small and fast, to try it out

@@ -1,8 +1,8 @@
 """Write the table of sizes in docs/models.md: parameters and multiply-adds, ours and published.
 
 Multiply-adds of matrix products and convolutions are counted on a run (`torch.utils.flop_counter`)
-at one cloud of 1,024 points and 40 classes, for our form and for the textbook one in
-benchmarks/reference. Published values, with their sources, are in the list below.
+at one cloud of 1,024 points and 40 classes, for our form and, where there is one, for the textbook
+form in benchmarks/reference. Published values, with their sources, are in the list below.
 
 Usage: ``python docs/make_models_table.py`` (from the repository)
 """
@@ -24,10 +24,7 @@ _START, _END = "<!-- sizes: docs/make_models_table.py -->", "<!-- end of sizes -
 # Name: parameters in millions, multiply-adds in millions, where they stand.
 PUBLISHED = {
     "pointnet": ("3.5", "440", "PointNet, Table 6"),
-    "pointnet-sa": ("–", "–", ""),
     "pointnet2": ("1.48", "1,684", "RS-CNN, complexity"),
-    "pointnet2-msg": ("–", "–", ""),
-    "dgcnn": ("–", "–", ""),
     "rscnn": ("1.41", "295", "RS-CNN, complexity"),
     "simpleview": ("0.8", "–", "SimpleView, §4"),
     "pointmlp-elite": ("0.68", "–", "PointMLP, Table 1"),
@@ -42,11 +39,13 @@ def multiply_adds(model: nn.Module) -> float:
     return counter.get_total_flops() / 2e6
 
 
-def reference(name: str) -> ModuleType:
-    """The textbook form of a network, by the name `create_model` takes."""
+def reference(name: str) -> ModuleType | None:
+    """The textbook form of a network, by the name `create_model` takes; None where ours is it."""
     stem = name.replace("-", "_")
     path = _ROOT / "benchmarks" / "reference" / f"{stem}.py"
     path = path if path.is_file() else path.with_stem(name.split("-")[0])
+    if not path.is_file():
+        return None
     spec = importlib.util.spec_from_file_location(f"reference_{stem}", path)
     assert spec is not None and spec.loader is not None  # noqa: S101
     module = importlib.util.module_from_spec(spec)
@@ -65,11 +64,11 @@ def table() -> str:
         torch.manual_seed(0)
         model = create_model(name, 40)
         size = sum(p.numel() for p in model.parameters()) / 1e6
-        ours = multiply_adds(model)
-        textbook = multiply_adds(reference(name).from_ours(model))
-        size_there, adds_there, source = PUBLISHED[name]
+        ours, book = multiply_adds(model), reference(name)
+        textbook = f"{multiply_adds(book.from_ours(model)):,.0f}" if book else "–"
+        size_there, adds_there, source = PUBLISHED.get(name, ("–", "–", ""))
         lines.append(
-            f"| `{name}` | {size:.2f} | {size_there} | {ours:,.0f} | {textbook:,.0f} "
+            f"| `{name}` | {size:.2f} | {size_there} | {ours:,.0f} | {textbook} "
             f"| {adds_there} | {source} |"
         )
     return "\n".join(lines)

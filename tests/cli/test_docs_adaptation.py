@@ -46,14 +46,14 @@ def rows(text, *head):
     line = "| " + " | ".join(head) + " |"
     assert text.count(line) == 1, line
     body = text.split(line)[1].split("\n")[2:]
-    found = {}
+    cells_of = {}
     for row in body:
         if not row.startswith("|"):
             break
         name, *cells = [cell.strip() for cell in row.strip().strip("|").split("|")]
-        assert name not in found
-        found[name.strip("`")] = cells
-    return found
+        assert name not in cells_of
+        cells_of[name.strip("`")] = cells
+    return cells_of
 
 
 def of_methods():
@@ -68,8 +68,8 @@ def of_methods():
 def commands(page):
     """Words of each command of a verb that trains or scores, continued lines joined."""
     text = page.replace("\\\n", " ")
-    found = re.findall(r"^(?:    )?qs3 (train|evaluate) ([^#\n]*)", text, flags=re.MULTILINE)
-    return [(verb, tuple(shlex.split(words))) for verb, words in found]
+    lines = re.findall(r"^(?:    )?qs3 (train|evaluate) ([^#\n]*)", text, flags=re.MULTILINE)
+    return [(verb, tuple(shlex.split(words))) for verb, words in lines]
 
 
 def small():
@@ -89,7 +89,7 @@ def test_settings_of_a_method_are_those_of_its_class(name):
         assert all(f"`{part}`" in text for part in COMPOSED[name])
         assert "| setting |" not in text
         return
-    fixed = {"self", "model", "label_smoothing", "norm"}
+    fixed = {"self", "model", "shared", "label_smoothing", "norm"}
     kind = method_class(name)
     own = {
         key: parameter.default
@@ -99,14 +99,14 @@ def test_settings_of_a_method_are_those_of_its_class(name):
     if not own:
         assert "No settings" in text
         return
-    told = rows(text, "setting", "default", "meaning")
-    assert list(told) == list(own)
+    table = rows(text, "setting", "default", "meaning")
+    assert list(table) == list(own)
     for key, default in own.items():
         if (name, key) in TOLD_IN_WORDS:
-            assert told[key][0] == TOLD_IN_WORDS[name, key]
+            assert table[key][0] == TOLD_IN_WORDS[name, key]
             continue
         # As --method-set reads it.
-        read = parse_settings("--method-set", [f"{key}={told[key][0]}"])[key]
+        read = parse_settings("--method-set", [f"{key}={table[key][0]}"])[key]
         assert read == json.loads(json.dumps(default)), key
         assert type(read) is type(default) or not isinstance(default, (bool, str)), key
     # Deviations that the class notes must be on the page.
@@ -129,19 +129,19 @@ def test_needs_passes_and_weights_of_a_method(name, monkeypatch):
     assert float(weights) == round(more / 1e6, 2)
     assert f"{own / 1e6:.2f} M" in PAGE
     made = create_method(base, small())
-    seen = []
+    passed = []
     network = type(made.model)
     encode = network.encode
 
     def counted(self, points):
-        seen.append(len(points))
+        passed.append(len(points))
         return encode(self, points)
 
     monkeypatch.setattr(network, "encode", counted)
     clouds = torch.rand(4, 24, 3, generator=torch.Generator().manual_seed(0))
     batch = Batch(clouds, torch.arange(4) % 3)
     made(batch, clouds if kind.uses_target else None, 0.5, torch.Generator().manual_seed(0))
-    assert len(seen) == int(passes.split(",")[0])
+    assert len(passed) == int(passes.split(",")[0])
 
 
 @pytest.mark.parametrize(("verb", "words"), [*commands(PAGE), *commands(README)])
@@ -172,8 +172,8 @@ def test_every_flag_that_is_named_exists(page, capsys):
     for kind in (TrainOptions, EvaluateOptions):
         with pytest.raises(SystemExit):
             tyro.cli(kind, args=["--help"])
-    told = capsys.readouterr().out
-    known = set(re.findall(r"--[a-z.-]+", told))
+    help_text = capsys.readouterr().out
+    known = set(re.findall(r"--[a-z.-]+", help_text))
     known |= {flag.replace("no-", "") for flag in known} | {"--checkpoints", "--crop"}
     for flag in re.findall(r"(?<![\w-])--[a-z][a-z.-]*(?<![.-])", page):
         assert flag in known, flag
@@ -191,17 +191,17 @@ def test_tables_of_rules_name_all_of_them():
 
 @pytest.mark.parametrize("preset", [name for name in PRESETS if name != "default"])
 def test_presets_on_the_page(preset):
-    told = rows(PAGE, "preset", "what differs from `default`")[preset][0].split(" unless ")[0]
+    differs = rows(PAGE, "preset", "what differs from `default`")[preset][0].split(" unless ")[0]
     default, chosen = PRESETS["default"], PRESETS[preset]
     for field in dataclasses.fields(SelfTrainingSettings):
         value, name = getattr(chosen, field.name), field.name
         words = f"{name}|{name.replace('_', ' ')}"
-        named = re.search(rf"(?<!\w)({words})\b", told) is not None
+        named = re.search(rf"(?<!\w)({words})\b", differs) is not None
         assert named == (value != getattr(default, name)), name
         if named and isinstance(value, bool):
-            assert f"no {name.replace('_', ' ')}" in told or value, name
+            assert f"no {name.replace('_', ' ')}" in differs or value, name
         elif named:
-            assert re.search(rf"\b{name}` ?`?{value}|{name} `{value}`", told), name
+            assert re.search(rf"\b{name}` ?`?{value}|{name} `{value}`", differs), name
 
 
 def value_of(cell, like):
@@ -217,20 +217,20 @@ def value_of(cell, like):
 
 def test_settings_of_self_training():
     text = sections(SETTINGS, 3)["Self-training"]
-    told = rows(text, "setting", "default", "`spst`", "what it does")
+    table = rows(text, "setting", "default", "`spst`", "what it does")
     names = [field.name for field in dataclasses.fields(SelfTrainingSettings)]
-    assert list(told) == names
+    assert list(table) == names
     for name in names:
-        for cell, preset in zip(told[name], ("default", "spst"), strict=False):
+        for cell, preset in zip(table[name], ("default", "spst"), strict=False):
             value = getattr(PRESETS[preset], name)
             assert value_of(cell, value) == value, (name, preset)
 
 
 def test_columns_where_text_and_code_differ():
-    told = rows(SETTINGS, "setting", "qs3", "`paper`", "`released`")
+    table = rows(SETTINGS, "setting", "qs3", "`paper`", "`released`")
     names = {field.name for field in dataclasses.fields(SelfTrainingSettings)}
     seen = set()
-    for row, cells in told.items():
+    for row, cells in table.items():
         name = re.match(r"\w+", row)[0]
         if name not in names:
             continue
@@ -248,10 +248,10 @@ def test_columns_where_text_and_code_differ():
 
 
 def test_settings_of_training():
-    told = rows(sections(SETTINGS, 2)["Training"], "setting", "default", "what it does")
+    table = rows(sections(SETTINGS, 2)["Training"], "setting", "default", "what it does")
     fields = {field.name for field in dataclasses.fields(TrainSettings)}
     new = {"normalisation", "holdout", "validate_every", "rule", "model_set", "method_set"}
-    names = {row.removeprefix("--").replace("-", "_"): cells for row, cells in told.items()}
+    names = {row.removeprefix("--").replace("-", "_"): cells for row, cells in table.items()}
     assert new <= set(names)
     for name in fields & set(names):
         default = getattr(TrainSettings(), name)

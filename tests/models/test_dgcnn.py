@@ -147,10 +147,6 @@ def test_half_precision_costs_no_more_than_in_plain_layers():
     assert 1e-3 < error(True, False) < 1.5 * error(True, True)
 
 
-def test_batch_of_one():
-    compare(make(torch.float64).eval(), clouds(b=1), 1e-9)
-
-
 @pytest.mark.parametrize("train", [True, False])
 def test_repeated_points(train):
     """At ties the maximum has no single gradient, so that outputs and statistics are compared."""

@@ -12,20 +12,12 @@ from torch import nn
 from torch.optim.swa_utils import update_bn
 
 from qs3.errors import InputError
-from qs3.models import DGCNN, Features, create_model, list_models
-from qs3.models.checks import (
-    check_choice,
-    check_flag,
-    check_number,
-    check_whole,
-    check_wholes,
-)
+from qs3.models import Features, create_model, list_models
 
 SMALL = {
     "dgcnn": {"neighbours": 6, "channels": (8, 8, 16), "embedding": 32, "hidden": (16, 8)},
     "pointnet": {"channels": (8, 8, 16), "hidden": (16, 8)},
-    "pointnet of each point": {"channels": (8, 8, 16), "hidden": (16, 8), "per_point": True},
-    "pointnet without T-Nets": {"channels": (8, 8, 16), "hidden": (16, 8), "transforms": False},
+    "pointnet of each point": {"channels": (8, 8, 16), "transforms": False, "per_point": True},
     "pointnet-sa": {
         "channels": (8, 8, 16, 16),
         "transform_hidden": (16, 8),
@@ -68,8 +60,7 @@ SMALL = {
         "embedding": 16,
         "hidden": (16, 8),
     },
-    "simpleview": {"width": 4, "resolution": 32},
-    "simpleview in perspective": {"width": 4, "resolution": 32, "projection": "perspective"},
+    "simpleview": {"width": 2, "resolution": 24},
 }
 NAMES = sorted(SMALL)
 
@@ -150,13 +141,6 @@ def test_gradient_reaches_every_parameter(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_same_seed_same_weights_and_other_seed_others(name):
-    first, again, other = (small(name, seed).state_dict() for seed in (0, 0, 1))
-    assert all(torch.equal(first[key], again[key]) for key in first)
-    assert any(not torch.equal(first[key], other[key]) for key in first)
-
-
-@pytest.mark.parametrize("name", NAMES)
 def test_training_steps_are_bit_identical(name):
     def steps():
         model = small(name).train()
@@ -173,100 +157,79 @@ def test_training_steps_are_bit_identical(name):
     assert all(torch.equal(first[key], again[key]) for key in first)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_state_dict_round_trip(name):
-    model, other = small(name, 0).eval(), small(name, 1).eval()
-    other.load_state_dict(model.state_dict())
-    assert torch.equal(model(clouds()), other(clouds()))
-
-
-def test_official_dgcnn_has_the_official_number_of_parameters():
-    # Convolutions 2·3·64 + 2·64·64 + 2·64·128 + 2·128·256, embedding 512·1024, head
-    # 2048·512 + 512·256 + 256 + 256·40 + 40, and two for each normalised channel.
-    weights = 384 + 8192 + 16384 + 65536 + 524288 + 1048576 + 131072 + 256 + 10240 + 40
-    normalised = 2 * (64 + 64 + 128 + 256 + 1024 + 512 + 256)
-    total = sum(p.numel() for p in DGCNN(40).parameters())
-    assert total == weights + normalised
+def waves(shape, start):
+    count = torch.Size(shape).numel()
+    return torch.sin(torch.arange(start, start + count, dtype=torch.float64)).view(shape)
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("name", "scores"),
     [
-        (lambda: create_model("dgcn", 5), "choose one of dgcnn, "),
-        (lambda: create_model("dgcnn", 5, neighbors=3), "unknown setting 'neighbors'.*neighbours"),
-        (lambda: create_model("dgcnn", 0), "num_classes"),
-        (lambda: create_model("dgcnn", 5, neighbours=256), "1 to 255"),
-        (
-            lambda: create_model("pointnet", 5, dropout=2.0),
-            "dropout must be a number, 0 to 1, not 2.0",
-        ),
+        ("pointmlp-elite", [21.100117, -8.881787, -17.175789, 14.851184, 12.563894]),
+        ("rscnn", [-6.035611, 0.860905, 4.4135, -2.880572, -2.998275]),
     ],
 )
-def test_faults_name_the_choices(call, message):
-    with pytest.raises(InputError, match=message):
-        call()
+def test_weights_of_release_0_1_give_the_scores_of_release_0_1(name, scores):
+    """There both networks had another form, with the same weights in the same order."""
+    model = small(name).double().eval()
+    for number, (key, tensor) in enumerate(model.state_dict().items()):
+        if tensor.is_floating_point():
+            variance = "running_var" in key
+            tensor.copy_(waves(tensor.shape, 100 * number) * (0.5 if variance else 1.0) + variance)
+    assert model(0.6 * waves((1, 40, 3), 7))[0].tolist() == pytest.approx(scores, abs=1e-6)
 
 
 @pytest.mark.parametrize(
     ("name", "settings", "message"),
     [
-        ("pointnet2", {"centres": (0, 4)}, "centres must be 2 whole numbers, each at least 1"),
-        ("pointnet2", {"centres": (12, 4, 2)}, "centres must be 2 whole numbers"),
-        ("pointnet2", {"embedding": ()}, "embedding must be 1 or more whole numbers"),
-        (
-            "pointnet2",
-            {"scales": (((-0.2, 4, (8, 8)),), ((0.4, 4, (8, 8)),))},
-            "radius in scales must be a number, larger than 0, not -0.2",
-        ),
-        ("pointnet2", {"scales": ()}, "scales must be one or more of"),
+        ("dgcn", {}, "choose one of dgcnn, "),
+        ("dgcnn", {"neighbors": 3}, "unknown setting 'neighbors' of dgcnn.*neighbours"),
+        ("dgcnn", {"num_classes": 0}, "num_classes must be at least 1"),
+        ("dgcnn", {"neighbours": 256}, "neighbours must be 1 to 255, not 256"),
+        ("dgcnn", {"neighbours": 2.5}, "field 'neighbours': 2.5 is not a whole number"),
+        ("dgcnn", {"neighbours": True}, "True is not a whole number"),
+        ("dgcnn", {"channels": ()}, "channels must be at least 1"),
+        ("dgcnn", {"hidden": (8, "8")}, r"'hidden\[1\]': '8' is not a whole number"),
+        ("pointnet", {"channels": (8, 8)}, "channels must be three or more"),
+        ("pointnet", {"channels": (8, 0, 8)}, "channels must be at least 1"),
+        ("pointnet", {"hidden": (8, 0)}, "hidden must be at least 1"),
+        ("pointnet", {"dropout": 2.0}, "dropout must be 0 to 1, not 2.0"),
+        ("pointnet", {"dropout": float("nan")}, "dropout must be 0 to 1"),
+        ("pointnet", {"per_point": "yes"}, "'yes' is not true or false"),
+        ("pointnet-sa", {"channels": (8, 8, 8)}, "a list of 3, not of 4"),
+        ("pointnet-sa", {"radius": 0.0}, "radius must be larger than 0"),
+        ("pointnet-sa", {"neighbours": 256}, "neighbours must be 1 to 255"),
+        ("pointnet2", {"centres": (12, 4, 2)}, "need one value for each level"),
+        ("pointnet2", {"ball_order": "random"}, "'random' is none of nearest, first"),
+        ("pointnet2", {"scales": ()}, "need one value for each level"),
+        ("pointnet2", {"scales": (((-0.2, 4, (8, 8)),),) * 2}, "radius in scales must be larger"),
+        ("pointnet2", {"scales": (((0.2, 256, (8, 8)),),) * 2}, "neighbours in scales must be 1"),
+        ("pointnet2", {"scales": (((0.2, 8, (8,)),),) * 2}, "widths must be two or more"),
         ("pointnet2-msg", {"grouping": "ssg"}, "unknown setting 'grouping'.* from centres, scal"),
-        ("pointnet", {"channels": ()}, "channels must be 3 or more whole numbers"),
-        ("pointnet", {"channels": (8, 0, 8)}, "channels must be 3 or more .* each at least 1"),
-        ("pointnet", {"hidden": (8, 0)}, "hidden must be 0 or more whole numbers, each at least 1"),
-        ("pointnet", {"dropout": -0.5}, "dropout must be a number, 0 to 1, not -0.5"),
-        ("pointnet", {"dropout": float("nan")}, "dropout must be a number"),
-        ("pointmlp-elite", {"reducers": (2, 2, 2, 0)}, "reducers must be .* each 1 to 255"),
-        ("pointmlp-elite", {"after": (1, 1, 256, 1)}, "after must be .* each 0 to 255"),
-        ("pointmlp-elite", {"bottleneck": 0.0}, "bottleneck must be a number, larger than 0"),
-        ("rscnn", {"radii": (float("inf"), 1.0)}, "radii must be a number"),
-        ("rscnn", {"neighbours": (0, 4)}, "neighbours must be .* each at least 1"),
-        ("rscnn", {"channels": (8, 2)}, "channels must be .* each at least 4"),
-        ("rscnn", {"order": "first"}, "unknown setting 'order'.* ball_order"),
-        ("simpleview", {"width": 0}, "width must be a whole number, at least 1, not 0"),
+        ("pointmlp-elite", {"reducers": (2, 2, 2, 0)}, "reducers must be 1 to 255"),
+        ("pointmlp-elite", {"after": (1, 1, 256, 1)}, "after must be 0 to 255"),
+        ("pointmlp-elite", {"reducers": (2, 2)}, "one value for each stage"),
+        ("pointmlp-elite", {"bottleneck": 0.0}, "bottleneck must be larger than 0"),
+        ("pointmlp-elite", {"embedding": 1}, "leaves nothing"),
+        ("rscnn", {"radii": (float("inf"), 1.0)}, "radii must be larger than 0"),
+        ("rscnn", {"radii": (0.2,)}, "one value for each level"),
+        ("rscnn", {"centres": (4, 8)}, "centres must not grow"),
+        ("rscnn", {"channels": (8, 2)}, "channels must be at least 4"),
+        ("rscnn", {"coordinates": "polar"}, "'polar' is none of absolute, relative"),
+        ("simpleview", {"width": 0}, "width must be at least 1"),
+        ("simpleview", {"resolution": 2000}, "resolution must be 8 to 1024"),
+        ("simpleview", {"projection": "flat"}, "'flat' is none of orthographic, perspective"),
     ],
 )
-def test_a_setting_out_of_range_is_named_with_its_range(name, settings, message):
+def test_unusable_settings_are_named(name, settings, message):
     with pytest.raises(InputError, match=message):
-        create_model(name, 5, **settings)
-
-
-@pytest.mark.parametrize(
-    ("check", "message"),
-    [
-        (lambda: check_whole("k", 2.5, 1, 255), "k must be a whole number, 1 to 255, not 2.5"),
-        (lambda: check_whole("k", True), "k must be a whole number"),
-        (lambda: check_wholes("widths", 8), "widths must be 1 or more whole numbers"),
-        (lambda: check_wholes("widths", (8, "8")), "widths must be 1 or more whole numbers"),
-        (lambda: check_number("dropout", "0.5", 0.0, 1.0), "dropout must be a number, 0 to 1"),
-        (lambda: check_number("radius", None), "radius must be a number, larger than 0"),
-        (lambda: check_flag("per_point", "yes"), "per_point must be true or false, not 'yes'"),
-        (lambda: check_choice("projection", 3, "near", "far"), "projection must be near or far"),
-    ],
-)
-def test_a_setting_of_another_kind_is_refused(check, message):
-    with pytest.raises(InputError, match=message):
-        check()
+        create_model(name, **{"num_classes": 5} | settings)
 
 
 def test_lists_within_lists_make_the_same_network():
     scales = json.loads(json.dumps(SMALL["pointnet2"]["scales"]))
     model = create_model("pointnet2", 5, **SMALL["pointnet2"] | {"scales": scales})
     assert model.levels[1].balls == small("pointnet2").levels[1].balls
-
-
-def test_json_lists_make_the_same_network():
-    model = create_model("pointnet", 5, channels=[8, 8, 16], hidden=[8])
-    assert model(clouds()).shape == (4, 5)
 
 
 @pytest.mark.parametrize("name", NAMES)

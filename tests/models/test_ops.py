@@ -80,12 +80,6 @@ def test_blocks_cover_every_row_once_in_bounded_memory(b, m, n):
     assert (seen == 1).all()
 
 
-@pytest.mark.parametrize("k", [0, 11])
-def test_knn_refuses_impossible_counts(k):
-    with pytest.raises(ValueError, match="neighbours of 10 points"):
-        knn(torch.zeros(1, 10, 3), k)
-
-
 def gathered(values, neighbours):
     return values[torch.arange(len(values))[:, None, None], neighbours]
 
@@ -129,9 +123,18 @@ def test_gradient_at_ties_goes_to_the_first_neighbour_alone():
     assert values.grad.flatten().tolist() == [0.0, 1.0, 2.0]
 
 
-def test_more_than_255_neighbours_are_refused():
-    with pytest.raises(ValueError, match="255"):
-        neighbour_max(torch.zeros(1, 300, 1), torch.zeros((1, 300, 256), dtype=torch.int64))
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda p: knn(p, 0), "neighbours of 10 points"),
+        (lambda p: ball_query(p, p, 1.0, 11), "neighbours of 10 points"),
+        (lambda p: farthest_point_sampling(p, 11), "of 10 points"),
+        (lambda p: neighbour_max(p, torch.zeros((1, 10, 256), dtype=torch.int64)), "255"),
+    ],
+)
+def test_impossible_counts_are_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call(torch.zeros(1, 10, 3))
 
 
 def test_flat_indices_stay_in_their_cloud():
@@ -190,12 +193,6 @@ def test_ball_blocks_do_not_matter(order, monkeypatch):
     assert torch.equal(ball_query(points, points[:, :90], 0.4, 8, order), whole)
 
 
-@pytest.mark.parametrize("k", [0, 11])
-def test_balls_refuse_impossible_counts(k):
-    with pytest.raises(ValueError, match="neighbours of 10 points"):
-        ball_query(torch.zeros(1, 10, 3), torch.zeros(1, 2, 3), 1.0, k)
-
-
 @pytest.mark.parametrize("start", [None, 4])
 def test_samples_are_those_of_brute_force(start):
     points = random_clouds(3, 80)
@@ -234,21 +231,16 @@ def test_both_ways_to_sample_give_the_same(dtype):
     assert torch.equal(farthest_point_sampling(points, 300, start), by_torch)
 
 
-@pytest.mark.parametrize("m", [0, 11])
-def test_sampling_refuses_impossible_counts(m):
-    with pytest.raises(ValueError, match="of 10 points"):
-        farthest_point_sampling(torch.zeros(1, 10, 3), m)
-
-
-@pytest.mark.parametrize("shape", [(2, 7), (2, 4, 3), (2, 2, 2, 2)])
+@pytest.mark.parametrize("shape", [(2, 7), (2, 2, 2, 2)])
 def test_gathering_and_its_gradients(shape):
     generator = torch.Generator().manual_seed(0)
     values = torch.randn(2, 6, 3, generator=generator, dtype=torch.float64, requires_grad=True)
     index = torch.randint(0, 6, shape, generator=generator)
     cloud = torch.arange(2).view(2, *[1] * (len(shape) - 1))
     assert torch.equal(gather_points(values, index), values[cloud, index])
-    assert torch.autograd.gradcheck(lambda v: gather_points(v, index), (values,))
-    assert torch.autograd.gradgradcheck(lambda v: gather_points(v, index).square(), (values,))
+    assert torch.autograd.gradcheck(lambda v: gather_points(v, index), (values,), fast_mode=True)
+    squares = (lambda v: gather_points(v, index).square(), (values,))
+    assert torch.autograd.gradgradcheck(*squares, fast_mode=True)
 
 
 def test_scattering_is_the_transpose_of_gathering():
@@ -283,7 +275,7 @@ def test_interpolation_at_known_points_and_its_gradients():
         three_nn_interpolate(known, known, features), features, rtol=0, atol=1e-5
     )
     inputs = (points.requires_grad_(), known.requires_grad_(), features)
-    assert torch.autograd.gradcheck(three_nn_interpolate, inputs)
+    assert torch.autograd.gradcheck(three_nn_interpolate, inputs, fast_mode=True)
 
 
 def test_interpolation_makes_nothing_larger_than_its_result():

@@ -8,10 +8,9 @@ import pytest
 import torch
 from torch import nn
 
-from qs3.errors import InputError
 from qs3.models import PointNet, create_model
 from qs3.models import pointnet as module
-from qs3.models.pointnet import linear_max, orthogonality
+from qs3.models.pointnet import linear_max
 
 FILE = Path(__file__).parents[2] / "benchmarks" / "reference" / "pointnet.py"
 SPEC = importlib.util.spec_from_file_location("pointnet_reference", FILE)
@@ -204,20 +203,3 @@ def test_transforms_start_at_the_identity():
     model = PointNet(5, **SMALL)
     identity = torch.eye(3).expand(4, 3, 3)
     torch.testing.assert_close(model.input_transform(clouds().float()), identity)
-
-
-def test_regulariser_is_read_by_a_hook():
-    model, found = random_model(), []
-    model.feature_transform.register_forward_hook(lambda _m, _i, matrix: found.append(matrix))
-    model(clouds())
-    (matrix,) = found
-    error = torch.eye(8, dtype=torch.float64) - torch.einsum("bij,bkj->bik", matrix, matrix)
-    expected = torch.linalg.matrix_norm(error).square().mean()
-    torch.testing.assert_close(orthogonality(matrix), expected)
-    rotation = torch.linalg.qr(torch.randn(2, 4, 4, dtype=torch.float64)).Q
-    assert float(orthogonality(rotation)) < 1e-20
-
-
-def test_too_few_layers():
-    with pytest.raises(InputError, match="channels must be 3 or more"):
-        PointNet(5, channels=(8, 8))

@@ -6,7 +6,6 @@ import pytest
 import torch
 from torch import nn
 
-from qs3.errors import InputError
 from qs3.models import PointNet2, create_model
 from qs3.models.ops import farthest_point_sampling
 
@@ -177,27 +176,3 @@ def test_a_bias_before_normalisation_folds_into_the_running_mean():
         norm.running_mean -= convolution.bias.detach()
     expected.groups = groups(model, points)
     assert error(model(points), expected(points)) < 1e-9
-
-
-def test_features_of_each_point_only_where_asked_for():
-    points = clouds("plain", torch.float32)
-    assert make("ssg", torch.float32).encode(points).local is None
-    model = PointNet2(5, "ssg", (24, 8), SSG, (16,), (8,), per_point=True)
-    assert model.encode(points).local.shape == (8, 60, 24)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"grouping": "mrg"}, "grouping must be ssg or msg"),
-        ({"ball_order": "random"}, "ball_order must be nearest or first"),
-        ({"scales": (((0.2, 256, (8, 8)),), ((0.4, 8, (8, 8)),))}, "1 to 255"),
-        (
-            {"scales": (((0.2, 8, (8,)),), ((0.4, 8, (8, 8)),))},
-            "widths in scales must be 2 or more",
-        ),
-    ],
-)
-def test_faults_name_the_setting(settings, message):
-    with pytest.raises(InputError, match=message):
-        create_model("pointnet2", 5, **settings)

@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import nn
 
-from qs3.errors import InputError
 from qs3.models import PointNetSA, create_model
 from qs3.models.ops import farthest_point_sampling, gather_points
 from qs3.models.pointnet_sa import SANode, fill_nodes
@@ -161,19 +160,3 @@ def test_filling_repeats_in_order():
     nodes = torch.arange(6.0).view(1, 3, 2)
     assert fill_nodes(nodes, 3) is nodes
     assert fill_nodes(nodes, 7)[0, :, 0].tolist() == [0, 2, 4, 0, 2, 4, 0]
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"channels": (8, 8, 8)}, "channels must be 4 whole numbers"),
-        ({"nodes": 0}, "nodes must be a whole number, at least 1"),
-        ({"neighbours": 256}, "neighbours must be a whole number, 1 to 255"),
-        ({"radius": 0.0}, "radius must be a number, larger than 0"),
-        ({"node_width": 0}, "node_width must be a whole number"),
-        ({"transform_hidden": (0,)}, "transform_hidden must be 0 or more whole numbers"),
-    ],
-)
-def test_unusable_settings_are_named(settings, message):
-    with pytest.raises(InputError, match=message):
-        create_model("pointnet-sa", 5, **settings)

@@ -95,11 +95,11 @@ def _nearest(
         cloud = slice(first, first + clouds)
         absent = ~valid[cloud, None]
         for start in range(0, n, rows):
-            here = queries[cloud, start : start + rows]
-            total = here[:, :, 0, None] - columns[cloud, None, 0]
+            block = queries[cloud, start : start + rows]
+            total = block[:, :, 0, None] - columns[cloud, None, 0]
             total.mul_(total)
             for axis in (1, 2):
-                difference = here[:, :, axis, None] - columns[cloud, None, axis]
+                difference = block[:, :, axis, None] - columns[cloud, None, axis]
                 total.add_(difference.mul_(difference))
             total.masked_fill_(absent, torch.inf)
             nearest[cloud, start : start + rows] = total.min(dim=2).indices

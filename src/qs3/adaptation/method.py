@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Generator, Tensor, nn
 
-from qs3.adaptation.normalisation import DomainNorm, SharedNorm
+from qs3.adaptation.normalisation import DomainNorm
 from qs3.errors import InputError
 from qs3.models import Features, PointClassifier, feature_widths
 
@@ -96,7 +96,7 @@ class Method(nn.Module, ABC):
             )
         self.model = model
         self.label_smoothing = label_smoothing
-        self.norm = SharedNorm(model) if norm is None else norm
+        self.norm = DomainNorm(model) if norm is None else norm
         self.right: Tensor | None = None
 
     @abstractmethod

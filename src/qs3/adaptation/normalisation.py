@@ -23,7 +23,7 @@ _AFFINE = ("weight", "bias")
 
 
 class DomainNorm(nn.Module):
-    """How the batch normalisation layers of a network treat the two domains.
+    """One set of running statistics, which follows every batch of either domain.
 
     Args:
         model: The network. It is not registered here: its method owns it.
@@ -41,10 +41,6 @@ class DomainNorm(nn.Module):
 
     def settle(self) -> None:
         """Leave plain layers behind, with the statistics that the target needs."""
-
-
-class SharedNorm(DomainNorm):
-    """One set of running statistics, which follows every batch of either domain."""
 
 
 class SeparateNorm(DomainNorm):
@@ -122,9 +118,9 @@ class TransNorm(SeparateNorm):
     @torch.no_grad()
     def _alpha(self, number: int) -> Tensor:
         layer, other = self._layers[number], self._other(number)
-        here = (layer.running_mean, layer.running_var)
-        there = (other["running_mean"], other["running_var"])
-        return channel_weights(here, there, layer.eps)  # pyright: ignore[reportArgumentType]
+        source = (layer.running_mean, layer.running_var)
+        target = (other["running_mean"], other["running_var"])
+        return channel_weights(source, target, layer.eps)  # pyright: ignore[reportArgumentType]
 
     @torch.no_grad()
     def settle(self) -> None:
@@ -167,4 +163,4 @@ def make_norm(name: Normalisation, model: PointClassifier) -> DomainNorm:
             f"unknown normalisation {name!r}; choose one of {', '.join(get_args(Normalisation))}"
         )
     kinds = {"separate": SeparateNorm, "transnorm": TransNorm}
-    return kinds.get(name, SharedNorm)(model)
+    return kinds.get(name, DomainNorm)(model)

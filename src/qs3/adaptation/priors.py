@@ -39,12 +39,12 @@ def estimate_prior_bbse(
     k = len(confusion)
     shares = check_prior("predicted", np.asarray(predicted, dtype=np.float64), k)
     sizes = confusion.sum(axis=1)
-    known = sizes > 0
-    if (confusion < 0).any() or not known.any():
+    present = sizes > 0
+    if (confusion < 0).any() or not present.any():
         raise InputError("the confusion matrix needs counts of at least one class")
-    within = (confusion[known] / sizes[known, None]).T
+    within = (confusion[present] / sizes[present, None]).T
     prior = np.zeros(k)
-    prior[known] = project_to_simplex(np.linalg.lstsq(within, shares, rcond=None)[0])
+    prior[present] = project_to_simplex(np.linalg.lstsq(within, shares, rcond=None)[0])
     return prior
 
 

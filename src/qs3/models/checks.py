@@ -1,9 +1,10 @@
 """Settings of networks and methods: unknown ones, wrong types and useless values are refused."""
 
 import dataclasses
+import functools
 import inspect
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, get_type_hints
 
 from qs3.errors import InputError
@@ -13,7 +14,7 @@ Number = int | float
 
 
 def read_settings(
-    kind: type, settings: Mapping[str, Any], what: str, fixed: Collection[str]
+    kind: type, settings: Mapping[str, Any], what: str, fixed: tuple[str, ...]
 ) -> dict[str, Any]:
     """Return settings as a class annotates them; lists, which JSON has, become tuples.
 
@@ -26,16 +27,24 @@ def read_settings(
     Raises:
         InputError: where a setting is unknown or of another type.
     """
-    parameters = inspect.signature(kind).parameters.values()
-    choice = [p.name for p in parameters if p.kind is not p.VAR_KEYWORD and p.name not in fixed]
+    table = _table(kind, fixed)
+    choice = [field.name for field in dataclasses.fields(table)]
     for key in settings:
         if key not in choice:
             words = f"choose from {', '.join(choice)}" if choice else "it takes none"
             raise InputError(f"unknown setting {key!r} of {what}; {words}")
-    hints = get_type_hints(kind.__init__)
-    shape = dataclasses.make_dataclass("Settings", [(key, hints[key]) for key in settings])
-    values = structure(dict(settings), shape, f"settings of {what}")
+    values = structure(dict(settings), table, f"settings of {what}")
     return {key: getattr(values, key) for key in settings}
+
+
+@functools.cache
+def _table(kind: type, fixed: tuple[str, ...]) -> type:
+    """Return a dataclass with the settings of a class as its fields."""
+    hints = get_type_hints(kind.__init__)
+    parameters = inspect.signature(kind).parameters.values()
+    names = [p.name for p in parameters if p.kind is not p.VAR_KEYWORD and p.name not in fixed]
+    fields = [(name, hints[name], dataclasses.field(default=None)) for name in names]
+    return dataclasses.make_dataclass(kind.__name__, fields, frozen=True)
 
 
 def check_range(

@@ -76,8 +76,8 @@ def feature_widths(model: PointClassifier) -> Widths:
         Widths(pooled=2048, per_point=None, local=512)
     """
     features = describe_point(model)
-    given = (features.pooled, features.per_point, features.local)
-    return Widths(*(None if part is None else part.shape[-1] for part in given))  # pyright: ignore[reportArgumentType]
+    parts = (features.pooled, features.per_point, features.local)
+    return Widths(*(None if part is None else part.shape[-1] for part in parts))  # pyright: ignore[reportArgumentType]
 
 
 class ClassifierHead(nn.Module):

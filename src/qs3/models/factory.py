@@ -52,5 +52,5 @@ def create_model(name: str, num_classes: int, **settings: Any) -> "PointClassifi
         raise InputError(f"unknown model {name!r}; choose one of {', '.join(_MODELS)}")
     module, kind, fixed = _MODELS[name]
     make = getattr(import_module(f"qs3.models.{module}"), kind)
-    values = {"num_classes": num_classes, **settings}
-    return make(**read_settings(make, values, name, fixed), **fixed)
+    values = read_settings(make, settings, name, ("num_classes", *fixed))
+    return make(num_classes, **fixed, **values)

@@ -80,8 +80,8 @@ def fold_norm(
     if not uses_batch(norm):
         assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
         scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
-        known = norm.running_mean if constant is None else norm.running_mean - constant
-        return scale[:, None] * weight, norm.bias - scale * known
+        before = norm.running_mean if constant is None else norm.running_mean - constant
+        return scale[:, None] * weight, norm.bias - scale * before
     assert moments is not None  # noqa: S101
     mean = weight @ moments.mean
     variance = ((weight @ moments.covariance) * weight).sum(dim=1).clamp_min(0.0)
@@ -104,19 +104,19 @@ def update_running(
         variance: Biased variance of its input.
         count: Number of values that both are taken over.
     """
-    known_mean, known_variance = norm.running_mean, norm.running_var
+    running_mean, running_variance = norm.running_mean, norm.running_var
     # A layer without running statistics keeps none; one in evaluation keeps those it has.
     moves = norm.training and norm.track_running_stats
-    if not moves or known_mean is None or known_variance is None:
+    if not moves or running_mean is None or running_variance is None:
         return
     momentum = norm.momentum
     if norm.num_batches_tracked is not None:
         norm.num_batches_tracked.add_(1)
         if momentum is None:
-            momentum = norm.num_batches_tracked.to(known_mean.dtype).reciprocal()
-    known_mean.lerp_(mean.to(known_mean), 0.0 if momentum is None else momentum)
+            momentum = norm.num_batches_tracked.to(running_mean.dtype).reciprocal()
+    running_mean.lerp_(mean.to(running_mean), 0.0 if momentum is None else momentum)
     unbiased = variance * (count / max(count - 1, 1))
-    known_variance.lerp_(unbiased.to(known_variance), 0.0 if momentum is None else momentum)
+    running_variance.lerp_(unbiased.to(running_variance), 0.0 if momentum is None else momentum)
 
 
 class FoldedLayer(nn.Module):

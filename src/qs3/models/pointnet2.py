@@ -150,16 +150,16 @@ class PointNet2(PointClassifier):
             *(PointwiseLayer(c, d, 0.0) for c, d in itertools.pairwise(widths))
         )
         self.classify = ClassifierHead(widths[-1], hidden, num_classes, dropout, 0.0)
-        self.per_point = per_point
+        self.grouping, self.per_point = grouping, per_point
 
     def encode(self, points: Float[Tensor, "b n 3"]) -> Features:
         """Describe each cloud by the maximum over the centres of the second level."""
-        known, features = points, None
+        centres, features = points, None
         for level in self.levels:
-            known, features = level(known, features)
+            centres, features = level(centres, features)
         assert features is not None  # noqa: S101
-        pooled = self.embed(torch.cat([known, features], dim=2)).amax(dim=1)
-        local = three_nn_interpolate(points, known, features) if self.per_point else None
+        pooled = self.embed(torch.cat([centres, features], dim=2)).amax(dim=1)
+        local = three_nn_interpolate(points, centres, features) if self.per_point else None
         return Features(pooled=pooled, local=local)
 
     def head(self, features: Features) -> Float[Tensor, "b k"]:

@@ -30,10 +30,10 @@ def pooled_layer(
         each = layer(points)
         return each.amax(dim=1), each.mean(dim=1)
     norm, weight = layer.norm, layer.linear.weight
-    batch, known = uses_batch(norm), None
+    batch, running = uses_batch(norm), None
     if not batch:
         assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
-        known = (norm.running_mean, norm.running_var)
+        running = (norm.running_mean, norm.running_var)
     kind = points.device.type
     if torch.is_autocast_enabled(kind):
         half = torch.get_autocast_dtype(kind)
@@ -44,7 +44,7 @@ def pooled_layer(
             weight,
             norm.weight,
             norm.bias,
-            known,
+            running,
             norm.eps,
             layer.slope,
         )
@@ -76,15 +76,15 @@ class _Pooled(torch.autograd.Function):
         weight: Tensor,
         scale: Tensor,
         shift: Tensor,
-        known: tuple[Tensor, Tensor] | None,
+        running: tuple[Tensor, Tensor] | None,
         eps: float,
         slope: float,
     ) -> tuple[Tensor, ...]:
         b, n, _ = points.shape
         d = len(weight)
         learns = any(ctx.needs_input_grad)
-        product = points @ weight.t() if learns or known is None else None
-        if known is None:
+        product = points @ weight.t() if learns or running is None else None
+        if running is None:
             assert product is not None  # noqa: S101
             mean = weight.to(scale.dtype) @ points.to(scale.dtype).mean(dim=(0, 1))
             variance = torch.zeros_like(mean)
@@ -92,7 +92,7 @@ class _Pooled(torch.autograd.Function):
                 variance += (product[block] - mean).square_().sum(dim=(0, 1))
             variance /= b * n
         else:
-            mean, variance = (value.clone() for value in known)
+            mean, variance = (value.clone() for value in running)
         deviation = torch.rsqrt(variance + eps)
         largest, average, slopes, weighted = (scale.new_zeros((b, d)) for _ in range(4))
         winner = torch.zeros((b, d), dtype=torch.int64, device=points.device)
@@ -113,7 +113,7 @@ class _Pooled(torch.autograd.Function):
                 *(points, weight, scale, shift, product, mean, deviation),
                 *(largest, winner, slopes, weighted),
             )
-            ctx.slope, ctx.known = slope, known is not None
+            ctx.slope, ctx.running = slope, running is not None
         ctx.mark_non_differentiable(mean, variance)
         return largest, average, mean, variance
 
@@ -129,7 +129,7 @@ class _Pooled(torch.autograd.Function):
         of_shift = (each * slopes + best).sum(dim=0)
         of_scale = (each * weighted + best * at_best).sum(dim=0)
         # In training the batch's mean and deviation depend on every value too.
-        share = 0.0 if ctx.known else 1.0 / (b * n)
+        share = 0.0 if ctx.running else 1.0 / (b * n)
         of_points, of_weight = torch.empty_like(points), scale.new_zeros(weight.shape)
         for block in _blocks(points, len(weight)):
             normed = (product[block] - mean).mul_(deviation)

@@ -5,31 +5,32 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from qs3.errors import InputError
 from qs3.models.classifier import PointClassifier
 from qs3.models.factory import create_model
 
 _PREFIX = "module."
+_NORM = {"weight": 1, "bias": 1, "running_mean": 1, "running_var": 1, "num_batches_tracked": 0}
+"""Tensors of a batch normalisation and their numbers of dimensions."""
 
 
-class _Layer(NamedTuple):
-    """A layer of a release, and what it is called here."""
+class _Tensor(NamedTuple):
+    """A tensor of a release, and what it is called here."""
 
     ours: str
     theirs: tuple[str, ...]
     """Its name, or its names where the release registers it twice."""
-    dimensions: dict[str, int]
-    """Number of dimensions of each of its tensors, by name."""
-    norm: str = ""
-    """Our normalisation after it, whose running mean takes a bias that ours leaves out."""
+    dimensions: int
+    absorbed: bool = False
+    """Whether it is a bias that ours leaves out, which goes into the running mean after it."""
 
 
 class _Release(NamedTuple):
-    """How a release names its layers, and which settings its shapes tell."""
+    """Tensors of a release, and which settings their shapes tell."""
 
-    layers: tuple[_Layer, ...]
+    tensors: tuple[_Tensor, ...]
     settings: Callable[[Mapping[str, Tensor]], dict[str, Any]]
     defaults: Mapping[str, Any] = {}
     """Settings in which the release differs from ours and that the weights do not tell."""
@@ -37,32 +38,35 @@ class _Release(NamedTuple):
 
 def _linear(
     ours: str, theirs: str, dimensions: int = 2, bias: bool = True, norm: str = ""
-) -> _Layer:
-    parts = {"weight": dimensions} | ({"bias": 1} if bias else {})
-    return _Layer(ours, (theirs,), parts, norm)
+) -> Iterator[_Tensor]:
+    yield _Tensor(f"{ours}.weight", (f"{theirs}.weight",), dimensions)
+    if norm:
+        yield _Tensor(f"{norm}.running_mean", (f"{theirs}.bias",), 1, absorbed=True)
+    elif bias:
+        yield _Tensor(f"{ours}.bias", (f"{theirs}.bias",), 1)
 
 
-def _norm(ours: str, *theirs: str) -> _Layer:
-    vectors = dict.fromkeys(("weight", "bias", "running_mean", "running_var"), 1)
-    return _Layer(ours, theirs, vectors | {"num_batches_tracked": 0})
+def _norm(ours: str, *theirs: str) -> Iterator[_Tensor]:
+    for part, dimensions in _NORM.items():
+        yield _Tensor(f"{ours}.{part}", tuple(f"{name}.{part}" for name in theirs), dimensions)
 
 
 def _widths(tensors: Mapping[str, Tensor], names: Sequence[str]) -> tuple[int, ...]:
     return tuple(len(tensors[f"{name}.weight"]) for name in names)
 
 
-def _dgcnn_layers() -> Iterator[_Layer]:
+def _dgcnn() -> Iterator[_Tensor]:
     for level in range(4):
         theirs = f"conv{level + 1}"
-        yield _linear(f"convolutions.{level}.linear", f"{theirs}.0", 4, bias=False)
-        yield _norm(f"convolutions.{level}.norm", f"{theirs}.1", f"bn{level + 1}")
-    yield _linear("embed.linear", "conv5.0", 3, bias=False)
-    yield _norm("embed.norm", "conv5.1", "bn5")
-    yield _linear("classify.layers.0", "linear1", bias=False)
-    yield _norm("classify.layers.1", "bn6")
-    yield _linear("classify.layers.4", "linear2")
-    yield _norm("classify.layers.5", "bn7")
-    yield _linear("classify.layers.8", "linear3")
+        yield from _linear(f"convolutions.{level}.linear", f"{theirs}.0", 4, bias=False)
+        yield from _norm(f"convolutions.{level}.norm", f"{theirs}.1", f"bn{level + 1}")
+    yield from _linear("embed.linear", "conv5.0", 3, bias=False)
+    yield from _norm("embed.norm", "conv5.1", "bn5")
+    yield from _linear("classify.layers.0", "linear1", bias=False)
+    yield from _norm("classify.layers.1", "bn6")
+    yield from _linear("classify.layers.4", "linear2")
+    yield from _norm("classify.layers.5", "bn7")
+    yield from _linear("classify.layers.8", "linear3")
 
 
 def _dgcnn_settings(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
@@ -74,24 +78,27 @@ def _dgcnn_settings(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
     }
 
 
-def _pointnet2_layers(multi: bool) -> Iterator[_Layer]:
+def _pointnet2(multi: bool) -> Iterator[_Tensor]:
     for level, scale in itertools.product(range(2), range(3 if multi else 1)):
         ours = f"levels.{level}.scales.{scale}.layers"
         kinds = ("conv_blocks", "bn_blocks") if multi else ("mlp_convs", "mlp_bns")
         block = f".{scale}" if multi else ""
         for depth in range(3):
-            convolution, norm = (f"sa{level + 1}.{kind}{block}.{depth}" for kind in kinds)
-            yield _norm(f"{ours}.{depth}.norm", norm)
-            yield _linear(f"{ours}.{depth}.linear", convolution, 4, norm=f"{ours}.{depth}.norm")
+            convolution, theirs = (f"sa{level + 1}.{kind}{block}.{depth}" for kind in kinds)
+            norm = f"{ours}.{depth}.norm"
+            yield from _norm(norm, theirs)
+            yield from _linear(
+                f"{ours}.{depth}.linear", convolution, 4, norm=f"{ours}.{depth}.norm"
+            )
     for depth in range(3):
         ours = f"embed.{depth}"
-        yield _norm(f"{ours}.norm", f"sa3.mlp_bns.{depth}")
-        yield _linear(f"{ours}.linear", f"sa3.mlp_convs.{depth}", 4, norm=f"{ours}.norm")
-    yield _norm("classify.layers.1", "bn1")
-    yield _linear("classify.layers.0", "fc1", norm="classify.layers.1")
-    yield _norm("classify.layers.5", "bn2")
-    yield _linear("classify.layers.4", "fc2")
-    yield _linear("classify.layers.8", "fc3")
+        yield from _norm(f"{ours}.norm", f"sa3.mlp_bns.{depth}")
+        yield from _linear(f"{ours}.linear", f"sa3.mlp_convs.{depth}", 4, norm=f"{ours}.norm")
+    yield from _norm("classify.layers.1", "bn1")
+    yield from _linear("classify.layers.0", "fc1", norm="classify.layers.1")
+    yield from _norm("classify.layers.5", "bn2")
+    yield from _linear("classify.layers.4", "fc2")
+    yield from _linear("classify.layers.8", "fc3")
 
 
 def _pointnet2_settings(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
@@ -99,12 +106,10 @@ def _pointnet2_settings(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
 
 
 _RELEASES = {
-    "dgcnn": _Release(tuple(_dgcnn_layers()), _dgcnn_settings),
-    "pointnet2": _Release(
-        tuple(_pointnet2_layers(False)), _pointnet2_settings, {"ball_order": "first"}
-    ),
+    "dgcnn": _Release(tuple(_dgcnn()), _dgcnn_settings),
+    "pointnet2": _Release(tuple(_pointnet2(False)), _pointnet2_settings, {"ball_order": "first"}),
     "pointnet2-msg": _Release(
-        tuple(_pointnet2_layers(True)), _pointnet2_settings, {"ball_order": "first"}
+        tuple(_pointnet2(True)), _pointnet2_settings, {"ball_order": "first"}
     ),
 }
 
@@ -160,14 +165,22 @@ s.save_file({k: v.clone() for k, v in d.get('model_state_dict', d).items()}, 'ou
     if name not in _RELEASES:
         raise InputError(f"no release known for {name!r}; choose one of {', '.join(_RELEASES)}")
     release = _RELEASES[name]
-    tensors = _under_first_names(name, _plain(name, state_dict), release.layers)
-    told = release.settings(tensors)
+    weights = _under_first_names(name, _plain(name, state_dict), release.tensors)
+    implied = release.settings(weights)
     for key in settings:
-        if key in told:
+        if key in implied:
             raise InputError(f"weights for {name}: they tell {key} themselves; leave it out")
     with torch.random.fork_rng(devices=[]):  # the fresh weights are not a draw of the caller's
-        model = create_model(name, **told, **(dict(release.defaults) | settings))
-    _fill(name, model, tensors, release.layers)
+        model = create_model(name, **implied, **(dict(release.defaults) | settings))
+    ours = model.state_dict()
+    for tensor in release.tensors:
+        key, target = tensor.theirs[0], ours[tensor.ours]
+        # The last dimensions of a convolution are 1.
+        expected = target.shape + (1,) * (tensor.dimensions - target.ndim)
+        if weights[key].shape != expected:
+            raise _odd_shape(name, key, weights[key], str(list(expected)))
+        value = weights[key].to(target.dtype).reshape(target.shape)
+        target.copy_(target - value if tensor.absorbed else value)
     return model.eval()
 
 
@@ -184,44 +197,37 @@ def _plain(name: str, state_dict: Mapping[str, Any]) -> dict[str, Tensor]:
 
 
 def _under_first_names(
-    name: str, tensors: Mapping[str, Tensor], layers: Sequence[_Layer]
+    name: str, weights: Mapping[str, Tensor], tensors: Sequence[_Tensor]
 ) -> dict[str, Tensor]:
-    """Return each layer's tensors under its first name; refuse what is too many or too few."""
-    found: dict[str, Tensor] = {}
-    missing: list[str] = []
-    unknown = set(tensors)
-    for layer in layers:
-        for part, dimensions in layer.dimensions.items():
-            names = [f"{prefix}.{part}" for prefix in layer.theirs]
-            given = [key for key in names if key in tensors]
-            unknown.difference_update(given)
-            missing += [key for key in names if key not in tensors]
-            if len(given) < len(names):
-                continue
-            first, *others = (tensors[key] for key in names)
-            if first.ndim != dimensions:
-                raise _odd_shape(name, names[0], first, f"{dimensions} dimensions")
-            if part != "num_batches_tracked" and not first.is_floating_point():
-                raise InputError(
-                    f"weights for {name}: {names[0]} holds {first.dtype}, not floating-point "
-                    "numbers; hand over the release's own tensors"
-                )
-            if any(not torch.equal(first, other) for other in others):
-                raise InputError(
-                    f"weights for {name}: {' and '.join(names)} are one tensor in the release, "
-                    "but differ here"
-                )
-            found[names[0]] = first
+    """Return each tensor under its first name; refuse what is too many, too few or odd."""
+    names = [key for tensor in tensors for key in tensor.theirs]
     faults = [
         f"{len(keys)} {what}, such as {', '.join(sorted(keys)[:3])}"
-        for what, keys in (("missing", missing), ("unknown", unknown))
+        for what, keys in (
+            ("missing", set(names) - set(weights)),
+            ("unknown", set(weights) - set(names)),
+        )
         if keys
     ]
     if faults:
         raise InputError(
             f"weights for {name}: {'; '.join(faults)}; hand over the release's state dict whole"
         )
-    return found
+    for tensor in tensors:
+        first, *others = (weights[key] for key in tensor.theirs)
+        if first.ndim != tensor.dimensions:
+            raise _odd_shape(name, tensor.theirs[0], first, f"{tensor.dimensions} dimensions")
+        if tensor.dimensions and not first.is_floating_point():
+            raise InputError(
+                f"weights for {name}: {tensor.theirs[0]} holds {first.dtype}, not floating-point "
+                "numbers; hand over the release's own tensors"
+            )
+        if any(not torch.equal(first, other) for other in others):
+            raise InputError(
+                f"weights for {name}: {' and '.join(tensor.theirs)} are one tensor in the "
+                "release, but differ here"
+            )
+    return {tensor.theirs[0]: weights[tensor.theirs[0]] for tensor in tensors}
 
 
 def _odd_shape(name: str, key: str, value: Tensor, expected: str) -> InputError:
@@ -229,21 +235,3 @@ def _odd_shape(name: str, key: str, value: Tensor, expected: str) -> InputError:
         f"weights for {name}: {key} has shape {list(value.shape)}, not {expected}; "
         "these are weights of another network"
     )
-
-
-@torch.no_grad()
-def _fill(
-    name: str, model: nn.Module, tensors: Mapping[str, Tensor], layers: Sequence[_Layer]
-) -> None:
-    """Copy the tensors into the network; the last dimensions of a convolution are 1."""
-    ours = model.state_dict()
-    for layer in layers:
-        for part, dimensions in layer.dimensions.items():
-            key = f"{layer.theirs[0]}.{part}"
-            absorbed = f"{layer.ours}.{part}" not in ours
-            target = ours[f"{layer.norm}.running_mean" if absorbed else f"{layer.ours}.{part}"]
-            expected = target.shape + (1,) * (dimensions - target.ndim)
-            if tensors[key].shape != expected:
-                raise _odd_shape(name, key, tensors[key], str(list(expected)))
-            value = tensors[key].to(target.dtype).reshape(target.shape)
-            target.copy_(target - value if absorbed else value)
