@@ -13,6 +13,7 @@ import pytest
 from qs3 import structure
 from qs3.evaluation.records import read_record
 from qs3.experiments import TABLES, grid, runs, scales, setup
+from qs3.experiments.experiment import load_experiment
 from qs3.experiments.figures import draw
 from qs3.experiments.setup import read_setup
 from qs3.experiments.table import FilledTable, Table
@@ -79,6 +80,8 @@ def wider(kind: type, modules: Sequence[Any], patch: pytest.MonkeyPatch, **types
 
 
 def test_a_setting_that_is_added_leaves_all_records_readable(monkeypatch):
+    for name in TABLES:
+        load_experiment(name)  # before its module could see a wider scale
     train = wider(config.TrainSettings, (config, grid, scales), monkeypatch)
     rounds = wider(config.SelfTrainingSettings, (config, grid), monkeypatch)
     scale = wider(scales.Scale, (scales, setup), monkeypatch, train=train)
