@@ -6,11 +6,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-SECTIONS = re.findall(
-    r"^### (Add [^\n]+)\n+Example: (\w+)\.\n+((?:\|.*\n)+)",
-    (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"),
-    re.MULTILINE,
-)
+TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+SECTIONS = re.findall(r"^### (Add [^\n]+)\n+Example: (\w+)\.\n+((?:\|.*\n)+)", TEXT, re.MULTILINE)
 # Who lists things of all kinds by choice: tables of runs, texts of help.
 BY_CHOICE = ("src/qs3/experiments/",)
 LIMITS = {"sensor": 2, "network": 5, "method": 4, "layout of data sets": 4, "table or figure": 3}
@@ -40,3 +37,10 @@ def test_there_are_few_of_them():
     assert counts.keys() == LIMITS.keys()
     for name, count in counts.items():
         assert 0 < count <= LIMITS[name]
+
+
+def test_every_path_that_is_named_is_there():
+    paths = re.findall(r"`((?:src|tests|docs|benchmarks)/[^`\s<>]+)`", TEXT)
+    assert len(paths) > 8
+    for path in paths:
+        assert (ROOT / path).exists(), path

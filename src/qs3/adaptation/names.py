@@ -59,9 +59,6 @@ COMPOSED: Mapping[str, tuple[str, RoundRule]] = {
 }
 """Methods that are a warm-up and a rule of self-training."""
 
-OLD_NAMES: Mapping[str, str] = {"qs3": "qbst"}
-"""Names in runs of earlier releases, which told QBST on a scanned source apart."""
-
 WITHOUT_TARGET = ("source-only", "pcm")
 """Methods whose training does without the target; rounds of self-training never do."""
 

@@ -125,13 +125,19 @@ def choose_split(root: Path, files: Sequence[CloudFile], split: str | None) -> l
     return [file for file in files if file.split == split]
 
 
-def read_files(root: Path, files: Sequence[CloudFile], class_names: Sequence[str]) -> RaggedClouds:
+def read_files(
+    root: Path,
+    files: Sequence[CloudFile],
+    class_names: Sequence[str],
+    read: Callable[[Path], np.ndarray] = read_cloud,
+) -> RaggedClouds:
     """Read cloud files; their names below ``root`` become the ids.
 
     Args:
         root: Folder that they lie in.
         files: What to read, in the order of the result.
         class_names: Names that the labels index; empty gives clouds without labels.
+        read: Reader of one file.
 
     Raises:
         InputError: where a file is bad; it is named.
@@ -142,7 +148,7 @@ def read_files(root: Path, files: Sequence[CloudFile], class_names: Sequence[str
     for file in tqdm(files, "read", unit="cloud", disable=None if len(files) > _MANY else True):
         ids.append(file.path.relative_to(root).as_posix())
         digest.update(f"{ids[-1]} {sha256(file.path)}\n".encode(errors="surrogateescape"))
-        clouds.append(read_cloud(file.path))
+        clouds.append(read(file.path))
     labels = [names.index(file.class_name) for file in files] if names else []
     splits = tuple(file.split for file in files)
     return RaggedClouds(

@@ -8,10 +8,11 @@ import hashlib
 import os
 import re
 import urllib.parse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 from tqdm import tqdm
 
 from qs3.errors import InputError
@@ -42,14 +43,21 @@ def write_folder(root: Path, clouds: RaggedClouds, ending: str) -> None:
     write_files(root, clouds, cloud_folders(clouds), ending)
 
 
-def write_files(root: Path, clouds: RaggedClouds, folders: Sequence[str], ending: str) -> None:
+def write_files(
+    root: Path,
+    clouds: RaggedClouds,
+    folders: Sequence[str],
+    ending: str,
+    encode: Callable[[np.ndarray], bytes] | None = None,
+) -> None:
     """Write each cloud as one file into its own folder below ``root``; names as in `write_folder`.
 
     Args:
         root: Folder to make.
         clouds: What to write.
         folders: Folder of each cloud, parts apart by ``/``; checked by the caller.
-        ending: One of `point_files.WRITTEN_FILES`.
+        ending: One of `point_files.WRITTEN_FILES`, or any with an ``encode`` of its own.
+        encode: Makes the file of a cloud; `point_files.cloud_bytes` by default.
     """
     taken: set[str] = set()
     count = len(clouds.clouds)
@@ -60,7 +68,9 @@ def write_files(root: Path, clouds: RaggedClouds, folders: Sequence[str], ending
         rows, "write", count, unit="cloud", disable=None if count > _MANY else True
     ):
         name = _free(f"{folder}/{file_stem(identifier, folder)}".lstrip("/"), taken)
-        (root / f"{name}{ending}").write_bytes(cloud_bytes(cloud, ending))
+        (root / f"{name}{ending}").write_bytes(
+            encode(cloud) if encode else cloud_bytes(cloud, ending)
+        )
 
 
 def cloud_folders(clouds: RaggedClouds) -> list[str]:
