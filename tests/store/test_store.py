@@ -220,3 +220,21 @@ def test_what_was_drawn_is_kept(fake, tmp_path):
     row = dataclasses.replace(rows(fake)[0], drawn=drawn)
     write_shard(tmp_path / "a.parquet", [row])
     assert read_shard(tmp_path / "a.parquet", ["drawn"])["drawn"].to_pylist() == [drawn]
+
+
+def test_a_data_set_begun_before_a_setting_existed_goes_on(fake, tmp_path):
+    fake.run(fake.work(4), tmp_path / "whole")
+    fake.run(fake.work(4), tmp_path / "old")
+    path = tmp_path / "old" / MANIFEST
+    value = json.loads(path.read_text())
+    del value["settings"]["scans_per_mesh"], value["settings"]["sensor"]["exposure"]["gain"]
+    path.write_text(json.dumps(value))
+    shard_path(tmp_path / "old", 0).unlink()
+    fake.run(fake.work(4), tmp_path / "old")
+    assert shard_path(tmp_path / "old", 0).read_bytes() == (
+        shard_path(tmp_path / "whole", 0).read_bytes()
+    )
+    with pytest.raises(InputError, match="made with scans_per_mesh = 1, not 2"):
+        fake.run(
+            fake.work(4), tmp_path / "old", dataclasses.replace(fake.SETTINGS, scans_per_mesh=2)
+        )

@@ -1,5 +1,6 @@
 """Runs and their scores: made in Python by any way, and by an earlier release."""
 
+import dataclasses
 import json
 from dataclasses import replace
 
@@ -126,3 +127,14 @@ def test_a_run_of_an_earlier_release_is_read(source, target, settings, tmp_path)
     (tmp_path / "run.json").write_text(json.dumps(old | {"colour": "red"}))
     with pytest.raises(InputError, match=r"run\.json.*'colour' is unknown"):
         read_run(tmp_path)
+
+
+def test_a_run_begun_before_a_setting_existed_goes_on(source, settings, tmp_path):
+    claim_run(tmp_path, "source-only", source, None, settings, None, None)
+    value = json.loads((tmp_path / "settings.json").read_text())
+    del value["train"]["clip_norm"], value["train"]["label_smoothing"]
+    (tmp_path / "settings.json").write_text(json.dumps(value))
+    claim_run(tmp_path, "source-only", source, None, settings, None, None)
+    other = dataclasses.replace(settings, label_smoothing=0.1)
+    with pytest.raises(InputError, match=r"holds a run with train\.label_smoothing = 0\.0, not"):
+        claim_run(tmp_path, "source-only", source, None, other, None, None)

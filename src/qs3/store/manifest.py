@@ -15,7 +15,7 @@ from typing import Any
 from qs3.errors import InputError
 from qs3.files import json_bytes, parse_json, sha256
 from qs3.store.folder import Folder, open_folder
-from qs3.structure import structure, unstructure
+from qs3.structure import fill, structure, unstructure
 
 MANIFEST = "dataset.json"
 SUMS = "SHA256SUMS"
@@ -99,8 +99,11 @@ def check_same(where: str, present: Manifest, wanted: Manifest) -> None:
         InputError: naming ``where`` and the first setting that differs.
     """
     from qs3.sensor.presets import sensor_name
+    from qs3.store.scan_item import GenerateSettings
 
     old, new = unstructure(present), unstructure(wanted)
+    defaults = unstructure(GenerateSettings().as_dict())
+    old["settings"] = fill(old["settings"], new["settings"], defaults)
     if isinstance(sensor := old["settings"].get("sensor"), dict) and "name" in sensor:
         sensor["name"] = sensor_name(sensor["name"])  # a data set that version 0.1 began
     for key in ("schema", "settings", "class_names", "rows", "shards"):

@@ -12,7 +12,7 @@ from qs3.errors import InputError
 from qs3.evaluation.records import DataRecord, rename_method, rename_settings, walk
 from qs3.files import holds_something, read_json, write_json
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.structure import structure, unstructure
+from qs3.structure import fill, structure, unstructure
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 
 RUN = "run.json"
@@ -157,7 +157,9 @@ def claim_run(
     if run_dir.exists() and not run_dir.is_dir():
         raise InputError(f"{run_dir}: is a file; name a folder for the run")
     if (run_dir / SETTINGS).is_file():
-        theirs, ours = _flat(read_settings(run_dir)), _flat(wanted)
+        defaults = {"train": TrainSettings(), "self_training": SelfTrainingSettings()}
+        begun = fill(read_settings(run_dir), wanted, unstructure(defaults))
+        theirs, ours = _flat(begun), _flat(wanted)
         for name in sorted(theirs.keys() | ours.keys()):
             if theirs.get(name) != ours.get(name):
                 raise InputError(
