@@ -27,7 +27,7 @@ _SPEC.loader.exec_module(_MODULE)
 SMALL = _MODULE.SMALL
 
 CLASSES = ("Stuhl", "テーブル", 'a "lamp"')
-TINY = "pointnet without T-Nets"
+TINY = "pointnet of each point"
 M = 40
 SIZES = [1, 2, M - 1, M, M + 1, 3 * M]
 

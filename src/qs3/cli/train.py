@@ -115,12 +115,15 @@ def preset_options(words: Sequence[str]) -> TrainOptions:
     rule = chosen.rounds_rule or COMPOSED.get(chosen.method, ("", None))[1]
     preset = chosen.preset or ("spst" if rule == "spst" else "default")
     rounds = PRESETS[preset]
-    return TrainOptions(
-        source=tyro.MISSING,
-        out=tyro.MISSING,
+    options = TrainOptions(
+        source="",
+        out=Path(),
         preset=preset,
         self_training=rounds if rule is None else replace(rounds, rule=rule),
     )
+    for name in ("source", "out"):  # must be given: tyro's marker for that is neither text nor path
+        object.__setattr__(options, name, tyro.MISSING)
+    return options
 
 
 def parse_settings(option: str, given: Sequence[str]) -> dict[str, Any]:

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeVar
 
 from qs3.errors import InputError
 from qs3.sensor.checks import check_choices, check_range
@@ -35,6 +35,9 @@ def renderer_dict(renderer: Renderer) -> dict[str, Any]:
     """All settings of a renderer and what it says of itself, as plain values for records."""
     settings: Any = renderer  # a dataclass
     return dataclasses.asdict(settings) | renderer.description
+
+
+_Camera = TypeVar("_Camera", bound="CameraSettings")
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,11 @@ class CameraSettings:
         if self.pattern is not None:
             pattern_image(sensor.pattern)  # a picture that cannot be read stops here
         return sensor
+
+    def with_sensor(self: _Camera, sensor: Sensor, renderer: Renderer) -> _Camera:
+        """The settings with a sensor and a renderer as they are: what would change it is gone."""
+        defaults = {f.name: f.default for f in dataclasses.fields(self) if f.name in self._CHANGES}
+        return dataclasses.replace(self, sensor=sensor, renderer=renderer, **defaults)
 
     def chosen(self, name: str) -> Any:
         """A setting by its name."""
