@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import pytest
 
 from qs3.errors import InputError
-from qs3.structure import structure, unstructure
+from qs3.structure import first_difference, structure, unstructure
 
 
 @dataclass(frozen=True)
@@ -119,3 +119,18 @@ def test_a_missing_key_and_another_kind_of_value_are_told() -> None:
 def test_every_field_of_a_frozen_dataclass_comes_back() -> None:
     made = structure(PLAIN, Outer, "a.json")
     assert {f.name for f in dataclasses.fields(made)} == set(unstructure(made))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "difference"),
+    [
+        ({"a": 1}, {"a": 1}, None),
+        ({"a": {"c": 1, "b": 1}}, {"a": {"c": 2, "b": 2}}, ("a.b", 1, 2)),
+        ({"a": None}, {"a": {"b": 1}}, ("a.b", None, 1)),
+        ({"a": {}}, {"a": None}, ("a", {}, None)),
+        ({"a": 1}, {}, ("a", 1, None)),
+        ({"a": [1]}, {"a": [2]}, ("a", [1], [2])),
+    ],
+)
+def test_the_first_setting_that_differs_is_named(old, new, difference):
+    assert first_difference(old, new) == difference

@@ -93,6 +93,30 @@ def fill(old: Any, wanted: Any, defaults: Any) -> Any:
     return filled | {name: defaults[name] for name in missing}
 
 
+def first_difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any] | None:
+    """Return name and both values of the first setting that differs, None where none does.
+
+    Names are compared in their order, a dot before those of an inner table; what one of the two
+    lacks is None there.
+
+    Example:
+        >>> first_difference({"a": 1, "b": {"c": 2}}, {"a": 1, "b": {"c": 3}})
+        ('b.c', 2, 3)
+    """
+    if old == new:
+        return None
+    tables = [{} if value is None else value for value in (old, new)]
+    if all(isinstance(table, Mapping) for table in tables):
+        for key in sorted({*tables[0], *tables[1]}):
+            inner = f"{name}.{key}" if name else str(key)
+            difference = first_difference(tables[0].get(key), tables[1].get(key), inner)
+            if difference is not None:
+                return difference
+        if old is not None and new is not None:
+            return None
+    return name, old, new
+
+
 @functools.cache
 def _converter() -> Converter:
     converter = Converter(forbid_extra_keys=True)

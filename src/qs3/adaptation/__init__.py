@@ -3,8 +3,9 @@
 Names, rules and validators need no PyTorch; it loads when a method is first asked for.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from qs3.lazy import loader
 
 if TYPE_CHECKING:
     from qs3.adaptation.factory import create_method as create_method
@@ -19,22 +20,13 @@ if TYPE_CHECKING:
     from qs3.adaptation.selection import select_quasi_balanced as select_quasi_balanced
     from qs3.adaptation.source_only import SourceOnly as SourceOnly
 
-_LAZY = {
-    "create_method": "factory",
-    "list_methods": "factory",
-    "method_class": "factory",
-    "Batch": "method",
-    "Method": "method",
-    "cross_entropy": "method",
-    "PseudoLabelled": "pseudo_labelled",
-    "SingleClassWarning": "selection",
-    "select_confident": "selection",
-    "select_quasi_balanced": "selection",
-    "SourceOnly": "source_only",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _LAZY:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)
+__getattr__ = loader(
+    __name__,
+    {
+        "factory": "create_method list_methods method_class",
+        "method": "Batch Method cross_entropy",
+        "pseudo_labelled": "PseudoLabelled",
+        "selection": "SingleClassWarning select_confident select_quasi_balanced",
+        "source_only": "SourceOnly",
+    },
+)

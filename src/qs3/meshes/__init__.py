@@ -3,9 +3,9 @@
 Names of classes load alone; trimesh comes with the first name that needs it.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from qs3.lazy import loader
 from qs3.meshes.classes import POINTDA10 as POINTDA10
 from qs3.meshes.classes import canonical as canonical
 
@@ -17,17 +17,11 @@ if TYPE_CHECKING:
     from qs3.meshes.normalising import normalise as normalise
     from qs3.meshes.normalising import sample_surface as sample_surface
 
-_LAZY = {
-    "MeshItem": "collections",
-    "collect": "collections",
-    "EXTENSIONS": "loading",
-    "load_mesh": "loading",
-    "normalise": "normalising",
-    "sample_surface": "normalising",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _LAZY:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)
+__getattr__ = loader(
+    __name__,
+    {
+        "collections": "MeshItem collect",
+        "loading": "EXTENSIONS load_mesh",
+        "normalising": "normalise sample_surface",
+    },
+)

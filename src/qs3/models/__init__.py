@@ -1,7 +1,8 @@
 """Networks that classify point clouds; PyTorch loads when one of these names is first used."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from qs3.lazy import loader
 
 if TYPE_CHECKING:
     from qs3.models.classifier import Features as Features
@@ -19,25 +20,18 @@ if TYPE_CHECKING:
     from qs3.models.rscnn import RSCNN as RSCNN
     from qs3.models.simpleview import SimpleView as SimpleView
 
-_LAZY = {
-    "Features": "classifier",
-    "PointClassifier": "classifier",
-    "describe_point": "classifier",
-    "feature_widths": "classifier",
-    "DGCNN": "dgcnn",
-    "create_model": "factory",
-    "list_models": "factory",
-    "PointMLPElite": "pointmlp",
-    "PointNet": "pointnet",
-    "PointNet2": "pointnet2",
-    "PointNetSA": "pointnet_sa",
-    "load_reference": "releases",
-    "RSCNN": "rscnn",
-    "SimpleView": "simpleview",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _LAZY:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)
+__getattr__ = loader(
+    __name__,
+    {
+        "classifier": "Features PointClassifier describe_point feature_widths",
+        "dgcnn": "DGCNN",
+        "factory": "create_model list_models",
+        "pointmlp": "PointMLPElite",
+        "pointnet": "PointNet",
+        "pointnet2": "PointNet2",
+        "pointnet_sa": "PointNetSA",
+        "releases": "load_reference",
+        "rscnn": "RSCNN",
+        "simpleview": "SimpleView",
+    },
+)

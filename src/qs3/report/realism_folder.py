@@ -14,6 +14,7 @@ from qs3.sensor.presets import Sensor, sensor_name, settings_dict
 from qs3.sensor.realism import RealismSettings, realism
 from qs3.sensor.render import Renderer
 from qs3.sensor.settings import renderer_dict
+from qs3.structure import first_difference
 
 RECORD = "realism.json"
 
@@ -75,17 +76,10 @@ def _earlier(path: Path, made_by: Mapping[str, Any]) -> dict[str, dict[str, Any]
         record["sensor"]["name"] = sensor_name(record["sensor"]["name"])
     now = json.loads(json.dumps(made_by))  # tuples become lists, as in the file
     for name, value in now.items():
-        if where := _difference(record.get(name), value, name):
+        if difference := first_difference(record.get(name), value, name):
+            place, was, is_now = difference
             raise InputError(
-                f"{path}: of other settings ({where}); name another folder for --out, or repeat "
-                "the settings to go on"
+                f"{path}: of other settings ({place} was {was}, is {is_now}); name another folder "
+                "for --out, or repeat the settings to go on"
             )
     return {result["id"]: result for result in record["tests"]}
-
-
-def _difference(old: Any, new: Any, name: str) -> str:
-    """Where two settings differ first: "matching.method was zncc, is opencv-bm"."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        parts = (_difference(old.get(k), new.get(k), f"{name}.{k}") for k in old.keys() | new)
-        return min((part for part in parts if part), default="")
-    return "" if old == new else f"{name} was {old}, is {new}"

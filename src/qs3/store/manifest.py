@@ -15,7 +15,7 @@ from typing import Any
 from qs3.errors import InputError
 from qs3.files import json_bytes, parse_json, sha256
 from qs3.store.folder import Folder, open_folder
-from qs3.structure import fill, structure, unstructure
+from qs3.structure import fill, first_difference, structure, unstructure
 
 MANIFEST = "dataset.json"
 SUMS = "SHA256SUMS"
@@ -107,7 +107,7 @@ def check_same(where: str, present: Manifest, wanted: Manifest) -> None:
     if isinstance(sensor := old["settings"].get("sensor"), dict) and "name" in sensor:
         sensor["name"] = sensor_name(sensor["name"])  # a data set that version 0.1 began
     for key in ("schema", "settings", "class_names", "rows", "shards"):
-        difference = _difference(key, old[key], new[key])
+        difference = first_difference(old[key], new[key], key)
         if difference is not None:
             name, was, now = difference
             raise InputError(
@@ -121,15 +121,6 @@ def check_same(where: str, present: Manifest, wanted: Manifest) -> None:
                 f"{wanted.versions[package]}: rows may differ from those of one version",
                 stacklevel=2,
             )
-
-
-def _difference(name: str, old: Any, new: Any) -> tuple[str, Any, Any] | None:
-    """Name and both values of the first setting that differs."""
-    if isinstance(old, Mapping) and isinstance(new, Mapping):
-        keys = sorted({*old, *new})
-        inner = (_difference(f"{name}.{key}", old.get(key), new.get(key)) for key in keys)
-        return next(filter(None, inner), None)
-    return None if old == new else (name, old, new)
 
 
 def open_dataset(where: str | Path | Folder) -> Manifest:

@@ -4,9 +4,10 @@ Settings and the folders of runs need no PyTorch; it loads when a training is fi
 """
 
 import sys
-from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
+
+from qs3.lazy import loader, names_of
 
 if TYPE_CHECKING:
     from qs3.training.batches import load_whole as load_whole
@@ -58,22 +59,16 @@ _MODULES = {
     "self_training": "self_train",
     "validation": "Checkpoint adapt_statistics read_checkpoints",
 }
+_NAMES = names_of(_MODULES)
 
-
-_WHERE = {name: module for module, names in _MODULES.items() for name in names.split()}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _WHERE:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_WHERE[name]}"), name)
+__getattr__ = loader(__name__, _MODULES)
 
 
 class _Package(ModuleType):
     """Keeps `fit` and `evaluate` the functions, when the modules of these names are imported."""
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if not (name in _WHERE and isinstance(value, ModuleType)):
+        if not (name in _NAMES and isinstance(value, ModuleType)):
             super().__setattr__(name, value)
 
 

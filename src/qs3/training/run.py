@@ -12,7 +12,7 @@ from qs3.errors import InputError
 from qs3.evaluation.records import DataRecord, rename_method, rename_settings, walk
 from qs3.files import holds_something, read_json, write_json
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.structure import fill, structure, unstructure
+from qs3.structure import fill, first_difference, structure, unstructure
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 
 RUN = "run.json"
@@ -159,26 +159,16 @@ def claim_run(
     if (run_dir / SETTINGS).is_file():
         defaults = {"train": TrainSettings(), "self_training": SelfTrainingSettings()}
         begun = fill(read_settings(run_dir), wanted, unstructure(defaults))
-        theirs, ours = _flat(begun), _flat(wanted)
-        for name in sorted(theirs.keys() | ours.keys()):
-            if theirs.get(name) != ours.get(name):
-                raise InputError(
-                    f"{run_dir}: holds a run with {name} = {theirs.get(name)!r}, not "
-                    f"{ours.get(name)!r}; name another folder or use its settings"
-                )
+        if difference := first_difference(begun, wanted):
+            name, theirs, ours = difference
+            raise InputError(
+                f"{run_dir}: holds a run with {name} = {theirs!r}, not {ours!r}; name another "
+                "folder or use its settings"
+            )
         return
     if holds_something(run_dir):
         raise InputError(f"{run_dir}: holds something else (no {SETTINGS}); name a new folder")
     write_json(run_dir / SETTINGS, wanted)
-
-
-def _flat(value: Any, name: str = "") -> dict[str, Any]:
-    if not isinstance(value, dict):
-        return {name: value}
-    items: dict[str, Any] = {}
-    for key, inner in value.items():
-        items |= _flat(inner, f"{name}.{key}" if name else key)
-    return items
 
 
 def fingerprint(clouds: PointClouds | UnlabelledClouds) -> str:
