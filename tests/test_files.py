@@ -73,6 +73,24 @@ def test_a_temporary_folder_is_fresh_and_goes(tmp_path: Path) -> None:
     assert (elsewhere / "mine").exists()
 
 
+@pytest.mark.parametrize("name", ["a" * 255, "ä" * 127, "a." + "b" * 253])
+def test_a_name_of_any_length_has_a_temporary_one(tmp_path: Path, name: str) -> None:
+    for _ in range(2):
+        with atomic_path(tmp_path / name) as temporary:
+            temporary.touch()
+        with temporary_folder(tmp_path / name) as folder:
+            assert folder.is_dir()
+    assert names(tmp_path) == [name]
+
+
+def test_a_link_in_place_of_the_lock_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("precious")
+    (tmp_path / LOCK).symlink_to(tmp_path / "mine")
+    with pytest.raises(InputError, match=r"\.lock: is a link"), folder_lock(tmp_path):
+        pass
+    assert (tmp_path / "mine").read_text() == "precious"
+
+
 def test_a_folder_has_one_holder_at_a_time(tmp_path: Path) -> None:
     refused = pytest.raises(InputError, match=rf"process {os.getpid()} on .*; wait for it")
     with folder_lock(tmp_path), refused, folder_lock(tmp_path):
@@ -120,7 +138,7 @@ def test_where_a_file_system_has_no_locks_the_name_decides(
             with folder_lock(tmp_path):
                 assert lock.read_text() == f"process {os.getpid()} on {machine}"
         else:
-            with pytest.raises(InputError, match=holder):
+            with pytest.raises(InputError, match=rf"{holder}.* remove .*\.lock"):
                 folder_lock(tmp_path).__enter__()
 
 

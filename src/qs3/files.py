@@ -20,6 +20,7 @@ LOCK = ".lock"
 """Name of the file that tells who writes into a folder; it is there only meanwhile."""
 
 _LEFT_OVER = re.compile(r"\..+\.(\d+|[0-9a-f]{8})\.tmp(\.\w+)?$")
+_LONGEST_STEM = 100  # bytes of a name that go into a temporary one; the longest name may have 143
 
 
 @contextlib.contextmanager
@@ -39,7 +40,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     # A random name: nobody can have put a link there to lead the write elsewhere.
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp{path.suffix}")
+    ending = path.suffix if len(path.suffix) < 16 else ""  # some writers go by it
+    temporary = path.with_name(f".{_stem(path)}.{secrets.token_hex(4)}.tmp{ending}")
     try:
         yield temporary
         sync_entry(temporary)
@@ -59,16 +61,21 @@ def temporary_folder(path: Path) -> Iterator[Path]:
     """
     path = Path(path).absolute()
     path.parent.mkdir(parents=True, exist_ok=True)
-    for entry in path.parent.glob(f".{glob.escape(path.name)}.????????.tmp"):
+    for entry in path.parent.glob(f".{glob.escape(_stem(path))}.????????.tmp"):
         if (entry / LOCK).is_file() and not entry.is_symlink():
             with contextlib.suppress(InputError), folder_lock(entry):  # nobody's any more
                 shutil.rmtree(entry, ignore_errors=True)
-    folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
+    folder = Path(tempfile.mkdtemp(prefix=f".{_stem(path)}.", suffix=".tmp", dir=path.parent))
     try:
         with folder_lock(folder):
             yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _stem(path: Path) -> str:
+    """The name of a path, as much of it as leaves room for a mark within the longest name."""
+    return os.fsencode(path.name)[:_LONGEST_STEM].decode(errors="ignore")
 
 
 @contextlib.contextmanager
@@ -96,14 +103,11 @@ def folder_lock(path: Path) -> Iterator[None]:
 def _open_lock(file: Path) -> int:
     """Open and lock a file that nobody else holds."""
     while True:
+        if file.is_symlink():
+            raise InputError(f"{file}: is a link, which qs3 does not follow; remove it")
         handle = os.open(file, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
         try:
-            holder = os.read(handle, 200).decode(errors="replace")
-            if not _locked(handle, holder):
-                raise InputError(
-                    f"{file.parent}: another qs3 is writing into this folder"
-                    f"{f' ({holder})' if holder else ''}; wait for it, or name another one"
-                )
+            _lock(handle, file)
             with contextlib.suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(handle), file.stat()):
                     return handle
@@ -113,28 +117,37 @@ def _open_lock(file: Path) -> int:
         os.close(handle)  # it was let go, and its file removed, since we opened it
 
 
-def _locked(handle: int, holder: str) -> bool:
-    """Lock an open file; False where ``holder`` or somebody else has it."""
+def _lock(handle: int, file: Path) -> None:
+    holder = os.read(handle, 200).decode(errors="replace")
     try:
         import fcntl
 
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
+        return
     except ImportError:  # Windows
-        return True
+        return
+    except BlockingIOError:
+        advice = "wait for it, or name another one"
     except OSError:  # a file system without locks
-        process, _, machine = holder.removeprefix("process ").partition(" on ")
-        if machine != socket.gethostname() or not process.isdigit():
-            return not holder
-        try:
-            os.kill(int(process), 0)
-        except ProcessLookupError:
-            return True
-        except PermissionError:
-            return False
-        return int(process) == os.getpid()  # ours since it was started: that one has ended
-    return True
+        if _has_ended(holder):
+            return
+        advice = f"wait for it or, if it has ended, remove {file}"
+    by = f" ({holder})" if holder else ""
+    raise InputError(f"{file.parent}: another qs3 is writing into this folder{by}; {advice}")
+
+
+def _has_ended(holder: str) -> bool:
+    """Whether the process that a lock names is gone for certain."""
+    process, _, machine = holder.removeprefix("process ").partition(" on ")
+    if machine != socket.gethostname() or not process.isdigit():
+        return not holder
+    try:
+        os.kill(int(process), 0)
+    except (ProcessLookupError, OverflowError):
+        return True
+    except PermissionError:
+        return False
+    return int(process) == os.getpid()  # ours since it was started: that one has ended
 
 
 def sync_entry(path: Path) -> None:
