@@ -53,17 +53,21 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def temporary_folder(path: Path) -> Iterator[Path]:
+def temporary_folder(path: Path, alone: bool = False) -> Iterator[Path]:
     """Yield a fresh folder beside ``path``, removed with all that is in it at the end.
 
     Its name is random: no folder that is there already is taken for it, and no link followed. It
     holds nothing but its lock. What a killed process left behind for the same ``path`` is removed.
+
+    Raises:
+        InputError: where another process has such a folder at this moment, and ``alone`` is asked.
     """
     path = Path(path).absolute()
     path.parent.mkdir(parents=True, exist_ok=True)
     for entry in path.parent.glob(f".{glob.escape(_stem(path))}.????????.tmp"):
         if (entry / LOCK).is_file() and not entry.is_symlink():
-            with contextlib.suppress(InputError), folder_lock(entry):  # nobody's any more
+            others = contextlib.nullcontext() if alone else contextlib.suppress(InputError)
+            with others, folder_lock(entry):  # nobody's any more
                 shutil.rmtree(entry, ignore_errors=True)
     folder = Path(tempfile.mkdtemp(prefix=f".{_stem(path)}.", suffix=".tmp", dir=path.parent))
     try:

@@ -126,7 +126,7 @@ def bad_cases() -> dict[str, tuple[str, bytes, str]]:
         "npy empty": ("a.npy", npy(np.zeros((0, 3))), "holds no point"),
         "npy text": ("a.npy", npy(np.array([["a", "b", "c"]])), "needs numbers"),
         "npy garbage": ("a.npy", b"not numpy", "cannot be read as npy"),
-        "npy cut": ("a.npy", npy(POINTS)[:-9], "cannot be read as npy"),
+        "npy cut": ("a.npy", npy(POINTS)[:-9], "cut off"),
         "ply garbage": ("a.ply", b"just some words\n", "cannot be read as ply"),
         "off garbage": ("a.off", b"just some words\n", "cannot be read as off"),
         "off empty": ("a.off", b"OFF\n0 0 0\n", "a.off"),

@@ -1,6 +1,8 @@
 """One data set into another layout."""
 
 import dataclasses
+import os
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -9,14 +11,13 @@ import numpy as np
 from tqdm import tqdm
 
 from qs3.errors import InputError
+from qs3.files import holds_something, sync_entry, temporary_folder
 from qs3.io.clouds import CloudKind
-from qs3.io.detect import format_named
 from qs3.io.layouts import FORMATS
 from qs3.io.layouts.store import write_store
-from qs3.io.load import read_clouds
+from qs3.io.load import format_named, read_clouds
 from qs3.io.preparation import resample
 from qs3.io.ragged import RaggedClouds
-from qs3.io.whole import check_free, whole
 from qs3.meshes.classes import map_labels
 
 _MANY = 500
@@ -59,19 +60,32 @@ def convert(
         written = [other.name for other in FORMATS.values() if other.write is not None]
         kin = [name for name in written if name.startswith(to)] or written
         raise InputError(f"{to}: is only read; written are {', '.join(kin)}")
-    check_free(target)
+    target = Path(target).resolve()
+    if not target.name or (target.exists() and (not target.is_dir() or holds_something(target))):
+        raise InputError(f"{target}: is there already; name a new or empty folder")
     clouds, name = read_clouds(source, split, cloud, origin)
     if classes is not None:
         clouds = _map_classes(clouds, classes, unmapped, str(source))
     clouds = _plain(clouds, num_points, str(source))
-    with whole(target) as temporary:
+    with temporary_folder(target, alone=True) as folder:
+        whole = folder / target.name  # some layouts go by it
         try:
             if layout.write is write_store:
-                write_store(temporary, clouds, name)
+                write_store(whole, clouds, name)
             else:
-                layout.write(temporary, clouds)
+                layout.write(whole, clouds)
+            for inner, _, files in os.walk(whole):
+                for entry in (*files, ""):
+                    sync_entry(Path(inner) / entry)
+            if target.is_dir():
+                shutil.rmtree(target)
+            whole.rename(target)
         except InputError as error:
             raise InputError(f"{to}: {error}") from error
+        except OSError as error:
+            error.filename = error.filename or str(target)  # a full disk names no file
+            raise
+    sync_entry(target.parent)
     return clouds
 
 

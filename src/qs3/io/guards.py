@@ -2,14 +2,18 @@
 
 Every reader of files that others made comes through here: sizes first, then the library, and
 whatever that raises becomes one line. Nothing is ever unpickled. Guards that follow the structure
-of one format stand beside its reader: `layouts.hdf5`, `extract.matlab`, `extract.scannet_masks`.
+of one format stand beside its reader: `layouts.hdf5`, `extract.matlab`, `ply`.
 """
 
+import contextlib
 import dataclasses
 import io
 import math
+import struct
 import warnings
-from collections.abc import Callable
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -23,12 +27,22 @@ from qs3.structure import structure
 Numbers = tuple[float, ...] | tuple[tuple[float, ...], ...]
 """A vector, or a matrix row by row, of a JSON file."""
 
+MOST_BYTES = 2 << 30
+"""Largest size of what a file announces, or is itself, where it is read into memory at once."""
+DENSEST = 100
+"""Largest ratio of announced to stored bytes; coordinates do not compress that well."""
 LARGEST_IMAGE = 1 << 25
 """Pixels; twice what any depth camera has."""
 
 _Kind = TypeVar("_Kind")
+_SLACK = 1 << 26  # labels of many clouds compress by more
+_LONGEST_TEXT = 1 << 20
+_MOST_MEMBERS = 50_000
 _DEFLATE_AT_BEST = 1032
 _DEEP = {"I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}  # bits a pixel, by Pillow's mode
+# What a zip file's lies and damages raise, by its many parts.
+_ZIP_FAULTS = (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError,
+               struct.error)  # fmt: skip
 
 
 def reason(error: Exception) -> str:
@@ -36,7 +50,40 @@ def reason(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 
-def read_small(path: Path, largest: int, what: str) -> bytes:
+def utf8(name: str) -> str:
+    r"""The name of a file as it is; bytes of it that are no UTF-8 as escapes.
+
+    Example:
+        >>> print(utf8("st\udcffhl"), utf8("Stühle"))
+        st\udcffhl Stühle
+    """
+    return name.encode("utf-8", errors="backslashreplace").decode("utf-8")
+
+
+def check_announced(what: str, announced: int, stored: int, densest: int = DENSEST) -> None:
+    """Refuse an announced size that cannot be, or that would fill the memory.
+
+    Args:
+        what: What is announced, for the message.
+        announced: Bytes that it would take.
+        stored: Bytes of the file that hold it.
+        densest: Largest ratio of the two; 1 where nothing is compressed.
+
+    Raises:
+        InputError: where it is more than ``MOST_BYTES`` or than ``stored`` can hold.
+    """
+    if announced > MOST_BYTES:
+        raise InputError(
+            f"{what} announces {announced} bytes; read are {MOST_BYTES} at most: split the file"
+        )
+    if announced > (stored if densest == 1 else max(_SLACK, densest * stored)):
+        raise InputError(
+            f"{what} announces {announced} bytes, but the file has {stored} of it; cut off, or "
+            "made to fill the memory"
+        )
+
+
+def read_small(path: Path, largest: int = MOST_BYTES, what: str = "one file") -> bytes:
     """Read a file of at most ``largest`` bytes.
 
     Raises:
@@ -49,7 +96,37 @@ def read_small(path: Path, largest: int, what: str) -> bytes:
     return path.read_bytes()
 
 
-def read_small_json(path: Path, largest: int) -> Any:
+def read_text(path: Path, largest: int = _LONGEST_TEXT, what: str = "a list or a table") -> str:
+    """Read a short text.
+
+    Raises:
+        InputError: where it is missing, longer, or not UTF-8.
+    """
+    try:
+        return read_small(path, largest, what).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: no text in UTF-8") from None
+
+
+def read_numbers(path: Path, counts: tuple[int, ...]) -> Float[np.ndarray, "n"]:
+    """Read a text file of numbers, apart by white space.
+
+    Raises:
+        InputError: where it is none, or there are not as many as one of ``counts``.
+    """
+    try:
+        numbers = np.array([float(word) for word in read_text(path).split()])
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: not a text file of numbers") from None
+    if len(numbers) not in counts:
+        wanted = " or ".join(map(str, counts))
+        raise InputError(f"{path}: {len(numbers)} numbers instead of {wanted}")
+    return numbers
+
+
+def read_small_json(path: Path, largest: int = 1 << 30) -> Any:
     """Read a JSON file of at most ``largest`` bytes.
 
     Raises:
@@ -90,13 +167,15 @@ def as_array(numbers: Numbers, shape: tuple[int, ...], name: str) -> Float[np.nd
     return np.array(flat).reshape(shape)
 
 
-def load_npy(content: bytes, accept: Callable[[tuple[int, ...], np.dtype], None]) -> np.ndarray:
-    """Return the array of an npy file.
+def load_npy(
+    content: bytes, accept: Callable[[tuple[int, ...], np.dtype], None] | None = None
+) -> np.ndarray:
+    """Return the array of an npy file; it shares the memory of ``content`` and is not written to.
 
     Args:
         content: The file.
-        accept: Raises where shape and type are not what is asked for; called before any memory is
-            taken.
+        accept: Raises where shape and type are not what is asked for; called before the numbers
+            are looked at.
 
     Raises:
         InputError: where the file is damaged, holds objects, or announces more than it has.
@@ -108,17 +187,69 @@ def load_npy(content: bytes, accept: Callable[[tuple[int, ...], np.dtype], None]
             (1, 0): np.lib.format.read_array_header_1_0,
             (2, 0): np.lib.format.read_array_header_2_0,
         }
-        shape, _, kind = readers[version](handle)
+        shape, in_columns, kind = readers[version](handle)
     except Exception as error:  # whatever a damaged header makes NumPy stumble over
         raise InputError(f"cannot be read as npy ({reason(error)})") from error
     if kind.hasobject:
         raise InputError("cannot be read as npy (holds pickled objects, which are never loaded)")
-    accept(shape, kind)
-    size, held = math.prod(shape) * kind.itemsize, len(content) - handle.tell()
-    if size > held:
-        raise InputError(f"cannot be read as npy (announces {size} bytes, but has {held})")
-    handle.seek(0)
-    return np.load(handle, allow_pickle=False)
+    if accept is not None:
+        accept(shape, kind)
+    count, begin = math.prod(shape), handle.tell()
+    size, held = count * kind.itemsize, len(content) - begin
+    check_announced(f"npy array of {kind} {list(shape)}", size, held, densest=1)
+    if min(shape, default=0) < 0 or not kind.itemsize:
+        raise InputError(f"cannot be read as npy ({kind} of shape {list(shape)})")
+    flat = np.frombuffer(content, kind, count, begin)
+    return flat.reshape(shape[::-1]).T if in_columns else flat.reshape(shape)
+
+
+@contextlib.contextmanager
+def open_zip(path: Path) -> Iterator[zipfile.ZipFile]:
+    """Open a zip file, unless it lists more members than any of this field.
+
+    Raises:
+        InputError: where it is missing, no zip file, or lists too many.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        with path.open("rb") as handle:
+            handle.seek(max(0, path.stat().st_size - 2**16 - 22))  # the end, with its comment
+            _, _, end = handle.read().rpartition(b"PK\5\6")
+        members = struct.unpack_from("<6xH", end)[0] if len(end) >= 8 else 0
+        archive = zipfile.ZipFile(path) if members <= _MOST_MEMBERS else None
+    except _ZIP_FAULTS as error:
+        raise InputError(f"{path}: cannot be read as zip ({reason(error)})") from error
+    if archive is None:
+        raise InputError(f"{path}: has {members} members; read are {_MOST_MEMBERS} at most")
+    with archive:
+        yield archive
+
+
+def read_member(
+    archive: zipfile.ZipFile, name: str, most: int = MOST_BYTES, densest: int = DENSEST
+) -> bytes | None:
+    """Return a member of a zip file by its exact name; None where there is none.
+
+    Raises:
+        InputError: where it is damaged, packed in a way that cannot be bounded, or would unpack to
+            more than ``most`` bytes.
+    """
+    try:
+        entry = archive.getinfo(name)
+    except KeyError:
+        return None
+    if entry.file_size > most:
+        raise InputError(f"{name} would unpack to {entry.file_size} bytes, more than {most}")
+    check_announced(name, entry.file_size, entry.compress_size, densest)
+    # The other packings of zip unpack in blocks that cannot be bounded.
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise InputError(f"{name} is packed in an unusual way; pack it with deflate")
+    try:
+        with archive.open(entry) as member:
+            return member.read(entry.file_size + 1)
+    except _ZIP_FAULTS as error:
+        raise InputError(f"{name} is damaged ({reason(error)})") from error
 
 
 def check_pixels(width: int, height: int) -> None:
@@ -133,16 +264,17 @@ def check_pixels(width: int, height: int) -> None:
         )
 
 
-def image_header(content: bytes, kind: Literal["PNG", "TIFF"]) -> tuple[tuple[int, int], str]:
-    """Return width and height of an image, and Pillow's mode (``L``, ``I;16``, ``F``, ``RGB`` …).
+def read_image(content: bytes, kind: Literal["PNG", "TIFF"]) -> tuple[np.ndarray, str]:
+    """Return an image, numbers as stored, and Pillow's mode (``L``, ``I;16``, ``F``, ``RGB`` …).
 
-    Nothing is decoded; of a PNG every chunk's length and checksum is looked at.
+    Of a PNG every chunk's length and checksum is looked at before anything is decoded.
 
     Raises:
         InputError: where it is of another kind, cut off or damaged, or announces more pixels than
             any depth image has or than its bytes could hold.
     """
     # Imported here: npy files need no image library.
+    import cv2
     from PIL import Image
 
     with warnings.catch_warnings():
@@ -162,25 +294,14 @@ def image_header(content: bytes, kind: Literal["PNG", "TIFF"]) -> tuple[tuple[in
             raise InputError(f"cut off or damaged ({reason(error)})") from error
     if size[0] * size[1] * _DEEP.get(mode, 1) // 8 > _DEFLATE_AT_BEST * len(content):
         raise InputError(f"announces {size[0]}×{size[1]} pixels but has {len(content)} bytes")
-    return size, mode
-
-
-def decode_image(content: bytes, size: tuple[int, int]) -> np.ndarray:
-    """Decode an image whose header was looked at, numbers as stored.
-
-    Raises:
-        InputError: where it is damaged, or has another size than ``size``.
-    """
-    import cv2
-
-    # Its complaints would stand beside our one line.
+    # OpenCV's complaints would stand beside our one line.
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+        decoded = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
-        image = None
+        decoded = None
     finally:
         cv2.utils.logging.setLogLevel(level)
-    if image is None or image.shape[1::-1] != size:
+    if decoded is None or decoded.shape[1::-1] != size:
         raise InputError("damaged, or of a kind that OpenCV cannot read")
-    return image
+    return decoded, mode

@@ -1,12 +1,14 @@
 """One door to every kind of data set: ours, an archive, a folder, any layout that is known."""
 
+import difflib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from qs3.errors import InputError
+from qs3.files import holds_something
 from qs3.io.clouds import CloudKind, Origin, PointClouds, UnlabelledClouds
-from qs3.io.detect import detect, format_named, require
+from qs3.io.layouts import FORMATS, FORMER_NAMES, Format, point_folders
 from qs3.io.layouts.store import read_ragged
 from qs3.io.ragged import RaggedClouds
 from qs3.store.folder import open_folder
@@ -77,13 +79,64 @@ def read_clouds(
     if isinstance(source, str) and "://" in source:
         return read_ragged(source, cloud, split), "store"
     path = Path(source)
-    if origin is None:
-        layout = detect(path)
-    else:
-        layout = format_named(origin)
-        require(path, layout)
+    layout = detect(path) if origin is None else format_named(origin)
+    require(path, layout)
     if layout.name == "store":
         return read_ragged(path, cloud, split), layout.name
     if cloud != "points":
         raise InputError(f"{path}: only a data set made by qs3 generate has {cloud!r} clouds")
     return layout.read(path, split), layout.name
+
+
+def detect(path: Path) -> Format:
+    """Return the one layout that a path looks like, judged by names.
+
+    Plain folders of point files fit much that has a name of its own; they count where nothing
+    else does.
+
+    Raises:
+        InputError: where the path is missing or empty, or fits no layout or several; they are
+            listed.
+    """
+    require(path)
+    fits = [layout for layout in FORMATS.values() if layout.detect(path)]
+    fits = [layout for layout in fits if layout not in point_folders.FORMATS] or fits
+    if len(fits) == 1:
+        return fits[0]
+    if not fits:
+        names = "; ".join(f"{layout.name}: {layout.layout}" for layout in FORMATS.values())
+        raise InputError(f"{path}: looks like no layout that is known; these are: {names}")
+    several = "; ".join(f"--from {layout.name}: {layout.layout}" for layout in fits)
+    raise InputError(f"{path}: could be several layouts; say which: {several}")
+
+
+def format_named(name: str) -> Format:
+    """Return a layout by its name.
+
+    Raises:
+        InputError: where there is none; the nearest name and all names are told.
+    """
+    name = FORMER_NAMES.get(name, name)
+    if name in FORMATS:
+        return FORMATS[name]
+    near = difflib.get_close_matches(name, FORMATS, n=1)
+    meant = f"; did you mean {near[0]}?" if near else ""
+    raise InputError(f"{name!r} is no known layout ({', '.join(FORMATS)}){meant}")
+
+
+def require(path: Path, layout: Format | None = None) -> None:
+    """Refuse a path that is missing or empty; where the data set is known, tell where it is got.
+
+    Args:
+        path: What is to be read.
+        layout: Layout that it shall be in; None where it is to be found out.
+
+    Raises:
+        InputError: where nothing is there.
+    """
+    if path.is_file() or holds_something(path):
+        return
+    what = "an empty folder" if path.is_dir() else "no such file or folder"
+    if layout is not None and layout.page:
+        what += f"; get it from {layout.page} and unpack it; expected: {layout.layout}"
+    raise InputError(f"{path}: {what}")

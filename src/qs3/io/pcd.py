@@ -1,24 +1,14 @@
 """PCD files (Point Cloud Library): reads ascii, binary and binary_compressed, writes binary."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float, Float32
 
+from qs3.errors import InputError
+from qs3.io.guards import check_announced
+
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _LONGEST_HEADER = 2**20
-
-
-@dataclass(frozen=True)
-class _Header:
-    """What the text before the data says."""
-
-    record: np.dtype
-    """One point."""
-    count: int
-    """Number of points."""
-    data: str
-    """``ascii``, ``binary`` or ``binary_compressed``."""
+_LZF_AT_BEST = 88
 
 
 def parse_pcd(content: bytes) -> Float32[np.ndarray, "n 3"]:
@@ -27,21 +17,22 @@ def parse_pcd(content: bytes) -> Float32[np.ndarray, "n 3"]:
     A point with a NaN is left out: it is how PCD marks a pixel that saw nothing.
 
     Raises:
+        InputError: where more is announced than the file holds.
         ValueError: where the content is not such a file or is cut off.
     """
-    header, body = _header(content)
-    if header.data == "ascii":
-        points = _ascii(header, body)
+    record, count, data, body = _header(content)
+    size = count * record.itemsize
+    if data == "ascii":
+        columns = _ascii(record, count, body)
+    elif data == "binary":
+        check_announced(f"{count} points", size, len(body), densest=1)
+        columns = np.frombuffer(body[:size], dtype=record)
+    elif data == "binary_compressed":
+        columns = _uncompressed(record, count, body)
     else:
-        if header.data == "binary_compressed":
-            columns = _uncompressed(header, body)
-        else:
-            size = header.count * header.record.itemsize
-            if len(body) < size:
-                raise ValueError(f"cut off: {len(body)} of {size} bytes of points")
-            records = np.frombuffer(body[:size], dtype=header.record)
-            columns = {axis: records[axis] for axis in "xyz"}
-        points = np.stack([_scalar(columns[axis]) for axis in "xyz"], axis=1)
+        raise ValueError(f"DATA {data} is unknown; save it as binary")
+    axes = [columns[axis].reshape(count, -1)[:, 0].astype(np.float64) for axis in "xyz"]
+    points = np.stack(axes, axis=1)
     return points[~np.isnan(points).any(axis=1)].astype(np.float32)
 
 
@@ -60,11 +51,8 @@ def pcd_bytes(points: Float[np.ndarray, "n 3"]) -> bytes:
     return header.encode("ascii") + np.ascontiguousarray(points, dtype="<f4").tobytes()
 
 
-def _scalar(column: np.ndarray) -> np.ndarray:
-    return column.reshape(len(column), -1)[:, 0].astype(np.float64)
-
-
-def _header(content: bytes) -> tuple[_Header, bytes]:
+def _header(content: bytes) -> tuple[np.dtype, int, str, bytes]:
+    """One point's record, the number of points, the kind of data, and what follows the header."""
     fields: dict[str, list[str]] = {}
     position = 0
     while "DATA" not in fields:
@@ -76,58 +64,52 @@ def _header(content: bytes) -> tuple[_Header, bytes]:
         if words and not words[0].startswith("#"):
             fields[words[0].upper()] = words[1:]
     try:
-        names = fields["FIELDS"]
-        sizes = [int(word) for word in fields["SIZE"]]
+        names, sizes = fields["FIELDS"], [int(word) for word in fields["SIZE"]]
         kinds = [_KINDS[word] for word in fields["TYPE"]]
         counts = [int(word) for word in fields.get("COUNT", ["1"] * len(names))]
-        points = int(fields["POINTS"][0])
+        points, data = int(fields["POINTS"][0]), fields["DATA"][0]
         if points < 0 or min(counts, default=0) < 1 or min(sizes, default=0) < 1:
             raise ValueError
-        data = fields["DATA"][0]
-        parts = [
-            (name if name in "xyz" else f"_{index}", f"<{kind}{size}", (count,))
-            for index, (name, kind, size, count) in enumerate(
-                zip(names, kinds, sizes, counts, strict=True)
-            )
-        ]
-        record = np.dtype(parts)
+        columns = enumerate(zip(names, kinds, sizes, counts, strict=True))
+        record = np.dtype(
+            [
+                (name if name in "xyz" else f"_{index}", f"<{kind}{size}", (count,))
+                for index, (name, kind, size, count) in columns
+            ]
+        )
     except (KeyError, IndexError, ValueError, TypeError) as error:
         raise ValueError("not a PCD file: its header is incomplete") from error
     if not set("xyz") <= set(names):
         raise ValueError("has no fields x, y and z")
-    if data not in ("ascii", "binary", "binary_compressed"):
-        raise ValueError(f"DATA {data} is unknown; save it as binary")
-    return _Header(record, points, data), content[position:]
+    return record, points, data, content[position:]
 
 
-def _ascii(header: _Header, body: bytes) -> np.ndarray:
+def _ascii(record: np.dtype, count: int, body: bytes) -> dict[str, np.ndarray]:
     """Pick x, y and z out of the lines; a field of several values takes as many words."""
-    names = header.record.names or ()
-    widths = [header.record[name].shape[0] for name in names]
+    names = record.names or ()
+    widths = [record[name].shape[0] for name in names]
     starts = dict(zip(names, np.cumsum([0, *widths[:-1]]).tolist(), strict=True))
-    rows = [line.split() for line in body.decode("ascii").splitlines() if line.strip()]
-    if len(rows) < header.count:
-        raise ValueError(f"cut off: {len(rows)} of {header.count} points")
+    rows = [line.split() for line in body.decode("ascii").splitlines() if line.strip()][:count]
+    if len(rows) < count:
+        raise ValueError(f"cut off: {len(rows)} of {count} points")
     if any(len(row) != sum(widths) for row in rows):
         raise ValueError(f"a line has not the {sum(widths)} numbers that the header announces")
-    picked = [[row[starts[axis]] for axis in "xyz"] for row in rows[: header.count]]
-    return np.array(picked, dtype=np.float64).reshape(-1, 3)
+    return {axis: np.array([float(row[starts[axis]]) for row in rows]) for axis in "xyz"}
 
 
-def _uncompressed(header: _Header, body: bytes) -> dict[str, np.ndarray]:
+def _uncompressed(record: np.dtype, count: int, body: bytes) -> dict[str, np.ndarray]:
     """Undo LZF; the values lie field after field, not point after point."""
     if len(body) < 8:
         raise ValueError("cut off")
     packed, size = (int(word) for word in np.frombuffer(body[:8], dtype="<u4"))
-    if len(body) < 8 + packed or size != header.count * header.record.itemsize:
+    if len(body) < 8 + packed or size != count * record.itemsize:
         raise ValueError("cut off, or of another size than the header says")
+    check_announced(f"{count} points", size, packed, _LZF_AT_BEST)
     raw = lzf_decompress(body[8 : 8 + packed], size)
     columns, begin = {}, 0
-    for name in header.record.names or ():
-        field = header.record[name]
-        end = begin + header.count * field.itemsize
-        columns[name] = np.frombuffer(raw[begin:end], dtype=field.base)
-        columns[name] = columns[name].reshape(header.count, -1)
+    for name in record.names or ():
+        end = begin + count * record[name].itemsize
+        columns[name] = np.frombuffer(raw[begin:end], dtype=record[name].base)
         begin = end
     return columns
 
@@ -140,7 +122,7 @@ def lzf_decompress(packed: bytes, size: int) -> bytes:
     back to copy from; the copy may overlap what it writes.
 
     Raises:
-        ValueError: where the stream is damaged or does not give ``size`` bytes.
+        InputError: where the stream is damaged or does not give ``size`` bytes.
 
     Example:
         >>> lzf_decompress(bytes([1, 97, 98, 0b001_00000, 1]), 5)
@@ -160,15 +142,14 @@ def lzf_decompress(packed: bytes, size: int) -> bytes:
             if length == 7:
                 length += packed[position]
                 position += 1
-            back = ((control & 31) << 8) + packed[position] + 1
+            begin = len(result) - ((control & 31) << 8) - packed[position] - 1
             position += 1
-            begin = len(result) - back
             if begin < 0:
-                raise ValueError("damaged compressed data")
+                raise InputError("damaged compressed data")
             for offset in range(length + 2):
                 result.append(result[begin + offset])
     except IndexError as error:
-        raise ValueError("damaged compressed data") from error
+        raise InputError("damaged compressed data") from error
     if len(result) != size:
-        raise ValueError(f"damaged compressed data: {len(result)} of {size} bytes")
+        raise InputError(f"damaged compressed data: {len(result)} of {size} bytes")
     return bytes(result)

@@ -1,14 +1,22 @@
 """PLY files: written here, the same bytes for the same points; read by trimesh after a look."""
 
 import io
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from qs3.errors import InputError
 from qs3.files import write_bytes
-from qs3.io.guards import reason
+from qs3.io.guards import check_announced, reason
+
+_SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4,
+          "double": 8, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4,
+          "float32": 4, "float64": 8}  # fmt: skip
+_FORMATS = ("ascii", "binary_little_endian", "binary_big_endian")
+_LONGEST_HEADER = 2**20
 
 
 def write_ply(
@@ -35,94 +43,77 @@ def ply_bytes(
     points: Float[np.ndarray, "n 3"], view: UInt8[np.ndarray, "n"] | None = None
 ) -> bytes:
     """Return what `write_ply` writes."""
-    kinds = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+    columns = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")] + [("view", "u1")] * (view is not None)
+    table = np.zeros(len(points), dtype=columns)
+    for axis, column in zip("xyz", np.transpose(points), strict=True):
+        table[axis] = column
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
     lines += [f"property float {axis}" for axis in "xyz"]
     if view is not None:
-        kinds.append(("view", "u1"))
-        lines.append("property uchar view")
-    table = np.zeros(len(points), dtype=kinds)
-    for column, axis in enumerate("xyz"):
-        table[axis] = points[:, column]
-    if view is not None:
         table["view"] = view
-    header = "\n".join([*lines, "end_header"]) + "\n"
-    return header.encode("ascii") + table.tobytes()
+        lines.append("property uchar view")
+    return "\n".join([*lines, "end_header\n"]).encode("ascii") + table.tobytes()
 
 
-_SIZES = {
-    "char": 1, "int8": 1, "uchar": 1, "uint8": 1, "short": 2, "int16": 2, "ushort": 2, "uint16": 2,
-    "int": 4, "int32": 4, "uint": 4, "uint32": 4, "float": 4, "float32": 4,
-    "double": 8, "float64": 8,
-}  # fmt: skip
-_LONGEST_HEADER = 2**20
-_FORMATS = ("ascii", "binary_little_endian", "binary_big_endian")
-
-
-def ply_vertices(content: bytes) -> Float[np.ndarray, "n 3"]:
-    """Return the vertices of a PLY file, of points or of a mesh, in the file's order.
+def load_ply(content: bytes) -> Any:
+    """Return a PLY file as trimesh's mesh or cloud of points, in the file's order.
 
     Raises:
-        InputError: where the file is damaged, cut off or announces more than it has.
+        InputError: where the file is damaged, cut off, announces more than it has, or has no
+            vertices with x, y and z.
     """
     # Imported here: point files of other kinds need no mesh library.
     import trimesh
 
-    content = checked_ply(content)
     try:
-        loaded = trimesh.load(io.BytesIO(content), file_type="ply", process=False)
+        content = _checked(content)
+        return trimesh.load(io.BytesIO(content), file_type="ply", process=False)
+    except InputError:
+        raise
     except Exception as error:  # parsers of damaged files raise whatever they stumble over
         raise InputError(f"cannot be read as ply ({reason(error)})") from error
-    return np.asarray(getattr(loaded, "vertices", np.zeros((0, 3))), dtype=np.float64)
 
 
-def checked_ply(content: bytes) -> bytes:
-    """Hold what a PLY file's header announces against the size of the file.
-
-    Returns:
-        The file, without what may follow its last row (trimesh takes that for damage).
-
-    Raises:
-        InputError: where it is no PLY file, announces more than it has, or has no vertices with
-            x, y and z.
-    """
-    head, end, _ = content[:_LONGEST_HEADER].partition(b"end_header")
-    lines = [line.split() for line in head.decode("ascii", errors="replace").splitlines()]
-    if not lines or lines[0] != ["ply"]:
-        raise InputError("cannot be read as ply (its first line is not ply)")
-    if not end:
-        raise InputError("cannot be read as ply (no end_header line)")
-    form, needed, announced, lists = "", 0, [], False
-    properties: dict[str, list[str]] = {}
-    for words in lines[1:]:
+def _checked(content: bytes) -> bytes:
+    """The file as trimesh is to see it, if its header announces no more than it holds."""
+    head, mark, _ = content[:_LONGEST_HEADER].partition(b"end_header")
+    if not head.startswith(b"ply") or not mark:
+        raise ValueError("no end_header line" if head.startswith(b"ply") else "no ply at its start")
+    body = content[len(head) + len(mark) :]
+    # trimesh logs what comments say of textures.
+    head = re.sub(rb"(?m)^(comment|obj_info)\b.*\n", b"", head)
+    form = ""
+    elements: list[tuple[str, int, dict[str, tuple[bool, int]]]] = []
+    for line in head.decode("ascii", errors="replace").splitlines()[1:]:
+        words = [*line.split(), ""]
         try:
-            if words[:1] == ["format"]:
+            if words[0] == "format":
                 form = _FORMATS[_FORMATS.index(words[1])]  # one of these, else a ValueError
-            elif words[:1] == ["element"]:
-                announced.append((words[1], int(words[2])))
-                properties[words[1]] = []
-            elif words[:1] == ["property"]:
-                name, count = announced[-1]
-                is_list = words[1] == "list"
-                lists |= is_list and count > 0
-                if is_list and count and "vertex" not in [other for other, _ in announced[:-1]]:
-                    raise InputError("has lists in or before its vertices; save it without")
-                properties[name].append(words[4 if is_list else 2])
-                # Of a list at least its length; in text at least a digit and a gap.
-                needed += count * (2 if form == "ascii" else _SIZES[words[2 if is_list else 1]])
-        except InputError:
-            raise
-        except (IndexError, KeyError, ValueError) as error:
-            line = " ".join(words)[:60]
-            raise InputError(f"cannot be read as ply (header line {line!r})") from error
-    held = len(content) - len(head) - len(end)
-    if not form or any(count < 0 or (count and not properties[n]) for n, count in announced):
-        raise InputError("cannot be read as ply (its header lacks the format or a property)")
-    if needed > held + 1:
-        rows = ", ".join(f"{count} {name}" for name, count in announced)
-        raise InputError(f"announces {rows}, which is at least {needed} bytes, but has {held}")
-    columns = properties.get("vertex", [])
-    if not {"x", "y", "z"} <= set(columns) or len(set(columns)) < len(columns):
-        raise InputError("its vertices need the properties x, y and z, each property once")
-    begin = len(head) + len(end) + (2 if content[len(head) + len(end) :].startswith(b"\r\n") else 1)
-    return content if form == "ascii" or lists else content[: begin + needed]
+            elif words[0] == "element":
+                elements.append((words[1], int(words[2]), {}))
+            elif words[0] == "property":
+                is_list, name, columns = words[1] == "list", words[-2], elements[-1][2]
+                if name in columns:
+                    raise InputError(f"{elements[-1][0]} needs each property once, {name} is twice")
+                columns[name] = (is_list, _SIZES[words[2 if is_list else 1]])
+        except (IndexError, KeyError):
+            raise ValueError(f"header line {line[:60]!r}") from None
+    if not form or any(count < 0 or (count and not columns) for _, count, columns in elements):
+        raise ValueError("its header lacks the format or a property, or counts below 0")
+    # Of a list at least its length; in text at least a digit and a gap.
+    needed = sum(
+        count * sum(2 if form == "ascii" else size for _, size in columns.values())
+        for _, count, columns in elements
+    )
+    rows = ", ".join(f"{count} {name}" for name, count, _ in elements)
+    check_announced(f"its header ({rows})", needed, len(body) + 1, densest=1)
+    lists = [n and any(many for many, _ in columns.values()) for _, n, columns in elements]
+    names = [name for name, _, _ in elements]
+    place = names.index("vertex") if "vertex" in names else -1
+    if place < 0 or not {"x", "y", "z"} <= set(elements[place][2]):
+        raise InputError("its vertices need the properties x, y and z")
+    if any(lists[: place + 1]):
+        raise InputError("has lists in or before its vertices; save it without")
+    if form != "ascii" and not any(lists):
+        body = body[: needed + (2 if body.startswith(b"\r\n") else 1)]  # the rest were damage to it
+    return head + mark + body

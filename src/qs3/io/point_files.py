@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from qs3.errors import InputError
-from qs3.io.guards import load_npy, reason
+from qs3.io.guards import load_npy, read_small, reason
 from qs3.io.pcd import parse_pcd, pcd_bytes
-from qs3.io.ply import checked_ply, ply_bytes
+from qs3.io.ply import load_ply, ply_bytes
 
 POINT_FILES = (".npy", ".xyz", ".txt", ".ply", ".pcd", ".off")
 WRITTEN_FILES = (".npy", ".xyz", ".ply", ".pcd")
@@ -32,12 +32,10 @@ def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np
         InputError: where the file is missing, of another format, damaged, empty or not finite.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
     suffix = path.suffix.lower()
-    if suffix not in POINT_FILES:
+    if path.is_file() and suffix not in POINT_FILES:
         raise InputError(f"{path}: not a point cloud file; known are {', '.join(POINT_FILES)}")
-    content = path.read_bytes()
+    content = read_small(path)
     if not content.strip():
         raise InputError(f"{path}: empty file")
     try:
@@ -56,7 +54,7 @@ def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np
     if not len(points):
         raise InputError(f"{path}: holds no point")
     with np.errstate(over="ignore"):
-        points = np.ascontiguousarray(points, dtype=np.float32)
+        points = np.array(points, dtype=np.float32, order="C")
     if not np.isfinite(points).all():
         raise InputError(f"{path}: a point is not finite; remove points with NaN or infinity")
     return points
@@ -138,8 +136,9 @@ def _trimesh(content: bytes, file_type: str, mesh_points: int, seed: int) -> np.
     from qs3.meshes.normalising import sample_surface
 
     if file_type == "ply":
-        content = checked_ply(content)
-    loaded = trimesh.load(io.BytesIO(content), file_type=file_type, process=False)
+        loaded = load_ply(content)
+    else:
+        loaded = trimesh.load(io.BytesIO(content), file_type=file_type, process=False)
     if isinstance(loaded, trimesh.Trimesh) and len(loaded.faces):
         return sample_surface(loaded, mesh_points, np.random.default_rng(seed))
     if isinstance(loaded, trimesh.Trimesh | trimesh.PointCloud):

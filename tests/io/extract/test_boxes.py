@@ -73,7 +73,7 @@ def test_convention_axes_are_the_rows_of_the_basis():
 )
 def test_what_is_no_box_is_refused(basis, half):
     with pytest.raises(InputError):
-        OrientedBox(np.zeros(3), basis, half)
+        inside_box(np.zeros((1, 3)), OrientedBox(np.zeros(3), basis, half))
 
 
 @pytest.mark.data

@@ -14,10 +14,11 @@ from hypothesis import strategies as st
 from qs3.errors import InputError
 from qs3.io.extract.cut import CutSettings, keep_pixels, lift, upright
 from qs3.io.extract.depth import (
-    DepthImage,
     DepthImageSettings,
-    cut_image,
-    list_depth_images,
+    Frame,
+    FrameObject,
+    cut_frame,
+    list_frames,
     read_names,
 )
 from qs3.io.extract.depth_images import read_depth, read_mask
@@ -50,15 +51,17 @@ def taken(tmp_path_factory):
     return folder, pose, depth
 
 
-def cut(folder, **more):
-    image = DepthImage("a", folder / "depth" / "a.png", folder / "mask" / "a.png")
-    return list(cut_image(image, CAMERA, DepthImageSettings(**more), {}))
+def cut(depth, mask, camera=CAMERA, names=None, **more):
+    """The objects of one depth image, called a."""
+    settings = DepthImageSettings(**more)
+    item = FrameObject("a", mask, upright(settings.gravity))
+    return list(cut_frame(Frame("a", depth, camera, (item,)), settings, names or {}))
 
 
 def test_convention_gravity_makes_the_cloud_upright_and_not_mirrored(taken):
     folder, pose, depth = taken
     gravity = pose[:3, :3].T @ [0.0, 0.0, -9.81]
-    (cloud,) = cut(folder, gravity=tuple(gravity))
+    (cloud,) = cut(folder / "depth" / "a.png", folder / "mask" / "a.png", gravity=tuple(gravity))
     assert cloud.points.dtype == np.float32
     assert len(cloud.points) == (depth > 0).sum()
     # All that is left between the cloud and the world is a turn about z and a shift.
@@ -77,10 +80,9 @@ def test_convention_without_gravity_the_image_is_upright(tmp_path):
     depth = np.zeros((5, 5), np.uint16)
     depth[2, 2] = depth[2, 4] = depth[1, 2] = 2000
     write_png(tmp_path / "d.png", depth)
-    image = DepthImage("d", tmp_path / "d.png", None)
     camera = Intrinsics(100.0, 50.0, 2.0, 2.0)
-    options = DepthImageSettings(box=(0, 0, 5, 5), cut=CutSettings(min_points=1))
-    (cloud,) = cut_image(image, camera, options, {})
+    options = {"box": (0, 0, 5, 5), "cut": CutSettings(min_points=1)}
+    (cloud,) = cut(tmp_path / "d.png", None, camera, **options)
     expected = [[0.0, 2.0, 0.04], [0.0, 2.0, 0.0], [0.04, 2.0, 0.0]]
     np.testing.assert_allclose(cloud.points, expected, atol=1e-6)
 
@@ -160,37 +162,36 @@ def test_a_mask_of_instances_gives_a_cloud_each_with_its_class(taken, tmp_path):
     mask[:, : WIDTH // 2][depth[:, : WIDTH // 2] > 0] = 700
     write_png(tmp_path / "mask" / "a.png", mask)
     (tmp_path / "names.csv").write_text("name,class\na/3,table\n*/700,chair\na,sofa\n")
-    image = DepthImage("a", folder / "depth" / "a.png", tmp_path / "mask" / "a.png")
+    image, masks = folder / "depth" / "a.png", tmp_path / "mask"
     names = read_names(tmp_path / "names.csv")
-    clouds = list(cut_image(image, CAMERA, DepthImageSettings(instances=True), names))
+    clouds = cut(image, masks / "a.png", names=names, instances=True)
     assert [(c.id, c.class_name) for c in clouds] == [("a/3", "table"), ("a/700", "chair")]
     assert sum(len(c.points) for c in clouds) == (depth > 0).sum()
     # Without the option both are one object; a coloured mask is what is not black.
-    (whole,) = cut_image(image, CAMERA, DepthImageSettings(class_name="x"), {})
+    (whole,) = cut(image, masks / "a.png", class_name="x")
     assert whole.class_name == "x"
     colour = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     colour[..., 2] = (mask > 0) * 9
-    write_png(tmp_path / "mask" / "colour.png", colour)
-    image = DepthImage("a", image.path, tmp_path / "mask" / "colour.png")
-    (other,) = cut_image(image, CAMERA, DepthImageSettings(), {})
+    write_png(masks / "colour.png", colour)
+    (other,) = cut(image, masks / "colour.png")
     np.testing.assert_array_equal(whole.points, other.points)
 
 
 def test_a_box_is_first_to_before_last_and_cuts_masks_too(taken):
     folder, _, depth = taken
-    (cloud,) = cut(folder, box=(70, 50, 90, 65))
+    image, mask = folder / "depth" / "a.png", folder / "mask" / "a.png"
+    (cloud,) = cut(image, mask, box=(70, 50, 90, 65))
     assert len(cloud.points) == (depth[50:65, 70:90] > 0).sum() > 100
     with pytest.raises(InputError, match="beyond its 160×120"):
-        cut(folder, box=(70, 50, 161, 65))
+        cut(image, mask, box=(70, 50, 161, 65))
 
 
 @pytest.mark.parametrize(("fx", "scale"), [(1e-300, None), (1e-9, None), (150.0, 1e30)])
 def test_points_that_no_camera_sees_are_refused(taken, fx, scale):
     folder, _, _ = taken
-    image = DepthImage("a", folder / "depth" / "a.png", folder / "mask" / "a.png")
-    camera = dataclasses.replace(CAMERA, fx=fx)
+    camera = dataclasses.replace(CAMERA, fx=fx, depth_scale=scale)
     with pytest.raises(InputError, match=r"a\.png: a point lies beyond"):
-        list(cut_image(image, camera, DepthImageSettings(depth_scale=scale), {}))
+        cut(folder / "depth" / "a.png", folder / "mask" / "a.png", camera)
 
 
 def test_every_way_to_tell_a_camera(tmp_path):
@@ -314,7 +315,7 @@ BAD_IMAGES = {
     "huge.npy": (npy("{'descr': '<f8', 'fortran_order': False, 'shape': (60000, 60000), }"),
                  "announces 60000×60000"),
     "short.npy": (npy("{'descr': '<f8', 'fortran_order': False, 'shape': (600, 600), }", b"0"),
-                  "announces 2880000 bytes, but has 1"),
+                  "announces 2880000 bytes"),
     "pickle.npy": (npy("{'descr': '|O', 'fortran_order': False, 'shape': (2, 2), }", b"0" * 64),
                    "pickled objects"),
     "line.npy": (npy("{'descr': '<f8', 'fortran_order': False, 'shape': (2,), }", b"0" * 16),
@@ -357,23 +358,27 @@ def test_a_folder_goes_with_a_folder_of_masks(tmp_path):
     (tmp_path / "masks").mkdir()
     for name in ("a.png", "b.tif", "c.png"):
         (tmp_path / "masks" / name).write_bytes(b"")
-    images = list_depth_images(tmp_path, tmp_path / "masks")
-    assert [(image.id, image.mask.name) for image in images] == [
+
+    def listed(source, mask=None):
+        return list_frames(source, CAMERA, DepthImageSettings(mask=mask))
+
+    frames = listed(tmp_path, tmp_path / "masks")
+    assert [(frame.id, frame.objects[0].mask.name) for frame in frames] == [
         ("a", "a.png"), ("b", "b.tif"), ("c", "c.png"),
     ]  # fmt: skip
     with pytest.raises(InputError, match="one mask for 3 depth images"):
-        list_depth_images(tmp_path, tmp_path / "masks" / "a.png")
+        listed(tmp_path, tmp_path / "masks" / "a.png")
     (tmp_path / "masks" / "c.png").unlink()
     with pytest.raises(InputError, match=r"no mask c\.png"):
-        list_depth_images(tmp_path, tmp_path / "masks")
+        listed(tmp_path, tmp_path / "masks")
     (tmp_path / "a.tif").write_bytes(b"")
     with pytest.raises(InputError, match="same name"):
-        list_depth_images(tmp_path)
+        listed(tmp_path)
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="no depth image"):
-        list_depth_images(tmp_path / "empty")
+        listed(tmp_path / "empty")
     with pytest.raises(InputError, match="no such file"):
-        list_depth_images(tmp_path / "absent")
+        listed(tmp_path / "absent")
 
 
 @pytest.mark.parametrize(

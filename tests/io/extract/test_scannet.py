@@ -6,7 +6,6 @@ import struct
 import tracemalloc
 import zipfile
 import zlib
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from qs3.errors import InputError
 from qs3.io.extract.run import ExtractedCloud, OutputSettings
 from qs3.io.extract.scannet import ScanNetSettings, extract_scannet
 from qs3.io.extract.scannet_frames import cut_scene
-from qs3.io.extract.scannet_masks import InstanceMasks, erode
+from qs3.io.extract.scannet_masks import erode, read_mask
 from qs3.io.extract.scannet_scene import (
     ScanNetScene,
     axis_alignment,
@@ -26,6 +25,7 @@ from qs3.io.extract.scannet_scene import (
     read_objects,
     read_splits,
 )
+from qs3.io.guards import open_zip
 from qs3.io.layouts.store import read_ragged
 from qs3.store.manifest import open_dataset
 
@@ -256,17 +256,17 @@ def test_a_cut_file_yields_no_object(room: Room, tmp_path: Path) -> None:
 # Masks.
 
 
-def masks_of(path: Path) -> closing[InstanceMasks]:
-    return closing(InstanceMasks(path, ((64, 48), (32, 24))))
+def mask_of(path: Path, frame: int) -> np.ndarray | None:
+    with open_zip(path) as archive:
+        return read_mask(archive, frame, ((64, 48), (32, 24)))
 
 
 def test_masks_come_back(tmp_path: Path, rng: np.random.Generator) -> None:
     large, little = (rng.integers(0, 200, size, dtype=np.uint8) for size in ((48, 64), (24, 32)))
     path = write_masks(tmp_path / "a.zip", {0: large, 100: little})
-    with masks_of(path) as masks:
-        np.testing.assert_array_equal(masks.read(0), large)
-        np.testing.assert_array_equal(masks.read(100), little)
-        assert masks.read(1) is None
+    np.testing.assert_array_equal(mask_of(path, 0), large)
+    np.testing.assert_array_equal(mask_of(path, 100), little)
+    assert mask_of(path, 1) is None
 
 
 def test_names_that_lead_elsewhere_do_no_harm(tmp_path: Path) -> None:
@@ -275,8 +275,7 @@ def test_names_that_lead_elsewhere_do_no_harm(tmp_path: Path) -> None:
         for name in ("../evil.png", "/evil.png", "instance-filt/../../evil.png", "C:\\evil.png"):
             archive.writestr(name, b"evil")
         archive.writestr("instance-filt/0.png", png(np.zeros((48, 64), np.uint8)))
-    with masks_of(path) as masks:
-        assert masks.read(0) is not None
+    assert mask_of(path, 0) is not None
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["a.zip"]
 
 
@@ -309,8 +308,8 @@ BAD_MASKS = {
 def test_a_bad_mask_is_one_line(tmp_path: Path, fault: str) -> None:
     content, message = BAD_MASKS[fault]
     path = write_masks(tmp_path / "a.zip", {7: content})
-    with masks_of(path) as masks, pytest.raises(InputError, match=message) as caught:
-        masks.read(7)
+    with pytest.raises(InputError, match=message) as caught:
+        mask_of(path, 7)
     assert "a.zip: instance-filt/7.png" in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -324,24 +323,21 @@ def test_a_zip_bomb_is_not_unpacked(tmp_path: Path) -> None:
     for message in (honest, struct.pack("<I", 2000)):
         path.write_bytes(content.replace(honest, message))
         tracemalloc.start()
-        with (
-            masks_of(path) as masks,
-            pytest.raises(InputError, match=r"unpack|damaged|not a PNG"),
-        ):
-            masks.read(0)
+        with pytest.raises(InputError, match=r"unpack|damaged|not a PNG"):
+            mask_of(path, 0)
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert peak < 2**20
     with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
         archive.writestr("instance-filt/0.png", bytes(1000))
-    with masks_of(path) as masks, pytest.raises(InputError, match="deflate"):
-        masks.read(0)
+    with pytest.raises(InputError, match="deflate"):
+        mask_of(path, 0)
 
 
 def test_no_zip_file_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "a.zip").write_bytes(b"PK\x05\x06" + bytes(10))
     with pytest.raises(InputError, match="cannot be read as zip"):
-        masks_of(tmp_path / "a.zip")
+        mask_of(tmp_path / "a.zip", 0)
 
 
 def test_erosion_keeps_what_is_alone_within_reach() -> None:

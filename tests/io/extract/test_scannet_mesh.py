@@ -76,9 +76,9 @@ def test_a_shared_segment_goes_to_the_first(tmp_path: Path) -> None:
         [(0, "chair", [7]), (1, "table", [7, 8]), (2, "floor", [9])],
     )
     scene = scene_of(tmp_path)
-    mesh = read_scene_mesh(scene, read_objects(scene))
-    np.testing.assert_array_equal(mesh.vertices, vertices)
-    assert mesh.owner.tolist() == [0, 0, 1, -1]
+    placed, owner = read_scene_mesh(scene, read_objects(scene))
+    np.testing.assert_array_equal(placed, vertices)
+    assert owner.tolist() == [0, 0, 1, -1]
 
 
 def scene_with(tmp_path: Path, name: str, content: bytes) -> ScanNetScene:

@@ -88,14 +88,16 @@ def test_far_points_raw_depth_margins_and_small_objects(root):
     # What is cut is what lies within the box, of all points of the frame.
     whole = truth(0) | {"coeffs": np.full(3, 50.0)}
     box = OrientedBox(*truth(0).values())
-    wide = dataclasses.replace(frames[0].boxes[0], centre=whole["centroid"], half=whole["coeffs"])
-    (every,) = clouds([dataclasses.replace(frames[0], boxes=(wide,))])
+    wide = dataclasses.replace(frames[0].objects[0], box=OrientedBox(*whole.values()))
+    (every,) = clouds([dataclasses.replace(frames[0], objects=(wide,))])
     assert inside_box(every.points.astype(np.float64), box).sum() == pytest.approx(count, abs=2)
 
 
 def test_classes_are_renamed_or_left_out_and_splits_read(root):
     frames = list_sunrgbd(root, splits=root / "allsplit.mat", rename=rename_to(None))
-    assert [[b.class_name for b in f.boxes] for f in frames] == [["sofa_chair", "toilet"]] * 2
+    assert [[item.class_name for item in f.objects] for f in frames] == [
+        ["sofa_chair", "toilet"]
+    ] * 2
     assert [frame.split for frame in frames] == ["train", "test"]
     assert {cloud.split for cloud in clouds(frames)} == {"train", "test"}
     with pytest.raises(InputError, match="no frame"):

@@ -13,7 +13,6 @@ from qs3.io.layouts.point_folders import write_folder
 from qs3.io.layouts.store import read_ragged
 from qs3.io.load import read_clouds
 from qs3.io.ragged import RaggedClouds
-from qs3.io.whole import whole
 from qs3.meshes.classes import POINTDA10
 from qs3.store.manifest import open_dataset
 

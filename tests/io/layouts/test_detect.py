@@ -1,9 +1,8 @@
 import pytest
 
 from qs3.errors import InputError
-from qs3.io.detect import detect, format_named, require
 from qs3.io.layouts import FORMATS
-from qs3.io.load import load_clouds
+from qs3.io.load import detect, format_named, load_clouds, require
 
 
 def touch(root, *names):

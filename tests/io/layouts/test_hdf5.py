@@ -6,6 +6,7 @@ import pytest
 
 from qs3.errors import InputError
 from qs3.geometry import y_up_to_z_up, z_up_to_y_up
+from qs3.io import guards
 from qs3.io.layouts import hdf5
 from qs3.io.layouts.hdf5 import hdf5_bytes, read_file
 from qs3.io.layouts.hdf5_sets import list_parts, read_parts
@@ -205,7 +206,7 @@ HOSTILE = {
     "external storage": (external_storage, "data lies in another file"),
     "virtual": (virtual, "data lies in another file"),
     "group": (group, "data is no dataset"),
-    "announced only": (never_written, r"announces 9830400000 bytes .* the file has 0"),
+    "announced only": (never_written, r"announces 9830400000 bytes"),
     "announced chunks": (never_written_chunks, r"announces 9830400000 bytes"),
     "labels announced": (huge_label, r"label announces 8000000000000 bytes"),
     "bomb": (bomb, r"announces 28800000 bytes"),
@@ -218,6 +219,7 @@ HOSTILE = {
 def test_hostile_files_are_refused_before_their_points_are_read(
     tmp_path, arrays, name, monkeypatch
 ):
+    monkeypatch.setattr(guards, "_SLACK", 2**20)
     change, message = HOSTILE[name]
     path = save(tmp_path / "a.h5", **arrays)
     with h5py.File(path, "a") as file:

@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 
 from qs3.errors import InputError
-from qs3.io.detect import detect
 from qs3.io.layouts import FORMATS, modelnet, scanobjectnn, trees
+from qs3.io.load import detect
 from qs3.meshes.classes import POINTDA10
 
 WRITTEN = [layout for layout in FORMATS.values() if layout.write is not None]

@@ -8,14 +8,13 @@ import pytest
 import trimesh
 
 from qs3.errors import InputError
-from qs3.io.detect import detect
 from qs3.io.layouts.modelnet import (
     CLASSES,
     read_modelnet_h5,
     read_modelnet_meshes,
     write_modelnet_h5,
 )
-from qs3.io.load import load_clouds
+from qs3.io.load import detect, load_clouds
 from qs3.meshes import loading
 from qs3.meshes.classes import POINTDA10
 from qs3.meshes.loading import load_mesh

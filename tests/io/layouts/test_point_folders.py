@@ -158,15 +158,15 @@ def ply_header(form: str, lines: str) -> bytes:
 XYZ = "property float x\nproperty float y\nproperty float z"
 HOSTILE = {
     "ply of 10 GB": ("a.ply", ply_header("binary_little_endian", f"element vertex 900000000\n{XYZ}")
-                     + bytes(60), "announces 900000000 vertex"),
+                     + bytes(60), "900000000 vertex.* announces"),
     "ply text of 10 GB": ("a.ply", ply_header("ascii", f"element vertex 900000000\n{XYZ}")
-                          + b"1 2 3\n", "announces 900000000 vertex"),
+                          + b"1 2 3\n", "900000000 vertex.* announces"),
     "ply beyond 64 bits": ("a.ply", ply_header("ascii", f"element vertex {10**30}\n{XYZ}")
-                           + b"1 2 3\n", "announces 1000000"),
+                           + b"1 2 3\n", "announces 6000000"),
     "ply faces": ("a.ply", ply_header(
         "binary_little_endian",
         f"element vertex 1\n{XYZ}\nelement face 900000000\nproperty list uchar int vertex_indices",
-    ) + bytes(60), "announces 1 vertex, 900000000 face"),
+    ) + bytes(60), "1 vertex, 900000000 face.* announces"),
     "ply rows of nothing": ("a.ply", ply_header(
         "binary_little_endian", f"element void 900000000\nelement vertex 1\n{XYZ}") + bytes(12),
         "lacks the format or a property"),
@@ -183,17 +183,17 @@ HOSTILE = {
     "ply endless header": ("a.ply", b"ply\n" + (b"comment ".ljust(60) + b"\n") * 20_000,
                            "no end_header"),
     "pcd of 10 GB": ("a.pcd", b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\n"
-                     b"POINTS 900000000\nDATA binary\n" + bytes(60), "60 of 10800000000 bytes"),
+                     b"POINTS 900000000\nDATA binary\n" + bytes(60), "announces 10800000000 bytes"),
     "pcd wide": ("a.pcd", b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 2000000000\n"
                  b"POINTS 1\nDATA binary\n" + bytes(60), "cannot be read as pcd"),
     "pcd negative": ("a.pcd", b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS -2\nDATA binary\n"
                      + bytes(60), "header is incomplete"),
     "pcd bomb": ("a.pcd", b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 357000000\n"
                  b"DATA binary_compressed\n" + struct.pack("<II", 52, 357000000 * 12) + bytes(52),
-                 "damaged"),
+                 "announces 4284000000"),
     "pcd endless header": ("a.pcd", (b"#".ljust(60) + b"\n") * 20_000, "no DATA line"),
     "npy of 10 GB": ("a.npy", npy_header("(900000000, 3)") + bytes(60), "announces 10800000000"),
-    "npy beyond 64 bits": ("a.npy", npy_header(f"({10**30}, 3)"), "cannot be read as npy"),
+    "npy beyond 64 bits": ("a.npy", npy_header(f"({10**30}, 3)"), "announces"),
     "npy negative": ("a.npy", npy_header("(-1, 3)") + bytes(60), "npy"),
     "npy code": ("a.npy", npy_header("__import__('os').getpid()"), "cannot be read as npy"),
     "off of 10 GB": ("a.off", b"OFF\n900000000 0 0\n1 2 3\n", "cannot be read as off"),

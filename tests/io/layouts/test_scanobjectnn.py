@@ -5,14 +5,13 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.io.detect import detect
 from qs3.io.layouts.scanobjectnn import (
     CLASSES,
     FORMAT,
     read_scanobjectnn,
     write_scanobjectnn,
 )
-from qs3.io.load import load_clouds
+from qs3.io.load import detect, load_clouds
 from qs3.meshes.classes import POINTDA10
 
 

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.io.detect import detect
 from qs3.io.layouts.trees import FORMATS, GRASPNET
-from qs3.io.load import load_clouds, load_unlabelled
+from qs3.io.load import detect, load_clouds, load_unlabelled
 from qs3.meshes.classes import POINTDA10
 
 SPECKLE, DEPTH = FORMATS[:2]

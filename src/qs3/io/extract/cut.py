@@ -57,33 +57,28 @@ def keep_pixels(
         mask: Pixels of the object.
         settings: What is dropped.
     """
+    # Imported here: what is cut from meshes needs no images.
+    import cv2
+
     with np.errstate(invalid="ignore"):
         keep = mask & (depth > settings.near) & (depth < settings.far)
     if settings.erode:
-        keep &= _eroded(mask, settings.erode)
+        square = np.ones((2 * settings.erode + 1,) * 2, np.uint8)
+        keep &= cv2.erode(mask.astype(np.uint8), square) > 0
     if settings.flying:
         keep &= _supported(np.where(keep, depth, np.nan), settings.flying)
     return keep
 
 
-def _eroded(mask: Bool[np.ndarray, "h w"], pixels: int) -> Bool[np.ndarray, "h w"]:
-    import cv2
-
-    square = np.ones((2 * pixels + 1, 2 * pixels + 1), np.uint8)
-    return cv2.erode(mask.astype(np.uint8), square) > 0
-
-
 def _supported(depth: Float[np.ndarray, "h w"], within: float) -> Bool[np.ndarray, "h w"]:
     """Whether at least three of the eight neighbours have about the same depth."""
-    height, width = depth.shape
     padded = np.pad(depth, 1, constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, depth.shape)
     count = np.zeros(depth.shape, np.uint8)
-    for row in range(3):
-        for column in range(3):
-            if (row, column) != (1, 1):
-                other = padded[row : row + height, column : column + width]
-                with np.errstate(invalid="ignore"):
-                    count += np.abs(other - depth) <= within
+    with np.errstate(invalid="ignore"):
+        for place in np.ndindex(3, 3):
+            if place != (1, 1):
+                count += np.abs(windows[place] - depth) <= within
     return count >= 3
 
 
@@ -189,14 +184,6 @@ class OrientedBox:
     half: Float[np.ndarray, "3"]
     """Half its size along each axis; the sign does not matter."""
 
-    def __post_init__(self) -> None:
-        if not all(np.isfinite(part).all() for part in (self.centre, self.basis, self.half)):
-            raise InputError("a number of the box is not finite")
-        lengths = np.linalg.norm(self.basis, axis=1)
-        # Axes of drawn quadrangles are square to each other only about.
-        if abs(lengths - 1).max() > 0.01 or abs(np.linalg.det(self.basis)) < 0.5:
-            raise InputError("the axes of the box are not three unit vectors about at right angles")
-
 
 def inside_box(
     points: Float[np.ndarray, "n 3"], box: OrientedBox, margin: float = 0.0
@@ -208,10 +195,20 @@ def inside_box(
         box: The box.
         margin: Metres by which each face is moved outwards.
 
+    Raises:
+        InputError: where the box has a number that is not finite, or its axes are no unit vectors
+            about at right angles.
+
     Example:
         >>> box = OrientedBox(np.zeros(3), np.eye(3), np.array([1.0, 1.0, 0.5]))
         >>> inside_box(np.array([[0.9, 0.0, 0.4], [0.9, 0.0, 0.6]]), box).tolist()
         [True, False]
     """
+    if not all(np.isfinite(part).all() for part in (box.centre, box.basis, box.half)):
+        raise InputError("a number of the box is not finite")
+    lengths = np.linalg.norm(box.basis, axis=1)
+    # Axes of drawn quadrangles are square to each other only about.
+    if abs(lengths - 1).max() > 0.01 or abs(np.linalg.det(box.basis)) < 0.5:
+        raise InputError("the axes of the box are not three unit vectors about at right angles")
     local = np.einsum("nj,ij->ni", points - box.centre, box.basis)
     return (np.abs(local) <= np.abs(box.half) + margin).all(axis=1)

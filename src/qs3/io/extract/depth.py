@@ -7,15 +7,15 @@ import csv
 import dataclasses
 import io
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
-from jaxtyping import Bool, Int32
+from jaxtyping import Bool, Float
 
 from qs3.errors import InputError
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
@@ -28,7 +28,7 @@ from qs3.io.extract.run import (
     recorded,
     run_extract,
 )
-from qs3.io.guards import read_small
+from qs3.io.guards import read_text, utf8
 
 _LARGEST_TABLE = 1 << 26
 _MOST_INSTANCES = 4096
@@ -85,7 +85,7 @@ def extract_depth(
     """Cut objects from depth images, or from scenes in BOP's layout, into a data set.
 
     Convention:
-        Metres; the camera is the origin, axes as `cut.upright` says. For BOP see `bop.cut_frame`.
+        Metres; the camera is the origin, axes as `cut.upright` says. For BOP see `bop`.
 
     Args:
         source: A depth image, a folder of them, a scene in BOP's layout, or a folder of scenes.
@@ -98,7 +98,6 @@ def extract_depth(
     """
     from qs3.io.extract import bop
 
-    source = Path(source)
     names = read_names(settings.names) if settings.names is not None else {}
     if bop.is_bop(source):
         return bop.extract_bop(source, output, settings, names)
@@ -112,11 +111,11 @@ def extract_depth(
         raise InputError("--instances: needs --mask, whose numbers it means")
     settings = dataclasses.replace(settings, class_name=settings.class_name or "object")
     camera = read_intrinsics(settings.intrinsics)
-    images = list_depth_images(source, settings.mask)
+    frames = list_frames(source, camera, settings)
     of_bop = ("frame", "depth_folder")
     return run_extract(
-        images,
-        partial(cut_image, camera=camera, settings=settings, names=names),
+        frames,
+        partial(cut_frame, settings=settings, names=names),
         output,
         settings={
             "extract": "extract_depth",
@@ -125,55 +124,81 @@ def extract_depth(
             "names": names,
         },
         class_names=sorted({settings.class_name, *names.values()}),
-        planned=None if settings.instances else len(images),
+        planned=None if settings.instances else len(frames),
         min_points=settings.cut.min_points,
     )
 
 
 @dataclass(frozen=True)
-class DepthImage:
-    """One depth image to cut objects from."""
+class FrameObject:
+    """An object of a depth image, or all of its mask's objects where instances are asked for."""
 
     id: str
-    """Its file name without ending."""
+    """Name of its cloud, and of what the instances' numbers are put behind."""
+    mask: Path | None
+    """The mask, or None where a box tells the object."""
+    to_axes: Float[np.ndarray, "k k"]
+    """What takes camera points to the axes of the cloud: a rotation, or a pose in metres."""
+    class_name: str = ""
+    """Its class, where that is known without the table of names."""
+    source: Mapping[str, object] = field(default_factory=dict)
+    """Where it came from, for the data set."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A depth image to cut objects from."""
+
+    id: str
+    """Its name, unique in the source."""
     path: Path
     """The file."""
-    mask: Path | None
-    """Its mask, or None where a box tells the object."""
+    camera: Intrinsics
+    """The camera that took it, with the depth scale in metres a step where that is known."""
+    objects: tuple[FrameObject, ...]
+    """What is cut out."""
 
 
-def list_depth_images(source: Path, mask: Path | None = None) -> list[DepthImage]:
+def list_frames(source: Path, camera: Intrinsics, settings: DepthImageSettings) -> list[Frame]:
     """List the depth images of a file or folder with the masks of the same name.
 
     Args:
         source: A depth image, or a folder with nothing else of those endings in it.
-        mask: The mask of one image, a folder of masks named as their images, or None.
+        camera: The camera of all.
+        settings: Mask, axes and depth scale.
 
     Raises:
         InputError: where there is no image, two have one name, or a mask is missing.
     """
-    if source.is_dir():
-        paths = _images(source)
-        if not paths:
-            raise InputError(
-                f"{source}: no depth image ({', '.join(DEPTH_FILES)}) and no scene of BOP's layout "
-                "(scene_camera.json) in it"
-            )
-    elif source.is_file():
-        paths = {source.stem: source}
-    else:
+    mask = settings.mask
+    if not source.exists():
         raise InputError(f"{source}: no such file or folder")
+    paths = _images(source) if source.is_dir() else {source.stem: source}
+    if not paths:
+        raise InputError(
+            f"{source}: no depth image ({', '.join(DEPTH_FILES)}) and no scene of BOP's layout "
+            "(scene_camera.json) in it"
+        )
     if mask is not None and not mask.exists():
         raise InputError(f"{mask}: no such file or folder")
-    if mask is None or mask.is_file():
-        if mask is not None and len(paths) > 1:
-            raise InputError(f"{mask}: one mask for {len(paths)} depth images; name a folder")
-        return [DepthImage(name, path, mask) for name, path in paths.items()]
-    masks = _images(mask)
+    if mask is not None and mask.is_dir():
+        masks = _images(mask)
+        for name, path in paths.items():
+            if name not in masks:
+                raise InputError(f"{mask}: no mask {name}.png for {path}")
+    elif mask is not None and len(paths) > 1:
+        raise InputError(f"{mask}: one mask for {len(paths)} depth images; name a folder")
+    else:
+        masks = dict.fromkeys(paths, mask)
+    level = upright(settings.gravity)
+    if settings.depth_scale is not None:
+        camera = dataclasses.replace(camera, depth_scale=settings.depth_scale)
+    frames = []
     for name, path in paths.items():
-        if name not in masks:
-            raise InputError(f"{mask}: no mask {name}.png for {path}")
-    return [DepthImage(name, path, masks[name]) for name, path in paths.items()]
+        source_of = {"image": utf8(path.name)}
+        item = FrameObject(utf8(name), masks[name], level, source=source_of)
+        frames.append(Frame(item.id, path, camera, (item,)))
+    return frames
 
 
 def _images(folder: Path) -> dict[str, Path]:
@@ -187,61 +212,64 @@ def _images(folder: Path) -> dict[str, Path]:
     return images
 
 
-def cut_image(
-    image: DepthImage,
-    camera: Intrinsics,
-    settings: DepthImageSettings,
-    names: Mapping[str, str],
+def cut_frame(
+    frame: Frame, settings: DepthImageSettings, names: Mapping[str, str]
 ) -> Iterator[ExtractedCloud]:
     """Cut the objects from one depth image.
+
+    Args:
+        frame: The image, its camera and its objects.
+        settings: What is cut.
+        names: Class by the object: ``a``, or of an instance ``a/1`` or ``*/1``.
 
     Raises:
         InputError: where a file is damaged, sizes differ, or the box is outside the image.
     """
-    depth = read_depth(image.path, settings.depth_scale or camera.depth_scale)
-    camera.check_size(depth.shape, str(image.path))
-    level = upright(settings.gravity)
-    for number, mask in _objects(image, settings, depth.shape):
-        keep = keep_pixels(depth, mask, settings.cut)
-        points = as_cloud(turn(level, lift(depth, keep, camera)), str(image.path))
-        if len(points) < settings.cut.min_points:
-            continue
-        keys = [image.id]
-        if settings.instances:
-            keys = [f"{image.id}/{number}", f"*/{number}", image.id]
-        yield ExtractedCloud(
-            id=keys[0],
-            class_name=next((names[key] for key in keys if key in names), settings.class_name),
-            points=points,
-            split=settings.split,
-            source={"image": image.path.name, "points": len(points), "pixels": int(mask.sum())},
-        )
+    depth = read_depth(frame.path, frame.camera.depth_scale)
+    frame.camera.check_size(depth.shape, str(frame.path))
+    for item in frame.objects:
+        for number, mask in _masks(frame, item, settings, depth.shape):
+            local = lift(depth, keep_pixels(depth, mask, settings.cut), frame.camera)
+            if len(local) < settings.cut.min_points:
+                continue
+            points = turn(item.to_axes[:3, :3], local)
+            if len(item.to_axes) == 4:
+                points = points + item.to_axes[:3, 3]
+            keys = [item.id]
+            if number is not None:
+                keys = [f"{item.id}/{number}", f"*/{number}", item.id]
+            named = next((names[key] for key in keys if key in names), settings.class_name)
+            yield ExtractedCloud(
+                id=keys[0],
+                class_name=item.class_name or named,
+                points=as_cloud(points, str(frame.path)),
+                split=settings.split,
+                source={**item.source, "points": len(points), "pixels": int(mask.sum())},
+            )
 
 
-def _objects(
-    image: DepthImage, settings: DepthImageSettings, shape: tuple[int, ...]
-) -> Iterable[tuple[int, Bool[np.ndarray, "h w"]]]:
-    """Number and pixels of each object, one at a time."""
+def _masks(
+    frame: Frame, item: FrameObject, settings: DepthImageSettings, shape: tuple[int, ...]
+) -> Iterator[tuple[int | None, Bool[np.ndarray, "h w"]]]:
+    """The pixels of an object; of each instance in its mask, with its number."""
     window = np.ones(shape, dtype=bool)
     if settings.box is not None:
         u0, v0, u1, v1 = settings.box
         if u1 > shape[1] or v1 > shape[0]:
-            raise InputError(
-                f"{image.path}: box {u0} {v0} {u1} {v1} goes beyond its {shape[1]}×{shape[0]} "
-                "pixels"
-            )
+            size = f"{shape[1]}×{shape[0]}"
+            raise InputError(f"{frame.path}: box {u0} {v0} {u1} {v1} goes beyond its {size} pixels")
         window[:] = False
         window[v0:v1, u0:u1] = True
-    if image.mask is None:
-        yield 1, window
+    if item.mask is None:
+        yield None, window
         return
-    mask: Int32[np.ndarray, "h w"] = read_mask(image.mask, shape)
+    mask = read_mask(item.mask, shape)
     if not settings.instances:
-        yield 1, (mask != 0) & window
+        yield None, (mask != 0) & window
         return
     numbers = np.unique(mask[mask != 0])
     if len(numbers) > _MOST_INSTANCES:
-        raise InputError(f"{image.mask}: {len(numbers)} instances; is it a mask of instances?")
+        raise InputError(f"{item.mask}: {len(numbers)} instances; is it a mask of instances?")
     for number in numbers.tolist():
         yield number, (mask == number) & window
 
@@ -252,13 +280,10 @@ def read_names(path: Path) -> dict[str, str]:
     Raises:
         InputError: where it is no such file, or a name is empty or comes twice.
     """
-    path = Path(path)
-    content = read_small(path, _LARGEST_TABLE, "a table of classes")
     names: dict[str, str] = {}
+    text = read_text(path, _LARGEST_TABLE)
     try:
-        rows: Any = csv.DictReader(
-            io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True
-        )
+        rows = csv.DictReader(io.StringIO(text, newline=""), strict=True)
         if not {"name", "class"} <= set(rows.fieldnames or ()):
             raise InputError(f"{path}: its first line must name the columns name,class")
         for row in rows:
@@ -267,8 +292,8 @@ def read_names(path: Path) -> dict[str, str]:
                 what = "comes twice" if name in names else "needs a name and a class"
                 raise InputError(f"{path}, line {rows.line_num}: {name!r} {what}")
             names[name] = kind
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: not a CSV of UTF-8 text ({error})") from error
+    except csv.Error as error:
+        raise InputError(f"{path}: not a CSV ({error})") from error
     if not names:
         raise InputError(f"{path}: no row after the columns' names")
     return names

@@ -7,14 +7,14 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from qs3.errors import InputError
-from qs3.io.guards import check_pixels, decode_image, image_header, load_npy, read_small
+from qs3.io.guards import check_pixels, load_npy, read_image, read_small
 
 DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
 """Endings of depth images and of masks."""
 
 MILLIMETRE = 0.001
 _LARGEST = 1 << 30
-_DEPTH_MODES = ("I;16", "I;16B", "I;16L", "I", "F")
+_DEPTH_MODES = ("", "I;16", "I;16B", "I;16L", "I", "F")  # Pillow's; empty for npy
 
 
 def read_depth(path: Path, depth_scale: float | None = None) -> Float32[np.ndarray, "h w"]:
@@ -48,12 +48,12 @@ def read_raw(path: Path) -> np.ndarray:
         InputError: as `read_depth`.
     """
     image, mode = _read(path, "iuf")
-    if mode and mode not in _DEPTH_MODES:
-        if mode in ("1", "L"):
-            raise InputError(
-                f"{path}: has 8 bits, which is a picture of depth and no measurement; save depth "
-                "as 16-bit PNG in millimetres, TIFF or npy"
-            )
+    if mode in ("1", "L"):
+        raise InputError(
+            f"{path}: has 8 bits, which is a picture of depth and no measurement; save depth as "
+            "16-bit PNG in millimetres, TIFF or npy"
+        )
+    if mode not in _DEPTH_MODES:
         raise InputError(
             f"{path}: a colour picture, not depth; depth is one grey channel of 16 bits"
         )
@@ -90,7 +90,6 @@ def read_mask(path: Path, shape: tuple[int, ...] | None = None) -> Int32[np.ndar
 
 def _read(path: Path, npy_kinds: str) -> tuple[np.ndarray, str]:
     """The numbers of an image as stored, and Pillow's mode; empty for an npy file."""
-    path = Path(path)
     ending = path.suffix.lower()
     if ending not in DEPTH_FILES:
         raise InputError(f"{path}: not a depth image; known are {', '.join(DEPTH_FILES)}")
@@ -106,7 +105,6 @@ def _read(path: Path, npy_kinds: str) -> tuple[np.ndarray, str]:
     try:
         if ending == ".npy":
             return load_npy(content, accept), ""
-        size, mode = image_header(content, "PNG" if ending == ".png" else "TIFF")
-        return decode_image(content, size), mode
+        return read_image(content, "PNG" if ending == ".png" else "TIFF")
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

@@ -1,7 +1,6 @@
 """The pinhole camera that took a depth image: its numbers, and the files they come in."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.errors import InputError
-from qs3.io.guards import Numbers, as_array, pick, read_small, read_small_json
+from qs3.io.guards import Numbers, as_array, pick, read_numbers, read_small_json
 
 _LARGEST = 1 << 20
 _FORMS = "give fx,fy,cx,cy, a JSON file, or a text file of 3×3 numbers"
@@ -80,10 +79,8 @@ def intrinsics_from_matrix(matrix: Float[np.ndarray, "3 3"], **more: Any) -> Int
     """
     if not np.isfinite(matrix).all():
         raise InputError("camera: the matrix K holds a number that is not finite")
-    if matrix[2, 0] or matrix[2, 1]:
+    if matrix[2, 0] or matrix[2, 1] or not math.isclose(matrix[2, 2], 1.0):
         raise InputError("camera: the last row of K is not 0 0 1; write K row by row")
-    if not math.isclose(matrix[2, 2], 1.0):
-        raise InputError("camera: the last row of K is not 0 0 1")
     if abs(matrix[0, 1]) > 1e-3 or matrix[1, 0]:
         raise InputError(f"camera: K has skew {matrix[0, 1]:g}; rectify the images first")
     fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
@@ -108,39 +105,27 @@ def read_intrinsics(given: str | Path) -> Intrinsics:
         >>> read_intrinsics("500,510,320,240").fy
         510.0
     """
-    text = str(given)
+    text, path = str(given), Path(given)
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
-        return _from_file(Path(given))
-    if len(numbers) != 4:
-        raise InputError(f"intrinsics {text!r}: {_FORMS}")
-    return _from_numbers(numbers)
-
-
-def _from_file(path: Path) -> Intrinsics:
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; {_FORMS}")
-    try:
-        if path.suffix.lower() == ".json":
-            return _from_json(pick(read_small_json(path, _LARGEST), _CameraFile, "camera"))
-        content = read_small(path, _LARGEST, "a camera").decode("utf-8")
-        return _from_numbers([float(word) for word in content.split()])
-    except InputError as error:
-        message = str(error)
-        raise InputError(message if str(path) in message else f"{path}: {message}") from error
-    except ValueError:  # UnicodeDecodeError too
-        raise InputError(f"{path}: not a text file of numbers; {_FORMS}") from None
-
-
-def _from_numbers(numbers: Sequence[float]) -> Intrinsics:
+        numbers = []
     if len(numbers) == 4:
         fx, fy, cx, cy = numbers
         return Intrinsics(fx, fy, cx, cy)
-    if len(numbers) not in (9, 16):
-        raise InputError(f"camera: {len(numbers)} numbers instead of 4, 9 or 16")
-    side = 3 if len(numbers) == 9 else 4
-    return intrinsics_from_matrix(np.array(numbers).reshape(side, side)[:3, :3])
+    if numbers or not path.is_file():
+        raise InputError(f"intrinsics {text!r}: {'' if numbers else 'no such file; '}{_FORMS}")
+    try:
+        if path.suffix.lower() == ".json":
+            return _from_json(pick(read_small_json(path, _LARGEST), _CameraFile, "camera"))
+        numbers = read_numbers(path, (4, 9, 16)).tolist()
+        if len(numbers) == 4:
+            return read_intrinsics(",".join(map(str, numbers)))
+        side = math.isqrt(len(numbers))
+        return intrinsics_from_matrix(np.reshape(numbers, (side, side))[:3, :3])
+    except InputError as error:
+        message = str(error)
+        raise InputError(message if str(path) in message else f"{path}: {message}") from error
 
 
 @dataclass(frozen=True)
@@ -173,10 +158,10 @@ def _from_json(file: _CameraFile) -> Intrinsics:
         if file.principal_point is None:
             raise InputError("camera: focal needs principal_point, its column and row")
         return Intrinsics(file.focal, file.focal, *file.principal_point, **more)
-    for name in ("cam_K", "K"):
-        if (matrix := getattr(file, name)) is not None:
-            return intrinsics_from_matrix(as_array(matrix, (3, 3), name), **more)
-    if file.intrinsic_matrix is not None:
-        turned = as_array(file.intrinsic_matrix, (3, 3), "intrinsic_matrix")
-        return intrinsics_from_matrix(turned.T, **more)
+    for name in ("cam_K", "K", "intrinsic_matrix"):
+        if (numbers := getattr(file, name)) is not None:
+            matrix = as_array(numbers, (3, 3), name)
+            return intrinsics_from_matrix(
+                matrix.T if name == "intrinsic_matrix" else matrix, **more
+            )
     raise InputError("camera: the JSON file has none of fx, focal, cam_K, K, intrinsic_matrix")

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from qs3.errors import InputError
-from qs3.io.guards import read_small, reason
+from qs3.io.guards import check_announced, read_small, reason
 
 _LARGEST_FILE = 1 << 30
-_LARGEST_VARIABLE = 1 << 31
 _DEFLATE_AT_BEST = 1032
+_BYTES_AN_ARRAY = 128  # of each array in a cell or a struct, once SciPy has made it
 _DEEPEST = 16
 _INT32, _UINT32, _MATRIX, _COMPRESSED = 5, 6, 14, 15
 _CELL, _STRUCT, _CHAR = 1, 2, 4
@@ -88,19 +88,21 @@ def _plain(value: Any) -> Any:
 
 
 def _check_file(content: memoryview, order: str, names: tuple[str, ...]) -> None:
-    at = 128
+    at, arrays = 128, 0
     while at < len(content):
         kind, data, at = _element(content, at, order)
         if kind == _COMPRESSED:
             kind, data = _inflated(data, order)
         if kind == _MATRIX:
-            _check_array(data, order, names)
+            arrays += _check_array(data, order, names)
+    whole = arrays * _BYTES_AN_ARRAY
+    check_announced(f"its tree of {arrays} arrays", whole, whole)
 
 
-def _check_array(data: memoryview, order: str, names: tuple[str, ...] = (), depth: int = 0) -> None:
-    """Hold an array's announced elements, and those of all arrays in it, against its bytes."""
+def _check_array(data: memoryview, order: str, names: tuple[str, ...] = (), depth: int = 0) -> int:
+    """Hold the announced elements of an array and of all arrays in it, which are counted."""
     if not len(data):
-        return
+        return 1
     kind, flags, at = _element(data, 0, order)
     if kind != _UINT32 or len(flags) != 8 or depth > _DEEPEST:
         raise InputError("damaged")
@@ -112,7 +114,7 @@ def _check_array(data: memoryview, order: str, names: tuple[str, ...] = (), dept
     shape = struct.unpack(f"{order}{len(sizes) // 4}i", sizes)
     _, name, at = _element(data, at, order)
     if depth == 0 and bytes(name).decode("latin-1") not in names:
-        return  # SciPy passes it over
+        return 0  # SciPy passes it over
     if code not in (_CELL, _STRUCT, _CHAR, *_NUMBERS):
         raise InputError("holds a sparse array, an object or a function; save plain tables")
     count = math.prod(shape)
@@ -130,18 +132,19 @@ def _check_array(data: memoryview, order: str, names: tuple[str, ...] = (), dept
         raise InputError(f"announces {count} elements but has {len(data) - at} bytes")
     # SciPy takes types and numbers of elements on trust: what is wrong there ends the process.
     expected = count if code in (_CELL, _STRUCT) else 2 if word & _COMPLEX else 1
-    elements = 0
+    elements, arrays = 0, 1
     while at < len(data):
         kind, inner, at = _element(data, at, order)
         elements += 1
         if code in (_CELL, _STRUCT) and kind == _MATRIX:
-            _check_array(inner, order, depth=depth + 1)
+            arrays += _check_array(inner, order, depth=depth + 1)
         elif not (code == _CHAR and kind in _TEXTS) and not (
             code in _NUMBERS and len(inner) == count * _SIZES.get(kind, -1)
         ):
             raise InputError("damaged")
     if elements != expected:
         raise InputError("damaged")
+    return arrays
 
 
 def _element(data: memoryview, at: int, order: str) -> tuple[int, memoryview, int]:
@@ -167,8 +170,7 @@ def _inflated(data: memoryview, order: str) -> tuple[int, memoryview]:
     if len(tag) < 8:
         raise InputError("cut off")
     kind, size = struct.unpack(order + "II", tag)
-    if size > min(_DEFLATE_AT_BEST * len(data) + 64, _LARGEST_VARIABLE):
-        raise InputError(f"announces {size} bytes in {len(data)} compressed ones")
+    check_announced("a variable", size, len(data) + 1, _DEFLATE_AT_BEST)
     content = packer.decompress(packer.unconsumed_tail, size) if size else b""
     if len(content) < size:
         raise InputError("cut off")

@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Float32
 
 from qs3.errors import InputError
+from qs3.io.guards import utf8
 from qs3.io.preparation import resample
 from qs3.meshes.classes import POINTDA10, map_labels
-from qs3.store.executors import Executor, Failure, InlineExecutor, LocalExecutor, guarded
-from qs3.store.executors.executor import failure_of, stop_if_fatal
+from qs3.store.executors import Failure, InlineExecutor, LocalExecutor, guarded, outcomes
+from qs3.store.executors.executor import failure_of
 from qs3.store.failures import read_failures, write_failures
 from qs3.store.folder import Folder, open_folder
 from qs3.store.info import info
@@ -149,7 +150,7 @@ def run_extract(
             or a fault lies with the machine and not with a unit.
     """
     out, num_points = output.out, output.num_points
-    names = [unit.id for unit in units]
+    names = [utf8(unit.id) for unit in units]
     if not units:
         raise InputError(f"{out}: nothing to extract from")
     if len(set(names)) < len(names):
@@ -174,32 +175,33 @@ def run_extract(
             settled -= set(failures)
             sums = {name: sums[name] for name in map(shard_name, sorted(settled))}
             write_sums(folder, sums)
-        call = functools.partial(
-            _unit_to_shard, folder, extract_one, tuple(class_names), num_points
-        )
+        make = functools.partial(_put_unit, folder, extract_one, tuple(class_names), num_points)
         todo = [index for index in range(len(units)) if index not in settled]
+        calls = ((index, make, index, units[index]) for index in todo)
         text = folder.name if progress else None
         bar = progress_bar(len(units), text, "scene", len(settled))
         objects = 0
 
-        def note(index: int, outcome: Any) -> None:
+        def note(index: int, outcome: tuple[str, int] | Failure) -> None:
             nonlocal objects
-            stop_if_fatal(outcome)
             was_logged = failures.pop(index, None) is not None
             if isinstance(outcome, Failure):
-                failures[index] = _record(units[index], index, outcome)
-                outcome = _write(folder, index, [])
+                name = names[index]
+                place = {"id": name, "object": name, "scan": 0, "class_name": "", "shard": index}
+                fault = {"row": 0, "error": outcome.kind, "reason": outcome.reason}
+                failures[index] = place | fault
+                outcome = _put(folder, index, [])
             if was_logged or index in failures:
                 write_failures(folder, failures.values())
-            objects += outcome[1]
             sums[shard_name(index)] = outcome[0]
             write_sums(folder, sums)
+            objects += outcome[1]
             bar.set_postfix(objects=objects, failed=len(failures), refresh=False)
             bar.update()
 
         with bar, executor:
             try:
-                for index, outcome in _outcomes(executor, call, units, todo):
+                for index, outcome in outcomes(executor, lambda: next(calls, None)):
                     note(index, outcome)
             except KeyboardInterrupt:
                 bar.set_description("finishing what is under way")
@@ -216,27 +218,7 @@ def run_extract(
     )
 
 
-def _outcomes(
-    executor: Executor, call: Callable[..., Any], units: Sequence[Unit], todo: Sequence[int]
-) -> Iterable[tuple[int, Any]]:
-    """The outcome of each unit, as they come."""
-    waiting, under_way = iter(todo), 0
-    while True:
-        while under_way < executor.ahead and (index := next(waiting, None)) is not None:
-            executor.submit(index, call, index, units[index])
-            under_way += 1
-        if not under_way:
-            return
-        under_way -= 1
-        yield executor.next()
-
-
-def _record(unit: Unit, index: int, failure: Failure) -> dict[str, Any]:
-    record = {"id": unit.id, "object": unit.id, "scan": 0, "class_name": "", "shard": index}
-    return record | {"row": 0, "error": failure.kind, "reason": failure.reason}
-
-
-def _unit_to_shard(
+def _put_unit(
     folder: Folder,
     extract_one: Callable[[Any], Iterable[ExtractedCloud]],
     class_names: tuple[str, ...],
@@ -245,21 +227,17 @@ def _unit_to_shard(
     unit: Unit,
 ) -> tuple[str, int] | Failure:
     """Extract one unit and write its shard: the checksum and the number of objects."""
-
-    def rows() -> list[CloudRow]:
-        return [_row(cloud, class_names, num_points) for cloud in extract_one(unit)]
-
-    made = guarded(rows)
-    if isinstance(made, Failure):
-        return made
+    rows = guarded(lambda: [_row(c, class_names, num_points) for c in extract_one(unit)])
+    if isinstance(rows, Failure):
+        return rows
     try:
-        return _write(folder, index, made)
+        return _put(folder, index, rows)
     except Exception as error:
         failure = failure_of(error)
         return Failure(failure.kind, f"{folder}: cannot be written to ({failure.reason})", True)
 
 
-def _write(folder: Folder, index: int, rows: Sequence[CloudRow]) -> tuple[str, int]:
+def _put(folder: Folder, index: int, rows: Sequence[CloudRow]) -> tuple[str, int]:
     return put_shard(folder, index, table_of(rows)), len(rows)
 
 
@@ -269,4 +247,4 @@ def _row(cloud: ExtractedCloud, class_names: Sequence[str], num_points: int) -> 
     if len(points) > num_points:
         points = resample(points, num_points)
     drawn = json.dumps(dict(cloud.source), sort_keys=True)
-    return cloud_alone(cloud.id, points, label, class_names[label], cloud.split, drawn)
+    return cloud_alone(utf8(cloud.id), points, label, class_names[label], cloud.split, drawn)

@@ -21,7 +21,8 @@ ECCV 2022; Dai et al., "ScanNet", CVPR 2017.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
+from zipfile import ZipFile
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -30,7 +31,7 @@ from qs3.errors import InputError
 from qs3.io.extract.fuse import ObjectFusion
 from qs3.io.extract.run import ExtractedCloud
 from qs3.io.extract.scannet import ScanNetSettings
-from qs3.io.extract.scannet_masks import InstanceMasks, erode
+from qs3.io.extract.scannet_masks import erode, read_mask
 from qs3.io.extract.scannet_mesh import NO_OBJECT, read_scene_mesh
 from qs3.io.extract.scannet_scene import (
     ScanNetScene,
@@ -41,6 +42,7 @@ from qs3.io.extract.scannet_scene import (
     rest,
 )
 from qs3.io.extract.sens import SensHeader, read_depth_frames, read_sens_header
+from qs3.io.guards import open_zip
 
 _MASKS = "_2d-instance-filt.zip"
 
@@ -147,9 +149,7 @@ def _owners(
 ) -> Owners:
     masks = scene.file(_MASKS)
     if settings.cut == "masks" or (settings.cut == "auto" and masks.is_file()):
-        sizes = (header.color_size, header.depth_size)
-        opened = stack.enter_context(closing(InstanceMasks(masks, sizes)))
-        return _by_masks(opened, header, settings.erode)
+        return _by_masks(stack.enter_context(open_zip(masks)), header, settings.erode)
     if settings.cut == "auto" and not scene.file("_vh_clean_2.ply").is_file():
         raise InputError(
             f"{scene.folder}: has neither {masks.name} nor {scene.id}_vh_clean_2.ply with its "
@@ -158,7 +158,7 @@ def _owners(
     return _by_mesh(scene, objects, settings.distance)
 
 
-def _by_masks(masks: InstanceMasks, header: SensHeader, radius: int) -> Owners:
+def _by_masks(archive: ZipFile, header: SensHeader, radius: int) -> Owners:
     """Objects by the mask's pixel that each point falls on."""
     # A pixel at depth z falls on the homogeneous pixel z · through + shift of the colour image.
     to_color = header.color_intrinsic @ header.depth_to_color[:3]
@@ -173,7 +173,7 @@ def _by_masks(masks: InstanceMasks, header: SensHeader, radius: int) -> Owners:
         pixels: Int[np.ndarray, "n"],
         camera_to_world: Float[np.ndarray, "4 4"],
     ) -> Int[np.ndarray, "n"] | None:
-        mask = masks.read(index)
+        mask = read_mask(archive, index, (header.color_size, header.depth_size))
         if mask is None:
             return None
         height, width = mask.shape
@@ -225,9 +225,9 @@ def _by_mesh(scene: ScanNetScene, objects: Sequence[SceneObject], distance: floa
     # Imported here: scenes cut by masks need no k-d tree.
     from scipy.spatial import KDTree
 
-    mesh = read_scene_mesh(scene, objects)
-    tree = KDTree(mesh.vertices)
-    wanted = mesh.vertices[mesh.owner != NO_OBJECT]
+    vertices, owner_of = read_scene_mesh(scene, objects)
+    tree = KDTree(vertices)
+    wanted = vertices[owner_of != NO_OBJECT]
     low = wanted.min(axis=0, initial=np.inf) - distance
     high = wanted.max(axis=0, initial=-np.inf) + distance
 
@@ -242,7 +242,7 @@ def _by_mesh(scene: ScanNetScene, objects: Sequence[SceneObject], distance: floa
         near = np.flatnonzero(((world >= low) & (world <= high)).all(axis=1))
         reach, vertex = map(np.asarray, tree.query(world[near], distance_upper_bound=distance))
         reached = np.isfinite(reach)
-        owner[near[reached]] = mesh.owner[vertex[reached]]
+        owner[near[reached]] = owner_of[vertex[reached]]
         return owner
 
     return owners

@@ -2,104 +2,49 @@
 
 ``<scene>_2d-instance-filt.zip`` holds ``instance-filt/<frame>.png``, 8 bits, the ``objectId`` + 1
 of each pixel, 0 where there is none. The masks are the annotated mesh as the colour camera sees it
-from the frame's pose, filtered, at the colour image's size (1296×968).
+from the frame's pose, filtered, at the colour image's size (1296×968). Members are read by their
+exact names and nothing is written to disk, so that names which would lead elsewhere do no harm.
 """
 
-import struct
 import zipfile
-import zlib
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import UInt8
 
 from qs3.errors import InputError
-from qs3.io.guards import decode_image, image_header
-
-_ZIP_FAULTS = (
-    zipfile.BadZipFile,
-    zlib.error,
-    EOFError,
-    OSError,
-    RuntimeError,  # encrypted; NotImplementedError is one too
-    ValueError,
-    struct.error,
-)
+from qs3.io.guards import read_image, read_member
 
 
-class InstanceMasks:
-    """The masks of one scene; to be closed after use.
+def read_mask(
+    archive: zipfile.ZipFile, frame: int, sizes: Sequence[tuple[int, int]]
+) -> UInt8[np.ndarray, "h w"] | None:
+    """Return the mask of a frame, None where there is none.
 
-    Members are read by their exact names and nothing is written to disk, so that names which would
-    lead elsewhere do no harm.
+    Args:
+        archive: The zip file of a scene, as `guards.open_zip` opens it.
+        frame: Its number.
+        sizes: Widths and heights that it may have.
+
+    Raises:
+        InputError: where it is damaged, of an unexpected size, or no 8-bit grey PNG.
     """
-
-    def __init__(self, path: Path, sizes: tuple[tuple[int, int], ...]) -> None:
-        """Open the zip file.
-
-        Args:
-            path: The zip file.
-            sizes: Widths and heights that a mask may have; others are refused before they are
-                unpacked.
-
-        Raises:
-            InputError: where it is missing or no zip file.
-        """
-        self._path = Path(path)
-        self._sizes = sizes
-        if not self._path.is_file():
-            raise InputError(f"{path}: no such file; download the scene's instance masks")
-        try:
-            self._zip = zipfile.ZipFile(self._path)
-        except (
-            zipfile.BadZipFile,
-            ValueError,
-            OSError,
-            NotImplementedError,
-            struct.error,
-        ) as error:
-            raise InputError(f"{path}: cannot be read as zip ({error}); copy it again") from error
-
-    def close(self) -> None:
-        """Close the zip file."""
-        self._zip.close()
-
-    def read(self, frame: int) -> UInt8[np.ndarray, "h w"] | None:
-        """Return the mask of a frame, None where there is none.
-
-        Raises:
-            InputError: where it is damaged, of an unexpected size, or no 8-bit grey PNG.
-        """
-        name = f"instance-filt/{frame}.png"
-        try:
-            entry = self._zip.getinfo(name)
-        except KeyError:
+    name = f"instance-filt/{frame}.png"
+    # An 8-bit image that nothing packs is a little larger than its pixels.
+    most = max(width * height for width, height in sizes) * 5 // 4 + 2**16
+    try:
+        content = read_member(archive, name, most)
+        if content is None:
             return None
-        where = f"{self._path}: {name}"
-        # An 8-bit image that nothing packs is a little larger than its pixels.
-        limit = max(width * height for width, height in self._sizes) * 5 // 4 + 2**16
-        if entry.file_size > limit:
-            raise InputError(f"{where} would unpack to {entry.file_size} bytes; it is no mask")
-        # The other packings of zip unpack in blocks that cannot be bounded.
-        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise InputError(f"{where} is packed in an unusual way; pack it with deflate")
-        try:
-            with self._zip.open(entry) as member:
-                content = member.read(limit + 1)
-        # What a zip file's lies and damages raise, by its many parts.
-        except _ZIP_FAULTS as error:
-            reason = str(error) or "cut off"
-            raise InputError(f"{where} is damaged ({reason}); copy the file again") from error
-        try:
-            size, mode = image_header(content, "PNG")
-            if size not in self._sizes:
-                expected = " or ".join(f"{w}×{h}" for w, h in dict.fromkeys(self._sizes))
-                raise InputError(f"has {size[0]}×{size[1]} pixels; expected {expected}")
-            if mode != "L":
-                raise InputError("is no grey image of 8 bits")
-            return decode_image(content, size)
-        except InputError as error:
-            raise InputError(f"{where}: {error}; copy the file again") from error
+        mask, mode = read_image(content, "PNG")
+        if mask.shape[1::-1] not in sizes:
+            expected = " or ".join(f"{w}×{h}" for w, h in dict.fromkeys(sizes))
+            raise InputError(f"has {mask.shape[1]}×{mask.shape[0]} pixels; expected {expected}")
+        if mode != "L":
+            raise InputError("is no grey image of 8 bits")
+    except InputError as error:
+        raise InputError(f"{archive.filename}: {name}: {error}; copy the file again") from error
+    return mask
 
 
 def erode(mask: UInt8[np.ndarray, "h w"], radius: int) -> UInt8[np.ndarray, "h w"]:

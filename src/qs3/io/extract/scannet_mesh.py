@@ -13,7 +13,6 @@ Source: Qin et al., "PointDAN", NeurIPS 2019 (https://github.com/canqin001/Point
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -27,50 +26,55 @@ from qs3.io.extract.scannet_scene import (
     SceneObject,
     axis_alignment,
     object_seed,
+    read_list,
     read_objects,
-    read_segments,
     rest,
 )
-from qs3.io.ply import ply_vertices
+from qs3.io.guards import read_small
+from qs3.io.ply import load_ply
 
 NO_OBJECT = -1
+_MESH, _SEGMENTS = "_vh_clean_2.ply", "_vh_clean_2.0.010000.segs.json"
 
 
-@dataclass(frozen=True, eq=False)
-class SceneMesh:
-    """The vertices of a scene's mesh and whose they are."""
-
-    vertices: Float[np.ndarray, "n 3"]
-    """In the scene's own frame, metres."""
-    owner: Int[np.ndarray, "n"]
-    """``SceneObject.id`` of each vertex, −1 where it is none of the objects asked for."""
-
-
-def read_scene_mesh(scene: ScanNetScene, objects: Sequence[SceneObject]) -> SceneMesh:
+def read_scene_mesh(
+    scene: ScanNetScene, objects: Sequence[SceneObject]
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
     """Read the decimated mesh of a scene and give its vertices to objects.
 
     Args:
         scene: The scene.
         objects: Objects of interest; a segment of two belongs to the first.
 
+    Returns:
+        The vertices in the scene's own frame, metres, and ``SceneObject.id`` of each, −1 where it
+        is none of the objects.
+
     Raises:
         InputError: where the mesh or its segments are missing, damaged, or do not fit each other.
     """
-    vertices = _vertices(scene)
-    path = scene.file("_vh_clean_2.0.010000.segs.json")
-    listed = read_segments(scene)
+    path = scene.file(_MESH)
+    content = read_small(path, what="a scene's decimated mesh")
+    try:
+        loaded = load_ply(content)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    vertices = np.asarray(getattr(loaded, "vertices", np.zeros((0, 3))), dtype=np.float64)
+    if not len(vertices) or not (np.abs(vertices) < 1e4).all():
+        raise InputError(f"{path}: has no vertices, or some are not finite")
+    listed = read_list(scene.file(_SEGMENTS), "segIndices")
     if not all(type(value) is int and 0 <= value < 2**31 for value in listed):
-        raise InputError(f"{path}: segIndices are not all whole numbers from 0 up")
+        raise InputError(f"{scene.file(_SEGMENTS)}: segIndices are not all whole numbers from 0 up")
     if len(listed) != len(vertices):
         raise InputError(
-            f"{path}: has {len(listed)} segIndices for {len(vertices)} vertices of "
-            f"{scene.file('_vh_clean_2.ply').name}; they are of different releases"
+            f"{scene.file(_SEGMENTS)}: has {len(listed)} segIndices for {len(vertices)} vertices "
+            f"of {path.name}; they are of different releases"
         )
     segments = np.array(listed, dtype=np.int64)
     owner = np.full(len(vertices), NO_OBJECT, dtype=np.int64)
     for item in reversed(objects):
         owner[np.isin(segments, np.array(item.segments, dtype=np.int64))] = item.id
-    return SceneMesh(vertices, owner)
+    return vertices, owner
 
 
 def cut_mesh_scene(
@@ -88,28 +92,15 @@ def cut_mesh_scene(
     """
     objects = read_objects(scene, settings.class_names)
     align = axis_alignment(scene)
-    mesh = read_scene_mesh(scene, objects)
+    vertices, owner = read_scene_mesh(scene, objects)
     for item in objects:
-        own = np.flatnonzero(mesh.owner == item.id)
+        own = np.flatnonzero(owner == item.id)
         if len(own) < settings.min_points:
             continue
         drawn = own
         if len(own) > num_points:
             rng = np.random.default_rng(object_seed(settings.seed, scene, item.id))
             drawn = np.sort(rng.choice(own, num_points, replace=False))
-        points, origin = rest(transform_points(align, mesh.vertices[drawn]))
+        points, origin = rest(transform_points(align, vertices[drawn]))
         source = {"label": item.label, "vertices": len(own), "origin": origin}
         yield ExtractedCloud(f"{scene.id}/{item.id}", item.class_name, points, scene.split, source)
-
-
-def _vertices(scene: ScanNetScene) -> Float[np.ndarray, "n 3"]:
-    path = scene.file("_vh_clean_2.ply")
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; download the scene's decimated mesh")
-    try:
-        vertices = ply_vertices(path.read_bytes())
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    if not len(vertices) or not (np.abs(vertices) < 1e4).all():
-        raise InputError(f"{path}: has no vertices, or some are not finite")
-    return vertices

@@ -23,7 +23,7 @@ from jaxtyping import Float
 
 from qs3.errors import InputError
 from qs3.io.extract.sens import is_rigid
-from qs3.io.guards import pick, read_small, read_small_json
+from qs3.io.guards import pick, read_small_json, read_text
 from qs3.meshes.classes import POINTDA10, map_labels
 
 LABELS: Mapping[str, str] = {
@@ -48,7 +48,6 @@ LABELS: Mapping[str, str] = {
 }
 """Free labels of ScanNet's annotators that the common table of class names does not hold."""
 
-_LARGEST = 1 << 30
 _SCENE = re.compile(r"scene\d{4}_\d{2}")
 
 
@@ -95,7 +94,6 @@ def list_scenes(
     Raises:
         InputError: where the folder or a scene asked for is not there, or nothing is left.
     """
-    root = Path(root)
     if not root.is_dir():
         raise InputError(f"{root}: no such folder; name the one that holds ScanNet's scans")
     if _SCENE.fullmatch(root.resolve().name):
@@ -110,16 +108,11 @@ def list_scenes(
     for name in scenes or ():
         if name not in folders:
             raise InputError(f"{root}: has no scene {name!r}; its folder is missing")
-    chosen = [
-        name
-        for name in sorted(folders)
-        if (scenes is None or name in scenes) and (splits is None or name in splits)
-    ]
+    wanted = [names for names in (scenes, splits) if names is not None]
+    chosen = [name for name in sorted(folders) if all(name in names for names in wanted)]
     if not chosen:
-        what = (
-            "no folder of the form scene0000_00" if not folders else "none of the scenes asked for"
-        )
-        raise InputError(f"{root}: holds {what}")
+        form = "no folder of the form scene0000_00"
+        raise InputError(f"{root}: holds {'none of the scenes asked for' if folders else form}")
     return [ScanNetScene(name, folders[name], (splits or {}).get(name, "")) for name in chosen]
 
 
@@ -140,7 +133,7 @@ def read_splits(train: Path | None = None, test: Path | None = None) -> dict[str
     for split, path in (("train", train), ("test", test)):
         if path is None:
             continue
-        for number, line in enumerate(_text(Path(path)).splitlines(), start=1):
+        for number, line in enumerate(read_text(path).splitlines(), start=1):
             name = line.strip()
             if name and not _SCENE.fullmatch(name):
                 raise InputError(f"{path}: line {number} is no scene's name: {name[:40]!r}")
@@ -172,7 +165,7 @@ def read_objects(scene: ScanNetScene, class_names: Sequence[str] = POINTDA10) ->
     """
     path = scene.file(".aggregation.json")
     objects: dict[int, SceneObject] = {}
-    for place, value in enumerate(_listed(path, "segGroups")):
+    for place, value in enumerate(read_list(path, "segGroups")):
         where = f"{path}: entry {place} of segGroups"
         group = pick(value, _Group, where)
         if not all(0 <= number < 2**31 for number in (group.objectId, *group.segments)):
@@ -207,7 +200,7 @@ def axis_alignment(scene: ScanNetScene) -> Float[np.ndarray, "4 4"]:
     path = scene.file(".txt")
     if not path.is_file():
         return np.eye(4)
-    for line in _text(path).splitlines():
+    for line in read_text(path).splitlines():
         key, _, value = line.partition("=")
         if key.strip() != "axisAlignment":
             continue
@@ -240,25 +233,13 @@ def object_seed(seed: int, scene: ScanNetScene, number: int) -> int:
     return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0])
 
 
-def read_segments(scene: ScanNetScene) -> list[Any]:
-    """Segment of each vertex as the scene's ``segs.json`` lists it, unchecked.
+def read_list(path: Path, key: str) -> list[Any]:
+    """The list under ``key`` of a JSON file of annotations, its entries unchecked.
 
     Raises:
         InputError: where the file is missing or is none.
     """
-    return _listed(scene.file("_vh_clean_2.0.010000.segs.json"), "segIndices")
-
-
-def _listed(path: Path, key: str) -> list[Any]:
-    """The list under ``key`` of a JSON file."""
-    content = read_small_json(path, _LARGEST)
+    content = read_small_json(path)
     if not isinstance(content, dict) or not isinstance(content.get(key), list):
         raise InputError(f"{path}: has no list {key!r}; it is no annotation of ScanNet")
     return content[key]
-
-
-def _text(path: Path) -> str:
-    try:
-        return read_small(path, _LARGEST, "a text of ScanNet").decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is no text ({error.reason})") from error

@@ -9,6 +9,7 @@ Convention:
     forward, stands at tilt · (x, z, −y) in the world: x right, y forward, z up, metres.
 """
 
+import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
@@ -31,7 +32,7 @@ from qs3.io.extract.cut import (
     turn,
 )
 from qs3.io.extract.depth_images import read_raw
-from qs3.io.extract.intrinsics import Intrinsics, intrinsics_from_matrix
+from qs3.io.extract.intrinsics import intrinsics_from_matrix
 from qs3.io.extract.run import (
     ExtractedCloud,
     ExtractReport,
@@ -78,19 +79,15 @@ class SunRgbdSettings:
 
 
 @dataclass(frozen=True)
-class SunBox:
+class SunObject:
     """One object of a frame as it is annotated."""
 
     number: int
     """Its place in the frame's list, from 0."""
     class_name: str
     """As it will be called."""
-    centre: Float[np.ndarray, "3"]
-    """``centroid``: the middle of the box in the world."""
-    basis: Float[np.ndarray, "3 3"]
-    """``basis``: one axis a row."""
-    half: Float[np.ndarray, "3"]
-    """``coeffs``: half its size along each axis, of either sign."""
+    box: OrientedBox
+    """``centroid``, ``basis`` and ``coeffs`` in the world."""
 
 
 @dataclass(frozen=True)
@@ -105,8 +102,8 @@ class SunFrame:
     """Camera matrix K, with pixels counted from 1."""
     tilt: Float[np.ndarray, "3 3"]
     """``Rtilt``, which makes z upright."""
-    boxes: tuple[SunBox, ...]
-    """The objects to cut."""
+    objects: tuple[SunObject, ...]
+    """What is cut out."""
     split: str = ""
     """``train``, ``test`` or empty."""
     fault: str = ""
@@ -128,7 +125,7 @@ def extract_sunrgbd(root: Path, output: OutputSettings, settings: SunRgbdSetting
 
     classes = wanted_classes(settings.classes)
     frames = list_sunrgbd(root, settings.boxes, settings.splits, settings.depth, rename_to(classes))
-    boxes = [box for frame in frames for box in frame.boxes]
+    objects = [item for frame in frames for item in frame.objects]
     return run_extract(
         frames,
         partial(cut_frame, settings=settings),
@@ -137,8 +134,8 @@ def extract_sunrgbd(root: Path, output: OutputSettings, settings: SunRgbdSetting
             "extract": "extract_sunrgbd",
             **recorded(settings, "boxes", "splits", "classes"),
         },
-        class_names=classes or sorted({box.class_name for box in boxes}),
-        planned=len(boxes),
+        class_names=classes or sorted({item.class_name for item in objects}),
+        planned=len(objects),
         min_points=settings.cut.min_points,
     )
 
@@ -154,17 +151,6 @@ def decode_depth(raw: UInt16[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
     return np.where(millimetres > 0, millimetres / np.float32(1000), np.float32(np.nan))
 
 
-def sun_camera(matrix: Float[np.ndarray, "3 3"]) -> Intrinsics:
-    """Return the camera of a matrix that counts pixels from 1.
-
-    Example:
-        >>> sun_camera(np.array([[529.5, 0, 365], [0, 529.5, 265], [0, 0, 1]])).cx
-        364.0
-    """
-    from_one = intrinsics_from_matrix(matrix)
-    return Intrinsics(from_one.fx, from_one.fy, from_one.cx - 1, from_one.cy - 1)
-
-
 def cut_frame(frame: SunFrame, settings: SunRgbdSettings) -> Iterator[ExtractedCloud]:
     """Cut the points within each box of one frame; floor and clutter in the box come with them.
 
@@ -174,10 +160,11 @@ def cut_frame(frame: SunFrame, settings: SunRgbdSettings) -> Iterator[ExtractedC
     if frame.fault:
         raise InputError(frame.fault)
     try:
-        camera = sun_camera(frame.matrix)
+        from_one = intrinsics_from_matrix(frame.matrix)
         check_rotation(frame.tilt, "Rtilt")
     except InputError as error:
         raise InputError(f"{frame.id}: {error}") from error
+    camera = dataclasses.replace(from_one, cx=from_one.cx - 1, cy=from_one.cy - 1)
     raw = read_raw(frame.depth)
     if raw.dtype != np.uint16:
         raise InputError(f"{frame.depth}: holds {raw.dtype}; SUN RGB-D's depth is 16-bit PNG")
@@ -185,20 +172,19 @@ def cut_frame(frame: SunFrame, settings: SunRgbdSettings) -> Iterator[ExtractedC
     keep = keep_pixels(depth, np.ones(depth.shape, dtype=bool), settings.cut)
     x, y, z = lift(depth, keep, camera).T
     world = turn(frame.tilt, np.stack([x, z, -y], axis=1))
-    for box in frame.boxes:
+    for item in frame.objects:
         try:
-            shape = OrientedBox(box.centre, box.basis, box.half)
+            points = world[inside_box(world, item.box, settings.margin)]
         except InputError as error:
-            raise InputError(f"{frame.id}, object {box.number}: {error}") from error
-        points = world[inside_box(world, shape, settings.margin)]
+            raise InputError(f"{frame.id}, object {item.number}: {error}") from error
         if len(points) < settings.cut.min_points:
             continue
         source = {
             "points": len(points),
-            "centroid": box.centre.tolist(),
-            "basis": box.basis.ravel().tolist(),
-            "coeffs": np.abs(box.half).tolist(),
+            "centroid": item.box.centre.tolist(),
+            "basis": item.box.basis.ravel().tolist(),
+            "coeffs": np.abs(item.box.half).tolist(),
         }
         cloud = as_cloud(points, frame.id)
-        identifier = f"{frame.id}/{box.number:03d}"
-        yield ExtractedCloud(identifier, box.class_name, cloud, frame.split, source)
+        identifier = f"{frame.id}/{item.number:03d}"
+        yield ExtractedCloud(identifier, item.class_name, cloud, frame.split, source)

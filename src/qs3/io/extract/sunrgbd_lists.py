@@ -17,13 +17,13 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from qs3.errors import InputError
+from qs3.io.extract.cut import OrientedBox
 from qs3.io.extract.matlab import read_mat, struct_rows
 from qs3.io.extract.scannet_scene import class_of
-from qs3.io.extract.sunrgbd import DepthKind, SunBox, SunFrame
-from qs3.io.guards import Numbers, as_array, pick, read_small, read_small_json
+from qs3.io.extract.sunrgbd import DepthKind, SunFrame, SunObject
+from qs3.io.guards import Numbers, as_array, pick, read_numbers, read_small_json
 
 META = "SUNRGBDMeta3DBB_v2.mat"
 DEPTH_FOLDERS: dict[DepthKind, str] = {"refined": "depth_bfx", "raw": "depth"}
@@ -31,7 +31,6 @@ DEPTH_FOLDERS: dict[DepthKind, str] = {"refined": "depth_bfx", "raw": "depth"}
 Rename = Callable[[str], str | None]
 """New name of an object's class, or None to leave the object out."""
 
-_LARGEST = 1 << 30
 _WORDS = {"endtable": "end table"}  # written as one word here
 _ROOM = ("wall", "floor", "ceiling")
 _AXES = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -72,7 +71,7 @@ def list_sunrgbd(
     kept = [
         dataclasses.replace(frame, split=parts.get(frame.id, ""))
         for frame in frames
-        if frame.boxes or frame.fault
+        if frame.objects or frame.fault
     ]
     if not kept:
         listed = f"of {path}" if path else "with annotation3Dfinal/index.json"
@@ -143,15 +142,16 @@ class _Box:
 
 @dataclass(frozen=True)
 class _MetaRow:
-    """What is read of a row of ``SUNRGBDMeta``, but its boxes."""
+    """What is read of a row of ``SUNRGBDMeta``."""
 
     depthpath: str
     K: Numbers
     Rtilt: Numbers
+    groundtruth3DBB: Any  # noqa: N815
 
 
-def _sun_boxes(rows: Iterable[Any], where: str, rename: Rename) -> tuple[SunBox, ...]:
-    boxes = []
+def _objects(rows: Iterable[Any], where: str, rename: Rename) -> tuple[SunObject, ...]:
+    objects = []
     for number, row in enumerate(rows):
         place = f"{where}, object {number}"
         word = row.get("classname") if isinstance(row, dict) else None
@@ -159,11 +159,11 @@ def _sun_boxes(rows: Iterable[Any], where: str, rename: Rename) -> tuple[SunBox,
             raise InputError(f"{place}: its class must be a name")
         name = rename(word)
         if name is not None:
-            box = pick(row, _Box, place)
-            basis = as_array(box.basis, (3, 3), f"{place}: basis")
-            centre, half = np.array(box.centroid), np.array(box.coeffs)
-            boxes.append(SunBox(number, name, centre, basis, half))
-    return tuple(boxes)
+            given = pick(row, _Box, place)
+            basis = as_array(given.basis, (3, 3), f"{place}: basis")
+            box = OrientedBox(np.array(given.centroid), basis, np.array(given.coeffs))
+            objects.append(SunObject(number, name, box))
+    return tuple(objects)
 
 
 def _from_mat(base: Path, path: Path, depth: DepthKind, rename: Rename) -> Iterator[SunFrame]:
@@ -183,20 +183,21 @@ def _from_mat(base: Path, path: Path, depth: DepthKind, rename: Rename) -> Itera
         if not picture.is_file():
             continue
         row = pick(value, _MetaRow, where)
-        if "groundtruth3DBB" not in value:
-            raise InputError(f"{where}: field 'groundtruth3DBB' is missing")
-        entries = struct_rows(value["groundtruth3DBB"], f"{where}.groundtruth3DBB")
         yield SunFrame(
             str(folder),
             picture,
             as_array(row.K, (3, 3), f"{where}.K"),
             as_array(row.Rtilt, (3, 3), f"{where}.Rtilt"),
-            _sun_boxes(entries, f"{where}.groundtruth3DBB", rename),
+            _objects(
+                struct_rows(row.groundtruth3DBB, f"{where}.groundtruth3DBB"),
+                f"{where}.groundtruth3DBB",
+                rename,
+            ),
         )
 
 
 def _from_json(base: Path, path: Path, depth: DepthKind, rename: Rename) -> Iterator[SunFrame]:
-    value = read_small_json(path, _LARGEST)
+    value = read_small_json(path)
     if not isinstance(value, dict):
         raise InputError(f"{path}: not a JSON object of frames")
     for name in sorted(value):
@@ -208,9 +209,9 @@ def _from_json(base: Path, path: Path, depth: DepthKind, rename: Rename) -> Iter
         if not isinstance(value[name], list) or not all(isinstance(e, dict) for e in value[name]):
             raise InputError(f"{where}: not a list of boxes")
         rows = [{**entry, "classname": entry.get("class")} for entry in value[name]]
-        boxes = _sun_boxes(rows, where, rename)
+        objects = _objects(rows, where, rename)
         if folder.is_dir():
-            yield _frame(base, folder, depth, boxes)
+            yield _frame(base, folder, depth, objects)
 
 
 @dataclass(frozen=True)
@@ -231,17 +232,16 @@ def _from_annotations(base: Path, depth: DepthKind, rename: Rename) -> Iterator[
             objects = value.get("objects") if isinstance(value, dict) else None
             if not isinstance(objects, list):
                 raise InputError(f"{path}: has no list of objects")
-            boxes = tuple(_annotated(path, objects, rename))
-            frame = _frame(base, folder, depth, boxes) if boxes else None
+            kept = tuple(_annotated(path, objects, rename))
+            if kept:
+                yield _frame(base, folder, depth, kept)
         except InputError as error:
             # One frame of thousands: it fails alone, and is logged.
             name = folder.relative_to(base).as_posix()
-            frame = SunFrame(name, path, np.eye(3), np.eye(3), (), fault=str(error))
-        if frame is not None:
-            yield frame
+            yield SunFrame(name, path, np.eye(3), np.eye(3), (), fault=str(error))
 
 
-def _annotated(path: Path, objects: Sequence[Any], rename: Rename) -> Iterator[SunBox]:
+def _annotated(path: Path, objects: Sequence[Any], rename: Rename) -> Iterator[SunObject]:
     """The boxes of a frame's own annotation, but those of walls, floor and ceiling."""
     for number, entry in enumerate(objects):
         if not isinstance(entry, dict) or not entry.get("polygon"):
@@ -262,38 +262,26 @@ def _annotated(path: Path, objects: Sequence[Any], rename: Rename) -> Iterator[S
         lengths = np.linalg.norm(sides, axis=1)
         if (lengths == 0).any():
             continue  # a line, which holds no point
-        yield SunBox(
-            number,
-            name,
+        box = OrientedBox(
             (first + third) / 2 - np.array([0.0, 0.0, (polygon.Ymin + polygon.Ymax) / 2]),
             np.vstack([sides / lengths[:, None], [0.0, 0.0, 1.0]]),
             np.array([*lengths, abs(polygon.Ymax - polygon.Ymin)]) / 2,
         )
+        yield SunObject(number, name, box)
 
 
-def _frame(base: Path, folder: Path, depth: DepthKind, boxes: tuple[SunBox, ...]) -> SunFrame:
+def _frame(base: Path, folder: Path, depth: DepthKind, objects: tuple[SunObject, ...]) -> SunFrame:
     """A frame by the files of its own folder."""
     pictures = sorted((folder / DEPTH_FOLDERS[depth]).glob("*.png"))
     tilts = sorted((folder / "extrinsics").glob("*.txt"))
     if len(pictures) != 1 or not tilts:
         what = f"{len(pictures)} {DEPTH_FOLDERS[depth]}/*.png instead of 1"
         raise InputError(f"{folder}: {what if tilts else 'has no extrinsics/*.txt'}")
-    matrix = _text_numbers(folder / "intrinsics.txt", (9,)).reshape(3, 3)
+    matrix = read_numbers(folder / "intrinsics.txt", (9,)).reshape(3, 3)
     # The last one is the latest that was made by hand.
-    turn = _text_numbers(tilts[-1], (9, 12)).reshape(3, -1)[:, :3]
+    turn = read_numbers(tilts[-1], (9, 12)).reshape(3, -1)[:, :3]
     tilt = _AXES @ turn @ _AXES.T
-    return SunFrame(folder.relative_to(base).as_posix(), pictures[0], matrix, tilt, boxes)
-
-
-def _text_numbers(path: Path, counts: tuple[int, ...]) -> Float[np.ndarray, "n"]:
-    content = read_small(path, 1 << 16, "a matrix")
-    try:
-        numbers = np.array([float(word) for word in content.decode("utf-8").split()])
-    except ValueError:
-        raise InputError(f"{path}: not a text file of numbers") from None
-    if len(numbers) not in counts:
-        raise InputError(f"{path}: {len(numbers)} numbers instead of {counts[-1]}")
-    return numbers
+    return SunFrame(folder.relative_to(base).as_posix(), pictures[0], matrix, tilt, objects)
 
 
 def _read_splits(path: Path) -> dict[str, str]:

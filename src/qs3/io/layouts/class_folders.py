@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from qs3.errors import InputError
 from qs3.files import sha256
+from qs3.io.guards import utf8
 from qs3.io.layouts.format import SPLITS
 from qs3.io.point_files import POINT_FILES, read_cloud
 from qs3.io.ragged import RaggedClouds
@@ -54,8 +55,7 @@ def read_folder(
     root = Path(root)
     files = list_folder(root, endings)
     names = sorted({file.class_name for file in files})
-    chosen = choose_split(root, files, split)
-    return read_files(root, chosen, () if names == [""] else names)
+    return read_files(root, choose_split(root, files, split), () if names == [""] else names)
 
 
 def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudFile]:
@@ -66,12 +66,28 @@ def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudF
     """
     if not root.is_dir():
         raise InputError(f"{root}: no such folder")
-    folders = _folders(root)
-    flat = [CloudFile(path, "", "") for path in _files(root, endings)]
-    deeper = _split_first(folders, endings) or _class_first(folders, endings)
-    files = [*flat, *deeper]
+    folders = entries(root, os.DirEntry.is_dir)
+    inner = {folder: entries(folder, os.DirEntry.is_dir) for folder in folders}
+    # A class may be named train.
+    split_first = all(f.name in SPLITS for f in folders) and not any(
+        path.name in SPLITS for paths in inner.values() for path in paths
+    )
+    places = [(root, "", "")]
+    for folder in folders:
+        if split_first:
+            places.append((folder, "", folder.name))
+            places += [(path, path.name, folder.name) for path in inner[folder]]
+        else:
+            places.append((folder, folder.name, ""))
+            places += [(folder / split, folder.name, split) for split in SPLITS]
+    files = [
+        CloudFile(path, utf8(name), split)
+        for place, name, split in places
+        for path in entries(place, lambda e: Path(e.name).suffix.lower() in endings and e.is_file())
+    ]
     loose = [file.path for file in files if not file.class_name]
-    if (flat and deeper) or 0 < len(loose) < len(files):
+    beside = [path for path in loose if path.parent == root]
+    if 0 < len(loose) < len(files) or 0 < len(beside) < len(files):
         raise InputError(
             f"{loose[0].parent}: has clouds both in class folders and beside them "
             f"({loose[0].name}); move either away"
@@ -81,31 +97,6 @@ def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudF
             f"{root}: no cloud found; known are {', '.join(endings)} in it, in <class>/ or in "
             "<class>/<train|test>/"
         )
-    return files
-
-
-def _class_first(folders: list[Path], endings: Sequence[str]) -> list[CloudFile]:
-    files = []
-    for folder in folders:
-        files += [CloudFile(path, folder.name, "") for path in _files(folder, endings)]
-        for split in SPLITS:
-            paths = _files(folder / split, endings)
-            files += [CloudFile(path, folder.name, split) for path in paths]
-    return files
-
-
-def _split_first(folders: list[Path], endings: Sequence[str]) -> list[CloudFile]:
-    """The files below train and test, where there is no other folder; none where that is not so."""
-    if any(folder.name not in SPLITS for folder in folders):
-        return []
-    files = []
-    for folder in folders:
-        inner = _folders(folder)
-        if any(path.name in SPLITS for path in inner):
-            return []  # a class that is named train
-        files += [CloudFile(path, "", folder.name) for path in _files(folder, endings)]
-        for path in inner:
-            files += [CloudFile(file, path.name, folder.name) for file in _files(path, endings)]
     return files
 
 
@@ -130,6 +121,7 @@ def read_files(
     files: Sequence[CloudFile],
     class_names: Sequence[str],
     read: Callable[[Path], np.ndarray] = read_cloud,
+    kind: str = "",
 ) -> RaggedClouds:
     """Read cloud files; their names below ``root`` become the ids.
 
@@ -138,43 +130,33 @@ def read_files(
         files: What to read, in the order of the result.
         class_names: Names that the labels index; empty gives clouds without labels.
         read: Reader of one file.
+        kind: What is read of a file, where that is not its points; for the checksum.
 
     Raises:
         InputError: where a file is bad; it is named.
     """
     names = tuple(class_names)
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(kind.encode())
     clouds, ids = [], []
     for file in tqdm(files, "read", unit="cloud", disable=None if len(files) > _MANY else True):
-        ids.append(file.path.relative_to(root).as_posix())
-        digest.update(f"{ids[-1]} {sha256(file.path)}\n".encode(errors="surrogateescape"))
+        ids.append(utf8(file.path.relative_to(root).as_posix()))
+        digest.update(f"{ids[-1]} {sha256(file.path)}\n".encode())
         clouds.append(read(file.path))
-    labels = [names.index(file.class_name) for file in files] if names else []
     splits = tuple(file.split for file in files)
     return RaggedClouds(
         clouds=clouds,
         ids=tuple(ids),
         checksum=digest.hexdigest(),
-        labels=np.array(labels, dtype=np.int64) if names else None,
+        labels=np.array([names.index(f.class_name) for f in files], np.int64) if names else None,
         class_names=names,
         splits=splits if any(splits) else (),
     )
 
 
-def _files(folder: Path, endings: Sequence[str]) -> list[Path]:
-    return _entries(folder, lambda e: Path(e.name).suffix.lower() in endings and e.is_file())
-
-
-def _folders(root: Path) -> list[Path]:
-    return _entries(root, lambda entry: entry.is_dir())
-
-
-def _entries(folder: Path, wanted: Callable[[os.DirEntry[str]], bool]) -> list[Path]:
+def entries(folder: Path, wanted: Callable[[os.DirEntry[str]], bool]) -> list[Path]:
+    """What a folder holds of a kind, hidden entries aside, in order; nothing where it is none."""
     if not folder.is_dir():
         return []
-    with os.scandir(folder) as entries:
-        return sorted(
-            folder / entry.name
-            for entry in entries
-            if not entry.name.startswith(".") and wanted(entry)
-        )
+    with os.scandir(folder) as listed:
+        names = [entry.name for entry in listed if entry.name[0] != "." and wanted(entry)]
+    return [folder / name for name in sorted(names)]

@@ -12,6 +12,8 @@ from qs3.io.ragged import RaggedClouds
 from qs3.meshes.classes import map_labels
 
 SPLITS = ("train", "test")
+POINTS = 2048
+"""Points a cloud, as most data sets of this field have them."""
 
 
 @dataclass(frozen=True)
@@ -44,3 +46,8 @@ def labels_as(clouds: RaggedClouds, class_names: Sequence[str]) -> Int[np.ndarra
     if not clouds.splits or any(split not in SPLITS for split in clouds.splits):
         raise InputError("this layout needs train or test for every cloud, and some have neither")
     return map_labels(clouds.class_names, clouds.labels, class_names)[0]
+
+
+def named_folder(path: Path, name: str) -> Path:
+    """The folder itself where it is called so, else the one of that name in it."""
+    return path if path.name == name else path / name

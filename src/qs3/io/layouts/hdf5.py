@@ -16,14 +16,8 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from qs3.errors import InputError
-from qs3.io.guards import reason
+from qs3.io.guards import DENSEST, check_announced, reason
 
-MOST_BYTES = 4 * 2**30
-"""Largest announced size of one dataset."""
-DENSEST = 100
-"""Largest ratio of announced size to file; coordinates do not compress that well."""
-
-_SLACK = 2**20
 _BLOCK = 2**24
 # gzip, shuffle, Fletcher's checksum, szip, LZF: what HDF5 and h5py bring; no plugin is loaded.
 _FILTERS = (1, 2, 3, 4, 32000)
@@ -49,14 +43,12 @@ def read_file(
 
     if not path.is_file():
         raise InputError(f"{path}: no such file")
-    size = path.stat().st_size
     try:
         with h5py.File(path, "r") as file:
-            data = _dataset(file, "data", size)
-            label = _dataset(file, "label", size)
+            data, label = (_dataset(file, name, path) for name in ("data", "label"))
             shape = data.shape
             if data.dtype.kind != "f" or len(shape) != 3 or shape[2] not in columns:
-                several = " or ".join(str(count) for count in columns)
+                several = " or ".join(map(str, columns))
                 raise InputError(
                     f"data must be floats of shape [b n {several}], not {data.dtype} of shape "
                     f"{list(shape)}"
@@ -68,16 +60,18 @@ def read_file(
                 )
             if 0 in shape:
                 raise InputError("holds no point")
-            labels = _labels(label[()].reshape(-1), classes)
-            points = _points(data)
+            numbers = label[()].reshape(-1)
+            low, high = int(numbers.min()), int(numbers.max())
+            if low < 0 or high >= classes:
+                raise InputError(f"label {min(low, 0) or high} is none of 0 to {classes - 1}")
+            return _points(data), numbers.astype(np.int64)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:  # the library raises whatever it stumbles over
         raise InputError(f"{path}: cannot be read as HDF5 ({reason(error)})") from error
-    return points, labels
 
 
-def _dataset(file: Any, name: str, size: int) -> Any:
+def _dataset(file: Any, name: str, path: Path) -> Any:
     """Return a dataset of plain numbers that lie in this file, no more than it can hold."""
     import h5py
 
@@ -94,34 +88,15 @@ def _dataset(file: Any, name: str, size: int) -> Any:
         raise InputError(f"{name} lies in another file, which is not read")
     if dataset.shape is None or dataset.dtype.kind not in "fiu" or dataset.dtype.itemsize > 8:
         raise InputError(f"{name} holds {dataset.dtype}, no plain numbers")
-    _check_size(dataset, name, size)
-    return dataset
-
-
-def _check_size(dataset: Any, name: str, size: int) -> None:
     plist = dataset.id.get_create_plist()
-    for index in range(plist.get_nfilters()):
-        if plist.get_filter(index)[0] not in _FILTERS:
-            raise InputError(f"{name} is compressed by a plugin; write it again with gzip or none")
-    announced = math.prod(dataset.shape) * dataset.dtype.itemsize
-    stored = min(dataset.id.get_storage_size(), size)
-    # Only chunks can be compressed; a chunk may be larger than the dataset.
-    most = stored
-    if dataset.chunks is not None:
-        announced = max(announced, math.prod(dataset.chunks) * dataset.dtype.itemsize)
-        most = max(_SLACK, DENSEST * stored)
-    if announced > min(most, MOST_BYTES):
-        raise InputError(
-            f"{name} announces {announced} bytes (shape {list(dataset.shape)}), but the file has "
-            f"{stored} of it; damaged, or made to fill the memory"
-        )
-
-
-def _labels(numbers: np.ndarray, classes: int) -> Int[np.ndarray, "b"]:
-    low, high = int(numbers.min()), int(numbers.max())
-    if low < 0 or high >= classes:
-        raise InputError(f"label {low if low < 0 else high} is none of 0 to {classes - 1}")
-    return numbers.astype(np.int64)
+    if any(plist.get_filter(i)[0] not in _FILTERS for i in range(plist.get_nfilters())):
+        raise InputError(f"{name} is compressed by a plugin; write it again with gzip or none")
+    # A chunk may be larger than the dataset; only chunks can be compressed.
+    cells = max(math.prod(dataset.shape), math.prod(dataset.chunks or (0,)))
+    size, stored = cells * dataset.dtype.itemsize, dataset.id.get_storage_size()
+    densest = DENSEST if dataset.chunks else 1
+    check_announced(name, size, min(stored, path.stat().st_size), densest)
+    return dataset
 
 
 def _points(data: Any) -> Float32[np.ndarray, "b n 3"]:

@@ -1,27 +1,29 @@
-"""Data sets of several HDF5 files: which belong to it, reading them as one, writing them."""
+"""Data sets of several HDF5 files: which belong to it, reading them as one, writing them.
+
+Clouds lie y up in the files of every such data set, and are turned z up and back.
+"""
 
 import hashlib
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int
+from jaxtyping import Float32, Integer
 
 from qs3.errors import InputError
 from qs3.files import sha256, write_bytes, write_text
-from qs3.io.guards import read_small
-from qs3.io.layouts.format import SPLITS
+from qs3.geometry import y_up_to_z_up, z_up_to_y_up
+from qs3.io.guards import read_text
+from qs3.io.layouts.format import POINTS, SPLITS
 from qs3.io.layouts.hdf5 import hdf5_bytes, read_file
 from qs3.io.preparation import stack
 from qs3.io.ragged import RaggedClouds
 
 CLOUDS_A_FILE = 2048
-POINTS = 2048
 
-_LONGEST_LIST = 2**20
 _H5_NAME = re.compile(r"[\w.+-]{1,200}\.h5", re.ASCII)
 
 
@@ -38,8 +40,8 @@ class Part:
 def read_parts(
     parts: Sequence[Part],
     class_names: Sequence[str],
-    columns: Sequence[int],
-    turn: Callable[[np.ndarray], np.ndarray] | None = None,
+    columns: Sequence[int] = (3,),
+    turn: bool = True,
 ) -> RaggedClouds:
     """Read files one after another; a cloud's id is ``<file>/<row>``.
 
@@ -47,7 +49,7 @@ def read_parts(
         parts: The files, no two of one name.
         class_names: Names that the labels index.
         columns: Numbers of columns that ``data`` may have; those after the third are dropped.
-        turn: What is done to the clouds.
+        turn: Turn the clouds z up.
 
     Raises:
         InputError: where a file is damaged, has other datasets, or a label has no class.
@@ -60,7 +62,7 @@ def read_parts(
     for part in parts:
         points, numbers = read_file(part.path, columns, len(class_names))
         digest.update(f"{part.path.name} {sha256(part.path)}\n".encode(errors="surrogateescape"))
-        clouds += list(points if turn is None else turn(points))
+        clouds += list(y_up_to_z_up(points) if turn else points)
         ids += [f"{part.path.stem}/{row:05d}" for row in range(len(points))]
         labels.append(numbers)
         splits += [part.split] * len(points)
@@ -94,8 +96,10 @@ def list_parts(root: Path, pattern: str, names: str, split: str | None) -> list[
         raise InputError(f"{root}: no such folder")
     parts = []
     for part in SPLITS:
-        listed = _from_list(root, root / f"{part}_files.txt")
-        parts += [Part(path, part) for path in listed or _from_names(root, pattern, part)]
+        matches = [re.fullmatch(pattern, name) for name in _names(root)]
+        own = sorted((int(match[2]), match[0]) for match in matches if match and match[1] == part)
+        paths = _from_list(root, root / f"{part}_files.txt") or [root / name for _, name in own]
+        parts += [Part(path, part) for path in paths]
     if not parts:
         raise InputError(f"{root}: holds no {names}")
     counts = Counter(part.path.name for part in parts)
@@ -133,23 +137,9 @@ def _from_list(root: Path, path: Path) -> list[Path]:
     return paths
 
 
-def _from_names(root: Path, pattern: str, split: str) -> list[Path]:
-    matches = [re.fullmatch(pattern, name) for name in _names(root)]
-    own = sorted((int(match[2]), match[0]) for match in matches if match and match[1] == split)
-    return [root / name for _, name in own]
-
-
 def text_lines(path: Path) -> list[str]:
-    """Return the lines of a short text, blank ones left out.
-
-    Raises:
-        InputError: where it is long or not UTF-8.
-    """
-    try:
-        lines = read_small(path, _LONGEST_LIST, "a list of names").decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: no text in UTF-8") from error
-    return [line.strip() for line in lines if line.strip()]
+    """Return the lines of a short text, blank ones left out."""
+    return [line.strip() for line in read_text(path).splitlines() if line.strip()]
 
 
 def named(root: Path, pattern: str) -> bool:
@@ -166,11 +156,7 @@ def _names(root: Path) -> list[str]:
 
 
 def same_size(clouds: RaggedClouds) -> Float32[np.ndarray, "b n 3"]:
-    """Return all clouds in one array, of their common size where they have one, else ``POINTS``.
-
-    Raises:
-        InputError: where there is none, or one is empty.
-    """
+    """Return all clouds in one array, of their common size where they have one, else ``POINTS``."""
     sizes = {len(cloud) for cloud in clouds.clouds}
     return stack(clouds.clouds, None if len(sizes) == 1 else POINTS, "this layout")
 
@@ -178,34 +164,34 @@ def same_size(clouds: RaggedClouds) -> Float32[np.ndarray, "b n 3"]:
 def write_parts(
     root: Path,
     clouds: RaggedClouds,
-    labels: Int[np.ndarray, "b"],
-    name: Callable[[str, int], str],
-    arrays: Callable[[np.ndarray, np.ndarray], Mapping[str, np.ndarray]],
+    labels: Integer[np.ndarray, "b ..."],
+    names: tuple[str, str],
     *,
+    columns: int = 3,
     most: int | None = CLOUDS_A_FILE,
     listed: str | None = None,
 ) -> None:
-    """Write the clouds of each split into files of their own; the order within a split is kept.
+    """Write the clouds of each split, turned y up, into files; the order within a split is kept.
 
     Args:
         root: Folder to write to.
         clouds: What to write; of each cloud the split counts.
-        labels: Labels to write.
-        name: Gives the name of a file by its split and its number within it.
-        arrays: Turns points [b n 3] and labels [b] into the datasets of a file.
+        labels: Labels to write, in the type and shape that the layout has.
+        names: Names of the files of train and of test; ``{}`` is their number.
+        columns: Columns of ``data``; those after the third are 0.
         most: Clouds a file; None puts all of a split into one.
         listed: Put before the names in ``<split>_files.txt``; None writes no such list.
     """
     points = same_size(clouds)
-    splits = np.array(clouds.splits)
-    for split in SPLITS:
-        rows = np.flatnonzero(splits == split)
+    data = np.zeros((*points.shape[:2], columns), dtype=np.float32)
+    data[..., :3] = z_up_to_y_up(points)
+    for split, name in zip(SPLITS, names, strict=True):
+        rows = np.flatnonzero(np.array(clouds.splits) == split)
         step = most or max(len(rows), 1)
-        names = []
-        for index, start in enumerate(range(0, len(rows), step)):
-            own = rows[start : start + step]
-            names.append(name(split, index))
-            write_bytes(root / names[-1], hdf5_bytes(arrays(points[own], labels[own])))
-        if names and listed is not None:
-            lines = "".join(f"{listed}{file}\n" for file in names)
+        parts = [rows[start : start + step] for start in range(0, len(rows), step)]
+        for index, own in enumerate(parts):
+            arrays = {"data": data[own], "label": labels[own]}
+            write_bytes(root / name.format(index), hdf5_bytes(arrays))
+        if parts and listed is not None:
+            lines = "".join(f"{listed}{name.format(index)}\n" for index in range(len(parts)))
             write_text(root / f"{split}_files.txt", lines)

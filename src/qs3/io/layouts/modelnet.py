@@ -19,18 +19,18 @@ Source: Wu et al., "3D ShapeNets", CVPR 2015; Qi et al., "PointNet", CVPR 2017
 """
 
 import hashlib
+import os
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int
-from tqdm import tqdm
+from jaxtyping import Float32
 
 from qs3.errors import InputError
-from qs3.files import sha256, write_text
-from qs3.geometry import y_up_to_z_up, z_up_to_y_up
-from qs3.io.layouts.class_folders import choose_split, list_folder
-from qs3.io.layouts.format import SPLITS, Format, labels_as
+from qs3.files import write_text
+from qs3.io.layouts.class_folders import choose_split, entries, list_folder, read_files
+from qs3.io.layouts.format import POINTS, SPLITS, Format, labels_as
 from qs3.io.layouts.hdf5_sets import list_parts, named, read_parts, text_lines, write_parts
 from qs3.io.ragged import RaggedClouds
 from qs3.meshes.classes import MODELNET40
@@ -43,8 +43,6 @@ _NAMES = "shape_names.txt"
 # The released lists name their files so, and some loaders open just that.
 _LISTED = "data/modelnet40_ply_hdf5_2048/"
 _MOST_CLASSES = 256
-_MESH_POINTS = 2048
-_MANY = 100
 _PAGE = "http://modelnet.cs.princeton.edu/ModelNet40.zip"
 
 
@@ -59,24 +57,19 @@ def read_modelnet_h5(path: Path, split: str | None = None) -> RaggedClouds:
         InputError: where there is no such file or split, a file is bad, or a label has no name;
             without ``shape_names.txt`` the names are ModelNet40's.
     """
-    root = Path(path)
-    parts = list_parts(root, _FILES, "ply_data_train<i>.h5 or ply_data_test<i>.h5", split)
-    names = root / _NAMES
-    if names.is_file():
-        return read_parts(parts, _read_names(names), (3,), y_up_to_z_up)
+    parts = list_parts(path, _FILES, "ply_data_train<i>.h5 or ply_data_test<i>.h5", split)
+    listed = path / _NAMES
+    if listed.is_file():
+        names = text_lines(listed)
+        if not 0 < len(set(names)) == len(names):
+            raise InputError(f"{listed}: needs one class name a line, none twice")
+        return read_parts(parts, names)
     try:
-        return read_parts(parts, CLASSES, (3,), y_up_to_z_up)
+        return read_parts(parts, CLASSES)
     except InputError as error:
         raise InputError(
-            f"{error} ({names} is missing, so the classes were taken to be ModelNet40's)"
+            f"{error} ({listed} is missing, so the classes were taken to be ModelNet40's)"
         ) from error
-
-
-def _read_names(path: Path) -> list[str]:
-    names = text_lines(path)
-    if not 0 < len(set(names)) == len(names):
-        raise InputError(f"{path}: needs one class name a line, none twice")
-    return names
 
 
 def write_modelnet_h5(path: Path, clouds: RaggedClouds) -> None:
@@ -96,10 +89,11 @@ def write_modelnet_h5(path: Path, clouds: RaggedClouds) -> None:
             whose name fits no line, or a cloud of neither train nor test.
     """
     names = _names(clouds.class_names)
-    labels = labels_as(clouds, names)
+    labels = labels_as(clouds, names).astype(np.uint8)[:, None]
     path.mkdir(parents=True, exist_ok=True)
     write_text(path / _NAMES, "".join(f"{name}\n" for name in names))
-    write_parts(path, clouds, labels, _file_name, _arrays, listed=_LISTED)
+    files = ("ply_data_train{}.h5", "ply_data_test{}.h5")
+    write_parts(path, clouds, labels, files, listed=_LISTED)
 
 
 def _names(class_names: Sequence[str]) -> Sequence[str]:
@@ -113,17 +107,6 @@ def _names(class_names: Sequence[str]) -> Sequence[str]:
     return class_names
 
 
-def _file_name(split: str, index: int) -> str:
-    return f"ply_data_{split}{index}.h5"
-
-
-def _arrays(
-    points: Float32[np.ndarray, "b n 3"], labels: Int[np.ndarray, "b"]
-) -> dict[str, np.ndarray]:
-    data = z_up_to_y_up(points).astype(np.float32)
-    return {"data": data, "label": labels.astype(np.uint8)[:, None]}
-
-
 def read_modelnet_meshes(path: Path, split: str | None = None) -> RaggedClouds:
     """Sample the meshes of a tree, one after another; only their samples stay in memory.
 
@@ -135,43 +118,30 @@ def read_modelnet_meshes(path: Path, split: str | None = None) -> RaggedClouds:
         InputError: where there is no mesh or split, a class is none of ModelNet40's, or a mesh is
             bad.
     """
-    root = Path(path)
-    files = list_folder(root, (".off",))
+    files = list_folder(path, (".off",))
     for file in files:
         if file.class_name not in MODELNET40 or file.split not in SPLITS:
             raise InputError(
                 f"{file.path}: is not in <class>/<train|test>/ of a class of ModelNet40"
             )
     names = sorted({file.class_name for file in files})
-    files = choose_split(root, files, split)
-    digest = hashlib.sha256(b"surface")
-    clouds, ids = [], []
-    for file in tqdm(files, "read", unit="mesh", disable=None if len(files) > _MANY else True):
-        ids.append(file.path.relative_to(root).as_posix())
-        digest.update(f"{ids[-1]} {sha256(file.path)}\n".encode(errors="surrogateescape"))
-        clouds.append(_sample(file.path, ids[-1]))
-    return RaggedClouds(
-        clouds=clouds,
-        ids=tuple(ids),
-        checksum=digest.hexdigest(),
-        labels=np.array([names.index(file.class_name) for file in files], dtype=np.int64),
-        class_names=tuple(names),
-        splits=tuple(file.split for file in files),
-    )
+    chosen = choose_split(path, files, split)
+    return read_files(path, chosen, names, partial(_sample, path), "surface")
 
 
-def _sample(path: Path, identifier: str) -> Float32[np.ndarray, "n 3"]:
+def _sample(root: Path, path: Path) -> Float32[np.ndarray, "n 3"]:
     # Imported here: listing layouts needs no mesh library.
     from qs3.meshes.loading import load_mesh
     from qs3.meshes.normalising import sample_surface
 
     # Of the id alone: a mesh more or less leaves all other clouds as they were.
-    digest = hashlib.sha256(identifier.encode(errors="surrogateescape")).digest()
+    name = path.relative_to(root).as_posix()
+    digest = hashlib.sha256(name.encode(errors="surrogateescape")).digest()
     rng = np.random.default_rng(np.frombuffer(digest, dtype="<u4"))
     mesh = load_mesh(path)
     try:
         with np.errstate(over="ignore", invalid="ignore"):
-            points = sample_surface(mesh, _MESH_POINTS, rng)
+            points = sample_surface(mesh, POINTS, rng)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     if not np.isfinite(points).all():
@@ -181,19 +151,17 @@ def _sample(path: Path, identifier: str) -> Float32[np.ndarray, "n 3"]:
 
 def _detect_meshes(path: Path) -> bool:
     try:
-        inner = [entry for entry in path.iterdir() if entry.is_dir() and entry.name[0] not in "._"]
-        return bool(inner) and all(_is_class(entry) for entry in inner)
-    except OSError:  # no folder, or one that cannot be listed
+        folders = [f for f in entries(path, os.DirEntry.is_dir) if f.name[0] != "_"]
+        return bool(folders) and all(
+            folder.name in MODELNET40 and any(_has_mesh(folder / part) for part in SPLITS)
+            for folder in folders
+        )
+    except OSError:  # a folder that cannot be listed
         return False
 
 
-def _is_class(folder: Path) -> bool:
-    parts = [folder / part for part in SPLITS]
-    return folder.name in MODELNET40 and any(_has_mesh(part) for part in parts)
-
-
 def _has_mesh(folder: Path) -> bool:
-    return folder.is_dir() and any(entry.suffix.lower() == ".off" for entry in folder.iterdir())
+    return bool(entries(folder, lambda entry: entry.name.lower().endswith(".off")))
 
 
 FORMATS = (

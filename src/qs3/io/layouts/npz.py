@@ -6,8 +6,8 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.files import sha256
-from qs3.io.guards import reason
-from qs3.io.layouts.format import Format
+from qs3.io.guards import MOST_BYTES, load_npy, open_zip, read_member
+from qs3.io.layouts.format import SPLITS, Format
 from qs3.io.ragged import RaggedClouds
 
 
@@ -24,27 +24,21 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
         split: ``train`` or ``test`` by ``is_train``; None takes all.
 
     Raises:
-        InputError: where the file is missing, damaged or holds other arrays.
+        InputError: where the file is missing, damaged, announces more than it can hold, or holds
+            other arrays.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
+    arrays = _read(path)
     try:
-        # Opened here: np.load leaves the handle open where the content is no archive.
-        with path.open("rb") as handle, np.load(handle, allow_pickle=False) as archive:
-            wanted = ("points", "offset", "label", "class_names", "is_train", "name")
-            arrays = {name: archive[name] for name in wanted if name in archive.files}
-    except Exception as error:  # a damaged zip file raises whatever its reader stumbles over
-        raise InputError(
-            f"{path}: not a NumPy archive of plain arrays ({reason(error)})"
-        ) from error
-    clouds = _clouds(path, arrays)
-    count = len(clouds)
-    for name in ("label", "is_train", "name"):
-        if name in arrays and arrays[name].shape != (count,):
-            raise InputError(f"{path}: {name} has shape {arrays[name].shape} for {count} clouds")
-    labels, names = _labels(path, arrays)
-    rows = _rows(path, arrays, split, count)
+        clouds = _clouds(arrays)
+        count = len(clouds)
+        for name in ("label", "is_train", "name"):
+            if name in arrays and arrays[name].shape != (count,):
+                raise InputError(f"{name} has shape {arrays[name].shape} for {count} clouds")
+        labels, names = _labels(arrays)
+        rows = _rows(arrays, split, count)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
     given, train = arrays.get("name"), arrays.get("is_train")
     ids = [f"{path.stem}/{i:05d}" for i in range(count)] if given is None else given.tolist()
     return RaggedClouds(
@@ -57,54 +51,71 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
     )
 
 
-def _clouds(path: Path, arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
+def _read(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an archive, of those that are known."""
+    arrays, whole = {}, 0
+    try:
+        with open_zip(path) as archive:
+            for name in ("points", "offset", "label", "class_names", "is_train", "name"):
+                content = read_member(archive, f"{name}.npy", MOST_BYTES - whole)
+                if content is not None:
+                    whole += len(content)
+                    arrays[name] = load_npy(content)
+    except InputError as error:
+        if not path.is_file():
+            raise
+        plain = str(error).removeprefix(f"{path}: ")
+        raise InputError(f"{path}: not a NumPy archive of plain arrays ({plain})") from error
+    return arrays
+
+
+def _clouds(arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
     points, offset = arrays.get("points"), arrays.get("offset")
     if points is None:
-        raise InputError(f"{path}: has no array called points")
+        raise InputError("has no array called points")
     if points.dtype.kind != "f" or points.ndim != (3 if offset is None else 2):
         raise InputError(
-            f"{path}: points must be numbers of shape [b n 3], or [m 3] with offset, not "
-            f"{points.dtype} of shape {list(points.shape)}"
+            f"points must be numbers of shape [b n 3], or [m 3] with offset, not {points.dtype} "
+            f"of shape {list(points.shape)}"
         )
     if points.shape[-1] != 3:
-        raise InputError(f"{path}: points have {points.shape[-1]} columns, not 3")
+        raise InputError(f"points have {points.shape[-1]} columns, not 3")
     if not np.isfinite(points).all():
-        raise InputError(f"{path}: a point is not finite")
+        raise InputError("a point is not finite")
     if offset is None:
         clouds = list(points)
     else:
         plain = offset.ndim == 1 and offset.dtype.kind in "iu" and len(offset) > 1
         whole = plain and offset[0] == 0 and offset[-1] == len(points)
         if not whole or (np.diff(offset.astype(np.int64)) <= 0).any():
-            raise InputError(f"{path}: offset does not cut the points into clouds")
+            raise InputError("offset does not cut the points into clouds")
         clouds = np.split(points, offset[1:-1])
     if not clouds or not len(clouds[0]):
-        raise InputError(f"{path}: holds no point")
+        raise InputError("holds no point")
     return clouds
 
 
-def _labels(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, tuple[str, ...]]:
+def _labels(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, tuple[str, ...]]:
     label, names = arrays.get("label"), arrays.get("class_names")
     if label is None:
         return None, ()
     if names is None or names.ndim != 1 or names.dtype.kind != "U":
-        raise InputError(f"{path}: label needs class_names, one text a class")
+        raise InputError("label needs class_names, one text a class")
     if label.dtype.kind not in "iu" or label.min() < 0 or label.max() >= len(names):
-        raise InputError(f"{path}: a label is not one of 0 to {len(names) - 1}")
-    return label.astype(np.int64), tuple(str(name) for name in names)
+        raise InputError(f"a label is not one of 0 to {len(names) - 1}")
+    return label.astype(np.int64), tuple(names.tolist())
 
 
-def _rows(path: Path, arrays: dict[str, np.ndarray], split: str | None, count: int) -> list[int]:
+def _rows(arrays: dict[str, np.ndarray], split: str | None, count: int) -> list[int]:
     if split is None:
         return list(range(count))
     train = arrays.get("is_train")
-    if train is None or split not in ("train", "test"):
+    if train is None or split not in SPLITS:
         parts = "no split" if train is None else "train and test"
-        raise InputError(f"{path}: has no split {split!r}; it has {parts}")
-    chosen = train.astype(bool)
-    rows = np.flatnonzero(chosen if split == "train" else ~chosen)
+        raise InputError(f"has no split {split!r}; it has {parts}")
+    rows = np.flatnonzero(train.astype(bool) == (split == "train"))
     if not len(rows):
-        raise InputError(f"{path}: split {split!r} is empty")
+        raise InputError(f"split {split!r} is empty")
     return rows.tolist()
 
 

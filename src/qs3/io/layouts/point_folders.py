@@ -8,11 +8,9 @@ import hashlib
 import os
 import re
 import urllib.parse
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 from tqdm import tqdm
 
 from qs3.errors import InputError
@@ -40,24 +38,17 @@ def write_folder(root: Path, clouds: RaggedClouds, ending: str) -> None:
     Raises:
         InputError: where a class name cannot name a folder, or a split is neither train nor test.
     """
-    write_files(root, clouds, cloud_folders(clouds), ending)
+    write_files(root, clouds, _cloud_folders(clouds), ending)
 
 
-def write_files(
-    root: Path,
-    clouds: RaggedClouds,
-    folders: Sequence[str],
-    ending: str,
-    encode: Callable[[np.ndarray], bytes] | None = None,
-) -> None:
+def write_files(root: Path, clouds: RaggedClouds, folders: Sequence[str], ending: str) -> None:
     """Write each cloud as one file into its own folder below ``root``; names as in `write_folder`.
 
     Args:
         root: Folder to make.
         clouds: What to write.
         folders: Folder of each cloud, parts apart by ``/``; checked by the caller.
-        ending: One of `point_files.WRITTEN_FILES`, or any with an ``encode`` of its own.
-        encode: Makes the file of a cloud; `point_files.cloud_bytes` by default.
+        ending: One of `point_files.WRITTEN_FILES`.
     """
     taken: set[str] = set()
     count = len(clouds.clouds)
@@ -67,18 +58,17 @@ def write_files(
     for cloud, identifier, folder in tqdm(
         rows, "write", count, unit="cloud", disable=None if count > _MANY else True
     ):
-        name = _free(f"{folder}/{file_stem(identifier, folder)}".lstrip("/"), taken)
-        (root / f"{name}{ending}").write_bytes(
-            encode(cloud) if encode else cloud_bytes(cloud, ending)
-        )
+        stem = name = f"{folder}/{file_stem(identifier, folder)}".lstrip("/")
+        number = 1
+        while name.casefold() in taken:
+            number += 1
+            name = f"{stem}-{number}"
+        taken.add(name.casefold())
+        (root / f"{name}{ending}").write_bytes(cloud_bytes(cloud, ending))
 
 
-def cloud_folders(clouds: RaggedClouds) -> list[str]:
-    """Return the folder of each cloud below the root: class, class/split, split or nothing.
-
-    Raises:
-        InputError: as `write_folder` does.
-    """
+def _cloud_folders(clouds: RaggedClouds) -> list[str]:
+    """The folder of each cloud below the root: class, class/split, split or nothing."""
     splits = clouds.splits or ("",) * len(clouds.ids)
     if other := sorted({split for split in splits if split not in ("", *SPLITS)}):
         raise InputError(
@@ -141,63 +131,38 @@ def file_stem(identifier: str, folder: str = "") -> str:
     return name
 
 
-def _free(name: str, taken: set[str]) -> str:
-    """Return the name, or one with a number after it where a file has it already."""
-    free, number = name, 1
-    while free.casefold() in taken:
-        number += 1
-        free = f"{name}-{number}"
-    taken.add(free.casefold())
-    return free
-
-
-def endings_of(root: Path) -> set[str]:
-    """Return the endings of all files down to ``<class>/<split>/*``, hidden ones aside."""
+def _endings(root: Path) -> set[str]:
+    """The endings of all data files down to ``<class>/<split>/*``, hidden ones aside."""
     endings: set[str] = set()
     for folder, inner, files in os.walk(root, followlinks=True):
         depth = len(Path(folder).relative_to(root).parts)
         inner[:] = [name for name in inner if not name.startswith(".") and depth < _DEPTH - 1]
         endings.update(Path(name).suffix.lower() for name in files if not name.startswith("."))
-    return endings
-
-
-def _only(ending: str, root: Path) -> bool:
-    """Whether ``root`` holds point files of this ending and no data of another kind."""
-    return endings_of(root) & {*POINT_FILES, *_OTHER_DATA} == {ending}
+    return endings & {*POINT_FILES, ".h5", ".hdf5", ".parquet"}
 
 
 def _mixed(root: Path) -> bool:
-    endings = endings_of(root) & {*POINT_FILES, *_OTHER_DATA}
-    single = len(endings) == 1 and endings <= set(WRITTEN_FILES)
-    return not endings.isdisjoint(POINT_FILES) and not single
+    """Whether a folder holds point files, but not of one kind alone that has its own name."""
+    endings = _endings(root)
+    return not endings.isdisjoint(POINT_FILES) and endings not in [{e} for e in WRITTEN_FILES]
 
 
-def _read(endings: Sequence[str], root: Path, split: str | None) -> RaggedClouds:
-    return read_folder(root, split, endings)
+def _one_kind(ending: str, what: str) -> Format:
+    return Format(
+        name=ending[1:],
+        layout=f"a folder of {what} files, <class>/<train|test>/*{ending} or fewer levels",
+        detect=lambda root: _endings(root) == {ending},
+        read=lambda root, split: read_folder(root, split, (ending,)),
+        write=lambda root, clouds: write_folder(root, clouds, ending),
+    )
 
-
-def _write(ending: str, root: Path, clouds: RaggedClouds) -> None:
-    write_folder(root, clouds, ending)
-
-
-_OTHER_DATA = (".h5", ".hdf5", ".parquet")
-_WHAT = {".ply": "PLY", ".pcd": "PCD", ".npy": "NumPy", ".xyz": "text"}
 
 FORMATS = (
-    *(
-        Format(
-            name=ending[1:],
-            layout=f"a folder of {what} files, <class>/<train|test>/*{ending} or fewer levels",
-            detect=partial(_only, ending),
-            read=partial(_read, (ending,)),
-            write=partial(_write, ending),
-        )
-        for ending, what in _WHAT.items()
-    ),
+    *map(_one_kind, (".ply", ".pcd", ".npy", ".xyz"), ("PLY", "PCD", "NumPy", "text")),
     Format(
         name="folder",
         layout=f"a folder of point files of several kinds ({', '.join(POINT_FILES)})",
         detect=_mixed,
-        read=partial(_read, POINT_FILES),
+        read=read_folder,
     ),
 )

@@ -25,14 +25,14 @@ import dataclasses
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float, Float32
 
 from qs3.errors import InputError
-from qs3.geometry import y_up_to_z_up, z_up_to_y_up
-from qs3.io.layouts.format import SPLITS, Format, labels_as
+from qs3.geometry import y_up_to_z_up
+from qs3.io.layouts.format import SPLITS, Format, labels_as, named_folder
 from qs3.io.layouts.hdf5_sets import list_parts, named, read_parts, same_size, write_parts
 from qs3.io.layouts.point_folders import write_folder
 from qs3.io.layouts.trees import read_ten_classes
@@ -79,13 +79,12 @@ def read_pointda10(
         InputError: where the domain cannot be told, the path holds several, a class is none of
             the ten, a file is bad, or a protocol is unknown.
     """
-    if protocol not in ("aligned", "original", "upright", "raw"):
+    if protocol not in get_args(Protocol):
         raise InputError(f"protocol {protocol!r}: choose aligned, original, upright or raw")
     root, domain = _domain(Path(path), domain)
     if domain == "scannet":
-        clouds = read_parts(
-            list_parts(root, _FILES, "train_<i>.h5 or test_<i>.h5", split), POINTDA10, (3, 6)
-        )
+        parts = list_parts(root, _FILES, "train_<i>.h5 or test_<i>.h5", split)
+        clouds = read_parts(parts, POINTDA10, (3, 6), turn=False)
     else:
         clouds = read_ten_classes(root, split, ".npy")
     labels = [] if clouds.labels is None else clouds.labels.tolist()
@@ -117,7 +116,7 @@ def _domain(path: Path, domain: Domain | None) -> tuple[Path, Domain]:
         raise InputError(f"{path}: no such folder")
     if domain is not None:
         return path, domain
-    inside = _domains_in(path)
+    inside = [name for name in DOMAINS if _is_domain(path / name, name)]
     if len(inside) > 1:
         several = ", ".join(str(path / name) for name in inside)
         raise InputError(f"{path}: holds several domains of PointDA-10; name one: {several}")
@@ -134,12 +133,6 @@ def _domain(path: Path, domain: Domain | None) -> tuple[Path, Domain]:
     )
 
 
-def _domains_in(root: Path) -> list[Domain]:
-    if not root.is_dir():
-        return []
-    return [name for name in DOMAINS if _is_domain(root / name, name)]
-
-
 def _is_domain(path: Path, domain: Domain) -> bool:
     if domain == "scannet":
         return named(path, _FILES)
@@ -148,8 +141,10 @@ def _is_domain(path: Path, domain: Domain) -> bool:
 
 def _detect(path: Path) -> bool:
     names = (path.name, path.resolve().name)
-    named_so = any(name in names and _is_domain(path, name) for name in DOMAINS)
-    return named_so or named(path, _FILES) or bool(_domains_in(path))
+    own = [name for name in DOMAINS if name in names or name == "scannet"]
+    return any(_is_domain(path, name) for name in own) or any(
+        _is_domain(path / name, name) for name in DOMAINS
+    )
 
 
 def write_npy(path: Path, clouds: RaggedClouds) -> None:
@@ -169,7 +164,7 @@ def write_npy(path: Path, clouds: RaggedClouds) -> None:
     """
     labels = labels_as(clouds, POINTDA10)
     points = same_size(clouds)
-    root = _own_folder(path, "modelnet")
+    root = named_folder(path, "modelnet")
     for name in POINTDA10:
         for part in SPLITS:
             (root / name / part).mkdir(parents=True, exist_ok=True)
@@ -192,34 +187,21 @@ def write_h5(path: Path, clouds: RaggedClouds) -> None:
     Raises:
         InputError: as `write_npy` does.
     """
-    labels = labels_as(clouds, POINTDA10)
-    root = _own_folder(path, "scannet")
-    write_parts(root, clouds, labels, _file_name, _h5_arrays, listed="./")
-
-
-def _file_name(split: str, index: int) -> str:
-    return f"{split}_{index}.h5"
-
-
-def _h5_arrays(points: Float32[np.ndarray, "b n 3"], labels: np.ndarray) -> dict[str, np.ndarray]:
-    data = np.zeros((*points.shape[:2], 6), dtype=np.float32)
-    data[..., :3] = z_up_to_y_up(points)
-    return {"data": data, "label": labels.astype(np.int32)}
-
-
-def _own_folder(path: Path, domain: Domain) -> Path:
-    return path if path.name == domain else path / domain
+    labels = labels_as(clouds, POINTDA10).astype(np.int32)
+    files = ("train_{}.h5", "test_{}.h5")
+    write_parts(named_folder(path, "scannet"), clouds, labels, files, columns=6, listed="./")
 
 
 _LAYOUT = "modelnet/ or shapenet/ with <class>/<train|test>/*.npy, or scannet/<train|test>_*.h5"
 
 
-def _format(
-    name: str,
-    protocol: Protocol,
-    layout: str,
-    write: Callable[[Path, RaggedClouds], None] | None = None,
-) -> Format:
+_WRITTEN: dict[str, Callable[[Path, RaggedClouds], None]] = {
+    "pointda10-npy": write_npy,
+    "pointda10-h5": write_h5,
+}
+
+
+def _format(name: str, protocol: Protocol, layout: str) -> Format:
     return Format(
         name=name,
         layout=layout,
@@ -227,11 +209,12 @@ def _format(
         # chosen by --from alone.
         detect=_detect if name == "pointda10" else lambda path: False,
         read=lambda path, split: read_pointda10(path, split, protocol),
-        write=write,
+        write=_WRITTEN.get(name),
         page="https://drive.google.com/file/d/1-LfJWL5geF9h0Z2QpdTL0n4lShy8wy2J (PointDA_data.zip)",
     )
 
 
+_UPRIGHT = "the same, turned z up but not scaled; written as"
 FORMATS = (
     _format(
         "pointda10",
@@ -244,16 +227,6 @@ FORMATS = (
         f"the same as PointDAN read it, not turned, the first 1,024 points: {_LAYOUT}",
     ),
     _format("pointda10-raw", "raw", f"the same as stored: {_LAYOUT}"),
-    _format(
-        "pointda10-npy",
-        "upright",
-        "the same, turned z up but not scaled; written as modelnet/<class>/<train|test>/*.npy",
-        write_npy,
-    ),
-    _format(
-        "pointda10-h5",
-        "upright",
-        "the same, turned z up but not scaled; written as scannet/<train|test>_*.h5",
-        write_h5,
-    ),
+    _format("pointda10-npy", "upright", f"{_UPRIGHT} modelnet/<class>/<train|test>/*.npy"),
+    _format("pointda10-h5", "upright", f"{_UPRIGHT} scannet/<train|test>_*.h5"),
 )

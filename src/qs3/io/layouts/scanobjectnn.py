@@ -23,10 +23,8 @@ import re
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int
 
 from qs3.errors import InputError
-from qs3.geometry import y_up_to_z_up, z_up_to_y_up
 from qs3.io.layouts.format import Format, labels_as
 from qs3.io.layouts.hdf5_sets import Part, choose, named, read_parts, write_parts
 from qs3.io.ragged import RaggedClouds
@@ -61,7 +59,7 @@ def read_scanobjectnn(path: Path, split: str | None = None) -> RaggedClouds:
         if match is None:
             raise InputError(f"{file}: is not called training_objectdataset*.h5 or test_*")
         parts.append(Part(file, _SPLITS[match[1]]))
-    return read_parts(choose(path, parts, split), CLASSES, (3,), y_up_to_z_up)
+    return read_parts(choose(path, parts, split), CLASSES)
 
 
 def _one_variant(folder: Path) -> list[Path]:
@@ -97,20 +95,10 @@ def write_scanobjectnn(path: Path, clouds: RaggedClouds) -> None:
         InputError: where there are no labels, a class is none of the fifteen,
             or a cloud is of neither train nor test.
     """
-    labels = labels_as(clouds, CLASSES)
+    labels = labels_as(clouds, CLASSES).astype(np.int32)
     path.mkdir(parents=True, exist_ok=True)
-    write_parts(path, clouds, labels, _file_name, _arrays, most=None)
-
-
-def _file_name(split: str, index: int) -> str:
-    return f"{'training' if split == 'train' else split}_objectdataset.h5"
-
-
-def _arrays(
-    points: Float32[np.ndarray, "b n 3"], labels: Int[np.ndarray, "b"]
-) -> dict[str, np.ndarray]:
-    data = z_up_to_y_up(points).astype(np.float32)
-    return {"data": data, "label": labels.astype(np.int32)}
+    files = ("training_objectdataset.h5", "test_objectdataset.h5")
+    write_parts(path, clouds, labels, files, most=None)
 
 
 def _detect(path: Path) -> bool:

@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from qs3.errors import InputError
 from qs3.io.clouds import CloudKind
+from qs3.io.guards import utf8
 from qs3.io.layouts.format import Format
 from qs3.io.ragged import RaggedClouds
 from qs3.store.folder import Folder, open_folder
@@ -56,9 +57,7 @@ def read_ragged(
             f"{folder}: unfinished, {len(shards)} of {manifest.shards} shards; run the same "
             "command again"
         )
-    ids: list[str] = []
-    labels: list[int] = []
-    parts: list[str] = []
+    rows: list[tuple[str, int, str]] = []
     clouds: list[np.ndarray] = []
     splits: set[str] = set()
     digest = hashlib.sha256()
@@ -68,23 +67,21 @@ def read_ragged(
         for columns, scanned, checksum in read:
             digest.update(checksum)
             splits.update(columns[2])
-            for identifier, label, part, points in zip(*columns, scanned, strict=True):
-                if split in (None, part):
-                    ids.append(identifier)
-                    labels.append(label)
-                    parts.append(part)
-                    clouds.append(points)
+            chosen = [i for i, part in enumerate(columns[2]) if split in (None, part)]
+            rows += [(columns[0][i], columns[1][i], columns[2][i]) for i in chosen]
+            clouds += [scanned[i] for i in chosen]
     if not clouds:
         named = ", ".join(sorted(filter(None, splits))) or "none"
         missing = "no cloud" if split is None else f"no cloud of split {split!r}; splits: {named}"
         raise InputError(f"{folder}: {missing}")
+    ids, labels, parts = zip(*rows, strict=True)
     return RaggedClouds(
         clouds=clouds,
-        ids=tuple(ids),
+        ids=ids,
         checksum=digest.hexdigest(),
         labels=np.array(labels, dtype=np.int64),
         class_names=manifest.class_names,
-        splits=tuple(parts),
+        splits=parts,
     )
 
 
@@ -124,47 +121,42 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
     Raises:
         InputError: where the clouds have no labels.
     """
-    from qs3.store.shards import put_shard, table_of
+    from qs3.store.shards import cloud_alone, put_shard, table_of
 
     if clouds.labels is None:
         raise InputError("clouds without labels make no qs3 data set; put them into class folders")
     count = len(clouds.clouds)
+    names = tuple(map(utf8, clouds.class_names))
+    splits = clouds.splits or ("",) * count
+    labels = clouds.labels.tolist()
     starts = range(0, count, ROWS_PER_SHARD)
+    folder = open_folder(root)
     root.mkdir(parents=True, exist_ok=True)
     manifest = Manifest(
         settings={"kind": "converted", "from": origin, "checksum": clouds.checksum},
-        class_names=tuple(_utf8(name) for name in clouds.class_names),
+        class_names=names,
         rows=count,
         shards=len(starts),
         versions=package_versions(),
     )
-    write_manifest(root, manifest)
+    write_manifest(folder, manifest)
     sums = {}
     bar = tqdm(total=count, desc="write", unit="cloud", disable=None if count > _MANY else True)
     with bar:
         for index, start in enumerate(starts):
-            rows = [_row(clouds, i) for i in range(start, min(start + ROWS_PER_SHARD, count))]
-            sums[shard_name(index)] = put_shard(open_folder(root), index, table_of(rows))
+            rows = [
+                cloud_alone(
+                    utf8(clouds.ids[i]),
+                    np.asarray(clouds.clouds[i], dtype=np.float32),
+                    labels[i],
+                    names[labels[i]],
+                    splits[i],
+                )
+                for i in range(start, min(start + ROWS_PER_SHARD, count))
+            ]
+            sums[shard_name(index)] = put_shard(folder, index, table_of(rows))
             bar.update(len(rows))
-    write_sums(open_folder(root), sums)
-
-
-def _row(clouds: RaggedClouds, index: int) -> Any:
-    from qs3.store.shards import cloud_alone
-
-    label = int(clouds.labels[index]) if clouds.labels is not None else -1
-    return cloud_alone(
-        _utf8(clouds.ids[index]),
-        np.asarray(clouds.clouds[index], dtype=np.float32),
-        label,
-        _utf8(clouds.class_names[label]),
-        clouds.splits[index] if clouds.splits else "",
-    )
-
-
-def _utf8(text: str) -> str:
-    """The text as it is; bytes of file names that are no UTF-8 as escapes."""
-    return text.encode("utf-8", errors="backslashreplace").decode("utf-8")
+    write_sums(folder, sums)
 
 
 FORMAT = Format(

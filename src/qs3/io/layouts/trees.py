@@ -16,14 +16,20 @@ Source: https://github.com/Gorilla-Lab-SCUT/QS3 (``data/dataloader_sim2real.py``
 """
 
 import dataclasses
-from functools import partial
+import os
 from pathlib import Path
 
 import numpy as np
 
 from qs3.errors import InputError
-from qs3.io.layouts.class_folders import CloudFile, choose_split, list_folder, read_files
-from qs3.io.layouts.format import SPLITS, Format, labels_as
+from qs3.io.layouts.class_folders import (
+    CloudFile,
+    choose_split,
+    entries,
+    list_folder,
+    read_files,
+)
+from qs3.io.layouts.format import POINTS, SPLITS, Format, labels_as, named_folder
 from qs3.io.layouts.point_folders import write_files, write_folder
 from qs3.io.ragged import RaggedClouds
 from qs3.meshes.classes import POINTDA10, map_labels
@@ -34,6 +40,7 @@ GRASPNET = (
 )
 """Classes of GraspNetPC-10 by their digit."""
 
+_GRASPNET_POINTS = 1024
 _CAMERAS = ("kinect", "realsense")
 _QS3_PAGE = "https://github.com/Gorilla-Lab-SCUT/QS3 ({} on Google Drive)"
 _GRASPNET_PAGE = "https://drive.google.com/file/d/1VVHmsSToFMVccge-LsYJW67IS94rNxWR"
@@ -64,12 +71,7 @@ def read_ten_classes(root: Path, split: str | None, ending: str) -> RaggedClouds
     return dataclasses.replace(clouds, labels=positions[clouds.labels], class_names=POINTDA10)
 
 
-def check_points(clouds: RaggedClouds, points: int) -> None:
-    """Refuse clouds of another size than the layout's.
-
-    Raises:
-        InputError: naming the first.
-    """
+def _check_points(clouds: RaggedClouds, points: int) -> None:
     for cloud, name in zip(clouds.clouds, clouds.ids, strict=True):
         if len(cloud) != points:
             raise InputError(
@@ -78,92 +80,78 @@ def check_points(clouds: RaggedClouds, points: int) -> None:
             )
 
 
-def _read_named(folder: str, path: Path, split: str | None) -> RaggedClouds:
-    """Read a tree: the folder itself under any name, or one that holds ``folder``."""
-    root = path / folder if (path / folder).is_dir() else path
-    return read_ten_classes(root, split, ".xyz")
-
-
-def _write_named(folder: str, points: int | None, path: Path, clouds: RaggedClouds) -> None:
-    """Write a tree that the released code reads, into ``folder`` below ``path``."""
-    labels = labels_as(clouds, POINTDA10)
-    if points is not None:
-        check_points(clouds, points)
-    root = path if path.name == folder else path / folder
-    ten = dataclasses.replace(clouds, labels=labels, class_names=POINTDA10)
-    write_folder(root, ten, ".xyz")
-
-
-def _detect_named(folder: str, path: Path) -> bool:
-    return (path.name == folder and path.is_dir()) or (path / folder).is_dir()
-
-
 def _named(name: str, title: str, folder: str, points: int | None = None) -> Format:
-    size = f", {points} points" if points else ""
+    """A tree in a folder of a known name; it may be read by the name of the layout alone."""
+
+    def read(path: Path, split: str | None) -> RaggedClouds:
+        inner = path / folder
+        return read_ten_classes(inner if inner.is_dir() else path, split, ".xyz")
+
+    def write(path: Path, clouds: RaggedClouds) -> None:
+        labels = labels_as(clouds, POINTDA10)
+        if points is not None:
+            _check_points(clouds, points)
+        ten = dataclasses.replace(clouds, labels=labels, class_names=POINTDA10)
+        write_folder(named_folder(path, folder), ten, ".xyz")
+
     return Format(
         name=name,
-        layout=f"{title}: {folder}/<class>/<train|test>/*.xyz{size}",
-        detect=partial(_detect_named, folder),
-        read=partial(_read_named, folder),
-        write=partial(_write_named, folder, points),
+        layout=f"{title}: {folder}/<class>/<train|test>/*.xyz"
+        + (f", {points} points" if points else ""),
+        detect=lambda path: named_folder(path, folder).is_dir(),
+        read=read,
+        write=write,
         page=_QS3_PAGE.format(title),
     )
 
 
-def _read_graspnet(
-    kind: str, cameras: tuple[str, ...], root: Path, split: str | None
-) -> RaggedClouds:
-    if not root.is_dir():
-        raise InputError(f"{root}: no such folder")
-    files = []
-    for part in SPLITS:
-        for camera in cameras:
-            files += _graspnet_files(root / part / kind / camera, part)
-    if not files:
-        where = " or ".join(f"{kind}/{camera}" for camera in cameras)
-        raise InputError(f"{root}: no cloud in <train|test>/{where}/<0-9>/*.xyz")
-    return read_files(root, choose_split(root, files, split), GRASPNET)
-
-
-def _graspnet_files(folder: Path, part: str) -> list[CloudFile]:
-    digits = {str(digit): name for digit, name in enumerate(GRASPNET)}
-    inner = sorted(path for path in folder.glob("[!.]*") if path.is_dir())
-    if other := [path for path in inner if path.name not in digits]:
-        raise InputError(f"{other[0]}: class folders are 0 to {len(GRASPNET) - 1} in this layout")
-    return [
-        CloudFile(path, digits[digit.name], part)
-        for digit in inner
-        for path in sorted(digit.glob("[!.]*"))
-        if path.suffix.lower() == ".xyz"
-    ]
-
-
-def _write_graspnet(kind: str, camera: str, points: int, root: Path, clouds: RaggedClouds) -> None:
-    labels = labels_as(clouds, GRASPNET).tolist()
-    check_points(clouds, points)
-    rows = zip(clouds.splits, labels, strict=True)
-    write_files(root, clouds, [f"{part}/{kind}/{camera}/{label}" for part, label in rows], ".xyz")
-
-
-def _detect_graspnet(kind: str, cameras: tuple[str, ...], path: Path) -> bool:
-    return all(any((path / part / kind / camera).is_dir() for part in SPLITS) for camera in cameras)
-
-
-def _graspnet(kind: str, *cameras: str, points: int = 1024) -> Format:
+def _graspnet(kind: str, *cameras: str) -> Format:
+    """One domain of GraspNetPC-10; of several cameras together it is only read."""
     below = cameras[0] if len(cameras) == 1 else f"<{'|'.join(cameras)}>"
-    alone = cameras if len(cameras) == 1 else ()
+
+    def read(root: Path, split: str | None) -> RaggedClouds:
+        if not root.is_dir():
+            raise InputError(f"{root}: no such folder")
+        files = []
+        for part in SPLITS:
+            for camera in cameras:
+                files += _digits(root / part / kind / camera, part)
+        if not files:
+            raise InputError(f"{root}: no cloud in <train|test>/{kind}/{below}/<0-9>/*.xyz")
+        return read_files(root, choose_split(root, files, split), GRASPNET)
+
+    def write(root: Path, clouds: RaggedClouds) -> None:
+        labels = labels_as(clouds, GRASPNET).tolist()
+        _check_points(clouds, _GRASPNET_POINTS)
+        rows = zip(clouds.splits, labels, strict=True)
+        folders = [f"{part}/{kind}/{cameras[0]}/{label}" for part, label in rows]
+        write_files(root, clouds, folders, ".xyz")
+
     return Format(
-        name="-".join(("graspnetpc10", kind.lower(), *alone)),
-        layout=f"GraspNetPC-10: <train|test>/{kind}/{below}/<0-9>/*.xyz, {points} points",
-        detect=partial(_detect_graspnet, kind, cameras),
-        read=partial(_read_graspnet, kind, cameras),
-        write=partial(_write_graspnet, kind, cameras[0], points) if alone else None,
+        name="-".join(("graspnetpc10", kind.lower(), *(cameras if len(cameras) == 1 else ()))),
+        layout=f"GraspNetPC-10: <train|test>/{kind}/{below}/<0-9>/*.xyz, {_GRASPNET_POINTS} points",
+        detect=lambda path: all(
+            any((path / part / kind / camera).is_dir() for part in SPLITS) for camera in cameras
+        ),
+        read=read,
+        write=write if len(cameras) == 1 else None,
         page=_GRASPNET_PAGE,
     )
 
 
+def _digits(folder: Path, part: str) -> list[CloudFile]:
+    names = {str(digit): name for digit, name in enumerate(GRASPNET)}
+    files = []
+    for digit in entries(folder, os.DirEntry.is_dir):
+        if digit.name not in names:
+            raise InputError(f"{digit}: class folders are 0 to {len(GRASPNET) - 1} in this layout")
+        paths = entries(digit, lambda entry: entry.name.lower().endswith(".xyz"))
+        files += [CloudFile(path, names[digit.name], part) for path in paths]
+    return files
+
+
 FORMATS = (
-    _named("specklenet10", "SpeckleNet10", "raw_pc_multiview_point_at", 2048),
+    _named("specklenet10", "SpeckleNet10", "raw_pc_multiview_point_at", POINTS),
     _named("depthscannet10", "DepthScanNet10", "Scannet_single_obj_1012_new"),
     _graspnet("Synthetic", *_CAMERAS),
     *(_graspnet(kind, camera) for kind in ("Synthetic", "Real") for camera in _CAMERAS),
