@@ -28,7 +28,7 @@ from qs3.store.manifest import (
     write_sums,
 )
 from qs3.store.progress import progress_bar
-from qs3.store.shards import CloudRow, cloud_alone, put_shard, table_of
+from qs3.store.shards import CloudRow, put_shard, table_of
 from qs3.structure import unstructure
 
 
@@ -163,8 +163,7 @@ def run_extract(
         shards=len(units),
         versions=package_versions(),
     )
-    folder.claim(MANIFEST)
-    with folder.locked():
+    with folder.claimed(MANIFEST):
         write_manifest(folder, manifest)
         failures = {record["shard"]: record for record in read_failures(folder)}
         sums = read_sums(folder)
@@ -269,4 +268,5 @@ def _row(cloud: ExtractedCloud, class_names: Sequence[str], num_points: int) -> 
     if len(points) > num_points:
         points = resample(points, num_points)
     drawn = json.dumps(dict(cloud.source), sort_keys=True)
-    return cloud_alone(cloud.id, points, label, class_names[label], cloud.split, drawn)
+    name, split = class_names[label], cloud.split
+    return CloudRow(cloud.id, cloud.id, 0, label, name, split, 0, points, drawn=drawn)

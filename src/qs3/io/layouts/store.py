@@ -150,16 +150,13 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
 
 
 def _row(clouds: RaggedClouds, index: int) -> Any:
-    from qs3.store.shards import cloud_alone
+    from qs3.store.shards import CloudRow
 
     label = int(clouds.labels[index]) if clouds.labels is not None else -1
-    return cloud_alone(
-        _utf8(clouds.ids[index]),
-        np.asarray(clouds.clouds[index], dtype=np.float32),
-        label,
-        _utf8(clouds.class_names[label]),
-        clouds.splits[index] if clouds.splits else "",
-    )
+    name, class_name = _utf8(clouds.ids[index]), _utf8(clouds.class_names[label])
+    points = np.asarray(clouds.clouds[index], dtype=np.float32)
+    split = clouds.splits[index] if clouds.splits else ""
+    return CloudRow(name, name, 0, label, class_name, split, 0, points)
 
 
 def _utf8(text: str) -> str:
