@@ -5,12 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pandas.util import hash_array
 
 from qs3.store.failures import read_failures
 from qs3.store.folder import Folder, open_folder
 from qs3.store.manifest import finished_shards, open_dataset, shard_name
-from qs3.store.shards import STATISTICS, load_shard
+from qs3.store.shards import STATISTICS, digests, load_shard
 
 
 def info(where: str | Path | Folder) -> dict[str, Any]:
@@ -41,7 +40,7 @@ def info(where: str | Path | Folder) -> dict[str, Any]:
         for name, count in collections.Counter(table["class_name"].to_pylist()).items():
             classes[name] = classes.get(name, 0) + count
         splits.update(table["split"].to_pylist())
-        objects.append(np.unique(hash_array(table["object"].to_numpy(), categorize=False)))
+        objects.append(np.unique(digests(map(str.encode, table["object"].to_pylist()))))
         sizes.append(np.diff(table["points"].combine_chunks().offsets.to_numpy()) // 3)
         for name in STATISTICS:
             figures[name].append(table[name].drop_null().to_numpy())

@@ -8,7 +8,7 @@ import hashlib
 import io
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, UInt8, UInt64
 
 from qs3.errors import InputError
 from qs3.store.folder import Folder
@@ -222,3 +222,8 @@ def flat_clouds(table: pa.Table, column: str, path: Any) -> list[Float32[np.ndar
             f"{path}: {column} of {name!r} is empty, not made of triples, or not finite"
         )
     return [values[begin:end].reshape(-1, 3) for begin, end in itertools.pairwise(offsets)]
+
+
+def digests(values: Iterable[bytes]) -> UInt64[np.ndarray, "_"]:
+    """Return 64 bits of the SHA-256 of each value, by which many are compared in little room."""
+    return np.frombuffer(b"".join(hashlib.sha256(v).digest()[:8] for v in values), np.uint64)

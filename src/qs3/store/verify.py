@@ -3,14 +3,13 @@
 import functools
 import hashlib
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 from jaxtyping import UInt64
-from pandas.util import hash_array
 
 from qs3.errors import InputError
 from qs3.files import LOCK
@@ -28,7 +27,7 @@ from qs3.store.manifest import (
 )
 from qs3.store.progress import progress_bar
 from qs3.store.scan_item import scan_seed
-from qs3.store.shards import load_shard, parse_shard
+from qs3.store.shards import digests, load_shard, parse_shard
 
 _PLAIN = ["id", "object", "scan", "label", "class_name", "seed"]
 _CLOUDS = {"points": "view", "clean": "clean_view", "surface": None}
@@ -72,10 +71,11 @@ def verify(where: str | Path, *, progress: bool = True) -> list[str]:
     for index in progress_bar(len(present), "verify" if progress else None, "shard", items=present):
         faults += _shard(folder, index, manifest, sums, seen)
     faults += _repetitions(folder, seen)
-    logged = [record["id"] for record in failures]
-    there = np.isin(_hashes(logged), np.concatenate(seen.ids or [_hashes([])]))
-    lost = [name for name, is_there in zip(logged, there, strict=True) if is_there]
-    faults += [f"{FAILURES}: {name} is logged as failed, and is there" for name in lost]
+    logged = digests(record["id"].encode() for record in failures)
+    for record in itertools.compress(
+        failures, np.isin(logged, np.concatenate([logged[:0], *seen.ids]))
+    ):
+        faults.append(f"{FAILURES}: {record['id']} is logged as failed, and is there")
     complete = len(present) == manifest.shards and manifest.rows is not None
     if complete and seen.rows + len(failures) != manifest.rows:
         faults.append(
@@ -121,14 +121,13 @@ def _shard(
         yield str(error)
         return
     seen.shards.append(index)
-    seen.ids.append(_hashes(table["id"].to_pylist()))
+    seen.ids.append(digests(map(str.encode, table["id"].to_pylist())))
     yield from _rows(name, table, manifest)
     for column, view in _CLOUDS.items():
         yield from _clouds(name, table, column, view, manifest)
     values, offsets = _flat(table["points"])
-    clouds = [values[begin:end].tobytes() for begin, end in itertools.pairwise(offsets)]
-    digests = b"".join(hashlib.sha256(cloud).digest()[:8] for cloud in clouds)
-    seen.clouds.append(np.frombuffer(digests, np.uint64))
+    pairs = itertools.pairwise(offsets)
+    seen.clouds.append(digests(values[begin:end].tobytes() for begin, end in pairs))
 
 
 def _rows(name: str, table: pa.Table, manifest: Manifest) -> Iterator[str]:
@@ -175,10 +174,6 @@ def _flat(column: pa.ChunkedArray) -> tuple[np.ndarray, np.ndarray]:
     return rows.values.to_numpy(zero_copy_only=False), rows.offsets.to_numpy()
 
 
-def _hashes(texts: Sequence[str]) -> UInt64[np.ndarray, "_"]:
-    return hash_array(np.array(texts, dtype=object), categorize=False)
-
-
 def _repetitions(folder: Folder, seen: _Seen) -> Iterator[str]:
     """Tell ids and clouds that come twice, by their names: those shards are read once more."""
     if not seen.shards:
@@ -193,8 +188,8 @@ def _repetitions(folder: Folder, seen: _Seen) -> Iterator[str]:
         position = int(np.searchsorted(starts, row, side="right")) - 1
         return shard_name(seen.shards[position]), names(position)[row - starts[position]]
 
-    for kind, digests in (("id", seen.ids), ("cloud", seen.clouds)):
-        values = np.concatenate(digests)
+    for kind, parts in (("id", seen.ids), ("cloud", seen.clouds)):
+        values = np.concatenate(parts)
         order = np.argsort(values, kind="stable")
         repeated = values[order][1:] == values[order][:-1]
         for first, later in sorted(zip(order[:-1][repeated], order[1:][repeated], strict=True)):

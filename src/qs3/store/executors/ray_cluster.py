@@ -75,6 +75,7 @@ class RayExecutor:
         Raises:
             InputError: where the cluster lost it for good.
         """
+        key: Any = None
         try:
             done, _ = self._ray.wait(list(self._keys), num_returns=1)
             key = self._keys.pop(done[0])
