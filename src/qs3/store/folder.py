@@ -86,10 +86,13 @@ class Folder:
 
     def write(self, name: str, data: bytes) -> None:
         """Write a file, whole or not at all."""
-        if self.path is None:
-            self._ask(lambda system: system.pipe_file(self._at(name), data))
-        else:
+        if self.path is not None:
             write_bytes(self.path / name, data)
+            return
+        try:
+            self._ask(lambda system: system.pipe_file(self._at(name), data))
+        except FileNotFoundError as error:
+            raise StorageError(f"{self.address}: cannot be written to ({error})") from error
 
     def names(self, below: str = "") -> list[str]:
         """Return the files below a sub-folder, with its name before theirs, in order."""
