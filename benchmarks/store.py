@@ -26,8 +26,9 @@ import pyarrow.parquet as pq
 import zarr
 
 from qs3.io.layouts.store import read_ragged
-from qs3.store.manifest import Manifest, shard_path, write_manifest
-from qs3.store.shards import CloudRow, DType, write_shard
+from qs3.store.folder import open_folder
+from qs3.store.manifest import Manifest, shard_name, write_manifest
+from qs3.store.shards import CloudRow, DType, put_shard, table_of
 
 ROWS = 64
 Reader = Callable[[np.ndarray | None], np.ndarray]
@@ -69,14 +70,14 @@ def write_store(folder: Path, clouds: np.ndarray, dtype: DType, whole: bool) -> 
                     other, view if whole else none, other,
                 )
             )  # fmt: skip
-        write_shard(shard_path(folder, shard), rows, dtype)
+        put_shard(open_folder(folder), shard, table_of(rows, dtype))
 
     def read(rows: np.ndarray | None) -> np.ndarray:
         if rows is None:
             return np.stack(read_ragged(folder).clouds)
         found = np.zeros((len(rows), *clouds.shape[1:]), np.float32)
         for shard in np.unique(rows // ROWS):
-            column = pq.read_table(shard_path(folder, int(shard)), columns=["points"])["points"]
+            column = pq.read_table(folder / shard_name(int(shard)), columns=["points"])["points"]
             mine = np.flatnonzero(rows // ROWS == shard)
             for place in mine:
                 values = column[int(rows[place] % ROWS)].values.to_numpy(zero_copy_only=False)

@@ -9,6 +9,10 @@ class InputError(QS3Error, ValueError):
     """A file, folder or setting handed in is not usable; the message names it and the fix."""
 
 
+class StorageError(InputError):
+    """A disk is full, or a store behind an address does not answer: no fault of what is stored."""
+
+
 class UnevenSizesError(InputError):
     """Clouds of several sizes, where one array for all was asked for."""
 

@@ -1,6 +1,7 @@
 """Files written whole or not at all, fresh temporary folders, locks, strict JSON, checksums."""
 
 import contextlib
+import errno
 import glob
 import hashlib
 import json
@@ -14,12 +15,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from qs3.errors import InputError
+from qs3.errors import InputError, StorageError
 
 LOCK = ".lock"
 """Name of the file that tells who writes into a folder; it is there only meanwhile."""
 
 _LEFT_OVER = re.compile(r"\..+\.(\d+|[0-9a-f]{8})\.tmp(\.\w+)?$")
+_SUSPECT = re.compile(r"\\u[dD][89a-fA-F]|[eE]\+?\d{3}")
+"""What halves of surrogate pairs and numbers that end as infinity look like in JSON."""
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LONGEST_STEM = 100  # bytes of a name that go into a temporary one; the longest name may have 143
 
 
@@ -29,6 +33,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
     The bytes are synced to disk before the rename, so that after a power cut the file is either
     the old one or the whole new one. On an exception the temporary file is removed.
+
+    Raises:
+        StorageError: where the disk is full; ``path`` is named.
 
     Example:
         >>> with temporary_folder(Path(tempfile.gettempdir()) / "example") as folder:
@@ -48,6 +55,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
         temporary.replace(path)
         with contextlib.suppress(OSError):  # some file systems sync no folders
             sync_entry(path.parent)
+    except OSError as error:
+        name_fault(error, path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -77,6 +87,16 @@ def temporary_folder(path: Path, alone: bool = False) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+def name_fault(error: OSError, path: Path) -> None:
+    """Put the file's name into an error of writing; a full disk is told with what to do."""
+    if error.errno in _FULL:
+        raise StorageError(
+            f"{path}: cannot be written ({error.strerror}); make room there and run the same "
+            "command again"
+        ) from error
+    error.filename = error.filename or str(path)
+
+
 def _stem(path: Path) -> str:
     """The name of a path, as much of it as leaves room for a mark within the longest name."""
     return os.fsencode(path.name)[:_LONGEST_STEM].decode(errors="ignore")
@@ -95,9 +115,12 @@ def folder_lock(path: Path) -> Iterator[None]:
     file = Path(path) / LOCK
     handle = _open_lock(file)
     try:
-        os.ftruncate(handle, 0)
-        os.lseek(handle, 0, os.SEEK_SET)
-        os.write(handle, f"process {os.getpid()} on {socket.gethostname()}".encode())
+        try:
+            os.ftruncate(handle, 0)
+            os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()}".encode(), 0)
+        except OSError as error:
+            name_fault(error, file)
+            raise
         yield
     finally:
         file.unlink(missing_ok=True)
@@ -200,7 +223,10 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(data: bytes | str, where: str | Path) -> Any:
-    """Read JSON text, strictly: no NaN, no infinity, no whole number of thousands of digits.
+    """Read JSON text, strictly: what comes back can be written again as JSON in UTF-8.
+
+    So no NaN, no infinity (1e999), no half of a surrogate pair, no whole number of thousands of
+    digits; nor is a file read that is nested deeper than Python goes.
 
     Raises:
         InputError: where it is not such JSON; ``where`` heads the message.
@@ -210,8 +236,11 @@ def parse_json(data: bytes | str, where: str | Path) -> Any:
         {'a': [1, 2]}
     """
     try:
-        text = data.decode("utf-8") if isinstance(data, bytes) else data
-        return json.loads(text, parse_constant=_refuse)
+        text = data.decode() if isinstance(data, bytes) else data.encode().decode()
+        value = json.loads(text, parse_constant=_refuse)
+        if _SUSPECT.search(text):
+            json.dumps(value, allow_nan=False, ensure_ascii=False).encode()
+        return value
     except RecursionError:
         raise InputError(f"{where}: not a JSON file (nested too deep)") from None
     except ValueError as error:  # UnicodeDecodeError and JSONDecodeError among them

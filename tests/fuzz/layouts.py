@@ -89,8 +89,9 @@ def layout(name: str) -> Layout:
 
 def build_generated(folder: Path) -> None:
     """A data set as ``generate`` makes it, every kind of cloud filled."""
-    from qs3.store.manifest import Manifest, shard_path, write_manifest
-    from qs3.store.shards import CloudRow, write_shard
+    from qs3.store.folder import open_folder
+    from qs3.store.manifest import Manifest, write_manifest
+    from qs3.store.shards import CloudRow, put_shard, table_of
 
     rng = np.random.default_rng(1)
     rows = []
@@ -107,7 +108,7 @@ def build_generated(folder: Path) -> None:
     folder.mkdir()
     write_manifest(folder, Manifest({"views": 5, "seed": 0}, CLASSES, 6, 2, {"qs3": "0"}))
     for shard in range(2):
-        write_shard(shard_path(folder, shard), rows[3 * shard : 3 * shard + 3])
+        put_shard(open_folder(folder), shard, table_of(rows[3 * shard : 3 * shard + 3]))
 
 
 def load_generated(path: Path) -> Any:

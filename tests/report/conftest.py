@@ -100,8 +100,9 @@ def page_path(report, tmp_path_factory) -> Path:
 def grid(tmp_path_factory) -> Path:
     """A folder with a source-only run, one that it warmed up, their data and their records."""
     from qs3.io import load_clouds, load_unlabelled
+    from qs3.store.folder import open_folder
     from qs3.store.manifest import Manifest, write_manifest
-    from qs3.store.shards import CloudRow, write_shard
+    from qs3.store.shards import CloudRow, put_shard, table_of
     from qs3.training import SelfTrainingSettings, TrainSettings, evaluate, fit
 
     folder = tmp_path_factory.mktemp("grid")
@@ -116,7 +117,7 @@ def grid(tmp_path_factory) -> Path:
                      clean, view, surface)
         )  # fmt: skip
     write_manifest(data, Manifest(class_names=names, rows=12, shards=1, settings={}, versions={}))
-    write_shard(data / "shard-00000.parquet", rows)
+    put_shard(open_folder(data), 0, table_of(rows))
     settings = TrainSettings(model="pointnet", num_points=24, epochs=2, batch_size=6, threads=1)
     source, target = load_clouds(data), load_unlabelled(data)
     fit("source-only", source, None, settings, run_dir=folder / "first")

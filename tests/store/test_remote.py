@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qs3.errors import InputError
+from qs3.errors import InputError, StorageError
 from qs3.io.layouts.store import read_ragged
 from qs3.io.load import load_clouds
-from qs3.store.folder import open_folder
+from qs3.store.folder import _file_system, open_folder
 from qs3.store.generate import GenerateReport
 from qs3.store.info import info
 from qs3.store.merge import merge
@@ -97,6 +97,82 @@ def test_processes_write_to_an_object_store_themselves(fake, tmp_path, bucket):
     merge([f"{bucket}-0", f"{bucket}-1"], tmp_path / "merged", progress=False)
     assert {p.name: p.read_bytes() for p in (tmp_path / "merged").iterdir()} == wanted
     assert verify(bucket, progress=False) == []
+    with pytest.raises(StorageError, match="s3://no-such-bucket/set: cannot be written"):
+        fake.run(items(fake), "s3://no-such-bucket/set")
+
+
+@pytest.fixture
+def failing(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """A store at failing://: how many questions it answers, and then how many it does not."""
+    import fsspec
+    from fsspec.implementations.memory import MemoryFileSystem
+
+    answers = [10**9, 0]
+
+    def asked() -> None:
+        answers[0] -= 1
+        if answers[0] < 0 < answers[1]:
+            answers[1] -= 1
+            raise ConnectionResetError("the other side\nhung up")
+
+    class Failing(MemoryFileSystem):
+        protocol = "failing"
+        store: dict = {}  # noqa: RUF012
+        pseudo_dirs = [""]  # noqa: RUF012
+
+        def cat_file(self, *arguments, **how):
+            asked()
+            return super().cat_file(*arguments, **how)
+
+        def pipe_file(self, *arguments, **how):
+            asked()
+            return super().pipe_file(*arguments, **how)
+
+        def ls(self, *arguments, **how):
+            asked()
+            return super().ls(*arguments, **how)
+
+        def info(self, *arguments, **how):
+            asked()
+            return super().info(*arguments, **how)
+
+    fsspec.register_implementation("failing", Failing, clobber=True)
+    _file_system.cache_clear()
+    monkeypatch.setattr("qs3.store.folder._PAUSES", (0.0, 0.0))
+    return answers
+
+
+def test_a_dead_store_is_no_missing_data_set(fake, failing):
+    fake.run(items(fake), "failing://shelf/set", row=fake.flaky_row)
+    failing[:] = 0, 10**9
+    message = r"^failing://shelf/set: the store does not answer .*ConnectionResetError: the other s"
+    for look in (info, read_ragged, load_clouds, lambda url: verify(url, progress=False)):
+        with pytest.raises(StorageError, match=message) as caught:
+            look("failing://shelf/set")
+        assert "\n" not in str(caught.value)
+    with pytest.raises(StorageError, match=message):
+        fake.run(items(fake), "failing://shelf/set")
+    failing[:] = 0, 2  # it comes back before patience ends
+    assert info("failing://shelf/set")["rows"] == 9
+
+
+@pytest.mark.parametrize("before", [3, 8, 12, 30])
+def test_a_store_that_dies_half_way_loses_nothing_and_blames_nobody(
+    fake, failing, tmp_path, before
+):
+    failing[:] = before, 10**9
+    with pytest.raises(InputError, match="does not answer"):
+        fake.run(items(fake), "failing://shelf/set", row=fake.flaky_row)
+    failing[1] = 0
+    fake.run(items(fake), "failing://shelf/set", row=fake.flaky_row)
+    assert content("failing://shelf/set") == whole(fake, tmp_path / "whole")
+
+
+def test_a_web_server_that_is_not_there_is_told_as_such(monkeypatch):
+    pytest.importorskip("aiohttp")
+    monkeypatch.setattr("qs3.store.folder._PAUSES", ())
+    with pytest.raises(StorageError, match=r"127.0.0.1:9/set: the store does not answer"):
+        info("http://127.0.0.1:9/set")
 
 
 def test_a_store_that_cannot_be_reached_is_told_in_one_line(fake):

@@ -9,13 +9,23 @@ import pytest
 from qs3.errors import InputError
 from qs3.io.layouts.store import read_ragged
 from qs3.io.load import load_clouds
+from qs3.store.folder import open_folder
 from qs3.store.generate import GenerateSettings
 from qs3.store.info import info
-from qs3.store.manifest import MANIFEST, Manifest, open_dataset, shard_path, write_manifest
-from qs3.store.shards import read_shard, write_shard
+from qs3.store.manifest import MANIFEST, Manifest, open_dataset, shard_name, write_manifest
+from qs3.store.shards import CloudRow, load_shard, put_shard, table_of
 from qs3.structure import unstructure
 
 SETTINGS = GenerateSettings(num_points=16)
+
+
+def put(folder: Path, index: int, rows: list[CloudRow]) -> Path:
+    put_shard(open_folder(folder), index, table_of(rows))
+    return folder / shard_name(index)
+
+
+def load(folder: Path, columns: list[str] | None = None):
+    return load_shard(open_folder(folder), 0, columns)
 
 
 def rows(fake, count=6):
@@ -34,9 +44,9 @@ def make(folder: Path, fake, shards=2) -> list:
         versions={"qs3": "0"},
     )
     write_manifest(folder, manifest)
-    write_shard(shard_path(folder, 0), made[:4])
+    put(folder, 0, made[:4])
     if shards > 1:
-        write_shard(shard_path(folder, 1), made[4:])
+        put(folder, 1, made[4:])
     return made
 
 
@@ -50,34 +60,28 @@ def test_what_is_written_comes_back(fake, tmp_path):
 
 
 def test_a_shard_reads_as_plain_parquet(fake, tmp_path):
+    drawn = '{"light.ambient": 0.1, "neighbour": "m1"}'
     made = rows(fake)
-    made[0] = dataclasses.replace(made[0], gross_share=float("nan"), split="")
-    write_shard(tmp_path / "a.parquet", made)
-    table = pq.read_table(tmp_path / "a.parquet")
-    first = table.slice(0, 1).to_pylist()[0]
+    made[0] = dataclasses.replace(made[0], gross_share=float("nan"), split="", drawn=drawn)
+    first = pq.read_table(put(tmp_path, 0, made)).slice(0, 1).to_pylist()[0]
     np.testing.assert_array_equal(np.reshape(first["points"], (-1, 3)), made[0].points)
     np.testing.assert_array_equal(first["view"], made[0].view)
     assert first["valid_fraction"] == 0.9
     assert first["gross_share"] is None
-    assert first["seed"] == made[0].seed
-    assert first["yaw"] == made[0].yaw
+    assert (first["seed"], first["yaw"], first["drawn"]) == (made[0].seed, made[0].yaw, drawn)
 
 
 def test_equal_rows_give_equal_bytes_and_a_bit_shows(fake, tmp_path):
     made = rows(fake)
-    for name in "ab":
-        write_shard(tmp_path / name, made)
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    one, same = (put(tmp_path, index, made).read_bytes() for index in range(2))
+    assert one == same
     points = made[0].points.copy()
     points[0, 0] = np.nextafter(points[0, 0], np.float32(2))
-    write_shard(tmp_path / "b", [dataclasses.replace(made[0], points=points), *made[1:]])
-    assert (tmp_path / "a").read_bytes() != (tmp_path / "b").read_bytes()
-    assert str(tmp_path).encode() not in (tmp_path / "a").read_bytes()
-
-
-def test_an_empty_shard_is_a_shard(tmp_path):
-    write_shard(tmp_path / "a", [])
-    assert read_shard(tmp_path / "a").num_rows == 0
+    changed = [dataclasses.replace(made[0], points=points), *made[1:]]
+    assert put(tmp_path, 1, changed).read_bytes() != one
+    assert str(tmp_path).encode() not in one
+    put(tmp_path, 0, [])
+    assert load(tmp_path).num_rows == 0
 
 
 def test_split_and_size_are_chosen(fake, tmp_path):
@@ -91,7 +95,7 @@ def test_split_and_size_are_chosen(fake, tmp_path):
 
 def test_an_unfinished_data_set_is_not_taken_for_a_whole_one(fake, tmp_path):
     make(tmp_path, fake)
-    shard_path(tmp_path, 1).unlink()
+    (tmp_path / shard_name(1)).unlink()
     with pytest.raises(InputError, match="unfinished, 1 of 2 shards"):
         read_ragged(tmp_path)
     assert len(read_ragged(tmp_path, partial=True).ids) == 4
@@ -103,16 +107,16 @@ def test_the_checksum_follows_the_bytes(fake, tmp_path):
     assert load_clouds(tmp_path, num_points=8).checksum == before  # of what was read, not made
     assert read_ragged(tmp_path, "clean").checksum != before
     other = dataclasses.replace(made[5], label=1 - made[5].label % 2)
-    write_shard(shard_path(tmp_path, 1), [made[4], other])
+    put(tmp_path, 1, [made[4], other])
     assert read_ragged(tmp_path).checksum != before
-    write_shard(shard_path(tmp_path, 1), made[4:][::-1])
+    put(tmp_path, 1, made[4:][::-1])
     assert read_ragged(tmp_path).checksum != before
 
 
 @pytest.mark.parametrize("damage", ["cut", "text", "empty", "bits"])
 def test_a_damaged_shard_is_named(fake, tmp_path, damage):
     make(tmp_path, fake)
-    path = shard_path(tmp_path, 1)
+    path = tmp_path / shard_name(1)
     content = path.read_bytes()
     begin = content.find(b"\x28\xb5\x2f\xfd")  # the first compressed page
     path.write_bytes(
@@ -130,8 +134,8 @@ def test_a_damaged_shard_is_named(fake, tmp_path, damage):
 
 def test_a_foreign_parquet_file_is_refused(fake, tmp_path):
     make(tmp_path, fake)
-    table = read_shard(shard_path(tmp_path, 0)).drop_columns(["clean"])
-    pq.write_table(table, shard_path(tmp_path, 0))
+    table = load(tmp_path).drop_columns(["clean"])
+    pq.write_table(table, tmp_path / shard_name(0))
     with pytest.raises(InputError, match="other columns"):
         read_ragged(tmp_path)
 
@@ -139,7 +143,7 @@ def test_a_foreign_parquet_file_is_refused(fake, tmp_path):
 def test_points_that_are_not_finite_are_refused(fake, tmp_path):
     made = make(tmp_path, fake)
     bad = dataclasses.replace(made[0], points=np.full((16, 3), np.nan, dtype=np.float32))
-    write_shard(shard_path(tmp_path, 0), [bad])
+    put(tmp_path, 0, [bad])
     with pytest.raises(InputError, match="points of 'm0#0'"):
         read_ragged(tmp_path)
     assert len(read_ragged(tmp_path, "clean").ids) == 3
@@ -204,22 +208,15 @@ def test_info_counts(fake, tmp_path):
 
 def test_a_data_set_of_schema_1_still_reads(fake, tmp_path):
     made = make(tmp_path, fake, shards=1)[:4]
-    old = pq.read_table(shard_path(tmp_path, 0)).drop_columns(["drawn"])
-    pq.write_table(old, shard_path(tmp_path, 0))
+    old = pq.read_table(tmp_path / shard_name(0)).drop_columns(["drawn"])
+    pq.write_table(old, tmp_path / shard_name(0))
     manifest = tmp_path / MANIFEST
     manifest.write_text(manifest.read_text().replace('"schema": 3', '"schema": 1'))
     assert open_dataset(tmp_path).schema == 1
     np.testing.assert_array_equal(read_ragged(tmp_path).clouds, [row.points for row in made])
-    assert read_shard(shard_path(tmp_path, 0), ["drawn", "id"])["drawn"].to_pylist() == ["{}"] * 4
-    assert read_shard(shard_path(tmp_path, 0)).column_names[-1] == "drawn"
+    assert load(tmp_path, ["drawn", "id"])["drawn"].to_pylist() == ["{}"] * 4
+    assert load(tmp_path).column_names[-1] == "drawn"
     assert info(tmp_path)["rows"] == 4
-
-
-def test_what_was_drawn_is_kept(fake, tmp_path):
-    drawn = '{"light.ambient": 0.1, "neighbour": "m1"}'
-    row = dataclasses.replace(rows(fake)[0], drawn=drawn)
-    write_shard(tmp_path / "a.parquet", [row])
-    assert read_shard(tmp_path / "a.parquet", ["drawn"])["drawn"].to_pylist() == [drawn]
 
 
 def test_a_data_set_begun_before_a_setting_existed_goes_on(fake, tmp_path):
@@ -229,11 +226,10 @@ def test_a_data_set_begun_before_a_setting_existed_goes_on(fake, tmp_path):
     value = json.loads(path.read_text())
     del value["settings"]["scans_per_mesh"], value["settings"]["sensor"]["exposure"]["gain"]
     path.write_text(json.dumps(value))
-    shard_path(tmp_path / "old", 0).unlink()
+    (tmp_path / "old" / shard_name(0)).unlink()
     fake.run(fake.work(4), tmp_path / "old")
-    assert shard_path(tmp_path / "old", 0).read_bytes() == (
-        shard_path(tmp_path / "whole", 0).read_bytes()
-    )
+    old, whole = (tmp_path / name / shard_name(0) for name in ("old", "whole"))
+    assert old.read_bytes() == whole.read_bytes()
     with pytest.raises(InputError, match="made with scans_per_mesh = 1, not 2"):
         fake.run(
             fake.work(4), tmp_path / "old", dataclasses.replace(fake.SETTINGS, scans_per_mesh=2)

@@ -13,8 +13,9 @@ from qs3.report.figure import PALETTE
 from qs3.sensor.presets import SENSORS
 from qs3.sensor.render.mitsuba import MitsubaRenderer
 from qs3.sensor.settings import ScanSettings
+from qs3.store.folder import open_folder
 from qs3.store.manifest import Manifest, write_manifest
-from qs3.store.shards import CloudRow, write_shard
+from qs3.store.shards import CloudRow, put_shard, table_of
 from qs3.viewer.colouring import by_error, by_height, by_view, round_limit
 from qs3.viewer.display import compose, frame_of, modes
 from qs3.viewer.distance import cloud_distance, mesh_distance, spacing
@@ -300,8 +301,8 @@ class TestStore:
             folder,
             Manifest(class_names=("bed", "chair"), rows=3, shards=2, settings={}, versions={}),
         )
-        write_shard(folder / "shard-00000.parquet", rows[:2])
-        write_shard(folder / "shard-00001.parquet", rows[2:])
+        for shard, part in enumerate((rows[:2], rows[2:])):
+            put_shard(open_folder(folder), shard, table_of(part))
         return folder
 
     def test_objects_come_with_all_their_clouds(self, folder):

@@ -11,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from qs3.errors import InputError
-from qs3.files import holds_something, sync_entry, temporary_folder
+from qs3.files import holds_something, name_fault, sync_entry, temporary_folder
 from qs3.io.clouds import CloudKind
 from qs3.io.layouts import FORMATS
 from qs3.io.layouts.store import write_store
@@ -83,7 +83,7 @@ def convert(
         except InputError as error:
             raise InputError(f"{to}: {error}") from error
         except OSError as error:
-            error.filename = error.filename or str(target)  # a full disk names no file
+            name_fault(error, target)
             raise
     sync_entry(target.parent)
     return clouds

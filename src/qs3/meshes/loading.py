@@ -1,5 +1,6 @@
 """Meshes read from files, checked before anything is done with them."""
 
+import logging
 import re
 import warnings
 from itertools import pairwise
@@ -13,11 +14,15 @@ from trimesh.resolvers import Resolver
 
 from qs3.errors import InputError
 from qs3.geometry import y_up_to_z_up
+from qs3.meshes.announced import check_gltf, memory_limit
 
 EXTENSIONS: tuple[str, ...] = (".off", ".obj", ".ply", ".stl", ".glb", ".gltf")
 """Endings of the files that ``load_mesh`` reads."""
 
 _Y_UP = (".glb", ".gltf")
+
+# Its warnings are about textures and the like, which are left out; who wants them adds a handler.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
 class _OwnFolder(Resolver):
@@ -64,7 +69,8 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> trimesh.Trimes
 
     Raises:
         InputError: where the file is missing, is no mesh, is cut short or damaged, has no faces
-            (a point file), has NaN or infinite vertices, or has no extent.
+            (a point file), has NaN or infinite vertices, has no extent, or takes far more memory
+            than a mesh of its size does.
     """
     path = Path(path)
     if up not in (None, "z", "y"):
@@ -78,8 +84,9 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> trimesh.Trimes
         raise InputError(f"{path}: not a mesh format; use one of {', '.join(EXTENSIONS)}")
     if path.stat().st_size == 0:
         raise InputError(f"{path}: the file is empty")
-    vertices, faces = _read_off(path) if ending == ".off" else _read_with_trimesh(path, ending)
-    vertices, faces = _checked(path, vertices, faces)
+    with memory_limit(path):
+        vertices, faces = _read_off(path) if ending == ".off" else _read_with_trimesh(path, ending)
+        vertices, faces = _checked(path, vertices, faces)
     if up == "y" or (up is None and ending in _Y_UP):
         vertices = y_up_to_z_up(vertices)
     return trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
@@ -158,6 +165,8 @@ def _read_with_trimesh(
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]:
     """Read any other format and merge what it holds, parts placed by the scene's transforms."""
     options: dict[str, Any] = {"process": False, "skip_materials": True}
+    if ending in _Y_UP:
+        check_gltf(path)
     if ending == ".obj":
         options |= {"maintain_order": True, "split_object": False, "group_material": False}
     try:
@@ -174,6 +183,8 @@ def _read_with_trimesh(
             vertices.append(points.reshape(-1, 3))
             faces.append(corners.reshape(-1, 3) + count)
             count += len(points)
+    except MemoryError:
+        raise
     except Exception as error:
         # A parser may fail in any way on a damaged file; the user needs the file's name.
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__

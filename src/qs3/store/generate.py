@@ -6,7 +6,6 @@ when all its scans are there. An object that fails is logged and absent.
 """
 
 import functools
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,15 +17,14 @@ from qs3.store.failures import read_failures, write_failures
 from qs3.store.folder import PARTS, Folder, open_folder
 from qs3.store.manifest import (
     MANIFEST,
+    Sums,
     changed_meshes,
     finished_shards,
     mesh_sums,
     read_mesh_sums,
-    read_sums,
     shard_name,
     write_manifest,
     write_mesh_sums,
-    write_sums,
 )
 from qs3.store.parts import (
     Place,
@@ -47,7 +45,6 @@ from qs3.store.shards import CloudRow, load_shard
 
 _KILLED = ("ProcessDied", "Timeout")
 _TOO_MANY = 50
-_SUMS_EVERY = 5.0  # seconds; the whole file is written anew each time
 
 
 @dataclass(frozen=True)
@@ -109,20 +106,13 @@ def generate(
     plan = make_plan(items, settings)
     manifest = plan.manifest()
     folder = open_folder(out)
-    folder.claim(MANIFEST)
-    try:
-        with folder.locked():
-            write_manifest(folder, manifest)
-            run = _Run(plan, folder, scan_one)
-            mine = range(index, plan.shards, count)
-            run.check_meshes(mine)
-            run.list_work(mine, retry_failed)
-            return run.work(executor, f"{folder.name}: scans" if progress else None)
-    except OSError as error:
-        raise InputError(
-            f"{folder}: cannot be written to ({error.strerror or error}); mend that and run "
-            "the same command again, nothing is lost"
-        ) from error
+    with folder.claimed(MANIFEST):
+        write_manifest(folder, manifest)
+        run = _Run(plan, folder, scan_one)
+        mine = range(index, plan.shards, count)
+        run.check_meshes(mine)
+        run.list_work(mine, retry_failed)
+        return run.work(executor, f"{folder.name}: scans" if progress else None)
 
 
 class _Run:
@@ -135,9 +125,7 @@ class _Run:
         """Rows that lie beside the shards, and the files' names."""
         self.settled = set(finished_shards(folder, plan.shards))
         """Shards that are put together, or all but."""
-        self.sums = read_sums(folder)
-        """Checksums of the shards."""
-        self.sums_written, self.sums_time = dict(self.sums), time.monotonic()
+        self.sums = Sums(folder)
         self.failures = {Place(r["shard"], r["row"]): r for r in read_failures(folder)}
         """What failed, now or before."""
         self.log_is_behind = bool(self.parts)
@@ -147,13 +135,13 @@ class _Run:
                 self.failures[place] = plan.failure_record(place, read_failure(folder, name))
             else:
                 self.failures.pop(place, None)
-        self.todo: list[Place] = []
-        """Rows to scan; the next is the last."""
-        self.awaited: dict[int, set[Place]] = {}
-        """Rows that each unfinished shard waits for."""
+        self.todo: list[tuple[int, list[int]]] = []
+        """Rows to scan by shard; the next of both is the last."""
+        self.awaited: dict[int, int] = {}
+        """How many rows each shard waits for that is not complete."""
         self.complete: list[int] = []
         """Shards that wait for nothing more."""
-        self.total = self.done = self.failed = 0
+        self.total = self.left = self.done = self.failed = 0
         self.failed_in_a_row: set[str] = set()
         """Objects that failed since the last that did not."""
 
@@ -165,7 +153,7 @@ class _Run:
         if changed:
             scanned = {place for shard in self.settled for place in self.plan.places(shard)}
             for place in sorted((scanned | set(self.parts)) - set(self.failures)):
-                name = self.plan.work(place)[0].id
+                name = self.plan.object_of(place)
                 if name in changed:
                     raise InputError(
                         f"{name}: the mesh has changed since it was scanned into {self.folder}; "
@@ -176,7 +164,8 @@ class _Run:
 
     def list_work(self, mine: Sequence[int], retry_failed: bool) -> None:
         """List the rows to scan and the shards to put together."""
-        for shard in mine:
+        with_parts = {place.shard for place in self.parts}
+        for shard in reversed(mine):
             places = list(self.plan.places(shard))
             self.total += len(places)
             if shard not in self.settled:
@@ -184,17 +173,17 @@ class _Run:
                 lost = [p for p in places if p not in self.parts or p in again]
             else:
                 # Parts beside a finished shard: an earlier call was stopped before it tidied up.
-                unsettled = shard_name(shard) not in self.sums or any(
-                    place.shard == shard for place in self.parts
-                )
+                unsettled = shard_name(shard) not in self.sums or shard in with_parts
                 absent = self._absent_rows(shard, places) if retry_failed or unsettled else []
                 lost = absent if retry_failed else []
                 if not lost and not unsettled:
                     continue
-            self.todo += lost
-            self.awaited[shard] = set(lost)
-        self.todo.reverse()
-        self.complete = [shard for shard, lost in self.awaited.items() if not lost][::-1]
+            if not lost:
+                self.complete.append(shard)
+                continue
+            self.left += len(lost)
+            self.awaited[shard] = len(lost)
+            self.todo.append((shard, [place.row for place in reversed(lost)]))
 
     def _absent_rows(self, shard: int, places: Sequence[Place]) -> list[Place]:
         """Rows that a finished shard lacks; failures of rows that it has are forgotten."""
@@ -207,7 +196,7 @@ class _Run:
 
     def work(self, executor: Executor, text: str | None) -> GenerateReport:
         """Do what is to do; ``text`` stands before the bar."""
-        skipped = self.total - len(self.todo)
+        skipped = self.total - self.left
         bar = progress_bar(self.total, text, "scan", skipped)
         with bar, executor:
             try:
@@ -223,7 +212,7 @@ class _Run:
                 executor.drain()
                 raise
             finally:
-                self._write_sums()
+                self.sums.write()
         if not written_parts(self.folder):
             self.folder.remove(PARTS)
         return GenerateReport(done=self.done, skipped=skipped, failed=self.failed)
@@ -236,13 +225,16 @@ class _Run:
             return shard, finish_shard, *self._finish_arguments(shard)
         if not self.todo:
             return None
-        place = self.todo.pop()
+        shard, rows = self.todo[-1]
+        place = Place(shard, rows.pop())
+        if not rows:
+            self.todo.pop()
         arguments = self.plan.arguments(*self.plan.position(place))
         call = functools.partial(self.scan_one, *arguments)
         return place, scan_to_part, self.folder, place, self.plan.settings.dtype, call
 
     def _scanned(self, place: Place, outcome: Failure | None) -> None:
-        self.awaited[place.shard].discard(place)
+        self.awaited[place.shard] -= 1
         if not self.awaited[place.shard]:
             self.complete.append(place.shard)
         if outcome is not None and outcome.kind in _KILLED:
@@ -258,7 +250,7 @@ class _Run:
         self.failures[place] = self.plan.failure_record(place, outcome)
         if outcome.kind in _KILLED:  # it could not write this itself
             write_failure(self.folder, place, outcome)
-        self.failed_in_a_row.add(self.plan.work(place)[0].id)
+        self.failed_in_a_row.add(self.plan.object_of(place))
         if len(self.failed_in_a_row) >= _TOO_MANY:
             raise InputError(
                 f"{_TOO_MANY} objects in a row failed, the last with: {outcome.reason}; if the "
@@ -287,19 +279,13 @@ class _Run:
             outcome = finish_shard(*self._finish_arguments(shard))
         name = shard_name(shard)
         if isinstance(outcome, Failure):
-            raise InputError(f"{self.folder}/{name}: {outcome.reason}")
+            where = str(self.folder)
+            reason = outcome.reason
+            raise InputError(reason if where in reason else f"{where}/{name}: {reason}")
         if not self.folder.exists(name):
             raise InputError(
                 f"{self.folder}/{name}: was written, but is not there; do all processes see one "
                 "and the same folder? Mend that and run the same command again"
             )
-        self.sums[name] = outcome
-        if time.monotonic() - self.sums_time > _SUMS_EVERY:
-            self._write_sums()
+        self.sums.note(name, outcome)
         self.folder.remove(part_folder(shard))
-
-    def _write_sums(self) -> None:
-        """Note the checksums; a shard without one is simply put together again."""
-        if self.sums != self.sums_written:
-            write_sums(self.folder, self.sums)
-        self.sums_written, self.sums_time = dict(self.sums), time.monotonic()

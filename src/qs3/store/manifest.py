@@ -1,10 +1,10 @@
 """What lies beside the shards: ``dataset.json``, ``SHA256SUMS`` and ``meshes.json``."""
 
 import concurrent.futures
-import dataclasses
 import hashlib
 import json
 import platform
+import time
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -24,8 +24,7 @@ SCHEMA_VERSION = 3
 _READABLE = (1, 2, 3)  # 2 has the column `drawn`; 3 checksums, half precision, unknown row counts
 _LARGEST = 10**9  # rows and shards; what is planned is counted through
 
-_FORMER_SENSORS = {"qs3": "paper"}
-
+_SUMS_EVERY = 5.0  # seconds; the whole file is written anew each time
 _PACKAGES = (
     "qs3",
     "mitsuba",
@@ -59,6 +58,10 @@ class Manifest:
         for name, count in (("rows", self.rows or 0), ("shards", self.shards)):
             if not 0 <= count < _LARGEST:
                 raise InputError(f"{name} must be from 0 to {_LARGEST}, not {count}")
+        for name in ("seed", "views"):  # those that are counted with
+            value = self.settings.get(name, 0)
+            if type(value) is not int or not 0 <= value < 2**63:
+                raise InputError(f"settings.{name} must be a whole number from 0, not {value!r}")
 
 
 def package_versions() -> dict[str, str]:
@@ -98,14 +101,11 @@ def check_same(where: str, present: Manifest, wanted: Manifest) -> None:
     Raises:
         InputError: naming ``where`` and the first setting that differs.
     """
-    from qs3.sensor.presets import sensor_name
     from qs3.store.scan_item import GenerateSettings
 
     old, new = unstructure(present), unstructure(wanted)
     defaults = unstructure(GenerateSettings().as_dict())
     old["settings"] = fill(old["settings"], new["settings"], defaults)
-    if isinstance(sensor := old["settings"].get("sensor"), dict) and "name" in sensor:
-        sensor["name"] = sensor_name(sensor["name"])  # a data set that version 0.1 began
     for key in ("schema", "settings", "class_names", "rows", "shards"):
         difference = first_difference(old[key], new[key], key)
         if difference is not None:
@@ -139,16 +139,11 @@ def open_dataset(where: str | Path | Folder) -> Manifest:
         raise InputError(
             f"{path}: schema {schema}, this version reads up to {SCHEMA_VERSION}; make it again"
         )
-    return _renamed(structure(value, Manifest, path))
-
-
-def _renamed(manifest: Manifest) -> Manifest:
-    """Call what earlier versions recorded by its name of today."""
+    manifest = structure(value, Manifest, path)
     sensor = manifest.settings.get("sensor")
-    if not isinstance(sensor, Mapping) or sensor.get("name") not in _FORMER_SENSORS:
-        return manifest
-    sensor = {**sensor, "name": _FORMER_SENSORS[sensor["name"]]}
-    return dataclasses.replace(manifest, settings={**manifest.settings, "sensor": sensor})
+    if isinstance(sensor, dict) and sensor.get("name") == "qs3":
+        sensor["name"] = "paper"  # as version 0.1 called it
+    return manifest
 
 
 def shard_name(index: int) -> str:
@@ -159,11 +154,6 @@ def shard_name(index: int) -> str:
         'shard-00003.parquet'
     """
     return f"shard-{index:05d}.parquet"
-
-
-def shard_path(folder: Path, index: int) -> Path:
-    """Return the path of shard ``index`` of a data set on a disk."""
-    return Path(folder) / shard_name(index)
 
 
 def finished_shards(folder: Folder, count: int) -> list[int]:
@@ -193,6 +183,31 @@ def read_sums(folder: Folder) -> dict[str, str]:
             raise InputError(f"{folder}/{SUMS}: damaged line {line[:80]!r}; delete the file")
         sums[name] = digest
     return sums
+
+
+class Sums(dict[str, str]):
+    """Checksums of a data set's shards, as read and as they come.
+
+    ``SHA256SUMS`` is written anew every few seconds: a shard that it lacks is simply put together
+    or copied again, and a whole file for every shard would cost more than the shards.
+    """
+
+    def __init__(self, folder: Folder) -> None:
+        """Read what is there."""
+        super().__init__(read_sums(folder))
+        self._folder, self._written, self._time = folder, dict(self), time.monotonic()
+
+    def note(self, name: str, digest: str) -> None:
+        """Take in the checksum of a shard."""
+        self[name] = digest
+        if time.monotonic() - self._time > _SUMS_EVERY:
+            self.write()
+
+    def write(self) -> None:
+        """Write what has come since."""
+        if self != self._written:
+            write_sums(self._folder, self)
+        self._written, self._time = dict(self), time.monotonic()
 
 
 def mesh_sums(items: Iterable[Any]) -> dict[str, str]:

@@ -1,6 +1,7 @@
 """Parts of one data set, made on several machines, put into one folder."""
 
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -11,6 +12,7 @@ from qs3.store.failures import read_failures, write_failures
 from qs3.store.folder import Folder, open_folder
 from qs3.store.manifest import (
     MANIFEST,
+    Sums,
     changed_meshes,
     check_same,
     finished_shards,
@@ -20,7 +22,6 @@ from qs3.store.manifest import (
     shard_name,
     write_manifest,
     write_mesh_sums,
-    write_sums,
 )
 from qs3.store.progress import progress_bar
 
@@ -61,13 +62,13 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True
     sums = [read_sums(folder) for folder in folders]
     holders = _holders(folders, manifest.shards)
     target = open_folder(out)
-    target.claim(MANIFEST)
     copied = 0
-    with target.locked():
+    with target.claimed(MANIFEST), contextlib.ExitStack() as at_the_end:
         write_manifest(target, manifest)
-        done = read_sums(target)
+        done = Sums(target)
+        at_the_end.callback(done.write)
         present = set(finished_shards(target, manifest.shards))
-        _check_unchanged(target, [shard_name(index) for index in present], done, sums)
+        _check_unchanged(target, present, done, sums)
         write_mesh_sums(target, meshes)
         failures: dict[str, dict[str, Any]] = {}
         for folder in folders:
@@ -91,8 +92,7 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True
                     "it and run that part again"
                 )
             target.write(name, content)
-            done[name] = digest
-            write_sums(target, done)
+            done.note(name, digest)
             copied += 1
     return MergeReport(copied, manifest.shards - copied, len(failures))
 
@@ -129,12 +129,12 @@ def _holders(folders: Sequence[Folder], shards: int) -> dict[int, list[int]]:
 
 def _check_unchanged(
     target: Folder,
-    present: Sequence[str],
+    present: Collection[int],
     done: Mapping[str, str],
     sums: Sequence[Mapping[str, str]],
 ) -> None:
     """Refuse to write over shards that an earlier merge brought and somebody then changed."""
-    for name in present:
+    for name in map(shard_name, sorted(present)):
         given = {part[name] for part in sums if name in part}
         if name in done and given and done[name] not in given:
             raise InputError(

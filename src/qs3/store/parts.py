@@ -9,31 +9,22 @@ the same bytes.
 import json
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 
 from qs3.errors import InputError
+from qs3.files import parse_json
 from qs3.store.executors import Failure, guarded
 from qs3.store.executors.executor import failure_of
 from qs3.store.folder import PARTS, Folder
 from qs3.store.manifest import shard_name
-from qs3.store.shards import (
-    DType,
-    empty_table,
-    load_shard,
-    parse_shard,
-    put_shard,
-    shard_bytes,
-    table_of,
-)
+from qs3.store.shards import DType, load_shard, parse_shard, put_shard, shard_bytes, table_of
 
 _PART = re.compile(rf"{re.escape(PARTS)}/(\d+)/(\d+)\.(parquet|json)")
 
 
-@dataclass(frozen=True, order=True)
-class Place:
+class Place(NamedTuple):
     """Where a row belongs."""
 
     shard: int
@@ -73,16 +64,19 @@ def scan_to_part(
     """
     row = guarded(scan)
     try:
-        if isinstance(row, Failure):
-            if not row.fatal:
-                write_failure(folder, place, row)
-            return row
-        folder.write(f"{place.stem}.parquet", shard_bytes(table_of([row], dtype)))
+        if not isinstance(row, Failure):
+            folder.write(f"{place.stem}.parquet", shard_bytes(table_of([row], dtype)))
+            return None
+        if not row.fatal:
+            write_failure(folder, place, row)
+        return row
     except Exception as error:
         failure = failure_of(error)
-        reason = f"{folder}: cannot be written to ({failure.reason}); mend that and run the same "
-        return Failure(failure.kind, reason + "command again, nothing is lost", fatal=True)
-    return None
+        reason = failure.reason
+        if not isinstance(error, InputError):  # which names the file and what to do
+            reason = f"{folder}: cannot be written to ({reason}); mend that and run the same "
+            reason += "command again, nothing is lost"
+        return Failure(failure.kind, reason, fatal=True)
 
 
 def write_failure(folder: Folder, place: Place, failure: Failure) -> None:
@@ -92,9 +86,16 @@ def write_failure(folder: Folder, place: Place, failure: Failure) -> None:
 
 
 def read_failure(folder: Folder, name: str) -> Failure:
-    """Read why a row is missing."""
-    record = json.loads(folder.read(name).decode("utf-8"))
-    return Failure(record["error"], record["reason"])
+    """Read why a row is missing.
+
+    Raises:
+        InputError: where the part is damaged.
+    """
+    record = parse_json(folder.read(name), f"{folder}/{name}")
+    try:
+        return Failure(str(record["error"]), str(record["reason"]))
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{folder}/{name}: damaged; delete it and run the same again") from error
 
 
 def finish_shard(
@@ -111,7 +112,7 @@ def finish_shard(
         InputError: where a part or the shard that is there is damaged, or a row is neither there
             nor among the failed.
     """
-    tables = [empty_table(dtype)]
+    tables = [table_of([], dtype)]
     name = shard_name(shard)
     if folder.exists(name):
         tables.append(load_shard(folder, shard))

@@ -39,15 +39,14 @@ class Plan:
         """Shards in all."""
         return -(-self.rows // self.settings.rows_per_shard)
 
+    def size(self, shard: int) -> int:
+        """Rows of a shard."""
+        size = self.settings.rows_per_shard
+        return min(size, self.rows - shard * size)
+
     def places(self, shard: int) -> Iterator[Place]:
         """Places of a shard's rows, in order."""
-        size = self.settings.rows_per_shard
-        return (Place(shard, row) for row in range(min(size, self.rows - shard * size)))
-
-    def work(self, place: Place) -> tuple[Item, int]:
-        """Return the object of a row and the index of its scan."""
-        position, scan = self.position(place)
-        return self.items[position], scan
+        return (Place(shard, row) for row in range(self.size(shard)))
 
     def position(self, place: Place) -> tuple[int, int]:
         """Return the index of a row's object in the list and that of its scan."""
@@ -62,18 +61,26 @@ class Plan:
         beside = neighbour_of(item, scan, self.items, settings.seed, position)
         return item, scan, settings, beside
 
-    def items_of(self, shards: Sequence[int]) -> list[Item]:
-        """Objects that have a row in one of the shards, in order."""
-        wanted = {self.position(place)[0] for shard in shards for place in self.places(shard)}
-        return [self.items[position] for position in sorted(wanted)]
+    def items_of(self, shards: Sequence[int]) -> Iterator[Item]:
+        """Objects that have a row in one of the shards, in order; some come twice."""
+        for shard in shards:
+            first, _ = self.position(Place(shard, 0))
+            last, _ = self.position(Place(shard, self.size(shard) - 1))
+            yield from self.items[first : last + 1]
+
+    def object_of(self, place: Place) -> str:
+        """Name of the object of a row."""
+        return self.items[self.position(place)[0]].id
 
     def row_id(self, place: Place) -> str:
         """Name of a row."""
-        return row_id(*self.work(place))
+        position, scan = self.position(place)
+        return row_id(self.items[position], scan)
 
     def failure_record(self, place: Place, failure: Failure) -> dict[str, Any]:
         """What the log of failures says of a row."""
-        item, scan = self.work(place)
+        position, scan = self.position(place)
+        item = self.items[position]
         return {
             "id": row_id(item, scan),
             "object": item.id,
@@ -104,9 +111,11 @@ def make_plan(items: Sequence[Item], settings: GenerateSettings) -> Plan:
     """
     if not items:
         raise InputError(f"{settings.meshes}: no mesh to scan")
-    for name, times in collections.Counter(item.id for item in items).items():
-        if times > 1:
-            raise InputError(f"{settings.meshes}: two meshes are called {name!r}; rename one")
+    ids: set[str] = set()
+    for item in items:
+        if item.id in ids:
+            raise InputError(f"{settings.meshes}: two meshes are called {item.id!r}; rename one")
+        ids.add(item.id)
     if settings.make_scene().needs_neighbour and len(items) < 2:
         raise InputError(
             f"{items[0].id}: a scene with a neighbour needs a second mesh to draw from"
@@ -185,7 +194,7 @@ def estimate(
         raise InputError(
             f"none of {len(chosen)} scans tried succeeded: {failure and failure.reason}"
         )
-    rows = sum(len(list(plan.places(shard))) for shard in range(part[0], plan.shards, part[1]))
+    rows = sum(plan.size(shard) for shard in range(part[0], plan.shards, part[1]))
     kept = slice(1, None) if len(seconds) > 1 else slice(None)
     return Estimate(
         objects=dict(sorted(objects.items())),

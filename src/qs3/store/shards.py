@@ -8,18 +8,17 @@ import hashlib
 import io
 import itertools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, UInt8, UInt64
 
 from qs3.errors import InputError
-from qs3.files import write_bytes
 from qs3.store.folder import Folder
 from qs3.store.manifest import shard_name
 
@@ -58,16 +57,26 @@ _SCHEMAS: dict[DType, pa.Schema] = {"float32": _schema("float32"), "float16": _s
 # Shards of schema 1 have no `drawn`: nothing could be.
 _SCHEMA_1 = pa.schema([column for column in _SCHEMAS["float32"] if column.name != "drawn"])
 _NAMES = _SCHEMAS["float32"].names
+# Noise shrinks by a tenth, a cloud of equal numbers a thousandfold: small files may, large may not.
+_MOST_BYTES, _MOST_SHARE = 1 << 28, 8
+
+
+def _no_cloud() -> Float32[np.ndarray, "0 3"]:
+    return np.zeros((0, 3), np.float32)
+
+
+def _no_view() -> UInt8[np.ndarray, "0"]:
+    return np.zeros(0, np.uint8)
 
 
 @dataclass(frozen=True)
 class CloudRow:
-    """One scan of one object; clouds are in the frame of the normalised mesh."""
+    """One scan of one object, in the frame of the normalised mesh; or a cloud from elsewhere."""
 
     id: str
     """Name of the row, unique in the data set."""
     object: str
-    """Name of the mesh."""
+    """Name of the mesh; of a cloud from elsewhere that of the row."""
     scan: int
     """Which scan of that mesh, from 0."""
     label: int
@@ -77,17 +86,17 @@ class CloudRow:
     split: str
     """``train``, ``test`` or empty."""
     seed: int
-    """Seed of the scan."""
+    """Seed of the scan; 0 where nothing was drawn."""
     points: Float[np.ndarray, "n 3"]
     """The noisy cloud."""
-    view: UInt8[np.ndarray, "_"]
+    view: UInt8[np.ndarray, "_"] = field(default_factory=_no_view)
     """View that each noisy point comes from; empty where that is not known."""
-    clean: Float[np.ndarray, "m 3"]
-    """Its twin from the true z-buffer."""
-    clean_view: UInt8[np.ndarray, "_"]
+    clean: Float[np.ndarray, "m 3"] = field(default_factory=_no_cloud)
+    """Its twin from the true z-buffer; empty where there is none."""
+    clean_view: UInt8[np.ndarray, "_"] = field(default_factory=_no_view)
     """View that each clean point comes from; empty where that is not known."""
-    surface: Float[np.ndarray, "s 3"]
-    """Samples of the mesh's whole surface."""
+    surface: Float[np.ndarray, "s 3"] = field(default_factory=_no_cloud)
+    """Samples of the mesh's whole surface; empty where there is no mesh."""
     yaw: float = 0.0
     """Rotation about z under which the mesh was scanned, radians; undone in the clouds."""
     valid_fraction: float | None = None
@@ -102,33 +111,6 @@ class CloudRow:
     """What was drawn for this scan (settings of the sensor, the neighbour), a JSON object."""
 
 
-def cloud_alone(
-    identifier: str,
-    points: Float32[np.ndarray, "n 3"],
-    label: int,
-    class_name: str,
-    split: str = "",
-    drawn: str = "{}",
-) -> CloudRow:
-    """Return the row of a cloud that was not scanned: without twin, surface, views and seed."""
-    nothing, no_view = np.zeros((0, 3), np.float32), np.zeros(0, np.uint8)
-    return CloudRow(
-        id=identifier,
-        object=identifier,
-        scan=0,
-        label=label,
-        class_name=class_name,
-        split=split,
-        seed=0,
-        points=points,
-        view=no_view,
-        clean=nothing,
-        clean_view=no_view,
-        surface=nothing,
-        drawn=drawn,
-    )
-
-
 def put_shard(folder: Folder, index: int, table: pa.Table) -> str:
     """Write a table as shard ``index`` of a data set; return the SHA-256 of the file."""
     content = shard_bytes(table)
@@ -137,7 +119,7 @@ def put_shard(folder: Folder, index: int, table: pa.Table) -> str:
 
 
 def table_of(rows: Sequence[CloudRow], dtype: DType = "float32") -> pa.Table:
-    """Put rows into a table of the data set's columns."""
+    """Put rows, or none, into a table of the data set's columns."""
     schema = _SCHEMAS[dtype]
     columns: dict[str, list[Any]] = {name: [] for name in schema.names}
     for row in rows:
@@ -150,11 +132,6 @@ def table_of(rows: Sequence[CloudRow], dtype: DType = "float32") -> pa.Table:
                 value = None
             values.append(value)
     return pa.Table.from_pydict(columns, schema=schema)
-
-
-def empty_table(dtype: DType = "float32") -> pa.Table:
-    """Return a table without rows."""
-    return _SCHEMAS[dtype].empty_table()
 
 
 def shard_bytes(table: pa.Table) -> bytes:
@@ -175,57 +152,46 @@ def shard_bytes(table: pa.Table) -> bytes:
     return buffer.getvalue()
 
 
-def write_shard(path: Path, rows: Sequence[CloudRow], dtype: DType = "float32") -> None:
-    """Write rows as one Parquet file: whole or not at all, equal rows to equal bytes."""
-    write_bytes(path, shard_bytes(table_of(rows, dtype)))
-
-
-def read_shard(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
-    """Read a shard, or some of its columns; one of schema 1 with nothing drawn.
-
-    Raises:
-        InputError: where the file is missing, cut off, or not a shard of this schema.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    return _read(path, str(path), columns)
-
-
 def load_shard(folder: Folder, index: int, columns: Sequence[str] | None = None) -> pa.Table:
     """Read shard ``index`` of a data set, or some of its columns: from a disk these alone.
 
     Raises:
-        InputError: as `read_shard` does.
+        InputError: where the file is missing, cut off, not a shard, or announces columns far
+            larger than itself.
     """
     name = shard_name(index)
-    if folder.path is not None:
-        return read_shard(folder.path / name, columns)
-    return parse_shard(folder.read(name), f"{folder}/{name}", columns)
+    where = f"{folder}/{name}"
+    if folder.path is None:
+        return parse_shard(folder.read(name), where, columns)
+    path = folder.path / name
+    if not path.is_file():
+        raise InputError(f"{where}: no such file")
+    return parse_shard(path, where, columns)
 
 
-def parse_shard(content: bytes, where: str, columns: Sequence[str] | None = None) -> pa.Table:
-    """Read a shard from its bytes; ``where`` names it in messages.
+def parse_shard(source: bytes | Path, where: str, columns: Sequence[str] | None = None) -> pa.Table:
+    """Read a shard from its bytes or file; one of schema 1 comes with nothing drawn.
+
+    ``where`` names it in messages.
 
     Raises:
-        InputError: as `read_shard` does.
+        InputError: as `load_shard` does.
     """
-    return _read(pa.BufferReader(content), where, columns)
-
-
-def _read(source: Any, where: str, columns: Sequence[str] | None) -> pa.Table:
+    wanted = list(_NAMES if columns is None else columns)
+    size = len(source) if isinstance(source, bytes) else source.stat().st_size
+    opened = pa.BufferReader(source) if isinstance(source, bytes) else source
     try:
-        with pq.ParquetFile(source, page_checksum_verification=True, pre_buffer=False) as file:
-            wanted = list(_NAMES if columns is None else columns)
-            if any(file.schema_arrow.equals(schema) for schema in _SCHEMAS.values()):
-                table = file.read(columns=wanted, use_threads=False)
-                table.validate(full=True)  # texts too: Arrow takes any bytes for UTF-8
-                return table
-            if not file.schema_arrow.equals(_SCHEMA_1):
+        with pq.ParquetFile(opened, page_checksum_verification=True, pre_buffer=False) as file:
+            is_first = file.schema_arrow.equals(_SCHEMA_1)
+            if not is_first and file.schema_arrow not in _SCHEMAS.values():
                 raise InputError(f"{where}: not a shard of a qs3 data set (other columns)")
-            table = file.read(columns=[n for n in wanted if n != "drawn"], use_threads=False)
-            table.validate(full=True)
-            if "drawn" in wanted:
+            groups = [file.metadata.row_group(i) for i in range(file.num_row_groups)]
+            if sum(group.total_byte_size for group in groups) > _MOST_BYTES + _MOST_SHARE * size:
+                raise InputError(f"{where}: announces far more than its {size} bytes can hold")
+            names = [name for name in wanted if not (is_first and name == "drawn")]
+            table = file.read(columns=names, use_threads=False)
+            table.validate(full=True)  # texts too: Arrow takes any bytes for UTF-8
+            if len(names) < len(wanted):
                 drawn = _SCHEMAS["float32"].field("drawn")
                 table = table.append_column(drawn, [["{}"] * len(table)])
             return table.select(wanted)
@@ -256,3 +222,8 @@ def flat_clouds(table: pa.Table, column: str, path: Any) -> list[Float32[np.ndar
             f"{path}: {column} of {name!r} is empty, not made of triples, or not finite"
         )
     return [values[begin:end].reshape(-1, 3) for begin, end in itertools.pairwise(offsets)]
+
+
+def digests(values: Iterable[bytes]) -> UInt64[np.ndarray, "_"]:
+    """Return 64 bits of the SHA-256 of each value, by which many are compared in little room."""
+    return np.frombuffer(b"".join(hashlib.sha256(v).digest()[:8] for v in values), np.uint64)

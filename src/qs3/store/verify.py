@@ -1,13 +1,15 @@
 """Look through a whole data set for anything that is not as it should be."""
 
+import functools
 import hashlib
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from jaxtyping import UInt64
 
 from qs3.errors import InputError
 from qs3.files import LOCK
@@ -25,19 +27,24 @@ from qs3.store.manifest import (
 )
 from qs3.store.progress import progress_bar
 from qs3.store.scan_item import scan_seed
-from qs3.store.shards import parse_shard
+from qs3.store.shards import digests, load_shard, parse_shard
 
+_PLAIN = ["id", "object", "scan", "label", "class_name", "seed"]
 _CLOUDS = {"points": "view", "clean": "clean_view", "surface": None}
 
 
 @dataclass
 class _Seen:
-    """What earlier rows had, by which repetitions are known."""
+    """Digests of the rows, shard by shard, by which repetitions show at the end."""
 
-    ids: dict[str, str] = field(default_factory=dict)
-    clouds: dict[bytes, str] = field(default_factory=dict)
-    seeds: dict[int, str] = field(default_factory=dict)
-    rows: int = 0
+    shards: list[int] = field(default_factory=list)
+    ids: list[UInt64[np.ndarray, "_"]] = field(default_factory=list)
+    clouds: list[UInt64[np.ndarray, "_"]] = field(default_factory=list)
+
+    @property
+    def rows(self) -> int:
+        """Rows in all."""
+        return sum(map(len, self.ids))
 
 
 def verify(where: str | Path, *, progress: bool = True) -> list[str]:
@@ -63,8 +70,12 @@ def verify(where: str | Path, *, progress: bool = True) -> list[str]:
     seen = _Seen()
     for index in progress_bar(len(present), "verify" if progress else None, "shard", items=present):
         faults += _shard(folder, index, manifest, sums, seen)
-    lost = [record for record in failures if record["id"] in seen.ids]
-    faults += [f"{FAILURES}: {r['id']} is logged as failed, and is there" for r in lost]
+    faults += _repetitions(folder, seen)
+    logged = digests(record["id"].encode() for record in failures)
+    for record in itertools.compress(
+        failures, np.isin(logged, np.concatenate([logged[:0], *seen.ids]))
+    ):
+        faults.append(f"{FAILURES}: {record['id']} is logged as failed, and is there")
     complete = len(present) == manifest.shards and manifest.rows is not None
     if complete and seen.rows + len(failures) != manifest.rows:
         faults.append(
@@ -109,42 +120,38 @@ def _shard(
     except InputError as error:
         yield str(error)
         return
-    seen.rows += len(table)
-    yield from _rows(name, table, manifest, seen)
+    seen.shards.append(index)
+    seen.ids.append(digests(map(str.encode, table["id"].to_pylist())))
+    yield from _rows(name, table, manifest)
     for column, view in _CLOUDS.items():
-        yield from _clouds(name, table, column, view, seen, manifest)
+        yield from _clouds(name, table, column, view, manifest)
+    values, offsets = _flat(table["points"])
+    pairs = itertools.pairwise(offsets)
+    seen.clouds.append(digests(values[begin:end].tobytes() for begin, end in pairs))
 
 
-def _rows(name: str, table: pa.Table, manifest: Manifest, seen: _Seen) -> Iterator[str]:
-    plain = ("id", "object", "scan", "label", "class_name", "seed")
-    root = manifest.settings.get("seed") if "work_list" in manifest.settings else None
-    for values in zip(*(table[column].to_pylist() for column in plain), strict=True):
-        row: dict[str, Any] = dict(zip(plain, values, strict=True))
+def _rows(name: str, table: pa.Table, manifest: Manifest) -> Iterator[str]:
+    is_scanned = "work_list" in manifest.settings  # others have no seeds
+    root, classes = manifest.settings.get("seed"), manifest.class_names
+    for row in table.select(_PLAIN).to_pylist():
         where = f"{name}: {row['id']}"
-        if row["id"] in seen.ids:
-            yield f"{where} is there twice, also in {seen.ids[row['id']]}"
-        seen.ids[row["id"]] = name
-        classes = manifest.class_names
         if not 0 <= row["label"] < len(classes) or classes[row["label"]] != row["class_name"]:
             yield f"{where} has label {row['label']} and class name {row['class_name']!r}"
-        if not isinstance(root, int):
-            continue  # not scanned, and so without seeds
-        if row["seed"] != scan_seed(root, row["object"], row["scan"]):
+        if not is_scanned or root is None:
+            continue
+        if row["id"] != f"{row['object']}#{row['scan']}":
+            yield f"{where} is called otherwise than its object {row['object']} and scan tell"
+        if row["scan"] < 0 or row["seed"] != scan_seed(root, row["object"], row["scan"]):
             yield f"{where} has seed {row['seed']}, not the one that root seed {root} gives"
-        elif row["seed"] in seen.seeds and seen.seeds[row["seed"]] != row["id"]:
-            yield f"{where} has the seed of {seen.seeds[row['seed']]}"
-        seen.seeds[row["seed"]] = row["id"]
 
 
 def _clouds(
-    name: str, table: pa.Table, column: str, view: str | None, seen: _Seen, manifest: Manifest
+    name: str, table: pa.Table, column: str, view: str | None, manifest: Manifest
 ) -> Iterator[str]:
-    rows = table[column].combine_chunks()
-    values, offsets = rows.values.to_numpy(zero_copy_only=False), rows.offsets.to_numpy()
-    views = None if view is None else table[view].combine_chunks()
-    sizes = None if views is None else np.diff(views.offsets.to_numpy())
+    values, offsets = _flat(table[column])
     if column != "points" and not len(values):
         return  # a converted set, which has noisy clouds alone
+    views, view_offsets = (None, offsets) if view is None else _flat(table[view])
     limit = manifest.settings.get("views", 256)
     for row, identifier in enumerate(table["id"].to_pylist()):
         cloud = values[offsets[row] : offsets[row + 1]]
@@ -153,13 +160,41 @@ def _clouds(
             yield f"{where} is empty or not made of triples"
         elif not np.isfinite(cloud).all():
             yield f"{where} is not finite"
-        if views is not None and sizes is not None and len(views.values):
-            if 3 * sizes[row] != len(cloud):
-                yield f"{where} has {len(cloud) // 3} points and {sizes[row]} views"
-            elif sizes[row] and max(views[row].as_py()) >= limit:
-                yield f"{where} names view {max(views[row].as_py())} of {limit}"
-        if column == "points":
-            digest = hashlib.sha256(cloud.tobytes()).digest()
-            if digest in seen.clouds:
-                yield f"{where} has the very points of {seen.clouds[digest]}"
-            seen.clouds[digest] = identifier
+        if views is not None and len(views):
+            own = views[view_offsets[row] : view_offsets[row + 1]]
+            if 3 * len(own) != len(cloud):
+                yield f"{where} has {len(cloud) // 3} points and {len(own)} views"
+            elif len(own) and own.max() >= limit:
+                yield f"{where} names view {own.max()} of {limit}"
+
+
+def _flat(column: pa.ChunkedArray) -> tuple[np.ndarray, np.ndarray]:
+    """All values of a column of lists, and where each list begins."""
+    rows = column.combine_chunks()
+    return rows.values.to_numpy(zero_copy_only=False), rows.offsets.to_numpy()
+
+
+def _repetitions(folder: Folder, seen: _Seen) -> Iterator[str]:
+    """Tell ids and clouds that come twice, by their names: those shards are read once more."""
+    if not seen.shards:
+        return
+    starts = np.cumsum([0, *map(len, seen.ids)])
+
+    @functools.cache
+    def names(position: int) -> list[str]:
+        return load_shard(folder, seen.shards[position], ["id"])["id"].to_pylist()
+
+    def place(row: int) -> tuple[str, str]:
+        position = int(np.searchsorted(starts, row, side="right")) - 1
+        return shard_name(seen.shards[position]), names(position)[row - starts[position]]
+
+    for kind, parts in (("id", seen.ids), ("cloud", seen.clouds)):
+        values = np.concatenate(parts)
+        order = np.argsort(values, kind="stable")
+        repeated = values[order][1:] == values[order][:-1]
+        for first, later in sorted(zip(order[:-1][repeated], order[1:][repeated], strict=True)):
+            (earlier, original), (name, identifier) = place(first), place(later)
+            if kind == "cloud":
+                yield f"{name}: points of {identifier} are the very points of {original}"
+            elif identifier == original:
+                yield f"{name}: {identifier} is there twice, also in {earlier}"

@@ -21,15 +21,14 @@ from qs3.store.info import info
 from qs3.store.manifest import (
     MANIFEST,
     Manifest,
+    Sums,
     finished_shards,
     package_versions,
-    read_sums,
     shard_name,
     write_manifest,
-    write_sums,
 )
 from qs3.store.progress import progress_bar
-from qs3.store.shards import CloudRow, cloud_alone, put_shard, table_of
+from qs3.store.shards import CloudRow, put_shard, table_of
 from qs3.structure import unstructure
 
 
@@ -164,17 +163,17 @@ def run_extract(
         shards=len(units),
         versions=package_versions(),
     )
-    folder.claim(MANIFEST)
-    with folder.locked():
+    with folder.claimed(MANIFEST):
         write_manifest(folder, manifest)
         failures = {record["shard"]: record for record in read_failures(folder)}
-        sums = read_sums(folder)
+        sums = Sums(folder)
         settled = {i for i in finished_shards(folder, len(units)) if shard_name(i) in sums}
-        if output.retry_failed and failures:
+        if output.retry_failed:
             # Forgotten first: a shard that is written anew has another checksum.
-            settled -= set(failures)
-            sums = {name: sums[name] for name in map(shard_name, sorted(settled))}
-            write_sums(folder, sums)
+            for index in settled & set(failures):
+                settled.remove(index)
+                del sums[shard_name(index)]
+            sums.write()
         make = functools.partial(_put_unit, folder, extract_one, tuple(class_names), num_points)
         todo = [index for index in range(len(units)) if index not in settled]
         calls = ((index, make, index, units[index]) for index in todo)
@@ -193,8 +192,7 @@ def run_extract(
                 outcome = _put(folder, index, [])
             if was_logged or index in failures:
                 write_failures(folder, failures.values())
-            sums[shard_name(index)] = outcome[0]
-            write_sums(folder, sums)
+            sums.note(shard_name(index), outcome[0])
             objects += outcome[1]
             bar.set_postfix(objects=objects, failed=len(failures), refresh=False)
             bar.update()
@@ -208,6 +206,8 @@ def run_extract(
                 for index, outcome in executor.drain():
                     note(index, outcome)
                 raise
+            finally:
+                sums.write()
     return ExtractReport(
         objects=info(folder)["rows"],
         units=len(todo),
@@ -247,4 +247,5 @@ def _row(cloud: ExtractedCloud, class_names: Sequence[str], num_points: int) -> 
     if len(points) > num_points:
         points = resample(points, num_points)
     drawn = json.dumps(dict(cloud.source), sort_keys=True)
-    return cloud_alone(utf8(cloud.id), points, label, class_names[label], cloud.split, drawn)
+    name, class_name = utf8(cloud.id), class_names[label]
+    return CloudRow(name, name, 0, label, class_name, cloud.split, 0, points, drawn=drawn)

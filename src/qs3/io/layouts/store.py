@@ -121,7 +121,7 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
     Raises:
         InputError: where the clouds have no labels.
     """
-    from qs3.store.shards import cloud_alone, put_shard, table_of
+    from qs3.store.shards import CloudRow, put_shard, table_of
 
     if clouds.labels is None:
         raise InputError("clouds without labels make no qs3 data set; put them into class folders")
@@ -144,16 +144,11 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
     bar = tqdm(total=count, desc="write", unit="cloud", disable=None if count > _MANY else True)
     with bar:
         for index, start in enumerate(starts):
-            rows = [
-                cloud_alone(
-                    utf8(clouds.ids[i]),
-                    np.asarray(clouds.clouds[i], dtype=np.float32),
-                    labels[i],
-                    names[labels[i]],
-                    splits[i],
-                )
-                for i in range(start, min(start + ROWS_PER_SHARD, count))
-            ]
+            rows = []
+            for i in range(start, min(start + ROWS_PER_SHARD, count)):
+                points = np.asarray(clouds.clouds[i], dtype=np.float32)
+                name, class_name = utf8(clouds.ids[i]), names[labels[i]]
+                rows.append(CloudRow(name, name, 0, labels[i], class_name, splits[i], 0, points))
             sums[shard_name(index)] = put_shard(folder, index, table_of(rows))
             bar.update(len(rows))
     write_sums(folder, sums)

@@ -1,11 +1,12 @@
 """What every executor does, and what a task that did not end well hands back."""
 
+import collections
 import errno
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
-from qs3.errors import InputError
+from qs3.errors import InputError, StorageError
 
 # Not of one object: a full or lost disk, a mount that went away, no more open files.
 _MACHINE_IS_AT_FAULT = (
@@ -97,12 +98,11 @@ def guarded(function: Callable[..., Any], *arguments: Any) -> Any:
 
 def failure_of(error: Exception) -> Failure:
     """Tell a fault of one object from one that no other task will be spared."""
-    lines = str(error).strip().splitlines()
-    reason = lines[0] if lines else ""
-    storage = isinstance(error, OSError) and error.errno in _MACHINE_IS_AT_FAULT
-    if storage and isinstance(error, OSError):
-        reason = error.strerror or reason
-    return Failure(type(error).__name__, reason, storage or isinstance(error, ImportError))
+    reason = (str(error).strip().splitlines() or [""])[0]
+    fatal = isinstance(error, ImportError | StorageError)
+    if isinstance(error, OSError) and error.errno in _MACHINE_IS_AT_FAULT:
+        fatal, reason = True, error.strerror or reason
+    return Failure(type(error).__name__, reason, fatal)
 
 
 def stop_if_fatal(outcome: Any) -> None:
@@ -113,3 +113,37 @@ def stop_if_fatal(outcome: Any) -> None:
     """
     if isinstance(outcome, Failure) and outcome.fatal:
         raise InputError(outcome.reason)
+
+
+class InlineExecutor:
+    """Does each call in this process when its outcome is asked for: for debugging, and cheap calls.
+
+    A crash or a hang of one ends or hangs all.
+    """
+
+    ahead = 1
+
+    def __init__(self) -> None:
+        self._waiting: collections.deque[tuple[Any, ...]] = collections.deque()
+
+    def submit(self, key: Any, function: Callable[..., Any], *arguments: Any) -> None:
+        """Keep a call for `next`."""
+        self._waiting.append((key, function, *arguments))
+
+    def next(self) -> tuple[Any, Any]:
+        """Do the oldest call."""
+        key, *call = self._waiting.popleft()
+        return key, guarded(*call)
+
+    def drain(self) -> list[tuple[Any, Any]]:
+        """Drop the calls that wait; none is under way."""
+        self._waiting.clear()
+        return []
+
+    def __enter__(self) -> "InlineExecutor":
+        """Return itself."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Drop what waits."""
+        self.drain()

@@ -1,5 +1,6 @@
 """Calls done in processes of this machine, each of which may crash or hang without harm."""
 
+import collections
 import concurrent.futures
 import contextlib
 import ctypes
@@ -18,6 +19,9 @@ from qs3.errors import InputError
 from qs3.store.executors.executor import Failure, guarded
 
 _BROKEN_IN_A_ROW = 3
+_DEATHS = 3
+"""A call whose process died is made again when no other is under way, so that no want of memory for
+several at once is taken for its fault; this many deaths are its own."""
 _LOCK_SECONDS = 5.0
 """A worker waits so long for the lock that all share, held for milliseconds at a time. One that was
 killed with it never gives it back: those that wait then end, and the pool is opened anew."""
@@ -35,15 +39,15 @@ class _Call:
     key: Any
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
-    retried: bool = False
+    deaths: int = 0
 
 
 class LocalExecutor:
     """A pool of processes started afresh (spawn).
 
-    A worker that dies is replaced and its call is made once more; one that takes longer than
-    ``timeout`` is killed and replaced, and its call has failed. Workers end by themselves when
-    this process is killed.
+    A worker that dies is replaced, and its call is made twice more, alone; one that takes longer
+    than ``timeout`` is killed and replaced, and its call has failed. Workers end by themselves
+    when this process is killed.
     """
 
     def __init__(
@@ -68,6 +72,7 @@ class LocalExecutor:
         self._timeout = timeout
         self._calls_per_process = calls_per_process
         self._calls: dict[Any, _Call] = {}
+        self._alone: collections.deque[_Call] = collections.deque()
         self._broken = 0
 
     def submit(self, key: Any, function: Callable[..., Any], *arguments: Any) -> None:
@@ -104,6 +109,8 @@ class LocalExecutor:
         from pebble import ProcessExpired
 
         while True:
+            if not self._calls:
+                self._schedule(self._alone.popleft())
             done, _ = concurrent.futures.wait(self._calls, return_when="FIRST_COMPLETED")
             future = next(iter(done))
             call = self._calls.pop(future)
@@ -112,10 +119,12 @@ class LocalExecutor:
             except concurrent.futures.TimeoutError:
                 value = Failure("Timeout", f"took over {self._timeout:g} s and was stopped")
             except ProcessExpired as error:
-                if not call.retried:
-                    self._schedule(dataclasses.replace(call, retried=True))
+                call = dataclasses.replace(call, deaths=call.deaths + 1)
+                if call.deaths < _DEATHS:
+                    self._alone.append(call)
                     continue
-                value = Failure("ProcessDied", f"its process died twice ({_how(error.exitcode)})")
+                how = f"its process died {_DEATHS} times, at last with no other beside it"
+                value = Failure("ProcessDied", f"{how} ({_how(error.exitcode)})")
             except BrokenProcessPool as error:
                 self._restart(call, error)
                 continue
@@ -149,6 +158,7 @@ class LocalExecutor:
         running = {f: call for f, call in self._calls.items() if not f.cancelled()}
         concurrent.futures.wait(running)
         self._calls.clear()
+        self._alone.clear()
         ended = [(call.key, f) for f, call in running.items() if f.exception() is None]
         return [(key, future.result()) for key, future in ended]
 
@@ -185,6 +195,7 @@ class LocalExecutor:
 
     def __exit__(self, *exception: object) -> None:
         """Stop the processes, at once where calls are left."""
+        self._alone.clear()
         self._close(at_once=bool(self._calls))
 
 

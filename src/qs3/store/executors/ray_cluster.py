@@ -2,23 +2,25 @@
 
 import contextlib
 import os
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from qs3.errors import InputError, MissingExtraError
-from qs3.store.executors.executor import Failure, guarded
-from qs3.store.executors.local import ONE_THREAD
+from qs3.store.executors.executor import Failure
+from qs3.store.executors.local import LocalExecutor
 
-_LOOK_EVERY = 1.0  # seconds between two looks at what has run too long
+_own: LocalExecutor | None = None
+"""The process beside a worker of the cluster in which its calls are done."""
 
 
 class RayExecutor:
-    """Each call is a task of one core, made again where its machine or process is lost.
+    """Each call is a task of one core, made again where its machine is lost.
 
-    What a call reads and writes must be reached from every machine under the same name. A call
-    that takes longer than ``timeout`` is stopped and has failed.
+    What a call reads and writes must be reached from every machine under the same name. On its
+    machine a call is done in a process beside the cluster's own, see `LocalExecutor`: one that
+    crashes it or takes longer than ``timeout`` has failed. So whatever the cluster itself tells of
+    a task is a loss of the cluster's and never a call's fault.
     """
 
     def __init__(
@@ -35,14 +37,13 @@ class RayExecutor:
                 ``local`` to start one here.
             timeout: Seconds that one call may take once it runs; None waits for ever.
             gpus: Share of a GPU that one call takes.
-            retries: Times that a call is made again after its machine or process died.
+            retries: Times that a call is made again after its machine was lost.
 
         Raises:
             InputError: where a number is out of range.
             MissingExtraError: where Ray is not installed.
         """
-        if timeout is not None and not timeout > 0:
-            raise InputError(f"timeout must be above 0 seconds, not {timeout}")
+        LocalExecutor(1, timeout)  # refuses what is out of range
         if not 0 <= gpus < float("inf"):
             raise InputError(f"gpus-per-scan must not be negative, but is {gpus}")
         if retries < 0:
@@ -53,10 +54,7 @@ class RayExecutor:
             raise MissingExtraError("ray", "ray") from error
         self._ray: Any = ray
         self._address, self._timeout, self._gpus, self._retries = address, timeout, gpus, retries
-        self._calls: dict[Any, tuple[Any, int]] = {}
-        self._stopped: set[int] = set()
-        self._count = 0
-        self._looked = 0.0
+        self._keys: dict[Any, Any] = {}
         self._connected_here = False
 
     @property
@@ -68,64 +66,38 @@ class RayExecutor:
 
     def submit(self, key: Any, function: Callable[..., Any], *arguments: Any) -> None:
         """Hand over a call."""
-        self._count += 1
-        reference = self._task.remote(
-            self._clock, self._count, str(Path.cwd()), function, arguments
-        )
-        self._calls[reference] = (key, self._count)
+        call = self._task.remote(self._timeout, str(Path.cwd()), function, arguments)
+        self._keys[call] = key
 
     def next(self) -> tuple[Any, Any]:
-        """Wait for any call."""
-        while True:
-            self._stop_what_hangs()
-            done, _ = self._ray.wait(list(self._calls), num_returns=1, timeout=_LOOK_EVERY)
-            if done:
-                key, number = self._calls.pop(done[0])
-                return key, self._outcome(done[0], number)
+        """Wait for any call.
 
-    def _outcome(self, reference: Any, number: int) -> Any:
+        Raises:
+            InputError: where the cluster lost it for good.
+        """
+        key: Any = None
         try:
-            return self._ray.get(reference)
+            done, _ = self._ray.wait(list(self._keys), num_returns=1)
+            key = self._keys.pop(done[0])
+            return key, self._ray.get(done[0])
         except self._ray.exceptions.RayTaskError as error:
             # It failed before any code of ours ran: qs3 or a module of it is missing there.
             cause = error.cause or error
             lines = str(cause).strip().splitlines() or [""]
-            return Failure(type(cause).__name__, f"on the cluster: {lines[0]}", fatal=True)
+            return key, Failure(type(cause).__name__, f"on the cluster: {lines[0]}", fatal=True)
         except self._ray.exceptions.RayError as error:
-            if number in self._stopped:
-                return Failure("Timeout", f"took over {self._timeout:g} s and was stopped")
-            what = str(error).strip().splitlines()
-            return Failure("ProcessDied", f"lost {self._retries + 1} times ({what[0]})")
-
-    def _stop_what_hangs(self) -> None:
-        if self._timeout is None or time.monotonic() - self._looked < _LOOK_EVERY:
-            return
-        self._looked = time.monotonic()
-        try:
-            running = self._ray.get(self._clock.running.remote(), timeout=10 * _LOOK_EVERY)
-        except self._ray.exceptions.RayError:  # the clock is being started again
-            return
-        for reference, (_, number) in self._calls.items():
-            if running.get(number, 0.0) > self._timeout and number not in self._stopped:
-                self._stopped.add(number)
-                self._ray.cancel(reference, force=True)
+            lines = str(error).strip().splitlines() or [""]
+            raise InputError(
+                f"--address {self._address}: the Ray cluster lost a call {self._retries + 1} times "
+                f"or cannot be reached ({type(error).__name__}: {lines[0]}); once it works, run "
+                "the same command again, nothing is lost"
+            ) from error
 
     def drain(self) -> list[tuple[Any, Any]]:
-        """Let the calls under way end, and drop the others; what ended."""
-        running: dict[int, float] = {}
-        with contextlib.suppress(self._ray.exceptions.RayError):
-            running = self._ray.get(self._clock.running.remote(), timeout=10 * _LOOK_EVERY)
-        wait = []
-        for reference, (_, number) in self._calls.items():
-            if number in running:
-                wait.append(reference)
-            else:
-                self._ray.cancel(reference)
-        done = []
-        if wait:
-            done, _ = self._ray.wait(wait, num_returns=len(wait), timeout=self._timeout)
-        ended = [(self._calls[r][0], self._outcome(r, self._calls[r][1])) for r in done]
-        self._calls.clear()
+        """Let the calls that were handed over end; what ended."""
+        ended = []
+        while self._keys:
+            ended.append(self.next())
         return ended
 
     def __enter__(self) -> "RayExecutor":
@@ -154,58 +126,36 @@ class RayExecutor:
                 f"--gpus-per-scan {self._gpus:g}: the cluster has no GPU at this moment; add a "
                 "machine with one, or leave the flag out"
             )
-        here = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
-            ray.get_runtime_context().get_node_id(), soft=True
-        )
-        clock = ray.remote(num_cpus=0, max_restarts=-1, scheduling_strategy=here)(_Clock)
-        self._clock = clock.remote()
         self._task = ray.remote(
-            num_cpus=1,
-            num_gpus=self._gpus,
-            max_retries=self._retries,
-            retry_exceptions=False,
-            runtime_env={"env_vars": ONE_THREAD},
-        )(_timed)
+            num_cpus=1, num_gpus=self._gpus, max_retries=self._retries, retry_exceptions=False
+        )(_call)
         return self
 
     def __exit__(self, *exception: object) -> None:
         """Stop what is left, and disconnect."""
-        for reference in self._calls:
-            self._ray.cancel(reference, force=True)
-        self._calls.clear()
-        self._ray.kill(self._clock)
+        with contextlib.suppress(self._ray.exceptions.RayError):
+            for reference in self._keys:
+                self._ray.cancel(reference, force=True)
+        self._keys.clear()
         if self._connected_here:
             self._ray.shutdown()
 
 
-class _Clock:
-    """Knows which calls run, and for how long."""
-
-    def __init__(self) -> None:
-        self._begun: dict[int, float] = {}
-
-    def begin(self, number: int) -> None:
-        self._begun[number] = time.monotonic()
-
-    def end(self, number: int) -> None:
-        self._begun.pop(number, None)
-
-    def running(self) -> dict[int, float]:
-        now = time.monotonic()
-        return {number: now - begun for number, begun in self._begun.items()}
-
-
-def _timed(
-    clock: Any, number: int, folder: str, function: Callable[..., Any], arguments: tuple[Any, ...]
+def _call(
+    timeout: float | None, folder: str, function: Callable[..., Any], arguments: tuple[Any, ...]
 ) -> Any:
-    """Make a call on a machine of the cluster."""
+    """Make a call on a machine of the cluster, in a process that is kept for the next."""
+    global _own
+    if _own is None:
+        _own = LocalExecutor(1, timeout).__enter__()
+    _own.submit(None, _in_folder, folder, function, arguments)
+    return _own.next()[1]
+
+
+def _in_folder(folder: str, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
     try:
         os.chdir(folder)  # names are relative to where the command was typed
     except OSError as error:
         reason = f"{folder}: not there on a machine of the cluster ({error.strerror})"
         return Failure("OSError", reason, fatal=True)
-    clock.begin.remote(number)
-    try:
-        return guarded(function, *arguments)
-    finally:
-        clock.end.remote(number)
+    return function(*arguments)
