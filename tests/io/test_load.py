@@ -1,7 +1,12 @@
+import struct
+import tracemalloc
+import zipfile
+
 import numpy as np
 import pytest
 
 from qs3.errors import InputError
+from qs3.io import guards
 from qs3.io.clouds import PointClouds, UnlabelledClouds, digests
 from qs3.io.load import load_clouds, load_unlabelled
 from qs3.meshes.classes import POINTDA10
@@ -151,6 +156,34 @@ def test_an_archive_that_is_none(rng, tmp_path):
         load_clouds(path)
     with pytest.raises(InputError, match="no split 'dev'"):
         load_clouds(tmp_path / "b.npz", split="dev")
+
+
+def test_an_archive_that_would_fill_the_memory_is_refused(tmp_path, monkeypatch):
+    header = {"descr": "<f4", "fortran_order": False, "shape": (500_000, 1000, 3)}
+    path = tmp_path / "a.npz"
+    for megabytes, packing in ((65, zipfile.ZIP_DEFLATED), (1, zipfile.ZIP_STORED)):
+        with (
+            zipfile.ZipFile(path, "w", packing) as archive,
+            archive.open("points.npy", "w") as member,
+        ):
+            np.lib.format.write_array_header_1_0(member, header)  # of 6 GB
+            for _ in range(megabytes):
+                member.write(bytes(2**20))
+        tracemalloc.start()
+        with pytest.raises(InputError, match=r"a\.npz: .* announces \d+ bytes"):
+            load_clouds(path)
+        assert tracemalloc.get_traced_memory()[1] < 2**24
+        tracemalloc.stop()
+    monkeypatch.setattr(guards, "MOST_BYTES", 1000)
+    with pytest.raises(InputError, match="read are 1000 at most"):
+        load_clouds(write_npz(path, np.random.default_rng(0)))
+
+
+def test_an_archive_of_a_hundred_thousand_members_is_refused(tmp_path):
+    end = struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 60_000, 60_000, 0, 0, 0)
+    (tmp_path / "a.npz").write_bytes(end)
+    with pytest.raises(InputError, match=r"a\.npz: .*60000 members"):
+        load_clouds(tmp_path / "a.npz")
 
 
 def test_a_generated_data_set(fake, tmp_path):

@@ -84,11 +84,7 @@ def check_announced(what: str, announced: int, stored: int, densest: int = DENSE
 
 
 def read_small(path: Path, largest: int = MOST_BYTES, what: str = "one file") -> bytes:
-    """Read a file of at most ``largest`` bytes.
-
-    Raises:
-        InputError: where it is missing or larger than ``what`` can be.
-    """
+    """Read a file of at most ``largest`` bytes; a longer one is refused as no ``what``."""
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     if path.stat().st_size > largest:
@@ -97,11 +93,7 @@ def read_small(path: Path, largest: int = MOST_BYTES, what: str = "one file") ->
 
 
 def read_text(path: Path, largest: int = _LONGEST_TEXT, what: str = "a list or a table") -> str:
-    """Read a short text.
-
-    Raises:
-        InputError: where it is missing, longer, or not UTF-8.
-    """
+    """Read a short text in UTF-8; anything else is refused."""
     try:
         return read_small(path, largest, what).decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -109,11 +101,7 @@ def read_text(path: Path, largest: int = _LONGEST_TEXT, what: str = "a list or a
 
 
 def read_numbers(path: Path, counts: tuple[int, ...]) -> Float[np.ndarray, "n"]:
-    """Read a text file of numbers, apart by white space.
-
-    Raises:
-        InputError: where it is none, or there are not as many as one of ``counts``.
-    """
+    """Read a text file of numbers, as many as one of ``counts``, apart by white space."""
     try:
         numbers = np.array([float(word) for word in read_text(path).split()])
     except ValueError as error:
@@ -127,11 +115,7 @@ def read_numbers(path: Path, counts: tuple[int, ...]) -> Float[np.ndarray, "n"]:
 
 
 def read_small_json(path: Path, largest: int = 1 << 30) -> Any:
-    """Read a JSON file of at most ``largest`` bytes.
-
-    Raises:
-        InputError: where it is missing, longer, or no JSON.
-    """
+    """Read a JSON file of at most ``largest`` bytes; a longer one is refused."""
     path = Path(path)
     if path.is_file() and path.stat().st_size > largest:
         raise InputError(f"{path}: {path.stat().st_size} bytes, more than the {largest} expected")
@@ -205,11 +189,7 @@ def load_npy(
 
 @contextlib.contextmanager
 def open_zip(path: Path) -> Iterator[zipfile.ZipFile]:
-    """Open a zip file, unless it lists more members than any of this field.
-
-    Raises:
-        InputError: where it is missing, no zip file, or lists too many.
-    """
+    """Open a zip file, unless it lists more members than any of this field."""
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
@@ -226,14 +206,12 @@ def open_zip(path: Path) -> Iterator[zipfile.ZipFile]:
         yield archive
 
 
-def read_member(
-    archive: zipfile.ZipFile, name: str, most: int = MOST_BYTES, densest: int = DENSEST
-) -> bytes | None:
+def read_member(archive: zipfile.ZipFile, name: str, most: int = MOST_BYTES) -> bytes | None:
     """Return a member of a zip file by its exact name; None where there is none.
 
     Raises:
-        InputError: where it is damaged, packed in a way that cannot be bounded, or would unpack to
-            more than ``most`` bytes.
+        InputError: where it is damaged, packed in a way that cannot be bounded, or announces
+            more than ``most`` bytes or than it can hold.
     """
     try:
         entry = archive.getinfo(name)
@@ -241,7 +219,7 @@ def read_member(
         return None
     if entry.file_size > most:
         raise InputError(f"{name} would unpack to {entry.file_size} bytes, more than {most}")
-    check_announced(name, entry.file_size, entry.compress_size, densest)
+    check_announced(name, entry.file_size, entry.compress_size)
     # The other packings of zip unpack in blocks that cannot be bounded.
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise InputError(f"{name} is packed in an unusual way; pack it with deflate")
@@ -253,11 +231,7 @@ def read_member(
 
 
 def check_pixels(width: int, height: int) -> None:
-    """Refuse a size that no depth image has.
-
-    Raises:
-        InputError: where a side is 0 or the pixels are more than ``LARGEST_IMAGE``.
-    """
+    """Refuse a size that no depth image has."""
     if width < 1 or height < 1 or width * height > LARGEST_IMAGE:
         raise InputError(
             f"announces {width}×{height} pixels; read are images of up to {LARGEST_IMAGE} pixels"

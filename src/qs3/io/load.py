@@ -111,11 +111,7 @@ def detect(path: Path) -> Format:
 
 
 def format_named(name: str) -> Format:
-    """Return a layout by its name.
-
-    Raises:
-        InputError: where there is none; the nearest name and all names are told.
-    """
+    """Return a layout by its name; of an unknown one the nearest name and all names are told."""
     name = FORMER_NAMES.get(name, name)
     if name in FORMATS:
         return FORMATS[name]
@@ -125,15 +121,7 @@ def format_named(name: str) -> Format:
 
 
 def require(path: Path, layout: Format | None = None) -> None:
-    """Refuse a path that is missing or empty; where the data set is known, tell where it is got.
-
-    Args:
-        path: What is to be read.
-        layout: Layout that it shall be in; None where it is to be found out.
-
-    Raises:
-        InputError: where nothing is there.
-    """
+    """Refuse a path that is missing or empty; tell where the data set is got, if it is known."""
     if path.is_file() or holds_something(path):
         return
     what = "an empty folder" if path.is_dir() else "no such file or folder"

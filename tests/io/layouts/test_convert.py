@@ -7,7 +7,8 @@ import time
 import numpy as np
 import pytest
 
-from qs3.errors import InputError
+from qs3.errors import InputError, StorageError
+from qs3.files import temporary_folder
 from qs3.io.convert import convert
 from qs3.io.layouts.point_folders import write_folder
 from qs3.io.layouts.store import read_ragged
@@ -142,7 +143,7 @@ def test_the_target_is_new_or_empty(tmp_path, source):
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["deep"]
 
 
-def test_a_failure_half_way_leaves_nothing(tmp_path, source, monkeypatch):
+def test_a_failure_half_way_leaves_nothing_and_a_full_disk_is_told(tmp_path, source, monkeypatch):
     written = []
 
     def fail_late(*arguments):
@@ -152,7 +153,7 @@ def test_a_failure_half_way_leaves_nothing(tmp_path, source, monkeypatch):
         return b"1 2 3\n"
 
     monkeypatch.setattr("qs3.io.layouts.point_folders.cloud_bytes", fail_late)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(StorageError, match=r"out: cannot be written \(No space left.*make room"):
         convert(source, tmp_path / "out", "xyz")
     assert len(written) == 13
     assert sorted(path.name for path in tmp_path.iterdir()) == ["source"]
@@ -160,11 +161,42 @@ def test_a_failure_half_way_leaves_nothing(tmp_path, source, monkeypatch):
 
 def test_two_at_a_time_are_refused(tmp_path, source):
     with (
-        whole(tmp_path / "out") as temporary,
+        temporary_folder(tmp_path / "out"),
         pytest.raises(InputError, match="another qs3 is writing"),
     ):
-        temporary.mkdir()
         convert(source, tmp_path / "out", "ply")
+
+
+def test_a_planted_link_is_not_followed(tmp_path, source):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "a.txt").write_text("keep")
+    # As older versions called it, and as what a killed run leaves.
+    for name in (".out.unfinished", ".out.0123abcd.tmp"):
+        (tmp_path / name).symlink_to(tmp_path / "mine")
+    convert(source, tmp_path / "out", "npy")
+    assert (tmp_path / "mine" / "a.txt").read_text() == "keep"
+    assert len(list((tmp_path / "out").iterdir())) == 10
+
+
+def test_the_longest_name_is_taken(tmp_path, source):
+    for to in ("store", "npy"):
+        convert(source, tmp_path / (to[0] * 250), to)
+        assert len(read_clouds(tmp_path / (to[0] * 250))[0].ids) == 20
+
+
+def test_names_of_other_bytes_are_escaped(tmp_path, source):
+    """Names of files are bytes; those that are no UTF-8 are stored as escapes."""
+    name = os.fsdecode(b"st\xfchle")
+    (source / "chair").rename(source / name)
+    (file,) = (source / name / "test").iterdir()
+    file.rename(file.with_name(f"{name}.npy"))
+    escaped = r"st\udcfchle"
+    clouds, _ = read_clouds(source)
+    assert escaped in clouds.class_names
+    assert f"{escaped}/test/{escaped}.npy" in clouds.ids
+    convert(source, tmp_path / "store", "store")
+    assert escaped in open_dataset(tmp_path / "store").class_names
+    assert f"{escaped}/test/{escaped}.npy" in read_ragged(tmp_path / "store").ids
 
 
 SLOW_CONVERT = """
@@ -181,17 +213,21 @@ convert.convert(sys.argv[1], sys.argv[2], "xyz")
 
 
 def test_a_killed_run_leaves_no_half_data_set_and_the_next_one_clears_up(tmp_path, source):
-    target, hidden = tmp_path / "out", tmp_path / ".out.unfinished"
+    target = tmp_path / "out"
+
+    def half():
+        return list(tmp_path.glob(".out.*.tmp/out/**/*.xyz"))
+
     process = subprocess.Popen([sys.executable, "-c", SLOW_CONVERT, str(source), str(target)])
     deadline = time.monotonic() + 60
-    while len(list(hidden.rglob("*.xyz"))) < 3:
+    while len(half()) < 3:
         assert time.monotonic() < deadline
         assert process.poll() is None
         time.sleep(0.005)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     assert not target.exists()
-    assert 3 <= len(list(hidden.rglob("*.xyz"))) < 20
+    assert 3 <= len(half()) < 20
     convert(source, target, "xyz")
-    assert not hidden.exists()
+    assert not list(tmp_path.glob(".out*"))
     assert len(list(target.rglob("*.xyz"))) == 20

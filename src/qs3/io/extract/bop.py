@@ -46,14 +46,8 @@ def extract_bop(
 ) -> ExtractReport:
     """Cut the objects of all images of a scene, or of a folder of scenes, into a data set.
 
-    Args:
-        source: The folder.
-        output: Where the clouds go.
-        settings: What is cut; the scene tells camera, masks and scale, so these are refused.
-        names: Class by the model: ``obj_000001`` or ``1``.
-
-    Raises:
-        InputError: as `qs3.io.extract.depth.extract_depth` does.
+    The scene tells camera, masks and scale, so that settings of these are refused. ``names`` gives
+    the class by the model: ``obj_000001`` or ``1``. Raises as `depth.extract_depth` does.
     """
     of_scene = ("intrinsics", "mask", "box", "depth_scale", "instances")
     for flag in of_scene:
@@ -92,12 +86,7 @@ def class_of(obj_id: int, settings: DepthImageSettings, names: Mapping[str, str]
 def list_bop_frames(
     source: Path, settings: DepthImageSettings, names: Mapping[str, str]
 ) -> tuple[list[Frame], Axes]:
-    """List the images of a scene, or of all scenes of a folder, in order; and the axes of clouds.
-
-    Raises:
-        InputError: where there is no scene, a file of one is damaged, or no file tells the poses
-            that the axes need.
-    """
+    """List the images of a scene, or of all scenes of a folder; and the axes of their clouds."""
     scenes = _scenes(Path(source))
     if not scenes:
         raise InputError(f"{source}: no scene of BOP's layout ({CAMERAS}) in it")

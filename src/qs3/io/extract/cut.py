@@ -111,11 +111,7 @@ def lift(
 
 
 def as_cloud(points: Float[np.ndarray, "n 3"], where: str) -> Float32[np.ndarray, "n 3"]:
-    """Return points as a cloud of a data set.
-
-    Raises:
-        InputError: where a point is not within 1,000 km, naming ``where``.
-    """
+    """Return points as a cloud of a data set; one beyond 1,000 km is refused, naming ``where``."""
     if not np.abs(points).max(initial=0.0) < _FARTHEST:
         raise InputError(f"{where}: a point lies beyond 1,000 km; check camera, depth and pose")
     return points.astype(np.float32)
@@ -161,11 +157,7 @@ def upright(gravity: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Float[np.n
 
 
 def check_rotation(matrix: Float[np.ndarray, "3 3"], name: str) -> None:
-    """Refuse a matrix that is no rotation.
-
-    Raises:
-        InputError: where its rows are not at right angles, of length 1 and right-handed.
-    """
+    """Refuse a matrix whose rows are not at right angles, of length 1 and right-handed."""
     if not np.isfinite(matrix).all() or not (
         np.abs(matrix @ matrix.T - np.eye(3)).max() < 0.01
         and math.isclose(float(np.linalg.det(matrix)), 1.0, abs_tol=0.01)

@@ -160,16 +160,7 @@ class Frame:
 
 
 def list_frames(source: Path, camera: Intrinsics, settings: DepthImageSettings) -> list[Frame]:
-    """List the depth images of a file or folder with the masks of the same name.
-
-    Args:
-        source: A depth image, or a folder with nothing else of those endings in it.
-        camera: The camera of all.
-        settings: Mask, axes and depth scale.
-
-    Raises:
-        InputError: where there is no image, two have one name, or a mask is missing.
-    """
+    """List the depth images of a file or folder, each with the mask of the same name."""
     mask = settings.mask
     if not source.exists():
         raise InputError(f"{source}: no such file or folder")
@@ -275,11 +266,7 @@ def _masks(
 
 
 def read_names(path: Path) -> dict[str, str]:
-    """Read which image, instance or object is of which class from a CSV with name and class.
-
-    Raises:
-        InputError: where it is no such file, or a name is empty or comes twice.
-    """
+    """Read which image, instance or object is of which class from a CSV with name and class."""
     names: dict[str, str] = {}
     text = read_text(path, _LARGEST_TABLE)
     try:

@@ -42,11 +42,7 @@ def read_depth(path: Path, depth_scale: float | None = None) -> Float32[np.ndarr
 
 
 def read_raw(path: Path) -> np.ndarray:
-    """Read the numbers [h w] of a depth image as they are stored.
-
-    Raises:
-        InputError: as `read_depth`.
-    """
+    """Read the numbers [h w] of a depth image as they are stored; raises as `read_depth` does."""
     image, mode = _read(path, "iuf")
     if mode in ("1", "L"):
         raise InputError(

@@ -66,11 +66,7 @@ def read_mat(path: Path, names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def struct_rows(value: Any, where: str) -> list[dict[str, Any]]:
-    """Return the elements of a struct array, arrays in them as lists; an empty array has none.
-
-    Raises:
-        InputError: where it is something else.
-    """
+    """Return the elements of a struct array, arrays in them as lists; an empty array has none."""
     rows = [value] if isinstance(value, dict) else value
     if isinstance(rows, np.ndarray) and rows.size == 0:
         return []

@@ -99,11 +99,7 @@ class ExtractReport:
 
 
 def wanted_classes(given: Sequence[str]) -> tuple[str, ...] | None:
-    """The classes to map onto: ``pointda10`` for its ten; None for ``all``, the source's own.
-
-    Raises:
-        InputError: where a class comes twice.
-    """
+    """The classes to map onto: ``pointda10`` for its ten; None for ``all``, the source's own."""
     if tuple(given) in (("all",), ()):
         return None
     if tuple(given) == ("pointda10",):

@@ -202,14 +202,7 @@ def _hidden(
     depth: Float[np.ndarray, "n"],
     cell: int,
 ) -> Bool[np.ndarray, "n"]:
-    """Whether points lie a twentieth of their depth behind others at their pixel.
-
-    Args:
-        rows: Row of each point's pixel.
-        columns: Its column.
-        depth: Its depth from that camera.
-        cell: Pixels to an edge of what counts as one place, about the spacing of the points.
-    """
+    """Whether points lie a twentieth of their depth behind others in the same cell of pixels."""
     # Imported here: scenes cut by their mesh do without.
     import cv2
 

@@ -19,16 +19,7 @@ from qs3.io.guards import read_image, read_member
 def read_mask(
     archive: zipfile.ZipFile, frame: int, sizes: Sequence[tuple[int, int]]
 ) -> UInt8[np.ndarray, "h w"] | None:
-    """Return the mask of a frame, None where there is none.
-
-    Args:
-        archive: The zip file of a scene, as `guards.open_zip` opens it.
-        frame: Its number.
-        sizes: Widths and heights that it may have.
-
-    Raises:
-        InputError: where it is damaged, of an unexpected size, or no 8-bit grey PNG.
-    """
+    """Return the mask of a frame, None where there is none; ``sizes`` (w, h) may it have."""
     name = f"instance-filt/{frame}.png"
     # An 8-bit image that nothing packs is a little larger than its pixels.
     most = max(width * height for width, height in sizes) * 5 // 4 + 2**16

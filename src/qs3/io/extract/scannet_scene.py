@@ -158,11 +158,7 @@ def class_of(label: str, class_names: Sequence[str] = POINTDA10) -> str | None:
 
 
 def read_objects(scene: ScanNetScene, class_names: Sequence[str] = POINTDA10) -> list[SceneObject]:
-    """Read the annotated objects of a scene that are in a class asked for.
-
-    Raises:
-        InputError: where the aggregation file is missing or is none.
-    """
+    """Read the annotated objects of a scene that are in a class asked for."""
     path = scene.file(".aggregation.json")
     objects: dict[int, SceneObject] = {}
     for place, value in enumerate(read_list(path, "segGroups")):
@@ -234,11 +230,7 @@ def object_seed(seed: int, scene: ScanNetScene, number: int) -> int:
 
 
 def read_list(path: Path, key: str) -> list[Any]:
-    """The list under ``key`` of a JSON file of annotations, its entries unchecked.
-
-    Raises:
-        InputError: where the file is missing or is none.
-    """
+    """The list under ``key`` of a JSON file of annotations, its entries unchecked."""
     content = read_small_json(path)
     if not isinstance(content, dict) or not isinstance(content.get(key), list):
         raise InputError(f"{path}: has no list {key!r}; it is no annotation of ScanNet")

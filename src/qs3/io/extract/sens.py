@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import Float, UInt16
 
 from qs3.errors import InputError
+from qs3.io.guards import LARGEST_IMAGE
 
 _VERSION = 4
 _RAW, _ZLIB = 0, 1
@@ -37,7 +38,6 @@ _CAMERAS = struct.Struct("<64f2i4IfQ")
 _FRAME = struct.Struct("<16f4Q")
 _LONGEST_NAME = 4096
 _MOST_DEPTH_PIXELS = 2**22
-_MOST_COLOR_PIXELS = 2**25
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,14 +79,8 @@ class DepthFrame:
 
 
 def read_sens_header(path: Path) -> SensHeader:
-    """Read the header of a ``.sens`` file and hold it against the file's size.
-
-    Raises:
-        InputError: where the file is missing, cut off, of another version or compression, or says
-            what cannot be.
-    """
-    path = _existing(path)
-    with path.open("rb", buffering=0) as handle:
+    """Read the header of a ``.sens`` file and hold it against the file's size."""
+    with _opened(path) as handle:
         return _header(path, handle)
 
 
@@ -96,45 +90,31 @@ def read_depth_frames(path: Path, every: int = 1) -> Iterator[DepthFrame]:
     The chain of all frames is walked before the first is yielded, so that a file that is cut off
     yields none; colours are passed over.
 
-    Args:
-        path: The file.
-        every: Step between frames.
-
     Raises:
         InputError: where the file is cut off, a pose is neither rigid nor marked as lost, or a
             depth image does not unpack to its size.
     """
-    if every < 1:
-        raise InputError(f"every {every}: the step between frames has to be at least 1")
-    path = _existing(path)
-    with path.open("rb", buffering=0) as handle:
+    with _opened(path) as handle:
         header = _header(path, handle)
-        for index, pose, _, _ in _frames(path, handle, header):
-            if index % every == 0:
-                _pose(path, index, pose)
-        for index, pose, place, size in _frames(path, handle, header):
-            if index % every == 0:
-                handle.seek(place)
-                blob = _read(path, handle, size, f"frame {index}")
-                yield DepthFrame(
-                    index, _unpack(path, index, header, blob), _pose(path, index, pose)
-                )
+        for _ in _frames(path, handle, header, every):
+            pass
+        for index, pose, place, size in _frames(path, handle, header, every):
+            handle.seek(place)
+            blob = _read(path, handle, size, f"frame {index}")
+            yield DepthFrame(index, _unpack(path, index, header, blob), pose)
 
 
-def _existing(path: Path) -> Path:
-    path = Path(path)
+def _opened(path: Path) -> BinaryIO:
     if not path.is_file():
         raise InputError(f"{path}: no such file; download the scene's .sens file")
-    return path
+    return path.open("rb")
 
 
 def _read(path: Path, handle: BinaryIO, size: int, what: str) -> bytes:
-    parts = b""
-    while len(parts) < size and (part := handle.read(size - len(parts))):
-        parts += part
-    if len(parts) < size:
+    content = handle.read(size)
+    if len(content) < size:
         raise InputError(f"{path}: cut off in {what}; copy or download it again")
-    return parts
+    return content
 
 
 def _header(path: Path, handle: BinaryIO) -> SensHeader:
@@ -146,35 +126,30 @@ def _header(path: Path, handle: BinaryIO) -> SensHeader:
         raise InputError(f"{path}: damaged: its sensor's name would be {length} bytes long")
     name = _read(path, handle, length, "its header").decode("utf-8", errors="replace")
     values = _CAMERAS.unpack(_read(path, handle, _CAMERAS.size, "its header"))
-    matrices = np.array(values[:64], dtype=np.float64).reshape(4, 4, 4)
+    color_k, color_e, depth_k, depth_e = np.array(values[:64], np.float64).reshape(4, 4, 4)
     _, packing, *sizes, shift, frames = values[64:]
     begin = _START.size + length + _CAMERAS.size
-    if packing not in (_RAW, _ZLIB):
-        raise InputError(
-            f"{path}: depth is packed as {_COMPRESSIONS.get(packing, packing)}, which is not read; "
-            "save it as zlib_ushort with ScanNet's tools"
-        )
     color, depth = (sizes[0], sizes[1]), (sizes[2], sizes[3])
-    if not 0 < depth[0] * depth[1] <= _MOST_DEPTH_PIXELS or color[0] * color[1] > (
-        _MOST_COLOR_PIXELS
-    ):
-        raise InputError(
-            f"{path}: damaged: images of {depth[0]}×{depth[1]} and {color[0]}×{color[1]} pixels"
-        )
-    if not (np.isfinite(shift) and shift > 0):
-        raise InputError(f"{path}: damaged: a depth shift of {shift}")
-    if frames == 0:
-        raise InputError(f"{path}: holds no frame")
-    if frames > (size - begin) // _FRAME.size:
-        raise InputError(
-            f"{path}: announces {frames} frames, more than its {size} bytes can hold; copy or "
-            "download it again"
-        )
-    color_k, color_e, depth_k, depth_e = matrices
+    pixels = (depth[0] * depth[1], color[0] * color[1])
     # A file without colours has no colour camera.
-    cameras = [depth_k] + [color_k] * bool(color[0] * color[1])
-    if not (all(map(_is_camera, cameras)) and is_rigid(depth_e) and is_rigid(color_e)):
-        raise InputError(f"{path}: damaged: the calibration of its cameras is none")
+    cameras = [depth_k] + [color_k] * bool(pixels[1])
+    faults = {
+        f"depth is packed as {_COMPRESSIONS.get(packing, packing)}, which is not read; save it as "
+        "zlib_ushort with ScanNet's tools": packing not in (_RAW, _ZLIB),
+        f"damaged: images of {depth[0]}×{depth[1]} and {color[0]}×{color[1]} pixels": not (
+            0 < pixels[0] <= _MOST_DEPTH_PIXELS and pixels[1] <= LARGEST_IMAGE
+        ),
+        f"damaged: a depth shift of {shift}": not 0 < shift < np.inf,
+        "holds no frame": frames == 0,
+        f"announces {frames} frames, more than its {size} bytes can hold; copy or download it "
+        "again": frames > (size - begin) // _FRAME.size,
+        "damaged: the calibration of its cameras is none": not (
+            all(map(_is_camera, cameras)) and is_rigid(depth_e) and is_rigid(color_e)
+        ),
+    }
+    for fault, is_there in faults.items():
+        if is_there:
+            raise InputError(f"{path}: {fault}")
     return SensHeader(
         sensor=name,
         depth_intrinsic=depth_k[:3, :3],
@@ -190,9 +165,9 @@ def _header(path: Path, handle: BinaryIO) -> SensHeader:
 
 
 def _frames(
-    path: Path, handle: BinaryIO, header: SensHeader
-) -> Iterator[tuple[int, Float[np.ndarray, "4 4"], int, int]]:
-    """Number, pose, place and size of the depth bytes of every frame, checked against the file."""
+    path: Path, handle: BinaryIO, header: SensHeader, every: int
+) -> Iterator[tuple[int, Float[np.ndarray, "4 4"] | None, int, int]]:
+    """Number, pose, place and size of the depth bytes of every such frame; all are checked."""
     end = path.stat().st_size
     width, height = header.depth_size
     plain = 2 * width * height
@@ -212,17 +187,14 @@ def _frames(
             raise InputError(
                 f"{path}: damaged: {what} has {depth_bytes} bytes of depth for {width}×{height}"
             )
-        yield index, np.array(values[:16], dtype=np.float64).reshape(4, 4), begin, depth_bytes
-
-
-def _pose(
-    path: Path, index: int, pose: Float[np.ndarray, "4 4"]
-) -> Float[np.ndarray, "4 4"] | None:
-    if np.isinf(pose[0, 0]) or not pose.any():
-        return None
-    if not is_rigid(pose):
-        raise InputError(f"{path}: damaged: the pose of frame {index} is no rigid transform")
-    return pose
+        if index % every == 0:
+            pose = np.array(values[:16], dtype=np.float64).reshape(4, 4)
+            is_lost = np.isinf(pose[0, 0]) or not pose.any()
+            if not is_lost and not is_rigid(pose):
+                raise InputError(
+                    f"{path}: damaged: the pose of frame {index} is no rigid transform"
+                )
+            yield index, None if is_lost else pose, begin, depth_bytes
 
 
 def is_rigid(matrix: Float[np.ndarray, "4 4"]) -> bool:

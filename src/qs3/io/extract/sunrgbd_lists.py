@@ -110,11 +110,7 @@ def _look_for_boxes(base: Path) -> Path | None:
 
 
 def below(root: Path, name: str) -> Path:
-    """Return the path of a name that a file gives, which must not lead out of ``root``.
-
-    Raises:
-        InputError: where it does.
-    """
+    """Return the path of a name that a file gives, which must not lead out of ``root``."""
     plain = PurePosixPath(name.replace("\\", "/"))
     path = root / plain
     if plain.is_absolute() or ".." in plain.parts or not plain.parts or "\0" in name:

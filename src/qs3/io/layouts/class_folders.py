@@ -59,11 +59,7 @@ def read_folder(
 
 
 def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudFile]:
-    """List the cloud files of a folder without reading them; see `read_folder`.
-
-    Raises:
-        InputError: as `read_folder` does.
-    """
+    """List the cloud files of a folder without reading them; all as `read_folder` does."""
     if not root.is_dir():
         raise InputError(f"{root}: no such folder")
     folders = entries(root, os.DirEntry.is_dir)
@@ -101,11 +97,7 @@ def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudF
 
 
 def choose_split(root: Path, files: Sequence[CloudFile], split: str | None) -> list[CloudFile]:
-    """Keep the files of one split; None keeps all.
-
-    Raises:
-        InputError: where there is none of that split.
-    """
+    """Keep the files of one split, of which there must be some; None keeps all."""
     if split is None:
         return list(files)
     parts = sorted({file.split for file in files if file.split})

@@ -109,11 +109,7 @@ def list_parts(root: Path, pattern: str, names: str, split: str | None) -> list[
 
 
 def choose(where: Path, parts: Sequence[Part], split: str | None) -> list[Part]:
-    """Keep the files of one split; None keeps all.
-
-    Raises:
-        InputError: where there is none.
-    """
+    """Keep the files of one split, of which there must be some; None keeps all."""
     chosen = [part for part in parts if split in (None, part.split)]
     if not chosen:
         others = ", ".join(sorted({part.split for part in parts}))

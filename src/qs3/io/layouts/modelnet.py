@@ -47,16 +47,7 @@ _PAGE = "http://modelnet.cs.princeton.edu/ModelNet40.zip"
 
 
 def read_modelnet_h5(path: Path, split: str | None = None) -> RaggedClouds:
-    """Read the folder.
-
-    Args:
-        path: Folder of the .h5 files.
-        split: ``train`` or ``test``; None takes both.
-
-    Raises:
-        InputError: where there is no such file or split, a file is bad, or a label has no name;
-            without ``shape_names.txt`` the names are ModelNet40's.
-    """
+    """Read the folder of .h5 files; without ``shape_names.txt`` the names are ModelNet40's."""
     parts = list_parts(path, _FILES, "ply_data_train<i>.h5 or ply_data_test<i>.h5", split)
     listed = path / _NAMES
     if listed.is_file():
@@ -75,18 +66,10 @@ def read_modelnet_h5(path: Path, split: str | None = None) -> RaggedClouds:
 def write_modelnet_h5(path: Path, clouds: RaggedClouds) -> None:
     """Write the folder; read back, clouds, class names and splits are equal.
 
-    Where all classes are among ModelNet40's, labels are those of the forty; other classes keep
-    their own labels, and ``shape_names.txt`` tells their names. Where the clouds have one size it
-    is kept; otherwise all are brought to 2,048 points. The order within a split is kept, the ids
-    are not.
-
-    Args:
-        path: New or empty folder.
-        clouds: What to write.
-
-    Raises:
-        InputError: where there are no labels, more than 256 classes, a class
-            whose name fits no line, or a cloud of neither train nor test.
+    Where all classes are among ModelNet40's, labels are those of the forty; other classes, at most
+    256, keep their own labels, and ``shape_names.txt`` tells their names. Where the clouds have one
+    size it is kept; otherwise all are brought to 2,048 points. The order within a split is kept,
+    the ids are not.
     """
     names = _names(clouds.class_names)
     labels = labels_as(clouds, names).astype(np.uint8)[:, None]
@@ -108,16 +91,7 @@ def _names(class_names: Sequence[str]) -> Sequence[str]:
 
 
 def read_modelnet_meshes(path: Path, split: str | None = None) -> RaggedClouds:
-    """Sample the meshes of a tree, one after another; only their samples stay in memory.
-
-    Args:
-        path: Folder of the classes.
-        split: ``train`` or ``test``; None takes both.
-
-    Raises:
-        InputError: where there is no mesh or split, a class is none of ModelNet40's, or a mesh is
-            bad.
-    """
+    """Sample the meshes of a tree, one after another; only their samples stay in memory."""
     files = list_folder(path, (".off",))
     for file in files:
         if file.class_name not in MODELNET40 or file.split not in SPLITS:

@@ -6,7 +6,7 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.files import sha256
-from qs3.io.guards import MOST_BYTES, load_npy, open_zip, read_member
+from qs3.io.guards import check_announced, load_npy, open_zip, read_member
 from qs3.io.layouts.format import SPLITS, Format
 from qs3.io.ragged import RaggedClouds
 
@@ -57,9 +57,10 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     try:
         with open_zip(path) as archive:
             for name in ("points", "offset", "label", "class_names", "is_train", "name"):
-                content = read_member(archive, f"{name}.npy", MOST_BYTES - whole)
+                content = read_member(archive, f"{name}.npy")
                 if content is not None:
                     whole += len(content)
+                    check_announced("all of it together", whole, whole)
                     arrays[name] = load_npy(content)
     except InputError as error:
         if not path.is_file():

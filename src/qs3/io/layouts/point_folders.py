@@ -42,14 +42,7 @@ def write_folder(root: Path, clouds: RaggedClouds, ending: str) -> None:
 
 
 def write_files(root: Path, clouds: RaggedClouds, folders: Sequence[str], ending: str) -> None:
-    """Write each cloud as one file into its own folder below ``root``; names as in `write_folder`.
-
-    Args:
-        root: Folder to make.
-        clouds: What to write.
-        folders: Folder of each cloud, parts apart by ``/``; checked by the caller.
-        ending: One of `point_files.WRITTEN_FILES`.
-    """
+    """Write each cloud as one file into its own of ``folders`` below ``root`` (``class/train``)."""
     taken: set[str] = set()
     count = len(clouds.clouds)
     for folder in sorted(set(folders)):

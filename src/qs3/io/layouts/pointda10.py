@@ -153,14 +153,6 @@ def write_npy(path: Path, clouds: RaggedClouds) -> None:
     Read back as ``upright`` or ``raw``, clouds, labels and splits are equal; as ``aligned`` they
     are the unit balls of the clouds. Where the clouds have one size it is kept; otherwise all are
     brought to 2,048 points. All ten classes get a folder, since some loaders count folders.
-
-    Args:
-        path: New or empty folder; where it is called modelnet, the tree goes into it.
-        clouds: What to write.
-
-    Raises:
-        InputError: where there are no labels, a class is none of the ten, or a
-            cloud is of neither train nor test.
     """
     labels = labels_as(clouds, POINTDA10)
     points = same_size(clouds)
@@ -179,13 +171,6 @@ def write_h5(path: Path, clouds: RaggedClouds) -> None:
     (x, z, −y), which is turned back without rounding: read as ``upright``, clouds, labels and
     splits are equal; as ``aligned`` they are `preparation.unit_ball` of the clouds, to the bit.
     Sizes as in `write_npy`; the order within a split is kept, the ids are not.
-
-    Args:
-        path: New or empty folder; where it is called scannet, the files go into it.
-        clouds: What to write.
-
-    Raises:
-        InputError: as `write_npy` does.
     """
     labels = labels_as(clouds, POINTDA10).astype(np.int32)
     files = ("train_{}.h5", "test_{}.h5")

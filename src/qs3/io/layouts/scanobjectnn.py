@@ -41,16 +41,7 @@ _SPLITS = {"training": "train", "test": "test"}
 
 
 def read_scanobjectnn(path: Path, split: str | None = None) -> RaggedClouds:
-    """Read the files of one variant.
-
-    Args:
-        path: A folder that holds one variant, its training file, test file or both; or one file.
-        split: ``train`` or ``test``; None takes what is there.
-
-    Raises:
-        InputError: where there is no such file or split, the folder holds several variants, or a
-            file is bad.
-    """
+    """Read one variant: a folder that holds its training file, test file or both; or one file."""
     path = Path(path)
     files = _one_variant(path) if path.is_dir() else [path]
     parts = []
@@ -86,14 +77,6 @@ def write_scanobjectnn(path: Path, clouds: RaggedClouds) -> None:
 
     Read back, clouds, classes and splits are equal. Where the clouds have one size it is kept;
     otherwise all are brought to 2,048 points. The order within a split is kept, the ids are not.
-
-    Args:
-        path: New or empty folder.
-        clouds: What to write.
-
-    Raises:
-        InputError: where there are no labels, a class is none of the fifteen,
-            or a cloud is of neither train nor test.
     """
     labels = labels_as(clouds, CLASSES).astype(np.int32)
     path.mkdir(parents=True, exist_ok=True)

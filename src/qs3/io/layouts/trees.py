@@ -47,17 +47,7 @@ _GRASPNET_PAGE = "https://drive.google.com/file/d/1VVHmsSToFMVccge-LsYJW67IS94rN
 
 
 def read_ten_classes(root: Path, split: str | None, ending: str) -> RaggedClouds:
-    """Read ``<class>/<train|test>/*`` whose folders are named after PointDA-10's ten classes.
-
-    Args:
-        root: Folder of the classes.
-        split: ``train`` or ``test``; None takes both.
-        ending: Of the files; others are passed over.
-
-    Raises:
-        InputError: where a class is none of the ten, a file lies outside train and test, or a file
-            is bad.
-    """
+    """Read ``<class>/<train|test>/*<ending>``, folders named after PointDA-10's ten classes."""
     files = list_folder(root, (ending,))
     for file in files:
         if file.split not in SPLITS or not file.class_name:
