@@ -12,6 +12,8 @@ from qs3.io.load import load_clouds, load_unlabelled
 from qs3.meshes.classes import POINTDA10
 from qs3.store.generate import GenerateSettings, generate
 
+from .hostile import refused
+
 
 @pytest.fixture
 def folder(tmp_path, rng):
@@ -136,9 +138,8 @@ def test_an_archive_of_clouds_of_different_sizes(rng, tmp_path):
 )
 def test_a_bad_archive_is_named(rng, tmp_path, changes, message):
     path = write_npz(tmp_path / "a.npz", rng, **changes)
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(message, "a.npz"):
         load_clouds(path)
-    assert "a.npz" in str(caught.value)
 
 
 def test_an_archive_that_is_none(rng, tmp_path):

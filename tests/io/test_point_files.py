@@ -10,6 +10,8 @@ from qs3.errors import InputError
 from qs3.io.pcd import lzf_decompress
 from qs3.io.point_files import read_cloud
 
+from .hostile import refused
+
 POINTS = np.array([[0.5, -1.25, 3.0], [1e-3, 2.0, -7.5], [0.0, 0.0, 0.25]], dtype=np.float32)
 NORMALS = np.array([[0, 0, 1], [0, 1, 0], [1, 0, 0]], dtype=np.float32)
 
@@ -145,10 +147,8 @@ def bad_cases() -> dict[str, tuple[str, bytes, str]]:
 def test_a_bad_file_is_one_clear_line_that_names_it(tmp_path, case):
     name, content, message = bad_cases()[case]
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(message, tmp_path / name):
         read_cloud(tmp_path / name)
-    assert str(caught.value).startswith(str(tmp_path / name))
-    assert "\n" not in str(caught.value)
 
 
 def test_pickled_content_is_never_loaded(tmp_path):

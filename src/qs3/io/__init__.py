@@ -1,8 +1,4 @@
-"""Data sets: clouds in memory, Parquet stores, readers, and the generation of new ones.
-
-Imported by name from their modules, since they need more: `generate` (the sensor), `store` and
-`shards` (Parquet).
-"""
+"""Clouds in memory, and the readers and writers of files, data sets and scans."""
 
 from qs3.io.clouds import CloudKind as CloudKind
 from qs3.io.clouds import PointClouds as PointClouds

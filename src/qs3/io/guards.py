@@ -61,16 +61,13 @@ def utf8(name: str) -> str:
 
 
 def check_announced(what: str, announced: int, stored: int, densest: int = DENSEST) -> None:
-    """Refuse an announced size that cannot be, or that would fill the memory.
+    """Refuse an announced size above ``MOST_BYTES``, or above what the file can hold of it.
 
     Args:
         what: What is announced, for the message.
         announced: Bytes that it would take.
         stored: Bytes of the file that hold it.
         densest: Largest ratio of the two; 1 where nothing is compressed.
-
-    Raises:
-        InputError: where it is more than ``MOST_BYTES`` or than ``stored`` can hold.
     """
     if announced > MOST_BYTES:
         raise InputError(
@@ -123,12 +120,7 @@ def read_small_json(path: Path, largest: int = 1 << 30) -> Any:
 
 
 def pick(value: Any, kind: type[_Kind], where: str | Path) -> _Kind:
-    """Take the fields of a dataclass out of a table of somebody's file, which may hold more.
-
-    Raises:
-        InputError: where it is no table, a field is missing or of another type; ``where`` heads
-            the message.
-    """
+    """Take the fields of a dataclass out of a table of somebody's file, which may hold more."""
     if not isinstance(value, dict):
         raise InputError(f"{where}: not a JSON object; a table of names and values is needed")
     names = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
@@ -154,15 +146,10 @@ def as_array(numbers: Numbers, shape: tuple[int, ...], name: str) -> Float[np.nd
 def load_npy(
     content: bytes, accept: Callable[[tuple[int, ...], np.dtype], None] | None = None
 ) -> np.ndarray:
-    """Return the array of an npy file; it shares the memory of ``content`` and is not written to.
+    """Return the array of an npy file; it shares the memory of ``content`` and is not writable.
 
-    Args:
-        content: The file.
-        accept: Raises where shape and type are not what is asked for; called before the numbers
-            are looked at.
-
-    Raises:
-        InputError: where the file is damaged, holds objects, or announces more than it has.
+    ``accept`` raises where shape and type are not what is asked for; it is called before the
+    numbers are looked at. Damaged files, objects, and more announced than there is are refused.
     """
     handle = io.BytesIO(content)
     try:

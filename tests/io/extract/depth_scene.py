@@ -61,11 +61,3 @@ def millimetres(depth) -> np.ndarray:
 def off_surface(mesh, points) -> np.ndarray:
     """Distance of each point from the mesh, metres."""
     return trimesh.proximity.closest_point(mesh, np.asarray(points, dtype=np.float64))[1]
-
-
-def mutated(content: bytes, rng) -> bytes:
-    """The bytes with a few of them changed, and at times cut off."""
-    changed = bytearray(content)
-    for _ in range(int(rng.integers(1, 6))):
-        changed[int(rng.integers(len(changed)))] = int(rng.integers(256))
-    return bytes(changed[: int(rng.integers(len(changed) + 1))] if rng.random() < 0.3 else changed)

@@ -24,10 +24,10 @@ from qs3.sensor.scan import scan
 from qs3.sensor.speckle import PatternSettings
 from qs3.sensor.views import Placement
 
+from ..hostile import fuzz, refused
 from .depth_scene import (
     MATRIX,
     camera_to_world,
-    mutated,
     off_surface,
     photograph,
     thing,
@@ -200,10 +200,8 @@ def spoil(scene, tmp_path, name, change):
 )  # fmt: skip
 def test_damaged_scenes_are_refused_by_name(scene, tmp_path, name, change, message):
     source = spoil(scene, tmp_path, name, change)
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(message, "scene"):
         clouds(source)
-    assert "scene" in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def drop(*names):
@@ -232,29 +230,12 @@ def test_folders_of_pictures_are_names_and_no_paths():
             DepthImageSettings(depth_folder=name)
 
 
-def fuzz(scene, tmp_path, rng, rounds):
-    shutil.copytree(scene, tmp_path / "scene")
-    refused = 0
-    for number in range(rounds):
-        name = ("scene_camera.json", "scene_gt.json")[number % 2]
-        path = tmp_path / "scene" / name
-        path.write_bytes(mutated((scene / name).read_bytes(), rng))
-        try:
-            frames, _ = list_bop_frames(tmp_path / "scene", DepthImageSettings(), {})
-            if number % 20 == 0:
-                clouds(tmp_path / "scene")
-            assert len(frames) <= 2
-        except InputError as error:
-            assert "\n" not in str(error)
-            refused += 1
-        path.write_bytes((scene / name).read_bytes())
-    assert refused > rounds / 10
-
-
 def test_mutated_scenes_are_read_or_refused(scene, tmp_path, rng):
-    fuzz(scene, tmp_path, rng, 200)
+    shutil.copytree(scene, tmp_path / "scene")
+    paths = [tmp_path / "scene" / name for name in ("scene_camera.json", "scene_gt.json")]
 
+    def read(_):
+        assert len(list_bop_frames(tmp_path / "scene", DepthImageSettings(), {})[0]) <= 2
 
-@pytest.mark.slow
-def test_many_mutated_scenes_are_read_or_refused(scene, tmp_path, rng):
-    fuzz(scene, tmp_path, rng, 4000)
+    fuzz(paths, read, rng, 200)
+    clouds(tmp_path / "scene")

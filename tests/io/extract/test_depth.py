@@ -24,13 +24,13 @@ from qs3.io.extract.depth import (
 from qs3.io.extract.depth_images import read_depth, read_mask
 from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
 
+from ..hostile import fuzz, mutated, refused
 from .depth_scene import (
     HEIGHT,
     MATRIX,
     WIDTH,
     camera_to_world,
     millimetres,
-    mutated,
     off_surface,
     photograph,
     thing,
@@ -265,10 +265,8 @@ def test_bad_cameras_on_the_command_line(text, message):
 def test_bad_camera_files_are_refused_by_name(tmp_path, name, text, message):
     path = tmp_path / name
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(message, path):
         read_intrinsics(path)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def png(width, height, bits=16, colour=0, data=b"\0" * 32):
@@ -331,10 +329,8 @@ def test_bad_images_are_refused_by_name(tmp_path, name, capfd):
     content, message = BAD_IMAGES[name]
     path = tmp_path / name
     path.write_bytes(content)
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(message, path):
         read_depth(path)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
     assert capfd.readouterr().err == ""
     if not name.startswith(("grey8", "colour")):
         with pytest.raises(InputError):
@@ -427,35 +423,17 @@ def resealed(content: bytes) -> bytes:
     return b"".join(parts)
 
 
-def fuzz(tmp_path, rng, rounds):
-    np.save(tmp_path / "a.npy", GREY16.astype(np.float32))
-    kinds = {
-        "png": encoded(".png", GREY16),
-        "tif": encoded(".tiff", GREY16),
-        "npy": (tmp_path / "a.npy").read_bytes(),
-    }
-    refused = 0
-    for number in range(rounds):
-        for kind, content in kinds.items():
-            bad = mutated(content, rng)
-            path = tmp_path / f"bad.{kind}"
-            path.write_bytes(resealed(bad) if kind == "png" and number % 2 else bad)
-            for read in (read_depth, read_mask):
-                try:
-                    image = read(path)
-                except InputError as error:
-                    assert "\n" not in str(error)
-                    refused += 1
-                else:
-                    assert image.ndim == 2
-                    assert image.size < 1 << 22
-    assert refused > rounds
-
-
 def test_mutated_images_are_read_or_refused(tmp_path, rng):
-    fuzz(tmp_path, rng, 60)
+    np.save(tmp_path / "a.npy", GREY16.astype(np.float32))
+    (tmp_path / "a.png").write_bytes(encoded(".png", GREY16))
+    (tmp_path / "a.tif").write_bytes(encoded(".tiff", GREY16))
 
+    def read(path):
+        assert read_depth(path).size < 1 << 22
+        read_mask(path)
 
-@pytest.mark.slow
-def test_many_mutated_images_are_read_or_refused(tmp_path, rng):
-    fuzz(tmp_path, rng, 1500)
+    def sealed(content, rng):
+        bad = mutated(content, rng)
+        return resealed(bad) if content.startswith(b"\x89PNG") and rng.random() < 0.5 else bad
+
+    fuzz(sorted(tmp_path.iterdir()), read, rng, 150, sealed)

@@ -29,6 +29,7 @@ from qs3.io.guards import open_zip
 from qs3.io.layouts.store import read_ragged
 from qs3.store.manifest import open_dataset
 
+from ..hostile import refused
 from .writers import (
     CHAIR,
     LOST,
@@ -308,10 +309,8 @@ BAD_MASKS = {
 def test_a_bad_mask_is_one_line(tmp_path: Path, fault: str) -> None:
     content, message = BAD_MASKS[fault]
     path = write_masks(tmp_path / "a.zip", {7: content})
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(message, "a.zip: instance-filt/7.png"):
         mask_of(path, 7)
-    assert "a.zip: instance-filt/7.png" in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_zip_bomb_is_not_unpacked(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from qs3.errors import InputError
 from qs3.geometry import look_at
 from qs3.io.extract.sens import read_depth_frames, read_sens_header
 
+from ..hostile import fuzz, refused
 from .writers import LOST, Sens, camera_matrix
 
 SIZE = (16, 12)
@@ -106,10 +107,8 @@ BAD_HEADERS = {
 def test_a_bad_file_is_one_line(tmp_path: Path, fault: str) -> None:
     sens, message = BAD_HEADERS[fault]
     path = sens.write(tmp_path / "a.sens")
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(message, path):
         list(read_depth_frames(path))
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_cut_file_yields_nothing(tmp_path: Path) -> None:
@@ -159,41 +158,6 @@ def test_damaged_depth_is_refused(tmp_path: Path, blob: bytes) -> None:
         next(frames)
 
 
-def mutated(content: bytes, rng: np.random.Generator) -> bytes:
-    """Change some bytes, or cut, double or drop a part."""
-    bad = bytearray(content)
-    kind = rng.integers(4)
-    begin, end = sorted(rng.integers(0, len(bad), 2).tolist())
-    if kind == 0:
-        for place in rng.integers(0, len(bad), rng.integers(1, 8)):
-            bad[place] = rng.choice([0, 1, 127, 128, 255, rng.integers(256)])
-    elif kind == 1:
-        del bad[end:]
-    elif kind == 2:
-        del bad[begin:end]
-    else:
-        bad[begin:begin] = bad[begin:end]
-    return bytes(bad)
-
-
-def fuzz(path: Path, count: int) -> int:
-    content, refused = small().content(), 0
-    rng = np.random.default_rng(0)
-    for _ in range(count):
-        path.write_bytes(mutated(content, rng))
-        try:
-            for frame in read_depth_frames(path):
-                assert frame.steps.shape == SIZE[::-1]
-        except InputError as error:
-            refused += 1
-            assert "\n" not in str(error)
-    return refused
-
-
-def test_mutated_files_raise_nothing_else(tmp_path: Path) -> None:
-    assert fuzz(tmp_path / "a.sens", 300) > 100
-
-
-@pytest.mark.slow
-def test_many_mutated_files_raise_nothing_else(tmp_path: Path) -> None:
-    assert fuzz(tmp_path / "a.sens", 3000) > 1000
+def test_mutated_files_raise_nothing_else(tmp_path: Path, rng: np.random.Generator) -> None:
+    path = small().write(tmp_path / "a.sens")
+    fuzz([path], lambda path: list(read_depth_frames(path)), rng, 200)

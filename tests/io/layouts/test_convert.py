@@ -118,9 +118,8 @@ def test_coordinates_beyond_float32_are_refused(tmp_path):
     ],
 )
 def test_what_cannot_be_done_is_one_line_and_leaves_nothing(tmp_path, source, options, message):
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(message):
         convert(source, tmp_path / "out", **options)
-    assert "\n" not in str(caught.value)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["source"]
 
 
@@ -203,6 +202,8 @@ SLOW_CONVERT = """
 import sys, time
 from qs3.io import convert
 from qs3.io.layouts import point_folders
+
+from ..hostile import refused
 write = point_folders.cloud_bytes
 def slowly(*arguments):
     time.sleep(0.02)

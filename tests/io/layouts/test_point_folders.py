@@ -15,6 +15,8 @@ from qs3.io.load import load_unlabelled
 from qs3.io.point_files import WRITTEN_FILES, cloud_bytes, read_cloud
 from qs3.io.ragged import RaggedClouds
 
+from ..hostile import fuzz
+
 
 def unlabelled(clouds, splits=()):
     ids = tuple(f"scene/{i}" for i in range(len(clouds)))
@@ -233,44 +235,19 @@ def test_a_ply_with_other_columns_and_elements_around_its_vertices(tmp_path, for
     np.testing.assert_array_equal(read_cloud(tmp_path / "a.ply"), [[1, 2, 3], [4, 5, 6]])
 
 
-def fuzzed(rng, content: bytes) -> bytes:
-    data = bytearray(content)
-    for _ in range(rng.integers(1, 6)):
-        kind, place = rng.integers(4), int(rng.integers(len(data)))
-        # Half of the time in the header, where it matters.
-        place = place % 160 if rng.random() < 0.5 else place
-        if kind == 0:
-            data[place] = rng.integers(256)
-        elif kind == 1:
-            del data[place : place + int(rng.integers(1, 40))]
-        elif kind == 2:
-            data[place:place] = bytes(rng.integers(48, 58, size=int(rng.integers(1, 12))).tolist())
-        else:
-            data = data[: place + 1]
-        if not data:
-            break
-    return bytes(data)
-
-
 @pytest.mark.parametrize("ending", [*WRITTEN_FILES, ".off", "mesh.ply"])
-def test_mutated_files_give_points_or_one_clear_line(rng, tmp_path, ending, count=60):
+def test_mutated_files_give_points_or_one_clear_line(rng, tmp_path, ending):
     points = rng.random((40, 3)).astype(np.float32)
     ball = trimesh.creation.icosphere(subdivisions=1)
     whole = {".off": lambda: ball.export(file_type="off").encode(),
              "mesh.ply": lambda: ball.export(file_type="ply")}  # fmt: skip
-    content = whole.get(ending, lambda: cloud_bytes(points, ending))()
     path = tmp_path / f"a{ending}"
-    refused = 0
-    for _ in range(count):
-        path.write_bytes(fuzzed(rng, content))
-        try:
-            result = read_cloud(path, mesh_points=20)
-        except InputError as error:
-            refused += 1
-            assert str(error).startswith(f"{path}: ")
-            assert "\n" not in str(error)
-        else:
-            assert result.dtype == np.float32
-            assert result.shape[1] == 3
-            assert np.isfinite(result).all()
-    assert refused > count // 10
+    path.write_bytes(whole.get(ending, lambda: cloud_bytes(points, ending))())
+
+    def read(path):
+        result = read_cloud(path, mesh_points=20)
+        assert result.dtype == np.float32
+        assert result.shape[1] == 3
+        assert np.isfinite(result).all()
+
+    fuzz([path], read, rng, 60)

@@ -12,6 +12,8 @@ from qs3.io.preparation import unit_ball
 from qs3.io.ragged import RaggedClouds
 from qs3.meshes.classes import POINTDA10
 
+from ..hostile import refused
+
 BY_NAME = {layout.name: layout for layout in pointda10.FORMATS}
 
 
@@ -303,6 +305,5 @@ def few_columns(root):
 def test_hostile_trees_are_refused_in_one_line(tmp_path, rng, damage, domain, message):
     release(tmp_path, rng)
     damage(tmp_path)
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(message):
         read_pointda10(tmp_path / domain)
-    assert "\n" not in str(caught.value)

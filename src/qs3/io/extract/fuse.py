@@ -96,26 +96,28 @@ class ObjectFusion:
     def __init__(self, voxel: float, max_points: int, max_frames: int, seed: int) -> None:
         self._voxel, self._max_points = voxel, max_points
         self._max_frames, self._seed = max_frames, seed
-        self._parts: dict[int, _Part] = {}
-        self._ranks: dict[int, int] = {}
-        self._used = 0
+        self._held: dict[int, tuple[int, int, _Part]] = {}  # rank, points and part of each frame
+        self._fused: list[_Part] = []  # of all frames, where none is left out
+        self._used = self._measured = 0
         self.offered = 0
         """Frames offered so far."""
-        self.measured = 0
-        """Points in the frames that are held or were fused, before sampling."""
-        self._counts: dict[int, int] = {}
 
     @property
     def frames(self) -> int:
         """Frames fused."""
-        return self._used if self._max_frames == 0 else len(self._parts)
+        return self._used + len(self._held)
+
+    @property
+    def measured(self) -> int:
+        """Points in the frames that are held or were fused, before sampling."""
+        return self._measured + sum(count for _, count, _ in self._held.values())
 
     def wants(self, frame: int) -> bool:
         """Whether `add` would keep a frame of this number now."""
         return (
             self._max_frames == 0
-            or len(self._ranks) < self._max_frames
-            or self._rank(frame) < max(self._ranks.values())
+            or len(self._held) < self._max_frames
+            or self._rank(frame) < max(rank for rank, _, _ in self._held.values())
         )
 
     def add(
@@ -135,22 +137,17 @@ class ObjectFusion:
         part = self._kept(points, mix(place, self._seed))
         if self._max_frames == 0:
             self._used += 1
-            self.measured += len(points)
-            self._parts[0] = self._union([*self._parts.values(), part])
+            self._measured += len(points)
+            self._fused = [self._union([*self._fused, part])]
             return
-        if len(self._parts) == self._max_frames:
-            worst = max(self._ranks, key=lambda kept: self._ranks[kept])
-            self.measured -= self._counts.pop(worst)
-            del self._parts[worst], self._ranks[worst]
-        self._parts[frame], self._ranks[frame] = part, self._rank(frame)
-        self._counts[frame] = len(points)
-        self.measured += len(points)
+        if len(self._held) == self._max_frames:
+            del self._held[max(self._held, key=lambda number: self._held[number][0])]
+        self._held[frame] = (self._rank(frame), len(points), part)
 
     def points(self) -> Float32[np.ndarray, "n 3"]:
         """Return the cloud: at most ``max_points`` measured points, frame after frame."""
-        if not self._parts:
-            return np.zeros((0, 3), dtype=np.float32)
-        return self._union([self._parts[frame] for frame in sorted(self._parts)])[0]
+        parts = self._fused + [self._held[frame][2] for frame in sorted(self._held)]
+        return self._union(parts)[0] if parts else np.zeros((0, 3), dtype=np.float32)
 
     def _rank(self, frame: int) -> int:
         return int(mix(np.array([frame], dtype=np.uint64), self._seed + 1)[0])

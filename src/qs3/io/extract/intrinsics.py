@@ -50,11 +50,7 @@ class Intrinsics:
             raise InputError(f"camera: depth scale {self.depth_scale:g} must be positive")
 
     def check_size(self, shape: tuple[int, ...], where: str) -> None:
-        """Refuse an image of another size than the camera's.
-
-        Raises:
-            InputError: naming ``where`` and both sizes.
-        """
+        """Refuse an image of another size than the camera's; ``where`` names it."""
         height, width = shape[:2]
         if (self.width or width, self.height or height) != (width, height):
             raise InputError(

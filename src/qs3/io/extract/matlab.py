@@ -31,15 +31,10 @@ _TEXTS = (1, 2, 4, 16, 17, 18)
 
 
 def read_mat(path: Path, names: tuple[str, ...]) -> dict[str, Any]:
-    """Read variables of a MAT file of version 5 to 7.
+    """Read those of some variables that a MAT file of version 5 to 7 has; others are passed over.
 
-    Args:
-        path: The file.
-        names: Variables to read; others are passed over.
-
-    Returns:
-        Those of them that are there: a struct array as a list of dicts, numbers as arrays without
-        dimensions of length 1, text as text.
+    A struct array comes as a list of dicts, numbers as arrays without dimensions of length 1, text
+    as text.
 
     Raises:
         InputError: where the file is missing, of another version, cut off or damaged, announces

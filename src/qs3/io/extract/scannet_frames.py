@@ -22,6 +22,7 @@ ECCV 2022; Dai et al., "ScanNet", CVPR 2017.
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
+from typing import NamedTuple
 from zipfile import ZipFile
 
 import numpy as np
@@ -46,12 +47,22 @@ from qs3.io.guards import open_zip
 
 _MASKS = "_2d-instance-filt.zip"
 
-Owners = Callable[
-    [int, Float[np.ndarray, "n 3"], Int[np.ndarray, "n"], Float[np.ndarray, "4 4"]],
-    Int[np.ndarray, "n"] | None,
-]
-"""Gives each point of a frame its object: from the frame's number, the points in the depth camera,
-their pixels and the pose; −1 is no object, None that the frame has no mask."""
+
+class Seen(NamedTuple):
+    """What the depth camera measured in one frame."""
+
+    frame: int
+    """Its number."""
+    points: Float[np.ndarray, "n 3"]
+    """In the depth camera, metres."""
+    pixels: Int[np.ndarray, "n"]
+    """Their pixels."""
+    pose: Float[np.ndarray, "4 4"]
+    """Camera to world."""
+
+
+Owners = Callable[[Seen], Int[np.ndarray, "n"] | None]
+"""Gives each point of a frame its object; −1 is no object, None that the frame has no mask."""
 
 
 def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[ExtractedCloud]:
@@ -60,14 +71,6 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
     One frame is in memory at a time, and of each object no more than ``max_frames`` ×
     ``max_points`` points, however long the scene; only the index of the masks' zip file grows, by
     less than 1 kB a frame. Nothing is yielded before the last frame is read.
-
-    Args:
-        scene: Needs the ``.sens`` file and the aggregation; the masks, or the mesh with its
-            segments.
-        settings: What is kept.
-
-    Raises:
-        InputError: where a file of the scene is missing, damaged or cut off.
     """
     objects = read_objects(scene, settings.class_names)
     align = axis_alignment(scene)
@@ -94,8 +97,8 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
                 continue
             flat = frame.steps.reshape(-1)
             pixels = np.flatnonzero((flat >= max(steps[0], 1)) & (flat <= steps[1]))
-            seen = rays[pixels] * (flat[pixels] / header.depth_shift)[:, None]
-            owner = owners(frame.index, seen, pixels, frame.camera_to_world)
+            points = rays[pixels] * (flat[pixels] / header.depth_shift)[:, None]
+            owner = owners(Seen(frame.index, points, pixels, frame.camera_to_world))
             if owner is None:
                 unmasked += 1
                 continue
@@ -104,8 +107,8 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
             for number, fusion in fusions.items():
                 own = np.flatnonzero(owner == number)
                 if len(own) >= settings.min_pixels:
-                    points = _moved(to_scene, seen[own]).astype(np.float32)
-                    fusion.add(frame.index, points, pixels[own])
+                    placed = _moved(to_scene, points[own]).astype(np.float32)
+                    fusion.add(frame.index, placed, pixels[own])
     if unmasked and not masked:
         raise InputError(f"{scene.file(_MASKS)}: has no mask of any frame read; it is incomplete")
     for item in objects:
@@ -167,24 +170,19 @@ def _by_masks(archive: ZipFile, header: SensHeader, radius: int) -> Owners:
     # Cameras apart: what the depth camera sees beside an object may lie behind it for the other.
     apart = np.linalg.norm(header.depth_to_color[:3, 3]) > 1e-3
 
-    def owners(
-        index: int,
-        seen: Float[np.ndarray, "n 3"],
-        pixels: Int[np.ndarray, "n"],
-        camera_to_world: Float[np.ndarray, "4 4"],
-    ) -> Int[np.ndarray, "n"] | None:
-        mask = read_mask(archive, index, (header.color_size, header.depth_size))
+    def owners(seen: Seen) -> Int[np.ndarray, "n"] | None:
+        mask = read_mask(archive, seen.frame, (header.color_size, header.depth_size))
         if mask is None:
             return None
         height, width = mask.shape
         mask = erode(mask, round(radius * width / header.depth_size[0]))
         if (width, height) != header.color_size:
-            return mask.reshape(-1)[pixels].astype(np.int64) - 1
-        moved = through[pixels] * seen[:, 2:] + shift
+            return mask.reshape(-1)[seen.pixels].astype(np.int64) - 1
+        moved = through[seen.pixels] * seen.points[:, 2:] + shift
         depth = np.maximum(moved[:, 2], 1e-6)
         u, v = np.rint(moved[:, 0] / depth), np.rint(moved[:, 1] / depth)
         inside = (moved[:, 2] > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-        owner = np.full(len(seen), NO_OBJECT, dtype=np.int64)
+        owner = np.full(len(seen.pixels), NO_OBJECT, dtype=np.int64)
         rows, columns = v[inside].astype(np.int64), u[inside].astype(np.int64)
         objects = mask[rows, columns].astype(np.int64) - 1
         if apart:
@@ -224,14 +222,9 @@ def _by_mesh(scene: ScanNetScene, objects: Sequence[SceneObject], distance: floa
     low = wanted.min(axis=0, initial=np.inf) - distance
     high = wanted.max(axis=0, initial=-np.inf) + distance
 
-    def owners(
-        index: int,
-        seen: Float[np.ndarray, "n 3"],
-        pixels: Int[np.ndarray, "n"],
-        camera_to_world: Float[np.ndarray, "4 4"],
-    ) -> Int[np.ndarray, "n"] | None:
-        world = _moved(camera_to_world, seen)
-        owner = np.full(len(seen), NO_OBJECT, dtype=np.int64)
+    def owners(seen: Seen) -> Int[np.ndarray, "n"] | None:
+        world = _moved(seen.pose, seen.points)
+        owner = np.full(len(seen.pixels), NO_OBJECT, dtype=np.int64)
         near = np.flatnonzero(((world >= low) & (world <= high)).all(axis=1))
         reach, vertex = map(np.asarray, tree.query(world[near], distance_upper_bound=distance))
         reached = np.isfinite(reach)

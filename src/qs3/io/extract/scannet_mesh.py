@@ -42,16 +42,8 @@ def read_scene_mesh(
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
     """Read the decimated mesh of a scene and give its vertices to objects.
 
-    Args:
-        scene: The scene.
-        objects: Objects of interest; a segment of two belongs to the first.
-
-    Returns:
-        The vertices in the scene's own frame, metres, and ``SceneObject.id`` of each, −1 where it
-        is none of the objects.
-
-    Raises:
-        InputError: where the mesh or its segments are missing, damaged, or do not fit each other.
+    The vertices are in the scene's own frame, metres; with each comes `SceneObject.id`, −1 where it
+    is of none of the objects. A segment of two objects belongs to the first.
     """
     path = scene.file(_MESH)
     content = read_small(path, what="a scene's decimated mesh")
@@ -82,13 +74,8 @@ def cut_mesh_scene(
 ) -> Iterator[ExtractedCloud]:
     """Yield the objects of one scene as vertices of its fused mesh.
 
-    Args:
-        scene: Needs the mesh, its segments and the aggregation.
-        settings: ``classes``, ``min_points`` and ``seed`` matter here.
-        num_points: Vertices drawn of an object; one of fewer comes whole.
-
-    Raises:
-        InputError: where a file of the scene is missing or damaged.
+    Of an object ``num_points`` are drawn; one of fewer comes whole. Of the settings ``classes``,
+    ``min_points`` and ``seed`` matter here.
     """
     objects = read_objects(scene, settings.class_names)
     align = axis_alignment(scene)

@@ -86,13 +86,8 @@ def list_scenes(
 ) -> list[ScanNetScene]:
     """List scenes in the order of their names.
 
-    Args:
-        root: A copy of the release, its ``scans`` folder, or one scene's folder.
-        scenes: Only these; None takes all.
-        splits: Split of each scene, as `read_splits` gives it; only scenes in it are listed.
-
-    Raises:
-        InputError: where the folder or a scene asked for is not there, or nothing is left.
+    ``root`` is a copy of the release, its ``scans`` folder, or one scene's folder. Only what
+    ``scenes`` and ``splits`` (as `read_splits` gives it) name is listed; something has to be.
     """
     if not root.is_dir():
         raise InputError(f"{root}: no such folder; name the one that holds ScanNet's scans")
@@ -119,15 +114,8 @@ def list_scenes(
 def read_splits(train: Path | None = None, test: Path | None = None) -> dict[str, str]:
     """Read the official lists, one scene a line, into the split of each scene.
 
-    ScanNet hides the labels of its own test scenes; its validation list is the ``test`` of
-    PointDA-10 and of the clouds made here (1,201 and 312 scenes).
-
-    Args:
-        train: Such as ``scannetv2_train.txt``.
-        test: Such as ``scannetv2_val.txt``.
-
-    Raises:
-        InputError: where a file is missing, a line is no scene, or a scene is in both.
+    ScanNet hides the labels of its own test scenes; its validation list, ``scannetv2_val.txt``, is
+    the ``test`` of PointDA-10 and of the clouds made here (1,201 and 312 scenes).
     """
     splits: dict[str, str] = {}
     for split, path in (("train", train), ("test", test)):
@@ -189,9 +177,6 @@ def axis_alignment(scene: ScanNetScene) -> Float[np.ndarray, "4 4"]:
     Convention:
         After it z is up and the room's walls lie along x and y. The scene's own frame has z up but
         for some degrees.
-
-    Raises:
-        InputError: where the line is no rigid transform.
     """
     path = scene.file(".txt")
     if not path.is_file():
@@ -213,11 +198,7 @@ def axis_alignment(scene: ScanNetScene) -> Float[np.ndarray, "4 4"]:
 def rest(
     points: Float[np.ndarray, "n 3"],
 ) -> tuple[Float[np.ndarray, "n 3"], list[float]]:
-    """Put a cloud's box over the origin, its lowest point on z = 0.
-
-    Returns:
-        The cloud and where the origin was, so that adding it gives the scene's coordinates back.
-    """
+    """Put a cloud's box over the origin, its lowest point on z = 0; also return where that was."""
     low, high = points.min(axis=0), points.max(axis=0)
     origin = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]], dtype=np.float64)
     return (points - origin).astype(np.float32), [float(value) for value in origin]

@@ -43,18 +43,11 @@ def list_sunrgbd(
     depth: DepthKind = "refined",
     rename: Rename = str,
 ) -> list[SunFrame]:
-    """List the frames that are there and have boxes of wanted classes.
+    """List the frames that are there and have boxes of wanted classes, of which there must be some.
 
-    Args:
-        root: The folder ``SUNRGBD`` or the one above it.
-        boxes: The .mat or .json file with the boxes; None looks for one at the root, above it
-            and in the toolbox, then for the frames' own annotations.
-        splits: The toolbox's ``allsplit.mat``; frames in neither of its parts are of no split.
-        depth: Which depth picture.
-        rename: New name of an object's class, or None to leave the object out.
-
-    Raises:
-        InputError: where nothing is found, or a file is damaged.
+    ``root`` is the folder ``SUNRGBD`` or the one above it. ``boxes`` is the .mat or .json file with
+    the boxes; None looks for one at the root, above it and in the toolbox, then for the frames' own
+    annotations. Frames in neither part of ``splits``, the toolbox's ``allsplit.mat``, are of none.
     """
     root = Path(root)
     if not root.is_dir():
@@ -85,8 +78,7 @@ def list_sunrgbd(
 def rename_to(classes: Sequence[str] | None) -> Rename:
     """Return what maps an annotator's word onto classes, and onto None where it is none of them.
 
-    Args:
-        classes: Names of the classes; None keeps the words.
+    Without classes the words stay.
 
     Example:
         >>> rename = rename_to(["table", "chair"])

@@ -115,17 +115,10 @@ def read_files(
     read: Callable[[Path], np.ndarray] = read_cloud,
     kind: str = "",
 ) -> RaggedClouds:
-    """Read cloud files; their names below ``root`` become the ids.
+    """Read cloud files in their order; their names below ``root`` become the ids.
 
-    Args:
-        root: Folder that they lie in.
-        files: What to read, in the order of the result.
-        class_names: Names that the labels index; empty gives clouds without labels.
-        read: Reader of one file.
-        kind: What is read of a file, where that is not its points; for the checksum.
-
-    Raises:
-        InputError: where a file is bad; it is named.
+    Labels index ``class_names``; without any there are no labels. ``kind`` tells what ``read``
+    makes of a file, where that is not its points, for the checksum.
     """
     names = tuple(class_names)
     digest = hashlib.sha256(kind.encode())

@@ -43,16 +43,10 @@ def read_parts(
     columns: Sequence[int] = (3,),
     turn: bool = True,
 ) -> RaggedClouds:
-    """Read files one after another; a cloud's id is ``<file>/<row>``.
+    """Read files of different names one after another; a cloud's id is ``<file>/<row>``.
 
-    Args:
-        parts: The files, no two of one name.
-        class_names: Names that the labels index.
-        columns: Numbers of columns that ``data`` may have; those after the third are dropped.
-        turn: Turn the clouds z up.
-
-    Raises:
-        InputError: where a file is damaged, has other datasets, or a label has no class.
+    ``columns`` are the numbers of columns that ``data`` may have; those after the third are
+    dropped. The clouds are turned z up where ``turn`` says so.
     """
     digest = hashlib.sha256()
     clouds: list[np.ndarray] = []
@@ -79,14 +73,9 @@ def read_parts(
 def list_parts(root: Path, pattern: str, names: str, split: str | None) -> list[Part]:
     """List the files of a folder: by ``<split>_files.txt`` where that lies there, else by names.
 
+    Names fit ``pattern``, with the groups split and number; ``names`` is the same for the message.
     Of a line only the name after the last slash counts, since released lists give the path on the
     machine that wrote them.
-
-    Args:
-        root: The folder.
-        pattern: Names of the files, with the groups split and number.
-        names: The same for the message.
-        split: ``train`` or ``test``; None takes both.
 
     Raises:
         InputError: where there is no such file or split, or a list leads out of the folder or

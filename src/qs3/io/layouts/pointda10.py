@@ -116,7 +116,7 @@ def _domain(path: Path, domain: Domain | None) -> tuple[Path, Domain]:
         raise InputError(f"{path}: no such folder")
     if domain is not None:
         return path, domain
-    inside = [name for name in DOMAINS if _is_domain(path / name, name)]
+    inside: list[Domain] = [name for name in DOMAINS if _is_domain(path / name, name)]
     if len(inside) > 1:
         several = ", ".join(str(path / name) for name in inside)
         raise InputError(f"{path}: holds several domains of PointDA-10; name one: {several}")
@@ -125,12 +125,16 @@ def _domain(path: Path, domain: Domain | None) -> tuple[Path, Domain]:
     if named(path, _FILES):
         return path, "scannet"
     for name in DOMAINS:
-        if name in (path.name, path.resolve().name):
+        if _is_called(path, name):
             return path, name
     raise InputError(
         f"{path}: no domain of PointDA-10; name a folder called modelnet, shapenet or scannet, "
         "since the name tells which axis is up"
     )
+
+
+def _is_called(path: Path, name: str) -> bool:
+    return name in (path.name, path.resolve().name)
 
 
 def _is_domain(path: Path, domain: Domain) -> bool:
@@ -140,8 +144,7 @@ def _is_domain(path: Path, domain: Domain) -> bool:
 
 
 def _detect(path: Path) -> bool:
-    names = (path.name, path.resolve().name)
-    own = [name for name in DOMAINS if name in names or name == "scannet"]
+    own: list[Domain] = [name for name in DOMAINS if name == "scannet" or _is_called(path, name)]
     return any(_is_domain(path, name) for name in own) or any(
         _is_domain(path / name, name) for name in DOMAINS
     )
