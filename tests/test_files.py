@@ -1,5 +1,6 @@
 """Files appear whole, temporary folders are fresh, and one process at a time holds a folder."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -8,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from qs3.errors import InputError
+from qs3.errors import InputError, StorageError
 from qs3.files import (
     LOCK,
     atomic_path,
@@ -47,10 +48,40 @@ def test_left_overs_are_known_and_removed_and_nothing_else(tmp_path: Path) -> No
     assert names(tmp_path) == [".a.backup.tmp", LOCK]
 
 
-@pytest.mark.parametrize("text", ["", "{", "NaN", "[1e999, Infinity]", "9" * 5000, "[" * 100_000])
-def test_json_is_strict(text: str) -> None:
-    with pytest.raises(InputError, match=r"^a\.json: not a JSON file"):
+def test_a_full_disk_is_told_by_the_files_name_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    for name in ("fsync", "pwrite"):
+        with monkeypatch.context() as patch:
+            patch.setattr(os, name, full)
+            with pytest.raises(StorageError, match=r"No space left on device.*make room") as caught:
+                (write_json if name == "fsync" else hold)(tmp_path / "a", {})
+            assert str(caught.value).startswith(f"{tmp_path / 'a'}")
+        assert names(tmp_path) in ([], ["a"])
+        assert not (tmp_path / "a").is_file()
+
+
+def hold(folder: Path, _: object) -> None:
+    folder.mkdir()
+    with folder_lock(folder):
+        pass
+
+
+LONE = r'{"a": "\ud83d"}'
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "{", "NaN", "[Infinity]", "[1e999]", "9" * 5000, "[" * 100_000, LONE, "\udc80", b"\xff"],
+)
+def test_json_is_strict(text: str | bytes) -> None:
+    with pytest.raises(InputError, match=r"^a\.json: not a JSON file") as caught:
         parse_json(text, "a.json")
+    assert str(caught.value).encode()
+    assert parse_json(r'"\ud83d\ude00 1e9999"', "a.json") == "\U0001f600 1e9999"
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_json(Path("never"), float("nan"))
 

@@ -78,6 +78,8 @@ def test_what_is_left_out_takes_its_default_and_whole_numbers_are_numbers() -> N
         ({"count": True}, "field 'count': True is not a whole number"),
         ({"count": 1.0}, "field 'count': 1.0 is not a whole number"),
         ({"count": "1"}, "field 'count': '1' is not a whole number"),
+        ({"count": [1]}, "field 'count': [1] is not a whole number"),
+        ({"count": 1e12}, "field 'count': 1000000000000.0 is not a whole number"),
         ({"flag": 1}, "field 'flag': 1 is not true or false"),
         ({"inner": {"share": "1"}}, "field 'inner.share': '1' is not a number"),
         ({"inner": {"share": True}}, "field 'inner.share': True is not a number"),

@@ -1,6 +1,7 @@
 """Whatever happens on the way, a data set ends with the same bytes, or says why not."""
 
 import dataclasses
+import errno
 import os
 import resource
 import signal
@@ -380,6 +381,43 @@ def test_parts_of_several_machines_merge_into_the_bytes_of_one(fake, tmp_path):
     (tmp_path / "part2" / "shard-00002.parquet").write_bytes(b"PAR1")
     with pytest.raises(InputError, match=r"part2/shard-00002\.parquet: damaged"):
         merge(parts, tmp_path / "fresh", progress=False)
+
+
+@pytest.mark.parametrize("writes", [0, 1, 2, 5])
+def test_a_disk_that_fills_while_parts_are_merged(fake, tmp_path, monkeypatch, writes):
+    items, merged = fake.work(ROWS), tmp_path / "merged"
+    fake.run(items, tmp_path / "whole")
+    sync, left = os.fsync, [2 * writes]  # of the file, and of the folder with its name
+
+    def full(handle):
+        left[0] -= 1
+        if left[0] < 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        sync(handle)
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(InputError, match=r"merged/.*No space left on device.*run the same command"):
+        merge([tmp_path / "whole"], merged, progress=False)
+    assert merged.exists() == (merged / "dataset.json").is_file() == (writes > 0)
+    monkeypatch.undo()
+    merge([tmp_path / "whole"], merged, progress=False)
+    assert fake.content(merged) == fake.content(tmp_path / "whole")
+
+
+def test_a_worker_that_dies_twice_for_want_of_room_is_tried_alone(tmp_path):
+    with LocalExecutor(2) as executor:
+        executor.submit("slow", time.sleep, 1.0)
+        executor.submit("shy", die_beside_others, tmp_path)
+        assert dict([executor.next(), executor.next()]) == {"slow": None, "shy": 3}
+
+
+def die_beside_others(folder: Path) -> int:
+    """Be killed twice, as by a system short of memory; return the number of the try."""
+    number = len(list(folder.iterdir())) + 1
+    (folder / str(number)).touch()
+    if number < 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
 
 
 def test_a_part_that_is_not_there_is_refused(fake, tmp_path):

@@ -14,6 +14,7 @@ from qs3.store.generate import GenerateSettings
 from qs3.store.info import info
 from qs3.store.manifest import MANIFEST, Manifest, open_dataset, shard_name, write_manifest
 from qs3.store.shards import CloudRow, load_shard, put_shard, table_of
+from qs3.store.verify import verify
 from qs3.structure import unstructure
 
 SETTINGS = GenerateSettings(num_points=16)
@@ -170,6 +171,64 @@ def test_a_damaged_manifest_is_named(tmp_path, text):
     (tmp_path / MANIFEST).write_bytes(text.encode("latin-1"))
     with pytest.raises(InputError, match=r"dataset\.json"):
         open_dataset(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        *(({"views": v}, "settings.views must be a whole") for v in (1.5, "x", True, [1], 1e12)),
+        ({"seed": -1}, "settings.seed must be a whole number from 0, not -1"),
+        ({"sensor": {"name": [1]}}, None),
+        ({"sensor": 7, "work_list": []}, None),
+    ],
+)
+def test_settings_that_nobody_wrote_are_told_or_harmless(fake, tmp_path, settings, message):
+    make(tmp_path, fake)
+    path = tmp_path / MANIFEST
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"settings": settings}))
+    if message is None:
+        info(tmp_path)
+        verify(tmp_path, progress=False)
+    else:
+        with pytest.raises(InputError, match=message):
+            verify(tmp_path, progress=False)
+
+
+def test_what_is_wrong_with_a_data_set_is_told_row_by_row(fake, tmp_path):
+    fake.run(fake.work(6), tmp_path)
+    assert verify(tmp_path, progress=False) == []
+    made = [fake.fake_row(item, 0, fake.SETTINGS) for item in fake.work(6)]
+    bad = {
+        "seed": 3,
+        "label": 0,
+        "points": made[1].points,
+        "clean": made[5].clean * np.nan,
+        "view": made[5].view[:3],
+    }
+    put(tmp_path, 1, [made[3], dataclasses.replace(made[5], **bad)])
+    (tmp_path / "thesis.txt").touch()
+    faults = " | ".join(verify(tmp_path, progress=False))
+    for words in (
+        "thesis.txt: does not belong here",
+        "shard-00001.parquet: its checksum is not the one in SHA256SUMS",
+        "shard-00001.parquet: m5#0 has label 0 and class name 'chair'",
+        "shard-00001.parquet: m5#0 has seed 3, not the one",
+        "shard-00001.parquet: points of m5#0 has 16 points and 3 views",
+        "shard-00001.parquet: clean of m5#0 is not finite",
+        "shard-00001.parquet: m3#0 is there twice, also in shard-00000.parquet",
+        "shard-00001.parquet: points of m3#0 are the very points of m3#0",
+        "shard-00001.parquet: points of m5#0 are the very points of m1#0",
+    ):
+        assert words in faults
+
+
+def test_a_shard_that_announces_more_than_it_can_hold_is_refused(fake, tmp_path, monkeypatch):
+    zeros = np.zeros((2**16, 3), np.float32)
+    put(tmp_path, 0, [dataclasses.replace(rows(fake)[0], points=zeros)])
+    assert load(tmp_path).num_rows == 1
+    monkeypatch.setattr("qs3.store.shards._MOST_BYTES", 2**18)
+    with pytest.raises(InputError, match=r"shard-00000\.parquet: announces far more"):
+        load(tmp_path)
 
 
 def test_a_folder_without_manifest_and_another_schema_are_refused(fake, tmp_path):

@@ -77,7 +77,7 @@ def _published() -> tuple[dict[str, dict[str, str]], str]:
 
 def _with_scan(page: "Report", name: str, sensor: str) -> "Report":
     """Add a scan step by step, or a note where none can be made here."""
-    from qs3.meshes.named import load_named
+    from qs3.meshes.collections import load_named
     from qs3.report.montage import scan_montage
     from qs3.sensor.settings import CameraSettings
 

@@ -37,7 +37,7 @@ def scan(
     """
     from qs3.files import claim_folder, write_json
     from qs3.io.ply import write_ply
-    from qs3.meshes.named import load_named
+    from qs3.meshes.collections import load_named
     from qs3.report.figure import write_png
     from qs3.report.montage import montage, montage_view
     from qs3.sensor.frames import write_frames, write_parts

@@ -1,7 +1,7 @@
 """Lists of meshes to scan: from a folder, or drawn from the procedural shapes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -10,6 +10,7 @@ import trimesh
 
 from qs3 import shapes
 from qs3.errors import InputError
+from qs3.files import sha256
 from qs3.meshes.classes import (
     POINTDA10,
     POINTDA10_OF_MODELNET,
@@ -17,42 +18,12 @@ from qs3.meshes.classes import (
     canonical,
 )
 from qs3.meshes.loading import load_mesh
-from qs3.meshes.trees import Leaf, read_tree
+from qs3.meshes.trees import MeshItem, read_tree
 
 POINTDA10_CHOICE = "pointda10"
 """The choice that takes PointDA-10's ten classes and gives them its names."""
 
 _MOST_NAMES = 60
-
-
-@dataclass(frozen=True)
-class MeshItem:
-    """One mesh of a collection, not yet read."""
-
-    id: str
-    """Name within the collection: the path below its root without ending, or shapes/<class>/<n>."""
-    class_name: str
-    """Class by folder, synset, CSV or shape; empty in a flat folder."""
-    split: str
-    """``"train"``, ``"test"`` or another, or empty where the collection has no split."""
-    path: Path | None
-    """The file, or None for a procedural shape."""
-    shape_seed: int | None
-    """Seed of ``shapes.make``, or None for a file."""
-    up: Literal["z", "y"] | None = None
-    """Up axis of the file, or None to go by its format; see ``load_mesh``."""
-
-    def load(self) -> trimesh.Trimesh:
-        """Read or make the mesh.
-
-        Raises:
-            InputError: where the file cannot be used.
-        """
-        if self.path is not None:
-            return load_mesh(self.path, up=self.up)
-        if self.shape_seed is None:
-            raise InputError(f"{self.id}: has neither a file nor a shape seed")
-        return shapes.make(self.class_name, self.shape_seed)
 
 
 def collect(
@@ -118,12 +89,13 @@ def _draws(per_class: int, seed: int, classes: Sequence[str] | None) -> list[Mes
 
 
 def _files(root: Path, classes: Sequence[str] | None, labels: Path | None) -> list[MeshItem]:
-    leaves = read_tree(root, labels)
-    own = [leaf.class_name for leaf in leaves]
-    names = own if classes is None else _rename(leaves, classes, str(root))
+    items = read_tree(root, labels)
+    if classes is None:
+        return items
+    names = _rename(items, classes, str(root))
     return [
-        MeshItem(leaf.id, name, leaf.split, root / leaf.relative, None, leaf.up)
-        for name, leaf in zip(names, leaves, strict=True)
+        replace(item, class_name=name)
+        for name, item in zip(names, items, strict=True)
         if name is not None
     ]
 
@@ -140,7 +112,7 @@ def _chosen_names(classes: str | Sequence[str] | None) -> tuple[str, ...] | None
     return names
 
 
-def _rename(leaves: Sequence[Leaf], classes: Sequence[str], source: str) -> list[str | None]:
+def _rename(items: Sequence[MeshItem], classes: Sequence[str], source: str) -> list[str | None]:
     """New class name of each mesh; None where it is not chosen.
 
     Of ModelNet ``pointda10`` are exactly ten folders (night_stand becomes cabinet; dresser,
@@ -148,7 +120,7 @@ def _rename(leaves: Sequence[Leaf], classes: Sequence[str], source: str) -> list
     monitor, pot becomes plant), of anything else whatever ``canonical`` maps onto them. Any of
     the ten may be missing. Other choices are names as they stand in the collection.
     """
-    have = {(leaf.layout, leaf.class_name) for leaf in leaves}
+    have = {(item.layout, item.class_name) for item in items}
     if tuple(classes) == (POINTDA10_CHOICE,):
         names = {key: _of_pointda10(*key) for key in have}
         if not any(names.values()):
@@ -158,10 +130,10 @@ def _rename(leaves: Sequence[Leaf], classes: Sequence[str], source: str) -> list
             if name not in {own for _, own in have}:
                 raise InputError(f"{source}: no class {name!r}; {_listed(have)}")
         names = {key: key[1] if key[1] in classes else None for key in have}
-    return [names[leaf.layout, leaf.class_name] for leaf in leaves]
+    return [names[item.layout, item.class_name] for item in items]
 
 
-def _of_pointda10(layout: str, name: str) -> str | None:
+def _of_pointda10(layout: str | None, name: str) -> str | None:
     if layout == "modelnet":
         return POINTDA10_OF_MODELNET.get(name)
     if layout == "shapenet":
@@ -169,9 +141,32 @@ def _of_pointda10(layout: str, name: str) -> str | None:
     return canonical(name) if canonical(name) in POINTDA10 else None
 
 
-def _listed(have: set[tuple[str, str]]) -> str:
+def _listed(have: set[tuple[str | None, str]]) -> str:
     names = sorted({name for _, name in have if name})
     if not names:
         return "its meshes lie flat, without classes"
     more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
     return f"it has {', '.join(names[:_MOST_NAMES])}{more}"
+
+
+def load_named(
+    name: str, seed: int, up: Literal["z", "y"] | None = None
+) -> tuple[trimesh.Trimesh, dict[str, str]]:
+    """Return the mesh of a file or a built-in class, and where it is from, for records.
+
+    Args:
+        name: A path, or one of `qs3.shapes.CLASSES` where no file has that name.
+        seed: Which draw of a built-in class.
+        up: Up axis of a file; by default y for glTF, z for all others.
+
+    Raises:
+        InputError: where it is neither, or the file holds no mesh.
+    """
+    if name in shapes.CLASSES and not Path(name).exists():
+        return shapes.make(name, seed=seed), {"name": name, "source": "shapes", "sha256": ""}
+    path = Path(name)
+    if not path.suffix and not path.exists():
+        raise InputError(
+            f"{name}: neither a mesh file nor a built-in class ({', '.join(shapes.CLASSES)})"
+        )
+    return load_mesh(path, up), {"name": path.name, "source": "file", "sha256": sha256(path)}

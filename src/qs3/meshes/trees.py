@@ -6,10 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import trimesh
+
+from qs3 import shapes
 from qs3.errors import InputError
 from qs3.meshes.classes import MODELNET40, SHAPENET
 from qs3.meshes.labels_csv import read_labels, read_shapenet_splits
-from qs3.meshes.loading import EXTENSIONS
+from qs3.meshes.loading import EXTENSIONS, load_mesh
 from qs3.meshes.walking import MeshFile, entries, ids, is_file, walk
 
 SPLITS: tuple[str, ...] = ("train", "test", "val")
@@ -21,24 +24,39 @@ _SHAPENET_FILES = ("models/model_normalized.obj", "model.obj")
 
 
 @dataclass(frozen=True, slots=True)
-class Leaf:
-    """One mesh of a tree."""
+class MeshItem:
+    """One mesh of a collection, not yet read."""
 
     id: str
-    """Path below the root without ending, as far as that is unique."""
-    relative: str
-    """Path below the root, with ``/`` on every system."""
+    """Name within the collection: the path below its root without ending as far as that is unique,
+    or shapes/<class>/<n>."""
     class_name: str
-    """Name of the class in the tree's own words; empty where it has none."""
+    """Class by folder, synset, CSV or shape; empty in a flat folder."""
     split: str
-    """Name of the split; empty where it has none."""
-    up: Literal["z", "y"] | None
-    """Up axis that the layout tells, or None."""
-    layout: Layout
-    """What the mesh was recognised as."""
+    """``"train"``, ``"test"`` or another, or empty where the collection has no split."""
+    path: Path | None
+    """The file, or None for a procedural shape."""
+    shape_seed: int | None
+    """Seed of ``shapes.make``, or None for a file."""
+    up: Literal["z", "y"] | None = None
+    """Up axis of the file, or None to go by its format; see ``load_mesh``."""
+    layout: Layout | None = None
+    """What the file was recognised as, or None for a procedural shape."""
+
+    def load(self) -> trimesh.Trimesh:
+        """Read or make the mesh.
+
+        Raises:
+            InputError: where the file cannot be used.
+        """
+        if self.path is not None:
+            return load_mesh(self.path, up=self.up)
+        if self.shape_seed is None:
+            raise InputError(f"{self.id}: has neither a file nor a shape seed")
+        return shapes.make(self.class_name, self.shape_seed)
 
 
-def read_tree(root: Path, labels: Path | None = None) -> list[Leaf]:
+def read_tree(root: Path, labels: Path | None = None) -> list[MeshItem]:
     """List the meshes of a folder with their classes and splits, in order of their ids.
 
     The layouts, tried in this order:
@@ -62,19 +80,19 @@ def read_tree(root: Path, labels: Path | None = None) -> list[Leaf]:
         what = "is a file; name the folder that holds it" if root.exists() else "no such folder"
         raise InputError(f"{root}: {what}")
     if labels is not None:
-        leaves = _labelled(root, labels)
+        items = _labelled(root, labels)
     else:
         synsets = _synsets(root)
-        leaves = _shapenet(root, synsets) if synsets else []
-        leaves += _folders(root, walk(root, skip=synsets))
-    if not leaves:
+        items = _shapenet(root, synsets) if synsets else []
+        items += _folders(root, walk(root, skip=synsets))
+    if not items:
         raise InputError(
             f"{root}: holds no mesh; expected <class>/*.ply, <class>/<train|test>/*.off, "
             f"<synset>/<id>/{_SHAPENET_FILES[0]} or a flat folder ({', '.join(EXTENSIONS)})"
         )
-    leaves.sort(key=lambda leaf: leaf.id)
-    _refuse_odd_names(root, leaves)
-    return leaves
+    items.sort(key=lambda item: item.id)
+    _refuse_odd_names(root, items)
+    return items
 
 
 def _synsets(root: Path) -> frozenset[str]:
@@ -84,7 +102,7 @@ def _synsets(root: Path) -> frozenset[str]:
     return frozenset(names if names & SHAPENET.keys() else ())
 
 
-def _shapenet(root: Path, synsets: frozenset[str]) -> list[Leaf]:
+def _shapenet(root: Path, synsets: frozenset[str]) -> list[MeshItem]:
     files: dict[tuple[str, str], str] = {}
     for synset in synsets:
         models = [(entry.name, _model(Path(entry.path))) for entry in entries(root / synset)]
@@ -99,11 +117,12 @@ def _shapenet(root: Path, synsets: frozenset[str]) -> list[Leaf]:
     table = root / "all.csv"
     splits = read_shapenet_splits(table, files.keys()) if table.is_file() else {}
     return [
-        Leaf(
+        MeshItem(
             f"{synset}/{name}/{file}".removesuffix(".obj"),
-            f"{synset}/{name}/{file}",
             SHAPENET.get(synset, synset),
             splits.get((synset, name), ""),
+            root / synset / name / file,
+            None,
             "y",
             "shapenet",
         )
@@ -115,7 +134,7 @@ def _model(folder: Path) -> str | None:
     return next((name for name in _SHAPENET_FILES if is_file(folder / name)), None)
 
 
-def _folders(root: Path, files: Sequence[MeshFile]) -> list[Leaf]:
+def _folders(root: Path, files: Sequence[MeshFile]) -> list[MeshItem]:
     paths = [file.relative.split("/") for file in files]
     _refuse_wrong_level(root, paths)
     is_modelnet = all(
@@ -124,24 +143,25 @@ def _folders(root: Path, files: Sequence[MeshFile]) -> list[Leaf]:
     )
     layout = "modelnet" if is_modelnet else "folders"
     return [
-        Leaf(name, file.relative, *place, _up(file.relative), layout)
+        MeshItem(name, *place, root / file.relative, None, _up(file.relative), layout)
         for name, file, place in zip(ids(files), files, _places(paths), strict=True)
     ]
 
 
-def _labelled(root: Path, labels: Path) -> list[Leaf]:
+def _labelled(root: Path, labels: Path) -> list[MeshItem]:
     files = walk(root)
     table = read_labels(labels, root, files) if files else {}
     places = _places([file.relative.split("/") for file in files])
-    leaves = []
-    # The ids are those of all meshes: a row more or less leaves them as they are.
+    items = []
+    # The ids are those of all meshes: a row more or less items them as they are.
     for name, file, (_, folder_split) in zip(ids(files), files, places, strict=True):
         if file.relative in table:
             class_name, split = table[file.relative]
             split = folder_split if split is None else split
             up = _up(file.relative)
-            leaves.append(Leaf(name, file.relative, class_name, split, up, "labels"))
-    return leaves
+            path = root / file.relative
+            items.append(MeshItem(name, class_name, split, path, None, up, "labels"))
+    return items
 
 
 def _places(paths: Sequence[list[str]]) -> Iterator[tuple[str, str]]:
@@ -183,10 +203,11 @@ def _refuse_wrong_level(root: Path, paths: Sequence[list[str]]) -> None:
             )
 
 
-def _refuse_odd_names(root: Path, leaves: Sequence[Leaf]) -> None:
+def _refuse_odd_names(root: Path, items: Sequence[MeshItem]) -> None:
     """Refuse names that no table can hold."""
-    for leaf in leaves:
+    for item in items:
+        relative = str(item.path.relative_to(root)) if item.path else ""
         try:
-            leaf.relative.encode()
+            relative.encode()
         except UnicodeEncodeError:
-            raise InputError(f"{root}: rename {leaf.relative!a}, which is not UTF-8") from None
+            raise InputError(f"{root}: rename {relative!a}, which is not UTF-8") from None

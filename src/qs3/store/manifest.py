@@ -1,7 +1,9 @@
 """What lies beside the shards: ``dataset.json``, ``SHA256SUMS`` and ``meshes.json``."""
 
 import concurrent.futures
+import functools
 import hashlib
+import itertools
 import json
 import platform
 import time
@@ -215,15 +217,19 @@ def mesh_sums(items: Iterable[Any]) -> dict[str, str]:
 
     A file that cannot be read has none either: its scan will fail, and say why.
     """
-    paths = {item.id: getattr(item, "path", None) for item in items}
-    files = {name: Path(path) for name, path in paths.items() if path is not None}
+    sums, left = {}, iter(items)
     with concurrent.futures.ThreadPoolExecutor() as pool:
-        sums = dict(zip(files, pool.map(_mesh_sum, files.values()), strict=True))
-    return {name: digest for name, digest in sums.items() if digest}
+        while some := list(itertools.islice(left, 4096)):  # the pool takes in all that it is given
+            for item, digest in zip(some, pool.map(_mesh_sum, some), strict=True):
+                if digest:
+                    sums[item.id] = digest
+    return sums
 
 
-def _mesh_sum(path: Path) -> str:
+def _mesh_sum(item: Any) -> str:
     """Checksum of a mesh file; of a glTF in text, with the buffers that lie beside it."""
+    if (path := getattr(item, "path", None)) is None:
+        return ""
     try:
         if path.suffix.lower() != ".gltf":
             return sha256(path)
@@ -251,8 +257,9 @@ def read_mesh_sums(folder: Folder) -> dict[str, str]:
 def write_mesh_sums(folder: Folder, sums: Mapping[str, str]) -> None:
     """Write ``meshes.json``, one line a mesh; none where no mesh is a file."""
     if sums:
-        text = json.dumps(dict(sorted(sums.items())), indent=0, ensure_ascii=False)
-        folder.write(MESHES, f"{text}\n".encode())
+        line = functools.partial(json.dumps, ensure_ascii=False)
+        lines = ",\n".join(f"{line(name)}: {line(sums[name])}" for name in sorted(sums))
+        folder.write(MESHES, f"{{\n{lines}\n}}\n".encode())
 
 
 def changed_meshes(noted: Mapping[str, str], now: Mapping[str, str]) -> list[str]:

@@ -193,7 +193,7 @@ def _repetitions(folder: Folder, seen: _Seen) -> Iterator[str]:
         order = np.argsort(values, kind="stable")
         repeated = values[order][1:] == values[order][:-1]
         for first, later in sorted(zip(order[:-1][repeated], order[1:][repeated], strict=True)):
-            (earlier, original), (name, identifier) = place(first), place(later)
+            (earlier, original), (name, identifier) = place(int(first)), place(int(later))
             if kind == "cloud":
                 yield f"{name}: points of {identifier} are the very points of {original}"
             elif identifier == original:

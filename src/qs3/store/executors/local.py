@@ -19,9 +19,7 @@ from qs3.errors import InputError
 from qs3.store.executors.executor import Failure, guarded
 
 _BROKEN_IN_A_ROW = 3
-_DEATHS = 3
-"""A call whose process died is made again when no other is under way, so that no want of memory for
-several at once is taken for its fault; this many deaths are its own."""
+_KILLED_FROM_OUTSIDE = (-9, -15)
 _LOCK_SECONDS = 5.0
 """A worker waits so long for the lock that all share, held for milliseconds at a time. One that was
 killed with it never gives it back: those that wait then end, and the pool is opened anew."""
@@ -45,9 +43,10 @@ class _Call:
 class LocalExecutor:
     """A pool of processes started afresh (spawn).
 
-    A worker that dies is replaced, and its call is made twice more, alone; one that takes longer
-    than ``timeout`` is killed and replaced, and its call has failed. Workers end by themselves
-    when this process is killed.
+    A worker that dies is replaced, and its call is made again while no other is under way, so
+    that no want of memory for several at once is taken for its fault: once where it crashed, twice
+    where it was killed from outside. One that takes longer than ``timeout`` is killed and
+    replaced, and its call has failed. Workers end by themselves when this process is killed.
     """
 
     def __init__(
@@ -120,10 +119,10 @@ class LocalExecutor:
                 value = Failure("Timeout", f"took over {self._timeout:g} s and was stopped")
             except ProcessExpired as error:
                 call = dataclasses.replace(call, deaths=call.deaths + 1)
-                if call.deaths < _DEATHS:
+                if call.deaths < (3 if error.exitcode in _KILLED_FROM_OUTSIDE else 2):
                     self._alone.append(call)
                     continue
-                how = f"its process died {_DEATHS} times, at last with no other beside it"
+                how = f"its process died {call.deaths} times, at last with no other beside it"
                 value = Failure("ProcessDied", f"{how} ({_how(error.exitcode)})")
             except BrokenProcessPool as error:
                 self._restart(call, error)
