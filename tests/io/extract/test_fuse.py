@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.errors import InputError
@@ -32,6 +32,7 @@ def rows(points: np.ndarray) -> list[tuple[float, ...]]:
     return sorted(map(tuple, points.tolist()))
 
 
+@settings(max_examples=40)
 @given(st.integers(0, 50), st.sampled_from([3, 50, 10**6]), st.sampled_from([1, 4, 9, 0]))
 def test_piece_by_piece_equals_all_at_once(seed: int, max_points: int, max_frames: int) -> None:
     frames = stream(seed, 9, 60)
@@ -47,6 +48,7 @@ def test_piece_by_piece_equals_all_at_once(seed: int, max_points: int, max_frame
     assert fusion.measured == len(points)
 
 
+@settings(max_examples=20)
 @given(st.permutations(range(8)), st.sampled_from([3, 0]))
 def test_the_order_of_frames_does_not_matter(order: list[int], max_frames: int) -> None:
     frames = stream(1, 8)

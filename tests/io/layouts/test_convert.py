@@ -17,7 +17,9 @@ from qs3.io.ragged import RaggedClouds
 from qs3.meshes.classes import POINTDA10
 from qs3.store.manifest import open_dataset
 
-PLAIN = ("store", "ply", "pcd", "npy", "xyz", "specklenet10", "depthscannet10")
+from ..hostile import refused
+
+PLAIN = ("store", "ply", "specklenet10")
 
 
 @pytest.fixture
@@ -111,9 +113,7 @@ def test_coordinates_beyond_float32_are_refused(tmp_path):
         ({"to": "ply2"}, "'ply2' is no known layout.*did you mean ply"),
         ({"to": "npz"}, "npz: is only read; written are store, "),
         ({"to": "pointda10"}, "is only read; written are pointda10-npy, pointda10-h5$"),
-        ({"to": "ply", "origin": "nyp"}, "'nyp' is no known layout"),
         ({"to": "ply", "cloud": "clean"}, "has 'clean' clouds"),
-        ({"to": "ply", "split": "dev"}, "no split 'dev'"),
         ({"to": "ply", "origin": "graspnetpc10-real-kinect"}, "no cloud in"),
     ],
 )
@@ -202,8 +202,6 @@ SLOW_CONVERT = """
 import sys, time
 from qs3.io import convert
 from qs3.io.layouts import point_folders
-
-from ..hostile import refused
 write = point_folders.cloud_bytes
 def slowly(*arguments):
     time.sleep(0.02)

@@ -2,7 +2,7 @@ import pytest
 
 from qs3.errors import InputError
 from qs3.io.layouts import FORMATS
-from qs3.io.load import detect, format_named, load_clouds, require
+from qs3.io.load import detect, format_named, require
 
 
 def touch(root, *names):
@@ -80,13 +80,6 @@ def test_an_unknown_name_lists_all_and_the_nearest():
     assert format_named("qs3").name == "store"  # as it was called before
 
 
-def test_every_layout_tells_what_it_is():
-    for name, layout in FORMATS.items():
-        assert layout.name == name
-        assert layout.layout
-        assert "\n" not in layout.layout
-
-
 def test_detection_survives_whatever_it_is_shown(tmp_path):
     touch(tmp_path, "file", "folder/x")
     (tmp_path / "loop").symlink_to(tmp_path)
@@ -94,8 +87,3 @@ def test_detection_survives_whatever_it_is_shown(tmp_path):
     for layout in FORMATS.values():
         for name in ("file", "folder", "loop", "dangling", "gone", ""):
             assert layout.detect(tmp_path / name) in (True, False)
-
-
-def test_only_our_own_data_has_clean_clouds(tmp_path):
-    with pytest.raises(InputError, match="'clean' clouds"):
-        load_clouds(touch(tmp_path, "chair/a.ply"), cloud="clean")

@@ -66,15 +66,6 @@ def test_equal_arrays_give_equal_bytes_at_any_time(arrays):
     assert hdf5_bytes(arrays) == first
 
 
-def test_other_programs_read_what_is_written(tmp_path, arrays):
-    (tmp_path / "a.h5").write_bytes(hdf5_bytes(arrays))
-    with h5py.File(tmp_path / "a.h5", "r") as file:
-        assert sorted(file) == ["data", "label"]
-        for name, array in arrays.items():
-            assert file[name].dtype == array.dtype
-            np.testing.assert_array_equal(file[name][:], array)
-
-
 def missing_data(file, arrays, folder):
     del file["data"]
 
