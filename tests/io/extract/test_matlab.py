@@ -8,6 +8,7 @@ import pytest
 from scipy.io import savemat
 
 from qs3.errors import InputError
+from qs3.io import guards
 from qs3.io.extract.matlab import read_mat, struct_rows
 
 from ..hostile import refused
@@ -95,6 +96,14 @@ def test_hostile_files_are_refused_in_one_line(tmp_path, name):
     path.write_bytes(content)
     with refused(message, path):
         read_mat(path, ("SUNRGBDMeta",))
+
+
+def test_more_arrays_than_memory_holds_are_refused(tmp_path, monkeypatch):
+    savemat(tmp_path / "a.mat", {"names": np.array(["x"] * 1000, dtype=object)})
+    assert len(read_mat(tmp_path / "a.mat", ("names",))["names"]) == 1000
+    monkeypatch.setattr(guards, "MOST_BYTES", 100_000)
+    with pytest.raises(InputError, match="tree of 1001 arrays announces 128128 bytes"):
+        read_mat(tmp_path / "a.mat", ("names",))
 
 
 def test_a_missing_file_is_told(tmp_path):

@@ -21,12 +21,12 @@ _MANY = 500
 
 @dataclass(frozen=True)
 class CloudFile:
-    """One file of a tree, not yet read."""
+    """One file of a data set, not yet read."""
 
     path: Path
     """The file."""
     class_name: str
-    """Name of its class; empty where the tree tells none."""
+    """Name of the class of all in it; empty where no folder tells one."""
     split: str
     """``train``, ``test`` or empty."""
 

@@ -7,7 +7,6 @@ import hashlib
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from qs3.errors import InputError
 from qs3.files import sha256, write_bytes, write_text
 from qs3.geometry import y_up_to_z_up, z_up_to_y_up
 from qs3.io.guards import read_text
+from qs3.io.layouts.class_folders import CloudFile, choose_split
 from qs3.io.layouts.format import POINTS, SPLITS
 from qs3.io.layouts.hdf5 import hdf5_bytes, read_file
 from qs3.io.preparation import stack
@@ -27,18 +27,8 @@ CLOUDS_A_FILE = 2048
 _H5_NAME = re.compile(r"[\w.+-]{1,200}\.h5", re.ASCII)
 
 
-@dataclass(frozen=True)
-class Part:
-    """One file of a data set, not yet read."""
-
-    path: Path
-    """The file."""
-    split: str
-    """``train`` or ``test``."""
-
-
 def read_parts(
-    parts: Sequence[Part],
+    parts: Sequence[CloudFile],
     class_names: Sequence[str],
     columns: Sequence[int] = (3,),
     turn: bool = True,
@@ -70,7 +60,7 @@ def read_parts(
     )
 
 
-def list_parts(root: Path, pattern: str, names: str, split: str | None) -> list[Part]:
+def list_parts(root: Path, pattern: str, names: str, split: str | None) -> list[CloudFile]:
     """List the files of a folder: by ``<split>_files.txt`` where that lies there, else by names.
 
     Names fit ``pattern``, with the groups split and number; ``names`` is the same for the message.
@@ -88,22 +78,13 @@ def list_parts(root: Path, pattern: str, names: str, split: str | None) -> list[
         matches = [re.fullmatch(pattern, name) for name in _names(root)]
         own = sorted((int(match[2]), match[0]) for match in matches if match and match[1] == part)
         paths = _from_list(root, root / f"{part}_files.txt") or [root / name for _, name in own]
-        parts += [Part(path, part) for path in paths]
+        parts += [CloudFile(path, "", part) for path in paths]
     if not parts:
         raise InputError(f"{root}: holds no {names}")
     counts = Counter(part.path.name for part in parts)
     if twice := [name for name, count in counts.items() if count > 1]:
         raise InputError(f"{root}: {twice[0]} is listed twice")
-    return choose(root, parts, split)
-
-
-def choose(where: Path, parts: Sequence[Part], split: str | None) -> list[Part]:
-    """Keep the files of one split, of which there must be some; None keeps all."""
-    chosen = [part for part in parts if split in (None, part.split)]
-    if not chosen:
-        others = ", ".join(sorted({part.split for part in parts}))
-        raise InputError(f"{where}: has no split {split!r}, only {others}")
-    return chosen
+    return choose_split(root, parts, split)
 
 
 def _from_list(root: Path, path: Path) -> list[Path]:

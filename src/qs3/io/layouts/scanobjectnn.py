@@ -25,8 +25,9 @@ from pathlib import Path
 import numpy as np
 
 from qs3.errors import InputError
+from qs3.io.layouts.class_folders import CloudFile, choose_split
 from qs3.io.layouts.format import Format, labels_as
-from qs3.io.layouts.hdf5_sets import Part, choose, named, read_parts, write_parts
+from qs3.io.layouts.hdf5_sets import named, read_parts, write_parts
 from qs3.io.ragged import RaggedClouds
 
 CLASSES = (
@@ -49,8 +50,8 @@ def read_scanobjectnn(path: Path, split: str | None = None) -> RaggedClouds:
         match = re.fullmatch(_FILES, file.name)
         if match is None:
             raise InputError(f"{file}: is not called training_objectdataset*.h5 or test_*")
-        parts.append(Part(file, _SPLITS[match[1]]))
-    return read_parts(choose(path, parts, split), CLASSES)
+        parts.append(CloudFile(file, "", _SPLITS[match[1]]))
+    return read_parts(choose_split(path, parts, split), CLASSES)
 
 
 def _one_variant(folder: Path) -> list[Path]:
