@@ -155,8 +155,3 @@ def crash_with_lock_row(item: Item, scan: int, settings: GenerateSettings) -> Cl
 def slow_flaky_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
     time.sleep(0.25)
     return flaky_row(item, scan, settings)
-
-
-def slow_deadly_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
-    time.sleep(0.4)
-    return deadly_row(item, scan, settings)

@@ -150,14 +150,12 @@ def test_seeds_depend_on_root_object_and_scan_alone_and_do_not_collide():
 
 def test_neighbours_are_other_objects_drawn_evenly_from_the_scans_own_seed(fake):
     work = items(fake)
-    drawn = [neighbour_of(work[1], scan, work, 0).id for scan in range(400)]
+    drawn = [neighbour_of(work, 1, scan, 0).id for scan in range(400)]
     counts = {name: drawn.count(name) for name in ("m0", "m2", "m3", "m4")}
     assert sum(counts.values()) == 400
     assert min(counts.values()) > 70
-    assert drawn == [neighbour_of(work[1], scan, work, 0).id for scan in range(400)]
-    assert drawn != [neighbour_of(work[1], scan, work, 1).id for scan in range(400)]
-    with pytest.raises(InputError, match="second mesh"):
-        neighbour_of(work[1], 0, work[1:2], 0)
+    assert drawn == [neighbour_of(work, 1, scan, 0).id for scan in range(400)]
+    assert drawn != [neighbour_of(work, 1, scan, 1).id for scan in range(400)]
 
 
 def test_a_scene_with_a_neighbour_hands_one_to_every_scan(fake, tmp_path):
@@ -171,7 +169,11 @@ def test_a_scene_with_a_neighbour_hands_one_to_every_scan(fake, tmp_path):
 
     settings = dataclasses.replace(SETTINGS, scene=SceneSettings("room+behind"))
     work = items(fake)
+    with pytest.raises(InputError, match="second mesh"):
+        fake.run(work[:1], tmp_path, settings, row=scan_one)
     fake.run(work, tmp_path, settings, row=scan_one)
     assert pairs == [
-        (item.id, scan, neighbour_of(item, scan, work, 0).id) for item in work for scan in range(3)
+        (item.id, scan, neighbour_of(work, i, scan, 0).id)
+        for i, item in enumerate(work)
+        for scan in range(3)
     ]

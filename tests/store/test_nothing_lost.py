@@ -179,11 +179,12 @@ def test_objects_that_hang_or_crash_fail_alone_and_what_was_written_counts(fake,
     assert verify(tmp_path, progress=False) == []
 
 
-def test_what_failed_is_scanned_again_when_asked(fake, tmp_path, monkeypatch):
+@pytest.mark.parametrize("without_record", [False, True])
+def test_what_failed_is_scanned_again_when_asked(fake, tmp_path, monkeypatch, without_record):
     marker = tmp_path / "marker"
     marker.touch()
     monkeypatch.setenv("QS3_FAKE_MARKER", str(marker))
-    items = fake.work(ROWS, bad=(0, 5, 6, 23))
+    items = [fake.FakeItem("bad\u2028\u0085é"), *fake.work(ROWS, bad=(5, 6, 23))[1:]]
 
     def run(**how):
         return fake.run(items, tmp_path / "out", row=fake.marked_row, **how)
@@ -191,7 +192,10 @@ def test_what_failed_is_scanned_again_when_asked(fake, tmp_path, monkeypatch):
     assert run() == GenerateReport(done=20, skipped=0, failed=4)
     assert run() == GenerateReport(done=0, skipped=24, failed=0)
     assert run(retry_failed=True) == GenerateReport(done=0, skipped=20, failed=4)
+    assert "bad\u2028\u0085é" in {record["object"] for record in read_failures(tmp_path / "out")}
     marker.unlink()
+    if without_record:
+        (tmp_path / "out" / "failures.jsonl").unlink()
     assert run(retry_failed=True) == GenerateReport(done=4, skipped=20, failed=0)
     assert read_failures(tmp_path / "out") == []
     fake.run(items, tmp_path / "new")
@@ -245,23 +249,7 @@ def test_a_fault_of_the_machine_does_not_go_through_the_whole_list(fake, tmp_pat
     assert verify(tmp_path, progress=False) == []
 
 
-def test_lost_rows_without_a_record_are_found_by_a_retry(fake, tmp_path, monkeypatch):
-    marker = tmp_path / "marker"
-    marker.touch()
-    monkeypatch.setenv("QS3_FAKE_MARKER", str(marker))
-    strange = [fake.FakeItem("bad\u2028\u0085é"), *fake.work(ROWS)[1:]]
-    fake.run(strange, tmp_path / "out", row=fake.marked_row)
-    assert [r["object"] for r in read_failures(tmp_path / "out")] == ["bad\u2028\u0085é"]
-    marker.unlink()
-    (tmp_path / "out" / "failures.jsonl").unlink()
-    report = fake.run(strange, tmp_path / "out", row=fake.marked_row, retry_failed=True)
-    assert report == GenerateReport(done=1, skipped=ROWS - 1, failed=0)
-    fake.run(strange, tmp_path / "whole")
-    assert fake.content(tmp_path / "out") == fake.content(tmp_path / "whole")
-
-
 def test_workers_use_one_thread_each():
-    pytest.importorskip("threadpoolctl")
     with LocalExecutor(1) as executor:
         executor.submit(0, threads_here)
         assert executor.next() == (0, {1})

@@ -1,7 +1,7 @@
 """Parts of one data set, made on several machines, put into one folder."""
 
 import contextlib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -59,8 +59,7 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True
     for folder in folders[1:]:
         check_same(str(folder), open_dataset(folder), manifest)
     meshes = _meshes(folders)
-    sums = [read_sums(folder) for folder in folders]
-    holders = _holders(folders, manifest.shards)
+    sources = _sources(folders, manifest.shards)
     target = open_folder(out)
     copied = 0
     with target.claimed(MANIFEST), contextlib.ExitStack() as at_the_end:
@@ -68,7 +67,12 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True
         done = Sums(target)
         at_the_end.callback(done.write)
         present = set(finished_shards(target, manifest.shards))
-        _check_unchanged(target, present, done, sums)
+        for name in map(shard_name, sorted(present)):
+            if name in done and sources[name][1] not in (None, done[name]):
+                raise InputError(
+                    f"{target}/{name}: is neither part's any more, failed scans were made up for "
+                    "here or there; merge into a new folder"
+                )
         write_mesh_sums(target, meshes)
         failures: dict[str, dict[str, Any]] = {}
         for folder in folders:
@@ -77,16 +81,12 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True
         text = "merge" if progress else None
         for index in progress_bar(manifest.shards, text, "shard", items=range(manifest.shards)):
             name = shard_name(index)
-            expected = {sums[holder][name] for holder in holders[index] if name in sums[holder]}
-            if len(expected) > 1:
-                between = " and ".join(str(folders[holder]) for holder in holders[index])
-                raise InputError(f"{name} differs between {between}")
-            if index in present and {done.get(name)} == expected:
+            source, expected = sources[name]
+            if index in present and name in done and done[name] == expected:
                 continue
-            source = folders[holders[index][0]]
             content = source.read(name)
             digest = sha256(content).hexdigest()
-            if expected and {digest} != expected:
+            if expected not in (None, digest):
                 raise InputError(
                     f"{source}/{name}: damaged, its checksum is not the one in SHA256SUMS; delete "
                     "it and run that part again"
@@ -111,33 +111,21 @@ def _meshes(folders: Sequence[Folder]) -> dict[str, str]:
     return meshes
 
 
-def _holders(folders: Sequence[Folder], shards: int) -> dict[int, list[int]]:
-    """For each shard the parts, by their position, that have it; refuse where none has one."""
-    holders: dict[int, list[int]] = {}
-    for position, folder in enumerate(folders):
-        for index in finished_shards(folder, shards):
-            holders.setdefault(index, []).append(position)
-    missing = [index for index in range(shards) if index not in holders]
+def _sources(folders: Sequence[Folder], shards: int) -> dict[str, tuple[Folder, str | None]]:
+    """For each shard the first part that has it, and its checksum if any part knows that."""
+    sources: dict[str, tuple[Folder, str | None]] = {}
+    for folder in folders:
+        sums = read_sums(folder)
+        for name in map(shard_name, finished_shards(folder, shards)):
+            first, digest = sources.get(name, (folder, None))
+            if digest and sums.get(name, digest) != digest:
+                raise InputError(f"{name} differs between {first} and {folder}")
+            sources[name] = first, digest or sums.get(name)
+    missing = [index for index in range(shards) if shard_name(index) not in sources]
     if missing:
         some = ", ".join(map(str, missing[:8])) + (" …" if len(missing) > 8 else "")
         raise InputError(
             f"{len(missing)} of {shards} shards are in none of the {len(folders)} parts "
             f"(numbers {some}); finish those parts first"
         )
-    return holders
-
-
-def _check_unchanged(
-    target: Folder,
-    present: Collection[int],
-    done: Mapping[str, str],
-    sums: Sequence[Mapping[str, str]],
-) -> None:
-    """Refuse to write over shards that an earlier merge brought and somebody then changed."""
-    for name in map(shard_name, sorted(present)):
-        given = {part[name] for part in sums if name in part}
-        if name in done and given and done[name] not in given:
-            raise InputError(
-                f"{target}/{name}: is neither part's any more, failed scans were made up for here "
-                "or there; merge into a new folder"
-            )
+    return sources

@@ -58,7 +58,7 @@ class Plan:
         item, settings = self.items[position], self.settings
         if not settings.make_scene().needs_neighbour:
             return item, scan, settings
-        beside = neighbour_of(item, scan, self.items, settings.seed, position)
+        beside = neighbour_of(self.items, position, scan, settings.seed)
         return item, scan, settings, beside
 
     def items_of(self, shards: Sequence[int]) -> Iterator[Item]:

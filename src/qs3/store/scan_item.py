@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol, runtime_checkable
 import numpy as np
 import tyro
 
-from qs3.errors import InputError
 from qs3.meshes.classes import POINTDA10, map_labels
 from qs3.sensor.checks import check_range
 from qs3.sensor.presets import settings_dict
@@ -95,26 +94,16 @@ def scan_seed(root: int, object_id: str, scan: int) -> int:
     return int(state[0] >> np.uint64(1))
 
 
-def neighbour_of(
-    item: Item, scan: int, items: Sequence[Item], root: int, position: int | None = None
-) -> Item:
-    """Draw another item of the work list for a scan; order and worker count do not matter.
+def neighbour_of(items: Sequence[Item], position: int, scan: int, root: int) -> Item:
+    """Draw another item of a work list for a scan; order and worker count do not matter.
 
     Args:
-        item: The object that is scanned.
+        items: The work list, of two at least.
+        position: Of the object that is scanned, in the list.
         scan: Index of its scan.
-        items: The work list.
         root: Root seed.
-        position: Of the object in the list, where it is known: a long list is then not searched.
-
-    Raises:
-        InputError: where there is no other.
     """
-    if position is None:
-        position = [other.id for other in items].index(item.id)
-    if len(items) < 2:
-        raise InputError(f"{item.id}: a scene with a neighbour needs a second mesh to draw from")
-    key = np.random.SeedSequence(scan_seed(root, item.id, scan), spawn_key=(0x4E42,))
+    key = np.random.SeedSequence(scan_seed(root, items[position].id, scan), spawn_key=(0x4E42,))
     drawn = int(np.random.default_rng(key).integers(len(items) - 1))
     return items[drawn + (drawn >= position)]
 
@@ -151,7 +140,7 @@ def scan_item(
         scan=scan_index,
         label=int(label[0]),
         class_name=settings.classes[int(label[0])],
-        split=_split(item, settings),
+        split=(item.split or "") if settings.split is None else settings.split,
         seed=seed,
         points=result.points,
         view=result.view,
@@ -167,10 +156,6 @@ def scan_item(
 def row_id(item: Item, scan: int) -> str:
     """Name of one scan of one object in its data set."""
     return f"{item.id}#{scan}"
-
-
-def _split(item: Item, settings: GenerateSettings) -> str:
-    return (item.split or "") if settings.split is None else settings.split
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

@@ -124,22 +124,18 @@ class LocalExecutor:
                     continue
                 how = f"its process died {call.deaths} times, at last with no other beside it"
                 value = Failure("ProcessDied", f"{how} ({_how(error.exitcode)})")
-            except BrokenProcessPool as error:
-                self._restart(call, error)
+            except BrokenProcessPool as error:  # a worker died before its first call
+                self._broken += 1
+                if self._broken > _BROKEN_IN_A_ROW:
+                    raise InputError(_NO_PROCESS) from error
+                self._calls[future] = call
+                self._reopen()
                 continue
             except Exception as error:  # its value could not come back; no other's will
                 value = Failure(type(error).__name__, str(error), fatal=True)
             else:
                 self._broken = 0
             return call.key, value
-
-    def _restart(self, call: _Call, error: Exception) -> None:
-        """Start a new pool where one broke as a whole: a worker died before its first call."""
-        self._broken += 1
-        if self._broken > _BROKEN_IN_A_ROW:
-            raise InputError(_NO_PROCESS) from error
-        self._reopen()
-        self._schedule(call)
 
     def _reopen(self) -> None:
         """Replace the pool, and hand over anew what it had."""
