@@ -134,21 +134,26 @@ def arrange(
     if parts & {"wall", "behind"}:
         poses = _on_arc(poses, np.radians(settings.arc))
     bodies, names = [body], ["object"]
-    front = _front(poses[0])
-    ground = float(body.mesh.vertices[:, 2].min()) - _LIFT * size
+    front, up = _front(poses[0]), np.array([0.0, 0.0, 1.0])
+    across = np.array([-front[1], front[0], 0.0])
+    half = settings.extent * size / 2
+    base = float(body.mesh.vertices[:, 2].min())
+    ground = base - _LIFT * size
     if neighbour is not None:
         turn, side = rng.uniform(0, 2 * np.pi), rng.choice([-1.0, 1.0])
         turned = neighbour.copy()
         turned.vertices = turned.vertices @ rotation_z(turn).T
-        place = _before if "behind" in parts else _beside
-        turned.vertices += place(body.mesh, turned, poses[0], side, settings, size)
+        gap = settings.neighbour_gap * size
+        if "behind" in parts:
+            turned.vertices += _before(body.mesh, turned, poses[0], side, gap, settings.cover)
+        else:  # on the same ground
+            shift = side * across * _apart(body.mesh, turned, side * across, gap)
+            shift[2] = base - turned.vertices[:, 2].min()
+            turned.vertices += shift
         if "floor" in parts:
             turned.vertices[:, 2] += max(0.0, ground - turned.vertices[:, 2].min())
         bodies.append(Body(turned, settings.neighbour or body.material))
         names.append("neighbour")
-    half = settings.extent * size / 2
-    across = np.array([-front[1], front[0], 0.0])
-    up = np.array([0.0, 0.0, 1.0])
     if "wall" in parts:
         reach = max(float((body.mesh.vertices @ -front).max()) for body in bodies)
         centre = -front * (reach + settings.wall_gap * size)
@@ -198,8 +203,8 @@ def _before(
     other: trimesh.Trimesh,
     pose: Pose,
     side: float,
-    settings: SceneSettings,
-    size: float,
+    gap: float,
+    cover: float,
 ) -> Float[np.ndarray, "3"]:
     """Place on the line of sight of ``pose``, moved aside until the wanted share is covered.
 
@@ -207,57 +212,29 @@ def _before(
     nothing from a camera that looks down by more than some 40°.
     """
     sight = pose.position / np.linalg.norm(pose.position)
-    shift = sight * _apart(mesh, other, sight, settings.neighbour_gap * size)
+    shift = sight * _apart(mesh, other, sight, gap)
     if float(((other.vertices + shift) @ sight).max()) >= np.linalg.norm(pose.position):
         raise InputError(
             "scene: no room for a neighbour between the first view's camera and the object; give "
             "placement a larger radius, or make the neighbour smaller (neighbour_size)"
         )
-    return shift + pose.camera_to_world[:3, 0] * _aside(mesh, other, shift, pose, side, settings)
-
-
-def _aside(
-    mesh: trimesh.Trimesh,
-    other: trimesh.Trimesh,
-    shift: Float[np.ndarray, "3"],
-    pose: Pose,
-    side: float,
-    settings: SceneSettings,
-) -> float:
-    """How far to move a neighbour along the camera's x axis so that it hides the wanted share."""
     x, y, z = transform_points(invert_rigid(pose.camera_to_world), np.asarray(mesh.vertices)).T
     reach = float(np.abs([x / z, y / z]).max())
     rig = StereoRig(width=_SURVEY, height=_SURVEY, focal=_SURVEY / 2 / reach)
     seen = DepthCaster(mesh).cast(rig, pose, rig.full_frame).mask
     moved = other.copy()
     moved.vertices = moved.vertices + shift
-    caster = DepthCaster(moved)
+    caster, along = DepthCaster(moved), pose.camera_to_world[:3, 0]
     # Far enough to be clear of the object, then inwards until both are in line.
-    width = float(np.ptp((moved.vertices - pose.position) @ pose.camera_to_world[:3, 0]))
+    width = float(np.ptp((moved.vertices - pose.position) @ along))
     best, error = 0.0, math.inf
     for offset in side * np.linspace(width / 2 + reach * float(z.max()), 0.0, _STEPS):
         # The neighbour moved to the right looks as from a camera moved to the left.
         hidden = caster.cast(rig, pose.shifted(-offset), rig.full_frame).mask & seen
-        miss = abs(float(hidden.sum()) / max(int(seen.sum()), 1) - settings.cover)
+        miss = abs(float(hidden.sum()) / max(int(seen.sum()), 1) - cover)
         if miss < error:
             best, error = float(offset), miss
-    return best
-
-
-def _beside(
-    mesh: trimesh.Trimesh,
-    other: trimesh.Trimesh,
-    pose: Pose,
-    side: float,
-    settings: SceneSettings,
-    size: float,
-) -> Float[np.ndarray, "3"]:
-    """Place to the left or right of the object, on the same ground."""
-    front = _front(pose)
-    along = side * np.array([-front[1], front[0], 0.0])
-    shift = along * _apart(mesh, other, along, settings.neighbour_gap * size)
-    shift[2] = mesh.vertices[:, 2].min() - other.vertices[:, 2].min()
-    return shift
+    return shift + along * best
 
 
 def _square(

@@ -12,11 +12,11 @@ from qs3.sensor.depth import backproject, depth_from_disparity, gate
 from qs3.sensor.exposure import expose_pair
 from qs3.sensor.matching import match, matching_canvas
 from qs3.sensor.presets import Sensor
-from qs3.sensor.render import StereoPair
+from qs3.sensor.render import Body, Scene, StereoPair
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, Region
+from qs3.sensor.speckle import pattern_image, stored_pattern
 from qs3.sensor.statistics import EMPTY_VIEW, ViewStatistics, view_statistics
-from qs3.sensor.stored import stored_pattern
 
 RIM = 16
 """Pixels around the object's box that are matched too: fattening reaches half a block."""
@@ -58,6 +58,13 @@ class ViewImages:
         """The pixels of ``part`` of the frame, which lies within ``region``."""
         x, y = part.x - self.region.x, part.y - self.region.y
         return image[max(y, 0) : y + part.height, max(x, 0) : x + part.width]
+
+
+def scene_of(bodies: Sequence[Body], sensor: Sensor) -> Scene:
+    """The bodies in the sensor's light."""
+    pattern = sensor.pattern
+    opening = pattern.tan_half_width, pattern.tan_half_height
+    return Scene(tuple(bodies), sensor.light, pattern_image(pattern), *opening)
 
 
 def object_region(bounds: Float[np.ndarray, "2 3"], sensor: Sensor, pose: Pose) -> Region:

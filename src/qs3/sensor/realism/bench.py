@@ -17,11 +17,10 @@ from qs3.sensor.lens import blur_reach
 from qs3.sensor.matching import matching_canvas
 from qs3.sensor.materials import Material
 from qs3.sensor.presets import Sensor
-from qs3.sensor.render import Body, Renderer, Scene
+from qs3.sensor.render import Body, Renderer
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, Region, StereoRig
-from qs3.sensor.speckle import pattern_image
-from qs3.sensor.view import Clock, ViewImages, take_view
+from qs3.sensor.view import Clock, ViewImages, scene_of, take_view
 
 VIEW = Pose.looking_at(np.zeros(3), np.array([0.0, 1.0, 0.0]))
 """The pose of the left camera."""
@@ -67,15 +66,14 @@ class Bench:
             noise: The same for the image noise; ``index`` by default.
             focus: What auto-exposure looks at; ``region`` by default.
         """
-        sensor, rig, pattern = self.sensor, self.rig, self.sensor.pattern
+        sensor, rig = self.sensor, self.rig
         focus = focus or region
         x0, y0, x1, y1 = matching_canvas(region, rig, sensor.matching).bounds
         left, top, right, bottom = focus.bounds
         x0, y0, x1, y1 = min(x0, left), min(y0, top), max(x1, right), max(y1, bottom)
         wide = Region(x0, y0, x1 - x0, y1 - y0)
         wide = wide.grown(blur_reach(sensor.exposure.psf), rig.width, rig.height)
-        opening = pattern.tan_half_width, pattern.tan_half_height
-        scene = Scene(tuple(bodies), sensor.light, pattern_image(pattern), *opening)
+        scene = scene_of(bodies, sensor)
         pair = self.renderer.render(scene, rig, [VIEW], [self.seed + index], regions=[wide])[0]
         rng = np.random.default_rng(self.seed + (index if noise is None else noise))
         caster = DepthCaster(*(body.mesh for body in bodies))

@@ -69,13 +69,7 @@ def bands(bench: Bench) -> Judged:
 
 
 def band_rows(disparity: Float[np.ndarray, "h w"], expected: float, where: str = "") -> list[Row]:
-    """Judge the band that has no match at the left border of a facing wall.
-
-    Args:
-        disparity: From the frame's first column on.
-        expected: Its width in pixels.
-        where: Added to the row's name.
-    """
+    """Judge the band without a match at the left border of a facing wall, ``expected`` px wide."""
     valid = np.isfinite(disparity)
     first = np.where(valid.any(axis=1), valid.argmax(axis=1), disparity.shape[1])
     what = f"left band {where}".strip()

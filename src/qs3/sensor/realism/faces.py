@@ -52,14 +52,7 @@ def scanned(bench: Bench) -> Judged:
 
 
 def shoot_object(bench: Bench, distance: float, turn: float, index: int) -> ViewImages:
-    """Photograph a cabinet of the sensor's object size, looked down upon; with normals.
-
-    Args:
-        bench: The sensor.
-        distance: Of the object's middle.
-        turn: Of the object about its vertical, in degrees.
-        index: Number of the photograph.
-    """
+    """Photograph a cabinet looked down upon, turned by ``turn`` degrees; with normals."""
     mesh = normalise(shapes.make("cabinet", seed=1), "box")
     points = np.asarray(mesh.vertices) * bench.sensor.object_size
     tilt = np.radians(_TILT)
@@ -118,12 +111,7 @@ def inside_faces(
 
 
 def scan_rows(ratio: Float[np.ndarray, "n"], cosine: Float[np.ndarray, "n"]) -> Judged:
-    """Judge signed distances in units of the law.
-
-    Args:
-        ratio: Distance over expected deviation of each point.
-        cosine: Cosine of its view angle.
-    """
+    """Judge signed distances in units of the law; with the cosine of each point's view angle."""
     if len(ratio) < 100:
         return [row("points", float(len(ratio)), 100.0)], {"distance": [], "share": []}
     median = float(np.median(ratio))

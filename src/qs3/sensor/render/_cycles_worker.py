@@ -262,11 +262,9 @@ class Studio:
         graph = _Graph(material.node_tree)
         grey = (settings["albedo"],) * 3 + (1.0,)
         model = settings["model"]
-        if model == "diffuse":
-            surface = graph.add("ShaderNodeBsdfDiffuse")
-            _inputs(surface, Color=grey, Roughness=0.0)
-        elif model == "mirror":
-            surface = graph.add("ShaderNodeBsdfAnisotropic")
+        if model in ("diffuse", "mirror"):
+            kind = {"diffuse": "Diffuse", "mirror": "Anisotropic"}[model]
+            surface = graph.add("ShaderNodeBsdf" + kind)
             _inputs(surface, Color=grey, Roughness=0.0)
         elif model == "principled":
             surface = graph.add("ShaderNodeBsdfPrincipled")
@@ -294,13 +292,11 @@ class Studio:
         self.scene.view_settings.view_transform = "Raw" if raw else quality["view_transform"]
         picture = self.scene.render.image_settings
         # Radiance as 32-bit floats, or a display's grey levels in 16 bits.
-        picture.file_format = "OPEN_EXR" if raw else "PNG"
-        picture.color_mode = "RGB"
-        picture.color_depth = "32" if raw else "16"
         if raw:
+            _set(picture, file_format="OPEN_EXR", color_mode="RGB", color_depth="32")
             picture.exr_codec = "NONE"
         else:
-            picture.compression = 0
+            _set(picture, file_format="PNG", color_mode="RGB", color_depth="16", compression=0)
 
     def _photograph(self, shot, request):
         rig, render = request["rig"], self.scene.render
@@ -349,8 +345,9 @@ class _Graph:
         self.tree = tree
         self.nodes = []
 
-    def add(self, kind, *feeds):
+    def add(self, kind, *feeds, **settings):
         node = self.tree.nodes.new(kind)
+        _set(node, **settings)
         self.nodes.append(node)
         for slot, feed in zip(node.inputs, feeds):  # noqa: B905
             self.link(feed, slot)
@@ -363,12 +360,7 @@ class _Graph:
             self.tree.links.new(feed, slot)
 
     def math(self, operation, *feeds):
-        node = self.tree.nodes.new("ShaderNodeMath")
-        node.operation = operation
-        self.nodes.append(node)
-        for slot, feed in zip(node.inputs, feeds):  # noqa: B905
-            self.link(feed, slot)
-        return node.outputs[0]
+        return self.add("ShaderNodeMath", *feeds, operation=operation).outputs[0]
 
     def beyond_touch(self, surface):
         """Let rays that have only just left a surface pass what lies in the same plane.

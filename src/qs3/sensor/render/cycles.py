@@ -48,10 +48,8 @@ def interpreter() -> tuple[str, ...] | None:
         python = sys.executable
     if python is None:
         beside = Path(f"{sys.prefix}-cycles")
-        for place in (beside / "bin" / "python", beside / "Scripts" / "python.exe"):
-            if place.is_file():
-                python = str(place)
-                break
+        places = beside / "bin" / "python", beside / "Scripts" / "python.exe"
+        python = next((str(place) for place in places if place.is_file()), None)
     return None if python is None else (python, str(_WORKER))
 
 
@@ -111,23 +109,24 @@ class CyclesRenderer:
         seeds: Sequence[int],
         regions: Sequence[Region] | None = None,
     ) -> list[StereoPair]:
-        """Photograph ``scene`` once from each pose; equal seeds give equal bits.
+        """Photograph ``scene`` once from each pose: `qs3.sensor.render.Renderer`.
 
         Raises:
-            InputError: where a camera sees the sky past a lone object.
             MissingExtraError: where there is no Blender.
             RenderError: where the worker died, hung or reported a fault; the next call starts a
                 fresh one.
-            ValueError: where there is not one seed (and region, if given) for each pose.
         """
         views = view_regions(scene, rig, poses, seeds, regions, self.full_frame)
         shots = [
-            # Two streams that never meet: the left camera's seeds are even.
-            _shot(rig, pose, camera, region, (2 * seed + side) % 2**31)
+            {
+                "camera": camera.camera_to_world.tolist(),
+                "projector": rig.projector(pose).camera_to_world.tolist(),
+                "region": [region.x, region.y, region.width, region.height],
+                # Two streams that never meet: the left camera's seeds are even.
+                "seed": (2 * seed + side) % 2**31,
+            }
             for pose, seed, parts in zip(poses, seeds, views, strict=True)
-            for side, (camera, region) in enumerate(
-                zip((pose, rig.right(pose)), parts, strict=True)
-            )
+            for side, camera, region in zip((0, 1), (pose, rig.right(pose)), parts, strict=True)
             if not region.empty
         ]
         with borrow(_command(), self.objects_per_worker) as worker:
@@ -205,12 +204,3 @@ def _command() -> tuple[str, ...]:
 def _versions(command: tuple[str, ...]) -> dict[str, str]:
     with borrow(command, 0) as worker:
         return {name: str(worker.greeting[name]) for name in ("blender", "python")}
-
-
-def _shot(rig: StereoRig, pose: Pose, camera: Pose, region: Region, seed: int) -> dict[str, Any]:
-    return {
-        "camera": camera.camera_to_world.tolist(),
-        "projector": rig.projector(pose).camera_to_world.tolist(),
-        "region": [region.x, region.y, region.width, region.height],
-        "seed": seed,
-    }
