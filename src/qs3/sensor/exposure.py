@@ -88,8 +88,8 @@ def expose_pair(
         rng: Speckle and noise of the left image, then of the right one; untouched without them.
 
     Returns:
-        Left and right grey levels, 0…255 or 0…1023; the right image has no pixel where the rig
-        has no second camera.
+        Left and right grey levels, 0…255 or 0…1023; a rig without a second camera has an empty
+        right image.
     """
     gain = 1.0 if pair.display else automatic_gain(pair, focus, rig, settings)
     shape = rig.full_frame.shape
@@ -161,13 +161,7 @@ def automatic_gain(
 
     Of the pixels of ``focus``, behind the lens, those count that show something: that differ from
     the background; all of them where none does. A black or empty focus leaves the gain at 1, or
-    at ``max_gain``, where that is set.
-
-    Args:
-        pair: Radiance.
-        focus: Part of the left frame.
-        rig: Supplies frame, focal length and principal point.
-        settings: The imager; 1 is returned where its ``auto`` is 0.
+    at ``max_gain``, where that is set; without ``auto`` it is 1.
     """
     if not settings.auto:
         return 1.0
@@ -219,5 +213,4 @@ def _through_lens(
     if settings.vignetting:
         light = light * vignette(rig, wide, settings.vignetting)
     light = blur(light, settings.psf)
-    x, y = part.x - wide.x, part.y - wide.y
-    return light[y : y + part.height, x : x + part.width]
+    return light[part.within(wide)]

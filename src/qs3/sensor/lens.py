@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 from jaxtyping import Float, Float32
-from scipy.special import ive
 
 from qs3.sensor.rig import Region, StereoRig
 
@@ -53,6 +52,8 @@ def blur_kernel(psf: float) -> Float[np.ndarray, "n"]:
         >>> round(float(kernel.sum()), 6), round(float((kernel * place**2).sum()), 3)
         (1.0, 0.25)
     """
+    from scipy.special import ive
+
     reach = blur_reach(psf)
     kernel = ive(np.abs(np.arange(-reach, reach + 1)), psf**2)
     return kernel / kernel.sum()

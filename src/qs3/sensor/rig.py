@@ -72,6 +72,10 @@ class Region:
         """Index of the rectangle in a full-frame image, rows first."""
         return slice(self.y, self.y + self.height), slice(self.x, self.x + self.width)
 
+    def within(self, other: "Region") -> tuple[slice, slice]:
+        """Index of the rectangle in an image of ``other``, which holds it."""
+        return Region(self.x - other.x, self.y - other.y, self.width, self.height).slices
+
     @property
     def bounds(self) -> tuple[int, int, int, int]:
         """First column and row, and the column and row after the last."""

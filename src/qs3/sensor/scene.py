@@ -11,18 +11,20 @@ Convention:
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 
 from qs3.errors import InputError
 from qs3.geometry import invert_rigid, rotation_z, transform_points
 from qs3.sensor.checks import check_range
 from qs3.sensor.materials import Material
-from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.render.scene import Body
 from qs3.sensor.rig import Pose, StereoRig
+
+if TYPE_CHECKING:
+    import trimesh
 
 LAYOUTS = ("alone", "floor", "wall", "room", "behind", "beside")
 _SURVEY, _STEPS = 96, 25  # pixels and places at which a neighbour's cover is tried
@@ -107,7 +109,7 @@ def arrange(
     body: Body,
     poses: Sequence[Pose],
     size: float,
-    neighbour: trimesh.Trimesh | None,
+    neighbour: "trimesh.Trimesh | None",
     rng: np.random.Generator,
 ) -> ArrangedScene:
     """Put everything else about the object.
@@ -159,11 +161,11 @@ def arrange(
         centre = -front * (reach + settings.wall_gap * size)
         if "floor" in parts:  # it stands on the floor
             centre = centre + up * (ground + half)
-        bodies.append(Body(_square(centre, across * half, up * half), settings.wall))
+        bodies.append(Body(rectangle(centre, across * half, up * half), settings.wall))
         names.append("wall")
     if "floor" in parts:
         centre = up * ground
-        bodies.append(Body(_square(centre, front * half, across * half), settings.floor))
+        bodies.append(Body(rectangle(centre, front * half, across * half), settings.floor))
         names.append("floor")
     return ArrangedScene(tuple(bodies), tuple(names), tuple(poses))
 
@@ -192,15 +194,15 @@ def _front(pose: Pose) -> Float[np.ndarray, "3"]:
 
 
 def _apart(
-    mesh: trimesh.Trimesh, other: trimesh.Trimesh, along: Float[np.ndarray, "3"], gap: float
+    mesh: "trimesh.Trimesh", other: "trimesh.Trimesh", along: Float[np.ndarray, "3"], gap: float
 ) -> float:
     """Distance along a direction at which a plane with ``gap`` about it parts the two meshes."""
     return float((mesh.vertices @ along).max() - (other.vertices @ along).min()) + gap
 
 
 def _before(
-    mesh: trimesh.Trimesh,
-    other: trimesh.Trimesh,
+    mesh: "trimesh.Trimesh",
+    other: "trimesh.Trimesh",
     pose: Pose,
     side: float,
     gap: float,
@@ -211,6 +213,8 @@ def _before(
     NOTE: it hovers there. A neighbour of the object's height that stood on the ground would hide
     nothing from a camera that looks down by more than some 40°.
     """
+    from qs3.sensor.render.raycast import DepthCaster
+
     sight = pose.position / np.linalg.norm(pose.position)
     shift = sight * _apart(mesh, other, sight, gap)
     if float(((other.vertices + shift) @ sight).max()) >= np.linalg.norm(pose.position):
@@ -237,9 +241,11 @@ def _before(
     return shift + along * best
 
 
-def _square(
+def rectangle(
     centre: Float[np.ndarray, "3"], a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]
-) -> trimesh.Trimesh:
-    """A square of two triangles, its normal along a × b."""
+) -> "trimesh.Trimesh":
+    """A rectangle of two triangles with half its sides a and b, its normal along a × b."""
+    import trimesh
+
     corners = np.array([centre - a - b, centre + a - b, centre + a + b, centre - a + b])
     return trimesh.Trimesh(vertices=corners, faces=[[0, 1, 2], [0, 2, 3]], process=False)

@@ -11,7 +11,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8, UInt16
 
@@ -72,6 +71,8 @@ def speckle_pattern(columns: int, rows: int, seed: int) -> Bool[np.ndarray, "row
         >>> int(dots.sum())
         6
     """
+    import cv2
+
     _check_cells(columns, rows)
     rng = np.random.default_rng(np.random.SeedSequence([seed, columns, rows]))
     down, across = rows // _TILE, columns // _TILE
@@ -159,6 +160,8 @@ def _check_cells(columns: int, rows: int) -> None:
 
 
 def _users_picture(path: Path) -> Float32[np.ndarray, "h w"]:
+    import cv2
+
     if not path.is_file():
         raise InputError(f"{path}: no such file; name a picture to project")
     grey = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
@@ -215,6 +218,8 @@ def stored_pattern(
         >>> stored_pattern(rig, PatternSettings(), rig.full_frame).shape
         (48, 64)
     """
+    import cv2
+
     picture = pattern_image(pattern)
     rows, columns = picture.shape
     cx, cy = rig.principal_point

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from qs3.errors import InputError
 from qs3.sensor.rig import Pose
@@ -72,17 +71,14 @@ def place_views(
 def _pose_on_shell(azimuth: float, placement: Placement, rng: np.random.Generator) -> Pose:
     radius = rng.uniform(*placement.radius)
     elevation = np.radians(rng.uniform(*placement.elevation))
-    direction = np.array(
-        [
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation),
-        ]
-    )
+    across, up = np.cos(elevation), np.sin(elevation)
+    direction = np.array([across * np.cos(azimuth), across * np.sin(azimuth), up])
     return Pose.looking_at(radius * direction, np.zeros(3))
 
 
 def _disturbed(pose: Pose, share: float, rng: np.random.Generator) -> Pose:
+    from scipy.spatial.transform import Rotation
+
     matrix = pose.camera_to_world.copy()
     matrix[:3, 3] += np.clip(0.05 * share * rng.standard_normal(3), -0.1, 0.1)
     euler = Rotation.from_matrix(matrix[:3, :3] @ _OPENCV_TO_OPENGL).as_euler("xyz")

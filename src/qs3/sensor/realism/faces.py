@@ -77,8 +77,8 @@ def off_faces(
         view: A photograph, with normals.
         rig: Supplies focal length, baseline and principal point.
         block: The matcher's block: within half of it a pixel's neighbours must show its face.
-        walls: Distances at which the noise on a wall is known.
-        sigma: The sub-pixel RMS there.
+        walls: Distances of facing walls.
+        sigma: The sub-pixel RMS on each.
 
     Returns:
         Distance over expected deviation, positive away from the camera; cosine of the view angle.

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 
 from qs3.sensor.matching import MatchingSettings
 from qs3.sensor.realism.bench import (
@@ -141,8 +141,8 @@ def steps(bench: Bench) -> Judged | str:
     quantum, shift = disparity_grid(bench.sensor.matching)
     if not quantum:
         return "the matcher's disparities are not rounded"
-    distance = middle(bench.sensor)
-    region = wall_region(bench.sensor, distance, 0.2 if bench.quick else 0.4)
+    distance, share = middle(bench.sensor), 0.2 if bench.quick else 0.4
+    region = wall_region(bench.sensor, distance, share)
     disparity = bench.shoot([painted(wall(distance, 30.0))], region).disparity
     values = disparity[np.isfinite(disparity)].astype(np.float64)
     return steps_rows(values, quantum, shift), {}
@@ -193,10 +193,8 @@ def kinect_rows(step: Float[np.ndarray, "n"], sigma: Float[np.ndarray, "n"]) -> 
     """Judge steps and noise in metres at ``DISTANCES``: within 20 % of what was measured."""
     squared = np.square(DISTANCES)
     rows, data = [], {"z": DISTANCES}
-    for name, short, made, law in (
-        ("step", "step", step, STEP),
-        ("noise σ", "sigma", sigma, SIGMA),
-    ):
+    figures = (("step", "step", step, STEP), ("noise σ", "sigma", sigma, SIGMA))
+    for name, short, made, law in figures:
         rows += [
             row(f"{name} at {z:g} m", 1000 * value, 800 * expected, 1200 * expected, "mm")
             for z, value, expected in zip(DISTANCES, made, law * squared, strict=True)
@@ -219,11 +217,7 @@ def repeats(bench: Bench) -> Judged | str:
     return repeats_rows(*(view.depth for view in views)), {}
 
 
-def repeats_rows(
-    first: Shaped[np.ndarray, "h w"],
-    again: Shaped[np.ndarray, "h w"],
-    other: Shaped[np.ndarray, "h w"],
-) -> list[Row]:
+def repeats_rows(first: np.ndarray, again: np.ndarray, other: np.ndarray) -> list[Row]:
     """Judge depths of equal seeds, and of other image noise."""
     same, changed = np.isclose(again, first, 0, 0, True), ~np.isclose(other, first, 0, 0, True)
     return [

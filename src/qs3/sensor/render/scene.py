@@ -2,16 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
-import trimesh
 from jaxtyping import Float32
 
 from qs3.errors import InputError
 from qs3.sensor.checks import check_range
 from qs3.sensor.materials import Material
 from qs3.sensor.rig import Pose, Region, StereoRig
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class LightSettings:
 class Body:
     """One thing in the scene."""
 
-    mesh: trimesh.Trimesh
+    mesh: "trimesh.Trimesh"
     """Its surface, in world coordinates."""
     material: Material = field(default_factory=Material)
     """What its surface does to light."""
@@ -63,7 +65,7 @@ class Scene:
     """Tangent of half its vertical opening angle."""
 
     @property
-    def mesh(self) -> trimesh.Trimesh:
+    def mesh(self) -> "trimesh.Trimesh":
         """Surface of the object."""
         return self.bodies[0].mesh
 
