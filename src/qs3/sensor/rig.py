@@ -16,6 +16,8 @@ from qs3.errors import InputError
 from qs3.geometry import invert_rigid, look_at, transform_points
 from qs3.sensor.checks import check_choices, check_range
 
+_MOST_PIXELS = 2**25  # three times the film of the largest depth cameras
+
 
 @dataclass(frozen=True)
 class Pose:
@@ -109,6 +111,11 @@ class StereoRig:
     def __post_init__(self) -> None:
         check_choices(self, "rig")
         check_range(self, "rig", "width", "height", low=1)
+        if self.width * self.height > _MOST_PIXELS:
+            raise InputError(
+                f"rig: a film of {self.width} × {self.height} pixels is larger than the "
+                f"{_MOST_PIXELS:,} that can be rendered; take a smaller width or height"
+            )
         check_range(self, "rig", "focal", "baseline", above=True)
         check_range(self, "rig", "projector_offset", low=-10.0, high=10.0)
         if self.second == "pattern" and self.projector_offset != 1:

@@ -51,6 +51,10 @@ class PatternSettings:
     def __post_init__(self) -> None:
         check_choices(self, "pattern")
         check_range(self, "pattern", "tan_half_width", "tan_half_height", above=True)
+        tangents = sorted((self.tan_half_width, self.tan_half_height))
+        if tangents[1] > 16 * tangents[0]:  # its picture has texels as wide as high
+            raise InputError("pattern: tan_half_width and tan_half_height are over 16 times apart")
+        check_range(self, "pattern", "columns", "rows", high=_LARGEST)
         check_range(self, "pattern", "seed")
         check_range(self, "pattern", "spot_size", high=2.0, above=True)
         if self.image is None:
@@ -164,7 +168,10 @@ def _users_picture(path: Path) -> Float32[np.ndarray, "h w"]:
 
     if not path.is_file():
         raise InputError(f"{path}: no such file; name a picture to project")
-    grey = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
+    try:
+        grey = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except cv2.error:  # empty, or of more pixels than OpenCV takes
+        grey = None
     if grey is None:
         raise InputError(f"{path}: not a picture that OpenCV can read; use PNG or JPEG")
     return grey.astype(np.float32) / 255.0

@@ -53,13 +53,12 @@ def place_views(
     every coordinate by clip(0.05·(i + 1)/V·N(0, 1), ±0.1) and every Euler angle by
     clip(0.1·(i + 1)/V·N(0, 1), ±0.1 rad).
 
-    Raises:
-        InputError: where ``views`` is not within 1…256 or the layout is unknown.
+    Args:
+        views: 1 to 256, as `qs3.sensor.settings.ScanSettings` checks.
+        layout: ``orbit`` or ``jitter``.
+        placement: Ranges of radius, elevation and azimuth.
+        rng: Draws them.
     """
-    if not 1 <= views <= 256:
-        raise InputError(f"views: {views} is not within 1…256")
-    if layout not in ("orbit", "jitter"):
-        raise InputError(f"view_layout: no layout {layout!r}; choose orbit or jitter")
     azimuth = np.radians(rng.uniform(*placement.azimuth))
     if layout == "orbit":
         steps = 2 * np.pi * np.arange(views) / views

@@ -21,7 +21,7 @@ from qs3.errors import InputError, MissingExtraError
 from qs3.sensor.checks import check_choices, check_range
 from qs3.sensor.render._worker_process import RenderError as RenderError
 from qs3.sensor.render._worker_process import Worker, borrow
-from qs3.sensor.render.scene import Scene, StereoPair, view_regions
+from qs3.sensor.render.scene import MOST_SAMPLES, Scene, StereoPair, view_regions
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 _QUALITY = ("samples", "max_bounces", "pixel_filter", "view_transform")
@@ -85,8 +85,9 @@ class CyclesRenderer:
 
     def __post_init__(self) -> None:
         check_choices(self, "renderer")
-        check_range(self, "renderer", "samples", low=1)
-        check_range(self, "renderer", "max_bounces", "objects_per_worker")
+        check_range(self, "renderer", "samples", low=1, high=MOST_SAMPLES)
+        check_range(self, "renderer", "max_bounces", high=128)
+        check_range(self, "renderer", "objects_per_worker")
         check_range(self, "renderer", "timeout", above=True)
 
     @property

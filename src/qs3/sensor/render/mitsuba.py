@@ -14,7 +14,7 @@ from qs3.sensor.render.cache import Photographer
 from qs3.sensor.render.embree import EmbreePhotographer
 from qs3.sensor.render.jit import JitPhotographer
 from qs3.sensor.render.path import PathPhotographer
-from qs3.sensor.render.scene import Scene, StereoPair, view_regions
+from qs3.sensor.render.scene import MOST_SAMPLES, Scene, StereoPair, view_regions
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 VARIANTS = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
@@ -91,8 +91,9 @@ class MitsubaRenderer:
         elif not usable(self.variant):
             raise InputError(f"renderer: {self.variant} does not work here; see: qs3 doctor")
         check_choices(self, "renderer")
-        check_range(self, "renderer", "samples", "cache_cell", "cache_rays", low=1)
-        check_range(self, "renderer", "max_depth", low=2)
+        check_range(self, "renderer", "samples", low=1, high=MOST_SAMPLES)
+        check_range(self, "renderer", "cache_cell", "cache_rays", low=1, high=4096)
+        check_range(self, "renderer", "max_depth", low=2, high=128)
 
     @property
     def description(self) -> dict[str, str]:

@@ -15,6 +15,9 @@ from qs3.sensor.rig import Pose, Region, StereoRig
 if TYPE_CHECKING:
     import trimesh
 
+MOST_SAMPLES = 2**16
+"""Rays a pixel that a renderer takes at most."""
+
 
 @dataclass(frozen=True)
 class LightSettings:
