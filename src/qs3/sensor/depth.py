@@ -66,7 +66,7 @@ def backproject(
     pose: Pose,
     settings: DepthSettings,
 ) -> Float[np.ndarray, "m 3"]:
-    """Lift the valid pixels of the reduced grid to world points.
+    """Lift the valid pixels of the reduced grid, row by row, to world points.
 
     Args:
         depth: Depth of the pixels of ``region``, at full resolution.
@@ -74,9 +74,6 @@ def backproject(
         region: Where in the frame ``depth`` lies.
         pose: Pose of the left camera.
         settings: Grid and principal point.
-
-    Returns:
-        World points in row-major order of the pixels.
 
     Example:
         >>> rig = StereoRig(width=5, height=5, focal=4.0)
@@ -102,13 +99,10 @@ def backproject(
 def fuse(
     clouds: Sequence[Float[np.ndarray, "_ 3"]], bounds: Float[np.ndarray, "2 3"] | None = None
 ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n"]]:
-    """Concatenate the clouds of all views, cropped to ``bounds`` where a box is given.
+    """Concatenate the clouds of all views, cropped to ``bounds``; the index of each point's view.
 
     NOTE: the released code crops to the object's own box, which removes flying points but also
     noisy points of the surface; the paper's text does not mention it.
-
-    Returns:
-        The points and, for each, the index of its view.
 
     Example:
         >>> fuse([np.zeros((1, 3)), np.ones((2, 3))])[1].tolist()

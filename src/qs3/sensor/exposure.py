@@ -125,7 +125,7 @@ def expose(
 
     Args:
         radiance: Scene radiance, linear.
-        settings: Response, gain, bits and the size of the noise.
+        settings: The imager.
         noise: Standard normal draws for each pixel; needed where ``settings.noise`` is above 0.
         speckle: Gamma draws of mean 1; needed where ``settings.speckle`` is above 0.
         automatic: The gain that auto-exposure chose.
@@ -141,13 +141,12 @@ def expose(
     light = np.maximum(radiance, 0.0)
     grey = light if display else _respond(light * (settings.gain * automatic), settings)
     levels = 255.0 * grey
-    if settings.speckle > 0:
-        if speckle is None:
-            raise ValueError("speckle draws are needed where the speckle is above 0")
+    for name, draws in (("speckle", speckle), ("noise", noise)):
+        if getattr(settings, name) > 0 and draws is None:
+            raise ValueError(f"{name} draws are needed where the {name} is above 0")
+    if speckle is not None:
         levels = levels * speckle
-    if settings.noise > 0:
-        if noise is None:
-            raise ValueError("noise draws are needed where the noise is above 0")
+    if noise is not None:
         levels = levels + settings.noise * noise
     if settings.offset:
         levels = levels + settings.offset

@@ -64,10 +64,14 @@ class Region:
 
     def grown(self, margin: int, width: int, height: int) -> "Region":
         """The rectangle with ``margin`` pixels more on every side, cut at the frame's borders."""
-        x0, y0 = max(0, self.x - margin), max(0, self.y - margin)
-        x1 = min(width, self.x + self.width + margin)
-        y1 = min(height, self.y + self.height + margin)
-        return Region(x0, y0, x1 - x0, y1 - y0)
+        wide, high = self.width + 2 * margin, self.height + 2 * margin
+        return Region(self.x - margin, self.y - margin, wide, high) & Region(0, 0, width, height)
+
+    def __and__(self, other: "Region") -> "Region":
+        """The pixels of both."""
+        low = max(self.x, other.x), max(self.y, other.y)
+        high = (min(a, b) for a, b in zip(self.bounds[2:], other.bounds[2:], strict=True))
+        return Region(*low, *(b - a for a, b in zip(low, high, strict=True)))
 
     @property
     def slices(self) -> tuple[slice, slice]:

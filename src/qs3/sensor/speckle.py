@@ -209,16 +209,8 @@ def stored_pattern(
     """The projected picture as a camera in the projector's place would see it, at any distance.
 
     A point at depth z then lies f·b/z further left in it than in the image, b being the distance
-    from the camera to the projector.
-
-    Args:
-        rig: Supplies focal length and principal point.
-        pattern: The picture and the cone into which it is thrown.
-        region: Part of the frame.
-        bits: Bits of a pixel.
-
-    Returns:
-        Grey levels: 255, or 1023 with 10 bits, is full power, 0 what lies outside the cone.
+    from the camera to the projector. Grey levels: 255, or 1023 with 10 bits, is full power, 0 what
+    lies outside the cone.
 
     Example:
         >>> rig = StereoRig(width=64, height=48, focal=40.0)

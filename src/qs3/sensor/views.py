@@ -52,12 +52,6 @@ def place_views(
     radius and elevation are drawn for each view. ``jitter``: one pose is drawn; view i ≥ 1 moves
     every coordinate by clip(0.05·(i + 1)/V·N(0, 1), ±0.1) and every Euler angle by
     clip(0.1·(i + 1)/V·N(0, 1), ±0.1 rad).
-
-    Args:
-        views: 1 to 256, as `qs3.sensor.settings.ScanSettings` checks.
-        layout: ``orbit`` or ``jitter``.
-        placement: Ranges of radius, elevation and azimuth.
-        rng: Draws them.
     """
     azimuth = np.radians(rng.uniform(*placement.azimuth))
     if layout == "orbit":

@@ -43,9 +43,8 @@ class RealismSettings:
         asked = {test.upper(): test for test in self.tests}
         unknown = [test for name, test in asked.items() if name not in LAWS]
         if unknown or not asked:
-            raise InputError(
-                f"tests: no test {unknown[0] if unknown else ''!r}; choose of {', '.join(LAWS)}"
-            )
+            name = unknown[0] if unknown else ""
+            raise InputError(f"tests: no test {name!r}; choose of {', '.join(LAWS)}")
         object.__setattr__(self, "tests", tuple(test for test in LAWS if test in asked))
         if self.seed < 0:
             raise InputError(f"seed: {self.seed} must not be below 0")

@@ -118,42 +118,19 @@ class Studio:
     def _fix_settings(self):
         """Plain path tracing: every ray counts, none is guessed, dropped or smoothed."""
         scene, cycles, render = self.scene, self.scene.cycles, self.scene.render
-        _set(
-            cycles,
-            device="CPU",
-            use_adaptive_sampling=False,
-            use_denoising=False,
-            use_light_tree=False,
-            use_guiding=False,
-            light_sampling_threshold=0.0,
-            min_light_bounces=0,
-            min_transparent_bounces=0,
-            sample_clamp_direct=0.0,
-            sample_clamp_indirect=0.0,
-            blur_glossy=0.0,
-            caustics_reflective=True,
-            caustics_refractive=True,
-            transparent_max_bounces=16,
-            sampling_pattern="TABULATED_SOBOL",
-            time_limit=0.0,
-            film_exposure=1.0,
-        )
-        _set(
-            render,
-            use_persistent_data=True,
-            use_compositing=False,
-            use_sequencer=False,
-            film_transparent=False,
-            dither_intensity=0.0,
-            resolution_percentage=100,
-            pixel_aspect_x=1.0,
-            pixel_aspect_y=1.0,
-            use_motion_blur=False,
-            use_file_extension=False,
-            use_overwrite=True,
-            threads_mode="FIXED",
-            threads=_processors(),
-        )
+        off = "adaptive_sampling", "denoising", "light_tree", "guiding"
+        _set(cycles, device="CPU", **{"use_" + name: False for name in off})
+        off = "light_sampling_threshold", "sample_clamp_direct", "sample_clamp_indirect"
+        _set(cycles, **dict.fromkeys((*off, "blur_glossy", "time_limit"), 0.0))
+        _set(cycles, min_light_bounces=0, min_transparent_bounces=0, transparent_max_bounces=16)
+        _set(cycles, caustics_reflective=True, caustics_refractive=True)
+        _set(cycles, sampling_pattern="TABULATED_SOBOL", film_exposure=1.0)
+        off = "compositing", "sequencer", "motion_blur", "file_extension"
+        _set(render, **{"use_" + name: False for name in off})
+        _set(render, use_persistent_data=True, use_overwrite=True, film_transparent=False)
+        _set(render, dither_intensity=0.0, resolution_percentage=100)
+        _set(render, pixel_aspect_x=1.0, pixel_aspect_y=1.0)
+        _set(render, threads_mode="FIXED", threads=_processors())
         _set(scene.view_settings, look="None", exposure=0.0, gamma=1.0, use_curve_mapping=False)
 
     def _wire_projector(self):

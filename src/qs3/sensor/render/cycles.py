@@ -173,11 +173,7 @@ class CyclesRenderer:
 
 
 def find_cycles() -> dict[str, str]:
-    """Where Cycles is and which version, for ``doctor``.
-
-    Returns:
-        ``command`` (the program), ``blender`` and ``python`` (their versions); empty where there
-        is no Blender.
+    """``command`` of Cycles, its versions of ``blender`` and ``python``; empty without Blender.
 
     Raises:
         InputError: where QS3_BLENDER or QS3_CYCLES_PYTHON names no file.

@@ -152,23 +152,17 @@ class StereoPair:
         self, part: Region
     ) -> tuple[Float32[np.ndarray, "h3 w3"], Float32[np.ndarray, "h3 w3"]]:
         """Left and right radiance of ``part`` of the frame, the background filled in."""
-        return (
-            _paste(self.left, self.left_region, part, self.background),
-            _paste(self.right, self.right_region, part, self.background),
-        )
+        sides = (self.left, self.left_region), (self.right, self.right_region)
+        left, right = (_paste(*side, part, self.background) for side in sides)
+        return left, right
 
 
 def _paste(
     image: Float32[np.ndarray, "h w"], region: Region, part: Region, background: float
 ) -> Float32[np.ndarray, "h2 w2"]:
-    canvas = np.full((part.height, part.width), background, dtype=np.float32)
-    x0, y0 = max(region.x, part.x), max(region.y, part.y)
-    x1 = min(region.x + region.width, part.x + part.width)
-    y1 = min(region.y + region.height, part.y + part.height)
-    if x0 < x1 and y0 < y1:
-        canvas[y0 - part.y : y1 - part.y, x0 - part.x : x1 - part.x] = image[
-            y0 - region.y : y1 - region.y, x0 - region.x : x1 - region.x
-        ]
+    canvas, shared = np.full(part.shape, background, dtype=np.float32), region & part
+    if not shared.empty:
+        canvas[shared.within(part)] = image[shared.within(region)]
     return canvas
 
 
