@@ -134,7 +134,7 @@ def test_orbit_stands_evenly_around_the_object_and_looks_at_it():
 
 @pytest.fixture(scope="module")
 def jittered():
-    return [place_views(5, "jitter", Placement(), np.random.default_rng(n)) for n in range(500)]
+    return [place_views(5, "jitter", Placement(), np.random.default_rng(n)) for n in range(300)]
 
 
 def test_jitter_is_one_degree_wide_as_measured_on_the_released_poses(jittered):
