@@ -8,10 +8,9 @@ Convention:
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 
 from qs3.sensor.lens import blur_reach
 from qs3.sensor.matching import matching_canvas
@@ -22,6 +21,9 @@ from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.scene import rectangle
 from qs3.sensor.view import Clock, ViewImages, scene_of, take_view
+
+if TYPE_CHECKING:
+    import trimesh
 
 VIEW = Pose.looking_at(np.zeros(3), np.array([0.0, 1.0, 0.0]))
 """The pose of the left camera."""
@@ -92,12 +94,12 @@ class Bench:
         return dataclasses.replace(self, renderer=dataclasses.replace(renderer, **raised))
 
 
-def painted(mesh: trimesh.Trimesh, albedo: float = ALBEDO) -> Body:
+def painted(mesh: "trimesh.Trimesh", albedo: float = ALBEDO) -> Body:
     """A matt body."""
     return Body(mesh, Material(albedo=albedo))
 
 
-def wall(distance: float, degrees: float = 0.0) -> trimesh.Trimesh:
+def wall(distance: float, degrees: float = 0.0) -> "trimesh.Trimesh":
     """A wall that meets the optical axis at ``distance`` and fills the frame.
 
     Turned by ``degrees`` about the vertical, its right side goes away from the camera.
@@ -108,7 +110,7 @@ def wall(distance: float, degrees: float = 0.0) -> trimesh.Trimesh:
 
 def plate(
     place: tuple[float, float], width: float, height: float, degrees: float = 0.0
-) -> trimesh.Trimesh:
+) -> "trimesh.Trimesh":
     """A rectangle at ``place`` (x and y) at the camera's height, that faces it but for a turn."""
     angle = np.radians(degrees)
     across = np.array([np.cos(angle), np.sin(angle), 0.0]) * width / 2

@@ -9,14 +9,10 @@ deviation (MAD) of 1/1.4826, if its noise is that of the wall.
 
 import dataclasses
 
-import cv2
 import numpy as np
-import trimesh
 from jaxtyping import Bool, Float
 
-from qs3 import shapes
 from qs3.geometry import rotation_z
-from qs3.meshes import normalise
 from qs3.sensor.realism.bench import VIEW, Bench, painted
 from qs3.sensor.realism.rows import Judged, row
 from qs3.sensor.realism.walls import wall_metrics
@@ -53,6 +49,11 @@ def scanned(bench: Bench) -> Judged:
 
 def shoot_object(bench: Bench, distance: float, turn: float, index: int) -> ViewImages:
     """Photograph a cabinet looked down upon, turned by ``turn`` degrees; with normals."""
+    import trimesh
+
+    from qs3 import shapes
+    from qs3.meshes import normalise
+
     mesh = normalise(shapes.make("cabinet", seed=1), "box")
     points = np.asarray(mesh.vertices) * bench.sensor.object_size
     tilt = np.radians(_TILT)
@@ -101,6 +102,8 @@ def inside_faces(
     view: ViewImages, ray: Float[np.ndarray, "h w 3"], reach: int
 ) -> Bool[np.ndarray, "h w"]:
     """Pixels around which all pixels within ``reach`` show the same plane."""
+    import cv2
+
     normals = np.asarray(view.normals)
     offset = np.einsum("ijk,ijk->ij", ray, normals) * view.true_depth
     plane = np.concatenate([normals, offset[..., None]], axis=-1)

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 
 from qs3.sensor.materials import MATERIALS
@@ -100,6 +99,8 @@ def clear(bench: Bench) -> Judged:
 
     They have no depth of their own; what is measured there lies elsewhere (Sarbolandi et al. 2015).
     """
+    import trimesh
+
     fine, rig = bench.refined(_SAMPLES), bench.rig
     near, far = edge_distances(bench)
     facing, room = before_wall(bench)
