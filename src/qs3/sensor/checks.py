@@ -52,7 +52,7 @@ def check_range(
     for name in names:
         value = getattr(settings, name)
         whole = settings.__dataclass_fields__[name].type in (int, int | None)
-        if isinstance(value, bool) or not isinstance(value, Integral if whole else Real):
+        if isinstance(value, bool) or not issubclass(type(value), Integral if whole else Real):
             raise InputError(f"{room}: {name} {value!r} must be a {'whole ' * whole}number")
         within = low < value if above else low <= value
         if not (within and (value < high if below else value <= high) and math.isfinite(value)):

@@ -53,12 +53,7 @@ def fill(bench: Bench) -> Judged:
 
 
 def rate(depth: Float[np.ndarray, "h w"]) -> float:
-    """Share of pixels that have a depth.
-
-    Example:
-        >>> rate(np.array([[1.0, np.nan]]))
-        0.5
-    """
+    """Share of pixels that have a depth."""
     return float(np.isfinite(depth).mean())
 
 
