@@ -10,7 +10,7 @@ import trimesh
 from qs3.errors import InputError
 from qs3.sensor.materials import MATERIALS, Material
 from qs3.sensor.render import Body, LightSettings, Scene
-from qs3.sensor.render.cache import CacheSettings, places
+from qs3.sensor.render.cache import places
 from qs3.sensor.render.embree import EmbreePhotographer, _turns
 from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
 from qs3.sensor.rig import Pose, Region, StereoRig
@@ -52,8 +52,14 @@ def smooth(image):
     return image[:high, :wide].reshape(high // 5, 5, wide // 5, 5).mean(axis=(1, 3))
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("max_depth", [2, 3])
+@pytest.mark.parametrize(
+    ("variant", "max_depth"),
+    [
+        pytest.param("llvm_ad_mono", 2, marks=needs_llvm),
+        pytest.param("llvm_ad_mono", 3, marks=needs_llvm),
+        ("scalar_rgb", 3),
+    ],
+)
 def test_convention_cached_light_is_path_traced_light(variant, max_depth):
     scene, frame = corner(), [RIG.full_frame]
     cached = pair(scene, variant, frame, samples=16, cache_rays=128, max_depth=max_depth)
@@ -123,8 +129,13 @@ def test_a_region_is_cut_out_of_the_frame(variant):
     assert np.abs(some.left[inner] - cut).max() < 1e-4
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("name", ["glossy-plastic", "glass"])
+@pytest.mark.parametrize(
+    ("variant", "name"),
+    [
+        pytest.param("llvm_ad_mono", "glossy-plastic", marks=needs_llvm),
+        ("scalar_rgb", "glass"),
+    ],
+)
 def test_shiny_surfaces_are_path_traced_whatever_the_setting(variant, name):
     scene = corner(MATERIALS[name])
     cached, traced = (pair(scene, variant, samples=1, indirect=how) for how in ("cached", "path"))
@@ -141,7 +152,7 @@ def test_stored_pattern_has_no_right_camera(variant):
 
 def test_embree_takes_diffuse_bodies_only():
     with pytest.raises(InputError, match="diffuse"):
-        EmbreePhotographer(corner(MATERIALS["metal"]), 1, 3, CacheSettings())
+        EmbreePhotographer(corner(MATERIALS["metal"]), 1, 3, 4, 32)
 
 
 @pytest.mark.parametrize("name", ["samples", "max_depth", "cache_cell", "cache_rays"])

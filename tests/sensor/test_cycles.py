@@ -24,8 +24,6 @@ pytestmark = pytest.mark.skipif(
 
 RIG = StereoRig(width=96, height=64, focal=110.0, baseline=0.3)
 POSE = Pose.looking_at(np.array([1.0, -2.0, 1.5]), np.array([0.1, 0.0, -0.1]))
-NEAR_RIG = StereoRig(width=160, height=120, focal=220.0, baseline=0.1)
-NEAR = Pose.looking_at(np.array([1.2, -1.9, 1.3]), np.array([0.05, 0.0, -0.1]))
 LEVEL = Pose.looking_at(np.array([0.0, -3.0, 0.0]), np.zeros(3))
 WHITE = np.ones((8, 8), np.float32)
 DARK = LightSettings(projector=0.0, sky=0.0, ambient=0.0, sky_elevation=60.0)
@@ -294,56 +292,6 @@ def test_bounces_end_where_mitsubas_do():
         levels.append(pair[1].left.mean())
     assert levels[1] > 1.03 * levels[0]
     assert levels[2] > 1.003 * levels[1]
-
-
-# As they are by default
-
-
-def letters() -> np.ndarray:
-    picture = np.zeros((480, 480), np.uint8)
-    for row, text in enumerate(("QS3", "FGR", "LJ7")):
-        cv2.putText(picture, text, (20, 150 + 150 * row), cv2.FONT_HERSHEY_SIMPLEX, 5, 255, 30)
-    return 0.1 + 0.9 * cv2.GaussianBlur(picture.astype(np.float32) / 255, (0, 0), 2)
-
-
-def alone(material: Material, light: LightSettings, pattern: np.ndarray) -> Scene:
-    return Scene((Body(asymmetric(), material),), light, pattern, 0.3, 0.3)
-
-
-def test_convention_the_default_renderers_images_register():
-    scene = alone(Material(), LightSettings(), letters())
-    cycles, ours = (
-        renderer.render(scene, NEAR_RIG, [NEAR], [1])[0].canvas(NEAR_RIG.full_frame)
-        for renderer in (CyclesRenderer(samples=128), mitsuba(16, "cached"))
-    )
-    for a, b in zip(cycles, ours, strict=True):
-        assert np.corrcoef(a.ravel(), b.ravel())[0, 1] > 0.98
-        assert np.corrcoef(a[:, ::-1].ravel(), b.ravel())[0, 1] < 0.5
-        shift, _ = cv2.phaseCorrelate(a.astype(np.float64), b.astype(np.float64))
-        assert max(map(abs, shift)) < 0.05
-
-
-@pytest.mark.parametrize("dark", [("sky", "ambient"), ("projector", "ambient"), ("sky",), ()])
-def test_levels_agree_light_by_light_on_wall_and_object(dark):
-    light = replace(LightSettings(), **dict.fromkeys(dark, 0.0))
-    facing = Scene(
-        (Body(box([3, 0.02, 3], [0, 0.01, 0])),),
-        replace(light, sky_elevation=30.0),
-        WHITE,
-        0.3,
-        0.3,
-    )
-    part = [Region(50, 40, 60, 40)]
-    for scene, pose, regions in (
-        (facing, LEVEL, part),
-        (alone(Material(), light, WHITE), NEAR, None),
-    ):
-        cycles, ours = (
-            renderer.render(scene, NEAR_RIG, [pose], [1], regions)[0]
-            for renderer in (CyclesRenderer(samples=64), mitsuba(16, "cached"))
-        )
-        assert cycles.left.mean() == pytest.approx(ours.left.mean(), rel=0.02)
-        assert cycles.right.mean() == pytest.approx(ours.right.mean(), rel=0.02)
 
 
 def test_a_scan_takes_what_a_view_transform_shows():

@@ -50,8 +50,7 @@ def exposed(pair, settings, seed=0, canvas=RIG.full_frame, focus=OBJECT, rig=RIG
 # Responses
 
 
-@pytest.mark.parametrize("response", ["film", "linear", "gamma"])
-@pytest.mark.parametrize("bits", [8, 10])
+@pytest.mark.parametrize(("response", "bits"), [("film", 8), ("linear", 10), ("gamma", 10)])
 def test_responses_are_monotone_from_black_to_white(response, bits):
     light = np.concatenate([np.linspace(0, 2, 400), np.geomspace(2, 1e9, 100)])[None]
     grey = expose(light, ExposureSettings(response=response, bits=bits)).astype(int)
@@ -77,12 +76,6 @@ def test_radiance_of_a_share_is_the_inverse(response):
     settings = ExposureSettings(response=response, bits=10)
     for share in (0.05, 0.5, 0.9):
         assert expose(np.array([[radiance_of(share, settings)]]), settings) == round(1023 * share)
-
-
-def test_gain_multiplies_the_radiance():
-    light = np.random.default_rng(0).random((20, 20))
-    brighter = dataclasses.replace(LINEAR, gain=0.5)
-    np.testing.assert_array_equal(expose(light, brighter), expose(light / 2, LINEAR))
 
 
 def test_display_referred_values_are_grey_already():
@@ -131,12 +124,6 @@ def test_speckle_grows_with_the_grey_level_and_spares_black():
         left, _ = exposed(pair_of(np.full((161, 201), level)), settings)
         assert left.std() == pytest.approx(1023 * level / np.sqrt(398.12), rel=0.03)
     assert not exposed(pair_of(np.zeros((161, 201))), settings)[0].any()
-
-
-def test_saturation_comes_after_the_speckle():
-    settings = ExposureSettings(response="linear", speckle=398.12)
-    left, _ = exposed(pair_of(np.full((161, 201), 2.0)), settings)
-    assert (left == 255).all()
 
 
 def test_noise_has_the_mean_and_size_asked_for():
@@ -258,12 +245,6 @@ def test_blur_keeps_energy_and_has_the_stated_second_moment(psf):
         assert (spread * axis**2).sum() == pytest.approx(psf**2, rel=2e-3)
     assert not spread[np.maximum(np.abs(u), np.abs(v)) > blur_reach(psf)].any()
     np.testing.assert_array_equal(spread, spread[::-1, ::-1])
-
-
-def test_blurs_add_their_variances():
-    image = np.random.default_rng(0).random((60, 70), dtype=np.float32)
-    twice, once = blur(blur(image, 0.6), 0.8), blur(image, 1.0)
-    np.testing.assert_allclose(twice[8:-8, 8:-8], once[8:-8, 8:-8], atol=1e-4)
 
 
 @pytest.mark.parametrize("psf", [0.5, 3.0])

@@ -6,7 +6,6 @@ import tomllib
 
 import numpy as np
 import pytest
-import trimesh
 
 from qs3.errors import InputError
 from qs3.sensor.depth import DepthSettings
@@ -14,7 +13,6 @@ from qs3.sensor.exposure import ExposureSettings
 from qs3.sensor.matching import MatchingSettings
 from qs3.sensor.presets import SENSORS, Sensor, get_sensor, load_sensor, sensor_toml, settings_dict
 from qs3.sensor.rig import StereoRig
-from qs3.sensor.scan import scan
 from qs3.sensor.speckle import PatternSettings
 from qs3.sensor.views import Placement
 
@@ -242,31 +240,6 @@ def test_missing_and_unreadable_files_are_told(tmp_path):
 def test_an_unknown_sensor_offers_the_nearest():
     with pytest.raises(InputError, match=r"no sensor 'd453'.*did you mean d4.5.*kinect-v1"):
         get_sensor("d453")
-
-
-class NoRenderer:
-    """Refuses to render: the fault must be found before."""
-
-    @property
-    def description(self) -> dict[str, str]:
-        return {"name": "none"}
-
-    def render(self, *_, **__):
-        raise AssertionError("rendered all the same")
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        # The camera inside the object, and a projector beyond which nothing is lit.
-        ("base = 'd435'\n[placement]\nradius = [0.1, 0.2]", "inside the object"),
-    ],
-)
-def test_a_rig_that_cannot_see_is_refused_before_rendering(text, message, tmp_path):
-    sensor = load_sensor(write(tmp_path, text + "\n"))
-    mesh = trimesh.creation.box(extents=[1.0, 0.9, 0.8])
-    with pytest.raises(InputError, match=message):
-        scan(mesh, sensor=sensor, views=1, renderer=NoRenderer())
 
 
 @pytest.mark.parametrize(

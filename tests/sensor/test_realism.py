@@ -9,23 +9,23 @@ import pytest
 
 from qs3.errors import InputError
 from qs3.sensor.presets import Sensor, get_sensor
-from qs3.sensor.realism import LAWS, RealismSettings, realism
+from qs3.sensor.realism import RealismSettings, realism
 from qs3.sensor.realism.bench import distances
 from qs3.sensor.realism.edges import band_rows, edge_rows, shadow_rows
 from qs3.sensor.realism.faces import inside_faces, off_faces, scan_rows
-from qs3.sensor.realism.kinect import DISTANCES, kinect_rows
 from qs3.sensor.realism.metrics import (
     camera_points,
     depth_step,
-    fit_plane,
     plane_metrics,
     plane_sigma,
 )
 from qs3.sensor.realism.rows import row
 from qs3.sensor.realism.surfaces import clear_rows, fall_rows
 from qs3.sensor.realism.walls import (
+    DISTANCES,
     bias_rows,
     disparity_grid,
+    kinect_rows,
     noise_rows,
     phases,
     repeats_rows,
@@ -88,12 +88,9 @@ def test_a_tilted_plane_has_no_noise_and_holes_count_as_no_fill():
     assert made.rms < 1e-9
 
 
-def test_z_accuracy_is_signed_and_relative():
+def test_z_accuracy_is_signed_and_a_wall_that_nothing_was_seen_of_has_no_metrics():
     depth = np.full((RIG.height, RIG.width), 1.02)
     assert plane_metrics(depth, RIG, RIG.full_frame, 1.0).z_accuracy == pytest.approx(0.02)
-
-
-def test_a_wall_that_nothing_was_seen_of_has_no_metrics():
     made = plane_metrics(np.full((160, 200), np.nan), RIG, RIG.full_frame, 1.0)
     assert made.fill == 0
     assert math.isnan(made.rms)
@@ -344,10 +341,6 @@ def test_a_row_tells_its_bounds_in_words():
     assert row("a", 0.2, -0.2, 0.2, strict=True)["passed"] is False
 
 
-def test_there_are_ten_laws_in_order():
-    assert list(LAWS) == [f"T{i}" for i in range(1, 11)]
-
-
 def test_unknown_tests_are_refused():
     with pytest.raises(InputError, match="T11"):
         RealismSettings(tests=("T11",))
@@ -360,12 +353,6 @@ def test_sweeps_stay_within_what_a_sensor_measures():
         assert sweep[0] > sensor.depth.near
         assert sweep[-1] < sensor.depth.far
         assert sensor.rig.disparity(sweep[0]) < sensor.matching.num_disparities - 2
-
-
-def test_plane_fit_tells_the_normal():
-    normal, offset = fit_plane(np.array([[0.0, 0, 1], [1, 0, 2], [0, 1, 1], [1, 1, 2]]))
-    np.testing.assert_allclose(normal, np.array([-1, 0, 1]) / math.sqrt(2), atol=1e-12)
-    assert offset == pytest.approx(1 / math.sqrt(2))
 
 
 @pytest.fixture(scope="module")

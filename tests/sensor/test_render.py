@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
 
 from qs3.errors import InputError
 from qs3.sensor.exposure import ExposureSettings, expose
@@ -151,13 +150,6 @@ def test_a_variant_is_set_again_after_another(renderer):
 def test_each_pose_needs_a_seed(small_rig, renderer):
     with pytest.raises(ValueError, match="seeds"):
         renderer.render(scene_of(asymmetric()), small_rig, [POSE], [1, 2])
-
-
-def test_user_pattern_reaches_the_scene(tmp_path, shown, small_rig, renderer):
-    Image.new("L", (64, 64), 0).save(tmp_path / "dark.png")
-    dark = pattern_image(PatternSettings(image=str(tmp_path / "dark.png")))
-    without = renderer.render(scene_of(asymmetric(), dark), small_rig, [POSE], [1])[0]
-    assert np.percentile(without.left, 99) < 0.5 * np.percentile(shown.left, 99)
 
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_mono"])

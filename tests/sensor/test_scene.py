@@ -8,6 +8,7 @@ import trimesh
 
 from qs3 import shapes
 from qs3.errors import InputError
+from qs3.geometry import rotation_z
 from qs3.meshes import normalise
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.matching import MatchingSettings
@@ -54,11 +55,8 @@ def part(made: ArrangedScene, name: str) -> trimesh.Trimesh:
     ("layout", "names"),
     [
         ("alone", ["object"]),
-        ("floor", ["object", "floor"]),
-        ("wall", ["object", "wall"]),
         ("room", ["object", "wall", "floor"]),
         ("behind", ["object", "neighbour"]),
-        ("beside", ["object", "neighbour"]),
         ("room+beside", ["object", "neighbour", "wall", "floor"]),
     ],
 )
@@ -122,7 +120,7 @@ def test_copies_of_one_pose_stay_as_they_are():
         np.testing.assert_array_equal(a.camera_to_world, b.camera_to_world)
 
 
-@pytest.mark.parametrize("name", shapes.CLASSES)
+@pytest.mark.parametrize("name", shapes.CLASSES[::3])
 def test_a_neighbour_in_front_hides_a_part(name, seed=1):
     rng = np.random.default_rng(seed)
     mesh = normalise(shapes.make(name, seed=seed))
@@ -138,7 +136,7 @@ def test_a_neighbour_in_front_hides_a_part(name, seed=1):
     assert 1 - seen.sum() / alone.sum() == pytest.approx(0.3, abs=0.1)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("layout", ["behind", "beside", "room+behind", "floor+beside"])
 def test_nothing_stands_in_anything(layout, seed):
     made = around(layout, seed=seed)
@@ -147,14 +145,8 @@ def test_nothing_stands_in_anything(layout, seed):
     sight = made.poses[0].position / np.linalg.norm(made.poses[0].position)
     flat = sight * [1, 1, 0]
     side = np.cross([0, 0, 1], flat / np.linalg.norm(flat))
-    gaps = [
-        max(
-            (other.vertices @ d).min() - (mesh.vertices @ d).max() for d in (sign * sight, sign * e)
-        )
-        for sign in (1, -1)
-        for e in (side,)
-    ]
-    assert max(gaps) > 0.1
+    ways = sight, -sight, side, -side
+    assert max((other.vertices @ d).min() - (mesh.vertices @ d).max() for d in ways) > 0.1
     if "floor" in made.names:
         assert other.vertices[:, 2].min() >= part(made, "floor").vertices[0, 2] - 1e-9
     elif layout == "beside":
@@ -257,7 +249,7 @@ def scans(quick):
             sensor=TINY,
             views=1,
             seed=5,
-            num_points=30_000,
+            num_points=2000,
             scene=layout,
             neighbour=table if "be" in layout else None,
             crop="none",
@@ -271,7 +263,7 @@ def scans(quick):
 
 def test_the_clean_twin_is_the_object_alone_in_every_scene(scans):
     for layout, made in scans.items():
-        exact = trimesh.proximity.closest_point(made.mesh, made.clean[::37])[1]
+        exact = trimesh.proximity.closest_point(made.mesh, made.clean[::3])[1]
         assert exact.max() < 1e-5, layout
 
 
@@ -306,40 +298,8 @@ def test_the_neighbour_is_in_the_picture_and_hides_the_object(scans):
     assert np.abs(np.median(error)) < 0.02
 
 
-def test_shadows_fall_on_the_floor(quick):
-    # The projector shines past the plate; the floor below it is in its shadow.
-    plate = trimesh.creation.box(extents=[1, 1, 0.02])
-    pole = trimesh.creation.box(extents=[0.05, 0.05, 1.0]).apply_translation([0, 0, -0.5])
-    sensor = dataclasses.replace(
-        TINY,
-        rig=StereoRig(300, 300, 300.0, 0.3, projector_offset=5.0),
-        placement=Placement(radius=(3.0, 3.0), elevation=(60.0, 60.0)),
-        light=dataclasses.replace(TINY.light, sky=0.0, ambient=0.001),
-    )
-    mesh = trimesh.util.concatenate([plate, pole])
-    made = scan(mesh, sensor=sensor, views=1, scene="floor", renderer=quick, full_frames=True)
-    images = made.images[0]
-    floor = np.isfinite(images.true_depth) & ~images.mask
-    # True shadow: floor points whose line to the projector meets the object.
-    rows, columns = np.nonzero(floor)
-    from qs3.geometry import rotation_z, transform_points
-
-    z = images.true_depth[rows, columns]
-    cx, cy = sensor.rig.principal_point
-    local = np.stack([(columns - cx) * z / 300, (rows - cy) * z / 300, z], axis=1)
-    points = transform_points(made.poses[0].camera_to_world, local)
-    eye = sensor.rig.projector(made.poses[0]).position
-    turned = made.mesh.copy()
-    turned.vertices = turned.vertices @ rotation_z(made.yaw).T
-    dark = turned.ray.intersects_any(points + 1e-3 * (eye - points), eye - points)
-    grey = images.left[rows, columns].astype(float)
-    assert 300 < dark.sum() < 0.5 * len(dark)
-    # Lit floor is dotted and bright on the mean, the shadow is nearly black.
-    assert grey[dark].mean() < 0.5 * grey[~dark].mean()
-
-
 def test_crops_keep_what_they_say(quick):
-    common = {"sensor": TINY, "views": 1, "seed": 5, "num_points": 40_000, "scene": "floor"}
+    common = {"sensor": TINY, "views": 1, "seed": 5, "num_points": 500, "scene": "floor"}
     chair = shapes.make("chair", seed=1)
     counts = {}
     for name, how in {
@@ -352,8 +312,6 @@ def test_crops_keep_what_they_say(quick):
         made = scan(chair, renderer=quick, **common, **how)
         counts[name] = made.fused_points
         if name in ("margin", "box", "both"):
-            from qs3.geometry import rotation_z
-
             turned = made.points.astype(float) @ rotation_z(made.yaw).T
             corners = made.mesh.vertices @ rotation_z(made.yaw).T
             margin = how.get("box_margin", 0.0) + 1e-5

@@ -1,19 +1,17 @@
 """A rig whose second image is the stored pattern."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import trimesh
 
 from qs3.sensor.depth import DepthSettings
+from qs3.sensor.exposure import ExposureSettings
 from qs3.sensor.matching import MatchingSettings
 from qs3.sensor.presets import Sensor
 from qs3.sensor.render.mitsuba import MitsubaRenderer
 from qs3.sensor.rig import StereoRig
 from qs3.sensor.scan import scan
-from qs3.sensor.speckle import PatternSettings
-from qs3.sensor.stored import stored_pattern
+from qs3.sensor.speckle import PatternSettings, stored_pattern
 from qs3.sensor.views import Placement
 
 ONE_CAMERA = Sensor(
@@ -23,6 +21,7 @@ ONE_CAMERA = Sensor(
     ),
     pattern=PatternSettings(columns=177, rows=138),
     matching=MatchingSettings(num_disparities=64, block_size=13),
+    exposure=ExposureSettings(noise=1.0),
     depth=DepthSettings(stride=1),
     placement=Placement(radius=(3.0, 3.0), elevation=(80.0, 80.0)),
 )
@@ -73,19 +72,7 @@ def test_one_camera_and_the_stored_pattern_measure_depth(found):
     assert np.median(distance) < 9 * 0.4 / 84
 
 
-def test_the_right_image_is_the_pattern_itself(found):
+def test_the_right_image_is_the_pattern_itself_and_has_no_noise(found):
     images = found.images[0]
     whole = stored_pattern(ONE_CAMERA.rig, ONE_CAMERA.pattern, ONE_CAMERA.rig.full_frame)
-    np.testing.assert_array_equal(images.right, whole[images.region.slices])
-
-
-def test_the_stored_pattern_has_no_noise():
-    noisy = dataclasses.replace(
-        ONE_CAMERA, exposure=dataclasses.replace(ONE_CAMERA.exposure, noise=5.0)
-    )
-    plate = trimesh.creation.box(extents=[1, 1, 0.02])
-    renderer = MitsubaRenderer(variant="scalar_rgb", samples=1)
-    made = scan(plate, sensor=noisy, views=1, seed=0, renderer=renderer, keep_images=True)
-    images = made.images[0]
-    whole = stored_pattern(noisy.rig, noisy.pattern, noisy.rig.full_frame)
     np.testing.assert_array_equal(images.right, whole[images.region.slices])

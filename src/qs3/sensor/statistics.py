@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -55,6 +54,8 @@ def view_statistics(
         >>> stats.disparity_bias, stats.disparity_sigma, stats.valid_fraction
         (0.5, 0.0, 1.0)
     """
+    import cv2
+
     if not true_depth.size:  # the object is out of this view's sight
         return EMPTY_VIEW
     seen = np.isfinite(true_depth)

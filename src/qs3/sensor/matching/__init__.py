@@ -8,12 +8,9 @@ import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
 from qs3.errors import InputError
-from qs3.sensor.matching.filters import quantise
-from qs3.sensor.matching.opencv_bm import match_opencv
 from qs3.sensor.matching.settings import MatchingSettings as MatchingSettings
 from qs3.sensor.matching.settings import matching_canvas as matching_canvas
 from qs3.sensor.matching.settings import matching_margin as matching_margin
-from qs3.sensor.matching.zncc import match_zncc
 
 Image = UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]
 
@@ -33,6 +30,10 @@ def match(left: Image, right: Image, settings: MatchingSettings) -> Float32[np.n
     Raises:
         InputError: where the images are too small for the search range or have too many bits.
     """
+    from qs3.sensor.matching.filters import quantise
+    from qs3.sensor.matching.opencv_bm import match_opencv
+    from qs3.sensor.matching.zncc import match_zncc
+
     least = settings.num_disparities + settings.block_size
     if left.shape[1] < least or left.shape[0] < settings.block_size:
         raise InputError(

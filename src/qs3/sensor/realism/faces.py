@@ -9,14 +9,10 @@ deviation (MAD) of 1/1.4826, if its noise is that of the wall.
 
 import dataclasses
 
-import cv2
 import numpy as np
-import trimesh
 from jaxtyping import Bool, Float
 
-from qs3 import shapes
 from qs3.geometry import rotation_z
-from qs3.meshes import normalise
 from qs3.sensor.realism.bench import VIEW, Bench, painted
 from qs3.sensor.realism.rows import Judged, row
 from qs3.sensor.realism.walls import wall_metrics
@@ -52,14 +48,12 @@ def scanned(bench: Bench) -> Judged:
 
 
 def shoot_object(bench: Bench, distance: float, turn: float, index: int) -> ViewImages:
-    """Photograph a cabinet of the sensor's object size, looked down upon; with normals.
+    """Photograph a cabinet looked down upon, turned by ``turn`` degrees; with normals."""
+    import trimesh
 
-    Args:
-        bench: The sensor.
-        distance: Of the object's middle.
-        turn: Of the object about its vertical, in degrees.
-        index: Number of the photograph.
-    """
+    from qs3 import shapes
+    from qs3.meshes import normalise
+
     mesh = normalise(shapes.make("cabinet", seed=1), "box")
     points = np.asarray(mesh.vertices) * bench.sensor.object_size
     tilt = np.radians(_TILT)
@@ -84,8 +78,8 @@ def off_faces(
         view: A photograph, with normals.
         rig: Supplies focal length, baseline and principal point.
         block: The matcher's block: within half of it a pixel's neighbours must show its face.
-        walls: Distances at which the noise on a wall is known.
-        sigma: The sub-pixel RMS there.
+        walls: Distances of facing walls.
+        sigma: The sub-pixel RMS on each.
 
     Returns:
         Distance over expected deviation, positive away from the camera; cosine of the view angle.
@@ -108,6 +102,8 @@ def inside_faces(
     view: ViewImages, ray: Float[np.ndarray, "h w 3"], reach: int
 ) -> Bool[np.ndarray, "h w"]:
     """Pixels around which all pixels within ``reach`` show the same plane."""
+    import cv2
+
     normals = np.asarray(view.normals)
     offset = np.einsum("ijk,ijk->ij", ray, normals) * view.true_depth
     plane = np.concatenate([normals, offset[..., None]], axis=-1)
@@ -118,12 +114,7 @@ def inside_faces(
 
 
 def scan_rows(ratio: Float[np.ndarray, "n"], cosine: Float[np.ndarray, "n"]) -> Judged:
-    """Judge signed distances in units of the law.
-
-    Args:
-        ratio: Distance over expected deviation of each point.
-        cosine: Cosine of its view angle.
-    """
+    """Judge signed distances in units of the law; with the cosine of each point's view angle."""
     if len(ratio) < 100:
         return [row("points", float(len(ratio)), 100.0)], {"distance": [], "share": []}
     median = float(np.median(ratio))

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 
 from qs3.sensor.materials import MATERIALS
@@ -47,22 +46,14 @@ def fill(bench: Bench) -> Judged:
     near, narrow = edge_distances(bench)[0], central(bench.rig, 0.1, 0.5)
     by_angle = [rate(bench.shoot([painted(wall(near, turn))], narrow).depth) for turn in ANGLES]
     rows = [row(f"least fill of walls to {far:.3g} m", min(filled), 0.99)]
-    for name, values, rates, part in (
-        ("albedo", ALBEDOS, by_albedo, patch),
-        ("angle", ANGLES, by_angle, narrow),
-    ):
-        rows += fall_rows(name, values, rates, part.width * part.height / block**2)
+    rows += fall_rows("albedo", ALBEDOS, by_albedo, patch.width * patch.height / block**2)
+    rows += fall_rows("angle", ANGLES, by_angle, narrow.width * narrow.height / block**2)
     curves = {"albedo": ALBEDOS, "fill_albedo": by_albedo, "angle": ANGLES, "fill_angle": by_angle}
     return rows, curves | {"z": sweep, "fill": filled}
 
 
 def rate(depth: Float[np.ndarray, "h w"]) -> float:
-    """Share of pixels that have a depth.
-
-    Example:
-        >>> rate(np.array([[1.0, np.nan]]))
-        0.5
-    """
+    """Share of pixels that have a depth."""
     return float(np.isfinite(depth).mean())
 
 
@@ -103,6 +94,8 @@ def clear(bench: Bench) -> Judged:
 
     They have no depth of their own; what is measured there lies elsewhere (Sarbolandi et al. 2015).
     """
+    import trimesh
+
     fine, rig = bench.refined(_SAMPLES), bench.rig
     near, far = edge_distances(bench)
     facing, room = before_wall(bench)
