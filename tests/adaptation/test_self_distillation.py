@@ -11,7 +11,6 @@ from scipy.special import log_softmax, softmax
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from qs3.adaptation import Batch, distortions
-from qs3.adaptation.normalisation import make_norm
 from qs3.adaptation.self_distillation import SelfDistillation, distillation_loss, ramp
 from qs3.errors import InputError
 from qs3.models import create_model
@@ -41,9 +40,9 @@ def make_model(name="pointnet"):
     return create_model("dgcnn", 3, neighbours=4, channels=(8, 8), embedding=16, hidden=(8,))
 
 
-def make_method(name="pointnet", norm="shared", **settings):
+def make_method(name="pointnet", **settings):
     model = make_model(name)
-    return SelfDistillation(model, norm=make_norm(norm, model), **settings)
+    return SelfDistillation(model, **settings)
 
 
 def batch(b=4, n=30):
@@ -107,7 +106,7 @@ def test_weight_grows():
 @pytest.mark.parametrize("norm", ["shared", "separate", "transnorm"])
 def test_teacher_begins_as_the_plain_mean_of_the_student(norm):
     """With t ↦ 1 − 1/(t + 1) it is the mean of all states so far, the first one included."""
-    method = make_method(norm=norm)
+    method = make_method(normalisation=norm)
     optimiser = adam(method)
     seen = [state(method)]
     for number in range(4):
@@ -161,7 +160,7 @@ def test_teacher_stands_still_in_a_pass():
 
 
 def test_teacher_normalises_the_target_with_its_own_target_statistics():
-    method = make_method(norm="separate")
+    method = make_method(normalisation="separate")
     optimiser = adam(method)
     for number in range(3):
         step(method, optimiser, number, target=3 + ball(3, 20, number))
@@ -195,7 +194,7 @@ def test_losses_are_the_parts():
 @pytest.mark.slow
 def test_distillation_learns():
     """Trained on it alone, the student's strong views come nearer to the teacher's weak ones."""
-    method = make_method(norm="shared")
+    method = make_method(normalisation="shared")
     optimiser = torch.optim.Adam(method.parameter_groups(0.01))
     target, values = ball(16, 40, 9), []
     for number in range(30):

@@ -1,6 +1,7 @@
 """Geometry-aware self-training, GAST (Zou et al., ICCV 2021): its two self-supervised tasks."""
 
-from typing import Literal, NamedTuple, Unpack
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -8,10 +9,10 @@ from torch import Generator, Tensor, nn
 
 from qs3.adaptation.curvature import surface
 from qs3.adaptation.deformations import CELLS, deform_cells, pick_cells
-from qs3.adaptation.method import Batch, Domain, Method, Shared, Target, Terms, cross_entropy
+from qs3.adaptation.method import Batch, Domain, Method, Target, Terms, cross_entropy
 from qs3.adaptation.pcm import draw_share, mix_halves
 from qs3.errors import InputError
-from qs3.models import PointClassifier, feature_widths
+from qs3.models import feature_widths
 from qs3.models.checks import check_positive
 
 _TURNS = 4
@@ -112,6 +113,7 @@ def location_loss(
     return each.mean() if weights is None else (weights * each).mean()
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class GAST(Method):
     """Classify the source; in both domains tell how clouds are turned and where they are distorted.
 
@@ -133,55 +135,39 @@ class GAST(Method):
     NOTE: labels mix as round(λ n) / n. The location layer is linear on every network; the released
     PointNet has a hidden layer there. In the released code the rotation task is off by default.
 
-    Args:
-        model: The network to train.
-        rotation: Whether there is a rotation task.
-        location: Whether there is a location task.
-        on_source: Whether the tasks run on source clouds as well as on target clouds.
-        curvature: Whether the location task is weighted by curvature.
-        classification_weight: w_c.
-        location_weight: w_l.
-        rotation_weight: w_r.
-        concentration: γ of λ ~ Beta(γ, γ).
-        shared: Label smoothing and normalisation, as of `Method`.
-
-    Raises:
-        InputError: where a setting is not usable, or both tasks are off.
     """
 
     uses_target = True
 
-    def __init__(
-        self,
-        model: PointClassifier,
-        *,
-        rotation: bool = True,
-        location: bool = True,
-        on_source: bool = True,
-        curvature: bool = True,
-        classification_weight: float = 0.5,
-        location_weight: float = 0.5,
-        rotation_weight: float = 0.2,
-        concentration: float = 1.0,
-        **shared: Unpack[Shared],
-    ) -> None:
-        super().__init__(model, **shared)
-        if not (rotation or location):
+    rotation: bool = True
+    """Whether there is a rotation task."""
+    location: bool = True
+    """Whether there is a location task."""
+    on_source: bool = True
+    """Whether the tasks run on source clouds as well as on target clouds."""
+    curvature: bool = True
+    """Whether the location task is weighted by curvature."""
+    classification_weight: float = 0.5
+    """w_c."""
+    location_weight: float = 0.5
+    """w_l."""
+    rotation_weight: float = 0.2
+    """w_r."""
+    concentration: float = 1.0
+    """γ of λ ~ Beta(γ, γ)."""
+
+    def __post_init__(self) -> None:
+        """Check the settings and make a linear layer for each task."""
+        super().__post_init__()
+        if not (self.rotation or self.location):
             raise InputError("rotation and location are both off; choose source-only instead")
-        check_positive("classification_weight", classification_weight)
-        check_positive("location_weight", location_weight)
-        check_positive("rotation_weight", rotation_weight)
-        check_positive("concentration", concentration)
-        self.on_source = on_source
-        self.curvature = curvature
-        self.classification_weight = classification_weight
-        self.location_weight = location_weight
-        self.rotation_weight = rotation_weight
-        self.concentration = concentration
-        pooled = feature_widths(model).pooled
-        self.locate = nn.Linear(pooled, CELLS) if location else None
-        self.turned_x = nn.Linear(pooled, _TURNS) if rotation else None
-        self.turned_y = nn.Linear(pooled, _TURNS) if rotation else None
+        weights = ("classification_weight", "location_weight", "rotation_weight")
+        for name in (*weights, "concentration"):
+            check_positive(name, getattr(self, name))
+        pooled = feature_widths(self.model).pooled
+        self.locate = nn.Linear(pooled, CELLS) if self.location else None
+        self.turned_x = nn.Linear(pooled, _TURNS) if self.rotation else None
+        self.turned_y = nn.Linear(pooled, _TURNS) if self.rotation else None
 
     def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of the source and the loss of each task in each domain."""
