@@ -82,7 +82,7 @@ def test_defrec_pcm_is_the_sum_of_the_two():
     generator = seeded()
     mixed = mix_clouds(batch.points, batch.labels, generator, 2.0)
     logits = method.model(mixed.points)
-    supervised = mixed_cross_entropy(logits, batch.labels, mixed.labels, mixed.share)
+    supervised = mixed_cross_entropy(logits, logits, mixed)
     rebuilt = method.rebuilding(batch.points, target, generator)
     torch.testing.assert_close(losses, {"pcm": 0.7 * supervised} | rebuilt)
     alone = PCM(method.model, concentration=2.0).eval()(batch, None, 0.0, seeded())

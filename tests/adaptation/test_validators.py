@@ -14,7 +14,7 @@ from scipy.special import softmax
 from scipy.stats import entropy as shannon
 from sklearn.metrics import adjusted_mutual_info_score
 
-from qs3.adaptation import validators
+from qs3.adaptation import graph_labels, validators
 from qs3.adaptation.density import density_ratio
 from qs3.adaptation.validators import (
     VALIDATORS,
@@ -109,14 +109,14 @@ def test_snd_is_the_double_loop(m):
 def test_snd_in_blocks(monkeypatch):
     features = np.random.default_rng(1).normal(size=(50, 6))
     whole = snd(features)
-    monkeypatch.setattr(validators, "_BLOCK", 350)  # seven rows at a time
+    monkeypatch.setattr(graph_labels, "_BLOCK", 350)  # seven rows at a time
     assert snd(features) == pytest.approx(whole, abs=1e-12)
 
 
 def test_snd_needs_bounded_memory(monkeypatch):
     """All similarities of 2000 clouds would take 32 MB."""
     features = np.random.default_rng(1).normal(size=(2000, 3))
-    monkeypatch.setattr(validators, "_BLOCK", 2**18)  # 2 MiB
+    monkeypatch.setattr(graph_labels, "_BLOCK", 2**18)  # 2 MiB
     tracemalloc.start()
     snd(features)
     peak = tracemalloc.get_traced_memory()[1]

@@ -1,7 +1,7 @@
 """Geometry-aware self-training, GAST (Zou et al., ICCV 2021): its two self-supervised tasks."""
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -9,8 +9,8 @@ from torch import Generator, Tensor, nn
 
 from qs3.adaptation.curvature import surface
 from qs3.adaptation.deformations import CELLS, deform_cells, pick_cells
-from qs3.adaptation.method import Batch, Domain, Method, Target, Terms, cross_entropy
-from qs3.adaptation.pcm import draw_share, mix_halves
+from qs3.adaptation.method import Batch, Domain, Method, Target, Terms
+from qs3.adaptation.pcm import Mixed, draw_share, mix_halves, mixed_cross_entropy
 from qs3.errors import InputError
 from qs3.models import feature_widths
 from qs3.models.checks import check_positive
@@ -19,19 +19,6 @@ _TURNS = 4
 """Quarter turns that the rotation task tells apart."""
 _LEAST = 20
 """Points that a distorted cell should have."""
-
-
-class MixedRotation(NamedTuple):
-    """Clouds made of two turned copies of one, and both turns."""
-
-    points: Float[Tensor, "b n 3"]
-    """Points of both copies, in a random order."""
-    about_x: Int[Tensor, "b"]
-    """Quarter turns of the first copy, about x."""
-    about_y: Int[Tensor, "b"]
-    """Quarter turns of the second copy, about y."""
-    share: float
-    """λ: part of the points that come from the first copy."""
 
 
 def turn(
@@ -56,8 +43,8 @@ def turn(
 
 def mix_rotations(
     points: Float[Tensor, "b n 3"], generator: Generator, concentration: float = 1.0
-) -> MixedRotation:
-    """Mix each cloud turned about x with itself turned about y.
+) -> Mixed:
+    """Mix each cloud turned about x with itself turned about y; the classes are quarter turns.
 
     round(λ n) farthest points come from the first, the rest from the second; λ is drawn once a
     batch, both turns for each cloud.
@@ -72,15 +59,7 @@ def mix_rotations(
     turns = torch.randint(_TURNS, (2, len(points)), generator=generator).to(points.device)
     first, second = turn(points, turns[0], "x"), turn(points, turns[1], "y")
     mixed, share = mix_halves(first, second, share, generator)
-    return MixedRotation(mixed, turns[0], turns[1], share)
-
-
-def rotation_loss(
-    about_x: Float[Tensor, "b 4"], about_y: Float[Tensor, "b 4"], mixed: MixedRotation
-) -> Float[Tensor, ""]:
-    """λ CE(turn about x) + (1 − λ) CE(turn about y), each with its own logits and labels."""
-    first, second = cross_entropy(about_x, mixed.about_x), cross_entropy(about_y, mixed.about_y)
-    return mixed.share * first + (1 - mixed.share) * second
+    return Mixed(mixed, turns[0], turns[1], share)
 
 
 def location_weights(
@@ -192,6 +171,6 @@ class GAST(Method):
         if self.turned_x is not None and self.turned_y is not None:
             mixed = mix_rotations(points, generator, self.concentration)
             pooled = self.features(mixed.points, domain).pooled
-            loss = rotation_loss(self.turned_x(pooled), self.turned_y(pooled), mixed)
+            loss = mixed_cross_entropy(self.turned_x(pooled), self.turned_y(pooled), mixed)
             terms[f"rotation_{domain}"] = self.rotation_weight * loss
         return terms

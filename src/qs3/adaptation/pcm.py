@@ -19,8 +19,10 @@ class Mixed(NamedTuple):
 
     points: Float[Tensor, "b n 3"]
     """Points of both, in a random order."""
-    labels: Int[Tensor, "b"]
-    """Class of each second cloud; that of the first is the batch's."""
+    first: Int[Tensor, "b"]
+    """Class of the first of the two."""
+    second: Int[Tensor, "b"]
+    """Class of the second."""
     share: float
     """λ: part of the points that come from the first."""
 
@@ -100,27 +102,32 @@ def mix_clouds(
     share = draw_share(concentration, generator)
     partner = torch.randperm(len(points), generator=generator).to(points.device)
     mixed, share = mix_halves(points, points[partner], share, generator)
-    return Mixed(mixed, labels[partner], share)
+    return Mixed(mixed, labels, labels[partner], share)
 
 
 def mixed_cross_entropy(
-    logits: Float[Tensor, "b k"],
-    first: Int[Tensor, "b"],
-    second: Int[Tensor, "b"],
-    share: float,
+    of_first: Float[Tensor, "b k"],
+    of_second: Float[Tensor, "b k"],
+    mixed: Mixed,
     label_smoothing: float = 0.0,
 ) -> Float[Tensor, ""]:
     """λ times the cross entropy with the first labels plus 1 − λ times that with the second.
 
+    Args:
+        of_first: Logits for the first labels.
+        of_second: Logits for the second labels; where one layer gives both, the same.
+        mixed: The clouds that they are of.
+        label_smoothing: ε of `cross_entropy`.
+
     Example:
         >>> logits = torch.tensor([[0.0, 1.0]])
-        >>> one, two = torch.tensor([0]), torch.tensor([1])
-        >>> round(float(mixed_cross_entropy(logits, one, two, 0.25)), 4)
+        >>> mixed = Mixed(torch.zeros(1, 1, 3), torch.tensor([0]), torch.tensor([1]), 0.25)
+        >>> round(float(mixed_cross_entropy(logits, logits, mixed)), 4)
         0.5633
     """
-    return share * cross_entropy(logits, first, label_smoothing) + (1 - share) * cross_entropy(
-        logits, second, label_smoothing
-    )
+    first = cross_entropy(of_first, mixed.first, label_smoothing)
+    second = cross_entropy(of_second, mixed.second, label_smoothing)
+    return mixed.share * first + (1 - mixed.share) * second
 
 
 def mixed_classification(
@@ -132,11 +139,9 @@ def mixed_classification(
     """
     mixed = mix_clouds(batch.points, batch.labels, generator, concentration)
     logits = method.logits(mixed.points, "source")
-    larger = batch.labels if mixed.share >= 0.5 else mixed.labels
+    larger = mixed.first if mixed.share >= 0.5 else mixed.second
     method.classification(logits.detach(), Batch(mixed.points, larger))
-    return mixed_cross_entropy(
-        logits, batch.labels, mixed.labels, mixed.share, method.label_smoothing
-    )
+    return mixed_cross_entropy(logits, logits, mixed, method.label_smoothing)
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
