@@ -151,13 +151,6 @@ def test_radius_takes_a_seed_with_enough_neighbours():
     assert torch.equal(moved, (torch.arange(300) >= 270).expand(20, -1))
 
 
-def test_radius_falls_back_on_the_fullest_ball():
-    lonely = torch.arange(1, 298)[:, None] * torch.tensor([10.0, 0, 0])
-    points = torch.cat([lonely, torch.zeros(3, 3)])[None].expand(10, -1, -1)
-    moved = deform_radius(points, seeded()).moved
-    assert torch.equal(moved, (torch.arange(300) >= 297).expand(10, -1))
-
-
 def test_features_collapse_the_points_most_alike():
     points = ball(3, 200)
     features = torch.randn(3, 200, 8, generator=seeded(3))
@@ -168,12 +161,6 @@ def test_features_collapse_the_points_most_alike():
         seeds = (order == mask.nonzero()[:, 0]).all(dim=1).nonzero()[:, 0]
         assert len(seeds) >= 1
         assert float((out[mask].mean(dim=0) - cloud[seeds]).norm(dim=1).min()) < 5 * SIGMA / 20**0.5
-
-
-def test_features_share_of_one_moves_all_and_of_none_one():
-    points = ball(2, 50)
-    assert deform_features(points, points, seeded(), share=1.0).moved.all()
-    assert deform_features(points, points, seeded(), share=0.0).moved.sum(dim=1).tolist() == [1, 1]
 
 
 def test_drop_points_keeps_points_as_probable_as_asked():

@@ -88,13 +88,6 @@ def test_one_share_a_batch_is_drawn_from_the_beta_distribution():
     assert stats.kstest(drawn, stats.uniform.cdf).pvalue < 1e-3
 
 
-@pytest.mark.parametrize("points", [clouds(2, 1), clouds(2, 2), torch.full((3, 20, 3), 0.2)])
-def test_few_and_equal_points(points):
-    mixed = mix_clouds(points, torch.arange(len(points)), seeded())
-    assert mixed.points.shape == points.shape
-    assert mixed.share in [m / points.shape[1] for m in range(points.shape[1] + 1)]
-
-
 def test_labels_mix_as_the_share():
     logits = torch.from_numpy(np.random.default_rng(0).normal(size=(4, 3)))
     first, second = torch.tensor([0, 1, 2, 0]), torch.tensor([2, 1, 0, 1])

@@ -14,7 +14,6 @@ from qs3.adaptation.pointdan import (
     PointDAN,
     fresh_head,
     head_parameters,
-    reversal_coefficient,
 )
 from qs3.models import Features, PointClassifier, create_model
 
@@ -97,14 +96,6 @@ def test_the_classifiers_part_and_the_network_brings_them_together():
             own = "classify" in key
             factor = 1.0 if own else -math.sin(0.2 * math.pi)
             torch.testing.assert_close(turned[key], factor * parameter.grad, rtol=1e-4, atol=1e-7)
-
-
-def test_the_coefficient_rises_from_zero_to_one():
-    values = [reversal_coefficient(p) for p in np.linspace(0, 1, 11)]
-    assert values[0] == 0.0
-    assert values[-1] == 1.0
-    assert values == sorted(values)
-    assert reversal_coefficient(1 / 3) == pytest.approx(0.5)
 
 
 def test_attention_is_the_published_formula():
