@@ -111,11 +111,7 @@ def _at_hand(name: str, setup: Setup) -> tuple[str, ...]:
     """Return the usual columns, those on real objects only where there are any."""
     real = setup.shared is not None and (setup.shared / REAL).is_file()
     columns = Table(name, setup).headings()[1]
-    return tuple(
-        column.key
-        for column in columns
-        if real or column.fields.get("target", Domain("D")).kind != "R"
-    )
+    return tuple(c.key for c in columns if real or c.fields.get("target") != Domain("R"))
 
 
 def collect_runs(products: Sequence[Product]) -> list[Run]:
