@@ -7,7 +7,7 @@ locking (half the range of the mean error over the fractional shifts), outliers 
 above) and valid pixels as shares; then the least seconds of three for one pair as a scan of the
 `paper` sensor matches it, 760 × 520 pixels and 160 disparities.
 
-    python benchmarks/matching.py [--density 0.025] [--sigma 0.8] [--device cpu] [--threads 1]
+    python benchmarks/matching.py [--density 0.025] [--sigma 0.8] [--threads 1]
 """
 
 import argparse
@@ -66,11 +66,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--density", type=float, default=0.025, help="dots a pixel")
     parser.add_argument("--sigma", type=float, default=0.8, help="of a dot, in pixels")
-    parser.add_argument("--device", default="cpu", choices=["cpu", "cuda", "auto"])
     parser.add_argument("--threads", type=int, default=cv2.getNumThreads())
     options = parser.parse_args()
     cv2.setNumThreads(options.threads)
-    print(f"{options.threads} threads, device {options.device}")
+    print(f"{options.threads} threads")
     names = ["method", "block", "noise", "RMS", "bias", "locking", "outliers", "valid", "seconds"]
     print("| " + " | ".join(names) + " |\n|" + "---|" * len(names))
     pairs = [dots((160, 360), s, options.density, options.sigma, seed=0) for s in SHIFTS]
@@ -84,15 +83,13 @@ def main() -> None:
         seconds = []
         for _ in range(3):
             start = time.perf_counter()
-            match(big[0], big[1], large, options.device)
+            match(big[0], big[1], large)
             seconds.append(time.perf_counter() - start)
         for noise in (0.0, 3.0):
             rng = np.random.default_rng(2)
             errors = np.stack(
                 [
-                    match(grey(a, noise, rng), grey(b, noise, rng), settings, options.device)[
-                        20:-20, 90:-20
-                    ]
+                    match(grey(a, noise, rng), grey(b, noise, rng), settings)[20:-20, 90:-20]
                     - shift
                     for (a, b), shift in zip(pairs, SHIFTS, strict=True)
                 ]

@@ -3,10 +3,13 @@
 Bare: a kernel that finds the first triangle of the camera's rays and does nothing else. The
 renderer's rays are counted in its NumPy form, which sends the same ones (but skips what is empty).
 
-    QS3_SHARED_DATA=… python benchmarks/ray_rate.py [--samples 4] [--repeats 7]
+    QS3_SHARED_DATA=… python benchmarks/ray_rate.py [--samples 4] [--repeats 7] [--sensor paper]
+
+Without ``QS3_SHARED_DATA`` the built-in shapes take the meshes' places.
 """
 
 import argparse
+import json
 import os
 import time
 from pathlib import Path
@@ -15,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from qs3 import shapes
 from qs3.meshes import load_mesh, normalise
 from qs3.sensor.presets import get_sensor
 from qs3.sensor.render import Body, Scene
@@ -37,7 +41,7 @@ class Counter:
         return self.scene.run(origins, rays, **kwargs)
 
 
-def bare(shapes, rig, camera, region, samples) -> float:
+def bare(bodies, rig, camera, region, samples) -> float:
     """Seconds to find the first triangle of every camera ray of a region."""
     n = region.width * region.height * samples
     rng = np.random.default_rng(0)
@@ -50,7 +54,7 @@ def bare(shapes, rig, camera, region, samples) -> float:
     dr.eval(ray)
     dr.sync_thread()
     start = time.perf_counter()
-    dr.eval(shapes.ray_intersect_preliminary(ray).t)
+    dr.eval(bodies.ray_intersect_preliminary(ray).t)
     dr.sync_thread()
     return time.perf_counter() - start
 
@@ -59,18 +63,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--samples", type=int, default=4)
     parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--sensor", default="paper")
+    parser.add_argument("--variant", default="", help="of Mitsuba; the fastest by default")
+    parser.add_argument("--meshes", type=int, default=10, help="classes, one mesh each")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args()
-    variant = best_variant()
+    variant = options.variant or best_variant()
     if variant.startswith("scalar"):
         raise SystemExit("the bare rate is measured with Dr.Jit; no libLLVM and no CUDA here")
     mi.set_variant(variant)
-    root = Path(os.environ["QS3_SHARED_DATA"]) / "cad"
-    sensor = get_sensor("paper")
+    root = Path(os.environ.get("QS3_SHARED_DATA", "")) / "cad"
+    sensor = get_sensor(options.sensor)
+    figures = {}
     print("| mesh | rays a pair | bare Mray/s | renderer Mray/s | share | ms a pair |")
     print("|" + "---|" * 6)
-    for folder in sorted(path for path in root.iterdir() if path.is_dir()):
-        path = sorted(folder.iterdir())[0]
-        mesh = normalise(load_mesh(path), "box")
+    for name in shapes.CLASSES[: options.meshes]:
+        files = sorted((root / name).glob("*.ply"))
+        mesh = normalise(load_mesh(files[0]) if files else shapes.make(name, seed=0), "box")
+        mesh.vertices = mesh.vertices * sensor.object_size
         p = sensor.pattern
         extents = (p.tan_half_width, p.tan_half_height)
         scene = Scene((Body(mesh),), sensor.light, pattern_image(p), *extents)
@@ -80,12 +90,12 @@ def main() -> None:
         counted = EmbreePhotographer(scene, options.samples, 3, 4, 32)
         counted._embree = counter = Counter(counted._embree)
         counted.photograph(sensor.rig, pose, tuple(regions), 0)
-        shapes = mi.load_dict({"type": "scene", **mitsuba_bodies(mi, scene)})
+        bodies = mi.load_dict({"type": "scene", **mitsuba_bodies(mi, scene)})
         renderer = MitsubaRenderer(variant=variant, samples=options.samples)
         rates, ours = [], []
         for _ in range(options.repeats):
             seconds = sum(
-                bare(shapes, sensor.rig, camera, region, options.samples)
+                bare(bodies, sensor.rig, camera, region, options.samples)
                 for camera, region in zip(cameras, regions, strict=True)
             )
             pixels = sum(region.width * region.height for region in regions)
@@ -95,9 +105,12 @@ def main() -> None:
             ours.append((time.perf_counter() - start) / 4)
         rate, seconds = np.median(rates), np.median(ours)
         reached = counter.rays / seconds
-        cells = [folder.name, f"{counter.rays / 1e6:.2f} M", f"{rate / 1e6:.1f}"]
+        figures[name] = {"bare": rate, "renderer": reached, "share": reached / rate}
+        cells = [name, f"{counter.rays / 1e6:.2f} M", f"{rate / 1e6:.1f}"]
         cells += [f"{reached / 1e6:.1f}", f"{reached / rate:.0%}", f"{1e3 * seconds:.0f}"]
         print("| " + " | ".join(cells) + " |", flush=True)
+    if options.json:
+        options.json.write_text(json.dumps(figures), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -160,8 +160,13 @@ def test_draws_come_from_the_generator_alone(method):
     assert values(0, 0) == values(0, 1)
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("target", ["one object", "a class less", "more than the source"])
+@pytest.mark.parametrize(
+    ("method", "target"),
+    [
+        *((method, "one object") for method in METHODS),
+        *zip(METHODS, itertools.cycle(["a class less", "more than the source"]), strict=False),
+    ],
+)
 def test_targets_of_any_size(method, target, tmp_path):
     few = {
         "one object": clouds(1, 5),
@@ -250,8 +255,16 @@ def test_the_poison_would_show(tmp_path):
     assert not same(state(one), state(other))
 
 
-@pytest.mark.parametrize("method", [name for name in METHODS if method_class(name).uses_target])
-@pytest.mark.parametrize("normalisation", ["separate", "transnorm"])
+@pytest.mark.parametrize(
+    ("method", "normalisation"),
+    [
+        *zip(
+            [name for name in METHODS if method_class(name).uses_target],
+            itertools.cycle(["separate", "transnorm"]),
+            strict=False,
+        )
+    ],
+)
 def test_every_normalisation(method, normalisation, tmp_path):
     chosen = settings(method, epochs=1, normalisation=normalisation)
     result = fit(method, SOURCE, TARGET, chosen, run_dir=tmp_path)
@@ -281,8 +294,9 @@ def test_any_warm_up_goes_with_any_self_training(method, rule, tmp_path):
     assert [c.stage for c in result.checkpoints] == ["round", "round", "warm-up"]
 
 
-@pytest.mark.parametrize("rule", ["uniform", "prior", "quantile"])
-@pytest.mark.parametrize("prior", ["em", "bbse"])
+@pytest.mark.parametrize(
+    ("rule", "prior"), [("uniform", ""), ("prior", "em"), ("prior", "bbse"), ("quantile", "")]
+)
 def test_further_rules_of_selection(rule, prior, tmp_path):
     own = {"prior": prior} if rule == "prior" else {}
     if rule != "quantile":

@@ -6,7 +6,6 @@ import torch
 
 from qs3.adaptation import curvature as module
 from qs3.adaptation.curvature import smallest_axis, surface
-from qs3.errors import InputError
 
 
 def sphere(rng, n, radius=1.0):
@@ -123,8 +122,3 @@ def test_blocks_do_not_change_it(rng, monkeypatch):
     monkeypatch.setattr(module, "_BLOCK", 3 * 32 * 7)
     for part, same in zip(surface(points), whole, strict=True):
         assert torch.equal(part, same)
-
-
-def test_settings_are_checked():
-    with pytest.raises(InputError, match="neighbours must be at least 3, not 2"):
-        surface(torch.zeros(1, 4, 3), 2)

@@ -128,12 +128,6 @@ def test_domain_loss_is_the_sum_of_two_mean_cross_entropies():
     assert domain_loss(source, target).item() == pytest.approx(expected, abs=1e-6)
 
 
-def test_the_coefficient_is_that_of_the_paper():
-    for p in (0.0, 0.25, 1.0):
-        assert reversal_coefficient(p) == pytest.approx(math.tanh(10 * p / 2))
-    assert reversal_coefficient(0.3, gamma=2.0) == pytest.approx(math.tanh(0.3))
-
-
 def test_the_discriminator_sees_both_domains_and_the_network_the_reverse():
     source, target = domains()
     method = DANN(tiny(), hidden=(8,), domain_weight=0.7)

@@ -12,8 +12,8 @@ from qs3.adaptation.deformations import (
     deform_radius,
     deform_split,
     deform_voxels,
+    drop_points,
     pick_cells,
-    resample,
 )
 
 SIGMA = 0.001**0.5
@@ -151,13 +151,6 @@ def test_radius_takes_a_seed_with_enough_neighbours():
     assert torch.equal(moved, (torch.arange(300) >= 270).expand(20, -1))
 
 
-def test_radius_falls_back_on_the_fullest_ball():
-    lonely = torch.arange(1, 298)[:, None] * torch.tensor([10.0, 0, 0])
-    points = torch.cat([lonely, torch.zeros(3, 3)])[None].expand(10, -1, -1)
-    moved = deform_radius(points, seeded()).moved
-    assert torch.equal(moved, (torch.arange(300) >= 297).expand(10, -1))
-
-
 def test_features_collapse_the_points_most_alike():
     points = ball(3, 200)
     features = torch.randn(3, 200, 8, generator=seeded(3))
@@ -170,16 +163,10 @@ def test_features_collapse_the_points_most_alike():
         assert float((out[mask].mean(dim=0) - cloud[seeds]).norm(dim=1).min()) < 5 * SIGMA / 20**0.5
 
 
-def test_features_share_of_one_moves_all_and_of_none_one():
-    points = ball(2, 50)
-    assert deform_features(points, points, seeded(), share=1.0).moved.all()
-    assert deform_features(points, points, seeded(), share=0.0).moved.sum(dim=1).tolist() == [1, 1]
-
-
-def test_resample_keeps_points_as_probable_as_asked():
+def test_drop_points_keeps_points_as_probable_as_asked():
     points = ball(1, 4).expand(20000, -1, -1)
     keep = torch.tensor([1.0, 0.9, 0.5, 0.2])
-    moved = resample(points, keep.expand(20000, -1), seeded()).moved
+    moved = drop_points(points, keep.expand(20000, -1), seeded()).moved
     # One point is always dropped; where there are two or more, nothing had to be added.
     free = moved.sum(dim=1) >= 2
     assert not moved[free, 0].any()
@@ -197,17 +184,17 @@ def keep_both(mask, keep):
 
 def test_dropped_points_land_beside_survivors():
     points = ball(3, 200)
-    deformed, moved = resample(points, torch.full((3, 200), 0.5), seeded())
+    deformed, moved = drop_points(points, torch.full((3, 200), 0.5), seeded())
     for cloud, out, mask in zip(points, deformed, moved, strict=True):
         near, at = torch.cdist(out[mask], cloud[~mask]).min(dim=1)
         assert float(near.max()) < 5 * SIGMA
         assert len(set(at.tolist())) > 30
 
 
-def test_resample_never_drops_all_nor_none():
+def test_drop_points_never_drops_all_nor_none():
     points = ball(50, 6)
-    assert (resample(points, torch.zeros(50, 6), seeded()).moved.sum(dim=1) == 5).all()
-    assert (resample(points, torch.ones(50, 6), seeded()).moved.sum(dim=1) == 1).all()
+    assert (drop_points(points, torch.zeros(50, 6), seeded()).moved.sum(dim=1) == 5).all()
+    assert (drop_points(points, torch.ones(50, 6), seeded()).moved.sum(dim=1) == 1).all()
 
 
 def test_split_thins_one_side_of_a_plane():

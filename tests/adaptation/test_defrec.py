@@ -68,7 +68,7 @@ def test_terms_of_defrec():
     batch, target = make_batch(), make_target()
     losses = method(batch, target, 0.0, seeded())
     deformed = deform_voxels(target, seeded())
-    predicted = method.rebuild.head(method.model.encode(deformed.points), deformed.moved)
+    predicted = method.rebuild["head"](method.model.encode(deformed.points), deformed.moved)
     rebuilt = reconstruction_loss(predicted, target, deformed.moved)
     supervised = cross_entropy(method.model(batch.points), batch.labels, 0.1)
     expected = {"source": 0.7 * supervised, "defrec_target": 0.3 * rebuilt}
@@ -82,8 +82,8 @@ def test_defrec_pcm_is_the_sum_of_the_two():
     generator = seeded()
     mixed = mix_clouds(batch.points, batch.labels, generator, 2.0)
     logits = method.model(mixed.points)
-    supervised = mixed_cross_entropy(logits, batch.labels, mixed.labels, mixed.share)
-    rebuilt = method.rebuild.losses(method, batch.points, target, generator)
+    supervised = mixed_cross_entropy(logits, logits, mixed)
+    rebuilt = method.rebuilding(batch.points, target, generator)
     torch.testing.assert_close(losses, {"pcm": 0.7 * supervised} | rebuilt)
     alone = PCM(method.model, concentration=2.0).eval()(batch, None, 0.0, seeded())
     torch.testing.assert_close(losses["pcm"], 0.7 * alone["pcm"])
@@ -121,7 +121,7 @@ def test_looking_for_features_leaves_no_trace():
     method = DefRec(make_model(), deformation="features")
     target = make_target()
     before = {k: v.clone() for k, v in method.state_dict().items()}
-    deformed = method.rebuild.deform(method, target, "target", seeded())
+    deformed = method.deform(target, "target", seeded())
     assert method.model.training
     assert all(torch.equal(v, before[k]) for k, v in method.state_dict().items())
     assert not deformed.points.requires_grad
@@ -129,7 +129,7 @@ def test_looking_for_features_leaves_no_trace():
     assert local is not None
     expected = deform_features(target, local.detach(), seeded())
     assert torch.equal(deformed.moved, expected.moved)
-    method.rebuild.deform(method, target, "target", seeded())
+    method.deform(target, "target", seeded())
     assert not method.model.training
 
 

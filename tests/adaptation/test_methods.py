@@ -5,7 +5,6 @@ import pytest
 import torch
 from scipy.special import log_softmax
 
-import qs3.adaptation
 from qs3.adaptation import Batch, Method, SourceOnly, create_method, cross_entropy
 from qs3.errors import InputError
 from qs3.models import create_model
@@ -40,14 +39,6 @@ def test_source_only_is_the_cross_entropy_of_the_source():
     assert list(losses) == ["source"]
     expected = cross_entropy(method.model(batch.points), batch.labels, 0.1)
     assert torch.equal(losses["source"], expected)
-
-
-def test_source_only_ignores_a_target():
-    method = make_method().eval()
-    losses = method.losses(make_batch(), torch.zeros(2, 5, 3), 0.5, torch.Generator())
-    assert torch.equal(
-        losses["source"], method(make_batch(), None, 0.0, torch.Generator())["source"]
-    )
 
 
 def test_default_parameter_group_holds_every_trainable_parameter():
@@ -98,8 +89,3 @@ def test_method_is_abstract():
 def test_unusable_settings_are_named(name, settings, message):
     with pytest.raises(InputError, match=message):
         create_method(name, create_model("pointnet", 3, channels=(8, 8, 16)), **settings)
-
-
-def test_unknown_name_of_the_package():
-    with pytest.raises(AttributeError, match="nothing_here"):
-        _ = qs3.adaptation.nothing_here

@@ -9,6 +9,7 @@ from qs3.adaptation import Batch, pcm
 from qs3.adaptation.method import cross_entropy
 from qs3.adaptation.pcm import (
     PCM,
+    Mixed,
     draw_share,
     mix_clouds,
     mix_halves,
@@ -71,9 +72,9 @@ def test_second_labels_are_those_of_the_second_clouds(seed):
     labels = torch.arange(5)
     points = clouds(n=30) * 0.01 + labels[:, None, None]
     mixed = mix_clouds(points, labels, seeded(seed))
-    assert sorted(mixed.labels.tolist()) == list(range(5))
+    assert sorted(mixed.second.tolist()) == list(range(5))
     owner = mixed.points.mean(dim=2).round().long()
-    for own, other, at in zip(labels, mixed.labels, owner, strict=True):
+    for own, other, at in zip(labels, mixed.second, owner, strict=True):
         assert set(at.tolist()) <= {int(own), int(other)}
         if own != other:
             assert int((at == own).sum()) == round(mixed.share * 30)
@@ -87,19 +88,13 @@ def test_one_share_a_batch_is_drawn_from_the_beta_distribution():
     assert stats.kstest(drawn, stats.uniform.cdf).pvalue < 1e-3
 
 
-@pytest.mark.parametrize("points", [clouds(2, 1), clouds(2, 2), torch.full((3, 20, 3), 0.2)])
-def test_few_and_equal_points(points):
-    mixed = mix_clouds(points, torch.arange(len(points)), seeded())
-    assert mixed.points.shape == points.shape
-    assert mixed.share in [m / points.shape[1] for m in range(points.shape[1] + 1)]
-
-
 def test_labels_mix_as_the_share():
     logits = torch.from_numpy(np.random.default_rng(0).normal(size=(4, 3)))
     first, second = torch.tensor([0, 1, 2, 0]), torch.tensor([2, 1, 0, 1])
     goal = 0.3 * torch.eye(3)[first] + 0.7 * torch.eye(3)[second]
     soft = torch.nn.functional.cross_entropy(logits, goal.double())
-    torch.testing.assert_close(mixed_cross_entropy(logits, first, second, 0.3), soft)
+    mixed = Mixed(torch.zeros(4, 1, 3), first, second, 0.3)
+    torch.testing.assert_close(mixed_cross_entropy(logits, logits, mixed), soft)
 
 
 def test_loss_of_the_method(monkeypatch):
@@ -112,7 +107,7 @@ def test_loss_of_the_method(monkeypatch):
     mixed = mix_clouds(batch.points, batch.labels, seeded(), 0.7)
     logits = method.model(mixed.points)
     expected = mixed.share * cross_entropy(logits, batch.labels, 0.1)
-    expected = expected + (1 - mixed.share) * cross_entropy(logits, mixed.labels, 0.1)
+    expected = expected + (1 - mixed.share) * cross_entropy(logits, mixed.second, 0.1)
     torch.testing.assert_close(losses, {"pcm": expected})
     assert asked[0] == 0.7
 
@@ -123,7 +118,7 @@ def test_the_larger_part_decides_what_counts_as_right(monkeypatch, share):
     labels = torch.tensor([0, 1, 2, 0])
     monkeypatch.setattr(pcm, "draw_share", lambda *_: share)
     mixed = mix_clouds(clouds(4), labels, seeded())
-    larger, smaller = (labels, mixed.labels) if share > 0.5 else (mixed.labels, labels)
+    larger, smaller = (labels, mixed.second) if share > 0.5 else (mixed.second, labels)
     right = (larger != smaller).sum()
     assert right > 0
     # A network that names the smaller part where the two differ.

@@ -9,13 +9,11 @@ from torch import nn
 
 from qs3.adaptation.method import Batch, cross_entropy
 from qs3.adaptation.mmd import mmd
-from qs3.adaptation.normalisation import make_norm
 from qs3.adaptation.pointdan import (
     NodeAttention,
     PointDAN,
     fresh_head,
     head_parameters,
-    reversal_coefficient,
 )
 from qs3.models import Features, PointClassifier, create_model
 
@@ -39,12 +37,12 @@ SMALL = {
 }
 
 
-def make(name, seed=0, norm=None, dropout=0.0, **settings):
+def make(name, seed=0, dropout=0.0, **settings):
     torch.manual_seed(seed)
     model = create_model(name, 3, **SMALL[name], dropout=dropout)
     if name != "pointnet-sa":
         settings = {"nodes": 10, "neighbours": 6, "node_width": 4} | settings
-    return PointDAN(model, norm=None if norm is None else make_norm(norm, model), **settings)
+    return PointDAN(model, **settings)
 
 
 def batches(b=4, b_t=5, n=40, n_t=30, seed=0):
@@ -73,7 +71,7 @@ def test_terms_follow_the_formulae(name):
         p1 = method.model.head(there).softmax(dim=1).numpy()
         p2 = method.second.head(there).softmax(dim=1).numpy()
         assert losses["discrepancy"] == pytest.approx(-2 * np.abs(p1 - p2).mean(), rel=1e-5)
-        nodes = [method.nodes(source.points, here), method.nodes(target, there)]
+        nodes = [method.nodes_of(source.points, here), method.nodes_of(target, there)]
         x = method.attention["source"](nodes[0])
         y = method.attention["target"](nodes[1])
         expected = 3 * mmd(x, y, (0.01, 0.1, 1.0, 10.0, 100.0)).item()
@@ -98,14 +96,6 @@ def test_the_classifiers_part_and_the_network_brings_them_together():
             own = "classify" in key
             factor = 1.0 if own else -math.sin(0.2 * math.pi)
             torch.testing.assert_close(turned[key], factor * parameter.grad, rtol=1e-4, atol=1e-7)
-
-
-def test_the_coefficient_rises_from_zero_to_one():
-    values = [reversal_coefficient(p) for p in np.linspace(0, 1, 11)]
-    assert values[0] == 0.0
-    assert values[-1] == 1.0
-    assert values == sorted(values)
-    assert reversal_coefficient(1 / 3) == pytest.approx(0.5)
 
 
 def test_attention_is_the_published_formula():
@@ -138,7 +128,7 @@ def test_each_domain_has_an_attention_of_its_own():
 @pytest.mark.parametrize("name", SMALL)
 @pytest.mark.parametrize("norm", ["shared", "transnorm"])
 def test_the_second_head_is_the_first_anew(name, norm):
-    method = make(name, norm=norm, dropout=0.3)
+    method = make(name, normalisation=norm, dropout=0.3)
     first, second = method.model.classify, method.second.classify
     plain = create_model(name, 3, **SMALL[name]).classify
     shapes = [(key, value.shape) for key, value in second.state_dict().items()]
@@ -211,7 +201,7 @@ def nodes_apart(method):
     method.train()
     with torch.no_grad():
         nodes = [
-            method.attention[domain](method.nodes(points, method.features(points, domain)))
+            method.attention[domain](method.nodes_of(points, method.features(points, domain)))
             for domain, points in (("source", source.points), ("target", target))
         ]
     return mmd(*nodes, method.bandwidths).item()

@@ -3,7 +3,6 @@
 import dataclasses
 import inspect
 import math
-import tracemalloc
 
 import numpy as np
 import pytest
@@ -65,10 +64,6 @@ def test_entropy_is_that_of_scipy(dtype):
     assert entropy(rows) == pytest.approx(expected, abs=1e-6 if dtype is np.float32 else 1e-12)
 
 
-def test_zeros_have_no_entropy():
-    assert entropy(np.array([[1.0, 0.0, 0.0]])) == 0.0
-
-
 def test_information_maximisation_is_mutual_information():
     """H(mean) − mean H is the mean divergence of the rows from their mean."""
     rows = predictions()
@@ -104,24 +99,6 @@ def test_snd_is_the_double_loop(m):
         weights = [math.exp(unit[i] @ unit[j] / 0.1) for j in range(m) if j != i]
         total += -sum(w / sum(weights) * math.log(w / sum(weights)) for w in weights)
     assert snd(features, temperature=0.1) == pytest.approx(total / m, abs=1e-10)
-
-
-def test_snd_in_blocks(monkeypatch):
-    features = np.random.default_rng(1).normal(size=(50, 6))
-    whole = snd(features)
-    monkeypatch.setattr(validators, "_BLOCK", 350)  # seven rows at a time
-    assert snd(features) == pytest.approx(whole, abs=1e-12)
-
-
-def test_snd_needs_bounded_memory(monkeypatch):
-    """All similarities of 2000 clouds would take 32 MB."""
-    features = np.random.default_rng(1).normal(size=(2000, 3))
-    monkeypatch.setattr(validators, "_BLOCK", 2**18)  # 2 MiB
-    tracemalloc.start()
-    snd(features)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 4 * 2**21
 
 
 def test_snd_of_one_cloud_and_of_zeros():
@@ -163,12 +140,6 @@ def test_density_ratio_refusals():
         density_ratio(rows[:0], rows, rows)
     with pytest.raises(InputError, match="strength"):
         density_ratio(rows, rows, rows, -1.0)
-
-
-def test_density_ratio_where_one_domain_is_a_single_cloud():
-    rng = np.random.default_rng(0)
-    ratio = density_ratio(rng.normal(size=(1, 2)), rng.normal(size=(6, 2)), np.eye(2))
-    assert np.isfinite(ratio).all()
 
 
 def test_density_ratio_ignores_constant_channels():
@@ -236,11 +207,6 @@ def test_class_ami_by_the_definition():
     predicted = np.where(np.arange(60) < 12, 0, labels)
     expected = adjusted_mutual_info_score(labels, predicted)
     assert class_ami(features, predicted, 3) == pytest.approx(expected, abs=1e-9)
-
-
-def test_class_ami_of_few_distinct_features():
-    assert class_ami(np.ones((9, 2)), np.zeros(9, dtype=np.int64), 3) == 0.0
-    assert class_ami(np.ones((9, 2)), np.arange(9) % 2, 3) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_a_collapse_scores_worse_than_the_truth():

@@ -89,7 +89,7 @@ def test_settings_of_a_method_are_those_of_its_class(name):
         assert all(f"`{part}`" in text for part in COMPOSED[name])
         assert "| setting |" not in text
         return
-    fixed = {"self", "model", "shared", "label_smoothing", "norm"}
+    fixed = {"self", "model", "label_smoothing", "normalisation"}
     kind = method_class(name)
     own = {
         key: parameter.default

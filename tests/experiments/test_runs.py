@@ -7,7 +7,7 @@ import pytest
 from qs3 import shapes
 from qs3.errors import InputError
 from qs3.experiments import TABLES
-from qs3.experiments.cost import Counts, run_seconds
+from qs3.experiments.cost import run_seconds
 from qs3.experiments.data import choose_meshes, make_plans, side_of
 from qs3.experiments.domains import Domain, data_of, parse_own
 from qs3.experiments.experiment import load_experiment, published
@@ -189,7 +189,7 @@ def test_a_path_through_a_link_and_a_name_of_ours_are_the_user_s(tmp_path):
 def test_hours_follow_the_number_of_steps():
     steps = {"source-only": 1.0, "dann": 3.0}
     scale = dataclasses.replace(TINY, train=dataclasses.replace(TINY.train, epochs=10))
-    counts = Counts(source=40, target=64, test=16)  # 36 trained on: 3 batches; 4 of the target
+    counts = (40, 64, 16)  # 36 trained on: 3 batches; 4 of the target
     looks = 10 * (40 + 64 + 16) / 16 / 3
     seconds = {
         row: run_seconds(make_run(scale, S, D, row), counts, steps)

@@ -1,14 +1,14 @@
 """CORAL: both domains with one covariance (Deep CORAL: Sun & Saenko, ECCV 2016 workshops)."""
 
-from typing import Literal, Unpack
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from qs3.adaptation.method import Batch, Method, Shared, Target, Terms
+from qs3.adaptation.method import Batch, Method, Target, Terms
 from qs3.errors import InputError
-from qs3.models import PointClassifier
 from qs3.models.checks import check_range
 
 Layer = Literal["logits", "pooled"]
@@ -44,42 +44,30 @@ def _covariance(x: Float[Tensor, "b c"]) -> Float[Tensor, "c c"]:
     return centred.t() @ centred / (len(x) - 1)
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class CORAL(Method):
     """Cross entropy on the source plus the distance of the domains' covariances.
 
     NOTE: the paper sets the weight so that both losses end about equal, and gives no number; here
     it is 1. Its last layer learns ten times as fast as the others, which came pretrained; here
     all are new and learn alike.
-
-    Args:
-        model: The network to train.
-        coral_weight: Factor of the distance, λ of the paper (eq. 6).
-        layer: Whose covariance is matched.
-        shared: Label smoothing and normalisation, as of `Method`.
-
-    Raises:
-        InputError: where a setting is unusable.
     """
 
     uses_target = True
 
-    def __init__(
-        self,
-        model: PointClassifier,
-        *,
-        coral_weight: float = 1.0,
-        layer: Layer = "logits",
-        **shared: Unpack[Shared],
-    ) -> None:
-        super().__init__(model, **shared)
-        check_range("coral_weight", coral_weight, 0, 1e6)
-        self.coral_weight, self.layer = coral_weight, layer
+    coral_weight: float = 1.0
+    """Factor of the distance, λ of the paper (eq. 6)."""
+    layer: Layer = "logits"
+    """Whose covariance is matched."""
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        super().__post_init__()
+        check_range("coral_weight", self.coral_weight, 0, 1e6)
 
     def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of the source and the distance of the covariances."""
-        assert target is not None  # noqa: S101
-        of_source = self.features(source.points, "source")
-        of_target = self.features(target, "target")
+        of_source, of_target = self.both(source, target)
         logits = self.head(of_source, "source")
         if self.layer == "logits":
             distance = coral(logits, self.head(of_target, "target"))

@@ -2,14 +2,14 @@
 
 import itertools
 import math
-from typing import Unpack
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
-from qs3.adaptation.method import Batch, Method, Shared, Target, Terms
-from qs3.models import PointClassifier, feature_widths
+from qs3.adaptation.method import Batch, Method, Target, Terms
+from qs3.models import feature_widths
 from qs3.models.checks import check_positive, check_range
 
 
@@ -71,6 +71,7 @@ def domain_loss(source: Float[Tensor, "b"], target: Float[Tensor, "b_t"]) -> Flo
     return softplus(source.float()).mean() + softplus(-target.float()).mean()
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class DANN(Method):
     """Domain-adversarial training on the pooled features, through gradient reversal.
 
@@ -80,45 +81,32 @@ class DANN(Method):
     NOTE: the authors published no network for point clouds. The discriminator is their largest
     (x → 1024 → 1024 → 1); their annealing of the learning rate, momentum and dropout are left to
     the settings of the training.
-
-    Args:
-        model: The network to train.
-        hidden: Widths of the discriminator's hidden layers.
-        gamma: γ of `reversal_coefficient`.
-        domain_weight: Factor of the domain loss.
-        shared: Label smoothing and normalisation, as of `Method`.
-
-    Raises:
-        InputError: where a setting is unusable.
     """
 
     uses_target = True
 
-    def __init__(
-        self,
-        model: PointClassifier,
-        *,
-        hidden: tuple[int, ...] = (1024, 1024),
-        gamma: float = 10.0,
-        domain_weight: float = 1.0,
-        **shared: Unpack[Shared],
-    ) -> None:
-        super().__init__(model, **shared)
-        check_range("hidden", (1, *hidden))
-        check_positive("gamma", gamma)
-        check_range("domain_weight", domain_weight, 0, 1e6)
-        self.gamma, self.domain_weight = gamma, domain_weight
+    hidden: tuple[int, ...] = (1024, 1024)
+    """Widths of the discriminator's hidden layers."""
+    gamma: float = 10.0
+    """γ of `reversal_coefficient`."""
+    domain_weight: float = 1.0
+    """Factor of the domain loss."""
+
+    def __post_init__(self) -> None:
+        """Check the settings and make the discriminator."""
+        super().__post_init__()
+        check_range("hidden", (1, *self.hidden))
+        check_positive("gamma", self.gamma)
+        check_range("domain_weight", self.domain_weight, 0, 1e6)
         layers: list[nn.Module] = []
-        widths = (feature_widths(model).pooled, *hidden)
+        widths = (feature_widths(self.model).pooled, *self.hidden)
         for c, d in itertools.pairwise(widths):
             layers += [nn.Linear(c, d), nn.ReLU()]
         self.discriminator = nn.Sequential(*layers, nn.Linear(widths[-1], 1))
 
     def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of the source and the domain loss of both."""
-        assert target is not None  # noqa: S101
-        of_source = self.features(source.points, "source")
-        of_target = self.features(target, "target")
+        of_source, of_target = self.both(source, target)
         coefficient = reversal_coefficient(progress, self.gamma)
         scores = [
             self.discriminator(reverse_gradient(features.pooled, coefficient))[:, 0]

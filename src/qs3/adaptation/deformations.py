@@ -92,7 +92,7 @@ def deform_cells(
         generator: Source of the draws.
     """
     moved = cells(points) == chosen[:, None]
-    return _collapse(points, moved, cell_centres().to(points)[chosen], generator)
+    return _scatter(points, moved, cell_centres().to(points)[chosen, None], generator)
 
 
 def deform_voxels(
@@ -145,7 +145,7 @@ def deform_radius(
         if bool((best >= least).all()):
             break
     centre = gather_points(points, seed[:, None])
-    return _collapse(points, _within(centre, points, radius)[:, 0], centre[:, 0], generator)
+    return _scatter(points, _within(centre, points, radius)[:, 0], centre, generator)
 
 
 def deform_features(
@@ -166,24 +166,24 @@ def deform_features(
     seed = torch.randint(n, (b, 1), generator=generator).to(points.device)
     alike = knn(features, max(1, round(share * n)), gather_points(features, seed))[:, 0]
     moved = torch.zeros((b, n), dtype=torch.bool, device=points.device).scatter_(1, alike, True)
-    return _collapse(points, moved, gather_points(points, seed)[:, 0], generator)
+    return _scatter(points, moved, gather_points(points, seed), generator)
 
 
 def deform_split(points: Float[Tensor, "b n 3"], generator: torch.Generator) -> Deformed:
     """Sample one side of a random plane through the mean thinly: sample-based, "split".
 
-    A quarter of the points on that side survive; see `resample`.
+    A quarter of the points on that side survive; see `drop_points`.
     """
     direction = _directions(points, generator)
     side = ((points - points.mean(dim=1, keepdim=True)) * direction).sum(dim=2) > 0
-    return resample(points, torch.where(side, 0.25, 1.0), generator)
+    return drop_points(points, torch.where(side, 0.25, 1.0), generator)
 
 
 def deform_gradient(points: Float[Tensor, "b n 3"], generator: torch.Generator) -> Deformed:
     """Sample ever more thinly along the longest axis: sample-based, "gradient".
 
     The probability to survive falls linearly, from 1 at one end to 0.05 at the other; which end is
-    which is drawn. See `resample`.
+    which is drawn. See `drop_points`.
     """
     low, high = points.amin(dim=1), points.amax(dim=1)
     axis = (high - low).argmax(dim=1)[:, None]
@@ -191,21 +191,21 @@ def deform_gradient(points: Float[Tensor, "b n 3"], generator: torch.Generator) 
     along = points.gather(2, axis[:, None].expand(-1, points.shape[1], 1))[:, :, 0]
     place = (along - low.gather(1, axis)) / length
     turned = torch.rand((len(points), 1), generator=generator).to(points.device) < 0.5
-    return resample(points, 1 - (1 - _FLOOR) * torch.where(turned, 1 - place, place), generator)
+    return drop_points(points, 1 - (1 - _FLOOR) * torch.where(turned, 1 - place, place), generator)
 
 
 def deform_lambertian(points: Float[Tensor, "b n 3"], generator: torch.Generator) -> Deformed:
     """Sample by the cosine between normal and a random direction: sample-based, "lambertian".
 
     The probability to survive is max(cos, 0.05), as of a surface that a light strikes; normals are
-    those of `qs3.adaptation.curvature.surface`. See `resample`.
+    those of `qs3.adaptation.curvature.surface`. See `drop_points`.
     """
     direction = _directions(points, generator)
     cosine = (surface(points).normals.to(points) * direction).sum(dim=2)
-    return resample(points, cosine.clamp_min(_FLOOR), generator)
+    return drop_points(points, cosine.clamp_min(_FLOOR), generator)
 
 
-def resample(
+def drop_points(
     points: Float[Tensor, "b n 3"], keep: Float[Tensor, "b n"], generator: torch.Generator
 ) -> Deformed:
     """Drop points at random, and let each that is dropped move to one that survives.
@@ -230,7 +230,7 @@ def resample(
     ticket = torch.rand((b, n), generator=generator).to(points.device)
     rank = torch.minimum((ticket * survivors).long(), survivors - 1)
     goal = gather_points(points, ranked.gather(1, rank))
-    return _scatter_around(points, moved, goal, generator)
+    return _scatter(points, moved, goal, generator)
 
 
 def _directions(points: Tensor, generator: torch.Generator) -> Tensor:
@@ -247,15 +247,7 @@ def _within(
     return squared <= radius * radius
 
 
-def _collapse(
-    points: Tensor, moved: Tensor, centres: Float[Tensor, "b 3"], generator: torch.Generator
-) -> Deformed:
-    return _scatter_around(points, moved, centres[:, None], generator)
-
-
-def _scatter_around(
-    points: Tensor, moved: Tensor, goal: Tensor, generator: torch.Generator
-) -> Deformed:
+def _scatter(points: Tensor, moved: Tensor, goal: Tensor, generator: torch.Generator) -> Deformed:
     noise = torch.randn(points.shape, generator=generator).to(points)
     return Deformed(torch.where(moved[:, :, None], goal + _VARIANCE**0.5 * noise, points), moved)
 

@@ -1,14 +1,15 @@
 """Deformation reconstruction, DefRec (Achituve et al., WACV 2021)."""
 
-from typing import Unpack, cast
+from dataclasses import dataclass
+from typing import cast
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor, nn
 
 from qs3.adaptation.deformations import DEFORMATIONS, Deformation, Deformed, deform_features
-from qs3.adaptation.method import Batch, Domain, Method, Shared, Target, Terms
-from qs3.models import Features, PointClassifier, feature_widths
+from qs3.adaptation.method import Batch, Domain, Method, Target, Terms
+from qs3.models import Features, feature_widths
 from qs3.models.checks import check_range
 from qs3.models.ops import gather_points
 
@@ -161,78 +162,7 @@ def _finish(width: int, dropout: float) -> tuple[nn.Module, ...]:
     return nn.BatchNorm1d(width), nn.ReLU(inplace=True), nn.Dropout(dropout)
 
 
-class Reconstruction(nn.Module):
-    """DefRec's task: deform clouds, pass them through a method's network, rebuild what moved.
-
-    Args:
-        model: The network whose features the head will read.
-        deformation: Which parts move, and where to.
-        weight: Factor of the loss.
-        on_source: Whether source clouds are deformed as well as target clouds.
-        dropout: Probability of dropping a hidden unit of the head.
-
-    Raises:
-        InputError: where a setting is not usable.
-    """
-
-    def __init__(
-        self,
-        model: PointClassifier,
-        deformation: Deformation,
-        weight: float,
-        on_source: bool,
-        dropout: float,
-    ) -> None:
-        super().__init__()
-        check_range("weight", weight, 0, 1)
-        check_range("dropout", dropout, 0, 1)
-        self.deformation: Deformation = deformation
-        self.weight = weight
-        self.on_source = on_source
-        widths = feature_widths(model)
-        self.head = ReconstructionHead(cast(int, widths.local), widths.pooled, dropout)
-
-    def losses(
-        self,
-        method: Method,
-        source: Float[Tensor, "b n 3"],
-        target: Float[Tensor, "b_t n_t 3"],
-        generator: Generator,
-    ) -> Terms:
-        """Return the weighted loss of each domain that is deformed."""
-        terms = {}
-        if self.on_source:
-            terms["defrec_source"] = self._loss(method, source, "source", generator)
-        terms["defrec_target"] = self._loss(method, target, "target", generator)
-        return terms
-
-    def _loss(self, method: Method, points: Tensor, domain: Domain, generator: Generator) -> Tensor:
-        deformed = self.deform(method, points, domain, generator)
-        predicted = self.head(method.features(deformed.points, domain), deformed.moved)
-        return self.weight * reconstruction_loss(predicted, points, deformed.moved)
-
-    def deform(
-        self,
-        method: Method,
-        points: Float[Tensor, "b n 3"],
-        domain: Domain,
-        generator: Generator,
-    ) -> Deformed:
-        """Return deformed clouds of a domain."""
-        if self.deformation != "features":
-            return DEFORMATIONS[self.deformation](points, generator)
-        # In evaluation mode, so that this look leaves no trace in the running statistics.
-        training = method.model.training
-        method.model.eval()
-        try:
-            with torch.no_grad():
-                local = method.features(points, domain).local
-        finally:
-            method.model.train(training)
-        assert local is not None  # noqa: S101
-        return deform_features(points, local, generator)
-
-
+@dataclass(eq=False, repr=False, kw_only=True)
 class DefRec(Method):
     """Classify the source; rebuild deformed parts of target clouds, and of source clouds if asked.
 
@@ -250,38 +180,62 @@ class DefRec(Method):
     NOTE: the head is evaluated at the moved points alone, whose batch statistics it then uses; the
     released one is evaluated at all points, and masked.
     NOTE: the weight is that of the released scripts; the default of their parser is 0.5.
-
-    Args:
-        model: The network to train; it must give local features.
-        deformation: Which parts move, and where to: see `qs3.adaptation.deformations`.
-        weight: w.
-        on_source: Whether source clouds are deformed and rebuilt as well.
-        dropout: Probability of dropping a hidden unit of the reconstruction head.
-        shared: Label smoothing and normalisation, as of `Method`.
-
-    Raises:
-        InputError: where a setting is not usable, or the network has no local features.
     """
 
     uses_target = True
     needs_local = True
 
-    def __init__(
-        self,
-        model: PointClassifier,
-        *,
-        deformation: Deformation = "voxels",
-        weight: float = 0.2,
-        on_source: bool = False,
-        dropout: float = 0.5,
-        **shared: Unpack[Shared],
-    ) -> None:
-        super().__init__(model, **shared)
-        self.rebuild = Reconstruction(model, deformation, weight, on_source, dropout)
+    deformation: Deformation = "voxels"
+    """Which parts move, and where to: see `qs3.adaptation.deformations`."""
+    weight: float = 0.2
+    """w."""
+    on_source: bool = False
+    """Whether source clouds are deformed and rebuilt as well."""
+    dropout: float = 0.5
+    """Probability of dropping a hidden unit of the reconstruction head."""
+
+    def __post_init__(self) -> None:
+        """Check the settings and make the reconstruction head."""
+        super().__post_init__()
+        check_range("weight", self.weight, 0, 1)
+        check_range("dropout", self.dropout, 0, 1)
+        widths = feature_widths(self.model)
+        head = ReconstructionHead(cast(int, widths.local), widths.pooled, self.dropout)
+        self.rebuild = nn.ModuleDict({"head": head})  # checkpoints know it as rebuild.head
 
     def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of the source and the distance of rebuilt parts."""
-        assert target is not None  # noqa: S101
         cross_entropy = self.classification(self.logits(source.points, "source"), source)
-        rebuilt = self.rebuild.losses(self, source.points, target, generator)
-        return {"source": (1 - self.rebuild.weight) * cross_entropy, **rebuilt}
+        rebuilt = self.rebuilding(source.points, target, generator)
+        return {"source": (1 - self.weight) * cross_entropy, **rebuilt}
+
+    def rebuilding(
+        self, source: Float[Tensor, "b n 3"], target: Target, generator: Generator
+    ) -> Terms:
+        """Deform clouds, rebuild what moved, and return the weighted loss of each domain."""
+        assert target is not None  # noqa: S101
+        domains: list[tuple[Domain, Tensor]] = [("source", source), ("target", target)]
+        terms = {}
+        for domain, points in domains if self.on_source else domains[1:]:
+            deformed = self.deform(points, domain, generator)
+            predicted = self.rebuild["head"](self.features(deformed.points, domain), deformed.moved)
+            loss = reconstruction_loss(predicted, points, deformed.moved)
+            terms[f"defrec_{domain}"] = self.weight * loss
+        return terms
+
+    def deform(
+        self, points: Float[Tensor, "b n 3"], domain: Domain, generator: Generator
+    ) -> Deformed:
+        """Return deformed clouds of a domain."""
+        if self.deformation != "features":
+            return DEFORMATIONS[self.deformation](points, generator)
+        # In evaluation mode, so that this look leaves no trace in the running statistics.
+        training = self.model.training
+        self.model.eval()
+        try:
+            with torch.no_grad():
+                local = self.features(points, domain).local
+        finally:
+            self.model.train(training)
+        assert local is not None  # noqa: S101
+        return deform_features(points, local, generator)

@@ -53,15 +53,13 @@ def create_method(
         model: The network to train.
         label_smoothing: ε of the source's cross entropy.
         normalisation: How the network normalises the two domains.
-        settings: Arguments of the method; those left out keep the paper's values.
+        settings: Further fields of the method; those left out keep the paper's values.
 
     Raises:
         InputError: where the name or a setting is unknown, a value is unusable, or the network
             does not give what the method needs.
     """
-    from qs3.adaptation.normalisation import make_norm
-
     kind = method_class(name)
-    values = read_settings(kind, settings, f"method {name}", ("model", "label_smoothing", "norm"))
-    norm = make_norm(normalisation, model)
-    return kind(model, label_smoothing=label_smoothing, norm=norm, **values)
+    shared = {"label_smoothing": label_smoothing, "normalisation": normalisation}
+    own = read_settings(kind, settings, f"method {name}", ("model", *shared))
+    return kind(model, **shared, **own)

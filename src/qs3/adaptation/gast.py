@@ -1,6 +1,7 @@
 """Geometry-aware self-training, GAST (Zou et al., ICCV 2021): its two self-supervised tasks."""
 
-from typing import Literal, NamedTuple, Unpack
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -8,29 +9,16 @@ from torch import Generator, Tensor, nn
 
 from qs3.adaptation.curvature import surface
 from qs3.adaptation.deformations import CELLS, deform_cells, pick_cells
-from qs3.adaptation.method import Batch, Domain, Method, Shared, Target, Terms, cross_entropy
-from qs3.adaptation.pcm import draw_share, mix_halves
+from qs3.adaptation.method import Batch, Domain, Method, Target, Terms
+from qs3.adaptation.pcm import Mixed, draw_share, mix_halves, mixed_cross_entropy
 from qs3.errors import InputError
-from qs3.models import PointClassifier, feature_widths
+from qs3.models import feature_widths
 from qs3.models.checks import check_positive
 
 _TURNS = 4
 """Quarter turns that the rotation task tells apart."""
 _LEAST = 20
 """Points that a distorted cell should have."""
-
-
-class MixedRotation(NamedTuple):
-    """Clouds made of two turned copies of one, and both turns."""
-
-    points: Float[Tensor, "b n 3"]
-    """Points of both copies, in a random order."""
-    about_x: Int[Tensor, "b"]
-    """Quarter turns of the first copy, about x."""
-    about_y: Int[Tensor, "b"]
-    """Quarter turns of the second copy, about y."""
-    share: float
-    """λ: part of the points that come from the first copy."""
 
 
 def turn(
@@ -55,8 +43,8 @@ def turn(
 
 def mix_rotations(
     points: Float[Tensor, "b n 3"], generator: Generator, concentration: float = 1.0
-) -> MixedRotation:
-    """Mix each cloud turned about x with itself turned about y.
+) -> Mixed:
+    """Mix each cloud turned about x with itself turned about y; the classes are quarter turns.
 
     round(λ n) farthest points come from the first, the rest from the second; λ is drawn once a
     batch, both turns for each cloud.
@@ -71,15 +59,7 @@ def mix_rotations(
     turns = torch.randint(_TURNS, (2, len(points)), generator=generator).to(points.device)
     first, second = turn(points, turns[0], "x"), turn(points, turns[1], "y")
     mixed, share = mix_halves(first, second, share, generator)
-    return MixedRotation(mixed, turns[0], turns[1], share)
-
-
-def rotation_loss(
-    about_x: Float[Tensor, "b 4"], about_y: Float[Tensor, "b 4"], mixed: MixedRotation
-) -> Float[Tensor, ""]:
-    """λ CE(turn about x) + (1 − λ) CE(turn about y), each with its own logits and labels."""
-    first, second = cross_entropy(about_x, mixed.about_x), cross_entropy(about_y, mixed.about_y)
-    return mixed.share * first + (1 - mixed.share) * second
+    return Mixed(mixed, turns[0], turns[1], share)
 
 
 def location_weights(
@@ -112,6 +92,7 @@ def location_loss(
     return each.mean() if weights is None else (weights * each).mean()
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class GAST(Method):
     """Classify the source; in both domains tell how clouds are turned and where they are distorted.
 
@@ -133,55 +114,39 @@ class GAST(Method):
     NOTE: labels mix as round(λ n) / n. The location layer is linear on every network; the released
     PointNet has a hidden layer there. In the released code the rotation task is off by default.
 
-    Args:
-        model: The network to train.
-        rotation: Whether there is a rotation task.
-        location: Whether there is a location task.
-        on_source: Whether the tasks run on source clouds as well as on target clouds.
-        curvature: Whether the location task is weighted by curvature.
-        classification_weight: w_c.
-        location_weight: w_l.
-        rotation_weight: w_r.
-        concentration: γ of λ ~ Beta(γ, γ).
-        shared: Label smoothing and normalisation, as of `Method`.
-
-    Raises:
-        InputError: where a setting is not usable, or both tasks are off.
     """
 
     uses_target = True
 
-    def __init__(
-        self,
-        model: PointClassifier,
-        *,
-        rotation: bool = True,
-        location: bool = True,
-        on_source: bool = True,
-        curvature: bool = True,
-        classification_weight: float = 0.5,
-        location_weight: float = 0.5,
-        rotation_weight: float = 0.2,
-        concentration: float = 1.0,
-        **shared: Unpack[Shared],
-    ) -> None:
-        super().__init__(model, **shared)
-        if not (rotation or location):
+    rotation: bool = True
+    """Whether there is a rotation task."""
+    location: bool = True
+    """Whether there is a location task."""
+    on_source: bool = True
+    """Whether the tasks run on source clouds as well as on target clouds."""
+    curvature: bool = True
+    """Whether the location task is weighted by curvature."""
+    classification_weight: float = 0.5
+    """w_c."""
+    location_weight: float = 0.5
+    """w_l."""
+    rotation_weight: float = 0.2
+    """w_r."""
+    concentration: float = 1.0
+    """γ of λ ~ Beta(γ, γ)."""
+
+    def __post_init__(self) -> None:
+        """Check the settings and make a linear layer for each task."""
+        super().__post_init__()
+        if not (self.rotation or self.location):
             raise InputError("rotation and location are both off; choose source-only instead")
-        check_positive("classification_weight", classification_weight)
-        check_positive("location_weight", location_weight)
-        check_positive("rotation_weight", rotation_weight)
-        check_positive("concentration", concentration)
-        self.on_source = on_source
-        self.curvature = curvature
-        self.classification_weight = classification_weight
-        self.location_weight = location_weight
-        self.rotation_weight = rotation_weight
-        self.concentration = concentration
-        pooled = feature_widths(model).pooled
-        self.locate = nn.Linear(pooled, CELLS) if location else None
-        self.turned_x = nn.Linear(pooled, _TURNS) if rotation else None
-        self.turned_y = nn.Linear(pooled, _TURNS) if rotation else None
+        weights = ("classification_weight", "location_weight", "rotation_weight")
+        for name in (*weights, "concentration"):
+            check_positive(name, getattr(self, name))
+        pooled = feature_widths(self.model).pooled
+        self.locate = nn.Linear(pooled, CELLS) if self.location else None
+        self.turned_x = nn.Linear(pooled, _TURNS) if self.rotation else None
+        self.turned_y = nn.Linear(pooled, _TURNS) if self.rotation else None
 
     def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of the source and the loss of each task in each domain."""
@@ -206,6 +171,6 @@ class GAST(Method):
         if self.turned_x is not None and self.turned_y is not None:
             mixed = mix_rotations(points, generator, self.concentration)
             pooled = self.features(mixed.points, domain).pooled
-            loss = rotation_loss(self.turned_x(pooled), self.turned_y(pooled), mixed)
+            loss = mixed_cross_entropy(self.turned_x(pooled), self.turned_y(pooled), mixed)
             terms[f"rotation_{domain}"] = self.rotation_weight * loss
         return terms

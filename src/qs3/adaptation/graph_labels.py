@@ -1,5 +1,7 @@
 """Pseudo labels refined on a graph of neighbouring features (NumPy and SciPy only)."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from jaxtyping import Float
 from scipy import sparse
@@ -90,27 +92,41 @@ def neighbour_graph(features: Float[np.ndarray, "m c"], k: int = 10) -> sparse.c
     """
     if k < 1:
         raise InputError(f"k must be at least 1, not {k}")
-    if not np.isfinite(features).all():
-        raise InputError("features hold NaN or infinity; the network has diverged")
+    check_features(features)
     m = len(features)
     k = min(k, m - 1)
     if k < 1:
         return sparse.csr_array((m, m))
-    rows = features.astype(np.float64)
-    length = np.linalg.norm(rows, axis=1, keepdims=True)
-    rows = np.divide(rows, length, out=np.zeros_like(rows), where=length > 0)
-    ends, weights = np.zeros((m, k), dtype=np.int64), np.zeros((m, k))
-    step = max(1, _BLOCK // m)
-    for start in range(0, m, step):
-        similar = rows[start : start + step] @ rows.T
-        own = np.arange(len(similar))
-        similar[own, start + own] = -np.inf
+    ends, weights = [], []
+    for similar in similarities(features):
         near = np.argpartition(similar, m - k, axis=1)[:, m - k :]
-        ends[start : start + step] = near
-        weights[start : start + step] = np.take_along_axis(similar, near, axis=1)
+        ends.append(near.copy())  # a view would keep the whole block
+        weights.append(np.maximum(np.take_along_axis(similar, near, axis=1), 0.0))
     starts = np.repeat(np.arange(m), k)
-    values = np.maximum(weights, 0.0).ravel()
-    directed = sparse.csr_array((values, (starts, ends.ravel())), shape=(m, m))
+    arrays = (np.concatenate(weights).ravel(), (starts, np.concatenate(ends).ravel()))
+    directed = sparse.csr_array(arrays, shape=(m, m))
     graph = sparse.csr_array(directed.maximum(directed.T))
     graph.eliminate_zeros()
     return graph
+
+
+def similarities(features: Float[np.ndarray, "m c"]) -> Iterator[Float[np.ndarray, "r m"]]:
+    """Yield the cosines of each cloud with all, −∞ with itself, a block of rows at a time.
+
+    A row of zeros has cosine 0 with all others.
+    """
+    rows = features.astype(np.float64)
+    length = np.linalg.norm(rows, axis=1, keepdims=True)
+    rows = np.divide(rows, length, out=np.zeros_like(rows), where=length > 0)
+    step = max(1, _BLOCK // len(rows))
+    for start in range(0, len(rows), step):
+        similar = rows[start : start + step] @ rows.T
+        own = np.arange(len(similar))
+        similar[own, start + own] = -np.inf
+        yield similar
+
+
+def check_features(features: Float[np.ndarray, "m c"], what: str = "features") -> None:
+    """Raise InputError where a value is not finite."""
+    if not np.isfinite(features).all():
+        raise InputError(f"{what} hold NaN or infinity; the network has diverged")

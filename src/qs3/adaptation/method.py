@@ -2,13 +2,15 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from typing import Literal, NamedTuple, TypedDict
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Generator, Tensor, nn
 
-from qs3.adaptation.normalisation import DomainNorm
+from qs3.adaptation.names import Normalisation
+from qs3.adaptation.normalisation import make_norm
 from qs3.errors import InputError
 from qs3.models import Features, PointClassifier, feature_widths
 
@@ -52,51 +54,45 @@ def cross_entropy(
     return torch.nn.functional.cross_entropy(logits, labels, label_smoothing=label_smoothing)
 
 
-class Shared(TypedDict, total=False):
-    """Settings that every method hands on to `Method`."""
-
-    label_smoothing: float
-    """ε of `cross_entropy` on the source."""
-    norm: DomainNorm | None
-    """How the network normalises the two domains; shared statistics where None."""
-
-
+@dataclass(eq=False, repr=False, kw_only=True)
 class Method(nn.Module, ABC):
     """A way to train a network on a labelled source and, maybe, an unlabelled target.
 
     A method owns the network and whatever else it trains (heads, discriminators). It never sees a
-    label of the target.
-
-    Args:
-        model: The network to train.
-        label_smoothing: ε of `cross_entropy` on the source.
-        norm: How the network normalises the two domains; shared statistics by default.
+    label of the target. Its settings are the fields of a dataclass; `__post_init__` refuses the
+    unusable ones and makes what else is trained.
 
     Raises:
-        InputError: where the method needs local features and the network has none.
+        InputError: where a setting is unusable, or the method needs local features and the network
+            has none.
     """
 
-    uses_target: bool = False
+    uses_target: ClassVar[bool] = False
     """Whether `losses` needs a batch of the target."""
-    needs_local: bool = False
+    needs_local: ClassVar[bool] = False
     """Whether the method needs ``Features.local`` of the network."""
 
-    def __init__(
-        self,
-        model: PointClassifier,
-        *,
-        label_smoothing: float = 0.0,
-        norm: DomainNorm | None = None,
-    ) -> None:
-        super().__init__()
-        if self.needs_local and feature_widths(model).local is None:
+    model: PointClassifier = field(kw_only=False)
+    """The network to train."""
+    label_smoothing: float = 0.0
+    """ε of `cross_entropy` on the source."""
+    normalisation: Normalisation = "shared"
+    """How the network normalises the two domains."""
+
+    def __new__(cls, *args: object, **settings: object):
+        """Prepare the module before its fields are set, as PyTorch asks."""
+        method = super().__new__(cls)
+        nn.Module.__init__(method)
+        return method
+
+    def __post_init__(self) -> None:
+        """Refuse unusable settings; make what else is trained."""
+        if self.needs_local and feature_widths(self.model).local is None:
             raise InputError(
                 f"{type(self).__name__} needs features of single points, which "
-                f"{type(model).__name__} does not give; choose dgcnn, pointnet or pointnet2"
+                f"{type(self.model).__name__} does not give; choose dgcnn, pointnet or pointnet2"
             )
-        self.model = model
-        self.label_smoothing = label_smoothing
-        self.norm = DomainNorm(model) if norm is None else norm
+        self.norm = make_norm(self.normalisation, self.model)
         self.right: Tensor | None = None
 
     @abstractmethod
@@ -126,6 +122,11 @@ class Method(nn.Module, ABC):
         """Return the logits of described clouds."""
         with self.norm.of(domain):
             return self.model.head(features)
+
+    def both(self, source: Batch, target: Target) -> tuple[Features, Features]:
+        """Describe a batch of each domain, the source first."""
+        assert target is not None  # noqa: S101
+        return self.features(source.points, "source"), self.features(target, "target")
 
     def logits(
         self, points: Float[Tensor, "b n 3"], domain: Domain = "source"

@@ -1,15 +1,14 @@
 """MMD: one distribution of pooled features in both domains (DAN: Long et al., ICML 2015)."""
 
 from collections.abc import Sequence
-from typing import Unpack
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from qs3.adaptation.method import Batch, Method, Shared, Target, Terms
+from qs3.adaptation.method import Batch, Method, Target, Terms
 from qs3.errors import InputError
-from qs3.models import PointClassifier
 from qs3.models.checks import check_positive, check_range
 
 FACTORS = tuple(2.0 ** (step / 2) for step in range(-16, 17))
@@ -48,7 +47,10 @@ def mmd(
     least = 1 if biased else 2
     if min(len(x), len(y)) < least:
         raise InputError(f"mmd needs samples of {least} or more, not {len(x)} and {len(y)}")
-    kernel = _gaussians(squared_distances(x, y), bandwidths)
+    squared = squared_distances(x, y)
+    kernel = torch.zeros_like(squared)
+    for sigma in bandwidths:
+        kernel = kernel + torch.exp(squared / (-2 * sigma**2))
     b = len(x)
     within = 0.0
     for square in (kernel[:b, :b], kernel[b:, b:]):
@@ -80,16 +82,6 @@ def squared_distances(x: Float[Tensor, "b c"], y: Float[Tensor, "m c"]) -> Float
         return total.clamp_min(0.0).fill_diagonal_(0.0)
 
 
-def _gaussians(
-    squared: Float[Tensor, "n n"], bandwidths: Sequence[float] | Float[Tensor, "s"]
-) -> Float[Tensor, "n n"]:
-    """Return Σ_σ exp(−d²/2σ²)."""
-    total = torch.zeros_like(squared)
-    for sigma in bandwidths:
-        total = total + torch.exp(squared / (-2 * sigma**2))
-    return total
-
-
 def median_bandwidths(
     x: Float[Tensor, "b c"], y: Float[Tensor, "m c"], factors: tuple[float, ...] = FACTORS
 ) -> Float[Tensor, "s"]:
@@ -113,46 +105,33 @@ def median_bandwidths(
         return (median * torch.tensor(factors, dtype=median.dtype, device=x.device) / 2).sqrt()
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class MMD(Method):
     """Cross entropy on the source plus the discrepancy of the pooled features' distributions.
 
     NOTE: DAN matches three layers of AlexNet, learns the kernels' mixture and estimates the
     unbiased discrepancy in linear time. Here it is the one layer that the head decides on, the
     kernels weigh alike, and the estimate takes all pairs, biased by default.
-
-    Args:
-        model: The network to train.
-        mmd_weight: Factor of the discrepancy, λ of DAN (eq. 4).
-        factors: Kernels, as multiples of the median squared distance of the batches; see
-            `median_bandwidths`.
-        biased: See `mmd`.
-        shared: Label smoothing and normalisation, as of `Method`.
-
-    Raises:
-        InputError: where a setting is unusable.
     """
 
     uses_target = True
 
-    def __init__(
-        self,
-        model: PointClassifier,
-        *,
-        mmd_weight: float = 1.0,
-        factors: tuple[float, ...] = FACTORS,
-        biased: bool = True,
-        **shared: Unpack[Shared],
-    ) -> None:
-        super().__init__(model, **shared)
-        check_range("mmd_weight", mmd_weight, 0, 1e6)
-        check_positive("factors", factors)
-        self.mmd_weight, self.factors, self.biased = mmd_weight, tuple(factors), biased
+    mmd_weight: float = 1.0
+    """Factor of the discrepancy, λ of DAN (eq. 4)."""
+    factors: tuple[float, ...] = FACTORS
+    """Kernels, as multiples of the batches' median squared distance; see `median_bandwidths`."""
+    biased: bool = True
+    """See `mmd`."""
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        super().__post_init__()
+        check_range("mmd_weight", self.mmd_weight, 0, 1e6)
+        check_positive("factors", self.factors)
 
     def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of the source and the discrepancy, mean over the kernels."""
-        assert target is not None  # noqa: S101
-        of_source = self.features(source.points, "source")
-        of_target = self.features(target, "target")
+        of_source, of_target = self.both(source, target)
         bandwidths = median_bandwidths(of_source.pooled, of_target.pooled, self.factors)
         distance = mmd(of_source.pooled, of_target.pooled, bandwidths, self.biased)
         return {

@@ -1,16 +1,15 @@
 """Point cloud mixup, PCM, alone and with DefRec (Achituve et al., WACV 2021)."""
 
-from typing import NamedTuple, Unpack
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Generator, Tensor
 
-from qs3.adaptation.deformations import Deformation
-from qs3.adaptation.defrec import Reconstruction
-from qs3.adaptation.method import Batch, Method, Shared, Target, Terms, cross_entropy
-from qs3.models import PointClassifier
+from qs3.adaptation.defrec import DefRec
+from qs3.adaptation.method import Batch, Method, Target, Terms, cross_entropy
 from qs3.models.checks import check_positive
 from qs3.models.ops import farthest_point_sampling, gather_points
 
@@ -20,8 +19,10 @@ class Mixed(NamedTuple):
 
     points: Float[Tensor, "b n 3"]
     """Points of both, in a random order."""
-    labels: Int[Tensor, "b"]
-    """Class of each second cloud; that of the first is the batch's."""
+    first: Int[Tensor, "b"]
+    """Class of the first of the two."""
+    second: Int[Tensor, "b"]
+    """Class of the second."""
     share: float
     """λ: part of the points that come from the first."""
 
@@ -101,27 +102,32 @@ def mix_clouds(
     share = draw_share(concentration, generator)
     partner = torch.randperm(len(points), generator=generator).to(points.device)
     mixed, share = mix_halves(points, points[partner], share, generator)
-    return Mixed(mixed, labels[partner], share)
+    return Mixed(mixed, labels, labels[partner], share)
 
 
 def mixed_cross_entropy(
-    logits: Float[Tensor, "b k"],
-    first: Int[Tensor, "b"],
-    second: Int[Tensor, "b"],
-    share: float,
+    of_first: Float[Tensor, "b k"],
+    of_second: Float[Tensor, "b k"],
+    mixed: Mixed,
     label_smoothing: float = 0.0,
 ) -> Float[Tensor, ""]:
     """λ times the cross entropy with the first labels plus 1 − λ times that with the second.
 
+    Args:
+        of_first: Logits for the first labels.
+        of_second: Logits for the second labels; where one layer gives both, the same.
+        mixed: The clouds that they are of.
+        label_smoothing: ε of `cross_entropy`.
+
     Example:
         >>> logits = torch.tensor([[0.0, 1.0]])
-        >>> one, two = torch.tensor([0]), torch.tensor([1])
-        >>> round(float(mixed_cross_entropy(logits, one, two, 0.25)), 4)
+        >>> mixed = Mixed(torch.zeros(1, 1, 3), torch.tensor([0]), torch.tensor([1]), 0.25)
+        >>> round(float(mixed_cross_entropy(logits, logits, mixed)), 4)
         0.5633
     """
-    return share * cross_entropy(logits, first, label_smoothing) + (1 - share) * cross_entropy(
-        logits, second, label_smoothing
-    )
+    first = cross_entropy(of_first, mixed.first, label_smoothing)
+    second = cross_entropy(of_second, mixed.second, label_smoothing)
+    return mixed.share * first + (1 - mixed.share) * second
 
 
 def mixed_classification(
@@ -133,85 +139,50 @@ def mixed_classification(
     """
     mixed = mix_clouds(batch.points, batch.labels, generator, concentration)
     logits = method.logits(mixed.points, "source")
-    larger = batch.labels if mixed.share >= 0.5 else mixed.labels
+    larger = mixed.first if mixed.share >= 0.5 else mixed.second
     method.classification(logits.detach(), Batch(mixed.points, larger))
-    return mixed_cross_entropy(
-        logits, batch.labels, mixed.labels, mixed.share, method.label_smoothing
-    )
+    return mixed_cross_entropy(logits, logits, mixed, method.label_smoothing)
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class PCM(Method):
     """Point cloud mixup on the source; the target is not used.
 
     NOTE: the labels mix as the share of points that rounding leaves, round(λ n) / n, not as λ.
-
-    Args:
-        model: The network to train.
-        concentration: γ of λ ~ Beta(γ, γ); 1 is the paper's.
-        shared: Label smoothing and normalisation, as of `Method`.
-
-    Raises:
-        InputError: where ``concentration`` is not larger than 0.
     """
 
-    def __init__(
-        self,
-        model: PointClassifier,
-        *,
-        concentration: float = 1.0,
-        **shared: Unpack[Shared],
-    ) -> None:
-        super().__init__(model, **shared)
-        check_positive("concentration", concentration)
-        self.concentration = concentration
+    concentration: float = 1.0
+    """γ of λ ~ Beta(γ, γ); 1 is the paper's."""
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        super().__post_init__()
+        check_positive("concentration", self.concentration)
 
     def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of mixed source clouds."""
         return {"pcm": mixed_classification(self, source, generator, self.concentration)}
 
 
-class DefRecPCM(Method):
+@dataclass(eq=False, repr=False, kw_only=True)
+class DefRecPCM(DefRec):
     """Classify mixed source clouds and rebuild deformed parts of target clouds.
 
     L = (1 − w) · PCM(source) + w · 20 · Chamfer(rebuilt part, original part).
 
     NOTE: all that `qs3.adaptation.defrec.DefRec` and `PCM` note holds here too.
-
-    Args:
-        model: The network to train; it must give local features.
-        deformation: As of `qs3.adaptation.defrec.DefRec`.
-        weight: w.
-        on_source: Whether source clouds are deformed and rebuilt as well.
-        dropout: Probability of dropping a hidden unit of the reconstruction head.
-        concentration: γ of λ ~ Beta(γ, γ); 1 is the paper's.
-        shared: Label smoothing and normalisation, as of `Method`.
-
-    Raises:
-        InputError: where a setting is not usable, or the network has no local features.
     """
 
-    uses_target = True
-    needs_local = True
+    concentration: float = 1.0
+    """γ of λ ~ Beta(γ, γ); 1 is the paper's."""
 
-    def __init__(
-        self,
-        model: PointClassifier,
-        *,
-        deformation: Deformation = "voxels",
-        weight: float = 0.2,
-        on_source: bool = False,
-        dropout: float = 0.5,
-        concentration: float = 1.0,
-        **shared: Unpack[Shared],
-    ) -> None:
-        super().__init__(model, **shared)
-        check_positive("concentration", concentration)
-        self.concentration = concentration
-        self.rebuild = Reconstruction(model, deformation, weight, on_source, dropout)
+    def __post_init__(self) -> None:
+        """Check the settings and make the reconstruction head."""
+        super().__post_init__()
+        check_positive("concentration", self.concentration)
 
     def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of mixed source clouds and the distance of rebuilt parts."""
-        assert target is not None  # noqa: S101
         mixed = mixed_classification(self, source, generator, self.concentration)
-        rebuilt = self.rebuild.losses(self, source.points, target, generator)
-        return {"pcm": (1 - self.rebuild.weight) * mixed, **rebuilt}
+        rebuilt = self.rebuilding(source.points, target, generator)
+        return {"pcm": (1 - self.weight) * mixed, **rebuilt}

@@ -3,15 +3,14 @@
 import copy
 import math
 from collections.abc import Iterable
-from dataclasses import replace
-from typing import Unpack
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
 from qs3.adaptation.dann import reverse_gradient
-from qs3.adaptation.method import Batch, Method, Shared, Target, Terms, cross_entropy
+from qs3.adaptation.method import Batch, Method, Target, Terms, cross_entropy
 from qs3.adaptation.mmd import mmd
 from qs3.models import Features, PointClassifier, describe_point
 from qs3.models.checks import check_positive, check_range
@@ -110,6 +109,7 @@ def fresh_head(model: PointClassifier) -> PointClassifier:
     return twin
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class PointDAN(Method):
     """Local alignment of self-adaptive nodes and global alignment by two classifiers.
 
@@ -131,72 +131,59 @@ class PointDAN(Method):
     - The source weight is 1; the authors take 0.5 where the target is ScanNet, and on ScanNet to
       ShapeNet.
 
-    Args:
-        model: The network to train; with local features or with nodes.
-        source_weight: w, factor of both cross entropies.
-        discrepancy_weight: Factor of the classifiers' discrepancy.
-        node_weight: Factor of the nodes' MMD.
-        bandwidths: σ of its kernels.
-        nodes: Nodes of a cloud; for a network without nodes, as are the next three.
-        neighbours: Points that a node looks at; at most 255.
-        radius: Of the ball that moves a node, in the unit of the points.
-        node_width: Width of a node's feature.
-        reduction: Bottleneck of the attention.
-        classifier_rate: Learning rate of the classifiers over that of everything else; published
-            are 2e-4 and 1e-4.
-        shared: Label smoothing and normalisation, as of `Method`.
-
-    Raises:
-        InputError: where a setting is unusable or the network has no local features.
     """
 
     uses_target = True
     needs_local = True
 
-    def __init__(
-        self,
-        model: PointClassifier,
-        *,
-        source_weight: float = 1.0,
-        discrepancy_weight: float = 1.0,
-        node_weight: float = 1.0,
-        bandwidths: tuple[float, ...] = (0.01, 0.1, 1.0, 10.0, 100.0),
-        nodes: int = 64,
-        neighbours: int = 64,
-        radius: float = 0.3,
-        node_width: int = 64,
-        reduction: int = 8,
-        classifier_rate: float = 2.0,
-        **shared: Unpack[Shared],
-    ) -> None:
-        super().__init__(model, **shared)
-        check_range("discrepancy_weight", discrepancy_weight, 0, 1e6)
-        check_range("node_weight", node_weight, 0, 1e6)
-        check_positive("bandwidths", bandwidths)
-        check_positive("classifier_rate", classifier_rate)
-        check_positive("source_weight", source_weight)
-        check_range("reduction", reduction)
-        self.source_weight = source_weight
-        self.discrepancy_weight, self.node_weight = discrepancy_weight, node_weight
-        self.bandwidths, self.classifier_rate = tuple(bandwidths), classifier_rate
-        self.second = fresh_head(model)
-        described = describe_point(model)
+    source_weight: float = 1.0
+    """w, factor of both cross entropies."""
+    discrepancy_weight: float = 1.0
+    """Factor of the classifiers' discrepancy."""
+    node_weight: float = 1.0
+    """Factor of the nodes' MMD."""
+    bandwidths: tuple[float, ...] = (0.01, 0.1, 1.0, 10.0, 100.0)
+    """σ of its kernels."""
+    nodes: int = 64
+    """Nodes of a cloud; for a network without nodes, as are the next three."""
+    neighbours: int = 64
+    """Points that a node looks at; at most 255."""
+    radius: float = 0.3
+    """Of the ball that moves a node, in the unit of the points."""
+    node_width: int = 64
+    """Width of a node's feature."""
+    reduction: int = 8
+    """Bottleneck of the attention."""
+    classifier_rate: float = 2.0
+    """Learning rate of the classifiers over that of everything else; published are 2e-4 and
+    1e-4."""
+
+    def __post_init__(self) -> None:
+        """Check the settings; make the second classifier, the nodes and the attention."""
+        super().__post_init__()
+        check_range("discrepancy_weight", self.discrepancy_weight, 0, 1e6)
+        check_range("node_weight", self.node_weight, 0, 1e6)
+        for name in ("bandwidths", "classifier_rate", "source_weight"):
+            check_positive(name, getattr(self, name))
+        check_range("reduction", self.reduction)
+        self.second = fresh_head(self.model)
+        described = describe_point(self.model)
         assert described.local is not None  # noqa: S101
-        channels = described.local.shape[2]
+        self.sa_node = None
         if described.nodes is None:
-            self.sa_node = SANode(channels, node_width, nodes, neighbours, radius, steered=True)
-            width = nodes * node_width
+            sizes = (described.local.shape[2], self.node_width, self.nodes, self.neighbours)
+            self.sa_node = SANode(*sizes, self.radius, steered=True)
+            width = self.nodes * self.node_width
         else:
-            self.sa_node, width = None, described.nodes[0].numel()
+            width = described.nodes[0].numel()
         self.attention = nn.ModuleDict(
-            {domain: NodeAttention(width, reduction) for domain in ("source", "target")}
+            {domain: NodeAttention(width, self.reduction) for domain in ("source", "target")}
         )
 
     def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of both classifiers, their negated discrepancy, the MMD."""
+        of_source, of_target = self.both(source, target)
         assert target is not None  # noqa: S101
-        of_source = self.features(source.points, "source")
-        of_target = self.features(target, "target")
         first = self.classification(self.head(of_source, "source"), source)
         second = cross_entropy(self.second.head(of_source), source.labels, self.label_smoothing)
         pooled = reverse_gradient(of_target.pooled, reversal_coefficient(progress))
@@ -206,8 +193,8 @@ class PointDAN(Method):
             for logits in (self.head(turned, "target"), self.second.head(turned))
         ]
         nodes = [
-            self.attention["source"](self.nodes(source.points, of_source)),
-            self.attention["target"](self.nodes(target, of_target)),
+            self.attention["source"](self.nodes_of(source.points, of_source)),
+            self.attention["target"](self.nodes_of(target, of_target)),
         ]
         return {
             "source": self.source_weight * (first + second),
@@ -215,7 +202,9 @@ class PointDAN(Method):
             "nodes": self.node_weight * mmd(nodes[0], nodes[1], self.bandwidths),
         }
 
-    def nodes(self, points: Float[Tensor, "b n 3"], features: Features) -> Float[Tensor, "b m f"]:
+    def nodes_of(
+        self, points: Float[Tensor, "b n 3"], features: Features
+    ) -> Float[Tensor, "b m f"]:
         """Return the nodes of described clouds, always as many."""
         if self.sa_node is None:
             assert features.nodes is not None  # noqa: S101

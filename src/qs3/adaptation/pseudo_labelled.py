@@ -1,39 +1,27 @@
 """Training on pseudo labels of the target, with or without the source beside them."""
 
-from typing import Unpack
+from dataclasses import dataclass
 
 import torch
 from torch import Generator, Tensor
 
-from qs3.adaptation.method import Batch, Domain, Method, Shared, Target, Terms, cross_entropy
-from qs3.models import PointClassifier
+from qs3.adaptation.method import Batch, Domain, Method, Target, Terms, cross_entropy
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class PseudoLabelled(Method):
     """Cross entropy on pseudo-labelled clouds of the target, plus that on the source.
 
     The first part of each batch is of the target, the second, where there is one, of the source.
     Each part passes through the network by itself, the source first.
-
-    Args:
-        model: The network to train.
-        source_weight: Factor of the source's loss in epoch 0; the target's is 1.
-        weight_step: Taken off both factors after each epoch (SPST: 0.005).
-        epochs: Numbers of the epochs of this training, for ``weight_step``.
-        shared: Label smoothing and normalisation, as of `Method`.
     """
 
-    def __init__(
-        self,
-        model: PointClassifier,
-        *,
-        source_weight: float = 1.0,
-        weight_step: float = 0.0,
-        epochs: range = range(1),
-        **shared: Unpack[Shared],
-    ) -> None:
-        super().__init__(model, **shared)
-        self.source_weight, self.weight_step, self.epochs = source_weight, weight_step, epochs
+    source_weight: float = 1.0
+    """Factor of the source's loss in epoch 0; the target's is 1."""
+    weight_step: float = 0.0
+    """Taken off both factors after each epoch (SPST: 0.005)."""
+    epochs: range = range(1)
+    """Numbers of the epochs of this training, for ``weight_step``."""
 
     def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the weighted cross entropies, ``pseudo`` and ``source``."""

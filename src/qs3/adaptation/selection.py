@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from qs3.adaptation.names import Selection, SingleClass
 from qs3.adaptation.priors import check_prior, check_probabilities
 from qs3.errors import InputError
+from qs3.models.checks import check_range
 
 
 class SingleClassWarning(UserWarning):
@@ -42,8 +43,7 @@ def select_confident(
         [True, False]
     """
     check_probabilities(probabilities)
-    if not 0.0 <= threshold <= 1.0:
-        raise InputError(f"threshold must be 0 to 1, not {threshold}")
+    check_range("threshold", threshold, 0, 1)
     confidence = probabilities.max(axis=1)
     return confidence >= threshold if inclusive else confidence > threshold
 
@@ -128,7 +128,7 @@ def select_uniform(
         >>> select_uniform(np.stack([p, 1 - p], axis=1), 0.8).tolist()
         [False, True, False, True]
     """
-    _check_share("quantile", quantile)
+    check_range("quantile", quantile, 0, 1)
     confident = select_confident(probabilities, threshold, inclusive=inclusive)
     counts = count_labels(probabilities, confident)
     present = counts[counts > 0]
@@ -168,7 +168,7 @@ def select_prior(
         >>> select_prior(rows, 0.7, np.array([0.5, 0.5])).tolist()
         [False, True, False, True, True, True]
     """
-    _check_share("quantile", quantile)
+    check_range("quantile", quantile, 0, 1)
     share = check_prior("prior", prior, probabilities.shape[1])
     confident = select_confident(probabilities, threshold, inclusive=inclusive)
     counts = count_labels(probabilities, confident)
@@ -211,7 +211,7 @@ def select_quantile(
         >>> select_quantile(np.stack([p, 1 - p], axis=1), 0.0, 0.5).tolist()
         [True, False, True, False, True]
     """
-    _check_share("share", share)
+    check_range("share", share, 0, 1)
     confident = select_confident(probabilities, threshold, inclusive=inclusive)
     counts = count_labels(probabilities, np.ones(len(probabilities), dtype=bool))
     # The share is meant as it is written: 0.07 of 100 is 7, not 8.
@@ -262,8 +262,3 @@ def balanced_count(members: int, total: int) -> int:
         6
     """
     return -(-members * (total - members) // total)
-
-
-def _check_share(name: str, value: float) -> None:
-    if not 0.0 <= value <= 1.0:
-        raise InputError(f"{name} must be 0 to 1, not {value}")

@@ -2,22 +2,19 @@
 
 import copy
 import math
-from typing import Unpack
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
 from qs3.adaptation import distortions
-from qs3.adaptation.method import Batch, Domain, Method, Shared, Target, Terms
+from qs3.adaptation.method import Batch, Domain, Method, Target, Terms
 from qs3.errors import InputError
-from qs3.models import PointClassifier
 from qs3.models.checks import check_positive, check_range
 
 _ELASTIC = ((0.2, 0.4), (0.8, 1.6))
 """Grain and strength of the strong view's two elastic distortions, as in the released code."""
-_LARGEST = 1e6
-"""No weight or length of this method makes sense beyond."""
 
 
 def distillation_loss(
@@ -55,6 +52,7 @@ def ramp(progress: float) -> float:
     return math.exp(-5.0 * (1.0 - progress) ** 2)
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class SelfDistillation(Method):
     """The student learns to see in a distorted cloud what its teacher sees in the plain one.
 
@@ -83,62 +81,46 @@ class SelfDistillation(Method):
     - The features are those of our networks: DGCNN's maximum and mean, where theirs is the maximum.
     - Optimiser and learning rate are those of the training settings (theirs: AdamW, one cycle).
 
-    Args:
-        model: The network to train, the student.
-        weight: Of the distillation, at the end of its growth.
-        student_temperature: τ_s of `distillation_loss`.
-        teacher_temperature: τ_t.
-        decay: Largest decay of the teacher's average.
-        source_keep: Share of a source cloud's points that the cut of the strong view leaves.
-        target_keep: The same on the target.
-        distortion: Factor on the elastic distortions; 0 leaves them out.
-        scale: Bounds of the strong view's scaling.
-        tilt: Standard deviation of small turns in the strong view, in radians; 0 leaves them out,
-            as the released code does.
-        sigma: Standard deviation of the jitter of both views, cut at five times it.
-        shared: Label smoothing and normalisation, as of `Method`.
-
-    Raises:
-        InputError: where a setting is unusable.
     """
 
     uses_target = True
 
-    def __init__(
-        self,
-        model: PointClassifier,
-        *,
-        weight: float = 1.0,
-        student_temperature: float = 0.5,
-        teacher_temperature: float = 0.1,
-        decay: float = 0.999,
-        source_keep: float = 0.7,
-        target_keep: float = 1.0,
-        distortion: float = 1.0,
-        scale: tuple[float, float] = (0.7, 1.5),
-        tilt: float = 0.0,
-        sigma: float = 0.01,
-        **shared: Unpack[Shared],
-    ) -> None:
-        super().__init__(model, **shared)
-        check_range("weight", weight, 0, _LARGEST)
-        check_range("distortion", distortion, 0, _LARGEST)
-        check_range("tilt", tilt, 0, _LARGEST)
-        check_range("sigma", sigma, 0, _LARGEST)
-        check_positive("student_temperature", student_temperature)
-        check_positive("teacher_temperature", teacher_temperature)
-        check_positive("scale", scale)
-        for name, keep in (("source_keep", source_keep), ("target_keep", target_keep)):
-            check_positive(name, keep)
-            check_range(name, keep, 0, 1)
-        if not 0.0 <= decay < 1.0:
-            raise InputError(f"decay must be 0 to below 1, not {decay}")
-        if scale[0] > scale[1]:
-            raise InputError(f"scale must be two bounds in order, not {scale}")
-        self.weight, self.decay = weight, decay
-        self.temperatures = (student_temperature, teacher_temperature)
-        self.keep = {"source": source_keep, "target": target_keep}
-        self.distortion, self.scale, self.tilt, self.sigma = distortion, scale, tilt, sigma
+    weight: float = 1.0
+    """Of the distillation, at the end of its growth."""
+    student_temperature: float = 0.5
+    """τ_s of `distillation_loss`."""
+    teacher_temperature: float = 0.1
+    """τ_t."""
+    decay: float = 0.999
+    """Largest decay of the teacher's average."""
+    source_keep: float = 0.7
+    """Share of a source cloud's points that the cut of the strong view leaves."""
+    target_keep: float = 1.0
+    """The same on the target."""
+    distortion: float = 1.0
+    """Factor on the elastic distortions; 0 leaves them out."""
+    scale: tuple[float, float] = (0.7, 1.5)
+    """Bounds of the strong view's scaling."""
+    tilt: float = 0.0
+    """Standard deviation of small turns in the strong view, in radians; 0 leaves them out, as the
+    released code does."""
+    sigma: float = 0.01
+    """Standard deviation of the jitter of both views, cut at five times it."""
+
+    def __post_init__(self) -> None:
+        """Check the settings and make the teacher."""
+        super().__post_init__()
+        for name in ("weight", "distortion", "tilt", "sigma"):
+            check_range(name, getattr(self, name), 0, 1e6)
+        for name in ("student_temperature", "teacher_temperature", "scale"):
+            check_positive(name, getattr(self, name))
+        for name in ("source_keep", "target_keep"):
+            check_positive(name, getattr(self, name))
+            check_range(name, getattr(self, name), 0, 1)
+        if not 0.0 <= self.decay < 1.0:
+            raise InputError(f"decay must be 0 to below 1, not {self.decay}")
+        if self.scale[0] > self.scale[1]:
+            raise InputError(f"scale must be two bounds in order, not {self.scale}")
         # Copied together, so that the teacher's normalisation looks after the teacher's layers.
         self.teacher, self.teacher_norm = copy.deepcopy((self.model, self.norm))
         self.teacher.requires_grad_(False)
@@ -151,13 +133,14 @@ class SelfDistillation(Method):
         goals, pooled, logits = [], [], None
         domains: tuple[tuple[Domain, Tensor], ...] = (("source", source.points), ("target", target))
         for domain, points in domains:
-            goals.append(self._describe(self._weak(points, generator), domain))
+            goals.append(self._describe(self._jitter(points, generator), domain))
             features = self.features(self._strong(points, domain, generator), domain)
             pooled.append(features.pooled)
             if domain == "source":
                 logits = self.head(features, domain)
         assert logits is not None  # noqa: S101
-        distance = distillation_loss(torch.cat(pooled), torch.cat(goals), *self.temperatures)
+        temperatures = self.student_temperature, self.teacher_temperature
+        distance = distillation_loss(torch.cat(pooled), torch.cat(goals), *temperatures)
         return {
             "source": self.classification(logits, source),
             "distillation": self.weight * ramp(progress) * distance,
@@ -183,7 +166,7 @@ class SelfDistillation(Method):
         with self.teacher_norm.of(domain):
             return self.teacher.encode(points).pooled
 
-    def _weak(self, points: Tensor, generator: Generator) -> Tensor:
+    def _jitter(self, points: Tensor, generator: Generator) -> Tensor:
         return distortions.jitter(points, generator, self.sigma, 5 * self.sigma)
 
     def _strong(self, points: Tensor, domain: Domain, generator: Generator) -> Tensor:
@@ -193,7 +176,6 @@ class SelfDistillation(Method):
             for grain, strength in _ELASTIC:
                 points = distortions.elastic(points, generator, grain, self.distortion * strength)
         points = distortions.rescale(points, generator, *self.scale)
-        points = distortions.jitter(points, generator, self.sigma, 5 * self.sigma)
-        if self.keep[domain] < 1:
-            points = distortions.occlude(points, generator, self.keep[domain])
-        return points
+        points = self._jitter(points, generator)
+        keep = self.source_keep if domain == "source" else self.target_keep
+        return points if keep == 1 else distortions.occlude(points, generator, keep)

@@ -14,11 +14,9 @@ from jaxtyping import Float, Int
 from scipy.special import xlogy
 
 from qs3.adaptation.density import density_ratio
+from qs3.adaptation.graph_labels import check_features, similarities
 from qs3.adaptation.priors import check_probabilities
 from qs3.errors import InputError
-
-_BLOCK = 2**22
-"""Similarities that are held at a time."""
 
 
 @dataclass(frozen=True)
@@ -111,25 +109,19 @@ def snd(features: Float[np.ndarray, "m c"], temperature: float = 0.05) -> float:
     """
     if not (temperature > 0 and np.isfinite(temperature)):
         raise InputError(f"temperature must be a positive number, not {temperature}")
-    rows = _check_features(features, "features")
-    m = len(rows)
-    if m == 1:
+    rows = _checked(features, "features")
+    if len(rows) == 1:
         return 0.0
-    length = np.linalg.norm(rows, axis=1, keepdims=True)
-    rows = np.divide(rows, length, out=np.zeros_like(rows), where=length > 0)
-    total, step = 0.0, max(1, _BLOCK // m)
-    for start in range(0, m, step):
-        similar = rows[start : start + step] @ rows.T
-        own = np.arange(len(similar))
-        similar[own, start + own] = -np.inf
+    total = 0.0
+    for similar in similarities(rows):
         similar -= similar.max(axis=1, keepdims=True)
         similar /= temperature
         share = np.exp(similar)
-        similar[own, start + own] = 0.0
+        similar[share == 0] = 0.0  # of a cloud with itself, which has no part in the mean
         whole = share.sum(axis=1)
         # The entropy of exp(l) / Z is ln Z minus the mean of l.
         total += float((np.log(whole) - np.einsum("ij,ij->i", share, similar) / whole).sum())
-    return total / m
+    return total / len(rows)
 
 
 def controlled_risk(weights: Float[np.ndarray, "v"], errors: Float[np.ndarray, "v"]) -> float:
@@ -168,9 +160,9 @@ def dev(
         InputError: where a set is empty, or a value is not finite.
     """
     _check(validation_probabilities)
-    source = _check_features(training_features, "training features")
-    target = _check_features(target_features, "target features")
-    points = _check_features(validation_features, "validation features")
+    source = _checked(training_features, "training features")
+    target = _checked(target_features, "target features")
+    points = _checked(validation_features, "validation features")
     weights = density_ratio(source, target, points)
     wrong = validation_probabilities.argmax(axis=1) != validation_labels
     return -controlled_risk(weights, wrong.astype(np.float64))
@@ -202,7 +194,7 @@ def class_ami(
     from sklearn.cluster import KMeans
     from sklearn.metrics import adjusted_mutual_info_score
 
-    rows = _check_features(features, "features")
+    rows = _checked(features, "features")
     if k < 1:
         raise InputError(f"k must be at least 1, not {k}")
     if len(np.unique(predicted)) < 2:
@@ -240,42 +232,37 @@ def _check(probabilities: np.ndarray) -> None:
     check_probabilities(probabilities)
 
 
-def _check_features(features: np.ndarray, what: str) -> np.ndarray:
+def _checked(features: np.ndarray, what: str) -> np.ndarray:
     if len(features) == 0:
         raise InputError(f"{what}: there are no clouds to score")
-    if not np.isfinite(features).all():
-        raise InputError(f"{what} hold NaN or infinity; the network has diverged")
+    check_features(features, what)
     return features.astype(np.float64)
 
 
-def _source_val(seen: Observation) -> float | None:
-    if seen.validation_probabilities is None or seen.validation_labels is None:
-        return None
-    return source_accuracy(seen.validation_probabilities, seen.validation_labels)
+def _of(score: Callable[..., float], *names: str) -> Callable[[Observation], float | None]:
+    """Return a score as a function of what is seen; None where part of that is not there."""
+
+    def of_seen(seen: Observation) -> float | None:
+        values = [getattr(seen, name) for name in names]
+        return None if any(value is None for value in values) else score(*values)
+
+    return of_seen
 
 
-def _dev(seen: Observation) -> float | None:
-    source, points = seen.training_features, seen.validation_features
-    probabilities, labels = seen.validation_probabilities, seen.validation_labels
-    if source is None or points is None or probabilities is None or labels is None:
-        return None
-    return dev(source, seen.target_features, points, probabilities, labels)
-
-
-def _class_ami(seen: Observation) -> float:
-    predicted = seen.target_probabilities.argmax(axis=1)
-    return class_ami(seen.target_features, predicted, seen.target_probabilities.shape[1])
-
-
+_HELD = ("validation_probabilities", "validation_labels")
 VALIDATORS: Mapping[str, Callable[[Observation], float | None]] = MappingProxyType(
     {
-        "source-val": _source_val,
-        "entropy": lambda seen: entropy(seen.target_probabilities),
-        "im": lambda seen: information_maximisation(seen.target_probabilities),
-        "bnm": lambda seen: bnm(seen.target_probabilities),
-        "snd": lambda seen: snd(seen.target_probabilities),
-        "dev": _dev,
-        "class-ami": _class_ami,
+        "source-val": _of(source_accuracy, *_HELD),
+        "entropy": _of(entropy, "target_probabilities"),
+        "im": _of(information_maximisation, "target_probabilities"),
+        "bnm": _of(bnm, "target_probabilities"),
+        "snd": _of(snd, "target_probabilities"),
+        "dev": _of(dev, "training_features", "target_features", "validation_features", *_HELD),
+        "class-ami": _of(
+            lambda features, p: class_ami(features, p.argmax(axis=1), p.shape[1]),
+            "target_features",
+            "target_probabilities",
+        ),
     }
 )
 """Every label-free score by its name; ``last`` needs none, and the oracle is not one of them."""

@@ -3,7 +3,7 @@
 import statistics
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 
@@ -59,80 +59,57 @@ class Step:
             torch.cuda.synchronize(self.device)
 
 
-def device_of(settings: TrainSettings) -> torch.device:
-    """Return the device that a training with these settings takes."""
-    cuda = settings.accelerator != "cpu" and torch.cuda.is_available()
-    return torch.device("cuda" if cuda else "cpu")
-
-
 def step_seconds(runs: Iterable[Run], settings: TrainSettings, steps: int = 2) -> dict[str, float]:
     """Return the median seconds of a step of each method of some runs of one network.
 
     The first step, on few points, warms up and is not counted.
     """
+    cuda = settings.accelerator != "cpu" and torch.cuda.is_available()
+    device = torch.device("cuda" if cuda else "cpu")
+    names = ["source-only", *(split_method(run.kind.method)[0] for run in runs)]
     threads = torch.get_num_threads()
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)
     try:
         seconds = {}
-        for name in methods_of(runs):
-            few = replace(settings, num_points=64, batch_size=4)
-            Step(name, few, device_of(settings))()
-            step = Step(name, settings, device_of(settings))
+        for name in dict.fromkeys(names):
+            Step(name, replace(settings, num_points=64, batch_size=4), device)()
+            step = Step(name, settings, device)
             seconds[name] = statistics.median(step() for _ in range(steps))
         return seconds
     finally:
         torch.set_num_threads(threads)
 
 
-@dataclass(frozen=True)
-class Counts:
-    """Clouds that a run reads."""
-
-    source: int
-    """Labelled clouds."""
-    target: int
-    """Clouds to adapt to."""
-    test: int
-    """Clouds to score on."""
-
-
-def methods_of(runs: Iterable[Run]) -> list[str]:
-    """Return the methods whose steps a grid takes, each once."""
-    return list(dict.fromkeys(["source-only", *(split_method(run.kind.method)[0] for run in runs)]))
-
-
 def run_seconds(
-    run: Run, counts: Counts, steps: Mapping[str, float], only_scores: bool = False
+    run: Run,
+    clouds: tuple[int, int, int],
+    steps: Mapping[str, float],
+    only_scores: bool = False,
 ) -> float:
     """Estimate the seconds of a run; a round is taken to keep every cloud of the target.
 
     Args:
         run: The run.
-        counts: Clouds that it reads.
+        clouds: Numbers of clouds to learn from, to adapt to, to score on.
         steps: Seconds of a step by method.
         only_scores: Whether its network is there, and nothing but its scores is missing.
     """
-    settings = run.train
-    base = split_method(run.kind.method)[0]
-    size = settings.batch_size
-    trained = counts.source - int(settings.holdout * counts.source)
-    looks = 1
-    seconds = 0.0
+    settings, rounds, (source, target, test) = run.train, run.self_training, clouds
+    base, size, plain = split_method(run.kind.method)[0], settings.batch_size, steps["source-only"]
     if only_scores:
-        return counts.test / size * _PASS * steps["source-only"]
+        return test / size * _PASS * plain
+    looks, seconds = 1, 0.0
     if not run.kind.warm_up:
-        batches = count_batches(trained, size)
+        batches = count_batches(source - int(settings.holdout * source), size)
         if method_class(base).uses_target:
-            batches = max(batches, count_batches(counts.target, size))
+            batches = max(batches, count_batches(target, size))
         seconds += settings.epochs * batches * steps[base]
         if settings.validate_every:
             looks = -(-settings.epochs // settings.validate_every)
-    if run.self_training is not None:
-        rounds = run.self_training
-        parts = 2 if rounds.source_loss else 1
-        batches = rounds.steps_per_epoch or count_batches(counts.target, size)
-        seconds += rounds.rounds * rounds.epochs * batches * parts * steps["source-only"]
+    if rounds is not None:
+        batches = rounds.steps_per_epoch or count_batches(target, size)
+        domains = 2 if rounds.source_loss else 1
+        seconds += rounds.rounds * rounds.epochs * batches * domains * plain
         looks = 2 * rounds.rounds
-    seen = looks * (counts.source + counts.target + counts.test) / size
-    return seconds + seen * _PASS * steps["source-only"]
+    return seconds + looks * sum(clouds) / size * _PASS * plain

@@ -1,6 +1,7 @@
 """Data of the tables: sources, and targets of other meshes under another sensor."""
 
 import hashlib
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -58,7 +59,7 @@ def choose_meshes(scale: Scale, shared: Path | None) -> Sides:
     folder = None if shared is None else shared / "cad"
     if folder is not None and folder.is_dir():
         files = collect(folder, classes="pointda10")
-        counts = {name: sum(item.class_name == name for item in files) for name in shapes.CLASSES}
+        counts = Counter(item.class_name for item in files)
         for item in files:
             if counts[item.class_name] >= _LEAST:
                 assert item.path is not None  # noqa: S101

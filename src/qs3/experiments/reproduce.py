@@ -89,7 +89,7 @@ def products(
     if not setup.seeds:
         raise InputError("--seeds: name at least one")
     made: list[Product] = []
-    known: dict[str, set[str]] = {"methods": set(), "tasks": set()}
+    choices: dict[str, set[str]] = {"methods": set(), "tasks": set()}
     for name in names:
         if name == GALLERIES:
             from qs3.experiments.galleries import Galleries
@@ -97,10 +97,10 @@ def products(
             made.append(Galleries(setup))
             continue
         experiment = load_experiment(name)
-        known["methods"] |= {row.key for row in experiment.rows(setup.scale)}
-        known["tasks"] |= {column.key for column in experiment.columns(setup.scale)}
+        choices["methods"] |= {row.key for row in experiment.rows(setup.scale)}
+        choices["tasks"] |= {column.key for column in experiment.columns(setup.scale)}
         made.append(Table(name, setup, tuple(rows), tuple(columns) or _at_hand(name, setup)))
-    for option, keys in known.items():
+    for option, keys in choices.items():
         for key in given[option]:
             if key not in keys:
                 raise InputError(f"--{option} {key}: choose from {', '.join(sorted(keys))}")
@@ -111,11 +111,7 @@ def _at_hand(name: str, setup: Setup) -> tuple[str, ...]:
     """Return the usual columns, those on real objects only where there are any."""
     real = setup.shared is not None and (setup.shared / REAL).is_file()
     columns = Table(name, setup).headings()[1]
-    return tuple(
-        column.key
-        for column in columns
-        if real or column.fields.get("target", Domain("D")).kind != "R"
-    )
+    return tuple(c.key for c in columns if real or c.fields.get("target") != Domain("R"))
 
 
 def collect_runs(products: Sequence[Product]) -> list[Run]:
@@ -222,7 +218,7 @@ def measure(
     Returns:
         Seconds on one core or device: of all scans, and of each run by its name.
     """
-    from qs3.experiments.cost import Counts, run_seconds, step_seconds
+    from qs3.experiments.cost import run_seconds, step_seconds
     from qs3.store.plan import estimate
 
     steps = {
@@ -238,8 +234,8 @@ def measure(
         # One training of the source alone serves several test sets.
         again = run.folder in trained
         trained.add(run.folder)
-        counts = Counts(source, target, test)
-        expected[run.name] = run_seconds(run, counts, steps[run.network], only_scores=again)
+        clouds = (source, target, test)
+        expected[run.name] = run_seconds(run, clouds, steps[run.network], only_scores=again)
     absent = [
         plan for name, plan in plans.items() if not (setup.out / DATA / name / MANIFEST).is_file()
     ]

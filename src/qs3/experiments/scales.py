@@ -137,57 +137,47 @@ _SIMPLEVIEW: Mapping[str, Any] = {
 """SimpleView's protocol of training, which the paper's main table follows. Below ``small`` there
 are too few epochs for a plateau to be seen."""
 
+_SMOKE = Scale(
+    name="smoke",
+    source_per_class=8,
+    target_per_class=4,
+    test_per_class=3,
+    source_views=2,
+    data_points=512,
+    train=TrainSettings(
+        model="dgcnn",
+        model_settings=_NARROW["dgcnn"],
+        num_points=256,
+        epochs=12,
+        batch_size=16,
+        learning_rate=2e-3,
+        validate_every=4,
+    ),
+    # Networks of so few clouds are seldom sure.
+    rounds={"threshold": 0.4, "rounds": 3, "epochs": 2},
+    tasks=("M-D", "S-D"),
+    networks=_NARROW,
+    fused_views=(1, 2, 4, 8),
+    thetas=(0.3, 0.4, 0.5),
+    steps=(0.0, 0.005, 0.02),
+    pointda10=("ordinary", "pointdan", "qbst-paper"),
+)
+
 SCALES: Mapping[ScaleName, Scale] = {
     # One seed of M-D and S-D takes about a quarter of an hour on one core.
-    "smoke": Scale(
-        name="smoke",
-        source_per_class=8,
-        target_per_class=4,
-        test_per_class=3,
-        source_views=2,
-        data_points=512,
-        train=TrainSettings(
-            model="dgcnn",
-            model_settings=_NARROW["dgcnn"],
-            num_points=256,
-            epochs=12,
-            batch_size=16,
-            learning_rate=2e-3,
-            validate_every=4,
-        ),
-        # Networks of so few clouds are seldom sure.
-        rounds={"threshold": 0.4, "rounds": 3, "epochs": 2},
-        tasks=("M-D", "S-D"),
-        networks=_NARROW,
-        fused_views=(1, 2, 4, 8),
-        thetas=(0.3, 0.4, 0.5),
-        steps=(0.0, 0.005, 0.02),
-        pointda10=("ordinary", "pointdan", "qbst-paper"),
-    ),
+    "smoke": _SMOKE,
     # Networks that learn something, in a few hours of one core; below the floor all the same.
-    "laptop": Scale(
+    "laptop": replace(
+        _SMOKE,
         name="laptop",
         source_per_class=16,
         target_per_class=6,
         test_per_class=6,
         source_views=3,
-        data_points=512,
-        train=TrainSettings(
-            model="dgcnn",
-            model_settings=_NARROW["dgcnn"],
-            num_points=256,
-            epochs=24,
-            batch_size=16,
-            learning_rate=2e-3,
-            validate_every=8,
-        ),
+        train=replace(_SMOKE.train, epochs=24, validate_every=8),
         rounds={"threshold": 0.6, "rounds": 4, "epochs": 3},
-        tasks=("M-D", "S-D"),
-        networks=_NARROW,
         fused_views=(1, 2, 3, 5, 8),
         thetas=(0.5, 0.6, 0.7, 0.8),
-        steps=(0.0, 0.005, 0.02),
-        pointda10=("ordinary", "pointdan", "qbst-paper"),
     ),
     "small": Scale(
         name="small",

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from qs3.errors import InputError
-from qs3.experiments.domains import DomainData, Own, Part, own_data
+from qs3.experiments.domains import DomainData, Own, own_data
 from qs3.experiments.scales import Scale
 from qs3.files import claim_folder, read_json, write_json
 from qs3.io.clouds import CloudKind
@@ -127,21 +127,13 @@ def read_setup(folder: Path) -> Setup:
 
 def _own_record(own: DomainData, scale: Scale) -> OwnRecord:
     """Return what the user's data are known by; reading them tells early what is wrong."""
-    train, test = own.train, own.test
-    assert test is not None and isinstance(train.data, Path)  # noqa: S101
-    return OwnRecord(
-        name=train.data.name,
-        cloud=train.cloud,
-        train_split=train.split,
-        test_split=test.split,
-        train=_checksum(train, scale),
-        test=_checksum(test, scale),
-    )
-
-
-def _checksum(part: Part, scale: Scale) -> str:
     from qs3.io import load_clouds
 
-    assert isinstance(part.data, Path)  # noqa: S101
-    points = scale.train.num_points
-    return load_clouds(part.data, split=part.split, cloud=part.cloud, num_points=points).checksum
+    train, test = own.train, own.test
+    assert test is not None and isinstance(train.data, Path)  # noqa: S101
+    path, cloud, points = train.data, train.cloud, scale.train.num_points
+    sums = [
+        load_clouds(path, split=part.split, cloud=cloud, num_points=points).checksum
+        for part in (train, test)
+    ]
+    return OwnRecord(path.name, cloud, train.split, test.split, *sums)

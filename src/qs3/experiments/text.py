@@ -97,10 +97,10 @@ def _scores(filled: FilledTable, score: str, with_published: bool = False) -> pd
         head.append(f"{column.title}, %")
         for line, place in zip(body, places, strict=True):
             line.append(_value(filled, place, score))
-        told = [_published(filled, place) for place in places]
-        if with_published and any(told):
+        cells = [_published(filled, place) for place in places]
+        if with_published and any(cells):
             head.append("paper")
-            for line, text in zip(body, told, strict=True):
+            for line, text in zip(body, cells, strict=True):
                 line.append(text or "–")
     return pd.DataFrame(body, columns=head)
 
@@ -208,17 +208,19 @@ def _intro(filled: FilledTable) -> list[str]:
     train = runs[0].train  # the same for all but for network and seed
     sources = [run.source for run in runs if run.row != SUPERVISED]
     data = [data_of(domain, own) for domain in dict.fromkeys([*sources, *(r.target for r in runs)])]
-    made = any(one.train.data == DataSet("source") for one in data)
+    made = any(domain.train.data == DataSet("source") for domain in data)
     objects = f", {scale.source_per_class} objects a class of M and S" if made else ""
     text = [
         f"Scale {scale.name}{objects}: {train.num_points} points, "
         f"{train.epochs} epochs, batches of {train.batch_size}, schedule {train.schedule}; "
         f"seeds {', '.join(map(str, setup.seeds))}. Per cent, mean ± standard error "
         "(ddof = 1) over n seeds, from the records alone; the network is the last epoch's.",
-        " ".join(["; ".join(one.title for one in data) + ".", *_scored(filled)]),
+        " ".join(["; ".join(domain.title for domain in data) + ".", *_scored(filled)]),
     ]
     stand_ins = [
-        f"{one.title.partition(':')[0]} for {one.stands_for}" for one in data if one.stands_for
+        f"{domain.title.partition(':')[0]} for {domain.stands_for}"
+        for domain in data
+        if domain.stands_for
     ]
     if stand_ins:
         text.append(

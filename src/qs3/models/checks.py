@@ -41,8 +41,8 @@ def read_settings(
 def _table(kind: type, fixed: tuple[str, ...]) -> type:
     """Return a dataclass with the settings of a class as its fields."""
     hints = get_type_hints(kind.__init__)
-    parameters = inspect.signature(kind).parameters.values()
-    names = [p.name for p in parameters if p.kind is not p.VAR_KEYWORD and p.name not in fixed]
+    own = list(inspect.signature(kind.__init__).parameters.values())[1:]
+    names = [p.name for p in own if p.kind is not p.VAR_KEYWORD and p.name not in fixed]
     fields = [(name, hints[name], dataclasses.field(default=None)) for name in names]
     return dataclasses.make_dataclass(kind.__name__, fields, frozen=True)
 

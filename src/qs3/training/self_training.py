@@ -15,7 +15,6 @@ from torch import Tensor
 
 from qs3.adaptation import Method, PseudoLabelled
 from qs3.adaptation.graph_labels import refine_probabilities
-from qs3.adaptation.normalisation import make_norm
 from qs3.adaptation.selection import select_confident
 from qs3.errors import InputError
 from qs3.evaluation.metrics import accuracy
@@ -311,7 +310,7 @@ def _train_round(
         weight_step=rounds.weight_step,
         epochs=range(first, first + rounds.epochs),
         label_smoothing=settings.label_smoothing,
-        norm=make_norm("shared" if plain else "separate", state.latest),
+        normalisation="shared" if plain else "separate",
     )
 
     best = state.best

@@ -1,7 +1,6 @@
 """What each switch of QBST is worth, S → D; all else as in the bench of adaptation.
 
 Not in the paper, whose text and released code differ in these switches (`qs3.training.config`).
-Command: ``qs3 reproduce adaptation-ablation --out DIR`` (``--dry-run`` prints counts and hours).
 """
 
 from qs3.experiments.experiment import Experiment, lines, tasks

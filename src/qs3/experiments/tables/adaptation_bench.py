@@ -1,7 +1,6 @@
 """The bench of adaptation: every method on scans and on surfaces, by every rule of selection.
 
 Paper: main table of adaptation methods of QS³ (ECCV 2022), whose figures stand beside ours.
-Command: ``qs3 reproduce adaptation-bench --out DIR`` (``--dry-run`` prints counts and hours).
 """
 
 from qs3.experiments.experiment import Experiment, lines, tasks

@@ -1,7 +1,6 @@
 """Networks without adaptation: does training on scans beat training on surfaces?
 
 Paper: QS³ (ECCV 2022), main table of ordinary classification, Sim2Real: M→D, S→D, M→S*, S→S*.
-Command: ``qs3 reproduce ordinary --out DIR`` (``--dry-run`` prints the hours on this machine).
 Published: S over M on D +12.5, +17.3, +4.2, +7.7 points for the four networks.
 """
 

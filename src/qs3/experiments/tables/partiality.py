@@ -3,7 +3,6 @@
 Not in the paper, which compares whole surfaces with noisy one-sided scans and cannot tell them
 apart. Here: samples of the whole surface; the noise-free one-sided twins; the noisy one-sided scans
 (the released code's five poses of one side); noisy scans from all around.
-Command: ``qs3 reproduce partiality --out DIR`` (``--dry-run`` prints the hours on this machine).
 """
 
 from qs3.experiments.domains import Domain

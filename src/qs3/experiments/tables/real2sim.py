@@ -1,7 +1,6 @@
 """Networks trained on the target and scored on simulations: which simulation is closer?
 
 Paper: QS³ (ECCV 2022), supplement, Table 1 (Real2Sim): D→M and D→S for four networks.
-Command: ``qs3 reproduce real2sim --out DIR`` (``--dry-run`` prints the hours on this machine).
 Published: D→S over D→M +14.9, +11.4, +13.0, +5.0 points.
 """
 

@@ -1,7 +1,6 @@
 """Does a classifier trained on one sensor's scans work on another's?
 
 Not in the paper. One view of the same meshes by each sensor; scored on other meshes.
-Command: ``qs3 reproduce sensors --out DIR`` (``--dry-run`` prints the hours on this machine).
 """
 
 import itertools

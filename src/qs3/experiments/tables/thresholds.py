@@ -3,7 +3,6 @@
 Paper: QS³ (ECCV 2022), supplement, Fig. 2: accuracy over θ₀ and over ε, sources M and S, target D.
 The figure has no printed numbers: best at θ₀ = 0.8 and ε = 0.005, and S above M throughout. The
 grid of values here is ours.
-Command: ``qs3 reproduce thresholds --out DIR`` (``--dry-run`` prints the hours on this machine).
 """
 
 from qs3.experiments.domains import Domain

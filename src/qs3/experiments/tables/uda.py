@@ -1,7 +1,6 @@
 """Methods of adaptation, as the paper compares them.
 
 Paper: QS³ (ECCV 2022), main table of adaptation and supplement, Table 2: M→D, S→D, S→S*, DGCNN.
-Command: ``qs3 reproduce uda --out DIR`` (``--dry-run`` prints the hours on this machine).
 Published: QBST 66.4 on M→D; QS³ 72.4 on S→D and 57.4 on S→S*, 8.4 and 6.3 over no adaptation.
 
 QBST has the settings of the paper's text here (preset ``paper``); the bench of adaptation

@@ -2,7 +2,6 @@
 
 Paper: QS³ (ECCV 2022), supplement, Fig. 1: accuracy of S→D over the number of fused views, four
 networks. The figure has no printed numbers: more views are better, and the paper takes five.
-Command: ``qs3 reproduce views --out DIR`` (``--dry-run`` prints the hours on this machine).
 """
 
 from qs3.experiments.domains import Domain
