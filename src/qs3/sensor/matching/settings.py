@@ -148,7 +148,9 @@ def matching_margin(settings: MatchingSettings) -> int:
 
     For ``opencv-bm``: half a block, the Sobel filter, a spare row, because OpenCV's Sobel filter
     takes rows in pairs and blanks a last odd one. For ``zncc``: half a block, half the median
-    filter, and ``min_region``: a connected region that leaves such a margin is not small.
+    filter, and ``min_region``: a connected region that leaves such a margin is not small. For
+    ``ad-census`` also the support, the census window and half a block of each further correction;
+    its scanlines reach further, ever more faintly.
     """
     half = settings.block_size // 2
     if settings.method == "opencv-bm":
@@ -157,6 +159,7 @@ def matching_margin(settings: MatchingSettings) -> int:
     if settings.method == "ad-census":
         own = settings.ad_census
         margin += own.arm + max(own.census_width, own.census_height) // 2
+        margin += half * max(0, own.corrections - 1)
     return margin
 
 
