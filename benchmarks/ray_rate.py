@@ -18,7 +18,6 @@ import numpy as np
 from qs3.meshes import load_mesh, normalise
 from qs3.sensor.presets import get_sensor
 from qs3.sensor.render import Body, Scene
-from qs3.sensor.render.cache import CacheSettings
 from qs3.sensor.render.embree import EmbreePhotographer
 from qs3.sensor.render.mitsuba import MitsubaRenderer, best_variant
 from qs3.sensor.render.path import mitsuba_bodies
@@ -78,7 +77,7 @@ def main() -> None:
         pose = place_views(1, "orbit", sensor.placement, np.random.default_rng(0))[0]
         cameras = (pose, sensor.rig.right(pose))
         regions = [photographed_region(scene, sensor.rig, camera) for camera in cameras]
-        counted = EmbreePhotographer(scene, options.samples, 3, CacheSettings())
+        counted = EmbreePhotographer(scene, options.samples, 3, 4, 32)
         counted._embree = counter = Counter(counted._embree)
         counted.photograph(sensor.rig, pose, tuple(regions), 0)
         shapes = mi.load_dict({"type": "scene", **mitsuba_bodies(mi, scene)})

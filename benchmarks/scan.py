@@ -23,9 +23,8 @@ import numpy as np
 from qs3.evaluation.environment import versions
 from qs3.geometry import rotation_z
 from qs3.meshes import load_mesh, normalise
-from qs3.sensor.depth import backproject, depth_from_disparity
+from qs3.sensor.depth import backproject, depth_from_disparity, fuse
 from qs3.sensor.exposure import expose
-from qs3.sensor.fusion import fuse
 from qs3.sensor.matching import match
 from qs3.sensor.presets import get_sensor
 from qs3.sensor.render import Body, Scene

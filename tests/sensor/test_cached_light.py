@@ -10,7 +10,7 @@ import trimesh
 from qs3.errors import InputError
 from qs3.sensor.materials import MATERIALS, Material
 from qs3.sensor.render import Body, LightSettings, Scene
-from qs3.sensor.render.cache import CacheSettings, places
+from qs3.sensor.render.cache import places
 from qs3.sensor.render.embree import EmbreePhotographer, _turns
 from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
 from qs3.sensor.rig import Pose, Region, StereoRig
@@ -141,7 +141,7 @@ def test_stored_pattern_has_no_right_camera(variant):
 
 def test_embree_takes_diffuse_bodies_only():
     with pytest.raises(InputError, match="diffuse"):
-        EmbreePhotographer(corner(MATERIALS["metal"]), 1, 3, CacheSettings())
+        EmbreePhotographer(corner(MATERIALS["metal"]), 1, 3, 4, 32)
 
 
 @pytest.mark.parametrize("name", ["samples", "max_depth", "cache_cell", "cache_rays"])

@@ -149,7 +149,6 @@ def test_a_crash_fails_its_object_alone(stand_in, tmp_path, fault, words):
     with pytest.raises(RenderError, match=words) as caught:
         maker()
     if "luck" in fault:
-        assert "out of luck" in caught.value.log
         assert "out of luck" in str(caught.value)
         assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)  # noqa: S301
     assert gone(first)

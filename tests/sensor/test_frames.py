@@ -203,6 +203,14 @@ def test_a_second_scan_leaves_no_picture_of_the_first(folder, made, tmp_path):
     assert len(list(tmp_path.glob("000000/*/*.png"))) == len(KINDS)
 
 
+def test_frames_that_were_not_written_to_the_end_have_no_json(made, tmp_path, monkeypatch):
+    write_frames(tmp_path, made)
+    monkeypatch.setattr("qs3.sensor.frames.encode_depth", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        write_frames(tmp_path, made)
+    assert not list(tmp_path.glob("000000/*.json"))
+
+
 def test_a_scan_without_whole_frames_is_refused(made, tmp_path):
     bare = dataclasses.replace(made, images=())
     with pytest.raises(InputError, match="full_frames"):

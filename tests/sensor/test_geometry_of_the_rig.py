@@ -4,7 +4,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from qs3.errors import InputError
 from qs3.geometry import invert_rigid, look_at, rotation_z, transform_points
 from qs3.sensor.depth import DepthSettings, backproject, depth_from_disparity
 from qs3.sensor.rig import Pose, Region, StereoRig
@@ -155,8 +154,3 @@ def test_jitter_moves_the_image_as_measured_on_the_released_poses(jittered):
     shifts = [[RIG.project(origin, pose)[0][0] - 539.5 for pose in poses] for poses in jittered]
     spread = np.std(np.array(shifts), axis=(0, 2))
     np.testing.assert_allclose(spread, [0, 60, 84, 101, 109], rtol=0.15, atol=1e-6)
-
-
-def test_no_views_are_refused():
-    with pytest.raises(InputError, match="views"):
-        place_views(0, "orbit", Placement(), np.random.default_rng(0))

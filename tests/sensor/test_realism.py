@@ -13,7 +13,6 @@ from qs3.sensor.realism import LAWS, RealismSettings, realism
 from qs3.sensor.realism.bench import distances
 from qs3.sensor.realism.edges import band_rows, edge_rows, shadow_rows
 from qs3.sensor.realism.faces import inside_faces, off_faces, scan_rows
-from qs3.sensor.realism.kinect import DISTANCES, kinect_rows
 from qs3.sensor.realism.metrics import (
     camera_points,
     depth_step,
@@ -24,8 +23,10 @@ from qs3.sensor.realism.metrics import (
 from qs3.sensor.realism.rows import row
 from qs3.sensor.realism.surfaces import clear_rows, fall_rows
 from qs3.sensor.realism.walls import (
+    DISTANCES,
     bias_rows,
     disparity_grid,
+    kinect_rows,
     noise_rows,
     phases,
     repeats_rows,

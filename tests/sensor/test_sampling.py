@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.errors import InputError
-from qs3.sensor.fusion import fuse
+from qs3.sensor.depth import fuse
 from qs3.sensor.sampling import farthest_point_sample, resample
 
 

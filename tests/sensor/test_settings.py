@@ -10,9 +10,13 @@ from qs3.errors import InputError
 from qs3.sensor.checks import check_choices
 from qs3.sensor.materials import get_material
 from qs3.sensor.presets import SENSORS
+from qs3.sensor.render.cycles import CyclesRenderer
+from qs3.sensor.render.mitsuba import MitsubaRenderer
+from qs3.sensor.rig import StereoRig
 from qs3.sensor.scan import scan
 from qs3.sensor.scene import SceneSettings
 from qs3.sensor.settings import PRESETS, CameraSettings, ScanSettings
+from qs3.sensor.speckle import PatternSettings
 
 
 def test_a_preset_is_a_whole_column_and_what_is_given_beside_it_wins():
@@ -75,3 +79,28 @@ def test_a_renderer_refuses_what_is_anothers():
 def test_a_keyword_that_is_no_setting_is_refused():
     with pytest.raises(TypeError, match="viwes"):
         scan(trimesh.creation.box(), viwes=3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "message"),
+    [
+        (ScanSettings, {"num_points": 10**7}, "num_points 10000000 must be .* at most 1000000"),
+        (ScanSettings, {"num_points": 1e12}, "num_points 1000000000000.0 must be a whole number"),
+        (ScanSettings, {"num_points": "x"}, "num_points 'x' must be a whole number"),
+        (ScanSettings, {"num_points": True}, "num_points True must be a whole number"),
+        (ScanSettings, {"views": 257}, "views 257"),
+        (ScanSettings, {"samples": 10**9}, "samples 1000000000 must be .* at most 65536"),
+        (StereoRig, {"width": 100_000}, "a film of 100000 × 1080 pixels"),
+        (PatternSettings, {"columns": 3 * 10**6}, "columns 3000000"),
+        (PatternSettings, {"tan_half_height": 1e6}, "tan_half_width"),
+        (CyclesRenderer, {"samples": 10**9}, "samples"),
+        (MitsubaRenderer, {"cache_rays": 10**9}, "cache_rays"),
+        (MitsubaRenderer, {"max_depth": 10**9}, "max_depth"),
+    ],
+)
+def test_absurd_sizes_are_refused_before_anything_is_allocated(kind, changes, message):
+    settings = kind()
+    for name, value in changes.items():
+        object.__setattr__(settings, name, value)  # past the tests' own check of types
+    with pytest.raises(InputError, match=message):
+        settings.__post_init__()

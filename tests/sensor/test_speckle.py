@@ -11,8 +11,13 @@ from qs3.errors import InputError
 from qs3.sensor.render import Body, LightSettings, Scene
 from qs3.sensor.render.mitsuba import MitsubaRenderer
 from qs3.sensor.rig import Pose, StereoRig
-from qs3.sensor.speckle import PatternSettings, pattern_image, speckle_pattern, spot_places
-from qs3.sensor.stored import stored_pattern
+from qs3.sensor.speckle import (
+    PatternSettings,
+    pattern_image,
+    speckle_pattern,
+    spot_places,
+    stored_pattern,
+)
 
 SPOTS = PatternSettings(columns=270, rows=168, kind="spots", spot_size=0.7)
 

@@ -12,8 +12,7 @@ from qs3.sensor.presets import Sensor
 from qs3.sensor.render.mitsuba import MitsubaRenderer
 from qs3.sensor.rig import StereoRig
 from qs3.sensor.scan import scan
-from qs3.sensor.speckle import PatternSettings
-from qs3.sensor.stored import stored_pattern
+from qs3.sensor.speckle import PatternSettings, stored_pattern
 from qs3.sensor.views import Placement
 
 ONE_CAMERA = Sensor(

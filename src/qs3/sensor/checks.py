@@ -3,6 +3,7 @@
 import functools
 import math
 import types
+from numbers import Integral, Real
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from qs3.errors import InputError
@@ -34,7 +35,7 @@ def check_range(
     above: bool = False,
     below: bool = False,
 ) -> None:
-    """Check that numbers are finite and within ``low`` … ``high``.
+    """Check that numbers are finite, whole where their field is, and within ``low`` … ``high``.
 
     Args:
         settings: A dataclass.
@@ -50,11 +51,14 @@ def check_range(
     """
     for name in names:
         value = getattr(settings, name)
+        whole = settings.__dataclass_fields__[name].type in (int, int | None)
+        if isinstance(value, bool) or not isinstance(value, Integral if whole else Real):
+            raise InputError(f"{room}: {name} {value!r} must be a {'whole ' * whole}number")
         within = low < value if above else low <= value
         if not (within and (value < high if below else value <= high) and math.isfinite(value)):
-            bound = f"{'above' if above else 'at least'} {low:g}"
+            bound = f"{'above' if above else 'at least'} {low:.9g}"
             if high < math.inf:
-                bound += f" and {'below' if below else 'at most'} {high:g}"
+                bound += f" and {'below' if below else 'at most'} {high:.9g}"
             raise InputError(f"{room}: {name} {value} must be {bound}")
 
 

@@ -1,4 +1,4 @@
-"""From disparity to depth to points (supplement, Eq. 1 to 3).
+"""From disparity to depth to points to one cloud (supplement, Eq. 1 to 3).
 
 Convention:
     Depth is along the optical axis, NaN where there is none. A point is z·K⁻¹·(u, v, 1) in the
@@ -6,11 +6,12 @@ Convention:
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from qs3.errors import InputError
 from qs3.geometry import transform_points
@@ -65,7 +66,7 @@ def backproject(
     pose: Pose,
     settings: DepthSettings,
 ) -> Float[np.ndarray, "m 3"]:
-    """Lift the valid pixels of the reduced grid to world points.
+    """Lift the valid pixels of the reduced grid, row by row, to world points.
 
     Args:
         depth: Depth of the pixels of ``region``, at full resolution.
@@ -73,9 +74,6 @@ def backproject(
         region: Where in the frame ``depth`` lies.
         pose: Pose of the left camera.
         settings: Grid and principal point.
-
-    Returns:
-        World points in row-major order of the pixels.
 
     Example:
         >>> rig = StereoRig(width=5, height=5, focal=4.0)
@@ -96,3 +94,23 @@ def backproject(
         cx, cy = rig.width / 2, rig.height / 2
     local = np.stack([(u - cx) * z / rig.focal, (v - cy) * z / rig.focal, z], axis=1)
     return transform_points(pose.camera_to_world, local)
+
+
+def fuse(
+    clouds: Sequence[Float[np.ndarray, "_ 3"]], bounds: Float[np.ndarray, "2 3"] | None = None
+) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n"]]:
+    """Concatenate the clouds of all views, cropped to ``bounds``; the index of each point's view.
+
+    NOTE: the released code crops to the object's own box, which removes flying points but also
+    noisy points of the surface; the paper's text does not mention it.
+
+    Example:
+        >>> fuse([np.zeros((1, 3)), np.ones((2, 3))])[1].tolist()
+        [0, 1, 1]
+    """
+    points = np.concatenate([np.zeros((0, 3)), *clouds])
+    view = np.repeat(np.arange(len(clouds)), [len(c) for c in clouds]).astype(np.uint8)
+    if bounds is None:
+        return points, view
+    keep = ((points >= bounds[0]) & (points <= bounds[1])).all(axis=1)  # its border included
+    return points[keep], view[keep]

@@ -88,8 +88,8 @@ def expose_pair(
         rng: Speckle and noise of the left image, then of the right one; untouched without them.
 
     Returns:
-        Left and right grey levels, 0…255 or 0…1023; the right image has no pixel where the rig
-        has no second camera.
+        Left and right grey levels, 0…255 or 0…1023; a rig without a second camera has an empty
+        right image.
     """
     gain = 1.0 if pair.display else automatic_gain(pair, focus, rig, settings)
     shape = rig.full_frame.shape
@@ -125,7 +125,7 @@ def expose(
 
     Args:
         radiance: Scene radiance, linear.
-        settings: Response, gain, bits and the size of the noise.
+        settings: The imager.
         noise: Standard normal draws for each pixel; needed where ``settings.noise`` is above 0.
         speckle: Gamma draws of mean 1; needed where ``settings.speckle`` is above 0.
         automatic: The gain that auto-exposure chose.
@@ -141,13 +141,12 @@ def expose(
     light = np.maximum(radiance, 0.0)
     grey = light if display else _respond(light * (settings.gain * automatic), settings)
     levels = 255.0 * grey
-    if settings.speckle > 0:
-        if speckle is None:
-            raise ValueError("speckle draws are needed where the speckle is above 0")
+    for name, draws in (("speckle", speckle), ("noise", noise)):
+        if getattr(settings, name) > 0 and draws is None:
+            raise ValueError(f"{name} draws are needed where the {name} is above 0")
+    if speckle is not None:
         levels = levels * speckle
-    if settings.noise > 0:
-        if noise is None:
-            raise ValueError("noise draws are needed where the noise is above 0")
+    if noise is not None:
         levels = levels + settings.noise * noise
     if settings.offset:
         levels = levels + settings.offset
@@ -161,13 +160,7 @@ def automatic_gain(
 
     Of the pixels of ``focus``, behind the lens, those count that show something: that differ from
     the background; all of them where none does. A black or empty focus leaves the gain at 1, or
-    at ``max_gain``, where that is set.
-
-    Args:
-        pair: Radiance.
-        focus: Part of the left frame.
-        rig: Supplies frame, focal length and principal point.
-        settings: The imager; 1 is returned where its ``auto`` is 0.
+    at ``max_gain``, where that is set; without ``auto`` it is 1.
     """
     if not settings.auto:
         return 1.0
@@ -219,5 +212,4 @@ def _through_lens(
     if settings.vignetting:
         light = light * vignette(rig, wide, settings.vignetting)
     light = blur(light, settings.psf)
-    x, y = part.x - wide.x, part.y - wide.y
-    return light[y : y + part.height, x : x + part.width]
+    return light[part.within(wide)]

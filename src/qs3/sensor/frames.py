@@ -35,16 +35,13 @@ MM_PER_UNIT = 1000.0
 _SCENE = "000000"
 
 
-def write_frames(folder: Path, scan: Scan) -> list[Path]:
+def write_frames(folder: Path, scan: Scan) -> None:
     """Write the frames of a scan.
 
     Args:
-        folder: Where ``models`` and the scene's folder go; pictures of an earlier scan in it are
-            removed.
+        folder: Where ``models`` and the scene's folder go. What an earlier scan left in it is
+            removed first, and the JSON files come last: a folder that has them is whole.
         scan: Made with ``full_frames``.
-
-    Returns:
-        The JSON files and folders written.
 
     Raises:
         InputError: where the scan holds no whole frames.
@@ -52,7 +49,7 @@ def write_frames(folder: Path, scan: Scan) -> list[Path]:
     if not scan.images or any(images.normals is None for images in scan.images):
         raise InputError("frames: the scan holds no whole frames; scan with full_frames=True")
     scene = Path(folder) / _SCENE
-    for stale in scene.glob("*/*.png"):
+    for stale in (*scene.glob("scene_*.json"), *scene.glob("*/*.png")):
         stale.unlink()
     mesh = scan.mesh.copy()
     mesh.vertices = mesh.vertices * MM_PER_UNIT
@@ -67,36 +64,20 @@ def write_frames(folder: Path, scan: Scan) -> list[Path]:
         world_to_camera = invert_rigid(pose.camera_to_world)
         turn = np.eye(4)
         turn[:3, :3] = rotation_z(scan.yaw)
-        model_to_camera = world_to_camera @ turn
         key = str(index)
-        cameras[key] = _camera(scan.sensor, scale) | {
-            "cam_R_w2c": world_to_camera[:3, :3].ravel().tolist(),
-            "cam_t_w2c": (world_to_camera[:3, 3] * MM_PER_UNIT).tolist(),
-        }
-        truth[key] = [
-            {
-                "cam_R_m2c": model_to_camera[:3, :3].ravel().tolist(),
-                "cam_t_m2c": (model_to_camera[:3, 3] * MM_PER_UNIT).tolist(),
-                "obj_id": 1,
-            }
-        ]
+        cameras[key] = _camera(scan.sensor, scale) | _transform("w2c", world_to_camera)
+        truth[key] = [_transform("m2c", world_to_camera @ turn) | {"obj_id": 1}]
         facts[key] = [_facts(images)]
     written = {"camera": cameras, "gt": truth, "gt_info": facts}
     for name, value in written.items():
         write_json(scene / f"scene_{name}.json", value)
-    return [scene / f"scene_{name}.json" for name in written] + sorted(
-        path for path in scene.iterdir() if path.is_dir()
-    )
 
 
 def write_parts(folder: Path, scan: Scan) -> list[Path]:
     """Write the object's part of each view: grey pair, depth and camera, for a quick look.
 
     Depth is in steps of 1/10,000 of the unit, 0 where there is none. Views that do not show the
-    object are left out.
-
-    Returns:
-        The files written.
+    object are left out. The files written are returned.
     """
     written: list[Path] = []
     cx, cy = scan.sensor.rig.principal_point
@@ -106,8 +87,8 @@ def write_parts(folder: Path, scan: Scan) -> list[Path]:
         pictures = {
             "left": images.left,
             "right": images.right,
-            "depth": _in_steps(images.depth),
-            "true-depth": _in_steps(images.true_depth),
+            "depth": encode_depth(images.depth, 0.1),
+            "true-depth": encode_depth(images.true_depth, 0.1),
         }
         for kind, picture in pictures.items():
             written.append(folder / f"view-{index}-{kind}.png")
@@ -127,10 +108,6 @@ def write_parts(folder: Path, scan: Scan) -> list[Path]:
         written.append(folder / f"view-{index}-camera.json")
         write_json(written[-1], camera)
     return written
-
-
-def _in_steps(depth: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
-    return np.nan_to_num(np.clip(np.rint(depth * 1e4), 0, 65535)).astype(np.uint16)
 
 
 def _write_picture(path: Path, picture: np.ndarray) -> None:
@@ -185,6 +162,11 @@ def _pictures(images: ViewImages, scale: float) -> dict[str, np.ndarray]:
     }
 
 
+def _transform(name: str, matrix: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
+    turn, shift = matrix[:3, :3], matrix[:3, 3] * MM_PER_UNIT
+    return {f"cam_R_{name}": turn.ravel().tolist(), f"cam_t_{name}": shift.tolist()}
+
+
 def _camera(sensor: Sensor, scale: float) -> dict[str, Any]:
     rig = sensor.rig
     cx, cy = rig.principal_point
@@ -217,8 +199,4 @@ def _facts(images: ViewImages) -> dict[str, Any]:
 
 
 def _box(mask: Bool[np.ndarray, "h w"]) -> list[int]:
-    rows, columns = np.nonzero(mask)
-    if not len(rows):
-        return [-1, -1, -1, -1]
-    x, y = int(columns.min()), int(rows.min())
-    return [x, y, int(columns.max()) - x + 1, int(rows.max()) - y + 1]
+    return list(cv2.boundingRect(mask.astype(np.uint8))) if mask.any() else [-1, -1, -1, -1]

@@ -4,18 +4,12 @@ import math
 
 import numpy as np
 from jaxtyping import Float, Float32
-from scipy.special import ive
 
 from qs3.sensor.rig import Region, StereoRig
 
 
 def vignette(rig: StereoRig, part: Region, share: float) -> Float32[np.ndarray, "h w"]:
     """How much of the light arrives: 1 − share + share·cos⁴ of the angle from the optical axis.
-
-    Args:
-        rig: Supplies focal length and principal point.
-        part: Part of the frame.
-        share: Share of the law, 0 (none) to 1 (all of it).
 
     Example:
         >>> rig = StereoRig(width=3, height=1, focal=1.0)  # the rim is seen at 45°
@@ -45,28 +39,23 @@ def blur_kernel(psf: float) -> Float[np.ndarray, "n"]:
     A sampled Gaussian has neither below one pixel (Lindeberg, Scale-space for discrete signals,
     1990). Cut at `blur_reach`, where it has lost less than 10⁻³ of its variance.
 
-    Args:
-        psf: Standard deviation in pixels, above 0.
-
     Example:
         >>> kernel, place = blur_kernel(0.5), np.arange(-4, 5)
         >>> round(float(kernel.sum()), 6), round(float((kernel * place**2).sum()), 3)
         (1.0, 0.25)
     """
+    from scipy.special import ive
+
     reach = blur_reach(psf)
     kernel = ive(np.abs(np.arange(-reach, reach + 1)), psf**2)
     return kernel / kernel.sum()
 
 
 def blur(light: Float32[np.ndarray, "h w"], psf: float) -> Float32[np.ndarray, "h w"]:
-    """Blur an image; beyond its borders it goes on as it ends.
+    """Blur an image by ``psf`` pixels, 0 or more; beyond its borders it goes on as it ends.
 
     Each pixel is the same sum in the same order wherever it lies, so that equal neighbourhoods
     give equal bits: vectorised filters of image libraries round differently at their ends.
-
-    Args:
-        light: The image.
-        psf: Standard deviation in pixels; 0 returns the image as it is.
     """
     if psf == 0 or not light.size:
         return light

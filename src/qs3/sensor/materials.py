@@ -47,10 +47,9 @@ MATERIALS: dict[str, Material] = {
 
 
 def get_material(name: Material | str) -> Material:
-    """Return the named material; a material is returned as it is.
+    """Return the named material, or raise an `InputError` that lists those there are.
 
-    Raises:
-        InputError: where there is none; the message lists those there are.
+    A material is returned as it is.
 
     Example:
         >>> get_material("dark").albedo

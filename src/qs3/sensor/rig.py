@@ -16,6 +16,8 @@ from qs3.errors import InputError
 from qs3.geometry import invert_rigid, look_at, transform_points
 from qs3.sensor.checks import check_choices, check_range
 
+_MOST_PIXELS = 2**25  # three times the film of the largest depth cameras
+
 
 @dataclass(frozen=True)
 class Pose:
@@ -62,15 +64,23 @@ class Region:
 
     def grown(self, margin: int, width: int, height: int) -> "Region":
         """The rectangle with ``margin`` pixels more on every side, cut at the frame's borders."""
-        x0, y0 = max(0, self.x - margin), max(0, self.y - margin)
-        x1 = min(width, self.x + self.width + margin)
-        y1 = min(height, self.y + self.height + margin)
-        return Region(x0, y0, x1 - x0, y1 - y0)
+        wide, high = self.width + 2 * margin, self.height + 2 * margin
+        return Region(self.x - margin, self.y - margin, wide, high) & Region(0, 0, width, height)
+
+    def __and__(self, other: "Region") -> "Region":
+        """The pixels of both."""
+        low = max(self.x, other.x), max(self.y, other.y)
+        high = (min(a, b) for a, b in zip(self.bounds[2:], other.bounds[2:], strict=True))
+        return Region(*low, *(b - a for a, b in zip(low, high, strict=True)))
 
     @property
     def slices(self) -> tuple[slice, slice]:
         """Index of the rectangle in a full-frame image, rows first."""
         return slice(self.y, self.y + self.height), slice(self.x, self.x + self.width)
+
+    def within(self, other: "Region") -> tuple[slice, slice]:
+        """Index of the rectangle in an image of ``other``, which holds it."""
+        return Region(self.x - other.x, self.y - other.y, self.width, self.height).slices
 
     @property
     def bounds(self) -> tuple[int, int, int, int]:
@@ -105,6 +115,11 @@ class StereoRig:
     def __post_init__(self) -> None:
         check_choices(self, "rig")
         check_range(self, "rig", "width", "height", low=1)
+        if self.width * self.height > _MOST_PIXELS:
+            raise InputError(
+                f"rig: a film of {self.width} × {self.height} pixels is larger than the "
+                f"{_MOST_PIXELS:,} that can be rendered; take a smaller width or height"
+            )
         check_range(self, "rig", "focal", "baseline", above=True)
         check_range(self, "rig", "projector_offset", low=-10.0, high=10.0)
         if self.second == "pattern" and self.projector_offset != 1:

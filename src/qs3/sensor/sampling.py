@@ -32,10 +32,7 @@ def farthest_point_sample(
         [0, 2]
     """
     n = len(points)
-    if not 1 <= num_points <= n:
-        raise InputError(f"cannot sample {num_points} points of a cloud of {n}")
-    if not np.isfinite(points).all():
-        raise InputError("cannot sample a cloud with a point that is not finite")
+    _check(points, n, num_points)
     points = np.ascontiguousarray(points, dtype=np.float64)
     columns = np.ascontiguousarray(points.T)
     tree: KDTree | None = None
@@ -78,10 +75,7 @@ def farthest_point_samples(
         [[0, 2]]
     """
     b, n, _ = clouds.shape
-    if not 1 <= num_points <= n:
-        raise InputError(f"cannot sample {num_points} points of a cloud of {n}")
-    if not np.isfinite(clouds).all():
-        raise InputError("cannot sample a cloud with a point that is not finite")
+    _check(clouds, n, num_points)
     chosen = np.zeros((b, num_points), dtype=np.int64)
     together = max(1, _TOGETHER // n)
     for first in range(0, b, together):
@@ -102,6 +96,13 @@ def farthest_point_samples(
             last = nearest.argmax(axis=1)
             chosen[first : first + together, step] = last
     return chosen
+
+
+def _check(points: np.ndarray, size: int, num_points: int) -> None:
+    if not 1 <= num_points <= size:
+        raise InputError(f"cannot sample {num_points} points of a cloud of {size}")
+    if not np.isfinite(points).all():
+        raise InputError("cannot sample a cloud with a point that is not finite")
 
 
 def resample(

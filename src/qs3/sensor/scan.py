@@ -14,25 +14,25 @@ from jaxtyping import Float32, UInt8
 from qs3.errors import InputError
 from qs3.geometry import rotation_z
 from qs3.meshes import normalise
-from qs3.sensor.fusion import fuse
+from qs3.sensor.depth import fuse
 from qs3.sensor.lens import blur_reach
 from qs3.sensor.matching import matching_canvas
 from qs3.sensor.obstacles import check_views
 from qs3.sensor.presets import Sensor
 from qs3.sensor.randomise import draw
-from qs3.sensor.render import Body, Scene
+from qs3.sensor.render import Body
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.sampling import resample
 from qs3.sensor.scene import arrange
 from qs3.sensor.settings import ScanSettings as ScanSettings
-from qs3.sensor.speckle import pattern_image
 from qs3.sensor.statistics import ViewStatistics
 from qs3.sensor.view import (
     Clock,
     ViewImages,
     clouds_of,
     object_region,
+    scene_of,
     statistics_of,
     take_view,
 )
@@ -138,7 +138,7 @@ def scan(
     with clock("render"):
         seeds = [int(s) for s in rng_render.integers(0, 2**31, size=how.views)]
         canvases = [matching_canvas(region, sensor.rig, sensor.matching) for region in regions]
-        built = _scene(around.bodies, sensor)
+        built = scene_of(around.bodies, sensor)
         # An object alone needs no more than its own box: the rest is background.
         reach = blur_reach(sensor.exposure.psf)
         frame = (sensor.rig.width, sensor.rig.height)
@@ -192,9 +192,3 @@ def _sized(
     made = normalise(mesh, size)
     made.vertices = made.vertices * object_size
     return made
-
-
-def _scene(bodies: tuple[Body, ...], sensor: Sensor) -> Scene:
-    thrown = sensor.pattern
-    light, picture = sensor.light, pattern_image(thrown)
-    return Scene(bodies, light, picture, thrown.tan_half_width, thrown.tan_half_height)

@@ -11,18 +11,20 @@ Convention:
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 
 from qs3.errors import InputError
 from qs3.geometry import invert_rigid, rotation_z, transform_points
 from qs3.sensor.checks import check_range
 from qs3.sensor.materials import Material
-from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.render.scene import Body
 from qs3.sensor.rig import Pose, StereoRig
+
+if TYPE_CHECKING:
+    import trimesh
 
 LAYOUTS = ("alone", "floor", "wall", "room", "behind", "beside")
 _SURVEY, _STEPS = 96, 25  # pixels and places at which a neighbour's cover is tried
@@ -107,7 +109,7 @@ def arrange(
     body: Body,
     poses: Sequence[Pose],
     size: float,
-    neighbour: trimesh.Trimesh | None,
+    neighbour: "trimesh.Trimesh | None",
     rng: np.random.Generator,
 ) -> ArrangedScene:
     """Put everything else about the object.
@@ -134,31 +136,36 @@ def arrange(
     if parts & {"wall", "behind"}:
         poses = _on_arc(poses, np.radians(settings.arc))
     bodies, names = [body], ["object"]
-    front = _front(poses[0])
-    ground = float(body.mesh.vertices[:, 2].min()) - _LIFT * size
+    front, up = _front(poses[0]), np.array([0.0, 0.0, 1.0])
+    across = np.array([-front[1], front[0], 0.0])
+    half = settings.extent * size / 2
+    base = float(body.mesh.vertices[:, 2].min())
+    ground = base - _LIFT * size
     if neighbour is not None:
         turn, side = rng.uniform(0, 2 * np.pi), rng.choice([-1.0, 1.0])
         turned = neighbour.copy()
         turned.vertices = turned.vertices @ rotation_z(turn).T
-        place = _before if "behind" in parts else _beside
-        turned.vertices += place(body.mesh, turned, poses[0], side, settings, size)
+        gap = settings.neighbour_gap * size
+        if "behind" in parts:
+            turned.vertices += _before(body.mesh, turned, poses[0], side, gap, settings.cover)
+        else:  # on the same ground
+            shift = side * across * _apart(body.mesh, turned, side * across, gap)
+            shift[2] = base - turned.vertices[:, 2].min()
+            turned.vertices += shift
         if "floor" in parts:
             turned.vertices[:, 2] += max(0.0, ground - turned.vertices[:, 2].min())
         bodies.append(Body(turned, settings.neighbour or body.material))
         names.append("neighbour")
-    half = settings.extent * size / 2
-    across = np.array([-front[1], front[0], 0.0])
-    up = np.array([0.0, 0.0, 1.0])
     if "wall" in parts:
         reach = max(float((body.mesh.vertices @ -front).max()) for body in bodies)
         centre = -front * (reach + settings.wall_gap * size)
         if "floor" in parts:  # it stands on the floor
             centre = centre + up * (ground + half)
-        bodies.append(Body(_square(centre, across * half, up * half), settings.wall))
+        bodies.append(Body(rectangle(centre, across * half, up * half), settings.wall))
         names.append("wall")
     if "floor" in parts:
         centre = up * ground
-        bodies.append(Body(_square(centre, front * half, across * half), settings.floor))
+        bodies.append(Body(rectangle(centre, front * half, across * half), settings.floor))
         names.append("floor")
     return ArrangedScene(tuple(bodies), tuple(names), tuple(poses))
 
@@ -187,82 +194,58 @@ def _front(pose: Pose) -> Float[np.ndarray, "3"]:
 
 
 def _apart(
-    mesh: trimesh.Trimesh, other: trimesh.Trimesh, along: Float[np.ndarray, "3"], gap: float
+    mesh: "trimesh.Trimesh", other: "trimesh.Trimesh", along: Float[np.ndarray, "3"], gap: float
 ) -> float:
     """Distance along a direction at which a plane with ``gap`` about it parts the two meshes."""
     return float((mesh.vertices @ along).max() - (other.vertices @ along).min()) + gap
 
 
 def _before(
-    mesh: trimesh.Trimesh,
-    other: trimesh.Trimesh,
+    mesh: "trimesh.Trimesh",
+    other: "trimesh.Trimesh",
     pose: Pose,
     side: float,
-    settings: SceneSettings,
-    size: float,
+    gap: float,
+    cover: float,
 ) -> Float[np.ndarray, "3"]:
     """Place on the line of sight of ``pose``, moved aside until the wanted share is covered.
 
     NOTE: it hovers there. A neighbour of the object's height that stood on the ground would hide
     nothing from a camera that looks down by more than some 40°.
     """
+    from qs3.sensor.render.raycast import DepthCaster
+
     sight = pose.position / np.linalg.norm(pose.position)
-    shift = sight * _apart(mesh, other, sight, settings.neighbour_gap * size)
+    shift = sight * _apart(mesh, other, sight, gap)
     if float(((other.vertices + shift) @ sight).max()) >= np.linalg.norm(pose.position):
         raise InputError(
             "scene: no room for a neighbour between the first view's camera and the object; give "
             "placement a larger radius, or make the neighbour smaller (neighbour_size)"
         )
-    return shift + pose.camera_to_world[:3, 0] * _aside(mesh, other, shift, pose, side, settings)
-
-
-def _aside(
-    mesh: trimesh.Trimesh,
-    other: trimesh.Trimesh,
-    shift: Float[np.ndarray, "3"],
-    pose: Pose,
-    side: float,
-    settings: SceneSettings,
-) -> float:
-    """How far to move a neighbour along the camera's x axis so that it hides the wanted share."""
     x, y, z = transform_points(invert_rigid(pose.camera_to_world), np.asarray(mesh.vertices)).T
     reach = float(np.abs([x / z, y / z]).max())
     rig = StereoRig(width=_SURVEY, height=_SURVEY, focal=_SURVEY / 2 / reach)
     seen = DepthCaster(mesh).cast(rig, pose, rig.full_frame).mask
     moved = other.copy()
     moved.vertices = moved.vertices + shift
-    caster = DepthCaster(moved)
+    caster, along = DepthCaster(moved), pose.camera_to_world[:3, 0]
     # Far enough to be clear of the object, then inwards until both are in line.
-    width = float(np.ptp((moved.vertices - pose.position) @ pose.camera_to_world[:3, 0]))
+    width = float(np.ptp((moved.vertices - pose.position) @ along))
     best, error = 0.0, math.inf
     for offset in side * np.linspace(width / 2 + reach * float(z.max()), 0.0, _STEPS):
         # The neighbour moved to the right looks as from a camera moved to the left.
         hidden = caster.cast(rig, pose.shifted(-offset), rig.full_frame).mask & seen
-        miss = abs(float(hidden.sum()) / max(int(seen.sum()), 1) - settings.cover)
+        miss = abs(float(hidden.sum()) / max(int(seen.sum()), 1) - cover)
         if miss < error:
             best, error = float(offset), miss
-    return best
+    return shift + along * best
 
 
-def _beside(
-    mesh: trimesh.Trimesh,
-    other: trimesh.Trimesh,
-    pose: Pose,
-    side: float,
-    settings: SceneSettings,
-    size: float,
-) -> Float[np.ndarray, "3"]:
-    """Place to the left or right of the object, on the same ground."""
-    front = _front(pose)
-    along = side * np.array([-front[1], front[0], 0.0])
-    shift = along * _apart(mesh, other, along, settings.neighbour_gap * size)
-    shift[2] = mesh.vertices[:, 2].min() - other.vertices[:, 2].min()
-    return shift
-
-
-def _square(
+def rectangle(
     centre: Float[np.ndarray, "3"], a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]
-) -> trimesh.Trimesh:
-    """A square of two triangles, its normal along a × b."""
+) -> "trimesh.Trimesh":
+    """A rectangle of two triangles with half its sides a and b, its normal along a × b."""
+    import trimesh
+
     corners = np.array([centre - a - b, centre + a - b, centre + a + b, centre - a + b])
     return trimesh.Trimesh(vertices=corners, faces=[[0, 1, 2], [0, 2, 3]], process=False)

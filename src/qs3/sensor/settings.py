@@ -14,6 +14,7 @@ from qs3.sensor.materials import Material, get_material
 from qs3.sensor.presets import Sensor, changed, get_sensor
 from qs3.sensor.randomise import resolve_ranges
 from qs3.sensor.render import Renderer
+from qs3.sensor.render.scene import MOST_SAMPLES
 from qs3.sensor.scene import SceneSettings
 from qs3.sensor.speckle import pattern_image
 from qs3.sensor.views import ViewLayout
@@ -79,7 +80,7 @@ class CameraSettings:
     def __post_init__(self) -> None:
         check_choices(self, "camera")
         if self.samples is not None:
-            check_range(self, "camera", "samples", low=1)
+            check_range(self, "camera", "samples", low=1, high=MOST_SAMPLES)
 
     def make_sensor(self) -> Sensor:
         """The sensor with every change.
@@ -183,7 +184,8 @@ class ScanSettings(CameraSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range(self, "scan", "num_points", "views", low=1)
+        check_range(self, "scan", "num_points", low=1, high=1_000_000)
+        check_range(self, "scan", "views", low=1, high=256)
         check_range(self, "scan", "box_margin", "seed")
 
     def chosen(self, name: str) -> Any:

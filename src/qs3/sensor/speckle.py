@@ -1,7 +1,8 @@
 """The projected pattern: seeded square dots or round spots, or a picture of the user's own.
 
 Either kind has columns/3 × rows/3 of them: 270 × 168 cells hold 90 × 56 = 5,040, about what a
-RealSense D435 throws.
+RealSense D435 throws. A camera without a second one compares its image with the stored pattern
+(Kinect v1).
 """
 
 import math
@@ -10,18 +11,19 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, UInt8, UInt16
 
 from qs3.errors import InputError
 from qs3.sensor.checks import check_choices, check_range
+from qs3.sensor.rig import Region, StereoRig
 
 _TILE = 3  # one dot in each 3×3 tile of cells: the density of 1 in 9
 _LEAST_DISTANCE = 1.5  # cells between two spots; the middle of a tile has it from all other tiles
 _SWEEPS = 32  # a spot moves at every second attempt, so that after these none is where it began
 _TEXELS = 4  # texels across a spot's full width at half maximum
 _LARGEST = 4096  # texels along a side
+_FINE = 4  # samples of a pixel of the stored pattern, each way
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,10 @@ class PatternSettings:
     def __post_init__(self) -> None:
         check_choices(self, "pattern")
         check_range(self, "pattern", "tan_half_width", "tan_half_height", above=True)
+        tangents = sorted((self.tan_half_width, self.tan_half_height))
+        if tangents[1] > 16 * tangents[0]:  # its picture has texels as wide as high
+            raise InputError("pattern: tan_half_width and tan_half_height are over 16 times apart")
+        check_range(self, "pattern", "columns", "rows", high=_LARGEST)
         check_range(self, "pattern", "seed")
         check_range(self, "pattern", "spot_size", high=2.0, above=True)
         if self.image is None:
@@ -69,6 +75,8 @@ def speckle_pattern(columns: int, rows: int, seed: int) -> Bool[np.ndarray, "row
         >>> int(dots.sum())
         6
     """
+    import cv2
+
     _check_cells(columns, rows)
     rng = np.random.default_rng(np.random.SeedSequence([seed, columns, rows]))
     down, across = rows // _TILE, columns // _TILE
@@ -156,9 +164,14 @@ def _check_cells(columns: int, rows: int) -> None:
 
 
 def _users_picture(path: Path) -> Float32[np.ndarray, "h w"]:
+    import cv2
+
     if not path.is_file():
         raise InputError(f"{path}: no such file; name a picture to project")
-    grey = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
+    try:
+        grey = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except cv2.error:  # empty, or of more pixels than OpenCV takes
+        grey = None
     if grey is None:
         raise InputError(f"{path}: not a picture that OpenCV can read; use PNG or JPEG")
     return grey.astype(np.float32) / 255.0
@@ -188,3 +201,34 @@ def _spots(settings: PatternSettings) -> Float32[np.ndarray, "h w"]:
     texel = y.clip(0, height - 1)[:, :, None] * width + x.clip(0, width - 1)[:, None, :]
     image = np.bincount(texel.ravel(), weight.ravel(), minlength=width * height)
     return np.minimum(image, 1.0).reshape(height, width).astype(np.float32)
+
+
+def stored_pattern(
+    rig: StereoRig, pattern: PatternSettings, region: Region, bits: Literal[8, 10] = 8
+) -> UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]:
+    """The projected picture as a camera in the projector's place would see it, at any distance.
+
+    A point at depth z then lies f·b/z further left in it than in the image, b being the distance
+    from the camera to the projector. Grey levels: 255, or 1023 with 10 bits, is full power, 0 what
+    lies outside the cone.
+
+    Example:
+        >>> rig = StereoRig(width=64, height=48, focal=40.0)
+        >>> stored_pattern(rig, PatternSettings(), rig.full_frame).shape
+        (48, 64)
+    """
+    import cv2
+
+    picture = pattern_image(pattern)
+    rows, columns = picture.shape
+    cx, cy = rig.principal_point
+    step = (np.arange(_FINE * max(region.width, region.height)) + 0.5) / _FINE - 0.5
+    x = (region.x + step[: _FINE * region.width] - cx) / rig.focal / pattern.tan_half_width
+    y = (region.y + step[: _FINE * region.height] - cy) / rig.focal / pattern.tan_half_height
+    across, down = np.meshgrid((x + 1) / 2 * columns - 0.5, (y + 1) / 2 * rows - 0.5)
+    across, down = across.astype(np.float32), down.astype(np.float32)
+    fine = cv2.remap(picture, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    fine *= np.outer(np.abs(y) <= 1, np.abs(x) <= 1)  # the cone ends sharply
+    seen = cv2.resize(fine, (region.width, region.height), interpolation=cv2.INTER_AREA)
+    white = 2**bits - 1
+    return np.rint(white * seen).clip(0, white).astype(np.uint8 if bits == 8 else np.uint16)

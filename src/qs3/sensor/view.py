@@ -12,11 +12,11 @@ from qs3.sensor.depth import backproject, depth_from_disparity, gate
 from qs3.sensor.exposure import expose_pair
 from qs3.sensor.matching import match, matching_canvas
 from qs3.sensor.presets import Sensor
-from qs3.sensor.render import StereoPair
+from qs3.sensor.render import Body, Scene, StereoPair
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, Region
+from qs3.sensor.speckle import pattern_image, stored_pattern
 from qs3.sensor.statistics import EMPTY_VIEW, ViewStatistics, view_statistics
-from qs3.sensor.stored import stored_pattern
 
 RIM = 16
 """Pixels around the object's box that are matched too: fattening reaches half a block."""
@@ -56,8 +56,14 @@ class ViewImages:
 
     def part(self, image: Shaped[np.ndarray, "h w"], part: Region) -> Shaped[np.ndarray, "h2 w2"]:
         """The pixels of ``part`` of the frame, which lies within ``region``."""
-        x, y = part.x - self.region.x, part.y - self.region.y
-        return image[max(y, 0) : y + part.height, max(x, 0) : x + part.width]
+        return image[part.within(self.region)]
+
+
+def scene_of(bodies: Sequence[Body], sensor: Sensor) -> Scene:
+    """The bodies in the sensor's light."""
+    pattern = sensor.pattern
+    opening = pattern.tan_half_width, pattern.tan_half_height
+    return Scene(tuple(bodies), sensor.light, pattern_image(pattern), *opening)
 
 
 def object_region(bounds: Float[np.ndarray, "2 3"], sensor: Sensor, pose: Pose) -> Region:
@@ -68,26 +74,19 @@ def object_region(bounds: Float[np.ndarray, "2 3"], sensor: Sensor, pose: Pose) 
 def clouds_of(
     images: ViewImages, part: Region, pose: Pose, sensor: Sensor, mask_crop: bool
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:
-    """The noisy and the true points of one view, in the world.
+    """The noisy and the true points of the object's part of one view, in the world.
 
     A view that does not show the object within the depth gate gives none: what its matcher found
-    is something else.
-
-    Args:
-        images: The pictures.
-        part: The object's part of the frame.
-        pose: Left camera.
-        sensor: Grid and depth gate.
-        mask_crop: Keep the pixels that show the object only.
+    is something else. With ``mask_crop`` only the pixels that show the object count.
     """
     if images.blind(sensor):
         return np.zeros((0, 3)), np.zeros((0, 3))
     depth = np.where(images.mask, images.depth, np.nan) if mask_crop else images.depth
-
-    def lift(image: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "n 3"]:
-        return backproject(images.part(image, part), sensor.rig, part, pose, sensor.depth)
-
-    return lift(depth), lift(images.true_object(sensor))
+    noisy, true = (
+        backproject(images.part(image, part), sensor.rig, part, pose, sensor.depth)
+        for image in (depth, images.true_object(sensor))
+    )
+    return noisy, true
 
 
 def statistics_of(images: ViewImages, part: Region, sensor: Sensor) -> ViewStatistics:
@@ -118,10 +117,7 @@ def take_view(
     """
     rig = sensor.rig
     canvas = matching_canvas(region, rig, sensor.matching)
-    inner = (
-        slice(region.y - canvas.y, region.y - canvas.y + region.height),
-        slice(region.x - canvas.x, region.x - canvas.x + region.width),
-    )
+    inner = region.within(canvas)
     with clock("exposure"):
         left, right = expose_pair(pair, canvas, focus, rig, sensor.exposure, rng)
         if rig.second == "pattern":

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from qs3.errors import InputError
 from qs3.sensor.rig import Pose
@@ -53,14 +52,7 @@ def place_views(
     radius and elevation are drawn for each view. ``jitter``: one pose is drawn; view i ≥ 1 moves
     every coordinate by clip(0.05·(i + 1)/V·N(0, 1), ±0.1) and every Euler angle by
     clip(0.1·(i + 1)/V·N(0, 1), ±0.1 rad).
-
-    Raises:
-        InputError: where ``views`` is not within 1…256 or the layout is unknown.
     """
-    if not 1 <= views <= 256:
-        raise InputError(f"views: {views} is not within 1…256")
-    if layout not in ("orbit", "jitter"):
-        raise InputError(f"view_layout: no layout {layout!r}; choose orbit or jitter")
     azimuth = np.radians(rng.uniform(*placement.azimuth))
     if layout == "orbit":
         steps = 2 * np.pi * np.arange(views) / views
@@ -72,17 +64,14 @@ def place_views(
 def _pose_on_shell(azimuth: float, placement: Placement, rng: np.random.Generator) -> Pose:
     radius = rng.uniform(*placement.radius)
     elevation = np.radians(rng.uniform(*placement.elevation))
-    direction = np.array(
-        [
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation),
-        ]
-    )
+    across, up = np.cos(elevation), np.sin(elevation)
+    direction = np.array([across * np.cos(azimuth), across * np.sin(azimuth), up])
     return Pose.looking_at(radius * direction, np.zeros(3))
 
 
 def _disturbed(pose: Pose, share: float, rng: np.random.Generator) -> Pose:
+    from scipy.spatial.transform import Rotation
+
     matrix = pose.camera_to_world.copy()
     matrix[:3, 3] += np.clip(0.05 * share * rng.standard_normal(3), -0.1, 0.1)
     euler = Rotation.from_matrix(matrix[:3, :3] @ _OPENCV_TO_OPENGL).as_euler("xyz")

@@ -22,7 +22,6 @@ from textwrap import wrap
 from typing import Any
 
 from qs3.errors import InputError
-from qs3.sensor.presets.cameras import SENSORS
 from qs3.sensor.presets.settings import Sensor, changed
 from qs3.structure import structure, unstructure
 
@@ -30,6 +29,9 @@ _WIDTH = 96
 _FORMER = {"qs3": "paper"}
 """Sensors that had another name in version 0.1."""
 _log = logging.getLogger(__name__)
+
+SENSORS: dict[str, Sensor] = {"paper": Sensor()}
+"""Sensors by name: the released scanner, and those of ``cameras.toml``."""
 
 
 def get_sensor(name: str) -> Sensor:
@@ -89,18 +91,7 @@ def load_sensor(path: Path | str) -> Sensor:
     """
     path = Path(path)
     table = _read(path)
-    base = table.pop("base", "paper")
-    if not isinstance(base, str) or base.lower().endswith(".toml"):
-        raise InputError(f"{path}: base: {base!r} is none of {', '.join(SENSORS)}")
-    try:
-        whole = unstructure(get_sensor(base))
-    except InputError as error:
-        raise InputError(f"{path}: base: {error}") from None
-    if "name" not in table:
-        whole |= {"name": path.stem, "description": f"after {sensor_name(base)}"}
-    elif isinstance(table["name"], str):
-        table["name"] = sensor_name(table["name"])
-    sensor = structure(_merged(whole, table), Sensor, path)
+    sensor = _sensor(table, path.stem, path)
     if isinstance(table.get("pattern"), dict) and "image" in table["pattern"]:
         picture = (path.parent / str(sensor.pattern.image)).resolve()
         if not picture.is_file():
@@ -133,6 +124,22 @@ def _read(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:  # broken TOML, or not UTF-8
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: not a TOML file: {reason}") from None
+
+
+def _sensor(table: dict[str, Any], name: str, path: Path) -> Sensor:
+    """A sensor of its table in a file; ``name`` is its name where it gives none."""
+    base = table.pop("base", "paper")
+    if not isinstance(base, str) or base.lower().endswith(".toml"):
+        raise InputError(f"{path}: base: {base!r} is none of {', '.join(SENSORS)}")
+    try:
+        whole = unstructure(get_sensor(base))
+    except InputError as error:
+        raise InputError(f"{path}: base: {error}") from None
+    if "name" not in table:
+        whole |= {"name": name, "description": f"after {sensor_name(base)}"}
+    elif isinstance(table["name"], str):
+        table["name"] = sensor_name(table["name"])
+    return structure(_merged(whole, table), Sensor, path)
 
 
 def _finite(text: str) -> float:
@@ -190,3 +197,8 @@ def _field_docstrings(cls: type) -> dict[str, str]:
             case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(ast.Constant(str(words))):
                 docstrings[name] = " ".join(words.replace("``", "").split())
     return docstrings
+
+
+_CAMERAS = Path(__file__).with_name("cameras.toml")
+for _name, _table in _read(_CAMERAS).items():
+    SENSORS[_name] = _sensor(_table, _name, _CAMERAS)

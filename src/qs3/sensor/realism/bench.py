@@ -17,11 +17,11 @@ from qs3.sensor.lens import blur_reach
 from qs3.sensor.matching import matching_canvas
 from qs3.sensor.materials import Material
 from qs3.sensor.presets import Sensor
-from qs3.sensor.render import Body, Renderer, Scene
+from qs3.sensor.render import Body, Renderer
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, Region, StereoRig
-from qs3.sensor.speckle import pattern_image
-from qs3.sensor.view import Clock, ViewImages, take_view
+from qs3.sensor.scene import rectangle
+from qs3.sensor.view import Clock, ViewImages, scene_of, take_view
 
 VIEW = Pose.looking_at(np.zeros(3), np.array([0.0, 1.0, 0.0]))
 """The pose of the left camera."""
@@ -67,15 +67,13 @@ class Bench:
             noise: The same for the image noise; ``index`` by default.
             focus: What auto-exposure looks at; ``region`` by default.
         """
-        sensor, rig, pattern = self.sensor, self.rig, self.sensor.pattern
+        sensor, rig = self.sensor, self.rig
         focus = focus or region
-        x0, y0, x1, y1 = matching_canvas(region, rig, sensor.matching).bounds
-        left, top, right, bottom = focus.bounds
-        x0, y0, x1, y1 = min(x0, left), min(y0, top), max(x1, right), max(y1, bottom)
+        both = np.array([matching_canvas(region, rig, sensor.matching).bounds, focus.bounds])
+        (x0, y0), (x1, y1) = both[:, :2].min(axis=0).tolist(), both[:, 2:].max(axis=0).tolist()
         wide = Region(x0, y0, x1 - x0, y1 - y0)
         wide = wide.grown(blur_reach(sensor.exposure.psf), rig.width, rig.height)
-        opening = pattern.tan_half_width, pattern.tan_half_height
-        scene = Scene(tuple(bodies), sensor.light, pattern_image(pattern), *opening)
+        scene = scene_of(bodies, sensor)
         pair = self.renderer.render(scene, rig, [VIEW], [self.seed + index], regions=[wide])[0]
         rng = np.random.default_rng(self.seed + (index if noise is None else noise))
         caster = DepthCaster(*(body.mesh for body in bodies))
@@ -102,9 +100,7 @@ def painted(mesh: trimesh.Trimesh, albedo: float = ALBEDO) -> Body:
 def wall(distance: float, degrees: float = 0.0) -> trimesh.Trimesh:
     """A wall that meets the optical axis at ``distance`` and fills the frame.
 
-    Args:
-        distance: Along the optical axis.
-        degrees: Turn about the vertical; its right side goes away from the camera.
+    Turned by ``degrees`` about the vertical, its right side goes away from the camera.
     """
     side = 2 * _REACH * distance
     return plate((0.0, distance), side, side, degrees)
@@ -116,22 +112,11 @@ def plate(
     """A rectangle at ``place`` (x and y) at the camera's height, that faces it but for a turn."""
     angle = np.radians(degrees)
     across = np.array([np.cos(angle), np.sin(angle), 0.0]) * width / 2
-    up = np.array([0.0, 0.0, height / 2])
-    centre = np.array([*place, 0.0])
-    corners = np.array(
-        [centre - across - up, centre + across - up, centre + across + up, centre - across + up]
-    )
-    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+    return rectangle(np.array([*place, 0.0]), across, np.array([0.0, 0.0, height / 2]))
 
 
 def central(rig: StereoRig, wide: float, high: float, left: int = 0) -> Region:
-    """The middle of the frame right of column ``left``.
-
-    Args:
-        rig: Supplies the frame.
-        wide: Share of the columns right of ``left``.
-        high: Share of the rows.
-        left: Columns left out, such as the band that has no match.
+    """The middle of the frame right of column ``left``, in shares of columns and rows.
 
     Example:
         >>> central(StereoRig(width=100, height=50), 0.4, 0.2)
@@ -166,11 +151,7 @@ def wall_region(
 ) -> Region:
     """The middle of what can be measured of a wall: right of the left band f·b/z.
 
-    Args:
-        sensor: The sensor.
-        distance: Of the wall.
-        share: Share of the columns.
-        high: Share of the rows; ``share`` by default.
+    It has ``share`` of the columns and ``high``, by default as much, of the rows.
     """
     left = int(np.ceil(sensor.rig.disparity(distance)))
     if sensor.matching.left_band == "opencv":

@@ -69,13 +69,7 @@ def bands(bench: Bench) -> Judged:
 
 
 def band_rows(disparity: Float[np.ndarray, "h w"], expected: float, where: str = "") -> list[Row]:
-    """Judge the band that has no match at the left border of a facing wall.
-
-    Args:
-        disparity: From the frame's first column on.
-        expected: Its width in pixels.
-        where: Added to the row's name.
-    """
+    """Judge the band without a match at the left border of a facing wall, ``expected`` px wide."""
     valid = np.isfinite(disparity)
     first = np.where(valid.any(axis=1), valid.argmax(axis=1), disparity.shape[1])
     what = f"left band {where}".strip()
@@ -164,15 +158,9 @@ def edge_rows(
 
 
 def fattening(part: Float[np.ndarray, "h w"], near: float, edge: int) -> Float[np.ndarray, "h"]:
-    """Pixels by which the plate reaches beyond its true edge in each row; negative where short.
+    """Pixels by which the plate, at the left, reaches beyond column ``edge`` − 1 in each row.
 
-    The plate is followed from the inside: holes within it do not end it, the last column of its
-    depth does.
-
-    Args:
-        part: Disparities, the plate to the left.
-        near: The plate's disparity.
-        edge: The first column outside the plate.
+    Holes within it do not end it, the last column of its depth does; negative where it is short.
 
     Example:
         >>> fattening(np.array([[9.0, 9.0, 9.0, 2.0], [9.0, 2.0, 2.0, 2.0]]), 9.0, 2).tolist()

@@ -52,14 +52,7 @@ def scanned(bench: Bench) -> Judged:
 
 
 def shoot_object(bench: Bench, distance: float, turn: float, index: int) -> ViewImages:
-    """Photograph a cabinet of the sensor's object size, looked down upon; with normals.
-
-    Args:
-        bench: The sensor.
-        distance: Of the object's middle.
-        turn: Of the object about its vertical, in degrees.
-        index: Number of the photograph.
-    """
+    """Photograph a cabinet looked down upon, turned by ``turn`` degrees; with normals."""
     mesh = normalise(shapes.make("cabinet", seed=1), "box")
     points = np.asarray(mesh.vertices) * bench.sensor.object_size
     tilt = np.radians(_TILT)
@@ -84,8 +77,8 @@ def off_faces(
         view: A photograph, with normals.
         rig: Supplies focal length, baseline and principal point.
         block: The matcher's block: within half of it a pixel's neighbours must show its face.
-        walls: Distances at which the noise on a wall is known.
-        sigma: The sub-pixel RMS there.
+        walls: Distances of facing walls.
+        sigma: The sub-pixel RMS on each.
 
     Returns:
         Distance over expected deviation, positive away from the camera; cosine of the view angle.
@@ -118,12 +111,7 @@ def inside_faces(
 
 
 def scan_rows(ratio: Float[np.ndarray, "n"], cosine: Float[np.ndarray, "n"]) -> Judged:
-    """Judge signed distances in units of the law.
-
-    Args:
-        ratio: Distance over expected deviation of each point.
-        cosine: Cosine of its view angle.
-    """
+    """Judge signed distances in units of the law; with the cosine of each point's view angle."""
     if len(ratio) < 100:
         return [row("points", float(len(ratio)), 100.0)], {"distance": [], "share": []}
     median = float(np.median(ratio))

@@ -4,6 +4,7 @@ Source: librealsense, tools/depth-quality. The plane is fitted to all points by 
 z; the lowest and highest 0.5 % of z are left out before the errors are formed.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -102,15 +103,9 @@ def averaged(metrics: Sequence[PlaneMetrics]) -> PlaneMetrics:
         >>> averaged([PlaneMetrics(1.0, 3.0, 0.3, 0.0), PlaneMetrics(0.5, 4.0, 0.4, 0.0)]).fill
         0.75
     """
-    fill, rms, pixels, accuracy = np.array(
-        [(m.fill, m.rms, m.sub_pixel, m.z_accuracy) for m in metrics]
-    ).T
-    return PlaneMetrics(
-        float(fill.mean()),
-        float(np.sqrt(np.mean(rms**2))),
-        float(np.sqrt(np.mean(pixels**2))),
-        float(accuracy.mean()),
-    )
+    fill, rms, pixels, accuracy = np.array([dataclasses.astuple(m) for m in metrics]).T
+    rms, pixels = (np.sqrt(np.mean(part**2)) for part in (rms, pixels))
+    return PlaneMetrics(float(fill.mean()), float(rms), float(pixels), float(accuracy.mean()))
 
 
 def depth_step(depth: Float[np.ndarray, "h w"], distance: float) -> float:

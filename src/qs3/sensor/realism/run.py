@@ -1,4 +1,4 @@
-"""All ten tests in order, with what was done before taken over."""
+"""The ten laws by id, and their tests in order, with what was done before taken over."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -8,10 +8,24 @@ from tqdm import tqdm
 
 from qs3.errors import InputError
 from qs3.sensor.presets import Sensor
+from qs3.sensor.realism import edges, faces, surfaces, walls
 from qs3.sensor.realism.bench import Bench
-from qs3.sensor.realism.laws import LAWS
-from qs3.sensor.realism.rows import plain
+from qs3.sensor.realism.rows import Judged, plain
 from qs3.sensor.render import Renderer
+
+LAWS: dict[str, tuple[str, Callable[[Bench], Judged | str]]] = {
+    "T1": ("RMS grows with the square of the distance", walls.noise),
+    "T2": ("No bias of disparity or distance", walls.bias),
+    "T3": ("Disparities come in the preset's steps", walls.steps),
+    "T4": ("Left band and occlusion shadow as wide as geometry says", edges.bands),
+    "T5": ("Edges fatten by no more than half a block", edges.edges),
+    "T6": ("Walls are filled; dark and glancing ones less", surfaces.fill),
+    "T7": ("No depth on a mirror or clear glass", surfaces.clear),
+    "T8": ("Steps and noise of the Kinect as measured", walls.kinect),
+    "T9": ("Image noise changes depth, equal seeds repeat it", walls.repeats),
+    "T10": ("Distances from a scanned object follow the law", faces.scanned),
+}
+"""Title, and test: figures beside their bounds and curves, or why the law does not apply."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +43,8 @@ class RealismSettings:
         asked = {test.upper(): test for test in self.tests}
         unknown = [test for name, test in asked.items() if name not in LAWS]
         if unknown or not asked:
-            raise InputError(
-                f"tests: no test {unknown[0] if unknown else ''!r}; choose of {', '.join(LAWS)}"
-            )
+            name = unknown[0] if unknown else ""
+            raise InputError(f"tests: no test {name!r}; choose of {', '.join(LAWS)}")
         object.__setattr__(self, "tests", tuple(test for test in LAWS if test in asked))
         if self.seed < 0:
             raise InputError(f"seed: {self.seed} must not be below 0")

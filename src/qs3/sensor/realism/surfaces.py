@@ -47,11 +47,8 @@ def fill(bench: Bench) -> Judged:
     near, narrow = edge_distances(bench)[0], central(bench.rig, 0.1, 0.5)
     by_angle = [rate(bench.shoot([painted(wall(near, turn))], narrow).depth) for turn in ANGLES]
     rows = [row(f"least fill of walls to {far:.3g} m", min(filled), 0.99)]
-    for name, values, rates, part in (
-        ("albedo", ALBEDOS, by_albedo, patch),
-        ("angle", ANGLES, by_angle, narrow),
-    ):
-        rows += fall_rows(name, values, rates, part.width * part.height / block**2)
+    rows += fall_rows("albedo", ALBEDOS, by_albedo, patch.width * patch.height / block**2)
+    rows += fall_rows("angle", ANGLES, by_angle, narrow.width * narrow.height / block**2)
     curves = {"albedo": ALBEDOS, "fill_albedo": by_albedo, "angle": ANGLES, "fill_angle": by_angle}
     return rows, curves | {"z": sweep, "fill": filled}
 

@@ -1,13 +1,14 @@
-"""Facing walls: noise against distance (T1), bias (T2), steps (T3), repetition (T9)."""
+"""Walls: noise by distance (T1), bias (T2), steps (T3), a Kinect's (T8), repetition (T9)."""
 
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 
 from qs3.sensor.matching import MatchingSettings
 from qs3.sensor.realism.bench import (
     Bench,
+    central,
     distances,
     middle,
     painted,
@@ -15,7 +16,14 @@ from qs3.sensor.realism.bench import (
     wall,
     wall_region,
 )
-from qs3.sensor.realism.metrics import PlaneMetrics, averaged, plane_metrics
+from qs3.sensor.realism.metrics import (
+    PlaneMetrics,
+    averaged,
+    camera_points,
+    depth_step,
+    plane_metrics,
+    plane_sigma,
+)
 from qs3.sensor.realism.rows import Judged, Row, row
 from qs3.sensor.rig import StereoRig
 
@@ -103,14 +111,10 @@ def bias(bench: Bench) -> Judged:
 
 
 def bias_rows(disparity: Sequence[Float[np.ndarray, "_"]], true: Sequence[float]) -> Judged:
-    """Judge disparities of facing walls.
+    """Judge disparities of facing walls, without NaN, beside the true one of each.
 
     Tested is the median over all pixels of all walls. The curve has each wall's mean without
     gross errors: a median would be rounded to the disparities' steps.
-
-    Args:
-        disparity: Of each wall, without NaN.
-        true: The disparity of each wall.
     """
     error = [d - t for d, t in zip(disparity, true, strict=True)]
     every = np.concatenate(error)
@@ -137,8 +141,8 @@ def steps(bench: Bench) -> Judged | str:
     quantum, shift = disparity_grid(bench.sensor.matching)
     if not quantum:
         return "the matcher's disparities are not rounded"
-    distance = middle(bench.sensor)
-    region = wall_region(bench.sensor, distance, 0.2 if bench.quick else 0.4)
+    distance, share = middle(bench.sensor), 0.2 if bench.quick else 0.4
+    region = wall_region(bench.sensor, distance, share)
     disparity = bench.shoot([painted(wall(distance, 30.0))], region).disparity
     values = disparity[np.isfinite(disparity)].astype(np.float64)
     return steps_rows(values, quantum, shift), {}
@@ -152,13 +156,7 @@ def disparity_grid(settings: MatchingSettings) -> tuple[float, float]:
 
 
 def steps_rows(values: Float[np.ndarray, "n"], quantum: float, shift: float = 0.0) -> list[Row]:
-    """Judge disparities: whole multiples of the quantum, and of no coarser one.
-
-    Args:
-        values: Disparities that cover many steps.
-        quantum: The step.
-        shift: What all of them are off its multiples.
-    """
+    """Judge disparities: off by ``shift`` multiples of the quantum, and of no coarser one."""
     whole = (values - shift) / quantum
     gaps = np.diff(np.unique(values))
     share = np.mean(whole == np.rint(whole)) if len(values) else np.nan
@@ -166,6 +164,43 @@ def steps_rows(values: Float[np.ndarray, "n"], quantum: float, shift: float = 0.
         row("share of whole multiples", share, 1.0, 1.0),
         row("smallest step", gaps.min() if len(gaps) else np.nan, quantum, quantum, "px"),
     ]
+
+
+# T8
+
+DISTANCES = (1.0, 2.0, 3.0, 4.0)
+"""In metres."""
+SIGMA, STEP = 1.43e-3, 2.85e-3
+"""Noise and step at 1 m in metres; both grow with the square of the distance. Khoshelham and
+Elberink 2012, Sensors 12(2):1437: σ_z = 2.85·10⁻⁵·z²·σ_d in centimetres with σ_d = 0.5 steps."""
+
+
+def kinect(bench: Bench) -> Judged | str:
+    """T8: walls turned by 15°, so that each crosses many steps, and covers each evenly."""
+    if bench.rig.second != "pattern":
+        return "measured on the Kinect v1, whose second image is the pattern"
+    share = 0.3 if bench.quick else 0.5
+    region = central(bench.rig, share, share)
+    step, sigma = [], []
+    for index, z in enumerate(DISTANCES):
+        depth = bench.shoot([painted(wall(z, 15.0))], region, index).depth
+        step.append(depth_step(depth, z))
+        sigma.append(plane_sigma(camera_points(depth, bench.rig, region), z))
+    return kinect_rows(np.array(step), np.array(sigma))
+
+
+def kinect_rows(step: Float[np.ndarray, "n"], sigma: Float[np.ndarray, "n"]) -> Judged:
+    """Judge steps and noise in metres at ``DISTANCES``: within 20 % of what was measured."""
+    squared = np.square(DISTANCES)
+    rows, data = [], {"z": DISTANCES}
+    figures = (("step", "step", step, STEP), ("noise σ", "sigma", sigma, SIGMA))
+    for name, short, made, law in figures:
+        rows += [
+            row(f"{name} at {z:g} m", 1000 * value, 800 * expected, 1200 * expected, "mm")
+            for z, value, expected in zip(DISTANCES, made, law * squared, strict=True)
+        ]
+        data |= {f"{short}_mm": 1000 * made, f"{short}_law_mm": 1000 * law * squared}
+    return rows, data
 
 
 # T9
@@ -182,11 +217,7 @@ def repeats(bench: Bench) -> Judged | str:
     return repeats_rows(*(view.depth for view in views)), {}
 
 
-def repeats_rows(
-    first: Shaped[np.ndarray, "h w"],
-    again: Shaped[np.ndarray, "h w"],
-    other: Shaped[np.ndarray, "h w"],
-) -> list[Row]:
+def repeats_rows(first: np.ndarray, again: np.ndarray, other: np.ndarray) -> list[Row]:
     """Judge depths of equal seeds, and of other image noise."""
     same, changed = np.isclose(again, first, 0, 0, True), ~np.isclose(other, first, 0, 0, True)
     return [

@@ -118,42 +118,19 @@ class Studio:
     def _fix_settings(self):
         """Plain path tracing: every ray counts, none is guessed, dropped or smoothed."""
         scene, cycles, render = self.scene, self.scene.cycles, self.scene.render
-        _set(
-            cycles,
-            device="CPU",
-            use_adaptive_sampling=False,
-            use_denoising=False,
-            use_light_tree=False,
-            use_guiding=False,
-            light_sampling_threshold=0.0,
-            min_light_bounces=0,
-            min_transparent_bounces=0,
-            sample_clamp_direct=0.0,
-            sample_clamp_indirect=0.0,
-            blur_glossy=0.0,
-            caustics_reflective=True,
-            caustics_refractive=True,
-            transparent_max_bounces=16,
-            sampling_pattern="TABULATED_SOBOL",
-            time_limit=0.0,
-            film_exposure=1.0,
-        )
-        _set(
-            render,
-            use_persistent_data=True,
-            use_compositing=False,
-            use_sequencer=False,
-            film_transparent=False,
-            dither_intensity=0.0,
-            resolution_percentage=100,
-            pixel_aspect_x=1.0,
-            pixel_aspect_y=1.0,
-            use_motion_blur=False,
-            use_file_extension=False,
-            use_overwrite=True,
-            threads_mode="FIXED",
-            threads=_processors(),
-        )
+        off = "adaptive_sampling", "denoising", "light_tree", "guiding"
+        _set(cycles, device="CPU", **{"use_" + name: False for name in off})
+        off = "light_sampling_threshold", "sample_clamp_direct", "sample_clamp_indirect"
+        _set(cycles, **dict.fromkeys((*off, "blur_glossy", "time_limit"), 0.0))
+        _set(cycles, min_light_bounces=0, min_transparent_bounces=0, transparent_max_bounces=16)
+        _set(cycles, caustics_reflective=True, caustics_refractive=True)
+        _set(cycles, sampling_pattern="TABULATED_SOBOL", film_exposure=1.0)
+        off = "compositing", "sequencer", "motion_blur", "file_extension"
+        _set(render, **{"use_" + name: False for name in off})
+        _set(render, use_persistent_data=True, use_overwrite=True, film_transparent=False)
+        _set(render, dither_intensity=0.0, resolution_percentage=100)
+        _set(render, pixel_aspect_x=1.0, pixel_aspect_y=1.0)
+        _set(render, threads_mode="FIXED", threads=_processors())
         _set(scene.view_settings, look="None", exposure=0.0, gamma=1.0, use_curve_mapping=False)
 
     def _wire_projector(self):
@@ -262,11 +239,9 @@ class Studio:
         graph = _Graph(material.node_tree)
         grey = (settings["albedo"],) * 3 + (1.0,)
         model = settings["model"]
-        if model == "diffuse":
-            surface = graph.add("ShaderNodeBsdfDiffuse")
-            _inputs(surface, Color=grey, Roughness=0.0)
-        elif model == "mirror":
-            surface = graph.add("ShaderNodeBsdfAnisotropic")
+        if model in ("diffuse", "mirror"):
+            kind = {"diffuse": "Diffuse", "mirror": "Anisotropic"}[model]
+            surface = graph.add("ShaderNodeBsdf" + kind)
             _inputs(surface, Color=grey, Roughness=0.0)
         elif model == "principled":
             surface = graph.add("ShaderNodeBsdfPrincipled")
@@ -294,13 +269,11 @@ class Studio:
         self.scene.view_settings.view_transform = "Raw" if raw else quality["view_transform"]
         picture = self.scene.render.image_settings
         # Radiance as 32-bit floats, or a display's grey levels in 16 bits.
-        picture.file_format = "OPEN_EXR" if raw else "PNG"
-        picture.color_mode = "RGB"
-        picture.color_depth = "32" if raw else "16"
         if raw:
+            _set(picture, file_format="OPEN_EXR", color_mode="RGB", color_depth="32")
             picture.exr_codec = "NONE"
         else:
-            picture.compression = 0
+            _set(picture, file_format="PNG", color_mode="RGB", color_depth="16", compression=0)
 
     def _photograph(self, shot, request):
         rig, render = request["rig"], self.scene.render
@@ -349,8 +322,9 @@ class _Graph:
         self.tree = tree
         self.nodes = []
 
-    def add(self, kind, *feeds):
+    def add(self, kind, *feeds, **settings):
         node = self.tree.nodes.new(kind)
+        _set(node, **settings)
         self.nodes.append(node)
         for slot, feed in zip(node.inputs, feeds):  # noqa: B905
             self.link(feed, slot)
@@ -363,12 +337,7 @@ class _Graph:
             self.tree.links.new(feed, slot)
 
     def math(self, operation, *feeds):
-        node = self.tree.nodes.new("ShaderNodeMath")
-        node.operation = operation
-        self.nodes.append(node)
-        for slot, feed in zip(node.inputs, feeds):  # noqa: B905
-            self.link(feed, slot)
-        return node.outputs[0]
+        return self.add("ShaderNodeMath", *feeds, operation=operation).outputs[0]
 
     def beyond_touch(self, surface):
         """Let rays that have only just left a surface pass what lies in the same plane.

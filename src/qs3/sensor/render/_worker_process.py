@@ -23,23 +23,10 @@ from qs3.errors import QS3Error
 
 _MARK = "@qs3 "
 _START_SECONDS = 300.0
-_TAIL_LINES = 12
 
 
 class RenderError(QS3Error, RuntimeError):
     """A renderer's own process failed; the object it was given fails, the next one does not."""
-
-    def __init__(self, reason: str, log: str = "") -> None:
-        super().__init__(reason, log)
-        self.reason = reason
-        """What happened to the process."""
-        self.log = log
-        """The end of what the process printed."""
-
-    def __str__(self) -> str:
-        """One line: what happened and the last that was printed."""
-        lines = [line.strip() for line in self.log.splitlines() if line.strip()]
-        return self.reason + (f"; its log ends: {' | '.join(lines[-4:])}" if lines else "")
 
 
 class Worker:
@@ -66,7 +53,7 @@ class Worker:
                 )
         except OSError as error:
             shutil.rmtree(self.folder, ignore_errors=True)
-            raise RenderError(f"{command[0]} does not start: {error.strerror}", "") from error
+            raise RenderError(f"{command[0]} does not start: {error.strerror}") from error
         stdout = self._process.stdout
         assert stdout is not None  # noqa: S101  (asked for above)
         threading.Thread(target=_listen, args=(stdout, self._lines), daemon=True).start()
@@ -82,9 +69,9 @@ class Worker:
         return self._process.pid
 
     @property
-    def alive(self) -> bool:
-        """Whether the child still runs."""
-        return self._process.poll() is None
+    def ended(self) -> bool:
+        """Whether the child runs no more."""
+        return self._process.poll() is not None
 
     def send(self, request: dict[str, Any]) -> None:
         """Hand the child one request; a child that is gone is noticed by `receive`."""
@@ -105,26 +92,25 @@ class Worker:
             try:
                 line = self._lines.get(timeout=max(0.0, deadline - time.monotonic()))
             except queue.Empty:
-                raise RenderError(
-                    f"the renderer's process kept silent for {timeout:g} s", self.log_tail()
-                ) from None
+                raise self._fault(f"kept silent for {timeout:g} s") from None
             if line is None:
-                raise RenderError(f"the renderer's process {self._end()}", self.log_tail())
+                raise self._fault(self._end())
             answer = _parse(line)
             if answer is None:
                 continue
             if answer.get("event") == event:
                 return answer
             reason = answer.get("reason", f"answered {answer.get('event')!r}, not {event!r}")
-            raise RenderError(f"the renderer's process failed: {reason}", self.log_tail())
+            raise self._fault(f"failed: {reason}")
 
-    def log_tail(self) -> str:
-        """The last lines of what the child printed."""
-        try:
+    def _fault(self, what: str) -> RenderError:
+        """One line: what happened and the last that the child printed."""
+        text = ""
+        with contextlib.suppress(OSError):
             text = (self.folder / "worker.log").read_text(errors="replace")
-        except OSError:
-            return ""
-        return "\n".join(text.splitlines()[-_TAIL_LINES:])
+        lines = [line.strip() for line in text.splitlines() if line.strip()]
+        end = f"; its log ends: {' | '.join(lines[-4:])}" if lines else ""
+        return RenderError(f"the renderer's process {what}{end}")
 
     def close(self) -> None:
         """End the child and all of its children now, and remove the folder."""
@@ -171,7 +157,7 @@ def borrow(command: tuple[str, ...], objects: int) -> Iterator[Worker]:
     """
     with _lock:
         worker = _idle.pop(command, None)
-    if worker is not None and (not worker.alive or 0 < objects <= worker.objects):
+    if worker is not None and (worker.ended or 0 < objects <= worker.objects):
         worker.close()
         worker = None
     worker = worker or Worker(command)
@@ -185,9 +171,8 @@ def borrow(command: tuple[str, ...], objects: int) -> Iterator[Worker]:
         _busy.discard(worker)
     worker.objects += 1
     with _lock:
-        spare = _idle.pop(command, None)  # another thread's
-        _idle[command] = worker
-    if spare is not None:
+        spare, _idle[command] = _idle.get(command), worker
+    if spare is not None:  # another thread's
         spare.close()
 
 

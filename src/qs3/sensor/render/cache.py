@@ -24,7 +24,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from qs3.errors import InputError
 from qs3.sensor.render.scene import Scene
 from qs3.sensor.rig import Pose, Region, StereoRig
 
@@ -46,20 +45,6 @@ def places(samples: int) -> Float32[np.ndarray, "n 2"]:
     ranks = np.argsort(np.argsort(np.arange(samples) * GOLDEN % 1))
     both = np.stack([np.arange(samples), ranks], axis=1)
     return ((both + 0.5) / samples).astype(np.float32)
-
-
-@dataclass(frozen=True)
-class CacheSettings:
-    """How finely the soft light is gathered."""
-
-    cell: int = 4
-    """Side in pixels of a cell."""
-    rays: int = 32
-    """Rays over the hemisphere in each cell."""
-
-    def __post_init__(self) -> None:
-        if self.cell < 1 or self.rays < 1:
-            raise InputError(f"renderer: cell {self.cell} and rays {self.rays} must be at least 1")
 
 
 def cells(region: Region, cell: int) -> Region:
@@ -200,16 +185,17 @@ class Photographer(ABC):
 
     arrays: Arrays
 
-    def __init__(self, scene: Scene, samples: int, max_depth: int, cache: CacheSettings) -> None:
-        self._scene, self._samples, self._cache = scene, samples, cache
-        self._bounces = max_depth - 2
+    def __init__(self, scene: Scene, samples: int, max_depth: int, cell: int, rays: int) -> None:
+        """Take the settings of `qs3.sensor.render.mitsuba.MitsubaRenderer`."""
+        self._scene, self._samples, self._bounces = scene, samples, max_depth - 2
+        self._cell, self._rays = cell, rays
 
     def photograph(
         self, rig: StereoRig, pose: Pose, regions: tuple[Region, Region], seed: int
     ) -> list[Float32[np.ndarray, "_ _"]]:
         """Radiance in the two regions of the pair at ``pose``; an empty region stays empty."""
         projector = Camera(self.arrays, rig, rig.projector(pose), rig.full_frame)
-        grid = cells(regions[0], self._cache.cell)
+        grid = cells(regions[0], self._cell)
         soft = self._gather(Camera(self.arrays, rig, pose, grid), grid, projector, seed)
         images = []
         for position, region in zip((pose, rig.right(pose)), regions, strict=True):

@@ -21,7 +21,7 @@ from qs3.errors import InputError, MissingExtraError
 from qs3.sensor.checks import check_choices, check_range
 from qs3.sensor.render._worker_process import RenderError as RenderError
 from qs3.sensor.render._worker_process import Worker, borrow
-from qs3.sensor.render.scene import Scene, StereoPair, view_regions
+from qs3.sensor.render.scene import MOST_SAMPLES, Scene, StereoPair, view_regions
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 _QUALITY = ("samples", "max_bounces", "pixel_filter", "view_transform")
@@ -48,10 +48,8 @@ def interpreter() -> tuple[str, ...] | None:
         python = sys.executable
     if python is None:
         beside = Path(f"{sys.prefix}-cycles")
-        for place in (beside / "bin" / "python", beside / "Scripts" / "python.exe"):
-            if place.is_file():
-                python = str(place)
-                break
+        places = beside / "bin" / "python", beside / "Scripts" / "python.exe"
+        python = next((str(place) for place in places if place.is_file()), None)
     return None if python is None else (python, str(_WORKER))
 
 
@@ -87,8 +85,9 @@ class CyclesRenderer:
 
     def __post_init__(self) -> None:
         check_choices(self, "renderer")
-        check_range(self, "renderer", "samples", low=1)
-        check_range(self, "renderer", "max_bounces", "objects_per_worker")
+        check_range(self, "renderer", "samples", low=1, high=MOST_SAMPLES)
+        check_range(self, "renderer", "max_bounces", high=128)
+        check_range(self, "renderer", "objects_per_worker")
         check_range(self, "renderer", "timeout", above=True)
 
     @property
@@ -111,23 +110,24 @@ class CyclesRenderer:
         seeds: Sequence[int],
         regions: Sequence[Region] | None = None,
     ) -> list[StereoPair]:
-        """Photograph ``scene`` once from each pose; equal seeds give equal bits.
+        """Photograph ``scene`` once from each pose: `qs3.sensor.render.Renderer`.
 
         Raises:
-            InputError: where a camera sees the sky past a lone object.
             MissingExtraError: where there is no Blender.
             RenderError: where the worker died, hung or reported a fault; the next call starts a
                 fresh one.
-            ValueError: where there is not one seed (and region, if given) for each pose.
         """
         views = view_regions(scene, rig, poses, seeds, regions, self.full_frame)
         shots = [
-            # Two streams that never meet: the left camera's seeds are even.
-            _shot(rig, pose, camera, region, (2 * seed + side) % 2**31)
+            {
+                "camera": camera.camera_to_world.tolist(),
+                "projector": rig.projector(pose).camera_to_world.tolist(),
+                "region": [region.x, region.y, region.width, region.height],
+                # Two streams that never meet: the left camera's seeds are even.
+                "seed": (2 * seed + side) % 2**31,
+            }
             for pose, seed, parts in zip(poses, seeds, views, strict=True)
-            for side, (camera, region) in enumerate(
-                zip((pose, rig.right(pose)), parts, strict=True)
-            )
+            for side, camera, region in zip((0, 1), (pose, rig.right(pose)), parts, strict=True)
             if not region.empty
         ]
         with borrow(_command(), self.objects_per_worker) as worker:
@@ -173,11 +173,7 @@ class CyclesRenderer:
 
 
 def find_cycles() -> dict[str, str]:
-    """Where Cycles is and which version, for ``doctor``.
-
-    Returns:
-        ``command`` (the program), ``blender`` and ``python`` (their versions); empty where there
-        is no Blender.
+    """``command`` of Cycles, its versions of ``blender`` and ``python``; empty without Blender.
 
     Raises:
         InputError: where QS3_BLENDER or QS3_CYCLES_PYTHON names no file.
@@ -205,12 +201,3 @@ def _command() -> tuple[str, ...]:
 def _versions(command: tuple[str, ...]) -> dict[str, str]:
     with borrow(command, 0) as worker:
         return {name: str(worker.greeting[name]) for name in ("blender", "python")}
-
-
-def _shot(rig: StereoRig, pose: Pose, camera: Pose, region: Region, seed: int) -> dict[str, Any]:
-    return {
-        "camera": camera.camera_to_world.tolist(),
-        "projector": rig.projector(pose).camera_to_world.tolist(),
-        "region": [region.x, region.y, region.width, region.height],
-        "seed": seed,
-    }

@@ -16,7 +16,6 @@ from qs3.sensor.render.cache import (
     R2,
     TRIES,
     Arrays,
-    CacheSettings,
     Camera,
     Photographer,
     SoftLight,
@@ -42,11 +41,11 @@ class EmbreePhotographer(Photographer):
         magnify=lambda camera, depth: camera.focal / depth,
     )
 
-    def __init__(self, scene: Scene, samples: int, max_depth: int, cache: CacheSettings) -> None:
+    def __init__(self, scene: Scene, *settings: int) -> None:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
-        super().__init__(scene, samples, max_depth, cache)
+        super().__init__(scene, *settings)
         if any(body.material.model != "diffuse" for body in scene.bodies):
             raise InputError("renderer: only diffuse bodies are rendered in this way")
         meshes = [body.mesh for body in scene.bodies]
@@ -70,13 +69,11 @@ class EmbreePhotographer(Photographer):
         samples = self._samples
         pixels = region.width * region.height
         row, column = _grid(region.height, region.width)
-        centre = np.float32(0.5)
-        light = self._environment(_rays(camera, column + centre, row + centre)) * np.float32(
-            samples
-        )
-        background = light / np.float32(samples)
+        half, count = np.float32(0.5), np.float32(samples)
+        light = self._environment(_rays(camera, column + half, row + half)) * count
+        background = light / count
         seen = np.zeros(pixels, np.float32)
-        place, facing = np.zeros((pixels, 3), np.float32), np.zeros((pixels, 3), np.float32)
+        place, facing = np.zeros((2, pixels, 3), np.float32)
         lane = np.arange(pixels)
         for k, (a, b) in enumerate(places(samples)):
             triangle, points, normals = self._look(camera, column[lane] + a, row[lane] + b)
@@ -96,14 +93,13 @@ class EmbreePhotographer(Photographer):
         place, facing = place[shown] / seen[shown, None], facing[shown]
         facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), np.float32(1e-6))
         light[shown] += seen[shown] * soft.at(place, facing)
-        return light / np.float32(samples)
+        return light / count
 
     def _gather(self, camera: Camera, grid: Region, projector: Camera, seed: int) -> "_EmbreeLight":
-        settings = self._cache
-        soft = _EmbreeLight(camera, grid, settings.cell, int)
+        soft = _EmbreeLight(camera, grid, self._cell, int)
         row, column = _grid(soft.rows, soft.columns)
         triangle = np.full(len(row), -1, np.int32)
-        place, facing = np.zeros((len(row), 3), np.float32), np.zeros((len(row), 3), np.float32)
+        place, facing = np.zeros((2, len(row), 3), np.float32)
         for k in range(TRIES):
             left = np.flatnonzero(triangle < 0)
             x, y = (np.float32((0.5 + k * step) % 1) for step in R2)
@@ -116,13 +112,11 @@ class EmbreePhotographer(Photographer):
         soft.place, soft.facing, soft.light, soft.filled = place, facing, light, triangle >= 0
         if len(shown):
             # By the cell's place in the frame, whatever the region.
-            down = (row[shown] + grid.y // settings.cell).astype(np.uint32)
-            across = (column[shown] + grid.x // settings.cell).astype(np.uint32)
+            down = (row[shown] + grid.y // self._cell).astype(np.uint32)
+            across = (column[shown] + grid.x // self._cell).astype(np.uint32)
             place, facing = place[shown], facing[shown]
             turn = _turns(down * 65536 + across, seed)
-            light[shown] = self._soft(
-                place, facing, triangle[shown], projector, settings.rays, turn
-            )
+            light[shown] = self._soft(place, facing, triangle[shown], projector, turn)
             whole = self.arrays.whole
             light[shown] = soft.smooth(
                 place, facing, whole(column[shown]), whole(row[shown]), light[shown]
@@ -136,10 +130,10 @@ class EmbreePhotographer(Photographer):
         normals: Float32[np.ndarray, "n 3"],
         triangle: Int32[np.ndarray, "n"],
         projector: Camera,
-        rays: int,
         turn: Float32[np.ndarray, "2 n"],
     ) -> Float32[np.ndarray, "n"]:
         """Radiance of diffuse points by light that does not come straight from the projector."""
+        rays = self._rays
         k = np.arange(rays, dtype=np.float32)[None]
         p = ((k + 0.5) / rays + turn[0, :, None]) % 1
         q = (k * np.float32(GOLDEN) + turn[1, :, None]) % 1
@@ -308,10 +302,8 @@ def _bilinear(
     x, y = u * np.float32(width) - np.float32(0.5), v * np.float32(height) - np.float32(0.5)
     x0, y0 = np.floor(x), np.floor(y)
     fx, fy = x - x0, y - y0
-    left = np.clip(x0.astype(np.int32), 0, width - 1)
-    right = np.clip(x0.astype(np.int32) + 1, 0, width - 1)
-    top = np.clip(y0.astype(np.int32), 0, height - 1)
-    bottom = np.clip(y0.astype(np.int32) + 1, 0, height - 1)
+    left, right = (np.clip(x0.astype(np.int32) + n, 0, width - 1) for n in (0, 1))
+    top, bottom = (np.clip(y0.astype(np.int32) + n, 0, height - 1) for n in (0, 1))
     upper = image[top, left] * (1 - fx) + image[top, right] * fx
     lower = image[bottom, left] * (1 - fx) + image[bottom, right] * fx
     return upper * (1 - fy) + lower * fy

@@ -9,7 +9,6 @@ from qs3.sensor.render.cache import (
     R2,
     TRIES,
     Arrays,
-    CacheSettings,
     Camera,
     Photographer,
     SoftLight,
@@ -26,12 +25,10 @@ class JitPhotographer(Photographer):
     Values that change between images are opaque: literals would compile a kernel each.
     """
 
-    def __init__(
-        self, mi: Any, scene: Scene, samples: int, max_depth: int, cache: CacheSettings
-    ) -> None:
+    def __init__(self, mi: Any, scene: Scene, *settings: int) -> None:
         import drjit as dr
 
-        super().__init__(scene, samples, max_depth, cache)
+        super().__init__(scene, *settings)
         self._mi, self._dr = mi, dr
         self._shapes = mi.load_dict({"type": "scene", **mitsuba_bodies(mi, scene)})
         self.arrays = Arrays(
@@ -51,10 +48,8 @@ class JitPhotographer(Photographer):
         )
         light = scene.light
         self._intensity = self._number(light.projector * np.pi)
-        self._half = (
-            self._number(0.5 / scene.tan_half_width),
-            self._number(0.5 / scene.tan_half_height),
-        )
+        tangents = scene.tan_half_width, scene.tan_half_height
+        self._half = [self._number(0.5 / tangent) for tangent in tangents]
         self._sky = self._number(light.sky)
         self._ambient = self._number(light.ambient)
         self._sky_z = self._number(np.sin(np.radians(light.sky_elevation)))
@@ -88,9 +83,9 @@ class JitPhotographer(Photographer):
         return dr.select(lit, share * slide * self._intensity / squared, 0)
 
     def _gather(self, camera: Camera, grid: Region, projector: Camera, seed: int) -> "_JitLight":
-        mi, dr, settings = self._mi, self._dr, self._cache
-        soft = _JitLight(camera, grid, settings.cell, self._count)
-        count = grid.width // settings.cell * (grid.height // settings.cell)
+        mi, dr, cell = self._mi, self._dr, self._cell
+        soft = _JitLight(camera, grid, cell, self._count)
+        count = grid.width // cell * (grid.height // cell)
         index = dr.arange(mi.UInt32, count)
         width, side = soft.columns, soft.cell
         row = index // width
@@ -110,11 +105,11 @@ class JitPhotographer(Photographer):
         shown &= si.is_valid()
         bsdf = si.bsdf()
         # By the cell's place in the frame, whatever the region.
-        across, down = grid.x // settings.cell, grid.y // settings.cell
+        across, down = grid.x // cell, grid.y // cell
         name = (row + self._count(down)) * 65536 + (index - row * width) + self._count(across)
         turn = mi.sample_tea_32(name, self._count(seed % 2**32), rounds=4)
         turn_x, turn_y = (mi.Float(word >> 8) * 2**-24 for word in turn)
-        total = self._count(settings.rays)
+        total = self._count(self._rays)
 
         def gather_on(k: Any, _: Any) -> Any:
             return shown & (k < total)

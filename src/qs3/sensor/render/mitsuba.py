@@ -10,11 +10,11 @@ from typing import Any, Literal
 
 from qs3.errors import InputError
 from qs3.sensor.checks import check_choices, check_range
-from qs3.sensor.render.cache import CacheSettings, Photographer
+from qs3.sensor.render.cache import Photographer
 from qs3.sensor.render.embree import EmbreePhotographer
 from qs3.sensor.render.jit import JitPhotographer
 from qs3.sensor.render.path import PathPhotographer
-from qs3.sensor.render.scene import Scene, StereoPair, view_regions
+from qs3.sensor.render.scene import MOST_SAMPLES, Scene, StereoPair, view_regions
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 VARIANTS = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
@@ -54,10 +54,10 @@ def best_variant() -> str:
     Raises:
         InputError: where none does.
     """
-    for variant in VARIANTS:
-        if usable(variant):
-            return variant
-    raise InputError("Mitsuba does not render here, not even as scalar_rgb; see: qs3 doctor")
+    variant = next(filter(usable, VARIANTS), None)
+    if variant is None:
+        raise InputError("Mitsuba does not render here, not even as scalar_rgb; see: qs3 doctor")
+    return variant
 
 
 @dataclass(frozen=True)
@@ -86,14 +86,14 @@ class MitsubaRenderer:
         if not self.variant:
             object.__setattr__(self, "variant", best_variant())
         elif self.variant not in VARIANTS:
-            raise InputError(
-                f"renderer: no variant {self.variant!r}; choose one of {', '.join(VARIANTS)}"
-            )
+            offer = ", ".join(VARIANTS)
+            raise InputError(f"renderer: no variant {self.variant!r}; choose one of {offer}")
         elif not usable(self.variant):
             raise InputError(f"renderer: {self.variant} does not work here; see: qs3 doctor")
         check_choices(self, "renderer")
-        check_range(self, "renderer", "samples", "cache_cell", "cache_rays", low=1)
-        check_range(self, "renderer", "max_depth", low=2)
+        check_range(self, "renderer", "samples", low=1, high=MOST_SAMPLES)
+        check_range(self, "renderer", "cache_cell", "cache_rays", low=1, high=4096)
+        check_range(self, "renderer", "max_depth", low=2, high=128)
 
     @property
     def description(self) -> dict[str, str]:
@@ -109,11 +109,7 @@ class MitsubaRenderer:
         seeds: Sequence[int],
         regions: Sequence[Region] | None = None,
     ) -> list[StereoPair]:
-        """Photograph ``scene`` once from each pose.
-
-        Raises:
-            ValueError: where there is not one seed (and region, if given) for each pose.
-        """
+        """Photograph ``scene`` once from each pose: `qs3.sensor.render.Renderer`."""
         views = view_regions(scene, rig, poses, seeds, regions, self.full_frame)
         photographer = self._photographer(_mitsuba(self.variant), scene)
         pairs = []
@@ -129,10 +125,10 @@ class MitsubaRenderer:
         cached = all(m.model == "diffuse" if scalar else m.rough for m in materials)
         if self.indirect == "path" or not cached:
             return PathPhotographer(mi, scene, self.samples, self.max_depth)
-        cache = CacheSettings(self.cache_cell, self.cache_rays)
+        settings = self.samples, self.max_depth, self.cache_cell, self.cache_rays
         if scalar:
-            return EmbreePhotographer(scene, self.samples, self.max_depth, cache)
-        return JitPhotographer(mi, scene, self.samples, self.max_depth, cache)
+            return EmbreePhotographer(scene, *settings)
+        return JitPhotographer(mi, scene, *settings)
 
 
 def _mitsuba(variant: str) -> Any:

@@ -41,20 +41,17 @@ class PathPhotographer:
         self._parameters.update()
         # Two streams that never meet: the left camera's seeds are even.
         return [
-            self._one(rig, camera, region, (2 * seed + side) % 2**32)
-            for side, (camera, region) in enumerate(
-                zip((pose, rig.right(pose)), regions, strict=True)
-            )
+            self._image(rig, camera, region, (2 * seed + side) % 2**32)
+            for side, camera, region in zip((0, 1), (pose, rig.right(pose)), regions, strict=True)
         ]
 
-    def _one(
+    def _image(
         self, rig: StereoRig, camera: Pose, region: Region, seed: int
     ) -> Float32[np.ndarray, "h w"]:
         """Render one region of one camera's frame."""
         if region.empty:
             return np.zeros(region.shape, dtype=np.float32)
-        width = -(-region.width // _FILM_STEP) * _FILM_STEP
-        height = -(-region.height // _FILM_STEP) * _FILM_STEP
+        width, height = (-(-side // _FILM_STEP) * _FILM_STEP for side in region.shape[::-1])
         cx, cy = rig.principal_point
         # Shift of the film from the optical axis, as a share of the film.
         shift_x = ((width - 1) / 2 + region.x - cx) / width

@@ -7,14 +7,15 @@ Convention:
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float, Int
 
 from qs3.sensor.rig import Pose, Region, StereoRig
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 @dataclass(frozen=True)
@@ -38,13 +39,17 @@ class DepthCaster:
     """Casts depth images of one or several meshes; holds their acceleration structure.
 
     Example:
+        >>> import trimesh
         >>> plate = trimesh.creation.box(extents=[1, 1, 0.5]).apply_translation([0, 0, 2.25])
         >>> rig = StereoRig(width=5, height=3, focal=4.0)
         >>> DepthCaster(plate).cast(rig, Pose(np.eye(4)), rig.full_frame).depth[1].tolist()
         [nan, 2.0, 2.0, 2.0, nan]
     """
 
-    def __init__(self, mesh: trimesh.Trimesh, *others: trimesh.Trimesh) -> None:
+    def __init__(self, mesh: "trimesh.Trimesh", *others: "trimesh.Trimesh") -> None:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
         meshes = (mesh, *others)
         triangles = np.concatenate([np.asarray(body.triangles, np.float64) for body in meshes])
         self._embree = EmbreeScene()

@@ -2,16 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
-import trimesh
 from jaxtyping import Float32
 
 from qs3.errors import InputError
 from qs3.sensor.checks import check_range
 from qs3.sensor.materials import Material
 from qs3.sensor.rig import Pose, Region, StereoRig
+
+if TYPE_CHECKING:
+    import trimesh
+
+MOST_SAMPLES = 2**16
+"""Rays a pixel that a renderer takes at most."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +46,7 @@ class LightSettings:
 class Body:
     """One thing in the scene."""
 
-    mesh: trimesh.Trimesh
+    mesh: "trimesh.Trimesh"
     """Its surface, in world coordinates."""
     material: Material = field(default_factory=Material)
     """What its surface does to light."""
@@ -63,7 +68,7 @@ class Scene:
     """Tangent of half its vertical opening angle."""
 
     @property
-    def mesh(self) -> trimesh.Trimesh:
+    def mesh(self) -> "trimesh.Trimesh":
         """Surface of the object."""
         return self.bodies[0].mesh
 
@@ -147,23 +152,17 @@ class StereoPair:
         self, part: Region
     ) -> tuple[Float32[np.ndarray, "h3 w3"], Float32[np.ndarray, "h3 w3"]]:
         """Left and right radiance of ``part`` of the frame, the background filled in."""
-        return (
-            _paste(self.left, self.left_region, part, self.background),
-            _paste(self.right, self.right_region, part, self.background),
-        )
+        sides = (self.left, self.left_region), (self.right, self.right_region)
+        left, right = (_paste(*side, part, self.background) for side in sides)
+        return left, right
 
 
 def _paste(
     image: Float32[np.ndarray, "h w"], region: Region, part: Region, background: float
 ) -> Float32[np.ndarray, "h2 w2"]:
-    canvas = np.full((part.height, part.width), background, dtype=np.float32)
-    x0, y0 = max(region.x, part.x), max(region.y, part.y)
-    x1 = min(region.x + region.width, part.x + part.width)
-    y1 = min(region.y + region.height, part.y + part.height)
-    if x0 < x1 and y0 < y1:
-        canvas[y0 - part.y : y1 - part.y, x0 - part.x : x1 - part.x] = image[
-            y0 - region.y : y1 - region.y, x0 - region.x : x1 - region.x
-        ]
+    canvas, shared = np.full(part.shape, background, dtype=np.float32), region & part
+    if not shared.empty:
+        canvas[shared.within(part)] = image[shared.within(region)]
     return canvas
 
 
