@@ -32,6 +32,6 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     except Exception as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise QS3Error(
-            f"this machine cannot compile ({reason}), which matching.method ad-census needs; "
-            "install numba and llvmlite of constraints.txt, or set matching.method to zncc"
+            f"this machine cannot compile ({reason}), as {function.__module__} needs it; install "
+            "numba and llvmlite in the versions of constraints.txt"
         ) from error
