@@ -211,7 +211,7 @@ def planes(disparity: np.ndarray) -> tuple[float, np.ndarray]:
     sizes, along = [], []
     for x, y in (map(int, place.split(",")) for place in PATCHES.split()):
         part = disparity[y : y + 60, x : x + 80].astype(float)
-        kept = np.isfinite(part)
+        kept, rest = np.isfinite(part), part
         for _ in range(3):
             rest = part - design @ np.linalg.lstsq(design[kept], part[kept])[0]
             kept = np.abs(rest) < 1

@@ -58,11 +58,11 @@ def match_ad_census(
     kept = (best > 0) & (best < settings.num_disparities - 1) & (best <= columns)
     if settings.left_right > 0:
         # The right image is searched as a left one is, both mirrored.
-        swapped = (
-            np.ascontiguousarray(part[:, ::-1])
-            for part in (images[1], images[0], right_bits, left_bits)
+        other, this = (np.ascontiguousarray(image[:, ::-1]) for image in (images[1], images[0]))
+        other_bits, this_bits = (
+            np.ascontiguousarray(bits[:, ::-1]) for bits in (right_bits, left_bits)
         )
-        back = _search(*swapped, settings, tone)[:, ::-1, 0]
+        back = _search(other, this, other_bits, this_bits, settings, tone)[:, ::-1, 0]
         agreed = np.take_along_axis(back, np.maximum(columns - best, 0), axis=1)
         kept &= np.abs(best - agreed) <= settings.left_right
     kept &= second - total >= own.second_peak * 4 * UNIT
