@@ -169,6 +169,10 @@ def matching_canvas(region: Region, rig: StereoRig, settings: MatchingSettings) 
     To the left it reaches the whole search range further: there lie the matches, and OpenCV leaves
     that band empty. For the left-right check of ``zncc`` it reaches as far to the right. It is
     never smaller than the matcher takes, unless the frame itself is.
+
+    NOTE: ``ad-census`` matches a region nearly as in the full frame only, as its scanlines begin
+    elsewhere: on a real pair 99.9 % of pixels are valid in both or in neither, and of those 98 %
+    and more have the same disparity to the bit.
     """
     margin = matching_margin(settings)
     x0, y0, x1, y1 = region.bounds
