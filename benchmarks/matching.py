@@ -1,25 +1,36 @@
-"""The matchers on synthetic dots of known shift: error, bias, pixel locking and time.
+"""The matchers on synthetic dots of known shift, and on a real pair beside the camera's own depth.
 
-Gaussian dots at random sub-pixel places, the right image the same dots moved left by 20 to 21 px in
-steps of 1/16, grey noise added to both, 8 bits, 64 disparities, thresholds as by default. The
-figures are over all pixels away from the border: total RMS and bias of the errors below 1 px,
+Dots: Gaussian dots at random sub-pixel places, the right image the same dots moved left by 20 to
+21 px in steps of 1/16, grey noise added to both, 8 bits, 64 disparities, thresholds as by default.
+The figures are over all pixels away from the border: total RMS and bias of the errors below 1 px,
 locking (half the range of the mean error over the fractional shifts), outliers (errors of 1 px and
 above) and valid pixels as shares; then the least seconds of three for one pair as a scan of the
 `paper` sensor matches it, 760 × 520 pixels and 160 disparities.
 
-    python benchmarks/matching.py [--density 0.025] [--sigma 0.8] [--threads 1]
+Pair: the D435's in `ir` of the folder that QS3_SHARED_DATA names, 848 × 480, f 427.12 px, b 50 mm,
+128 disparities. Valid pixels right of column 48; median of the differences from the camera and the
+share above 3 px; how far the box reaches beyond its upper and slanted right edge and the bottle
+beyond the camera's left and right end (medians, px); RMS on 13 patches of floor and box after a
+plane is taken off, and its autocorrelation along x; processor seconds and MiB of one match.
+
+    python benchmarks/matching.py [dots] [pair] [--picture pair.png] [--threads 1]
 """
 
 import argparse
+import multiprocessing
+import os
+import resource
 import time
-from typing import Literal
+import warnings
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from qs3.sensor.matching import MatchingSettings, match
+from qs3.sensor.matching.settings import Method
 
-CANDIDATES: list[tuple[Literal["opencv-bm", "zncc"], int, bool]] = [
+CANDIDATES: list[tuple[Method, int, bool]] = [
     ("opencv-bm", 15, False),
     ("opencv-bm", 15, True),
     ("opencv-bm", 19, True),
@@ -29,6 +40,7 @@ CANDIDATES: list[tuple[Literal["opencv-bm", "zncc"], int, bool]] = [
     ("zncc", 15, False),
     ("zncc", 19, False),
     ("zncc", 21, False),
+    ("ad-census", 19, False),
 ]
 SHIFTS = np.arange(20, 21, 1 / 16)
 
@@ -62,29 +74,22 @@ def grey(image: np.ndarray, noise: float, rng: np.random.Generator) -> np.ndarra
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--density", type=float, default=0.025, help="dots a pixel")
-    parser.add_argument("--sigma", type=float, default=0.8, help="of a dot, in pixels")
-    parser.add_argument("--threads", type=int, default=cv2.getNumThreads())
-    options = parser.parse_args()
-    cv2.setNumThreads(options.threads)
-    print(f"{options.threads} threads")
+def table_of_dots() -> None:
     names = ["method", "block", "noise", "RMS", "bias", "locking", "outliers", "valid", "seconds"]
     print("| " + " | ".join(names) + " |\n|" + "---|" * len(names))
-    pairs = [dots((160, 360), s, options.density, options.sigma, seed=0) for s in SHIFTS]
+    pairs = [dots((160, 360), s, 0.025, 0.8, seed=0) for s in SHIFTS]
     big = [
         grey(image, 3.0, np.random.default_rng(0))
-        for image in dots((520, 760), 40.3, options.density, options.sigma, seed=1)
+        for image in dots((520, 760), 40.3, 0.025, 0.8, seed=1)
     ]
     for method, block, corrected in CANDIDATES:
         settings = MatchingSettings(method, 64, block, corrected)
         large = MatchingSettings(method, 160, block, corrected)
         seconds = []
         for _ in range(3):
-            start = time.perf_counter()
+            start = time.process_time()
             match(big[0], big[1], large)
-            seconds.append(time.perf_counter() - start)
+            seconds.append(time.process_time() - start)
         for noise in (0.0, 3.0):
             rng = np.random.default_rng(2)
             errors = np.stack(
@@ -104,6 +109,163 @@ def main() -> None:
                 f"{(np.abs(errors[valid]) >= 1).mean():.2%} | {valid.mean():.1%} | "
                 f"{min(seconds):.3f} |"
             )
+
+
+def real_pair() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Both images, and the disparity of the camera's own depth, in steps of about 5 mm."""
+    folder = Path(os.environ["QS3_SHARED_DATA"]) / "ir"
+    left, right = (
+        cv2.imread(str(folder / f"d435_{side}.png"), cv2.IMREAD_GRAYSCALE)
+        for side in ("left", "right")
+    )
+    picture = cv2.imread(str(folder / "d435_depth_preview.png")).astype(float)
+    blue, green, red = picture.transpose(2, 0, 1)
+    # Blue over cyan and yellow to red, 4 · 254 steps; the line is that which our matchers agree on.
+    place = np.where(red == 0, green, 254 + (red + 254 - blue) / 2)
+    place = np.where((red >= 254) & (green < 254), 762 - green, place)
+    place[picture.sum(axis=2) == 0] = np.nan
+    camera = 427.12 * 50 / (198.9 + 1.275 * place)
+    return left, right, camera.repeat(2, axis=0).repeat(2, axis=1)
+
+
+def sgbm(left: np.ndarray, right: np.ndarray, block: int, mode: int) -> np.ndarray:
+    penalty = 8 * block**2
+    matcher = cv2.StereoSGBM.create(
+        0, 128, block, penalty, 4 * penalty, 1, uniquenessRatio=5, mode=mode
+    )
+    padded = [np.pad(image, ((0, 0), (128, 0)), mode="edge") for image in (left, right)]
+    disparity = matcher.compute(*padded)[:, 128:].astype(np.float32) / 16
+    return np.where(disparity > 0, disparity, np.nan)
+
+
+def ours(
+    left: np.ndarray, right: np.ndarray, method: Method, block: int, texture: float = 2.0
+) -> np.ndarray:
+    settings = MatchingSettings(
+        method, 128, block, left_band="physical", texture=texture, median=3, quantum=1 / 32
+    )
+    return match(left, right, settings)
+
+
+PAIR_CANDIDATES = {
+    "opencv-bm 19": (ours, "opencv-bm", 19),
+    "zncc 19": (ours, "zncc", 19),
+    "zncc 19, texture 0": (ours, "zncc", 19, 0.0),
+    "SGBM 3WAY, 3": (sgbm, 3, cv2.STEREO_SGBM_MODE_SGBM_3WAY),
+    "SGBM HH, 7": (sgbm, 7, cv2.STEREO_SGBM_MODE_HH),
+    "ad-census": (ours, "ad-census", 19),
+}
+
+
+def measured(name: str, threads: int) -> tuple[np.ndarray, float, float]:
+    """Disparity, processor seconds and MiB; in a process of its own."""
+    cv2.setNumThreads(threads)
+    left, right, _ = real_pair()
+    matcher, *options = PAIR_CANDIDATES[name]
+    matcher(left[:64, :256], right[:64, :256], *options)
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    start = time.process_time()
+    disparity = matcher(left, right, *options)
+    seconds = time.process_time() - start
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory
+    return disparity, seconds, grown / 1024
+
+
+def spill(disparity: np.ndarray) -> tuple[float, float]:
+    """How far the box reaches up and to the right beyond the edges that the left image shows."""
+    up, right = [], []
+    for x in range(190, 364, 2):
+        edge = round(176.1 - 0.244 * x)
+        box = np.nanmedian(disparity[edge + 6 : edge + 26, x])
+        floor = np.nanmedian(disparity[edge - 60 : edge - 35, x])
+        near = disparity[edge - 30 : edge + 10, x] > (box + floor) / 2
+        up.append(30 - near.argmax())
+    for y in range(100, 176, 2):
+        edge = round(316.4 + 0.749 * y)
+        box = np.nanmedian(disparity[y, edge - 28 : edge - 8])
+        floor = np.nanmedian(disparity[y, edge + 31 : edge + 46])
+        near = disparity[y, edge - 16 : edge + 30] > (box + floor) / 2
+        right.append(30 - near[::-1].argmax())
+    return float(np.median(up)), float(np.median(right))
+
+
+def bottle(disparity: np.ndarray) -> np.ndarray:
+    """Median of the first and last column that is 4 px nearer than the floor beside it."""
+    rows = disparity[44:130]
+    floor = np.nanmedian(np.hstack([rows[:, 400:425], rows[:, 520:545]]), axis=1)
+    near = rows[:, 425:520] > floor[:, None] + 4
+    near = near[near.any(axis=1)]
+    return np.median([near.argmax(axis=1), 94 - near[:, ::-1].argmax(axis=1)], axis=1)
+
+
+PATCHES = (
+    "560,60 660,60 740,110 700,330 60,300 60,380 160,400 300,400 420,400 740,400 560,120 250,20 "
+    "100,60"
+)
+
+
+def planes(disparity: np.ndarray) -> tuple[float, np.ndarray]:
+    """RMS on patches of 80 × 60, and autocorrelation along x at 1, 4 and 8 px; medians."""
+    v, u = np.mgrid[:60, :80]
+    design = np.stack([u, v, np.ones_like(u)], axis=-1).astype(float)
+    sizes, along = [], []
+    for x, y in (map(int, place.split(",")) for place in PATCHES.split()):
+        part = disparity[y : y + 60, x : x + 80].astype(float)
+        kept, rest = np.isfinite(part), part
+        for _ in range(3):
+            rest = part - design @ np.linalg.lstsq(design[kept], part[kept])[0]
+            kept = np.abs(rest) < 1
+        rest = np.where(kept, rest - rest[kept].mean(), np.nan)
+        power = np.nanmean(rest**2)
+        sizes.append(np.sqrt(power))
+        along.append([np.nanmean(rest[:, k:] * rest[:, :-k]) / power for k in (1, 4, 8)])
+    return float(np.median(sizes)), np.median(along, axis=0)
+
+
+def coloured(disparity: np.ndarray) -> np.ndarray:
+    levels = np.nan_to_num((disparity - 20) / 40 * 255).clip(0, 255).astype(np.uint8)
+    picture = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)
+    picture[~np.isfinite(disparity)] = 0
+    return picture
+
+
+def table_of_pair(threads: int, picture: Path | None) -> None:
+    names = ["matcher", "valid", "median Δ", "> 3 px", "box up", "box right", "bottle left"]
+    names += ["bottle right", "plane RMS", "autocorrelation at 1, 4, 8", "seconds", "MiB"]
+    print("| " + " | ".join(names) + " |\n|" + "---|" * len(names))
+    camera = real_pair()[2]
+    rows = {"the camera": (camera, float("nan"), float("nan"))}
+    for name in PAIR_CANDIDATES:
+        with multiprocessing.get_context("spawn").Pool(1) as pool:
+            rows[name] = pool.apply(measured, (name, threads))
+    for name, (disparity, seconds, memory) in rows.items():
+        off = np.abs(disparity - camera)
+        off = off[np.isfinite(off)]
+        (up, right), (rms, along) = spill(disparity), planes(disparity)
+        ends = bottle(disparity) - bottle(camera)
+        print(
+            f"| {name} | {np.isfinite(disparity)[:, 48:].mean():.3f} | {np.median(off):.3f} | "
+            f"{(off > 3).mean():.2%} | {up:+.0f} | {right:+.0f} | {-ends[0]:+.0f} | "
+            f"{ends[1]:+.0f} | {rms:.3f} | {' '.join(f'{r:.2f}' for r in along)} | "
+            f"{seconds:.2f} | {memory:.0f} |"
+        )
+    if picture is not None:
+        panels = [coloured(rows[name][0]) for name in ("the camera", "ad-census", "zncc 19")]
+        cv2.imwrite(str(picture), np.hstack(panels))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("tables", nargs="*", default=["dots", "pair"], help="dots, pair")
+    parser.add_argument("--picture", type=Path, help="of the camera's depth, ad-census and zncc")
+    parser.add_argument("--threads", type=int, default=1)
+    options = parser.parse_args()
+    cv2.setNumThreads(options.threads)
+    warnings.filterwarnings("ignore", "All-NaN slice")
+    if "dots" in options.tables:
+        table_of_dots()
+    if "pair" in options.tables:
+        table_of_pair(options.threads, options.picture)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@ import pytest
 
 from qs3.errors import InputError
 from qs3.io.preparation import resample, unit_ball
-from qs3.sensor import sampling
 from qs3.sensor.sampling import farthest_point_sample, farthest_point_samples
 from qs3.training import batches
 from qs3.training.batches import prepare, subsample
@@ -19,10 +18,8 @@ def clouds(rng):
     return points
 
 
-def test_indices_are_those_of_one_cloud_after_another(clouds, monkeypatch):
+def test_indices_are_those_of_one_cloud_after_another(clouds):
     expected = np.stack([farthest_point_sample(cloud, 120) for cloud in clouds])
-    assert np.array_equal(farthest_point_samples(clouds, 120), expected)
-    monkeypatch.setattr(sampling, "_TOGETHER", 700)  # two clouds at a time
     assert np.array_equal(farthest_point_samples(clouds, 120), expected)
 
 

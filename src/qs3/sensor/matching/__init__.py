@@ -1,4 +1,4 @@
-"""Block matching of a rectified pair: OpenCV's StereoBM, as the paper uses it, or our own ZNCC.
+"""Matching of a rectified pair: OpenCV's StereoBM, as the paper uses it, our ZNCC, or AD-Census.
 
 Convention:
     Disparity is u_left − u_right ≥ 0 in pixels of the left image, NaN where there is no match.
@@ -19,7 +19,7 @@ def match(left: Image, right: Image, settings: MatchingSettings) -> Float32[np.n
     """Match a rectified pair.
 
     Args:
-        left: Grey levels of 8 bits, or of 10 bits in 16, which only ``zncc`` takes.
+        left: Grey levels of 8 bits, or of 10 bits in 16, which ``opencv-bm`` does not take.
         right: The same of the other camera.
         settings: The matcher.
 
@@ -29,6 +29,7 @@ def match(left: Image, right: Image, settings: MatchingSettings) -> Float32[np.n
 
     Raises:
         InputError: where the images are too small for the search range or have too many bits.
+        QS3Error: where ``ad-census`` is asked for on a machine that cannot compile.
     """
     from qs3.sensor.matching.filters import quantise
     from qs3.sensor.matching.opencv_bm import match_opencv
@@ -40,13 +41,24 @@ def match(left: Image, right: Image, settings: MatchingSettings) -> Float32[np.n
             f"matching: an image of {left.shape[1]} × {left.shape[0]} pixels is too small for "
             f"{settings.num_disparities} disparities and a block of {settings.block_size}"
         )
-    if settings.method == "zncc":
-        disparity = match_zncc(left, right, settings)
-    elif left.dtype == np.uint8 and right.dtype == np.uint8:
+    if settings.method == "opencv-bm":
+        if left.dtype != np.uint8 or right.dtype != np.uint8:
+            raise InputError(
+                "matching: opencv-bm takes images of 8 bits only; set exposure bits to 8 or method "
+                "to zncc"
+            )
         disparity = match_opencv(left, right, settings)
     else:
-        raise InputError(
-            "matching: opencv-bm takes images of 8 bits only; set exposure bits to 8 or method to "
-            "zncc"
-        )
+        if left.dtype != right.dtype:
+            raise InputError(
+                f"matching: the left image is {left.dtype}, the right one {right.dtype}"
+            )
+        if left.dtype != np.uint8 and max(left.max(), right.max()) > 1023:
+            raise InputError("matching: an image of 16 bits must hold 10-bit grey levels, 0…1023")
+        if settings.method == "zncc":
+            disparity = match_zncc(left, right, settings)
+        else:
+            from qs3.sensor.matching.ad_census import match_ad_census  # it imports a compiler
+
+            disparity = match_ad_census(left, right, settings)
     return quantise(disparity, settings.quantum)

@@ -1,15 +1,77 @@
 """The matcher's settings, and how far around a region it looks."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from qs3.errors import InputError
 from qs3.sensor.checks import check_choices, check_range
 from qs3.sensor.rig import Region, StereoRig
 
-Method = Literal["opencv-bm", "zncc"]
+Method = Literal["opencv-bm", "zncc", "ad-census"]
 
 QUANTA = (0.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32)
+
+
+@dataclass(frozen=True)
+class AdCensusSettings:
+    """What only ``ad-census`` has. Grey levels are of 255.
+
+    MEI: Mei et al., ICCV workshops 2011, its table of parameters. INTEL: a D415's own, as
+    librealsense issue 1590 prints them; its names in brackets.
+    """
+
+    census_width: int = 9
+    """Width of the census window in pixels; odd. MEI: 9 × 7."""
+    census_height: int = 7
+    """Height of it; odd. Both together leave at most 64 pixels to compare."""
+    lambda_census: float = 30.0
+    """Bits that differ are worth 1 − exp(−bits/λ). MEI: 30 (``lambdaCensus``)."""
+    lambda_ad: float = 10.0
+    """So are grey levels that differ. MEI: 10 (``lambdaAD``)."""
+    arm: int = 9
+    """Longest arm of the support in pixels, 1 to 15. Our choice: as far as the blocks of 19 reach
+    by which walls look smoothed; MEI has 34 for pictures without a pattern."""
+    arm_threshold: float = 13.0
+    """An arm ends where grey differs by more. INTEL: 51 of 1023."""
+    penalty_small: float = 1.0
+    """Of a step of one disparity, where the greatest cost is 2. MEI: 1."""
+    penalty_large: float = 5.7
+    """Of any other step, at most 6. INTEL: 5.7 times the small one (``K1`` 60, ``K2`` 342);
+    MEI: 3."""
+    edge: float = 15.0
+    """Difference of neighbours that is an edge, at which steps are cheaper. MEI: 15."""
+    edge_divisor: float = 1.5
+    """By this. MEI: 4 at an edge of one image, 10 at one of both. Our choice: less, as each dot of
+    a pattern is an edge; more leaves holes."""
+    second_peak: float = 0.03
+    """What the least cost further than one disparity away must exceed the least by, as a mean of
+    the four paths; 0 is no check. INTEL has one (``secondPeak``), in a unit of its own."""
+    corrections: int = 2
+    """Rounds of averaging and least squares over ``block_size`` pixels that find the fraction of a
+    pixel; 0 leaves the V through the costs, which locks to whole pixels."""
+    surface: float = 1.0
+    """Greatest step of disparity between neighbours that lie on one surface, in pixels."""
+    grain: float = 1.0
+    """Noise in grey levels below which no contrast counts as such."""
+
+    def __post_init__(self) -> None:
+        compared = self.census_width * self.census_height - 1
+        if (
+            min(self.census_width, self.census_height) < 1
+            or compared % 2
+            or not 2 <= compared <= 64
+        ):
+            raise InputError(
+                f"matching: census_width {self.census_width} and census_height "
+                f"{self.census_height} must be odd and leave 2 to 64 pixels to compare"
+            )
+        check_range(self, "matching", "arm", low=1, high=15)
+        check_range(self, "matching", "lambda_census", "lambda_ad", "grain", above=True)
+        check_range(self, "matching", "arm_threshold", "edge", "second_peak", "surface")
+        check_range(self, "matching", "penalty_large", high=6.0)
+        check_range(self, "matching", "penalty_small", high=self.penalty_large)
+        check_range(self, "matching", "edge_divisor", low=1.0)
+        check_range(self, "matching", "corrections", high=10)
 
 
 @dataclass(frozen=True)
@@ -17,11 +79,13 @@ class MatchingSettings:
     """The matcher. OpenCV's own defaults hold for what is not named here."""
 
     method: Method = "opencv-bm"
-    """``opencv-bm`` is OpenCV's StereoBM; ``zncc`` our zero-mean normalised cross-correlation."""
+    """``opencv-bm`` is OpenCV's StereoBM; ``zncc`` our zero-mean normalised cross-correlation;
+    ``ad-census`` census and absolute difference over adaptive supports, as the D400 series does."""
     num_disparities: int = 160
     """Disparities searched, from 0; for ``opencv-bm`` a multiple of 16."""
     block_size: int = 19
-    """Side of the square window in pixels; odd, 5 to 255 (``zncc``: 5 to 31)."""
+    """Side of the square window in pixels; odd, 5 to 255 (else: 5 to 31). For ``ad-census`` the
+    window over one surface that fractions of a pixel are measured in."""
     bias_correction: bool = False
     """``opencv-bm``: take 1/32 px off: StereoBM rounds up when it packs its result into 1/16 px."""
     left_band: Literal["opencv", "physical"] = "opencv"
@@ -32,8 +96,8 @@ class MatchingSettings:
     everything else, ``bias_correction`` and the filters included; 0 is no rounding beyond the
     matcher's own."""
     left_right: float = 1.0
-    """``zncc``: greatest difference in whole pixels between the matches from left and from right;
-    0 is no check."""
+    """``zncc``, ``ad-census``: greatest difference in whole pixels between the matches from
+    left and from right; 0 is no check."""
     uniqueness: float = 0.03
     """``zncc``: the best correlation must exceed every other further than one pixel away by this;
     0 is no check."""
@@ -42,10 +106,12 @@ class MatchingSettings:
     texture: float = 2.0
     """``zncc``: least standard deviation of either block in grey levels of 255."""
     median: Literal[0, 3, 5] = 0
-    """``zncc``: side of the median filter over disparities; 0 is none."""
+    """``zncc``, ``ad-census``: side of the median filter over disparities; 0 is none."""
     min_region: int = 0
-    """``zncc``: connected regions of fewer pixels are dropped, where neighbours of up to 1 px
-    difference are connected; 0 keeps all."""
+    """``zncc``, ``ad-census``: connected regions of fewer pixels are dropped, where neighbours of
+    up to 1 px difference are connected; 0 keeps all."""
+    ad_census: AdCensusSettings = field(default_factory=AdCensusSettings)
+    """What only ``ad-census`` has."""
 
     def __post_init__(self) -> None:
         check_choices(self, "matching")
@@ -82,12 +148,19 @@ def matching_margin(settings: MatchingSettings) -> int:
 
     For ``opencv-bm``: half a block, the Sobel filter, a spare row, because OpenCV's Sobel filter
     takes rows in pairs and blanks a last odd one. For ``zncc``: half a block, half the median
-    filter, and ``min_region``: a connected region that leaves such a margin is not small.
+    filter, and ``min_region``: a connected region that leaves such a margin is not small. For
+    ``ad-census`` also the support, the census window and half a block of each further correction;
+    its scanlines reach further, ever more faintly.
     """
     half = settings.block_size // 2
     if settings.method == "opencv-bm":
         return half + 3
-    return half + settings.median // 2 + settings.min_region
+    margin = half + settings.median // 2 + settings.min_region
+    if settings.method == "ad-census":
+        own = settings.ad_census
+        margin += own.arm + max(own.census_width, own.census_height) // 2
+        margin += half * max(0, own.corrections - 1)
+    return margin
 
 
 def matching_canvas(region: Region, rig: StereoRig, settings: MatchingSettings) -> Region:
@@ -96,6 +169,10 @@ def matching_canvas(region: Region, rig: StereoRig, settings: MatchingSettings) 
     To the left it reaches the whole search range further: there lie the matches, and OpenCV leaves
     that band empty. For the left-right check of ``zncc`` it reaches as far to the right. It is
     never smaller than the matcher takes, unless the frame itself is.
+
+    NOTE: ``ad-census`` matches a region nearly as in the full frame only, as its scanlines begin
+    elsewhere: on a real pair 99.9 % of pixels are valid in both or in neither, and of those 98 %
+    and more have the same disparity to the bit.
     """
     margin = matching_margin(settings)
     x0, y0, x1, y1 = region.bounds

@@ -20,7 +20,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int, Int32, UInt8, UInt16
 
-from qs3.errors import InputError
 from qs3.sensor.matching.filters import drop_small_regions, median_of_valid
 from qs3.sensor.matching.settings import MatchingSettings
 
@@ -47,15 +46,8 @@ def match_zncc(
         left: Grey levels of 8 bits, or of 10 bits in 16.
         right: The same of the other camera.
         settings: The matcher; the fields marked ``zncc``.
-
-    Raises:
-        InputError: for images of different kinds, or of more than 10 bits.
     """
-    if left.dtype != right.dtype:
-        raise InputError(f"matching: the left image is {left.dtype}, the right one {right.dtype}")
     bits = 8 if left.dtype == np.uint8 else 10
-    if max(left.max(), right.max()) >= 2**bits:
-        raise InputError("matching: an image of 16 bits must hold 10-bit grey levels, 0…1023")
     pair = _Pair(_side(left, bits, settings), _side(right, bits, settings), settings, bits)
     peaks = _Peaks(*(np.zeros(left.shape, np.int32) for _ in range(5)))
     starts = range(0, len(left), BAND)

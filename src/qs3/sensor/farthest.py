@@ -1,0 +1,65 @@
+"""The compiled loop of farthest point sampling."""
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from qs3.sensor.compiled import compiled
+
+
+@compiled
+def sample(
+    points: Float64[np.ndarray, "3 n"],
+    order: Int64[np.ndarray, "n"],
+    count: int,
+    start: int,
+    size: int,
+) -> Int64[np.ndarray, "m"]:
+    """Choose points; of equally far ones the lowest of ``order``.
+
+    Args:
+        points: By coordinates, neighbours near each other.
+        order: Their indices in the cloud.
+        count: How many to choose.
+        start: Place of the first one in ``points``.
+        size: Points a block.
+
+    Returns:
+        Indices in the cloud.
+    """
+    n = points.shape[1]
+    blocks = (n + size - 1) // size
+    low, high = np.empty((blocks, 3)), np.empty((blocks, 3))
+    for block in range(blocks):
+        for axis in range(3):
+            part = points[axis, block * size : min(n, (block + 1) * size)]
+            low[block, axis], high[block, axis] = part.min(), part.max()
+    nearest = np.full(n, np.inf)  # squared distance from the points chosen
+    greatest = np.full(blocks, np.inf)  # the greatest of a block, and where it is
+    place = np.zeros(blocks, np.int64)
+    chosen = np.zeros(count, np.int64)
+    at = start
+    for i in range(count):
+        chosen[i] = order[at]
+        a, b, c = points[0, at], points[1, at], points[2, at]
+        for block in range(blocks):
+            u = max(low[block, 0] - a, 0.0, a - high[block, 0])
+            v = max(low[block, 1] - b, 0.0, b - high[block, 1])
+            w = max(low[block, 2] - c, 0.0, c - high[block, 2])
+            if u * u + v * v + w * w < greatest[block]:
+                top, where = -1.0, block * size
+                for j in range(block * size, min(n, (block + 1) * size)):
+                    u, v, w = points[0, j] - a, points[1, j] - b, points[2, j] - c
+                    distance = u * u + v * v + w * w
+                    distance = distance if distance < nearest[j] else nearest[j]
+                    nearest[j] = distance
+                    if distance > top or (distance == top and order[j] < order[where]):
+                        top, where = distance, j
+                greatest[block], place[block] = top, where
+        best = 0
+        for block in range(1, blocks):
+            if greatest[block] > greatest[best] or (
+                greatest[block] == greatest[best] and order[place[block]] < order[place[best]]
+            ):
+                best = block
+        at = place[best]
+    return chosen
