@@ -90,3 +90,9 @@ def test_blocks_do_not_change_it(rng, monkeypatch):
     monkeypatch.setattr(torch.Tensor, "min", spy)
     assert torch.equal(chamfer(x, y), whole)
     assert max(sizes) == 200
+
+
+def test_half_precision_is_widened(rng):
+    x, y = (cloud.half() for cloud in clouds(rng))
+    assert chamfer(x, y).dtype == torch.float32
+    np.testing.assert_allclose(chamfer(x, y), chamfer(x.double(), y.double()), rtol=1e-6)

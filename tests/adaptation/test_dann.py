@@ -176,3 +176,9 @@ def test_mmd_and_coral_are_their_functions_of_the_batches():
     torch.testing.assert_close(value, 3 * coral(model.head(here), model.head(there)))
     value = CORAL(model, layer="pooled")(source, target, 0.5, torch.Generator())["coral"]
     torch.testing.assert_close(value, coral(here.pooled, there.pooled))
+
+
+def test_the_coefficient_is_that_of_the_paper():
+    for p in (0.0, 0.25, 1.0):
+        assert reversal_coefficient(p) == pytest.approx(math.tanh(10 * p / 2))
+    assert reversal_coefficient(0.3, gamma=2.0) == pytest.approx(math.tanh(0.3))

@@ -234,3 +234,16 @@ def test_lambertian_keeps_what_faces_the_light():
         facing = cloud @ light
         assert float((~mask)[facing > 0.9].float().mean()) > 0.85
         assert float((~mask)[facing < 0].float().mean()) < 0.1
+
+
+def test_radius_falls_back_on_the_fullest_ball():
+    lonely = torch.arange(1, 298)[:, None] * torch.tensor([10.0, 0, 0])
+    points = torch.cat([lonely, torch.zeros(3, 3)])[None].expand(10, -1, -1)
+    moved = deform_radius(points, seeded()).moved
+    assert torch.equal(moved, (torch.arange(300) >= 297).expand(10, -1))
+
+
+def test_features_share_of_one_moves_all_and_of_none_one():
+    points = ball(2, 50)
+    assert deform_features(points, points, seeded(), share=1.0).moved.all()
+    assert deform_features(points, points, seeded(), share=0.0).moved.sum(dim=1).tolist() == [1, 1]

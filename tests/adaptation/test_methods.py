@@ -89,3 +89,11 @@ def test_method_is_abstract():
 def test_unusable_settings_are_named(name, settings, message):
     with pytest.raises(InputError, match=message):
         create_method(name, create_model("pointnet", 3, channels=(8, 8, 16)), **settings)
+
+
+def test_source_only_ignores_a_target():
+    method = make_method().eval()
+    losses = method.losses(make_batch(), torch.zeros(2, 5, 3), 0.5, torch.Generator())
+    assert torch.equal(
+        losses["source"], method(make_batch(), None, 0.0, torch.Generator())["source"]
+    )

@@ -14,6 +14,7 @@ from qs3.adaptation.pointdan import (
     PointDAN,
     fresh_head,
     head_parameters,
+    reversal_coefficient,
 )
 from qs3.models import Features, PointClassifier, create_model
 
@@ -233,3 +234,11 @@ def test_both_alignments_do_what_they_are_for():
     assert nodes_apart(local) < 0.8 * nodes_apart(off)
     apart = trained(node_weight=0.0, discrepancy_weight=5.0)
     assert disagreement(apart) > 3 * disagreement(off)
+
+
+def test_the_coefficient_rises_from_zero_to_one():
+    values = [reversal_coefficient(p) for p in np.linspace(0, 1, 11)]
+    assert values[0] == 0.0
+    assert values[-1] == 1.0
+    assert values == sorted(values)
+    assert reversal_coefficient(1 / 3) == pytest.approx(0.5)

@@ -283,3 +283,24 @@ def test_shares_are_meant_as_written():
     rows = np.stack([confidence, 1 - confidence], axis=1)
     assert ceil(0.07 * 100) == 8
     assert select_quantile(rows, 0.0, 0.07).sum() == 7
+
+
+def test_ends_differ():
+    """Six of class 0 and two of class 1: ⌈6 · 2/8⌉ = 2 and ⌈2 · 6/8⌉ = 2 are kept."""
+    confidence = np.array([0.9, 0.95, 0.85, 0.99, 0.81, 0.82, 0.1, 0.1])
+    rows = np.stack([confidence, 1 - confidence], axis=1)
+    most = select_quasi_balanced(rows, 0.8)
+    least = select_quasi_balanced(rows, 0.8, selection="least-confident")
+    assert np.flatnonzero(most).tolist() == [1, 3, 6, 7]
+    assert np.flatnonzero(least).tolist() == [4, 5, 6, 7]
+
+
+@given(probabilities(), st.sampled_from([0.55, 0.75]), st.booleans())
+def test_the_threshold_itself(rows, threshold, inclusive):
+    for rule in (
+        partial(select_uniform, quantile=1.0),
+        partial(select_quantile, share=1.0),
+        partial(select_prior, prior=prior_of(rows), quantile=1.0),
+    ):
+        chosen = rule(rows, threshold, inclusive=inclusive)
+        assert not (chosen & ~select_confident(rows, threshold, inclusive=inclusive)).any()

@@ -11,7 +11,7 @@ from scipy.special import log_softmax, softmax
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from qs3.adaptation import Batch, distortions
-from qs3.adaptation.self_distillation import SelfDistillation, distillation_loss
+from qs3.adaptation.self_distillation import SelfDistillation, distillation_loss, ramp
 from qs3.models import create_model
 
 ALL = {
@@ -290,3 +290,18 @@ def test_elastic_is_trilinear_between_its_nodes():
         field = RegularGridInterpolator((axis, axis, axis), noise[0, coordinate])
         expected = 2.0 * field(points[0].numpy()[:, ::-1])
         assert moved[:, coordinate] == pytest.approx(expected, abs=1e-5)
+
+
+def test_no_gradient_goes_to_the_goal():
+    student, teacher = (torch.randn(2, 3, requires_grad=True) for _ in range(2))
+    distillation_loss(student, teacher).backward()
+    assert teacher.grad is None
+
+
+def test_weight_grows():
+    assert [ramp(t) for t in (0.0, 0.5, 1.0)] == pytest.approx([math.exp(-5), math.exp(-1.25), 1.0])
+
+
+@pytest.mark.parametrize("name", list(ALL))
+def test_distortions_far_from_the_origin_stay_finite(name):
+    assert torch.isfinite(ALL[name](1e6 + ball(), draws())).all()

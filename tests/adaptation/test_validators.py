@@ -13,7 +13,7 @@ from scipy.special import softmax
 from scipy.stats import entropy as shannon
 from sklearn.metrics import adjusted_mutual_info_score
 
-from qs3.adaptation import validators
+from qs3.adaptation import graph_labels, validators
 from qs3.adaptation.density import density_ratio
 from qs3.adaptation.validators import (
     VALIDATORS,
@@ -287,3 +287,20 @@ def test_refusals():
         class_ami(np.zeros((0, 3)), np.zeros(0, dtype=np.int64), 2)
     with pytest.raises(InputError, match="k must be at least 1"):
         class_ami(np.ones((2, 3)), np.arange(2), 0)
+
+
+def test_zeros_have_no_entropy():
+    assert entropy(np.array([[1.0, 0.0, 0.0]])) == 0.0
+
+
+def test_snd_in_blocks(monkeypatch):
+    features = np.random.default_rng(1).normal(size=(50, 6))
+    whole = snd(features)
+    monkeypatch.setattr(graph_labels, "_BLOCK", 350)  # seven rows at a time
+    assert snd(features) == pytest.approx(whole, abs=1e-12)
+
+
+def test_density_ratio_where_one_domain_is_a_single_cloud():
+    rng = np.random.default_rng(0)
+    ratio = density_ratio(rng.normal(size=(1, 2)), rng.normal(size=(6, 2)), np.eye(2))
+    assert np.isfinite(ratio).all()
