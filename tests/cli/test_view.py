@@ -153,7 +153,7 @@ def test_serves_until_ctrl_c(archive):
     ) as process:  # fmt: skip
         assert process.stdout is not None
         address = process.stdout.readline().strip()
-        port = int(address.rsplit(":", 1)[1])
+        port = int(address.rsplit(":", 1)[1].partition("/")[0])
         with urllib.request.urlopen(address, timeout=30) as page:  # noqa: S310
             assert page.status == 200
         process.send_signal(signal.SIGINT)
