@@ -96,8 +96,10 @@ def feature_map(
         style = {"markersize": 6.5, "markerfacecolor": face, "markeredgecolor": "#555555"}
         legend.append(Line2D([], [], linestyle="", marker=marker, label=short(kind, 20), **style))
     for index in np.unique(labels).tolist():
-        style = {"markersize": 7, "color": class_colour(index), "label": short(class_names[index])}
-        legend.append(Line2D([], [], linestyle="", marker="s", **style))
+        colour, name = class_colour(index), short(class_names[index])
+        legend.append(
+            Line2D([], [], linestyle="", marker="s", markersize=7, color=colour, label=name)
+        )
     axes.set_title(short(title, 40))
     axes.set_aspect("equal", adjustable="datalim")
     without_frame(axes)
