@@ -132,17 +132,3 @@ def test_a_method_of_an_earlier_release_is_taken_with_a_note(capsys):
     options = tyro.cli(TrainOptions, args=words, default=defaults(words)["options"])
     assert options.method == "qbst"
     assert capsys.readouterr().err.count("--method qs3 is qbst now") == 1
-
-
-def test_labels_of_the_target_may_be_anything(qs3, store, tmp_path):
-    rng = np.random.default_rng(0)
-    points = rng.normal(size=(6, 80, 3))
-    weights = []
-    for case, label in {"a": np.arange(6), "b": np.arange(6)[::-1]}.items():
-        path = tmp_path / f"{case}.npz"
-        np.savez(path, points=points, labels=label, class_names=np.array(list("uvwxyz")))
-        run = tmp_path / case
-        qs3("train", "--source", store, "--target", path, "--out", run, "--method", "coral",
-            *QUICK)  # fmt: skip
-        weights.append((run / "model.safetensors").read_bytes())
-    assert weights[0] == weights[1]
