@@ -46,10 +46,6 @@ def atomic_path(path: Path) -> Iterator[Path]:
         temporary.replace(path)
         with contextlib.suppress(OSError):  # some file systems sync no folders
             sync_entry(path.parent)
-    except OSError as error:
-        if error.filename in (None, str(temporary)):  # a full disk names no file
-            error.filename = str(path)
-        raise
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -11,7 +11,6 @@ import pytest
 
 from qs3.cli import VERBS
 from qs3.cli.text import columns, printable, show
-from qs3.files import atomic_path
 
 HOSTILE = "a\x1b[2J\x9b31m\r\n\u202eb"
 
@@ -55,8 +54,7 @@ def test_a_full_disk_names_the_file_and_what_to_do(typed, monkeypatch, tmp_path)
     assert done.stderr.startswith(b"qs3: <stdout>: No space left on device; make room")
 
     def write(*_):
-        with atomic_path(tmp_path / "scan.json"):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "scan.json"))
 
     monkeypatch.setattr("qs3.sensor.presets.get_sensor", write)
     line = typed.refuses("sensors", "show", "d435")

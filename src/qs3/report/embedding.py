@@ -95,7 +95,7 @@ def feature_map(
         face = "none" if hollow else "#555555"
         style = {"markersize": 6.5, "markerfacecolor": face, "markeredgecolor": "#555555"}
         legend.append(Line2D([], [], linestyle="", marker=marker, label=short(kind, 20), **style))
-    for index in np.unique(labels).tolist():
+    for index in map(int, np.unique(labels)):
         colour, name = class_colour(index), short(class_names[index])
         legend.append(
             Line2D([], [], linestyle="", marker="s", markersize=7, color=colour, label=name)
