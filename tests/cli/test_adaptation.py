@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import tyro
 
-from qs3.cli.train import TrainOptions, _note_old_name, parse_settings, preset_options
+from qs3.cli.train import TrainOptions, _note_old_name, defaults, parse_settings
 from qs3.errors import InputError
 from qs3.evaluation import read_record
 from qs3.meshes.classes import POINTDA10
@@ -121,7 +121,7 @@ def test_settings_are_json_or_words():
     ],
 )
 def test_a_preset_follows_the_method(arguments, preset):
-    chosen = preset_options(arguments)
+    chosen = defaults(arguments)["options"]
     assert chosen.preset == preset
     assert chosen.self_training == PRESETS[preset]
 
@@ -129,20 +129,6 @@ def test_a_preset_follows_the_method(arguments, preset):
 def test_a_method_of_an_earlier_release_is_taken_with_a_note(capsys):
     _note_old_name.cache_clear()
     words = ["--source", "a", "--out", "b", "--method", "qs3"]
-    options = tyro.cli(TrainOptions, args=words, default=preset_options(words))
+    options = tyro.cli(TrainOptions, args=words, default=defaults(words)["options"])
     assert options.method == "qbst"
     assert capsys.readouterr().err.count("--method qs3 is qbst now") == 1
-
-
-def test_labels_of_the_target_may_be_anything(qs3, store, tmp_path):
-    rng = np.random.default_rng(0)
-    points = rng.normal(size=(6, 80, 3))
-    weights = []
-    for case, label in {"a": np.arange(6), "b": np.arange(6)[::-1]}.items():
-        path = tmp_path / f"{case}.npz"
-        np.savez(path, points=points, labels=label, class_names=np.array(list("uvwxyz")))
-        run = tmp_path / case
-        qs3("train", "--source", store, "--target", path, "--out", run, "--method", "coral",
-            *QUICK)  # fmt: skip
-        weights.append((run / "model.safetensors").read_bytes())
-    assert weights[0] == weights[1]

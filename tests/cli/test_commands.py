@@ -91,7 +91,7 @@ def test_options_mean_what_the_settings_mean_in_python(typed, monkeypatch, words
     assert released == (changes.get("preset") == "released")
 
 
-def test_scan_writes_what_it_says_and_the_same_bytes_again(qs3, quick, tmp_path):
+def test_scan_writes_what_it_says(qs3, quick, tmp_path):
     out = tmp_path / "chair"
     done = qs3("scan", "chair", "--out", out, "--seed", 2, "--save-images", *quick)
     names = {p.name for p in out.iterdir()}
@@ -121,9 +121,6 @@ def test_scan_writes_what_it_says_and_the_same_bytes_again(qs3, quick, tmp_path)
     assert np.abs(np.median(error)) < 0.02
     montage = cv2.imread(str(out / "montage.png"))
     assert min(montage.shape[:2]) > 600
-    qs3("scan", "chair", "--out", tmp_path / "again", "--seed", 2, *quick)
-    for file in ("cloud.ply", "clean.ply", "montage.png"):
-        assert (tmp_path / "again" / file).read_bytes() == (out / file).read_bytes()
 
 
 def test_generate_is_byte_identical_with_two_workers_and_does_nothing_again(
@@ -139,21 +136,6 @@ def test_generate_is_byte_identical_with_two_workers_and_does_nothing_again(
     done = qs3("generate", *flags, "--out", store)
     assert "0 scans written, 10 were there before" in done.stderr
     assert {p.name: p.stat().st_mtime_ns for p in store.glob("*.parquet")} == before
-
-
-def test_store_holds_noisy_clean_and_surface_clouds_that_overlay(store):
-    from qs3.io import load_clouds
-
-    clouds = [load_clouds(store, num_points=128, cloud=c) for c in ("points", "clean", "surface")]
-    assert [len(c) for c in clouds] == [10, 10, 10]
-    assert clouds[0].labels.tolist() == list(range(10))
-    # All lie in the normalised mesh's box; the noisy cloud in the box of the turned mesh, whose
-    # corners are at most at a radius of 1.
-    assert np.abs(clouds[1].points).max() <= 0.5 + 1e-5
-    assert np.abs(clouds[2].points).max() <= 0.5 + 1e-5
-    radius = np.linalg.norm(clouds[0].points[:, :, :2], axis=2)
-    assert 0.3 < radius.max() <= 1 + 1e-5
-    assert np.abs(clouds[0].points[:, :, 2]).max() <= 0.5 + 1e-5
 
 
 def test_train_evaluate_predict(qs3, run, store, tmp_path):
@@ -174,18 +156,6 @@ def test_train_evaluate_predict(qs3, run, store, tmp_path):
     for row in rows:
         assert sum(row["probabilities"].values()) == pytest.approx(1.0)
         assert row["confidence"] == max(row["probabilities"].values())
-
-
-def test_qbst_with_a_preset(qs3, run, store, tmp_path):
-    qs3("train", "--source", store, "--target", store, "--method", "qbst", "--warm-up", run,
-        "--preset", "released", "--self-training.rounds", 2, "--self-training.epochs", 1,
-        "--self-training.threshold", 0.1, "--model", "pointnet", "--num-points", 64,
-        "--epochs", 2, "--batch-size", 5, "--threads", 1, "--out", tmp_path / "run")  # fmt: skip
-    record = json.loads(qs3("evaluate", tmp_path / "run", "--data", store, "--json").stdout)
-    assert record["settings"]["preset"] == "released"
-    assert [r["theta"] for r in record["rounds"]] == [0.1, pytest.approx(0.105)]
-    assert "transductive" in record["marks"]
-    assert record["settings"]["self_training"]["selection"] == "least-confident"
 
 
 def test_doctor_tells_what_is_here(qs3):

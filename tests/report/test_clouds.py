@@ -3,7 +3,6 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from qs3.errors import InputError
 from qs3.report.clouds import SIDES, draw_cloud, gallery, project, samples_per_class
 
 
@@ -84,9 +83,3 @@ def test_gallery_keeps_every_cloud_in_its_cell(rng):
 def test_gallery_shows_no_more_than_its_columns(rng):
     figure = gallery({"a": [rng.normal(size=(7, 3)) for _ in range(5)]}, columns=2)
     assert len(np.asarray(figure.axes[0].collections[0].get_offsets())) == 14
-
-
-@pytest.mark.parametrize(("samples", "columns"), [({}, 3), ({"a": []}, 0)])
-def test_gallery_refuses_nothing(samples, columns):
-    with pytest.raises(InputError, match="gallery"):
-        gallery(samples, columns=columns)

@@ -11,8 +11,8 @@ from qs3.errors import InputError
 from qs3.evaluation.records import read_record, write_record
 from qs3.files import read_json
 from qs3.io import load_clouds
-from qs3.report.collect import collect, look, read_domains
-from qs3.report.lookup import read_data
+from qs3.report.collect import collect, look
+from qs3.report.lookup import read_domain
 from qs3.report.page import render
 from qs3.report.settings import ReportSettings
 from qs3.training import load_model
@@ -159,14 +159,11 @@ def test_data_are_read_as_the_run_and_its_record_read_them(grid, tmp_path):
     }
     assert len(kinds) == 3
 
-    def read(recorded, **given):
-        settings = ReportSettings(data=data, source=data, **given)
-        domains = read_domains(run, recorded, settings, loaded)
-        return tuple(kinds[clouds.checksum] for clouds in domains)
+    def read(recorded, cloud=None):
+        return kinds[read_domain((data, None, cloud), recorded, folder, loaded).checksum]
 
-    assert read(record) == ("surface", "clean")
-    assert read(None) == ("surface", "points")  # the run's own target
-    assert read(record, cloud="points", source_cloud="clean") == ("clean", "points")
+    assert [read(run.source), read(record.test), read(run.target)] == ["surface", "clean", "points"]
+    assert read(record.test, "points") == "points"
     report, _ = collect(holdings, ReportSettings(data=data, clouds=0))
     assert "Scored on 12 clouds of shapes (clean)." in report.summary
     assert "labelled clouds of shapes (surface)" in report.summary
@@ -178,7 +175,8 @@ def test_data_without_twins_are_read_whatever_the_record_says(grid, tmp_path):
     np.savetxt(tmp_path / "scans" / "chair" / "a.xyz", np.eye(3))
     test = read_record(records_of(grid / "first")[0]).test
     recorded = dataclasses.replace(test, cloud="clean")
-    clouds = read_data(str(tmp_path / "scans"), None, None, recorded, 3, ("chair",))
+    loaded = load_model(grid / "first")._replace(class_names=("chair",))
+    clouds = read_domain((str(tmp_path / "scans"), None, None), recorded, tmp_path, loaded)
     assert clouds.origin.cloud == "points"
 
 

@@ -51,10 +51,3 @@ def test_map_tells_classes_by_colour_and_domains_by_marker(rng):
     assert first != second
     texts = [text.get_text() for text in figure.legends[0].get_texts()]
     assert texts == ["source", "target", "a", "c"]  # no class that has no cloud
-
-
-def test_arrays_that_do_not_fit_are_refused(rng):
-    with pytest.raises(InputError, match="do not fit"):
-        feature_map(rng.normal(size=(4, 2)), np.zeros(4, int), ("a",) * 3, ("a",))
-    with pytest.raises(InputError, match="do not fit"):
-        feature_map(np.zeros((0, 2)), np.zeros(0, int), (), ("a",))

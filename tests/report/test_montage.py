@@ -7,9 +7,8 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from qs3.errors import InputError
 from qs3.report.figure import NO_VALUE, png_bytes, write_png
-from qs3.report.montage import MontageView, montage, object_box
+from qs3.report.montage import MontageView, montage
 
 HEIGHT, WIDTH = 40, 60
 
@@ -31,19 +30,19 @@ def axes_of(figure: Figure) -> dict:
     return {a.get_title(): a for f in figure.subfigs for a in f.axes if a.get_title()}
 
 
-def test_every_panel_is_there_with_and_without_its_twin(view):
+def test_every_panel_is_there(view):
     names = ["pattern", "left image", "right image", "disparity [px]", "depth [m]"]
     names += ["true depth [m]", "depth error [m]", "distribution of the error"]
     noisy = [f"noisy cloud (100 points), {side}" for side in ("front", "side", "top")]
     clean = [f"clean twin (50 points), {side}" for side in ("front", "side", "top")]
     view = dataclasses.replace(view, unit="m")
     assert list(axes_of(montage(view))) == names + noisy + clean
-    assert list(axes_of(montage(dataclasses.replace(view, clean=None)))) == names + noisy
 
 
-def test_convention_pixels_lie_where_they_are_y_down(view):
+def test_convention_pixels_lie_where_they_are_y_down(view, monkeypatch):
     """Pixel (row, column) is drawn at y = row, x = column, with y growing downwards."""
-    axes = axes_of(montage(dataclasses.replace(view, box=(15, 5, 55, 35))))["left image"]
+    monkeypatch.setattr("qs3.report.montage._MARGIN", 5)
+    axes = axes_of(montage(view))["left image"]
     shown = axes.images[0]
     assert list(shown.get_extent()) == [14.5, 54.5, 34.5, 4.5]
     assert axes.get_ylim()[0] > axes.get_ylim()[1]
@@ -98,9 +97,8 @@ def test_a_scan_that_saw_nothing_is_drawn_too(view):
         depth=nothing,
         true_depth=nothing,
         cloud=np.zeros((0, 3)),
-        clean=None,
+        clean=np.zeros((0, 3)),
         pattern=None,
-        box=object_box(nothing),
     )
     assert len(png_bytes(montage(blind), dpi=20)) > 1000
 
@@ -112,20 +110,6 @@ def test_large_pattern_shows_its_middle(view):
     shown = axes["pattern (its middle 256 px)"].images[0]
     assert shown.get_clim() == (0, 255)
     assert np.argwhere(np.asarray(shown.get_array()) == 255).tolist() == [[128, 128]]
-
-
-@pytest.mark.parametrize("box", [(0, 0, WIDTH + 1, 5), (5, 5, 5, 9), (-1, 0, 4, 4)])
-def test_box_outside_the_image_is_refused(view, box):
-    with pytest.raises(InputError, match="box"):
-        montage(dataclasses.replace(view, box=box))
-
-
-def test_object_box_holds_the_object_and_no_more(view):
-    x0, y0, x1, y1 = object_box(view.true_depth, margin=0)
-    assert np.isfinite(view.true_depth[y0:y1, x0:x1]).all()
-    assert np.isfinite(view.true_depth).sum() == (x1 - x0) * (y1 - y0)
-    assert object_box(view.true_depth, margin=1000) == (0, 0, WIDTH, HEIGHT)
-    assert object_box(np.full((3, 3), np.nan)) is None
 
 
 def test_bytes_depend_on_the_view_alone(view, tmp_path):

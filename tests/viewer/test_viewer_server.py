@@ -1,9 +1,10 @@
 """The viewer's pages and its server: what the controls do, and that nobody else gets in."""
 
+import contextlib
+import http.client
 import socket
 import threading
 import time
-import urllib.error
 import urllib.request
 
 import numpy as np
@@ -26,27 +27,53 @@ def server():
         yield server
 
 
-def answer(server, path="/"):
-    try:
-        with urllib.request.urlopen(url_of(server) + path, timeout=10) as got:  # noqa: S310
-            return got.status, got.read()
-    except urllib.error.HTTPError as error:
-        with error:
-            return error.code, error.read()
+def answer(server, path="", headers=(), token=None):
+    """Status and body of a request below the token, or another; headers may come twice."""
+    token = server.token if token is None else token
+    host = [("Host", f"localhost:{server.get_port()}")]
+    given = headers if any(name == "Host" for name, _ in headers) else [*host, *headers]
+    connection = http.client.HTTPConnection("127.0.0.1", server.get_port(), timeout=10)
+    connection.putrequest("GET", f"/{token}/{path}", skip_host=True)
+    for header in given:
+        connection.putheader(*header)
+    connection.endheaders()
+    with contextlib.closing(connection), connection.getresponse() as got:
+        return got.status, got.read()
+
+
+UPGRADE = [
+    ("Upgrade", "websocket"), ("Connection", "Upgrade"), ("Sec-WebSocket-Version", "13"),
+    ("Sec-WebSocket-Key", "AAAAAAAAAAAAAAAAAAAAAA=="),
+]  # fmt: skip
 
 
 def test_hands_out_its_page_and_says_how_to_reach_it_from_elsewhere(server):
-    status, body = answer(server)
-    assert status == 200
-    assert b"viser" in body.lower()
+    with urllib.request.urlopen(url_of(server), timeout=10) as got:  # noqa: S310
+        assert b"viser" in got.read().lower()
     port = server.get_port()
     assert tunnel_of(server) == f"ssh -L {port}:localhost:{port} {socket.gethostname()}"
 
 
+@pytest.mark.parametrize("upgrade", [[], UPGRADE], ids=["page", "socket"])
+def test_forbids_who_has_no_token_and_who_comes_from_elsewhere(server, upgrade):
+    good, own = 101 if upgrade else 200, f"localhost:{server.get_port()}"
+    assert answer(server, headers=upgrade)[0] == good
+    assert answer(server, headers=[*upgrade, ("Origin", f"http://{own}")])[0] == good
+    tunnelled = [("Host", "127.0.0.1:9"), ("Origin", "http://127.0.0.1:9")]
+    assert answer(server, headers=[*upgrade, *tunnelled])[0] == good
+    for token in ("", "x" * len(server.token), server.token[:-1], "%ff", server.token.upper()):
+        assert answer(server, headers=upgrade, token=token)[0] == 403
+    for host in ("example.org", "localhost.example.org", f"{own}.example.org", "192.168.1.2:80"):
+        assert answer(server, headers=[*upgrade, ("Host", host)])[0] == 403
+    assert answer(server, headers=[*upgrade, ("Host", own), ("Host", own)])[0] == 403
+    for origin in ("http://example.org", f"https://{own}", "http://localhost:1", "null"):
+        assert answer(server, headers=[*upgrade, ("Origin", origin)])[0] == 403
+
+
 @pytest.mark.parametrize(
     "path",
-    ["/../viser/__init__.py", "/%2e%2e/%2e%2e/__init__.py", "//etc/passwd", "/..%5c__init__.py",
-     "/index.html/../../../__init__.py", "/__init__.py", "/etc/passwd"],
+    ["../viser/__init__.py", "%2e%2e/%2e%2e/__init__.py", "/etc/passwd", "..%5c__init__.py",
+     "index.html/../../../__init__.py", "__init__.py", "etc/passwd"],
 )  # fmt: skip
 def test_reads_no_file_of_the_disk(server, path):
     status, body = answer(server, path)

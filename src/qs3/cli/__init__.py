@@ -4,8 +4,10 @@ Standard output carries results (paths, scores, tables); standard error carries 
 a user can mend is one line on standard error and exit code 2; Ctrl-C ends with 130.
 """
 
+import errno
 import sys
 from collections.abc import Sequence
+from itertools import pairwise
 
 VERBS = {
     "scan": "Photograph one mesh: noisy cloud, clean twin, a picture of every stage.",
@@ -44,38 +46,51 @@ ELSEWHERE = {
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one verb; the exit code says how it ended."""
-    from qs3.errors import QS3Error
+    from qs3.cli.text import prepare_streams, printable, tell
 
-    given = list(sys.argv[1:] if arguments is None else arguments)
+    prepare_streams()
     try:
-        code = _run(given)
-    except QS3Error as error:
-        print(f"qs3: {error}", file=sys.stderr)
-        code = 2
+        code = _run(list(sys.argv[1:] if arguments is None else arguments))
     except KeyboardInterrupt:
-        print("qs3: stopped; run the same command again to go on", file=sys.stderr)
+        tell("qs3: stopped; run the same command again to go on")
         code = 130
     except BrokenPipeError:
-        # The reader of our output went away (`qs3 … | head`): nothing to tell it.
-        sys.stderr.close()
-        code = 141
-    except OSError as error:
-        reason = error.strerror or str(error)
-        print(f"qs3: {error.filename or 'file system'}: {reason}", file=sys.stderr)
+        code = 141  # the reader of our output went away (`qs3 … | head`): nothing to tell it
+    except Exception as error:
+        line = _line_of(error)
+        if line is None:
+            raise
+        tell(f"qs3: {printable(line, keep='')}")
         code = 2
     sys.exit(code)
 
 
+def _line_of(error: Exception) -> str | None:
+    """What to tell of a fault that a user can mend; None of any other, which is one of ours."""
+    from qs3.errors import QS3Error
+
+    if isinstance(error, QS3Error):
+        return str(error)
+    if not isinstance(error, OSError):
+        return None
+    line = f"{error.filename or 'file system'}: {error.strerror or error}"
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        line += "; make room, then run the same command again"
+    return line
+
+
 def _run(given: list[str]) -> int:
     """Import and run the verb that is asked for, and nothing else: a scan starts fast."""
+    from qs3.cli.text import show, tell
+
     verb, *rest = given or [""]
     if verb in ("", "-h", "--help"):
-        print(_help(), file=sys.stdout if verb else sys.stderr)
+        (show if verb else tell)(_help())
         return 0 if verb else 2
     if verb == "--version":
         from importlib.metadata import version
 
-        print(f"qs3 {version('qs3')}")
+        show(f"qs3 {version('qs3')}")
         return 0
     if verb not in VERBS:
         from difflib import get_close_matches
@@ -84,6 +99,10 @@ def _run(given: list[str]) -> int:
 
         near = get_close_matches(verb, VERBS) or VERBS
         raise InputError(f"{verb}: no such verb; did you mean {' or '.join(near)}? See qs3 --help")
+    if any(pair == ("--out", "") for pair in pairwise(rest)) or "--out=" in rest:
+        from qs3.errors import InputError
+
+        raise InputError('--out "": is empty; name what to write')
     from qs3.cli.options import run_verb
 
     return run_verb(verb, ELSEWHERE.get(verb, f"{verb}.{verb}"), VERBS[verb], rest)

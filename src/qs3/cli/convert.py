@@ -1,12 +1,11 @@
 """``qs3 convert``: a data set of this field into the layout of another."""
 
-import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-from qs3.cli.text import columns
+from qs3.cli.text import columns, show, tell
 from qs3.errors import InputError
 
 
@@ -46,7 +45,7 @@ def convert(
         for layout in FORMATS.values():
             able = ["yes" if way is not None else "no" for way in (layout.read, layout.write)]
             rows.append((layout.name, able[0], able[1], layout.layout))
-        print(*columns(rows), sep="\n")
+        show(*columns(rows))
         return 0
     if source is None or target is None or not to:
         raise InputError("convert: name what to read, what to write and its layout: qs3 convert "
@@ -62,10 +61,10 @@ def convert(
         classes=POINTDA10 if classes == ("pointda10",) else classes or None,
         unmapped=unmapped,
     )
-    print(target)
+    show(target)
     kind, given = "without labels", "--method qbst --source DATA --target"
     if clouds.labels is not None:
         kind, given = f"of {len(set(clouds.labels.tolist()))} classes", "--source"
-    print(f"{len(clouds.ids)} clouds {kind} written as {to}. Next: qs3 train {given} {target} "
-          "--out RUN", file=sys.stderr)  # fmt: skip
+    tell(f"{len(clouds.ids)} clouds {kind} written as {to}. Next: qs3 train {given} {target} "
+         "--out RUN")  # fmt: skip
     return 0

@@ -6,14 +6,14 @@ then adapted to the target without its labels, and both networks are scored.
 """
 
 import dataclasses
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-import tyro
-
+from qs3.cli.options import Flat
+from qs3.cli.store import refuse_failures
+from qs3.cli.text import show, tell
 from qs3.files import claim_folder, write_json
 
 _MARKER = "demo.json"
@@ -61,7 +61,7 @@ DEFAULTS = DemoSettings()
 
 def demo(
     out: Path = Path("demo"),
-    settings: Annotated[DemoSettings, tyro.conf.arg(name="")] = DEFAULTS,
+    settings: Flat[DemoSettings] = DEFAULTS,
 ) -> int:
     """Run everything once on built-in shapes: scan, train, adapt, report.
 
@@ -72,33 +72,29 @@ def demo(
     start = time.perf_counter()
     folder = claim_folder(out, _MARKER)
     write_json(folder / _MARKER, dataclasses.asdict(settings))
-    for step, (title, make) in enumerate(
-        [
-            ("scan the source: built-in shapes, views all around", _source),
-            ("scan the target: other shapes, another sensor, one view", _target),
-            ("train on the source", _train),
-            ("adapt to the target without its labels", _adapt),
-        ],
-        start=1,
-    ):
-        print(f"[{step}/5] {title}", file=sys.stderr)
-        make(folder, settings)
-    print("[5/5] score and report", file=sys.stderr)
+    tell("[1/5] scan the source: built-in shapes, views all around")
+    _scan(folder / "source", settings, settings.source_per_class, settings.seed,
+          views=settings.source_views)  # fmt: skip
+    tell("[2/5] scan the target: other shapes, another sensor, one view")
+    _scan(folder / "target", settings, settings.target_per_class, settings.seed + 1,
+          views=1, view_layout="jitter", sensor=settings.target_sensor)  # fmt: skip
+    _train(folder, settings)
+    tell("[5/5] score and report")
     before, after, path = _report(folder, settings)
-    print(f"accuracy on the target, source-only: {before.accuracy:.1%}")
-    print(f"accuracy on the target, after QBST:  {after.accuracy:.1%}")
-    print(f"({before.clouds} clouds, whose labels served this score alone)")
-    print(f"report: {path}")
-    print(f"{time.perf_counter() - start:.0f} s. Open {path} in a browser.", file=sys.stderr)
+    show(f"accuracy on the target, source-only: {before.accuracy:.1%}")
+    show(f"accuracy on the target, after QBST:  {after.accuracy:.1%}")
+    show(f"({before.clouds} clouds, whose labels served this score alone)")
+    show(f"report: {path}")
+    tell(f"{time.perf_counter() - start:.0f} s. Open {path} in a browser.")
     return 0
 
 
-def _generate(folder: Path, settings: DemoSettings, per_class: int, seed: int, **how: Any) -> None:
-    from qs3.errors import QS3Error
+def _scan(folder: Path, settings: DemoSettings, per_class: int, seed: int, **how: Any) -> None:
     from qs3.meshes import collect
+    from qs3.store.failures import read_failures
     from qs3.store.generate import GenerateSettings, generate
 
-    report = generate(
+    generate(
         collect("shapes", per_class=per_class, seed=seed),
         folder,
         GenerateSettings(
@@ -111,8 +107,7 @@ def _generate(folder: Path, settings: DemoSettings, per_class: int, seed: int, *
         ),
         workers=settings.workers,
     )
-    if report.failed:
-        raise QS3Error(f"{folder / 'failures.jsonl'}: {report.failed} scans failed; see there")
+    refuse_failures(str(folder), read_failures(folder), "scans")
 
 
 def _renderer(settings: DemoSettings) -> Any:
@@ -121,45 +116,22 @@ def _renderer(settings: DemoSettings) -> Any:
     return CameraSettings(samples=settings.samples, variant=settings.variant).make_renderer()
 
 
-def _source(folder: Path, settings: DemoSettings) -> None:
-    _generate(
-        folder / "source",
-        settings,
-        settings.source_per_class,
-        settings.seed,
-        views=settings.source_views,
-    )
-
-
-def _target(folder: Path, settings: DemoSettings) -> None:
-    _generate(
-        folder / "target",
-        settings,
-        settings.target_per_class,
-        settings.seed + 1,
-        views=1,
-        view_layout="jitter",
-        sensor=settings.target_sensor,
-    )
-
-
 def _train(folder: Path, settings: DemoSettings) -> None:
-    from qs3.io import load_clouds
-    from qs3.training import fit, load_whole
-
-    source = load_whole(load_clouds, folder / "source", settings.num_points)
-    fit("source-only", source, None, _train_settings(settings), run_dir=folder / "source-only")
-
-
-def _adapt(folder: Path, settings: DemoSettings) -> None:
+    """Train on the source, then adapt to the target."""
     from qs3.io import load_clouds, load_unlabelled
-    from qs3.training import fit, load_whole, self_training_preset
+    from qs3.training import TrainSettings, fit, load_whole, self_training_preset
 
+    names = ("model", "num_points", "epochs", "batch_size", "seed")
+    train = TrainSettings(**{name: getattr(settings, name) for name in names})
+    source = load_whole(load_clouds, folder / "source", settings.num_points)
+    tell("[3/5] train on the source")
+    fit("source-only", source, None, train, run_dir=folder / "source-only")
+    tell("[4/5] adapt to the target without its labels")
     fit(
         "qbst",
-        load_whole(load_clouds, folder / "source", settings.num_points),
+        source,
         load_whole(load_unlabelled, folder / "target", settings.num_points),
-        _train_settings(settings),
+        train,
         self_training_preset(
             "default",
             threshold=settings.threshold,
@@ -172,31 +144,26 @@ def _adapt(folder: Path, settings: DemoSettings) -> None:
     )
 
 
-def _train_settings(settings: DemoSettings) -> Any:
-    from qs3.training import TrainSettings
-
-    return TrainSettings(
-        model=settings.model,
-        num_points=settings.num_points,
-        epochs=settings.epochs,
-        batch_size=settings.batch_size,
-        seed=settings.seed,
-    )
-
-
 def _report(folder: Path, settings: DemoSettings) -> tuple[Any, Any, Path]:
     """Score both networks on the target and write the page."""
     from qs3 import shapes
     from qs3.report.collect import collect, look
-    from qs3.report.montage import scan_montage
+    from qs3.report.montage import montage_view
     from qs3.report.page import write_report
     from qs3.report.settings import ReportSettings
-    from qs3.sensor.presets import get_sensor
+    from qs3.sensor.scan import scan
     from qs3.training import evaluate
 
     records = [evaluate(folder / name, folder / "target") for name in ("source-only", "qbst")]
     source, target = records[1].source, records[1].test
     page, _ = collect(look(folder), ReportSettings(run=folder / "qbst"))
+    made = scan(
+        shapes.make("chair", seed=settings.seed),
+        views=settings.source_views,
+        seed=settings.seed,
+        renderer=_renderer(settings),
+        keep_images=True,
+    )
     page = dataclasses.replace(
         page,
         title="qs3 demo: from CAD models to a depth camera",
@@ -209,13 +176,7 @@ def _report(folder: Path, settings: DemoSettings) -> tuple[Any, Any, Path]:
         ),
         command=f"qs3 demo --out {folder.name}",
         settings=dataclasses.asdict(settings) | {"runs": records[1].settings},
-        montage=scan_montage(
-            shapes.make("chair", seed=settings.seed),
-            get_sensor("paper"),
-            _renderer(settings),
-            settings.source_views,
-            settings.seed,
-        ),
+        montage=montage_view(made)[0],
         montage_title="chair · sensor paper",
         notes=(
             *page.notes,
@@ -223,6 +184,5 @@ def _report(folder: Path, settings: DemoSettings) -> tuple[Any, Any, Path]:
             "that everything runs, not how much a method gains.",
         ),
     )
-    path = folder / "report.html"
-    write_report(path, page)
-    return records[0].scores, records[1].scores, path
+    write_report(folder / "report.html", page)
+    return records[0].scores, records[1].scores, folder / "report.html"

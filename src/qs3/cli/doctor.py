@@ -6,6 +6,7 @@ import platform
 import re
 from typing import Any
 
+from qs3.cli.text import show
 from qs3.errors import QS3Error
 
 _PURPOSE = {
@@ -31,7 +32,7 @@ def doctor(json_output: bool = False) -> int:
     """
     machine = examine()
     if json_output:
-        print(json.dumps(machine, indent=2))
+        show(json.dumps(machine, indent=2))
     else:
         _print(machine)
     return 0 if machine["ready"] else 1
@@ -97,30 +98,30 @@ def _cycles() -> dict[str, str]:
 
 
 def _print(machine: dict[str, Any]) -> None:
-    print(f"Python {machine['python']}")
+    show(f"Python {machine['python']}")
     for name, version in machine["packages"].items():
-        print(f"  {'ok     ' if version else 'MISSING'} {name} {version or ''}".rstrip())
+        show(f"  {'ok     ' if version else 'MISSING'} {name} {version or ''}".rstrip())
         if version is None:
-            print(f"          get it with: pip install {name}")
-    print("Renderer (Mitsuba 3, fastest first)")
+            show(f"          get it with: pip install {name}")
+    show("Renderer (Mitsuba 3, fastest first)")
     for variant, works in machine["renderers"].items():
         used = "   <- used" if variant == machine["renderer"] else ""
         reason = "" if works else f": {_ADVICE[variant]}"
-        print(f"  {'ok     ' if works else 'absent '} {variant}{reason}{used}")
+        show(f"  {'ok     ' if works else 'absent '} {variant}{reason}{used}")
     cycles = machine["cycles"]
-    print("The paper's renderer (--renderer cycles; optional)")
+    show("The paper's renderer (--renderer cycles; optional)")
     if "fault" in cycles:
-        print(f"  absent  cycles: {cycles['fault']}")
+        show(f"  absent  cycles: {cycles['fault']}")
     else:
-        print(
+        show(
             f"  ok      cycles: Blender {cycles['blender']} (Python {cycles['python']}), "
             f"{cycles['command']}"
         )
-    print(f"Training on: {machine['device']}")
-    print("Extras (each for what stands beside it, and nothing else)")
+    show(f"Training on: {machine['device']}")
+    show("Extras (each for what stands beside it, and nothing else)")
     for extra, here in machine["extras"].items():
         how = "" if here else f": in a checkout, pip install -e '.[{extra}]'"
-        print(f"  {'ok     ' if here else 'absent '} {extra} ({_PURPOSE[extra]}){how}")
-    print(
+        show(f"  {'ok     ' if here else 'absent '} {extra} ({_PURPOSE[extra]}){how}")
+    show(
         "Ready." if machine["ready"] else "Not ready: mend what is marked MISSING or absent above."
     )

@@ -1,87 +1,66 @@
 """``qs3 evaluate`` and ``qs3 predict``: scores of a run, and its answers for single files."""
 
-import json
-import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from json import dumps
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import tyro
 
-from qs3.cli.options import Flat
+from qs3.cli.text import columns, printable, show, tell
 from qs3.errors import InputError
 from qs3.evaluation.records import Scores
 from qs3.io.clouds import CloudKind
 from qs3.structure import unstructure
 
 
-@dataclass(frozen=True)
-class EvaluateOptions:
-    """Score a run on labelled clouds; the only verb that reads labels of a target."""
+def evaluate_run(
+    run: Annotated[Path, tyro.conf.Positional],
+    data: str,
+    split: str | None = None,
+    cloud: CloudKind = "points",
+    checkpoints: bool = False,
+    json: bool = False,
+) -> int:
+    """Score a run: accuracy, class-mean accuracy, confusion matrix.
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """Folder of a run."""
-    data: str
-    """Labelled clouds: a folder that qs3 generate made, a folder of class folders, an npz file."""
-    split: str | None = None
-    """Part of the data, such as test; all of it by default."""
-    cloud: CloudKind = "points"
-    """Of generated data: noisy scans, their clean twins, or samples of the whole surface."""
-    checkpoints: bool = False
-    """Score every checkpoint too, and tell which one each validator would have chosen; apart from
-    them the oracle, an upper bound that looks at the labels of the data."""
-    json: bool = False
-    """Print the whole record as JSON in place of text."""
+    It leaves a record in the run; no other verb reads labels of a target.
 
-
-@dataclass(frozen=True)
-class PredictOptions:
-    """Tell the class of single clouds."""
-
-    run: Annotated[Path, tyro.conf.Positional]
-    """Folder of a run, or its model.safetensors."""
-    files: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Clouds: NPY, XYZ, PLY, PCD, or a mesh as OFF; z up."""
-    json: bool = False
-    """Print JSON with the probability of every class in place of text."""
-
-
-def evaluate_run(options: Flat[EvaluateOptions]) -> int:
-    """Score a run: accuracy, class-mean accuracy, confusion matrix; leaves a record in the run."""
+    Args:
+        run: Folder of a run.
+        data: Labelled clouds: a folder that qs3 generate made, a folder of class folders, an npz
+            file.
+        split: Part of the data, such as test; all of it by default.
+        cloud: Of generated data: noisy scans, their clean twins, or samples of the whole surface.
+        checkpoints: Score every checkpoint too, and tell which one each validator would have
+            chosen; apart from them the oracle, an upper bound that looks at the labels of the data.
+        json: Print the whole record as JSON in place of text.
+    """
     from qs3.training import evaluate, record_path
 
-    record = evaluate(
-        options.run,
-        options.data,
-        split=options.split,
-        cloud=options.cloud,
-        checkpoints=options.checkpoints,
-    )
-    if options.json:
-        print(json.dumps(unstructure(record), indent=2))
+    record = evaluate(run, data, split=split, cloud=cloud, checkpoints=checkpoints)
+    if json:
+        show(dumps(unstructure(record), indent=2))
     else:
-        print(scores_text(record.scores, record.marks))
+        show(*scores_text(record.scores, record.marks))
         if record.choices:
-            print(choices_text(record.choices))
-    print(f"record: {record_path(options.run, record)}", file=sys.stderr)
+            show(*choices_text(record.choices))
+    tell(f"record: {record_path(run, record)}")
     return 0
 
 
-def choices_text(choices: Mapping[str, Mapping[str, Any]]) -> str:
-    """What each rule would have chosen, as text."""
-    lines = [f"\n{'chosen by':<14}{'checkpoint':<18}{'accuracy':>10}{'class mean':>12}"]
+def choices_text(choices: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """What each rule would have chosen, as lines."""
+    rows: list[tuple[str, ...]] = [("chosen by", "checkpoint", "accuracy", "class mean")]
     for rule, choice in choices.items():
-        where = f"{choice['stage']} {choice['number']}"
+        scores = (f"{choice[name]:.1%}" for name in ("accuracy", "class_mean_accuracy"))
         name = "oracle *" if rule == "oracle" else rule
-        mean = f"{choice['accuracy']:>10.1%}{choice['class_mean_accuracy']:>12.1%}"
-        lines.append(f"{name:<14}{where:<18}{mean}")
-    return "\n".join([*lines, "* looks at the labels of this data: an upper bound"])
+        rows.append((name, f"{choice['stage']} {choice['number']}", *scores))
+    return ["", *columns(rows, 2), "* looks at the labels of this data: an upper bound"]
 
 
-def scores_text(scores: Scores, marks: Sequence[str] = ()) -> str:
-    """Scores as text: accuracies, recall of each class, confusion matrix."""
+def scores_text(scores: Scores, marks: Sequence[str] = ()) -> list[str]:
+    """Scores as lines: accuracies, recall of each class, confusion matrix."""
     low, high = scores.interval
     lines = [
         f"accuracy            {scores.accuracy:.1%}  (95 % interval {low:.0%} to {high:.0%}, "
@@ -90,45 +69,54 @@ def scores_text(scores: Scores, marks: Sequence[str] = ()) -> str:
     ]
     if marks:
         lines.append(f"marks               {', '.join(marks)}")
-    width = max(len(name) for name in scores.class_names)
-    counts = [list(row) for row in scores.confusion]
-    cell = max(5, len(str(max(max(row) for row in counts))) + 1)
-    head = "".join(f"{name[: cell - 1]:>{cell}}" for name in scores.class_names)
-    lines.append(f"\n{'true, predicted:':<{width + 9}}{head}")
-    for name, recall, row in zip(scores.class_names, scores.per_class, counts, strict=True):
-        share = "   –  " if recall is None else f"{recall:6.1%}"
-        cells = "".join(f"{count:>{cell}}" for count in row[: len(scores.class_names)])
-        lines.append(f"{name:<{width}}  {share} {cells}")
-    return "\n".join(lines)
+    count = len(scores.class_names)
+    rows = [("true, predicted:", "", *(name[:8] for name in scores.class_names))]
+    for name, recall, row in zip(
+        scores.class_names, scores.per_class, scores.confusion, strict=True
+    ):
+        share = "–" if recall is None else f"{recall:.1%}"
+        rows.append((name, share, *map(str, row[:count])))
+    return [*lines, "", *columns(rows, 1)]
 
 
-def predict(options: Flat[PredictOptions]) -> int:
-    """Tell the class of each file and how confident the network is."""
+def predict(
+    run: Annotated[Path, tyro.conf.Positional],
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    json: bool = False,
+) -> int:
+    """Tell the class of each file and how confident the network is.
+
+    Args:
+        run: Folder of a run, or its model.safetensors.
+        files: Clouds: NPY, XYZ, PLY, PCD, or a mesh as OFF; z up.
+        json: Print JSON with the probability of every class in place of text.
+    """
     from qs3.io import read_cloud
     from qs3.io.preparation import stack
     from qs3.training import load_model, predict_probabilities
 
-    if not options.files:
+    if not files:
         raise InputError("name one or more files of points after the run")
-    loaded = load_model(options.run)
+    loaded = load_model(run)
     num_points = loaded.settings["train"]["num_points"]
-    clouds = [read_cloud(path) for path in options.files]
+    clouds = [read_cloud(path) for path in files]
     answers: list[dict[str, Any]] = []
-    for path, cloud in zip(options.files, clouds, strict=True):
-        batch = stack([cloud], num_points, str(path))
-        shares = predict_probabilities(loaded.model, batch)[0]
-        best = int(np.argmax(shares))
+    for path, cloud in zip(files, clouds, strict=True):
+        shares = predict_probabilities(loaded.model, stack([cloud], num_points, str(path)))[0]
+        shares = dict(zip(loaded.class_names, shares.tolist(), strict=True))
+        best = max(shares, key=lambda name: shares[name])
         answers.append(
             {
                 "file": str(path),
-                "class": loaded.class_names[best],
-                "confidence": float(shares[best]),
-                "probabilities": dict(zip(loaded.class_names, shares.tolist(), strict=True)),
+                "class": best,
+                "confidence": shares[best],
+                "probabilities": shares,
             }
         )
-    if options.json:
-        print(json.dumps(answers, indent=2))
-    else:
-        for row in answers:
-            print(f"{row['file']}\t{row['class']}\t{row['confidence']:.3f}")
+    if json:
+        show(dumps(answers, indent=2))
+        return 0
+    for answer in answers:
+        names = (printable(answer[name], keep="") for name in ("file", "class"))
+        show("\t".join([*names, f"{answer['confidence']:.3f}"]))
     return 0

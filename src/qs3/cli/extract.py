@@ -1,6 +1,5 @@
 """``qs3 extract``: objects out of real scans, into a data set."""
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +7,8 @@ from typing import Annotated
 import tyro
 
 from qs3.cli.options import Flat
-from qs3.errors import InputError
+from qs3.cli.store import refuse_failures
+from qs3.cli.text import show, tell
 from qs3.io.extract.depth import DepthImageSettings, extract_depth
 from qs3.io.extract.run import ExtractReport, OutputSettings
 from qs3.io.extract.scannet import ScanNetSettings, extract_scannet
@@ -69,25 +69,19 @@ extract: dict[str, Callable[..., int]] = {"scannet": scannet, "sunrgbd": sunrgbd
 
 def _tell(out: str, report: ExtractReport) -> int:
     """Tell what was done and what comes next; failures are an error."""
-    from qs3.store.failures import FAILURES, read_failures
+    from qs3.store.failures import read_failures
 
     if report.axes:
-        print(f"clouds in the axes of the {report.axes}", file=sys.stderr)
-    print(out)
+        tell(f"clouds in the axes of the {report.axes}")
+    show(out)
     left = ""
     if report.planned is not None and not report.failed:
         fewer = report.planned - report.objects
         left = f" of {report.planned}, {fewer} had fewer than {report.min_points} points"
-    print(
+    tell(
         f"{report.objects} objects{left}; {report.units} frames or scenes done, {report.skipped} "
         f"were there before, {report.failed} failed. Next: qs3 train --method qbst --source DATA "
-        f"--target {out} --out RUN",
-        file=sys.stderr,
+        f"--target {out} --out RUN"
     )
-    if report.failed:
-        first = read_failures(out)[0]
-        raise InputError(
-            f"{out}/{FAILURES}: {report.failed} failed; the first: {first['id']}: "
-            f"{first['reason']}; all others are there, --retry-failed does these again"
-        )
+    refuse_failures(out, read_failures(out), "scenes or frames")
     return 0

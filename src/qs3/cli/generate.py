@@ -3,16 +3,18 @@
 import dataclasses
 import os
 import re
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from qs3.cli.options import Flat
+from qs3.cli.store import refuse_failures
+from qs3.cli.text import show, tell
 from qs3.errors import InputError
 from qs3.store.scan_item import GenerateSettings
 
 if TYPE_CHECKING:
     from qs3.meshes import MeshItem
+    from qs3.store.plan import Plan
 
 
 def generate(
@@ -59,10 +61,14 @@ def generate(
         settings: How they are scanned and written. Another seed draws other shapes and poses.
     """
     from qs3.meshes.classes import POINTDA10
+    from qs3.store.failures import read_failures
     from qs3.store.generate import generate as generate_data
     from qs3.store.plan import make_plan, resolve_renderer
 
-    part = _part(shard)
+    match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", shard)
+    if not match or not int(match[1]) < int(match[2]):
+        raise InputError(f"--shard {shard}: give i/n with i from 0 to n - 1, such as 0/8")
+    part = int(match[1]), int(match[2])
     items = _items(meshes, up, per_class, settings.seed, classes, labels)
     names = {item.class_name for item in items}
     settings = dataclasses.replace(
@@ -72,16 +78,27 @@ def generate(
         per_class=per_class if "shapes" in meshes else None,
     )
     settings.as_dict()  # a scene or a range that makes no sense stops here
-    processes = _cores() if workers is None else workers
+    usable = getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count() or 1))(0)
+    processes = len(usable) if workers is None else workers
     if dry_run:
         plan = make_plan(items, settings)
-        return _dry_run(plan, part, timeout, processes if executor == "local" else None)
+        show(*_expected(plan, part, timeout, processes if executor == "local" else None))
+        return 0
     place = _executor(executor, processes, timeout, address, gpus_per_scan)
     report = generate_data(
         items, out, settings, executor=place, shard=part, retry_failed=retry_failed
     )
-    print(out)
-    return _tell(report, out, part[1])
+    show(out)
+    following = f"qs3 train --source {out} --out RUN"
+    if part[1] > 1:
+        following = f"qs3 merge PART… --out DIR, once all {part[1]} parts are there"
+    failures = read_failures(out)
+    tell(
+        f"{report.done} scans written, {report.skipped} were there before, "
+        f"{len(failures)} failed. Next: {following}"
+    )
+    refuse_failures(out, failures, "scans")
+    return 0
 
 
 def _items(
@@ -114,18 +131,6 @@ def _items(
     return items
 
 
-def _part(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
-    if not match or not int(match[1]) < int(match[2]):
-        raise InputError(f"--shard {text}: give i/n with i from 0 to n - 1, such as 0/8")
-    return int(match[1]), int(match[2])
-
-
-def _cores() -> int:
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return usable or 1
-
-
 def _executor(name: str, workers: int, timeout: float, address: str, gpus_per_scan: float) -> Any:
     if name == "ray":
         from qs3.store.executors.ray_cluster import RayExecutor
@@ -136,40 +141,18 @@ def _executor(name: str, workers: int, timeout: float, address: str, gpus_per_sc
     return InlineExecutor() if workers == 0 else LocalExecutor(workers, timeout)
 
 
-def _dry_run(plan: Any, part: tuple[int, int], timeout: float, workers: int | None) -> int:
-    """Print what the run would make and cost; without ``workers`` for one of any machine."""
+def _expected(
+    plan: "Plan", part: tuple[int, int], timeout: float, workers: int | None
+) -> list[str]:
+    """What the run would make and cost; without ``workers`` for one of any machine."""
     from qs3.store.plan import estimate
 
     expected = estimate(plan, part, timeout=timeout)
-    for name, objects in expected.objects.items():
-        print(f"{name}: {objects} objects")
-    print(
-        f"{expected.rows} scans, of which {expected.part_rows} in this part, {plan.shards} shards"
-    )
-    print(f"disk: {expected.bytes / 1e9:.3g} GB")
     machine = "one worker" if workers is None else f"{max(workers, 1)} workers of this machine"
     hours = expected.seconds / max(workers or 1, 1) / 3600
-    print(f"time: {hours:.3g} hours with {machine}, from {expected.measured} scans")
-    return 0
-
-
-def _tell(report: Any, out: str, parts: int) -> int:
-    """Say what was done and what comes next; failures are an error."""
-    from qs3.store.failures import FAILURES, read_failures
-
-    failures = read_failures(out)
-    following = f"qs3 train --source {out} --out RUN"
-    if parts > 1:
-        following = f"qs3 merge PART… --out DIR, once all {parts} parts are there"
-    print(
-        f"{report.done} scans written, {report.skipped} were there before, "
-        f"{len(failures)} failed. Next: {following}",
-        file=sys.stderr,
-    )
-    if failures:
-        first = failures[0]
-        raise InputError(
-            f"{out}/{FAILURES}: {len(failures)} scans failed; the first: {first['id']}: "
-            f"{first['reason']}; all others are there, --retry-failed scans these again"
-        )
-    return 0
+    return [
+        *(f"{name}: {objects} objects" for name, objects in expected.objects.items()),
+        f"{expected.rows} scans, of which {expected.part_rows} in this part, {plan.shards} shards",
+        f"disk: {expected.bytes / 1e9:.3g} GB",
+        f"time: {hours:.3g} hours with {machine}, from {expected.measured} scans",
+    ]

@@ -1,6 +1,7 @@
 """From words of a command line to the library's own settings, by tyro."""
 
 import dataclasses
+import functools
 import importlib
 import types
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
@@ -16,18 +17,20 @@ _registry = ConstructorRegistry()
 
 
 def run_verb(verb: str, place: str, text: str, words: list[str]) -> int:
-    """Run the function at ``place``, or one of several, on the words of a command line."""
-    module, _, name = place.partition(".")
-    function: Any = getattr(importlib.import_module(f"qs3.cli.{module}"), name)
+    """Run the function at ``place``, or one of several, on the words of a command line.
+
+    Where some options choose the defaults of others, the module has ``defaults``: from the words to
+    arguments of the function.
+    """
+    name, _, function_name = place.partition(".")
+    module = importlib.import_module(f"qs3.cli.{name}")
+    function: Any = getattr(module, function_name)
     how: dict[str, Any] = {"prog": f"qs3 {verb}", "args": words, "registry": _registry}
     if isinstance(function, dict):
         return tyro.extras.subcommand_cli_from_dict(function, description=text, **how)
-    if verb == "train":
-        from qs3.cli.train import TrainOptions, preset_options
-
-        how["description"] = function.__doc__
-        return function(tyro.cli(TrainOptions, default=preset_options(words), **how))
-    return tyro.cli(function, **how) or 0
+    if hasattr(module, "defaults"):
+        function = functools.partial(function, **module.defaults(words))
+    return tyro.cli(function, **how)
 
 
 @_registry.primitive_rule

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from qs3.cli.options import Flat
-from qs3.cli.text import columns
+from qs3.cli.text import columns, show, tell
 from qs3.sensor.realism import RealismSettings
 from qs3.sensor.settings import CameraSettings
 
@@ -40,8 +40,8 @@ def realism(
         tqdm.write(f"{result['id']} {_VERDICTS[result['passed']]}, {cost}", file=sys.stderr)
 
     results = test_camera(out, camera.make_sensor(), camera.make_renderer(), settings, say)
-    print(*table(results), sep="\n")
-    _tell(results, out)
+    show(*table(results))
+    tell(*_summary(results, out))
     missed = any(result["passed"] is False for result in results)
     return 1 if strict and missed else 0
 
@@ -73,7 +73,7 @@ def _number(value: float) -> str:
     return f"{value:,.0f}" if float(value).is_integer() else f"{value:.4g}"
 
 
-def _tell(results: Sequence[Mapping[str, Any]], folder: Path) -> None:
+def _summary(results: Sequence[Mapping[str, Any]], folder: Path) -> list[str]:
     """What came out, which plots there are, and where to look."""
     from qs3.report.realism import REALISM_PLOTS
     from qs3.report.realism_folder import RECORD
@@ -85,12 +85,10 @@ def _tell(results: Sequence[Mapping[str, Any]], folder: Path) -> None:
         for test, plot in REALISM_PLOTS.items()
         if folder / plot not in drawn
     ]
-    if absent:
-        print(f"no {', '.join(absent)}", file=sys.stderr)
     counts = {verdict: list(verdicts.values()).count(verdict) for verdict in _VERDICTS.values()}
     look = " and ".join(map(str, [*drawn[:1], folder / RECORD]))
-    print(
+    return [
+        *([f"no {', '.join(absent)}"] if absent else []),
         f"{counts['pass']} passed, {counts['MISS']} missed, {counts['does not apply']} do not "
         f"apply. Look at {look}",
-        file=sys.stderr,
-    )
+    ]

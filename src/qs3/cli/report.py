@@ -1,7 +1,6 @@
 """``qs3 report``: one self-contained page about a run, several runs, or records."""
 
 import shlex
-import sys
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from qs3.cli.options import Flat
+from qs3.cli.text import show, tell
 from qs3.errors import InputError, QS3Error
 from qs3.report.settings import ReportSettings
 
@@ -43,18 +43,16 @@ def report(
         raise InputError(f"{out}: is a folder; name a file for --out")
     published, source = _published()
     holdings = look(folder, published)
-    print("scoring, laying out features …", file=sys.stderr)
+    tell("scoring, laying out features …")
     page, faults = collect(holdings, settings)
-    for fault in faults:
-        print(f"qs3: left out: {fault}", file=sys.stderr)
+    tell(*(f"qs3: left out: {fault}" for fault in faults))
     command = command_of(folder, settings, mesh, sensor)
     page = replace(page, command=command, published_source=source)
     verdict = write_report(out, page if mesh == "none" else _with_scan(page, mesh, sensor))
-    print(out)
+    show(out)
     if verdict is not None:
-        print(verdict.opening, file=sys.stderr)
-    size = out.stat().st_size / 1e6
-    print(f"{size:.1f} MB, one file. Open it in a browser.", file=sys.stderr)
+        tell(verdict.opening)
+    tell(f"{out.stat().st_size / 1e6:.1f} MB, one file. Open it in a browser.")
     return 1 if faults else 0
 
 
@@ -78,21 +76,21 @@ def _published() -> tuple[dict[str, dict[str, str]], str]:
 def _with_scan(page: "Report", name: str, sensor: str) -> "Report":
     """Add a scan step by step, or a note where none can be made here."""
     from qs3.meshes.collections import load_named
-    from qs3.report.montage import scan_montage
-    from qs3.sensor.settings import CameraSettings
+    from qs3.report.montage import montage_view
+    from qs3.sensor.scan import ScanSettings, scan
 
     mesh, origin = load_named(name, 0)
-    camera = CameraSettings(sensor=sensor)
-    made = camera.make_sensor()
+    settings = ScanSettings(sensor=sensor, views=2)
+    settings = replace(settings, sensor=settings.make_sensor())  # a bad one is refused
     try:
-        renderer = camera.make_renderer()
+        settings = replace(settings, renderer=settings.make_renderer())
     except QS3Error as error:
-        print(f"no scan can be made here: {error}", file=sys.stderr)
+        tell(f"no scan can be made here: {error}")
         note = "No renderer works where this page was made: no scan is shown."
         return replace(page, notes=(*page.notes, note))
-    print("scanning for the pictures …", file=sys.stderr)
-    title = f"{origin['name']} · sensor {sensor}"
-    return replace(page, montage=scan_montage(mesh, made, renderer), montage_title=title)
+    tell("scanning for the pictures …")
+    view, _ = montage_view(scan(mesh, settings, keep_images=True))
+    return replace(page, montage=view, montage_title=f"{origin['name']} · sensor {sensor}")
 
 
 def command_of(

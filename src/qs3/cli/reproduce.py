@@ -1,13 +1,14 @@
 """``qs3 reproduce``: tables and figures anew, from data to records to files."""
 
 import os
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from qs3.cli.options import Flat
+from qs3.cli.text import show, tell
 from qs3.errors import InputError
 from qs3.experiments import GALLERIES, TABLES, ScaleName
 from qs3.experiments.reproduce import Workers
@@ -45,11 +46,11 @@ class ReproduceOptions:
     """Print counts and hours, measured on a few scans and steps; write nothing."""
     threads: int = 1
     """CPU threads of a training; numbers are the same for the same count."""
-    workers: Annotated[Workers, tyro.conf.arg(name="")] = field(default_factory=Workers)
+    workers: Flat[Workers] = field(default_factory=Workers)
     """Who does the work."""
 
 
-def reproduce(options: Annotated[ReproduceOptions, tyro.conf.arg(name="")]) -> int:
+def reproduce(options: Flat[ReproduceOptions]) -> int:
     """Make tables and figures anew, with their data and trainings; only what is missing is done."""
     from qs3.experiments.domains import parse_own
     from qs3.experiments.reproduce import products
@@ -70,17 +71,8 @@ def reproduce(options: Annotated[ReproduceOptions, tyro.conf.arg(name="")]) -> i
     )
     names = options.names or (*TABLES, GALLERIES)
     parts = products(names, setup, options.methods, options.tasks)
-    stream = sys.stdout if options.dry_run else sys.stderr
-    paths = make(
-        parts,
-        setup,
-        options.workers,
-        lambda line: print(line, file=stream, flush=True),
-        options.dry_run,
-    )
-    for path in paths:
-        if path.is_file():
-            print(path.read_text(encoding="utf-8"))
-    for path in paths:
-        print(f"made: {path}", file=sys.stderr)
+    say = show if options.dry_run else tell
+    paths = make(parts, setup, options.workers, say, options.dry_run)
+    show(*(path.read_text(encoding="utf-8") for path in paths if path.is_file()))
+    tell(*(f"made: {path}" for path in paths))
     return 0

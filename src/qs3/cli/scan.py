@@ -1,7 +1,6 @@
 """``qs3 scan``: one mesh through the whole sensor, with pictures."""
 
 import dataclasses
-import sys
 import time
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,6 +9,7 @@ import numpy as np
 import tyro
 
 from qs3.cli.options import Flat
+from qs3.cli.text import show, tell
 from qs3.sensor.settings import ScanSettings
 
 
@@ -70,10 +70,9 @@ def scan(
     if frames:
         write_frames(folder / "frames", result)
         written.append(folder / "frames")
-    for path in written:
-        print(path)
-    print(f"{_summary(result)}; {time.perf_counter() - start:.1f} s. "
-          f"Look at {folder / 'montage.png'}", file=sys.stderr)  # fmt: skip
+    show(*written)
+    tell(f"{_summary(result)}; {time.perf_counter() - start:.1f} s. "
+         f"Look at {folder / 'montage.png'}")  # fmt: skip
     return 0
 
 
@@ -102,13 +101,12 @@ def _record(settings: ScanSettings, origin: dict[str, Any], result: Any) -> dict
 
 
 def _summary(result: Any) -> str:
-    def mean(name: str) -> float:
+    mean = {}
+    for name in ("disparity_sigma", "disparity_bias", "gross_share", "valid_fraction"):
         values = [getattr(view, name) for view in result.views]
-        measured = [value for value in values if value is not None]
-        return float(np.mean(measured)) if measured else float("nan")
-
+        mean[name] = np.mean([value for value in values if value is not None] or [np.nan])
     return (
         f"{len(result.views)} views, {result.fused_points} fused points: disparity σ "
-        f"{mean('disparity_sigma'):.3f} px, bias {mean('disparity_bias'):+.3f} px, gross errors "
-        f"{mean('gross_share'):.1%}, valid {mean('valid_fraction'):.0%} of the object's pixels"
+        f"{mean['disparity_sigma']:.3f} px, bias {mean['disparity_bias']:+.3f} px, gross errors "
+        f"{mean['gross_share']:.1%}, valid {mean['valid_fraction']:.0%} of the object's pixels"
     )

@@ -1,11 +1,10 @@
 """``qs3 sensors``: the built-in ones, and any of them as a TOML file to copy and edit."""
 
-import sys
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from qs3.cli.text import columns
+from qs3.cli.text import columns, show, tell
 from qs3.errors import InputError
 
 
@@ -24,17 +23,16 @@ def sensors(
     if action == "show":
         if not name:
             raise InputError(f"sensors show: name one of {', '.join(SENSORS)}, or a TOML file")
-        print(sensor_toml(get_sensor(name)), end="")
+        show(sensor_toml(get_sensor(name)), end="")
         return 0
     if name:
         raise InputError(f"sensors list: takes no name; to see it: qs3 sensors show {name}")
     rows = [("name", "pixels", "f (px)", "baseline", "range", "from", "what it is")]
     rows += [_row(sensor) for sensor in SENSORS.values()]
-    print(*columns(rows), sep="\n")
-    print(
+    show(*columns(rows))
+    tell(
         "range: depths kept; from: distance of the rig to the object's centre; without a unit: in "
-        "sizes of the object. Next: qs3 sensors show d435 > my_camera.toml",
-        file=sys.stderr,
+        "sizes of the object. Next: qs3 sensors show d435 > my_camera.toml"
     )
     return 0
 

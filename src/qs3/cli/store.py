@@ -1,14 +1,34 @@
 """``qs3 info``, ``qs3 verify`` and ``qs3 merge``: look after finished data sets."""
 
 import json
-import sys
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import tyro
 
+from qs3.cli.text import show, tell
 from qs3.errors import InputError
 
 _Folder = Annotated[str, tyro.conf.Positional]
+_STATISTICS = {
+    "valid_fraction": ("valid pixels of the object", ".1%"),
+    "disparity_bias": ("disparity bias, px", "+.3f"),
+    "disparity_sigma": ("disparity σ, px", ".3f"),
+    "gross_share": ("gross errors", ".2%"),
+}
+
+
+def refuse_failures(out: str, failures: Sequence[Mapping[str, Any]], what: str) -> None:
+    """Stop where a data set has failures; the first is named.
+
+    Raises:
+        InputError: where there are any.
+    """
+    if failures:
+        raise InputError(
+            f"{out}/failures.jsonl: {len(failures)} {what} failed; the first: {failures[0]['id']}: "
+            f"{failures[0]['reason']}; all others are there, --retry-failed does these again"
+        )
 
 
 def info(folder: _Folder, as_json: bool = False) -> int:
@@ -24,16 +44,14 @@ def info(folder: _Folder, as_json: bool = False) -> int:
     contents = count(folder)
     failures = read_failures(folder)
     if as_json:
-        print(json.dumps({**contents, "failures": failures}, indent=2, ensure_ascii=False))
+        show(json.dumps({**contents, "failures": failures}, indent=2))
         return 0
-    for line in _lines(contents):
-        print(line)
-    for record in failures[:5]:
-        print(f"  {record['id']}: {record['reason']}")
+    show(*_lines(contents))
+    show(*(f"  {record['id']}: {record['reason']}" for record in failures[:5]))
     if len(failures) > 5:
-        print(f"  and {len(failures) - 5} more in failures.jsonl")
+        show(f"  and {len(failures) - 5} more in failures.jsonl")
     if contents["shards"] < contents["shards_planned"]:
-        print(f"unfinished: run the same command again to go on with {folder}", file=sys.stderr)
+        tell(f"unfinished: run the same command again to go on with {folder}")
     return 0
 
 
@@ -49,20 +67,13 @@ def _lines(contents: dict[str, Any]) -> list[str]:
     ]
     if any(contents["splits"]):
         lines.append("splits: " + _counts(contents["splits"]))
-    names = {
-        "valid_fraction": ("valid pixels of the object", "{:.1%}"),
-        "disparity_bias": ("disparity bias, px", "{:+.3f}"),
-        "disparity_sigma": ("disparity σ, px", "{:.3f}"),
-        "gross_share": ("gross errors", "{:.2%}"),
-    }
     for name, value in contents["statistics"].items():
-        label, form = names[name]
-        lines.append(f"{label} (median): {form.format(value)}")
+        label, form = _STATISTICS[name]
+        lines.append(f"{label} (median): {value:{form}}")
     sensor = contents["settings"].get("sensor")
     if isinstance(sensor, dict) and "name" in sensor:
         lines.append(f"sensor: {sensor['name']}")
-    lines.append(f"failed: {contents['failed']}")
-    return lines
+    return [*lines, f"failed: {contents['failed']}"]
 
 
 def _counts(counts: dict[str, int]) -> str:
@@ -78,11 +89,10 @@ def verify(folder: _Folder) -> int:
     from qs3.store.verify import verify as look_through
 
     faults = look_through(folder)
-    for fault in faults:
-        print(fault)
+    show(*faults)
     if faults:
         raise InputError(f"{folder}: {len(faults)} faults, printed above")
-    print(f"{folder}: no fault", file=sys.stderr)
+    tell(f"{folder}: no fault")
     return 0
 
 
@@ -96,10 +106,9 @@ def merge(parts: Annotated[tuple[str, ...], tyro.conf.Positional], out: str) -> 
     from qs3.store.merge import merge as put_together
 
     report = put_together(parts, out)
-    print(out)
-    print(
+    show(out)
+    tell(
         f"{report.copied} shards copied, {report.skipped} were there before; {report.failed} scans "
-        f"had failed. Next: qs3 verify {out}",
-        file=sys.stderr,
+        f"had failed. Next: qs3 verify {out}"
     )
     return 0

@@ -1,12 +1,13 @@
 """``qs3 table`` and ``qs3 figure``: a table or a figure of the records that are there."""
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, get_args
 
 import tyro
 
+from qs3.cli.options import Flat
+from qs3.cli.text import show, tell
 from qs3.errors import InputError
 from qs3.experiments import TABLES, FigureFormat, TableFormat
 
@@ -41,9 +42,7 @@ class TableOptions:
         return Table(self.name, read_setup(self.results), self.methods, self.tasks).read()
 
 
-def table(
-    options: Annotated[TableOptions, tyro.conf.arg(name="")], format: TableFormat = "md"
-) -> int:
+def table(options: Flat[TableOptions], format: TableFormat = "md") -> int:
     """Print a table, ours beside the published figures, from records alone.
 
     Cells without runs show the command that makes them.
@@ -55,11 +54,11 @@ def table(
     from qs3.experiments.text import FORMATS
 
     filled = options.read()
-    print(FORMATS[format](filled))
+    show(FORMATS[format](filled))
     return _refused(filled)
 
 
-def figure(options: Annotated[TableOptions, tyro.conf.arg(name="")], out: Path) -> int:
+def figure(options: Flat[TableOptions], out: Path) -> int:
     """Draw the figure of a table from records alone.
 
     Args:
@@ -75,11 +74,11 @@ def figure(options: Annotated[TableOptions, tyro.conf.arg(name="")], out: Path) 
 
     filled = options.read()
     write_bytes(out, picture(filled, kind))
-    print(out)
+    show(out)
     return _refused(filled)
 
 
 def _refused(filled: "FilledTable") -> int:
     for fault in filled.faults:
-        print(f"qs3: refused: {fault}", file=sys.stderr)
+        tell(f"qs3: refused: {fault}")
     return INCOMPLETE if filled.faults else 0

@@ -1,17 +1,101 @@
-"""Plain text in columns."""
+"""What the verbs print: results on standard output, talk on standard error, nothing that hides.
 
+Names of files, of classes and in records are others' words: what a terminal would obey, or what
+would hide or turn the text around, is written as an escape.
+"""
+
+import logging
+import os
+import sys
+import unicodedata
+import warnings
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+_OBEYED = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+"""Categories of Unicode: control, format (turns of direction), surrogates, breaks of lines."""
+_format_warning = warnings.formatwarning
 
 
-def columns(rows: Sequence[Sequence[str]]) -> list[str]:
+def show(*lines: object, end: str = "\n") -> None:
+    """Print results."""
+    _print(sys.stdout, lines, end)
+
+
+def tell(*lines: object) -> None:
+    """Print talk: what is under way, what comes next, faults."""
+    _print(sys.stderr, lines, "\n")
+
+
+def printable(text: str, keep: str = "\n\t") -> str:
+    r"""Write control characters, but those to ``keep``, and what cannot be encoded as escapes.
+
+    Example:
+        >>> print(printable("a\x1b[2Jb"))
+        a\x1b[2Jb
+    """
+    return "".join(
+        letter
+        if letter in keep or unicodedata.category(letter) not in _OBEYED
+        else letter.encode("unicode_escape").decode()
+        for letter in text
+    )
+
+
+def columns(rows: Sequence[Sequence[str]], right: int | None = None) -> list[str]:
     """Lines of a table, each column as wide as its widest cell.
+
+    Args:
+        rows: Cells.
+        right: The columns from this one on stand on the right of their place, as numbers do.
 
     Example:
         >>> columns([("name", "f"), ("d435", "430")])
         ['name  f', 'd435  430']
     """
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    cells = [[printable(cell, keep="") for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    first = len(widths) if right is None else right
     return [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
+        "  ".join(
+            f"{cell:{'<' if place < first else '>'}{widths[place]}}"
+            for place, cell in enumerate(row)
+        ).rstrip()
+        for row in cells
     ]
+
+
+def prepare_streams() -> None:
+    """Let output never fail for what it says: closed streams, other encodings, hostile names."""
+    for name in ("stdin", "stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:  # closed, as by 2>&-; opened in this order it takes the same number
+            mode = "r" if name == "stdin" else "w"
+            setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115
+        elif name != "stdin" and hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+    if logging.lastResort is not None:
+        logging.lastResort.setFormatter(_Formatter())
+    warnings.formatwarning = _warning
+
+
+class _Formatter(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record))
+
+
+def _warning(*given: Any, **named: Any) -> str:
+    return printable(_format_warning(*given, **named))
+
+
+def _print(stream: Any, lines: Sequence[object], end: str) -> None:
+    try:
+        for line in lines:
+            stream.write(printable(str(line)) + end)
+        stream.flush()
+    except OSError as error:
+        # What is left in the buffer goes nowhere, lest the end of the program fails once more.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        error.filename = stream.name
+        raise

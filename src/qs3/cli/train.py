@@ -2,7 +2,6 @@
 
 import functools
 import json
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -14,6 +13,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from qs3.adaptation.names import COMPOSED, WITHOUT_TARGET, MethodName, RoundRule, split_method
 from qs3.cli.options import Flat
+from qs3.cli.text import show, tell
 from qs3.errors import InputError
 from qs3.evaluation.records import rename_method
 from qs3.io.clouds import CloudKind
@@ -25,7 +25,7 @@ TIME_UP = 3
 
 @functools.cache
 def _note_old_name(name: str) -> None:
-    print(f"--method {name} is {rename_method(name)} now, on whatever source", file=sys.stderr)
+    tell(f"--method {name} is {rename_method(name)} now, on whatever source")
 
 
 def _method(words: list[str]) -> str:
@@ -100,30 +100,26 @@ class TrainOptions(Choices):
     """How rounds of self-training select and train."""
 
 
-def preset_options(words: Sequence[str]) -> TrainOptions:
+def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
     """Return the defaults of ``qs3 train`` under what a command line chooses.
 
     A preset sets the defaults of all self-training settings, so that one given beside it wins and
     the help shows what is in force. SPST has its own.
 
     Example:
-        >>> chosen = preset_options(["--method", "gast-spst", "--self-training.rounds", "2"])
+        >>> words = ["--method", "gast-spst", "--self-training.rounds", "2"]
+        >>> chosen = defaults(words)["options"]
         >>> chosen.preset, chosen.self_training.weight_step
         ('spst', 0.005)
     """
     chosen, _ = tyro.cli(Choices, args=list(words), return_unknown_args=True, add_help=False)
     rule = chosen.rounds_rule or COMPOSED.get(chosen.method, ("", None))[1]
     preset = chosen.preset or ("spst" if rule == "spst" else "default")
-    rounds = PRESETS[preset]
-    options = TrainOptions(
-        source="",
-        out=Path(),
-        preset=preset,
-        self_training=rounds if rule is None else replace(rounds, rule=rule),
-    )
+    rounds = PRESETS[preset] if rule is None else replace(PRESETS[preset], rule=rule)
+    options = TrainOptions(source="", out=Path(), preset=preset, self_training=rounds)
     for name in ("source", "out"):  # must be given: tyro's marker for that is neither text nor path
         object.__setattr__(options, name, tyro.MISSING)
-    return options
+    return {"options": options}
 
 
 def parse_settings(option: str, given: Sequence[str]) -> dict[str, Any]:
@@ -168,12 +164,12 @@ def train(options: Flat[TrainOptions]) -> int:
         model_settings=parse_settings("--model-set", options.model_set),
         method_settings=parse_settings("--method-set", options.method_set),
     )
+    points, target = settings.num_points, None
     part = {"split": options.source_split, "cloud": options.source_cloud}
-    source = load_whole(load_clouds, options.source, settings.num_points, **part)
-    target = None
+    source = load_whole(load_clouds, options.source, points, **part)
     if options.target is not None:
         part = {"split": options.target_split, "cloud": options.target_cloud}
-        target = load_whole(load_unlabelled, options.target, settings.num_points, **part)
+        target = load_whole(load_unlabelled, options.target, points, **part)
     try:
         fit(
             options.method,
@@ -189,8 +185,8 @@ def train(options: Flat[TrainOptions]) -> int:
             tensorboard=options.log == "tensorboard",
         )
     except TimeUpError as stop:
-        print(f"qs3: {stop}", file=sys.stderr)
+        tell(f"qs3: {stop}")
         return TIME_UP
-    print(options.out)
-    print(f"Next: qs3 evaluate {options.out} --data DATA", file=sys.stderr)
+    show(options.out)
+    tell(f"Next: qs3 evaluate {options.out} --data DATA")
     return 0

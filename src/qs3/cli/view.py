@@ -1,7 +1,6 @@
 """``qs3 view``: look at a data set, a run's answers, or a mesh that is scanned live."""
 
 import contextlib
-import sys
 import threading
 from contextlib import AbstractContextManager
 from functools import partial
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from qs3.cli.options import Flat
+from qs3.cli.text import show, tell
 from qs3.sensor.settings import ScanSettings
 
 if TYPE_CHECKING:
@@ -51,14 +51,14 @@ def view(
     # All is read before anything is served, so that a fault shows in time.
     page = _scan_page(what, data, up, settings) or _gallery(what, data, split, cloud, class_name)
     with serve(port, f"qs3 view · {Path(what).name}") as server, page(server):
-        print(url_of(server), flush=True)
+        show(url_of(server))
         hint = f"From another machine, first: {tunnel_of(server)}"
-        print(f"open it in a browser; Ctrl-C ends it. {hint}", file=sys.stderr, flush=True)
+        tell(f"open it in a browser; Ctrl-C ends it. {hint}")
         with contextlib.suppress(KeyboardInterrupt):
             never = threading.Event()
             while not never.wait(1.0):  # in steps: some systems do not wake a wait without end
                 pass
-        print("stopped", file=sys.stderr)
+        tell("stopped")
     return 0
 
 

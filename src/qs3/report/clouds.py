@@ -14,7 +14,6 @@ from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from qs3.errors import InputError
 from qs3.report.figure import house_style, short, without_frame
 
 SIDES = {"front": (0.0, 0.0), "side": (90.0, 0.0), "top": (0.0, 90.0)}
@@ -63,7 +62,6 @@ def draw_cloud(
     azimuth: float,
     elevation: float,
     limits: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None = None,
-    size: float = 4.0,
 ) -> None:
     """Scatter one cloud on ``axes``, far points first; rows that are not finite are left out.
 
@@ -74,13 +72,12 @@ def draw_cloud(
         elevation: Viewer's elevation in degrees.
         limits: Lowest and highest corner of the box to frame, so that several clouds share a
             scale; default: that of the points.
-        size: Diameter of a point in typographic points, squared.
     """
     points = points[np.isfinite(points).all(axis=1)]
     seen = project(points, azimuth, elevation)
     order = np.argsort(seen[:, 2], kind="stable")
     colours = shade(points[:, 2], seen[:, 2])
-    axes.scatter(seen[order, 0], seen[order, 1], s=size, c=colours[order], linewidths=0)
+    axes.scatter(seen[order, 0], seen[order, 1], s=4.0, c=colours[order], linewidths=0)
     axes.set_aspect("equal")
     without_frame(axes)
     if limits is None and len(points):
@@ -118,7 +115,6 @@ def gallery(
     samples: Mapping[str, Sequence[Float[np.ndarray, "_ 3"]]],
     title: str = "",
     columns: int = 4,
-    point_size: float = 1.6,
 ) -> Figure:
     """Draw a grid of clouds: one row a class, up to ``columns`` clouds a row, each fitted.
 
@@ -126,13 +122,7 @@ def gallery(
         samples: Clouds of each class, by class name; they may differ in their number of points.
         title: Heading.
         columns: Clouds a row; more are left out.
-        point_size: Diameter of a point in typographic points, squared.
-
-    Raises:
-        InputError: where there is no class, or ``columns`` is below 1.
     """
-    if not samples or columns < 1:
-        raise InputError("gallery: hand in at least one class and one column")
     names, rows = [short(name) for name in samples], len(samples)
     cell, left, top = 0.95, 0.25 + 0.09 * max(map(len, names)), 0.35  # inches
     width, height = left + cell * columns, top + cell * rows
@@ -155,7 +145,7 @@ def gallery(
             colours.append(shade(cloud[:, 2], seen[:, 2])[order])
     if spots:
         spot = np.concatenate(spots)
-        axes.scatter(spot[:, 0], spot[:, 1], s=point_size, c=np.concatenate(colours), linewidths=0)
+        axes.scatter(spot[:, 0], spot[:, 1], s=1.6, c=np.concatenate(colours), linewidths=0)
     axes.set_xlim(-0.5, columns - 0.5)
     axes.set_ylim(0.5 - rows, 0.5)
     axes.set_title(short(title, 40))

@@ -9,14 +9,14 @@ from typing import Any
 from qs3.errors import InputError, QS3Error
 from qs3.evaluation.environment import versions
 from qs3.evaluation.records import DataRecord, RunRecord, find_records
-from qs3.io.clouds import PointClouds, digests
+from qs3.io.clouds import digests
 from qs3.io.preparation import unit_ball
 from qs3.report import parts
 from qs3.report.contents import Report, Scored
 from qs3.report.lines import NamedRecord, score_lines
-from qs3.report.lookup import find_before, find_data, read_data
+from qs3.report.lookup import find_before, read_domain
 from qs3.report.settings import ReportSettings
-from qs3.training.checkpoint import LoadedModel, load_model
+from qs3.training.checkpoint import load_model
 from qs3.training.evaluate import caveats
 from qs3.training.run import RUN, Run, find_runs, read_run
 
@@ -149,28 +149,32 @@ def _rank(method: str, supervised: bool) -> int:
 def _of_run(run: Run, holdings: Holdings, settings: ReportSettings) -> Report:
     loaded = load_model(run.folder)
     place = settings.before or find_before(run, holdings.runs)
-    models: dict[str, LoadedModel] = {}
+    models = {run.method: loaded}
     if place is not None:
         before = load_model(place)
         if before.class_names != loaded.class_names:
             raise InputError(
                 f"{place}: knows other classes than {run.folder}; name another --before"
             )
-        models[_name_before(place, run.method)] = before
-    models[run.method] = loaded
+        models = {_name_before(place, run.method): before} | models
     record = _record_in(run.folder, holdings.records)
-    source, target = read_domains(run, record, settings, loaded)
     test = None if record is None else record.test
+    named = settings.source, settings.source_split, settings.source_cloud
+    source = read_domain(named, run.source, run.folder, loaded)
+    named = settings.data, settings.split, settings.cloud
+    its_own = None if settings.data is None else run.target
+    target = read_domain(named, test or its_own, run.folder, loaded)
+    domains = {"source": source, "target": target}
+    domains = {name: clouds for name, clouds in domains.items() if clouds is not None}
     networks: list[Scored] = []
-    notes: list[str] = []
     answers: dict[str, Any] = {}
+    notes: list[str] = []
     if target is not None:
         test = DataRecord.of(target.origin, target.checksum, len(target))
         for name, model in models.items():
             scored, answers[name] = parts.score_network(name, model, target)
             networks.append(scored)
-        seen = {*digests(target.points), *digests(unit_ball(target.points))}
-        marks = caveats(run, seen)
+        marks = caveats(run, {*digests(target.points), *digests(unit_ball(target.points))})
     else:
         marks = () if record is None else record.marks
         if record is not None:
@@ -181,11 +185,6 @@ def _of_run(run: Run, holdings: Holdings, settings: ReportSettings) -> Report:
             "The labelled clouds of the target are not at hand: --data shows them, and the "
             "features of both domains."
         )
-    domains = {
-        name: clouds
-        for name, clouds in (("source", source), ("target", target))
-        if clouds is not None
-    }
     curves, marks_of_rounds = parts.curves([*([] if place is None else [place]), run.folder])
     hardware = {} if record is None else {"hardware": record.hardware}
     shown = settings.clouds // 2
@@ -213,33 +212,6 @@ def _name_before(place: Path, after: str) -> str:
         return place.name
     name = read_run(place).method
     return name if name != after else f"{name} ({place.name})"
-
-
-def read_domains(
-    run: Run, record: RunRecord | None, settings: ReportSettings, loaded: LoadedModel
-) -> tuple[PointClouds | None, PointClouds | None]:
-    """Labelled clouds of the source and of the target, where they are named or at hand.
-
-    Args:
-        run: The run told about in full.
-        record: Its record; of generated data the cloud that it was scored on is read.
-        settings: What the user named.
-        loaded: Its network.
-
-    Raises:
-        InputError: where what the user named cannot be read or does not fit the run.
-    """
-    how = loaded.settings["train"]["num_points"], loaded.class_names
-    if settings.source is None:
-        source = find_data(run.source, run.folder, *how)
-    else:
-        named = settings.source, settings.source_split, settings.source_cloud
-        source = read_data(*named, run.source, *how)
-    test = None if record is None else record.test
-    if settings.data is None:
-        return source, find_data(test, run.folder, *how)
-    named = settings.data, settings.split, settings.cloud
-    return source, read_data(*named, test or run.target, *how)
 
 
 def _record_in(

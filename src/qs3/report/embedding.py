@@ -72,12 +72,7 @@ def feature_map(
         domains: Domain of each cloud; the first that occurs is drawn hollow and below.
         class_names: Names of the classes.
         title: Heading.
-
-    Raises:
-        InputError: where lengths differ or there is no cloud.
     """
-    if not len(positions) == len(labels) == len(domains) or not len(positions):
-        raise InputError("feature_map: positions, labels and domains do not fit")
     figure = Figure(figsize=(5.2, 6.2), layout="constrained")
     axes = figure.add_subplot()
     kinds = list(dict.fromkeys(domains))
@@ -98,16 +93,13 @@ def feature_map(
             zorder=1 + index,
         )
         face = "none" if hollow else "#555555"
+        style = {"markersize": 6.5, "markerfacecolor": face, "markeredgecolor": "#555555"}
+        legend.append(Line2D([], [], linestyle="", marker=marker, label=short(kind, 20), **style))
+    for index in map(int, np.unique(labels)):
+        colour, name = class_colour(index), short(class_names[index])
         legend.append(
-            Line2D([], [], linestyle="", marker=marker, markersize=6.5, label=short(kind, 20),
-                   markerfacecolor=face, markeredgecolor="#555555")
-        )  # fmt: skip
-    present = [index for index in range(len(class_names)) if (labels == index).any()]
-    legend += [
-        Line2D([], [], linestyle="", marker="s", markersize=7, color=class_colour(index),
-               label=short(class_names[index]))
-        for index in present
-    ]  # fmt: skip
+            Line2D([], [], linestyle="", marker="s", markersize=7, color=colour, label=name)
+        )
     axes.set_title(short(title, 40))
     axes.set_aspect("equal", adjustable="datalim")
     without_frame(axes)

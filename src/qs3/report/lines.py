@@ -131,28 +131,30 @@ def _line(runs: Sequence[NamedRecord], differs: str) -> ScoreLine:
     )
 
 
+def leaves(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Leaves of nested mappings by dotted name, in their order.
+
+    Example:
+        >>> leaves({"seed": 1, "sensor": {"views": 5, "names": ("a", "b")}})
+        {'seed': 1, 'sensor.views': 5, 'sensor.names': ('a', 'b')}
+    """
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        name = f"{prefix}{key}"
+        flat |= leaves(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
+    return flat
+
+
 def _differences(shared: Sequence[Mapping[str, Any]]) -> list[str]:
     """What is not the same in all of ``shared``, as text for each of them."""
-    flat = [_flat(values) for values in shared]
+    flat = [{name: json.dumps(v) for name, v in leaves(values).items()} for values in shared]
     names = sorted({name for values in flat for name in values})
-    odd = [name for name in names if len({values.get(name, "–") for values in flat}) > 1]
-    texts = []
-    for values in flat:
-        parts = []
-        for name in odd:
-            value, short = values.get(name, "–"), name.rpartition(".")[2]
-            if name.startswith("data."):
-                value, short = value.strip('"')[:8], f"{short} data"
-            parts.append(f"{short} {value}")
-        texts.append(", ".join(parts))
-    return texts
+    odd = [name for name in names if len({values.get(name) for values in flat}) > 1]
 
+    def text(name: str, value: str) -> str:
+        short = name.rpartition(".")[2]
+        if name.startswith("data."):
+            short, value = f"{short} data", value.strip('"')[:8]
+        return f"{short} {value}"
 
-def _flat(value: Any, name: str = "") -> dict[str, str]:
-    """Leaves of nested mappings as JSON, by dotted name."""
-    if not isinstance(value, Mapping):
-        return {name: json.dumps(value)}
-    items: dict[str, str] = {}
-    for key, inner in value.items():
-        items |= _flat(inner, f"{name}.{key}" if name else str(key))
-    return items
+    return [", ".join(text(name, values.get(name, "–")) for name in odd) for values in flat]

@@ -1,5 +1,8 @@
 """What a page needs besides its run: the clouds that were read, and the network before."""
 
+import contextlib
+import functools
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -7,71 +10,56 @@ from typing import Any
 from qs3.errors import QS3Error
 from qs3.evaluation.records import DataRecord
 from qs3.io import load_clouds
-from qs3.io.clouds import PointClouds
+from qs3.io.clouds import CloudKind, PointClouds
 from qs3.store.manifest import MANIFEST
-from qs3.training.checkpoint import load_model, weights_fingerprint
+from qs3.training.checkpoint import LoadedModel, load_model, weights_fingerprint
 from qs3.training.run import MODEL, Run, is_run
 
 _LEVELS = 5
 """How far above a run its data are looked for: a grid has runs/<task>/<row>/<seed>."""
 
 
-def find_data(
-    data: DataRecord | None, run: Path, num_points: int, class_names: Sequence[str]
-) -> PointClouds | None:
-    """The clouds that a run read, looked for by name near the run; None where they are not there.
-
-    They must have the checksum of the record: data of the same name are not enough.
-    """
-    if data is None:
-        return None
-    bases = [run.resolve(), *run.resolve().parents][: _LEVELS + 1]
-    for place in (p for base in bases for p in (base / data.name, base / "data" / data.name)):
-        if not place.exists():
-            continue
-        try:
-            clouds = load_clouds(
-                place,
-                split=data.split,
-                num_points=num_points,
-                cloud=data.cloud,
-                class_names=class_names,
-            )
-        except QS3Error:
-            continue
-        if clouds.checksum == data.checksum:
-            return clouds
-    return None
-
-
-def read_data(
-    place: str,
-    split: str | None,
-    cloud: Any,
+def read_domain(
+    named: tuple[str | None, str | None, CloudKind | None],
     recorded: DataRecord | None,
-    num_points: int,
-    class_names: Sequence[str],
-) -> PointClouds:
-    """The clouds that the user named.
+    run: Path,
+    model: LoadedModel,
+) -> PointClouds | None:
+    """The clouds that the user named, or those of a record, by name near the run.
+
+    The latter must have the checksum of the record: data of the same name are not enough. None
+    where they are not there.
 
     Args:
-        place: Where they are.
-        split: Part of them.
-        cloud: Which cloud of generated data was asked for; None takes that of ``recorded``.
+        named: What the user named: where they are, part of them, which cloud of generated data
+            (by default that of the record).
         recorded: What the run or its record read.
-        num_points: Points a cloud.
-        class_names: Classes of the network.
+        run: Folder of the run.
+        model: Its network, which says how many points and what classes.
 
     Raises:
-        InputError: where they cannot be read or have other classes or no such cloud.
+        InputError: where what was named cannot be read or has other classes or no such cloud.
     """
-    if cloud is None:
-        generated = "://" in place or (Path(place) / MANIFEST).is_file()
-        # Other data than generated ones have no twin to choose.
-        cloud = recorded.cloud if generated and recorded is not None else "points"
-    return load_clouds(
-        place, split=split, num_points=num_points, cloud=cloud, class_names=class_names
-    )
+    given, split, cloud = named
+    points, names = model.settings["train"]["num_points"], model.class_names
+    load = functools.partial(load_clouds, num_points=points, class_names=names)
+    if given is not None:
+        if cloud is None:
+            generated = "://" in given or (Path(given) / MANIFEST).is_file()
+            # Other data than generated ones have no twin to choose.
+            cloud = recorded.cloud if generated and recorded is not None else "points"
+        return load(given, split=split, cloud=cloud)
+    if recorded is None:
+        return None
+    bases = [run.resolve(), *run.resolve().parents][: _LEVELS + 1]
+    for base, inner in itertools.product(bases, (".", "data")):
+        place = base / inner / recorded.name
+        if place.exists():
+            with contextlib.suppress(QS3Error):
+                clouds = load(place, split=recorded.split, cloud=recorded.cloud)
+                if clouds.checksum == recorded.checksum:
+                    return clouds
+    return None
 
 
 def find_before(after: Run, others: Sequence[Run]) -> Path | None:
@@ -91,18 +79,15 @@ def find_before(after: Run, others: Sequence[Run]) -> Path | None:
         for place in dict.fromkeys([*(run.folder for run in others), *beside, *grid]):
             if place == folder or not is_run(place) or not (place / MODEL).is_file():
                 continue
-            try:
+            with contextlib.suppress(QS3Error):  # a broken neighbour is not this report's business
                 if weights_fingerprint(load_model(place).model) == weights:
                     return place
-            except QS3Error:  # a broken neighbour is none of this report's business
-                continue
         return None
     if after.method == "source-only":
         return None
-    for run in others:
-        if run.method == "source-only" and all(
-            run.settings.get(name) == after.settings.get(name)
-            for name in ("source", "class_names", "train")
-        ):
-            return run.folder
-    return None
+
+    def learnt_from(run: Run) -> list[Any]:
+        return [run.settings.get(name) for name in ("source", "class_names", "train")]
+
+    plain = (run for run in others if run.method == "source-only")
+    return next((run.folder for run in plain if learnt_from(run) == learnt_from(after)), None)

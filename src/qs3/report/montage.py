@@ -6,11 +6,9 @@ Convention:
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import matplotlib
 import numpy as np
-import trimesh
 from jaxtyping import Float, Shaped, UInt8
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
@@ -19,13 +17,13 @@ from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from qs3.errors import InputError
 from qs3.report.clouds import SIDES, draw_cloud
 from qs3.report.figure import NO_VALUE, house_style, short, without_frame
-from qs3.sensor.presets import Sensor
-from qs3.sensor.scan import Scan, scan
+from qs3.sensor.scan import Scan
 from qs3.sensor.speckle import pattern_image
 
+_MARGIN = 20
+"""Pixels shown around the object."""
 _LOST, _EXTRA = "#6e6e6e", "#ddaa33"
 
 
@@ -45,12 +43,10 @@ class MontageView:
     """Depth of the z-buffer, NaN where the ray misses the object."""
     cloud: Float[np.ndarray, "n 3"]
     """The noisy cloud, z up."""
-    clean: Float[np.ndarray, "m 3"] | None = None
+    clean: Float[np.ndarray, "m 3"]
     """Its clean twin."""
     pattern: Shaped[np.ndarray, "ph pw"] | None = None
     """The projector's pattern, 0 to 1 or 8-bit."""
-    box: tuple[int, int, int, int] | None = None
-    """Show only columns x0 … x1 − 1 and rows y0 … y1 − 1: (x0, y0, x1, y1)."""
     unit: str = "mesh units"
     """Unit of lengths."""
 
@@ -69,71 +65,34 @@ def montage_view(made: Scan) -> tuple[MontageView, int]:
         cloud=made.points,
         clean=made.clean,
         pattern=pattern_image(made.sensor.pattern),
-        box=object_box(true_depth, 20),
+        unit="m" if made.sensor.metric else "mesh units",
     )
     return view, best
-
-
-def scan_montage(
-    mesh: trimesh.Trimesh, sensor: Sensor, renderer: Any, views: int = 2, seed: int = 0
-) -> MontageView:
-    """Scan a mesh for the pictures of its best view."""
-    made = scan(mesh, sensor=sensor, views=views, seed=seed, renderer=renderer, keep_images=True)
-    return montage_view(made)[0]
-
-
-def object_box(
-    true_depth: Float[np.ndarray, "h w"], margin: int = 12
-) -> tuple[int, int, int, int] | None:
-    """Box (x0, y0, x1, y1) around the pixels that see the object; None where none does.
-
-    Example:
-        >>> depth = np.full((20, 30), np.nan)
-        >>> depth[5:9, 7:20] = 1.0
-        >>> object_box(depth, margin=2)
-        (5, 3, 22, 11)
-    """
-    rows, columns = np.nonzero(np.isfinite(true_depth))
-    if not len(rows):
-        return None
-    height, width = true_depth.shape
-    return (
-        max(int(columns.min()) - margin, 0),
-        max(int(rows.min()) - margin, 0),
-        min(int(columns.max()) + 1 + margin, width),
-        min(int(rows.max()) + 1 + margin, height),
-    )
 
 
 @house_style
 def montage(view: MontageView, title: str = "") -> Figure:
     """Draw one scan: four pictures, four of its depth, and each cloud from three sides.
 
-    Args:
-        view: What to show.
-        title: Heading.
-
-    Raises:
-        InputError: where ``view.box`` holds no pixel of the images.
+    Of the pictures the part that shows the object is drawn, with a margin; all where none does.
     """
-    height, width = view.left.shape
-    x0, y0, x1, y1 = view.box or (0, 0, width, height)
-    if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
-        raise InputError(f"box: {view.box} does not lie in the image of {width} × {height} pixels")
-    part = slice(y0, y1), slice(x0, x1)
+    y, x = np.isfinite(view.true_depth).nonzero()
+    shown = [(max(i.min() - _MARGIN, 0), i.max() + 1 + _MARGIN) for i in (y, x) if len(i)]
+    part = tuple(slice(*ends) for ends in shown) or (slice(None), slice(None))
+    (y0, y1, _), (x0, x1, _) = (
+        own.indices(size) for own, size in zip(part, view.left.shape, strict=True)
+    )
     extent = (x0 - 0.5, x1 - 0.5, y1 - 0.5, y0 - 0.5)
     depth, true = view.depth[part], view.true_depth[part]
     error = (depth - true).astype(np.float64)
 
-    clouds = [("noisy cloud", view.cloud)]
-    if view.clean is not None:
-        clouds.append(("clean twin", view.clean))
-    heights = (6.0, 3.0 * len(clouds))
+    clouds = [("noisy cloud", view.cloud), ("clean twin", view.clean)]
+    heights = (6.0, 6.0)
     figure = Figure(figsize=(12.0, sum(heights)), layout="constrained")
     halves = figure.add_gridspec(2, 1, height_ratios=heights)
     upper, lower = figure.add_subfigure(halves[0]), figure.add_subfigure(halves[1])
     cells = upper.subplots(2, 4).ravel()
-    places = lower.subplots(len(clouds), 3, squeeze=False)
+    places = lower.subplots(2, 3)
     if title:
         figure.suptitle(short(title, 90), fontsize=13)
 

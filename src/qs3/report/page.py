@@ -2,11 +2,10 @@
 
 import base64
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import jinja2
 import numpy as np
@@ -18,6 +17,7 @@ from qs3.report.clouds import gallery
 from qs3.report.contents import Cloud, Report
 from qs3.report.embedding import feature_map
 from qs3.report.figure import png_bytes
+from qs3.report.lines import leaves
 from qs3.report.montage import montage
 from qs3.report.plots import class_accuracy, confusion_heatmap, selection_counts, training_curves
 from qs3.report.verdict import Verdict, judge
@@ -67,7 +67,7 @@ def _template() -> jinja2.Template:
         "script": _asset("viewer.js"),
         "digest": _digest,
         "png": _png,
-        "flatten": flatten,
+        "leaves": leaves,
         "encode_points": encode_points,
         "class_accuracy": class_accuracy,
         "confusion_heatmap": confusion_heatmap,
@@ -116,24 +116,6 @@ def encode_points(points: Float[np.ndarray, "n 3"]) -> str:
         points /= max(float(np.linalg.norm(points, axis=1).max()), 1e-12)
     whole = np.round(points * 32767).astype("<i2")
     return base64.b64encode(whole.tobytes()).decode("ascii")
-
-
-def flatten(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """Return the leaves of nested mappings as (dotted name, value) in their order.
-
-    Example:
-        >>> flatten({"seed": 1, "sensor": {"views": 5, "names": ("a", "b")}})
-        [('seed', '1'), ('sensor.views', '5'), ('sensor.names', 'a, b')]
-    """
-    leaves: list[tuple[str, str]] = []
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            leaves += flatten(value, f"{prefix}{name}.")
-        elif isinstance(value, list | tuple):
-            leaves.append((f"{prefix}{name}", ", ".join(map(str, value))))
-        else:
-            leaves.append((f"{prefix}{name}", str(value)))
-    return leaves
 
 
 def _asset(name: str) -> str:

@@ -19,6 +19,7 @@ from qs3.training.checkpoint import LoadedModel
 from qs3.training.history import HISTORY
 from qs3.training.predict import describe, predict_probabilities
 
+_ACCURACY = "accuracy in training", "labelled clouds, augmented"
 _MAPPED = 400  # clouds of a domain on a map: beyond that dots hide one another
 
 
@@ -97,43 +98,31 @@ def curves(runs: Sequence[Path]) -> tuple[tuple[Curve, ...], tuple[float, ...]]:
     Raises:
         InputError: where a history is damaged.
     """
-    lines: dict[tuple[str, str], tuple[list[float], list[float]]] = {}
+    lines: dict[tuple[str, str], list[tuple[int, float]]] = {}
     epoch, marks = 0, []
-    for stage, epochs in (stage for run in runs for stage in _history(run)):
-        if stage == "round":
-            marks.append(epoch + 0.5)
-        for losses, accuracy in epochs:
-            epoch += 1
-            values = {("loss", name): value for name, value in losses.items()}
-            if accuracy is not None:
-                values["accuracy in training", "labelled clouds, augmented"] = accuracy
-            for key, value in values.items():
-                x, y = lines.setdefault(key, ([], []))
-                x.append(float(epoch))
-                y.append(value)
-    drawn = [
-        Curve(name, np.array(x), np.array(y), panel) for (panel, name), (x, y) in lines.items()
-    ]
+    for history in (run / HISTORY for run in runs if (run / HISTORY).is_file()):
+        try:
+            for text in history.read_text(encoding="utf-8").splitlines():
+                line = parse_json(text, history)
+                epochs = []
+                if line["kind"] == "epoch":
+                    epochs = [(line["losses"], line["accuracy"])]
+                elif line["kind"] == "round":
+                    marks.append(epoch + 0.5)
+                    epochs = zip(line["losses"], line["accuracies"], strict=True)
+                for losses, accuracy in epochs:
+                    epoch += 1
+                    for name, value in losses.items():
+                        lines.setdefault(("loss", name), []).append((epoch, value))
+                    if accuracy is not None:
+                        lines.setdefault(_ACCURACY, []).append((epoch, accuracy))
+        except (AttributeError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{history}: not the history of a run ({error})") from error
+    drawn = []
+    for (panel, name), values in lines.items():
+        x, y = np.array(values, np.float64).T
+        drawn.append(Curve(name, x, y, panel))
     return tuple(drawn), tuple(marks)
-
-
-def _history(run: Path) -> list[tuple[str, list[tuple[dict[str, float], float | None]]]]:
-    """Losses and accuracy of the epochs of each line of a run's history."""
-    path = run / HISTORY
-    if not path.is_file():
-        return []
-    stages = []
-    try:
-        for text in path.read_text(encoding="utf-8").splitlines():
-            line = parse_json(text, path)
-            if line["kind"] == "epoch":
-                stages.append(("epoch", [(line["losses"], line["accuracy"])]))
-            elif line["kind"] == "round":
-                pairs = zip(line["losses"], line["accuracies"], strict=True)
-                stages.append(("round", list(pairs)))
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: not the history of a run ({error})") from error
-    return stages
 
 
 def selection_rounds(

@@ -12,6 +12,8 @@ from qs3.errors import InputError
 from qs3.report.figure import AFTER, BEFORE, PALETTE, class_colour, house_style, short
 
 _WIDTH = 5.2  # inches: at a phone's 360 px the 10-point text is still about 10 px high
+_COLOURS = (PALETTE[0], PALETTE[6], PALETTE[3], PALETTE[7], PALETTE[2], "#000000")
+_LINES = {"color": 2 * _COLOURS, "linestyle": 3 * ("-", "--", ":", "-.")}
 
 
 @dataclass(frozen=True)
@@ -47,44 +49,28 @@ class SelectionRound:
 
 
 @house_style
-def training_curves(
-    curves: Sequence[Curve], marks: Sequence[float] = (), mark_label: str = "round"
-) -> Figure:
+def training_curves(curves: Sequence[Curve], marks: Sequence[float] = ()) -> Figure:
     """Draw curves over epochs, one panel below the other for each `Curve.panel`.
 
     Args:
         curves: What to draw.
-        marks: Epochs at which a thin vertical line stands, for instance where rounds begin.
-        mark_label: What such a line means.
-
-    Raises:
-        InputError: where there is no curve.
+        marks: Epochs at which rounds begin: a thin vertical line stands there.
     """
-    if not curves:
-        raise InputError("training_curves: there is no curve to draw")
     panels = list(dict.fromkeys(curve.panel for curve in curves))
     figure = Figure(figsize=(_WIDTH, 0.5 + 2.4 * len(panels)), layout="constrained")
     grid = figure.subplots(len(panels), 1, sharex=True, squeeze=False)
     for axes, panel in zip(grid[:, 0], panels, strict=True):
         for mark in marks:
             axes.axvline(mark, color="#cccccc", linewidth=0.8, zorder=0)
-        lines = [curve for curve in curves if curve.panel == panel]
-        for index, curve in enumerate(lines):
-            style = ("-", "--", ":", "-.")[index % 4]
-            axes.plot(
-                curve.x,
-                curve.y,
-                style,
-                color=_LINES[index % len(_LINES)],
-                label=short(curve.name, 28),
-                linewidth=1.8,
-                marker="o" if len(curve.x) < 12 else None,
-                markersize=3.5,
-            )
+        axes.set_prop_cycle(**_LINES)
+        for curve in (curve for curve in curves if curve.panel == panel):
+            marker = "o" if len(curve.x) < 12 else None
+            label = short(curve.name, 28)
+            axes.plot(curve.x, curve.y, label=label, linewidth=1.8, marker=marker, markersize=3.5)
         axes.set_ylabel(short(panel, 24))
         axes.margins(y=0.08)
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, fontsize=9)
-    grid[-1, 0].set_xlabel("epoch" + (f" (grey line: {mark_label} begins)" if len(marks) else ""))
+    grid[-1, 0].set_xlabel("epoch" + (" (grey line: round begins)" if len(marks) else ""))
     grid[-1, 0].xaxis.set_major_locator(MaxNLocator(8, integer=True))
     return figure
 
@@ -96,10 +82,8 @@ def selection_counts(rounds: Sequence[SelectionRound], class_names: Sequence[str
     A dotted outline shows how many clouds were above the threshold.
 
     Raises:
-        InputError: where there is no round, or its counts do not fit the class names.
+        InputError: where the counts do not fit the class names.
     """
-    if not rounds:
-        raise InputError("selection_counts: there is no round to draw")
     if any(len(r.kept) != len(class_names) for r in rounds):
         raise InputError(f"selection_counts: counts are not of {len(class_names)} classes")
     places = np.array([r.index for r in rounds])
@@ -111,15 +95,8 @@ def selection_counts(rounds: Sequence[SelectionRound], class_names: Sequence[str
     floor = np.zeros(len(rounds))
     for index, name in enumerate(class_names):
         height = np.array([r.kept[index] for r in rounds], dtype=np.float64)
-        lower.bar(
-            places,
-            height,
-            0.75,
-            floor,
-            color=class_colour(index),
-            label=short(name),
-            edgecolor="white",
-        )
+        style = {"color": class_colour(index), "edgecolor": "white"}
+        lower.bar(places, height, 0.75, floor, label=short(name), **style)
         floor += height
     above = np.array([int(r.confident.sum()) for r in rounds])
     outline = {"color": "none", "edgecolor": "#555555", "linestyle": ":", "linewidth": 1.2}
@@ -145,13 +122,8 @@ def confusion_heatmap(
         matrix: Counts; one column more than classes counts predictions of none of them.
         class_names: Names in the order of the rows.
         title: Heading.
-
-    Raises:
-        InputError: where the matrix does not fit the names.
     """
     k = len(class_names)
-    if matrix.shape not in {(k, k), (k, k + 1)} or not k:
-        raise InputError(f"confusion_heatmap: {matrix.shape} does not fit {k} class names")
     total = matrix.sum(axis=1, keepdims=True)
     share = np.divide(matrix, total, out=np.zeros(matrix.shape), where=total > 0)
     names = [short(name) for name in class_names]
@@ -162,18 +134,10 @@ def confusion_heatmap(
     axes.imshow(share, cmap="Blues", vmin=0.0, vmax=1.0)
     for (row, column), count in np.ndenumerate(matrix):
         if count:
-            dark = share[row, column] > 0.55
+            colour = "white" if share[row, column] > 0.55 else "black"
             weight = "bold" if row == column else "normal"
-            axes.text(
-                column,
-                row,
-                str(count),
-                ha="center",
-                va="center",
-                color="white" if dark else "black",
-                fontsize=9,
-                fontweight=weight,
-            )
+            style = {"ha": "center", "va": "center", "fontsize": 9, "fontweight": weight}
+            axes.text(column, row, str(count), color=colour, **style)
     axes.set_xticks(range(len(columns)), columns, rotation=55, ha="right", rotation_mode="anchor")
     axes.set_yticks(range(k), names)
     axes.set_xticks(np.arange(len(columns) - 1) + 0.5, minor=True)
@@ -205,13 +169,8 @@ def class_accuracy(
         class_names: Names of the classes.
         counts: Clouds of each class, told beside its name.
         names: What the two are called.
-
-    Raises:
-        InputError: where the lengths differ.
     """
     k = len(class_names)
-    if not len(before) == len(after) == len(counts) == k or not k:
-        raise InputError(f"class_accuracy: the arrays do not fit {k} class names")
     figure = Figure(figsize=(_WIDTH, 0.9 + 0.46 * k), layout="constrained")
     axes = figure.add_subplot()
     rows = np.arange(k)
@@ -233,6 +192,3 @@ def class_accuracy(
     axes.tick_params(axis="y", length=0)
     figure.legend(loc="outside upper center", ncols=2)
     return figure
-
-
-_LINES = (PALETTE[0], PALETTE[6], PALETTE[3], PALETTE[7], PALETTE[2], "#000000")

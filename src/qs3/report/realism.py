@@ -19,26 +19,13 @@ _WIDTH = 5.2
 _MEASURED, _LAW, _SECOND = PALETTE[0], PALETTE[6], PALETTE[2]
 _Result = Mapping[str, Any]
 
-REALISM_PLOTS: dict[str, str] = {
-    "T1": "rms.png",
-    "T2": "bias.png",
-    "T5": "edge.png",
-    "T6": "fill.png",
-    "T8": "steps.png",
-    "T10": "distances.png",
-}
-"""File name of the plot of each test that has one."""
-
 
 def realism_plot(result: _Result, sensor: Sensor) -> Figure | None:
-    """Draw one test's result, where it has a plot and its curves are there.
+    """Draw one test's result; None where it has no plot, or did not apply.
 
     Args:
         result: As `qs3.sensor.realism.realism` gives it.
         sensor: What was tested: supplies focal length, baseline and block.
-
-    Returns:
-        None for a test that has no plot, or that did not apply.
     """
     if result["id"] not in _DRAW or not result["data"]:
         return None
@@ -107,16 +94,9 @@ def edge_plot(result: _Result, sensor: Sensor) -> Figure:
     figure, axes = _plot(sensor, "profile of an edge", across, "share of the rows")
     axes.axvspan(-half, half, color=_SECOND, alpha=0.2, label="± half a block")
     axes.axvline(0, color="black", linewidth=0.8)
-    axes.plot(
-        offset, _series(result, "near_share"), "-", color=_MEASURED, label="depth of the plate"
-    )
-    axes.plot(
-        offset,
-        _series(result, "between_share"),
-        "--",
-        color=_LAW,
-        label="depth in between",
-    )
+    near, between = _series(result, "near_share"), _series(result, "between_share")
+    axes.plot(offset, near, "-", color=_MEASURED, label="depth of the plate")
+    axes.plot(offset, between, "--", color=_LAW, label="depth in between")
     axes.set(xlim=(offset.min(), offset.max()), ylim=(-0.03, 1.05))
     figure.legend(loc="outside lower center", fontsize=9, ncols=3)
     return figure
@@ -187,6 +167,8 @@ _DRAW: dict[str, Callable[[_Result, Sensor], Figure]] = {
     "T8": steps_plot,
     "T10": distances_plot,
 }
+REALISM_PLOTS = {test: f"{draw.__name__.removesuffix('_plot')}.png" for test, draw in _DRAW.items()}
+"""File name of the plot of each test that has one."""
 
 
 def _plot(sensor: Sensor, title: str, x: str, y: str) -> tuple[Figure, Axes]:

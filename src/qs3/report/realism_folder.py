@@ -1,6 +1,6 @@
 """The folder of a test of a simulated camera: a record to go on from after a stop, and plots."""
 
-import json
+import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from qs3.sensor.presets import Sensor, sensor_name, settings_dict
 from qs3.sensor.realism import RealismSettings, realism
 from qs3.sensor.render import Renderer
 from qs3.sensor.settings import renderer_dict
-from qs3.structure import first_difference
+from qs3.structure import fill, first_difference, unstructure
 
 RECORD = "realism.json"
 
@@ -47,7 +47,13 @@ def test_camera(
         "settings": {"quick": settings.quick, "seed": settings.seed},
         "versions": versions(),
     }
-    before = _earlier(Path(out) / RECORD, made_by)
+    own: Any = renderer  # a dataclass
+    defaults = {
+        "sensor": settings_dict(Sensor()),
+        "renderer": {field.name: field.default for field in dataclasses.fields(own)},
+        "settings": unstructure(RealismSettings()),
+    }
+    before = _earlier(Path(out) / RECORD, made_by, defaults)
     results = dict(before)
     folder = claim_folder(out, RECORD)
 
@@ -65,8 +71,13 @@ def test_camera(
     return realism(sensor, renderer, settings, done=before, on_result=keep)
 
 
-def _earlier(path: Path, made_by: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Results that lie in the folder, by id, where they are of the same settings."""
+def _earlier(
+    path: Path, made_by: Mapping[str, Any], defaults: Mapping[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """Results that lie in the folder, by id, where they are of the same settings.
+
+    Settings that a record does not have were added since: it has their ``defaults``.
+    """
     if not path.is_file():
         return {}
     record = read_json(path)
@@ -74,12 +85,12 @@ def _earlier(path: Path, made_by: Mapping[str, Any]) -> dict[str, dict[str, Any]
         raise InputError(f"{path}: not a record of qs3 realism; name another folder for --out")
     if isinstance(record.get("sensor"), dict) and "name" in record["sensor"]:
         record["sensor"]["name"] = sensor_name(record["sensor"]["name"])
-    now = json.loads(json.dumps(made_by))  # tuples become lists, as in the file
-    for name, value in now.items():
-        if difference := first_difference(record.get(name), value, name):
-            place, was, is_now = difference
-            raise InputError(
-                f"{path}: of other settings ({place} was {was}, is {is_now}); name another folder "
-                "for --out, or repeat the settings to go on"
-            )
+    now = unstructure(made_by)
+    before = fill({name: record.get(name) for name in now}, now, unstructure(defaults))
+    if difference := first_difference(before, now):
+        place, was, is_now = difference
+        raise InputError(
+            f"{path}: of other settings ({place} was {was}, is {is_now}); name another folder "
+            "for --out, or repeat the settings to go on"
+        )
     return {result["id"]: result for result in record["tests"]}

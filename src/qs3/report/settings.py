@@ -35,14 +35,8 @@ class ReportSettings:
     def __post_init__(self) -> None:
         if self.clouds < 0:
             raise InputError(f"--clouds {self.clouds}: must not be negative")
-        for name, place, parts in (
-            ("data", self.data, {"split": self.split, "cloud": self.cloud}),
-            (
-                "source",
-                self.source,
-                {"source-split": self.source_split, "source-cloud": self.source_cloud},
-            ),
-        ):
-            for part, value in parts.items():
-                if place is None and value is not None:
-                    raise InputError(f"--{part} goes with --{name}; name the clouds")
+        parts = {"data": ("split", "cloud"), "source": ("source_split", "source_cloud")}
+        for place, part in ((place, part) for place, own in parts.items() for part in own):
+            if getattr(self, place) is None and getattr(self, part) is not None:
+                option = part.replace("_", "-")
+                raise InputError(f"--{option} goes with --{place}; name the clouds")

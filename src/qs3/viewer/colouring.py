@@ -2,12 +2,12 @@
 
 import html
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import matplotlib
 import numpy as np
 from jaxtyping import Float, UInt8
+from matplotlib.colors import to_hex
 
 from qs3.report.figure import AFTER, NO_VALUE, PALETTE, class_colour
 
@@ -34,7 +34,7 @@ class Colouring:
         """The legend as HTML; names are escaped, whatever a file calls itself."""
         lines = [f"<b>{html.escape(self.title)}</b>"]
         if self.ends is not None:
-            stops = ",".join(map(_hex, _MAP(np.linspace(0, 1, _STOPS))[:, :3]))
+            stops = ",".join(map(to_hex, _MAP(np.linspace(0, 1, _STOPS))))
             low, high = map(html.escape, self.ends)
             lines += [
                 f'<div style="height:0.7em;background:linear-gradient(to right,{stops})"></div>',
@@ -74,7 +74,7 @@ def by_view(view: UInt8[np.ndarray, "n"]) -> Colouring:
         (class_colour(number), f"view {number + 1} ({count} point{'s' * (count != 1)})")
         for number, count in zip(numbers.tolist(), counts.tolist(), strict=True)
     )
-    palette = np.array([_rgb(colour) for colour in PALETTE], dtype=np.uint8)
+    palette = np.array([_rgb(colour) for colour in PALETTE])
     return Colouring(palette[view % len(PALETTE)], "view", swatches)
 
 
@@ -108,40 +108,21 @@ def round_limit(distance: Float[np.ndarray, "n"]) -> float:
     return float(f"{next((s for s in (1, 2, 5) if s * power >= value), 10) * power:.6g}")
 
 
-def by_class(count: int, index: int, class_names: Sequence[str], title: str) -> Colouring:
-    """Colour all points of a cloud by its class.
+def flat(
+    count: int, title: str, colour: str = NO_VALUE, swatches: tuple[tuple[str, str], ...] = ()
+) -> Colouring:
+    """Colour all points of a cloud alike, by default grey.
 
     Example:
-        >>> by_class(2, 1, ["bed", "chair"], "predicted class").swatches[0][1]
-        'chair'
+        >>> flat(2, "predicted class", "#332288", (("#332288", "chair"),)).colours.tolist()
+        [[51, 34, 136], [51, 34, 136]]
     """
-    colour = class_colour(index)
-    return Colouring(_flat(count, colour), title, ((colour, class_names[index]),))
-
-
-def by_verdict(count: int, right: bool) -> Colouring:
-    """Colour all points of a cloud by whether its prediction is right."""
-    colour = RIGHT if right else WRONG
-    swatches = ((RIGHT, "right"), (WRONG, "wrong"))
-    return Colouring(_flat(count, colour), f"prediction: {swatches[not right][1]}", swatches)
-
-
-def plain(count: int, reason: str) -> Colouring:
-    """Colour all points grey, and say why."""
-    return Colouring(_flat(count, NO_VALUE), reason)
+    return Colouring(np.tile(_rgb(colour), (count, 1)), title, swatches)
 
 
 def _viridis(share: Float[np.ndarray, "n"]) -> UInt8[np.ndarray, "n 3"]:
     return np.asarray(_MAP(np.clip(share, 0, 1), bytes=True))[:, :3]
 
 
-def _flat(count: int, colour: str) -> UInt8[np.ndarray, "n 3"]:
-    return np.tile(np.array(_rgb(colour), dtype=np.uint8), (count, 1))
-
-
-def _rgb(colour: str) -> tuple[int, int, int]:
-    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
-
-
-def _hex(colour: Float[np.ndarray, "3"]) -> str:
-    return "#" + "".join(f"{round(255 * float(part)):02x}" for part in colour)
+def _rgb(colour: str) -> UInt8[np.ndarray, "3"]:
+    return np.frombuffer(bytes.fromhex(colour[1:]), np.uint8)

@@ -6,18 +6,12 @@ from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from qs3.io.clouds import CloudKind
-from qs3.viewer.colouring import (
-    Colouring,
-    by_class,
-    by_error,
-    by_height,
-    by_verdict,
-    by_view,
-    plain,
-)
-from qs3.viewer.distance import cloud_distance, mesh_distance, spacing
+from qs3.report.figure import class_colour
+from qs3.viewer.colouring import RIGHT, WRONG, Colouring, by_error, by_height, by_view, flat
+from qs3.viewer.distance import mesh_distance, spacing
 from qs3.viewer.exhibits import KINDS, Answers, Exhibit
 
 Mode = Literal["view", "height", "error", "predicted class", "right or wrong"]
@@ -84,7 +78,7 @@ def compose(
         facts += answers.facts(row)
         if answers.truth is not None:
             facts += [("this is", "wrong" if answers.wrong[row] else "right")]
-    colouring = plain(len(points), f"{mode}: not known for this cloud")
+    colouring = flat(len(points), f"{mode}: not known for this cloud")
     if mode == "error":
         colouring, measured = _error(exhibit, kind, limit, colouring)
         facts += measured
@@ -93,9 +87,13 @@ def compose(
     elif mode == "height":
         colouring = by_height(points)
     elif mode == "predicted class" and answers is not None:
-        colouring = by_class(len(points), answers.best(row), answers.class_names, mode)
+        colour = class_colour(answers.best(row))
+        named = ((colour, answers.class_names[answers.best(row)]),)
+        colouring = flat(len(points), mode, colour, named)
     elif mode == "right or wrong" and answers is not None and answers.truth is not None:
-        colouring = by_verdict(len(points), not answers.wrong[row])
+        verdicts = ((RIGHT, "right"), (WRONG, "wrong"))
+        colour, verdict = verdicts[int(answers.wrong[row])]
+        colouring = flat(len(points), f"prediction: {verdict}", colour, verdicts)
     return Display(points, colouring, (*facts, *exhibit.facts))
 
 
@@ -109,7 +107,7 @@ def _error(
         truth, distance = "the mesh", mesh_distance(points, exhibit.mesh)
     elif kind == "points" and "clean" in exhibit.clouds:
         clean = exhibit.clouds["clean"]
-        truth, distance = "the clean twin", cloud_distance(points, clean)
+        truth, distance = "the clean twin", KDTree(clean).query(points)[0]
         # A distance to a cloud is never below about half its spacing, however good the sensor.
         facts.append(("spacing of the clean twin", f"{spacing(clean):.3g}{unit}"))
     else:

@@ -8,18 +8,6 @@ from scipy.spatial import KDTree
 _PAIRS = 2_000_000  # points times triangles that are measured at once
 
 
-def cloud_distance(
-    points: Float[np.ndarray, "n 3"], truth: Float[np.ndarray, "m 3"]
-) -> Float[np.ndarray, "n"]:
-    """Distance of each point to the nearest point of ``truth``, in the unit of the points.
-
-    Example:
-        >>> cloud_distance(np.array([[0.0, 0, 2]]), np.array([[0.0, 0, 0], [0, 0, 3]])).tolist()
-        [1.0]
-    """
-    return KDTree(truth).query(points)[0]
-
-
 def spacing(points: Float[np.ndarray, "n 3"]) -> float:
     """Median distance of a point to its nearest neighbour; 0 for fewer than two points.
 

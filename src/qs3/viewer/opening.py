@@ -1,6 +1,6 @@
 """What the user named, opened for the viewer: a mesh, a cloud, a data set, or a run's answers."""
 
-import sys
+import logging
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,6 +12,7 @@ from qs3.errors import InputError, UnevenSizesError
 from qs3.io.clouds import CloudKind, PointClouds, UnlabelledClouds
 from qs3.viewer.exhibits import Answers, ArrayExhibits, Exhibits, StoreExhibits
 
+_LOG = logging.getLogger(__name__)
 _SHOWN_POINTS = 2048  # of a cloud, where the clouds of a data set differ in size
 _RUN_FILES = ("settings.json", "model.safetensors")
 
@@ -70,8 +71,7 @@ def open_exhibits(
     try:
         clouds = _read(what, split, num_points=None)
     except UnevenSizesError:
-        text = f"{what}: clouds of several sizes, shown with {_SHOWN_POINTS} points each\n"
-        sys.stderr.write(text)
+        _LOG.warning("%s: clouds of several sizes, shown with %d points each", what, _SHOWN_POINTS)
         clouds = _read(what, split, num_points=_SHOWN_POINTS)
     return ArrayExhibits.of(clouds), None
 

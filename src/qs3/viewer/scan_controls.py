@@ -9,7 +9,7 @@ import trimesh
 
 from qs3.sensor.materials import MATERIALS, get_material
 from qs3.sensor.presets import Sensor
-from qs3.sensor.scan import Scan, scan
+from qs3.sensor.scan import scan
 from qs3.sensor.settings import ScanSettings
 from qs3.viewer.exhibits import STATISTICS, Exhibit, statistics
 
@@ -143,11 +143,7 @@ def rescan(settings: ScanSettings, mesh: trimesh.Trimesh, name: str) -> Exhibit:
     Raises:
         InputError: where the sensor sees nothing of it.
     """
-    return exhibit_of(scan(mesh, settings), name)
-
-
-def exhibit_of(made: Scan, name: str) -> Exhibit:
-    """A scan as something to show."""
+    made = scan(mesh, settings)
     means = {}
     for statistic in STATISTICS:
         values = [v for view in made.views if (v := getattr(view, statistic)) is not None]

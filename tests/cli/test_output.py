@@ -1,0 +1,86 @@
+"""What the command prints, whatever names say, however its streams are set."""
+
+import errno
+import logging
+import os
+import subprocess
+import sys
+import warnings
+
+import pytest
+
+from qs3.cli import VERBS
+from qs3.cli.text import columns, printable, show
+
+HOSTILE = "a\x1b[2J\x9b31m\r\n\u202eb"
+
+
+def run(redirection="", **environment):
+    """`qs3 sensors` in a shell: what it prints is not ASCII, on both streams."""
+    return subprocess.run(
+        ["sh", "-c", f'"$0" -m qs3 sensors {redirection}', sys.executable],
+        env=os.environ | environment,
+        capture_output=True,
+    )
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [
+        {"PYTHONIOENCODING": "ascii"},
+        {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+    ],
+)
+def test_output_is_readable_where_it_is_not_utf8(environment):
+    done = run(**environment)
+    assert done.returncode == 0
+    assert b"d435" in done.stdout
+    assert b"\\xd7" in done.stdout  # × of the pixels
+    done.stdout.decode("ascii")
+
+
+def test_closed_streams_are_no_fault_and_talk_goes_nowhere_else():
+    done = run("2>&-")
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert b"range:" not in done.stdout
+    assert run("<&- >&- 2>&-").returncode == 0
+    assert run("show nosuch 2>&-").returncode == 2
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")  # noqa: PTH110
+def test_a_full_disk_names_the_file_and_what_to_do(typed, monkeypatch, tmp_path):
+    done = run("> /dev/full")
+    assert (done.returncode, done.stderr.count(b"\n")) == (2, 1)
+    assert done.stderr.startswith(b"qs3: <stdout>: No space left on device; make room")
+
+    def write(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "scan.json"))
+
+    monkeypatch.setattr("qs3.sensor.presets.get_sensor", write)
+    line = typed.refuses("sensors", "show", "d435")
+    assert f"{tmp_path / 'scan.json'}: No space left on device; make room" in line
+
+
+def test_control_characters_reach_no_terminal(typed, capfd, tmp_path):
+    line = typed.refuses("scan", tmp_path / f"{HOSTILE}.off", "--out", tmp_path / "out")
+    assert r"a\x1b[2J\x9b31m\r\n\u202eb.off" in line
+    show(HOSTILE)
+    assert logging.lastResort is not None
+    logged = logging.lastResort.format(logging.makeLogRecord({"msg": HOSTILE}))
+    warned = warnings.formatwarning(HOSTILE, UserWarning, "a.py", 1)
+    rows = columns([(HOSTILE, "1"), ("b", "2")])
+    for text in (capfd.readouterr().out, logged, warned, *rows):
+        assert not set(text.removesuffix("\n")) & set("\x1b\x9b\r\u202e")
+    assert len(rows[0].splitlines()) == 1
+    assert printable("σ é 椅子\ud800") == r"σ é 椅子\ud800"
+
+
+WRITERS = ("scan", "realism", "generate", "merge", "train", "export", "reproduce", "figure")
+
+
+@pytest.mark.parametrize("verb", [*WRITERS, "report", "demo", "extract"])
+def test_an_empty_name_to_write_to_is_refused(typed, verb):
+    assert verb in VERBS
+    words = ["depth", "x"] if verb == "extract" else ["x"]
+    assert "--out" in typed.refuses(verb, *words, "--out", "")
+    assert "--out" in typed.refuses(verb, *words, "--out=")
