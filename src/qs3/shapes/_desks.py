@@ -4,14 +4,14 @@ import numpy as np
 
 from qs3.shapes._dice import Dice
 from qs3.shapes._joinery import carcass, corners, fronts, legs
-from qs3.shapes._solids import Solid, block, sheet, within
+from qs3.shapes._solids import Solid, block, centred, sheet, within
 
 
 def desk(dice: Dice) -> list[Solid]:
     """Desk with drawers on one or both sides, panels or legs."""
     width, depth, height = dice.between(1.0, 1.9), dice.between(0.5, 0.8), dice.between(0.7, 0.78)
     thick = dice.between(0.02, 0.04) * dice.bulk
-    x, y, under = (-width / 2, width / 2), (-depth / 2, depth / 2), height - thick
+    x, y, under = centred(width), centred(depth), height - thick
     parts = [block(x, y, (under, height))]
     unit, inset = dice.between(0.3, 0.45), dice.between(0.0, 0.04)
     floor = dice.pick(0.0, 0.0, dice.between(0.1, 0.5) * under)
@@ -49,7 +49,7 @@ def writing_desk(dice: Dice) -> list[Solid]:
     width, depth, height = dice.between(0.8, 1.4), dice.between(0.38, 0.65), dice.between(0.7, 0.8)
     thick, leg = 0.02 * dice.bulk, dice.between(0.03, 0.05) * dice.bulk**0.7
     box = dice.between(0.09, 0.18)
-    x, y, under = (-width / 2, width / 2), (-depth / 2, depth / 2), height - thick
+    x, y, under = centred(width), centred(depth), height - thick
     inset = leg / 2 + 0.01
     parts = [block(x, y, (under, height))]
     span = within(x, inset)
@@ -108,7 +108,7 @@ def counter(dice: Dice) -> list[Solid]:
     thick = dice.between(0.03, 0.06)
     if dice.chance(0.3):
         width = dice.between(1.4, 2.4)
-        x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+        x, y = centred(width), centred(depth)
         return [
             block(x, y, (height - thick, height)),
             block(within(x, 0.03), (y[0] + 0.04, y[0] + 0.08), (0, height - thick / 2)),
@@ -134,7 +134,7 @@ def counter(dice: Dice) -> list[Solid]:
     ends = [
         block((0.0, depth - 0.08), (-0.015, 0.015), (0, height - thick / 2))
         .move(radius - depth)
-        .turn("z", float(np.degrees(a)))
+        .turn("z", np.degrees(a))
         for a in (angle[0], angle[-1])
     ]
     return [sheet(top, thick), sheet(wall, 0.04), *ends]

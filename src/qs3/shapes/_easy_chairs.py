@@ -10,6 +10,7 @@ from qs3.shapes._solids import (
     at_height,
     beam,
     block,
+    centred,
     cushion,
     loft,
     outline,
@@ -30,7 +31,7 @@ def wing(dice: Dice) -> list[Solid]:
     width, depth = dice.between(0.68, 0.84), dice.between(0.66, 0.82)
     seat, high, arm = dice.between(0.4, 0.48), dice.between(0.95, 1.18), dice.between(0.55, 0.66)
     thick, foot = dice.between(0.09, 0.14), dice.between(0.08, 0.2)
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     run = (y[0], y[1] - thick + 0.02)
     parts = [
         cushion(dice, within(x, 0.03), (y[0] + 0.03, y[1]), (foot, seat - 0.08), 0.03),

@@ -10,6 +10,7 @@ from qs3.shapes._solids import (
     around,
     beam,
     block,
+    centred,
     cushion,
     lathe,
     outline,
@@ -23,12 +24,10 @@ def _stool_top(dice: Dice, width: Number, z: Number) -> list[Solid]:
     thick = dice.between(0.025, 0.05) * dice.bulk
     kind = dice.pick("round", "square", "pad", "low_poly")
     if kind == "square":
-        return [block((-width / 2, width / 2), (-width / 2, width / 2), (z - thick, z))]
+        return [block(centred(width), centred(width), (z - thick, z))]
     if kind == "pad":
         heights = (z - thick - 0.02, z)
-        return [
-            cushion(dice, (-width / 2, width / 2), (-width / 2, width / 2), heights, 0.03, 0.01)
-        ]
+        return [cushion(dice, centred(width), centred(width), heights, 0.03, 0.01)]
     sides = 8 if kind == "low_poly" else max(16, dice.sides)
     return [slab(outline(width * 1.05, width * 1.05, sides, phase=0.5), (z - thick, z))]
 
@@ -37,13 +36,13 @@ def stool(dice: Dice) -> list[Solid]:
     """Low stool without a back, or a pouffe."""
     width, high = dice.between(0.32, 0.5), dice.between(0.3, 0.52)
     if dice.chance(0.12):
-        side, soft = (-width / 2, width / 2), dice.between(0.05, 0.12)
+        side, soft = centred(width), dice.between(0.05, 0.12)
         return [
             cushion(dice, side, side, (0.0, min(high, 0.9 * width)), soft, 0.02, max(3, dice.steps))
         ]
     leg = dice.between(0.03, 0.05) * dice.bulk**1.2
     inset = 0.16 * width
-    spots = corners((-width / 2, width / 2), (-width / 2, width / 2), inset)
+    spots = corners(centred(width), centred(width), inset)
     if dice.chance(0.25):
         spots = [
             (0.3 * width * np.cos(a), 0.3 * width * np.sin(a)) for a in np.radians([90, 210, 330])
@@ -100,12 +99,12 @@ def bench(dice: Dice) -> list[Solid]:
     """Bench for one or several, with or without a back."""
     width, depth, seat = dice.between(0.7, 1.5), dice.between(0.34, 0.5), dice.between(0.4, 0.48)
     thick, leg = 0.03 * dice.bulk, dice.between(0.04, 0.06) * dice.bulk**0.7
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     parts, slatted = [], dice.chance(0.4)
     planks = dice.count(3, 6) if slatted else 1
     for a, b in zip(np.linspace(*y, planks + 1)[:-1], np.linspace(*y, planks + 1)[1:], strict=True):
         gap = 0.012 if slatted else 0.0
-        parts.append(block(x, (float(a) + gap / 2, float(b) - gap / 2), (seat - thick, seat)))
+        parts.append(block(x, (a + gap / 2, b - gap / 2), (seat - thick, seat)))
     inset = leg / 2 + dice.between(0.0, 0.08)
     spots = corners(x, y, leg / 2)
     spots = [(px - np.sign(px) * (inset - leg / 2), py) for px, py in spots]

@@ -6,7 +6,7 @@ import numpy as np
 
 from qs3.shapes._dice import Dice
 from qs3.shapes._joinery import corners, legs
-from qs3.shapes._solids import Number, Solid, Span, cushion, pillow, tube, within
+from qs3.shapes._solids import Number, Solid, Span, centred, cushion, pillow, tube, within
 
 
 def upholstered(dice: Dice, width: Number, seats: int, lean: Number | None = None) -> list[Solid]:
@@ -20,7 +20,7 @@ def upholstered(dice: Dice, width: Number, seats: int, lean: Number | None = Non
     side = dice.between(0.08, 0.26) * (0.8 if seats == 1 else 1.0)
     back = dice.between(0.12, 0.26)
     soft = dice.pick(0.005, 0.03, dice.between(0.03, 0.09))
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     base = seat - dice.between(0.1, 0.18)
     parts = [
         cushion(dice, within(x, 0.01), (y[0] + 0.02, y[1] - 0.01), (foot, base), min(soft, 0.03))
@@ -35,7 +35,7 @@ def upholstered(dice: Dice, width: Number, seats: int, lean: Number | None = Non
     plump = dice.between(0.0, 0.04)
     loose = dice.chance(0.7)
     for a, b in pairwise(edges):
-        span = (float(a) + 0.002, float(b) - 0.002)
+        span = (a + 0.002, b - 0.002)
         parts.append(cushion(dice, span, run, (base - 0.01, seat), max(soft, 0.02), plump))
         if loose:
             thick = dice.between(0.1, 0.18)

@@ -11,6 +11,7 @@ from qs3.shapes._solids import (
     beam,
     bend,
     block,
+    centred,
     cushion,
     lathe,
     ribbon,
@@ -24,7 +25,7 @@ def framed(dice: Dice) -> list[Solid]:
     width, length = bed_size(dice)
     thick, board = dice.between(0.14, 0.3), dice.between(0.03, 0.05) * dice.bulk
     base = dice.between(0.2, 0.36)
-    x, y = (-width / 2, width / 2), (-length / 2, length / 2)
+    x, y = centred(width), centred(length)
     rail = (dice.between(0.06, 0.18), base + dice.between(0.0, 0.08))
     outer = within(x, -board)
     parts = [
@@ -49,7 +50,7 @@ def platform(dice: Dice) -> list[Solid]:
     """Low bed whose deck stands out beyond the mattress."""
     width, length = bed_size(dice)
     thick, lip, deck = dice.between(0.12, 0.25), dice.between(0.02, 0.2), dice.between(0.12, 0.28)
-    x, y = (-width / 2, width / 2), (-length / 2, length / 2)
+    x, y = centred(width), centred(length)
     outer = within(x, -lip)
     front = (y[0] - lip, y[1])
     parts = [block(outer, front, (deck - dice.between(0.06, 0.12), deck))]
@@ -70,7 +71,7 @@ def boxspring(dice: Dice) -> list[Solid]:
         dice.between(0.18, 0.36),
         dice.between(0.16, 0.3),
     )
-    x, y = (-width / 2, width / 2), (-length / 2, length / 2)
+    x, y = centred(width), centred(length)
     parts = [cushion(dice, x, y, (foot, foot + box), dice.pick(0.005, 0.03))]
     if foot > 0:
         parts += legs(
@@ -95,7 +96,7 @@ def bunk(dice: Dice) -> list[Solid]:
         dice.between(1.9, 2.1),
         dice.between(0.05, 0.09) * dice.bulk**0.5,
     )
-    x, y = (-width / 2, width / 2), (-length / 2, length / 2)
+    x, y = centred(width), centred(length)
     lower, upper = dice.between(0.25, 0.4), dice.between(1.1, 1.5)
     top, thick = upper + dice.between(0.35, 0.5), dice.between(0.1, 0.17)
     parts = [block(around(px, post / 2), around(py, post / 2), (0, top)) for px in x for py in y]
@@ -125,7 +126,7 @@ def four_poster(dice: Dice) -> list[Solid]:
     """Bed with a tall post at each corner and bars across the top."""
     width, length = max(bed_size(dice)[0], 1.2), dice.between(1.95, 2.15)
     post, high = dice.between(0.05, 0.09), dice.between(1.7, 2.15)
-    x, y = (-width / 2, width / 2), (-length / 2, length / 2)
+    x, y = centred(width), centred(length)
     base, thick = dice.between(0.28, 0.4), dice.between(0.18, 0.28)
     spots = corners(within(x, -post / 2), within(y, -post / 2), 0.0)
     parts = legs(dice, spots, high, post, dice.pick("square", "round", "turned"))
@@ -152,7 +153,7 @@ def sled(dice: Dice) -> list[Solid]:
         dice.between(0.18, 0.26),
         dice.between(0.03, 0.06),
     )
-    x, y = (-width / 2, width / 2), (-length / 2, length / 2)
+    x, y = centred(width), centred(length)
     parts = []
     for s, rise in ((1, dice.between(0.5, 0.8)), (-1, dice.between(0.25, 0.55))):
         t = np.linspace(0, 1, 9)
@@ -178,7 +179,7 @@ def metal(dice: Dice) -> list[Solid]:
         dice.between(0.28, 0.42),
         dice.between(0.14, 0.24),
     )
-    x, y = (-width / 2, width / 2), (-length / 2, length / 2)
+    x, y = centred(width), centred(length)
     parts = []
     for py, high in (
         (y[1], base + thick + dice.between(0.25, 0.6)),
@@ -191,7 +192,7 @@ def metal(dice: Dice) -> list[Solid]:
         parts.append(tube(hoop, bar, dice.sides))
         parts.append(tube([(x[0], py, base), (x[1], py, base)], 0.8 * bar, dice.sides))
         for px in np.linspace(x[0], x[1], dice.count(4, 9))[1:-1]:
-            parts.append(tube([(float(px), py, base), (float(px), py, high)], 0.5 * bar, 6))
+            parts.append(tube([(px, py, base), (px, py, high)], 0.5 * bar, 6))
         if dice.chance(0.3):
             profile = [(0.0, high), (0.03, high + 0.03), (0.0, high + 0.06)]
             parts.append(lathe(profile, 8, x[0] + 0.4 * width, py).move(0, 0, -0.015))
@@ -204,7 +205,7 @@ def metal(dice: Dice) -> list[Solid]:
 def cot(dice: Dice) -> list[Solid]:
     """Child's cot with bars on all sides."""
     width, length, high = dice.between(0.6, 0.75), dice.between(1.2, 1.45), dice.between(0.8, 1.0)
-    x, y, post = (-width / 2, width / 2), (-length / 2, length / 2), dice.between(0.035, 0.055)
+    x, y, post = centred(width), centred(length), dice.between(0.035, 0.055)
     base, low = dice.between(0.3, 0.5), dice.between(0.15, 0.25)
     parts = legs(dice, corners(x, y, 0.0), high, post, "square")
     parts.append(block(x, y, (base - 0.04, base)))

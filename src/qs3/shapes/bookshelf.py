@@ -6,7 +6,7 @@ import numpy as np
 
 from qs3.shapes._dice import Dice
 from qs3.shapes._joinery import books, carcass, corners, fronts, knick_knacks, legs
-from qs3.shapes._solids import Number, Solid, Span, around, beam, block, within
+from qs3.shapes._solids import Number, Solid, Span, around, beam, block, centred, within
 
 
 def _fill(dice: Dice, x: Span, y: Span, z: Number, room: Number, share: Number) -> list[Solid]:
@@ -23,7 +23,7 @@ def _backed(dice: Dice, doors: bool) -> list[Solid]:
     depth, high = dice.between(0.2, 0.4), dice.between(0.9, 2.3)
     board = dice.between(0.016, 0.03) * dice.bulk
     foot = dice.pick(0.0, dice.between(0.04, 0.1))
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     parts = carcass(x, y, (foot, high), board, back=dice.chance(0.85) or doors)
     share = dice.pick(0.0, 0.0, dice.between(0.3, 1.0))
     bays = np.linspace(
@@ -36,15 +36,15 @@ def _backed(dice: Dice, doors: bool) -> list[Solid]:
     levels = np.linspace(foot, high - board, rows + 1)
     for i, level in enumerate(levels[:-1]):
         if i:
-            z = float(level)
+            z = level
             parts.append(block(within(x, board / 2), (y[0] + 0.004, y[1] - 0.002), (z, z + board)))
         if level < shut:
             continue
         for a, b in pairwise(bays):
-            span = (float(a) + board / 2 + 0.005, float(b) - board / 2 - 0.005)
+            span = (a + board / 2 + 0.005, b - board / 2 - 0.005)
             inner = (y[0] + 0.01, y[1] - board / 2)
             parts += _fill(
-                dice, span, inner, float(level) + board, float(levels[1] - levels[0]) - board, share
+                dice, span, inner, level + board, float(levels[1] - levels[0]) - board, share
             )
     if doors:
         parts += fronts(
@@ -75,13 +75,13 @@ def open_frame(dice: Dice) -> list[Solid]:
     """Boards between four or six uprights, seen through from all sides."""
     width, depth, high = dice.between(0.5, 1.5), dice.between(0.25, 0.42), dice.between(0.7, 2.1)
     post, board = dice.between(0.02, 0.05) * dice.bulk**0.7, dice.between(0.018, 0.03) * dice.bulk
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     parts = legs(dice, corners(x, y, post / 2), high, post, dice.pick("square", "round"))
     rows = dice.count(2, 6)
     levels = np.linspace(dice.between(0.05, 0.2), high - board, rows)
     share = dice.pick(0.0, 0.0, dice.between(0.3, 1.0))
     for i, level in enumerate(levels):
-        z = float(level)
+        z = level
         parts.append(block(within(x, 0.005), within(y, 0.005), (z, z + board)))
         if i < rows - 1:
             room = float(levels[1] - levels[0]) - board
@@ -89,7 +89,7 @@ def open_frame(dice: Dice) -> list[Solid]:
                 dice, within(x, post), (y[0] + post, y[1] - 0.01), z + board, room, share
             )
     if dice.chance(0.4):
-        a, b = float(levels[0]) + board / 2, float(levels[-1]) + board / 2
+        a, b = levels[0] + board / 2, levels[-1] + board / 2
         parts += [
             beam(
                 (x[0] + post, y[1] - post / 2, a), (x[1] - post, y[1] - post / 2, b), 0.012, 0.012
@@ -119,7 +119,7 @@ def ladder(dice: Dice) -> list[Solid]:
     share = dice.pick(0.0, dice.between(0.3, 1.0))
     levels = np.linspace(dice.between(0.12, 0.3), high - dice.between(0.05, 0.2), rows)
     for level in levels:
-        z = float(level)
+        z = level
         front = -depth / 2 + (depth - bar) * z / high - bar / 2
         span = (front, depth / 2)
         parts.append(block((-width / 2 + 0.002, width / 2 - 0.002), span, (z, z + board)))
@@ -139,7 +139,7 @@ def corner(dice: Dice) -> list[Solid]:
     )
     parts = []
     for level in np.linspace(0.0, high - board, rows + 1):
-        z = float(level)
+        z = level
         parts += [
             block((0, run), (-depth, 0), (z, z + board)),
             block((0, depth), (-down, -depth + 0.002), (z, z + board)),
@@ -154,7 +154,7 @@ def corner(dice: Dice) -> list[Solid]:
     room = high / rows - board
     for level in np.linspace(0.0, high - board, rows + 1)[:-1]:
         inner = (-depth + 0.01, -board)
-        parts += _fill(dice, (depth + 0.02, run - board), inner, float(level) + board, room, share)
+        parts += _fill(dice, (depth + 0.02, run - board), inner, level + board, room, share)
     return parts + ends
 
 
@@ -170,7 +170,7 @@ def cubes(dice: Dice) -> list[Solid]:
         if columns > 2 and dice.chance(0.3)
         else [rows] * columns
     )
-    y, back, share = (-depth / 2, depth / 2), dice.chance(0.5), dice.pick(0.0, 0.3, 0.8)
+    y, back, share = centred(depth), dice.chance(0.5), dice.pick(0.0, 0.3, 0.8)
     parts = []
     for i, tall in enumerate(steps):
         for j in range(tall):
@@ -198,7 +198,7 @@ def wall_board(dice: Dice) -> list[Solid]:
     width, depth = dice.between(0.4, 1.4), dice.between(0.18, 0.32)
     board, drop = dice.between(0.025, 0.045) * dice.bulk, dice.between(0.1, 0.2)
     count, step = dice.pick(1, 1, 1, 2, 3), dice.between(0.3, 0.42)
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     wide = dice.between(0.02, 0.06) * dice.bulk
     share = dice.between(0.0, 1.4)
     inset = dice.between(0.03, 0.2) * width
@@ -241,18 +241,16 @@ def rack(dice: Dice) -> list[Solid]:
     width, depth, high = dice.between(0.6, 1.2), dice.between(0.25, 0.38), dice.between(0.4, 1.0)
     board, rows = dice.between(0.018, 0.035) * dice.bulk, dice.count(2, 4)
     slope = dice.pick(0.0, dice.between(8, 25))
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     parts = [block((px, px + board), y, (0, high)) for px in (x[0], x[1] - board)]
     for level in np.linspace(0.1, high - 0.08, rows):
         if dice.chance(0.3):
             for py in np.linspace(y[0] + 0.04, y[1] - 0.04, 4):
-                z = (float(level), float(level) + 0.02)
+                z = (level, level + 0.02)
                 parts.append(block(within(x, board / 2), around(py, 0.015), z))
         else:
-            shelf = block(
-                within(x, board / 2), within(y, 0.02), (float(level), float(level) + 0.8 * board)
-            )
-            parts.append(shelf.turn("x", slope, (0, 0, float(level))))
+            shelf = block(within(x, board / 2), within(y, 0.02), (level, level + 0.8 * board))
+            parts.append(shelf.turn("x", slope, (0, 0, level)))
     if dice.chance(0.4):
         parts.append(block(x, (y[0], y[1]), (high - board, high)))
     return parts

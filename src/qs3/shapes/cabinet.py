@@ -2,7 +2,7 @@
 
 from qs3.shapes._dice import Dice
 from qs3.shapes._joinery import carcass, corners, fronts, knick_knacks, legs
-from qs3.shapes._solids import Number, Solid, Span, around, block, within
+from qs3.shapes._solids import Number, Solid, Span, around, block, centred, within
 
 
 def _body(dice: Dice, x: Span, y: Span, z: Span) -> tuple[list[Solid], Span]:
@@ -44,7 +44,7 @@ def _topped(
 def nightstand(dice: Dice) -> list[Solid]:
     """Small chest beside a bed, shut by drawers or a door."""
     width, depth, high = dice.between(0.36, 0.65), dice.between(0.34, 0.52), dice.between(0.4, 0.72)
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     parts, free = _body(dice, x, y, (0.0, high))
     if dice.chance(0.65):
         parts += fronts(dice, within(x, 0.01), free, y[0], 1, dice.count(1, 3))
@@ -60,7 +60,7 @@ def open_nightstand(dice: Dice) -> list[Solid]:
     """Four posts that carry a drawer box and a shelf below it."""
     width, depth, high = dice.between(0.4, 0.75), dice.between(0.34, 0.5), dice.between(0.42, 0.72)
     post, thick = dice.between(0.03, 0.055) * dice.bulk, dice.between(0.018, 0.03) * dice.bulk
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     over = dice.pick(0.0, 0.02)
     parts = [block(within(x, -over), within(y, -over), (high - thick, high))]
     style = dice.pick("square", "square", "tapered")
@@ -84,7 +84,7 @@ def dresser(dice: Dice) -> list[Solid]:
         dice.between(0.38, 0.55),
         dice.between(0.95, 1.4) if tall else dice.between(0.7, 1.0),
     )
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     parts, free = _body(dice, x, y, (0.0, high))
     columns = 1 if tall else dice.count(1, 3)
     parts += fronts(
@@ -96,7 +96,7 @@ def dresser(dice: Dice) -> list[Solid]:
 def wardrobe(dice: Dice) -> list[Solid]:
     """Tall cupboard for clothes."""
     width, depth, high = dice.between(0.6, 2.3), dice.between(0.4, 0.68), dice.between(1.65, 2.35)
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     parts, free = _body(dice, x, y, (0.0, high))
     split = free[0] + (dice.between(0.15, 0.3) * (free[1] - free[0]) if dice.chance(0.4) else 0.0)
     columns = max(1, round(width / dice.between(0.4, 0.6)))
@@ -113,7 +113,7 @@ def wardrobe(dice: Dice) -> list[Solid]:
 def sideboard(dice: Dice) -> list[Solid]:
     """Long chest with doors, drawers and perhaps an open bay."""
     width, depth, high = dice.between(0.9, 2.0), dice.between(0.36, 0.52), dice.between(0.6, 0.95)
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     parts, free = _body(dice, x, y, (0.0, high))
     bays = dice.count(2, 4)
     cut = free[1] - dice.pick(0.0, 0.25, 0.35) * (free[1] - free[0])
@@ -127,8 +127,8 @@ def tv_bench(dice: Dice) -> list[Solid]:
     """Long, low bench for a television, part open."""
     width, depth, high = dice.between(1.2, 2.2), dice.between(0.32, 0.48), dice.between(0.28, 0.55)
     x, y, board = (
-        (-width / 2, width / 2),
-        (-depth / 2, depth / 2),
+        centred(width),
+        centred(depth),
         dice.between(0.018, 0.03) * dice.bulk,
     )
     foot = dice.pick(0.0, dice.between(0.05, 0.18))
@@ -213,7 +213,7 @@ def hutch(dice: Dice) -> list[Solid]:
     """Shut below, open or glazed shelves above."""
     width, depth, low = dice.between(0.5, 1.3), dice.between(0.35, 0.5), dice.between(0.6, 0.95)
     high, board = dice.between(1.5, 2.1), dice.between(0.018, 0.03) * dice.bulk
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     parts, free = _body(dice, x, y, (0.0, low))
     drawers = dice.pick(0.0, 0.3) * (free[1] - free[0])
     heights = (free[0], free[1] - drawers)

@@ -13,6 +13,7 @@ from qs3.shapes._solids import (
     beam,
     bend,
     block,
+    centred,
     cushion,
     lathe,
     ribbon,
@@ -78,7 +79,7 @@ def four_legs(dice: Dice) -> list[Solid]:
     width, depth = dice.between(0.38, 0.52), dice.between(0.38, 0.52)
     seat, back = dice.between(0.42, 0.5), dice.between(0.36, 0.66)
     thick, leg = 0.025 * dice.bulk, dice.between(0.024, 0.042) * dice.bulk
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     top = (seat - thick, seat)
     parts = [
         block(x, y, top)
@@ -152,7 +153,7 @@ def swivel(dice: Dice) -> list[Solid]:
     """Office chair that turns on a star base."""
     width, depth = dice.between(0.44, 0.54), dice.between(0.42, 0.52)
     seat, thick = dice.between(0.42, 0.54), dice.between(0.04, 0.1)
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     parts = _star_base(dice, seat - thick)
     parts.append(cushion(dice, x, y, (seat - thick, seat), dice.between(0.02, 0.05), 0.01))
     tall, gap = dice.between(0.35, 0.75), dice.between(0.02, 0.16)
@@ -183,7 +184,7 @@ def swivel(dice: Dice) -> list[Solid]:
         for s in (-1, 1):
             out = s * (width / 2 + 0.02)
             heights = (seat + rise - 0.03, seat + rise)
-            parts.append(cushion(dice, around(out, 0.035), (-run / 2, run / 2), heights, 0.012))
+            parts.append(cushion(dice, around(out, 0.035), centred(run), heights, 0.012))
             route = [
                 (s * (width / 2 - 0.08), 0, seat - thick / 2),
                 (out, 0, seat - thick / 2),
@@ -221,7 +222,7 @@ def cantilever(dice: Dice) -> list[Solid]:
     parts.append(tube([(-width / 2, r, bar), (width / 2, r, bar)], bar, dice.sides))
     thick = dice.between(0.02, 0.06)
     z = (seat - 0.03, seat - 0.03 + thick)
-    parts.append(cushion(dice, (-width / 2, width / 2), (f, r - 0.02), z, 0.015))
+    parts.append(cushion(dice, centred(width), (f, r - 0.02), z, 0.015))
     low = dice.between(0.0, 0.2)
     rest = cushion(
         dice,

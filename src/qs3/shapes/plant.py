@@ -39,7 +39,7 @@ def cactus(dice: Dice) -> list[Solid]:
         high = r * dice.between(1.6, 7.0) if count == 1 else r * dice.between(1.4, 4.5)
         a = 2 * np.pi * i / count + dice.between(0, 0.6)
         off = 0.0 if count == 1 else pot * 0.48
-        x, y = off * float(np.cos(a)), off * float(np.sin(a))
+        x, y = off * np.cos(a), off * np.sin(a)
         ribs = dice.pick(0, dice.count(6, 12))
         sides = 2 * ribs if ribs else max(6, dice.sides)
         t = np.linspace(0, 1, 8)
@@ -119,8 +119,8 @@ def palm(dice: Dice) -> list[Solid]:
             out, up = np.cumsum(long / 6 * np.cos(t)), np.cumsum(long / 6 * np.sin(t))
             c, s = np.cos(np.radians(a)), np.sin(np.radians(a))
             for j in range(1, 6):
-                spot = (float(out[j] * c), float(out[j] * s), head[2] + float(up[j]))
-                slope = float(np.degrees(t[j])) + 5
+                spot = (float(out[j] * c), float(out[j] * s), head[2] + up[j])
+                slope = np.degrees(t[j]) + 5
                 for turn in (a - 60, a + 60):
                     parts.append(leaf(spot, turn, slope, long * 0.28, 0.025, 40, 0.005))
     return parts
@@ -188,7 +188,7 @@ def trailing(dice: Dice) -> list[Solid]:
         ]
         parts.append(tube(bend(path, 0.6 * pot), 0.004, 5))
         for t in np.linspace(0.2, 1.0, 5):
-            spot = (out * c * (1 + 0.02 * t), out * s * (1 + 0.02 * t), earth - fall * float(t))
+            spot = (out * c * (1 + 0.02 * t), out * s * (1 + 0.02 * t), earth - fall * t)
             parts.append(
                 leaf(spot, a + dice.between(-90, 90), dice.between(-30, 30), 0.07, 0.045, 50)
             )

@@ -13,6 +13,7 @@ from qs3.shapes._solids import (
     around,
     beam,
     block,
+    centred,
     curved_wall,
     cushion,
     tube,
@@ -116,7 +117,7 @@ def daybed(dice: Dice) -> list[Solid]:
     """Chaise longue: a couch with one raised end."""
     width, depth, seat = dice.between(1.5, 1.9), dice.between(0.65, 0.85), dice.between(0.36, 0.45)
     foot, thick = dice.between(0.1, 0.2), dice.between(0.1, 0.16)
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     parts = [cushion(dice, x, y, (foot, seat), 0.04, 0.02)]
     head = cushion(
         dice, (x[0], x[0] + thick), y, (foot + 0.05, seat + dice.between(0.25, 0.45)), 0.05
@@ -144,7 +145,7 @@ def chesterfield(dice: Dice) -> list[Solid]:
         dice.between(0.06, 0.14),
     )
     wall = r * dice.between(1.0, 1.6)
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     parts = [
         cushion(dice, within(x, 0.01), (y[0] + 0.03, y[1] - 0.01), (foot, seat - 0.12), 0.02),
         block(x, (y[1] - wall, y[1]), (foot, high - r)),
@@ -159,9 +160,7 @@ def chesterfield(dice: Dice) -> list[Solid]:
     edges = np.linspace(x[0] + wall - 0.01, x[1] - wall + 0.01, dice.count(2, 3) + 1)
     for a, b in pairwise(edges):
         z = (seat - 0.13, seat)
-        parts.append(
-            cushion(dice, (float(a), float(b) - 0.003), (y[0], y[1] - wall + 0.01), z, 0.04, 0.02)
-        )
+        parts.append(cushion(dice, (a, b - 0.003), (y[0], y[1] - wall + 0.01), z, 0.04, 0.02))
     return parts + legs(dice, corners(x, y, 0.09), foot + 0.01, 0.06)
 
 
@@ -171,7 +170,7 @@ def slab(dice: Dice) -> list[Solid]:
     wall, foot = dice.between(0.05, 0.11), dice.between(0.06, 0.2)
     high = seat + dice.between(0.16, 0.34)
     arm = high if dice.chance(0.5) else seat + dice.between(0.05, 0.15)
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     parts = [block(x, y, (foot, foot + 0.06)), block(x, (y[1] - wall, y[1]), (foot, high))]
     sides = dice.pick((-1, 1), (-1, 1), (1,))
     for s in sides:
@@ -179,16 +178,10 @@ def slab(dice: Dice) -> list[Solid]:
     edges = np.linspace(x[0] + wall if -1 in sides else x[0], x[1] - wall, dice.count(1, 3) + 1)
     for a, b in pairwise(edges):
         z = (foot + 0.05, seat)
-        parts.append(
-            cushion(dice, (float(a), float(b) - 0.004), (y[0], y[1] - wall + 0.003), z, 0.025, 0.01)
-        )
+        parts.append(cushion(dice, (a, b - 0.004), (y[0], y[1] - wall + 0.003), z, 0.025, 0.01))
         if dice.chance(0.5):
             run = (y[1] - wall - 0.13, y[1] - wall + 0.01)
-            parts.append(
-                cushion(
-                    dice, (float(a) + 0.02, float(b) - 0.02), run, (seat - 0.02, high + 0.06), 0.04
-                )
-            )
+            parts.append(cushion(dice, (a + 0.02, b - 0.02), run, (seat - 0.02, high + 0.06), 0.04))
     if dice.chance(0.3):
         for s in (-1, 1):
             px = s * (width / 2 - 0.15)
@@ -227,7 +220,7 @@ def futon(dice: Dice) -> list[Solid]:
     """Folded mattress on a frame of slats, or a sofa without arms."""
     width, depth, seat = dice.between(1.3, 2.0), dice.between(0.7, 0.9), dice.between(0.34, 0.44)
     thick, lean, tall = dice.between(0.12, 0.2), dice.between(8, 24), dice.between(0.4, 0.55)
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     base = seat - thick
     parts = [cushion(dice, x, y, (base, seat), 0.05, 0.02)]
     pad = cushion(dice, x, (y[1] - thick, y[1]), (base, base + thick + tall), 0.05)

@@ -15,6 +15,7 @@ from qs3.shapes._solids import (
     beam,
     bend,
     block,
+    centred,
     lathe,
     outline,
     slab,
@@ -41,7 +42,7 @@ def _size(dice: Dice) -> tuple[float, float, float]:
 def _top(dice: Dice, width: Number, depth: Number, height: Number, thick: Number) -> Solid:
     exponent = dice.pick(2.0, 2.6, 6.0, 0.0, 0.0, 0.0, 0.0)
     if exponent == 0.0:
-        return block((-width / 2, width / 2), (-depth / 2, depth / 2), (height - thick, height))
+        return block(centred(width), centred(depth), (height - thick, height))
     return slab(outline(width, depth, max(16, dice.sides), exponent), (height - thick, height))
 
 
@@ -58,7 +59,7 @@ def four_legs(dice: Dice) -> list[Solid]:
     width, depth, height = _size(dice)
     thick = dice.between(0.018, 0.04) * dice.bulk
     leg = min(dice.between(0.035, 0.08) * dice.bulk, 0.2 * depth)
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     round_top = dice.chance(0.15)
     if round_top:
         top = slab(outline(width, depth, max(16, dice.sides)), (height - thick, height))
@@ -145,7 +146,7 @@ def trestle(dice: Dice) -> list[Solid]:
     width, depth, height = dice.between(1.0, 2.2), dice.between(0.6, 1.0), dice.between(0.45, 0.78)
     thick, bar = dice.between(0.02, 0.05) * dice.bulk, dice.between(0.04, 0.08) * dice.bulk**0.7
     inset, style = dice.between(0.08, 0.2) * width, dice.pick("A", "X", "post")
-    parts = [block((-width / 2, width / 2), (-depth / 2, depth / 2), (height - thick, height))]
+    parts = [block(centred(width), centred(depth), (height - thick, height))]
     under, half = height - thick, depth / 2 - 0.05
     for s in (-1, 1):
         x = s * (width / 2 - inset)
@@ -188,7 +189,7 @@ def coffee(dice: Dice) -> list[Solid]:
     """Low table: drawer box, shelf below, drum, block or two nested tops."""
     width, depth = dice.between(0.7, 1.4), dice.between(0.45, 0.85)
     height, thick = dice.between(0.28, 0.48), dice.between(0.025, 0.05) * dice.bulk
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     kind = dice.pick("shelf", "box", "drum", "open_box", "slab_legs")
     if kind == "drum":
         wide = dice.between(0.45, 0.9)
@@ -244,13 +245,11 @@ def folding(dice: Dice) -> list[Solid]:
     """Camping or garden table on crossed legs."""
     width, depth, height = dice.between(0.6, 1.4), dice.between(0.5, 0.8), dice.between(0.55, 0.75)
     thick, bar = dice.between(0.018, 0.035) * dice.bulk, dice.between(0.025, 0.05) * dice.bulk**0.7
-    x, y, under = (-width / 2, width / 2), (-depth / 2, depth / 2), height - thick
+    x, y, under = centred(width), centred(depth), height - thick
     parts, planks = [], dice.pick(1, 1, dice.count(4, 8))
     edges = np.linspace(*y, planks + 1)
     for a, b in pairwise(edges):
-        parts.append(
-            block(x, (float(a), float(b) - (0.01 if planks > 1 else 0.0)), (under, height))
-        )
+        parts.append(block(x, (a, b - (0.01 if planks > 1 else 0.0)), (under, height)))
     reach = width / 2 - dice.between(0.05, 0.15)
     for s in (-1, 1):
         for t in (-1, 1):
@@ -268,7 +267,7 @@ def panel(dice: Dice) -> list[Solid]:
     """Waterfall table of boards, on two panel ends, or on bent sled frames."""
     width, depth, height = dice.between(0.8, 1.9), dice.between(0.4, 0.9), dice.between(0.32, 0.78)
     thick = dice.between(0.02, 0.05) * dice.bulk
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     parts = [block(x, y, (height - thick, height))]
     if dice.chance(0.5):
         inset = dice.pick(0.0, dice.between(0.05, 0.2) * width)
