@@ -1,6 +1,6 @@
 """Closed solids from which furniture is put together; lengths in metres, z up."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
@@ -145,7 +145,7 @@ def block(x: Span, y: Span, z: Span) -> Solid:
     return slab(corners, z)
 
 
-def posts(xs: Sequence[Number], ys: Sequence[Number], half: Number, z: Span) -> list[Solid]:
+def posts(xs: Iterable[Number], ys: Iterable[Number], half: Number, z: Span) -> list[Solid]:
     """Upright boxes 2 ``half`` wide over every crossing of ``xs`` and ``ys``."""
     return [block(around(x, half), around(y, half), z) for x in xs for y in ys]
 
