@@ -308,7 +308,7 @@ def curved_wall(plan: Float[np.ndarray, "n 2"], z: Span, thickness: Number) -> S
 
 
 def ribbon(
-    path: Float[np.ndarray, "n 3"], across: Float[np.ndarray, "n 3"], thickness: Number
+    path: Float[np.ndarray, "n 3"], across: Float[np.ndarray, "#n 3"], thickness: Number
 ) -> Solid:
     """Strip along ``path`` that reaches ``across`` to either side of it."""
     return sheet(np.stack([path - across, path, path + across], axis=1), thickness)
