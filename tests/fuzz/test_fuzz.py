@@ -29,21 +29,12 @@ def test_many_damaged_files(tmp_path: Path) -> None:
     judge(attack(tuple(LAYOUTS), tmp_path, 1500, seed=1), 1500)
 
 
-@pytest.fixture(scope="session")
-def ends(tmp_path_factory, request) -> dict[str, dict]:
-    """How every hand-made case that was asked for ends; all in one process."""
-    asked = {item.callspec.params.get("name") for item in request.session.items
-             if item.path == request.path and hasattr(item, "callspec")}  # fmt: skip
-    names = [name for name in CASES if name in asked]
-    found = attack(names, tmp_path_factory.mktemp("cases"), len(names))
-    return {end["name"]: end for end in found}
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.slow] * case.slow) for n, case in CASES.items()]
-)
-def test_a_hand_made_case(name: str, ends: dict[str, dict]) -> None:
-    assert ends[name]["kind"] in CASES[name].ends, ends[name]
+@pytest.mark.parametrize("slow", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_hand_made_cases(slow: bool, tmp_path: Path) -> None:
+    names = [name for name, case in CASES.items() if case.slow == slow]
+    ends = attack(names, tmp_path, len(names))
+    bad = [str(end) for end in ends if end["kind"] not in CASES[end["name"]].ends]
+    assert not bad, "\n".join(bad)
 
 
 def test_every_threat_has_its_test() -> None:
