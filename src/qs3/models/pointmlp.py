@@ -193,7 +193,3 @@ class PointMLPElite(PointClassifier):
             for stage, group in zip(self.stages, self.group(points), strict=True):
                 features = stage(features, *group)
         return Features(pooled=features.amax(dim=1))
-
-    def head(self, features: Features) -> Float[Tensor, "b k"]:
-        """Return the logits."""
-        return self.classify(features.pooled)

@@ -180,10 +180,6 @@ class RSCNN(PointClassifier):
         embedded = self.embed(torch.cat([points, features], dim=2))
         return Features(pooled=normalised(self.embed_norm, embedded).amax(dim=1).relu())
 
-    def head(self, features: Features) -> Float[Tensor, "b k"]:
-        """Return the logits."""
-        return self.classify(features.pooled)
-
 
 def _with_centre(around: Int[Tensor, "b m k"], samples: Int[Tensor, "b m"]) -> Int[Tensor, "b m k"]:
     """Put the centre into balls that do not hold it, for the last point; fill up with it."""
