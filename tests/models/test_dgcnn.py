@@ -1,8 +1,6 @@
 """DGCNN against its textbook form on the same graphs."""
 
 import copy
-import importlib.util
-from pathlib import Path
 
 import pytest
 import torch
@@ -11,22 +9,16 @@ from torch import nn
 from qs3.models import DGCNN, pooling
 from qs3.models.ops import knn
 
-PATH = Path(__file__).parents[2] / "benchmarks" / "reference" / "dgcnn.py"
-SPEC = importlib.util.spec_from_file_location("textbook_dgcnn", PATH)
-textbook = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(textbook)
+from .common import randomise
+from .common import textbook as load_textbook
+
+textbook = load_textbook("dgcnn")
 
 
 def make(dtype, neighbours=7, **settings):
     torch.manual_seed(0)
     model = DGCNN(5, neighbours, (16, 16, 24), 32, (16, 8), 0.0, **settings)
-    for layer in model.modules():
-        if isinstance(layer, nn.BatchNorm1d):
-            with torch.no_grad():
-                layer.weight.normal_()  # both signs
-                layer.bias.normal_()
-                layer.running_mean.normal_()
-                layer.running_var.uniform_(0.5, 1.5)
+    randomise(model, most=1.5)
     return model.to(dtype)
 
 

@@ -1,8 +1,6 @@
 """PointNet against its textbook form, and what its widest layer saves."""
 
 import copy
-import importlib.util
-from pathlib import Path
 
 import pytest
 import torch
@@ -12,12 +10,9 @@ from qs3.models import PointNet, create_model
 from qs3.models import pointnet as module
 from qs3.models.pointnet import linear_max
 
-FILE = Path(__file__).parents[2] / "benchmarks" / "reference" / "pointnet.py"
-SPEC = importlib.util.spec_from_file_location("pointnet_reference", FILE)
-assert SPEC is not None
-assert SPEC.loader is not None
-textbook = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(textbook)
+from .common import textbook as load_textbook
+
+textbook = load_textbook("pointnet")
 
 SMALL = {"channels": (8, 8, 8, 12, 32), "hidden": (16, 8)}
 
