@@ -71,8 +71,9 @@ def command(*words: Any) -> str:
     control = {c for c in printed if (ord(c) < 32 and c not in "\n\r\t") or c in "\x7f\x9b"}
     if control:
         raise AssertionError(f"control characters {control} reach the terminal")
-    if code == 2 and streams[1].getvalue():
-        raise QS3Error(streams[1].getvalue().rstrip("\n"))
+    faults = [line for line in streams[1].getvalue().splitlines() if line.startswith("qs3: ")]
+    if code in (1, 2) and faults:  # 1: something was left out
+        raise QS3Error("\n".join(faults))
     if code:
         raise AssertionError(f"exit code {code}: {printed}")
     return printed
@@ -82,7 +83,8 @@ def _run(folder: Path) -> Path:
     """A run, trained once for all cases, and its data beside it."""
     made = folder.parent / "own" / "made-run"
     if not made.exists():
-        build_run(made)
+        with contextlib.redirect_stderr(io.StringIO()):
+            build_run(made)
     return Path(shutil.copytree(made, folder / "run"))
 
 
@@ -289,8 +291,14 @@ def control_characters(folder: Path) -> None:
 
 @case("refused")
 def empty_name_to_write_to(folder: Path) -> None:
+    from qs3.errors import QS3Error
+
     build_generated(folder / "data")
-    command("merge", folder / "data", "--out", "")
+    try:
+        command("merge", folder / "data", "--out", "")
+    except QS3Error as error:
+        assert "--out" in str(error), error
+        raise
 
 
 @case("ok")
