@@ -178,4 +178,5 @@ def main(folder: Path, seed: int, first: int, last: int, names: Sequence[str]) -
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), *(int(word) for word in sys.argv[2:5]), sys.argv[5:])
+    place, start, low, high, *given = sys.argv[1:]
+    main(Path(place), int(start), int(low), int(high), given)

@@ -56,11 +56,12 @@ def close(value, reference, tolerance, name=""):
     assert error(value, reference) <= tolerance, name
 
 
-@pytest.mark.parametrize("per_point", [False, True])
-@pytest.mark.parametrize("transforms", [False, True])
+@pytest.mark.parametrize(("transforms", "per_point"), [(True, False), (True, True), (False, False)])
 @pytest.mark.parametrize("train", [False, True])
-@pytest.mark.parametrize("offset", [0.0, 30.0])
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-9), (torch.float32, 1e-4)])
+@pytest.mark.parametrize(
+    ("dtype", "tolerance", "offset"),
+    [(torch.float64, 1e-9, 30.0), (torch.float32, 1e-4, 0.0), (torch.float32, 1e-4, 30.0)],
+)
 def test_is_the_textbook_function(dtype, tolerance, offset, train, transforms, per_point):
     ours = random_model(transforms=transforms, per_point=per_point).train(train)
     slow = textbook.from_ours(ours)  # in double precision, with no rounding of its own
