@@ -119,11 +119,11 @@ def test_a_cloud_that_is_not_finite_spoils_its_own_scores_alone(name, learns):
     wanted = model(points)
     points[1, 7, 2] = torch.nan
     with torch.set_grad_enabled(learns):
-        found = model(points)
+        result = model(points)
     rest = [0, 2, 3]
-    torch.testing.assert_close(found[rest], wanted[rest])
+    torch.testing.assert_close(result[rest], wanted[rest])
     # Images leave such a point out, as they do points outside.
-    assert found[1].isfinite().all() == name.startswith("simpleview")
+    assert result[1].isfinite().all() == name.startswith("simpleview")
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -336,9 +336,9 @@ def test_compiled_networks_give_the_same_scores_and_gradients(backend, names):
 def test_a_gpu_gives_the_same_scores_and_gradients(name):
     model = small(name).double().eval()
     twin = copy.deepcopy(model).cuda()
-    here, there = model(clouds().double()), twin(clouds().double().cuda())
-    torch.testing.assert_close(there.cpu(), here, rtol=0, atol=1e-9)
-    here.square().sum().backward()
-    there.square().sum().backward()
+    on_cpu, on_gpu = model(clouds().double()), twin(clouds().double().cuda())
+    torch.testing.assert_close(on_gpu.cpu(), on_cpu, rtol=0, atol=1e-9)
+    on_cpu.square().sum().backward()
+    on_gpu.square().sum().backward()
     for one, two in zip(twin.parameters(), model.parameters(), strict=True):
         torch.testing.assert_close(one.grad.cpu(), two.grad, rtol=1e-9, atol=1e-9)

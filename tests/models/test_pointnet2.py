@@ -39,13 +39,13 @@ def clouds(kind, dtype, b=8, n=60):
 
 
 def groups(model, points):
-    found = []
+    result = []
     for level in model.levels:
         chosen = farthest_point_sampling(points, min(level.centres, points.shape[1]))
         centres, balls = level.group(points)
-        found.append((chosen, balls))
+        result.append((chosen, balls))
         points = centres
-    return found
+    return result
 
 
 def error(ours, theirs):
@@ -81,13 +81,13 @@ def test_is_the_textbook_in_double(grouping, train, kind):
 def test_levels_are_the_textbook_in_single_precision(grouping, kind):
     model = make(grouping, torch.float32).train()
     points = clouds(kind, torch.float32, b=16)
-    found = groups(model, points)
+    result = groups(model, points)
     exact = textbook.from_ours(model.double())
     model.float()
-    exact.groups = found
+    exact.groups = result
     known, features = points, None
     expected, at = None, points.double()
-    for level, (chosen, balls), reference in zip(model.levels, found, exact.levels, strict=True):
+    for level, (chosen, balls), reference in zip(model.levels, result, exact.levels, strict=True):
         known, features = level(known, features)
         centres = textbook.pick(at, chosen)
         described = []

@@ -112,14 +112,14 @@ def check(name: str, family: str, seed: int) -> trimesh.Trimesh:
 
 @pytest.mark.parametrize(("name", "family"), FAMILIES)
 def test_objects_are_sound(name: str, family: str) -> None:
-    extents = np.stack([check(name, family, seed).extents for seed in range(2)])
+    extents = np.stack([check(name, family, seed).extents for seed in range(3)])
     assert (np.ptp(extents, axis=0) > 1e-3).all(), f"{name} {family}: draws of one size"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "family"), FAMILIES)
 def test_many_objects_are_sound(name: str, family: str) -> None:
-    for seed in range(2, 40):
+    for seed in range(3, 40):
         check(name, family, seed)
 
 
