@@ -138,7 +138,7 @@ def build_meshes(ending: str) -> Callable[[Path], None]:
 
         (folder / "chair").mkdir(parents=True)
         mesh = shapes.make("table", 0)
-        data = mesh.export(file_type=ending)
+        data: Any = mesh.export(file_type=ending)
         path = folder / "chair" / f"one.{ending}"
         path.write_bytes(data if isinstance(data, bytes) else data.encode())
 
