@@ -139,7 +139,7 @@ def build_meshes(ending: str) -> Callable[[Path], None]:
 
         (folder / "chair").mkdir(parents=True)
         mesh = shapes.make("table", 0)
-        data = mesh.export(file_type=ending)
+        data: Any = mesh.export(file_type=ending)
         path = folder / "chair" / f"one.{ending}"
         path.write_bytes(data if isinstance(data, bytes) else data.encode())
 
@@ -152,7 +152,54 @@ def load_meshes(path: Path) -> Any:
     return [item.load() for item in collect(str(path))]
 
 
+def build_sensor(folder: Path) -> None:
+    import contextlib
+
+    from qs3.cli import main
+
+    folder.mkdir()
+    with (
+        (folder / "camera.toml").open("w") as file,
+        contextlib.redirect_stdout(file),
+        contextlib.suppress(SystemExit),
+    ):
+        main(["sensors", "show", "d435"])
+
+
+def load_sensor(path: Path) -> Any:
+    from qs3.sensor.presets.toml_file import load_sensor
+
+    return load_sensor(path)
+
+
+def build_run(folder: Path) -> None:
+    """A run as ``train`` leaves it, with the record of ``evaluate``."""
+    from qs3.training import TrainSettings, evaluate, fit
+
+    data = folder.with_name(f"{folder.name}-data")
+    build_generated(data)
+    network = {"channels": [4, 4, 8], "hidden": [4], "transforms": False}
+    settings = TrainSettings(
+        model="pointnet", model_settings=network, num_points=16, epochs=1, batch_size=3, threads=1
+    )
+    fit("source-only", load_any(data), None, settings, run_dir=folder)
+    evaluate(folder, data)
+    for leftover in (folder / "history.jsonl", *folder.rglob("events.*")):
+        leftover.unlink(missing_ok=True)
+
+
+def load_run(path: Path) -> Any:
+    from qs3.evaluation.records import read_record
+    from qs3.training.checkpoint import load_model
+    from qs3.training.run import read_run
+
+    records = [read_record(record) for record in sorted((path / "records").iterdir())]
+    return load_model(path), read_run(path), records
+
+
 LAYOUTS: dict[str, Layout] = {
+    "sensor": Layout(build_sensor, load_sensor, "camera.toml"),
+    "run": Layout(build_run, load_run),
     "generated": Layout(build_generated, load_generated),
     "npz": Layout(build_npz, load_any, "clouds.npz"),
     **{name: layout(name) for name in ("store", "ply", "pcd", "npy", "xyz", *POINTS)},

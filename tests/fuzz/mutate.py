@@ -4,51 +4,18 @@ import re
 
 import numpy as np
 
-_NUMBERS = [
-    0,
-    1,
-    0x7F,
-    0x80,
-    0xFF,
-    0x7FFF,
-    0xFFFF,
-    2**31 - 1,
-    2**31,
-    2**32 - 1,
-    2**63 - 1,
-    2**64 - 1,
-]
-_WORDS = [
-    *(
-        b"nan",
-        b"inf",
-        b"-1",
-        b"0",
-        b"1e999",
-        b"99999999999999999999",
-        b"",
-        b"\xff\xfe",
-        b"..",
-        b"/",
-    ),
-    *(
-        b"../../etc/passwd",
-        b"null",
-        b"true",
-        b"[]",
-        b"{}",
-        b'"',
-        b"\x00",
-        b"-2147483649",
-        b"1e-400",
-    ),
-]
+_NUMBERS = [0, 1, *(2**bits - less for bits in (7, 8, 15, 16, 31, 32, 63, 64) for less in (0, 1))]
+_WORDS = (
+    b"nan inf -1 0 1.5 1e12 1e999 1e-400 -2147483649 99999999999999999999 \xff\xfe .. / "
+    b'../../etc/passwd null true [] {} [1] "x" "\\ud800" \x00 \x1b[2J "'
+).split(b" ")
+_WORDS += [b"", b"9" * 5000, b"[" * 100_000]
 
 
 def mutate(data: bytes, rng: np.random.Generator) -> bytes:
     """Damage a file in one to three places."""
     for _ in range(int(rng.integers(1, 4))):
-        data = _ONE[int(rng.integers(len(_ONE)))](data, rng)
+        data = _WAYS[int(rng.integers(len(_WAYS)))](data, rng)
     return data
 
 
@@ -93,8 +60,8 @@ def _repeat(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _word(data: bytes, rng: np.random.Generator) -> bytes:
-    """Replace one number or name of a text."""
-    words = list(re.finditer(rb"[-+.\w]+", data[:65536]))
+    """Replace one number, name or quoted text of a text file."""
+    words = list(re.finditer(rb'"[^"]*"|[-+.\w]+', data[:65536]))
     if not words:
         return _flip(data, rng)
     at = words[int(rng.integers(len(words)))]
@@ -102,4 +69,4 @@ def _word(data: bytes, rng: np.random.Generator) -> bytes:
     return data[: at.start()] + word + data[at.end() :]
 
 
-_ONE = [_flip, _number, _cut, _remove, _insert, _repeat, _word]
+_WAYS = [_flip, _number, _cut, _remove, _insert, _repeat, _word]

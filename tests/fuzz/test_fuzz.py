@@ -1,52 +1,46 @@
-"""Damaged files of every layout: read, or refused in one clear line; nothing else ever happens."""
+"""Hostile and damaged files: read, or refused in one clear line; nothing else ever happens."""
 
-import json
-import subprocess
-import sys
+import re
 from pathlib import Path
 
 import pytest
 
+from .attack import ROOT, attack
+from .cases import CASES
 from .layouts import LAYOUTS
 
-WORKER = Path(__file__).parent / "worker.py"
-SAMPLES = 1000
-
-
-def run(name: str, folder: Path, first: int, last: int) -> list[dict]:
-    """Load damaged copies in a process of their own; a crash of it is one sample's end."""
-    ends: list[dict] = []
-    while first < last:
-        command = [sys.executable, str(WORKER), name, str(folder), str(first), str(last)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        lines = [json.loads(line) for line in done.stdout.splitlines()]
-        ends += [line for line in lines if "end" in line]
-        if done.returncode == 0:
-            break
-        if not lines or "end" in lines[-1]:
-            raise AssertionError(f"the worker failed outside a sample: {done.stderr[-2000:]}")
-        crash = lines[-1] | {"end": f"process died: {done.returncode} {done.stderr[-300:]}"}
-        ends.append(crash)
-        first = crash["sample"] + 1
-    return ends
+QUICK = ("generated", "npz", "pointda10-h5", "mesh-off", "mesh-glb", "sensor")
 
 
 def judge(ends: list[dict], count: int) -> None:
     assert len(ends) == count
-    bad = [end for end in ends if end["end"] not in ("read", "refused")]
-    assert not bad, "\n".join(json.dumps(end) for end in bad[:20])
-    several = [end for end in ends if end.get("lines", 1) != 1]
-    assert not several, "\n".join(json.dumps(end) for end in several[:5])
+    bad = [str(end) for end in ends if end["kind"] not in ("ok", "refused")]
+    assert not bad, "\n".join(bad[:20])
     # The damage has to matter: a loader that reads everything would not be tested at all.
-    assert sum(end["end"] == "refused" for end in ends) > count / 10
+    assert sum(end["kind"] == "refused" for end in ends) > count / 5
 
 
-@pytest.mark.parametrize("name", ["generated", "npz", "pointda10-h5", "mesh-off"])
-def test_a_few_damaged_copies(name, tmp_path):
-    judge(run(name, tmp_path, 0, 30), 30)
+def test_a_few_damaged_files(tmp_path: Path) -> None:
+    judge(attack(QUICK, tmp_path, 60), 60)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", LAYOUTS)
-def test_a_thousand_damaged_copies(name, tmp_path):
-    judge(run(name, tmp_path, 0, SAMPLES), SAMPLES)
+def test_many_damaged_files(tmp_path: Path) -> None:
+    judge(attack(tuple(LAYOUTS), tmp_path, 1500, seed=1), 1500)
+
+
+@pytest.mark.parametrize("slow", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_hand_made_cases(slow: bool, tmp_path: Path) -> None:
+    names = [name for name, case in CASES.items() if case.slow == slow]
+    ends = attack(names, tmp_path, len(names))
+    bad = [str(end) for end in ends if end["kind"] not in CASES[end["name"]].ends]
+    assert not bad, "\n".join(bad)
+
+
+def test_every_threat_has_its_test() -> None:
+    text = (ROOT / "SECURITY.md").read_text()
+    named = re.findall(r"`(tests/[\w/]+\.py)(?:::(\w+))?`", text)
+    assert len(named) > 10
+    for file, test in named:
+        source = (ROOT / file).read_text()
+        assert not test or re.search(rf"def {test}\(", source), f"{file}::{test} is not there"

@@ -1,8 +1,6 @@
 """DGCNN against its textbook form on the same graphs."""
 
 import copy
-import importlib.util
-from pathlib import Path
 
 import pytest
 import torch
@@ -11,22 +9,16 @@ from torch import nn
 from qs3.models import DGCNN, pooling
 from qs3.models.ops import knn
 
-PATH = Path(__file__).parents[2] / "benchmarks" / "reference" / "dgcnn.py"
-SPEC = importlib.util.spec_from_file_location("textbook_dgcnn", PATH)
-textbook = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(textbook)
+from .common import randomise
+from .common import textbook as load_textbook
+
+textbook = load_textbook("dgcnn")
 
 
 def make(dtype, neighbours=7, **settings):
     torch.manual_seed(0)
     model = DGCNN(5, neighbours, (16, 16, 24), 32, (16, 8), 0.0, **settings)
-    for layer in model.modules():
-        if isinstance(layer, nn.BatchNorm1d):
-            with torch.no_grad():
-                layer.weight.normal_()  # both signs
-                layer.bias.normal_()
-                layer.running_mean.normal_()
-                layer.running_var.uniform_(0.5, 1.5)
+    randomise(model, most=1.5)
     return model.to(dtype)
 
 
@@ -64,9 +56,9 @@ def compare(model, points, tolerance, gradients=True):
     slow = textbook.from_ours(model).double()
     graphs = graphs_of(model, points)
     ours, theirs = points.clone().requires_grad_(), points.double().requires_grad_()
-    found = results(model, model(ours), ours)
+    result = results(model, model(ours), ours)
     expected = results(slow, slow(theirs, graphs), theirs)
-    close(found["logits"], expected["logits"], tolerance, "logits")
+    close(result["logits"], expected["logits"], tolerance, "logits")
     pairs = textbook.pairs(model, slow)
     for number, (fast, same) in enumerate(pairs):
         for name, value in fast.named_buffers():
@@ -80,7 +72,7 @@ def compare(model, points, tolerance, gradients=True):
                 if reference is not None:  # a bias before a normalisation has a gradient of 0
                     close(value.grad, reference.view_as(value), tolerance, f"{number} {name}")
     if gradients:
-        close(found["points"], expected["points"], tolerance, "points")
+        close(result["points"], expected["points"], tolerance, "points")
 
 
 @pytest.mark.parametrize("train", [True, False])
@@ -115,8 +107,8 @@ def test_pooled_features_are_those_of_the_points():
     model.per_point = False
     lean = model.encode(clouds())
     assert lean.per_point is None
-    for found in (features.pooled, lean.pooled):
-        torch.testing.assert_close(found, both, rtol=0, atol=1e-12)
+    for result in (features.pooled, lean.pooled):
+        torch.testing.assert_close(result, both, rtol=0, atol=1e-12)
     with torch.no_grad():
         torch.testing.assert_close(model.encode(clouds()).pooled, both, rtol=0, atol=1e-12)
 
@@ -139,8 +131,8 @@ def test_half_precision_costs_no_more_than_in_plain_layers():
         total = 0.0
         for seed in range(6):
             exact = gradient(seed, torch.float64, False, True)
-            found = gradient(seed, torch.float32, half, per_point)
-            total += float((found - exact).norm() / exact.norm()) / 6
+            result = gradient(seed, torch.float32, half, per_point)
+            total += float((result - exact).norm() / exact.norm()) / 6
         return total
 
     assert error(False, False) < 1e-5

@@ -1,14 +1,12 @@
 """What a training step keeps for its gradient, ours against the textbook form."""
 
-import importlib.util
-from pathlib import Path
-
 import pytest
 import torch
 
 from qs3.models import create_model
 
-REFERENCE = Path(__file__).parents[2] / "benchmarks" / "reference"
+from .common import textbook
+
 # Share of the textbook's bytes that ours may keep. PointNet spares its widest layer alone.
 SHARES = {
     "dgcnn": 0.25,
@@ -16,15 +14,6 @@ SHARES = {
     "pointnet-sa": 0.5,
     "pointnet2": 0.6,
 }
-
-
-def reference(name):
-    path = REFERENCE / f"{name.replace('-', '_')}.py"
-    path = path if path.is_file() else path.with_stem(name.split("-")[0])
-    spec = importlib.util.spec_from_file_location(f"reference_{path.stem}", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def kept(model, points):
@@ -50,5 +39,5 @@ def test_less_is_kept_than_in_the_textbook_form(name):
     points = torch.randn(2, 256, 3) * 0.4
     model = create_model(name, 10)
     ours = kept(model, points)
-    theirs = kept(reference(name).from_ours(model), points)
+    theirs = kept(textbook(name).from_ours(model), points)
     assert 0 < ours <= SHARES[name] * theirs, ours / theirs

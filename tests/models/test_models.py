@@ -119,11 +119,11 @@ def test_a_cloud_that_is_not_finite_spoils_its_own_scores_alone(name, learns):
     wanted = model(points)
     points[1, 7, 2] = torch.nan
     with torch.set_grad_enabled(learns):
-        found = model(points)
+        result = model(points)
     rest = [0, 2, 3]
-    torch.testing.assert_close(found[rest], wanted[rest])
+    torch.testing.assert_close(result[rest], wanted[rest])
     # Images leave such a point out, as they do points outside.
-    assert found[1].isfinite().all() == name.startswith("simpleview")
+    assert result[1].isfinite().all() == name.startswith("simpleview")
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -187,36 +187,21 @@ def test_weights_of_release_0_1_give_the_scores_of_release_0_1(name, scores):
         ("dgcnn", {"num_classes": 0}, "num_classes must be at least 1"),
         ("dgcnn", {"neighbours": 256}, "neighbours must be 1 to 255, not 256"),
         ("dgcnn", {"neighbours": 2.5}, "field 'neighbours': 2.5 is not a whole number"),
-        ("dgcnn", {"neighbours": True}, "True is not a whole number"),
-        ("dgcnn", {"channels": ()}, "channels must be at least 1"),
-        ("dgcnn", {"hidden": (8, "8")}, r"'hidden\[1\]': '8' is not a whole number"),
         ("pointnet", {"channels": (8, 8)}, "channels must be three or more"),
-        ("pointnet", {"channels": (8, 0, 8)}, "channels must be at least 1"),
         ("pointnet", {"hidden": (8, 0)}, "hidden must be at least 1"),
-        ("pointnet", {"dropout": 2.0}, "dropout must be 0 to 1, not 2.0"),
         ("pointnet", {"dropout": float("nan")}, "dropout must be 0 to 1"),
-        ("pointnet", {"per_point": "yes"}, "'yes' is not true or false"),
         ("pointnet-sa", {"channels": (8, 8, 8)}, "a list of 3, not of 4"),
         ("pointnet-sa", {"radius": 0.0}, "radius must be larger than 0"),
-        ("pointnet-sa", {"neighbours": 256}, "neighbours must be 1 to 255"),
         ("pointnet2", {"centres": (12, 4, 2)}, "need one value for each level"),
-        ("pointnet2", {"ball_order": "random"}, "'random' is none of nearest, first"),
-        ("pointnet2", {"scales": ()}, "need one value for each level"),
         ("pointnet2", {"scales": (((-0.2, 4, (8, 8)),),) * 2}, "radius in scales must be larger"),
         ("pointnet2", {"scales": (((0.2, 256, (8, 8)),),) * 2}, "neighbours in scales must be 1"),
         ("pointnet2", {"scales": (((0.2, 8, (8,)),),) * 2}, "widths must be two or more"),
         ("pointnet2-msg", {"grouping": "ssg"}, "unknown setting 'grouping'.* from centres, scal"),
         ("pointmlp-elite", {"reducers": (2, 2, 2, 0)}, "reducers must be 1 to 255"),
-        ("pointmlp-elite", {"after": (1, 1, 256, 1)}, "after must be 0 to 255"),
-        ("pointmlp-elite", {"reducers": (2, 2)}, "one value for each stage"),
-        ("pointmlp-elite", {"bottleneck": 0.0}, "bottleneck must be larger than 0"),
         ("pointmlp-elite", {"embedding": 1}, "leaves nothing"),
         ("rscnn", {"radii": (float("inf"), 1.0)}, "radii must be larger than 0"),
-        ("rscnn", {"radii": (0.2,)}, "one value for each level"),
         ("rscnn", {"centres": (4, 8)}, "centres must not grow"),
         ("rscnn", {"channels": (8, 2)}, "channels must be at least 4"),
-        ("rscnn", {"coordinates": "polar"}, "'polar' is none of absolute, relative"),
-        ("simpleview", {"width": 0}, "width must be at least 1"),
         ("simpleview", {"resolution": 2000}, "resolution must be 8 to 1024"),
         ("simpleview", {"projection": "flat"}, "'flat' is none of orthographic, perspective"),
     ],
@@ -251,16 +236,6 @@ def test_evaluation_changes_nothing_and_repeats_itself(name):
     assert torch.equal(first, model(clouds()))
     assert all(torch.equal(before[key], value) for key, value in model.state_dict().items())
     assert torch.equal(first, copy.deepcopy(model)(clouds()))
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_training_moves_every_running_statistic(name):
-    model = small(name).train()
-    before = copy.deepcopy(model.state_dict())
-    model(clouds())
-    for key, value in model.state_dict().items():
-        if "running" in key:
-            assert not torch.equal(before[key], value), key
 
 
 def without_dropout(name):
@@ -338,11 +313,10 @@ def test_half_the_bits_give_nearly_the_same_scores(name):
 @pytest.mark.parametrize(
     ("backend", "names"),
     [
-        pytest.param("aot_eager", ["dgcnn"], marks=pytest.mark.slow),
         pytest.param("aot_eager", NAMES, marks=pytest.mark.slow),
         pytest.param("inductor", NAMES, marks=pytest.mark.slow),
     ],
-    ids=["one traced", "all traced", "all compiled"],
+    ids=["traced", "compiled"],
 )
 def test_compiled_networks_give_the_same_scores_and_gradients(backend, names):
     worker = Path(__file__).with_name("compile_worker.py")
@@ -362,9 +336,9 @@ def test_compiled_networks_give_the_same_scores_and_gradients(backend, names):
 def test_a_gpu_gives_the_same_scores_and_gradients(name):
     model = small(name).double().eval()
     twin = copy.deepcopy(model).cuda()
-    here, there = model(clouds().double()), twin(clouds().double().cuda())
-    torch.testing.assert_close(there.cpu(), here, rtol=0, atol=1e-9)
-    here.square().sum().backward()
-    there.square().sum().backward()
+    on_cpu, on_gpu = model(clouds().double()), twin(clouds().double().cuda())
+    torch.testing.assert_close(on_gpu.cpu(), on_cpu, rtol=0, atol=1e-9)
+    on_cpu.square().sum().backward()
+    on_gpu.square().sum().backward()
     for one, two in zip(twin.parameters(), model.parameters(), strict=True):
         torch.testing.assert_close(one.grad.cpu(), two.grad, rtol=1e-9, atol=1e-9)

@@ -59,8 +59,8 @@ def test_a_stage_is_the_papers_row_by_row(offset, train):
     samples = torch.randint(20, (3, 6), generator=generator)
     neighbours = torch.randint(20, (3, 6, 4), generator=generator)
     expected = by_hand(stage, features, samples, neighbours)
-    found = stage(features, samples, neighbours).detach().numpy()
-    np.testing.assert_allclose(found, expected, atol=1e-9)
+    result = stage(features, samples, neighbours).detach().numpy()
+    np.testing.assert_allclose(result, expected, atol=1e-9)
 
 
 def test_each_stage_keeps_the_first_half_of_the_one_before():

@@ -1,6 +1,4 @@
-import importlib.util
 import itertools
-from pathlib import Path
 
 import pytest
 import torch
@@ -9,10 +7,10 @@ from torch import nn
 from qs3.models import PointNet2, create_model
 from qs3.models.ops import farthest_point_sampling
 
-FILE = Path(__file__).parents[2] / "benchmarks" / "reference" / "pointnet2.py"
-SPEC = importlib.util.spec_from_file_location("reference_pointnet2", FILE)
-textbook = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(textbook)
+from .common import randomise
+from .common import textbook as load_textbook
+
+textbook = load_textbook("pointnet2")
 
 SSG = (((0.5, 8, (8, 8, 16)),), ((0.9, 6, (16, 16, 24)),))
 MSG = (
@@ -25,12 +23,7 @@ def make(grouping, dtype):
     torch.manual_seed(0)
     scales = SSG if grouping == "ssg" else MSG
     model = PointNet2(5, grouping, (24, 8), scales, (16, 32), (16, 8), dropout=0.0).to(dtype)
-    for layer in model.modules():
-        if isinstance(layer, nn.BatchNorm1d):  # scales of both signs
-            nn.init.normal_(layer.weight)
-            nn.init.normal_(layer.bias)
-            nn.init.normal_(layer.running_mean)
-            nn.init.uniform_(layer.running_var, 0.5, 2.0)
+    randomise(model)
     return model
 
 
@@ -46,13 +39,13 @@ def clouds(kind, dtype, b=8, n=60):
 
 
 def groups(model, points):
-    found = []
+    result = []
     for level in model.levels:
         chosen = farthest_point_sampling(points, min(level.centres, points.shape[1]))
         centres, balls = level.group(points)
-        found.append((chosen, balls))
+        result.append((chosen, balls))
         points = centres
-    return found
+    return result
 
 
 def error(ours, theirs):
@@ -88,13 +81,13 @@ def test_is_the_textbook_in_double(grouping, train, kind):
 def test_levels_are_the_textbook_in_single_precision(grouping, kind):
     model = make(grouping, torch.float32).train()
     points = clouds(kind, torch.float32, b=16)
-    found = groups(model, points)
+    result = groups(model, points)
     exact = textbook.from_ours(model.double())
     model.float()
-    exact.groups = found
+    exact.groups = result
     known, features = points, None
     expected, at = None, points.double()
-    for level, (chosen, balls), reference in zip(model.levels, found, exact.levels, strict=True):
+    for level, (chosen, balls), reference in zip(model.levels, result, exact.levels, strict=True):
         known, features = level(known, features)
         centres = textbook.pick(at, chosen)
         described = []

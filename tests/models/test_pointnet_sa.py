@@ -1,8 +1,6 @@
 """PointNet with self-adaptive nodes against its textbook form, and the laws of the nodes."""
 
-import importlib.util
 import itertools
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,22 +11,17 @@ from qs3.models import PointNetSA, create_model
 from qs3.models.ops import farthest_point_sampling, gather_points
 from qs3.models.pointnet_sa import SANode, fill_nodes
 
-FILE = Path(__file__).parents[2] / "benchmarks" / "reference" / "pointnet_sa.py"
-SPEC = importlib.util.spec_from_file_location("reference_pointnet_sa", FILE)
-textbook = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(textbook)
+from .common import randomise
+from .common import textbook as load_textbook
+
+textbook = load_textbook("pointnet_sa")
 
 
 def make(dtype=torch.float64, **settings):
     torch.manual_seed(0)
     settings = {"nodes": 10, "neighbours": 7, "radius": 0.5, "node_width": 6} | settings
     model = PointNetSA(5, (8, 12, 16, 24), (16, 8), hidden=(8,), **settings).to(dtype)
-    for layer in model.modules():
-        if isinstance(layer, nn.BatchNorm1d):  # scales of both signs
-            nn.init.normal_(layer.weight)
-            nn.init.normal_(layer.bias)
-            nn.init.normal_(layer.running_mean)
-            nn.init.uniform_(layer.running_var, 0.5, 2.0)
+    randomise(model)
     for transform in (model.input_transform, model.feature_transform):
         nn.init.normal_(transform.regress.layers[-1].weight, std=0.1)
     return model
@@ -47,11 +40,11 @@ def test_scores_gradients_and_statistics_are_those_of_the_textbook(kind, train):
     ours = make().train(train)
     theirs = textbook.from_ours(ours)
     points = clouds(kind)
-    here, there = ours(points), theirs(points)
-    torch.testing.assert_close(here, there, rtol=1e-9, atol=1e-9)
-    weights = torch.randn(here.shape, generator=torch.Generator().manual_seed(2)).double()
-    (here * weights).sum().backward()
-    (there * weights).sum().backward()
+    scores, goal = ours(points), theirs(points)
+    torch.testing.assert_close(scores, goal, rtol=1e-9, atol=1e-9)
+    weights = torch.randn(scores.shape, generator=torch.Generator().manual_seed(2)).double()
+    (scores * weights).sum().backward()
+    (goal * weights).sum().backward()
     pairs = textbook.pairs(ours, theirs)
     assert {id(p) for fast, _ in pairs for p in fast.parameters()} == {
         id(p) for p in ours.parameters()

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from torch import nn
 
 from qs3.models.rscnn import RSCNN
+
+from .common import randomise
 
 SMALL = {
     "centres": (12, 5),
@@ -22,12 +23,7 @@ def make(**settings):
     """A small network whose normalisations have scales of both signs and some history."""
     torch.manual_seed(0)
     model = RSCNN(5, **{**SMALL, **settings}).double()
-    for layer in model.modules():
-        if isinstance(layer, nn.BatchNorm1d):
-            nn.init.normal_(layer.weight)
-            nn.init.normal_(layer.bias)
-            nn.init.normal_(layer.running_mean, std=0.3)
-            nn.init.uniform_(layer.running_var, 0.5, 1.5)
+    randomise(model, 0.3, 1.5)
     return model
 
 

@@ -1,8 +1,5 @@
 """SimpleView: its images against a camera drawn by hand, its network against the textbook form."""
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -11,12 +8,10 @@ from torch import nn
 from qs3.models import SimpleView, create_model
 from qs3.models.simpleview import ResNet18, depth_images
 
-FILE = Path(__file__).parents[2] / "benchmarks" / "reference" / "simpleview.py"
-SPEC = importlib.util.spec_from_file_location("simpleview_reference", FILE)
-assert SPEC is not None
-assert SPEC.loader is not None
-textbook = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(textbook)
+from .common import randomise
+from .common import textbook as load_textbook
+
+textbook = load_textbook("simpleview")
 
 BOTH = ("orthographic", "perspective")
 SIDES = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1.0]])
@@ -128,13 +123,7 @@ def test_points_beyond_the_image_are_not_seen(projection):
 def random_model(seed=0, **settings):
     torch.manual_seed(seed)
     model = SimpleView(5, width=4, resolution=24, dropout=0.0, **settings).double()
-    with torch.no_grad():
-        for layer in model.modules():
-            if isinstance(layer, nn.BatchNorm1d | nn.BatchNorm2d):
-                layer.weight.normal_()
-                layer.bias.normal_()
-                layer.running_mean.normal_(std=0.3)
-                layer.running_var.uniform_(0.5, 2.0)
+    randomise(model, 0.3)
     return model
 
 

@@ -32,13 +32,16 @@ class PointClassifier(nn.Module, ABC):
         Points are [b n 3], z up, in the unit ball. Other layouts are private to the network.
     """
 
+    classify: nn.Module
+    """From the pooled feature to the logits."""
+
     @abstractmethod
     def encode(self, points: Float[Tensor, "b n 3"]) -> Features:
         """Describe each cloud."""
 
-    @abstractmethod
     def head(self, features: Features) -> Float[Tensor, "b k"]:
         """Return the logits of the k classes."""
+        return self.classify(features.pooled)
 
     def forward(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b k"]:
         """Return the logits of each cloud."""
@@ -125,7 +128,21 @@ def normalised(norm: nn.BatchNorm1d, values: Float[Tensor, "*b c"]) -> Float[Ten
     return norm(values.flatten(0, -2)).view_as(values)
 
 
-class PointwiseLayer(nn.Module):
+class LinearNorm(nn.Module):
+    """A linear map without a bias and the batch normalisation of its output.
+
+    Args:
+        channels: Width of the input.
+        width: Width of the output.
+    """
+
+    def __init__(self, channels: int, width: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(channels, width, bias=False)
+        self.norm = nn.BatchNorm1d(width)
+
+
+class PointwiseLayer(LinearNorm):
     """The same linear map at every point, batch normalisation over all points, leaky ReLU.
 
     Args:
@@ -135,9 +152,7 @@ class PointwiseLayer(nn.Module):
     """
 
     def __init__(self, channels: int, width: int, slope: float) -> None:
-        super().__init__()
-        self.linear = nn.Linear(channels, width, bias=False)
-        self.norm = nn.BatchNorm1d(width)
+        super().__init__(channels, width)
         self.slope = slope
 
     def forward(self, points: Float[Tensor, "b n c"]) -> Float[Tensor, "b n d"]:

@@ -7,7 +7,13 @@ from jaxtyping import Float, Float64, Int
 from torch import Tensor, nn
 
 from qs3.models.checks import check_range
-from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
+from qs3.models.classifier import (
+    ClassifierHead,
+    Features,
+    LinearNorm,
+    PointClassifier,
+    PointwiseLayer,
+)
 from qs3.models.normalisation import update_running, uses_batch
 from qs3.models.ops import flat_indices, knn, neighbour_max, neighbour_sum
 from qs3.models.pooling import pooled_layer
@@ -17,7 +23,7 @@ _FEW = 16
 """Channels up to which moments are taken in double precision."""
 
 
-class EdgeConv(nn.Module):
+class EdgeConv(LinearNorm):
     """EdgeConv with batch normalisation and the maximum over neighbours (Wang et al., §3.1).
 
     The function is that of the textbook: for every edge from point i to neighbour j,
@@ -37,20 +43,12 @@ class EdgeConv(nn.Module):
     """
 
     def __init__(self, channels: int, width: int) -> None:
-        super().__init__()
-        self.linear = nn.Linear(2 * channels, width, bias=False)
-        # Holds scale, shift and running statistics; applied to edges below.
-        self.norm = nn.BatchNorm1d(width)
+        super().__init__(2 * channels, width)
 
     def forward(
         self, points: Float[Tensor, "b n c"], neighbours: Int[Tensor, "b n k"]
     ) -> Float[Tensor, "b n d"]:
-        """Return the new features of each point.
-
-        Args:
-            points: Features of each point.
-            neighbours: Indices within the own cloud.
-        """
+        """Return the new features of each point; neighbours are counted within the own cloud."""
         with torch.autocast(points.device.type, enabled=False):
             dtype = self.linear.weight.dtype
             return self._convolve(points.to(dtype), neighbours)
@@ -100,14 +98,8 @@ def edge_covariance(
     The variance of a channel that looks at x_j − x_i alone is a small difference of its entries. In
     positions, where neighbours of a dense cloud lie close, single precision would leave three right
     digits of it; their products are therefore double too. Features of later layers lie further
-    apart, and their products would cost too much.
-
-    Args:
-        points: Features of each point.
-        neighbours: Indices within the own cloud.
-        share: Share of the edges that end in each point; sums to 1.
-        neighbour_mean: Mean of x_j over the edges.
-        own_mean: Mean of x_i over the edges.
+    apart, and their products would cost too much. ``share`` is that of the edges that end in each
+    point; the means are those of x_j and x_i over the edges.
     """
     if points.shape[2] <= _FEW:
         points, share = points.double(), share.double()
@@ -169,20 +161,13 @@ class DGCNN(PointClassifier):
     def encode(self, points: Float[Tensor, "b n 3"]) -> Features:
         """Describe each cloud by the maximum and the mean over its points."""
         k = min(self.neighbours, points.shape[1])
-        levels = []
-        features = points
+        levels = [points]
         for convolution in self.convolutions:
-            features = convolution(features, knn(features, k))
-            levels.append(features)
-        local = torch.cat(levels, dim=2)
-        if self.per_point:
-            per_point = self.embed(local)
-            parts = (per_point.amax(dim=1), per_point.mean(dim=1))
-        else:
-            per_point = None
+            levels.append(convolution(levels[-1], knn(levels[-1], k)))
+        local = torch.cat(levels[1:], dim=2)
+        per_point = self.embed(local) if self.per_point else None
+        if per_point is None:
             parts = pooled_layer(self.embed, local)
+        else:
+            parts = (per_point.amax(dim=1), per_point.mean(dim=1))
         return Features(pooled=torch.cat(parts, dim=1), per_point=per_point, local=local)
-
-    def head(self, features: Features) -> Float[Tensor, "b k"]:
-        """Return the logits."""
-        return self.classify(features.pooled)

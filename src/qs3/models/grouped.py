@@ -55,14 +55,7 @@ class GroupedMLP(nn.Module):
         centres: Float[Tensor, "b m 3"],
         index: Int[Tensor, "b m k"],
     ) -> Float[Tensor, "b m d"]:
-        """Describe each group.
-
-        Args:
-            points: Positions.
-            features: What is known of each point; None where that is its position alone.
-            centres: Centres of the groups.
-            index: Points of each group, counted within the own cloud; k at most 255.
-        """
+        """Describe each group; ``index`` counts within the own cloud, k is at most 255."""
         b, m, k = index.shape
         if k > 255:
             raise ValueError(f"at most 255 neighbours, not {k}")

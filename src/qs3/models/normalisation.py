@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.errors import InputError
+from qs3.models.classifier import LinearNorm
 
 
 class Moments(NamedTuple):
@@ -96,47 +97,27 @@ def update_running(
 ) -> None:
     """Move the running statistics, where there are any, as batch normalisation does.
 
-    Without a momentum they are the plain mean over all batches so far.
-
-    Args:
-        norm: The layer.
-        mean: Mean of its input.
-        variance: Biased variance of its input.
-        count: Number of values that both are taken over.
+    Without a momentum they are the plain mean over all batches so far. ``count`` is the number of
+    values that the mean and the biased variance are taken over.
     """
     running_mean, running_variance = norm.running_mean, norm.running_var
     # A layer without running statistics keeps none; one in evaluation keeps those it has.
     moves = norm.training and norm.track_running_stats
     if not moves or running_mean is None or running_variance is None:
         return
+    assert norm.num_batches_tracked is not None  # noqa: S101
+    norm.num_batches_tracked.add_(1)
     momentum = norm.momentum
-    if norm.num_batches_tracked is not None:
-        norm.num_batches_tracked.add_(1)
-        if momentum is None:
-            momentum = norm.num_batches_tracked.to(running_mean.dtype).reciprocal()
-    running_mean.lerp_(mean.to(running_mean), 0.0 if momentum is None else momentum)
+    if momentum is None:
+        momentum = norm.num_batches_tracked.to(running_mean.dtype).reciprocal()
+    running_mean.lerp_(mean.to(running_mean), momentum)
     unbiased = variance * (count / max(count - 1, 1))
-    running_variance.lerp_(unbiased.to(running_variance), 0.0 if momentum is None else momentum)
+    running_variance.lerp_(unbiased.to(running_variance), momentum)
 
 
-class FoldedLayer(nn.Module):
-    """A linear map and batch normalisation that are applied as one linear map.
-
-    Args:
-        channels: Width of the input.
-        width: Width of the output.
-    """
-
-    def __init__(self, channels: int, width: int) -> None:
-        super().__init__()
-        self.linear = nn.Linear(channels, width, bias=False)
-        # Holds scale, shift and running statistics.
-        self.norm = nn.BatchNorm1d(width)
+class FoldedLayer(LinearNorm):
+    """A linear map and batch normalisation that are applied as one linear map."""
 
     def fold(self, moments: Moments | None) -> tuple[Float[Tensor, "d c"], Float[Tensor, "d"]]:
-        """Return the weight and the shift of the normalised map.
-
-        Args:
-            moments: Those of the input; needed in training.
-        """
+        """Return weight and shift of the normalised map; see `fold_norm`."""
         return fold_norm(self.norm, self.linear.weight, moments)

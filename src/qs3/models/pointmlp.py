@@ -64,8 +64,8 @@ class Stage(nn.Module):
         self.scale = nn.Parameter(torch.ones(channels))
         self.transfer = nn.Linear(2 * channels, width, bias=False)
         self.transfer_norm = nn.BatchNorm1d(width)
-        self.before = nn.ModuleList(ResidualBlock(width, hidden) for _ in range(before))
-        self.after = nn.ModuleList(ResidualBlock(width, hidden) for _ in range(after))
+        self.before = nn.Sequential(*(ResidualBlock(width, hidden) for _ in range(before)))
+        self.after = nn.Sequential(*(ResidualBlock(width, hidden) for _ in range(after)))
 
     def forward(
         self,
@@ -73,24 +73,13 @@ class Stage(nn.Module):
         samples: Int[Tensor, "b m"],
         neighbours: Int[Tensor, "b m k"],
     ) -> Float[Tensor, "b m d"]:
-        """Return the features of the centres.
-
-        Args:
-            features: Features of the points.
-            samples: Indices of the centres.
-            neighbours: Indices of the points around each.
-        """
+        """Return the features of the centres, given by index as are the points around them."""
         centre = gather_points(features, samples)[:, :, None]
         difference = gather_points(features, neighbours) - centre
         scaled = self.scale * difference * _inverse_deviation(difference, features)
         pair = torch.cat([scaled, centre.expand_as(scaled)], dim=3)
         values = normalised(self.transfer_norm, self.transfer(pair)).relu_()
-        for block in self.before:
-            values = block(values)
-        values = values.amax(dim=2)
-        for block in self.after:
-            values = block(values)
-        return values
+        return self.after(self.before(values).amax(dim=2))
 
 
 def _inverse_deviation(
@@ -193,7 +182,3 @@ class PointMLPElite(PointClassifier):
             for stage, group in zip(self.stages, self.group(points), strict=True):
                 features = stage(features, *group)
         return Features(pooled=features.amax(dim=1))
-
-    def head(self, features: Features) -> Float[Tensor, "b k"]:
-        """Return the logits."""
-        return self.classify(features.pooled)

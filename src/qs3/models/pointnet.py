@@ -241,7 +241,3 @@ class PointNet(PointClassifier):
             return Features(pooled=self.pool(late), local=local)
         per_point = self.pool.each(late)
         return Features(pooled=per_point.amax(dim=1), per_point=per_point, local=local)
-
-    def head(self, features: Features) -> Float[Tensor, "b k"]:
-        """Return the logits."""
-        return self.classify(features.pooled)

@@ -161,7 +161,3 @@ class PointNet2(PointClassifier):
         pooled = self.embed(torch.cat([centres, features], dim=2)).amax(dim=1)
         local = three_nn_interpolate(points, centres, features) if self.per_point else None
         return Features(pooled=pooled, local=local)
-
-    def head(self, features: Features) -> Float[Tensor, "b k"]:
-        """Return the logits."""
-        return self.classify(features.pooled)

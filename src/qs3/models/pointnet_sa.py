@@ -191,7 +191,3 @@ class PointNetSA(PointClassifier):
             local=local,
             nodes=fill_nodes(nodes.features, self.sa_node.nodes),
         )
-
-    def head(self, features: Features) -> Float[Tensor, "b k"]:
-        """Return the logits."""
-        return self.classify(features.pooled)

@@ -40,13 +40,7 @@ def pooled_layer(
         points, weight = points.to(half), weight.to(half)
     with torch.autocast(kind, enabled=False):
         largest, average, mean, variance = _Pooled.apply(
-            points,
-            weight,
-            norm.weight,
-            norm.bias,
-            running,
-            norm.eps,
-            layer.slope,
+            points, weight, norm.weight, norm.bias, running, norm.eps, layer.slope
         )
         if batch:
             update_running(norm, mean, variance, points.shape[0] * points.shape[1])

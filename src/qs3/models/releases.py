@@ -55,6 +55,16 @@ def _widths(tensors: Mapping[str, Tensor], names: Sequence[str]) -> tuple[int, .
     return tuple(len(tensors[f"{name}.weight"]) for name in names)
 
 
+def _head(*names: str, norms: tuple[str, str], biases: bool) -> Iterator[_Tensor]:
+    """Three linear layers, the first two normalised; with biases before that, or without."""
+    for layer, (theirs, norm) in enumerate(zip(names, (*norms, ""), strict=True)):
+        ours, after = f"classify.layers.{4 * layer}", f"classify.layers.{4 * layer + 1}"
+        if norm:
+            yield from _norm(after, norm)
+        absorbs = after if layer == 0 and biases else ""
+        yield from _linear(ours, theirs, bias=layer > 0, norm=absorbs)
+
+
 def _dgcnn() -> Iterator[_Tensor]:
     for level in range(4):
         theirs = f"conv{level + 1}"
@@ -62,11 +72,7 @@ def _dgcnn() -> Iterator[_Tensor]:
         yield from _norm(f"convolutions.{level}.norm", f"{theirs}.1", f"bn{level + 1}")
     yield from _linear("embed.linear", "conv5.0", 3, bias=False)
     yield from _norm("embed.norm", "conv5.1", "bn5")
-    yield from _linear("classify.layers.0", "linear1", bias=False)
-    yield from _norm("classify.layers.1", "bn6")
-    yield from _linear("classify.layers.4", "linear2")
-    yield from _norm("classify.layers.5", "bn7")
-    yield from _linear("classify.layers.8", "linear3")
+    yield from _head("linear1", "linear2", "linear3", norms=("bn6", "bn7"), biases=False)
 
 
 def _dgcnn_settings(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
@@ -79,38 +85,30 @@ def _dgcnn_settings(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
 
 
 def _pointnet2(multi: bool) -> Iterator[_Tensor]:
-    for level, scale in itertools.product(range(2), range(3 if multi else 1)):
-        ours = f"levels.{level}.scales.{scale}.layers"
-        kinds = ("conv_blocks", "bn_blocks") if multi else ("mlp_convs", "mlp_bns")
-        block = f".{scale}" if multi else ""
-        for depth in range(3):
-            convolution, theirs = (f"sa{level + 1}.{kind}{block}.{depth}" for kind in kinds)
-            norm = f"{ours}.{depth}.norm"
-            yield from _norm(norm, theirs)
-            yield from _linear(
-                f"{ours}.{depth}.linear", convolution, 4, norm=f"{ours}.{depth}.norm"
-            )
-    for depth in range(3):
-        ours = f"embed.{depth}"
-        yield from _norm(f"{ours}.norm", f"sa3.mlp_bns.{depth}")
-        yield from _linear(f"{ours}.linear", f"sa3.mlp_convs.{depth}", 4, norm=f"{ours}.norm")
-    yield from _norm("classify.layers.1", "bn1")
-    yield from _linear("classify.layers.0", "fc1", norm="classify.layers.1")
-    yield from _norm("classify.layers.5", "bn2")
-    yield from _linear("classify.layers.4", "fc2")
-    yield from _linear("classify.layers.8", "fc3")
+    kinds = ("conv_blocks", "bn_blocks") if multi else ("mlp_convs", "mlp_bns")
+    places = [
+        (f"levels.{level}.scales.{scale}.layers", f"sa{level + 1}", kinds, f"{scale}." * multi)
+        for level, scale in itertools.product(range(2), range(3 if multi else 1))
+    ]
+    places.append(("embed", "sa3", ("mlp_convs", "mlp_bns"), ""))
+    for (ours, theirs, (convolution, norm), block), depth in itertools.product(places, range(3)):
+        layer, place = f"{ours}.{depth}", f"{block}{depth}"
+        yield from _norm(f"{layer}.norm", f"{theirs}.{norm}.{place}")
+        yield from _linear(
+            f"{layer}.linear", f"{theirs}.{convolution}.{place}", 4, norm=f"{layer}.norm"
+        )
+    yield from _head("fc1", "fc2", "fc3", norms=("bn1", "bn2"), biases=True)
 
 
 def _pointnet2_settings(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
     return {"num_classes": len(tensors["fc3.weight"])}
 
 
+_FIRST = {"ball_order": "first"}
 _RELEASES = {
     "dgcnn": _Release(tuple(_dgcnn()), _dgcnn_settings),
-    "pointnet2": _Release(tuple(_pointnet2(False)), _pointnet2_settings, {"ball_order": "first"}),
-    "pointnet2-msg": _Release(
-        tuple(_pointnet2(True)), _pointnet2_settings, {"ball_order": "first"}
-    ),
+    "pointnet2": _Release(tuple(_pointnet2(False)), _pointnet2_settings, _FIRST),
+    "pointnet2-msg": _Release(tuple(_pointnet2(True)), _pointnet2_settings, _FIRST),
 }
 
 
@@ -200,13 +198,11 @@ def _under_first_names(
     name: str, weights: Mapping[str, Tensor], tensors: Sequence[_Tensor]
 ) -> dict[str, Tensor]:
     """Return each tensor under its first name; refuse what is too many, too few or odd."""
-    names = [key for tensor in tensors for key in tensor.theirs]
+    names = {key for tensor in tensors for key in tensor.theirs}
+    odd = {"missing": names - set(weights), "unknown": set(weights) - names}
     faults = [
         f"{len(keys)} {what}, such as {', '.join(sorted(keys)[:3])}"
-        for what, keys in (
-            ("missing", set(names) - set(weights)),
-            ("unknown", set(weights) - set(names)),
-        )
+        for what, keys in odd.items()
         if keys
     ]
     if faults:

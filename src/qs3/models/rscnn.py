@@ -133,9 +133,7 @@ class RSCNN(PointClassifier):
             check_range(name, values, 4 if name == "channels" else 1)
         check_positive("radii", radii)
         if {len(values) for values in levels.values()} != {len(radii)}:
-            raise InputError(
-                "centres, radii, neighbours and channels need one value for each level"
-            )
+            raise InputError(f"radii, {', '.join(levels)} need one value for each level")
         if list(centres) != sorted(centres, reverse=True):
             raise InputError(f"centres must not grow, not {centres}")
         check_range("embedding", embedding)
@@ -143,9 +141,7 @@ class RSCNN(PointClassifier):
         self.ball_order: BallOrder = ball_order
         self.relative = coordinates == "relative"
         widths = (0, *channels[:-1])
-        self.convolutions = nn.ModuleList(
-            RSConv(c, d) for c, d in zip(widths, channels, strict=True)
-        )
+        self.convolutions = nn.ModuleList(map(RSConv, widths, channels))
         self.embed = nn.Linear(channels[-1] + 3, embedding, bias=False)
         self.embed_norm = nn.BatchNorm1d(embedding)
         self.classify = ClassifierHead(embedding, hidden, num_classes, dropout, 0.0)
@@ -156,11 +152,9 @@ class RSCNN(PointClassifier):
         groups = []
         counts = [min(count, points.shape[1]) for count in self.centres]
         levels = zip(nested_samples(points, counts), self.radii, self.neighbours, strict=True)
-        for samples, radius, k in levels:
-            centres = gather_points(points, samples)
-            around = ball_query(
-                points, centres, radius, min(k + 1, points.shape[1]), self.ball_order
-            )
+        for samples, radius, neighbours in levels:
+            centres, k = gather_points(points, samples), min(neighbours + 1, points.shape[1])
+            around = ball_query(points, centres, radius, k, self.ball_order)
             if self.ball_order == "first":
                 around = _with_centre(around, samples)
             groups.append((samples, around))
@@ -179,10 +173,6 @@ class RSCNN(PointClassifier):
         assert features is not None  # noqa: S101
         embedded = self.embed(torch.cat([points, features], dim=2))
         return Features(pooled=normalised(self.embed_norm, embedded).amax(dim=1).relu())
-
-    def head(self, features: Features) -> Float[Tensor, "b k"]:
-        """Return the logits."""
-        return self.classify(features.pooled)
 
 
 def _with_centre(around: Int[Tensor, "b m k"], samples: Int[Tensor, "b m"]) -> Int[Tensor, "b m k"]:

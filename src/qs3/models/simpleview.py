@@ -20,14 +20,14 @@ _NEAR = 0.01
 _FIXED = 2.0**40
 """Inverse depths are summed as integers of this unit, whose sum has no order."""
 _VIEWS = (
-    ("+x", (1, 1), (2, -1), (0, -1)),
-    ("+y", (0, -1), (2, -1), (1, -1)),
-    ("-x", (1, -1), (2, -1), (0, 1)),
-    ("-y", (0, 1), (2, -1), (1, 1)),
-    ("+z", (0, 1), (1, -1), (2, -1)),
-    ("-z", (0, 1), (1, 1), (2, 1)),
+    ((1, 1), (2, -1), (0, -1)),
+    ((0, -1), (2, -1), (1, -1)),
+    ((1, -1), (2, -1), (0, 1)),
+    ((0, 1), (2, -1), (1, 1)),
+    ((0, 1), (1, -1), (2, -1)),
+    ((0, 1), (1, 1), (2, 1)),
 )
-"""Where each camera stands, and its right, down and forward as (world axis, sign)."""
+"""Right, down and forward of the cameras at +x, +y, −x, −y, +z, −z as (world axis, sign)."""
 
 
 @torch.no_grad()
@@ -66,8 +66,7 @@ def depth_images(
     """
     points = in_single_precision(points)
     b = points.shape[0]
-    axes = torch.tensor([[a for a, _ in view[1:]] for view in _VIEWS], device=points.device)
-    signs = torch.tensor([[s for _, s in view[1:]] for view in _VIEWS], device=points.device)
+    axes, signs = torch.tensor(_VIEWS, device=points.device).unbind(dim=2)
     right, down, forward = (points[:, :, axes] * signs).unbind(dim=3)
     depth = forward + _DISTANCE
     if projection == "perspective":

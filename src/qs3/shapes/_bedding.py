@@ -1,11 +1,22 @@
 """What beds share: sizes, mattress with pillows and blanket, headboards."""
 
-from itertools import pairwise
+from itertools import product
 
 import numpy as np
 
 from qs3.shapes._dice import Dice
-from qs3.shapes._solids import Number, Solid, Span, around, block, cushion, pillow, ribbon, within
+from qs3.shapes._solids import (
+    Number,
+    Solid,
+    Span,
+    around,
+    block,
+    cushion,
+    pillow,
+    ribbon,
+    split,
+    within,
+)
 
 
 def bed_size(dice: Dice) -> tuple[float, float]:
@@ -21,45 +32,31 @@ def bedding(dice: Dice, x: Span, y: Span, z: Number, thick: Number) -> list[Soli
     width = x[1] - x[0]
     count = 1 if width < 1.15 else 2
     if dice.chance(0.9):
-        for row in range(dice.pick(1, 1, 2)):
-            for i in range(count):
-                cx = x[0] + width * (i + 0.5) / count
-                half, deep = dice.between(0.3, 0.42) * width / count, dice.between(0.16, 0.24)
-                rise = dice.between(0.08, 0.16)
-                if dice.chance(0.3):
-                    pad = cushion(dice, (-half, half), (-deep, deep), (0, rise), 0.05, 0.01)
-                else:
-                    pad = pillow((-half, half), (-deep, deep), (0, rise))
-                lean = dice.between(0, 12) + (25 if row else 0)
-                pad = pad.turn("x", lean)
-                parts.append(
-                    pad.move(
-                        cx, y[1] - deep - 0.05 - 0.16 * row, top - pad.vertices[:, 2].min() - 0.025
-                    )
-                )
+        for row, i in product(range(dice.pick(1, 1, 2)), range(count)):
+            cx = x[0] + width * (i + 0.5) / count
+            half, deep = dice.between(0.3, 0.42) * width / count, dice.between(0.16, 0.24)
+            box = ((-half, half), (-deep, deep), (0, dice.between(0.08, 0.16)))
+            pad = cushion(dice, *box, 0.05, 0.01) if dice.chance(0.3) else pillow(*box)
+            pad = pad.turn("x", dice.between(0, 12) + (25 if row else 0))
+            low = pad.vertices[:, 2].min()
+            parts.append(pad.move(cx, y[1] - deep - 0.05 - 0.16 * row, top - low - 0.025))
     if dice.chance(0.65):
         over = dice.between(0.01, 0.03)
         cover = (y[0] - over, y[0] + dice.between(0.3, 0.75) * (y[1] - y[0]))
-        drop = top - dice.between(0.4, 1.1) * thick
-        blanket = cushion(
-            dice, within(x, -over), cover, (drop, top + dice.between(0.02, 0.05)), 0.03
-        )
-        parts.append(blanket)
+        heights = (top - dice.between(0.4, 1.1) * thick, top + dice.between(0.02, 0.05))
+        parts.append(cushion(dice, within(x, -over), cover, heights, 0.03))
     return parts
 
 
 def headboard(dice: Dice, x: Span, y: Number, z: Span, thick: Number) -> list[Solid]:
+    """Board at the head or foot of a bed, from ``y`` to the rear."""
     style = dice.pick("board", "board", "padded", "slats", "posts", "arch")
     low, high = z
     if style == "board":
         return [block(x, (y, y + thick), z)]
     if style == "padded":
-        count = dice.pick(1, 2, 3, 5)
-        edges = np.linspace(*x, count + 1)
-        return [
-            cushion(dice, (float(a) - 0.002, float(b) + 0.002), (y, y + 2 * thick), z, 0.03)
-            for a, b in pairwise(edges)
-        ]
+        run = (y, y + 2 * thick)
+        return [cushion(dice, a, run, z, 0.03) for a in split(x, dice.pick(1, 2, 3, 5), -0.004)]
     if style == "arch":
         u = np.linspace(0, 1, 9)
         path = np.stack([np.zeros(9), np.full(9, y + thick / 2), low + (high - low) * u], axis=1)
@@ -74,8 +71,8 @@ def headboard(dice: Dice, x: Span, y: Number, z: Span, thick: Number) -> list[So
     if style == "posts":
         return [*parts, block(x, around(mid, thick / 3), (low, high - 0.03))]
     rail = dice.between(0.06, 0.12)
-    parts.append(block(x, around(mid, thick / 2), (high - rail, high)))
-    parts.append(block(x, around(mid, thick / 2), (low, low + rail)))
+    for heights in ((high - rail, high), (low, low + rail)):
+        parts.append(block(x, around(mid, thick / 2), heights))
     for px in np.linspace(x[0] + 0.12, x[1] - 0.12, dice.count(3, 9)):
         parts.append(block(around(px, 0.015), (y - 0.002, mid + 0.01), (low, high - rail / 2)))
     return parts

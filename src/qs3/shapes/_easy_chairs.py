@@ -10,6 +10,7 @@ from qs3.shapes._solids import (
     at_height,
     beam,
     block,
+    centred,
     cushion,
     loft,
     outline,
@@ -30,22 +31,18 @@ def wing(dice: Dice) -> list[Solid]:
     width, depth = dice.between(0.68, 0.84), dice.between(0.66, 0.82)
     seat, high, arm = dice.between(0.4, 0.48), dice.between(0.95, 1.18), dice.between(0.55, 0.66)
     thick, foot = dice.between(0.09, 0.14), dice.between(0.08, 0.2)
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
-    run = (y[0], y[1] - thick + 0.02)
+    x, y = centred(width), centred(depth)
+    inner, run = (x[0] + thick - 0.02, x[1] - thick + 0.02), (y[0], y[1] - thick + 0.02)
     parts = [
         cushion(dice, within(x, 0.03), (y[0] + 0.03, y[1]), (foot, seat - 0.08), 0.03),
-        cushion(
-            dice, (x[0] + thick - 0.02, x[1] - thick + 0.02), run, (seat - 0.1, seat), 0.04, 0.02
-        ),
+        cushion(dice, inner, run, (seat - 0.1, seat), 0.04, 0.02),
+        cushion(dice, within(x, thick / 2), (y[1] - thick, y[1]), (foot, high), 0.05),
     ]
-    parts.append(cushion(dice, within(x, thick / 2), (y[1] - thick, y[1]), (foot, high), 0.05))
-    reach = dice.between(0.16, 0.3)
-    for s in (-1, 1):
-        side = sorted((s * (width / 2 - thick), s * width / 2))
-        span = (side[0], side[1])
-        parts.append(cushion(dice, span, (y[0] + 0.04, y[1] - 0.02), (foot, arm), 0.04))
+    reach, rear = dice.between(0.16, 0.3), y[1] - 0.02
+    for span in ((x[0], x[0] + thick), (x[1] - thick, x[1])):
+        parts.append(cushion(dice, span, (y[0] + 0.04, rear), (foot, arm), 0.04))
         z = (arm - 0.06, high - dice.between(0.02, 0.12))
-        parts.append(cushion(dice, span, (y[1] - reach, y[1] - 0.02), z, 0.045))
+        parts.append(cushion(dice, span, (y[1] - reach, rear), z, 0.045))
     return parts + legs(dice, corners(x, y, 0.07), foot + 0.01, dice.between(0.04, 0.06))
 
 
@@ -66,30 +63,22 @@ def lounge(dice: Dice) -> list[Solid]:
     width, depth, seat = dice.between(0.6, 0.76), dice.between(0.6, 0.75), dice.between(0.34, 0.42)
     arm, bar = dice.between(0.54, 0.64), dice.between(0.025, 0.05) * dice.bulk**0.5
     slope, lean = dice.between(3, 12), dice.between(14, 30)
+    x, y = centred(width), centred(depth)
+    front, rear = within(y, bar / 2)
     parts = []
-    for s in (-1, 1):
-        x = s * (width / 2 - bar / 2)
-        front, rear = -depth / 2 + bar / 2, depth / 2 - bar / 2
-        parts += [
-            beam((x, front, 0), (x, front, arm), bar, bar),
-            beam((x, rear, 0), (x, rear, arm), bar, bar),
-            block(around(x, bar), (front - bar, rear + bar), (arm - 0.01, arm + 0.02)),
-            beam((x, front, seat - 0.1), (x, rear, seat - 0.12), bar, bar),
-        ]
-    inner, base = width / 2 - bar * 0.6, seat - 0.11
+    for px in within(x, bar / 2):
+        parts += [beam((px, py, 0), (px, py, arm), bar, bar) for py in (front, rear)]
+        parts.append(block(around(px, bar), (front - bar, rear + bar), (arm - 0.01, arm + 0.02)))
+        parts.append(beam((px, front, seat - 0.1), (px, rear, seat - 0.12), bar, bar))
+    inner, base, end = within(x, bar * 0.6), seat - 0.11, y[1] - 0.05
     pad = dice.between(0.08, 0.14)
-    seat_pad = cushion(
-        dice, (-inner, inner), (-depth / 2, depth / 2 - 0.05), (base, base + pad), 0.03, 0.01
-    )
+    seat_pad = cushion(dice, inner, (y[0], end), (base, base + pad), 0.03, 0.01)
     z = (base, base + dice.between(0.5, 0.7))
-    back = cushion(dice, (-inner, inner), (depth / 2 - 0.05 - pad, depth / 2 - 0.05), z, 0.035)
-    pivot = (0.0, depth / 2 - 0.05, base)
+    back = cushion(dice, inner, (end - pad, end), z, 0.035)
+    pivot = (0.0, end, base)
     parts += [seat_pad.turn("x", -slope, pivot), back.turn("x", -lean, pivot)]
-    heights = (base - 0.02, base + 0.04)
-    parts.append(
-        block((-inner - 0.01, inner + 0.01), (depth / 2 - 0.09, depth / 2 - 0.03), heights)
-    )
-    return parts
+    run, heights = (y[1] - 0.09, y[1] - 0.03), (base - 0.02, base + 0.04)
+    return [*parts, block(within(inner, -0.01), run, heights)]
 
 
 def tub(dice: Dice) -> list[Solid]:
@@ -103,31 +92,17 @@ def tub(dice: Dice) -> list[Solid]:
     e = dice.between(2.0, 4.0)
     reach = (np.abs(np.cos(angle)) ** e + np.abs(np.sin(angle)) ** e) ** (-1 / e)
     rim = np.interp(np.sin(angle), [-0.3, 1.0], [arm, high])
-    levels = np.linspace(0, 1, 4)[:, None]
-    grid = np.stack(
-        [
-            (width - wall) / 2 * (reach * np.cos(angle))[None] * np.ones_like(levels),
-            (depth - wall) / 2 * (reach * np.sin(angle))[None] * np.ones_like(levels),
-            foot + levels * (rim - foot)[None],
-        ],
-        axis=2,
-    )
-    parts = [sheet(grid.swapaxes(0, 1), wall)]
+    x = (width - wall) / 2 * (reach * np.cos(angle))
+    y = (depth - wall) / 2 * (reach * np.sin(angle))
+    columns = [np.stack([x, y, foot + t * (rim - foot)], axis=1) for t in np.linspace(0, 1, 4)]
     plan = outline(width - wall, depth - wall, 24, e)
-    rings = [
-        at_height(plan * s, z)
-        for s, z in ((0.97, foot), (1, foot + 0.03), (1, seat - 0.03), (0.93, seat))
+    levels = ((0.97, foot), (1, foot + 0.03), (1, seat - 0.03), (0.93, seat))
+    parts = [
+        sheet(np.stack(columns, axis=1), wall),
+        loft(np.stack([at_height(plan * share, z) for share, z in levels])),
     ]
-    parts.append(loft(np.stack(rings)))
     if dice.chance(0.3):
-        parts.append(
-            pillow((-0.2, 0.2), (-0.07, 0.07), (-0.18, 0.18)).move(
-                0, depth / 2 - wall - 0.05, seat + 0.16
-            )
-        )
-    return parts + legs(
-        dice,
-        corners((-0.3 * width, 0.3 * width), (-0.3 * depth, 0.3 * depth), 0.0),
-        foot + 0.01,
-        0.04,
-    )
+        pad = pillow((-0.2, 0.2), (-0.07, 0.07), (-0.18, 0.18))
+        parts.append(pad.move(0, depth / 2 - wall - 0.05, seat + 0.16))
+    spots = corners(around(0, 0.3 * width), around(0, 0.3 * depth), 0.0)
+    return parts + legs(dice, spots, foot + 0.01, 0.04)

@@ -1,7 +1,8 @@
 """Closed solids from which furniture is put together; lengths in metres, z up."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -117,9 +118,20 @@ def around(middle: Number, half: Number) -> Span:
     return (middle - half, middle + half)
 
 
+def centred(length: Number) -> Span:
+    """Span of this length about 0."""
+    return (-length / 2, length / 2)
+
+
 def within(span: Span, by: Number) -> Span:
     """Take ``by`` off both ends of a span; a negative one makes it longer."""
     return (span[0] + by, span[1] - by)
+
+
+def split(span: Span, count: int, gap: Number = 0.0) -> list[Span]:
+    """Cut a span into equal ones, each shorter by ``gap``."""
+    edges = np.linspace(*span, count + 1)
+    return [(a + gap / 2, b - gap / 2) for a, b in pairwise(edges)]
 
 
 def slab(polygon: Float[np.ndarray, "n 2"], z: Span) -> Solid:
@@ -131,6 +143,42 @@ def block(x: Span, y: Span, z: Span) -> Solid:
     """Box along the axes."""
     corners = np.array([(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])], dtype=float)
     return slab(corners, z)
+
+
+def posts(xs: Iterable[Number], ys: Iterable[Number], half: Number, z: Span) -> list[Solid]:
+    """Upright boxes 2 ``half`` wide over every crossing of ``xs`` and ``ys``."""
+    return [block(around(x, half), around(y, half), z) for x in xs for y in ys]
+
+
+def flanks(x: Span, y: Span, z: Span, board: Number) -> list[Solid]:
+    """Two upright boards at the ends of ``x``, inside it."""
+    return [block(a, y, z) for a in ((x[0], x[0] + board), (x[1] - board, x[1]))]
+
+
+def frame(
+    x: Span, y: Span, z: Span, hole: tuple[Span, Span], run: Span, hair: Number = 0.0
+) -> list[Solid]:
+    """Four boards around a hole in x and z; those above and below reach over ``run``.
+
+    These two fall short of the heights ``z`` by a ``hair``.
+    """
+    (left, right), (low, top) = hole
+    return [
+        block((x[0], left), y, z),
+        block((right, x[1]), y, z),
+        block(run, y, (z[0] + hair, low)),
+        block(run, y, (top, z[1] - hair)),
+    ]
+
+
+def frustum(half: Span, middle: Number, ends: Sequence[Span], squeeze: Number = 1.0) -> Solid:
+    """Tapering box along y; ``half`` is in x and z, ``ends`` are (share of it, y)."""
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half
+    rings = [
+        np.stack([s * corners[:, 0], np.full(4, y), middle + s * corners[:, 1] * squeeze], axis=1)
+        for s, y in ends
+    ]
+    return loft(np.stack(rings))
 
 
 def cushion(
@@ -177,13 +225,20 @@ def pillow(x: Span, y: Span, z: Span, sides: int = 8) -> Solid:
     return loft(rings * half + middle, cap="zip")
 
 
-def lathe(profile: Sequence[Span], sides: int = 16, x: Number = 0.0, y: Number = 0.0) -> Solid:
+def lathe(
+    profile: Sequence[Span],
+    sides: int = 16,
+    x: Number = 0.0,
+    y: Number = 0.0,
+    cyclic: bool = False,
+) -> Solid:
     """Turn a profile of (radius, z) about the vertical through (x, y).
 
-    A vessel's profile runs up the outside and down the inside to radius 0.
+    A vessel's profile runs up the outside and down the inside to radius 0, or back to its start
+    where it is ``cyclic``.
     """
     rings = [at_height(outline(2 * r, 2 * r, sides, phase=0.5), z) for r, z in profile]
-    return loft(np.stack(rings) + np.array([x, y, 0.0]))
+    return loft(np.stack(rings) + np.array([x, y, 0.0]), cyclic)
 
 
 def ball(radius: Number, centre: Point, sides: int = 12, squash: Number = 1.0) -> Solid:
@@ -253,7 +308,7 @@ def curved_wall(plan: Float[np.ndarray, "n 2"], z: Span, thickness: Number) -> S
 
 
 def ribbon(
-    path: Float[np.ndarray, "n 3"], across: Float[np.ndarray, "n 3"], thickness: Number
+    path: Float[np.ndarray, "n 3"], across: Float[np.ndarray, "#n 3"], thickness: Number
 ) -> Solid:
     """Strip along ``path`` that reaches ``across`` to either side of it."""
     return sheet(np.stack([path - across, path, path + across], axis=1), thickness)

@@ -1,12 +1,8 @@
 """Upholstered seats: an armchair with one cushion, a sofa with more."""
 
-from itertools import pairwise
-
-import numpy as np
-
 from qs3.shapes._dice import Dice
 from qs3.shapes._joinery import corners, legs
-from qs3.shapes._solids import Number, Solid, Span, cushion, pillow, tube, within
+from qs3.shapes._solids import Number, Solid, Span, centred, cushion, pillow, split, tube, within
 
 
 def upholstered(dice: Dice, width: Number, seats: int, lean: Number | None = None) -> list[Solid]:
@@ -20,62 +16,53 @@ def upholstered(dice: Dice, width: Number, seats: int, lean: Number | None = Non
     side = dice.between(0.08, 0.26) * (0.8 if seats == 1 else 1.0)
     back = dice.between(0.12, 0.26)
     soft = dice.pick(0.005, 0.03, dice.between(0.03, 0.09))
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     base = seat - dice.between(0.1, 0.18)
-    parts = [
-        cushion(dice, within(x, 0.01), (y[0] + 0.02, y[1] - 0.01), (foot, base), min(soft, 0.03))
-    ]
+    run = (y[0] + 0.02, y[1] - 0.01)
+    parts = [cushion(dice, within(x, 0.01), run, (foot, base), min(soft, 0.03))]
     lean = dice.pick(0.0, dice.between(2, 14)) if lean is None else lean
+    pivot = (0, y[1], base)
     rest = cushion(dice, within(x, side * 0.5), (y[1] - back, y[1]), (foot + 0.03, high), soft)
-    parts.append(rest.turn("x", -lean, (0, y[1], base)))
+    parts.append(rest.turn("x", -lean, pivot))
     parts += _arms(dice, x, (y[0] + dice.pick(0.0, 0.05), y[1] - 0.01), (foot, arm), side, soft)
     inner = (x[0] + side - 0.005, x[1] - side + 0.005)
-    edges = np.linspace(*inner, seats + 1)
     run = (y[0] - dice.pick(0.0, 0.03), y[1] - back + 0.01)
     plump = dice.between(0.0, 0.04)
     loose = dice.chance(0.7)
-    for a, b in pairwise(edges):
-        span = (float(a) + 0.002, float(b) - 0.002)
+    for span in split(inner, seats, 0.004):
         parts.append(cushion(dice, span, run, (base - 0.01, seat), max(soft, 0.02), plump))
         if loose:
             thick = dice.between(0.1, 0.18)
             z = (seat - 0.02, high + dice.between(-0.06, 0.05))
             pad = cushion(dice, span, (run[1] - thick, run[1] + 0.03), z, max(soft, 0.03))
-            parts.append(pad.turn("x", -lean, (0, y[1], base)))
+            parts.append(pad.turn("x", -lean, pivot))
     if dice.chance(0.35):
         parts += _throw_pillows(dice, inner, run[1] - 0.18 * loose, seat)
     if foot > 0:
-        parts += legs(
-            dice,
-            corners(x, y, 0.07),
-            foot + 0.01,
-            dice.between(0.03, 0.07),
-            dice.pick("square", "tapered", "cone"),
-        )
+        leg, style = dice.between(0.03, 0.07), dice.pick("square", "tapered", "cone")
+        parts += legs(dice, corners(x, y, 0.07), foot + 0.01, leg, style)
     return parts
 
 
 def _arms(dice: Dice, x: Span, y: Span, z: Span, side: Number, soft: Number) -> list[Solid]:
     style = dice.pick("square", "square", "rolled", "sloped")
+    low, top = z
     parts = []
     for s, span in ((-1, (x[0], x[0] + side)), (1, (x[1] - side, x[1]))):
-        top = z[1]
         if style == "rolled":
             r = max(0.6 * side, 0.07)
-            parts.append(cushion(dice, span, y, (z[0], top - r * 0.8), min(soft, 0.03)))
+            parts.append(cushion(dice, span, y, (low, top - r * 0.8), min(soft, 0.03)))
             cx = (span[0] + span[1]) / 2 + s * 0.15 * side
-            parts.append(
-                tube([(cx, y[0] - 0.01, top - r), (cx, y[1], top - r)], r, max(8, dice.sides))
-            )
-        else:
-            arm = cushion(dice, span, y, (z[0], top), soft)
-            if style == "sloped":
-                v = arm.vertices.copy()
-                fall = dice.between(0.1, 0.35) * (top - z[0])
-                share = (v[:, 1] - y[0]) / (y[1] - y[0])
-                v[:, 2] -= fall * (1 - share) * (v[:, 2] - z[0]) / (top - z[0])
-                arm = Solid(v, arm.faces)
-            parts.append(arm)
+            ends = [(cx, y[0] - 0.01, top - r), (cx, y[1], top - r)]
+            parts.append(tube(ends, r, max(8, dice.sides)))
+            continue
+        arm = cushion(dice, span, y, (low, top), soft)
+        if style == "sloped":
+            v = arm.vertices
+            fall = dice.between(0.1, 0.35) * (top - low)
+            share = (v[:, 1] - y[0]) / (y[1] - y[0])
+            v[:, 2] -= fall * (1 - share) * (v[:, 2] - low) / (top - low)
+        parts.append(arm)
     return parts
 
 

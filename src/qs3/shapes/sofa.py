@@ -1,7 +1,5 @@
 """Sofas: straight, corner, chaise, daybed, chesterfield, slab, curved, futon."""
 
-from itertools import pairwise
-
 import numpy as np
 
 from qs3.shapes._dice import Dice
@@ -13,8 +11,12 @@ from qs3.shapes._solids import (
     around,
     beam,
     block,
+    centred,
     curved_wall,
     cushion,
+    flanks,
+    posts,
+    split,
     tube,
     within,
 )
@@ -28,7 +30,7 @@ def straight(dice: Dice) -> list[Solid]:
 
 
 def _module(
-    dice: Dice, x: Span, y: Span, look: dict[str, float], *, rear: bool, right: bool
+    dice: Dice, x: Span, y: Span, look: dict[str, float], *, rear: bool = False, right: bool = False
 ) -> list[Solid]:
     """Block of a sectional: base, seat cushion, and a back at the rear, at the right or both."""
     seat, back, soft = look["seat"], look["back"], look["soft"]
@@ -57,11 +59,9 @@ def _row(
     dice: Dice, seats: int, unit: Number, depth: Number, look: dict[str, float]
 ) -> list[Solid]:
     """Modules with a back at the rear, from x = 0 to the left."""
-    parts = []
-    for i in range(seats):
-        x1 = -i * unit + 0.004
-        parts += _module(dice, (x1 - unit - 0.004, x1), (0.0, depth), look, rear=True, right=False)
-    return parts
+    ends = [-i * unit + 0.004 for i in range(seats)]
+    spans = [((end - unit - 0.004, end), (0.0, depth)) for end in ends]
+    return [part for x, y in spans for part in _module(dice, x, y, look, rear=True)]
 
 
 def _look(dice: Dice) -> dict[str, float]:
@@ -87,7 +87,7 @@ def corner(dice: Dice) -> list[Solid]:
     parts += _row(dice, along, unit, depth, look)
     for i in range(down):
         y1 = -i * unit + 0.004
-        parts += _module(dice, (0.0, depth), (y1 - unit - 0.004, y1), look, rear=False, right=True)
+        parts += _module(dice, (0.0, depth), (y1 - unit - 0.004, y1), look, right=True)
     if dice.chance(0.6):
         arm, side = (look["foot"], look["arm"]), look["back"]
         left, front = -along * unit + 0.004, -down * unit + 0.004
@@ -103,7 +103,7 @@ def chaise(dice: Dice) -> list[Solid]:
     look, unit, depth = _look(dice), dice.between(0.58, 0.8), dice.between(0.8, 1.0)
     seats, run = dice.count(1, 3), dice.between(0.45, 0.9)
     parts = _row(dice, seats, unit, depth, look)
-    parts += _module(dice, (0.0, unit), (-run, depth), look, rear=True, right=False)
+    parts += _module(dice, (0.0, unit), (-run, depth), look, rear=True)
     arm, side = (look["foot"], look["arm"]), look["back"]
     left = -seats * unit + 0.004
     parts.append(cushion(dice, (left - side, left + 0.01), (0.0, depth), arm, look["soft"]))
@@ -116,52 +116,38 @@ def daybed(dice: Dice) -> list[Solid]:
     """Chaise longue: a couch with one raised end."""
     width, depth, seat = dice.between(1.5, 1.9), dice.between(0.65, 0.85), dice.between(0.36, 0.45)
     foot, thick = dice.between(0.1, 0.2), dice.between(0.1, 0.16)
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y, low = centred(width), centred(depth), foot + 0.05
     parts = [cushion(dice, x, y, (foot, seat), 0.04, 0.02)]
-    head = cushion(
-        dice, (x[0], x[0] + thick), y, (foot + 0.05, seat + dice.between(0.25, 0.45)), 0.05
-    )
-    parts.append(head.turn("y", -dice.between(5, 25), (x[0], 0, foot + 0.05)))
+    end, heights = (x[0], x[0] + thick), (low, seat + dice.between(0.25, 0.45))
+    head = cushion(dice, end, y, heights, 0.05)
+    parts.append(head.turn("y", -dice.between(5, 25), (x[0], 0, low)))
     if dice.chance(0.5):
-        parts.append(
-            cushion(
-                dice,
-                (x[0], x[0] + dice.between(0.5, 0.9) * width),
-                (y[1] - 0.12, y[1]),
-                (foot + 0.05, seat + dice.between(0.18, 0.35)),
-                0.05,
-            )
-        )
+        span = (x[0], x[0] + dice.between(0.5, 0.9) * width)
+        heights = (low, seat + dice.between(0.18, 0.35))
+        parts.append(cushion(dice, span, (y[1] - 0.12, y[1]), heights, 0.05))
     return parts + legs(dice, corners(x, y, 0.08), foot + 0.02, 0.05)
 
 
 def chesterfield(dice: Dice) -> list[Solid]:
     """Low roll all round: arms as high as the back."""
     width, depth, seat = dice.between(1.4, 2.3), dice.between(0.8, 0.98), dice.between(0.4, 0.48)
-    high, r, foot = (
-        seat + dice.between(0.22, 0.36),
-        dice.between(0.08, 0.13),
-        dice.between(0.06, 0.14),
-    )
+    high, r = seat + dice.between(0.22, 0.36), dice.between(0.08, 0.13)
+    foot = dice.between(0.06, 0.14)
     wall = r * dice.between(1.0, 1.6)
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y, sides = centred(width), centred(depth), max(10, dice.sides)
+    heights, level = (foot, high - r), high - r
     parts = [
         cushion(dice, within(x, 0.01), (y[0] + 0.03, y[1] - 0.01), (foot, seat - 0.12), 0.02),
-        block(x, (y[1] - wall, y[1]), (foot, high - r)),
+        block(x, (y[1] - wall, y[1]), heights),
     ]
-    for s in (-1, 1):
-        span = (x[0], x[0] + wall) if s < 0 else (x[1] - wall, x[1])
-        parts.append(block(span, (y[0] + 0.01, y[1]), (foot, high - r)))
-        cx = s * (width / 2 - 0.3 * wall)
-        parts.append(tube([(cx, y[0], high - r), (cx, y[1], high - r)], r, max(10, dice.sides)))
+    arms = flanks(x, (y[0] + 0.01, y[1]), heights, wall)
+    for arm, cx in zip(arms, within(x, 0.3 * wall), strict=True):
+        parts += [arm, tube([(cx, cy, level) for cy in y], r, sides)]
     cy = y[1] - 0.3 * wall
-    parts.append(tube([(x[0], cy, high - r), (x[1], cy, high - r)], r, max(10, dice.sides)))
-    edges = np.linspace(x[0] + wall - 0.01, x[1] - wall + 0.01, dice.count(2, 3) + 1)
-    for a, b in pairwise(edges):
-        z = (seat - 0.13, seat)
-        parts.append(
-            cushion(dice, (float(a), float(b) - 0.003), (y[0], y[1] - wall + 0.01), z, 0.04, 0.02)
-        )
+    parts.append(tube([(cx, cy, level) for cx in x], r, sides))
+    run = (y[0], y[1] - wall + 0.01)
+    for a, b in split(within(x, wall - 0.01), dice.count(2, 3)):
+        parts.append(cushion(dice, (a, b - 0.003), run, (seat - 0.13, seat), 0.04, 0.02))
     return parts + legs(dice, corners(x, y, 0.09), foot + 0.01, 0.06)
 
 
@@ -171,34 +157,22 @@ def slab(dice: Dice) -> list[Solid]:
     wall, foot = dice.between(0.05, 0.11), dice.between(0.06, 0.2)
     high = seat + dice.between(0.16, 0.34)
     arm = high if dice.chance(0.5) else seat + dice.between(0.05, 0.15)
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     parts = [block(x, y, (foot, foot + 0.06)), block(x, (y[1] - wall, y[1]), (foot, high))]
-    sides = dice.pick((-1, 1), (-1, 1), (1,))
-    for s in sides:
-        parts.append(block((x[0], x[0] + wall) if s < 0 else (x[1] - wall, x[1]), y, (foot, arm)))
-    edges = np.linspace(x[0] + wall if -1 in sides else x[0], x[1] - wall, dice.count(1, 3) + 1)
-    for a, b in pairwise(edges):
-        z = (foot + 0.05, seat)
-        parts.append(
-            cushion(dice, (float(a), float(b) - 0.004), (y[0], y[1] - wall + 0.003), z, 0.025, 0.01)
-        )
+    both = dice.pick(True, True, False)
+    parts += flanks(x, y, (foot, arm), wall)[0 if both else 1 :]
+    inner = (x[0] + wall if both else x[0], x[1] - wall)
+    rear = y[1] - wall
+    for a, b in split(inner, dice.count(1, 3)):
+        seat_run = (y[0], rear + 0.003)
+        parts.append(cushion(dice, (a, b - 0.004), seat_run, (foot + 0.05, seat), 0.025, 0.01))
         if dice.chance(0.5):
-            run = (y[1] - wall - 0.13, y[1] - wall + 0.01)
-            parts.append(
-                cushion(
-                    dice, (float(a) + 0.02, float(b) - 0.02), run, (seat - 0.02, high + 0.06), 0.04
-                )
-            )
+            run, z = (rear - 0.13, rear + 0.01), (seat - 0.02, high + 0.06)
+            parts.append(cushion(dice, (a + 0.02, b - 0.02), run, z, 0.04))
     if dice.chance(0.3):
-        for s in (-1, 1):
-            px = s * (width / 2 - 0.15)
-            parts += [
-                block(around(px, 0.02), y, (0, 0.03)),
-                *(
-                    block(around(px, 0.02), around(py, 0.02), (0.01, foot + 0.01))
-                    for py in within(y, 0.1)
-                ),
-            ]
+        for px in within(x, 0.15):
+            parts.append(block(around(px, 0.02), y, (0, 0.03)))
+            parts += posts([px], within(y, 0.1), 0.02, (0.01, foot + 0.01))
         return parts
     return parts + legs(dice, corners(x, y, 0.1), foot + 0.01, 0.04)
 
@@ -210,15 +184,10 @@ def curved(dice: Dice) -> list[Solid]:
     back, high = dice.between(0.14, 0.24), dice.between(0.7, 0.85)
     angle = np.radians(np.linspace(90 - sweep, 90 + sweep, 17))
     arc = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    middle = outer - depth / 2
     rest = curved_wall((outer - back / 2) * arc, (foot, high), back)
-    parts = [curved_wall(middle * arc, (foot, seat), depth), rest]
+    parts = [curved_wall((outer - depth / 2) * arc, (foot, seat), depth), rest]
     if foot > 0:
-        spots = [
-            (radius * np.cos(a), radius * np.sin(a))
-            for radius in (outer - 0.1, outer - depth + 0.1)
-            for a in angle[[2, 8, 14]]
-        ]
+        spots = [tuple(r * arc[i]) for r in (outer - 0.1, outer - depth + 0.1) for i in (2, 8, 14)]
         parts += legs(dice, spots, foot + 0.02, 0.04, "round")
     return parts
 
@@ -227,7 +196,7 @@ def futon(dice: Dice) -> list[Solid]:
     """Folded mattress on a frame of slats, or a sofa without arms."""
     width, depth, seat = dice.between(1.3, 2.0), dice.between(0.7, 0.9), dice.between(0.34, 0.44)
     thick, lean, tall = dice.between(0.12, 0.2), dice.between(8, 24), dice.between(0.4, 0.55)
-    x, y = (-width / 2, width / 2), (-depth / 2, depth / 2)
+    x, y = centred(width), centred(depth)
     base = seat - thick
     parts = [cushion(dice, x, y, (base, seat), 0.05, 0.02)]
     pad = cushion(dice, x, (y[1] - thick, y[1]), (base, base + thick + tall), 0.05)
@@ -236,11 +205,9 @@ def futon(dice: Dice) -> list[Solid]:
     parts += legs(dice, corners(x, y, 0.06), base - 0.02, dice.between(0.04, 0.07))
     if dice.chance(0.5):
         arm = seat + dice.between(0.12, 0.2)
-        for s in (-1, 1):
-            px = s * (width / 2 + 0.02)
+        for px in within(x, -0.02):
             parts.append(beam((px, y[0], arm), (px, y[1], arm), 0.07, 0.03))
-            for py in within(y, 0.05):
-                parts.append(block(around(px, 0.025), around(py, 0.025), (0, arm)))
+            parts += posts([px], within(y, 0.05), 0.025, (0, arm))
     return parts
 
 
