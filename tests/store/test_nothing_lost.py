@@ -137,20 +137,6 @@ def test_workers_end_with_the_process_that_started_them(start, tmp_path):
     wait_for(lambda: not any(alive(pid) for pid in workers))
 
 
-def test_a_worker_killed_from_outside_costs_nothing(fake, start, tmp_path):
-    process = start(tmp_path / "out")
-    wait_for(lambda: written_rows(tmp_path / "out") >= 4)
-    workers = [
-        pid
-        for pid in children(process.pid)
-        if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
-    ]
-    os.kill(workers[0], signal.SIGKILL)
-    printed, errors = process.communicate(timeout=120)
-    assert (process.returncode, printed.split()) == (0, [str(ROWS), "0", "0"]), errors
-    assert fake.content(tmp_path / "out") == whole(fake, tmp_path)
-
-
 @pytest.mark.parametrize("row", ["crash_in_write_row", "crash_with_lock_row"])
 def test_a_process_that_dies_once_leaves_nothing_undone_and_nothing_behind(
     fake, start, tmp_path, row

@@ -189,9 +189,9 @@ class LocalExecutor:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Stop the processes, at once where calls are left."""
+        """Stop the processes, at once where an exception ends the block: some may not be up yet."""
         self._alone.clear()
-        self._close(at_once=bool(self._calls))
+        self._close(at_once=bool(self._calls) or any(exception))
 
 
 def _how(code: int) -> str:
