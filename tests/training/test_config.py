@@ -74,6 +74,8 @@ def test_overrides():
         (lambda: TrainSettings(holdout=1.0), "holdout = 1.0"),
         (lambda: TrainSettings(rule="im", validate_every=0), "leaves no checkpoint"),
         (lambda: TrainSettings(batch_size=1), "batch_size = 1 must be at least 2"),
+        (lambda: TrainSettings(num_points=99999), "99999 must be at most 16384; .* take 37.3 GiB"),
+        (lambda: TrainSettings(num_points=10**12), "num_points = 1000000000000 must be at most"),
         (lambda: TrainSettings(epochs=0), "epochs = 0"),
         (lambda: TrainSettings(label_smoothing=1.0), "label_smoothing"),
         (lambda: TrainSettings(threads=0), "threads = 0"),

@@ -243,7 +243,7 @@ def test_unusable_places_and_runs_are_refused(tmp_path):
         with pytest.raises(InputError, match=message):
             export_run(*arguments)
     (tmp_path / "settings.json").write_text('{"train": {}}')
-    with pytest.raises(InputError, match="num_points"):
+    with pytest.raises(InputError, match="is missing"):
         export_run(tmp_path, "onnx")
 
 

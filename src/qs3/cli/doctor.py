@@ -44,11 +44,14 @@ def examine() -> dict[str, Any]:
     needed = _requirements()
     packages = {name: _version(name) for name in needed.pop("")}
     variants = {variant: usable(variant) for variant in VARIANTS}
-    device = None
+    device, threads = None, None
     if packages["torch"] is not None:
         import torch
 
+        from qs3.training.threads import describe_threads
+
         device = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
+        threads = describe_threads()
     return {
         "python": platform.python_version(),
         "packages": packages,
@@ -56,6 +59,7 @@ def examine() -> dict[str, Any]:
         "renderer": next((variant for variant in VARIANTS if variants[variant]), None),
         "cycles": _cycles(),
         "device": device,
+        "threads": threads,
         "extras": {
             extra: all(_version(name) is not None for name in needed.get(extra, ()))
             for extra in _PURPOSE
@@ -116,7 +120,7 @@ def _print(machine: dict[str, Any]) -> None:
             f"  ok      cycles: Blender {cycles['blender']} (Python {cycles['python']}), "
             f"{cycles['command']}"
         )
-    print(f"Training on: {machine['device']}")
+    print(f"Training on: {machine['device']}; {machine['threads']}")
     print("Extras (each for what stands beside it, and nothing else)")
     for extra, here in machine["extras"].items():
         how = "" if here else f": in a checkout, pip install -e '.[{extra}]'"

@@ -71,7 +71,7 @@ def step_seconds(runs: Iterable[Run], settings: TrainSettings, steps: int = 2) -
     The first step, on few points, warms up and is not counted.
     """
     threads = torch.get_num_threads()
-    if settings.threads is not None:
+    if isinstance(settings.threads, int):
         torch.set_num_threads(settings.threads)
     try:
         seconds = {}

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from qs3.errors import InputError
 from qs3.files import write_bytes
 from qs3.models import PointClassifier, create_model
+from qs3.structure import structure
 from qs3.training.config import TrainSettings
 from qs3.training.run import MODEL, SETTINGS, read_settings
 
@@ -212,6 +213,7 @@ def load_model(run_dir: Path) -> LoadedModel:
     else:
         kept = ("model", "model_settings", "num_points")
         settings = {"train": {key: facts[key] for key in kept if key in facts}}
+        structure(settings["train"], TrainSettings, path)  # refuses what is none
     return LoadedModel(model.eval(), class_names, settings)
 
 

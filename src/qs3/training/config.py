@@ -20,6 +20,8 @@ PresetName = Literal["default", "spst", "paper", "released"]
 """Whole columns of settings: our defaults, SPST's, QS³'s text, QS³'s released code."""
 Prior = Literal["em", "bbse"]
 """Estimates of the target's class shares."""
+MOST_POINTS = 16_384
+"""Most points a cloud: the distances among those of one alone take 1 GiB."""
 
 
 @dataclass(frozen=True)
@@ -81,14 +83,19 @@ class TrainSettings:
     devices: int = 1
     """GPUs, or CPU processes, of this machine that share each batch. Each normalises its own share
     (batch normalisation), so that results differ a little between numbers of devices."""
-    threads: int | None = None
-    """CPU threads of each process; None leaves PyTorch's choice, or shares the cores between
-    several processes. Results are bit-identical for equal numbers, and after a stop on at most two
-    devices (DDP sums the first step's gradients of three in another order)."""
+    threads: int | Literal["auto"] | None = None
+    """CPU threads of each process. None takes the cores (OMP_NUM_THREADS where it is set), or one
+    for each of several processes; auto times a few steps, as one thread may be faster on a busy
+    machine. A run keeps its number. Results are bit-identical for equal numbers, and after a stop
+    on at most two devices (DDP sums the first step's gradients of three in another order)."""
 
     def __post_init__(self) -> None:
         for name in ("num_points", "epochs", "learning_rate"):
             _check(self, name, getattr(self, name) > 0, "must be above 0")
+        points = self.num_points
+        fault = f"must be at most {MOST_POINTS}; the distances among the points of one cloud alone "
+        fault += f"would take {points**2 / 2**28:.3g} GiB"
+        _check(self, "num_points", points <= MOST_POINTS, fault)
         _check_word(self, "accelerator", Accelerator)
         _check(self, "devices", self.devices > 0, "must be above 0")
         least = 2 * self.devices
@@ -107,7 +114,8 @@ class TrainSettings:
         _check_word(self, "rule", Rule)
         good = self.rule == "last" or self.validate_every > 0
         _check(self, "validate_every", good, f"leaves no checkpoint for rule = {self.rule!r}")
-        _check(self, "threads", self.threads is None or self.threads > 0, "must be above 0")
+        good = self.threads in (None, "auto") or (type(self.threads) is int and self.threads > 0)
+        _check(self, "threads", good, "must be above 0, or auto")
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,7 @@ from torch import Tensor, distributed
 from qs3.errors import InputError, QS3Error
 from qs3.training.config import TrainSettings
 from qs3.training.progress import TimeUpError
+from qs3.training.threads import threads
 
 _LOG = logging.getLogger(__name__)
 _GRACE = 60.0
@@ -258,7 +259,7 @@ def _do(mouth: Connection, rank: int, folder: str, settings: TrainSettings, work
         os.dup2(silence, stream)
     mouth.send("")
     try:
-        with threads(settings), _joined(settings, rank, folder) as fabric:
+        with threads(int(settings.threads or 1)), _joined(settings, rank, folder) as fabric:
             work(fabric)
     except TimeUpError:
         return
@@ -325,18 +326,3 @@ def gather_rows(rows: np.ndarray, mine: slice, count: int, fabric: Fabric) -> np
     total = fabric.all_reduce(torch.from_numpy(whole).to(fabric.device), reduce_op="sum")
     assert isinstance(total, Tensor)  # noqa: S101
     return total.cpu().numpy()
-
-
-@contextlib.contextmanager
-def threads(settings: TrainSettings) -> Iterator[None]:
-    """Compute with the CPU threads of the settings for a while."""
-    before = torch.get_num_threads()
-    count = settings.threads
-    if count is None and settings.devices > 1:
-        count = max(1, before // settings.devices)
-    if count is not None:
-        torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

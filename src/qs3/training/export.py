@@ -148,9 +148,8 @@ def export_run(run: Path, to: str, out: Path | None = None) -> Exported:
     folder = run.parent if run.is_file() else run
     path = folder / f"model{SUFFIXES[to]}" if out is None else Path(out)
     _check_place(path, to)
-    train = loaded.settings.get("train")
-    num_points = train.get("num_points") if isinstance(train, dict) else None
-    if not isinstance(num_points, int) or num_points < 1:
+    num_points = loaded.settings["train"].get("num_points")
+    if num_points is None:
         raise InputError(f"{run}: does not tell the number of points a cloud (num_points)")
     facts = {"class_names": list(loaded.class_names), "settings": loaded.settings}
     start = time.perf_counter()
