@@ -78,7 +78,7 @@ def test_damaged_shapes_are_told(clouds):
 @pytest.mark.slow
 def test_no_false_mark_on_real_objects(shared_data):
     """The nearest two different objects are more than the tolerance apart."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     from qs3.training.overlap import TOLERANCE
 
@@ -86,5 +86,5 @@ def test_no_false_mark_on_real_objects(shared_data):
         points = np.load(shared_data / name)["points"].astype(np.float32)
         texts = shapes(points)
         rows = np.frombuffer(bytes.fromhex("".join(texts)), "<i2").reshape(len(texts), -1)
-        nearest = cKDTree(rows).query(rows, 2, p=np.inf)[0][:, 1] * 1e-4
+        nearest = KDTree(rows).query(rows, 2, p=np.inf)[0][:, 1] * 1e-4
         assert (nearest <= TOLERANCE).sum() == 0

@@ -81,7 +81,7 @@ def caveats(run: Run, *tested: Float[np.ndarray, "b n 3"]) -> tuple[str, ...]:
 
 def _near(known: Sequence[str], tested: Sequence[str], run: Run) -> bool:
     """Whether one of the tested shapes is one of those known, but for rounding."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     if not known or not tested:
         return False
@@ -92,5 +92,5 @@ def _near(known: Sequence[str], tested: Sequence[str], run: Run) -> bool:
         )
     except ValueError as error:
         raise InputError(f"{run.folder}: shapes of clouds in run.json are damaged") from error
-    distances, _ = cKDTree(seen).query(asked, p=np.inf)
+    distances, _ = KDTree(seen).query(asked, p=np.inf)
     return bool(distances.min() * _UNIT <= TOLERANCE)
