@@ -1,3 +1,4 @@
+import math
 import subprocess
 import sys
 from dataclasses import asdict, replace
@@ -80,6 +81,10 @@ def test_overrides():
         (lambda: TrainSettings(label_smoothing=1.0), "label_smoothing"),
         (lambda: TrainSettings(threads=0), "threads = 0"),
         (lambda: TrainSettings(seed=-1), "seed = -1"),
+        (lambda: TrainSettings(clip_norm=0.0), "clip_norm = 0.0"),
+        (lambda: TrainSettings(clip_norm=math.inf), "clip_norm = inf"),
+        (lambda: TrainSettings(ema_decay=1.0), "ema_decay = 1.0"),
+        (lambda: TrainSettings(devices=0), "devices = 0"),
     ],
 )
 def test_faults_name_the_setting(call, message):
@@ -90,6 +95,7 @@ def test_faults_name_the_setting(call, message):
 def test_unknown_words_are_refused_without_the_type_checks_of_the_tests():
     calls = {
         'TrainSettings(rule="oracle")': "rule = oracle is none of last",
+        'TrainSettings(accelerator="mps")': "accelerator = mps is none of auto, cpu, cuda",
         'TrainSettings(schedule="steps")': "schedule = steps is none of cosine, plateau",
         'TrainSettings(normalisation="own")': "normalisation = own is none of shared",
         'SelfTrainingSettings(rule="pst")': "rule = pst is none of qbst",

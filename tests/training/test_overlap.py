@@ -43,8 +43,8 @@ REWRITTEN = {
 
 @pytest.mark.parametrize("name", REWRITTEN)
 def test_a_cloud_written_anew_is_known(clouds, rng, name):
-    for known in (clouds, subsample(clouds, 64)):  # a training on fewer points
-        seen = seen_clouds(clouds, known)
+    for cut in (clouds, subsample(clouds, 64)):  # a training on fewer points
+        seen = seen_clouds(cut, clouds)
         for cloud in clouds[:5]:
             test = REWRITTEN[name](cloud[None], rng)
             assert caveats(run_of(seen), test) == ("training clouds",)
@@ -53,7 +53,7 @@ def test_a_cloud_written_anew_is_known(clouds, rng, name):
 
 def test_what_the_network_gets_is_known_too(clouds):
     chosen = subsample(clouds, 64)
-    seen = seen_clouds(clouds, chosen)
+    seen = seen_clouds(chosen, clouds)
     assert caveats(run_of(seen), chosen[3:4] + np.float32(1e-4)) == ("training clouds",)
 
 

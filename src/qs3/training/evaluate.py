@@ -52,10 +52,8 @@ def evaluate(
     """
     made, loaded = read_run(run), load_model(run)
     train = loaded.settings["train"]
-    test = _labelled(data, split, cloud, train["num_points"], loaded.class_names)
-    tested = [test.points]
-    test = replace(test, points=subsample(test.points, train["num_points"]))
-    tested += [] if test.points is tested[0] else [test.points]
+    whole = _labelled(data, split, cloud, train["num_points"], loaded.class_names)
+    test = replace(whole, points=subsample(whole.points, train["num_points"]))
     record = RunRecord(
         method=made.method,
         model=train["model"],
@@ -72,7 +70,7 @@ def evaluate(
         commit=git_commit(),
         rounds=made.rounds,
         choices=_choices(Path(run), loaded, test) if checkpoints else {},
-        marks=caveats(made, *tested),
+        marks=caveats(made, test.points, whole.points),
         experiment=experiment,
     )
     write_record(record_path(run, record), record)

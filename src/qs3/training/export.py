@@ -192,11 +192,11 @@ def compare(
             points = (points + rng.normal(size=(b, 1, 3))) * 10.0 ** rng.uniform(-3, 3)
             points = points.astype(np.float32)
             wanted = predict_probabilities(model, points, num_points=num_points)
-            found = runner(points)
-            if found.shape != wanted.shape or not np.isfinite(found).all():
+            got = runner(points)
+            if got.shape != wanted.shape or not np.isfinite(found).all():
                 differences += [float("inf")] * b
             else:
-                differences += np.abs(found - wanted).max(axis=1).tolist()
+                differences += np.abs(got - wanted).max(axis=1).tolist()
     return np.array(differences)
 
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import logging
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -151,12 +150,12 @@ def fit(
         count = claimed.threads or 1
         settings = replace(settings, threads=count)
         chosen = subsample(source.points, settings.num_points, run_dir)
-        source_clouds, source_shapes = seen_clouds(source.points, chosen)
+        source_clouds, source_shapes = seen_clouds(chosen, source.points)
         target_clouds, target_shapes = (), ()
         prepared, prepared_target = replace(source, points=unit_ball(chosen)), None
         if target is not None:
             chosen = subsample(target.points, settings.num_points, run_dir)
-            target_clouds, target_shapes = seen_clouds(target.points, chosen)
+            target_clouds, target_shapes = seen_clouds(chosen, target.points)
             prepared_target = replace(target, points=unit_ball(chosen))
         job = replace(
             job,
@@ -215,19 +214,10 @@ def fit(
 
 def _with_warm_up(run: Run, before: Run) -> Run:
     """Add what the network has seen in its warm-up, for the marks of its scores."""
-
-    def both(first: Sequence[str], second: Sequence[str]) -> tuple[str, ...]:
-        return tuple(sorted({*first, *second}))
-
-    return replace(
-        run,
-        supervised=run.supervised or before.supervised,
-        source_clouds=both(run.source_clouds, before.source_clouds),
-        source_shapes=both(run.source_shapes, before.source_shapes),
-        target_clouds=both(run.target_clouds, before.target_clouds),
-        target_shapes=both(run.target_shapes, before.target_shapes),
-        unknown_warm_up=before.unknown_warm_up,
-    )
+    names = ("source_clouds", "source_shapes", "target_clouds", "target_shapes")
+    both = {name: tuple(sorted({*getattr(run, name), *getattr(before, name)})) for name in names}
+    supervised = run.supervised or before.supervised
+    return replace(run, **both, supervised=supervised, unknown_warm_up=before.unknown_warm_up)
 
 
 def _plan(
@@ -254,11 +244,7 @@ def _require_judges(
     target: UnlabelledClouds | None,
     has_holdout: bool,
 ) -> None:
-    """Refuse, before anything is trained, what would lack something in the end.
-
-    Raises:
-        InputError: where the rule or the estimate of the class shares has nothing to go by.
-    """
+    """Refuse, before anything is trained, what would lack something in the end."""
     by_source = settings.rule in ("source-val", "dev")
     bbse = rounds is not None and rounds.rule == "prior" and rounds.prior == "bbse"
     if not has_holdout and (by_source or bbse):
@@ -274,11 +260,7 @@ def _require_judges(
 def _check_warm_up(
     folder: Path, base: str, source: PointClouds, settings: TrainSettings
 ) -> tuple[str, bool]:
-    """Return the checksum of a warm-up's weights, and whether the held-out part is new to it.
-
-    Raises:
-        InputError: where it is one for other classes or settings, or of another method.
-    """
+    """Return the checksum of a warm-up's weights, and whether the held-out part is new to it."""
     model, class_names, its = load_model(folder)
     if class_names != source.class_names:
         raise InputError(

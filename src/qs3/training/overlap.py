@@ -37,35 +37,39 @@ def shapes(points: Float[np.ndarray, "b n 3"]) -> list[str]:
         if radius > 1e-6 * np.abs(cloud).max(initial=0.0):
             x = (centred / radius).T
             moments = np.array([x[list(axes)].prod(axis=0).mean() for axes in _MOMENTS])
-            texts.append(
-                (moments / _UNIT).round().clip(-32768, 32767).astype("<i2").tobytes().hex()
-            )
+            numbers = (moments / _UNIT).round().clip(-32768, 32767)
+            texts.append(numbers.astype("<i2").tobytes().hex())
     return texts
 
 
 def seen_clouds(
-    whole: Float[np.ndarray, "b n 3"], chosen: Float[np.ndarray, "b m 3"]
+    chosen: Float[np.ndarray, "b m 3"], whole: Float[np.ndarray, "b n 3"]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return checksums and shapes of clouds that a network gets to see, for its ``run.json``.
 
     Args:
+        chosen: The points that the network gets.
         whole: The clouds as read.
-        chosen: The points of them that the network gets.
     """
-    both = shapes(chosen) if whole is chosen else [*shapes(whole), *shapes(chosen)]
-    return tuple(digests(chosen)), tuple(dict.fromkeys(both))
+    return tuple(digests(chosen)), tuple(dict.fromkeys(_both_shapes(chosen, whole)))
 
 
-def caveats(run: Run, *tested: Float[np.ndarray, "b n 3"]) -> tuple[str, ...]:
+def _both_shapes(chosen: np.ndarray, whole: np.ndarray) -> list[str]:
+    return shapes(chosen) if whole is chosen else [*shapes(chosen), *shapes(whole)]
+
+
+def caveats(
+    run: Run, chosen: Float[np.ndarray, "b m 3"], whole: Float[np.ndarray, "b n 3"] | None = None
+) -> tuple[str, ...]:
     """Caveats of a score: which of the tested clouds the run has seen.
 
     Args:
         run: The run.
-        tested: The clouds, as read and, where that is something else, as the network gets them.
+        chosen: The points that the network gets.
+        whole: The clouds as read, where these are more.
     """
-    checksums = {name for points in tested for name in digests(points)}
-    checksums.update(name for points in tested for name in digests(unit_ball(points)))
-    texts = [text for points in tested for text in shapes(points)]
+    checksums = {*digests(chosen), *digests(unit_ball(chosen))}
+    texts = _both_shapes(chosen, chosen if whole is None else whole)
 
     def has_seen(clouds: Collection[str], known: Sequence[str]) -> bool:
         return not checksums.isdisjoint(clouds) or _near(known, texts, run)
