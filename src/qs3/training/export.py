@@ -193,7 +193,7 @@ def compare(
             points = points.astype(np.float32)
             wanted = predict_probabilities(model, points, num_points=num_points)
             got = runner(points)
-            if got.shape != wanted.shape or not np.isfinite(found).all():
+            if got.shape != wanted.shape or not np.isfinite(got).all():
                 differences += [float("inf")] * b
             else:
                 differences += np.abs(got - wanted).max(axis=1).tolist()
