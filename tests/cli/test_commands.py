@@ -201,7 +201,8 @@ def test_doctor_knows_every_extra_that_a_user_may_want(capsys):
     ]
     assert set(doctor._PURPOSE) == set(extras) - {"cycles", "dev", "docs"}
     machine = {"python": "3", "packages": {"numpy": None}, "renderers": {}, "renderer": None,
-               "cycles": {"fault": "not here"}, "device": "CPU", "threads": "2 CPU threads", "ready": False,
+               "cycles": {"fault": "not here"}, "device": "CPU", "threads": "2 CPU threads",
+               "ready": False,
                "extras": {"ray": False, "view": True}}  # fmt: skip
     doctor._print(machine)
     text = capsys.readouterr().out
