@@ -171,11 +171,13 @@ def test_doctor_knows_every_extra_that_a_user_may_want(capsys):
     ]
     assert set(doctor._PURPOSE) == set(extras) - {"cycles", "dev", "docs"}
     machine = {"python": "3", "packages": {"numpy": None}, "renderers": {}, "renderer": None,
-               "cycles": {"fault": "not here"}, "device": "CPU", "ready": False,
+               "cycles": {"fault": "not here"}, "device": "CPU", "threads": "2 CPU threads",
+               "ready": False,
                "extras": {"ray": False, "view": True}}  # fmt: skip
     doctor._print(machine)
     text = capsys.readouterr().out
     assert "pip install numpy" in text
+    assert "Training on: CPU; 2 CPU threads\n" in text
     assert (
         "absent  ray (qs3 generate --executor ray): in a checkout, pip install -e '.[ray]'" in text
     )

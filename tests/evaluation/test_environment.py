@@ -11,10 +11,10 @@ from qs3.evaluation import environment
 def test_versions_and_hardware_are_those_of_this_machine():
     assert environment.versions()["numpy"] == np.__version__
     assert environment.versions()["qs3"] == importlib.metadata.version("qs3")
-    found = environment.hardware()
-    assert 1 <= found["cores"] <= (os.cpu_count() or 1)
-    assert found["cpu"]
-    assert all(isinstance(name, str) for name in found["gpus"])
+    hardware = environment.hardware()
+    assert 1 <= hardware["cores"] <= (os.cpu_count() or 1)
+    assert hardware["cpu"]
+    assert all(isinstance(name, str) for name in hardware["gpus"])
 
 
 def test_a_copy_outside_a_repository_has_no_commit(monkeypatch, tmp_path):

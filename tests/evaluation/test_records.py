@@ -98,7 +98,7 @@ def test_records_are_found_below_a_folder_in_order(record, tmp_path):
     (tmp_path / "deep" / "seed-2" / "records" / "a.json").write_text("{}")
     (tmp_path / "deep" / "other.json").write_text("{}")
     records, faults = find_records(tmp_path)
-    assert [found.seed for _, found in records] == [0, 1, 2]
+    assert [made.seed for _, made in records] == [0, 1, 2]
     assert len(faults) == 1
     with pytest.raises(InputError, match="no such folder"):
         find_records(tmp_path / "nowhere")

@@ -18,17 +18,17 @@ def make_clouds(count=24, seed=0, noise=0.0, names=("ball", "disc", "rod")):
     return PointClouds(points.astype(np.float32), labels, tuple(names), ids)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def source():
     return make_clouds()
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def target():
     return make_clouds(count=30, seed=1, noise=0.1)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def settings():
     return TrainSettings(
         model="pointnet",

@@ -1,3 +1,4 @@
+import math
 import subprocess
 import sys
 from dataclasses import asdict, replace
@@ -74,10 +75,16 @@ def test_overrides():
         (lambda: TrainSettings(holdout=1.0), "holdout = 1.0"),
         (lambda: TrainSettings(rule="im", validate_every=0), "leaves no checkpoint"),
         (lambda: TrainSettings(batch_size=1), "batch_size = 1 must be at least 2"),
+        (lambda: TrainSettings(num_points=99999), "99999 must be at most 16384; .* take 37.3 GiB"),
+        (lambda: TrainSettings(num_points=10**12), "num_points = 1000000000000 must be at most"),
         (lambda: TrainSettings(epochs=0), "epochs = 0"),
         (lambda: TrainSettings(label_smoothing=1.0), "label_smoothing"),
         (lambda: TrainSettings(threads=0), "threads = 0"),
         (lambda: TrainSettings(seed=-1), "seed = -1"),
+        (lambda: TrainSettings(clip_norm=0.0), "clip_norm = 0.0"),
+        (lambda: TrainSettings(clip_norm=math.inf), "clip_norm = inf"),
+        (lambda: TrainSettings(ema_decay=1.0), "ema_decay = 1.0"),
+        (lambda: TrainSettings(devices=0), "devices = 0"),
     ],
 )
 def test_faults_name_the_setting(call, message):
@@ -88,6 +95,7 @@ def test_faults_name_the_setting(call, message):
 def test_unknown_words_are_refused_without_the_type_checks_of_the_tests():
     calls = {
         'TrainSettings(rule="oracle")': "rule = oracle is none of last",
+        'TrainSettings(accelerator="mps")': "accelerator = mps is none of auto, cpu, cuda",
         'TrainSettings(schedule="steps")': "schedule = steps is none of cosine, plateau",
         'TrainSettings(normalisation="own")': "normalisation = own is none of shared",
         'SelfTrainingSettings(rule="pst")': "rule = pst is none of qbst",

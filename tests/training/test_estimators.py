@@ -34,7 +34,6 @@ def test_the_line_of_the_readme(source, target):
     ("made", "method", "rounds"),
     [
         (Adapter("dann", "pointnet", train=TRAIN), "dann", None),
-        (QBST("pointnet", train=TRAIN, self_training=ROUNDS), "source-only", {"rule": "qbst"}),
         (
             SPST("pointnet", train=TRAIN, self_training=ROUNDS, warm_up="coral"),
             "coral",

@@ -9,6 +9,7 @@ import pytest
 
 from qs3.errors import InputError
 from qs3.evaluation import read_record
+from qs3.files import LOCK, folder_lock
 from qs3.training import (
     QBST,
     SelfTrainingSettings,
@@ -22,10 +23,18 @@ from qs3.training import (
     self_train,
 )
 from qs3.training.batches import prepare
-from qs3.training.checkpoint import new_model
-from qs3.training.run import claim_run
+from qs3.training.checkpoint import load_model, new_model, read_tensors, write_tensors
+from qs3.training.run import RunSettings, claim_run
 
 ROUNDS = SelfTrainingSettings(rounds=1, epochs=1, threshold=0.34)
+
+
+def claim(folder, *of):
+    """Begin a run, and leave it there."""
+    with claim_run(folder, RunSettings.of(*of, None), lambda begun: begun or 1) as claimed:
+        return claimed
+
+
 pytestmark = pytest.mark.filterwarnings("ignore::qs3.adaptation.selection.SingleClassWarning")
 
 
@@ -89,7 +98,7 @@ def test_a_warm_ups_clouds_count_as_seen(source, target, settings, tmp_path):
 def test_an_unfinished_run_is_told_from_none(source, settings, tmp_path):
     with pytest.raises(InputError, match="not a run of qs3"):
         read_run(tmp_path)
-    claim_run(tmp_path, "source-only", source, None, settings, None, None)
+    claim(tmp_path, "source-only", source, None, settings, None)
     assert is_run(tmp_path)
     with pytest.raises(InputError, match="not finished"):
         read_run(tmp_path)
@@ -97,7 +106,7 @@ def test_an_unfinished_run_is_told_from_none(source, settings, tmp_path):
 
 def test_a_run_of_an_earlier_release_is_read(source, target, settings, tmp_path):
     """As 0.1.0 wrote it: ``run.json`` without a schema, method qs3, a labeller."""
-    claim_run(tmp_path, "qbst", source, target.without_labels(), settings, ROUNDS, None)
+    claim(tmp_path, "qbst", source, target.without_labels(), settings, ROUNDS)
     save_model(tmp_path, new_model(settings, 3, 0), source.class_names, settings)
     value = json.loads((tmp_path / "settings.json").read_text())
     value["self_training"]["labeller"] = value["self_training"].pop("teacher")
@@ -123,18 +132,54 @@ def test_a_run_of_an_earlier_release_is_read(source, target, settings, tmp_path)
     record = evaluate(tmp_path, target)
     assert (record.method, record.source.clouds, record.marks) == ("qbst", 24, ())
     # and the same call goes on with it
-    claim_run(tmp_path, "qbst", source, target.without_labels(), settings, ROUNDS, None)
+    claim(tmp_path, "qbst", source, target.without_labels(), settings, ROUNDS)
     (tmp_path / "run.json").write_text(json.dumps(old | {"colour": "red"}))
     with pytest.raises(InputError, match=r"run\.json.*'colour' is unknown"):
         read_run(tmp_path)
 
 
+@pytest.mark.parametrize("value", [1.5, "x", True, [1], 1e12, 10**12, None, -1])
+def test_settings_that_are_none_are_told_in_a_line(source, settings, tmp_path, value):
+    """In ``settings.json``, and in a file of weights on its own."""
+    claim(tmp_path, "source-only", source, None, settings, None)
+    model = new_model(settings, 3, 0)
+    save_model(tmp_path, model, source.class_names, settings)
+    spoilt = json.loads((tmp_path / "settings.json").read_text())
+    spoilt["train"]["num_points"] = value
+    (tmp_path / "settings.json").write_text(json.dumps(spoilt))
+    with pytest.raises(InputError, match=r"settings\.json: .*num_points"):
+        load_model(tmp_path)
+    tensors, facts = read_tensors(tmp_path / "model.safetensors")
+    alone = tmp_path / "alone" / "weights.safetensors"
+    write_tensors(alone, tensors, facts | {"num_points": value})
+    with pytest.raises(InputError, match=r"weights\.safetensors: .*num_points"):
+        load_model(alone)
+
+
+def test_one_training_at_a_time(source, settings, tmp_path):
+    run = tmp_path / "run"
+    fit("source-only", source, None, settings, run_dir=run)
+    with folder_lock(run), pytest.raises(InputError, match=r"run: another qs3 .*process \d+ on"):
+        fit("source-only", source, None, settings, run_dir=run)
+    (run / LOCK).write_text("process 1 on elsewhere")  # of one that was killed
+    seen = []
+    fit("source-only", source, None, settings, run_dir=run, on_epoch=lambda r, m: seen.append(r))
+    assert not seen
+    assert not (run / LOCK).exists()
+
+    def again(record, method):
+        fit("source-only", source, None, settings, run_dir=tmp_path / "new")
+
+    with pytest.raises(InputError, match="another qs3 is writing"):
+        fit("source-only", source, None, settings, run_dir=tmp_path / "new", on_epoch=again)
+
+
 def test_a_run_begun_before_a_setting_existed_goes_on(source, settings, tmp_path):
-    claim_run(tmp_path, "source-only", source, None, settings, None, None)
+    claim(tmp_path, "source-only", source, None, settings, None)
     value = json.loads((tmp_path / "settings.json").read_text())
     del value["train"]["clip_norm"], value["train"]["label_smoothing"]
     (tmp_path / "settings.json").write_text(json.dumps(value))
-    claim_run(tmp_path, "source-only", source, None, settings, None, None)
+    claim(tmp_path, "source-only", source, None, settings, None)
     other = dataclasses.replace(settings, label_smoothing=0.1)
     with pytest.raises(InputError, match=r"holds a run with train\.label_smoothing = 0\.0, not"):
-        claim_run(tmp_path, "source-only", source, None, other, None, None)
+        claim(tmp_path, "source-only", source, None, other, None)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from qs3.adaptation import Method, SourceOnly
-from qs3.errors import InputError, QS3Error
+from qs3.errors import InputError
 from qs3.training.batches import batches, count_batches, prepare
 from qs3.training.checkpoint import new_model
 from qs3.training.loop import train
@@ -72,7 +72,7 @@ def test_random_state_of_the_caller_is_untouched(source, settings):
     assert torch.equal(torch.rand(1), expected)
 
 
-@pytest.mark.parametrize("epoch", [0, 2, 3])
+@pytest.mark.parametrize("epoch", [1, 3])
 def test_resumed_is_uninterrupted(source, settings, tmp_path, epoch):
     whole, history = run(source, settings)
     with pytest.raises(Stop):
@@ -146,16 +146,6 @@ def test_target_reaches_a_method_that_uses_it(source, target, settings):
         train(Sees(model), source, None, settings)
 
 
-def test_loss_that_is_not_finite_names_epoch_and_batch(source, settings):
-    class Diverges(SourceOnly):
-        def losses(self, source, target, progress, generator):
-            losses = super().losses(source, target, progress, generator)
-            return {"source": losses["source"] * (math.nan if progress >= 0.5 else 1.0)}
-
-    with pytest.raises(QS3Error, match="nan in epoch 2, batch 0"):
-        train(Diverges(new_model(settings, 3, 0)), source, None, settings)
-
-
 def test_one_cloud_is_too_few(source, settings):
     with pytest.raises(InputError, match="1 clouds are too few"):
         run(source.select(np.array([0])), settings)
@@ -183,13 +173,6 @@ def test_bf16_trains(source, settings):
     assert all((a - b).abs().max() < 0.1 for a, b in pairs)
 
 
-def test_device_that_is_not_here_is_told(source, settings):
-    if torch.cuda.is_available():
-        pytest.skip("there is a GPU")
-    with pytest.raises(InputError, match="accelerator 'cuda'"):
-        run(source, replace(settings, accelerator="cuda"))
-
-
 @pytest.mark.parametrize("count", [2, 3, 8, 9, 10, 17])
 def test_batches_hold_each_cloud_once_but_for_a_last_single_one(count):
     cut = list(batches(count, 4, np.random.default_rng(0)))
@@ -197,10 +180,3 @@ def test_batches_hold_each_cloud_once_but_for_a_last_single_one(count):
     assert min(map(len, cut)) >= 2
     rows = np.concatenate(cut)
     assert len(set(rows.tolist())) == len(rows) == count - (count % 4 == 1)
-
-
-def test_prepare_is_in_the_unit_ball_with_the_asked_points(source):
-    prepared = prepare(source.points * 7 + 3, 16)
-    assert prepared.shape == (24, 16, 3)
-    assert prepared.dtype == np.float32
-    assert np.linalg.norm(prepared, axis=2).max() <= 1 + 1e-6

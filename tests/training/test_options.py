@@ -38,7 +38,7 @@ def same(a, b):
     return all(torch.equal(a[name], b[name]) for name in a)
 
 
-def told(run_dir):
+def history_of(run_dir):
     return [json.loads(line) for line in (run_dir / history.HISTORY).read_text().splitlines()]
 
 
@@ -182,8 +182,8 @@ def test_only_clouds_of_several_sizes_are_read_twice():
 
 
 def test_stopped_in_time_again_and_again_is_uninterrupted(source, target, settings, tmp_path):
-    rounds = SelfTrainingSettings(rounds=2, epochs=2, threshold=0.4)
-    settings = replace(settings, epochs=20, ema_decay=0.8, clip_norm=1.0)
+    rounds = SelfTrainingSettings(rounds=1, epochs=2, threshold=0.4)
+    settings = replace(settings, epochs=12, ema_decay=0.8, clip_norm=1.0)
     arguments = ("qbst", source, target.without_labels(), settings, rounds)
     whole = fit(*arguments, run_dir=tmp_path / "whole")
     stops = 0
@@ -194,10 +194,10 @@ def test_stopped_in_time_again_and_again_is_uninterrupted(source, target, settin
         except TimeUpError as error:
             assert "run the same again to go on" in str(error)
             stops += 1
-            assert stops < 30
-    assert stops >= 19  # one epoch a call
+            assert stops < 20
+    assert stops >= 11  # one epoch a call
     assert same(whole.model, result.model)
-    assert plain(told(tmp_path / "whole")) == plain(told(tmp_path / "cut"))
+    assert plain(history_of(tmp_path / "whole")) == plain(history_of(tmp_path / "cut"))
 
 
 def plain(lines):
@@ -210,7 +210,7 @@ def test_history_is_there_after_each_epoch_and_repeats_nothing(source, settings,
     seen = []
 
     def look(record, method):
-        seen.append([line["epoch"] for line in told(tmp_path)])
+        seen.append([line["epoch"] for line in history_of(tmp_path)])
         if record.epoch == 1 and len(seen) == 2:
             raise Stop
 
@@ -252,38 +252,17 @@ def test_absent_tensorboard_names_the_extra(source, settings, tmp_path, monkeypa
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize(
-    ("changes", "named"),
-    [
-        ({"clip_norm": 0.0}, "clip_norm = 0.0"),
-        ({"clip_norm": math.inf}, "clip_norm = inf"),
-        ({"ema_decay": 1.0}, "ema_decay = 1.0"),
-        ({"ema_decay": 0.0}, "ema_decay = 0.0"),
-        ({"devices": 0}, "devices = 0"),
-    ],
-)
-def test_faulty_settings_are_named(settings, changes, named):
-    with pytest.raises(InputError, match=named):
-        replace(settings, **changes)
-
-
-def test_apples_gpus_are_refused(settings):
-    object.__setattr__(settings, "accelerator", "mps")  # as without the type checks of the tests
-    with pytest.raises(InputError, match="accelerator = mps is none of auto, cpu, cuda"):
-        settings.__post_init__()
-
-
 def test_statistics_stay_in_full_precision_under_bf16(source, settings):
     """Running statistics under bf16 are those of single precision, to the rounding of bf16."""
-    found = {}
+    buffers = {}
     for precision in ("32-true", "bf16-mixed"):
         method = SourceOnly(new_model(settings, 3, 0))
         changed = replace(settings, epochs=1, batch_size=24, precision=precision)
         train(method, source, None, changed)
-        found[precision] = dict(method.model.named_buffers())
-    for name, buffer in found["bf16-mixed"].items():
-        assert buffer.dtype == found["32-true"][name].dtype
-        torch.testing.assert_close(buffer, found["32-true"][name], rtol=0.05, atol=0.02)
+        buffers[precision] = dict(method.model.named_buffers())
+    for name, buffer in buffers["bf16-mixed"].items():
+        assert buffer.dtype == buffers["32-true"][name].dtype
+        torch.testing.assert_close(buffer, buffers["32-true"][name], rtol=0.05, atol=0.02)
 
 
 SCRIPT = """
@@ -318,7 +297,7 @@ def test_killed_in_the_middle_of_an_epoch_is_uninterrupted(source, target, setti
              json.dumps([asdict(settings), asdict(rounds)])],
             stderr=subprocess.DEVNULL,
         )  # fmt: skip
-        while not (cut / history.HISTORY).exists() or len(told(cut)) < lines:
+        while not (cut / history.HISTORY).exists() or len(history_of(cut)) < lines:
             assert process.poll() is None
             time.sleep(0.005)
         time.sleep(0.02)
@@ -327,4 +306,4 @@ def test_killed_in_the_middle_of_an_epoch_is_uninterrupted(source, target, setti
     assert len(list(cut.glob("subsample-*"))) == 2
     result = fit(*arguments, run_dir=cut)
     assert same(whole.model, result.model)
-    assert plain(told(cut)) == plain(told(tmp_path / "whole"))
+    assert plain(history_of(cut)) == plain(history_of(tmp_path / "whole"))

@@ -45,11 +45,14 @@ def examine() -> dict[str, Any]:
     needed = _requirements()
     packages = {name: _version(name) for name in needed.pop("")}
     variants = {variant: usable(variant) for variant in VARIANTS}
-    device = None
+    device, threads = None, None
     if packages["torch"] is not None:
         import torch
 
+        from qs3.training.threads import describe_threads
+
         device = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
+        threads = describe_threads()
     return {
         "python": platform.python_version(),
         "packages": packages,
@@ -57,6 +60,7 @@ def examine() -> dict[str, Any]:
         "renderer": next((variant for variant in VARIANTS if variants[variant]), None),
         "cycles": _cycles(),
         "device": device,
+        "threads": threads,
         "extras": {
             extra: all(_version(name) is not None for name in needed.get(extra, ()))
             for extra in _PURPOSE
@@ -117,7 +121,7 @@ def _print(machine: dict[str, Any]) -> None:
             f"  ok      cycles: Blender {cycles['blender']} (Python {cycles['python']}), "
             f"{cycles['command']}"
         )
-    show(f"Training on: {machine['device']}")
+    show(f"Training on: {machine['device']}; {machine['threads']}")
     show("Extras (each for what stands beside it, and nothing else)")
     for extra, here in machine["extras"].items():
         how = "" if here else f": in a checkout, pip install -e '.[{extra}]'"

@@ -36,9 +36,9 @@ def hardware() -> dict[str, Any]:
 def _cpu() -> str:
     listing = Path("/proc/cpuinfo")
     if listing.is_file():
-        found = re.search(r"^model name\s*:\s*(.+)$", listing.read_text(), re.MULTILINE)
-        if found:
-            return found[1].strip()
+        line = re.search(r"^model name\s*:\s*(.+)$", listing.read_text(), re.MULTILINE)
+        if line:
+            return line[1].strip()
     return platform.processor() or platform.machine()
 
 

@@ -259,7 +259,7 @@ def _check_scores(path: Path, scores: Scores) -> None:
         matrix = np.array(scores.confusion, dtype=np.int64).reshape(k, k + 1)
     except (ValueError, OverflowError):
         raise InputError(f"{path}: field 'scores.confusion' is no table of counts") from None
-    counts, right = matrix.sum(axis=1), matrix[np.arange(k), np.arange(k)]
+    counts, right = matrix.sum(axis=1), matrix.diagonal()
     total = int(counts.sum())
     if (matrix < 0).any() or total != scores.clouds or not total:
         raise InputError(f"{path}: field 'scores.clouds' is not the sum of 'scores.confusion'")

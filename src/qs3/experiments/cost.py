@@ -68,7 +68,7 @@ def step_seconds(runs: Iterable[Run], settings: TrainSettings, steps: int = 2) -
     device = torch.device("cuda" if cuda else "cpu")
     names = ["source-only", *(split_method(run.kind.method)[0] for run in runs)]
     threads = torch.get_num_threads()
-    if settings.threads is not None:
+    if isinstance(settings.threads, int):
         torch.set_num_threads(settings.threads)
     try:
         seconds = {}

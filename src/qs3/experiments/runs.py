@@ -197,5 +197,5 @@ def warm_up_of(scale: Scale, run: Run) -> Run | None:
     row = run.kind.warm_up
     if not row:
         return None
-    threads, network = run.train.threads, run.network
-    return make_run(scale, run.source, run.target, row, run.seed, threads, network)
+    threads = run.train.threads if isinstance(run.train.threads, int) else None
+    return make_run(scale, run.source, run.target, row, run.seed, threads, run.network)

@@ -9,15 +9,13 @@ from typing import Any
 from qs3.errors import InputError, QS3Error
 from qs3.evaluation.environment import versions
 from qs3.evaluation.records import DataRecord, RunRecord, find_records
-from qs3.io.clouds import digests
-from qs3.io.preparation import unit_ball
 from qs3.report import parts
 from qs3.report.contents import Report, Scored
 from qs3.report.lines import NamedRecord, score_lines
 from qs3.report.lookup import find_before, read_domain
 from qs3.report.settings import ReportSettings
 from qs3.training.checkpoint import load_model
-from qs3.training.evaluate import caveats
+from qs3.training.overlap import caveats
 from qs3.training.run import RUN, Run, find_runs, read_run
 
 _OLD_NAME = re.compile(r"([^-]+-.+)_([^_]+)_seed-\d+")
@@ -174,7 +172,7 @@ def _of_run(run: Run, holdings: Holdings, settings: ReportSettings) -> Report:
         for name, model in models.items():
             scored, answers[name] = parts.score_network(name, model, target)
             networks.append(scored)
-        marks = caveats(run, {*digests(target.points), *digests(unit_ball(target.points))})
+        marks = caveats(run, target.points)
     else:
         marks = () if record is None else record.marks
         if record is not None:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from qs3.errors import InputError
 from qs3.files import write_bytes
 from qs3.models import PointClassifier, create_model
+from qs3.structure import structure
 from qs3.training.config import TrainSettings
 from qs3.training.run import MODEL, SETTINGS, read_settings
 
@@ -46,16 +47,8 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     Raises:
         InputError: where the file is missing, is not safetensors, or was not written by qs3.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
     facts = read_facts(path)
-    try:
-        with safetensors.safe_open(path, framework="pt") as handle:  # pyright: ignore[reportPrivateImportUsage]
-            tensors = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118
-    except (safetensors.SafetensorError, OSError) as error:
-        raise InputError(f"{path}: not a safetensors file of qs3 ({error})") from error
-    return tensors, facts
+    return safetensors.torch.load_file(path), facts
 
 
 def read_facts(path: Path) -> dict[str, Any]:
@@ -64,8 +57,11 @@ def read_facts(path: Path) -> dict[str, Any]:
     Raises:
         InputError: as `read_tensors`.
     """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
     try:
-        with safetensors.safe_open(Path(path), framework="pt") as handle:  # pyright: ignore[reportPrivateImportUsage]
+        with safetensors.safe_open(path, framework="pt") as handle:  # pyright: ignore[reportPrivateImportUsage]
             facts = json.loads((handle.metadata() or {})["qs3"])
     except (safetensors.SafetensorError, KeyError, ValueError, OSError) as error:
         raise InputError(f"{path}: not a safetensors file of qs3 ({error})") from error
@@ -212,6 +208,7 @@ def load_model(run_dir: Path) -> LoadedModel:
     else:
         kept = ("model", "model_settings", "num_points")
         settings = {"train": {key: facts[key] for key in kept if key in facts}}
+        structure(settings["train"], TrainSettings, path)  # refuses what is none
     return LoadedModel(model.eval(), class_names, settings)
 
 

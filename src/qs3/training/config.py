@@ -3,13 +3,14 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import tyro
 
 from qs3.adaptation.names import Normalisation, RoundRule, Rule, Selection, SingleClass
 from qs3.errors import InputError
 
+_Settings = TypeVar("_Settings", bound=Any)
 Schedule = Literal["cosine", "plateau"]
 """A cosine to 0 over the training; or halved where the loss falls no more."""
 Precision = Literal["32-true", "bf16-mixed", "16-mixed", "64-true"]
@@ -20,6 +21,8 @@ PresetName = Literal["default", "spst", "paper", "released"]
 """Whole columns of settings: our defaults, SPST's, QS³'s text, QS³'s released code."""
 Prior = Literal["em", "bbse"]
 """Estimates of the target's class shares."""
+MOST_POINTS = 16_384
+"""Most points a cloud: the distances among those of one alone take 1 GiB."""
 
 
 @dataclass(frozen=True)
@@ -81,16 +84,19 @@ class TrainSettings:
     devices: int = 1
     """GPUs, or CPU processes, of this machine that share each batch. Each normalises its own share
     (batch normalisation), so that results differ a little between numbers of devices."""
-    threads: int | None = None
-    """CPU threads of each process; None leaves PyTorch's choice, or shares the cores between
-    several processes. Results are bit-identical for equal numbers, and after a stop on at most two
-    devices (DDP sums the first step's gradients of three in another order)."""
+    threads: int | Literal["auto"] | None = None
+    """CPU threads of each process. None takes the cores (OMP_NUM_THREADS where it is set), or one
+    for each of several processes; auto times a few steps, as one thread may be faster on a busy
+    machine. A run keeps its number. Results are bit-identical for equal numbers, and after a stop
+    on at most two devices (DDP sums the first step's gradients of three in another order)."""
 
     def __post_init__(self) -> None:
-        for name in ("num_points", "epochs", "learning_rate"):
+        for name in ("num_points", "epochs", "learning_rate", "devices"):
             _check(self, name, getattr(self, name) > 0, "must be above 0")
-        _check_word(self, "accelerator", Accelerator)
-        _check(self, "devices", self.devices > 0, "must be above 0")
+        points = self.num_points
+        fault = f"must be at most {MOST_POINTS}; the distances among the points of one cloud alone "
+        fault += f"would take {points**2 / 2**28:.3g} GiB"
+        _check(self, "num_points", points <= MOST_POINTS, fault)
         least = 2 * self.devices
         fault = f"must be at least {least}" + (", 2 a device" if self.devices > 1 else "")
         _check(self, "batch_size", self.batch_size >= least, fault)
@@ -102,12 +108,13 @@ class TrainSettings:
         for name in ("label_smoothing", "holdout"):
             _check(self, name, 0 <= getattr(self, name) < 1, "must be in 0 to below 1")
         _check(self, "validate_every", self.validate_every >= 0, "must not be negative")
-        _check_word(self, "schedule", Schedule)
-        _check_word(self, "normalisation", Normalisation)
-        _check_word(self, "rule", Rule)
+        words = {"accelerator": Accelerator, "schedule": Schedule, "rule": Rule}
+        for name, kind in (words | {"normalisation": Normalisation}).items():
+            _check_word(self, name, kind)
         good = self.rule == "last" or self.validate_every > 0
         _check(self, "validate_every", good, f"leaves no checkpoint for rule = {self.rule!r}")
-        _check(self, "threads", self.threads is None or self.threads > 0, "must be above 0")
+        good = self.threads in (None, "auto") or (type(self.threads) is int and self.threads > 0)
+        _check(self, "threads", good, "must be above 0, or auto")
 
 
 @dataclass(frozen=True)
@@ -205,8 +212,8 @@ def _default(kind: type, name: str) -> Any:
 
 
 def _check_word(settings: Any, name: str, kind: Any) -> None:
-    known = get_args(kind)
-    _check(settings, name, getattr(settings, name) in known, f"is none of {', '.join(known)}")
+    words = get_args(kind)
+    _check(settings, name, getattr(settings, name) in words, f"is none of {', '.join(words)}")
 
 
 def _check(settings: Any, name: str, good: bool, fault: str) -> None:
@@ -253,8 +260,17 @@ def self_training_preset(name: str, **overrides: Any) -> SelfTrainingSettings:
     """
     if name not in PRESETS:
         raise InputError(f"unknown preset {name!r}; choose one of {', '.join(PRESETS)}")
-    known = [f.name for f in fields(SelfTrainingSettings)]
-    for key in overrides:
-        if key not in known:
-            raise InputError(f"unknown setting {key!r}; choose from {', '.join(known)}")
-    return replace(PRESETS[name], **overrides)
+    return changed(PRESETS[name], overrides)
+
+
+def changed(settings: _Settings, given: Mapping[str, Any], where: str = "") -> _Settings:
+    """Return settings with some of them changed.
+
+    Raises:
+        InputError: where one is unknown; ``where`` ends the message.
+    """
+    names = [field.name for field in fields(settings)]
+    for name in given:
+        if name not in names:
+            raise InputError(f"unknown setting {name!r}{where}; choose from {', '.join(names)}")
+    return replace(settings, **given)

@@ -19,9 +19,9 @@ import threading
 import time
 import types
 from collections.abc import Callable, Iterable, Iterator
-from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import torch
@@ -30,10 +30,17 @@ from lightning_fabric.plugins.environments.lightning import LightningEnvironment
 from lightning_fabric.strategies.ddp import DDPStrategy
 from lightning_fabric.utilities.exceptions import MisconfigurationException
 from torch import Tensor, distributed
+from torch.multiprocessing.spawn import (
+    ProcessContext,
+    ProcessException,
+    ProcessExitedException,
+    start_processes,
+)
 
 from qs3.errors import InputError, QS3Error
 from qs3.training.config import TrainSettings
 from qs3.training.progress import TimeUpError
+from qs3.training.threads import threads
 
 _LOG = logging.getLogger(__name__)
 _GRACE = 60.0
@@ -119,7 +126,7 @@ def _joined(settings: TrainSettings, rank: int, folder: str) -> Iterator[Fabric]
         raise InputError("this process computes in a group already; set devices to 1")
     fabric = make_fabric(settings, rank)
     cuda = fabric.device.type == "cuda"
-    with _environment(_loopback()):
+    with mock.patch.dict(os.environ, _loopback()):  # puts all of it back
         meeting = str(Path(folder) / "meeting")
         store = distributed.FileStore(meeting, settings.devices)  # pyright: ignore[reportPrivateImportUsage]
         distributed.init_process_group(
@@ -145,20 +152,6 @@ def _loopback() -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def _environment(changes: dict[str, str]) -> Iterator[None]:
-    """Set environment variables for a while."""
-    names = (*changes, "MASTER_ADDR", "MASTER_PORT")
-    before = {name: os.environ[name] for name in names if name in os.environ}
-    os.environ.update(changes)
-    try:
-        yield
-    finally:
-        for name in names:
-            os.environ.pop(name, None)
-        os.environ.update(before)
-
-
-@contextlib.contextmanager
 def all_devices(settings: TrainSettings, work: Work) -> Iterator[Fabric]:
     """Compute on all devices of the settings; this process is the first of them.
 
@@ -173,82 +166,75 @@ def all_devices(settings: TrainSettings, work: Work) -> Iterator[Fabric]:
     if settings.devices == 1:
         yield make_fabric(settings)
         return
+    faults: list[str] = []
     with tempfile.TemporaryDirectory(prefix="qs3-") as folder:
-        others: list[_Other] = []
+        others = _start(settings, work, folder)
+
+        def failed(seconds: float) -> bool:
+            """Whether one of the others failed, now or within some seconds."""
+            try:
+                others.join(seconds)
+            except ProcessException as error:
+                faults.append(_fault(error))
+            return bool(faults)
+
+        def watch() -> None:
+            """End this process where another one died and a GPU waits for it without end."""
+            while not failed(0.5):
+                if not others.sentinels:
+                    return
+            time.sleep(_GRACE)
+            sys.stderr.write(f"qs3: {faults[0]}\n")
+            sys.stderr.flush()
+            os._exit(2)
+
         try:
-            with _no_main():
-                for rank in range(1, settings.devices):
-                    others.append(_Other(rank, folder, settings, work))
-            for other in others:
-                other.wait_until_ready()
+            while len(list(Path(folder).glob("ready-*"))) < settings.devices - 1:
+                if failed(0.1):
+                    raise QS3Error(faults[0])
             with _joined(settings, 0, folder) as fabric:
+                # On a CPU the broken connection is an error at once: nobody needs to watch.
                 if fabric.device.type == "cuda":
-                    threading.Thread(target=_watch, args=(others,), daemon=True).start()
+                    threading.Thread(target=watch, daemon=True).start()
                 yield fabric
-            for other in others:
-                other.process.join(_GRACE)
+            for process in others.processes:
+                process.join(_GRACE)
         except RuntimeError as error:
-            fault = _fault(others)
-            if fault is None:
+            if not failed(5.0):
                 raise
-            raise QS3Error(fault) from error
+            raise QS3Error(faults[0]) from error
         finally:
-            for other in others:
-                other.end()
+            for process in others.processes:
+                process.kill()
+                process.join()
 
 
-@contextlib.contextmanager
-def _no_main() -> Iterator[None]:
-    """Hide the caller's script, which a process that is started would run once more."""
+def _start(settings: TrainSettings, work: Work, folder: str) -> ProcessContext:
+    """Start the other processes; the caller's script, which each would run once more, is hidden."""
     main = sys.modules["__main__"]
     sys.modules["__main__"] = types.ModuleType("__main__")
     try:
-        yield
+        count, arguments = settings.devices - 1, (folder, settings, work)
+        context = start_processes(_do, arguments, count, join=False, daemon=True)
+        assert context is not None  # noqa: S101
+        return context
     finally:
         sys.modules["__main__"] = main
 
 
-class _Other:
-    """A process that computes on another device."""
-
-    def __init__(self, rank: int, folder: str, settings: TrainSettings, work: Work) -> None:
-        self.rank, self.wanted, self.reason = rank, True, ""
-        context = multiprocessing.get_context("spawn")
-        self.ear, mouth = context.Pipe(duplex=False)
-        arguments = (mouth, rank, folder, settings, work)
-        self.process = context.Process(target=_do, args=arguments, daemon=True)
-        self.process.start()
-        mouth.close()
-
-    def wait_until_ready(self) -> None:
-        wait([self.ear, self.process.sentinel])
-        fault = self.fault()
-        if fault is not None:
-            raise QS3Error(fault)
-
-    def end(self) -> None:
-        self.wanted = False
-        self.process.kill()
-        self.process.join()
-        self.ear.close()
-
-    def fault(self) -> str | None:
-        """How it failed; None where it did not."""
-        with contextlib.suppress(EOFError, OSError):
-            while self.wanted and self.ear.poll():
-                self.reason = self.ear.recv()
-        code = self.process.exitcode
-        if not self.wanted or not code:
-            return None
+def _fault(error: ProcessException) -> str:
+    """Say in a line which process ended how."""
+    how = f"failed: {str(error).strip().splitlines()[-1].removeprefix('qs3.errors.')}"
+    if isinstance(error, ProcessExitedException):
+        code = error.exit_code
         how = f"was killed (signal {-code})" if code < 0 else f"failed (code {code})"
-        reason = f": {self.reason}" if self.reason and code > 0 else ""
-        return (
-            f"the process of device {self.rank} {how}{reason}; run the same again to go on after "
-            "the last finished epoch"
-        )
+    return (
+        f"the process of device {error.error_index + 1} {how}; run the same again to go on after "
+        "the last finished epoch"
+    )
 
 
-def _do(mouth: Connection, rank: int, folder: str, settings: TrainSettings, work: Work) -> None:
+def _do(index: int, folder: str, settings: TrainSettings, work: Work) -> None:
     """Work on one further device, with the processes that meet in the folder."""
     # Ctrl-C reaches every process of a terminal: the first decides, and ends this one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -256,16 +242,13 @@ def _do(mouth: Connection, rank: int, folder: str, settings: TrainSettings, work
     silence = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):  # the first process talks
         os.dup2(silence, stream)
-    mouth.send("")
-    try:
-        with threads(settings), _joined(settings, rank, folder) as fabric:
-            work(fabric)
-    except TimeUpError:
-        return
-    except Exception as error:
-        reason = str(error) if isinstance(error, QS3Error) else f"{type(error).__name__}: {error}"
-        mouth.send(" ".join(reason.split()))
-        sys.exit(2)
+    (Path(folder) / f"ready-{index}").touch()
+    with (
+        contextlib.suppress(TimeUpError),
+        threads(int(settings.threads or 1)),
+        _joined(settings, index + 1, folder) as fabric,
+    ):
+        work(fabric)
 
 
 def _end_with_the_first() -> None:
@@ -273,33 +256,6 @@ def _end_with_the_first() -> None:
     assert first is not None  # noqa: S101
     first.join()
     os._exit(1)
-
-
-def _fault(others: list[_Other]) -> str | None:
-    """Wait a moment for the process that tore the group apart, and say how it ended."""
-    for _ in range(50):
-        for other in others:
-            fault = other.fault()
-            if fault is not None:
-                return fault
-        time.sleep(0.1)
-    return None
-
-
-def _watch(others: list[_Other]) -> None:
-    """End this process where another one died and a GPU waits for it without end.
-
-    On a CPU the broken connection is an error at once, and nobody needs to watch.
-    """
-    while any(other.wanted for other in others):
-        fault = next((f for f in (other.fault() for other in others) if f), None)
-        if fault is not None:
-            time.sleep(_GRACE)
-            if any(other.wanted for other in others):
-                sys.stderr.write(f"qs3: {fault}\n")
-                sys.stderr.flush()
-                os._exit(2)
-        time.sleep(0.5)
 
 
 def make_equal(tensors: Iterable[Tensor], fabric: Fabric) -> None:
@@ -325,18 +281,3 @@ def gather_rows(rows: np.ndarray, mine: slice, count: int, fabric: Fabric) -> np
     total = fabric.all_reduce(torch.from_numpy(whole).to(fabric.device), reduce_op="sum")
     assert isinstance(total, Tensor)  # noqa: S101
     return total.cpu().numpy()
-
-
-@contextlib.contextmanager
-def threads(settings: TrainSettings) -> Iterator[None]:
-    """Compute with the CPU threads of the settings for a while."""
-    before = torch.get_num_threads()
-    count = settings.threads
-    if count is None and settings.devices > 1:
-        count = max(1, before // settings.devices)
-    if count is not None:
-        torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

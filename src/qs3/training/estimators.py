@@ -4,10 +4,8 @@ Constructors only keep what they are given; `fit` does the work and leaves attri
 underscore at their end.
 """
 
-import contextlib
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -18,7 +16,7 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from qs3.adaptation.names import split_method
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
+from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, changed
 from qs3.training.fit import FitResult, fit
 from qs3.training.predict import predict_probabilities
 
@@ -93,14 +91,12 @@ class Adapter(ClassifierMixin, BaseEstimator):
         for name, parameter in {"model": "model", "seed": "random_state"}.items():
             if name in train:
                 raise InputError(f"give {name} as the parameter {parameter}, not in train")
-        settings = _changed(TrainSettings(), "train", train)
-        settings = replace(settings, model=self.model, seed=self.random_state)
+        train |= {"model": self.model, "seed": self.random_state}
+        settings = changed(TrainSettings(), train, " in train")
         method, rounds = self._plan()
-        with contextlib.ExitStack() as stack:
-            folder = self.run_dir
-            if folder is None:
-                folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="qs3-")) + "/run"
-            self.result_ = fit(method, source, target, settings, rounds, run_dir=Path(folder))
+        with tempfile.TemporaryDirectory(prefix="qs3-") as temporary:
+            folder = Path(temporary) / "run" if self.run_dir is None else Path(self.run_dir)
+            self.result_ = fit(method, source, target, settings, rounds, run_dir=folder)
         self.model_ = self.result_.model
         self.classes_ = np.array(source.class_names)
         self._num_points = settings.num_points
@@ -108,10 +104,8 @@ class Adapter(ClassifierMixin, BaseEstimator):
 
     def _plan(self) -> tuple[str, SelfTrainingSettings | None]:
         """The method, and the settings of the rounds that follow it."""
-        if self.self_training is None:
-            return self.method, None
-        _, rule = split_method(self.method)
-        return self.method, _rounds(self.self_training, rule)
+        given = self.self_training
+        return self.method, None if given is None else _rounds(given, split_method(self.method)[1])
 
     def predict_proba(
         self, clouds: PointClouds | UnlabelledClouds | Float[np.ndarray, "b n 3"]
@@ -210,15 +204,6 @@ class SPST(QBST):
 
 def _rounds(given: Mapping[str, Any], rule: str | None) -> SelfTrainingSettings:
     """Settings of rounds: those given, the others from the preset of the rule."""
-    own = {} if rule is None else {"rule": rule}
-    given = own | dict(given)
+    given = ({} if rule is None else {"rule": rule}) | dict(given)
     preset = PRESETS["spst" if given.get("rule") == "spst" else "default"]
-    return _changed(preset, "self_training", given)
-
-
-def _changed(settings: Any, what: str, given: Mapping[str, Any]) -> Any:
-    names = [field.name for field in fields(settings)]
-    for name in given:
-        if name not in names:
-            raise InputError(f"unknown setting {name!r} in {what}; choose from {', '.join(names)}")
-    return replace(settings, **given)
+    return changed(preset, given, " in self_training")

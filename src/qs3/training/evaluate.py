@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,14 @@ from qs3.errors import InputError
 from qs3.evaluation.environment import git_commit, hardware, versions
 from qs3.evaluation.records import RECORDS, RunRecord, Scores, score, write_record
 from qs3.io import load_clouds
-from qs3.io.clouds import CloudKind, PointClouds, digests
-from qs3.io.preparation import unit_ball
+from qs3.io.clouds import CloudKind, PointClouds
 from qs3.io.ragged import RaggedClouds
 from qs3.structure import unstructure
+from qs3.training.batches import load_whole, subsample
 from qs3.training.checkpoint import LoadedModel, load_model
+from qs3.training.overlap import caveats
 from qs3.training.predict import predict_probabilities
-from qs3.training.run import Run, data_record, read_run
+from qs3.training.run import data_record, read_run
 from qs3.training.validation import ROUND, choose, load_checkpoint, read_checkpoints
 
 
@@ -51,7 +52,8 @@ def evaluate(
     """
     made, loaded = read_run(run), load_model(run)
     train = loaded.settings["train"]
-    test = _labelled(data, split, cloud, train["num_points"], loaded.class_names)
+    whole = _labelled(data, split, cloud, train["num_points"], loaded.class_names)
+    test = replace(whole, points=subsample(whole.points, train["num_points"]))
     record = RunRecord(
         method=made.method,
         model=train["model"],
@@ -68,7 +70,7 @@ def evaluate(
         commit=git_commit(),
         rounds=made.rounds,
         choices=_choices(Path(run), loaded, test) if checkpoints else {},
-        marks=caveats(made, {*digests(test.points), *digests(unit_ball(test.points))}),
+        marks=caveats(made, test.points, whole.points),
         experiment=experiment,
     )
     write_record(record_path(run, record), record)
@@ -82,17 +84,6 @@ def record_path(run: Path, record: RunRecord) -> Path:
     return Path(run) / RECORDS / f"{Path(record.test.name).stem}-{digest}.json"
 
 
-def caveats(run: Run, tested: Collection[str]) -> tuple[str, ...]:
-    """Caveats of a score: which of the tested clouds the run has seen, by their checksums."""
-    seen = {
-        "transductive": not set(tested).isdisjoint(run.target_clouds),
-        "supervised": run.supervised,
-        "training clouds": not set(tested).isdisjoint(run.source_clouds),
-        "warm-up of unknown origin": run.unknown_warm_up,
-    }
-    return tuple(mark for mark, holds in seen.items() if holds)
-
-
 def _labelled(
     data: str | Path | PointClouds,
     split: str | None,
@@ -100,13 +91,12 @@ def _labelled(
     num_points: int,
     class_names: tuple[str, ...],
 ) -> PointClouds:
-    """Clouds of the network's number of points, with labels that index its classes."""
+    """Clouds with labels that index the network's classes."""
     if not isinstance(data, PointClouds):
-        return load_clouds(
-            data, split=split, num_points=num_points, cloud=cloud, class_names=class_names
-        )
+        part = {"split": split, "cloud": cloud, "class_names": class_names}
+        return load_whole(load_clouds, data, num_points, **part)
     given = RaggedClouds(list(data.points), data.ids, data.checksum, data.labels, data.class_names)
-    return replace(given.labelled(num_points, class_names, "data"), origin=data.origin)
+    return replace(given.labelled(None, class_names, "data"), origin=data.origin)
 
 
 def _scores(loaded: LoadedModel, test: PointClouds) -> Scores:

@@ -148,9 +148,8 @@ def export_run(run: Path, to: str, out: Path | None = None) -> Exported:
     folder = run.parent if run.is_file() else run
     path = folder / f"model{SUFFIXES[to]}" if out is None else Path(out)
     _check_place(path, to)
-    train = loaded.settings.get("train")
-    num_points = train.get("num_points") if isinstance(train, dict) else None
-    if not isinstance(num_points, int) or num_points < 1:
+    num_points = loaded.settings["train"].get("num_points")
+    if num_points is None:
         raise InputError(f"{run}: does not tell the number of points a cloud (num_points)")
     facts = {"class_names": list(loaded.class_names), "settings": loaded.settings}
     start = time.perf_counter()
@@ -193,11 +192,11 @@ def compare(
             points = (points + rng.normal(size=(b, 1, 3))) * 10.0 ** rng.uniform(-3, 3)
             points = points.astype(np.float32)
             wanted = predict_probabilities(model, points, num_points=num_points)
-            found = runner(points)
-            if found.shape != wanted.shape or not np.isfinite(found).all():
+            got = runner(points)
+            if got.shape != wanted.shape or not np.isfinite(got).all():
                 differences += [float("inf")] * b
             else:
-                differences += np.abs(found - wanted).max(axis=1).tolist()
+                differences += np.abs(got - wanted).max(axis=1).tolist()
     return np.array(differences)
 
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import logging
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -10,21 +9,23 @@ from pathlib import Path
 from qs3.adaptation import method_class
 from qs3.adaptation.names import split_method
 from qs3.errors import InputError
-from qs3.io.clouds import PointClouds, UnlabelledClouds, digests
+from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.preparation import unit_ball
 from qs3.models import PointClassifier
 from qs3.structure import unstructure
 from qs3.training.batches import require_finite, require_unlabelled, subsample
 from qs3.training.checkpoint import load_model, weights_fingerprint
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
-from qs3.training.distributed import all_devices, make_fabric, threads
+from qs3.training.distributed import all_devices, make_fabric
 from qs3.training.history import EpochRecord, History
 from qs3.training.job import Job, fresh_model, make_method, run_job
 from qs3.training.loop import EpochCallback
+from qs3.training.overlap import seen_clouds
 from qs3.training.progress import Deadline
 from qs3.training.run import (
     RUN,
     Run,
+    RunSettings,
     claim_run,
     data_record,
     fingerprint,
@@ -33,6 +34,7 @@ from qs3.training.run import (
     write_run,
 )
 from qs3.training.self_training import RoundCallback, RoundRecord
+from qs3.training.threads import choose_threads, threads, trial_step
 from qs3.training.validation import Checkpoint, held_out_rows, read_checkpoints
 
 _LOG = logging.getLogger(__name__)
@@ -140,56 +142,63 @@ def fit(
     _require_judges(settings, rounds_settings, target, has_holdout)
     job = Job(base, source, None, target, settings, rounds_settings, run_dir, warm_up)
     # What cannot be made must not leave a folder behind that refuses the corrected call.
-    make_method(fresh_model(job), job)
-    make_fabric(settings)
+    trial, device = make_method(fresh_model(job), job), make_fabric(settings)
     history = History(run_dir, tensorboard)
-    claim_run(run_dir, method, source, target, settings, rounds_settings, weights)
-    chosen = subsample(source.points, settings.num_points, run_dir)
-    source_clouds, target_clouds = digests(chosen), []
-    prepared, prepared_target = replace(source, points=unit_ball(chosen)), None
-    if target is not None:
-        chosen = subsample(target.points, settings.num_points, run_dir)
-        target_clouds = digests(chosen)
-        prepared_target = replace(target, points=unit_ball(chosen))
-    job = replace(
-        job,
-        source=prepared.select(~held),
-        holdout=prepared.select(held) if has_holdout else None,
-        target=prepared_target,
-    )
-    with (
-        threads(settings),
-        contextlib.closing(history),
-        all_devices(settings, partial(run_job, job)) as fabric,
-    ):
-        model, epochs, rounds = run_job(
+    wanted = RunSettings.of(method, source, target, settings, rounds_settings, weights)
+    step = partial(trial_step, trial, len(source.class_names), settings, device)
+    with claim_run(run_dir, wanted, partial(choose_threads, settings, step=step)) as claimed:
+        count = claimed.threads or 1
+        settings = replace(settings, threads=count)
+        chosen = subsample(source.points, settings.num_points, run_dir)
+        source_clouds, source_shapes = seen_clouds(chosen, source.points)
+        target_clouds, target_shapes = (), ()
+        prepared, prepared_target = replace(source, points=unit_ball(chosen)), None
+        if target is not None:
+            chosen = subsample(target.points, settings.num_points, run_dir)
+            target_clouds, target_shapes = seen_clouds(chosen, target.points)
+            prepared_target = replace(target, points=unit_ball(chosen))
+        job = replace(
             job,
-            fabric,
-            history=history,
-            deadline=deadline,
-            on_epoch=on_epoch,
-            on_round=on_round,
+            source=prepared.select(~held),
+            holdout=prepared.select(held) if has_holdout else None,
+            target=prepared_target,
+            settings=settings,
         )
-    adapted = (
-        needs or settings.normalisation != "shared" or settings.rule not in ("last", "source-val")
-    )
-    if rounds_settings is not None and method == base:
-        method = f"{base}+{rounds_settings.rule}"
-    run = Run(
-        method=method,
-        selection=settings.rule,
-        source=data_record(source),
-        target=None if target is None else data_record(target),
-        source_clouds=tuple(source_clouds),
-        target_clouds=tuple(target_clouds) if adapted else (),
-        unknown_warm_up=warm_up is not None and before is None,
-        rounds=tuple(asdict(record) for record in rounds),
-        seconds=sum_seconds(epochs, rounds),
-        preset=None if rounds_settings is None else preset,
-        supervised=supervised,
-        folder=run_dir,
-    )
-    write_run(run if before is None else _with_warm_up(run, before))
+        with (
+            threads(count),
+            contextlib.closing(history),
+            all_devices(settings, partial(run_job, job)) as fabric,
+        ):
+            model, epochs, rounds = run_job(
+                job,
+                fabric,
+                history=history,
+                deadline=deadline,
+                on_epoch=on_epoch,
+                on_round=on_round,
+            )
+        adapted = needs or settings.normalisation != "shared"
+        adapted = adapted or settings.rule not in ("last", "source-val")
+        if rounds_settings is not None and method == base:
+            method = f"{base}+{rounds_settings.rule}"
+        run = Run(
+            method=method,
+            selection=settings.rule,
+            source=data_record(source),
+            target=None if target is None else data_record(target),
+            source_clouds=source_clouds,
+            source_shapes=source_shapes,
+            target_clouds=target_clouds if adapted else (),
+            target_shapes=target_shapes if adapted else (),
+            threads=count,
+            unknown_warm_up=warm_up is not None and before is None,
+            rounds=tuple(asdict(record) for record in rounds),
+            seconds=sum_seconds(epochs, rounds),
+            preset=None if rounds_settings is None else preset,
+            supervised=supervised,
+            folder=run_dir,
+        )
+        write_run(run if before is None else _with_warm_up(run, before))
     return FitResult(
         model=model.eval(),
         history=tuple(epochs),
@@ -205,17 +214,10 @@ def fit(
 
 def _with_warm_up(run: Run, before: Run) -> Run:
     """Add what the network has seen in its warm-up, for the marks of its scores."""
-
-    def both(first: Sequence[str], second: Sequence[str]) -> tuple[str, ...]:
-        return tuple(sorted({*first, *second}))
-
-    return replace(
-        run,
-        supervised=run.supervised or before.supervised,
-        source_clouds=both(run.source_clouds, before.source_clouds),
-        target_clouds=both(run.target_clouds, before.target_clouds),
-        unknown_warm_up=before.unknown_warm_up,
-    )
+    names = ("source_clouds", "source_shapes", "target_clouds", "target_shapes")
+    both = {name: tuple(sorted({*getattr(run, name), *getattr(before, name)})) for name in names}
+    supervised = run.supervised or before.supervised
+    return replace(run, **both, supervised=supervised, unknown_warm_up=before.unknown_warm_up)
 
 
 def _plan(
@@ -242,11 +244,7 @@ def _require_judges(
     target: UnlabelledClouds | None,
     has_holdout: bool,
 ) -> None:
-    """Refuse, before anything is trained, what would lack something in the end.
-
-    Raises:
-        InputError: where the rule or the estimate of the class shares has nothing to go by.
-    """
+    """Refuse, before anything is trained, what would lack something in the end."""
     by_source = settings.rule in ("source-val", "dev")
     bbse = rounds is not None and rounds.rule == "prior" and rounds.prior == "bbse"
     if not has_holdout and (by_source or bbse):
@@ -262,11 +260,7 @@ def _require_judges(
 def _check_warm_up(
     folder: Path, base: str, source: PointClouds, settings: TrainSettings
 ) -> tuple[str, bool]:
-    """Return the checksum of a warm-up's weights, and whether the held-out part is new to it.
-
-    Raises:
-        InputError: where it is one for other classes or settings, or of another method.
-    """
+    """Return the checksum of a warm-up's weights, and whether the held-out part is new to it."""
     model, class_names, its = load_model(folder)
     if class_names != source.class_names:
         raise InputError(

@@ -78,7 +78,7 @@ def describe(
     training = model.training
     model.eval()
     mine = _part(len(points), fabric)
-    found: list[np.ndarray] = []
+    answers: list[np.ndarray] = []
     try:
         # A lone point tells the widths where this device has no cloud.
         example = torch.zeros(1, 1, 3).to(parameter)
@@ -90,10 +90,10 @@ def describe(
                 encoded = model.encode(batch.to(parameter.device, parameter.dtype))
                 logits = model.head(encoded)
             parts = (torch.softmax(logits.double(), dim=1), encoded.pooled.double())
-            found.append(torch.cat(parts, dim=1).cpu().numpy())
+            answers.append(torch.cat(parts, dim=1).cpu().numpy())
     finally:
         model.train(training)
-    rows = np.concatenate([np.zeros((0, classes + width)), *found])
+    rows = np.concatenate([np.zeros((0, classes + width)), *answers])
     if fabric is not None:
         rows = gather_rows(rows, mine, len(points), fabric)
     return Description(rows[:, :classes], rows[:, classes:])

@@ -1,8 +1,9 @@
 """The folder of a run: its settings, what is told of it when it is finished, where runs lie."""
 
+import contextlib
 import hashlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,9 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.evaluation.records import DataRecord, rename_method, rename_settings, walk
-from qs3.files import holds_something, read_json, write_json
+from qs3.files import claim_folder, folder_lock, read_json, write_json
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.structure import fill, first_difference, structure, unstructure
+from qs3.structure import first_difference, structure, unstructure
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 
 RUN = "run.json"
@@ -43,6 +44,12 @@ class Run:
     """What each round of self-training did."""
     seconds: Mapping[str, float]
     """Wall-clock seconds: ``source``, ``rounds``, ``total``."""
+    source_shapes: tuple[str, ...] = ()
+    """What the labelled clouds look like, so that one written anew is known too."""
+    target_shapes: tuple[str, ...] = ()
+    """The same of the clouds of the target."""
+    threads: int | None = None
+    """CPU threads of each process, in the call that ended the run; None where it is not known."""
     preset: str | None = None
     """Preset of the rounds; None without rounds, or where the caller named none."""
     supervised: bool = False
@@ -53,6 +60,45 @@ class Run:
     """Where the run lies; not in the file."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """``settings.json``: ``train``, ``self_training``, ``class_names`` …; not in the file."""
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """What is told of a run when it begins: its ``settings.json``."""
+
+    method: str
+    """Method, as it was asked for."""
+    train: TrainSettings
+    """How to train."""
+    class_names: tuple[str, ...]
+    """Names of the classes, in the order of the logits."""
+    self_training: SelfTrainingSettings | None = None
+    """How to train oneself; None without rounds."""
+    selection: str = "last"
+    """Rule that chooses the network."""
+    source: str = ""
+    """Checksum of the labelled clouds, by which the run is known again."""
+    target: str | None = None
+    """That of the clouds of the target."""
+    warm_up: str | None = None
+    """That of the weights that the run starts from."""
+    threads: int | None = None
+    """CPU threads of each process; None in runs of earlier releases."""
+
+    @classmethod
+    def of(
+        cls,
+        method: str,
+        source: PointClouds,
+        target: UnlabelledClouds | None,
+        settings: TrainSettings,
+        rounds: SelfTrainingSettings | None,
+        warm_up: str | None,
+    ) -> "RunSettings":
+        """Return the settings of a training on these clouds."""
+        seen = None if target is None else fingerprint(target)
+        names, rule = source.class_names, settings.rule
+        return cls(method, settings, names, rounds, rule, fingerprint(source), seen, warm_up)
 
 
 def write_run(run: Run) -> None:
@@ -90,16 +136,19 @@ def read_run(folder: Path) -> Run:
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
-    """Read the settings of a run, by their names of today.
+    """Read ``settings.json``, the `RunSettings` of a run as plain values, by their names of today.
 
     Raises:
-        InputError: where they are missing or not an object.
+        InputError: where the file is missing, or holds what cannot be a setting.
     """
-    path = Path(folder) / SETTINGS
+    return unstructure(_settings(Path(folder) / SETTINGS))
+
+
+def _settings(path: Path) -> RunSettings:
     value = read_json(path)
-    if not isinstance(value, dict):
-        raise InputError(f"{path}: not the settings of a run")
-    return rename_settings(value)
+    return structure(
+        rename_settings(value) if isinstance(value, dict) else value, RunSettings, path
+    )
 
 
 def is_run(folder: Path) -> bool:
@@ -120,55 +169,46 @@ def find_runs(folder: Path) -> list[Path]:
     return runs
 
 
+@contextlib.contextmanager
 def claim_run(
-    run_dir: Path,
-    method: str,
-    source: PointClouds,
-    target: UnlabelledClouds | None,
-    settings: TrainSettings,
-    rounds: SelfTrainingSettings | None,
-    warm_up: str | None,
-) -> None:
-    """Write a run's settings to its folder, or check that they are the ones already there.
+    folder: Path, wanted: RunSettings, threads: Callable[[int | None], int]
+) -> Iterator[RunSettings]:
+    """Keep a folder for a run, to the end of the block: made, or that of the same run.
+
+    Its settings are written, or compared with those already there. Numbers of threads may differ.
 
     Args:
-        run_dir: The folder.
-        method: Name of the method.
-        source: Labelled clouds, by whose checksum a run is known again; so of the target.
-        target: Unlabelled clouds.
-        settings: How to train.
-        rounds: How to train oneself.
-        warm_up: Checksum of the weights that the run starts from.
+        folder: The folder.
+        wanted: Settings of the run.
+        threads: Chooses the number of CPU threads, given the one that the run was begun with.
+
+    Yields:
+        The settings, with the number of threads.
 
     Raises:
-        InputError: where the folder is a file, holds something else, or a run of other settings;
-            the first setting that differs is named.
+        InputError: where another process writes there, the folder is a file, holds something else,
+            or a run of other settings; the first setting that differs is named.
     """
-    wanted = {
-        "method": method,
-        "train": unstructure(settings),
-        "self_training": None if rounds is None else unstructure(rounds),
-        "selection": settings.rule,
-        "class_names": list(source.class_names),
-        "source": fingerprint(source),
-        "target": None if target is None else fingerprint(target),
-        "warm_up": warm_up,
-    }
-    if run_dir.exists() and not run_dir.is_dir():
-        raise InputError(f"{run_dir}: is a file; name a folder for the run")
-    if (run_dir / SETTINGS).is_file():
-        defaults = {"train": TrainSettings(), "self_training": SelfTrainingSettings()}
-        begun = fill(read_settings(run_dir), wanted, unstructure(defaults))
-        if difference := first_difference(begun, wanted):
+    path = claim_folder(folder, SETTINGS) / SETTINGS
+    with folder_lock(folder):
+        begun = _settings(path) if path.is_file() else None
+        if begun is not None and (difference := first_difference(_fixed(begun), _fixed(wanted))):
             name, theirs, ours = difference
             raise InputError(
-                f"{run_dir}: holds a run with {name} = {theirs!r}, not {ours!r}; name another "
+                f"{folder}: holds a run with {name} = {theirs!r}, not {ours!r}; name another "
                 "folder or use its settings"
             )
-        return
-    if holds_something(run_dir):
-        raise InputError(f"{run_dir}: holds something else (no {SETTINGS}); name a new folder")
-    write_json(run_dir / SETTINGS, wanted)
+        ready = replace(wanted, threads=threads(None if begun is None else begun.threads))
+        if begun is None:
+            write_json(path, unstructure(ready))
+        yield ready
+
+
+def _fixed(settings: RunSettings) -> dict[str, Any]:
+    """The settings that a run keeps from its beginning to its end."""
+    value = unstructure(settings)
+    del value["threads"], value["train"]["threads"]
+    return value
 
 
 def fingerprint(clouds: PointClouds | UnlabelledClouds) -> str:

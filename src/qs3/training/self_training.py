@@ -1,5 +1,6 @@
 """Self-training in rounds: label the target, select, train, raise the threshold (Algorithm 1)."""
 
+import contextlib
 import copy
 import logging
 import time
@@ -18,7 +19,7 @@ from qs3.adaptation.graph_labels import refine_probabilities
 from qs3.adaptation.selection import select_confident
 from qs3.errors import InputError
 from qs3.evaluation.metrics import accuracy
-from qs3.io.clouds import PointClouds, UnlabelledClouds, digests
+from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.training.batches import require_finite, require_unlabelled
 from qs3.training.checkpoint import (
@@ -31,12 +32,14 @@ from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.distributed import make_fabric
 from qs3.training.history import EpochRecord, History
 from qs3.training.loop import EpochCallback, train
+from qs3.training.overlap import seen_clouds
 from qs3.training.predict import Description, describe, predict_probabilities
 from qs3.training.progress import Deadline
 from qs3.training.rounds import RoundRecord, Rounds, begin_rounds, write_rounds
 from qs3.training.rules import Select, make_rule
-from qs3.training.run import Run, claim_run, data_record, sum_seconds, write_run
+from qs3.training.run import Run, RunSettings, claim_run, data_record, sum_seconds, write_run
 from qs3.training.state import CHECKPOINT
+from qs3.training.threads import choose_threads, threads
 from qs3.training.validation import adapt_statistics
 
 _LOG = logging.getLogger(__name__)
@@ -94,37 +97,49 @@ def self_train(
     """
     require_unlabelled(target)
     fabric = fabric or make_fabric(settings)
-    if run_dir is not None:
-        run_dir, warm_up = Path(run_dir), weights_fingerprint(model)
-        claim_run(run_dir, self_training.rule, source, target, settings, self_training, warm_up)
-    adapted, records = run_rounds(
-        model,
-        source,
-        target,
-        settings,
-        self_training,
-        fabric,
-        holdout=holdout,
-        select=select,
-        run_dir=run_dir,
-        on_round=on_round,
-        on_epoch=on_epoch,
-    )
-    if run_dir is not None:
-        save_model(run_dir, adapted, source.class_names, settings)
-        run = Run(
-            method=self_training.rule,
-            selection="last",
-            source=data_record(source),
-            target=data_record(target),
-            source_clouds=tuple(digests(source.points)),
-            target_clouds=tuple(digests(target.points)),
-            unknown_warm_up=True,
-            rounds=tuple(asdict(record) for record in records),
-            seconds=sum_seconds([], records),
-            folder=run_dir,
+    with contextlib.ExitStack() as stack:
+        choose = partial(choose_threads, settings, step=None)
+        if run_dir is None:
+            count = choose(None)
+        else:
+            run_dir, method = Path(run_dir), self_training.rule
+            given = source, target, settings, self_training, weights_fingerprint(model)
+            claimed = claim_run(run_dir, RunSettings.of(method, *given), choose)
+            count = stack.enter_context(claimed).threads or 1
+        stack.enter_context(threads(count))
+        adapted, records = run_rounds(
+            model,
+            source,
+            target,
+            settings,
+            self_training,
+            fabric,
+            holdout=holdout,
+            select=select,
+            run_dir=run_dir,
+            on_round=on_round,
+            on_epoch=on_epoch,
         )
-        write_run(run)
+        if run_dir is not None:
+            save_model(run_dir, adapted, source.class_names, settings)
+            source_clouds, source_shapes = seen_clouds(source.points, source.points)
+            target_clouds, target_shapes = seen_clouds(target.points, target.points)
+            run = Run(
+                method=self_training.rule,
+                selection="last",
+                source=data_record(source),
+                target=data_record(target),
+                source_clouds=source_clouds,
+                source_shapes=source_shapes,
+                target_clouds=target_clouds,
+                target_shapes=target_shapes,
+                threads=count,
+                unknown_warm_up=True,
+                rounds=tuple(asdict(record) for record in records),
+                seconds=sum_seconds([], records),
+                folder=run_dir,
+            )
+            write_run(run)
     return adapted, records
 
 
