@@ -10,6 +10,8 @@ from jaxtyping import Float
 
 from qs3.errors import InputError, UnevenSizesError
 
+_CLOUDS = 256  # brought to the unit ball at a time
+
 
 def unit_ball(points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n 3"]:
     """Centre each cloud on its mean and divide by its farthest distance from there.
@@ -20,12 +22,19 @@ def unit_ball(points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n 3"]:
         >>> unit_ball(np.array([[[0.0, 0, 0], [4, 0, 0]]])).tolist()
         [[[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]]
     """
+    balls = np.empty(points.shape, dtype=np.float32)
+    for start in range(0, len(points), _CLOUDS):  # in double precision, but never all at once
+        balls[start : start + _CLOUDS] = _unit_balls(points[start : start + _CLOUDS])
+    return balls
+
+
+def _unit_balls(points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n 3"]:
     centred = points - points.mean(axis=1, keepdims=True, dtype=np.float64)
     radius = np.linalg.norm(centred, axis=2).max(axis=1, initial=0.0)[:, None, None]
     # Equal points can miss their own mean by a rounding error, which must not be blown up.
     extent = np.abs(points).max(axis=(1, 2), initial=0.0)[:, None, None]
     flat = radius <= 1e-12 * extent
-    return np.where(flat, 0.0, centred / np.where(flat, 1.0, radius)).astype(np.float32)
+    return np.where(flat, 0.0, centred / np.where(flat, 1.0, radius))
 
 
 def resample(

@@ -119,7 +119,7 @@ def subsample(
     path, index = None, None
     if cache is not None:
         key = hashlib.sha256(f"{points.shape} {points.dtype} {num_points}".encode())
-        key.update(np.ascontiguousarray(points).tobytes())
+        key.update(np.ascontiguousarray(points).data)
         path = Path(cache) / f"subsample-{key.hexdigest()[:16]}.safetensors"
         index = _read_choice(path, (b, num_points), n)
     if index is None:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from qs3.errors import InputError
-from qs3.files import write_bytes
+from qs3.files import parse_json, write_bytes
 from qs3.models import PointClassifier, create_model
 from qs3.structure import structure
 from qs3.training.config import TrainSettings
@@ -62,8 +62,8 @@ def read_facts(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: no such file")
     try:
         with safetensors.safe_open(path, framework="pt") as handle:  # pyright: ignore[reportPrivateImportUsage]
-            facts = json.loads((handle.metadata() or {})["qs3"])
-    except (safetensors.SafetensorError, KeyError, ValueError, OSError) as error:
+            facts = parse_json((handle.metadata() or {})["qs3"], path)
+    except (safetensors.SafetensorError, KeyError, InputError, OSError) as error:
         raise InputError(f"{path}: not a safetensors file of qs3 ({error})") from error
     if not isinstance(facts, dict):
         raise InputError(f"{path}: not a safetensors file of qs3 (facts are no object)")
