@@ -214,7 +214,7 @@ def test_a_real_pair_is_held_against_its_own_depth(realism, camera, flat, tmp_pa
     assert record["median_abs_px"] < 0.05
     assert record["plane_rms_px"] < 0.05
     assert record["edge_spill_px"]["median"] is None
-    assert "no edge" in record["notes"][0]
+    assert "0 pixels of edges" in record["notes"][0]
     assert record["notes"][0] in done.stderr
     assert "RMS on planes" in done.stdout
     assert (out / "pair.png").read_bytes()[1:4] == b"PNG"

@@ -54,6 +54,8 @@ def test_the_image_tells_where_an_edge_is(rng):
     assert np.nanmedian(spill(camera, edges)) == pytest.approx(4, abs=0.35)
     assert len(find_edges(picture(half(0), rng, contrast=0), camera).level) < 20
     assert not len(find_edges(picture(half(0), rng), np.where(half(0), 20.0, 17.0)).level)
+    spots = 600 * gaussian_filter((rng.random(SHAPE) < 1 / 80).astype(float), 1.4)
+    assert len(find_edges((14 + spots).clip(0, 255).astype(np.uint8), camera).level) < 20
 
 
 def test_strays_and_holes_move_no_edge(rng):

@@ -59,9 +59,9 @@ def realism(
 
 def _pair(out: Path, pair: InfraredPair, camera: CameraSettings) -> int:
     """Hold the matcher against a real camera's own depth."""
-    from qs3.report.pair import PAIR_PLOT, PAIR_RECORD, test_pair
+    from qs3.report.pair import PAIR_PLOT, PAIR_RECORD, compare_pair
 
-    record = test_pair(out, pair, camera.make_sensor().matching)
+    record = compare_pair(out, pair, camera.make_sensor().matching)
     show(*pair_table(record))
     tell(*record["notes"], f"Look at {out / PAIR_PLOT} and {out / PAIR_RECORD}")
     return 0

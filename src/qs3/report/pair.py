@@ -18,7 +18,7 @@ _OURS, _CAMERA = PALETTE[0], PALETTE[6]
 _OFF = 2.0  # pixels of disparity at which the difference has its full colour
 
 
-def test_pair(out: Path, pair: InfraredPair, settings: MatchingSettings) -> dict[str, Any]:
+def compare_pair(out: Path, pair: InfraredPair, settings: MatchingSettings) -> dict[str, Any]:
     """Compare, and write figures and picture.
 
     Args:

@@ -25,10 +25,10 @@ LAGS = (1, 4, 8)
 
 _STEP = 4.0  # least step of disparity at an edge: a D4xx tells it from any noise
 _LAG = 3  # pixels on either side of a step that may show a depth in between
-_ALONG = 10  # rows up and down the line through an edge
+_ALONG = 15  # rows up and down the line through an edge
 _ACROSS = 16  # columns to either side of it in which grey levels change
 _NEARNESS = 4.0  # σ of the weight by which the change nearest to the line is preferred
-_CONTRAST = 4.0  # an edge is so many times the median change across the line
+_CONTRAST = 3.0  # at an edge each third of the line changes by as many medians, or 2 σ of noise
 _INSIDE, _OUTSIDE = 8, 20  # columns about an edge in which a surface may end
 _FEWEST = 20  # pixels of edges, and of these on a side, that a median is told of
 _FLAT = 0.5  # pixels of disparity off a plane that are its noise: 3 to 4 σ of a D4xx
@@ -124,7 +124,10 @@ def compare(pair: InfraredPair, settings: MatchingSettings) -> Comparison:
             "focal length, baseline or depth scale another camera's?"
         )
     if len(edges.level) < _FEWEST:
-        notes.append("no edge that depth and image both show: no spill")
+        notes.append(
+            f"{len(edges.level)} pixels of edges that depth and image both show, fewer than "
+            f"{_FEWEST}: no spill"
+        )
     if not patches:
         notes.append(f"no plane of {PATCH[0]} × {PATCH[1]} px in the camera's depth: no noise")
     figures = {
@@ -183,12 +186,12 @@ def find_edges(image: Image, camera: Float[np.ndarray, "h w"]) -> Edges:
 
     Args:
         image: The left image.
-        camera: Disparity that tells where surfaces end, within `_ACROSS` pixels.
+        camera: Disparity that tells where surfaces end, within a few pixels.
 
     Returns:
         An edge for each pixel at which the rims are met along rows or columns, at 45° or less to
-        their normal. What has no straight rim, a step below 4 px, or no edge in the image that
-        stands out, is left out.
+        their normal. Left out is what has no straight rim, a step below 4 px, another near surface
+        within 20 px, or no edge in the image that stands out along all of the line.
     """
     grey = image.astype(np.float64) * (255 / (255 if image.dtype == np.uint8 else 1023))
     rows, columns = np.indices(camera.shape)
@@ -211,11 +214,14 @@ def _rims(
 
     level, steps = _steps(camera)
     height, width = camera.shape
-    margin, reach = max(_ALONG + 3, _OUTSIDE), _ALONG + 2
+    margin, reach = _OUTSIDE, _ALONG + 2
     along, across = np.arange(-_ALONG, _ALONG + 1), np.arange(-_ACROSS, _ACROSS + 1)
     found = []
     for y, x in np.argwhere(steps).tolist():
         if not (margin <= x < width - margin and margin <= y < height - margin):
+            continue
+        beyond = camera[y, x + 1 : x + 1 + _OUTSIDE]
+        if (beyond > level[y, x]).any():  # another surface, or a stray: where ours ends is moot
             continue
         around = steps[y - _ALONG : y + _ALONG + 1, x - reach : x + reach + 1]
         down, right = np.argwhere(around).T - np.array([[_ALONG], [reach]])
@@ -230,10 +236,12 @@ def _rims(
                 continue
             place = (x + start + slope * along)[:, None] + np.arange(-_ACROSS - 1, _ACROSS + 2)
             lines = np.broadcast_to((y + along)[:, None], place.shape)
-            profile = np.median(map_coordinates(grey, [lines, place], order=1), axis=0)
-            change = np.abs(profile[2:] - profile[:-2]) / 2
+            lines = map_coordinates(grey, [lines, place], order=1)
+            profiles = np.stack([np.median(part, axis=0) for part in np.array_split(lines, 3)])
+            rise = (profiles[:, 2:] - profiles[:, :-2]) / 2
+            change = np.where(np.abs(np.sign(rise).sum(axis=0)) == 3, np.abs(rise).min(axis=0), 0)
             peak = int(np.argmax(change * np.exp(-((across / _NEARNESS) ** 2) / 2)))
-            if change[peak] < max(1.0, _CONTRAST * np.median(change)):
+            if change[peak] < max(1.0, _CONTRAST * np.median(np.abs(rise))):
                 continue
             top = slice(max(0, peak - 2), peak + 3)
             shift = start + float(np.average(across[top], weights=change[top]))
