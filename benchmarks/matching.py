@@ -29,6 +29,7 @@ import numpy as np
 
 from qs3.sensor.matching import MatchingSettings, match
 from qs3.sensor.matching.settings import Method
+from qs3.sensor.realism.pair import plane_noise
 
 CANDIDATES: list[tuple[Method, int, bool]] = [
     ("opencv-bm", 15, False),
@@ -198,28 +199,8 @@ def bottle(disparity: np.ndarray) -> np.ndarray:
     return np.median([near.argmax(axis=1), 94 - near[:, ::-1].argmax(axis=1)], axis=1)
 
 
-PATCHES = (
-    "560,60 660,60 740,110 700,330 60,300 60,380 160,400 300,400 420,400 740,400 560,120 250,20 "
-    "100,60"
-)
-
-
-def planes(disparity: np.ndarray) -> tuple[float, np.ndarray]:
-    """RMS on patches of 80 × 60, and autocorrelation along x at 1, 4 and 8 px; medians."""
-    v, u = np.mgrid[:60, :80]
-    design = np.stack([u, v, np.ones_like(u)], axis=-1).astype(float)
-    sizes, along = [], []
-    for x, y in (map(int, place.split(",")) for place in PATCHES.split()):
-        part = disparity[y : y + 60, x : x + 80].astype(float)
-        kept, rest = np.isfinite(part), part
-        for _ in range(3):
-            rest = part - design @ np.linalg.lstsq(design[kept], part[kept])[0]
-            kept = np.abs(rest) < 1
-        rest = np.where(kept, rest - rest[kept].mean(), np.nan)
-        power = np.nanmean(rest**2)
-        sizes.append(np.sqrt(power))
-        along.append([np.nanmean(rest[:, k:] * rest[:, :-k]) / power for k in (1, 4, 8)])
-    return float(np.median(sizes)), np.median(along, axis=0)
+PATCHES = [(560, 60), (660, 60), (740, 110), (700, 330), (60, 300), (60, 380), (160, 400)]
+PATCHES += [(300, 400), (420, 400), (740, 400), (560, 120), (250, 20), (100, 60)]
 
 
 def coloured(disparity: np.ndarray) -> np.ndarray:
@@ -241,7 +222,7 @@ def table_of_pair(threads: int, picture: Path | None) -> None:
     for name, (disparity, seconds, memory) in rows.items():
         off = np.abs(disparity - camera)
         off = off[np.isfinite(off)]
-        (up, right), (rms, along) = spill(disparity), planes(disparity)
+        (up, right), (rms, along) = spill(disparity), plane_noise(disparity, PATCHES)
         ends = bottle(disparity) - bottle(camera)
         print(
             f"| {name} | {np.isfinite(disparity)[:, 48:].mean():.3f} | {np.median(off):.3f} | "

@@ -7,6 +7,8 @@ import subprocess
 import sys
 import time
 
+import cv2
+import numpy as np
 import pytest
 
 # The D435's optics on a small chip: what is far is still measured, and a test takes a second.
@@ -175,3 +177,104 @@ def test_a_killed_run_leaves_a_record_that_goes_on(realism, camera, tmp_path):
     after = record(folder)["tests"]
     assert [test["id"] for test in after] == ["T3", "T4", "T9"]
     assert after[: len(before)] == before
+
+
+def pair_options(folder, left, right, depth, focal=215.0):
+    """Writes a pair, its depth (in metres) as PNG in millimetres and its K; names them."""
+    for name, image in (("left", left), ("right", right)):
+        cv2.imwrite(str(folder / f"{name}.png"), image)
+    cv2.imwrite(str(folder / "depth.png"), np.nan_to_num(1000 * depth).round().astype(np.uint16))
+    height, width = depth.shape
+    matrix = f"{focal} 0 {(width - 1) / 2}\n0 {focal} {(height - 1) / 2}\n0 0 1\n"
+    (folder / "K.txt").write_text(matrix)
+    return ("--pair", folder / "left.png", folder / "right.png", "--depth", folder / "depth.png",
+            "--intrinsics", folder / "K.txt", "--baseline", 0.05)  # fmt: skip
+
+
+@pytest.fixture
+def flat(tmp_path, rng):
+    """Options of a pair of a wall at 12 px, of which the camera misses a part."""
+    texture = rng.integers(0, 60000, (150, 200 + 12), dtype=np.uint16)
+    depth = np.full((150, 200), 215.0 * 0.05 / 12)
+    depth[50:80, 100:150] = np.nan
+    return pair_options(tmp_path, texture[:, :200], texture[:, 12:], depth)
+
+
+def test_a_real_pair_is_held_against_its_own_depth(realism, camera, flat, tmp_path):
+    out = tmp_path / "out"
+    common = ("--sensor", camera, "--matching", "zncc", "--out", out)
+    done = realism(*flat, *common)
+    made = (out / "pair.json").read_bytes()
+    record = json.loads(made)
+    assert record["camera_valid"] == pytest.approx(1 - 1500 / (150 * 188), abs=1e-3)
+    assert record["camera_holes"] == pytest.approx(1500 / (150 * 188), abs=1e-3)
+    assert record["valid"] > 0.85  # half a block of the frame's rim has no match
+    assert record["holes"] == pytest.approx(1 - record["valid"], abs=1e-6)
+    assert record["over_3px"] == 0
+    assert record["median_abs_px"] < 0.05
+    assert record["plane_rms_px"] < 0.05
+    assert record["edge_spill_px"]["median"] is None
+    assert "0 pixels of edges" in record["notes"][0]
+    assert record["notes"][0] in done.stderr
+    assert "RMS on planes" in done.stdout
+    assert (out / "pair.png").read_bytes()[1:4] == b"PNG"
+    depth = tmp_path / "depth.npy"  # in metres
+    np.save(depth, cv2.imread(str(tmp_path / "depth.png"), cv2.IMREAD_UNCHANGED) / 1000)
+    realism(*flat[:4], depth, *flat[5:], *common)
+    assert (out / "pair.json").read_bytes() == made
+    swapped = realism(flat[0], flat[2], flat[1], *flat[3:], *common)
+    assert "LEFT and RIGHT swapped" in swapped.stderr
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"--pair": None}, "needs --pair"),
+        ({"--depth": None}, "needs --depth"),
+        ({"--intrinsics": None, "--baseline": None}, "needs --intrinsics --baseline"),
+        ({"--intrinsics": "absent.txt"}, "absent.txt"),
+        ({"--baseline": 50}, "metres"),
+        ({"--depth": "absent.png"}, "absent.png"),
+        ({"--depth": "left8.png"}, "8 bits"),
+        ({"--depth": "small.npy"}, "small.npy: is 100×75 pixels"),
+        ({"--depth-scale": 1.0}, "depth-scale"),
+        ({"--pair": ("left8.png", "right.png")}, "uint16"),
+        ({"--pair": ("left8.png", "K.txt")}, "K.txt"),
+        ({"--tests": "T1"}, "--tests"),
+        ({"--matching": "opencv-bm"}, "8 bits"),
+    ],
+    ids=str,
+)
+def test_faults_of_a_pair_are_one_line(
+    refused, camera, flat, tmp_path, monkeypatch, changes, words
+):
+    monkeypatch.chdir(tmp_path)
+    cv2.imwrite("left8.png", np.zeros((150, 200), np.uint8))
+    np.save("small.npy", np.ones((75, 100)))
+    given = {flat[0]: flat[1:3], **dict(zip(flat[3::2], flat[4::2], strict=True)), **changes}
+    options = []
+    for name, value in given.items():
+        if value is not None:
+            options += [name, *(value if isinstance(value, tuple) else (value,))]
+    assert words in refused(*options, "--sensor", camera, "--out", "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.data
+def test_a_real_d435_pair(realism, d435_pair, tmp_path):
+    left, right, disparity = d435_pair
+    options = pair_options(tmp_path, left, right, 427.12 * 0.05 / disparity, 427.12)
+    out = tmp_path / "out"
+    realism(*options, "--sensor", "d435", "--matching", "ad-census", "--out", out)
+    made = json.loads((out / "pair.json").read_text())
+    assert made["valid"] >= 0.965
+    assert made["over_3px"] <= 0.004
+    ours, own = made["edge_spill_px"], made["camera_edge_spill_px"]
+    assert abs(ours["upper"]) <= 2  # the box's edge, most of them
+    assert abs(ours["right"]) <= 3
+    assert abs(ours["median"]) <= 2.5
+    assert -1 <= ours["p10"] <= ours["p90"] <= 5
+    assert 0 <= own["median"] <= 2  # as edges drawn by hand tell
+    assert made["edge_pixels"] > 300
+    assert made["planes"] > 50
+    assert made["camera_plane_rms_px"] == pytest.approx(0.064, abs=0.01)

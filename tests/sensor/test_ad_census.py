@@ -224,28 +224,9 @@ def test_each_faulty_setting_is_named(fault):
         AdCensusSettings(**fault)
 
 
-def camera_depth(preview):
-    """Disparity that a jet picture of depth stands for, at its own size; NaN where it is black.
-
-    The picture runs from blue over cyan and yellow to red in 4 · 254 steps of 1.275 mm from 199 mm,
-    as a line through the depth that three matchers find in the same pair shows.
-    """
-    blue, green, red = preview.astype(float).transpose(2, 0, 1)
-    place = np.where(red == 0, green, np.where(green >= 254, 254 + (red + 254 - blue) / 2, 0))
-    place = np.where((red >= 254) & (green < 254), 762 - green, place)
-    place[preview.sum(axis=2) == 0] = np.nan
-    return 427.12 * 50 / (198.9 + 1.275 * place)
-
-
 @pytest.mark.data
-def test_a_real_d435_pair_is_matched_as_the_camera_does(shared_data):
-    folder = shared_data / "ir"
-    left, right = (
-        cv2.imread(str(folder / f"d435_{side}.png"), cv2.IMREAD_GRAYSCALE)
-        for side in ("left", "right")
-    )
-    preview = cv2.imread(str(folder / "d435_depth_preview.png"))
-    camera = camera_depth(preview).repeat(2, axis=0).repeat(2, axis=1)
+def test_a_real_d435_pair_is_matched_as_the_camera_does(d435_pair):
+    left, right, camera = d435_pair
     disparity = match(left, right, dataclasses.replace(SETTINGS, num_disparities=128))
     assert np.isfinite(disparity)[:, 48:].mean() >= 0.965
     error = np.abs(disparity - camera)

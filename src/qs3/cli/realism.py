@@ -7,7 +7,10 @@ from typing import Any
 
 from qs3.cli.options import Flat
 from qs3.cli.text import columns, show, tell
+from qs3.errors import InputError
+from qs3.io.extract.infrared import PairFiles
 from qs3.sensor.realism import RealismSettings
+from qs3.sensor.realism.pair import InfraredPair
 from qs3.sensor.settings import CameraSettings
 
 _VERDICTS = {True: "pass", False: "MISS", None: "does not apply"}
@@ -18,10 +21,12 @@ def realism(
     strict: bool = False,
     settings: Flat[RealismSettings] = RealismSettings(),  # noqa: B008
     camera: Flat[CameraSettings] = CameraSettings(sensor="d435"),  # noqa: B008
+    files: Flat[PairFiles] = PairFiles(),  # noqa: B008
 ) -> int:
     """Test a simulated camera against the laws of real ones.
 
-    Ten laws, measured beside expected: a table, a record and plots.
+    Ten laws, measured beside expected: a table, a record and plots. Or, with --pair, its matcher
+    on a real infrared pair beside the depth that the real camera made of it.
 
     Args:
         out: Folder to write: realism.json and plots. Run the same command again to go on after a
@@ -30,7 +35,13 @@ def realism(
             other.
         settings: Which tests.
         camera: What is tested.
+        files: A real camera's images and depth.
     """
+    pair = files.read()
+    if pair is not None:
+        if strict or settings != RealismSettings():
+            raise InputError("--pair: takes none of --strict, --quick, --seed and --tests")
+        return _pair(out, pair, camera)
     from tqdm import tqdm
 
     from qs3.report.realism_folder import test_camera
@@ -44,6 +55,41 @@ def realism(
     tell(*_summary(results, out))
     missed = any(result["passed"] is False for result in results)
     return 1 if strict and missed else 0
+
+
+def _pair(out: Path, pair: InfraredPair, camera: CameraSettings) -> int:
+    """Hold the matcher against a real camera's own depth."""
+    from qs3.report.pair import PAIR_PLOT, PAIR_RECORD, compare_pair
+
+    record = compare_pair(out, pair, camera.make_sensor().matching)
+    show(*pair_table(record))
+    tell(*record["notes"], f"Look at {out / PAIR_PLOT} and {out / PAIR_RECORD}")
+    return 0
+
+
+def pair_table(record: Mapping[str, Any]) -> list[str]:
+    """Lines of the table: what, ours, the camera's."""
+
+    def cell(value: Any, unit: str = "") -> str:
+        if isinstance(value, dict):
+            value = [value["median"], value["p10"], value["p90"]]
+        if isinstance(value, list):
+            return " ".join("–" if part is None else f"{part:.2f}" for part in value)
+        return "–" if value is None else f"{value:.2%}" if unit == "%" else f"{value:.3f}"
+
+    rows = [("", "ours", "the camera")]
+    for name, what, unit in (
+        ("valid", "valid pixels right of the left band", "%"),
+        ("holes", "of these only the other has", "%"),
+        ("edge_spill_px", "spill beyond edges: median, p10, p90 [px]", ""),
+        ("plane_rms_px", "RMS on planes [px]", ""),
+        ("autocorrelation", "its autocorrelation at 1, 4, 8 px along x", ""),
+    ):
+        rows.append((what, cell(record[name], unit), cell(record[f"camera_{name}"], unit)))
+    rows.append(("median |difference of disparity| [px]", cell(record["median_abs_px"]), ""))
+    rows.append(("more than 1 px off", cell(record["over_1px"], "%"), ""))
+    rows.append(("more than 3 px off", cell(record["over_3px"], "%"), ""))
+    return columns(rows)
 
 
 def table(results: Sequence[Mapping[str, Any]]) -> list[str]:

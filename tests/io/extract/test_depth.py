@@ -320,7 +320,7 @@ BAD_IMAGES = {
                  "shape"),
     "text.npy": (b"depth", "cannot be read as npy"),
     "code.npy": (npy("__import__('os').getcwd()"), "cannot be read as npy"),
-    "depth.exr": (b"v/1\1", "not a depth image"),
+    "depth.exr": (b"v/1\1", "not an image of a depth camera"),
 }  # fmt: skip
 
 

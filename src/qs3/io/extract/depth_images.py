@@ -1,10 +1,10 @@
-"""Depth images and masks from files: 16-bit PNG, TIFF and npy."""
+"""Depth images, infrared images and masks from files: PNG, TIFF and npy."""
 
 import math
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Float32, Int32, UInt8, UInt16
 
 from qs3.errors import InputError
 from qs3.io.guards import check_pixels, load_npy, read_image, read_small
@@ -56,6 +56,25 @@ def read_raw(path: Path) -> np.ndarray:
     return image
 
 
+def read_infrared(path: Path) -> UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]:
+    """Read an infrared image; one of three channels, as viewers store it, becomes grey.
+
+    Args:
+        path: A PNG, TIFF or npy file of 8 or 16 bits.
+
+    Raises:
+        InputError: where the file is missing, damaged or of another kind.
+    """
+    import cv2
+
+    image, _ = _read(path, "u")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{path}: holds {image.dtype}; an infrared image has 8 or 16 bits")
+    if image.ndim == 3:
+        image = cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_BGR2GRAY)
+    return image
+
+
 def read_mask(path: Path, shape: tuple[int, ...] | None = None) -> Int32[np.ndarray, "h w"]:
     """Read a mask: 0 is background, other numbers are objects.
 
@@ -88,7 +107,9 @@ def _read(path: Path, npy_kinds: str) -> tuple[np.ndarray, str]:
     """The numbers of an image as stored, and Pillow's mode; empty for an npy file."""
     ending = path.suffix.lower()
     if ending not in DEPTH_FILES:
-        raise InputError(f"{path}: not a depth image; known are {', '.join(DEPTH_FILES)}")
+        raise InputError(
+            f"{path}: not an image of a depth camera; known are {', '.join(DEPTH_FILES)}"
+        )
     content = read_small(path, _LARGEST, "a depth image")
 
     def accept(shape: tuple[int, ...], kind: np.dtype) -> None:
