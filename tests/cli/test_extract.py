@@ -78,7 +78,7 @@ def test_a_bad_image_fails_alone_and_is_told(typed, pictures):
                  pictures / "out", "--intrinsics", "50,50,29,19", "--workers", "0",
                  code=2)  # fmt: skip
     line = done.stderr.splitlines()[-1]
-    assert "1 failed; the first: 1:" in line
+    assert "1 scenes or frames failed; the first: 1:" in line
     assert "save depth as 16-bit PNG" in line
     assert read_ragged(pictures / "out").ids == ("0", "2")
 

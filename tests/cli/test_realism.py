@@ -164,7 +164,7 @@ def test_a_killed_run_leaves_a_record_that_goes_on(realism, camera, tmp_path):
         stderr=subprocess.DEVNULL,
     )
     try:
-        for _ in range(600):
+        for _ in range(2400):
             if (folder / "realism.json").is_file() and record(folder)["tests"]:
                 break
             time.sleep(0.05)

@@ -200,7 +200,7 @@ def all_devices(settings: TrainSettings, work: Work) -> Iterator[Fabric]:
             for process in others.processes:
                 process.join(_GRACE)
         except RuntimeError as error:
-            if not failed(5.0):
+            if not failed(20.0):  # on a busy machine it takes its time to end
                 raise
             raise QS3Error(faults[0]) from error
         finally:
