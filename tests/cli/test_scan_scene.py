@@ -57,3 +57,47 @@ def test_generate_draws_neighbours_and_settings_and_records_them(qs3, quick, tmp
     assert settings["scene"]["layout"] == "room+beside"
     assert settings["box_margin"] == 0.05
     assert settings["randomise"]["light.projector"][2] == "log"
+
+
+def test_generate_draws_rooms_alike_with_any_number_of_workers(qs3, quick, tmp_path):
+    common = ("generate", "--meshes", "shapes", "--classes", "chair", "plant", "--per-class", 1,
+              "--scans-per-mesh", 2, "--sensor", "d435", "--randomise", "rooms", "material=diffuse",
+              "room.distance=0.8:1.5", "--num-points", 64, "--crop", "mask", *quick)  # fmt: skip
+    for name, workers in (("a", 1), ("b", 2)):
+        qs3(*common, "--out", tmp_path / name, "--workers", workers)
+    shards = [(tmp_path / name / "shard-00000.parquet").read_bytes() for name in "ab"]
+    assert shards[0] == shards[1]
+    rows = pq.read_table(tmp_path / "a" / "shard-00000.parquet").to_pylist()
+    drawn = [json.loads(row["drawn"]) for row in rows]
+    assert len({values["object_size"] for values in drawn}) == len(rows) == 4
+    for row, values in zip(rows, drawn, strict=True):
+        assert 0.8 <= values["room.distance"] <= 1.5
+        assert values["room.redraws"] >= 0
+        beside = bool({"behind", "beside"} & {*values["room.layout"].split("+")})
+        assert ("neighbour" in values) is beside
+        assert np.ptp(np.reshape(row["surface"], (-1, 3)), axis=0).max() <= values["object_size"]
+    settings = json.loads((tmp_path / "a" / "dataset.json").read_text())["settings"]
+    assert settings["randomise"]["room.distance"] == [0.8, 1.5]
+
+
+def test_generate_refuses_a_class_without_a_real_size_before_it_begins(typed, tmp_path):
+    folder = tmp_path / "meshes" / "toilet"
+    folder.mkdir(parents=True)
+    trimesh.creation.box((1, 1, 1)).export(folder / "a.ply")
+    said = typed.refuses("generate", "--meshes", folder.parent, "--sensor", "d435", "--object-size",
+                         "class", "--out", tmp_path / "out", "--workers", 0,
+                         "--variant", "scalar_rgb")  # fmt: skip
+    assert "'toilet'" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_scan_takes_the_size_of_a_file_and_tells_its_guess(qs3, quick, tmp_path):
+    mesh = tmp_path / "part.stl"
+    trimesh.creation.box((400.0, 300.0, 200.0)).export(mesh)
+    how = ("--sensor", "d435", "--object-size", "file", "--num-points", 64, *quick)
+    done = qs3("scan", mesh, "--out", tmp_path / "guessed", *how)
+    assert "does not tell its unit: taken for mm" in done.stderr
+    record = json.loads((tmp_path / "guessed" / "scan.json").read_text())
+    assert record["drawn"] == {"object_size": 0.4, "units": "mm (guessed)"}
+    assert record["settings"]["object_size"] == "file"
+    assert "400 m" in qs3.refuses("scan", mesh, "--out", tmp_path / "x", "--units", "m", *how)

@@ -20,6 +20,7 @@ def scan(
     save_images: bool = False,
     frames: bool = False,
     neighbour: str = "",
+    class_name: str = "",
     settings: Flat[ScanSettings] = ScanSettings(),  # noqa: B008
 ) -> int:
     """Photograph one mesh: noisy cloud, clean twin, a picture of every stage.
@@ -33,6 +34,7 @@ def scan(
         frames: Also write whole frames in BOP's scene layout, into frames/: grey pair, depth, true
             depth, masks, normals, cameras and poses.
         neighbour: Mesh file or built-in class that stands in front (scene behind) or beside.
+        class_name: Class of a mesh file (chair, …), for --object-size class.
         settings: How it is scanned.
     """
     from qs3.files import claim_folder, write_json
@@ -51,7 +53,15 @@ def scan(
         # Its own draw: a chair beside a chair is another one.
         beside, origin["neighbour"] = load_named(neighbour, settings.seed + 1)
     settings = dataclasses.replace(settings, renderer=settings.make_renderer())
-    result = scan_mesh(shape, settings, neighbour=beside, keep_images=True, full_frames=frames)
+    names = [class_name or _class(origin), _class(origin.get("neighbour", {}))]
+    result = scan_mesh(
+        shape,
+        settings,
+        neighbour=beside,
+        class_names=names,
+        keep_images=True,
+        full_frames=frames,
+    )
     # Everything is computed before the folder is touched: a fault leaves nothing behind.
     view, best = montage_view(result)
     title = f"{origin['name']} · sensor {result.sensor.name} · view {best + 1} of {settings.views}"
@@ -74,6 +84,11 @@ def scan(
     tell(f"{_summary(result)}; {time.perf_counter() - start:.1f} s. "
          f"Look at {folder / 'montage.png'}")  # fmt: skip
     return 0
+
+
+def _class(origin: dict[str, Any]) -> str:
+    """Class of a built-in shape; a file's is not known."""
+    return origin["name"] if origin.get("source") == "shapes" else ""
 
 
 def _record(settings: ScanSettings, origin: dict[str, Any], result: Any) -> dict[str, Any]:

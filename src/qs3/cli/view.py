@@ -39,7 +39,7 @@ def view(
         data: With a run: the clouds to predict on; labels that lie there are shown, not used.
         split: Part of the data, such as test; all of it by default.
         cloud: With a run on generated data: the cloud that the network is shown.
-        class_name: Show the objects of this class first.
+        class_name: Show the objects of this class first; of a mesh file, its class.
         up: Up axis of a mesh file; by default y for glTF, z for all others.
         port: Port of 127.0.0.1 to listen on; 0 takes a free one.
         settings: With a mesh: how it is scanned to start with; the seed draws a built-in class.
@@ -49,7 +49,8 @@ def view(
     require_viser()
     require_free(port)
     # All is read before anything is served, so that a fault shows in time.
-    page = _scan_page(what, data, up, settings) or _gallery(what, data, split, cloud, class_name)
+    page = _scan_page(what, data, up, class_name or "", settings)
+    page = page or _gallery(what, data, split, cloud, class_name)
     with serve(port, f"qs3 view · {Path(what).name}") as server, page(server):
         show(url_of(server))
         hint = f"From another machine, first: {tunnel_of(server)}"
@@ -73,7 +74,7 @@ def _gallery(
 
 
 def _scan_page(
-    what: str, data: str | None, up: Any, settings: ScanSettings
+    what: str, data: str | None, up: Any, class_name: str, settings: ScanSettings
 ) -> "Callable[[Any], AbstractContextManager[Any]] | None":
     """The page of a mesh file or a built-in class, scanned live; None for anything else."""
     from qs3 import shapes
@@ -89,8 +90,8 @@ def _scan_page(
 
     def scan(settings: ScanSettings, draw: int) -> "Exhibit":
         if mesh is not None:
-            return rescan(settings, mesh, name)
-        return rescan(settings, shapes.make(what, seed=draw), f"{name}, draw {draw}")
+            return rescan(settings, mesh, name, class_name)
+        return rescan(settings, shapes.make(what, seed=draw), f"{name}, draw {draw}", what)
 
     start = resolve(settings)
     return partial(scan_page, scan=scan, start=start, draws=_DRAWS if built_in else 0)

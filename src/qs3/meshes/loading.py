@@ -56,7 +56,8 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> trimesh.Trimes
 
     A scene's parts are placed by their transforms and merged; polygons are cut into triangles;
     faces without area, vertices without a face, colours, textures and materials are left out.
-    Vertices that coincide stay apart, so the same file always gives the same arrays.
+    Vertices that coincide stay apart, so the same file always gives the same arrays. Where the
+    format has a unit of length (glTF: metres), ``mesh.units`` tells it.
 
     Convention:
         The mesh comes back with z up. glTF (.glb, .gltf) is y up by its standard and is turned
@@ -85,11 +86,15 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> trimesh.Trimes
     if path.stat().st_size == 0:
         raise InputError(f"{path}: the file is empty")
     with memory_limit(path):
-        vertices, faces = _read_off(path) if ending == ".off" else _read_with_trimesh(path, ending)
+        read = (*_read_off(path), None) if ending == ".off" else _read_with_trimesh(path, ending)
+        vertices, faces, units = read
         vertices, faces = _checked(path, vertices, faces)
     if up == "y" or (up is None and ending in _Y_UP):
         vertices = y_up_to_z_up(vertices)
-    return trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
+    mesh = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
+    if units is not None:
+        mesh.units = units
+    return mesh
 
 
 def _checked(
@@ -162,8 +167,11 @@ def _read_off(path: Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 
 
 def _read_with_trimesh(
     path: Path, ending: str
-) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]:
-    """Read any other format and merge what it holds, parts placed by the scene's transforms."""
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"], str | None]:
+    """Read any other format and merge what it holds, parts placed by the scene's transforms.
+
+    The third is the unit of length, where the format has one.
+    """
     options: dict[str, Any] = {"process": False, "skip_materials": True}
     if ending in _Y_UP:
         check_gltf(path)
@@ -175,6 +183,7 @@ def _read_with_trimesh(
             loaded = trimesh.load(
                 handle, file_type=ending[1:], resolver=_OwnFolder(path.parent), **options
             )
+            units = "meters" if ending in _Y_UP else loaded.units
             parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
         vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
         for part in parts:
@@ -189,4 +198,4 @@ def _read_with_trimesh(
         # A parser may fail in any way on a damaged file; the user needs the file's name.
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: cannot be read as {ending[1:].upper()} ({reason})") from error
-    return np.concatenate(vertices), np.concatenate(faces)
+    return np.concatenate(vertices), np.concatenate(faces), units

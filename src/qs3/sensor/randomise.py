@@ -1,23 +1,30 @@
 """Domain randomisation: settings of the sensor drawn anew for each object.
 
 Names are the sensor's own with dots, such as ``light.ambient``. ``material`` draws one of the
-named materials; every other name draws a number from a range.
+named materials; every other name draws a number from a range. Names such as ``room.height`` are
+not the sensor's: they are drawn for the place of camera and object (`qs3.sensor.rooms.Room`).
 """
 
 import dataclasses
 import difflib
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from qs3.errors import InputError
 from qs3.sensor.materials import MATERIALS
 from qs3.sensor.presets import Sensor, changed
+from qs3.sensor.rooms import ROOM_RANGES, Room
+from qs3.sensor.scene import LAYOUTS
 
+_NAMED = {"material": tuple(MATERIALS), "room.layout": LAYOUTS}
+"""What is drawn from a list of names."""
 # What a depth camera sees in a home: no mirrors and no glass, of which it sees nothing.
 _COMMON = ("diffuse", "principled", "rough-specular", "glossy-plastic", "metal", "dark")
+
+_Settings = TypeVar("_Settings")
 
 
 def default_ranges(sensor: Sensor) -> dict[str, tuple[Any, ...]]:
@@ -51,11 +58,12 @@ def resolve_ranges(
         randomise: ``(low, high)`` (uniform) or ``(low, high, "log")`` (uniform in the logarithm)
             by name, and ``material`` a list of names; or such ranges as words:
             ``light.ambient=0:0.1``, ``exposure.gain=0.5:2:log``, ``material=diffuse,metal``;
-            ``"default"`` is `default_ranges`.
+            ``"default"`` is `default_ranges`, and ``"rooms"`` these and all of ``ROOM_RANGES``,
+            in part replaced by the words beside it. One range of a room brings all of them.
 
     Raises:
         InputError: for a name that is no number of the sensor, a range that is none, or one at
-            whose ends the sensor would be invalid.
+            whose ends the sensor would be invalid; for a room without a sensor in metres.
 
     Example:
         >>> resolve_ranges(Sensor(), {"light.ambient": (0, 0.1)})
@@ -65,12 +73,28 @@ def resolve_ranges(
     """
     if not isinstance(randomise, Mapping):
         words = [randomise] if isinstance(randomise, str) else list(randomise or ())
-        randomise = default_ranges(sensor) if words == ["default"] else _parsed(words)
+        if words == ["default"]:
+            randomise = default_ranges(sensor)
+        elif "rooms" in words:
+            words.remove("rooms")
+            randomise = default_ranges(sensor) | ROOM_RANGES | _parsed(words)
+        else:
+            randomise = _parsed(words)
+    if any(name.startswith("room.") for name in randomise):
+        if not sensor.metric:
+            raise InputError(
+                f"randomise: rooms are in metres, and the sensor {sensor.name} is not; take one "
+                "that is, such as d435"
+            )
+        randomise = ROOM_RANGES | dict(randomise)
     ranges = {name: _range(sensor, name, randomise[name]) for name in sorted(randomise)}
     # Settings check themselves when they are made: each end of each range is tried once.
     for name, values in ranges.items():
-        for value in values if name == "material" else values[:2]:
-            changed(sensor, name, value)
+        for value in values if name in _NAMED else values[:2]:
+            if name.startswith("room."):
+                changed(Room(), name.removeprefix("room."), value)
+            else:
+                changed(sensor, name, value)
     return ranges
 
 
@@ -83,7 +107,7 @@ def draw(
 
     Args:
         sensor: Supplies what is not drawn.
-        randomise: As for `resolve_ranges`.
+        randomise: As for `resolve_ranges`; a room is `draw_room`'s.
         rng: One number is drawn for each name, in alphabetical order.
 
     Returns:
@@ -98,11 +122,27 @@ def draw(
         >>> drawn
         {'exposure.gain': 0.5, 'material': 'metal'}
     """
+    ranges = resolve_ranges(sensor, randomise)
+    return _drawn(sensor, {n: r for n, r in ranges.items() if not n.startswith("room.")}, rng)
+
+
+def draw_room(
+    ranges: Mapping[str, tuple[Any, ...]], rng: np.random.Generator
+) -> tuple[Room, dict[str, Any]]:
+    """Draw a room from what `resolve_ranges` returned; the same values by name are returned too."""
+    own = {n.removeprefix("room."): r for n, r in ranges.items() if n.startswith("room.")}
+    room, drawn = _drawn(Room(), own, rng)
+    return room, {f"room.{name}": value for name, value in drawn.items()}
+
+
+def _drawn(
+    settings: _Settings, ranges: Mapping[str, tuple[Any, ...]], rng: np.random.Generator
+) -> tuple[_Settings, dict[str, Any]]:
     drawn: dict[str, Any] = {}
     # The material comes before its own numbers, such as material.albedo: m < material.
-    for name, values in resolve_ranges(sensor, randomise).items():
+    for name, values in ranges.items():
         share = float(rng.random())
-        if name == "material":
+        if isinstance(values[0], str):
             value = values[min(int(share * len(values)), len(values) - 1)]
         elif isinstance(values[0], int):
             low, high = values[0], values[1]
@@ -112,9 +152,9 @@ def draw(
             value = min(max(math.exp(low + share * (high - low)), values[0]), values[1])
         else:
             value = values[0] + share * (values[1] - values[0])
-        sensor = changed(sensor, name, value)
+        settings = changed(settings, name, value)
         drawn[name] = value
-    return sensor, drawn
+    return settings, drawn
 
 
 def _parsed(words: Sequence[str]) -> dict[str, tuple[Any, ...]]:
@@ -125,9 +165,9 @@ def _parsed(words: Sequence[str]) -> dict[str, tuple[Any, ...]]:
         if not equals or name in ranges:
             raise InputError(
                 f"randomise: {word!r} is not understood, or named twice; write "
-                "light.ambient=0:0.1, material=diffuse,metal, or default alone"
+                "light.ambient=0:0.1, material=diffuse,metal, rooms, or default alone"
             )
-        if name == "material":
+        if name in _NAMED:
             ranges[name] = tuple(text.split(","))
             continue
         numbers, log = text.split(":"), ()
@@ -158,12 +198,12 @@ def numbers_of(settings: Any, prefix: str = "") -> dict[str, type]:
 
 
 def _range(sensor: Sensor, name: str, values: Sequence[Any]) -> tuple[Any, ...]:
-    if name == "material":
+    if name in _NAMED:
         chosen = (values,) if isinstance(values, str) else tuple(values)
         if not chosen:
-            raise InputError(f"randomise: material: name some of {', '.join(MATERIALS)}")
+            raise InputError(f"randomise: {name}: name some of {', '.join(_NAMED[name])}")
         return tuple(chosen)
-    types = numbers_of(sensor)
+    types = numbers_of(sensor) | numbers_of(Room(), "room.")
     if name not in types:
         near = difflib.get_close_matches(name, ["material", *types], n=3, cutoff=0.4)
         near = near or [other for other in types if other.split(".")[-1] == name.split(".")[-1]]

@@ -1,4 +1,4 @@
-"""What stands around the object: a floor, a wall, a neighbour, or nothing as in the paper.
+"""What stands around the object: floor, wall, table, neighbour, or nothing as in the paper.
 
 Convention:
     World: z up; the object stands about the origin. The first view says where the front is: the
@@ -26,8 +26,9 @@ from qs3.sensor.rig import Pose, StereoRig
 if TYPE_CHECKING:
     import trimesh
 
-LAYOUTS = ("alone", "floor", "wall", "room", "behind", "beside")
+LAYOUTS = ("alone", "floor", "wall", "room", "behind", "beside", "table")
 _SURVEY, _STEPS = 96, 25  # pixels and places at which a neighbour's cover is tried
+_TABLE, _RIM = (0.7, 1.2, 0.03), 0.1  # least depth, width and thickness of a table's top; its rim
 _LIFT = 1e-4  # of the object's size between it and the floor: equal planes would flicker
 
 
@@ -37,9 +38,10 @@ class SceneSettings:
 
     layout: str = "alone"
     """``alone`` (the paper), on a ``floor``, before a ``wall``, in a ``room`` (both), ``behind``
-    a neighbour that hides part of it, or ``beside`` one; joined by + as in ``room+beside``."""
+    a neighbour that hides part of it, or ``beside`` one, on a ``table``; joined by + as in
+    ``room+beside``."""
     floor: Material = field(default_factory=lambda: Material(albedo=0.5))
-    """Surface of the floor."""
+    """Surface of the floor and of the table's top."""
     wall: Material = field(default_factory=lambda: Material(albedo=0.6))
     """Surface of the wall."""
     neighbour: Material | None = None
@@ -53,6 +55,8 @@ class SceneSettings:
     cover: float = 0.3
     """``behind``: share of what the first view sees of the object that the neighbour hides, as
     near as its shape allows."""
+    table_height: float = 0.75
+    """From the floor to the table's top, in the unit of the scene."""
     extent: float = 20.0
     """Side of the floor and of the wall."""
     arc: float = 120.0
@@ -69,7 +73,7 @@ class SceneSettings:
         if {"behind", "beside"} <= self.parts:
             raise InputError("scene: the neighbour stands in front (behind) or beside, not both")
         check_range(self, "scene", "wall_gap", "neighbour_gap")
-        check_range(self, "scene", "neighbour_size", "extent", above=True)
+        check_range(self, "scene", "neighbour_size", "extent", "table_height", above=True)
         check_range(self, "scene", "cover", high=1, above=True)
         check_range(self, "scene", "arc", high=170)
 
@@ -99,7 +103,7 @@ class ArrangedScene:
     bodies: tuple[Body, ...]
     """The object first."""
     names: tuple[str, ...]
-    """What each body is: object, neighbour, floor or wall."""
+    """What each body is: object, neighbour, table, wall or floor."""
     poses: tuple[Pose, ...]
     """Left camera of each view."""
 
@@ -156,6 +160,11 @@ def arrange(
             turned.vertices[:, 2] += max(0.0, ground - turned.vertices[:, 2].min())
         bodies.append(Body(turned, settings.neighbour or body.material))
         names.append("neighbour")
+    if "table" in parts:
+        bodies.append(Body(_table_top([b.mesh for b in bodies], front, across), settings.floor))
+        bodies[-1].mesh.vertices += up * ground
+        names.append("table")
+        ground -= settings.table_height
     if "wall" in parts:
         reach = max(float((body.mesh.vertices @ -front).max()) for body in bodies)
         centre = -front * (reach + settings.wall_gap * size)
@@ -239,6 +248,24 @@ def _before(
         if miss < error:
             best, error = float(offset), miss
     return shift + along * best
+
+
+def _table_top(
+    meshes: "Sequence[trimesh.Trimesh]",
+    front: Float[np.ndarray, "3"],
+    across: Float[np.ndarray, "3"],
+) -> "trimesh.Trimesh":
+    """A slab under all of the meshes, its upper side at height 0, its sides along the axes."""
+    import trimesh
+
+    axes = np.stack([front, across])
+    points = np.concatenate([mesh.vertices for mesh in meshes]) @ axes.T
+    low, high = points.min(axis=0) - _RIM, points.max(axis=0) + _RIM
+    sides = np.maximum(high - low, _TABLE[:2])
+    slab = trimesh.creation.box((*sides, _TABLE[2]))
+    corners = np.asarray(slab.vertices) + np.append((low + high) / 2, -_TABLE[2] / 2)
+    turned = corners[:, :2] @ axes + corners[:, 2:] * [0.0, 0.0, 1.0]
+    return trimesh.Trimesh(vertices=turned, faces=slab.faces, process=False)
 
 
 def rectangle(

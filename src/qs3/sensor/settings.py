@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
 
 from qs3.errors import InputError
+from qs3.meshes.sizes import Unit
 from qs3.sensor.checks import check_choices, check_range
 from qs3.sensor.depth import PrincipalPoint
 from qs3.sensor.matching.settings import Method
@@ -82,6 +83,15 @@ class CameraSettings:
         if self.samples is not None:
             check_range(self, "camera", "samples", low=1, high=MOST_SAMPLES)
 
+    @property
+    def _changes(self) -> dict[str, str]:
+        """Those of `_CHANGES` that change something."""
+        return {
+            name: place
+            for name, place in self._CHANGES.items()
+            if (value := self.chosen(name)) is not None and value is not False
+        }
+
     def make_sensor(self) -> Sensor:
         """The sensor with every change.
 
@@ -89,17 +99,15 @@ class CameraSettings:
             InputError: where there is no such sensor, or it takes no such value.
         """
         sensor = get_sensor(self.sensor) if isinstance(self.sensor, str) else self.sensor
-        for name, place in self._CHANGES.items():
-            value = self.chosen(name)
-            if value is not None and value is not False:
-                sensor = changed(sensor, place, value)
+        for name, place in self._changes.items():
+            sensor = changed(sensor, place, self.chosen(name))
         if self.pattern is not None:
             pattern_image(sensor.pattern)  # a picture that cannot be read stops here
         return sensor
 
     def with_sensor(self: _Camera, sensor: Sensor, renderer: Renderer) -> _Camera:
         """The settings with a sensor and a renderer as they are: what would change it is gone."""
-        defaults = {f.name: f.default for f in dataclasses.fields(self) if f.name in self._CHANGES}
+        defaults = {f.name: f.default for f in dataclasses.fields(self) if f.name in self._changes}
         return dataclasses.replace(self, sensor=sensor, renderer=renderer, **defaults)
 
     def chosen(self, name: str) -> Any:
@@ -156,14 +164,18 @@ class ScanSettings(CameraSettings):
     principal_point: PrincipalPoint | None = None
     """Where the optical axis is taken to meet the image, as in the sensor's depth.principal_point;
     default by preset, then by sensor."""
-    object_size: float | None = None
-    """Size of every object, in metres for real cameras; default by sensor."""
+    object_size: float | Literal["file", "class"] | None = None
+    """Size of every object, in metres for real cameras; or the size that the mesh's file gives it;
+    or one drawn from the real sizes of its class; default by sensor, class in rooms."""
+    units: Unit | None = None
+    """Unit of the meshes, for the object size file; by default what a file says (glTF: m), else m
+    up to a longest side of 5 and mm above."""
     material: Material | str | None = None
     """Surface of the object by name: diffuse, principled, rough-specular, glossy-plastic, metal,
     dark, mirror or glass; default by sensor."""
     scene: SceneSettings | str = "alone"
-    """alone (the paper), floor, wall, room (both), behind a neighbour or beside one; joined by +
-    as in room+beside."""
+    """alone (the paper), floor, wall, room (both), behind a neighbour or beside one, on a table;
+    joined by + as in room+beside."""
     floor_material: Material | str | None = None
     """Surface of the floor by name, such as dark; default: diffuse, albedo 0.5."""
     wall_material: Material | str | None = None
@@ -171,7 +183,10 @@ class ScanSettings(CameraSettings):
     randomise: Mapping[str, Sequence[Any]] | Sequence[str] | None = None
     """Draw settings of the sensor anew for each scan: light.ambient=0:0.1,
     exposure.gain=0.5:2:log, material=diffuse,metal,dark, or default alone (materials, ambient
-    light, projector, gain)."""
+    light, projector, gain). rooms, for cameras in metres, draws these, the class's size, the layout
+    and the camera's place: height, distance, aim; room.distance=1:2 beside it narrows one."""
+    least_pixels: int = 1000
+    """Pixels of the object that each view of a room must show; else it is drawn again."""
     seed: int = 0
     """All random steps follow from it."""
 
@@ -184,6 +199,9 @@ class ScanSettings(CameraSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if isinstance(self.object_size, str) and self.object_size not in ("file", "class"):
+            raise InputError(f"scan: object_size {self.object_size!r}: file, class or a number")
+        check_range(self, "scan", "least_pixels", low=1)
         check_range(self, "scan", "num_points", low=1, high=1_000_000)
         check_range(self, "scan", "views", low=1, high=256)
         check_range(self, "scan", "box_margin", "seed")
@@ -192,6 +210,45 @@ class ScanSettings(CameraSettings):
         """A setting by its name, or the preset's where it is None."""
         value = getattr(self, name)
         return PRESETS[self.preset].get(name) if value is None else value
+
+    @property
+    def _changes(self) -> dict[str, str]:
+        sized = isinstance(self.object_size, str)  # for each object anew
+        return {n: p for n, p in super()._changes.items() if n != "object_size" or not sized}
+
+    def make_sensor(self) -> Sensor:
+        """The sensor with every change.
+
+        Raises:
+            InputError: where there is no such sensor, or it takes no such value.
+        """
+        sensor = super().make_sensor()
+        if isinstance(self.object_size, str) and not sensor.metric:
+            raise InputError(
+                f"object_size {self.object_size} is in metres, and the sensor {sensor.name} is "
+                "not; take one that is, such as d435, or a number"
+            )
+        return sensor
+
+    @property
+    def real_size(self) -> Literal["file", "class"] | None:
+        """What gives each object a size of its own, if anything does."""
+        if isinstance(self.object_size, str):
+            return self.object_size
+        return "class" if self.object_size is None and self.room_layouts else None
+
+    @property
+    def room_layouts(self) -> tuple[str, ...]:
+        """The layouts that rooms are drawn from; none where no rooms are drawn."""
+        return resolve_ranges(self.make_sensor(), self.randomise).get("room.layout", ())
+
+    @property
+    def needs_neighbour(self) -> bool:
+        """Whether a second mesh is needed, if only for some draws of rooms."""
+        layouts = self.room_layouts
+        return any(SceneSettings(name).needs_neighbour for name in layouts) or (
+            not layouts and self.make_scene().needs_neighbour
+        )
 
     def make_scene(self) -> SceneSettings:
         """What stands around the object."""
@@ -207,6 +264,7 @@ class ScanSettings(CameraSettings):
         names = [f.name for f in dataclasses.fields(ScanSettings) if f.name not in apart]
         crop = self.chosen("crop")
         return {name: self.chosen(name) for name in names} | {
+            "object_size": self.object_size if isinstance(self.object_size, str) else None,
             "box_crop": crop in ("box", "both"),
             "mask_crop": crop in ("mask", "both"),
             "scene": dataclasses.asdict(self.make_scene()),

@@ -85,4 +85,6 @@ def make(class_name: str, seed: int = 0, family: str | None = None) -> trimesh.T
     vertices = vertices - [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]
     if mirrored:
         vertices, faces = vertices * [-1.0, 1.0, 1.0], faces[:, ::-1]
-    return trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
+    made = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
+    made.units = "meters"
+    return made

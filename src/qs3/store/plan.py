@@ -13,6 +13,7 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.meshes.classes import map_labels
+from qs3.meshes.sizes import class_ranges
 from qs3.store.executors import Failure, LocalExecutor
 from qs3.store.manifest import Manifest, package_versions
 from qs3.store.parts import Place
@@ -56,7 +57,7 @@ class Plan:
     def arguments(self, position: int, scan: int) -> tuple[Any, ...]:
         """What `scan_item` is handed: object, scan, settings, and a neighbour where one stands."""
         item, settings = self.items[position], self.settings
-        if not settings.make_scene().needs_neighbour:
+        if not settings.needs_neighbour:
             return item, scan, settings
         beside = neighbour_of(self.items, position, scan, settings.seed)
         return item, scan, settings, beside
@@ -116,11 +117,14 @@ def make_plan(items: Sequence[Item], settings: GenerateSettings) -> Plan:
         if item.id in ids:
             raise InputError(f"{settings.meshes}: two meshes are called {item.id!r}; rename one")
         ids.add(item.id)
-    if settings.make_scene().needs_neighbour and len(items) < 2:
+    if settings.needs_neighbour and len(items) < 2:
         raise InputError(
             f"{items[0].id}: a scene with a neighbour needs a second mesh to draw from"
         )
     names = sorted({item.class_name for item in items})
+    if settings.real_size == "class":
+        for name in names:
+            class_ranges(name)
     map_labels(names, np.arange(len(names)), settings.classes)
     return Plan(items, settings)
 

@@ -13,6 +13,7 @@ import tyro
 from qs3.meshes.classes import POINTDA10, map_labels
 from qs3.sensor.checks import check_range
 from qs3.sensor.presets import settings_dict
+from qs3.sensor.scene import SceneSettings
 from qs3.sensor.settings import ScanSettings, renderer_dict
 from qs3.store.shards import STATISTICS, CloudRow, DType
 
@@ -127,13 +128,17 @@ def scan_item(
 
     seed = scan_seed(settings.seed, item.id, scan_index)
     beside = None if neighbour is None else neighbour.load()
-    result = scan(item.load(), settings, seed=seed, neighbour=beside)
+    classes = [one.class_name for one in (item, neighbour) if one is not None]
+    result = scan(item.load(), settings, seed=seed, neighbour=beside, class_names=classes)
     # The scan draws from children of `seed`; the key keeps this stream apart from them.
     surface_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0x50BF,)))
     surface = sample_surface(result.mesh, settings.num_points, surface_rng)
     label = map_labels([item.class_name], np.zeros(1, dtype=np.int64), settings.classes)[0]
     means = {name: _mean([getattr(view, name) for view in result.views]) for name in STATISTICS}
-    drawn = result.drawn | ({} if neighbour is None else {"neighbour": neighbour.id})
+    drawn = dict(result.drawn)
+    layout = drawn.get("room.layout", settings.make_scene().layout)
+    if neighbour is not None and SceneSettings(layout).needs_neighbour:  # not in all rooms
+        drawn["neighbour"] = neighbour.id
     return CloudRow(
         id=row_id(item, scan_index),
         object=item.id,

@@ -137,13 +137,15 @@ def _replaced(sensor: Sensor, places: Mapping[str, Any]) -> Sensor:
     return dataclasses.replace(sensor, **made)
 
 
-def rescan(settings: ScanSettings, mesh: trimesh.Trimesh, name: str) -> Exhibit:
+def rescan(
+    settings: ScanSettings, mesh: trimesh.Trimesh, name: str, class_name: str = ""
+) -> Exhibit:
     """Scan a mesh, and hand it back as something to show.
 
     Raises:
         InputError: where the sensor sees nothing of it.
     """
-    made = scan(mesh, settings)
+    made = scan(mesh, settings, class_names=[class_name])
     means = {}
     for statistic in STATISTICS:
         values = [v for view in made.views if (v := getattr(view, statistic)) is not None]

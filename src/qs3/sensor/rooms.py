@@ -1,0 +1,104 @@
+"""Where somebody in a room would hold the camera: one draw of ``--randomise rooms``.
+
+Convention:
+    Metres; the object stands about the origin, its box's underside on the floor or on a table.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from qs3.sensor.checks import check_range
+from qs3.sensor.rig import Pose, StereoRig
+from qs3.sensor.scene import SceneSettings
+from qs3.sensor.views import Placement
+
+ROOM_RANGES: dict[str, tuple[Any, ...]] = {
+    "room.layout": ("alone", "floor", "wall", "room", "room+behind", "room+beside", "room+table"),
+    "room.height": (0.8, 1.8),
+    "room.distance": (0.8, 4.0),
+    "room.azimuth": (0.0, 360.0),
+    "room.aim_x": (-0.4, 0.4),
+    "room.aim_y": (-0.4, 0.4),
+    "room.table": (0.7, 0.8),
+}
+"""Our choice: eyes of somebody who sits or stands, and the reach of the D4xx and the Kinect."""
+
+_TABLE_MOST = 0.7  # longest side of what stands on one
+_SIDE = 12.0  # of floor and wall
+
+
+@dataclass(frozen=True)
+class Room:
+    """One draw."""
+
+    layout: str = "room"
+    """Layout of the scene."""
+    height: float = 1.3
+    """Of the camera above the floor."""
+    distance: float = 2.0
+    """From the side of the object's box to the camera, along the floor."""
+    azimuth: float = 0.0
+    """Of the first view about the vertical, in degrees."""
+    aim_x: float = 0.0
+    """How far to the right of the object's centre the camera aims, in halves of what the image
+    shows at its distance."""
+    aim_y: float = 0.0
+    """The same downwards."""
+    table: float = 0.75
+    """Height of the table's top above the floor."""
+
+    def __post_init__(self) -> None:
+        SceneSettings(self.layout)
+        check_range(self, "room", "height", "distance", "table", above=True)
+        check_range(self, "room", "azimuth", low=-360, high=360)
+        check_range(self, "room", "aim_x", "aim_y", low=-0.9, high=0.9)
+
+    def scene(self, settings: SceneSettings, size: float) -> SceneSettings:
+        """What stands around an object of a size: a room of 12 m."""
+        extent = _SIDE / size
+        return dataclasses.replace(
+            settings, layout=self.layout, table_height=self.table, extent=extent
+        )
+
+    def placement(self, bounds: Float[np.ndarray, "2 3"]) -> Placement:
+        """Place of the first view about an object of these bounds; the other ones go round."""
+        angle = math.radians(self.azimuth)
+        way = np.maximum(np.abs([math.cos(angle), math.sin(angle)]), 1e-9)
+        along = float((np.abs(bounds[:, :2]).max(axis=0) / way).min()) + self.distance
+        floor = float(bounds[0, 2]) - self.table * ("table" in SceneSettings(self.layout).parts)
+        up = floor + self.height
+        radius, elevation = math.hypot(along, up), math.degrees(math.atan2(up, along))
+        return Placement((radius, radius), (elevation, elevation), (self.azimuth, self.azimuth))
+
+    def aimed(self, pose: Pose, rig: StereoRig) -> Pose:
+        """Turn a camera that looks at the origin so that it looks beside it."""
+        half = np.linalg.norm(pose.position) / rig.focal / 2
+        right, down = pose.camera_to_world[:3, 0], pose.camera_to_world[:3, 1]
+        target = half * (self.aim_x * rig.width * right + self.aim_y * rig.height * down)
+        ahead, aside = (Pose.looking_at(pose.position, at) for at in (np.zeros(3), target))
+        matrix = pose.camera_to_world.copy()
+        matrix[:3, :3] = (
+            aside.camera_to_world[:3, :3] @ ahead.camera_to_world[:3, :3].T @ matrix[:3, :3]
+        )
+        return Pose(matrix)
+
+
+def fitting(layouts: tuple[str, ...], size: float, neighbour: bool) -> tuple[str, ...]:
+    """The layouts that suit an object: no table for a long one, no neighbour where there is none.
+
+    Example:
+        >>> fitting(("floor", "room+table", "behind"), size=2.0, neighbour=True)
+        ('floor', 'behind')
+    """
+    made = {name: SceneSettings(name) for name in layouts}
+    return tuple(
+        name
+        for name, scene in made.items()
+        if (size <= _TABLE_MOST or "table" not in scene.parts)
+        and (neighbour or not scene.needs_neighbour)
+    )

@@ -1,0 +1,114 @@
+"""Real sizes: a mesh's own unit in metres, and lengths drawn from the ranges of its class."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy import stats
+
+from qs3 import shapes
+from qs3.errors import InputError
+from qs3.meshes import load_mesh
+from qs3.meshes.classes import POINTDA10
+from qs3.meshes.sizes import CLASS_SIZES, _note, class_size, file_size
+
+
+def part(length: float) -> trimesh.Trimesh:
+    return trimesh.creation.box((length, length / 2, length / 3))
+
+
+@pytest.mark.parametrize(
+    ("length", "unit", "metres"),
+    [(60.0, "mm", 0.06), (600.0, "mm", 0.6), (60.0, "cm", 0.6), (10.0, "in", 0.254), (2.0, "m", 2)],
+)
+def test_a_length_in_a_unit_is_that_many_metres(length, unit, metres):
+    size, told = file_size(part(length), unit)
+    assert size == pytest.approx(metres, rel=1e-12)
+    assert told == unit
+
+
+def test_a_mesh_that_tells_its_unit_is_believed(tmp_path):
+    part(2.0).export(tmp_path / "part.glb")
+    part(2.0).export(tmp_path / "part.off")
+    assert file_size(load_mesh(tmp_path / "part.glb")) == (2.0, "meters")
+    assert load_mesh(tmp_path / "part.off").units is None
+    assert file_size(shapes.make("bed"))[1] == "meters"
+    mesh = part(60.0)
+    mesh.units = "0.01 * meters"  # as DAE has it
+    assert file_size(mesh)[0] == pytest.approx(0.6)
+    assert file_size(mesh, "mm")[0] == pytest.approx(0.06)
+
+
+@pytest.mark.parametrize(("length", "size", "unit"), [(2.0, 2.0, "m"), (60.0, 0.06, "mm")])
+def test_a_guess_says_so_once(caplog, length, size, unit):
+    _note.cache_clear()
+    for _ in range(2):
+        assert file_size(part(length)) == (pytest.approx(size), f"{unit} (guessed)")
+    assert [f"taken for {unit}" in line for line in caplog.messages] == [True]
+
+
+@pytest.mark.parametrize(
+    ("length", "unit", "message"),
+    [
+        (60.0, "m", "60 m long.*units"),
+        (60_000.0, None, r"mm \(guessed\) long, which is 60 m"),
+        (1e-4, None, "no object of 0.001 to 10 m"),
+    ],
+)
+def test_what_is_no_object_is_refused(length, unit, message):
+    with pytest.raises(InputError, match=message) as caught:
+        file_size(part(length), unit)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_unit_is_refused():
+    mesh = part(1.0)
+    mesh.units = "cubits"
+    with pytest.raises(InputError, match=r"cubits.*units"):
+        file_size(mesh)
+
+
+@pytest.mark.parametrize("name", POINTDA10)
+def test_sizes_of_a_class_keep_to_both_of_its_ranges(name):
+    longest, heights = CLASS_SIZES[name]
+    for seed in range(30):
+        mesh = shapes.make(name, seed=seed)
+        size = class_size(mesh, name, np.random.default_rng(seed))
+        assert longest[0] - 1e-9 <= size <= longest[1] + 1e-9
+        height = size * mesh.extents[2] / mesh.extents.max()
+        possible = [side * mesh.extents[2] / mesh.extents.max() for side in longest]
+        if possible[0] <= heights[1] and possible[1] >= heights[0]:  # its shape allows it
+            assert heights[0] - 1e-9 <= height <= heights[1] + 1e-9
+        assert size == class_size(mesh, name, np.random.default_rng(seed))
+
+
+def test_sizes_are_uniform_in_the_logarithm_at_any_scale_of_the_mesh():
+    rng = np.random.default_rng(0)
+    draws = [class_size(part(10.0**s), "Floor Lamp", rng) for s in np.linspace(-3, 3, 300)]
+    low, high = 3 * CLASS_SIZES["lamp"][1][0], CLASS_SIZES["lamp"][0][1]  # as high as a third
+    span = stats.loguniform(low, high)
+    assert stats.kstest(draws, span.cdf).pvalue > 0.01
+
+
+def test_a_class_without_a_size_is_refused():
+    with pytest.raises(InputError, match=r"'toilet'.*bathtub"):
+        class_size(part(1.0), "toilet", np.random.default_rng(0))
+
+
+def test_the_table_holds_published_means_and_what_real_views_show(shared_data):
+    means = {
+        "bathtub": (1.398, 0.473),
+        "bed": (2.114, 0.927),
+        "bookshelf": (1.689, 1.689),
+        "cabinet": (1.173, 1.173),
+        "chair": (0.827, 0.827),
+        "sofa": (1.867, 0.845),
+        "table": (1.280, 0.718),
+    }  # VoteNet's type_mean_size; the dresser's for the cabinet
+    for name, mean in means.items():
+        for value, (low, high) in zip(mean, CLASS_SIZES[name], strict=True):
+            assert low < value < high
+    real = dict(np.load(shared_data / "nyuv2_objects.npz"))
+    longest = np.ptp(real["points"].astype(np.float32), axis=1).max(axis=1)
+    for index, name in enumerate(real["class_names"].tolist()):
+        seen = longest[real["strict"].astype(bool) & (real["label"] == index)]
+        assert np.quantile(seen, 0.95) <= CLASS_SIZES[name][0][1]

@@ -1,0 +1,237 @@
+"""Rooms: drawn within their ranges, from the scan's seed alone, and again where little shows."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+
+from qs3 import shapes
+from qs3.errors import InputError
+from qs3.meshes.sizes import CLASS_SIZES
+from qs3.sensor.depth import DepthSettings
+from qs3.sensor.presets import SENSORS, Sensor
+from qs3.sensor.randomise import default_ranges, draw_room, resolve_ranges
+from qs3.sensor.render import Body
+from qs3.sensor.rig import StereoRig
+from qs3.sensor.rooms import ROOM_RANGES, Room, fitting
+from qs3.sensor.scan import scan
+from qs3.sensor.scene import SceneSettings, arrange
+from qs3.sensor.settings import ScanSettings
+from qs3.sensor.views import Placement, place_views
+
+D435 = SENSORS["d435"]
+# A quarter of the D435's pixels and spots.
+TINY = dataclasses.replace(
+    D435,
+    name="tiny",
+    rig=StereoRig(width=424, height=240, focal=215.0, baseline=0.05),
+    pattern=dataclasses.replace(D435.pattern, columns=135, rows=84),
+    matching=dataclasses.replace(D435.matching, num_disparities=64, block_size=15),
+    depth=DepthSettings(near=0.2, far=8.0, stride=1),
+)
+ALL = ["rooms", "material=diffuse"]
+
+
+def chair(**how):
+    how = {"sensor": TINY, "views": 1, "num_points": 64, "least_pixels": 20} | how
+    return scan(shapes.make("chair", seed=1), class_names=["chair"], **how)
+
+
+def turned(seed: int = 0) -> trimesh.Trimesh:
+    mesh = shapes.make("plant", seed=seed)
+    mesh.vertices -= mesh.bounds.mean(axis=0)
+    return mesh
+
+
+def test_rooms_are_the_default_ranges_and_places_and_words_replace_them():
+    ranges = resolve_ranges(D435, "rooms")
+    assert ranges == dict(sorted((default_ranges(D435) | ROOM_RANGES).items()))
+    words = ["rooms", "room.distance=1:2", "room.layout=floor,room+table"]
+    narrow = resolve_ranges(D435, words)
+    assert narrow["room.distance"] == (1.0, 2.0)
+    assert narrow["room.layout"] == ("floor", "room+table")
+    assert set(narrow) == set(ranges)
+    assert set(resolve_ranges(D435, ["room.distance=1:2"])) == set(ROOM_RANGES)
+    assert resolve_ranges(D435, narrow) == narrow  # as the records have it
+
+
+def test_draws_of_rooms_keep_to_their_ranges_and_follow_their_seed():
+    ranges = resolve_ranges(D435, "rooms")
+    seen = set()
+    for seed in range(100):
+        room, drawn = draw_room(ranges, np.random.default_rng(seed))
+        assert (room, drawn) == draw_room(ranges, np.random.default_rng(seed))
+        assert {f"room.{k}": v for k, v in dataclasses.asdict(room).items()} == drawn
+        seen.add(room.layout)
+        for name, values in ROOM_RANGES.items():
+            if name != "room.layout":
+                assert values[0] <= drawn[name] <= values[1]
+    assert seen == set(ROOM_RANGES["room.layout"])
+
+
+@pytest.mark.parametrize("layout", ["floor", "room", "room+table"])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_camera_stands_as_high_and_as_far_as_drawn(layout, seed):
+    room, _ = draw_room(resolve_ranges(D435, "rooms"), np.random.default_rng(seed))
+    room = dataclasses.replace(room, layout=layout)
+    mesh = turned(seed)
+    low, high = mesh.bounds
+    (pose,) = place_views(1, "orbit", room.placement(mesh.bounds), np.random.default_rng(0))
+    size = float(mesh.extents.max())
+    scene = room.scene(SceneSettings(), size)
+    made = arrange(scene, Body(mesh), [pose], size, None, np.random.default_rng(0))
+    floor = made.bodies[made.names.index("floor")].mesh.vertices[:, 2]
+    assert pose.position[2] - floor.max() == pytest.approx(room.height, abs=1e-3)
+    assert np.degrees(np.arctan2(pose.position[1], pose.position[0])) % 360 == pytest.approx(
+        room.azimuth % 360
+    )
+    # Along the floor from the side of a box about the origin as wide as its farther side.
+    half = np.maximum(high, -low)[:2]
+    way = pose.position[:2] / np.linalg.norm(pose.position[:2])
+    side = (half / np.abs(way)).min()
+    assert np.linalg.norm(pose.position[:2]) - side == pytest.approx(room.distance)
+    if layout == "room+table":
+        top = made.bodies[made.names.index("table")].mesh
+        assert top.bounds[1, 2] - floor.max() == pytest.approx(room.table)
+        assert low[2] - top.bounds[1, 2] == pytest.approx(0, abs=1e-3)  # the object stands on it
+        assert (top.bounds[0, :2] < low[:2]).all()
+        assert (top.bounds[1, :2] > high[:2]).all()
+        assert top.is_watertight
+
+
+def test_a_table_stands_under_the_neighbour_too():
+    mesh, other = turned(0), turned(1)
+    pose = place_views(1, "orbit", Placement(), np.random.default_rng(0))
+    made = arrange(
+        SceneSettings("table+beside"), Body(mesh), pose, 1.0, other, np.random.default_rng(0)
+    )
+    assert made.names == ("object", "neighbour", "table")
+    for body in made.bodies[:2]:
+        assert body.mesh.vertices[:, 2].min() == pytest.approx(mesh.bounds[0, 2])
+        corners = body.mesh.vertices - [0, 0, body.mesh.bounds[0, 2] + 0.01]
+        assert (
+            made.bodies[2]
+            .mesh.convex_hull.contains(corners * [1, 1, 0] + [0, 0, mesh.bounds[0, 2] - 0.015])
+            .all()
+        )
+
+
+@pytest.mark.parametrize("kind", ["orbit", "jitter"])
+def test_the_object_is_seen_opposite_of_where_the_camera_aims(kind):
+    room = Room(aim_x=-0.3, aim_y=0.35)
+    placement = Placement(radius=(2.0, 2.0))
+    for pose in place_views(3, kind, placement, np.random.default_rng(1)):
+        before, _ = D435.rig.project(np.zeros((1, 3)), pose)
+        after, _ = D435.rig.project(np.zeros((1, 3)), room.aimed(pose, D435.rig))
+        moved = (after - before)[0] / [D435.rig.width / 2, D435.rig.height / 2]
+        assert (moved * [1, -1] > 0.1).all()
+        if kind == "orbit":
+            down = pose.camera_to_world[:3, :2] @ [-0.3 * D435.rig.width, 0.35 * D435.rig.height]
+            target = (down / D435.rig.focal)[None]  # half of the image, at 2 m
+            middle, _ = D435.rig.project(target, room.aimed(pose, D435.rig))
+            np.testing.assert_allclose(middle[0], D435.rig.principal_point, atol=1e-6)
+
+
+def test_layouts_suit_the_object():
+    layouts = ROOM_RANGES["room.layout"]
+    assert fitting(layouts, 0.5, True) == layouts
+    assert fitting(layouts, 2.0, True) == layouts[:-1]
+    assert fitting(layouts, 0.5, False) == (*layouts[:4], layouts[-1])
+
+
+def test_a_scan_in_a_room_records_its_draws_and_equals_itself(renderer):
+    a, b = (chair(randomise=ALL, seed=3, renderer=renderer) for _ in range(2))
+    np.testing.assert_array_equal(a.points, b.points)
+    assert a.drawn == b.drawn
+    assert set(a.drawn) == {
+        "exposure.gain", "light.ambient", "light.projector", "material", "object_size",
+        "room.redraws", *ROOM_RANGES,
+    }  # fmt: skip
+    assert a.mesh.extents.max() == pytest.approx(a.drawn["object_size"]) == a.sensor.object_size
+    assert CLASS_SIZES["chair"][0][0] <= a.drawn["object_size"] <= CLASS_SIZES["chair"][0][1]
+    assert np.linalg.norm(a.poses[0].position) == pytest.approx(a.sensor.placement.radius[0])
+    assert a.views[0].object_pixels >= 20
+
+
+def test_a_room_that_shows_little_is_drawn_again_and_counted(renderer):
+    free, strict = (
+        chair(randomise=ALL, seed=3, renderer=renderer, least_pixels=n) for n in (20, 5000)
+    )
+    assert free.drawn["room.redraws"] == 0
+    assert free.views[0].object_pixels < 5000 <= strict.views[0].object_pixels
+    assert strict.drawn["room.redraws"] > 0
+    own = {"material", "object_size", "light.ambient", "light.projector", "exposure.gain"}
+    assert all(free.drawn[name] == strict.drawn[name] for name in own)  # the room alone is drawn
+    with pytest.raises(InputError, match=r"50 rooms in a row.*least_pixels is 101760"):
+        chair(randomise=ALL, least_pixels=424 * 240, renderer=renderer)
+
+
+def test_the_cloud_is_as_large_as_the_files_unit_says(renderer):
+    near = dataclasses.replace(
+        TINY,
+        rig=dataclasses.replace(TINY.rig, width=240, height=240, focal=400.0),
+        matching=dataclasses.replace(TINY.matching, num_disparities=64),
+        placement=Placement(radius=(0.8, 0.8), elevation=(30.0, 30.0), azimuth=(0.0, 0.0)),
+    )
+    part = trimesh.creation.box((60.0, 50.0, 40.0))
+    how = {"sensor": near, "views": 1, "renderer": renderer, "num_points": 256}
+    small, large = (
+        scan(mesh, object_size="file", units="mm", **how)
+        for mesh in (part, part.copy().apply_scale(10))
+    )
+    assert (small.drawn, large.drawn) == (
+        {"object_size": pytest.approx(0.06), "units": "mm"},
+        {"object_size": pytest.approx(0.6), "units": "mm"},
+    )
+    for made, size in ((small, 0.06), (large, 0.6)):  # a pixel shows 2 mm of what is at 0.8 m
+        assert np.ptp(made.clean, axis=0).max() == pytest.approx(size, rel=0.2)
+        # The box of the crop is that of the turned object: up to √2 as wide.
+        assert 0.8 * size < np.ptp(made.points, axis=0).max() < 1.5 * size
+
+
+def test_the_size_does_not_depend_on_how_it_is_normalised():
+    for size in ("box", "ball"):
+        made = chair(size=size, object_size="class", seed=5)
+        assert made.mesh.extents.max() == pytest.approx(made.drawn["object_size"])
+        again = chair(size=size, object_size="class", seed=5)
+        np.testing.assert_array_equal(made.points, again.points)
+
+
+def test_a_large_object_is_stood_off_from_as_much_as_it_is_larger():
+    bed = scan(shapes.make("bed"), sensor=TINY, views=1, object_size="file", num_points=64)
+    away = (bed.sensor.object_size - TINY.object_size) / 2
+    assert away > 0
+    assert bed.sensor.placement.radius == pytest.approx([r + away for r in TINY.placement.radius])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sensor": "paper", "randomise": "rooms"}, "in metres, and the sensor paper is not"),
+        ({"sensor": "paper", "object_size": "class"}, "in metres, and the sensor paper is not"),
+        ({"least_pixels": 0, "randomise": "rooms"}, "least_pixels"),
+        ({"randomise": "rooms", "class_names": ["toilet"]}, "toilet"),
+        ({"randomise": "rooms", "class_names": ()}, "object_size class"),
+        ({"randomise": {"room.height": (-1, 1)}}, "height"),
+        ({"randomise": {"room.layout": ("garden",)}}, "garden"),
+        ({"randomise": {"room.width": (1, 2)}}, "room.width"),
+        ({"randomise": ["rooms", "room.layout=behind"]}, "none of the layouts behind"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(changes, message):
+    how = {"sensor": TINY, "views": 1, "class_names": ["chair"]} | changes
+    with pytest.raises(InputError, match=message) as caught:
+        scan(shapes.make("chair"), **how)
+    assert "\n" not in str(caught.value)
+
+
+def test_settings_say_what_sizes_and_neighbours_they_need():
+    rooms = ScanSettings(sensor="d435", randomise="rooms")
+    assert (rooms.real_size, rooms.needs_neighbour) == ("class", True)
+    own = ScanSettings(sensor="d435", randomise=["rooms", "room.layout=floor"], object_size=0.5)
+    assert (own.real_size, own.needs_neighbour) == (None, False)
+    assert ScanSettings(sensor="d435", object_size="file").as_dict()["object_size"] == "file"
+    assert ScanSettings(scene="beside").needs_neighbour
+    assert ScanSettings().real_size is None
+    assert isinstance(rooms.make_sensor(), Sensor)
