@@ -342,8 +342,8 @@ def test_a_row_tells_its_bounds_in_words():
 
 
 def test_unknown_tests_are_refused():
-    with pytest.raises(InputError, match="T11"):
-        RealismSettings(tests=("T11",))
+    with pytest.raises(InputError, match="T12"):
+        RealismSettings(tests=("T12",))
 
 
 def test_sweeps_stay_within_what_a_sensor_measures():

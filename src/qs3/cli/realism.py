@@ -21,7 +21,7 @@ def realism(
 ) -> int:
     """Test a simulated camera against the laws of real ones.
 
-    Ten laws, measured beside expected: a table, a record and plots.
+    Eleven laws, measured beside expected: a table, a record and plots.
 
     Args:
         out: Folder to write: realism.json and plots. Run the same command again to go on after a
