@@ -1,4 +1,4 @@
-"""Tables of docs/realism.md: ten tests by sensor from records of `qs3 realism`, walls by matcher.
+"""Tables of docs/realism.md: the tests by sensor from records of `qs3 realism`, walls by matcher.
 
     for sensor in d415 d435 d455 kinect-v1; do qs3 realism --sensor $sensor --out out/$sensor; done
     python benchmarks/realism_table.py out/d415 out/d435 out/d455 out/kinect-v1

@@ -143,7 +143,7 @@ def test_strict_ends_with_one_where_a_test_misses(realism, camera, first):
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (("--tests", "T1", "T11"), "T11"),
+        (("--tests", "T1", "T12"), "T12"),
         (("--seed", -1), "seed"),
         (("--samples", 0), "samples"),
         (("--sensor", "d345"), "d435"),

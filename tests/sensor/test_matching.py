@@ -315,7 +315,7 @@ METHODS = {
     "bm": BM,
     "zncc": ZNCC,
     "zncc-one-way": dataclasses.replace(ZNCC, left_right=0.0, block_size=9, quantum=1 / 32),
-    "zncc-filtered": dataclasses.replace(ZNCC, median=5, min_region=25, uniqueness=0.15),
+    "zncc-filtered": dataclasses.replace(ZNCC, median=5, min_region=16, uniqueness=0.15),
     "zncc-opencv-band": dataclasses.replace(
         ZNCC, median=3, min_region=9, left_band="opencv", uniqueness=0.15
     ),
@@ -340,7 +340,8 @@ def test_region_matching_equals_full_frame_matching_bit_for_bit(name):
 def test_the_margin_holds_what_the_filters_reach():
     assert matching_margin(BM) == 10
     assert matching_margin(ZNCC) == 7
-    assert matching_margin(dataclasses.replace(ZNCC, median=5, min_region=30)) == 7 + 2 + 30
+    assert matching_margin(dataclasses.replace(ZNCC, median=5, min_region=9)) == 7 + 2 + 9
+    assert matching_margin(dataclasses.replace(ZNCC, min_region=50)) == 7 + 16
 
 
 @pytest.mark.parametrize(

@@ -86,6 +86,7 @@ def test_other_settings_or_another_work_list_are_refused(fake, tmp_path):
         ({"randomise": {"light.ambient": (0.0, 0.1)}}, "randomise"),
         ({"crop": "both"}, "mask_crop"),
         ({"box_margin": 0.1}, "box_margin"),
+        ({"remove_outliers": True}, "remove_outliers"),
     ]:
         other = dataclasses.replace(SETTINGS, **changed)
         with pytest.raises(InputError, match=name):

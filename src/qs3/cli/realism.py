@@ -25,7 +25,7 @@ def realism(
 ) -> int:
     """Test a simulated camera against the laws of real ones.
 
-    Ten laws, measured beside expected: a table, a record and plots. Or, with --pair, its matcher
+    Eleven laws, measured beside expected: a table, a record and plots. Or, with --pair, its matcher
     on a real infrared pair beside the depth that the real camera made of it.
 
     Args:

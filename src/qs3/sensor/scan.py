@@ -20,6 +20,7 @@ from qs3.sensor.depth import fuse, gate
 from qs3.sensor.lens import blur_reach
 from qs3.sensor.matching import matching_canvas
 from qs3.sensor.obstacles import check_views
+from qs3.sensor.outliers import inliers
 from qs3.sensor.presets import Sensor
 from qs3.sensor.randomise import draw, draw_room, resolve_ranges
 from qs3.sensor.render import Body
@@ -180,10 +181,14 @@ def scan(
 
     with clock("fusion"):
         shown = list(zip(images, parts, around.poses, strict=True))
-        clouds = [clouds_of(*view, sensor, crop in ("mask", "both")) for view in shown]
+        beyond = how.depth_margin if crop in ("mask", "both") else None
+        clouds = [clouds_of(*view, sensor, beyond) for view in shown]
         margin = np.array([[-how.box_margin], [how.box_margin]])
         box = bounds + margin if crop in ("box", "both") else None
         points, view = fuse([noisy for noisy, _ in clouds], box)
+        if how.remove_outliers:
+            inside = inliers(points)
+            points, view = points[inside], view[inside]
         clean_points, clean_view = fuse([clean for _, clean in clouds])
     if not len(points) or not len(clean_points):
         raise InputError(

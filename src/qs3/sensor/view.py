@@ -72,19 +72,23 @@ def object_region(bounds: Float[np.ndarray, "2 3"], sensor: Sensor, pose: Pose) 
 
 
 def clouds_of(
-    images: ViewImages, part: Region, pose: Pose, sensor: Sensor, mask_crop: bool
+    images: ViewImages, part: Region, pose: Pose, sensor: Sensor, margin: float | None
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:
     """The noisy and the true points of the object's part of one view, in the world.
 
     A view that does not show the object within the depth gate gives none: what its matcher found
-    is something else. With ``mask_crop`` only the pixels that show the object count.
+    is something else. With a ``margin`` only the pixels that show the object count, and of these
+    the depths within the true ones' range and the margin.
     """
     if images.blind(sensor):
         return np.zeros((0, 3)), np.zeros((0, 3))
-    depth = np.where(images.mask, images.depth, np.nan) if mask_crop else images.depth
+    depth, truth = images.depth, images.true_object(sensor)
+    if margin is not None:
+        off = np.maximum(np.nanmin(truth) - depth, depth - np.nanmax(truth))
+        depth = np.where(images.mask & (off <= margin), depth, np.nan)
     noisy, true = (
         backproject(images.part(image, part), sensor.rig, part, pose, sensor.depth)
-        for image in (depth, images.true_object(sensor))
+        for image in (depth, truth)
     )
     return noisy, true
 

@@ -143,19 +143,23 @@ class MatchingSettings:
             )
 
 
+_THREAD = 16  # a patch of 50 px that is no thread is shorter
+
+
 def matching_margin(settings: MatchingSettings) -> int:
     """Pixels that the matcher looks at around a pixel, the search range not counted.
 
     For ``opencv-bm``: half a block, the Sobel filter, a spare row, because OpenCV's Sobel filter
     takes rows in pairs and blanks a last odd one. For ``zncc``: half a block, half the median
-    filter, and ``min_region``: a connected region that leaves such a margin is not small. For
-    ``ad-census`` also the support, the census window and half a block of each further correction;
-    its scanlines reach further, ever more faintly.
+    filter, and ``min_region`` up to 16: a connected region that leaves such a margin is not small,
+    or else a thread, which is told by its part within. For ``ad-census`` also the support, the
+    census window and half a block of each further correction; its scanlines reach further, ever
+    more faintly.
     """
     half = settings.block_size // 2
     if settings.method == "opencv-bm":
         return half + 3
-    margin = half + settings.median // 2 + settings.min_region
+    margin = half + settings.median // 2 + min(settings.min_region, _THREAD)
     if settings.method == "ad-census":
         own = settings.ad_census
         margin += own.arm + max(own.census_width, own.census_height) // 2

@@ -1,4 +1,4 @@
-"""The ten laws by id, and their tests in order, with what was done before taken over."""
+"""The eleven laws by id, and their tests in order, with what was done before taken over."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -8,7 +8,7 @@ from tqdm import tqdm
 
 from qs3.errors import InputError
 from qs3.sensor.presets import Sensor
-from qs3.sensor.realism import edges, faces, surfaces, walls
+from qs3.sensor.realism import clouds, edges, faces, surfaces, walls
 from qs3.sensor.realism.bench import Bench
 from qs3.sensor.realism.rows import Judged, plain
 from qs3.sensor.render import Renderer
@@ -24,6 +24,7 @@ LAWS: dict[str, tuple[str, Callable[[Bench], Judged | str]]] = {
     "T8": ("Steps and noise of the Kinect as measured", walls.kinect),
     "T9": ("Image noise changes depth, equal seeds repeat it", walls.repeats),
     "T10": ("Distances from a scanned object follow the law", faces.scanned),
+    "T11": ("No strays about an object in a room", clouds.strays),
 }
 """Title, and test: figures beside their bounds and curves, or why the law does not apply."""
 
@@ -37,7 +38,7 @@ class RealismSettings:
     seed: int = 0
     """All random steps follow from it."""
     tests: tuple[str, ...] = tuple(LAWS)
-    """Tests to do, T1 to T10; others may be added to the same folder."""
+    """Tests to do, T1 to T11; others may be added to the same folder."""
 
     def __post_init__(self) -> None:
         asked = {test.upper(): test for test in self.tests}

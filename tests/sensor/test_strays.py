@@ -1,0 +1,117 @@
+"""Strays: how they are measured, and each step that drops them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+
+from qs3.sensor.depth import DepthSettings
+from qs3.sensor.outliers import inliers
+from qs3.sensor.presets import get_sensor
+from qs3.sensor.realism.clouds import ratio_rows
+from qs3.sensor.rig import Pose, StereoRig
+from qs3.sensor.scan import scan
+from qs3.sensor.settings import ScanSettings
+from qs3.sensor.statistics import radius_ratio
+from qs3.sensor.view import ViewImages, clouds_of
+from qs3.shapes import make
+
+
+def sphere(count, rng):
+    points = rng.standard_normal((count, 3))
+    return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def test_the_radius_ratio_is_a_shapes_own_and_one_stray_shrinks_it():
+    rng = np.random.default_rng(0)
+    ball = sphere(20_000, rng) * rng.random((20_000, 1)) ** (1 / 3)
+    ratio = radius_ratio(ball)
+    assert ratio == pytest.approx(0.9 ** (1 / 3), abs=0.01)
+    assert radius_ratio(7 * ball + [1.0, -2.0, 3.0]) == pytest.approx(ratio, abs=1e-9)
+    strayed = np.concatenate([ball, [[0.0, 10.0, 0.0]]])
+    assert radius_ratio(strayed) == pytest.approx(ratio / 10, rel=0.02)
+    assert radius_ratio(np.ones((5, 3))) == 1.0
+
+
+def reference(points):
+    """The same by all distances, point by point."""
+    kept = list(range(len(points)))
+    for _ in range(2):
+        far = np.sort(cdist(points[kept], points[kept]), axis=1)[:, 1:17].mean(axis=1)
+        bound = np.median(far) + 3 * 1.4826 * np.median(np.abs(far - np.median(far)))
+        kept = [index for index, mean in zip(kept, far, strict=True) if mean <= bound]
+    radius = np.linalg.norm(points[kept] - np.median(points[kept], axis=0), axis=1)
+    return [index for index, r in zip(kept, radius, strict=True) if r <= 3 * np.median(radius)]
+
+
+def test_outliers_go_and_the_surface_stays():
+    rng = np.random.default_rng(1)
+    surface = sphere(1500, rng)
+    clump = np.array([0.0, 6.0, 0.0]) + 0.05 * rng.standard_normal((40, 3))
+    cloud = np.concatenate([surface, rng.uniform(2, 5, (30, 3)), clump])
+    kept = inliers(cloud)
+    assert kept[:1500].mean() > 0.95
+    assert not kept[1500:].any()  # the clump is as dense as the surface: its radius tells it
+    assert np.flatnonzero(kept).tolist() == reference(cloud)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 17])
+def test_a_cloud_of_few_points_is_taken(count):
+    assert inliers(sphere(count, np.random.default_rng(2))).shape == (count,)
+
+
+def test_the_crop_with_the_mask_ends_a_margin_beyond_the_true_depths():
+    rig = StereoRig(width=8, height=2, focal=10.0, baseline=0.05)
+    sensor = dataclasses.replace(get_sensor("d435"), rig=rig, depth=DepthSettings(stride=1))
+    true = np.tile(np.linspace(1.5, 2.2, 8), (2, 1))
+    depth = np.array([[1.39, 1.41, 2.0, 2.29, 2.31, 5.0, np.nan, 2.2], [1.8] * 8])
+    mask = np.array([[True] * 8, [False] * 8])
+    grey = np.zeros(true.shape, np.uint8)
+    view = ViewImages(rig.full_frame, grey, grey, depth.astype(np.float32), depth, true, mask)
+
+    def found(margin):
+        cloud, clean = clouds_of(view, rig.full_frame, Pose(np.eye(4)), sensor, margin)
+        np.testing.assert_allclose(clean[:, 2], true[0])
+        return cloud[:, 2].round(6).tolist()
+
+    assert found(0.1) == [1.41, 2.0, 2.29, 2.2]
+    assert found(0.0) == [2.0, 2.2]
+    assert found(10.0) == [1.39, 1.41, 2.0, 2.29, 2.31, 5.0, 2.2]
+    assert found(None) == [*found(10.0), *[1.8] * 8]
+
+
+def test_outlier_removal_is_an_option_that_is_off(renderer):
+    assert ScanSettings().remove_outliers is False
+    how = {"sensor": "kinect-v1", "views": 1, "scene": "room", "crop": "mask", "seed": 3}
+    chair = make("chair", seed=1)
+    whole, cleaned = (
+        scan(chair, **how, num_points=60_000, renderer=renderer, remove_outliers=option)
+        for option in (False, True)
+    )
+    points = whole.points[: whole.fused_points]
+    kept = points[inliers(points.astype(np.float64))]
+    assert 0 < cleaned.fused_points < whole.fused_points
+    assert abs(len(kept) - cleaned.fused_points) <= 2  # half precision apart
+    assert set(map(tuple, cleaned.points)) <= set(map(tuple, whole.points))
+    np.testing.assert_array_equal(cleaned.clean, whole.clean)
+
+
+def test_presets_of_cameras_drop_small_patches_and_the_papers_does_not():
+    least = {name: get_sensor(name).matching.min_region for name in
+             ("paper", "qs3-800", "kinect-v1", "d415", "d435", "d455")}  # fmt: skip
+    assert least["paper"] == least["qs3-800"] == 0
+    assert all(least[name] > 1 for name in ("kinect-v1", "d415", "d435", "d455"))
+
+
+# The law T11
+
+
+def test_t11_wants_real_scans_ratios():
+    clean = np.linspace(0.6, 0.9, 40).tolist()
+    rows, data = ratio_rows(clean, clean)
+    assert [figure["passed"] for figure in rows] == [True] * 3 + [None] * 3
+    assert data["ratio"] == data["clean"] == clean
+    strayed = [0.3, 0.3, 0.3, *clean[3:]]  # the 5 % quantile alone
+    assert [figure["passed"] for figure in ratio_rows(strayed, clean)[0][:3]] == [False, True, True]
+    assert not any(f["passed"] for f in ratio_rows([r / 2 for r in clean], clean)[0])
