@@ -116,6 +116,7 @@ def test_real_cameras_are_metric_and_their_parts_agree(name):
     rig, pattern, depth = sensor.rig, sensor.pattern, sensor.depth
     assert sensor.metric
     assert sensor.matching.left_band == "physical"
+    assert sensor.matching.method == ("zncc" if name == "kinect-v1" else "ad-census")
     # The search reaches to the near end of the gate.
     assert rig.disparity(depth.near) <= sensor.matching.num_disparities
     # The pattern covers the left image at the far end of the gate.
