@@ -24,8 +24,8 @@ def test_a_new_thing_touches_the_files_that_are_listed(title, example, table):
     word = re.compile(rf"\b{example}\b", re.IGNORECASE)
     mentioning = {
         str(path.relative_to(ROOT))
-        for path in (ROOT / "src").rglob("*.py")
-        if word.search(path.read_text(encoding="utf-8"))
+        for path in (ROOT / "src").rglob("*.*")
+        if path.suffix in (".py", ".toml") and word.search(path.read_text(encoding="utf-8"))
     }
     unlisted = {path for path in mentioning - listed if not path.startswith(BY_CHOICE)}
     assert not unlisted
