@@ -42,6 +42,7 @@ MATCHERS: tuple[tuple[Literal["opencv-bm", "zncc"], int], ...] = (
     ("zncc", 15),
     ("zncc", 21),
 )
+TOLD = ("autocorrelation", "locking", "share kept", "fall over")
 Record = dict[str, Any]
 
 
@@ -70,14 +71,14 @@ def heading(record: Record) -> str:
 
 def family(what: str) -> str:
     """A figure's name without the place it was taken at: rows of one family share a line."""
-    return re.sub(r" (at [\d.]+ m|\(from .*\)|to [\d.]+ m)$", "", what)
+    return re.sub(r" (at [\d.]+ (m|px)|\(.*\)|to [\d.]+ m)$", "", what)
 
 
-def judged(result: Record) -> dict[str, list[Record]]:
-    """A test's figures that have bounds, by family."""
+def shown(result: Record) -> dict[str, list[Record]]:
+    """A test's figures that have bounds, and some that are told beside them, by family."""
     found: dict[str, list[Record]] = {}
     for row in result["rows"]:
-        if row["passed"] is not None:
+        if row["passed"] is not None or row["what"].startswith(TOLD):
             found.setdefault(family(row["what"]), []).append(row)
     return found
 
@@ -87,8 +88,8 @@ def figures(rows: list[Record], bounds: bool) -> str:
     words = []
     for row in rows:
         text = "–" if row["measured"] is None else f"{row['measured']:.4g}"
-        text = text if row["passed"] else f"**{text}**"
-        words.append(f"{text} ({row['expected']})" if bounds else text)
+        text = text if row["passed"] is not False else f"**{text}**"
+        words.append(f"{text} ({row['expected']})" if bounds and row["expected"] else text)
     return ", ".join(words) + (f" {rows[0]['unit']}" if rows[0]["unit"] else "")
 
 
@@ -98,7 +99,7 @@ def realism_table(records: list[Record]) -> str:
     lines.append("|" + "---|" * (len(records) + 1))
     for test, (title, _) in LAWS.items():
         results = [next((t for t in r["tests"] if t["id"] == test), None) for r in records]
-        seen = [judged(result) if result else {} for result in results]
+        seen = [shown(result) if result else {} for result in results]
         names = list(dict.fromkeys(name for one in seen for name in one))
         shared = {
             name: {row["expected"] for one in seen for row in one.get(name, [])} for name in names
@@ -107,7 +108,7 @@ def realism_table(records: list[Record]) -> str:
         for name in names:
             (bound, *others) = shared[name]
             unit = next(one[name][0]["unit"] for one in seen if name in one)
-            first.append(f"{name}{'' if others else f': {bound} {unit}'.rstrip()}")
+            first.append(f"{name}{'' if others or not bound else f': {bound} {unit}'.rstrip()}")
         cells = ["<br>".join(first).replace("|", "\\|")]
         for result, one in zip(results, seen, strict=True):
             if result is None:

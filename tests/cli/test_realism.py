@@ -111,7 +111,7 @@ def test_other_settings_do_not_mix(refused, camera, first, tmp_path):
     line = refused(*common, *FAST, "--seed", 3)
     assert "settings.seed was 0, is 3" in line
     line = refused(*common, *FAST, "--matching", "opencv-bm")
-    assert "sensor.matching.method was zncc, is opencv-bm" in line
+    assert "sensor.matching.method was ad-census, is opencv-bm" in line
     assert (folder / "realism.json").read_bytes() == old
     other = tmp_path / "other"
     other.mkdir()

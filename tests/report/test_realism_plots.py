@@ -105,8 +105,9 @@ def test_bias_is_in_order_of_the_fraction_with_the_median_and_its_bounds():
     assert low < -0.02 and high > 0.03
 
 
-def test_the_edge_is_marked_by_half_a_block():
-    block = dataclasses.replace(D435.matching, block_size=11)
+@pytest.mark.parametrize(("method", "most"), [("zncc", 5.5), ("ad-census", 2.5)])
+def test_the_edge_is_marked_by_what_the_matcher_may_be_off(method, most):
+    block = dataclasses.replace(D435.matching, method=method, block_size=11)
     figure = realism_plot(result("T5"), dataclasses.replace(D435, matching=block))
     drawn = lines(figure)
     np.testing.assert_array_equal(drawn["depth of the plate"].get_ydata(), DATA["T5"]["near_share"])
@@ -114,7 +115,7 @@ def test_the_edge_is_marked_by_half_a_block():
         drawn["depth in between"].get_ydata(), DATA["T5"]["between_share"]
     )
     (band,) = figure.axes[0].patches
-    assert band.get_bbox().intervalx.tolist() == [-5.5, 5.5]
+    assert band.get_bbox().intervalx.tolist() == [-most, most]
 
 
 def test_fill_gets_darker_and_more_glancing_to_the_right():

@@ -4,16 +4,28 @@ import dataclasses
 import math
 import tomllib
 
+import cv2
 import numpy as np
 import pytest
 
 from qs3.errors import InputError
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.exposure import ExposureSettings
+from qs3.sensor.lens import blur
 from qs3.sensor.matching import MatchingSettings
-from qs3.sensor.presets import SENSORS, Sensor, get_sensor, load_sensor, sensor_toml, settings_dict
-from qs3.sensor.rig import StereoRig
-from qs3.sensor.speckle import PatternSettings
+from qs3.sensor.presets import (
+    SENSORS,
+    Sensor,
+    changed,
+    get_sensor,
+    load_sensor,
+    sensor_toml,
+    settings_dict,
+)
+from qs3.sensor.realism.bench import VIEW, painted, wall
+from qs3.sensor.rig import Region, StereoRig
+from qs3.sensor.speckle import PatternSettings, rosette_places
+from qs3.sensor.view import scene_of
 from qs3.sensor.views import Placement
 
 REAL = ("d415", "d435", "d455", "kinect-v1")
@@ -74,12 +86,37 @@ def test_the_d435_throws_about_5000_spots_over_its_published_field():
     assert degrees(pattern.tan_half_height) == pytest.approx(63, abs=0.1)
 
 
+def test_the_d415_throws_a_dot_per_105_to_150_pixels_that_adds_as_much_as_measured(renderer):
+    sensor = SENSORS["d415"]
+    rig, pattern = sensor.rig, sensor.pattern
+    area = 4 * rig.focal**2 * pattern.tan_half_width * pattern.tan_half_height
+    dots = len(rosette_places(pattern.columns, pattern.rows, pattern.seed))
+    assert 105 <= area / dots <= 150
+    for distance in sensor.placement.radius:
+        region, seen = Region(520, 260, 240, 200), []
+        for projector in (sensor.light.projector, 0.0):
+            lit = changed(sensor, "light.projector", projector)
+            scene = scene_of([painted(wall(distance))], lit)
+            pair = renderer.render(scene, rig, [VIEW], [0], regions=[region])[0]
+            seen.append(blur(pair.canvas(region)[0], sensor.exposure.psf))
+        on, off = seen
+        assert 0.04 <= on.mean() / off.mean() - 1 <= 0.32
+        # Through three pixels of a Gaussian, wherever its peak lies between them.
+        spots = np.maximum(on - off, 1e-9)
+        peaks = (spots == cv2.dilate(spots, np.ones((7, 7)))) & (spots > 0.5 * spots.max())
+        y, x = np.nonzero(peaks[:, 1:-1])
+        before, peak, after = np.log([spots[y, x + k] for k in range(3)])
+        widths = np.sqrt(8 * np.log(2) / (2 * peak - before - after))
+        assert np.median(widths) == pytest.approx(3.3, abs=0.2)
+
+
 @pytest.mark.parametrize("name", REAL)
 def test_real_cameras_are_metric_and_their_parts_agree(name):
     sensor = SENSORS[name]
     rig, pattern, depth = sensor.rig, sensor.pattern, sensor.depth
     assert sensor.metric
     assert sensor.matching.left_band == "physical"
+    assert sensor.matching.method == ("zncc" if name == "kinect-v1" else "ad-census")
     # The search reaches to the near end of the gate.
     assert rig.disparity(depth.near) <= sensor.matching.num_disparities
     # The pattern covers the left image at the far end of the gate.

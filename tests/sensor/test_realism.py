@@ -11,9 +11,10 @@ from qs3.errors import InputError
 from qs3.sensor.presets import Sensor, get_sensor
 from qs3.sensor.realism import LAWS, RealismSettings, realism
 from qs3.sensor.realism.bench import distances
-from qs3.sensor.realism.edges import band_rows, edge_rows, shadow_rows
+from qs3.sensor.realism.edges import band_rows, bar_rows, edge_rows, shadow_rows, spill_rows
 from qs3.sensor.realism.faces import inside_faces, off_faces, scan_rows
 from qs3.sensor.realism.metrics import (
+    autocorrelation,
     camera_points,
     depth_step,
     plane_metrics,
@@ -115,6 +116,17 @@ def test_t1_wants_the_square_law_and_a_real_sensors_noise(sigma, misses):
     assert len(data["z"]) == len(data["rms_mm"]) == len(data["subpixel_rms"]) == len(data["fill"])
 
 
+def test_autocorrelation_tells_blurred_noise_from_sharp():
+    rng = np.random.default_rng(8)
+    sharp = wall_disparity(1.0, 0.1, rng, quantum=1e-9)
+    blurred = np.mean([np.roll(sharp, shift, axis=1) for shift in range(8)], axis=0)[:, 8:]
+    for error, alike in ((sharp, (0, 0, 0)), (blurred, (7 / 8, 1 / 2, 0))):
+        sloped = error + 0.003 * np.arange(error.shape[1])  # a slope is no error
+        sloped[0, :5] = np.nan
+        np.testing.assert_allclose(autocorrelation(sloped, (1, 4, 8)), alike, atol=0.05)
+    assert np.isnan(autocorrelation(np.full((4, 9), np.nan), (1,))).all()
+
+
 # T2
 
 
@@ -180,15 +192,15 @@ def edge_scene(left=60, right=120, near=36.0, far=21.5, shadow=15, grow=0):
 
 @pytest.mark.parametrize(("shadow", "good"), [(15, True), (21, True), (3, False), (26, False)])
 def test_t4_measures_the_shadow_beside_an_edge(shadow, good):
-    rows = shadow_rows(edge_scene(shadow=shadow), 60, 36.0, 21.5, 17)
+    rows = shadow_rows(edge_scene(shadow=shadow), 60, 36.0, 21.5, 8.5)
     assert rows[0]["measured"] == shadow
     assert passed(rows) is good
 
 
 def test_t4_sees_the_shadow_through_a_fattened_edge_and_not_right_of_the_plate():
-    assert shadow_rows(edge_scene(grow=5), 60, 36.0, 21.5, 17)[0]["measured"] == 15
+    assert shadow_rows(edge_scene(grow=5), 60, 36.0, 21.5, 8.5)[0]["measured"] == 15
     swapped = edge_scene()[:, ::-1]  # the shadow on the wrong side
-    assert not passed(shadow_rows(swapped, 60, 36.0, 21.5, 17))
+    assert not passed(shadow_rows(swapped, 60, 36.0, 21.5, 8.5))
 
 
 # T5
@@ -196,7 +208,7 @@ def test_t4_sees_the_shadow_through_a_fattened_edge_and_not_right_of_the_plate()
 
 @pytest.mark.parametrize(("grow", "good"), [(0, True), (8, True), (9, False), (12, False)])
 def test_t5_measures_fattening_on_both_sides(grow, good):
-    rows, data = edge_rows(edge_scene(grow=grow), (60, 119), 36.0, 21.5, 17)
+    rows, data = edge_rows(edge_scene(grow=grow), (60, 119), 36.0, 21.5, 17, 8.5)
     assert [figure["measured"] for figure in rows[:2]] == [grow, grow]
     assert passed(rows) is good
     near = np.asarray(data["near_share"])
@@ -205,14 +217,60 @@ def test_t5_measures_fattening_on_both_sides(grow, good):
 
 
 def test_t5_misses_an_eroded_plate_and_counts_flying_points():
-    rows, _ = edge_rows(edge_scene(left=72, right=108), (60, 119), 36.0, 21.5, 17)
+    rows, _ = edge_rows(edge_scene(left=72, right=108), (60, 119), 36.0, 21.5, 17, 8.5)
     assert len(missed(rows)) == 2
     scene = edge_scene()
     scene[:, 118:121] = 28.0
-    rows, data = edge_rows(scene, (60, 119), 36.0, 21.5, 17)
+    rows, data = edge_rows(scene, (60, 119), 36.0, 21.5, 17, 8.5)
     # 3 of the 2 × 2 × 17 columns about the edges, 15 of which have no match.
     assert rows[2]["measured"] == pytest.approx(100 * 3 / (68 - 15))
     assert max(data["between_share"]) == 0.5
+
+
+def target_views(step, grow=0, band=None):
+    """Box, can and table of 60 px before a wall of disparity 20, as `spill_rows` takes them."""
+    views = {}
+    for name, top in (("box", 30), ("can", 0), ("table", 40)):
+        true = np.zeros((80, 200), bool)
+        true[top:, 70:130] = True
+        made = np.full(true.shape, 20.0)
+        made[:, 70 - (step if band is None else band) : 70] = np.nan
+        made[max(0, top - grow) :, 70 - grow : 130 + grow] = 20.0 + step
+        views[name] = view_of(made.astype(np.float32), true)
+    return views
+
+
+def view_of(disparity, mask):
+    grey, depth = np.zeros(mask.shape, np.uint8), np.ones(mask.shape)
+    return ViewImages(RIG.full_frame, grey, grey, disparity, depth, depth, mask)
+
+
+@pytest.mark.parametrize("step", [5, 10, 25])
+@pytest.mark.parametrize("grow", [-2, 0, 2, 3, 6])
+def test_t5_wants_ad_census_within_two_and_a_half_pixels(step, grow):
+    rows = spill_rows(target_views(step, grow, step + max(0, grow)), 20.0, step)
+    assert [figure["measured"] for figure in rows[:7]] == [grow] * 7
+    late = [] if grow <= 5 else [rows[6]["what"]]
+    wrong = [] if abs(grow) <= 2.5 else [figure["what"] for figure in rows[:6]]
+    assert missed(rows) == wrong + late
+    assert [figure["measured"] for figure in rows[7:]] == [step, step]
+
+
+@pytest.mark.parametrize(("band", "good"), [(6, False), (8, True), (12, True), (13, False)])
+def test_t5_wants_the_band_left_of_an_edge_empty(band, good):
+    rows = spill_rows(target_views(10, band=band), 20.0, 10)
+    assert [figure["measured"] for figure in rows[7:]] == [band, band]
+    assert passed(rows) is good
+
+
+def test_t5_tells_which_bars_are_kept():
+    mask, seen = np.zeros((10, 100), bool), np.full((10, 100), 20.0, np.float32)
+    for place, width in ((10, 3), (30, 5), (50, 8), (70, 12)):
+        mask[:, place : place + width] = True
+    seen[:, 70:76] = 30.0
+    rows = bar_rows(view_of(seen, mask), 30.2)
+    assert [figure["measured"] for figure in rows] == [0, 0, 0, 0.5]
+    assert passed(rows)
 
 
 # T6
@@ -223,7 +281,9 @@ def test_t6_wants_fill_to_fall_but_for_counting_noise():
     assert passed(fall_rows("albedo", at, (1.0, 0.999, 0.9995, 0.6, 0.0), 100.0))
     assert not passed(fall_rows("albedo", at, (1.0, 0.7, 0.95, 0.6, 0.0), 100.0))  # rises
     assert not passed(fall_rows("albedo", at, (0.0, 0.2, 0.5, 0.9, 1.0), 100.0))
-    assert not passed(fall_rows("albedo", at, (1.0, 1.0, 1.0, 1.0, 1.0), 100.0))  # never falls
+    full = (1.0,) * 5
+    assert not passed(fall_rows("albedo", at, full, 100.0))  # never falls
+    assert passed(fall_rows("albedo", at, full, 100.0, falls=False))
 
 
 def test_t6_counting_noise_is_that_of_binomial_counts():

@@ -14,6 +14,7 @@ from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.speckle import (
     PatternSettings,
     pattern_image,
+    rosette_places,
     speckle_pattern,
     spot_places,
     stored_pattern,
@@ -33,11 +34,11 @@ def test_pattern_has_one_dot_in_nine_and_none_adjacent(seed):
     assert np.median(distance) <= 3
 
 
-@pytest.mark.parametrize("draw", [speckle_pattern, spot_places])
+@pytest.mark.parametrize("draw", [speckle_pattern, spot_places, rosette_places])
 def test_patterns_follow_their_seed(draw):
     assert draw(30, 30, 4).tobytes() == draw(30, 30, 4).tobytes()
     assert (draw(30, 30, 4) != draw(30, 30, 5)).any()
-    with pytest.raises(InputError, match="multiples of 3"):
+    with pytest.raises(InputError, match="multiples of"):
         draw(31, 30, 0)
 
 
@@ -143,6 +144,21 @@ def test_spots_are_like_themselves_at_no_distance():
     assert likeness[distance > 3].max() > 0.9
 
 
+def test_rosettes_have_dense_rings_and_loose_petals_and_are_unlike_each_other():
+    settings = PatternSettings(columns=240, rows=150, kind="rosettes", spot_size=0.83)
+    places = rosette_places(240, 150, 0)
+    assert len(places) == 240 * 150 / 9
+    apart = cKDTree(places).query(places, 2)[0][:, 1].reshape(-1, 25)
+    ring, petals = np.median(apart[:, :10]), np.median(apart[:, 10:])
+    assert ring < 1.7 < 2 < petals
+    # Nothing is far from a spot, and no two rosettes are alike.
+    inside = np.random.default_rng(0).uniform((15, 15), (225, 135), (4000, 2))
+    assert cKDTree(places).query(inside)[0].max() < 7
+    image = pattern_image(settings)
+    likeness, distance = self_correlation(image)
+    assert np.abs(likeness[distance > 2 * image.shape[1] / 240]).max() < 0.12
+
+
 def test_spots_are_gaussian_of_the_stated_width():
     settings = PatternSettings(columns=12, rows=9, kind="spots", spot_size=0.8, seed=2)
     image = pattern_image(settings)
@@ -171,6 +187,7 @@ def test_pictures_of_spots_are_fine_enough_and_not_too_large(spot_size):
     [
         ({"columns": 31}, "multiples of 3"),
         ({"rows": 0}, "multiples of 3"),
+        ({"kind": "rosettes", "columns": 630, "rows": 498}, "multiples of 15"),
         ({"spot_size": 0.0}, "spot_size"),
         ({"spot_size": 2.5}, "spot_size"),
         ({"tan_half_width": 0.0}, "tan_half_width"),

@@ -11,6 +11,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, NullLocator
 
 from qs3.report.figure import NO_VALUE, PALETTE, house_style
 from qs3.sensor.presets import Sensor
+from qs3.sensor.realism.edges import allowed
 
 LAW_PIXELS = 0.08
 """Sub-pixel RMS of the law of noise: a well-lit wall, Intel's guide to tuning depth cameras."""
@@ -87,12 +88,12 @@ def bias_plot(result: _Result, sensor: Sensor) -> Figure:
 
 @house_style
 def edge_plot(result: _Result, sensor: Sensor) -> Figure:
-    """What is measured across the edge of a plate before a wall (T5), half a block marked."""
+    """What is measured across the edge of a plate before a wall (T5), its bounds marked."""
     offset = _series(result, "offset")
-    half = sensor.matching.block_size / 2
+    most = allowed(sensor.matching)
     across = "pixels from the true edge (left: on the plate)"
     figure, axes = _plot(sensor, "profile of an edge", across, "share of the rows")
-    axes.axvspan(-half, half, color=_SECOND, alpha=0.2, label="± half a block")
+    axes.axvspan(-most, most, color=_SECOND, alpha=0.2, label=f"± {most:g} px")
     axes.axvline(0, color="black", linewidth=0.8)
     near, between = _series(result, "near_share"), _series(result, "between_share")
     axes.plot(offset, near, "-", color=_MEASURED, label="depth of the plate")

@@ -51,8 +51,8 @@ class CameraSettings:
     image_noise: float | None = None
     """Gaussian noise of the images in grey levels of 255; default by sensor."""
     matching: Method | None = None
-    """OpenCV's block matching, or our own, twice as precise where images are not grainy; default by
-    sensor."""
+    """OpenCV's block matching; our own (zncc), twice as precise where images are not grainy; or
+    what real D4xx seem to do (ad-census), sharp at edges; default by sensor."""
     bias_correction: bool = False
     """Take off the 1/32 px by which OpenCV's block matching rounds up."""
     pattern: Path | None = None

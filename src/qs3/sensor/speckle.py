@@ -1,6 +1,6 @@
-"""The projected pattern: seeded square dots or round spots, or a picture of the user's own.
+"""The projected pattern: seeded square dots, round spots, or a picture of the user's own.
 
-Either kind has columns/3 × rows/3 of them: 270 × 168 cells hold 90 × 56 = 5,040, about what a
+Each kind has columns/3 × rows/3 of them: 270 × 168 cells hold 90 × 56 = 5,040, about what a
 RealSense D435 throws. A camera without a second one compares its image with the stored pattern
 (Kinect v1).
 """
@@ -23,6 +23,11 @@ _LEAST_DISTANCE = 1.5  # cells between two spots; the middle of a tile has it fr
 _SWEEPS = 32  # a spot moves at every second attempt, so that after these none is where it began
 _TEXELS = 4  # texels across a spot's full width at half maximum
 _LARGEST = 4096  # texels along a side
+_ROSETTE = 15  # cells on a side that hold a rosette of 25 spots, so that its density is 1 in 9 too
+# Of a rosette: a ring of ten, and five petals of three; angles in turns, radii in cells.
+_TURNS = np.r_[np.arange(10) / 10, (np.arange(5)[:, None] / 5 + [-0.055, 0.055, 0]).ravel()]
+_RADII = np.r_[np.full(10, 2.9), np.tile([5.4, 5.4, 7.8], 5)]
+_CENTRES, _SPOTS = 0.8, 0.2  # standard deviations of places in cells: no two rosettes are alike
 _FINE = 4  # samples of a pixel of the stored pattern, each way
 
 
@@ -31,18 +36,19 @@ class PatternSettings:
     """The speckle pattern and the cone that the projector throws it into."""
 
     columns: int = 633
-    """Cells across the pattern; a multiple of 3."""
+    """Cells across the pattern; a multiple of 3, of 15 with ``rosettes``."""
     rows: int = 495
-    """Cells down the pattern; a multiple of 3."""
-    kind: Literal["tiles", "spots"] = "tiles"
+    """Cells down the pattern; a multiple of 3, of 15 with ``rosettes``."""
+    kind: Literal["tiles", "spots", "rosettes"] = "tiles"
     """``tiles``: square dots on the cells of a grid, as released. ``spots``: round Gaussian spots
-    at places off the grid, one in each 3×3 tile of cells, as laser projectors throw them."""
+    at places off the grid, one in each 3×3 tile of cells, as laser projectors throw them.
+    ``rosettes``: such spots in dense rings with loose petals, 25 on 15×15 cells, as a D415's."""
     tan_half_width: float = 0.625
     """Tangent of half the horizontal opening angle (0.625 is 64°)."""
     tan_half_height: float = 0.625
     """Tangent of half the vertical opening angle."""
     spot_size: float = 1.0
-    """Full width at half maximum of a spot, in cells, up to 2 (``spots`` only)."""
+    """Full width at half maximum of a spot, in cells, up to 2 (not of ``tiles``)."""
     seed: int = 0
     """Which pattern; one projector has one."""
     image: str | None = None
@@ -58,7 +64,8 @@ class PatternSettings:
         check_range(self, "pattern", "seed")
         check_range(self, "pattern", "spot_size", high=2.0, above=True)
         if self.image is None:
-            _check_cells(self.columns, self.rows)
+            side = _ROSETTE if self.kind == "rosettes" else _TILE
+            _check_cells(self.columns, self.rows, side)
 
 
 def speckle_pattern(columns: int, rows: int, seed: int) -> Bool[np.ndarray, "rows columns"]:
@@ -133,6 +140,33 @@ def spot_places(columns: int, rows: int, seed: int) -> Float[np.ndarray, "n 2"]:
     return places[1:-1, 1:-1].reshape(-1, 2)
 
 
+def rosette_places(columns: int, rows: int, seed: int) -> Float[np.ndarray, "n 2"]:
+    """Places in rosettes: rings of ten, each with five petals of three, turned at random.
+
+    Their middles are on rows 15 cells apart, every second row half a step further, and off that
+    by 0.8 cells each way; each spot is off its place in the rosette by 0.2.
+
+    Returns:
+        Column and row in cells as `spot_places` has them; a few lie just outside the pattern.
+
+    Raises:
+        InputError: where ``columns`` or ``rows`` is not a positive multiple of 15.
+
+    Example:
+        >>> rosette_places(30, 15, seed=1).shape
+        (50, 2)
+    """
+    _check_cells(columns, rows, _ROSETTE)
+    rng = np.random.default_rng(np.random.SeedSequence([seed, columns, rows, 2]))
+    y, x = np.mgrid[: rows // _ROSETTE, : columns // _ROSETTE].reshape(2, -1)
+    middles = _ROSETTE * np.stack([x + 0.25 + y % 2 / 2, y + 0.5], axis=-1)
+    middles += _CENTRES * rng.standard_normal(middles.shape)
+    angles = 2 * np.pi * (_TURNS + rng.random((len(middles), 1)))
+    away = _RADII[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    away += _SPOTS * rng.standard_normal(away.shape)
+    return (middles[:, None] + away).reshape(-1, 2)
+
+
 _AROUND = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)]
 
 
@@ -149,18 +183,18 @@ def pattern_image(settings: PatternSettings) -> Float32[np.ndarray, "h w"]:
     """
     if settings.image is not None:
         image = _users_picture(Path(settings.image))
-    elif settings.kind == "spots":
-        image = _spots(settings)
-    else:
+    elif settings.kind == "tiles":
         dots = speckle_pattern(settings.columns, settings.rows, settings.seed)
         image = np.kron(dots, np.ones((2, 2), dtype=bool)).astype(np.float32)
+    else:
+        image = _spots(settings)
     image.setflags(write=False)
     return image
 
 
-def _check_cells(columns: int, rows: int) -> None:
-    if columns < _TILE or rows < _TILE or columns % _TILE or rows % _TILE:
-        raise InputError(f"pattern: {columns} × {rows} cells; both must be multiples of {_TILE}")
+def _check_cells(columns: int, rows: int, side: int = _TILE) -> None:
+    if columns < side or rows < side or columns % side or rows % side:
+        raise InputError(f"pattern: {columns} × {rows} cells; both must be multiples of {side}")
 
 
 def _users_picture(path: Path) -> Float32[np.ndarray, "h w"]:
@@ -189,7 +223,8 @@ def _spots(settings: PatternSettings) -> Float32[np.ndarray, "h w"]:
     width, height = scale * columns, scale * rows
     sigma = scale * settings.spot_size / math.sqrt(8 * math.log(2))
     # Texel i reaches from i to i + 1, so that its centre is at i + 1/2.
-    centre = spot_places(columns, rows, settings.seed) * scale - 0.5
+    places = rosette_places if settings.kind == "rosettes" else spot_places
+    centre = places(columns, rows, settings.seed) * scale - 0.5
     nearest = np.rint(centre).astype(int)
     reach = np.arange(-math.ceil(4 * sigma), math.ceil(4 * sigma) + 1)
     x, y = (nearest[:, axis, None] + reach for axis in (0, 1))

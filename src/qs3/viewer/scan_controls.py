@@ -3,10 +3,11 @@
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import trimesh
 
+from qs3.sensor.matching.settings import Method
 from qs3.sensor.materials import MATERIALS, get_material
 from qs3.sensor.presets import Sensor
 from qs3.sensor.scan import scan
@@ -79,7 +80,7 @@ def make_controls(settings: ScanSettings) -> tuple[Control, ...]:
         Control("room light", "Other light ×", 1.0, (), 0.0, 20.0, 0.1),
         Control("gain", "Gain ×", 1.0, (), 0.1, 8.0, 0.1),
         Control("exposure.noise", "Image noise (grey)", sensor.exposure.noise, (), 0.0, 20.0, 0.1),
-        Control("matching.method", "Matcher", matching.method, ("opencv-bm", "zncc")),
+        Control("matching.method", "Matcher", matching.method, get_args(Method)),
         Control("matching.block_size", "Block (px)", matching.block_size, (), 5, 31, 2),
         Control(
             "matching.num_disparities", "Disparities", matching.num_disparities, (), 16, 512, whole

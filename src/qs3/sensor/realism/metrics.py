@@ -108,6 +108,28 @@ def averaged(metrics: Sequence[PlaneMetrics]) -> PlaneMetrics:
     return PlaneMetrics(float(fill.mean()), float(rms), float(pixels), float(accuracy.mean()))
 
 
+def autocorrelation(disparity: Float[np.ndarray, "h w"], lags: Sequence[int]) -> list[float]:
+    """How alike errors of a plane are ``lags`` pixels apart along x: 1 is the same, 0 no relation.
+
+    Errors are from the plane in disparity that fits best; those of a pixel and above are left out.
+
+    Example:
+        >>> flat = np.tile([20.0, 20.1], (4, 30))  # every pixel the opposite of its neighbour
+        >>> [round(r, 2) for r in autocorrelation(flat, (1, 2))]
+        [-1.0, 1.0]
+    """
+    y, x = np.indices(disparity.shape)
+    design = np.stack([x, y, np.ones_like(x)], axis=-1)
+    kept = np.isfinite(disparity)
+    kept &= np.abs(disparity - np.median(disparity[kept])) < 1 if kept.any() else False
+    if kept.sum() < 3:
+        return [math.nan] * len(lags)
+    plane, *_ = np.linalg.lstsq(design[kept].astype(float), disparity[kept], rcond=None)
+    error = np.where(kept, disparity - design @ plane, np.nan)
+    power = np.nanmean(error**2)
+    return [float(np.nanmean(error[:, k:] * error[:, :-k]) / power) for k in lags]
+
+
 def depth_step(depth: Float[np.ndarray, "h w"], distance: float) -> float:
     """The smallest difference of neighbouring depth levels around ``distance``.
 
