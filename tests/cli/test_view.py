@@ -136,7 +136,7 @@ def test_a_mesh_is_scanned_with_the_settings_of_the_page(tmp_path):
     shapes.make("table", seed=1).export(tmp_path / "table.ply")
     camera = ScanSettings(variant="scalar_rgb", samples=1, views=1, num_points=64, seed=3)
     for what, draws in ((str(tmp_path / "table.ply"), 0), ("table", 100)):
-        page = _scan_page(what, None, None, camera).keywords
+        page = _scan_page(what, None, None, "", camera).keywords
         assert page["draws"] == draws
         item = page["scan"](with_controls(page["start"], {"object_size": 0.5}), 1)
         assert item.clouds["points"].shape == (64, 3)
