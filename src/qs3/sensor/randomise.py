@@ -99,30 +99,24 @@ def resolve_ranges(
 
 
 def draw(
-    sensor: Sensor,
-    randomise: Mapping[str, Sequence[Any]] | Sequence[str] | None,
-    rng: np.random.Generator,
+    sensor: Sensor, ranges: Mapping[str, tuple[Any, ...]], rng: np.random.Generator
 ) -> tuple[Sensor, dict[str, Any]]:
-    """Draw a sensor from ranges.
+    """Draw a sensor from what `resolve_ranges` returned; a room is `draw_room`'s.
 
     Args:
         sensor: Supplies what is not drawn.
-        randomise: As for `resolve_ranges`; a room is `draw_room`'s.
-        rng: One number is drawn for each name, in alphabetical order.
+        ranges: The ranges, in their fixed order.
+        rng: One number is drawn for each name.
 
     Returns:
         The sensor, and what was drawn by name.
 
-    Raises:
-        InputError: as `resolve_ranges` does.
-
     Example:
-        >>> ranges = {"material": ("metal",), "exposure.gain": (0.5, 0.5)}
+        >>> ranges = resolve_ranges(Sensor(), {"material": ["metal"], "exposure.gain": (0.5, 0.5)})
         >>> drawn = draw(Sensor(), ranges, np.random.default_rng(0))[1]
         >>> drawn
         {'exposure.gain': 0.5, 'material': 'metal'}
     """
-    ranges = resolve_ranges(sensor, randomise)
     return _drawn(sensor, {n: r for n, r in ranges.items() if not n.startswith("room.")}, rng)
 
 
