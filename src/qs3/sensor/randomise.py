@@ -16,7 +16,7 @@ import numpy as np
 from qs3.errors import InputError
 from qs3.sensor.materials import MATERIALS
 from qs3.sensor.presets import Sensor, changed
-from qs3.sensor.rooms import ROOM_RANGES, Room
+from qs3.sensor.rooms import PLACE, ROOM_RANGES, Room
 from qs3.sensor.scene import LAYOUTS
 
 _NAMED = {"material": tuple(MATERIALS), "room.layout": LAYOUTS}
@@ -121,11 +121,16 @@ def draw(
 
 
 def draw_room(
-    ranges: Mapping[str, tuple[Any, ...]], rng: np.random.Generator
+    ranges: Mapping[str, tuple[Any, ...]], rng: np.random.Generator, room: Room | None = None
 ) -> tuple[Room, dict[str, Any]]:
-    """Draw a room from what `resolve_ranges` returned; the same values by name are returned too."""
+    """Draw a room from what `resolve_ranges` returned; the same values by name are returned too.
+
+    With a ``room`` the place of another view in it alone is drawn: height, distance and aim.
+    """
     own = {n.removeprefix("room."): r for n, r in ranges.items() if n.startswith("room.")}
-    room, drawn = _drawn(Room(), own, rng)
+    if room is not None:
+        own = {name: values for name, values in own.items() if name in PLACE}
+    room, drawn = _drawn(room or Room(), own, rng)
     return room, {f"room.{name}": value for name, value in drawn.items()}
 
 

@@ -22,10 +22,11 @@ from qs3.sensor.presets import Sensor
 from qs3.sensor.randomise import draw
 from qs3.sensor.render import Body
 from qs3.sensor.render.raycast import DepthCaster
-from qs3.sensor.rig import Pose, StereoRig
+from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.sampling import resample
+from qs3.sensor.scene import ArrangedScene
 from qs3.sensor.settings import ScanSettings as ScanSettings
-from qs3.sensor.staging import resized, sized, stand, stand_in_room
+from qs3.sensor.staging import resized, sized, stand, stand_in_rooms
 from qs3.sensor.statistics import ViewStatistics
 from qs3.sensor.view import Clock, ViewImages, measure, object_region, scene_of, take_view
 
@@ -109,8 +110,8 @@ def scan(
     scene, crop = how.make_scene(), how.chosen("crop")
     sensor = how.make_sensor()
     sensor = sensor if rig is None else dataclasses.replace(sensor, rig=rig)
-    how = dataclasses.replace(how, sensor=sensor)  # a file of one's own is read once
-    renderer = how.make_renderer()
+    # A file of one's own is read once, and a renderer that does not work here stops this first.
+    how = dataclasses.replace(how, sensor=sensor, renderer=how.make_renderer())
     rng_place, rng_render, rng_noise, rng_sample, rng_scene, rng_settings, rng_size, rng_room = (
         np.random.default_rng(s) for s in np.random.SeedSequence(how.seed).spawn(8)
     )
@@ -129,43 +130,30 @@ def scan(
         neighbour.vertices = neighbour.vertices * scene.neighbour_size
         drawn |= {f"neighbour_{name}": value for name, value in size.items()}
     body = Body(turned, sensor.material)
-    if "room.layout" in how.ranges:
-        sensor, around, room = stand_in_room(how, sensor, body, neighbour, rng_room, rng_scene)
-        drawn |= room
+    if how.room_layouts:
+        rooms = stand_in_rooms(how, sensor, body, neighbour, rng_room, rng_scene)
     else:
-        around = stand(how, scene, sensor, body, neighbour, rng_place, rng_scene)
-    parts = [object_region(bounds, sensor, pose) for pose in around.poses]
-    regions = [sensor.rig.full_frame] * how.views if full_frames else parts
-
-    with clock("render"):
-        seeds = [int(s) for s in rng_render.integers(0, 2**31, size=how.views)]
-        canvases = [matching_canvas(region, sensor.rig, sensor.matching) for region in regions]
-        built = scene_of(around.bodies, sensor)
-        # An object alone needs no more than its own box: the rest is background.
-        reach = blur_reach(sensor.exposure.psf)
-        frame = (sensor.rig.width, sensor.rig.height)
-        wanted = None if built.alone else [c.grown(reach, *frame) for c in canvases]
-        pairs = renderer.render(built, sensor.rig, around.poses, seeds, wanted)
-    with clock("true_depth"):
-        casters = [DepthCaster(*(body.mesh for body in around.bodies))]
-        casters += [DepthCaster(turned)] if full_frames else []
-    images = [
-        take_view(pair, sensor, region, part, casters, rng_noise, clock)
-        for pair, region, part in zip(pairs, regions, parts, strict=True)
-    ]
-
-    with clock("fusion"):
-        beyond = how.depth_margin if crop in ("mask", "both") else None
-        shown = zip(images, parts, around.poses, strict=True)
-        clouds, cleans, statistics = zip(*(measure(*v, sensor, beyond) for v in shown), strict=True)
-        margin = np.array([[-how.box_margin], [how.box_margin]])
-        box = bounds + margin if crop in ("box", "both") else None
-        points, view = fuse(clouds, box)
-        if how.remove_outliers:
-            inside = inliers(points)
-            points, view = points[inside], view[inside]
-        clean_points, clean_view = fuse(cleans)
-    if not len(points) or not len(clean_points):
+        rooms = [(sensor, stand(how, sensor, body, neighbour, rng_place, rng_scene), {})]
+    # A room of which the sensor got no point is drawn again, as one that shows too little is.
+    for sensor, around, room in rooms:
+        parts = [object_region(bounds, sensor, pose) for pose in around.poses]
+        images = _photograph(how, sensor, around, parts, full_frames, rng_render, rng_noise, clock)
+        with clock("fusion"):
+            beyond = how.depth_margin if crop in ("mask", "both") else None
+            shown = zip(images, parts, around.poses, strict=True)
+            measured = [measure(*one, sensor, beyond) for one in shown]
+            clouds, cleans, statistics = zip(*measured, strict=True)
+            margin = np.array([[-how.box_margin], [how.box_margin]])
+            box = bounds + margin if crop in ("box", "both") else None
+            points, view = fuse(clouds, box)
+            if how.remove_outliers:
+                inside = inliers(points)
+                points, view = points[inside], view[inside]
+            clean_points, clean_view = fuse(cleans)
+        if len(points) and len(clean_points):
+            drawn |= room
+            break
+    else:
         raise InputError(
             "the sensor saw no point of the object: it is too thin, hidden, out of the depth gate, "
             "or outside the image; check the mesh, the scene and the sensor's placement"
@@ -189,3 +177,34 @@ def scan(
         drawn=drawn,
         images=tuple(images) if keep_images or full_frames else (),
     )
+
+
+def _photograph(
+    how: ScanSettings,
+    sensor: Sensor,
+    around: ArrangedScene,
+    parts: Sequence[Region],
+    full_frames: bool,
+    rng_render: np.random.Generator,
+    rng_noise: np.random.Generator,
+    clock: Clock,
+) -> list[ViewImages]:
+    """Render every view, expose and match it, and cast its true depth."""
+    regions = [sensor.rig.full_frame] * len(parts) if full_frames else parts
+    with clock("render"):
+        seeds = [int(s) for s in rng_render.integers(0, 2**31, size=len(parts))]
+        canvases = [matching_canvas(region, sensor.rig, sensor.matching) for region in regions]
+        built = scene_of(around.bodies, sensor)
+        # An object alone needs no more than its own box: the rest is background.
+        reach = blur_reach(sensor.exposure.psf)
+        frame = (sensor.rig.width, sensor.rig.height)
+        wanted = None if built.alone else [c.grown(reach, *frame) for c in canvases]
+        renderer = how.make_renderer()
+        pairs = renderer.render(built, sensor.rig, around.poses, seeds, wanted)
+    with clock("true_depth"):
+        casters = [DepthCaster(*(body.mesh for body in around.bodies))]
+        casters += [DepthCaster(around.bodies[0].mesh)] if full_frames else []
+    return [
+        take_view(pair, sensor, region, part, casters, rng_noise, clock)
+        for pair, region, part in zip(pairs, regions, parts, strict=True)
+    ]

@@ -1,6 +1,7 @@
 """How large object and neighbour are, and where they and the camera stand for one scan."""
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from qs3.sensor.randomise import draw_room
 from qs3.sensor.render import Body
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rooms import Room, fitting
-from qs3.sensor.scene import ArrangedScene, SceneSettings, arrange
+from qs3.sensor.scene import ArrangedScene, arrange
 from qs3.sensor.settings import ScanSettings
 from qs3.sensor.view import object_region
 from qs3.sensor.views import place_views
@@ -68,13 +69,11 @@ def resized(sensor: Sensor, object_size: float) -> Sensor:
 
 def stand(
     how: ScanSettings,
-    scene: SceneSettings,
     sensor: Sensor,
     body: Body,
     neighbour: trimesh.Trimesh | None,
     rng_place: np.random.Generator,
     rng_scene: np.random.Generator,
-    room: Room | None = None,
 ) -> ArrangedScene:
     """Place the views, and everything else about the object.
 
@@ -82,28 +81,31 @@ def stand(
         InputError: where a camera or the projector stands in something.
     """
     poses = place_views(how.views, how.chosen("view_layout"), sensor.placement, rng_place)
-    if room is not None:
-        poses = [room.aimed(pose, sensor.rig) for pose in poses]
-    around = arrange(scene, body, poses, sensor.object_size, neighbour, rng_scene)
+    around = arrange(how.make_scene(), body, poses, sensor.object_size, neighbour, rng_scene)
     check_views(around, sensor)
     return around
 
 
-def stand_in_room(
+def stand_in_rooms(
     how: ScanSettings,
     sensor: Sensor,
     body: Body,
     neighbour: trimesh.Trimesh | None,
     rng_room: np.random.Generator,
     rng_scene: np.random.Generator,
-) -> tuple[Sensor, ArrangedScene, dict[str, Any]]:
-    """Draw rooms until one shows enough of the object in each view.
+) -> Iterator[tuple[Sensor, ArrangedScene, dict[str, Any]]]:
+    """Draw rooms that show enough of the object in each view; whoever asks for another gets one.
 
-    Returns:
-        The sensor where it stands, the scene, and what was drawn, ``room.redraws`` among it.
+    Layout, azimuth and table are the room's; height, distance and aim are each view's own, but for
+    ``jitter``, whose views are copies of one. Where a later view shows too little, it alone is
+    drawn again.
+
+    Yields:
+        The sensor where its first view stands, the scene, and what was drawn, ``room.redraws``
+        among it; what is another view's own has its index behind it: ``room.height.1``.
 
     Raises:
-        InputError: where none does, or none can be arranged; the last one's fault is told.
+        InputError: where the last of 50 rooms will not do either; its fault is told.
     """
     bounds = np.asarray(body.mesh.bounds)
     longest = float(body.mesh.extents.max())
@@ -113,34 +115,47 @@ def stand_in_room(
             f"randomise: none of the layouts {', '.join(how.room_layouts)} suits the object: "
             "add floor, or name a neighbour's mesh"
         )
-    ranges = how.ranges | {"room.layout": layouts}
-    fault = ""
+    ranges, view_layout = how.ranges | {"room.layout": layouts}, how.chosen("view_layout")
+    count = 1 if view_layout == "jitter" else how.views
+    rooms, drawn, poor, fault = [Room()] * count, {}, [0], ""
     for redraws in range(_MOST_DRAWS):
-        room, drawn = draw_room(ranges, rng_room)
-        scene = room.scene(how.make_scene(), sensor.object_size)
-        other = neighbour if scene.needs_neighbour else None
+        for view in range(count) if 0 in poor else poor:
+            room, values = draw_room(ranges, rng_room, rooms[0] if view else None)
+            turn = room.scene(how.make_scene(), 1.0).turns(count)[view]
+            rooms[view] = dataclasses.replace(room, azimuth=room.azimuth + turn)
+            drawn |= {f"{name}.{view}" if view else name: value for name, value in values.items()}
+        scene = rooms[0].scene(how.make_scene(), sensor.object_size)
+        other, poor = neighbour if scene.needs_neighbour else None, [0]
         try:
-            placed = dataclasses.replace(sensor, placement=room.placement(bounds))
-            around = stand(how, scene, placed, body, other, rng_room, rng_scene, room)
+            placed = [dataclasses.replace(sensor, placement=r.placement(bounds)) for r in rooms]
+            poses = [
+                room.aimed(pose, sensor.rig)
+                for room, own in zip(rooms, placed, strict=True)
+                for pose in place_views(how.views // count, view_layout, own.placement, rng_room)
+            ]
+            around = arrange(scene, body, poses, sensor.object_size, other, rng_scene)
+            check_views(around, placed[0])
         except InputError as error:  # a camera in a neighbour, say
             fault = str(error)
             continue
-        seen = _seen(around, placed)
-        if seen >= how.least_pixels:
-            return placed, around, drawn | {"room.redraws": redraws}
-        fault = f"it shows {seen} pixels of the object, and least_pixels is {how.least_pixels}"
+        seen = _seen(around, sensor)
+        poor = [view for view in range(count) if min(seen[view::count]) < how.least_pixels]
+        fault = f"it shows {min(seen)} pixels of the object, and least_pixels is {how.least_pixels}"
+        if not poor:
+            yield placed[0], around, drawn | {"room.redraws": redraws}
+            fault, poor = "the sensor saw no point of the object in it", [0]
     raise InputError(
         f"randomise: {_MOST_DRAWS} rooms in a row would not do, the last one because: {fault}; "
         "narrow the ranges (room.distance=0.8:2), or lower least_pixels"
     )
 
 
-def _seen(around: ArrangedScene, sensor: Sensor) -> int:
-    """Pixels that show the object within the depth gate, in the view that shows least."""
+def _seen(around: ArrangedScene, sensor: Sensor) -> list[int]:
+    """Pixels that show the object within the depth gate, in each view."""
     caster = DepthCaster(*(body.mesh for body in around.bodies))
     bounds, counts = np.asarray(around.bodies[0].mesh.bounds), []
     for pose in around.poses:
         cast = caster.cast(sensor.rig, pose, object_region(bounds, sensor, pose))
         shown = gate(np.where(cast.mask, cast.depth, np.nan), sensor.depth)
         counts.append(int(np.isfinite(shown).sum()))
-    return min(counts)
+    return counts
