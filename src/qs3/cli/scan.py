@@ -64,7 +64,9 @@ def scan(
     )
     # Everything is computed before the folder is touched: a fault leaves nothing behind.
     view, best = montage_view(result)
-    title = f"{origin['name']} · sensor {result.sensor.name} · view {best + 1} of {settings.views}"
+    title = (
+        f"{origin['name']} · sensor {result.sensor.name} · view {best + 1} of {len(result.views)}"
+    )
     figure = montage(view, title)
     record = _record(settings, origin, result)
     folder = claim_folder(out, "scan.json")

@@ -71,8 +71,9 @@ def _lines(contents: dict[str, Any]) -> list[str]:
         label, form = _STATISTICS[name]
         lines.append(f"{label} (median): {value:{form}}")
     sensor = contents["settings"].get("sensor")
-    if isinstance(sensor, dict) and "name" in sensor:
-        lines.append(f"sensor: {sensor['name']}")
+    sensors = [one for one in (sensor if isinstance(sensor, list) else [sensor]) if one]
+    if sensors and all(isinstance(one, dict) and "name" in one for one in sensors):
+        lines.append("sensor: " + ", ".join(str(one["name"]) for one in sensors))
     return [*lines, f"failed: {contents['failed']}"]
 
 

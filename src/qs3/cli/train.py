@@ -16,7 +16,7 @@ from qs3.cli.options import Flat
 from qs3.cli.text import show, tell
 from qs3.errors import InputError
 from qs3.evaluation.records import rename_method
-from qs3.io.clouds import CloudKind
+from qs3.io.clouds import CloudChoice
 from qs3.training.config import PRESETS, PresetName, SelfTrainingSettings, TrainSettings
 
 TIME_UP = 3
@@ -77,9 +77,10 @@ class TrainOptions(Choices):
     """Part of the source, such as train; all of it by default."""
     target_split: str | None = None
     """Part of the target."""
-    source_cloud: CloudKind = "points"
-    """Of generated data: noisy scans, their clean twins, or samples of the whole surface."""
-    target_cloud: CloudKind = "points"
+    source_cloud: CloudChoice = "points"
+    """Of generated data: noisy scans, their clean twins, samples of the whole surface, or all of
+    these together."""
+    target_cloud: CloudChoice = "points"
     """The same of the target."""
     supervised: bool = False
     """Mark the run as supervised: its source is the labelled training part of the target."""

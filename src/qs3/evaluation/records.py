@@ -20,7 +20,7 @@ from qs3.evaluation.metrics import (
     wilson_interval,
 )
 from qs3.files import read_json, write_json
-from qs3.io.clouds import CloudKind, Origin
+from qs3.io.clouds import CloudChoice, Origin
 from qs3.structure import structure, unstructure
 
 RECORD = "record.json"
@@ -43,7 +43,7 @@ class DataRecord:
     """Number of clouds."""
     split: str | None = None
     """Part of the data; None is all of it."""
-    cloud: CloudKind = "points"
+    cloud: CloudChoice = "points"
     """Which cloud of a generated data set."""
 
     @classmethod

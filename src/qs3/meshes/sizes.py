@@ -54,8 +54,8 @@ def class_ranges(class_name: str) -> tuple[tuple[float, float], tuple[float, flo
     if canonical(class_name) not in CLASS_SIZES:
         raise InputError(
             f"object_size class: no real size is known of class {class_name!r}, only of "
-            f"{', '.join(CLASS_SIZES)}; name one of them (class_name), or take object_size "
-            "file or a number"
+            f"{', '.join(CLASS_SIZES)}; take the size in the mesh's file (--object-size file), or "
+            "a number of metres"
         )
     return CLASS_SIZES[canonical(class_name)]
 

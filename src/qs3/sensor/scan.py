@@ -26,7 +26,7 @@ from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.sampling import resample
 from qs3.sensor.scene import ArrangedScene
 from qs3.sensor.settings import ScanSettings as ScanSettings
-from qs3.sensor.staging import resized, sized, stand, stand_in_rooms
+from qs3.sensor.staging import choose, resized, sized, stand, stand_in_rooms
 from qs3.sensor.statistics import ViewStatistics
 from qs3.sensor.view import Clock, ViewImages, measure, object_region, scene_of, take_view
 
@@ -58,8 +58,8 @@ class Scan:
     sensor: Sensor
     """The sensor as it was used: with the rig, the object size and what was drawn."""
     drawn: dict[str, Any] = field(default_factory=dict)
-    """What ``randomise`` and ``object_size`` drew, by name; of a room also how often it was drawn
-    again."""
+    """What ``randomise``, ``object_size``, several sensors and ``least_views`` drew, by name; of a
+    room also how often it was drawn again."""
     images: tuple[ViewImages, ...] = field(default=())
     """The pictures of each view, where ``keep_images`` or ``full_frames`` asked for them."""
 
@@ -107,20 +107,22 @@ def scan(
         (2048, 3)
     """
     how = dataclasses.replace(settings or ScanSettings(), **changes)
+    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(how.seed).spawn(9)]
+    how, chosen = choose(how, streams.pop())
+    rng_place, rng_render, rng_noise, rng_sample, rng_scene, rng_settings, rng_size, rng_room = (
+        streams
+    )
     scene, crop = how.make_scene(), how.chosen("crop")
     sensor = how.make_sensor()
     sensor = sensor if rig is None else dataclasses.replace(sensor, rig=rig)
     # A file of one's own is read once, and a renderer that does not work here stops this first.
     how = dataclasses.replace(how, sensor=sensor, renderer=how.make_renderer())
-    rng_place, rng_render, rng_noise, rng_sample, rng_scene, rng_settings, rng_size, rng_room = (
-        np.random.default_rng(s) for s in np.random.SeedSequence(how.seed).spawn(8)
-    )
     clock = Clock()
 
     sensor, drawn = draw(sensor, how.ranges, rng_settings)
     own_class, other_class = (*class_names, "", "")[:2]
     normalised, scale, size = sized(mesh, how, own_class, sensor.object_size, rng_size)
-    sensor, drawn = resized(sensor, scale), drawn | size
+    sensor, drawn = resized(sensor, scale), drawn | size | chosen
     yaw = float(rng_place.uniform(0, 2 * np.pi))
     turned = normalised.copy()
     turned.vertices = turned.vertices @ rotation_z(yaw).T

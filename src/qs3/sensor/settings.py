@@ -47,8 +47,9 @@ _Camera = TypeVar("_Camera", bound="CameraSettings")
 class CameraSettings:
     """The simulated camera: a sensor, what is changed about it, and what renders its images."""
 
-    sensor: Sensor | str = "paper"
-    """A sensor by name (qs3 sensors lists them: paper, d435, …) or your own TOML file."""
+    sensor: Sensor | str | tuple[Sensor | str, ...] = "paper"
+    """A sensor by name (qs3 sensors lists them: paper, d435, …) or your own TOML file; of several,
+    as in d435,kinect-v1, each scan draws one."""
     image_noise: float | None = None
     """Gaussian noise of the images in grey levels of 255; default by sensor."""
     matching: Method | None = None
@@ -97,14 +98,23 @@ class CameraSettings:
         """The sensor with every change.
 
         Raises:
-            InputError: where there is no such sensor, or it takes no such value.
+            InputError: where there is no such sensor, it takes no such value, or there are several.
         """
+        if isinstance(self.sensor, tuple):
+            names = ", ".join(str(getattr(one, "name", one)) for one in self.sensor)
+            raise InputError(f"sensor: one is needed here, not several ({names}); name one")
         sensor = get_sensor(self.sensor) if isinstance(self.sensor, str) else self.sensor
         for name, place in self._changes.items():
             sensor = changed(sensor, place, self.chosen(name))
         if self.pattern is not None:
             pattern_image(sensor.pattern)  # a picture that cannot be read stops here
         return sensor
+
+    def each_sensor(self: _Camera) -> tuple[_Camera, ...]:
+        """The settings with each sensor alone; themselves where there is one."""
+        if not isinstance(self.sensor, tuple):
+            return (self,)
+        return tuple(dataclasses.replace(self, sensor=one) for one in self.sensor)
 
     def with_sensor(self: _Camera, sensor: Sensor, renderer: Renderer) -> _Camera:
         """The settings with a sensor and a renderer as they are: what would change it is gone."""
@@ -148,6 +158,8 @@ class ScanSettings(CameraSettings):
     """Which column of the settings in which the paper's text and its code differ."""
     views: int = 5
     """Views fused into one cloud."""
+    least_views: int | None = None
+    """Draw the number of views of each scan, from this up to views."""
     view_layout: ViewLayout | None = None
     """orbit around the object (the paper's text), or jitter of one pose as released; default by
     preset."""
@@ -212,6 +224,8 @@ class ScanSettings(CameraSettings):
         check_range(self, "scan", "least_pixels", low=1)
         check_range(self, "scan", "num_points", low=1, high=1_000_000)
         check_range(self, "scan", "views", low=1, high=256)
+        if self.least_views is not None:
+            check_range(self, "scan", "least_views", low=1, high=self.views)
         check_range(self, "scan", "box_margin", "depth_margin", "seed")
 
     def chosen(self, name: str) -> Any:
@@ -250,10 +264,10 @@ class ScanSettings(CameraSettings):
         """What ``randomise`` draws from, as `qs3.sensor.randomise.resolve_ranges` returns it."""
         return resolve_ranges(self.make_sensor(), self.randomise)
 
-    @property
+    @functools.cached_property
     def room_layouts(self) -> tuple[str, ...]:
         """The layouts that rooms are drawn from; none where no rooms are drawn."""
-        return self.ranges.get("room.layout", ())
+        return self.each_sensor()[0].ranges.get("room.layout", ())
 
     @property
     def needs_neighbour(self) -> bool:
@@ -275,11 +289,11 @@ class ScanSettings(CameraSettings):
         apart = {*(f.name for f in dataclasses.fields(CameraSettings)), *self._CHANGES, "preset"}
         apart |= {"crop", "floor_material", "wall_material", "seed"}
         names = [f.name for f in dataclasses.fields(ScanSettings) if f.name not in apart]
-        crop = self.chosen("crop")
+        crop, ranges = self.chosen("crop"), [dict(one.ranges) for one in self.each_sensor()]
         return {name: self.chosen(name) for name in names} | {
             "object_size": self.object_size if isinstance(self.object_size, str) else None,
             "box_crop": crop in ("box", "both"),
             "mask_crop": crop in ("mask", "both"),
             "scene": dataclasses.asdict(self.make_scene()),
-            "randomise": dict(self.ranges),
+            "randomise": ranges if isinstance(self.sensor, tuple) else ranges[0],
         }

@@ -1,4 +1,4 @@
-"""How large object and neighbour are, and where they and the camera stand for one scan."""
+"""With what, how large and where one scan is taken: all that is drawn before the pictures."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -23,6 +23,26 @@ from qs3.sensor.view import object_region
 from qs3.sensor.views import place_views
 
 _MOST_DRAWS = 50  # of a room, before it is given up
+
+
+def choose(
+    how: ScanSettings, rng: np.random.Generator
+) -> tuple[ScanSettings, dict[str, str | int]]:
+    """Draw one of several sensors, and a number of views where ``least_views`` asks for it.
+
+    Returns:
+        The settings with that sensor and that number, and what was drawn, by name.
+    """
+    drawn: dict[str, str | int] = {}
+    share = rng.random()  # drawn in any case: neither depends on whether the other is drawn
+    if how.least_views is not None:
+        drawn["views"] = how.least_views + int(share * (how.views - how.least_views + 1))
+        how = dataclasses.replace(how, views=drawn["views"], least_views=None)
+    if isinstance(how.sensor, tuple):
+        how = how.each_sensor()[int(rng.integers(len(how.sensor)))]
+        sensor = how.make_sensor()
+        how, drawn["sensor"] = dataclasses.replace(how, sensor=sensor), sensor.name
+    return how, drawn
 
 
 def sized(

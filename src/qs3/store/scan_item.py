@@ -5,7 +5,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import tyro
@@ -19,6 +19,9 @@ from qs3.store.shards import STATISTICS, CloudRow, DType
 
 if TYPE_CHECKING:
     import trimesh
+
+
+RecipeName = Literal["rooms"]
 
 
 @runtime_checkable
@@ -49,6 +52,8 @@ class Item(Protocol):
 class GenerateSettings(ScanSettings):
     """What a data set's bytes depend on, together with the work list; ``seed`` is its root seed."""
 
+    recipe: Annotated[RecipeName | None, tyro.conf.Suppress] = None
+    """Name of the recipe that these settings began as; a label for the record."""
     meshes: Annotated[str, tyro.conf.Suppress] = "shapes"
     """``shapes`` or the name (not the path) of the folder of meshes; a label for the record."""
     per_class: Annotated[int | None, tyro.conf.Suppress] = None
@@ -75,11 +80,31 @@ class GenerateSettings(ScanSettings):
         }
         plain = super().as_dict() | {name: getattr(self, name) for name in sorted(own)}
         plain |= {"classes": list(self.classes), "seed": self.seed}
-        plain["sensor"] = settings_dict(self.make_sensor())
+        sensors = [settings_dict(one.make_sensor()) for one in self.each_sensor()]
+        plain["sensor"] = sensors if isinstance(self.sensor, tuple) else sensors[0]
         plain["renderer"] = None
         if not isinstance(self.renderer, str):
             plain["renderer"] = renderer_dict(self.renderer)
         return plain
+
+
+RECIPES: dict[RecipeName, GenerateSettings] = {
+    "rooms": GenerateSettings(
+        recipe="rooms",
+        per_class=60,
+        scans_per_mesh=2,
+        sensor=("d415", "d435", "d455", "kinect-v1"),
+        least_views=1,
+        crop="mask",
+        randomise=("rooms",),
+    )
+}
+"""Whole settings by name. ``rooms``: a source that is to meet scans of real rooms.
+
+Example:
+    >>> dataclasses.replace(RECIPES["rooms"], sensor="d435", seed=1).crop
+    'mask'
+"""
 
 
 def scan_seed(root: int, object_id: str, scan: int) -> int:

@@ -137,7 +137,8 @@ def fit(
         weights, unseen = _check_warm_up(warm_up, base, source, settings)
         before = read_run(warm_up) if (warm_up / RUN).is_file() else None
     run_dir = Path(run_dir)
-    held = held_out_rows(source.labels, settings)
+    scans, rows = np.unique(source.scan_rows(), return_inverse=True)
+    held = held_out_rows(source.labels[scans], settings)[rows]  # a scan's clouds stay together
     has_holdout = unseen and bool(held.any())
     _require_judges(settings, rounds_settings, target, has_holdout)
     job = Job(base, source, None, target, settings, rounds_settings, run_dir, warm_up)
