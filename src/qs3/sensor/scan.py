@@ -36,6 +36,7 @@ from qs3.sensor.view import (
     ViewImages,
     clouds_of,
     object_region,
+    photograph,
     scene_of,
     statistics_of,
     take_view,
@@ -170,7 +171,7 @@ def scan(
         reach = blur_reach(sensor.exposure.psf)
         frame = (sensor.rig.width, sensor.rig.height)
         wanted = None if built.alone else [c.grown(reach, *frame) for c in canvases]
-        pairs = renderer.render(built, sensor.rig, around.poses, seeds, wanted)
+        pairs = photograph(renderer, built, sensor, around.poses, seeds, wanted)
     with clock("true_depth"):
         casters = [DepthCaster(*(body.mesh for body in around.bodies))]
         casters += [DepthCaster(turned)] if full_frames else []

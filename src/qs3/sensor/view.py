@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Shaped, UInt
@@ -12,7 +12,7 @@ from qs3.sensor.depth import backproject, depth_from_disparity, gate
 from qs3.sensor.exposure import expose_pair
 from qs3.sensor.matching import match, matching_canvas
 from qs3.sensor.presets import Sensor
-from qs3.sensor.render import Body, Scene, StereoPair
+from qs3.sensor.render import Body, Renderer, Scene, StereoPair
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, Region
 from qs3.sensor.speckle import pattern_image, stored_pattern
@@ -68,6 +68,26 @@ def scene_of(bodies: Sequence[Body], sensor: Sensor) -> Scene:
     pattern = sensor.pattern
     opening = pattern.tan_half_width, pattern.tan_half_height
     return Scene(tuple(bodies), sensor.light, pattern_image(pattern), *opening)
+
+
+def photograph(
+    renderer: Renderer,
+    scene: Scene,
+    sensor: Sensor,
+    poses: Sequence[Pose],
+    seeds: Sequence[int],
+    regions: Sequence[Region] | None = None,
+) -> list[StereoPair]:
+    """Photograph views as the sensor's exposure needs them: `qs3.sensor.render.Renderer`.
+
+    Coherent speckle wants each view once more, with the projector off.
+    """
+    pairs = renderer.render(scene, sensor.rig, poses, seeds, regions)
+    if not sensor.exposure.coherent:
+        return pairs
+    room = replace(scene, light=replace(scene.light, projector=0.0))
+    rooms = renderer.render(room, sensor.rig, poses, seeds, regions)
+    return [replace(pair, room=dark) for pair, dark in zip(pairs, rooms, strict=True)]
 
 
 def object_region(bounds: Float[np.ndarray, "2 3"], sensor: Sensor, pose: Pose) -> Region:
