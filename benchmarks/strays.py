@@ -29,7 +29,7 @@ from qs3.sensor.sampling import resample
 from qs3.sensor.scan import Scan, scan
 from qs3.sensor.settings import ScanSettings
 from qs3.sensor.statistics import radius_ratio
-from qs3.sensor.view import clouds_of
+from qs3.sensor.view import measure
 
 SHARES = (0.05, 0.25, 0.5)
 UNBOUNDED = 100.0
@@ -68,7 +68,7 @@ def cleaned(made: Scan, least: int, step: str) -> Cloud:
         depth = depth_from_disparity(kept, camera.rig, camera.depth)
         images = dataclasses.replace(images, disparity=kept, depth=depth)
     margin = ScanSettings.depth_margin if step in STEPS[2:] else UNBOUNDED
-    points, _ = clouds_of(images, images.region, pose, camera, margin)
+    points, _, _ = measure(images, images.region, pose, camera, margin)
     if step == STEPS[-1]:
         points = points[inliers(points)]
     chosen = resample(points, 2048, np.random.default_rng(0))

@@ -14,7 +14,7 @@ from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.scan import scan
 from qs3.sensor.settings import ScanSettings
 from qs3.sensor.statistics import radius_ratio
-from qs3.sensor.view import ViewImages, clouds_of
+from qs3.sensor.view import ViewImages, measure
 from qs3.shapes import make
 
 
@@ -72,7 +72,7 @@ def test_the_crop_with_the_mask_ends_a_margin_and_noise_off_the_true_surface():
     view = ViewImages(rig.full_frame, grey, grey, depth.astype(np.float32), depth, true, mask)
 
     def found(margin):
-        cloud, clean = clouds_of(view, rig.full_frame, Pose(np.eye(4)), sensor, margin)
+        cloud, clean, _ = measure(view, rig.full_frame, Pose(np.eye(4)), sensor, margin)
         np.testing.assert_allclose(clean[:, 2], true[0])
         return cloud[:, 2].round(6).tolist()
 

@@ -1,6 +1,7 @@
 """How an object is scanned: every option once, for `qs3.scan`, data sets and the command line."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -245,10 +246,15 @@ class ScanSettings(CameraSettings):
             return self.object_size
         return "class" if self.object_size is None and self.room_layouts else None
 
+    @functools.cached_property
+    def ranges(self) -> dict[str, tuple[Any, ...]]:
+        """What ``randomise`` draws from, as `qs3.sensor.randomise.resolve_ranges` returns it."""
+        return resolve_ranges(self.make_sensor(), self.randomise)
+
     @property
     def room_layouts(self) -> tuple[str, ...]:
         """The layouts that rooms are drawn from; none where no rooms are drawn."""
-        return resolve_ranges(self.make_sensor(), self.randomise).get("room.layout", ())
+        return self.ranges.get("room.layout", ())
 
     @property
     def needs_neighbour(self) -> bool:
@@ -276,5 +282,5 @@ class ScanSettings(CameraSettings):
             "box_crop": crop in ("box", "both"),
             "mask_crop": crop in ("mask", "both"),
             "scene": dataclasses.asdict(self.make_scene()),
-            "randomise": resolve_ranges(self.make_sensor(), self.randomise),
+            "randomise": dict(self.ranges),
         }

@@ -54,10 +54,6 @@ class ViewImages:
         """True depth of the object where it is seen within the depth gate, NaN elsewhere."""
         return gate(np.where(self.mask, self.true_depth, np.nan), sensor.depth)
 
-    def blind(self, sensor: Sensor) -> bool:
-        """Whether no pixel shows the object within the depth gate: what is matched is not it."""
-        return not np.isfinite(self.true_object(sensor)).any()
-
     def part(self, image: Shaped[np.ndarray, "h w"], part: Region) -> Shaped[np.ndarray, "h2 w2"]:
         """The pixels of ``part`` of the frame, which lies within ``region``."""
         return image[part.within(self.region)]
@@ -95,18 +91,18 @@ def object_region(bounds: Float[np.ndarray, "2 3"], sensor: Sensor, pose: Pose) 
     return sensor.rig.region_of(bounds, pose, RIM)
 
 
-def clouds_of(
+def measure(
     images: ViewImages, part: Region, pose: Pose, sensor: Sensor, margin: float | None
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:
-    """The noisy and the true points of the object's part of one view, in the world.
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"], ViewStatistics]:
+    """The noisy and the true points of the object's part of one view, in the world, and its errors.
 
     A view that does not show the object within the depth gate gives none: what its matcher found
     is something else. With a ``margin`` only the pixels that show the object count, and of these
     the depths within the margin, and three times a matcher's noise, of the true one there.
     """
-    if images.blind(sensor):
-        return np.zeros((0, 3)), np.zeros((0, 3))
     depth, truth = images.depth, images.true_object(sensor)
+    if not np.isfinite(truth).any():
+        return np.zeros((0, 3)), np.zeros((0, 3)), EMPTY_VIEW
     if margin is not None:
         noise = NOISE * truth**2 / float(sensor.rig.disparity(1.0))
         depth = np.where(np.abs(depth - truth) <= margin + 3 * noise, depth, np.nan)
@@ -114,19 +110,13 @@ def clouds_of(
         backproject(images.part(image, part), sensor.rig, part, pose, sensor.depth)
         for image in (depth, truth)
     )
-    return noisy, true
-
-
-def statistics_of(images: ViewImages, part: Region, sensor: Sensor) -> ViewStatistics:
-    """Measure a view on the object's part of the frame; all None where it does not show it."""
-    if images.blind(sensor):
-        return EMPTY_VIEW
-    return view_statistics(
+    statistics = view_statistics(
         images.part(images.disparity, part),
         images.part(images.true_depth, part),
         sensor.rig,
         images.part(images.mask, part),
     )
+    return noisy, true, statistics
 
 
 def take_view(
