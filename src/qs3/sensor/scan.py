@@ -28,7 +28,15 @@ from qs3.sensor.scene import ArrangedScene
 from qs3.sensor.settings import ScanSettings as ScanSettings
 from qs3.sensor.staging import choose, resized, sized, stand, stand_in_rooms
 from qs3.sensor.statistics import ViewStatistics
-from qs3.sensor.view import Clock, ViewImages, measure, object_region, scene_of, take_view
+from qs3.sensor.view import (
+    Clock,
+    ViewImages,
+    measure,
+    object_region,
+    photograph,
+    scene_of,
+    take_view,
+)
 
 
 @dataclass(frozen=True)
@@ -201,8 +209,7 @@ def _photograph(
         reach = blur_reach(sensor.exposure.psf)
         frame = (sensor.rig.width, sensor.rig.height)
         wanted = None if built.alone else [c.grown(reach, *frame) for c in canvases]
-        renderer = how.make_renderer()
-        pairs = renderer.render(built, sensor.rig, around.poses, seeds, wanted)
+        pairs = photograph(how.make_renderer(), built, sensor, around.poses, seeds, wanted)
     with clock("true_depth"):
         casters = [DepthCaster(*(body.mesh for body in around.bodies))]
         casters += [DepthCaster(around.bodies[0].mesh)] if full_frames else []

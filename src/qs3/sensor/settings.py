@@ -172,9 +172,10 @@ class ScanSettings(CameraSettings):
     box_margin: float = 0.0
     """Enlarge the box of the crop on every side, in the unit of the scene."""
     depth_margin: float = 0.1
-    """A crop with the mask keeps depths at most this much before the nearest or behind the farthest
-    depth that the object truly shows in a view, in the unit of the scene. Our choice: three times
-    the noise of the D435 at the far end of an object at 2.8 m."""
+    """A crop with the mask keeps depths at most this much, and 0.3 pixels of disparity, before or
+    behind what a pixel truly shows, in the unit of the scene: as a label in 3D leaves out what
+    hangs off an object's rim, and one in the image does not. Our choice; a large one bounds
+    nothing."""
     remove_outliers: bool = False
     """Take statistical outliers out of the fused cloud, as is done with real scans (16 neighbours,
     3 robust deviations, twice)."""
