@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import tyro
 
 from qs3.adaptation.names import Normalisation, RoundRule, Rule, Selection, SingleClass
 from qs3.errors import InputError
+from qs3.io.preparation import PAPER, ROBUST, Preparation
 
 _Settings = TypeVar("_Settings", bound=Any)
 Schedule = Literal["cosine", "plateau"]
@@ -34,7 +35,9 @@ class TrainSettings:
     model_settings: Annotated[Mapping[str, Any], tyro.conf.Suppress] = field(default_factory=dict)
     """Arguments of the network that differ from its defaults."""
     num_points: int = 1024
-    """Points a cloud, by farthest point sampling before normalisation to the unit ball."""
+    """Points a cloud, by farthest point sampling before normalisation."""
+    preparation: Annotated[Preparation, tyro.conf.arg(name="")] = PAPER
+    """What is done to clouds before the network gets them."""
     epochs: int = 200
     """Passes over the source."""
     batch_size: int = 32
@@ -244,6 +247,16 @@ PRESETS: Mapping[str, SelfTrainingSettings] = {
 """The settings of each preset."""
 
 
+def preparation_of(preset: str | None) -> Preparation:
+    """Return the preparation that goes with a preset of self-training, or with none.
+
+    Example:
+        >>> preparation_of("released").redraw, preparation_of(None).redraw
+        (False, True)
+    """
+    return PAPER if preset in ("paper", "released") else ROBUST
+
+
 def self_training_preset(name: str, **overrides: Any) -> SelfTrainingSettings:
     """Return a preset with some settings changed.
 
@@ -264,13 +277,16 @@ def self_training_preset(name: str, **overrides: Any) -> SelfTrainingSettings:
 
 
 def changed(settings: _Settings, given: Mapping[str, Any], where: str = "") -> _Settings:
-    """Return settings with some of them changed.
+    """Return settings with some of them changed; of settings inside them, a mapping changes some.
 
     Raises:
         InputError: where one is unknown; ``where`` ends the message.
     """
     names = [field.name for field in fields(settings)]
-    for name in given:
+    values = dict(given)
+    for name, value in given.items():
         if name not in names:
             raise InputError(f"unknown setting {name!r}{where}; choose from {', '.join(names)}")
-    return replace(settings, **given)
+        if is_dataclass(inner := getattr(settings, name)) and isinstance(value, Mapping):
+            values[name] = changed(inner, value, where)
+    return replace(settings, **values)
