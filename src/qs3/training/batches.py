@@ -16,6 +16,7 @@ from qs3.errors import InputError, UnevenSizesError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.preparation import unit_ball
 from qs3.sensor.sampling import farthest_point_samples
+from qs3.training.augmentation import turned
 from qs3.training.checkpoint import read_tensors, write_tensors
 from qs3.training.config import TrainSettings
 
@@ -214,10 +215,7 @@ def augment(
     place, count = place.to(points.device), len(points) if total is None else total
     drawn = {"generator": generator, "device": points.device, "dtype": points.dtype}
     if settings.rotate_z:
-        angle = 2 * torch.pi * torch.rand(count, 1, **drawn)[place]
-        c, s = angle.cos(), angle.sin()
-        x, y, z = points.unbind(2)
-        points = torch.stack([c * x - s * y, s * x + c * y, z], dim=2)
+        points = turned(points, 2 * torch.pi * torch.rand(count, 1, **drawn)[place])
     if settings.jitter_sigma > 0 and settings.jitter_clip > 0:
         noise = settings.jitter_sigma * torch.randn(count, *points.shape[1:], **drawn)
         points = points + noise.clamp_(-settings.jitter_clip, settings.jitter_clip)[place]
