@@ -15,7 +15,8 @@ from qs3.errors import InputError, UnevenSizesError
 from qs3.io.clouds import PointClouds, UnlabelledClouds, numbered
 from qs3.io.preparation import PAPER, Preparation
 from qs3.models.sized import ball_radius
-from qs3.training.config import TrainSettings
+from qs3.training.augmentation import augment_clouds, turned
+from qs3.training.config import Augmentation, TrainSettings
 from qs3.training.prepared import Prepared, normalise_batch, prepare_clouds
 
 _SHARE_OF_MEMORY = 0.25
@@ -115,6 +116,9 @@ def subsample(
     return prepare_clouds(clouds, num_points, cache=cache).chosen(slice(None))
 
 
+_NONE = Augmentation()
+
+
 class Share(NamedTuple):
     """The part of every batch that falls to one of several devices."""
 
@@ -164,38 +168,55 @@ class DeviceClouds:
         rows: np.ndarray,
         generator: torch.Generator | None = None,
         share: Share = WHOLE,
+        augmentation: Augmentation = _NONE,
     ) -> Batch:
         """Return this device's share of the clouds at ``rows``, normalised, on the device.
 
+        The clouds are augmented whole, their points drawn from what is left, then normalised.
+
         Args:
             rows: Clouds of a batch.
-            generator: Source of the draws of points where they are drawn anew, on the device;
-                without one the fixed choice is taken. Several devices draw alike, each for all.
+            generator: Source of all draws, on the device; without one the fixed choice of points is
+                taken as it is. Several devices draw alike, each for the whole batch.
             share: This device's part.
+            augmentation: What is done to the clouds.
         """
-        mine = rows[share.rank :: share.world]
         preparation, num_points = self.clouds.preparation, self.clouds.num_points
-        drawn = generator if preparation.redraw else None
-        index = self.clouds.indices(mine, num_points if drawn is None else None)
-        places = self.clouds.rows[mine][:, None]
-        if self.held is None:
-            points = torch.from_numpy(self.clouds.clouds.points[places, index]).to(self.device)
+        mine = slice(share.rank, None, share.world)
+        labels = self.labels[torch.from_numpy(rows[mine])].to(self.device)
+        if generator is None or (augmentation == _NONE and not preparation.redraw):
+            return Batch(normalise_batch(self._points(rows[mine], num_points), preparation), labels)
+        width = None if preparation.redraw else num_points
+        if augmentation == _NONE:
+            points = self._points(rows[mine], width)
+            kept = self._distinct(rows[mine], points.shape[1])
         else:
-            where = (torch.from_numpy(part).to(self.device) for part in (places, index))
-            points = self.held[tuple(where)]
-        if drawn is not None:
-            keys = torch.rand(len(rows), index.shape[1], generator=drawn, device=drawn.device)
-            keys = keys[share.rank :: share.world].to(self.device)
-            points = draw_points(points, self._counting(mine, index.shape[1]), num_points, keys)
-        labels = self.labels[torch.from_numpy(mine)].to(self.device)
+            points, kept = augment_clouds(self._points(rows, width), augmentation, generator)
+            distinct = self._distinct(rows, points.shape[1])
+            kept = kept & distinct
+            kept = torch.where(kept.any(dim=1, keepdim=True), kept, distinct)[mine]
+            points = points[mine]
+        keys = torch.arange(float(points.shape[1]), device=self.device).expand(points.shape[:2])
+        if preparation.redraw:
+            size = len(rows), points.shape[1]
+            keys = torch.rand(size, generator=generator, device=self.device)[mine]
+        points = draw_points(points, kept, num_points, keys)
         return Batch(normalise_batch(points, preparation), labels)
 
-    def _counting(self, rows: np.ndarray, width: int) -> Bool[Tensor, "r w"]:
+    def _points(self, rows: np.ndarray, width: int | None) -> Float[Tensor, "r w 3"]:
+        """The first points that count of clouds, or all, as read, on the device."""
+        places, index = self.clouds.rows[rows][:, None], self.clouds.indices(rows, width)
+        if self.held is None:
+            return torch.from_numpy(self.clouds.clouds.points[places, index]).to(self.device)
+        where = (torch.from_numpy(part).to(self.device) for part in (places, index))
+        return self.held[tuple(where)]
+
+    def _distinct(self, rows: np.ndarray, width: int) -> Bool[Tensor, "r w"]:
         """Which points of clouds repeat none before them."""
         order = self.clouds.order
-        counts = (
-            np.full(len(rows), width) if order is None else order.counts[self.clouds.rows[rows]]
-        )
+        counts = np.full(len(rows), width)
+        if order is not None:
+            counts = order.counts[self.clouds.rows[rows]]
         return torch.from_numpy(np.arange(width) < counts[:, None]).to(self.device)
 
 
@@ -252,10 +273,7 @@ def augment(
     place, count = place.to(points.device), len(points) if total is None else total
     drawn = {"generator": generator, "device": points.device, "dtype": points.dtype}
     if settings.rotate_z:
-        angle = 2 * torch.pi * torch.rand(count, 1, **drawn)[place]
-        c, s = angle.cos(), angle.sin()
-        x, y, z = points.unbind(2)
-        points = torch.stack([c * x - s * y, s * x + c * y, z], dim=2)
+        points = turned(points, 2 * torch.pi * torch.rand(count, 1, **drawn)[place])
     if settings.jitter_sigma > 0 and settings.jitter_clip > 0:
         noise = settings.jitter_sigma * torch.randn(count, *points.shape[1:], **drawn)
         noise = noise.clamp_(-settings.jitter_clip, settings.jitter_clip)[place]
@@ -308,7 +326,10 @@ def make_batch(
 
     The augmentation of a cloud does not depend on the number of devices.
     """
-    parts = [clouds.take(index, generator, share) for clouds, index in zip(sets, rows, strict=True)]
+    parts = [
+        clouds.take(index, generator, share, settings.augmentation)
+        for clouds, index in zip(sets, rows, strict=True)
+    ]
     places, total = [], 0
     for index in rows:
         places += range(total + share.rank, total + len(index), share.world)
