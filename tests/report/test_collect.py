@@ -160,7 +160,7 @@ def test_data_are_read_as_the_run_and_its_record_read_them(grid, tmp_path):
     assert len(kinds) == 3
 
     def read(recorded, cloud=None):
-        return kinds[read_domain((data, None, cloud), recorded, folder, loaded).checksum]
+        return kinds[read_domain((data, None, cloud), recorded, folder, loaded).clouds.checksum]
 
     assert [read(run.source), read(record.test), read(run.target)] == ["surface", "clean", "points"]
     assert read(record.test, "points") == "points"
@@ -177,7 +177,7 @@ def test_data_without_twins_are_read_whatever_the_record_says(grid, tmp_path):
     recorded = dataclasses.replace(test, cloud="clean")
     loaded = load_model(grid / "first")._replace(class_names=("chair",))
     clouds = read_domain((str(tmp_path / "scans"), None, None), recorded, tmp_path, loaded)
-    assert clouds.origin.cloud == "points"
+    assert clouds.clouds.origin.cloud == "points"
 
 
 @pytest.mark.parametrize(

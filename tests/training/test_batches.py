@@ -4,9 +4,15 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.training.batches import DeviceClouds, Share, augment, batches, make_batch
+from qs3.io.preparation import PAPER, Preparation, unit_ball
+from qs3.training.batches import DeviceClouds, Share, augment, batches, draw_points, make_batch
+from qs3.training.prepared import prepare_clouds
 
 CPU = torch.device("cpu")
+
+
+def ready(clouds, device=CPU, num_points=64, preparation=PAPER):
+    return DeviceClouds(prepare_clouds(clouds, num_points, preparation), device)
 
 
 def generator(seed=0):
@@ -38,9 +44,12 @@ def test_jitter_is_clipped_gaussian(settings):
     assert torch.equal(augment(torch.ones(2, 3, 3), off, generator()), torch.ones(2, 3, 3))
 
 
+@pytest.mark.parametrize("redraw", [False, True])
 @pytest.mark.parametrize("world", [2, 3])
-def test_shares_are_the_whole_batch_once(source, target, settings, world):
-    sets = [DeviceClouds(source, CPU), DeviceClouds(target, CPU)]
+def test_shares_are_the_whole_batch_once(source, target, settings, world, redraw):
+    """With points drawn anew too: the draws of a cloud are those of one device."""
+    how = {"num_points": 40, "preparation": Preparation(redraw=redraw)}
+    sets = [ready(source, **how), ready(target, **how)]
     rows = [np.array([5, 0, 7, 3, 9, 11, 2]), np.arange(6)]
     whole = make_batch(sets, rows, settings, generator())
     parts = [
@@ -64,17 +73,63 @@ def test_last_batch_too_small_for_all_devices_is_dropped():
 
 
 def test_clouds_without_labels_are_taken(target):
-    clouds = DeviceClouds(target.without_labels(), CPU)
-    taken = clouds.take(np.array([3, 1]))
-    assert np.array_equal(taken.points.numpy(), target.points[[3, 1]])
+    taken = ready(target.without_labels()).take(np.array([3, 1]))
+    assert np.array_equal(taken.points.numpy(), unit_ball(target.points[[3, 1]]))
     assert not taken.labels.any()
 
 
 def test_clouds_stay_off_a_gpu_that_is_full(source, monkeypatch):
     """A quarter of the free memory is the limit; batches go to the device all the same."""
     monkeypatch.setattr("qs3.training.batches._free_memory", lambda device: 0.0)
-    clouds = DeviceClouds(source, torch.device("meta"))
-    assert clouds.points.device.type == "cpu"
+    clouds = ready(source, torch.device("meta"))
+    assert clouds.held is None
     assert clouds.take(np.array([0])).points.device.type == "meta"
     monkeypatch.undo()
-    assert DeviceClouds(source, torch.device("meta")).points.device.type == "meta"
+    assert ready(source, torch.device("meta")).held.device.type == "meta"
+
+
+@pytest.mark.parametrize("preparation", [PAPER, Preparation(radius_share=0.9)])
+def test_a_device_that_holds_the_clouds_gives_what_others_are_sent(
+    source, monkeypatch, preparation
+):
+    rows = np.array([7, 0, 3])
+    sent = ready(source, num_points=40, preparation=preparation)
+    held = ready(source, num_points=40, preparation=preparation)
+    held.held = torch.from_numpy(source.points)
+    for seed in (None, 0):
+        draws = [None if seed is None else generator(seed) for _ in range(2)]
+        first, second = sent.take(rows, draws[0]), held.take(rows, draws[1])
+        assert torch.equal(first.points, second.points)
+        assert torch.equal(first.labels, second.labels)
+
+
+def test_points_are_drawn_among_those_that_are_kept():
+    points = torch.arange(30.0)[None, :, None].expand(2000, 30, 3)
+    kept = torch.ones(2000, 30, dtype=torch.bool)
+    kept[:, 20:] = False
+    keys = torch.rand(2000, 30, generator=generator())
+    drawn = draw_points(points, kept, 15, keys)[:, :, 0].long()
+    assert drawn.max() < 20
+    assert all(len(set(row)) == 15 for row in drawn.tolist())  # none twice
+    counts = torch.bincount(drawn.flatten(), minlength=20).double()
+    # Each of 20 is drawn with probability 3/4: within five standard deviations.
+    assert (counts / 2000 - 0.75).abs().max() < 5 * np.sqrt(0.75 * 0.25 / 2000)
+    few = draw_points(points, kept, 45, keys)[:, :, 0].long()
+    assert all(
+        sorted(np.bincount(row, minlength=20).tolist()) == [2] * 15 + [3] * 5 for row in few[:20]
+    )
+
+
+def test_redrawn_points_differ_and_the_fixed_choice_does_not(source, settings):
+    clouds = ready(source, num_points=40, preparation=Preparation(redraw=True))
+    rows = np.arange(4)
+    draws = [clouds.take(rows, generator(seed)).points for seed in (0, 0, 1)]
+    assert torch.equal(draws[0], draws[1])
+    assert not torch.equal(draws[0], draws[2])
+    fixed = ready(source, num_points=40).take(rows, generator()).points
+    assert torch.equal(clouds.take(rows).points, fixed)
+    assert np.array_equal(clouds.clouds[rows], fixed.numpy())
+    # As many points as there are leave nothing to draw.
+    whole = ready(source, preparation=Preparation(redraw=True)).take(rows, generator()).points
+    wanted = ready(source).take(rows).points
+    assert torch.equal(whole.sort(dim=1).values, wanted.sort(dim=1).values)

@@ -17,9 +17,10 @@ from qs3.adaptation import SourceOnly
 from qs3.errors import InputError, QS3Error
 from qs3.training import SelfTrainingSettings, fit, load_model
 from qs3.training import distributed as module
-from qs3.training.batches import DeviceClouds, Share, make_batch, prepare
+from qs3.training.batches import DeviceClouds, Share, make_batch
 from qs3.training.checkpoint import derived_seed, new_model, read_tensors, seed_sequence
 from qs3.training.distributed import all_devices, gather_rows, has_bf16_units, make_fabric
+from qs3.training.prepared import prepare_clouds
 from qs3.training.state import CHECKPOINT
 
 
@@ -48,7 +49,7 @@ def test_one_step_of_two_devices_is_the_step_written_out(source, two, tmp_path):
     rng = np.random.default_rng(seed_sequence(settings.seed, 0, 0))
     augmentation = int(rng.integers(2**62, size=3)[0])
     order = rng.permutation(23)
-    clouds = DeviceClouds(replace(source, points=prepare(source.points, 64)), torch.device("cpu"))
+    clouds = DeviceClouds(prepare_clouds(source, 64), torch.device("cpu"))
     gradients, losses, buffers = [], [], None
     for rank in range(2):
         replica = copy.deepcopy(model)

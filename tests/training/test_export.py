@@ -18,7 +18,8 @@ from qs3.models.ops import farthest_point_sampling
 from qs3.models.ops.sampling import sample_in_a_loop
 from qs3.training import TrainSettings, export, predict_probabilities, save_model
 from qs3.training.batches import subsample
-from qs3.training.export import compare, export_run, subsample_in_a_graph, unit_ball_in_a_graph
+from qs3.training.export import compare, export_run, subsample_in_a_graph
+from qs3.training.prepared import normalise_in_a_graph
 
 _SUITE = Path(__file__).parents[1] / "models" / "test_models.py"
 _SPEC = importlib.util.spec_from_file_location("suite_of_models", _SUITE)
@@ -92,12 +93,12 @@ def test_subsampling_in_a_graph_breaks_ties_and_repeats_points_alike():
         assert np.array_equal(got.numpy(), subsample(points, M).astype(np.float64))
 
 
-def test_unit_ball_in_a_graph_is_that_of_training():
+def test_normalise_in_a_graph_is_that_of_training():
     points = clouds(4, 50)
-    got = unit_ball_in_a_graph(torch.from_numpy(points).double()).float().numpy()
+    got = normalise_in_a_graph(torch.from_numpy(points).double()).float().numpy()
     np.testing.assert_allclose(got, unit_ball(points), rtol=0, atol=1e-7)
     same = torch.full((1, 7, 3), 0.1, dtype=torch.float64)
-    assert torch.equal(unit_ball_in_a_graph(same), torch.zeros(1, 7, 3, dtype=torch.float64))
+    assert torch.equal(normalise_in_a_graph(same), torch.zeros(1, 7, 3, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("m", [1, 9, 40])

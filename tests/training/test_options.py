@@ -270,9 +270,11 @@ import json, sys
 import numpy as np
 from pathlib import Path
 from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.io.preparation import Preparation
 from qs3.training import SelfTrainingSettings, TrainSettings, fit
 data, run = np.load(sys.argv[1]), Path(sys.argv[2])
 settings, rounds = json.loads(sys.argv[3])
+settings["preparation"] = Preparation(**settings["preparation"])
 names = ("ball", "disc", "rod")
 source = PointClouds(data["points"], data["labels"], names, tuple(map(str, range(24))))
 target = UnlabelledClouds(data["target"], tuple(map(str, range(30))))

@@ -4,7 +4,7 @@ import pytest
 from qs3.errors import InputError
 from qs3.io.preparation import resample, unit_ball
 from qs3.sensor.sampling import farthest_point_sample, farthest_point_samples
-from qs3.training import batches
+from qs3.training import prepared
 from qs3.training.batches import prepare, subsample
 
 
@@ -38,7 +38,7 @@ def test_choice_is_made_once(clouds, tmp_path, monkeypatch):
     def forbidden(points, num_points):
         raise AssertionError("made again")
 
-    monkeypatch.setattr(batches, "farthest_point_samples", forbidden)
+    monkeypatch.setattr(prepared, "farthest_point_samples", forbidden)
     assert np.array_equal(subsample(clouds, 50, tmp_path), first)
     for other, count in ((clouds, 51), (clouds + 1, 50), (clouds[:4], 50)):
         with pytest.raises(AssertionError, match="made again"):

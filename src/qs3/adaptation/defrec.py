@@ -184,6 +184,7 @@ class DefRec(Method):
 
     uses_target = True
     needs_local = True
+    in_unit_ball = True
 
     deformation: Deformation = "voxels"
     """Which parts move, and where to: see `qs3.adaptation.deformations`."""

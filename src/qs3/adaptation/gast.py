@@ -14,6 +14,7 @@ from qs3.adaptation.pcm import Mixed, draw_share, mix_halves, mixed_cross_entrop
 from qs3.errors import InputError
 from qs3.models import feature_widths
 from qs3.models.checks import check_positive
+from qs3.models.sized import unit_of
 
 _TURNS = 4
 """Quarter turns that the rotation task tells apart."""
@@ -159,18 +160,20 @@ class GAST(Method):
 
     def _tasks(self, points: Tensor, domain: Domain, generator: Generator) -> Terms:
         terms = {}
+        unit = unit_of(self.model, points)
+        points = points / unit
         if self.locate is not None:
             located = pick_cells(points, _LEAST, generator)
             distorted = deform_cells(points, located, generator)
             weights = None
             if self.curvature:
                 weights = location_weights(surface(points).curvature, distorted.moved)
-            logits = self.locate(self.features(distorted.points, domain).pooled)
+            logits = self.locate(self.features(distorted.points * unit, domain).pooled)
             loss = location_loss(logits, located, weights)
             terms[f"location_{domain}"] = self.location_weight * loss
         if self.turned_x is not None and self.turned_y is not None:
             mixed = mix_rotations(points, generator, self.concentration)
-            pooled = self.features(mixed.points, domain).pooled
+            pooled = self.features(mixed.points * unit, domain).pooled
             loss = mixed_cross_entropy(self.turned_x(pooled), self.turned_y(pooled), mixed)
             terms[f"rotation_{domain}"] = self.rotation_weight * loss
         return terms

@@ -13,6 +13,7 @@ from qs3.adaptation.names import Normalisation
 from qs3.adaptation.normalisation import make_norm
 from qs3.errors import InputError
 from qs3.models import Features, PointClassifier, feature_widths
+from qs3.models.sized import Sized
 
 Domain = Literal["source", "target"]
 """Where clouds come from; it decides which batch statistics the network uses."""
@@ -71,6 +72,8 @@ class Method(nn.Module, ABC):
     """Whether `losses` needs a batch of the target."""
     needs_local: ClassVar[bool] = False
     """Whether the method needs ``Features.local`` of the network."""
+    in_unit_ball: ClassVar[bool] = False
+    """Whether it takes clouds of radius 1 alone, not those of a network that is told their size."""
 
     model: PointClassifier = field(kw_only=False)
     """The network to train."""
@@ -91,6 +94,11 @@ class Method(nn.Module, ABC):
             raise InputError(
                 f"{type(self).__name__} needs features of single points, which "
                 f"{type(self.model).__name__} does not give; choose dgcnn, pointnet or pointnet2"
+            )
+        if self.in_unit_ball and isinstance(self.model, Sized):
+            raise InputError(
+                f"{type(self).__name__} changes clouds in the unit ball, where they have no size; "
+                "leave size_input out, or choose another method"
             )
         self.norm = make_norm(self.normalisation, self.model)
         self.right: Tensor | None = None

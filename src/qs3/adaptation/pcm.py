@@ -151,6 +151,8 @@ class PCM(Method):
     NOTE: the labels mix as the share of points that rounding leaves, round(λ n) / n, not as λ.
     """
 
+    in_unit_ball = True
+
     concentration: float = 1.0
     """γ of λ ~ Beta(γ, γ); 1 is the paper's."""
 

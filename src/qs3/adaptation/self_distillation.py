@@ -12,6 +12,7 @@ from qs3.adaptation import distortions
 from qs3.adaptation.method import Batch, Domain, Method, Target, Terms
 from qs3.errors import InputError
 from qs3.models.checks import check_positive, check_range
+from qs3.models.sized import Sized, unit_of
 
 _ELASTIC = ((0.2, 0.4), (0.8, 1.6))
 """Grain and strength of the strong view's two elastic distortions, as in the released code."""
@@ -100,7 +101,7 @@ class SelfDistillation(Method):
     distortion: float = 1.0
     """Factor on the elastic distortions; 0 leaves them out."""
     scale: tuple[float, float] = (0.7, 1.5)
-    """Bounds of the strong view's scaling."""
+    """Bounds of the strong view's scaling; a network that is told the size gets none."""
     tilt: float = 0.0
     """Standard deviation of small turns in the strong view, in radians; 0 leaves them out, as the
     released code does."""
@@ -133,8 +134,10 @@ class SelfDistillation(Method):
         goals, pooled, logits = [], [], None
         domains: tuple[tuple[Domain, Tensor], ...] = (("source", source.points), ("target", target))
         for domain, points in domains:
-            goals.append(self._describe(self._jitter(points, generator), domain))
-            features = self.features(self._strong(points, domain, generator), domain)
+            unit = unit_of(self.model, points)
+            points = points / unit
+            goals.append(self._describe(self._jitter(points, generator) * unit, domain))
+            features = self.features(self._strong(points, domain, generator) * unit, domain)
             pooled.append(features.pooled)
             if domain == "source":
                 logits = self.head(features, domain)
@@ -175,7 +178,8 @@ class SelfDistillation(Method):
         if self.distortion > 0:
             for grain, strength in _ELASTIC:
                 points = distortions.elastic(points, generator, grain, self.distortion * strength)
-        points = distortions.rescale(points, generator, *self.scale)
+        if not isinstance(self.model, Sized):  # size would be told wrongly
+            points = distortions.rescale(points, generator, *self.scale)
         points = self._jitter(points, generator)
         keep = self.source_keep if domain == "source" else self.target_keep
         return points if keep == 1 else distortions.occlude(points, generator, keep)

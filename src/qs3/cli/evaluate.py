@@ -92,17 +92,15 @@ def predict(
         json: Print JSON with the probability of every class in place of text.
     """
     from qs3.io import read_cloud
-    from qs3.io.preparation import stack
     from qs3.training import load_model, predict_probabilities
 
     if not files:
         raise InputError("name one or more files of points after the run")
     loaded = load_model(run)
-    num_points = loaded.settings["train"]["num_points"]
     clouds = [read_cloud(path) for path in files]
     answers: list[dict[str, Any]] = []
     for path, cloud in zip(files, clouds, strict=True):
-        shares = predict_probabilities(loaded.model, stack([cloud], num_points, str(path)))[0]
+        shares = predict_probabilities(loaded, cloud[None])[0]
         shares = dict(zip(loaded.class_names, shares.tolist(), strict=True))
         best = max(shares, key=lambda name: shares[name])
         answers.append(

@@ -17,7 +17,13 @@ from qs3.cli.text import show, tell
 from qs3.errors import InputError
 from qs3.evaluation.records import rename_method
 from qs3.io.clouds import CloudChoice
-from qs3.training.config import PRESETS, PresetName, SelfTrainingSettings, TrainSettings
+from qs3.training.config import (
+    PRESETS,
+    PresetName,
+    SelfTrainingSettings,
+    TrainSettings,
+    preparation_of,
+)
 
 TIME_UP = 3
 """Exit code where --max-time stopped a run that the same command takes up again."""
@@ -105,7 +111,7 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
     """Return the defaults of ``qs3 train`` under what a command line chooses.
 
     A preset sets the defaults of all self-training settings, so that one given beside it wins and
-    the help shows what is in force. SPST has its own.
+    the help shows what is in force. SPST has its own; the paper's two have its preparation too.
 
     Example:
         >>> words = ["--method", "gast-spst", "--self-training.rounds", "2"]
@@ -117,7 +123,8 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
     rule = chosen.rounds_rule or COMPOSED.get(chosen.method, ("", None))[1]
     preset = chosen.preset or ("spst" if rule == "spst" else "default")
     rounds = PRESETS[preset] if rule is None else replace(PRESETS[preset], rule=rule)
-    options = TrainOptions(source="", out=Path(), preset=preset, self_training=rounds)
+    how = TrainSettings(preparation=preparation_of(preset))
+    options = TrainOptions(source="", out=Path(), preset=preset, train=how, self_training=rounds)
     for name in ("source", "out"):  # must be given: tyro's marker for that is neither text nor path
         object.__setattr__(options, name, tyro.MISSING)
     return {"options": options}

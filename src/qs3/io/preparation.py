@@ -1,16 +1,50 @@
-"""The one way of clouds into a network: one number of points, the unit ball.
+"""The one way of clouds into a network: no strays, one number of points, a ball of radius 1.
 
 Every function returns new float32 arrays and leaves its input as it was.
 """
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from qs3.errors import InputError, UnevenSizesError
 
-_CLOUDS = 256  # brought to the unit ball at a time
+_CLOUDS = 256  # normalised at a time
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """How clouds become what a network takes: the same for every domain, in training and after it.
+
+    The defaults are those of the paper.
+    """
+
+    remove_outliers: bool = False
+    """Whether stray points go before anything else (`qs3.sensor.outliers.inliers`), and points that
+    repeat another."""
+    radius_share: float = 1.0
+    """Share of the points within radius 1. At 1 the centre is the mean, and the farthest point sets
+    the radius; below, the coordinate-wise median and a quantile of the distances from there, which
+    one stray point hardly moves."""
+    redraw: bool = False
+    """Whether each epoch trains on other points of each cloud, drawn at random. Whatever does not
+    train takes the farthest point sample."""
+    size_input: bool = False
+    """Whether the network is told how large a cloud is (`qs3.models.sized.Sized`): for data in
+    metres, of objects that have their real sizes."""
+
+    def __post_init__(self) -> None:
+        if not 0.5 <= self.radius_share <= 1:
+            raise InputError(f"setting radius_share = {self.radius_share} must be in 0.5 to 1")
+
+
+PAPER = Preparation()
+"""That of the paper and of all runs before there was another."""
+ROBUST = Preparation(remove_outliers=True, radius_share=0.95, redraw=True)
+"""What real scans survive: the default where no preset of the paper is asked for."""
 
 
 def unit_ball(points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n 3"]:
@@ -22,19 +56,74 @@ def unit_ball(points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n 3"]:
         >>> unit_ball(np.array([[[0.0, 0, 0], [4, 0, 0]]])).tolist()
         [[[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]]
     """
+    return normalise(points, PAPER)
+
+
+def normalise(
+    points: Float[np.ndarray, "b n 3"], preparation: Preparation
+) -> Float[np.ndarray, "b n 3"]:
+    """Centre each cloud and divide it by its radius, both as ``radius_share`` has them.
+
+    With ``size_input`` clouds are centred alone: the network sees to the rest. A cloud of equal
+    points becomes zeros, as does one of which so many are equal that the radius is zero.
+
+    Example:
+        >>> line = np.array([[[float(x), 0, 0] for x in (*range(20), 1000)]])
+        >>> normalise(line, Preparation(radius_share=0.9))[0, [0, 19], 0].tolist()
+        [-1.0, 0.8999999761581421]
+    """
     balls = np.empty(points.shape, dtype=np.float32)
     for start in range(0, len(points), _CLOUDS):  # in double precision, but never all at once
-        balls[start : start + _CLOUDS] = _unit_balls(points[start : start + _CLOUDS])
+        balls[start : start + _CLOUDS] = _normalised(points[start : start + _CLOUDS], preparation)
     return balls
 
 
-def _unit_balls(points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n 3"]:
-    centred = points - points.mean(axis=1, keepdims=True, dtype=np.float64)
-    radius = np.linalg.norm(centred, axis=2).max(axis=1, initial=0.0)[:, None, None]
+def _normalised(
+    points: Float[np.ndarray, "b n 3"], preparation: Preparation
+) -> Float[np.ndarray, "b n 3"]:
+    share = preparation.radius_share
+    if share == 1 or not points.size:
+        centre = points.mean(axis=1, keepdims=True, dtype=np.float64)
+    else:
+        centre = np.median(points.astype(np.float64), axis=1, keepdims=True)
+    centred = points - centre
+    distance = np.linalg.norm(centred, axis=2)
+    if share == 1 or not points.size:
+        radius = distance.max(axis=1, initial=0.0)[:, None, None]
+    else:
+        rank = radius_rank(share, points.shape[1])
+        radius = np.partition(distance, rank, axis=1)[:, rank, None, None]
     # Equal points can miss their own mean by a rounding error, which must not be blown up.
     extent = np.abs(points).max(axis=(1, 2), initial=0.0)[:, None, None]
     flat = radius <= 1e-12 * extent
+    if preparation.size_input:
+        return np.where(flat, 0.0, centred)
     return np.where(flat, 0.0, centred / np.where(flat, 1.0, radius))
+
+
+def radius_rank(share: float, count: int) -> int:
+    """Place, in ascending order, of the least distance that a share of so many does not exceed.
+
+    Example:
+        >>> radius_rank(0.95, 1024), radius_rank(1.0, 7), radius_rank(0.5, 1)
+        (972, 6, 0)
+    """
+    return max(0, math.ceil(share * count) - 1)
+
+
+def distinct_inliers(
+    cloud: Float[np.ndarray, "n 3"], preparation: Preparation
+) -> Int[np.ndarray, "k"]:
+    """Indices of the points that count: each place once, and no strays where they are to go.
+
+    Example:
+        >>> distinct_inliers(np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 0]]), PAPER).tolist()
+        [0, 1]
+    """
+    from qs3.sensor.outliers import inliers
+
+    kept = np.sort(np.unique(cloud, axis=0, return_index=True)[1])
+    return kept[inliers(cloud[kept])] if preparation.remove_outliers else kept
 
 
 def resample(

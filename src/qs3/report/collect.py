@@ -16,7 +16,7 @@ from qs3.report.lookup import find_before, read_domain
 from qs3.report.settings import ReportSettings
 from qs3.training.checkpoint import load_model
 from qs3.training.overlap import caveats
-from qs3.training.run import RUN, Run, find_runs, read_run
+from qs3.training.run import RUN, Run, data_record, find_runs, read_run
 
 _OLD_NAME = re.compile(r"([^-]+-.+)_([^_]+)_seed-\d+")
 _MEANING = {
@@ -168,11 +168,11 @@ def _of_run(run: Run, holdings: Holdings, settings: ReportSettings) -> Report:
     answers: dict[str, Any] = {}
     notes: list[str] = []
     if target is not None:
-        test = DataRecord.of(target.origin, target.checksum, len(target))
+        test = data_record(target.clouds)
         for name, model in models.items():
             scored, answers[name] = parts.score_network(name, model, target)
             networks.append(scored)
-        marks = caveats(run, target.points)
+        marks = caveats(run, target)
     else:
         marks = () if record is None else record.marks
         if record is not None:

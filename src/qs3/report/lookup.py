@@ -1,7 +1,6 @@
 """What a page needs besides its run: the clouds that were read, and the network before."""
 
 import contextlib
-import functools
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +11,9 @@ from qs3.evaluation.records import DataRecord
 from qs3.io import load_clouds
 from qs3.io.clouds import CloudKind, PointClouds
 from qs3.store.manifest import MANIFEST
+from qs3.training.batches import load_whole
 from qs3.training.checkpoint import LoadedModel, load_model, weights_fingerprint
+from qs3.training.prepared import Prepared, prepare_clouds
 from qs3.training.run import MODEL, Run, is_run
 
 _LEVELS = 5
@@ -24,7 +25,7 @@ def read_domain(
     recorded: DataRecord | None,
     run: Path,
     model: LoadedModel,
-) -> PointClouds | None:
+) -> Prepared[PointClouds] | None:
     """The clouds that the user named, or those of a record, by name near the run.
 
     The latter must have the checksum of the record: data of the same name are not enough. None
@@ -42,7 +43,13 @@ def read_domain(
     """
     given, split, cloud = named
     points, names = model.settings["train"]["num_points"], model.class_names
-    load = functools.partial(load_clouds, num_points=points, class_names=names)
+
+    def load(data: str | Path, split: str | None, cloud: CloudKind) -> Prepared[PointClouds]:
+        part = {"split": split, "cloud": cloud, "class_names": names}
+        return prepare_clouds(
+            load_whole(load_clouds, data, points, **part), points, model.preparation
+        )
+
     if given is not None:
         if cloud is None:
             generated = "://" in given or (Path(given) / MANIFEST).is_file()
@@ -57,7 +64,7 @@ def read_domain(
         if place.exists():
             with contextlib.suppress(QS3Error):
                 clouds = load(place, split=recorded.split, cloud=recorded.cloud)
-                if clouds.checksum == recorded.checksum:
+                if clouds.clouds.checksum == recorded.checksum:
                     return clouds
     return None
 

@@ -14,26 +14,26 @@ from qs3.io.clouds import PointClouds
 from qs3.report.contents import Cloud, FeatureMap, Scored
 from qs3.report.embedding import embed
 from qs3.report.plots import Curve, SelectionRound
-from qs3.training.batches import prepare
 from qs3.training.checkpoint import LoadedModel
 from qs3.training.history import HISTORY
-from qs3.training.predict import describe, predict_probabilities
+from qs3.training.predict import describe
+from qs3.training.prepared import Prepared, prepare_clouds
 
 _ACCURACY = "accuracy in training", "labelled clouds, augmented"
 _MAPPED = 400  # clouds of a domain on a map: beyond that dots hide one another
 
 
 def score_network(
-    name: str, loaded: LoadedModel, target: PointClouds
+    name: str, loaded: LoadedModel, target: Prepared[PointClouds]
 ) -> tuple[Scored, Int[np.ndarray, "b"]]:
     """Score a network on labelled clouds, and return its answers too."""
-    answers = predict_probabilities(loaded.model, target.points).argmax(axis=1)
+    answers = describe(loaded.model, _for(loaded, target)).probabilities.argmax(axis=1)
     scores = score(target.labels, answers, target.class_names)
     return Scored(name, scores, answers == target.labels), answers
 
 
 def show_clouds(
-    domains: Mapping[str, PointClouds],
+    domains: Mapping[str, Prepared[PointClouds]],
     count: int,
     answers: Mapping[str, Mapping[str, Int[np.ndarray, "b"]]],
 ) -> dict[str, list[Cloud]]:
@@ -47,11 +47,13 @@ def show_clouds(
     shown = {}
     for domain, clouds in domains.items():
         names, given = clouds.class_names, answers.get(domain, {})
+        labels = clouds.labels
         shown[domain] = []
-        for row in even_rows(clouds.labels, count):
+        for row in even_rows(labels, count):
             taken = [f"{names[classes[row]]} ({network})" for network, classes in given.items()]
             note = f"Taken for {', '.join(taken)}" if taken else ""
-            shown[domain].append(Cloud(clouds.points[row], names[clouds.labels[row]], note))
+            points = clouds.chosen(slice(row, row + 1))[0]
+            shown[domain].append(Cloud(points, names[labels[row]], note))
     return shown
 
 
@@ -70,7 +72,7 @@ def even_rows(labels: Int[np.ndarray, "b"], count: int) -> list[int]:
 
 
 def feature_maps(
-    models: Mapping[str, LoadedModel], domains: Mapping[str, PointClouds]
+    models: Mapping[str, LoadedModel], domains: Mapping[str, Prepared[PointClouds]]
 ) -> tuple[FeatureMap, ...]:
     """Features of each network on both domains, in the plane; none where clouds are too few."""
     mapped = {
@@ -82,14 +84,21 @@ def feature_maps(
     maps = []
     for name, loaded in models.items():
         features = [
-            describe(loaded.model, prepare(clouds.points, clouds.points.shape[1])).features
-            for clouds in mapped.values()
+            describe(loaded.model, _for(loaded, clouds)).features for clouds in mapped.values()
         ]
         try:
             maps.append(FeatureMap(name, embed(np.concatenate(features)), labels, kinds))
         except InputError:  # a handful of clouds makes no map
             continue
     return tuple(maps)
+
+
+def _for(loaded: LoadedModel, clouds: Prepared[PointClouds]) -> Prepared[PointClouds]:
+    """Clouds as this network takes them: the one before may have another preparation."""
+    if loaded.preparation == clouds.preparation:
+        return clouds
+    ready = prepare_clouds(clouds.clouds, clouds.num_points, loaded.preparation)
+    return ready.select(clouds.rows)
 
 
 def curves(runs: Sequence[Path]) -> tuple[tuple[Curve, ...], tuple[float, ...]]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from qs3.lazy import loader, names_of
 
 if TYPE_CHECKING:
+    from qs3.training.augmentation import augment_clouds as augment_clouds
     from qs3.training.batches import load_whole as load_whole
     from qs3.training.batches import prepare as prepare
     from qs3.training.batches import subsample as subsample
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from qs3.training.checkpoint import load_model as load_model
     from qs3.training.checkpoint import save_model as save_model
     from qs3.training.config import PRESETS as PRESETS
+    from qs3.training.config import Augmentation as Augmentation
     from qs3.training.config import SelfTrainingSettings as SelfTrainingSettings
     from qs3.training.config import TrainSettings as TrainSettings
     from qs3.training.config import self_training_preset as self_training_preset
@@ -44,9 +46,10 @@ if TYPE_CHECKING:
     from qs3.training.validation import read_checkpoints as read_checkpoints
 
 _MODULES = {
+    "augmentation": "augment_clouds",
     "batches": "load_whole prepare subsample",
     "checkpoint": "LoadedModel load_model save_model",
-    "config": "PRESETS SelfTrainingSettings TrainSettings self_training_preset",
+    "config": "PRESETS Augmentation SelfTrainingSettings TrainSettings self_training_preset",
     "estimators": "QBST SPST Adapter",
     "evaluate": "evaluate record_path",
     "fit": "FitResult fit",

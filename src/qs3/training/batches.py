@@ -1,6 +1,5 @@
 """From clouds in memory to batches on the device."""
 
-import hashlib
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -8,16 +7,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from qs3.adaptation import Batch
 from qs3.errors import InputError, UnevenSizesError
-from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.io.preparation import unit_ball
-from qs3.sensor.sampling import farthest_point_samples
-from qs3.training.checkpoint import read_tensors, write_tensors
-from qs3.training.config import TrainSettings
+from qs3.io.clouds import PointClouds, UnlabelledClouds, numbered
+from qs3.io.preparation import PAPER, Preparation
+from qs3.models.sized import ball_radius
+from qs3.training.augmentation import augment_clouds, turned
+from qs3.training.config import Augmentation, TrainSettings
+from qs3.training.prepared import Prepared, normalise_batch, prepare_clouds
 
 _SHARE_OF_MEMORY = 0.25
 """Part of a GPU's free memory that the clouds may take; the network needs the rest."""
@@ -80,19 +80,22 @@ def load_whole(load: Callable[..., Any], data: str | Path, num_points: int, **pa
         return load(data, num_points=num_points, **part)
 
 
-def prepare(points: np.ndarray, num_points: int, cache: Path | None = None) -> np.ndarray:
-    """Subsample clouds [b n 3] to ``num_points`` points each and bring them to the unit ball.
+def prepare(
+    points: Float[np.ndarray, "b n 3"], num_points: int, preparation: Preparation = PAPER
+) -> Float[np.ndarray, "b m 3"]:
+    """Return clouds as a network takes them: ``num_points`` points each, normalised.
 
     Args:
         points: Clouds, as read.
         num_points: Points a cloud.
-        cache: Folder that keeps the choice of points; see `subsample`.
+        preparation: What is done to them.
 
     Example:
         >>> prepare(np.random.default_rng(0).normal(size=(2, 50, 3)), 16).shape
         (2, 16, 3)
     """
-    return unit_ball(subsample(points, num_points, cache))
+    clouds = UnlabelledClouds(points, numbered(len(points)))
+    return prepare_clouds(clouds, num_points, preparation).points
 
 
 def subsample(
@@ -103,43 +106,17 @@ def subsample(
     Args:
         points: Clouds, as read.
         num_points: Points a cloud. Fewer points than that are repeated in order.
-        cache: Folder where the choice is kept (``subsample-<checksum>.safetensors``), so that a
-            resumed run need not make it again. A file there that is damaged, or belongs to other
-            clouds, is made anew.
+        cache: Folder where the choice is kept, as in `prepare_clouds`.
 
     Example:
         >>> subsample(np.zeros((2, 50, 3)), 16).shape
         (2, 16, 3)
     """
-    b, n, _ = points.shape
-    if n == num_points or not b:
-        return points
-    if n < num_points:
-        return points[:, np.arange(num_points) % n]
-    path, index = None, None
-    if cache is not None:
-        key = hashlib.sha256(f"{points.shape} {points.dtype} {num_points}".encode())
-        key.update(np.ascontiguousarray(points).data)
-        path = Path(cache) / f"subsample-{key.hexdigest()[:16]}.safetensors"
-        index = _read_choice(path, (b, num_points), n)
-    if index is None:
-        index = farthest_point_samples(points, num_points).astype(np.min_scalar_type(n - 1))
-        if path is not None:
-            digest = hashlib.sha256(index.tobytes()).hexdigest()
-            write_tensors(path, {"index": torch.from_numpy(index)}, {"sha256": digest})
-    return np.take_along_axis(points, index[:, :, None].astype(np.int64), axis=1)
+    clouds = UnlabelledClouds(points, numbered(len(points)))
+    return prepare_clouds(clouds, num_points, cache=cache).chosen(slice(None))
 
 
-def _read_choice(path: Path, shape: tuple[int, int], n: int) -> UInt[np.ndarray, "b m"] | None:
-    """Return the indices that were kept, or None where they are absent or unsound."""
-    try:
-        tensors, facts = read_tensors(path)
-        index = tensors["index"].numpy()
-    except (InputError, KeyError):
-        return None
-    sound = index.shape == shape and index.dtype == np.min_scalar_type(n - 1)
-    sound = sound and facts.get("sha256") == hashlib.sha256(index.tobytes()).hexdigest()
-    return index if sound else None
+_NONE = Augmentation()
 
 
 class Share(NamedTuple):
@@ -156,7 +133,7 @@ WHOLE = Share()
 
 
 class DeviceClouds:
-    """Clouds as tensors: on the device once and for all where they fit.
+    """Clouds of which batches are made on the device; a GPU holds them where they fit.
 
     Args:
         clouds: Prepared clouds, with labels or without.
@@ -167,23 +144,105 @@ class DeviceClouds:
         InputError: where points are not finite.
     """
 
-    def __init__(self, clouds: PointClouds | UnlabelledClouds, device: torch.device) -> None:
-        require_finite(clouds.points, clouds.ids)
-        self.device = device
+    def __init__(
+        self, clouds: Prepared[PointClouds] | Prepared[UnlabelledClouds], device: torch.device
+    ) -> None:
+        whole = clouds.clouds
+        require_finite(whole.points, whole.ids)
+        self.clouds, self.device = clouds, device
         self.ids = clouds.ids
-        self.points = torch.from_numpy(np.ascontiguousarray(clouds.points, dtype=np.float32))
-        labels = clouds.labels if isinstance(clouds, PointClouds) else np.zeros(len(clouds))
+        labels = (
+            whole.labels[clouds.rows] if isinstance(whole, PointClouds) else np.zeros(len(self))
+        )
         self.labels = torch.from_numpy(labels.astype(np.int64))
-        if self.points.nbytes <= _SHARE_OF_MEMORY * _free_memory(device):
-            self.points, self.labels = self.points.to(device), self.labels.to(device)
+        self.held: Tensor | None = None
+        size = whole.points.size * 4
+        if device.type != "cpu" and size <= _SHARE_OF_MEMORY * _free_memory(device):
+            self.held = torch.from_numpy(np.asarray(whole.points, np.float32)).to(device)
 
     def __len__(self) -> int:
         return len(self.ids)
 
-    def take(self, rows: np.ndarray) -> Batch:
-        """Return the clouds at ``rows``, on the device."""
-        index = torch.from_numpy(rows).to(self.points.device)
-        return Batch(self.points[index].to(self.device), self.labels[index].to(self.device))
+    def take(
+        self,
+        rows: np.ndarray,
+        generator: torch.Generator | None = None,
+        share: Share = WHOLE,
+        augmentation: Augmentation = _NONE,
+    ) -> Batch:
+        """Return this device's share of the clouds at ``rows``, normalised, on the device.
+
+        The clouds are augmented whole, their points drawn from what is left, then normalised.
+
+        Args:
+            rows: Clouds of a batch.
+            generator: Source of all draws, on the device; without one the fixed choice of points is
+                taken as it is. Several devices draw alike, each for the whole batch.
+            share: This device's part.
+            augmentation: What is done to the clouds.
+        """
+        preparation, num_points = self.clouds.preparation, self.clouds.num_points
+        mine = slice(share.rank, None, share.world)
+        labels = self.labels[torch.from_numpy(rows[mine])].to(self.device)
+        if generator is None or (augmentation == _NONE and not preparation.redraw):
+            return Batch(normalise_batch(self._points(rows[mine], num_points), preparation), labels)
+        width = None if preparation.redraw else num_points
+        if augmentation == _NONE:
+            points = self._points(rows[mine], width)
+            kept = self._distinct(rows[mine], points.shape[1])
+        else:
+            points, kept = augment_clouds(self._points(rows, width), augmentation, generator)
+            distinct = self._distinct(rows, points.shape[1])
+            kept = kept & distinct
+            kept = torch.where(kept.any(dim=1, keepdim=True), kept, distinct)[mine]
+            points = points[mine]
+        keys = torch.arange(float(points.shape[1]), device=self.device).expand(points.shape[:2])
+        if preparation.redraw:
+            size = len(rows), points.shape[1]
+            keys = torch.rand(size, generator=generator, device=self.device)[mine]
+        points = draw_points(points, kept, num_points, keys)
+        return Batch(normalise_batch(points, preparation), labels)
+
+    def _points(self, rows: np.ndarray, width: int | None) -> Float[Tensor, "r w 3"]:
+        """The first points that count of clouds, or all, as read, on the device."""
+        places, index = self.clouds.rows[rows][:, None], self.clouds.indices(rows, width)
+        if self.held is None:
+            return torch.from_numpy(self.clouds.clouds.points[places, index]).to(self.device)
+        where = (torch.from_numpy(part).to(self.device) for part in (places, index))
+        return self.held[tuple(where)]
+
+    def _distinct(self, rows: np.ndarray, width: int) -> Bool[Tensor, "r w"]:
+        """Which points of clouds repeat none before them."""
+        order = self.clouds.order
+        counts = np.full(len(rows), width)
+        if order is not None:
+            counts = order.counts[self.clouds.rows[rows]]
+        return torch.from_numpy(np.arange(width) < counts[:, None]).to(self.device)
+
+
+def draw_points(
+    points: Float[Tensor, "b n 3"],
+    kept: Bool[Tensor, "b n"],
+    num_points: int,
+    keys: Float[Tensor, "b n"],
+) -> Float[Tensor, "b m 3"]:
+    """Take the points with the least keys among those that are kept; too few are repeated in turn.
+
+    Args:
+        points: Clouds.
+        kept: Points to choose from, one at least in each cloud.
+        num_points: Points to take.
+        keys: Random numbers for a random choice; ascending ones for the first points.
+
+    Example:
+        >>> line = torch.arange(4.0)[None, :, None].expand(1, 4, 3)
+        >>> kept = torch.tensor([[False, True, False, True]])
+        >>> draw_points(line, kept, 3, torch.tensor([[0.1, 0.9, 0.2, 0.3]]))[0, :, 0].tolist()
+        [3.0, 1.0, 3.0]
+    """
+    order = keys.masked_fill(~kept, torch.inf).argsort(dim=1, stable=True)
+    place = torch.arange(num_points, device=points.device) % kept.sum(dim=1, keepdim=True)
+    return points.gather(1, order.gather(1, place)[:, :, None].expand(-1, -1, 3))
 
 
 def _free_memory(device: torch.device) -> float:
@@ -214,13 +273,14 @@ def augment(
     place, count = place.to(points.device), len(points) if total is None else total
     drawn = {"generator": generator, "device": points.device, "dtype": points.dtype}
     if settings.rotate_z:
-        angle = 2 * torch.pi * torch.rand(count, 1, **drawn)[place]
-        c, s = angle.cos(), angle.sin()
-        x, y, z = points.unbind(2)
-        points = torch.stack([c * x - s * y, s * x + c * y, z], dim=2)
+        points = turned(points, 2 * torch.pi * torch.rand(count, 1, **drawn)[place])
     if settings.jitter_sigma > 0 and settings.jitter_clip > 0:
         noise = settings.jitter_sigma * torch.randn(count, *points.shape[1:], **drawn)
-        points = points + noise.clamp_(-settings.jitter_clip, settings.jitter_clip)[place]
+        noise = noise.clamp_(-settings.jitter_clip, settings.jitter_clip)[place]
+        if settings.preparation.size_input:  # the cloud is in metres
+            share = settings.preparation.radius_share
+            noise = noise * ball_radius(points, share)[:, None, None]
+        points = points + noise
     return points
 
 
@@ -267,7 +327,7 @@ def make_batch(
     The augmentation of a cloud does not depend on the number of devices.
     """
     parts = [
-        clouds.take(index[share.rank :: share.world])
+        clouds.take(index, generator, share, settings.augmentation)
         for clouds, index in zip(sets, rows, strict=True)
     ]
     places, total = [], 0

@@ -14,8 +14,10 @@ from torch import Tensor, nn
 
 from qs3.errors import InputError
 from qs3.files import parse_json, write_bytes
+from qs3.io.preparation import PAPER, Preparation
 from qs3.models import PointClassifier, create_model
-from qs3.structure import structure
+from qs3.models.sized import Sized
+from qs3.structure import structure, unstructure
 from qs3.training.config import TrainSettings
 from qs3.training.run import MODEL, SETTINGS, read_settings
 
@@ -31,6 +33,13 @@ class LoadedModel(NamedTuple):
     """Names of the classes, in the order of the logits."""
     settings: dict[str, Any]
     """The content of ``settings.json``."""
+    preparation: Preparation = PAPER
+    """What is done to clouds before the network gets them."""
+
+    @property
+    def num_points(self) -> int | None:
+        """Points a cloud; None where nothing tells."""
+        return self.settings["train"].get("num_points")
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> None:
@@ -137,7 +146,14 @@ def new_model(settings: TrainSettings, num_classes: int, seed: int) -> PointClas
     """Make the network of the settings with weights drawn from ``seed`` alone."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return create_model(settings.model, num_classes, **settings.model_settings)
+        return _make(settings.model, num_classes, settings.model_settings, settings.preparation)
+
+
+def _make(
+    name: str, num_classes: int, arguments: Mapping[str, Any], preparation: Preparation
+) -> PointClassifier:
+    model = create_model(name, num_classes, **arguments)
+    return Sized(model, preparation.radius_share) if preparation.size_input else model
 
 
 def save_model(
@@ -171,6 +187,7 @@ def save_model(
         "model": settings.model,
         "model_settings": dict(settings.model_settings),
         "num_points": settings.num_points,
+        "preparation": unstructure(settings.preparation),
     }
     write_tensors(path, model.state_dict(), {**(facts or {}), **own})
     return path
@@ -198,18 +215,19 @@ def load_model(run_dir: Path) -> LoadedModel:
             raise InputError(f"{path}: format {facts['format']}, this version reads {FORMAT}")
         class_names = tuple(str(name) for name in facts["class_names"])
         name, arguments = facts["model"], dict(facts["model_settings"])
+        preparation = structure(facts.get("preparation", {}), Preparation, path)
         with torch.random.fork_rng(devices=[]):
-            model = create_model(name, len(class_names), **arguments)
+            model = _make(name, len(class_names), arguments, preparation)
     except (KeyError, TypeError) as error:
         raise InputError(f"{path}: does not say which network it holds ({error})") from error
     load_tensors_into(model, tensors, path)
     if (path.parent / SETTINGS).is_file():
         settings = read_settings(path.parent)
     else:
-        kept = ("model", "model_settings", "num_points")
+        kept = ("model", "model_settings", "num_points", "preparation")
         settings = {"train": {key: facts[key] for key in kept if key in facts}}
         structure(settings["train"], TrainSettings, path)  # refuses what is none
-    return LoadedModel(model.eval(), class_names, settings)
+    return LoadedModel(model.eval(), class_names, settings, preparation)
 
 
 def weights_fingerprint(model: PointClassifier) -> str:

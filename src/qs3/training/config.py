@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import tyro
 
 from qs3.adaptation.names import Normalisation, RoundRule, Rule, Selection, SingleClass
 from qs3.errors import InputError
+from qs3.io.preparation import PAPER, ROBUST, Preparation
 
 _Settings = TypeVar("_Settings", bound=Any)
 Schedule = Literal["cosine", "plateau"]
@@ -26,6 +27,77 @@ MOST_POINTS = 16_384
 
 
 @dataclass(frozen=True)
+class Augmentation:
+    """What a scan loses and gains, imitated on clouds in training; all off by default.
+
+    Lengths are relative to the cloud's radius, half the diagonal of the box of its middle 98 %.
+    """
+
+    plane: float = 0.0
+    """Probability that a random plane cuts a cloud."""
+    plane_share: float = 0.4
+    """Largest share of the points behind that plane, which are lost."""
+    cone: float = 0.0
+    """Probability that a random view cone, a camera's image, cuts a cloud."""
+    cone_share: float = 0.4
+    """Largest share of the points outside that cone, which are lost."""
+    patches: float = 0.0
+    """Probability that patches of a cloud are lost."""
+    patch_count: int = 4
+    """Patches about random points, which may overlap."""
+    patch_radius: float = 0.25
+    """Largest radius of a cloud's patches."""
+    least: float = 0.25
+    """Share of the points that planes, cones and patches together always leave."""
+    stretch: float = 0.0
+    """Probability that a cloud is stretched, each axis by a factor of its own."""
+    stretch_factor: float = 1.2
+    """Largest factor, and the inverse of the smallest."""
+    tilt: float = 0.0
+    """Probability that a cloud is tilted about a random horizontal axis."""
+    tilt_degrees: float = 3.0
+    """Largest angle of that tilt."""
+    floor: float = 0.0
+    """Probability that a slab of floor beneath replaces points."""
+    wall: float = 0.0
+    """Probability that a slab of wall beside the box, along one of its faces, replaces points."""
+    neighbour: float = 0.0
+    """Probability that the near piece of another cloud of the batch, beside it, replaces points."""
+    clutter_share: float = 0.2
+    """Largest share of the points that each of floor, wall and neighbour replaces."""
+    noise: float = 0.0
+    """Probability that Gaussian noise is added to a cloud."""
+    noise_sigma: float = 0.02
+    """Largest standard deviation of a cloud's noise."""
+
+    def __post_init__(self) -> None:
+        for name in ("plane", "cone", "patches", "stretch", "tilt", "floor", "wall", "neighbour"):
+            _check(self, name, 0 <= getattr(self, name) <= 1, "must be in 0 to 1")
+        for name in ("noise", "plane_share", "cone_share", "clutter_share"):
+            _check(self, name, 0 <= getattr(self, name) <= 1, "must be in 0 to 1")
+        for name in ("patch_radius", "noise_sigma", "tilt_degrees"):
+            _check(self, name, getattr(self, name) >= 0, "must not be negative")
+        _check(self, "least", 0 < self.least <= 1, "must be above 0, to 1")
+        _check(self, "patch_count", self.patch_count > 0, "must be above 0")
+        _check(self, "stretch_factor", self.stretch_factor >= 1, "must be at least 1")
+
+    @classmethod
+    def scanned(cls, **overrides: Any) -> "Augmentation":
+        """Return all of them together, as a first guess at what a scan does to clean surfaces.
+
+        Args:
+            overrides: Settings that differ.
+
+        Example:
+            >>> Augmentation.scanned(wall=0.0).plane
+            0.3
+        """
+        usual: dict[str, Any] = {"plane": 0.3, "cone": 0.3, "patches": 0.3, "stretch": 1.0}
+        usual |= {"tilt": 1.0, "floor": 0.2, "wall": 0.1, "neighbour": 0.2, "noise": 0.5}
+        return cls(**usual | overrides)
+
+
+@dataclass(frozen=True)
 class TrainSettings:
     """How a network is trained on labelled clouds."""
 
@@ -34,7 +106,13 @@ class TrainSettings:
     model_settings: Annotated[Mapping[str, Any], tyro.conf.Suppress] = field(default_factory=dict)
     """Arguments of the network that differ from its defaults."""
     num_points: int = 1024
-    """Points a cloud, by farthest point sampling before normalisation to the unit ball."""
+    """Points a cloud, by farthest point sampling before normalisation."""
+    preparation: Annotated[Preparation, tyro.conf.arg(name="")] = PAPER
+    """What is done to clouds before the network gets them: by default the paper's here, and what
+    real scans survive in ``qs3 train`` (`preparation_of`)."""
+    augmentation: Augmentation = field(default_factory=Augmentation)
+    """What a scan loses and gains, imitated on every cloud of a batch before its points are
+    chosen."""
     epochs: int = 200
     """Passes over the source."""
     batch_size: int = 32
@@ -244,6 +322,16 @@ PRESETS: Mapping[str, SelfTrainingSettings] = {
 """The settings of each preset."""
 
 
+def preparation_of(preset: str | None) -> Preparation:
+    """Return the preparation that goes with a preset of self-training, or with none.
+
+    Example:
+        >>> preparation_of("released").redraw, preparation_of(None).redraw
+        (False, True)
+    """
+    return PAPER if preset in ("paper", "released") else ROBUST
+
+
 def self_training_preset(name: str, **overrides: Any) -> SelfTrainingSettings:
     """Return a preset with some settings changed.
 
@@ -264,13 +352,16 @@ def self_training_preset(name: str, **overrides: Any) -> SelfTrainingSettings:
 
 
 def changed(settings: _Settings, given: Mapping[str, Any], where: str = "") -> _Settings:
-    """Return settings with some of them changed.
+    """Return settings with some of them changed; of settings inside them, a mapping changes some.
 
     Raises:
         InputError: where one is unknown; ``where`` ends the message.
     """
     names = [field.name for field in fields(settings)]
-    for name in given:
+    values = dict(given)
+    for name, value in given.items():
         if name not in names:
             raise InputError(f"unknown setting {name!r}{where}; choose from {', '.join(names)}")
-    return replace(settings, **given)
+        if is_dataclass(inner := getattr(settings, name)) and isinstance(value, Mapping):
+            values[name] = changed(inner, value, where)
+    return replace(settings, **values)

@@ -16,7 +16,13 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from qs3.adaptation.names import split_method
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, changed
+from qs3.training.config import (
+    PRESETS,
+    SelfTrainingSettings,
+    TrainSettings,
+    changed,
+    preparation_of,
+)
 from qs3.training.fit import FitResult, fit
 from qs3.training.predict import predict_probabilities
 
@@ -92,14 +98,14 @@ class Adapter(ClassifierMixin, BaseEstimator):
             if name in train:
                 raise InputError(f"give {name} as the parameter {parameter}, not in train")
         train |= {"model": self.model, "seed": self.random_state}
-        settings = changed(TrainSettings(), train, " in train")
+        settings = changed(TrainSettings(preparation=preparation_of(None)), train, " in train")
         method, rounds = self._plan()
         with tempfile.TemporaryDirectory(prefix="qs3-") as temporary:
             folder = Path(temporary) / "run" if self.run_dir is None else Path(self.run_dir)
             self.result_ = fit(method, source, target, settings, rounds, run_dir=folder)
         self.model_ = self.result_.model
         self.classes_ = np.array(source.class_names)
-        self._num_points = settings.num_points
+        self._how = {"num_points": settings.num_points, "preparation": settings.preparation}
         return self
 
     def _plan(self) -> tuple[str, SelfTrainingSettings | None]:
@@ -118,7 +124,7 @@ class Adapter(ClassifierMixin, BaseEstimator):
         if not hasattr(self, "model_"):
             raise InputError(f"this {type(self).__name__} is not fitted yet; call fit first")
         points = clouds if isinstance(clouds, np.ndarray) else clouds.points
-        return predict_probabilities(self.model_, points, num_points=self._num_points)
+        return predict_probabilities(self.model_, points, **self._how)
 
     def predict(
         self, clouds: PointClouds | UnlabelledClouds | Float[np.ndarray, "b n 3"]

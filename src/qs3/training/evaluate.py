@@ -15,10 +15,11 @@ from qs3.io import load_clouds
 from qs3.io.clouds import CloudKind, PointClouds
 from qs3.io.ragged import RaggedClouds
 from qs3.structure import unstructure
-from qs3.training.batches import load_whole, subsample
+from qs3.training.batches import load_whole, require_finite
 from qs3.training.checkpoint import LoadedModel, load_model
 from qs3.training.overlap import caveats
-from qs3.training.predict import predict_probabilities
+from qs3.training.predict import describe
+from qs3.training.prepared import Prepared, prepare_clouds
 from qs3.training.run import data_record, read_run
 from qs3.training.validation import ROUND, choose, load_checkpoint, read_checkpoints
 
@@ -53,14 +54,15 @@ def evaluate(
     made, loaded = read_run(run), load_model(run)
     train = loaded.settings["train"]
     whole = _labelled(data, split, cloud, train["num_points"], loaded.class_names)
-    test = replace(whole, points=subsample(whole.points, train["num_points"]))
+    require_finite(whole.points, whole.ids)
+    test = prepare_clouds(whole, train["num_points"], loaded.preparation)
     record = RunRecord(
         method=made.method,
         model=train["model"],
         settings=loaded.settings | {"preset": made.preset},
         source=made.source,
         target=made.target,
-        test=data_record(test),
+        test=data_record(whole),
         seed=train["seed"],
         selection=made.selection,
         scores=_scores(loaded, test),
@@ -70,7 +72,7 @@ def evaluate(
         commit=git_commit(),
         rounds=made.rounds,
         choices=_choices(Path(run), loaded, test) if checkpoints else {},
-        marks=caveats(made, test.points, whole.points),
+        marks=caveats(made, test),
         experiment=experiment,
     )
     write_record(record_path(run, record), record)
@@ -99,12 +101,14 @@ def _labelled(
     return replace(given.labelled(None, class_names, "data"), origin=data.origin)
 
 
-def _scores(loaded: LoadedModel, test: PointClouds) -> Scores:
-    answers = predict_probabilities(loaded.model, test.points).argmax(axis=1)
+def _scores(loaded: LoadedModel, test: Prepared[PointClouds]) -> Scores:
+    answers = describe(loaded.model, test).probabilities.argmax(axis=1)
     return score(test.labels, answers, loaded.class_names)
 
 
-def _choices(run: Path, loaded: LoadedModel, test: PointClouds) -> dict[str, dict[str, Any]]:
+def _choices(
+    run: Path, loaded: LoadedModel, test: Prepared[PointClouds]
+) -> dict[str, dict[str, Any]]:
     """Score the checkpoints of the run's last stage, and let every rule choose among them."""
     checkpoints = read_checkpoints(run, ROUND) or read_checkpoints(run)
     if not checkpoints:

@@ -8,7 +8,7 @@ import time
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,12 @@ from torch import Tensor, nn
 
 from qs3.errors import InputError, MissingExtraError, QS3Error
 from qs3.files import write_bytes
+from qs3.io.preparation import PAPER, Preparation
 from qs3.models import PointClassifier
 from qs3.models.ops.sampling import sample_in_a_loop
 from qs3.training.checkpoint import load_model
 from qs3.training.predict import predict_probabilities
+from qs3.training.prepared import normalise_in_a_graph
 
 SUFFIXES: Mapping[str, str] = {"onnx": ".onnx", "torch-export": ".pt2"}
 """The formats, and how the names of their files end."""
@@ -64,7 +66,7 @@ class CloudClassifier(nn.Module):
 
     Inside are the steps of `qs3.training.batches.prepare`, in double precision as there: clouds of
     more than ``num_points`` points are subsampled from point 0 on, points of
-    smaller ones are repeated in order; then the unit ball.
+    smaller ones are repeated in order; then they are normalised. Outliers must be gone before.
 
     Convention:
         Points are [b n 3], finite, z up; all clouds of a batch have the same n.
@@ -72,6 +74,7 @@ class CloudClassifier(nn.Module):
     Args:
         model: The network.
         num_points: Points a cloud that it was trained on.
+        preparation: What was done to them.
 
     Example:
         >>> from qs3.models import create_model
@@ -80,15 +83,16 @@ class CloudClassifier(nn.Module):
         True
     """
 
-    def __init__(self, model: PointClassifier, num_points: int) -> None:
+    def __init__(
+        self, model: PointClassifier, num_points: int, preparation: Preparation = PAPER
+    ) -> None:
         super().__init__()
-        self.model = model
-        self.num_points = num_points
+        self.model, self.num_points, self.preparation = model, num_points, preparation
 
     def forward(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b k"]:
         """Return the probabilities of the classes."""
         chosen = subsample_in_a_graph(points.double(), self.num_points)
-        logits = self.model(unit_ball_in_a_graph(chosen).float())
+        logits = self.model(normalise_in_a_graph(chosen, self.preparation).float())
         return torch.softmax(logits.double(), dim=1).float()
 
 
@@ -107,19 +111,6 @@ def subsample_in_a_graph(points: Float[Tensor, "b n 3"], num_points: int) -> Flo
     end = torch.where(count > num_points, num_points, 1)
     chosen = sample_in_a_loop(points.permute(2, 0, 1).contiguous(), chosen, end, repeat=True)
     return points.gather(1, chosen[:, :, None].expand(-1, -1, 3))
-
-
-def unit_ball_in_a_graph(points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
-    """Bring clouds to the unit ball as `qs3.io.preparation.unit_ball`.
-
-    Example:
-        >>> unit_ball_in_a_graph(torch.tensor([[[0.0, 0, 0], [4, 0, 0]]]))[0, :, 0].tolist()
-        [-1.0, 1.0]
-    """
-    centred = points - points.mean(dim=1, keepdim=True)
-    radius = centred.square().sum(dim=2).sqrt().amax(dim=1)[:, None, None]
-    flat = radius <= 1e-12 * points.abs().amax(dim=(1, 2))[:, None, None]
-    return torch.where(flat, 0.0, centred / torch.where(flat, 1.0, radius))
 
 
 def export_run(run: Path, to: str, out: Path | None = None) -> Exported:
@@ -151,11 +142,17 @@ def export_run(run: Path, to: str, out: Path | None = None) -> Exported:
     num_points = loaded.settings["train"].get("num_points")
     if num_points is None:
         raise InputError(f"{run}: does not tell the number of points a cloud (num_points)")
-    facts = {"class_names": list(loaded.class_names), "settings": loaded.settings}
+    facts = {
+        "class_names": list(loaded.class_names),
+        "settings": loaded.settings,
+        # What a caller has to do to a cloud first; the rest is inside.
+        "expects": {"outliers_removed": loaded.preparation.remove_outliers},
+    }
     start = time.perf_counter()
-    data, runner = _serialise(loaded.model, num_points, facts, to)
+    inside = replace(loaded.preparation, remove_outliers=False)
+    data, runner = _serialise(loaded.model, num_points, inside, facts, to)
     seconds = time.perf_counter() - start
-    differences = compare(loaded.model, num_points, runner)
+    differences = compare(loaded.model, num_points, runner, inside)
     worst, strays = float(differences.max()), int((differences > ROUNDING).sum())
     if strays > STRAYS[0] or worst > STRAYS[1]:
         raise QS3Error(
@@ -168,7 +165,11 @@ def export_run(run: Path, to: str, out: Path | None = None) -> Exported:
 
 
 def compare(
-    model: PointClassifier, num_points: int, runner: _Runner, seed: int = 0
+    model: PointClassifier,
+    num_points: int,
+    runner: _Runner,
+    preparation: Preparation = PAPER,
+    seed: int = 0,
 ) -> Float[np.ndarray, "m"]:
     """Return for each of many clouds the largest difference of an exported network's probability.
 
@@ -180,6 +181,7 @@ def compare(
         model: The source.
         num_points: Points a cloud that it was trained on.
         runner: From clouds to probabilities, by the exported network.
+        preparation: What it does to the clouds.
         seed: Of the clouds.
     """
     rng = np.random.default_rng(seed)
@@ -191,7 +193,9 @@ def compare(
             points = rng.normal(size=(b, n, 3)) * rng.uniform(0.1, 1, size=(b, 1, 3))
             points = (points + rng.normal(size=(b, 1, 3))) * 10.0 ** rng.uniform(-3, 3)
             points = points.astype(np.float32)
-            wanted = predict_probabilities(model, points, num_points=num_points)
+            wanted = predict_probabilities(
+                model, points, num_points=num_points, preparation=preparation
+            )
             got = runner(points)
             if got.shape != wanted.shape or not np.isfinite(got).all():
                 differences += [float("inf")] * b
@@ -237,10 +241,14 @@ def _is_program(path: Path) -> bool:
 
 
 def _serialise(
-    model: PointClassifier, num_points: int, facts: Mapping[str, Any], to: str
+    model: PointClassifier,
+    num_points: int,
+    preparation: Preparation,
+    facts: Mapping[str, Any],
+    to: str,
 ) -> tuple[bytes, _Runner]:
     """Return the file's bytes, and a way to run them."""
-    network = CloudClassifier(model, num_points).eval().requires_grad_(False)
+    network = CloudClassifier(model, num_points, preparation).eval().requires_grad_(False)
     # Its values do not matter; sizes that are not 1 nor num_points fix nothing.
     example = torch.zeros(2, num_points + 3, 3)
     text = json.dumps(facts, ensure_ascii=False, sort_keys=True)

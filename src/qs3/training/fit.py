@@ -10,10 +10,9 @@ from qs3.adaptation import method_class
 from qs3.adaptation.names import split_method
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.io.preparation import unit_ball
 from qs3.models import PointClassifier
-from qs3.structure import unstructure
-from qs3.training.batches import require_finite, require_unlabelled, subsample
+from qs3.structure import first_difference, unstructure
+from qs3.training.batches import require_finite, require_unlabelled
 from qs3.training.checkpoint import load_model, weights_fingerprint
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
 from qs3.training.distributed import all_devices, make_fabric
@@ -21,6 +20,7 @@ from qs3.training.history import EpochRecord, History
 from qs3.training.job import Job, fresh_model, make_method, run_job
 from qs3.training.loop import EpochCallback
 from qs3.training.overlap import seen_clouds
+from qs3.training.prepared import Prepared, prepare_clouds
 from qs3.training.progress import Deadline
 from qs3.training.run import (
     RUN,
@@ -56,12 +56,12 @@ class FitResult:
     """Networks along the way, with what each validator says of them."""
     adapted: bool
     """Whether the target had a part in the weights or in the choice of the network."""
-    source: PointClouds
-    """What was trained on, prepared: the source without its held-out part."""
-    holdout: PointClouds | None
-    """The held-out part of the source, prepared; None where there is none."""
-    target: UnlabelledClouds | None
-    """The target, prepared."""
+    source: Prepared[PointClouds]
+    """What was trained on: the source without its held-out part."""
+    holdout: Prepared[PointClouds] | None
+    """The held-out part of the source; None where there is none."""
+    target: Prepared[UnlabelledClouds] | None
+    """The target."""
 
 
 def fit(
@@ -141,29 +141,31 @@ def fit(
     held = held_out_rows(source.labels[scans], settings)[rows]  # a scan's clouds stay together
     has_holdout = unseen and bool(held.any())
     _require_judges(settings, rounds_settings, target, has_holdout)
-    job = Job(base, source, None, target, settings, rounds_settings, run_dir, warm_up)
     # What cannot be made must not leave a folder behind that refuses the corrected call.
-    trial, device = make_method(fresh_model(job), job), make_fabric(settings)
+    model = fresh_model(base, settings, len(source.class_names))
+    trial, device = make_method(base, model, settings), make_fabric(settings)
     history = History(run_dir, tensorboard)
     wanted = RunSettings.of(method, source, target, settings, rounds_settings, weights)
     step = partial(trial_step, trial, len(source.class_names), settings, device)
     with claim_run(run_dir, wanted, partial(choose_threads, settings, step=step)) as claimed:
         count = claimed.threads or 1
         settings = replace(settings, threads=count)
-        chosen = subsample(source.points, settings.num_points, run_dir)
-        source_clouds, source_shapes = seen_clouds(chosen, source.points)
+        how = settings.num_points, settings.preparation, run_dir
+        prepared, prepared_target = prepare_clouds(source, *how), None
+        source_clouds, source_shapes = seen_clouds(prepared)
         target_clouds, target_shapes = (), ()
-        prepared, prepared_target = replace(source, points=unit_ball(chosen)), None
         if target is not None:
-            chosen = subsample(target.points, settings.num_points, run_dir)
-            target_clouds, target_shapes = seen_clouds(chosen, target.points)
-            prepared_target = replace(target, points=unit_ball(chosen))
-        job = replace(
-            job,
-            source=prepared.select(~held),
-            holdout=prepared.select(held) if has_holdout else None,
-            target=prepared_target,
-            settings=settings,
+            prepared_target = prepare_clouds(target, *how)
+            target_clouds, target_shapes = seen_clouds(prepared_target)
+        job = Job(
+            base,
+            prepared.select(~held),
+            prepared.select(held) if has_holdout else None,
+            prepared_target,
+            settings,
+            rounds_settings,
+            run_dir,
+            warm_up,
         )
         with (
             threads(count),
@@ -262,21 +264,21 @@ def _check_warm_up(
     folder: Path, base: str, source: PointClouds, settings: TrainSettings
 ) -> tuple[str, bool]:
     """Return the checksum of a warm-up's weights, and whether the held-out part is new to it."""
-    model, class_names, its = load_model(folder)
+    model, class_names, its, _ = load_model(folder)
     if class_names != source.class_names:
         raise InputError(
             f"{folder}: its classes ({', '.join(class_names)}) are not those of the source "
             f"({', '.join(source.class_names)})"
         )
     ours, trained = unstructure(settings), its.get("train", {})
-    names = ["model", "model_settings", "num_points"]
+    names = ["model", "model_settings", "num_points", "preparation"]
     names += ["method_settings"] if "method_settings" in trained else []
-    for name in names:
-        if trained.get(name) != ours[name]:
-            raise InputError(
-                f"{folder}: trained with {name} = {trained.get(name)!r}, not {ours[name]!r}; use "
-                "the same setting"
-            )
+    theirs, wanted = ({name: one.get(name) for name in names} for one in (trained, ours))
+    if difference := first_difference(theirs, wanted):
+        name, old, new = difference
+        raise InputError(
+            f"{folder}: trained with {name} = {old!r}, not {new!r}; use the same setting"
+        )
     if its.get("self_training") is not None:
         raise InputError(f"{folder}: is self-trained itself; name the run before its rounds")
     method = its.get("method", base)

@@ -17,6 +17,7 @@ from qs3.training.checkpoint import derived_seed, load_model, new_model, save_mo
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.history import EpochRecord, History
 from qs3.training.loop import EpochCallback, train
+from qs3.training.prepared import Prepared
 from qs3.training.progress import Deadline
 from qs3.training.self_training import RoundCallback, RoundRecord, run_rounds
 from qs3.training.validation import ROUND, Validation, choose, load_checkpoint, read_checkpoints
@@ -30,12 +31,12 @@ class Job:
 
     method: str
     """Method of the training, or of the warm-up before self-training."""
-    source: PointClouds
-    """Labelled clouds to train on, prepared."""
-    holdout: PointClouds | None
-    """Labelled clouds of the source for the validators, prepared."""
-    target: UnlabelledClouds | None
-    """Clouds of the target, prepared; None where there are none."""
+    source: Prepared[PointClouds]
+    """Labelled clouds to train on."""
+    holdout: Prepared[PointClouds] | None
+    """Labelled clouds of the source for the validators."""
+    target: Prepared[UnlabelledClouds] | None
+    """Clouds of the target; None where there are none."""
     settings: TrainSettings
     """How to train."""
     rounds: SelfTrainingSettings | None
@@ -46,13 +47,12 @@ class Job:
     """Run whose network takes the place of a training on the source."""
 
 
-def make_method(model: PointClassifier, job: Job) -> Method:
+def make_method(name: str, model: PointClassifier, settings: TrainSettings) -> Method:
     """Return the method that trains the network; what else it trains is drawn from the seed."""
-    settings = job.settings
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derived_seed(settings.seed, 4))
         return create_method(
-            job.method,
+            name,
             model,
             label_smoothing=settings.label_smoothing,
             normalisation=settings.normalisation,
@@ -60,10 +60,9 @@ def make_method(model: PointClassifier, job: Job) -> Method:
         )
 
 
-def fresh_model(job: Job) -> PointClassifier:
+def fresh_model(method: str, settings: TrainSettings, count: int) -> PointClassifier:
     """Return the network with the weights that a training begins with."""
-    seed = derived_seed(job.settings.seed, 0)
-    return new_model_for(job.method, job.settings, len(job.source.class_names), seed)
+    return new_model_for(method, settings, count, derived_seed(settings.seed, 0))
 
 
 def new_model_for(method: str, settings: TrainSettings, count: int, seed: int) -> PointClassifier:
@@ -112,7 +111,8 @@ def run_job(
     else:
         stage = job.method if job.rounds is None else WARM_UP
         folder = job.run_dir if job.rounds is None else job.run_dir / WARM_UP
-        method = make_method(fresh_model(job), job)
+        fresh = fresh_model(job.method, job.settings, len(job.source.class_names))
+        method = make_method(job.method, fresh, job.settings)
         epochs, _ = train(
             method,
             job.source,

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +27,13 @@ from qs3.training.checkpoint import load_optimiser, optimiser_tensors, seed_sequ
 from qs3.training.config import TrainSettings
 from qs3.training.distributed import make_equal, make_fabric
 from qs3.training.history import EpochRecord, Log
+from qs3.training.prepared import Prepared, as_prepared
 from qs3.training.progress import Deadline, Progress, TimeUpError
 from qs3.training.schedules import cosine, plateau
 from qs3.training.state import TrainingState, averaged, make_average
+
+Labelled = PointClouds | Prepared[PointClouds]
+"""Labelled clouds, as read or prepared."""
 
 EpochCallback = Callable[[EpochRecord, Method], None]
 """Called after each epoch; an exception ends the training, which then resumes after this epoch."""
@@ -40,8 +45,8 @@ Observer = Callable[[Method, int], None]
 
 def train(
     method: Method,
-    source: PointClouds | Sequence[PointClouds],
-    target: UnlabelledClouds | None,
+    source: Labelled | Sequence[Labelled],
+    target: UnlabelledClouds | Prepared[UnlabelledClouds] | None,
     settings: TrainSettings,
     *,
     fabric: Fabric | None = None,
@@ -66,9 +71,9 @@ def train(
     Args:
         method: The method with its network; trained in place and left in training mode. With
             ``ema_decay`` it holds the moving average at the end.
-        source: Labelled clouds, prepared. Of several sets, each step takes a batch of each, and an
-            epoch is one pass over the first; the others begin anew when they end.
-        target: Clouds of the target, prepared; they are not looked at where the method does not
+        source: Labelled clouds, as read or prepared. Of several sets, each step takes a batch of
+            each, and an epoch is one pass over the first; the others begin anew when they end.
+        target: Clouds of the target, likewise; they are not looked at where the method does not
             use them. An epoch is one pass over the source or the target, whichever is longer.
         settings: How to train.
         fabric: Devices and number format; made from the settings where it is not given.
@@ -97,7 +102,11 @@ def train(
     fabric = fabric or make_fabric(settings)
     share = Share(fabric.global_rank, fabric.world_size)
     least = 2 * share.world
-    sets = [source] if isinstance(source, PointClouds) else list(source)
+    ready = partial(as_prepared, settings=settings)
+    sets = [
+        ready(clouds)
+        for clouds in ([source] if isinstance(source, PointClouds | Prepared) else source)
+    ]
     for clouds in sets:
         if len(clouds) < least:
             raise InputError(f"{len(clouds)} clouds are too few to train on; give at least {least}")
@@ -120,7 +129,7 @@ def train(
     if log is not None:
         log(history)
     labelled = [DeviceClouds(clouds, fabric.device) for clouds in sets]
-    unlabelled = None if target is None else DeviceClouds(target, fabric.device)
+    unlabelled = None if target is None else DeviceClouds(ready(target), fabric.device)
 
     # A target of a single cloud goes in twice, each time with another augmentation.
     drawn_from = 0 if target is None else max(len(target), least)

@@ -1,6 +1,6 @@
 """Which clouds a run has seen: by their bytes, and by their shape where they were written anew."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -9,6 +9,7 @@ from jaxtyping import Float
 from qs3.errors import InputError
 from qs3.io.clouds import digests
 from qs3.io.preparation import unit_ball
+from qs3.training.prepared import Prepared
 from qs3.training.run import Run
 
 TOLERANCE = 1e-3
@@ -20,7 +21,7 @@ _UNIT = 1e-4
 _MOMENTS = [axes for k in (2, 3) for axes in combinations_with_replacement(range(3), k)]
 
 
-def shapes(points: Float[np.ndarray, "b n 3"]) -> list[str]:
+def shapes(points: Iterable[Float[np.ndarray, "n 3"]]) -> list[str]:
     """Describe clouds by what stays when they are written anew: moments of second and third order.
 
     They are taken about the mean, in units of the root mean square distance from there: order,
@@ -42,34 +43,36 @@ def shapes(points: Float[np.ndarray, "b n 3"]) -> list[str]:
     return texts
 
 
-def seen_clouds(
-    chosen: Float[np.ndarray, "b m 3"], whole: Float[np.ndarray, "b n 3"]
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def seen_clouds(prepared: Prepared) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return checksums and shapes of clouds that a network gets to see, for its ``run.json``.
 
-    Args:
-        chosen: The points that the network gets.
-        whole: The clouds as read.
+    Their shapes are those of what it gets and, where that is less, of the clouds as read.
     """
-    return tuple(digests(chosen)), tuple(dict.fromkeys(_both_shapes(chosen, whole)))
+    checksums = tuple(text for block in prepared.blocks() for text in digests(block))
+    return checksums, tuple(dict.fromkeys(_both_shapes(prepared)))
 
 
-def _both_shapes(chosen: np.ndarray, whole: np.ndarray) -> list[str]:
-    return shapes(chosen) if whole is chosen else [*shapes(chosen), *shapes(whole)]
+def _both_shapes(prepared: Prepared) -> list[str]:
+    texts = [text for block in prepared.blocks() for text in shapes(block)]
+    if prepared.order is not None:
+        texts += shapes(prepared.clouds.points[row] for row in prepared.rows)
+    return texts
 
 
-def caveats(
-    run: Run, chosen: Float[np.ndarray, "b m 3"], whole: Float[np.ndarray, "b n 3"] | None = None
-) -> tuple[str, ...]:
+def caveats(run: Run, prepared: Prepared) -> tuple[str, ...]:
     """Caveats of a score: which of the tested clouds the run has seen.
 
     Args:
         run: The run.
-        chosen: The points that the network gets.
-        whole: The clouds as read, where these are more.
+        prepared: The tested clouds.
     """
-    checksums = {*digests(chosen), *digests(unit_ball(chosen))}
-    texts = _both_shapes(chosen, chosen if whole is None else whole)
+    checksums = {
+        text
+        for block in prepared.blocks()
+        for points in (block, unit_ball(block))
+        for text in digests(points)
+    }
+    texts = _both_shapes(prepared)
 
     def has_seen(clouds: Collection[str], known: Sequence[str]) -> bool:
         return not checksums.isdisjoint(clouds) or _near(known, texts, run)

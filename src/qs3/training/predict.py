@@ -8,9 +8,13 @@ import torch
 from jaxtyping import Float
 from lightning_fabric import Fabric
 
+from qs3.io.clouds import UnlabelledClouds, numbered
+from qs3.io.preparation import PAPER, Preparation
 from qs3.models import PointClassifier
-from qs3.training.batches import prepare, require_finite
+from qs3.training.batches import require_finite
+from qs3.training.checkpoint import LoadedModel
 from qs3.training.distributed import gather_rows
+from qs3.training.prepared import Prepared, prepare_clouds
 
 
 class Description(NamedTuple):
@@ -23,19 +27,23 @@ class Description(NamedTuple):
 
 
 def predict_probabilities(
-    model: PointClassifier,
+    model: PointClassifier | LoadedModel,
     points: Float[np.ndarray, "b n 3"],
     *,
     num_points: int | None = None,
+    preparation: Preparation | None = None,
     batch_size: int = 32,
     fabric: Fabric | None = None,
 ) -> Float[np.ndarray, "b k"]:
     """Predict the class probabilities of clouds, without augmentation.
 
     Args:
-        model: The network; its mode is put back afterwards, its device stays.
-        points: Clouds as read; they are brought to the unit ball here.
-        num_points: Points a cloud, by farthest point sampling; None takes all.
+        model: The network, or what `qs3.training.load_model` gave, which knows how it was trained;
+            its mode is put back afterwards, its device stays.
+        points: Clouds as read.
+        num_points: Points a cloud, by farthest point sampling; None takes the loaded network's, or
+            all.
+        preparation: What is done to the clouds; None takes the loaded network's, or the unit ball.
         batch_size: Clouds in a forward pass. It does not change the result but for rounding.
         fabric: Number format, and devices that share the clouds: all must call, all get the same.
             Single precision on one device where it is not given.
@@ -52,15 +60,19 @@ def predict_probabilities(
         >>> predict_probabilities(create_model("pointnet", 4), points, num_points=16).shape
         (3, 4)
     """
+    if isinstance(model, LoadedModel):
+        num_points, preparation = num_points or model.num_points, preparation or model.preparation
+        model = model.model
+    clouds = UnlabelledClouds(points, numbered(len(points)))
     require_finite(points, [str(row) for row in range(len(points))])
-    prepared = prepare(points, points.shape[1] if num_points is None else num_points)
+    prepared = prepare_clouds(clouds, num_points or points.shape[1], preparation or PAPER)
     return describe(model, prepared, batch_size=batch_size, fabric=fabric).probabilities
 
 
 @torch.no_grad()
 def describe(
     model: PointClassifier,
-    points: Float[np.ndarray, "b n 3"],
+    points: Float[np.ndarray, "b n 3"] | Prepared,
     *,
     batch_size: int = 32,
     fabric: Fabric | None = None,

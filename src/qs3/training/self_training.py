@@ -33,7 +33,8 @@ from qs3.training.distributed import make_fabric
 from qs3.training.history import EpochRecord, History
 from qs3.training.loop import EpochCallback, train
 from qs3.training.overlap import seen_clouds
-from qs3.training.predict import Description, describe, predict_probabilities
+from qs3.training.predict import Description, describe
+from qs3.training.prepared import Prepared, as_prepared, label_clouds
 from qs3.training.progress import Deadline
 from qs3.training.rounds import RoundRecord, Rounds, begin_rounds, write_rounds
 from qs3.training.rules import Select, make_rule
@@ -56,12 +57,12 @@ Look = Callable[[int, PointClassifier], None]
 
 def self_train(
     model: PointClassifier,
-    source: PointClouds,
-    target: UnlabelledClouds,
+    source: PointClouds | Prepared[PointClouds],
+    target: UnlabelledClouds | Prepared[UnlabelledClouds],
     settings: TrainSettings,
     self_training: SelfTrainingSettings,
     *,
-    holdout: PointClouds | None = None,
+    holdout: PointClouds | Prepared[PointClouds] | None = None,
     select: Select | None = None,
     fabric: Fabric | None = None,
     run_dir: Path | None = None,
@@ -75,9 +76,9 @@ def self_train(
 
     Args:
         model: The warm-up network Φ₀; it is not changed.
-        source: Labelled clouds, prepared by `qs3.training.batches.prepare`. Their labels are used
-            where ``source_loss`` is set; their class names always.
-        target: Clouds without labels, prepared.
+        source: Labelled clouds, as read or prepared. Their labels are used where ``source_loss`` is
+            set; their class names always.
+        target: Clouds without labels, likewise.
         settings: Network, batch size, rate, augmentation, seed. Its epochs are not used.
         self_training: Settings of the rounds.
         holdout: Part of the source that is not trained on, for an estimate of the class shares.
@@ -95,7 +96,10 @@ def self_train(
         InputError: where the target is empty, its points are not finite, or the folder holds
             another run.
     """
-    require_unlabelled(target)
+    source, target = as_prepared(source, settings), as_prepared(target, settings)
+    require_unlabelled(target.clouds)
+    if holdout is not None:
+        holdout = as_prepared(holdout, settings)
     fabric = fabric or make_fabric(settings)
     with contextlib.ExitStack() as stack:
         choose = partial(choose_threads, settings, step=None)
@@ -103,7 +107,8 @@ def self_train(
             count = choose(None)
         else:
             run_dir, method = Path(run_dir), self_training.rule
-            given = source, target, settings, self_training, weights_fingerprint(model)
+            given = source.clouds, target.clouds, settings, self_training
+            given = *given, weights_fingerprint(model)
             claimed = claim_run(run_dir, RunSettings.of(method, *given), choose)
             count = stack.enter_context(claimed).threads or 1
         stack.enter_context(threads(count))
@@ -122,13 +127,13 @@ def self_train(
         )
         if run_dir is not None:
             save_model(run_dir, adapted, source.class_names, settings)
-            source_clouds, source_shapes = seen_clouds(source.points, source.points)
-            target_clouds, target_shapes = seen_clouds(target.points, target.points)
+            source_clouds, source_shapes = seen_clouds(source)
+            target_clouds, target_shapes = seen_clouds(target)
             run = Run(
                 method=self_training.rule,
                 selection="last",
-                source=data_record(source),
-                target=data_record(target),
+                source=data_record(source.clouds),
+                target=data_record(target.clouds),
                 source_clouds=source_clouds,
                 source_shapes=source_shapes,
                 target_clouds=target_clouds,
@@ -145,13 +150,13 @@ def self_train(
 
 def run_rounds(
     model: PointClassifier,
-    source: PointClouds,
-    target: UnlabelledClouds,
+    source: Prepared[PointClouds],
+    target: Prepared[UnlabelledClouds],
     settings: TrainSettings,
     rounds: SelfTrainingSettings,
     fabric: Fabric,
     *,
-    holdout: PointClouds | None = None,
+    holdout: Prepared[PointClouds] | None = None,
     select: Select | None = None,
     run_dir: Path | None = None,
     look: Look | None = None,
@@ -169,7 +174,7 @@ def run_rounds(
     """
     if not len(target):
         raise InputError("the target has no cloud; give unlabelled clouds")
-    require_finite(target.points, target.ids, "target: ")
+    require_finite(target.clouds.points, target.clouds.ids, "target: ")
     path = None if run_dir is None else Path(run_dir) / STATE
     state = begin_rounds(model, len(target), rounds, fabric, path)
     classes = len(source.class_names)
@@ -182,7 +187,7 @@ def run_rounds(
         theta = rounds.threshold + (number - 1) * rounds.step if rounds.rule != "quantile" else 0.0
 
         # Line 3: label the target.
-        probabilities = _label(say(state, target.points), rounds)
+        probabilities = _label(say(state, target), rounds)
         labels = probabilities.argmax(axis=1)
 
         # Lines 4 to 17: select.
@@ -191,7 +196,7 @@ def run_rounds(
         if select is None:
             held = None
             if holdout is not None and len(holdout) and rounds.prior == "bbse":
-                held = holdout.labels, say(state, holdout.points).probabilities
+                held = holdout.labels, say(state, holdout).probabilities
             rule = make_rule(rounds, number, source.labels, held)
         else:
             rule = select
@@ -257,18 +262,18 @@ def run_rounds(
 
 def _say(
     state: Rounds,
-    points: np.ndarray,
+    clouds: Prepared,
     settings: TrainSettings,
     rounds: SelfTrainingSettings,
-    target: UnlabelledClouds,
+    target: Prepared[UnlabelledClouds],
     fabric: Fabric,
 ) -> Description:
     """What the teacher says of clouds."""
     teacher = state.latest if state.best is None else state.best.model
     if settings.normalisation == "adabn":
         teacher = copy.deepcopy(teacher)  # training goes on from the statistics of both domains
-        adapt_statistics(teacher, target.points, settings.batch_size)
-    return describe(teacher, points, batch_size=settings.batch_size, fabric=fabric)
+        adapt_statistics(teacher, target, settings.batch_size)
+    return describe(teacher, clouds, batch_size=settings.batch_size, fabric=fabric)
 
 
 def _label(said: Description, rounds: SelfTrainingSettings) -> Float[np.ndarray, "m k"]:
@@ -295,21 +300,15 @@ def _train_round(
     chosen: Int[np.ndarray, "c"],
     labels: Int[np.ndarray, "c"],
     apart: Bool[np.ndarray, "c"],
-    source: PointClouds,
-    target: UnlabelledClouds,
+    source: Prepared[PointClouds],
+    target: Prepared[UnlabelledClouds],
     settings: TrainSettings,
     rounds: SelfTrainingSettings,
     fabric: Fabric,
     train: Callable[..., tuple[list[EpochRecord], dict[str, Tensor]]],
 ) -> list[EpochRecord]:
     """Train the latest network on pseudo labels; the clouds ``apart`` judge the best teacher."""
-    rows = chosen[~apart]
-    pseudo = PointClouds(
-        points=target.points[rows],
-        labels=labels[~apart].astype(np.int64),
-        class_names=source.class_names,
-        ids=tuple(target.ids[row] for row in rows),
-    )
+    pseudo = label_clouds(target, chosen, labels, source.class_names).select(~apart)
     before = sum(not record.skipped for record in state.records)
     if before == 0 and rounds.init == "scratch":
         seed = derived_seed(settings.seed, STREAM, 0)
@@ -334,13 +333,9 @@ def _train_round(
         if best is None or not apart.any():
             return
         with method.norm.of("target"):
-            probabilities = predict_probabilities(
-                method.model,
-                target.points[chosen[apart]],
-                batch_size=settings.batch_size,
-                fabric=fabric,
-            )
-            score = accuracy(labels[apart], probabilities.argmax(axis=1))
+            judged = target.select(chosen[apart])
+            said = describe(method.model, judged, batch_size=settings.batch_size, fabric=fabric)
+            score = accuracy(labels[apart], said.probabilities.argmax(axis=1))
             if score > best.score:
                 best.score.fill_(score)
                 best.model.load_state_dict(method.model.state_dict())

@@ -26,6 +26,7 @@ from qs3.training.checkpoint import (
 )
 from qs3.training.config import TrainSettings
 from qs3.training.predict import Description, describe
+from qs3.training.prepared import Prepared
 
 _LOG = logging.getLogger(__name__)
 CHECKPOINTS = "checkpoints"
@@ -54,9 +55,9 @@ class Validation:
 
     Args:
         run_dir: Folder of the run; weights go to ``checkpoints/`` there.
-        source: The part of the source that is trained on, prepared.
-        holdout: The part that is not, prepared; None where there is none.
-        target: Clouds without labels, prepared; None where there are none.
+        source: The part of the source that is trained on.
+        holdout: The part that is not; None where there is none.
+        target: Clouds without labels; None where there are none.
         settings: How often to look, and whose normalisation counts.
         fabric: The devices; all must call.
     """
@@ -64,9 +65,9 @@ class Validation:
     def __init__(
         self,
         run_dir: Path,
-        source: PointClouds,
-        holdout: PointClouds | None,
-        target: UnlabelledClouds | None,
+        source: Prepared[PointClouds],
+        holdout: Prepared[PointClouds] | None,
+        target: Prepared[UnlabelledClouds] | None,
         settings: TrainSettings,
         fabric: Fabric,
     ) -> None:
@@ -93,9 +94,7 @@ class Validation:
         target, holdout, source = (
             None
             if clouds is None or not len(clouds)
-            else describe(
-                model, clouds.points, batch_size=self.settings.batch_size, fabric=self.fabric
-            )
+            else describe(model, clouds, batch_size=self.settings.batch_size, fabric=self.fabric)
             for clouds in (self.target, self.holdout, self.source)
         )
         if self.fabric.is_global_zero:
@@ -134,11 +133,13 @@ class Validation:
     def adapt(self, model: PointClassifier) -> None:
         """Compute batch statistics anew over the target where the settings ask for AdaBN."""
         if self.settings.normalisation == "adabn" and self.target is not None:
-            adapt_statistics(model, self.target.points, self.settings.batch_size)
+            adapt_statistics(model, self.target, self.settings.batch_size)
 
 
 @torch.no_grad()
-def adapt_statistics(model: PointClassifier, points: np.ndarray, batch_size: int = 32) -> None:
+def adapt_statistics(
+    model: PointClassifier, points: np.ndarray | Prepared, batch_size: int = 32
+) -> None:
     """Compute the running statistics of batch normalisation anew over clouds (AdaBN).
 
     Each layer's mean and variance become the averages over the batches, all of the same weight

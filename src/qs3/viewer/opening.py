@@ -91,7 +91,7 @@ def _open_run(
 ) -> tuple[Exhibits, Answers]:
     from tqdm import tqdm
 
-    from qs3.training import load_model, predict_probabilities
+    from qs3.training import load_model, load_whole, predict_probabilities
 
     if data is None:
         raise InputError(f"{run}: is a run; name the clouds to predict on with --data")
@@ -100,9 +100,10 @@ def _open_run(
         points = int(loaded.settings["train"]["num_points"])
     except (KeyError, TypeError, ValueError):
         raise InputError(f"{run}: not a finished run of qs3 train (no num_points in it)") from None
-    clouds = _read(data, split, num_points=points, cloud=cloud, class_names=loaded.class_names)
+    part = {"split": split, "cloud": cloud, "class_names": loaded.class_names}
+    clouds = load_whole(_read, data, points, **part)
     starts = tqdm(range(0, len(clouds), 32), "predict", unit="batch", disable=None)
-    shares = [predict_probabilities(loaded.model, clouds.points[i : i + 32]) for i in starts]
+    shares = [predict_probabilities(loaded, clouds.points[i : i + 32]) for i in starts]
     truth = clouds.labels if isinstance(clouds, PointClouds) else None
     answers = Answers(np.concatenate(shares), loaded.class_names, truth, cloud)
     if _is_store(data):

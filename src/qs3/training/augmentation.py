@@ -1,0 +1,349 @@
+"""What a scan loses and gains, imitated on whole batches of clouds.
+
+The pure functions take what is drawn; `augment_clouds` draws it. Nothing depends on a cloud's unit:
+lengths are relative to its robust box. The vertical is z.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from qs3.training.config import Augmentation
+
+_OUTSIDE = 0.01
+"""Share of the points beyond each side of the robust box."""
+_MARGIN = 0.4
+"""What a crop leaves beside the object, in radii: slabs reach at most so far beyond its box."""
+_GAP = 0.2
+"""Largest distance of a wall or neighbour from the box, in radii."""
+_THICKNESS = 0.02
+"""Thickness of a slab, in radii."""
+
+
+class Box(NamedTuple):
+    """The axis-parallel box about the middle 98 % of each cloud's coordinates."""
+
+    low: Float[Tensor, "b 1 3"]
+    """Its lower corner."""
+    high: Float[Tensor, "b 1 3"]
+    """Its upper corner."""
+
+    @property
+    def centre(self) -> Float[Tensor, "b 1 3"]:
+        """The middle."""
+        return (self.low + self.high) / 2
+
+    @property
+    def radius(self) -> Float[Tensor, "b 1 1"]:
+        """Half the diagonal, the unit of all lengths."""
+        return (self.high - self.low).norm(dim=2, keepdim=True) / 2
+
+
+def robust_box(points: Float[Tensor, "b n 3"]) -> Box:
+    """Return the box that single strays cannot move."""
+    ordered, beyond = points.sort(dim=1).values, int(_OUTSIDE * points.shape[1])
+    return Box(ordered[:, beyond, None], ordered[:, points.shape[1] - 1 - beyond, None])
+
+
+def lose_highest(
+    kept: Bool[Tensor, "b n"],
+    score: Float[Tensor, "b n"],
+    count: Int[Tensor, "b 1"],
+    least: float,
+) -> Bool[Tensor, "b n"]:
+    """Return which points are still kept after those of the highest score are lost.
+
+    Args:
+        kept: Points that are there.
+        score: What orders them.
+        count: How many of each cloud go.
+        least: Share of all points that stays; fewer go where it would be touched.
+    """
+    left = kept.sum(dim=1, keepdim=True) - math.ceil(least * kept.shape[1])
+    order = score.masked_fill(~kept, -torch.inf).argsort(dim=1, descending=True, stable=True)
+    place = torch.arange(kept.shape[1], device=kept.device)
+    lost = torch.zeros_like(kept).scatter(1, order, place < torch.minimum(count, left))
+    return kept & ~lost
+
+
+def beyond_plane(
+    points: Float[Tensor, "b n 3"], normal: Float[Tensor, "b 1 3"]
+) -> Float[Tensor, "b n"]:
+    """Score points by their place along a plane's normal: the highest lie farthest behind it."""
+    return (points * normal).sum(dim=2)
+
+
+def outside_cone(
+    points: Float[Tensor, "b n 3"], camera: Float[Tensor, "b 1 3"], aim: Float[Tensor, "b 1 3"]
+) -> Float[Tensor, "b n"]:
+    """Score points by the angle between their ray from the camera and its axis, as −cosine."""
+    return -torch.cosine_similarity(points - camera, aim - camera, dim=2)
+
+
+def near_patch(
+    points: Float[Tensor, "b n 3"], centres: Float[Tensor, "b k 3"]
+) -> Float[Tensor, "b n"]:
+    """Score points by how near the nearest of the centres is: −distance."""
+    exact = "donot_use_mm_for_euclid_dist"
+    return -torch.cdist(points, centres, compute_mode=exact).amin(dim=2)
+
+
+def stretched(
+    points: Float[Tensor, "b n 3"], centre: Float[Tensor, "b 1 3"], factor: Float[Tensor, "b 1 3"]
+) -> Float[Tensor, "b n 3"]:
+    """Stretch each axis by a factor, about the centre; factor 1 changes no bit."""
+    return points + (factor - 1) * (points - centre)
+
+
+def turned(points: Float[Tensor, "b n 3"], angle: Float[Tensor, "b 1"]) -> Float[Tensor, "b n 3"]:
+    """Turn clouds about z.
+
+    Convention:
+        Anticlockwise seen from above, as `qs3.geometry.rotation_z`; radians.
+    """
+    c, s = angle.cos(), angle.sin()
+    x, y, z = points.unbind(2)
+    return torch.stack([c * x - s * y, s * x + c * y, z], dim=2)
+
+
+def tilted(
+    points: Float[Tensor, "b n 3"],
+    centre: Float[Tensor, "b 1 3"],
+    heading: Float[Tensor, "b 1"],
+    angle: Float[Tensor, "b 1"],
+) -> Float[Tensor, "b n 3"]:
+    """Rotate clouds about a horizontal axis through the centre; angle 0 changes no bit.
+
+    Convention:
+        Right-handed about (cos h, sin h, 0), by Rodrigues' formula; radians.
+    """
+    axis = _horizontal(heading).expand_as(points)
+    across = torch.linalg.cross(axis, points - centre)
+    along = torch.linalg.cross(axis, across)
+    return points + angle.sin()[:, None] * across + (1 - angle.cos())[:, None] * along
+
+
+def slab(
+    box: Box,
+    axis: Int[Tensor, "b 1"],
+    upper: Bool[Tensor, "b 1"],
+    gap: Float[Tensor, "b 1"],
+    edges: Float[Tensor, "b 2 3"],
+    uniform: Float[Tensor, "b n 3"],
+) -> Float[Tensor, "b n 3"]:
+    """Return points of a slab along a face of the box, reaching a margin beyond its edges.
+
+    Args:
+        box: The clouds' boxes.
+        axis: Which coordinate the slab bounds: 0 and 1 for a wall, 2 for floor.
+        upper: Whether it lies on the upper side.
+        gap: Its distance from the face, in radii.
+        edges: In 0 to 1, how much of the lower and upper half of the box it leaves free.
+        uniform: In 0 to 1, where the points lie on what it covers.
+    """
+    margin = _MARGIN * box.radius * torch.ones_like(box.low)
+    low, high = box.low - margin, box.high + margin
+    low[..., 2] = box.low[..., 2]  # nothing lies beneath the floor
+    start, stop = edges[:, :1] / 2, 1 - edges[:, 1:] / 2
+    inside = low + (high - low) * (start + (stop - start) * uniform)
+    depth = box.radius * (gap[:, None] + _THICKNESS * uniform)
+    outside = torch.where(upper[:, None], box.high + depth, box.low - depth)
+    bounded = torch.arange(3, device=axis.device) == axis
+    return torch.where(bounded[:, None], outside, inside)
+
+
+def piece_beside(
+    box: Box,
+    others: Float[Tensor, "b n 3"],
+    size: Float[Tensor, "b 1"],
+    turn: Float[Tensor, "b 1"],
+    heading: Float[Tensor, "b 1"],
+    aside: Float[Tensor, "b 1"],
+    gap: Float[Tensor, "b 1"],
+) -> Float[Tensor, "b n 3"]:
+    """Stand other clouds beside these, on the same floor; the nearest of their points come first.
+
+    Args:
+        box: Boxes of these clouds.
+        others: The other clouds.
+        size: Their radius then, in these clouds' radii.
+        turn: Angle by which they are turned about the vertical.
+        heading: Direction in which they stand, seen from above.
+        aside: Shift across that direction, in radii.
+        gap: Distance to the box along that direction, in radii.
+    """
+    theirs = robust_box(others)
+    scale = size[:, None] * box.radius / theirs.radius.clamp_min(torch.finfo(others.dtype).tiny)
+    piece = turned(scale * (others - theirs.centre), turn)
+    ahead, across = _horizontal(heading), _horizontal(heading + torch.pi / 2)
+    progress = (piece * ahead).sum(dim=2)
+    order = progress.argsort(dim=1, stable=True)
+    near = progress.gather(1, order)[:, int(_OUTSIDE * piece.shape[1]), None, None]
+    reach = ((box.high - box.low) / 2 * ahead.abs()).sum(dim=2, keepdim=True)
+    distance = reach + gap[:, None] * box.radius - near
+    place = box.centre + distance * ahead + aside[:, None] * box.radius * across
+    foot = box.low + scale * (theirs.high - theirs.low) / 2
+    place = torch.cat([place[..., :2], foot[..., 2:]], dim=2)
+    return piece.gather(1, order[..., None].expand_as(piece)) + place
+
+
+def replaced(
+    points: Float[Tensor, "b n 3"],
+    kept: Bool[Tensor, "b n"],
+    substitutes: Float[Tensor, "b n 3"],
+    share: Float[Tensor, "b 1"],
+    uniform: Float[Tensor, "b n"],
+) -> Float[Tensor, "b n 3"]:
+    """Put the first substitutes in the place of random points, a share of those that are kept.
+
+    Args:
+        points: Clouds.
+        kept: Points that may be replaced.
+        substitutes: What takes their place, in this order.
+        share: Share of each cloud's kept points, rounded down.
+        uniform: In 0 to 1; the points where it is highest go.
+    """
+    count = (share * kept.sum(dim=1, keepdim=True)).long()
+    order = uniform.masked_fill(~kept, -1).argsort(dim=1, descending=True, stable=True)
+    new = torch.arange(kept.shape[1], device=kept.device) < count
+    places = order[..., None].expand_as(points)
+    return points.scatter(
+        1, places, torch.where(new[..., None], substitutes, points.gather(1, places))
+    )
+
+
+def _horizontal(heading: Float[Tensor, "b 1"]) -> Float[Tensor, "b 1 3"]:
+    return torch.stack([heading.cos(), heading.sin(), torch.zeros_like(heading)], dim=2)
+
+
+@dataclass(frozen=True)
+class _Draws:
+    """Random numbers of a batch."""
+
+    like: Float[Tensor, "b n 3"]
+    generator: torch.Generator
+
+    def uniform(self, *shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
+        """Numbers [b …] from low to high."""
+        size, device, dtype = (len(self.like), *shape), self.like.device, self.like.dtype
+        drawn = torch.rand(size, generator=self.generator, device=device, dtype=dtype)
+        return low + (high - low) * drawn
+
+    def normal(self, *shape: int) -> Tensor:
+        """Standard normal numbers [b …]."""
+        size, device, dtype = (len(self.like), *shape), self.like.device, self.like.dtype
+        return torch.randn(size, generator=self.generator, device=device, dtype=dtype)
+
+    def angle(self) -> Float[Tensor, "b 1"]:
+        """Angles of the whole circle."""
+        return self.uniform(1, high=2 * math.pi)
+
+    def strength(self, probability: float, most: float) -> Float[Tensor, "b 1"]:
+        """Strengths up to the greatest; 0 for the clouds that are spared."""
+        return most * self.uniform(1) * (self.uniform(1) < probability)
+
+
+def augment_clouds(
+    points: Float[Tensor, "b n 3"], settings: Augmentation, generator: torch.Generator
+) -> tuple[Float[Tensor, "b n 3"], Bool[Tensor, "b n"]]:
+    """Imitate on a whole batch what a scan does to its clouds.
+
+    Several devices that share a batch each do it to all of it, with generators alike, and take
+    their part of the result: a neighbour is another cloud of the batch.
+
+    Args:
+        points: Clouds, on any device, in any unit, z up, before they are turned and normalised.
+        settings: What is done, how often and how strongly.
+        generator: Source of all draws, on the device of the points. What is off draws nothing.
+
+    Returns:
+        The points, and which of them the scan would have kept.
+    """
+    kept = torch.ones_like(points[..., 0], dtype=torch.bool)
+    if settings == Augmentation():
+        return points, kept
+    draw, box = _Draws(points, generator), robust_box(points)
+    if settings.stretch > 0:
+        span = math.log(settings.stretch_factor) * (draw.uniform(1, 1) < settings.stretch)
+        factor, centre = (span * draw.uniform(1, 3, low=-1.0)).exp(), box.centre
+        points = stretched(points, centre, factor)
+        box = Box(*(stretched(corner, centre, factor) for corner in box))
+    kept = _cut(points, kept, box, settings, draw)
+    points = _clutter(points, kept, box, settings, draw)
+    if settings.tilt > 0:
+        angle = draw.strength(settings.tilt, settings.tilt_degrees).deg2rad()
+        points = tilted(points, box.centre, draw.angle(), angle)
+    if settings.noise > 0:
+        sigma = draw.strength(settings.noise, settings.noise_sigma)[..., None] * box.radius
+        points = points + sigma * draw.normal(*points.shape[1:])
+    return points, kept
+
+
+def _cut(
+    points: Float[Tensor, "b n 3"],
+    kept: Bool[Tensor, "b n"],
+    box: Box,
+    settings: Augmentation,
+    draw: _Draws,
+) -> Bool[Tensor, "b n"]:
+    n = points.shape[1]
+    if settings.plane > 0:
+        score = beyond_plane(points, draw.normal(1, 3))
+        count = (draw.strength(settings.plane, settings.plane_share) * n).long()
+        kept = lose_highest(kept, score, count, settings.least)
+    if settings.cone > 0:
+        level = draw.uniform(1, 1, high=math.pi / 3)
+        sight = level.cos() * _horizontal(draw.angle()) + level.sin() * points.new_tensor([0, 0, 1])
+        camera = box.centre + draw.uniform(1, 1, low=1.5, high=4.0) * box.radius * sight
+        score = outside_cone(points, camera, _take(points, draw.uniform(1)))
+        count = (draw.strength(settings.cone, settings.cone_share) * n).long()
+        kept = lose_highest(kept, score, count, settings.least)
+    if settings.patches > 0:
+        score = near_patch(points, _take(points, draw.uniform(settings.patch_count)))
+        size = draw.strength(settings.patches, settings.patch_radius) * box.radius[:, 0]
+        count = (kept & (-score < size)).sum(dim=1, keepdim=True)
+        kept = lose_highest(kept, score, count, settings.least)
+    return kept
+
+
+def _clutter(
+    points: Float[Tensor, "b n 3"],
+    kept: Bool[Tensor, "b n"],
+    box: Box,
+    settings: Augmentation,
+    draw: _Draws,
+) -> Float[Tensor, "b n 3"]:
+    b, n, _ = points.shape
+    never = torch.zeros_like(kept[:, :1])
+
+    def put(probability: float, new: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
+        share = draw.strength(probability, settings.clutter_share)
+        return replaced(points, kept, new, share, draw.uniform(n))
+
+    if settings.neighbour > 0:
+        step = 1 + (draw.uniform() * (b - 1)).long()
+        others = points[(torch.arange(b, device=points.device) + step) % b]
+        size, aside = draw.uniform(1, low=0.7, high=1.4), draw.uniform(1, low=-0.5, high=0.5)
+        gap = draw.uniform(1, high=_GAP)
+        piece = piece_beside(box, others, size, draw.angle(), draw.angle(), aside, gap)
+        points = put(settings.neighbour, piece)
+    if settings.wall > 0:
+        axis, upper = draw.uniform(1) < 0.5, draw.uniform(1) < 0.5
+        gap, edges = draw.uniform(1, high=_GAP), draw.uniform(2, 3)
+        wall = slab(box, axis.long(), upper, gap, edges, draw.uniform(n, 3))
+        points = put(settings.wall, wall)
+    if settings.floor > 0:
+        edges, gap = draw.uniform(2, 3), 0 * box.radius[:, 0]
+        floor = slab(box, never.long() + 2, never, gap, edges, draw.uniform(n, 3))
+        points = put(settings.floor, floor)
+    return points
+
+
+def _take(points: Float[Tensor, "b n 3"], uniform: Float[Tensor, "b k"]) -> Float[Tensor, "b k 3"]:
+    """Points of each cloud at places in 0 to 1."""
+    index = (uniform * points.shape[1]).long()
+    return points.gather(1, index[..., None].expand(-1, -1, 3))

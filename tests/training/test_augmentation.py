@@ -1,0 +1,294 @@
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from qs3.errors import InputError
+from qs3.structure import structure, unstructure
+from qs3.training import Augmentation, augment_clouds
+from qs3.training.augmentation import (
+    Box,
+    beyond_plane,
+    lose_highest,
+    near_patch,
+    outside_cone,
+    piece_beside,
+    replaced,
+    robust_box,
+    slab,
+    stretched,
+    tilted,
+)
+
+CHANCES = ("plane", "cone", "patches", "stretch", "tilt", "floor", "wall", "neighbour", "noise")
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.fixture
+def clouds():
+    """Six boxes of points, [6 400 3], of several sizes."""
+    drawn = torch.rand(6, 400, 3, generator=generator(), dtype=torch.float64)
+    sizes = torch.rand(6, 1, 3, generator=generator(1), dtype=torch.float64) + 0.3
+    return drawn * sizes
+
+
+def every(chance=1.0, **others):
+    return Augmentation(**dict.fromkeys(CHANCES, chance), **others)
+
+
+def test_off_changes_and_draws_nothing(clouds):
+    source = generator()
+    points, kept = augment_clouds(clouds, Augmentation(), source)
+    assert points is clouds
+    assert kept.all()
+    assert torch.equal(source.get_state(), generator().get_state())
+
+
+@pytest.mark.parametrize("name", CHANCES)
+def test_each_has_its_chance_per_cloud(name):
+    many = torch.rand(400, 120, 3, generator=generator())
+    some = replace(
+        Augmentation(), **{name: 0.3}, plane_share=1.0, cone_share=1.0, clutter_share=1.0
+    )
+    points, kept = augment_clouds(many, some, generator(3))
+    changed = ((points != many).any(dim=2) | ~kept).any(dim=1).float().mean()
+    assert 0.2 < changed < 0.4
+    assert points.shape == many.shape
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nothing_depends_on_the_unit_or_the_place(clouds, seed):
+    points, kept = augment_clouds(clouds, every(), generator(seed))
+    shift = torch.tensor([3.0, -7.0, 2.0], dtype=torch.float64)
+    moved, also = augment_clouds(1024 * clouds + shift, every(), generator(seed))
+    assert torch.equal(kept, also)
+    torch.testing.assert_close(moved, 1024 * points + shift, rtol=0, atol=1e-6)
+
+
+def test_the_least_share_is_always_kept(clouds):
+    for seed in range(20):
+        harsh = every(plane_share=1.0, cone_share=1.0, patch_radius=1.5, least=0.3)
+        points, kept = augment_clouds(clouds, harsh, generator(seed))
+        counts = kept.sum(dim=1)
+        assert (counts >= 120).all()
+        assert points.isfinite().all()
+    assert (counts == 120).any()  # the bound is what stops such harsh cuts
+
+
+def test_a_cloud_of_equal_points_stays_finite():
+    points, kept = augment_clouds(torch.ones(2, 30, 3), every(), generator())
+    assert points.isfinite().all()
+    assert (kept.sum(dim=1) >= 8).all()
+    alone, _ = augment_clouds(torch.rand(1, 3, 3), every(), generator())
+    assert alone.isfinite().all()
+
+
+def test_lost_are_the_highest_of_those_still_there():
+    kept = torch.tensor([[True, True, False, True, True], [True] * 5])
+    score = torch.tensor([[3.0, 1.0, 9.0, 5.0, 2.0], [0.0, 1.0, 2.0, 3.0, 4.0]])
+    left = lose_highest(kept, score, torch.tensor([[1], [4]]), 0.4)
+    assert left.tolist() == [[True, True, False, False, True], [True, True, False, False, False]]
+
+
+def test_a_plane_cuts_up_to_its_share(clouds):
+    shares = []
+    for seed in range(30):
+        _, kept = augment_clouds(clouds, Augmentation(plane=1.0, plane_share=0.4), generator(seed))
+        shares += (1 - kept.double().mean(dim=1)).tolist()
+        for cloud, stays in zip(clouds.numpy(), kept.numpy(), strict=True):
+            assert stays.all() or separable(cloud, stays)
+    assert max(shares) <= 0.4
+    assert 0.15 < np.mean(shares) < 0.25  # uniform in 0 to 0.4
+
+
+def separable(cloud, stays):
+    """Whether a plane parts the points, by a linear program: w·x + c ≥ 1 here, ≤ −1 there."""
+    from scipy.optimize import linprog
+
+    sign = np.where(stays, 1.0, -1.0)[:, None]
+    rows = -sign * np.c_[cloud, np.ones(len(cloud))]
+    return linprog(np.zeros(4), rows, -np.ones(len(cloud)), bounds=(None, None)).status == 0
+
+
+def test_a_plane_scores_along_its_normal(clouds):
+    normal = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64).expand(6, 1, 3)
+    assert torch.equal(beyond_plane(clouds, normal).argsort(1), clouds[..., 2].argsort(1))
+
+
+def test_a_cone_keeps_what_lies_inside_it(clouds):
+    camera, aim = clouds.new_tensor([0, -3, 1]).expand(6, 1, 3), clouds[:, :1]
+    score = outside_cone(clouds, camera, aim)
+    ray, axis = (clouds - camera).numpy(), (aim - camera).numpy()
+    sine = np.linalg.norm(np.cross(ray, axis), axis=2)
+    angle = np.arctan2(sine, (ray * axis).sum(axis=2))
+    np.testing.assert_allclose(-score, np.cos(angle), rtol=1e-9)
+    kept = lose_highest(torch.ones(6, 400, dtype=torch.bool), score, torch.full((6, 1), 150), 0.25)
+    for angles, stays in zip(angle, kept.numpy(), strict=True):
+        assert stays.sum() == 250
+        assert angles[stays].max() <= angles[~stays].min()
+
+
+def test_patches_are_balls(clouds):
+    centres = clouds[:, :4]
+    apart = np.linalg.norm(clouds[:, :, None] - centres[:, None], axis=3).min(axis=2)
+    np.testing.assert_allclose(-near_patch(clouds, centres), apart, atol=1e-12)
+    one = Augmentation(patches=1.0, patch_count=1, patch_radius=0.5)
+    _, kept = augment_clouds(clouds, one, generator(2))
+    radius = robust_box(clouds).radius[:, 0, 0]
+    for cloud, stays, size in zip(clouds, kept, radius, strict=True):
+        lost = cloud[~stays]
+        assert len(lost)
+        reach = torch.cdist(lost, cloud)[:, ~stays].amax(dim=1).amin()  # from the centre
+        assert reach < 0.5 * size
+
+
+def test_the_box_is_not_moved_by_a_stray(clouds):
+    strayed = clouds.clone()
+    strayed[:, 7] = 1000.0
+    box, moved = robust_box(clouds), robust_box(strayed)
+    torch.testing.assert_close(moved.low, box.low, atol=0.02, rtol=0)
+    torch.testing.assert_close(moved.high, box.high, atol=0.02, rtol=0)
+    inside = ((clouds >= box.low) & (clouds <= box.high)).double().mean(dim=1)
+    assert ((inside >= 0.97) & (inside < 1)).all()
+
+
+def test_stretch_is_log_uniform_about_the_centre(clouds):
+    many = clouds.repeat(200, 1, 1)
+    points, kept = augment_clouds(many, Augmentation(stretch=1.0, stretch_factor=1.5), generator())
+    assert kept.all()
+    size, before = points.amax(1) - points.amin(1), many.amax(1) - many.amin(1)
+    logs = (size / before).log() / np.log(1.5)
+    assert logs.abs().max() <= 1 + 1e-9
+    assert abs(float(logs.mean())) < 0.05
+    assert abs(float(logs.std()) - 3**-0.5) < 0.02  # of a uniform in −1 to 1
+    torch.testing.assert_close(robust_box(points).centre, robust_box(many).centre)
+    assert torch.equal(stretched(clouds, clouds[:, :1], torch.ones_like(clouds[:, :1])), clouds)
+
+
+def test_convention_tilt_is_right_handed_about_a_horizontal_axis(clouds):
+    heading, angle = torch.rand(2, 6, 1, generator=generator(), dtype=torch.float64)
+    centre = clouds[:, :1]
+    points = tilted(clouds, centre, heading, angle)
+    for row in range(6):
+        h, a = float(heading[row]), float(angle[row])
+        turn = Rotation.from_rotvec(a * np.array([np.cos(h), np.sin(h), 0.0]))
+        expected = turn.apply((clouds - centre)[row].numpy()) + centre[row].numpy()
+        np.testing.assert_allclose(points[row], expected, atol=1e-12)
+    assert torch.equal(tilted(clouds, centre, heading, 0 * angle), clouds)
+
+
+def test_tilt_ends_at_its_angle():
+    upright = torch.zeros(500, 40, 3, dtype=torch.float64)
+    upright[..., 2] = torch.linspace(-1, 1, 40)
+    points, _ = augment_clouds(upright, Augmentation(tilt=1.0, tilt_degrees=10.0), generator())
+    rod = points[:, -1] - points[:, 0]
+    angle = torch.atan2(rod[:, :2].norm(dim=1), rod[:, 2]).rad2deg()
+    assert 9.5 < angle.max() <= 10
+    assert angle.min() < 0.5
+
+
+def test_noise_has_a_scale_of_its_own_for_each_cloud():
+    many = torch.rand(300, 500, 3, generator=generator(), dtype=torch.float64)
+    points, _ = augment_clouds(many, Augmentation(noise=1.0, noise_sigma=0.04), generator(1))
+    sigma = (points - many).std(dim=(1, 2)) / robust_box(many).radius[:, 0, 0]
+    assert sigma.max() < 0.042
+    assert abs(float(sigma.mean()) - 0.02) < 0.003
+    assert abs(float(sigma.std()) - 0.04 / 12**0.5) < 0.002  # uniform in 0 to 0.04
+
+
+def unit_box(count):
+    corner = torch.zeros(count, 1, 3, dtype=torch.float64)
+    return Box(corner, corner + 1)
+
+
+def test_a_slab_lies_along_a_face():
+    axis, upper = torch.tensor([[2], [0], [1]]), torch.tensor([[False], [True], [False]])
+    gap = torch.tensor([[0.0], [0.1], [0.2]], dtype=torch.float64)
+    uniform = torch.rand(3, 4000, 3, generator=generator(), dtype=torch.float64)
+    edges = torch.zeros(3, 2, 3, dtype=torch.float64)
+    floor, right, front = slab(unit_box(3), axis, upper, gap, edges, uniform)
+    radius, margin = 3**0.5 / 2, 0.4 * 3**0.5 / 2
+    assert (floor[:, 2] <= 0).all()
+    assert floor[:, 2].min() >= -0.02 * radius
+    assert (right[:, 0] >= 1 + 0.1 * radius).all()
+    assert right[:, 0].max() <= 1 + 0.12 * radius
+    assert (front[:, 1] <= -0.2 * radius).all()
+    assert right[:, 2].min() >= 0  # a wall ends at the floor
+    for across in (floor[:, 0], floor[:, 1], right[:, 1], front[:, 0]):
+        assert abs(float(across.min()) + margin) < 0.01
+        assert abs(float(across.max()) - 1 - margin) < 0.01
+    edges[:, :, 0] = 0.5  # a quarter free on either side
+    part = slab(unit_box(3), axis, upper, gap, edges, uniform)[0, :, 0]
+    low, high = -margin, 1 + margin
+    assert abs(float(part.min()) - low - (high - low) / 4) < 0.01
+    assert abs(float(part.max()) - high + (high - low) / 4) < 0.01
+
+
+def test_a_neighbour_stands_beside_on_the_same_floor(clouds):
+    box, others = robust_box(clouds), clouds.roll(1, 0) + 5
+    turn, heading = 6.28 * torch.rand(2, 6, 1, generator=generator(), dtype=torch.float64)
+    size, gap = torch.full_like(turn, 0.8), torch.full_like(turn, 0.1)
+    piece = piece_beside(box, others, size, turn, heading, 0 * gap, gap)
+    ahead = torch.cat([heading.cos(), heading.sin()], dim=1)[:, None]
+    progress = (piece[..., :2] * ahead).sum(dim=2)
+    assert (progress.diff(dim=1) >= 0).all()  # the nearest first
+    mine = ((clouds - box.centre)[..., :2] * ahead).sum(dim=2)
+    beyond = progress - (box.centre[..., :2] * ahead).sum(dim=2)
+    free = beyond[:, 4] - mine.sort(dim=1).values[:, -5]  # but for strays of either
+    assert (free > 0.1 * box.radius[:, 0, 0] - 1e-9).all()
+    theirs = robust_box(piece)
+    torch.testing.assert_close(theirs.low[..., 2], box.low[..., 2])
+    # A likeness of the other: every distance is scaled alike.
+    scale = 0.8 * box.radius / robust_box(others).radius
+    spread = (others - others.mean(dim=1, keepdim=True)).norm(dim=2).sort(dim=1).values
+    found = (piece - piece.mean(dim=1, keepdim=True)).norm(dim=2).sort(dim=1).values
+    torch.testing.assert_close(found, scale[..., 0] * spread)
+
+
+def test_a_share_of_the_kept_points_is_replaced(clouds):
+    kept = torch.rand(6, 400, generator=generator()) < 0.5
+    new = torch.full_like(clouds, 9.0) + torch.arange(400)[:, None]
+    share = torch.full((6, 1), 0.3, dtype=torch.float64)
+    uniform = torch.rand(6, 400, generator=generator(1), dtype=torch.float64)
+    points = replaced(clouds, kept, new, share, uniform)
+    changed = (points != clouds).any(dim=2)
+    assert not (changed & ~kept).any()
+    counts = (0.3 * kept.sum(dim=1)).long()
+    assert changed.sum(dim=1).tolist() == counts.tolist()
+    for cloud, differs, count in zip(points, changed, counts, strict=True):
+        firsts = cloud[differs][:, 0].sort().values
+        assert firsts.tolist() == [9.0 + place for place in range(count)]
+
+
+def test_neighbours_are_other_clouds():
+    kinds = torch.rand(5, 200, 3, generator=generator())
+    kinds[0, :, 2] *= 0.01  # one flat cloud among four tall ones
+    seen = 0
+    for seed in range(10):
+        settings = Augmentation(neighbour=1.0, clutter_share=0.5)
+        points, kept = augment_clouds(kinds, settings, generator(seed))
+        assert kept.all()
+        new = points[0][(points[0] != kinds[0]).any(dim=1)]
+        if len(new) > 5:
+            assert new[:, 2].max() > 0.1
+            seen += 1
+    assert seen > 5
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(Augmentation)])
+def test_settings_out_of_their_range_are_refused(name):
+    for value in (-1,) if name == "patch_count" else (-0.5, float("nan")):
+        with pytest.raises(InputError, match=f"setting {name} = "):
+            replace(Augmentation(), **{name: value})
+
+
+def test_the_bundle_has_all_of_them_and_can_be_written():
+    bundle = Augmentation.scanned(noise=0.25)
+    assert bundle.noise == 0.25
+    assert all(getattr(bundle, name) > 0 for name in CHANCES)
+    assert structure(unstructure(bundle), Augmentation, "here") == bundle
