@@ -1,11 +1,11 @@
 """Makes tables anew: data, runs, records, then the tables from the records alone."""
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Union
+from unittest import mock
 
 from qs3.errors import InputError
 from qs3.experiments import GALLERIES
@@ -183,7 +183,8 @@ def reproduce(
         # A cluster gives a run its GPU itself.
         devices = () if workers.executor == "ray" else workers.devices
         at_once = max(len(workers.devices), workers.workers)
-        with _quiet_workers():
+        # Processes start without progress bars: several would write over one another.
+        with mock.patch.dict(os.environ, TQDM_DISABLE="1"):
             failed = run_grid(left, setup, tell, expected, executor, devices, at_once)
     paths = []
     for product in products:
@@ -194,20 +195,6 @@ def reproduce(
     if failed:
         raise InputError(f"{'; '.join(failed)}; mend that and run the same command again")
     return paths
-
-
-@contextmanager
-def _quiet_workers() -> Iterator[None]:
-    """Start processes without progress bars: several would write over one another."""
-    before = os.environ.get("TQDM_DISABLE")
-    os.environ["TQDM_DISABLE"] = "1"
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["TQDM_DISABLE"]
-        else:
-            os.environ["TQDM_DISABLE"] = before
 
 
 def measure(
