@@ -151,13 +151,14 @@ def reproduce(
         InputError: where the folder is for other settings, a record is damaged or not of its run,
             or a run failed; what was made stays made.
     """
-    from qs3.experiments.data import make_data, make_plans, which_meshes
+    from qs3.experiments.data import choose_meshes, make_data, make_plans
 
     runs = collect_runs(products)
     drawn = [data for product in products for data in product.sets()]
-    plans = make_plans(setup.scale, setup.shared, [*data_sets(runs, setup.own), *drawn])
+    sides = choose_meshes(setup.scale, setup.shared)
+    plans = make_plans(setup.scale, sides, [*data_sets(runs, setup.own), *drawn])
     if not dry_run:
-        claim(setup, which_meshes(setup.scale, setup.shared))
+        claim(setup, sides.meshes)
     left = missing(runs, setup)  # a damaged record stops here, not after hours
     executor = workers.start()  # a missing extra is told before anything is made
     needed = {data.name for data in [*data_sets(left, setup.own), *drawn]}
