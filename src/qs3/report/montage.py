@@ -88,7 +88,7 @@ def montage(view: MontageView, title: str = "") -> Figure:
 
     clouds = [("noisy cloud", view.cloud), ("clean twin", view.clean)]
     figure = Figure(figsize=(12.0, 12.0), layout="constrained")
-    upper, lower = figure.subfigures(2, 1)
+    upper, lower = figure.subfigures(2, 1, squeeze=False)[:, 0]
     cells = upper.subplots(2, 4).ravel()
     places = lower.subplots(2, 3)
     if title:
