@@ -65,6 +65,17 @@ def settings(method, network="pointnet", **changes):
     return replace(plain, **changes)
 
 
+def fit_after_a_stop(*arguments, run_dir):
+    """Fit, end it after the first epoch as a kill would, and take it up again."""
+
+    def stop(record, _):
+        raise Stop
+
+    with pytest.raises(Stop):
+        fit(*arguments, run_dir=run_dir, on_epoch=stop)
+    return fit(*arguments, run_dir=run_dir)
+
+
 def state(result):
     return result.model.state_dict()
 
@@ -134,13 +145,7 @@ def test_resumed_is_uninterrupted_and_seeds_count(method, network, tmp_path):
     assert len(whole.history) == 2
     assert all(np.isfinite(list(epoch.losses.values())).all() for epoch in whole.history)
     assert all(0 <= epoch.accuracy <= 1 for epoch in whole.history)
-
-    def stop(record, _):
-        raise Stop
-
-    with pytest.raises(Stop):
-        fit(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "cut", on_epoch=stop)
-    resumed = fit(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "cut")
+    resumed = fit_after_a_stop(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "cut")
     assert same(state(whole), state(resumed))
     assert whole.checkpoints == resumed.checkpoints
     assert same(state(resumed), load_model(tmp_path / "cut").model.state_dict())
@@ -217,14 +222,7 @@ def test_poisoned_labels_of_the_target_change_no_bit(method, rule, tmp_path):
         if method in COMPOSED:
             rounds = replace(ROUNDS, rule=COMPOSED[method][1])
         chosen = settings(method, epochs=2, rule=rule)
-        arguments = (method, SOURCE, target, chosen, rounds)
-
-        def stop(record, _):
-            raise Stop
-
-        with pytest.raises(Stop):
-            fit(*arguments, run_dir=run, on_epoch=stop)
-        result = fit(*arguments, run_dir=run)
+        result = fit_after_a_stop(method, SOURCE, target, chosen, rounds, run_dir=run)
         history = [json.loads(line) for line in (run / "history.jsonl").read_text().splitlines()]
         for line in history:
             line.pop("seconds", None)
@@ -373,13 +371,7 @@ def test_networks_without_local_features_are_refused_by_name(method):
 def test_trains_on_two_devices_and_resumes(method, tmp_path):
     chosen = settings(method, "dgcnn", devices=2, epochs=2)
     whole = fit(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "whole")
-
-    def stop(record, _):
-        raise Stop
-
-    with pytest.raises(Stop):
-        fit(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "cut", on_epoch=stop)
-    resumed = fit(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "cut")
+    resumed = fit_after_a_stop(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "cut")
     assert same(state(whole), state(resumed))
     assert whole.checkpoints == resumed.checkpoints
 

@@ -118,10 +118,10 @@ def _record(settings: ScanSettings, origin: dict[str, Any], result: Any) -> dict
 
 
 def _summary(result: Any) -> str:
-    mean = {}
-    for name in ("disparity_sigma", "disparity_bias", "gross_share", "valid_fraction"):
-        values = [getattr(view, name) for view in result.views]
-        mean[name] = np.mean([value for value in values if value is not None] or [np.nan])
+    from qs3.store.scan_item import mean_statistics
+
+    means = mean_statistics(result.views)
+    mean = {name: np.nan if value is None else value for name, value in means.items()}
     return (
         f"{len(result.views)} views, {result.fused_points} fused points: disparity σ "
         f"{mean['disparity_sigma']:.3f} px, bias {mean['disparity_bias']:+.3f} px, gross errors "

@@ -159,7 +159,6 @@ def scan_item(
     surface_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0x50BF,)))
     surface = sample_surface(result.mesh, settings.num_points, surface_rng)
     label = map_labels([item.class_name], np.zeros(1, dtype=np.int64), settings.classes)[0]
-    means = {name: _mean([getattr(view, name) for view in result.views]) for name in STATISTICS}
     drawn = dict(result.drawn)
     layout = drawn.get("room.layout", settings.make_scene().layout)
     if neighbour is not None and SceneSettings(layout).needs_neighbour:  # not in all rooms
@@ -179,7 +178,7 @@ def scan_item(
         surface=surface.astype(np.float32),
         yaw=result.yaw,
         drawn=json.dumps(drawn, sort_keys=True),
-        **means,
+        **mean_statistics(result.views),
     )
 
 
@@ -188,6 +187,10 @@ def row_id(item: Item, scan: int) -> str:
     return f"{item.id}#{scan}"
 
 
-def _mean(values: Sequence[float | None]) -> float | None:
-    numbers = [value for value in values if value is not None]
-    return float(np.mean(numbers)) if numbers else None
+def mean_statistics(views: Sequence[object]) -> dict[str, float | None]:
+    """Mean of each of `STATISTICS` over the views that have it; None where none has."""
+    means: dict[str, float | None] = {}
+    for name in STATISTICS:
+        known = [value for view in views if (value := getattr(view, name)) is not None]
+        means[name] = float(np.mean(known)) if known else None
+    return means
