@@ -121,10 +121,18 @@ def _refined(
     tone: float,
 ) -> Float64[np.ndarray, "h w"]:
     """Disparities averaged and corrected as often as the settings say."""
-    if own.corrections == 0:
+    valid = np.isfinite(disparity)
+    if own.corrections == 0 or not valid.any():
         return disparity
-    left, right = (image / tone for image in images)
-    arms = surface_arms(disparity, longest, own.surface)
+    # Nothing is read beyond what is valid, its matches, a pixel for each correction, and the cubic.
+    around = own.corrections + 5
+    rows, columns = (np.flatnonzero(valid.any(axis=axis)) for axis in (1, 0))
+    first = max(0, columns[0] - int(np.nanmax(disparity)) - around)
+    part = np.s_[rows[0] : rows[-1] + 1, first : columns[-1] + around]
+    left, right = (image[part] / tone for image in images)
+    inner, made = disparity[part], np.full_like(disparity, np.nan)
+    arms = surface_arms(inner, longest, own.surface)
     for _ in range(own.corrections):
-        disparity = corrected(left, right, averaged(disparity, arms), arms, own.grain)
-    return disparity
+        inner = corrected(left, right, averaged(inner, arms), arms, own.grain)
+    made[part] = inner
+    return made
