@@ -125,6 +125,7 @@ def scan(
     sensor = how.make_sensor()
     sensor = sensor if rig is None else dataclasses.replace(sensor, rig=rig)
     renderer = how.make_renderer()
+    device = how.matching_device(renderer)
     rng_place, rng_render, rng_noise, rng_sample, rng_scene, rng_settings, rng_size, rng_room = (
         np.random.default_rng(s) for s in np.random.SeedSequence(how.seed).spawn(8)
     )
@@ -175,7 +176,7 @@ def scan(
         casters = [DepthCaster(*(body.mesh for body in around.bodies))]
         casters += [DepthCaster(turned)] if full_frames else []
     images = [
-        take_view(pair, sensor, region, part, casters, rng_noise, clock)
+        take_view(pair, sensor, region, part, casters, rng_noise, clock, device)
         for pair, region, part in zip(pairs, regions, parts, strict=True)
     ]
 
