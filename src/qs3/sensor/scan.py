@@ -209,11 +209,13 @@ def _photograph(
         reach = blur_reach(sensor.exposure.psf)
         frame = (sensor.rig.width, sensor.rig.height)
         wanted = None if built.alone else [c.grown(reach, *frame) for c in canvases]
-        pairs = photograph(how.make_renderer(), built, sensor, around.poses, seeds, wanted)
+        renderer = how.make_renderer()
+        pairs = photograph(renderer, built, sensor, around.poses, seeds, wanted)
     with clock("true_depth"):
         casters = [DepthCaster(*(body.mesh for body in around.bodies))]
         casters += [DepthCaster(around.bodies[0].mesh)] if full_frames else []
+    device = how.matching_device(renderer)
     return [
-        take_view(pair, sensor, region, part, casters, rng_noise, clock)
+        take_view(pair, sensor, region, part, casters, rng_noise, clock, device)
         for pair, region, part in zip(pairs, regions, parts, strict=True)
     ]

@@ -208,6 +208,9 @@ class ScanSettings(CameraSettings):
     and the camera's place: height, distance, aim; room.distance=1:2 beside it narrows one."""
     least_pixels: int = 1000
     """Pixels of the object that each view of a room must show; else it is drawn again."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where ad-census searches, to the same bits: cuda is a GPU through torch, which auto takes
+    where Mitsuba renders on one too."""
     seed: int = 0
     """All random steps follow from it."""
 
@@ -278,6 +281,12 @@ class ScanSettings(CameraSettings):
             not layouts and self.make_scene().needs_neighbour
         )
 
+    def matching_device(self, renderer: Renderer) -> str:
+        """Where to match, ``cpu`` or ``cuda``, beside what renders."""
+        if self.device != "auto":
+            return self.device
+        return "cuda" if renderer.description.get("variant", "").startswith("cuda") else "cpu"
+
     def make_scene(self) -> SceneSettings:
         """What stands around the object."""
         scene = SceneSettings(self.scene) if isinstance(self.scene, str) else self.scene
@@ -288,7 +297,7 @@ class ScanSettings(CameraSettings):
     def as_dict(self) -> dict[str, Any]:
         """Plain values for records; what the sensor and the renderer say of themselves is apart."""
         apart = {*(f.name for f in dataclasses.fields(CameraSettings)), *self._CHANGES, "preset"}
-        apart |= {"crop", "floor_material", "wall_material", "seed"}
+        apart |= {"crop", "floor_material", "wall_material", "device", "seed"}
         names = [f.name for f in dataclasses.fields(ScanSettings) if f.name not in apart]
         crop, ranges = self.chosen("crop"), [dict(one.ranges) for one in self.each_sensor()]
         return {name: self.chosen(name) for name in names} | {

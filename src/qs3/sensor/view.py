@@ -127,6 +127,7 @@ def take_view(
     casters: Sequence[DepthCaster],
     rng: np.random.Generator,
     clock: "Clock",
+    device: str = "cpu",
 ) -> ViewImages:
     """Expose and match ``region`` of one view, with auto-exposure on ``focus``; cast its depth.
 
@@ -141,7 +142,7 @@ def take_view(
         if rig.second == "pattern":
             right = stored_pattern(rig, sensor.pattern, canvas, sensor.exposure.bits)
     with clock("matching"):
-        disparity = match(left, right, sensor.matching)[inner]
+        disparity = match(left, right, sensor.matching, device)[inner]
     with clock("true_depth"):
         whole = len(casters) > 1
         cast = casters[0].cast(rig, pair.pose, region, normals=whole)
