@@ -1,7 +1,7 @@
 """All that wants a GPU, in one command that can be repeated: see `STAGES` for what it does.
 
     python benchmarks/gpu.py [--out results/gpu] [--minutes 25] [--only scan grid]
-    python benchmarks/gpu.py --cpu --tiny --out /tmp/gpu       every stage at toy size, on the CPU
+    python benchmarks/gpu.py --cpu --tiny --out runs/tiny      every stage at toy size, on the CPU
     python benchmarks/gpu.py --dry-run                         tells the stages and their commands
 
 Each stage is a process with a time limit of its own; one that fails or runs out of time does not
@@ -387,7 +387,7 @@ STAGES: dict[str, tuple[Callable[[argparse.Namespace, Save], None], float]] = {
     "data": (data, 4),
     "grid": (grid, 25),
 }
-"""What is done, in this order, and the minutes that each may take; the last has what is left."""
+"""What is done, in this order, and the minutes of 25 that each may take; the last has the rest."""
 
 
 def again(*words: str, options: argparse.Namespace) -> None:
@@ -537,7 +537,8 @@ def main() -> int:
         if left < 10:
             print(f"{name}: no time is left; run the same command again", flush=True)
             continue
-        status = run_stage(name, min(60 * STAGES[name][1], left), options)
+        own = 60 * STAGES[name][1] * options.minutes / 25
+        status = run_stage(name, min(own, left), options)
         print(f"{name}: {status}, log in work/{name}.log", flush=True)
         (options.out / SUMMARY).write_text(summary(options.out), encoding="utf-8")
     print(options.out / SUMMARY)

@@ -214,7 +214,7 @@ def _fixed(settings: RunSettings) -> dict[str, Any]:
 def fingerprint(clouds: PointClouds | UnlabelledClouds) -> str:
     """SHA-256 over points, and labels and class names where there are any."""
     digest = hashlib.sha256(str(clouds.points.shape).encode())
-    digest.update(np.ascontiguousarray(clouds.points, dtype=np.float32).tobytes())
+    digest.update(np.ascontiguousarray(clouds.points, dtype=np.float32).data)
     if isinstance(clouds, PointClouds):
         digest.update(np.ascontiguousarray(clouds.labels, dtype=np.int64).tobytes())
         digest.update("\0".join(clouds.class_names).encode())
