@@ -6,6 +6,8 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from qs3.adaptation import method_class
 from qs3.adaptation.names import split_method
 from qs3.errors import InputError
