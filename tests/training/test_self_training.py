@@ -10,13 +10,26 @@ import torch
 from qs3.adaptation.selection import SingleClassWarning
 from qs3.errors import InputError
 from qs3.io.clouds import UnlabelledClouds
-from qs3.training import SelfTrainingSettings, fit, load_model, self_training_preset
+from qs3.io.preparation import ROBUST
+from qs3.training import (
+    Augmentation,
+    SelfTrainingSettings,
+    fit,
+    load_model,
+    self_training_preset,
+)
 from qs3.training.batches import prepare
 from qs3.training.checkpoint import derived_seed, new_model
 from qs3.training.distributed import make_fabric
 from qs3.training.predict import predict_probabilities
 from qs3.training.self_training import self_train
 
+WIDE = {
+    "preparation": replace(ROBUST, size_input=True),
+    "augmentation": Augmentation.scanned(),
+    "num_points": 40,
+}
+"""Outliers removed, points drawn anew, sizes told, clouds augmented."""
 ROUNDS = SelfTrainingSettings(rounds=3, epochs=2, threshold=0.4)
 
 
@@ -77,9 +90,12 @@ def test_the_type_of_the_target_has_no_labels():
     assert names == {"points", "ids", "checksum", "origin"}
 
 
-def test_labels_of_the_target_cannot_matter(source, target, settings, warm, tmp_path):
+@pytest.mark.parametrize("way", ["paper", "robust"])
+def test_labels_of_the_target_cannot_matter(source, target, settings, warm, tmp_path, way):
     """Poisoned labels leave the run bit-identical: they are not in what it is handed."""
     poisoned = replace(target, labels=(target.labels + 1) % 3)
+    if way == "robust":
+        settings, warm = replace(settings, **WIDE), None
     runs = [
         fit(
             "qbst",
@@ -93,6 +109,7 @@ def test_labels_of_the_target_cannot_matter(source, target, settings, warm, tmp_
         for name, clouds in {"true": target, "poisoned": poisoned}.items()
     ]
     assert same(runs[0].model, runs[1].model)
+    assert not hasattr(runs[0].target.clouds, "labels")
 
 
 def test_a_labelled_target_is_refused(source, target, settings, warm, tmp_path):
@@ -107,10 +124,13 @@ def test_a_labelled_target_is_refused(source, target, settings, warm, tmp_path):
         ("paper", "middle of round 2"),
         ("spst", "between rounds"),
         ("released", "middle of round 2"),
+        ("robust", "middle of round 2"),
     ],
 )
 def test_resumed_is_uninterrupted(source, target, settings, tmp_path, preset, where):
     settings = replace(settings, epochs=12, seed=1)
+    if preset == "robust":
+        settings, preset = replace(settings, **WIDE), "default"
     # From scratch, a shrinking pool is too small here to go on; `released` covers that start.
     changes = {"init": "warm-up"} if preset == "paper" else {}
     rounds = self_training_preset(preset, rounds=3, epochs=8, threshold=0.34, **changes)

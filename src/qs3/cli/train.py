@@ -172,12 +172,12 @@ def train(options: Flat[TrainOptions]) -> int:
         model_settings=parse_settings("--model-set", options.model_set),
         method_settings=parse_settings("--method-set", options.method_set),
     )
-    points, target = settings.num_points, None
+    how, target = (settings.num_points, settings.preparation), None
     part = {"split": options.source_split, "cloud": options.source_cloud}
-    source = load_whole(load_clouds, options.source, points, **part)
+    source = load_whole(load_clouds, options.source, *how, **part)
     if options.target is not None:
         part = {"split": options.target_split, "cloud": options.target_cloud}
-        target = load_whole(load_unlabelled, options.target, points, **part)
+        target = load_whole(load_unlabelled, options.target, *how, **part)
     try:
         fit(
             options.method,

@@ -21,6 +21,7 @@ def load_clouds(
     num_points: int | None = 1024,
     cloud: CloudChoice = "points",
     class_names: Sequence[str] | None = None,
+    most: int | None = None,
 ) -> PointClouds:
     """Read labelled clouds from whatever ``source`` is.
 
@@ -32,12 +33,14 @@ def load_clouds(
         cloud: Which cloud of a generated data set; ``all`` takes the three of each scan.
         class_names: Classes that the labels shall index, found by name or alias. None takes
             PointDA-10's ten where all map onto them, else the source's own.
+        most: As in `qs3.io.preparation.stack`, where ``num_points`` is None.
 
     Raises:
         InputError: where the source is none of these, is damaged, has no labels, or has a class
             that is not in ``class_names``.
     """
-    clouds = read_clouds(source, split, cloud)[0].labelled(num_points, class_names, str(source))
+    read = read_clouds(source, split, cloud)[0]
+    clouds = read.labelled(num_points, class_names, str(source), most)
     return replace(clouds, origin=Origin(open_folder(source).name, split, cloud))
 
 
@@ -47,6 +50,7 @@ def load_unlabelled(
     split: str | None = None,
     num_points: int | None = 1024,
     cloud: CloudChoice = "points",
+    most: int | None = None,
 ) -> UnlabelledClouds:
     """Read clouds and leave any labels behind; a flat folder of point files will do too.
 
@@ -55,7 +59,7 @@ def load_unlabelled(
     Raises:
         InputError: where the source is no data set or is damaged.
     """
-    clouds = read_clouds(source, split, cloud)[0].unlabelled(num_points, str(source))
+    clouds = read_clouds(source, split, cloud)[0].unlabelled(num_points, str(source), most)
     return replace(clouds, origin=Origin(open_folder(source).name, split, cloud))
 
 

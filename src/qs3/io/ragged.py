@@ -31,7 +31,11 @@ class RaggedClouds:
     """Split of each cloud (``train``, ``test`` or empty), where the files tell."""
 
     def labelled(
-        self, num_points: int | None, class_names: Sequence[str] | None, where: str
+        self,
+        num_points: int | None,
+        class_names: Sequence[str] | None,
+        where: str,
+        most: int | None = None,
     ) -> PointClouds:
         """Return clouds of one size with labels that index ``class_names``.
 
@@ -40,6 +44,7 @@ class RaggedClouds:
             class_names: Classes of the result; None takes PointDA-10's ten where every class maps
                 onto them, else the files' own.
             where: What was read, for messages.
+            most: As in `qs3.io.preparation.stack`.
 
         Raises:
             InputError: where there are no labels, a class is not in ``class_names``, or sizes
@@ -54,10 +59,12 @@ class RaggedClouds:
             if class_names is not None:
                 raise InputError(f"{where}: {error}") from error
             names, labels = self.class_names, self.labels.astype(np.int64)
-        points = stack(self.clouds, num_points, where)
+        points = stack(self.clouds, num_points, where, most)
         return PointClouds(points, labels, names, self.ids, self.checksum)
 
-    def unlabelled(self, num_points: int | None, where: str) -> UnlabelledClouds:
+    def unlabelled(
+        self, num_points: int | None, where: str, most: int | None = None
+    ) -> UnlabelledClouds:
         """Return clouds of one size without labels, and with numbers for names.
 
         Names of files and objects often tell the class; not even they go along. Nor does the order
@@ -67,6 +74,6 @@ class RaggedClouds:
         Raises:
             InputError: where there is no cloud, or sizes differ and no size is asked for.
         """
-        points = stack(self.clouds, num_points, where)
+        points = stack(self.clouds, num_points, where, most)
         order = np.argsort(digests(points), kind="stable")
         return UnlabelledClouds(points[order], numbered(len(points)), self.checksum)

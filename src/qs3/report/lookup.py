@@ -46,9 +46,8 @@ def read_domain(
 
     def load(data: str | Path, split: str | None, cloud: CloudKind) -> Prepared[PointClouds]:
         part = {"split": split, "cloud": cloud, "class_names": names}
-        return prepare_clouds(
-            load_whole(load_clouds, data, points, **part), points, model.preparation
-        )
+        clouds = load_whole(load_clouds, data, points, model.preparation, **part)
+        return prepare_clouds(clouds, points, model.preparation)
 
     if given is not None:
         if cloud is None:

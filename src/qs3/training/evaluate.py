@@ -53,7 +53,7 @@ def evaluate(
     """
     made, loaded = read_run(run), load_model(run)
     train = loaded.settings["train"]
-    whole = _labelled(data, split, cloud, train["num_points"], loaded.class_names)
+    whole = _labelled(data, split, cloud, loaded)
     require_finite(whole.points, whole.ids)
     test = prepare_clouds(whole, train["num_points"], loaded.preparation)
     record = RunRecord(
@@ -87,18 +87,15 @@ def record_path(run: Path, record: RunRecord) -> Path:
 
 
 def _labelled(
-    data: str | Path | PointClouds,
-    split: str | None,
-    cloud: CloudKind,
-    num_points: int,
-    class_names: tuple[str, ...],
+    data: str | Path | PointClouds, split: str | None, cloud: CloudKind, loaded: LoadedModel
 ) -> PointClouds:
     """Clouds with labels that index the network's classes."""
     if not isinstance(data, PointClouds):
-        part = {"split": split, "cloud": cloud, "class_names": class_names}
-        return load_whole(load_clouds, data, num_points, **part)
+        part = {"split": split, "cloud": cloud, "class_names": loaded.class_names}
+        points = loaded.settings["train"]["num_points"]
+        return load_whole(load_clouds, data, points, loaded.preparation, **part)
     given = RaggedClouds(list(data.points), data.ids, data.checksum, data.labels, data.class_names)
-    return replace(given.labelled(None, class_names, "data"), origin=data.origin)
+    return replace(given.labelled(None, loaded.class_names, "data"), origin=data.origin)
 
 
 def _scores(loaded: LoadedModel, test: Prepared[PointClouds]) -> Scores:
