@@ -18,7 +18,8 @@ from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.history import EpochRecord, History
 from qs3.training.loop import EpochCallback, train
 from qs3.training.progress import Deadline
-from qs3.training.self_training import RoundCallback, RoundRecord, Task, run_rounds
+from qs3.training.rounds import RoundCallback, RoundRecord, Task
+from qs3.training.self_training import run_rounds
 from qs3.training.validation import ROUND, Validation, choose, load_checkpoint, read_checkpoints
 
 WARM_UP = "warm-up"

@@ -2,8 +2,7 @@
 
 import logging
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from lightning_fabric import Fabric
 
 from qs3.adaptation import Method, PseudoLabelled
 from qs3.adaptation.selection import select_confident
+from qs3.adaptation.self_distillation import follow
 from qs3.errors import InputError
 from qs3.evaluation.metrics import accuracy
 from qs3.io.clouds import PointClouds, UnlabelledClouds
@@ -26,60 +26,28 @@ from qs3.training.checkpoint import (
 )
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.distributed import make_fabric
-from qs3.training.history import EpochRecord, History
+from qs3.training.history import EpochRecord
 from qs3.training.loop import EpochCallback, train
 from qs3.training.overlap import seen_clouds
 from qs3.training.predict import predict_probabilities
-from qs3.training.progress import Deadline
-from qs3.training.rounds import RoundRecord, Rounds, begin_rounds, write_rounds
-from qs3.training.rules import Select, make_rule
+from qs3.training.rounds import (
+    RoundCallback,
+    RoundRecord,
+    Rounds,
+    Task,
+    begin_rounds,
+    write_rounds,
+)
+from qs3.training.rules import Select, make_rule, round_threshold
 from qs3.training.run import Run, RunSettings, claim_run, data_record, sum_seconds, write_run
 from qs3.training.state import CHECKPOINT
 from qs3.training.teacher import ask_teacher
 from qs3.training.threads import choose_threads, threads
+from qs3.training.validation import ROUND
 
 _LOG = logging.getLogger(__name__)
-STATE = "rounds.safetensors"
 STREAM = 1
 """Sets the random draws of the rounds apart from those of the warm-up."""
-
-
-RoundCallback = Callable[[RoundRecord, PointClassifier], None]
-"""Called after each round, when its state is written."""
-Look = Callable[[int, PointClassifier], None]
-"""Called on every device after each round, before its state is written."""
-
-
-@dataclass(frozen=True)
-class Task:
-    """What a run of rounds works on, beside the network, and who is told of it."""
-
-    source: PointClouds
-    """Labelled clouds, prepared."""
-    target: UnlabelledClouds
-    """Clouds without labels, prepared."""
-    settings: TrainSettings
-    """How a round trains."""
-    rounds: SelfTrainingSettings
-    """How it labels and selects."""
-    fabric: Fabric
-    """Devices and number format; all devices do the rounds."""
-    holdout: PointClouds | None = None
-    """Part of the source that is not trained on, prepared."""
-    select: Select | None = None
-    """Selection rule, in place of the one of the settings."""
-    run_dir: Path | None = None
-    """Folder that keeps the state after each epoch and round."""
-    look: Look | None = None
-    """Looks at the network after each round."""
-    on_round: RoundCallback | None = None
-    """Called after each round."""
-    on_epoch: EpochCallback | None = None
-    """Called after each epoch."""
-    history: History | None = None
-    """Is told of epochs and rounds."""
-    deadline: Deadline | None = None
-    """Ends the rounds before an epoch that would end too late."""
 
 
 def self_train(
@@ -108,7 +76,8 @@ def self_train(
         target: Clouds without labels, prepared.
         settings: Network, batch size, rate, augmentation, seed. Its epochs are not used.
         self_training: Settings of the rounds.
-        holdout: Part of the source that is not trained on, for an estimate of the class shares.
+        holdout: Part of the source that is not trained on, prepared: for the calibration, and for
+            an estimate of the class shares.
         select: Selection rule, in place of the one of the settings.
         fabric: Device and number format; made from the settings where it is not given.
         run_dir: Folder of a run, from which a call that was killed goes on after its last epoch,
@@ -120,8 +89,8 @@ def self_train(
         The network of the last round, and a record of each round.
 
     Raises:
-        InputError: where the target is empty, its points are not finite, or the folder holds
-            another run.
+        InputError: where the target is empty, its points are not finite, a setting needs a
+            held-out part and there is none, or the folder holds another run.
     """
     require_unlabelled(target)
     fabric = fabric or make_fabric(settings)
@@ -152,6 +121,7 @@ def self_train(
         run = Run(
             method=method,
             selection="last",
+            chosen={"stage": ROUND, "number": len(records)},
             source=data_record(source),
             target=data_record(target),
             source_clouds=source_clouds,
@@ -174,24 +144,19 @@ def run_rounds(model: PointClassifier, task: Task) -> tuple[PointClassifier, lis
     if not len(target):
         raise InputError("the target has no cloud; give unlabelled clouds")
     require_finite(target.points, target.ids, "target: ")
-    path = None if task.run_dir is None else task.run_dir / STATE
-    state = begin_rounds(model, len(target), rounds, task.fabric, path)
+    state = begin_rounds(model, task)
     classes = len(source.class_names)
     if task.history is not None:
         task.history.put("round", state.records)
     for number in range(len(state.records) + 1, rounds.rounds + 1):
         start, pool = time.perf_counter(), state.pool
-        # Line 19: θ rises by ε; by ``quantile`` each class has a threshold of its own.
-        theta = rounds.threshold + (number - 1) * rounds.step if rounds.rule != "quantile" else 0.0
-
         # Line 3: label the target.
-        said = ask_teacher(
-            state, target.points, task.holdout, task.settings, rounds, fabric=task.fabric
-        )
+        said = ask_teacher(state, task)
         labels = said.target.argmax(axis=1)
 
-        # Lines 4 to 17: select.
+        # Lines 4 to 17: select. θ rises from round to round (line 19).
         candidates = said.target[pool]
+        theta = round_threshold(rounds, number, candidates)
         rule = task.select or make_rule(rounds, number, source.labels, said.held)
         chosen = pool[rule(candidates, theta)]
 
@@ -221,26 +186,28 @@ def run_rounds(model: PointClassifier, task: Task) -> tuple[PointClassifier, lis
             agreement=None if state.labels is None else float((labels == state.labels).mean()),
             skipped=skipped,
             single_class=int(np.count_nonzero(over)) == 1,
-            held_out=None if state.best is None else float(state.best.score),
+            held_out=float(state.teacher.score) if rounds.teacher == "best" else None,
             losses=tuple(epoch.losses for epoch in epochs),
             seconds=time.perf_counter() - start,
             accuracies=tuple(epoch.accuracy for epoch in epochs),
             learning_rates=tuple(epoch.learning_rate for epoch in epochs),
+            temperature=said.temperature,
         )
         state.labels = labels
+        state.kept.append(np.stack([chosen, labels[chosen]]))
         state.records.append(record)
-        _finish_round(state, task, path)
+        _finish_round(state, task)
     return state.latest, state.records
 
 
-def _finish_round(state: Rounds, task: Task, path: Path | None) -> None:
+def _finish_round(state: Rounds, task: Task) -> None:
     """Write the state, and tell of the round."""
     record = state.records[-1]
     if task.look is not None:
         task.look(record.round, state.latest)
-    if path is not None and task.fabric.is_global_zero:
-        write_rounds(path, state)
-        (path.parent / CHECKPOINT).unlink(missing_ok=True)
+    if task.run_dir is not None and task.fabric.is_global_zero:
+        write_rounds(task, state)
+        (task.run_dir / CHECKPOINT).unlink(missing_ok=True)
     task.fabric.barrier()
     if task.history is not None:
         task.history.put("round", state.records)
@@ -262,8 +229,16 @@ def _too_few(number: int, count: int, classes: int, devices: int) -> bool:
 def _train_round(
     state: Rounds, task: Task, number: int, pseudo: PointClouds, apart: Bool[np.ndarray, "c"]
 ) -> list[EpochRecord]:
-    """Train the latest network on pseudo labels; the clouds ``apart`` judge the best teacher."""
-    settings, rounds, best = task.settings, task.rounds, state.best
+    """Train the latest network on pseudo labels, and let the teacher follow.
+
+    Args:
+        state: Holds both.
+        task: What else there is.
+        number: Count of the round.
+        pseudo: Selected clouds with their pseudo labels.
+        apart: Those that are not trained on: they judge the ``best`` teacher.
+    """
+    settings, rounds, teacher = task.settings, task.rounds, state.teacher
     before = sum(not record.skipped for record in state.records)
     if before == 0 and rounds.init == "scratch":
         seed = derived_seed(settings.seed, STREAM, 0)
@@ -273,27 +248,29 @@ def _train_round(
     first = before * rounds.epochs
     # TransNorm's weights are in the network's scales already; a second time they would double.
     plain = settings.normalisation in ("shared", "adabn")
+    smoothing = rounds.label_smoothing
     method = PseudoLabelled(
         state.latest,
         source_weight=rounds.source_weight,
         weight_step=rounds.weight_step,
         epochs=range(first, first + rounds.epochs),
-        label_smoothing=settings.label_smoothing,
+        label_smoothing=settings.label_smoothing if smoothing is None else smoothing,
         normalisation="shared" if plain else "separate",
     )
     kept, judges = pseudo.select(~apart), pseudo.select(apart)
 
-    def judge(method: Method, epoch: int) -> None:
-        if best is None or not len(judges):
-            return
+    def teach(method: Method, epoch: int) -> None:
         with method.norm.of("target"):
-            probabilities = predict_probabilities(
-                method.model, judges.points, batch_size=settings.batch_size, fabric=task.fabric
-            )
-            score = accuracy(judges.labels, probabilities.argmax(axis=1))
-            if score > best.score:
-                best.score.fill_(score)
-                best.model.load_state_dict(method.model.state_dict())
+            if rounds.teacher == "average":
+                follow(teacher.model, method.model, rounds.teacher_decay)
+            elif rounds.teacher == "best" and len(judges):
+                probabilities = predict_probabilities(
+                    method.model, judges.points, batch_size=settings.batch_size, fabric=task.fabric
+                )
+                score = accuracy(judges.labels, probabilities.argmax(axis=1))
+                if score > teacher.score:
+                    teacher.score.fill_(score)
+                    teacher.model.load_state_dict(method.model.state_dict())
 
     epochs, optimiser = train(
         method,
@@ -306,8 +283,8 @@ def _train_round(
         steps_per_epoch=rounds.steps_per_epoch,
         first_epoch=first if continuous else 0,
         optimiser_state=state.optimiser if continuous else None,
-        observer=judge,
-        beside=best,
+        observer=teach,
+        beside=None if rounds.teacher == "latest" else teacher,
         on_epoch=task.on_epoch,
         log=None if task.history is None else task.history.training(f"round-{number}"),
         deadline=task.deadline,
