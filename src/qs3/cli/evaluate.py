@@ -42,11 +42,28 @@ def evaluate_run(
     if json:
         show(dumps(unstructure(record), indent=2))
     else:
+        if record.chosen is not None:
+            stage, number = record.chosen["stage"], record.chosen["number"]
+            show(f"checkpoint          {stage} {number}, by rule {record.selection}")
         show(*scores_text(record.scores, record.marks))
+        show(*rounds_text(record.rounds))
         if record.choices:
             show(*choices_text(record.choices))
     tell(f"record: {record_path(run, record)}")
     return 0
+
+
+def rounds_text(rounds: Sequence[Mapping[str, Any]]) -> list[str]:
+    """How many pseudo labels of the clouds that are known here were right, as lines."""
+    if not any("right" in done for done in rounds):
+        return []
+    rows: list[tuple[str, ...]] = [("round", "kept", "known here", "right", "")]
+    for done in rounds:
+        known, right = sum(done["known"]), sum(done["right"])
+        share = f"{right / known:.1%}" if known else "–"
+        numbers = (done["round"], sum(done["kept"]), known, right)
+        rows.append((*map(str, numbers), share))
+    return ["", *columns(rows, 0)]
 
 
 def choices_text(choices: Mapping[str, Mapping[str, Any]]) -> list[str]:

@@ -27,6 +27,8 @@ from qs3.training.config import (
 
 TIME_UP = 3
 """Exit code where --max-time stopped a run that the same command takes up again."""
+NO_ROUND = 4
+"""Exit code where no round of self-training had enough clouds to train on."""
 
 
 @functools.cache
@@ -157,6 +159,7 @@ def train(options: Flat[TrainOptions]) -> int:
     start = time.monotonic()  # reading the data counts
     from qs3.io import load_clouds, load_unlabelled
     from qs3.training import Deadline, TimeUpError, fit, load_whole, parse_duration
+    from qs3.training.rounds import all_skipped, remarks
 
     seconds = None if options.max_time is None else parse_duration(options.max_time)
     try:
@@ -179,7 +182,7 @@ def train(options: Flat[TrainOptions]) -> int:
         part = {"split": options.target_split, "cloud": options.target_cloud}
         target = load_whole(load_unlabelled, options.target, *how, **part)
     try:
-        fit(
+        result = fit(
             options.method,
             source,
             target,
@@ -196,5 +199,9 @@ def train(options: Flat[TrainOptions]) -> int:
         tell(f"qs3: {stop}")
         return TIME_UP
     show(options.out)
+    for line in remarks(result.rounds, options.self_training, source.class_names):
+        tell(f"qs3: {line}")
+    if all_skipped(result.rounds):
+        return NO_ROUND
     tell(f"Next: qs3 evaluate {options.out} --data DATA")
     return 0
