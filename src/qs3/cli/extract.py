@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import tyro
 
@@ -18,16 +18,16 @@ from qs3.io.extract.sunrgbd import extract_sunrgbd
 
 def _verb(function: Callable[..., ExtractReport]) -> Callable[..., int]:
     """One of the library's functions as a verb: its settings are the options, its text the help."""
+    kind: Any = get_type_hints(function)["settings"]
 
-    def verb(source: Path, output: OutputSettings, settings: object) -> int:
+    def verb(
+        source: Annotated[Path, tyro.conf.Positional],
+        output: Flat[OutputSettings],
+        settings: Flat[kind],  # pyright: ignore[reportInvalidTypeForm]
+    ) -> int:
         return _tell(output.out, function(source, output, settings))
 
     verb.__doc__ = (function.__doc__ or "").partition("Raises:")[0]
-    verb.__annotations__ = {
-        "source": Annotated[Path, tyro.conf.Positional],
-        "output": Flat[OutputSettings],
-        "settings": Flat[get_type_hints(function)["settings"]],
-    }
     return verb
 
 

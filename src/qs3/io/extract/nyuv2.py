@@ -142,7 +142,9 @@ def list_nyuv2(path: Path, splits: Path | None = None) -> tuple[list[NyuFrame], 
     beside = path.with_name(SPLITS)
     splits = splits or (beside if beside.is_file() else None)
     parts = dict.fromkeys(range(1, count + 1), "")
-    for name in ("train", "test") if splits else ():
+    for name in ("train", "test"):
+        if splits is None:
+            break
         given = np.ravel(read_mat(splits, (f"{name}Ndxs",)).get(f"{name}Ndxs", ()))
         for number in given.tolist():
             if given.dtype.kind not in "iuf" or parts.get(number) != "":
