@@ -151,7 +151,7 @@ def test_train_evaluate_predict(qs3, run, store, tmp_path):
     rng = np.random.default_rng(0)
     np.save(tmp_path / "a.npy", rng.standard_normal((500, 3)))
     np.savetxt(tmp_path / "b.xyz", rng.standard_normal((20, 3)))
-    done = qs3("predict", run, tmp_path / "a.npy", tmp_path / "b.xyz", "--json")
+    done = qs3("predict", run, tmp_path / "a.npy", tmp_path / "b.xyz", "--json", "-")
     rows = json.loads(done.stdout)
     assert [row["file"] for row in rows] == [str(tmp_path / n) for n in ("a.npy", "b.xyz")]
     for row in rows:

@@ -39,7 +39,6 @@ ELSEWHERE = {
     "info": "store.info",
     "verify": "store.verify",
     "evaluate": "evaluate.evaluate_run",
-    "predict": "evaluate.predict",
     "figure": "table.figure",
 }
 """Module and function of the other verbs."""
