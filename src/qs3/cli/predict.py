@@ -41,7 +41,8 @@ def predict(
     if top < 1:
         raise InputError(f"--top {top}: must be at least 1")
     paths = table.list_clouds(files)
-    bar = progress_bar(len(paths), "predict", "cloud", items=table.predict_files(run, paths))
+    text = "predict" if len(paths) > 1 else None
+    bar = progress_bar(len(paths), text, "cloud", items=table.predict_files(run, paths))
     answers: list[table.Answer] = [*bar]
     if json == Path("-"):
         show(table.answers_json(answers), end="")
