@@ -19,6 +19,7 @@ VERBS = {
     "verify": "Check a data set: checksums, finite points, labels, seeds, duplicates, counts.",
     "convert": "Convert a data set into the layout of another.",
     "extract": "Cut objects out of real scans into a data set.",
+    "segment": "Cut a scan of a table or a floor into the objects that stand on it.",
     "train": "Train a classifier, with a method of adaptation to an unlabelled target if asked.",
     "evaluate": "Score a run: accuracy, class-mean accuracy, confusion matrix.",
     "predict": "Tell the class of each file and how confident the network is.",
@@ -38,7 +39,6 @@ ELSEWHERE = {
     "info": "store.info",
     "verify": "store.verify",
     "evaluate": "evaluate.evaluate_run",
-    "predict": "evaluate.predict",
     "figure": "table.figure",
 }
 """Module and function of the other verbs."""
