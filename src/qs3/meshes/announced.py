@@ -71,7 +71,7 @@ def check_3mf(path: Path) -> None:
     Raises:
         InputError: where it does, or it is damaged.
     """
-    from lxml import etree
+    from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
     from trimesh.exchange.common import XML_PARSER_OPTIONS
 
     inside: dict[str, list[str]] = {}

@@ -105,8 +105,8 @@ def file_size(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float,
     """
     side = float(mesh.extents.max())
     name = mesh.units or unit
-    if mesh.units and unit and not math.isclose(_metres(name), _metres(unit)):
-        _note_file(name, unit)
+    if mesh.units and unit and not math.isclose(_metres(mesh.units), _metres(unit)):
+        _note_file(mesh.units, unit)
     if name is None:
         name = "m" if side <= _METRES_TO else "mm"
         _note(name)
