@@ -8,7 +8,8 @@ Statistics of the disparity are measured outside the clock, on both sides alike.
     QS3_SHARED_DATA=… python benchmarks/scan.py --out scan.json
     QS3_SHARED_DATA=… python benchmarks/scan.py --out scan.json --only cycles-128 --objects 2
 
-A set-up that the file holds already is not measured again: delete the file to start anew.
+A set-up that the file holds already is not measured again: delete the file to start anew. Beside
+other programs compare processor seconds alone. ``--sensor`` takes another sensor for ours.
 """
 
 import argparse
@@ -89,14 +90,15 @@ def plain(mesh, poses, renderer, seeds) -> tuple[dict[str, float], list]:
     return seconds, disparities
 
 
-def measure(setup: dict, path: Path, seed: int) -> dict:
+def measure(setup: dict, path: Path, seed: int, sensor: str) -> dict:
     """Seconds and noise of one set-up on one mesh."""
     mesh = load_mesh(path)
     if "variant" in setup:
         renderer = MitsubaRenderer(**setup)
-        scan(mesh, seed=seed, renderer=renderer, views=1)  # kernels are compiled outside the clock
+        how = {"sensor": sensor, "seed": seed, "renderer": renderer}
+        scan(mesh, **how, views=1)  # kernels are compiled outside the clock
         begin, cpu = time.perf_counter(), time.process_time()
-        made = scan(mesh, seed=seed, renderer=renderer, views=VIEWS)
+        made = scan(mesh, **how, views=VIEWS)
         total, cpu = time.perf_counter() - begin, time.process_time() - cpu
         seconds, views = made.seconds, made.views
     else:
@@ -130,17 +132,25 @@ def measure(setup: dict, path: Path, seed: int) -> dict:
 def table(record: dict) -> str:
     """The record as a table: medians over the meshes, and ratios on the meshes in common."""
     rows = [
-        "| set-up | objects | s an object | render | match | rest | σ px | bias px | valid "
-        "| × cycles-16 | × cycles-128 |",
-        "|" + "---|" * 11,
+        "| set-up | objects | s an object | processor s | render | match | rest | σ px | bias px "
+        "| valid | × cycles-16 | × cycles-128 |",
+        "|" + "---|" * 12,
     ]
     for name, made in record["setups"].items():
         values = list(made.values())
         stages = [m["stages"] for m in values]
         total = np.median([m["total"] for m in values])
+        cpu = np.median([m["cpu"] for m in values])
         render = np.median([s["render"] for s in stages])
         matching = np.median([s["matching"] for s in stages])
-        cells = [name, str(len(values)), f"{total:.2f}", f"{render:.2f}", f"{matching:.2f}"]
+        cells = [
+            name,
+            str(len(values)),
+            f"{total:.2f}",
+            f"{cpu:.2f}",
+            f"{render:.2f}",
+            f"{matching:.2f}",
+        ]
         cells.append(f"{total - render - matching:.2f}")
         for key, form in (("disparity_sigma", ".3f"), ("disparity_bias", "+.3f")):
             cells.append(format(np.median([m[key] for m in values]), form))
@@ -158,6 +168,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--only", nargs="*", default=[])
+    parser.add_argument("--sensor", default="paper")
     parser.add_argument("--objects", type=int, default=len(CLASSES))
     options = parser.parse_args()
     root = Path(os.environ["QS3_SHARED_DATA"]) / "cad"
@@ -165,15 +176,17 @@ def main() -> None:
     record = {"versions": versions(), "cores": os.cpu_count(), "setups": {}}
     if options.out.is_file():
         record = json.loads(options.out.read_text())
-    record["sensor"] = dataclasses.asdict(SENSOR)
+    record["sensor"] = dataclasses.asdict(get_sensor(options.sensor))
     for name, setup in setups().items():
-        if options.only and name not in options.only:
+        if (options.only and name not in options.only) or (
+            options.sensor != "paper" and name.startswith("cycles")
+        ):
             continue
         done = record["setups"].setdefault(name, {})
         for seed, path in enumerate(meshes):
             if path.parent.name in done:
                 continue
-            done[path.parent.name] = measure(setup, path, seed)
+            done[path.parent.name] = measure(setup, path, seed, options.sensor)
             options.out.write_text(json.dumps(record, indent=1))
             made = done[path.parent.name]
             print(f"{name:22} {made['mesh']:40} {made['total']:8.2f} s", flush=True)

@@ -5,7 +5,7 @@
 
 Prints quantiles of the radius ratio r (law T11) for each sensor and step, and of the real objects
 in nyuv2_objects.npz (``strict``) where the folder of shared data has them. The sheet draws a cloud
-of each class in its unit ball, seen from 35° beside its camera.
+of each class, as T11 measures it, in its unit ball, seen from 35° beside its camera.
 """
 
 import argparse
@@ -29,11 +29,12 @@ from qs3.sensor.sampling import resample
 from qs3.sensor.scan import Scan, scan
 from qs3.sensor.settings import ScanSettings
 from qs3.sensor.statistics import radius_ratio
-from qs3.sensor.view import clouds_of
+from qs3.sensor.view import measure
 
 SHARES = (0.05, 0.25, 0.5)
 UNBOUNDED = 100.0
 STEPS = ("as matched", "patches dropped", "and depths bounded", "and outliers removed")
+MEASURED = STEPS[2]
 Cloud = tuple[np.ndarray, float]
 """Points, and the azimuth of the camera in degrees as `draw_cloud` counts it."""
 
@@ -66,9 +67,8 @@ def cleaned(made: Scan, least: int, step: str) -> Cloud:
         kept = drop_small_regions(images.disparity, least)
         depth = depth_from_disparity(kept, camera.rig, camera.depth)
         images = dataclasses.replace(images, disparity=kept, depth=depth)
-    bounded = step in STEPS[2:]
-    margin = ScanSettings.depth_margin if bounded else UNBOUNDED
-    points, _ = clouds_of(images, images.region, pose, camera, margin)
+    margin = ScanSettings.depth_margin if step in STEPS[2:] else UNBOUNDED
+    points, _, _ = measure(images, images.region, pose, camera, margin)
     if step == STEPS[-1]:
         points = points[inliers(points)]
     chosen = resample(points, 2048, np.random.default_rng(0))
@@ -94,6 +94,10 @@ def line(name: str, step: str, ratios: list[float]) -> str:
     return f"| {name} | {step} | {len(ratios)} | {cells} |"
 
 
+def label(name: str, ratios: list[float]) -> str:
+    return name + "\nr " + " ".join(f"{value:.2f}" for value in np.quantile(ratios, SHARES))
+
+
 @house_style
 def sheet(rows: dict[str, list[Cloud]]) -> Figure:
     """One row a source, one column a class."""
@@ -101,7 +105,7 @@ def sheet(rows: dict[str, list[Cloud]]) -> Figure:
     grid = figure.subplots(len(rows), len(shapes.CLASSES), squeeze=False)
     limits = (np.full(3, -0.7), np.full(3, 0.7))
     for (name, clouds), row in zip(rows.items(), grid, strict=True):
-        row[0].set_ylabel(name.replace(", ", "\n"), fontsize=6)
+        row[0].set_ylabel(name, fontsize=6)
         for axes, (points, camera) in zip(row, clouds[: len(row)], strict=True):
             made = unit_ball(np.asarray(points, np.float64)[None])[0]
             draw_cloud(axes, made[:1024], camera + 35, 20, limits)
@@ -125,14 +129,16 @@ def main() -> None:
         for step in STEPS:
             if least or step != "patches dropped":  # the paper's sensor drops none
                 clouds = [cleaned(one, least, step) for one in made]
-                rows[f"{sensor}, {step}"] = clouds
                 ratios = [radius_ratio(points) for points, _ in clouds]
+                if step == MEASURED:
+                    rows[label(sensor, ratios)] = clouds
                 print(line(f"`{sensor}`", step, ratios), flush=True)
         clean = [radius_ratio(one.clean) for one in made]
         print(line(f"`{sensor}`", "clean twins", clean), flush=True)
     path = Path(os.environ.get("QS3_SHARED_DATA", "")) / "nyuv2_objects.npz"
     if path.exists():
-        ratios, rows["NYU Depth v2"] = real(path)
+        ratios, shown = real(path)
+        rows[label("NYU Depth v2", ratios)] = shown
         print(line("NYU Depth v2", "real, strict", ratios))
     if settings.sheet:
         settings.sheet.parent.mkdir(parents=True, exist_ok=True)

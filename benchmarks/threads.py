@@ -21,6 +21,10 @@ from typing import Any
 
 CASES = ("dgcnn:8:256", "dgcnn:16:1024", "pointnet:32:1024", "pointnet2:16:512")
 """Network, clouds in a batch, points a cloud: a quick trial, and what people train."""
+HEAD = (
+    "| network | clouds × points | beside | before, all cores | after, all cores "
+    "| after, one thread | auto takes |\n|---|---|---|---|---|---|---|"
+)
 
 
 @contextlib.contextmanager
@@ -82,17 +86,13 @@ def measure_apart(case: str, seconds: float, spin: str | None) -> list[dict[str,
     return json.loads(done.stdout)
 
 
-def table(lines: list[dict[str, Any]]) -> str:
-    """Return the table as Markdown, in samples a second."""
-    head = "| network | clouds × points | beside | before, all cores | after, all cores "
-    text = [head + "| after, one thread | auto takes |", "|---|---|---|---|---|---|---|"]
-    for line in lines:
-        name, batch, points = line["case"].split(":")
-        beside = ("nothing", "one busy core", "two busy cores")[line["hogs"]]
-        rates = (line["before"], line.get("all", line["one"]), line["one"])
-        cells = (name, f"{batch} × {points}", beside, *(f"{rate:.3g}" for rate in rates))
-        text.append(f"| {' | '.join(cells)} | {line['auto']} of {line['cores']} |")
-    return "\n".join(text)
+def row(line: dict[str, Any]) -> str:
+    """Return a row of the table, in samples a second."""
+    name, batch, points = line["case"].split(":")
+    beside = ("nothing", "one busy core", "two busy cores")[line["hogs"]]
+    rates = (line["before"], line.get("all", line["one"]), line["one"])
+    cells = (name, f"{batch} × {points}", beside, *(f"{rate:.3g}" for rate in rates))
+    return f"| {' | '.join(cells)} | {line['auto']} of {line['cores']} |"
 
 
 def main() -> None:
@@ -106,13 +106,14 @@ def main() -> None:
     if options.case:
         print(json.dumps(measure(options.case, options.seconds)))
         return
-    lines = []
+    lines: list[dict[str, Any]] = []
+    print(HEAD, flush=True)
     for case in options.cases:
         before = measure_apart(case, options.seconds, None)
         after = measure_apart(case, options.seconds, "1000")
         for old, new in zip(before, after, strict=True):
             lines.append(new | {"before": old.get("all", old["one"])})
-    print(table(lines))
+            print(row(lines[-1]), flush=True)
     if options.out is not None:
         options.out.write_text(json.dumps(lines, indent=2) + "\n")
 

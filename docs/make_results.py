@@ -8,6 +8,7 @@ Tables are written from the records; those that wait for runs are left out.
 
 import argparse
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 from qs3.experiments import GALLERIES, TABLES
@@ -34,7 +35,10 @@ def main() -> None:
         if filled.faults or not filled.records:
             print(f"{name}: left out", *filled.faults)
         else:
-            print(filled.with_records().write())
+            # Of the rows and columns alone that have records.
+            places = [place for place in filled.runs if filled.records_of(place)]
+            rows, columns = (tuple(dict.fromkeys(place[i] for place in places)) for i in (0, 1))
+            print(replace(filled.table, rows=rows, columns=columns).write())
 
 
 if __name__ == "__main__":

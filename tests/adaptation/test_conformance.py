@@ -15,6 +15,8 @@ from qs3.io import load_clouds, load_unlabelled
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import create_model
 from qs3.training import SelfTrainingSettings, TrainSettings, fit, load_model
+from qs3.training.checkpoint import read_tensors
+from qs3.training.rounds import STATE
 from qs3.training.validation import choose, held_out_rows, read_checkpoints
 
 NETWORKS = {
@@ -29,6 +31,18 @@ NETWORKS = {
 }
 METHODS = list_methods()
 ROUNDS = SelfTrainingSettings(rounds=2, epochs=1, threshold=0.34)
+SWITCHED = SelfTrainingSettings(
+    rounds=2,
+    epochs=1,
+    teacher="average",
+    turns=2,
+    calibrate=True,
+    refine=True,
+    label_smoothing=0.0,
+    threshold_share=0.8,
+    floor=2,
+)
+"""Rounds with all that is off by default."""
 pytestmark = pytest.mark.filterwarnings("ignore::qs3.adaptation.SingleClassWarning")
 SMALLER = {"pointdan": {"nodes": 8, "neighbours": 6}, "dann": {"hidden": (16,)}}
 """Settings that only save time; all else is a method's default."""
@@ -63,6 +77,17 @@ def settings(method, network="pointnet", **changes):
         threads=1,
     )
     return replace(plain, **changes)
+
+
+def fit_after_a_stop(*arguments, run_dir):
+    """Fit, end it after the first epoch as a kill would, and take it up again."""
+
+    def stop(record, _):
+        raise Stop
+
+    with pytest.raises(Stop):
+        fit(*arguments, run_dir=run_dir, on_epoch=stop)
+    return fit(*arguments, run_dir=run_dir)
 
 
 def state(result):
@@ -134,13 +159,7 @@ def test_resumed_is_uninterrupted_and_seeds_count(method, network, tmp_path):
     assert len(whole.history) == 2
     assert all(np.isfinite(list(epoch.losses.values())).all() for epoch in whole.history)
     assert all(0 <= epoch.accuracy <= 1 for epoch in whole.history)
-
-    def stop(record, _):
-        raise Stop
-
-    with pytest.raises(Stop):
-        fit(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "cut", on_epoch=stop)
-    resumed = fit(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "cut")
+    resumed = fit_after_a_stop(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "cut")
     assert same(state(whole), state(resumed))
     assert whole.checkpoints == resumed.checkpoints
     assert same(state(resumed), load_model(tmp_path / "cut").model.state_dict())
@@ -198,14 +217,16 @@ def test_no_domain_is_truncated(count, seen_whole, tmp_path, monkeypatch):
     assert seen[seen_whole] >= whole[seen_whole]
 
 
-@pytest.mark.parametrize("method", [*METHODS, *COMPOSED])
+@pytest.mark.parametrize("method", [*METHODS, *COMPOSED, "qbst, switched"])
 @pytest.mark.parametrize("rule", [pytest.param("last", marks=pytest.mark.slow), "im"])
 def test_poisoned_labels_of_the_target_change_no_bit(method, rule, tmp_path):
     """The files' labels are all wrong; read, trained, stopped, resumed, chosen: the same bits."""
+    method, _, switched = method.partition(", ")
     truth = clouds(12, 3)
     names = np.array(truth.class_names)
     runs = []
-    for case, labels in {"true": truth.labels, "wrong": (truth.labels + 1) % 3}.items():
+    cases = {"true": truth.labels, "wrong": (truth.labels + 1) % 3}
+    for case, labels in cases.items():
         path = tmp_path / case / "target.npz"
         path.parent.mkdir()
         np.savez(path, points=truth.points, label=labels, class_names=names)
@@ -213,18 +234,11 @@ def test_poisoned_labels_of_the_target_change_no_bit(method, rule, tmp_path):
         target = load_unlabelled(path, num_points=None)
         assert isinstance(target, UnlabelledClouds)
         run = path.parent / "run"
-        rounds = None
-        if method in COMPOSED:
+        rounds = SWITCHED if switched else None
+        if method in COMPOSED and not switched:
             rounds = replace(ROUNDS, rule=COMPOSED[method][1])
         chosen = settings(method, epochs=2, rule=rule)
-        arguments = (method, SOURCE, target, chosen, rounds)
-
-        def stop(record, _):
-            raise Stop
-
-        with pytest.raises(Stop):
-            fit(*arguments, run_dir=run, on_epoch=stop)
-        result = fit(*arguments, run_dir=run)
+        result = fit_after_a_stop(method, SOURCE, target, chosen, rounds, run_dir=run)
         history = [json.loads(line) for line in (run / "history.jsonl").read_text().splitlines()]
         for line in history:
             line.pop("seconds", None)
@@ -236,6 +250,9 @@ def test_poisoned_labels_of_the_target_change_no_bit(method, rule, tmp_path):
     assert len(right.checkpoints) >= 2
     assert history == history_of_wrong
     assert kept == kept_of_wrong
+    if switched:
+        rounds, others = (read_tensors(tmp_path / case / "run" / STATE)[0] for case in cases)
+        assert same(rounds, others)
     if rule == "im":
         stage = right.checkpoints[-1].stage if method not in COMPOSED else "round"
         run = tmp_path / "true" / "run"
@@ -373,13 +390,7 @@ def test_networks_without_local_features_are_refused_by_name(method):
 def test_trains_on_two_devices_and_resumes(method, tmp_path):
     chosen = settings(method, "dgcnn", devices=2, epochs=2)
     whole = fit(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "whole")
-
-    def stop(record, _):
-        raise Stop
-
-    with pytest.raises(Stop):
-        fit(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "cut", on_epoch=stop)
-    resumed = fit(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "cut")
+    resumed = fit_after_a_stop(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "cut")
     assert same(state(whole), state(resumed))
     assert whole.checkpoints == resumed.checkpoints
 

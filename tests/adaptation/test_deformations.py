@@ -16,6 +16,8 @@ from qs3.adaptation.deformations import (
     pick_cells,
 )
 
+from .common import ball, seeded
+
 SIGMA = 0.001**0.5
 
 
@@ -27,23 +29,9 @@ ALL = {**DEFORMATIONS, "features": by_own_features}
 every = pytest.mark.parametrize("deform", ALL.values(), ids=ALL)
 
 
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def ball(b=4, n=300, seed=0):
-    points = torch.randn(b, n, 3, generator=seeded(seed))
-    return points / points.norm(dim=2).amax(dim=1)[:, None, None]
-
-
 def shell(b, n=1000):
     """Points of the unit sphere, of which many cells hold forty."""
     return torch.nn.functional.normalize(torch.randn(b, n, 3, generator=seeded()), dim=2)
-
-
-def repeated():
-    points = ball(2, 30)
-    return points.repeat(1, 3, 1)
 
 
 CLOUDS = {
@@ -51,7 +39,7 @@ CLOUDS = {
     "few": ball(3, 5),
     "two": ball(2, 2),
     "one": ball(2, 1),
-    "repeated": repeated(),
+    "repeated": ball(2, 30).repeat(1, 3, 1),
     "equal": torch.full((2, 50, 3), 0.3),
     "outside": ball() * 40 + 7,
     "double": ball().double(),

@@ -6,33 +6,15 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from qs3.adaptation import Batch
 from qs3.adaptation.deformations import Deformation, deform_features, deform_voxels
 from qs3.adaptation.defrec import DefRec, ReconstructionHead, reconstruction_loss
 from qs3.adaptation.method import cross_entropy
 from qs3.adaptation.pcm import PCM, DefRecPCM, mix_clouds, mixed_cross_entropy
-from qs3.models import Features, create_model
+from qs3.models import Features
+
+from .common import make_batch, make_model, make_target, seeded
 
 both = pytest.mark.parametrize("method_class", [DefRec, DefRecPCM])
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def make_model(name="pointnet"):
-    torch.manual_seed(0)
-    if name == "pointnet":
-        return create_model("pointnet", 3, channels=(8, 8, 16), hidden=(8,))
-    return create_model("dgcnn", 3, neighbours=4, channels=(8, 8), embedding=16, hidden=(8,))
-
-
-def make_batch(b=4, n=60):
-    return Batch(torch.rand(b, n, 3, generator=seeded(1)) * 2 - 1, torch.arange(b) % 3)
-
-
-def make_target(b=3, n=50):
-    return torch.rand(b, n, 3, generator=seeded(2)) * 2 - 1
 
 
 def test_loss_is_twenty_times_chamfer_over_moved_points(rng):

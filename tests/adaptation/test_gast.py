@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.adaptation import Batch, gast, pcm
+from qs3.adaptation import gast, pcm
 from qs3.adaptation.curvature import surface
 from qs3.adaptation.deformations import cell_centres, cells
 from qs3.adaptation.gast import (
@@ -16,24 +16,8 @@ from qs3.adaptation.gast import (
 )
 from qs3.adaptation.method import cross_entropy
 from qs3.adaptation.pcm import Mixed, mixed_cross_entropy
-from qs3.models import create_model
 
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def make_model():
-    torch.manual_seed(0)
-    return create_model("pointnet", 3, channels=(8, 8, 16), hidden=(8,))
-
-
-def make_batch(b=4, n=80):
-    return Batch(torch.rand(b, n, 3, generator=seeded(1)) * 2 - 1, torch.arange(b) % 3)
-
-
-def make_target(b=3, n=60):
-    return torch.rand(b, n, 3, generator=seeded(2)) * 2 - 1
+from .common import make_batch, make_model, make_target, seeded
 
 
 def rotation(axis, quarters):

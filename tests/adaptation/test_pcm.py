@@ -16,12 +16,9 @@ from qs3.adaptation.pcm import (
     mixed_cross_entropy,
     sample_spread,
 )
-from qs3.models import create_model
 from qs3.models.ops import farthest_point_sampling
 
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
+from .common import make_model, seeded
 
 
 def clouds(b=5, n=40):
@@ -30,11 +27,6 @@ def clouds(b=5, n=40):
 
 def rows(cloud):
     return [tuple(row) for row in cloud.tolist()]
-
-
-def make_method(**settings):
-    torch.manual_seed(0)
-    return PCM(create_model("pointnet", 3, channels=(8, 8, 16), hidden=(8,)), **settings)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.5, 0.987, 1.0])
@@ -98,7 +90,7 @@ def test_labels_mix_as_the_share():
 
 
 def test_loss_of_the_method(monkeypatch):
-    method = make_method(label_smoothing=0.1, concentration=0.7).eval()
+    method = PCM(make_model(), label_smoothing=0.1, concentration=0.7).eval()
     batch = Batch(clouds(4), torch.tensor([0, 1, 2, 0]))
     asked = []
     real = pcm.draw_share
@@ -114,7 +106,7 @@ def test_loss_of_the_method(monkeypatch):
 
 @pytest.mark.parametrize("share", [0.2, 0.8])
 def test_the_larger_part_decides_what_counts_as_right(monkeypatch, share):
-    method = make_method().eval()
+    method = PCM(make_model()).eval()
     labels = torch.tensor([0, 1, 2, 0])
     monkeypatch.setattr(pcm, "draw_share", lambda *_: share)
     mixed = mix_clouds(clouds(4), labels, seeded())

@@ -1,5 +1,6 @@
 """``qs3 scan`` and ``qs3 generate`` with a scene, randomisation and frames."""
 
+import dataclasses
 import json
 
 import cv2
@@ -101,3 +102,80 @@ def test_scan_takes_the_size_of_a_file_and_tells_its_guess(qs3, quick, tmp_path)
     assert record["drawn"] == {"object_size": 0.4, "units": "mm (guessed)"}
     assert record["settings"]["object_size"] == "file"
     assert "400 m" in qs3.refuses("scan", mesh, "--out", tmp_path / "x", "--units", "m", *how)
+
+
+def test_the_recipe_is_settings_and_what_is_given_beside_it_wins(typed, monkeypatch, tmp_path):
+    from qs3.store.plan import make_plan
+    from qs3.store.scan_item import RECIPES
+
+    asked = []
+
+    def stop(items, settings):
+        asked.append(make_plan(items, settings))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("qs3.store.plan.make_plan", stop)
+    words = ("generate", "--recipe", "rooms", "--out", tmp_path / "out", "--dry-run",
+             "--variant", "scalar_rgb")  # fmt: skip
+    typed(*words, code=130)
+    help_text = typed(*words, "--help").stdout
+    assert "kinect-v1" in help_text.split("--sensor")[1].split("--image-noise")[0]
+    given = ("--sensor", "d435", "--views", 1, "--per-class", 2, "--scans-per-mesh", 3)
+    typed(*words, *given, "--object-size", "file", code=130)
+    whole, changed = asked
+    recipe = dataclasses.replace(RECIPES["rooms"], meshes="shapes", variant="scalar_rgb")
+    different = ("sensor", "renderer")  # made by now
+    for name in {field.name for field in dataclasses.fields(recipe)} - {*different}:
+        assert getattr(whole.settings, name) == getattr(recipe, name)
+    assert [one.name for one in whole.settings.sensor] == list(RECIPES["rooms"].sensor)
+    assert (len(whole.items), whole.rows) == (600, 1200)
+    assert (changed.settings.sensor.name, changed.settings.views) == ("d435", 1)
+    assert (len(changed.items), changed.rows) == (20, 60)
+    assert changed.settings.real_size == "file"
+    assert list(changed.settings.randomise) == ["rooms"]
+
+
+def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(qs3, tmp_path):
+    from qs3.io import load_clouds
+
+    how = ("generate", "--recipe", "rooms", "--classes", "chair", "plant", "--per-class", 1,
+           "--scans-per-mesh", 3, "--sensor", "d435,kinect-v1", "--views", 2, "--num-points", 64,
+           "--variant", "scalar_rgb", "--samples", 1)  # fmt: skip
+    for name, workers in (("a", 1), ("b", 2)):
+        done = qs3(*how, "--out", tmp_path / name, "--workers", workers)
+        assert "--source-cloud all" in done.stderr
+    shards = [(tmp_path / name / "shard-00000.parquet").read_bytes() for name in "ab"]
+    assert shards[0] == shards[1]
+    rows = pq.read_table(tmp_path / "a" / "shard-00000.parquet").to_pylist()
+    drawn = [json.loads(row["drawn"]) for row in rows]
+    assert {values["sensor"] for values in drawn} == {"d435", "kinect-v1"}
+    for row, values in zip(rows, drawn, strict=True):
+        assert max(row["clean_view"]) < values["views"] <= 2
+        assert ("room.height.1" in values) is (values["views"] == 2)
+        for kind in ("clean", "surface"):  # in metres, as large as was drawn
+            extent = np.ptp(np.reshape(row[kind], (-1, 3)), axis=0).max()
+            assert extent <= values["object_size"] * (1 + 1e-6)
+    settings = json.loads((tmp_path / "a" / "dataset.json").read_text())["settings"]
+    assert settings["recipe"] == "rooms"
+    assert [one["name"] for one in settings["sensor"]] == ["d435", "kinect-v1"]
+    assert "sensor: d435, kinect-v1" in qs3("info", tmp_path / "a").stdout
+    assert qs3("verify", tmp_path / "a").stdout == ""
+    whole = load_clouds(tmp_path / "a", num_points=None, cloud="all")
+    single = [load_clouds(tmp_path / "a", num_points=None, cloud=c).points
+              for c in ("points", "clean", "surface")]  # fmt: skip
+    np.testing.assert_array_equal(whole.points, np.concatenate(single))
+    np.testing.assert_array_equal(whole.scan_rows(), np.tile(np.arange(6), 3))
+    again = qs3(*how, "--out", tmp_path / "a", "--workers", 1)
+    assert "0 scans written, 6 were there before" in again.stderr
+
+
+def test_the_recipe_refuses_a_class_without_a_real_size_with_what_to_do(typed, tmp_path):
+    folder = tmp_path / "meshes" / "bracket"
+    folder.mkdir(parents=True)
+    trimesh.creation.box((1, 1, 1)).export(folder / "a.ply")
+    trimesh.creation.box((1, 1, 2)).export(folder / "b.ply")
+    said = typed.refuses("generate", "--recipe", "rooms", "--meshes", folder.parent, "--out",
+                         tmp_path / "out", "--workers", 0, "--variant", "scalar_rgb")  # fmt: skip
+    assert "'bracket'" in said
+    assert "--object-size file" in said
+    assert not (tmp_path / "out").exists()

@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 import pytest
 
-from qs3.experiments.data import make_plans
+from qs3.experiments.data import choose_meshes, make_plans
 from qs3.experiments.grid import data_sets
 from qs3.experiments.reproduce import Workers, collect_runs, products, reproduce
 from qs3.experiments.scales import SCALES, Scale
@@ -78,7 +78,7 @@ def make_tables(out, names, rows=(), columns=(), seeds=(0, 1), tell=lambda line:
     setup = Setup(out, TINY, seeds=seeds, threads=1, **changes)
     parts = products(names, setup, rows, columns)
     sets = [*data_sets(collect_runs(parts), setup.own), *(d for p in parts for d in p.sets())]
-    plans = make_plans(TINY, None, sets)
+    plans = make_plans(TINY, choose_meshes(TINY, None), sets)
     claim(setup, "shapes")
     for name, plan in plans.items():
         if not (out / "data" / name).exists():

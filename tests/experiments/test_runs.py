@@ -37,7 +37,7 @@ def test_every_cell_has_its_data_and_its_work_list(scale, tmp_path):
         assert before is None or before.folder in made
         made.add(run.folder)
     few = dataclasses.replace(scale, source_per_class=1, target_per_class=1, test_per_class=1)
-    plans = make_plans(few, None, sets)
+    plans = make_plans(few, choose_meshes(few, None), sets)
     assert len(plans) == len(sets) and all(plan.rows for plan in plans.values())
 
 

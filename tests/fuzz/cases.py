@@ -9,7 +9,6 @@ import shutil
 import struct
 import subprocess
 import sys
-import zipfile
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -98,18 +97,6 @@ def _npy(folder: Path) -> Path:
     return folder / "src"
 
 
-@case("ok")
-def planted_link(folder: Path) -> None:
-    """Folders that unfinished work is thought to have left are never adopted."""
-    source, precious = _npy(folder), folder / "precious"
-    precious.mkdir()
-    (precious / "thesis").touch()
-    for name in (".dst.unfinished", ".dst.tmp"):
-        (folder / name).symlink_to(precious)
-    command("convert", source, folder / "dst", "--to", "ply")
-    assert [path.name for path in precious.iterdir()] == ["thesis"]
-
-
 _TOO_MUCH = {"deep": "[" * 100_000, "long": "9" * 5000}
 
 
@@ -161,15 +148,6 @@ def run_num_points(folder: Path, value: Any) -> None:
 
 
 @case("ok", "refused")
-def file_name_not_utf8(folder: Path) -> None:
-    source = _npy(folder)
-    victim = next(source.rglob("*.npy"))
-    os.rename(victim, os.fsencode(victim.parent) + b"/\xff.npy")  # noqa: PTH104
-    command("convert", source, folder / "dst", "--to", "store")
-    command("info", folder / "dst")
-
-
-@case("ok", "refused")
 def run_record_surrogate(folder: Path) -> None:
     run = _run(folder)
     (path,) = (run / "records").iterdir()
@@ -190,39 +168,6 @@ def ply_texture_comment(folder: Path) -> None:
         "property list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
     )
     load_mesh(folder / "a.ply")
-
-
-@case("refused", form={"places": (5, 1), "corners": (3, 5), "instances": (3, 0)})
-def glb_announces(folder: Path, form: tuple[int, int]) -> None:
-    """Accessors of 5·10⁸ values that no bytes stand behind; one mesh placed 20,000 times."""
-    from qs3.meshes import load_mesh
-
-    huge = 500_000_000
-    size, corners = form
-    many = corners == 0
-    vertices = 3000 if many else 3
-    data = np.random.default_rng(0).normal(size=(vertices, 3)).astype("<f4").tobytes()
-    view = {} if size == 5 else {"bufferView": 0}
-    count = huge if size == 5 else vertices
-    accessors = [{"componentType": 5126, "type": "VEC3", "count": count} | view]
-    accessors.append({"componentType": 5125, "type": "SCALAR", "count": huge})
-    indexed = {"indices": 1} if corners == 5 else {}
-    tree = {
-        "asset": {"version": "2.0"},
-        "buffers": [{"byteLength": len(data)}],
-        "bufferViews": [{"buffer": 0, "byteLength": len(data)}],
-        "accessors": accessors[: 2 if indexed else 1],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}} | indexed]}],
-        "nodes": [{"mesh": 0}] * (20_000 if many else 1),
-        "scenes": [{"nodes": list(range(20_000 if many else 1))}],
-        "scene": 0,
-    }
-    text = json.dumps(tree).encode()
-    text += b" " * (-len(text) % 4)
-    body = struct.pack("<II", len(text), 0x4E4F534A) + text
-    body += struct.pack("<II", len(data), 0x004E4942) + data
-    (folder / "a.glb").write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
-    load_mesh(folder / "a.glb")
 
 
 @case("refused")
@@ -248,16 +193,6 @@ def npz_of_zeros(folder: Path) -> None:
     entry = b"PK\1\2" + struct.pack("<H", 20) + common + struct.pack("<3H2I", 0, 0, 0, 0, 0) + name
     end = struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 1, 1, len(entry), len(local) + len(packed), 0)
     (folder / "a.npz").write_bytes(local + packed + entry + end)
-    load_clouds(folder / "a.npz", num_points=32)
-
-
-@case("refused")
-def npz_of_empty_members(folder: Path) -> None:
-    from qs3.io.load import load_clouds
-
-    with zipfile.ZipFile(folder / "a.npz", "w") as archive:
-        for number in range(100_000):
-            archive.writestr(zipfile.ZipInfo(f"{number}.npy"), b"")
     load_clouds(folder / "a.npz", num_points=32)
 
 
@@ -299,11 +234,6 @@ def empty_name_to_write_to(folder: Path) -> None:
     except QS3Error as error:
         assert "--out" in str(error), error
         raise
-
-
-@case("ok")
-def long_name_to_write_to(folder: Path) -> None:
-    command("convert", _npy(folder), folder / ("a" * 250), "--to", "store")
 
 
 @case("ok", words={"ascii": "exec", "closed": "exec 2>&-;"})

@@ -89,26 +89,9 @@ def layout(name: str) -> Layout:
 
 def build_generated(folder: Path) -> None:
     """A data set as ``generate`` makes it, every kind of cloud filled."""
-    from qs3.store.folder import open_folder
-    from qs3.store.manifest import Manifest, write_manifest
-    from qs3.store.shards import CloudRow, put_shard, table_of
+    from ..stores import write_store
 
-    rng = np.random.default_rng(1)
-    rows = []
-    for index in range(6):
-        points = rng.normal(size=(64, 3)).astype(np.float32)
-        view = rng.integers(0, 5, 64, dtype=np.uint8)
-        name = CLASSES[index % 3]
-        rows.append(
-            CloudRow(
-                f"m{index}#0", f"m{index}", 0, index % 3, name, "train", index, points, view,
-                points, view, points, valid_fraction=0.9,
-            )
-        )  # fmt: skip
-    folder.mkdir()
-    write_manifest(folder, Manifest({"views": 5, "seed": 0}, CLASSES, 6, 2, {"qs3": "0"}))
-    for shard in range(2):
-        put_shard(open_folder(folder), shard, table_of(rows[3 * shard : 3 * shard + 3]))
+    write_store(folder, CLASSES, [(index % 3, "train", 64) for index in range(6)], shards=2)
 
 
 def load_generated(path: Path) -> Any:

@@ -2,13 +2,16 @@ import struct
 import tracemalloc
 import zipfile
 
+import h5py
 import numpy as np
 import pytest
 
 from qs3.errors import InputError
 from qs3.io import guards
 from qs3.io.clouds import PointClouds, UnlabelledClouds, digests
+from qs3.io.layouts.hdf5 import read_file
 from qs3.io.load import load_clouds, load_unlabelled
+from qs3.io.point_files import cloud_bytes, read_cloud
 from qs3.meshes.classes import POINTDA10
 from qs3.store.generate import GenerateSettings, generate
 
@@ -175,7 +178,7 @@ def test_an_archive_that_would_fill_the_memory_is_refused(tmp_path, monkeypatch)
             load_clouds(path)
         assert tracemalloc.get_traced_memory()[1] < 2**24
         tracemalloc.stop()
-    monkeypatch.setattr(guards, "MOST_BYTES", 1000)
+    monkeypatch.setenv(guards.LIMIT, str(1000 / 2**30))
     with pytest.raises(InputError, match="read are 1000 at most"):
         load_clouds(write_npz(path, np.random.default_rng(0)))
 
@@ -217,3 +220,34 @@ def test_modelnet10_keeps_its_own_classes(shared_data):
     assert "toilet" in test.class_names
     assert test.ids[0].startswith("bathtub_")
     assert len(load_unlabelled(path, split="train")) == 3991
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.npy", "a.h5", "a.ply"])
+def test_the_largest_file_is_named_by_the_environment(tmp_path, rng, monkeypatch, name):
+    points = rng.random((4, 50, 3)).astype(np.float32)
+    path = tmp_path / name
+    if name == "a.npz":
+        np.savez(path, points=points)
+    elif name == "a.h5":
+        with h5py.File(path, "w") as file:
+            file["data"], file["label"] = points, np.zeros(4, np.uint8)
+    else:
+        path.write_bytes(cloud_bytes(points[0], path.suffix))
+
+    def read():
+        if name == "a.h5":
+            return read_file(path, columns=(3,), classes=1)
+        return read_cloud(path) if name != "a.npz" else load_unlabelled(path, num_points=None)
+
+    read()
+    monkeypatch.setenv(guards.LIMIT, str(500 / 2**30))
+    message = r"read are 500 at most: split the file, or.* QS3_LARGEST_FILE_GIB to a larger number"
+    with pytest.raises(InputError, match=message) as caught:
+        read()
+    assert str(caught.value).startswith(f"{path}: ")
+    monkeypatch.setenv(guards.LIMIT, str(5000 / 2**30))
+    read()
+    for word in ("much", "-1", "nan", "inf", "0"):
+        monkeypatch.setenv(guards.LIMIT, word)
+        with pytest.raises(InputError, match=f"QS3_LARGEST_FILE_GIB={word}: a number of GiB"):
+            read()

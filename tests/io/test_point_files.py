@@ -1,5 +1,6 @@
 import io
 import struct
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -160,6 +161,17 @@ def test_pickled_content_is_never_loaded(tmp_path):
     with pytest.raises(InputError, match="cannot be read as npy"):
         read_cloud(tmp_path / "a.npy")
     assert not (tmp_path / "sprung").exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux alone tells what a process has")
+@pytest.mark.parametrize("suffix", [".ply", ".off"])
+def test_what_takes_far_more_memory_than_its_size_is_refused(tmp_path, monkeypatch, suffix):
+    path = tmp_path / f"a{suffix}"
+    trimesh.creation.box().export(path)
+    monkeypatch.setattr(trimesh, "load", lambda *_, **__: bytearray(3 << 30))
+    with pytest.raises(InputError, match=r"takes over 2\.0 GiB of memory to read") as caught:
+        read_cloud(path)
+    assert str(caught.value).count(str(path)) == 1
 
 
 def test_other_files_are_refused(tmp_path):

@@ -1,7 +1,6 @@
 """Small files that announce much are refused before anything is taken for them."""
 
 import json
-import logging
 import struct
 from pathlib import Path
 
@@ -76,14 +75,3 @@ def test_reading_takes_so_much_memory_and_no_more(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"a\.off: takes over 2\.0 GiB"), memory_limit(path):
         np.empty(2**32, np.uint8)
     assert resource.getrlimit(resource.RLIMIT_AS) == before
-
-
-def test_what_the_parser_says_of_textures_goes_to_no_screen(tmp_path: Path) -> None:
-    (tmp_path / "a.ply").write_text(
-        "ply\nformat ascii 1.0\ncomment TextureFile none.png\nelement vertex 3\n"
-        "property float x\nproperty float y\nproperty float z\nelement face 1\n"
-        "property list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
-    )
-    load_mesh(tmp_path / "a.ply")
-    handlers = logging.getLogger("trimesh").handlers  # without one Python writes to stderr
-    assert any(isinstance(handler, logging.NullHandler) for handler in handlers)

@@ -1,14 +1,14 @@
-"""SimpleView: its images against a camera drawn by hand, its network against the textbook form."""
+"""SimpleView: its images against a camera drawn by hand."""
 
 import numpy as np
 import pytest
 import torch
 from torch import nn
 
-from qs3.models import SimpleView, create_model
+from qs3.models import create_model
 from qs3.models.simpleview import ResNet18, depth_images
 
-from .common import randomise
+from .common import make
 from .common import textbook as load_textbook
 
 textbook = load_textbook("simpleview")
@@ -120,49 +120,6 @@ def test_points_beyond_the_image_are_not_seen(projection):
     assert not depth_images(inside + 30, 16, "orthographic").any()
 
 
-def random_model(seed=0, **settings):
-    torch.manual_seed(seed)
-    model = SimpleView(5, width=4, resolution=24, dropout=0.0, **settings).double()
-    randomise(model, 0.3)
-    return model
-
-
-def run(logits, model):
-    weights = torch.randn(logits.shape, generator=torch.Generator().manual_seed(2)).to(logits)
-    (logits * weights).sum().backward()
-    return {name: p.grad for name, p in model.named_parameters()}
-
-
-def close(value, reference, tolerance, name=""):
-    value, reference = value.detach().double(), reference.detach().double()
-    scale = float(reference.abs().max())
-    worst = float((value - reference).abs().max())
-    assert worst <= tolerance * max(scale, 1e-12), f"{name}: {worst} of {scale}"
-
-
-@pytest.mark.parametrize("projection", BOTH)
-@pytest.mark.parametrize("train", [False, True])
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-9), (torch.float32, 1e-4)])
-def test_is_the_textbook_function(dtype, tolerance, train, projection):
-    # With seeds 0 and 1 a ReLU of the textbook form itself, rounded, falls on its other side.
-    ours = random_model(seed=3, projection=projection).train(train)
-    slow = textbook.from_ours(ours)  # in double precision, with no rounding of its own
-    points = ball(b=4, dtype=dtype)
-    images = depth_images(points, 24, projection)
-    ours = ours.to(dtype)
-    logits, expected = ours(points), slow(points, images.double())
-    close(logits, expected, tolerance, "logits")
-    run(logits, ours)
-    run(expected, slow)
-    for fast, reference in textbook.pairs(ours, slow):
-        for name, parameter in fast.named_parameters():
-            goal = getattr(reference, name).grad
-            if goal.abs().max() > 1e-6:  # a shift before the head's normalisation has none
-                close(parameter.grad, goal, tolerance, name)
-        for name, buffer in fast.named_buffers():
-            close(buffer, getattr(reference, name), tolerance, name)
-
-
 @pytest.mark.parametrize("projection", BOTH)
 def test_the_textbook_draws_the_same_images(projection):
     images = depth_images(ball(), 16, projection)
@@ -170,7 +127,7 @@ def test_the_textbook_draws_the_same_images(projection):
 
 
 def test_pooled_holds_each_view_in_its_place():
-    model = random_model().eval()
+    model = make("simpleview").eval()
     images = depth_images(ball(), 24)
     alone = [model.backbone(images[:, view, None]) for view in range(6)]
     pooled = model.encode(ball()).pooled

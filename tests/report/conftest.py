@@ -14,6 +14,8 @@ from qs3.report.montage import MontageView
 from qs3.report.page import write_report
 from qs3.report.plots import Curve, SelectionRound
 
+from ..stores import write_store
+
 HOSTILE = '</script><script>alert(\'x\')</script><img src="http://example.org/a.png" onerror="b()">'
 
 
@@ -100,24 +102,11 @@ def page_path(report, tmp_path_factory) -> Path:
 def grid(tmp_path_factory) -> Path:
     """A folder with a source-only run, one that it warmed up, their data and their records."""
     from qs3.io import load_clouds, load_unlabelled
-    from qs3.store.folder import open_folder
-    from qs3.store.manifest import Manifest, write_manifest
-    from qs3.store.shards import CloudRow, put_shard, table_of
     from qs3.training import SelfTrainingSettings, TrainSettings, evaluate, fit
 
     folder = tmp_path_factory.mktemp("grid")
-    data, rng, names = folder / "shapes", np.random.default_rng(0), ("bed", "chair", "sofa")
-    data.mkdir()
-    rows = []
-    for index in range(12):
-        noisy, clean, surface = rng.normal(size=(3, 32, 3)).astype(np.float32)
-        view, label = np.zeros(32, np.uint8), index % 3
-        rows.append(
-            CloudRow(f"o{index}", f"o{index}", 0, label, names[label], "train", 3, noisy, view,
-                     clean, view, surface)
-        )  # fmt: skip
-    write_manifest(data, Manifest(class_names=names, rows=12, shards=1, settings={}, versions={}))
-    put_shard(open_folder(data), 0, table_of(rows))
+    rows = [(index % 3, "train", 32) for index in range(12)]
+    data = write_store(folder / "shapes", ("bed", "chair", "sofa"), rows)
     settings = TrainSettings(model="pointnet", num_points=24, epochs=2, batch_size=6, threads=1)
     source, target = load_clouds(data), load_unlabelled(data)
     fit("source-only", source, None, settings, run_dir=folder / "first")

@@ -9,10 +9,11 @@ from qs3.errors import InputError
 from qs3.sensor.exposure import ExposureSettings, expose, expose_pair, radiance_of
 from qs3.sensor.lens import blur, blur_reach
 from qs3.sensor.matching import MatchingSettings
-from qs3.sensor.presets import Sensor
+from qs3.sensor.presets import Sensor, get_sensor
 from qs3.sensor.render import StereoPair
 from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.scan import scan
+from qs3.sensor.view import photograph, scene_of
 
 RIG = StereoRig(width=201, height=161, focal=100.0)
 OBJECT = Region(40, 30, 110, 90)
@@ -124,6 +125,44 @@ def test_speckle_grows_with_the_grey_level_and_spares_black():
         left, _ = exposed(pair_of(np.full((161, 201), level)), settings)
         assert left.std() == pytest.approx(1023 * level / np.sqrt(398.12), rel=0.03)
     assert not exposed(pair_of(np.zeros((161, 201))), settings)[0].any()
+
+
+def test_coherent_speckle_spares_the_rooms_light():
+    settings = ExposureSettings(response="linear", coherent=4.0, bits=10)
+    room, dots = np.full((161, 201), 0.2), np.zeros((161, 201))
+    dots[:, :100] = 0.1
+    pair = dataclasses.replace(pair_of(room + dots), room=pair_of(room))
+    left, right = exposed(pair, settings)
+    for grey in (left, right):
+        assert (grey[:, 100:] == round(1023 * 0.2)).all()
+        factor = (grey[:, :100] / 1023 - 0.2) / 0.1
+        assert factor.mean() == pytest.approx(1, abs=0.02)
+        assert factor.std() == pytest.approx(0.5, rel=0.03)
+    assert abs(np.corrcoef(left[:, :100].ravel(), right[:, :100].ravel())[0, 1]) < 0.03
+    with pytest.raises(ValueError, match="projector"):
+        exposed(pair_of(room), settings)
+
+
+@pytest.mark.parametrize("coherent", [0.0, 4.0])
+def test_a_view_is_taken_without_the_projector_where_speckle_needs_it(coherent):
+    lit = []
+
+    class Lamp:
+        @property
+        def description(self):
+            return {}
+
+        def render(self, scene, rig, poses, seeds, regions=None):
+            lit.append((scene.light.projector, *seeds))
+            return [pair_of(np.full((2, 2), scene.light.projector)) for _ in poses]
+
+    sensor = dataclasses.replace(get_sensor("d415"), exposure=ExposureSettings(coherent=coherent))
+    pose = Pose(np.eye(4))
+    pairs = photograph(Lamp(), scene_of((), sensor), sensor, [pose] * 2, [3, 4])
+    assert [pair.left.max() for pair in pairs] == [1.0, 1.0]
+    assert lit == ([(1.0, 3, 4), (0.0, 3, 4)] if coherent else [(1.0, 3, 4)])
+    assert all((pair.room is None) == (coherent == 0) for pair in pairs)
+    assert not any(pair.room.left.any() for pair in pairs if pair.room)
 
 
 def test_noise_has_the_mean_and_size_asked_for():

@@ -8,10 +8,15 @@ import trimesh
 from scipy import stats
 
 from qs3.errors import InputError
+from qs3.sensor import randomise
 from qs3.sensor.materials import MATERIALS
 from qs3.sensor.presets import SENSORS, Sensor
-from qs3.sensor.randomise import default_ranges, draw, numbers_of, resolve_ranges
+from qs3.sensor.randomise import default_ranges, numbers_of, resolve_ranges
 from qs3.sensor.scan import scan
+
+
+def draw(sensor, ranges, rng):
+    return randomise.draw(sensor, resolve_ranges(sensor, ranges), rng)
 
 
 def many(ranges, count=200, sensor=None):

@@ -9,7 +9,7 @@ import pytest
 
 from qs3.errors import InputError
 from qs3.sensor.presets import Sensor, get_sensor
-from qs3.sensor.realism import LAWS, RealismSettings, realism
+from qs3.sensor.realism import RealismSettings, realism
 from qs3.sensor.realism.bench import distances
 from qs3.sensor.realism.edges import band_rows, bar_rows, edge_rows, shadow_rows, spill_rows
 from qs3.sensor.realism.faces import inside_faces, off_faces, scan_rows
@@ -454,8 +454,6 @@ def test_a_sensor_without_steps_and_one_without_noise_are_told(renderer, small):
 
 
 @pytest.mark.slow
-def test_the_d435_passes_all_tests_but_t11(renderer):
-    """Its miss of T11 is told in docs/realism.md; the Kinect passes."""
-    tests = tuple(test for test in LAWS if test != "T11")
-    for result in realism(get_sensor("d435"), renderer, RealismSettings(quick=True, tests=tests)):
+def test_the_d435_passes_all_tests(renderer):
+    for result in realism(get_sensor("d435"), renderer, RealismSettings(quick=True)):
         assert result["passed"] is not False, result

@@ -1,6 +1,7 @@
 """Rooms: drawn within their ranges, from the scan's seed alone, and again where little shows."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,13 +9,15 @@ import trimesh
 
 from qs3 import shapes
 from qs3.errors import InputError
+from qs3.geometry import rotation_z
 from qs3.meshes.sizes import CLASS_SIZES
+from qs3.sensor import staging
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.presets import SENSORS, Sensor
 from qs3.sensor.randomise import default_ranges, draw_room, resolve_ranges
 from qs3.sensor.render import Body
 from qs3.sensor.rig import StereoRig
-from qs3.sensor.rooms import ROOM_RANGES, Room, fitting
+from qs3.sensor.rooms import PLACE, ROOM_RANGES, Room, fitting
 from qs3.sensor.scan import scan
 from qs3.sensor.scene import SceneSettings, arrange
 from qs3.sensor.settings import ScanSettings
@@ -165,6 +168,88 @@ def test_a_room_that_shows_little_is_drawn_again_and_counted(renderer):
     assert all(free.drawn[name] == strict.drawn[name] for name in own)  # the room alone is drawn
     with pytest.raises(InputError, match=r"50 rooms in a row.*least_pixels is 101760"):
         chair(randomise=ALL, least_pixels=424 * 240, renderer=renderer)
+
+
+@dataclasses.dataclass(frozen=True)
+class Shutter:
+    """A renderer whose first pictures are all black."""
+
+    inner: Any
+    dark: int
+    taken: list[int] = dataclasses.field(default_factory=list)
+
+    @property
+    def description(self):
+        return self.inner.description
+
+    def render(self, scene, rig, poses, seeds, regions=None):
+        pairs = self.inner.render(scene, rig, poses, seeds, regions)
+        self.taken.append(len(pairs))
+        if len(self.taken) > self.dark:
+            return pairs
+        black = [{n: 0 * getattr(p, n) for n in ("left", "right", "background")} for p in pairs]
+        return [dataclasses.replace(p, **b) for p, b in zip(pairs, black, strict=True)]
+
+
+def test_a_room_of_which_the_sensor_gets_no_point_is_drawn_again_up_to_the_same_limit(
+    renderer, monkeypatch
+):
+    still = dataclasses.replace(TINY, exposure=dataclasses.replace(TINY.exposure, noise=0.0))
+    how = {"sensor": still, "randomise": ALL, "seed": 3, "crop": "mask"}
+    free = chair(renderer=renderer, **how)
+    shutter = Shutter(renderer, dark=2)
+    again = chair(renderer=shutter, **how)
+    assert (free.drawn["room.redraws"], again.drawn["room.redraws"]) == (0, 2)
+    assert len(shutter.taken) == 3
+    assert again.drawn["room.height"] != free.drawn["room.height"]
+    assert again.drawn["object_size"] == free.drawn["object_size"]
+    monkeypatch.setattr(staging, "_MOST_DRAWS", 3)
+    with pytest.raises(InputError, match=r"3 rooms in a row.*saw no point of the object"):
+        chair(renderer=Shutter(renderer, dark=99), **how)
+
+
+def test_each_view_of_a_room_has_a_height_a_distance_and_an_aim_of_its_own(renderer):
+    how = {"randomise": ["rooms", "material=diffuse", "room.layout=room"], "renderer": renderer}
+    made, one = (chair(views=views, seed=3, **how) for views in (3, 1))
+    assert made.drawn.items() >= (one.drawn | {"room.redraws": made.drawn["room.redraws"]}).items()
+    later = {f"room.{name}.{view}" for name in PLACE for view in (1, 2)}
+    assert set(made.drawn) - set(one.drawn) == later
+    assert min(view.object_pixels for view in made.views) >= 20
+    floor = made.mesh.bounds[0, 2]
+    azimuths = []
+    for view, pose in enumerate(made.poses):
+        room = {name: made.drawn[f"room.{name}" + f".{view}" * (view > 0)] for name in PLACE}
+        assert pose.position[2] - floor == pytest.approx(room["height"], abs=1e-3)
+        half = np.abs((made.mesh.vertices @ rotation_z(made.yaw).T)[:, :2]).max(axis=0)
+        way = pose.position[:2] / np.linalg.norm(pose.position[:2])
+        side = (half / np.abs(way)).min()
+        assert np.linalg.norm(pose.position[:2]) - side == pytest.approx(room["distance"])
+        azimuths.append(np.degrees(np.arctan2(*pose.position[1::-1])))
+    turns = np.mod(np.subtract(azimuths, made.drawn["room.azimuth"]), 360)
+    np.testing.assert_allclose(turns, [0, 40, 320], atol=1e-9)  # the arc before a wall
+
+
+def test_copies_of_one_pose_share_one_place(renderer):
+    made = chair(views=2, view_layout="jitter", randomise=ALL, seed=3, renderer=renderer)
+    assert not [name for name in made.drawn if name.endswith(".1")]
+    apart = np.linalg.norm(made.poses[0].position - made.poses[1].position)
+    assert 0 < apart < 0.2
+
+
+def test_a_later_view_that_shows_little_is_drawn_again_alone():
+    mesh, alone = Body(shapes.make("chair", seed=1)), 0
+    for seed in range(8):
+        drawn = []
+        for least in (20, 2000):
+            how = ScanSettings(sensor=TINY, views=3, least_pixels=least, randomise=ALL)
+            streams = (np.random.default_rng(seed) for _ in range(2))
+            drawn.append(next(staging.stand_in_rooms(how, TINY, mesh, None, *streams))[2])
+        free, strict = drawn
+        if free["room.height"] == strict["room.height"]:  # the first view would do
+            alone += free["room.redraws"] < strict["room.redraws"]
+            changed = {name for name in free if free[name] != strict[name]} - {"room.redraws"}
+            assert changed <= {f"room.{name}.{view}" for name in PLACE for view in (1, 2)}
+    assert alone > 0
 
 
 def test_the_cloud_is_as_large_as_the_files_unit_says(renderer):

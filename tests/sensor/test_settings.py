@@ -1,10 +1,13 @@
 """Settings of a scan: presets, changes of the sensor, records."""
 
+import collections
 import dataclasses
 from typing import Literal
 
+import numpy as np
 import pytest
 import trimesh
+from scipy import stats
 
 from qs3.errors import InputError
 from qs3.sensor.checks import check_choices
@@ -17,6 +20,7 @@ from qs3.sensor.scan import scan
 from qs3.sensor.scene import SceneSettings
 from qs3.sensor.settings import PRESETS, CameraSettings, ScanSettings
 from qs3.sensor.speckle import PatternSettings
+from qs3.sensor.staging import choose
 
 
 def test_a_preset_is_a_whole_column_and_what_is_given_beside_it_wins():
@@ -104,3 +108,32 @@ def test_absurd_sizes_are_refused_before_anything_is_allocated(kind, changes, me
         object.__setattr__(settings, name, value)  # past the tests' own check of types
     with pytest.raises(InputError, match=message):
         settings.__post_init__()
+
+
+def test_each_scan_draws_one_of_several_sensors_and_a_number_of_views_evenly():
+    names = ("d415", "d435", "d455", "kinect-v1")
+    settings = ScanSettings(sensor=names, views=5, least_views=1)
+    several = [choose(settings, np.random.default_rng(seed)) for seed in range(600)]
+    for name, values in {"sensor": names, "views": (1, 2, 3, 4, 5)}.items():
+        counts = collections.Counter(drawn[name] for _, drawn in several)
+        assert set(counts) == set(values)
+        assert stats.chisquare(list(counts.values())).pvalue > 0.01
+    for how, drawn in several[:50]:
+        assert how.make_sensor() == SENSORS[drawn["sensor"]]
+        assert (how.views, how.least_views) == (drawn["views"], None)
+    one = dataclasses.replace(settings, sensor="d435")  # neither depends on the other
+    same = [choose(one, np.random.default_rng(seed))[1] for seed in range(50)]
+    assert same == [{"views": drawn["views"]} for _, drawn in several[:50]]
+    assert choose(ScanSettings(), np.random.default_rng(0)) == (ScanSettings(), {})
+
+
+def test_several_sensors_are_recorded_and_refused_where_one_is_needed():
+    settings = ScanSettings(sensor=("d435", SENSORS["kinect-v1"]), randomise="rooms")
+    alone = [dataclasses.replace(settings, sensor=name) for name in ("d435", "kinect-v1")]
+    assert settings.as_dict()["randomise"] == [one.as_dict()["randomise"] for one in alone]
+    assert (settings.real_size, settings.needs_neighbour) == ("class", True)
+    with pytest.raises(InputError, match=r"one is needed here, not several \(d435, kinect-v1\)"):
+        settings.make_sensor()
+    for views, least in ((2, 3), (2, 0)):
+        with pytest.raises(InputError, match="least_views"):
+            ScanSettings(views=views, least_views=least)

@@ -14,7 +14,7 @@ from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.scan import scan
 from qs3.sensor.settings import ScanSettings
 from qs3.sensor.statistics import radius_ratio
-from qs3.sensor.view import ViewImages, clouds_of
+from qs3.sensor.view import ViewImages, measure
 from qs3.shapes import make
 
 
@@ -61,24 +61,25 @@ def test_a_cloud_of_few_points_is_taken(count):
     assert inliers(sphere(count, np.random.default_rng(2))).shape == (count,)
 
 
-def test_the_crop_with_the_mask_ends_a_margin_beyond_the_true_depths():
-    rig = StereoRig(width=8, height=2, focal=10.0, baseline=0.05)
+def test_the_crop_with_the_mask_ends_a_margin_and_noise_off_the_true_surface():
+    rig = StereoRig(width=8, height=2, focal=10.0, baseline=12.0)  # noise z²/400 thrice
     sensor = dataclasses.replace(get_sensor("d435"), rig=rig, depth=DepthSettings(stride=1))
-    true = np.tile(np.linspace(1.5, 2.2, 8), (2, 1))
-    depth = np.array([[1.39, 1.41, 2.0, 2.29, 2.31, 5.0, np.nan, 2.2], [1.8] * 8])
+    true = np.tile([1.5, 1.5, 1.5, 2.0, 2.0, 4.0, 4.0, 4.0], (2, 1))
+    off = np.array([0.105, -0.105, 0.106, 0.109, -0.111, 0.139, 0.141, np.nan])
+    depth = true + off
     mask = np.array([[True] * 8, [False] * 8])
     grey = np.zeros(true.shape, np.uint8)
     view = ViewImages(rig.full_frame, grey, grey, depth.astype(np.float32), depth, true, mask)
 
     def found(margin):
-        cloud, clean = clouds_of(view, rig.full_frame, Pose(np.eye(4)), sensor, margin)
+        cloud, clean, _ = measure(view, rig.full_frame, Pose(np.eye(4)), sensor, margin)
         np.testing.assert_allclose(clean[:, 2], true[0])
         return cloud[:, 2].round(6).tolist()
 
-    assert found(0.1) == [1.41, 2.0, 2.29, 2.2]
-    assert found(0.0) == [2.0, 2.2]
-    assert found(10.0) == [1.39, 1.41, 2.0, 2.29, 2.31, 5.0, 2.2]
-    assert found(None) == [*found(10.0), *[1.8] * 8]
+    assert found(0.1) == [1.605, 1.395, 2.109, 4.139]
+    assert found(0.0) == []
+    assert found(10.0) == depth[0, :7].round(6).tolist()
+    assert found(None) == [*found(10.0), *found(10.0)]
 
 
 def test_outlier_removal_is_an_option_that_is_off(renderer):

@@ -96,6 +96,15 @@ def test_other_settings_or_another_work_list_are_refused(fake, tmp_path):
     assert fake.content(tmp_path) == before
 
 
+def test_a_data_set_from_before_recipes_and_drawn_views_goes_on(fake, tmp_path):
+    fake.run(items(fake), tmp_path, SETTINGS)
+    manifest = json.loads((tmp_path / MANIFEST).read_text())
+    for name in ("recipe", "least_views"):
+        assert manifest["settings"].pop(name) is None
+    (tmp_path / MANIFEST).write_text(json.dumps(manifest))
+    assert fake.run(items(fake), tmp_path, SETTINGS).skipped == 15
+
+
 def test_bad_input_leaves_nothing_behind(fake, tmp_path):
     out = tmp_path / "out"
     for work, changed, message in [

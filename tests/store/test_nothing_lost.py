@@ -16,7 +16,7 @@ import pytest
 from qs3.errors import InputError
 from qs3.files import folder_lock
 from qs3.io.layouts.store import read_ragged
-from qs3.store.executors import InlineExecutor, LocalExecutor
+from qs3.store.executors import Failure, InlineExecutor, LocalExecutor
 from qs3.store.failures import read_failures
 from qs3.store.folder import Folder
 from qs3.store.generate import GenerateReport
@@ -159,10 +159,40 @@ def test_objects_that_hang_or_crash_fail_alone_and_what_was_written_counts(fake,
     failures = {r["id"]: (r["error"], r["reason"]) for r in read_failures(tmp_path)}
     assert failures["hangs#0"] == ("Timeout", "took over 12 s and was stopped")
     assert failures["crashes#0"][0] == "ProcessDied"
-    assert "signal SIGSEGV: a crash, or no memory left" in failures["crashes#0"][1]
+    reason = "its process died 3 times, twice with no other beside it (signal SIGSEGV: a crash)"
+    assert failures["crashes#0"][1] == reason
     done = [item for item in items if item.id not in ("hangs", "crashes")]
     assert read_ragged(tmp_path).ids == tuple(f"{item.id}#0" for item in done)
     assert verify(tmp_path, progress=False) == []
+
+
+def test_what_the_machine_kills_is_no_failure_and_is_made_on_the_next_run(fake, tmp_path):
+    items = [fake.FakeItem("killed" if i == 9 else f"m{i}") for i in range(ROWS)]
+    message = r"could not make 1, the first killed#0: .*SIGKILL.* run the same command again"
+    with pytest.raises(InputError, match=message) as caught:
+        fake.run(items, tmp_path / "out", row=fake.deadly_row, workers=2)
+    assert "\n" not in str(caught.value)
+    assert written_rows(tmp_path / "out") == ROWS - 1
+    assert read_failures(tmp_path / "out") == []
+    report = fake.run(items, tmp_path / "out")
+    assert report == GenerateReport(done=1, skipped=ROWS - 1, failed=0)
+    fake.run(items, tmp_path / "whole")
+    assert fake.content(tmp_path / "out") == fake.content(tmp_path / "whole")
+
+
+def test_a_machine_that_kills_every_process_is_not_tried_on_and_on(fake, tmp_path):
+    items = [fake.FakeItem(f"killed{i}") for i in range(ROWS)]
+    with pytest.raises(InputError, match="could not make 5, the first killed0#0"):
+        fake.run(items, tmp_path, row=fake.deadly_row, executor=Killer())
+    assert read_failures(tmp_path) == []
+    assert written_rows(tmp_path) == 0
+
+
+class Killer(InlineExecutor):
+    """Tells of each call that its process was killed."""
+
+    def next(self):
+        return self._waiting.popleft()[0], Failure("Killed", "(signal SIGKILL)")
 
 
 @pytest.mark.parametrize("without_record", [False, True])

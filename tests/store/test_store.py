@@ -60,6 +60,21 @@ def test_what_is_written_comes_back(fake, tmp_path):
         assert read.ids == tuple(r.id for r in made)
 
 
+def test_all_three_clouds_of_each_scan_come_as_clouds_of_their_own(fake, tmp_path):
+    made = make(tmp_path, fake)
+    clouds = read_ragged(tmp_path, "all")
+    parts = {kind: read_ragged(tmp_path, kind) for kind in ("points", "clean", "surface")}
+    expected = {
+        f"{i}/{k}": c for k, p in parts.items() for i, c in zip(p.ids, p.clouds, strict=True)
+    }
+    assert set(clouds.ids) == set(expected)
+    assert len(clouds.ids) == 3 * len(made)
+    for name, cloud, label in zip(clouds.ids, clouds.clouds, clouds.labels, strict=True):
+        np.testing.assert_array_equal(cloud, expected[name])
+        assert label == {row.id: row.label for row in made}[name.rpartition("/")[0]]
+    assert clouds.checksum not in {part.checksum for part in parts.values()}
+
+
 def test_a_shard_reads_as_plain_parquet(fake, tmp_path):
     drawn = '{"light.ambient": 0.1, "neighbour": "m1"}'
     made = rows(fake)

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from qs3.errors import InputError
+from qs3.io.clouds import Origin, PointClouds
 from qs3.training import (
     SelfTrainingSettings,
     fit,
@@ -14,7 +15,7 @@ from qs3.training import (
     save_model,
 )
 from qs3.training.checkpoint import new_model, read_tensors, write_tensors
-from qs3.training.run import MODEL, fingerprint
+from qs3.training.run import MODEL, fingerprint, read_run
 
 ROUNDS = SelfTrainingSettings(rounds=1, epochs=1, threshold=0.4)
 
@@ -202,3 +203,20 @@ def test_predictions_are_probabilities_and_deterministic(source, settings):
     moved = predict_probabilities(model, source.points * 5 + 2)  # the unit ball undoes it
     np.testing.assert_allclose(first, moved, atol=1e-4)
     assert predict_probabilities(model, source.points[:0]).shape == (0, 3)
+
+
+def test_all_three_clouds_of_a_scan_are_trained_on_or_held_out_together(source, settings, tmp_path):
+    kinds = ("points", "clean", "surface")
+    three = PointClouds(
+        points=np.concatenate([source.points + np.float32(0.01 * i) for i in range(3)]),
+        labels=np.tile(source.labels, 3),
+        class_names=source.class_names,
+        ids=tuple(f"{name}/{kind}" for kind in kinds for name in source.ids),
+        origin=Origin("set", None, "all"),
+    )
+    how = replace(settings, epochs=1, holdout=0.25)
+    alone = fit("source-only", source, None, how, run_dir=tmp_path / "alone").holdout
+    held = fit("source-only", three, None, how, run_dir=tmp_path / "three").holdout
+    assert held.ids == tuple(f"{name}/{kind}" for kind in kinds for name in alone.ids)
+    record = read_run(tmp_path / "three").source
+    assert record.label == "set (all)"

@@ -13,15 +13,14 @@ from qs3.report.figure import PALETTE
 from qs3.sensor.presets import SENSORS
 from qs3.sensor.render.mitsuba import MitsubaRenderer
 from qs3.sensor.settings import ScanSettings
-from qs3.store.folder import open_folder
-from qs3.store.manifest import Manifest, write_manifest
-from qs3.store.shards import CloudRow, put_shard, table_of
 from qs3.viewer.colouring import by_error, by_height, by_view, round_limit
 from qs3.viewer.display import compose, frame_of, modes
 from qs3.viewer.distance import mesh_distance, spacing
 from qs3.viewer.exhibits import Answers, Exhibit, StoreExhibits
 from qs3.viewer.rescan import Rescanner
 from qs3.viewer.scan_controls import make_controls, resolve, with_controls
+
+from ..stores import write_store
 
 HOSTILE = "<img src=x onerror=alert(1)>{alert(2)}"
 
@@ -281,32 +280,16 @@ class TestScanControls:
 
 class TestStore:
     @pytest.fixture
-    def folder(self, tmp_path, rng):
-        def row(index, label, split, twin=True):
-            points = rng.normal(size=(5 + index, 3)).astype(np.float32)
-            clean = rng.normal(size=(7, 3)).astype(np.float32)
-            return CloudRow(
-                f"o{index}", f"o{index}", 0, label, ("bed", "chair")[label], split, 3, points,
-                np.full(len(points), index, np.uint8), clean, np.zeros(7, np.uint8), clean,
-            )  # fmt: skip
-
-        folder = tmp_path / "set"
-        folder.mkdir()
-        rows = [row(0, 0, "train"), row(1, 1, "test"), row(2, 1, "train")]
-        write_manifest(
-            folder,
-            Manifest(class_names=("bed", "chair"), rows=3, shards=2, settings={}, versions={}),
-        )
-        for shard, part in enumerate((rows[:2], rows[2:])):
-            put_shard(open_folder(folder), shard, table_of(part))
-        return folder
+    def folder(self, tmp_path):
+        rows = [(0, "train", 5), (1, "test", 6), (1, "train", 7)]
+        return write_store(tmp_path / "set", ("bed", "chair"), rows, shards=2)
 
     def test_objects_come_with_all_their_clouds(self, folder):
         exhibits = StoreExhibits(folder)
         assert len(exhibits) == 3
         assert exhibits.labels == ("bed", "chair", "chair")
         last = exhibits[2]
-        assert last.name == "o2"
+        assert last.name == "o2#0"
         assert {kind: len(cloud) for kind, cloud in last.clouds.items()} == {
             "points": 7, "clean": 7, "surface": 7
         }  # fmt: skip

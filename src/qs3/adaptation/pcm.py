@@ -167,21 +167,13 @@ class PCM(Method):
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
-class DefRecPCM(DefRec):
+class DefRecPCM(PCM, DefRec):
     """Classify mixed source clouds and rebuild deformed parts of target clouds.
 
     L = (1 − w) · PCM(source) + w · 20 · Chamfer(rebuilt part, original part).
 
     NOTE: all that `qs3.adaptation.defrec.DefRec` and `PCM` note holds here too.
     """
-
-    concentration: float = 1.0
-    """γ of λ ~ Beta(γ, γ); 1 is the paper's."""
-
-    def __post_init__(self) -> None:
-        """Check the settings and make the reconstruction head."""
-        super().__post_init__()
-        check_positive("concentration", self.concentration)
 
     def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of mixed source clouds and the distance of rebuilt parts."""

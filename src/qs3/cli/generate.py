@@ -3,23 +3,43 @@
 import dataclasses
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+
+import tyro
 
 from qs3.cli.options import Flat
 from qs3.cli.store import refuse_failures
 from qs3.cli.text import show, tell
 from qs3.errors import InputError
-from qs3.store.scan_item import GenerateSettings
+from qs3.store.scan_item import RECIPES, GenerateSettings, RecipeName
 
 if TYPE_CHECKING:
     from qs3.meshes import MeshItem
     from qs3.store.plan import Plan
 
 
+@dataclasses.dataclass(frozen=True)
+class Choices:
+    """What chooses the defaults of other options."""
+
+    recipe: RecipeName | None = None
+
+
+def defaults(words: Sequence[str]) -> dict[str, Any]:
+    """Return the defaults of ``qs3 generate`` under the recipe that a command line names."""
+    chosen, _ = tyro.cli(Choices, args=list(words), return_unknown_args=True, add_help=False)
+    if chosen.recipe is None:
+        return {}
+    settings = RECIPES[chosen.recipe]
+    return {"meshes": ("shapes",), "per_class": settings.per_class, "settings": settings}
+
+
 def generate(
     meshes: tuple[str, ...],
     out: str,
+    recipe: RecipeName | None = None,
     up: Literal["z", "y"] | None = None,
     per_class: int = 10,
     classes: tuple[str, ...] = (),
@@ -41,6 +61,8 @@ def generate(
             for the built-in ones; several go into one data set. A neighbour is another of them.
         out: Folder of the data set, or an address such as s3://bucket/folder; run the same command
             again to go on after a stop.
+        recipe: rooms: settings for a source that is to meet scans of real rooms (cameras, sizes,
+            layouts and views drawn); an option given beside it wins.
         up: Up axis of every mesh file; by default y for glTF and ShapeNet, z for all others.
         per_class: Objects a class, of the built-in shapes.
         classes: Classes to scan, by the names of their folders, or pointda10 for its ten, renamed;
@@ -57,7 +79,8 @@ def generate(
         shard: i/n makes part i of n (from 0), on one of n machines, each into a folder of its own;
             see qs3 merge.
         retry_failed: Scan again what failed before.
-        dry_run: Print counts, disk space and time, measured on three scans; write nothing.
+        dry_run: Print counts, disk space and time, measured on three scans of each sensor; write
+            nothing.
         settings: How they are scanned and written. Another seed draws other shapes and poses.
     """
     from qs3.meshes.classes import POINTDA10
@@ -90,6 +113,8 @@ def generate(
     )
     show(out)
     following = f"qs3 train --source {out} --out RUN"
+    if recipe is not None:
+        following += " --source-cloud all"
     if part[1] > 1:
         following = f"qs3 merge PART… --out DIR, once all {part[1]} parts are there"
     failures = read_failures(out)
@@ -147,7 +172,8 @@ def _expected(
     """What the run would make and cost; without ``workers`` for one of any machine."""
     from qs3.store.plan import estimate
 
-    expected = estimate(plan, part, timeout=timeout)
+    scans = 3 * len(plan.settings.each_sensor())
+    expected = estimate(plan, part, scans=scans, timeout=timeout)
     machine = "one worker" if workers is None else f"{max(workers, 1)} workers of this machine"
     hours = expected.seconds / max(workers or 1, 1) / 3600
     return [

@@ -33,6 +33,16 @@ def run_verb(verb: str, place: str, text: str, words: list[str]) -> int:
     return tyro.cli(function, **how)
 
 
+_LISTED: PrimitiveConstructorSpec[Any] = PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="NAME[,NAME…]",
+    instance_from_str=lambda words: tuple(words[0].split(",")) if "," in words[0] else words[0],
+    is_instance=lambda value: isinstance(value, str | tuple),
+    str_from_instance=lambda value: [value if isinstance(value, str) else ",".join(value)],
+)
+"""One name, or several joined by commas."""
+
+
 @_registry.primitive_rule
 def _by_name(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     """What takes an object or its name (a sensor, a material, ranges) takes names alone here."""
@@ -42,6 +52,8 @@ def _by_name(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     names = [member for member in members if not _is_object(member)]
     if len(names) == len(members):
         return None
+    if any(get_origin(name) is tuple for name in names):
+        return _LISTED
     kind: Any = Union[tuple(names)]  # noqa: UP007
     spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kind, info.markers))
     return spec if isinstance(spec, PrimitiveConstructorSpec) else None

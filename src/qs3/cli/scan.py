@@ -26,7 +26,8 @@ def scan(
     """Photograph one mesh: noisy cloud, clean twin, a picture of every stage.
 
     Args:
-        mesh: A mesh file (OFF, OBJ, PLY, STL, GLB, GLTF) or a built-in class (chair, …).
+        mesh: A mesh file (OFF, OBJ, PLY, STL, GLB, GLTF, STEP, IGES, 3MF) or a built-in class
+            (chair, …).
         out: Folder to write: cloud.ply, clean.ply, montage.png, scan.json.
         up: Up axis of the mesh file; by default y for glTF, z for all others.
         save_images: Also write the grey pair, the 16-bit depth and the camera of each view,
@@ -64,7 +65,9 @@ def scan(
     )
     # Everything is computed before the folder is touched: a fault leaves nothing behind.
     view, best = montage_view(result)
-    title = f"{origin['name']} · sensor {result.sensor.name} · view {best + 1} of {settings.views}"
+    title = (
+        f"{origin['name']} · sensor {result.sensor.name} · view {best + 1} of {len(result.views)}"
+    )
     figure = montage(view, title)
     record = _record(settings, origin, result)
     folder = claim_folder(out, "scan.json")
@@ -116,10 +119,10 @@ def _record(settings: ScanSettings, origin: dict[str, Any], result: Any) -> dict
 
 
 def _summary(result: Any) -> str:
-    mean = {}
-    for name in ("disparity_sigma", "disparity_bias", "gross_share", "valid_fraction"):
-        values = [getattr(view, name) for view in result.views]
-        mean[name] = np.mean([value for value in values if value is not None] or [np.nan])
+    from qs3.store.scan_item import mean_statistics
+
+    means = mean_statistics(result.views)
+    mean = {name: np.nan if value is None else value for name, value in means.items()}
     return (
         f"{len(result.views)} views, {result.fused_points} fused points: disparity σ "
         f"{mean['disparity_sigma']:.3f} px, bias {mean['disparity_bias']:+.3f} px, gross errors "

@@ -10,12 +10,6 @@ from qs3.cli.text import show, tell
 from qs3.errors import InputError
 
 _Folder = Annotated[str, tyro.conf.Positional]
-_STATISTICS = {
-    "valid_fraction": ("valid pixels of the object", ".1%"),
-    "disparity_bias": ("disparity bias, px", "+.3f"),
-    "disparity_sigma": ("disparity σ, px", ".3f"),
-    "gross_share": ("gross errors", ".2%"),
-}
 
 
 def refuse_failures(out: str, failures: Sequence[Mapping[str, Any]], what: str) -> None:
@@ -56,6 +50,8 @@ def info(folder: _Folder, as_json: bool = False) -> int:
 
 
 def _lines(contents: dict[str, Any]) -> list[str]:
+    from qs3.store.shards import STATISTICS
+
     planned = "" if contents["rows_planned"] is None else f" of {contents['rows_planned']} planned"
     points = " to ".join(str(size) for size in dict.fromkeys(contents["points"])) or "no"
     lines = [
@@ -68,11 +64,12 @@ def _lines(contents: dict[str, Any]) -> list[str]:
     if any(contents["splits"]):
         lines.append("splits: " + _counts(contents["splits"]))
     for name, value in contents["statistics"].items():
-        label, form = _STATISTICS[name]
+        label, form = STATISTICS[name]
         lines.append(f"{label} (median): {value:{form}}")
     sensor = contents["settings"].get("sensor")
-    if isinstance(sensor, dict) and "name" in sensor:
-        lines.append(f"sensor: {sensor['name']}")
+    sensors = [one for one in (sensor if isinstance(sensor, list) else [sensor]) if one]
+    if sensors and all(isinstance(one, dict) and "name" in one for one in sensors):
+        lines.append("sensor: " + ", ".join(str(one["name"]) for one in sensors))
     return [*lines, f"failed: {contents['failed']}"]
 
 

@@ -16,7 +16,7 @@ from qs3.cli.options import Flat
 from qs3.cli.text import show, tell
 from qs3.errors import InputError
 from qs3.evaluation.records import rename_method
-from qs3.io.clouds import CloudKind
+from qs3.io.clouds import CloudChoice
 from qs3.training.config import (
     PRESETS,
     PresetName,
@@ -27,6 +27,8 @@ from qs3.training.config import (
 
 TIME_UP = 3
 """Exit code where --max-time stopped a run that the same command takes up again."""
+NO_ROUND = 4
+"""Exit code where no round of self-training had enough clouds to train on."""
 
 
 @functools.cache
@@ -83,9 +85,10 @@ class TrainOptions(Choices):
     """Part of the source, such as train; all of it by default."""
     target_split: str | None = None
     """Part of the target."""
-    source_cloud: CloudKind = "points"
-    """Of generated data: noisy scans, their clean twins, or samples of the whole surface."""
-    target_cloud: CloudKind = "points"
+    source_cloud: CloudChoice = "points"
+    """Of generated data: noisy scans, their clean twins, samples of the whole surface, or all of
+    these together."""
+    target_cloud: CloudChoice = "points"
     """The same of the target."""
     supervised: bool = False
     """Mark the run as supervised: its source is the labelled training part of the target."""
@@ -156,6 +159,7 @@ def train(options: Flat[TrainOptions]) -> int:
     start = time.monotonic()  # reading the data counts
     from qs3.io import load_clouds, load_unlabelled
     from qs3.training import Deadline, TimeUpError, fit, load_whole, parse_duration
+    from qs3.training.rounds import all_skipped, remarks
 
     seconds = None if options.max_time is None else parse_duration(options.max_time)
     try:
@@ -178,7 +182,7 @@ def train(options: Flat[TrainOptions]) -> int:
         part = {"split": options.target_split, "cloud": options.target_cloud}
         target = load_whole(load_unlabelled, options.target, *how, **part)
     try:
-        fit(
+        result = fit(
             options.method,
             source,
             target,
@@ -195,5 +199,9 @@ def train(options: Flat[TrainOptions]) -> int:
         tell(f"qs3: {stop}")
         return TIME_UP
     show(options.out)
+    for line in remarks(result.rounds, options.self_training, source.class_names):
+        tell(f"qs3: {line}")
+    if all_skipped(result.rounds):
+        return NO_ROUND
     tell(f"Next: qs3 evaluate {options.out} --data DATA")
     return 0

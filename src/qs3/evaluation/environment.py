@@ -10,15 +10,8 @@ from typing import Any
 
 from qs3.store.manifest import package_versions
 
-
-def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that a result depends on.
-
-    Example:
-        >>> "numpy" in versions()
-        True
-    """
-    return package_versions()
+versions = package_versions
+"""The versions of Python and of the packages that a result depends on."""
 
 
 def hardware() -> dict[str, Any]:

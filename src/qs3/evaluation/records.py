@@ -20,7 +20,7 @@ from qs3.evaluation.metrics import (
     wilson_interval,
 )
 from qs3.files import read_json, write_json
-from qs3.io.clouds import CloudKind, Origin
+from qs3.io.clouds import CloudChoice, Origin
 from qs3.structure import structure, unstructure
 
 RECORD = "record.json"
@@ -43,7 +43,7 @@ class DataRecord:
     """Number of clouds."""
     split: str | None = None
     """Part of the data; None is all of it."""
-    cloud: CloudKind = "points"
+    cloud: CloudChoice = "points"
     """Which cloud of a generated data set."""
 
     @classmethod
@@ -116,7 +116,13 @@ class RunRecord:
     commit: str = ""
     """Commit of the source tree, empty where unknown."""
     rounds: tuple[Mapping[str, Any], ...] = ()
-    """What each round of self-training did."""
+    """What each round of self-training did. Where clouds that it kept are among those of the test,
+    also, by pseudo label, how many of them are ``known`` so and how many were ``right``."""
+    chosen: Mapping[str, str | int] | None = None
+    """Checkpoint of the scores: its ``stage`` and ``number``; None in earlier releases."""
+    checkpoints: tuple[Mapping[str, Any], ...] = ()
+    """Where every checkpoint of the last stage was scored: stage, number, accuracies, and what the
+    validators said of it without labels."""
     choices: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Where every checkpoint was scored: of each rule its checkpoint, accuracy and class-mean
     accuracy. ``oracle`` among them chose by the labels of the test set: an upper bound."""
@@ -210,25 +216,17 @@ def read_record(path: Path) -> RunRecord:
     schema = value.get("schema") if isinstance(value, dict) else None
     if type(schema) is not int or not 1 <= schema <= SCHEMA_VERSION:
         raise InputError(f"{path}: record schema {schema}, this version reads 1 to 3")
-    for migrate in _MIGRATIONS[schema - 1 :]:
-        value = migrate(value)
+    value = _from_2(value) if schema < SCHEMA_VERSION else value
     record = structure(value | {"schema": SCHEMA_VERSION}, RunRecord, path)
     _check_scores(path, record.scores)
     return record
 
 
-def _from_1(value: dict[str, Any]) -> dict[str, Any]:
-    return {"choices": {}} | value
-
-
 def _from_2(value: dict[str, Any]) -> dict[str, Any]:
+    """Give names of today; schema 1 lacked the choices as well, which may be absent."""
     settings = value.get("settings")
     named = {"settings": rename_settings(settings)} if isinstance(settings, dict) else {}
     return value | named | {"method": rename_method(value.get("method"))}
-
-
-_MIGRATIONS = (_from_1, _from_2)
-"""From each schema to the next."""
 
 
 def rename_settings(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -36,6 +36,11 @@ class Sides:
     cad: int
     """How many of them are artists' meshes, not procedural shapes."""
 
+    @property
+    def meshes(self) -> str:
+        """``shapes+cad`` where artists' meshes take part, else ``shapes``."""
+        return "shapes+cad" if self.cad else "shapes"
+
 
 def side_of(file_name: str) -> str:
     """Return ``source``, ``train`` or ``test``: half, a quarter and a quarter, by name alone.
@@ -91,9 +96,7 @@ def _draws(class_name: str, count: int, seed: int) -> list[MeshItem]:
     return collect("shapes", per_class=count, seed=seed, classes=[class_name])
 
 
-def make_plans(
-    scale: Scale, shared: Path | None, sets: Iterable[DataSet], renderer: Any = None
-) -> dict[str, Plan]:
+def make_plans(scale: Scale, sides: Sides, sets: Iterable[DataSet]) -> dict[str, Plan]:
     """Return the work lists of data sets, by the names of their folders.
 
     - ``source``: a row has the scan and samples of the surface of the same mesh, so that M and S
@@ -107,15 +110,12 @@ def make_plans(
 
     Args:
         scale: How many.
-        shared: Folder with artists' meshes; None takes shapes alone.
+        sides: Of which meshes.
         sets: Which data sets.
-        renderer: Renderer; None takes the default.
     """
-    sides = choose_meshes(scale, shared)
     common = {
-        "meshes": "shapes+cad" if sides.cad else "shapes",
+        "meshes": sides.meshes,
         "num_points": scale.data_points,
-        "renderer": renderer or "mitsuba",
         "rows_per_shard": 32,
     }
     plans = {}
@@ -124,11 +124,6 @@ def make_plans(
         settings = GenerateSettings(**{**common, **own})
         plans[data.name] = make_plan(items, resolve_renderer(settings))
     return plans
-
-
-def which_meshes(scale: Scale, shared: Path | None) -> str:
-    """Return ``shapes+cad`` where artists' meshes take part, else ``shapes``."""
-    return "shapes+cad" if choose_meshes(scale, shared).cad else "shapes"
 
 
 def _plan(data: DataSet, scale: Scale, sides: Sides) -> tuple[list[MeshItem], Mapping[str, Any]]:

@@ -1,11 +1,11 @@
 """Makes tables anew: data, runs, records, then the tables from the records alone."""
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Union
+from unittest import mock
 
 from qs3.errors import InputError
 from qs3.experiments import GALLERIES
@@ -151,13 +151,14 @@ def reproduce(
         InputError: where the folder is for other settings, a record is damaged or not of its run,
             or a run failed; what was made stays made.
     """
-    from qs3.experiments.data import make_data, make_plans, which_meshes
+    from qs3.experiments.data import choose_meshes, make_data, make_plans
 
     runs = collect_runs(products)
     drawn = [data for product in products for data in product.sets()]
-    plans = make_plans(setup.scale, setup.shared, [*data_sets(runs, setup.own), *drawn])
+    sides = choose_meshes(setup.scale, setup.shared)
+    plans = make_plans(setup.scale, sides, [*data_sets(runs, setup.own), *drawn])
     if not dry_run:
-        claim(setup, which_meshes(setup.scale, setup.shared))
+        claim(setup, sides.meshes)
     left = missing(runs, setup)  # a damaged record stops here, not after hours
     executor = workers.start()  # a missing extra is told before anything is made
     needed = {data.name for data in [*data_sets(left, setup.own), *drawn]}
@@ -183,7 +184,8 @@ def reproduce(
         # A cluster gives a run its GPU itself.
         devices = () if workers.executor == "ray" else workers.devices
         at_once = max(len(workers.devices), workers.workers)
-        with _quiet_workers():
+        # Processes start without progress bars: several would write over one another.
+        with mock.patch.dict(os.environ, TQDM_DISABLE="1"):
             failed = run_grid(left, setup, tell, expected, executor, devices, at_once)
     paths = []
     for product in products:
@@ -194,20 +196,6 @@ def reproduce(
     if failed:
         raise InputError(f"{'; '.join(failed)}; mend that and run the same command again")
     return paths
-
-
-@contextmanager
-def _quiet_workers() -> Iterator[None]:
-    """Start processes without progress bars: several would write over one another."""
-    before = os.environ.get("TQDM_DISABLE")
-    os.environ["TQDM_DISABLE"] = "1"
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["TQDM_DISABLE"]
-        else:
-            os.environ["TQDM_DISABLE"] = before
 
 
 def measure(

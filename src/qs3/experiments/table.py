@@ -1,7 +1,7 @@
 """A table of a folder: its runs, and what their records say."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -161,12 +161,6 @@ class FilledTable:
     """Records that are there, by the name of the run."""
     faults: tuple[str, ...] = ()
     """What is wrong with each record that was refused."""
-
-    def with_records(self) -> Table:
-        """Return the table of those rows and columns alone that have records."""
-        places = [place for place in self.runs if self.records_of(place)]
-        rows, columns = (tuple(dict.fromkeys(place[i] for place in places)) for i in (0, 1))
-        return replace(self.table, rows=rows, columns=columns)
 
     def records_of(self, place: Place) -> list[RunRecord]:
         """Return the records of a cell, in the order of the seeds."""

@@ -9,6 +9,8 @@ from jaxtyping import Float, Int
 
 CloudKind = Literal["points", "clean", "surface"]
 """A scanned object's noisy cloud, its twin from the true z-buffer, samples of its whole surface."""
+CloudChoice = Literal["points", "clean", "surface", "all"]
+"""One of these, or all three of each scan as clouds of their own."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +21,7 @@ class Origin:
     """Last part of the path, never the path."""
     split: str | None = None
     """Part of the data; None is all of it."""
-    cloud: CloudKind = "points"
+    cloud: CloudChoice = "points"
     """Which cloud of a generated data set."""
 
 
@@ -73,6 +75,14 @@ class PointClouds:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def scan_rows(self) -> Int[np.ndarray, "b"]:
+        """Row of each cloud's scan: its own, or of all three of a scan that of the first."""
+        if self.origin is None or self.origin.cloud != "all":
+            return np.arange(len(self))
+        first: dict[str, int] = {}
+        scans = (name.rpartition("/")[0] for name in self.ids)
+        return np.array([first.setdefault(scan, row) for row, scan in enumerate(scans)])
 
     def select(self, rows: np.ndarray) -> "PointClouds":
         """Return the clouds at ``rows`` (indices or a mask), in that order."""

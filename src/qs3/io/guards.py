@@ -9,6 +9,7 @@ import contextlib
 import dataclasses
 import io
 import math
+import os
 import struct
 import warnings
 import zipfile
@@ -27,8 +28,8 @@ from qs3.structure import structure
 Numbers = tuple[float, ...] | tuple[tuple[float, ...], ...]
 """A vector, or a matrix row by row, of a JSON file."""
 
-MOST_BYTES = 2 << 30
-"""Largest size of what a file announces, or is itself, where it is read into memory at once."""
+LIMIT = "QS3_LARGEST_FILE_GIB"
+"""Environment variable: GiB that a file read into memory at once may have or announce; 2."""
 DENSEST = 100
 """Largest ratio of announced to stored bytes; coordinates do not compress that well."""
 LARGEST_IMAGE = 1 << 25
@@ -60,8 +61,24 @@ def utf8(name: str) -> str:
     return name.encode("utf-8", errors="backslashreplace").decode("utf-8")
 
 
+def most_bytes() -> int:
+    """Largest size of what a file announces, or is itself, where it is read into memory at once.
+
+    Raises:
+        InputError: where ``QS3_LARGEST_FILE_GIB`` is no number above 0.
+    """
+    word = os.environ.get(LIMIT) or "2"
+    try:
+        most = int(float(word) * 2**30)
+    except (ValueError, OverflowError):
+        most = 0
+    if most < 1:
+        raise InputError(f"{LIMIT}={word}: a number of GiB above 0 is needed")
+    return most
+
+
 def check_announced(what: str, announced: int, stored: int, densest: int = DENSEST) -> None:
-    """Refuse an announced size above ``MOST_BYTES``, or above what the file can hold of it.
+    """Refuse an announced size above `most_bytes`, or above what the file can hold of it.
 
     Args:
         what: What is announced, for the message.
@@ -69,9 +86,10 @@ def check_announced(what: str, announced: int, stored: int, densest: int = DENSE
         stored: Bytes of the file that hold it.
         densest: Largest ratio of the two; 1 where nothing is compressed.
     """
-    if announced > MOST_BYTES:
+    if announced > (most := most_bytes()):
         raise InputError(
-            f"{what} announces {announced} bytes; read are {MOST_BYTES} at most: split the file"
+            f"{what} announces {announced} bytes; read are {most} at most: split the file, or, "
+            f"where you trust it, set {LIMIT} to a larger number than {most / 2**30:g}"
         )
     if announced > (stored if densest == 1 else max(_SLACK, densest * stored)):
         raise InputError(
@@ -80,11 +98,13 @@ def check_announced(what: str, announced: int, stored: int, densest: int = DENSE
         )
 
 
-def read_small(path: Path, largest: int = MOST_BYTES, what: str = "one file") -> bytes:
-    """Read a file of at most ``largest`` bytes; a longer one is refused as no ``what``."""
+def read_small(path: Path, largest: int | None = None, what: str = "the file") -> bytes:
+    """Read a file of at most ``largest`` bytes, `most_bytes` where it is None; none longer."""
     if not path.is_file():
         raise InputError(f"{path}: no such file")
-    if path.stat().st_size > largest:
+    if largest is None:
+        check_announced(f"{path}: {what}", path.stat().st_size, path.stat().st_size)
+    elif path.stat().st_size > largest:
         raise InputError(f"{path}: {path.stat().st_size} bytes, too long for {what}")
     return path.read_bytes()
 
@@ -193,18 +213,18 @@ def open_zip(path: Path) -> Iterator[zipfile.ZipFile]:
         yield archive
 
 
-def read_member(archive: zipfile.ZipFile, name: str, most: int = MOST_BYTES) -> bytes | None:
+def read_member(archive: zipfile.ZipFile, name: str, most: int | None = None) -> bytes | None:
     """Return a member of a zip file by its exact name; None where there is none.
 
     Raises:
         InputError: where it is damaged, packed in a way that cannot be bounded, or announces
-            more than ``most`` bytes or than it can hold.
+            more than ``most`` bytes, than `most_bytes`, or than it can hold.
     """
     try:
         entry = archive.getinfo(name)
     except KeyError:
         return None
-    if entry.file_size > most:
+    if most is not None and entry.file_size > most:
         raise InputError(f"{name} would unpack to {entry.file_size} bytes, more than {most}")
     check_announced(name, entry.file_size, entry.compress_size)
     # The other packings of zip unpack in blocks that cannot be bounded.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from qs3.errors import InputError
 from qs3.files import holds_something
-from qs3.io.clouds import CloudKind, Origin, PointClouds, UnlabelledClouds
+from qs3.io.clouds import CloudChoice, Origin, PointClouds, UnlabelledClouds
 from qs3.io.layouts import FORMATS, FORMER_NAMES, Format, point_folders
 from qs3.io.layouts.store import read_ragged
 from qs3.io.ragged import RaggedClouds
@@ -19,7 +19,7 @@ def load_clouds(
     *,
     split: str | None = None,
     num_points: int | None = 1024,
-    cloud: CloudKind = "points",
+    cloud: CloudChoice = "points",
     class_names: Sequence[str] | None = None,
     most: int | None = None,
 ) -> PointClouds:
@@ -30,7 +30,7 @@ def load_clouds(
             other layout of `qs3.io.layouts` that its names tell.
         split: Part to read; None takes all.
         num_points: Points a cloud; others are resampled. None keeps what is there.
-        cloud: Which cloud of a generated data set.
+        cloud: Which cloud of a generated data set; ``all`` takes the three of each scan.
         class_names: Classes that the labels shall index, found by name or alias. None takes
             PointDA-10's ten where all map onto them, else the source's own.
         most: As in `qs3.io.preparation.stack`, where ``num_points`` is None.
@@ -49,7 +49,7 @@ def load_unlabelled(
     *,
     split: str | None = None,
     num_points: int | None = 1024,
-    cloud: CloudKind = "points",
+    cloud: CloudChoice = "points",
     most: int | None = None,
 ) -> UnlabelledClouds:
     """Read clouds and leave any labels behind; a flat folder of point files will do too.
@@ -66,7 +66,7 @@ def load_unlabelled(
 def read_clouds(
     source: str | Path,
     split: str | None = None,
-    cloud: CloudKind = "points",
+    cloud: CloudChoice = "points",
     origin: str | None = None,
 ) -> tuple[RaggedClouds, str]:
     """Read a data set as its files have it; also return the name of its layout.

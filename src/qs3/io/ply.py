@@ -68,7 +68,7 @@ def load_ply(content: bytes) -> Any:
     try:
         content = _checked(content)
         return trimesh.load(io.BytesIO(content), file_type="ply", process=False)
-    except InputError:
+    except (InputError, MemoryError):
         raise
     except Exception as error:  # parsers of damaged files raise whatever they stumble over
         raise InputError(f"cannot be read as ply ({reason(error)})") from error

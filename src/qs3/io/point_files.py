@@ -11,6 +11,7 @@ from qs3.errors import InputError
 from qs3.io.guards import load_npy, read_small, reason
 from qs3.io.pcd import parse_pcd, pcd_bytes
 from qs3.io.ply import load_ply, ply_bytes
+from qs3.meshes.announced import memory_limit
 
 POINT_FILES = (".npy", ".xyz", ".txt", ".ply", ".pcd", ".off")
 WRITTEN_FILES = (".npy", ".xyz", ".ply", ".pcd")
@@ -46,9 +47,10 @@ def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np
         elif suffix in (".xyz", ".txt"):
             points = _text(content)
         else:
-            points = _trimesh(content, suffix[1:], mesh_points, seed)
+            with memory_limit(path):
+                points = _trimesh(content, suffix[1:], mesh_points, seed)
     except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+        raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
     except Exception as error:  # parsers of damaged files raise whatever they stumble over
         raise InputError(f"{path}: cannot be read as {suffix[1:]} ({reason(error)})") from error
     if not len(points):

@@ -9,7 +9,7 @@ from typing import Any
 from qs3.errors import QS3Error
 from qs3.evaluation.records import DataRecord
 from qs3.io import load_clouds
-from qs3.io.clouds import CloudKind, PointClouds
+from qs3.io.clouds import CloudChoice, PointClouds
 from qs3.store.manifest import MANIFEST
 from qs3.training.batches import load_whole
 from qs3.training.checkpoint import LoadedModel, load_model, weights_fingerprint
@@ -21,7 +21,7 @@ _LEVELS = 5
 
 
 def read_domain(
-    named: tuple[str | None, str | None, CloudKind | None],
+    named: tuple[str | None, str | None, CloudChoice | None],
     recorded: DataRecord | None,
     run: Path,
     model: LoadedModel,
@@ -44,7 +44,7 @@ def read_domain(
     given, split, cloud = named
     points, names = model.settings["train"]["num_points"], model.class_names
 
-    def load(data: str | Path, split: str | None, cloud: CloudKind) -> Prepared[PointClouds]:
+    def load(data: str | Path, split: str | None, cloud: CloudChoice) -> Prepared[PointClouds]:
         part = {"split": split, "cloud": cloud, "class_names": names}
         clouds = load_whole(load_clouds, data, points, model.preparation, **part)
         return prepare_clouds(clouds, points, model.preparation)

@@ -87,10 +87,8 @@ def montage(view: MontageView, title: str = "") -> Figure:
     error = (depth - true).astype(np.float64)
 
     clouds = [("noisy cloud", view.cloud), ("clean twin", view.clean)]
-    heights = (6.0, 6.0)
-    figure = Figure(figsize=(12.0, sum(heights)), layout="constrained")
-    halves = figure.add_gridspec(2, 1, height_ratios=heights)
-    upper, lower = figure.add_subfigure(halves[0]), figure.add_subfigure(halves[1])
+    figure = Figure(figsize=(12.0, 12.0), layout="constrained")
+    upper, lower = figure.subfigures(2, 1, squeeze=False)[:, 0]
     cells = upper.subplots(2, 4).ravel()
     places = lower.subplots(2, 3)
     if title:

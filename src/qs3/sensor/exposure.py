@@ -1,8 +1,9 @@
 """From radiance to the grey image of 8 or 10 bits that the matcher sees.
 
-In this order: vignetting, point-spread function, gain or auto-exposure, response, Gamma speckle,
-Gaussian noise, saturation, rounding. Speckle multiplies grey levels, as in SAPIEN (after Landau et
-al.: shape 398.12; noise −0.231 ± 0.83 of 255); saturation comes last, as a full well's does.
+In this order: vignetting, point-spread function, speckle of the projector's own light, gain or
+auto-exposure, response, Gamma speckle, Gaussian noise, saturation, rounding. Speckle multiplies
+grey levels, as in SAPIEN (after Landau et al.: shape 398.12; noise −0.231 ± 0.83 of 255);
+saturation comes last, as a full well's does.
 """
 
 import math
@@ -48,6 +49,9 @@ class ExposureSettings:
     speckle: float = 0.0
     """Shape of the Gamma distribution of mean 1 that multiplies each pixel (coherent speckle and
     photon noise); larger is less, 398.12 as Landau et al. measured; 0 is none."""
+    coherent: float = 0.0
+    """The same for the projector's light alone, a laser's, behind the lens: a second picture is
+    taken without it. 0 is none."""
     noise: float = 0.0
     """Standard deviation of additive Gaussian noise, in grey levels of 255."""
     offset: float = 0.0
@@ -58,7 +62,7 @@ class ExposureSettings:
     def __post_init__(self) -> None:
         check_choices(self, "exposure")
         check_range(self, "exposure", "gamma", "gain", above=True)
-        check_range(self, "exposure", "max_gain", "speckle", "noise")
+        check_range(self, "exposure", "max_gain", "speckle", "coherent", "noise")
         check_range(self, "exposure", "auto", high=1.0, below=True)
         check_range(self, "exposure", "psf", high=20.0)
         check_range(self, "exposure", "vignetting", high=1.0)
@@ -102,6 +106,12 @@ def expose_pair(
         if settings.noise > 0:
             noise = rng.standard_normal(shape, np.float32)[canvas.slices]
         light = _through_lens(pair, index, canvas, rig, settings)
+        if settings.coherent > 0:
+            if pair.room is None:
+                raise ValueError("coherent speckle needs the picture without the projector's light")
+            room = _through_lens(pair.room, index, canvas, rig, settings)
+            grains = rng.standard_gamma(settings.coherent, shape, np.float32)[canvas.slices]
+            light = room + np.maximum(light - room, 0) * (grains / np.float32(settings.coherent))
         return expose(light, settings, noise, speckle, gain, pair.display)
 
     if rig.second == "pattern":

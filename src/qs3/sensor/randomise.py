@@ -16,7 +16,7 @@ import numpy as np
 from qs3.errors import InputError
 from qs3.sensor.materials import MATERIALS
 from qs3.sensor.presets import Sensor, changed
-from qs3.sensor.rooms import ROOM_RANGES, Room
+from qs3.sensor.rooms import PLACE, ROOM_RANGES, Room
 from qs3.sensor.scene import LAYOUTS
 
 _NAMED = {"material": tuple(MATERIALS), "room.layout": LAYOUTS}
@@ -99,39 +99,38 @@ def resolve_ranges(
 
 
 def draw(
-    sensor: Sensor,
-    randomise: Mapping[str, Sequence[Any]] | Sequence[str] | None,
-    rng: np.random.Generator,
+    sensor: Sensor, ranges: Mapping[str, tuple[Any, ...]], rng: np.random.Generator
 ) -> tuple[Sensor, dict[str, Any]]:
-    """Draw a sensor from ranges.
+    """Draw a sensor from what `resolve_ranges` returned; a room is `draw_room`'s.
 
     Args:
         sensor: Supplies what is not drawn.
-        randomise: As for `resolve_ranges`; a room is `draw_room`'s.
-        rng: One number is drawn for each name, in alphabetical order.
+        ranges: The ranges, in their fixed order.
+        rng: One number is drawn for each name.
 
     Returns:
         The sensor, and what was drawn by name.
 
-    Raises:
-        InputError: as `resolve_ranges` does.
-
     Example:
-        >>> ranges = {"material": ("metal",), "exposure.gain": (0.5, 0.5)}
+        >>> ranges = resolve_ranges(Sensor(), {"material": ["metal"], "exposure.gain": (0.5, 0.5)})
         >>> drawn = draw(Sensor(), ranges, np.random.default_rng(0))[1]
         >>> drawn
         {'exposure.gain': 0.5, 'material': 'metal'}
     """
-    ranges = resolve_ranges(sensor, randomise)
     return _drawn(sensor, {n: r for n, r in ranges.items() if not n.startswith("room.")}, rng)
 
 
 def draw_room(
-    ranges: Mapping[str, tuple[Any, ...]], rng: np.random.Generator
+    ranges: Mapping[str, tuple[Any, ...]], rng: np.random.Generator, room: Room | None = None
 ) -> tuple[Room, dict[str, Any]]:
-    """Draw a room from what `resolve_ranges` returned; the same values by name are returned too."""
+    """Draw a room from what `resolve_ranges` returned; the same values by name are returned too.
+
+    With a ``room`` the place of another view in it alone is drawn: height, distance and aim.
+    """
     own = {n.removeprefix("room."): r for n, r in ranges.items() if n.startswith("room.")}
-    room, drawn = _drawn(Room(), own, rng)
+    if room is not None:
+        own = {name: values for name, values in own.items() if name in PLACE}
+    room, drawn = _drawn(room or Room(), own, rng)
     return room, {f"room.{name}": value for name, value in drawn.items()}
 
 

@@ -1,4 +1,4 @@
-"""Where somebody in a room would hold the camera: one draw of ``--randomise rooms``.
+"""Where somebody in a room would hold the camera: the draws of ``--randomise rooms``.
 
 Convention:
     Metres; the object stands about the origin, its box's underside on the floor or on a table.
@@ -28,13 +28,16 @@ ROOM_RANGES: dict[str, tuple[Any, ...]] = {
 }
 """Our choice: eyes of somebody who sits or stands, and the reach of the D4xx and the Kinect."""
 
+PLACE = ("height", "distance", "aim_x", "aim_y")
+"""What each view has of its own."""
+
 _TABLE_MOST = 0.7  # longest side of what stands on one
 _SIDE = 12.0  # of floor and wall
 
 
 @dataclass(frozen=True)
 class Room:
-    """One draw."""
+    """One draw: a room as one of its views has it."""
 
     layout: str = "room"
     """Layout of the scene."""
@@ -43,7 +46,7 @@ class Room:
     distance: float = 2.0
     """From the side of the object's box to the camera, along the floor."""
     azimuth: float = 0.0
-    """Of the first view about the vertical, in degrees."""
+    """Of the view about the vertical, in degrees."""
     aim_x: float = 0.0
     """How far to the right of the object's centre the camera aims, in halves of what the image
     shows at its distance."""
@@ -55,7 +58,7 @@ class Room:
     def __post_init__(self) -> None:
         SceneSettings(self.layout)
         check_range(self, "room", "height", "distance", "table", above=True)
-        check_range(self, "room", "azimuth", low=-360, high=360)
+        check_range(self, "room", "azimuth", low=-720, high=720)
         check_range(self, "room", "aim_x", "aim_y", low=-0.9, high=0.9)
 
     def scene(self, settings: SceneSettings, size: float) -> SceneSettings:
@@ -66,7 +69,7 @@ class Room:
         )
 
     def placement(self, bounds: Float[np.ndarray, "2 3"]) -> Placement:
-        """Place of the first view about an object of these bounds; the other ones go round."""
+        """Place of the view about an object of these bounds."""
         angle = math.radians(self.azimuth)
         way = np.maximum(np.abs([math.cos(angle), math.sin(angle)]), 1e-9)
         along = float((np.abs(bounds[:, :2]).max(axis=0) / way).min()) + self.distance

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     import trimesh
 
 LAYOUTS = ("alone", "floor", "wall", "room", "behind", "beside", "table")
+_ARCED = {"wall", "behind"}  # with these the views stay on an arc
 _SURVEY, _STEPS = 96, 25  # pixels and places at which a neighbour's cover is tried
 _TABLE, _RIM = (0.7, 1.2, 0.03), 0.1  # least depth, width and thickness of a table's top; its rim
 _LIFT = 1e-4  # of the object's size between it and the floor: equal planes would flicker
@@ -95,6 +96,17 @@ class SceneSettings:
         """Whether a second mesh is needed."""
         return bool(self.parts & {"behind", "beside"})
 
+    def turns(self, views: int) -> list[float]:
+        """Degrees about the vertical from the first view to each: all round, or along the arc.
+
+        Example:
+            >>> SceneSettings("floor").turns(3)[1:], SceneSettings("wall").turns(3)[1:]
+            ([120.0, 240.0], [40.0, -40.0])
+        """
+        if self.parts & _ARCED:
+            return _along(self.arc, views)
+        return [360.0 * index / views for index in range(views)]
+
 
 @dataclass(frozen=True)
 class ArrangedScene:
@@ -137,7 +149,7 @@ def arrange(
         )
         raise InputError(f"scene: layout {settings.layout!r} {wanted}")
     parts = settings.parts
-    if parts & {"wall", "behind"}:
+    if parts & _ARCED:
         poses = _on_arc(poses, np.radians(settings.arc))
     bodies, names = [body], ["object"]
     front, up = _front(poses[0]), np.array([0.0, 0.0, 1.0])
@@ -180,18 +192,23 @@ def arrange(
 
 
 def _on_arc(poses: Sequence[Pose], arc: float) -> list[Pose]:
-    """The poses turned about z so that they stand on an arc about the first: 0, +s, −s, +2s, …."""
+    """The poses turned about z so that they stand on an arc about the first."""
     azimuths = [math.atan2(pose.position[1], pose.position[0]) for pose in poses]
     spread = max(abs(math.remainder(a - azimuths[0], 2 * math.pi)) for a in azimuths)
-    if spread <= arc / 2:  # copies of one pose stay as they are
+    if spread <= arc / 2 + 1e-9:  # copies of one pose stay as they are
         return list(poses)
-    step, turned = arc / len(poses), []
-    for index, (pose, azimuth) in enumerate(zip(poses, azimuths, strict=True)):
-        offset = step * ((index + 1) // 2) * (1 if index % 2 else -1)
+    turned = []
+    for pose, azimuth, offset in zip(poses, azimuths, _along(arc, len(poses)), strict=True):
         matrix, rotation = pose.camera_to_world.copy(), rotation_z(azimuths[0] + offset - azimuth)
         matrix[:3] = rotation @ matrix[:3]
         turned.append(Pose(matrix))
     return turned
+
+
+def _along(arc: float, count: int) -> list[float]:
+    """Places on an arc, in its unit: 0, +s, −s, +2s, …."""
+    step = arc / count
+    return [step * ((index + 1) // 2) * (1 if index % 2 else -1) for index in range(count)]
 
 
 def _front(pose: Pose) -> Float[np.ndarray, "3"]:

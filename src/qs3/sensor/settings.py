@@ -1,6 +1,7 @@
 """How an object is scanned: every option once, for `qs3.scan`, data sets and the command line."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,8 +47,9 @@ _Camera = TypeVar("_Camera", bound="CameraSettings")
 class CameraSettings:
     """The simulated camera: a sensor, what is changed about it, and what renders its images."""
 
-    sensor: Sensor | str = "paper"
-    """A sensor by name (qs3 sensors lists them: paper, d435, …) or your own TOML file."""
+    sensor: Sensor | str | tuple[Sensor | str, ...] = "paper"
+    """A sensor by name (qs3 sensors lists them: paper, d435, …) or your own TOML file; of several,
+    as in d435,kinect-v1, each scan draws one."""
     image_noise: float | None = None
     """Gaussian noise of the images in grey levels of 255; default by sensor."""
     matching: Method | None = None
@@ -96,14 +98,23 @@ class CameraSettings:
         """The sensor with every change.
 
         Raises:
-            InputError: where there is no such sensor, or it takes no such value.
+            InputError: where there is no such sensor, it takes no such value, or there are several.
         """
+        if isinstance(self.sensor, tuple):
+            names = ", ".join(str(getattr(one, "name", one)) for one in self.sensor)
+            raise InputError(f"sensor: one is needed here, not several ({names}); name one")
         sensor = get_sensor(self.sensor) if isinstance(self.sensor, str) else self.sensor
         for name, place in self._changes.items():
             sensor = changed(sensor, place, self.chosen(name))
         if self.pattern is not None:
             pattern_image(sensor.pattern)  # a picture that cannot be read stops here
         return sensor
+
+    def each_sensor(self: _Camera) -> tuple[_Camera, ...]:
+        """The settings with each sensor alone; themselves where there is one."""
+        if not isinstance(self.sensor, tuple):
+            return (self,)
+        return tuple(dataclasses.replace(self, sensor=one) for one in self.sensor)
 
     def with_sensor(self: _Camera, sensor: Sensor, renderer: Renderer) -> _Camera:
         """The settings with a sensor and a renderer as they are: what would change it is gone."""
@@ -147,6 +158,8 @@ class ScanSettings(CameraSettings):
     """Which column of the settings in which the paper's text and its code differ."""
     views: int = 5
     """Views fused into one cloud."""
+    least_views: int | None = None
+    """Draw the number of views of each scan, from this up to views."""
     view_layout: ViewLayout | None = None
     """orbit around the object (the paper's text), or jitter of one pose as released; default by
     preset."""
@@ -159,9 +172,10 @@ class ScanSettings(CameraSettings):
     box_margin: float = 0.0
     """Enlarge the box of the crop on every side, in the unit of the scene."""
     depth_margin: float = 0.1
-    """A crop with the mask keeps depths at most this much before the nearest or behind the farthest
-    depth that the object truly shows in a view, in the unit of the scene. Our choice: three times
-    the noise of the D435 at the far end of an object at 2.8 m."""
+    """A crop with the mask keeps depths at most this much, and 0.3 pixels of disparity, before or
+    behind what a pixel truly shows, in the unit of the scene: as a label in 3D leaves out what
+    hangs off an object's rim, and one in the image does not. Our choice; a large one bounds
+    nothing."""
     remove_outliers: bool = False
     """Take statistical outliers out of the fused cloud, as is done with real scans (16 neighbours,
     3 robust deviations, twice)."""
@@ -175,8 +189,8 @@ class ScanSettings(CameraSettings):
     """Size of every object, in metres for real cameras; or the size that the mesh's file gives it;
     or one drawn from the real sizes of its class; default by sensor, class in rooms."""
     units: Unit | None = None
-    """Unit of the meshes, for the object size file; by default what a file says (glTF: m), else m
-    up to a longest side of 5 and mm above."""
+    """Unit of the meshes whose files tell none (glTF, STEP, IGES and 3MF do), for the object size
+    file; by default m up to a longest side of 5 and mm above."""
     material: Material | str | None = None
     """Surface of the object by name: diffuse, principled, rough-specular, glossy-plastic, metal,
     dark, mirror or glass; default by sensor."""
@@ -194,6 +208,9 @@ class ScanSettings(CameraSettings):
     and the camera's place: height, distance, aim; room.distance=1:2 beside it narrows one."""
     least_pixels: int = 1000
     """Pixels of the object that each view of a room must show; else it is drawn again."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where ad-census searches, to the same bits: cuda is a GPU through torch, which auto takes
+    where Mitsuba renders on one too."""
     seed: int = 0
     """All random steps follow from it."""
 
@@ -211,6 +228,8 @@ class ScanSettings(CameraSettings):
         check_range(self, "scan", "least_pixels", low=1)
         check_range(self, "scan", "num_points", low=1, high=1_000_000)
         check_range(self, "scan", "views", low=1, high=256)
+        if self.least_views is not None:
+            check_range(self, "scan", "least_views", low=1, high=self.views)
         check_range(self, "scan", "box_margin", "depth_margin", "seed")
 
     def chosen(self, name: str) -> Any:
@@ -244,10 +263,15 @@ class ScanSettings(CameraSettings):
             return self.object_size
         return "class" if self.object_size is None and self.room_layouts else None
 
-    @property
+    @functools.cached_property
+    def ranges(self) -> dict[str, tuple[Any, ...]]:
+        """What ``randomise`` draws from, as `qs3.sensor.randomise.resolve_ranges` returns it."""
+        return resolve_ranges(self.make_sensor(), self.randomise)
+
+    @functools.cached_property
     def room_layouts(self) -> tuple[str, ...]:
         """The layouts that rooms are drawn from; none where no rooms are drawn."""
-        return resolve_ranges(self.make_sensor(), self.randomise).get("room.layout", ())
+        return self.each_sensor()[0].ranges.get("room.layout", ())
 
     @property
     def needs_neighbour(self) -> bool:
@@ -256,6 +280,12 @@ class ScanSettings(CameraSettings):
         return any(SceneSettings(name).needs_neighbour for name in layouts) or (
             not layouts and self.make_scene().needs_neighbour
         )
+
+    def matching_device(self, renderer: Renderer) -> str:
+        """Where to match, ``cpu`` or ``cuda``, beside what renders."""
+        if self.device != "auto":
+            return self.device
+        return "cuda" if renderer.description.get("variant", "").startswith("cuda") else "cpu"
 
     def make_scene(self) -> SceneSettings:
         """What stands around the object."""
@@ -267,13 +297,13 @@ class ScanSettings(CameraSettings):
     def as_dict(self) -> dict[str, Any]:
         """Plain values for records; what the sensor and the renderer say of themselves is apart."""
         apart = {*(f.name for f in dataclasses.fields(CameraSettings)), *self._CHANGES, "preset"}
-        apart |= {"crop", "floor_material", "wall_material", "seed"}
+        apart |= {"crop", "floor_material", "wall_material", "device", "seed"}
         names = [f.name for f in dataclasses.fields(ScanSettings) if f.name not in apart]
-        crop = self.chosen("crop")
+        crop, ranges = self.chosen("crop"), [dict(one.ranges) for one in self.each_sensor()]
         return {name: self.chosen(name) for name in names} | {
             "object_size": self.object_size if isinstance(self.object_size, str) else None,
             "box_crop": crop in ("box", "both"),
             "mask_crop": crop in ("mask", "both"),
             "scene": dataclasses.asdict(self.make_scene()),
-            "randomise": resolve_ranges(self.make_sensor(), self.randomise),
+            "randomise": ranges if isinstance(self.sensor, tuple) else ranges[0],
         }

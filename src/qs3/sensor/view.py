@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Shaped, UInt
@@ -12,7 +12,7 @@ from qs3.sensor.depth import backproject, depth_from_disparity, gate
 from qs3.sensor.exposure import expose_pair
 from qs3.sensor.matching import match, matching_canvas
 from qs3.sensor.presets import Sensor
-from qs3.sensor.render import Body, Scene, StereoPair
+from qs3.sensor.render import Body, Renderer, Scene, StereoPair
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, Region
 from qs3.sensor.speckle import pattern_image, stored_pattern
@@ -20,6 +20,10 @@ from qs3.sensor.statistics import EMPTY_VIEW, ViewStatistics, view_statistics
 
 RIM = 16
 """Pixels around the object's box that are matched too: fattening reaches half a block."""
+
+NOISE = 0.1
+"""Disparity noise in pixels, of which a crop with the mask leaves three standard deviations: what
+Intel's guide to tuning depth cameras takes for the most of a good camera."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +54,6 @@ class ViewImages:
         """True depth of the object where it is seen within the depth gate, NaN elsewhere."""
         return gate(np.where(self.mask, self.true_depth, np.nan), sensor.depth)
 
-    def blind(self, sensor: Sensor) -> bool:
-        """Whether no pixel shows the object within the depth gate: what is matched is not it."""
-        return not np.isfinite(self.true_object(sensor)).any()
-
     def part(self, image: Shaped[np.ndarray, "h w"], part: Region) -> Shaped[np.ndarray, "h2 w2"]:
         """The pixels of ``part`` of the frame, which lies within ``region``."""
         return image[part.within(self.region)]
@@ -66,43 +66,57 @@ def scene_of(bodies: Sequence[Body], sensor: Sensor) -> Scene:
     return Scene(tuple(bodies), sensor.light, pattern_image(pattern), *opening)
 
 
+def photograph(
+    renderer: Renderer,
+    scene: Scene,
+    sensor: Sensor,
+    poses: Sequence[Pose],
+    seeds: Sequence[int],
+    regions: Sequence[Region] | None = None,
+) -> list[StereoPair]:
+    """Photograph views as the sensor's exposure needs them: `qs3.sensor.render.Renderer`.
+
+    Coherent speckle wants each view once more, with the projector off.
+    """
+    pairs = renderer.render(scene, sensor.rig, poses, seeds, regions)
+    if not sensor.exposure.coherent:
+        return pairs
+    room = replace(scene, light=replace(scene.light, projector=0.0))
+    rooms = renderer.render(room, sensor.rig, poses, seeds, regions)
+    return [replace(pair, room=dark) for pair, dark in zip(pairs, rooms, strict=True)]
+
+
 def object_region(bounds: Float[np.ndarray, "2 3"], sensor: Sensor, pose: Pose) -> Region:
     """The part of the left frame that is matched for the object's sake."""
     return sensor.rig.region_of(bounds, pose, RIM)
 
 
-def clouds_of(
+def measure(
     images: ViewImages, part: Region, pose: Pose, sensor: Sensor, margin: float | None
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:
-    """The noisy and the true points of the object's part of one view, in the world.
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"], ViewStatistics]:
+    """The noisy and the true points of the object's part of one view, in the world, and its errors.
 
     A view that does not show the object within the depth gate gives none: what its matcher found
     is something else. With a ``margin`` only the pixels that show the object count, and of these
-    the depths within the true ones' range and the margin.
+    the depths within the margin, and three times a matcher's noise, of the true one there.
     """
-    if images.blind(sensor):
-        return np.zeros((0, 3)), np.zeros((0, 3))
     depth, truth = images.depth, images.true_object(sensor)
+    if not np.isfinite(truth).any():
+        return np.zeros((0, 3)), np.zeros((0, 3)), EMPTY_VIEW
     if margin is not None:
-        off = np.maximum(np.nanmin(truth) - depth, depth - np.nanmax(truth))
-        depth = np.where(images.mask & (off <= margin), depth, np.nan)
+        noise = NOISE * truth**2 / float(sensor.rig.disparity(1.0))
+        depth = np.where(np.abs(depth - truth) <= margin + 3 * noise, depth, np.nan)
     noisy, true = (
         backproject(images.part(image, part), sensor.rig, part, pose, sensor.depth)
         for image in (depth, truth)
     )
-    return noisy, true
-
-
-def statistics_of(images: ViewImages, part: Region, sensor: Sensor) -> ViewStatistics:
-    """Measure a view on the object's part of the frame; all None where it does not show it."""
-    if images.blind(sensor):
-        return EMPTY_VIEW
-    return view_statistics(
+    statistics = view_statistics(
         images.part(images.disparity, part),
         images.part(images.true_depth, part),
         sensor.rig,
         images.part(images.mask, part),
     )
+    return noisy, true, statistics
 
 
 def take_view(
@@ -113,6 +127,7 @@ def take_view(
     casters: Sequence[DepthCaster],
     rng: np.random.Generator,
     clock: "Clock",
+    device: str = "cpu",
 ) -> ViewImages:
     """Expose and match ``region`` of one view, with auto-exposure on ``focus``; cast its depth.
 
@@ -127,7 +142,7 @@ def take_view(
         if rig.second == "pattern":
             right = stored_pattern(rig, sensor.pattern, canvas, sensor.exposure.bits)
     with clock("matching"):
-        disparity = match(left, right, sensor.matching)[inner]
+        disparity = match(left, right, sensor.matching, device)[inner]
     with clock("true_depth"):
         whole = len(casters) > 1
         cast = casters[0].cast(rig, pair.pose, region, normals=whole)

@@ -15,17 +15,9 @@ from qs3.shapes import bathtub, bed, bookshelf, cabinet, chair, lamp, monitor, p
 from qs3.shapes._dice import Dice
 from qs3.shapes._solids import Solid, assemble
 
+_MODULES = (bathtub, bed, bookshelf, cabinet, chair, lamp, monitor, plant, sofa, table)
 _FAMILIES: dict[str, tuple[Callable[[Dice], list[Solid]], ...]] = {
-    "bathtub": bathtub.FAMILIES,
-    "bed": bed.FAMILIES,
-    "bookshelf": bookshelf.FAMILIES,
-    "cabinet": cabinet.FAMILIES,
-    "chair": chair.FAMILIES,
-    "lamp": lamp.FAMILIES,
-    "monitor": monitor.FAMILIES,
-    "plant": plant.FAMILIES,
-    "sofa": sofa.FAMILIES,
-    "table": table.FAMILIES,
+    module.__name__.rpartition(".")[2]: module.FAMILIES for module in _MODULES
 }
 
 CLASSES: tuple[str, ...] = tuple(_FAMILIES)

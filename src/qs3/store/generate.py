@@ -43,7 +43,7 @@ from qs3.store.scan_item import scan_item as scan_item
 from qs3.store.scan_item import scan_seed as scan_seed
 from qs3.store.shards import CloudRow, load_shard
 
-_KILLED = ("ProcessDied", "Timeout")
+_STOPPED = ("ProcessDied", "Timeout")
 _TOO_MANY = 50
 
 
@@ -95,7 +95,8 @@ def generate(
     Raises:
         InputError: where the list is empty or has equal ids, a class is unknown, the folder holds
             something else or a data set of other settings, another process writes into it, or a
-            fault lies with the machine (a missing package, a full disk) and not with an object.
+            fault lies with the machine (a missing package, a full disk, processes that are killed)
+            and not with an object.
     """
     index, count = shard
     if not 0 <= index < count:
@@ -200,7 +201,7 @@ class _Run:
         bar = progress_bar(self.total, text, "scan", skipped)
         with bar, executor:
             try:
-                for key, outcome in outcomes(executor, self._next_call):
+                for key, outcome in outcomes(executor, self._next_call, self._name_of):
                     if isinstance(key, Place):
                         self._scanned(key, outcome)
                         bar.set_postfix(failed=self.failed, refresh=False)
@@ -233,11 +234,14 @@ class _Run:
         call = functools.partial(self.scan_one, *arguments)
         return place, scan_to_part, self.folder, place, self.plan.settings.dtype, call
 
+    def _name_of(self, key: Place | int) -> str:
+        return self.plan.row_id(key) if isinstance(key, Place) else shard_name(key)
+
     def _scanned(self, place: Place, outcome: Failure | None) -> None:
         self.awaited[place.shard] -= 1
         if not self.awaited[place.shard]:
             self.complete.append(place.shard)
-        if outcome is not None and outcome.kind in _KILLED:
+        if outcome is not None and outcome.kind in _STOPPED:
             # It may have been stopped when its row was written and the answer was not yet here.
             outcome = None if self.folder.exists(f"{place.stem}.parquet") else outcome
         if outcome is None:
@@ -248,7 +252,7 @@ class _Run:
         self.failed += 1
         self.log_is_behind = True
         self.failures[place] = self.plan.failure_record(place, outcome)
-        if outcome.kind in _KILLED:  # it could not write this itself
+        if outcome.kind in _STOPPED:  # it could not write this itself
             write_failure(self.folder, place, outcome)
         self.failed_in_a_row.add(self.plan.object_of(place))
         if len(self.failed_in_a_row) >= _TOO_MANY:
@@ -275,7 +279,7 @@ class _Run:
         return self.folder, shard, self.plan.settings.dtype, order, failed
 
     def _finished(self, shard: int, outcome: str | Failure) -> None:
-        if isinstance(outcome, Failure) and outcome.kind in _KILLED:
+        if isinstance(outcome, Failure) and outcome.kind in _STOPPED:
             outcome = finish_shard(*self._finish_arguments(shard))
         name = shard_name(shard)
         if isinstance(outcome, Failure):

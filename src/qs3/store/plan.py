@@ -131,9 +131,9 @@ def make_plan(items: Sequence[Item], settings: GenerateSettings) -> Plan:
 
 def resolve_renderer(settings: GenerateSettings) -> GenerateSettings:
     """Choose sensor and renderer where they are but named: the same ones for every worker."""
-    return dataclasses.replace(
-        settings, sensor=settings.make_sensor(), renderer=settings.make_renderer()
-    )
+    made = tuple(one.make_sensor() for one in settings.each_sensor())
+    sensor = made if isinstance(settings.sensor, tuple) else made[0]
+    return dataclasses.replace(settings, sensor=sensor, renderer=settings.make_renderer())
 
 
 def work_list_checksum(items: Sequence[Item]) -> str:

@@ -5,7 +5,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import tyro
@@ -19,6 +19,9 @@ from qs3.store.shards import STATISTICS, CloudRow, DType
 
 if TYPE_CHECKING:
     import trimesh
+
+
+RecipeName = Literal["rooms"]
 
 
 @runtime_checkable
@@ -49,6 +52,8 @@ class Item(Protocol):
 class GenerateSettings(ScanSettings):
     """What a data set's bytes depend on, together with the work list; ``seed`` is its root seed."""
 
+    recipe: Annotated[RecipeName | None, tyro.conf.Suppress] = None
+    """Name of the recipe that these settings began as; a label for the record."""
     meshes: Annotated[str, tyro.conf.Suppress] = "shapes"
     """``shapes`` or the name (not the path) of the folder of meshes; a label for the record."""
     per_class: Annotated[int | None, tyro.conf.Suppress] = None
@@ -75,11 +80,31 @@ class GenerateSettings(ScanSettings):
         }
         plain = super().as_dict() | {name: getattr(self, name) for name in sorted(own)}
         plain |= {"classes": list(self.classes), "seed": self.seed}
-        plain["sensor"] = settings_dict(self.make_sensor())
+        sensors = [settings_dict(one.make_sensor()) for one in self.each_sensor()]
+        plain["sensor"] = sensors if isinstance(self.sensor, tuple) else sensors[0]
         plain["renderer"] = None
         if not isinstance(self.renderer, str):
             plain["renderer"] = renderer_dict(self.renderer)
         return plain
+
+
+RECIPES: dict[RecipeName, GenerateSettings] = {
+    "rooms": GenerateSettings(
+        recipe="rooms",
+        per_class=60,
+        scans_per_mesh=2,
+        sensor=("d415", "d435", "d455", "kinect-v1"),
+        least_views=1,
+        crop="mask",
+        randomise=["rooms"],
+    )
+}
+"""Whole settings by name. ``rooms``: a source that is to meet scans of real rooms.
+
+Example:
+    >>> dataclasses.replace(RECIPES["rooms"], sensor="d435", seed=1).crop
+    'mask'
+"""
 
 
 def scan_seed(root: int, object_id: str, scan: int) -> int:
@@ -134,7 +159,6 @@ def scan_item(
     surface_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0x50BF,)))
     surface = sample_surface(result.mesh, settings.num_points, surface_rng)
     label = map_labels([item.class_name], np.zeros(1, dtype=np.int64), settings.classes)[0]
-    means = {name: _mean([getattr(view, name) for view in result.views]) for name in STATISTICS}
     drawn = dict(result.drawn)
     layout = drawn.get("room.layout", settings.make_scene().layout)
     if neighbour is not None and SceneSettings(layout).needs_neighbour:  # not in all rooms
@@ -154,7 +178,7 @@ def scan_item(
         surface=surface.astype(np.float32),
         yaw=result.yaw,
         drawn=json.dumps(drawn, sort_keys=True),
-        **means,
+        **mean_statistics(result.views),
     )
 
 
@@ -163,6 +187,10 @@ def row_id(item: Item, scan: int) -> str:
     return f"{item.id}#{scan}"
 
 
-def _mean(values: Sequence[float | None]) -> float | None:
-    numbers = [value for value in values if value is not None]
-    return float(np.mean(numbers)) if numbers else None
+def mean_statistics(views: Sequence[object]) -> dict[str, float | None]:
+    """Mean of each of `STATISTICS` over the views that have it; None where none has."""
+    means: dict[str, float | None] = {}
+    for name in STATISTICS:
+        known = [value for view in views if (value := getattr(view, name)) is not None]
+        means[name] = float(np.mean(known)) if known else None
+    return means

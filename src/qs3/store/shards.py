@@ -22,7 +22,13 @@ from qs3.errors import InputError
 from qs3.store.folder import Folder
 from qs3.store.manifest import shard_name
 
-STATISTICS = ("valid_fraction", "disparity_bias", "disparity_sigma", "gross_share")
+STATISTICS = {
+    "valid_fraction": ("valid pixels of the object", ".1%"),
+    "disparity_bias": ("disparity bias, px", "+.3f"),
+    "disparity_sigma": ("disparity σ, px", ".3f"),
+    "gross_share": ("gross errors", ".2%"),
+}
+"""Statistics of a scan, means over its views: what readers see of each, and how it is written."""
 
 DType = Literal["float32", "float16"]
 """Type of the coordinates on disk. Half precision is good to 0.0005 at a size of 1."""

@@ -2,26 +2,29 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from qs3.adaptation.validators import VALIDATORS
+import numpy as np
+
 from qs3.errors import InputError
 from qs3.evaluation.environment import git_commit, hardware, versions
 from qs3.evaluation.records import RECORDS, RunRecord, Scores, score, write_record
+from qs3.evaluation.regret import choose_each
 from qs3.io import load_clouds
 from qs3.io.clouds import CloudKind, PointClouds
 from qs3.io.ragged import RaggedClouds
 from qs3.structure import unstructure
 from qs3.training.batches import load_whole, require_finite
 from qs3.training.checkpoint import LoadedModel, load_model
-from qs3.training.overlap import caveats
+from qs3.training.overlap import both_checksums, caveats
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared, prepare_clouds
+from qs3.training.rounds import kept_clouds
 from qs3.training.run import data_record, read_run
-from qs3.training.validation import ROUND, choose, load_checkpoint, read_checkpoints
+from qs3.training.validation import ROUND, load_checkpoint, read_checkpoints
 
 
 def evaluate(
@@ -56,6 +59,7 @@ def evaluate(
     whole = _labelled(data, split, cloud, loaded)
     require_finite(whole.points, whole.ids)
     test = prepare_clouds(whole, train["num_points"], loaded.preparation)
+    scored = _scored(Path(run), test) if checkpoints else []
     record = RunRecord(
         method=made.method,
         model=train["model"],
@@ -70,8 +74,10 @@ def evaluate(
         versions=versions(),
         hardware=hardware(),
         commit=git_commit(),
-        rounds=made.rounds,
-        choices=_choices(Path(run), loaded, test) if checkpoints else {},
+        rounds=_count_right(Path(run), made.rounds, test),
+        chosen=made.chosen,
+        checkpoints=tuple(scored),
+        choices=_choices(scored) if scored else {},
         marks=caveats(made, test),
         experiment=experiment,
     )
@@ -103,27 +109,55 @@ def _scores(loaded: LoadedModel, test: Prepared[PointClouds]) -> Scores:
     return score(test.labels, answers, loaded.class_names)
 
 
-def _choices(
-    run: Path, loaded: LoadedModel, test: Prepared[PointClouds]
-) -> dict[str, dict[str, Any]]:
-    """Score the checkpoints of the run's last stage, and let every rule choose among them."""
+def _count_right(
+    run: Path, rounds: Sequence[Mapping[str, Any]], test: Prepared[PointClouds]
+) -> tuple[Mapping[str, Any], ...]:
+    """Add to what rounds did how many of the pseudo labels that they kept were right.
+
+    Args:
+        run: Folder of the run.
+        rounds: What its rounds did.
+        test: Labelled clouds. Those of the target among them are known by the points that the
+            network gets.
+    """
+    found = kept_clouds(run)
+    if found is None or len(found[1]) != len(rounds):
+        return tuple(rounds)
+    clouds, kept = found
+    truth: dict[str, int] = {}
+    for texts in both_checksums(test):
+        truth |= zip(texts, test.labels.tolist(), strict=True)
+    labels = np.array([truth.get(cloud, -1) for cloud in clouds])
+    if (labels < 0).all():
+        return tuple(rounds)
+    told = []
+    for record, (rows, pseudo) in zip(rounds, kept, strict=True):
+        known, size = labels[rows] >= 0, len(record["kept"])
+        counted = {"known": pseudo[known], "right": pseudo[labels[rows] == pseudo]}
+        counts = {name: np.bincount(of, minlength=size).tolist() for name, of in counted.items()}
+        told.append({**record, **counts})
+    return tuple(told)
+
+
+def _scored(run: Path, test: Prepared[PointClouds]) -> list[dict[str, Any]]:
+    """Score the checkpoints of the run's last stage."""
     checkpoints = read_checkpoints(run, ROUND) or read_checkpoints(run)
     if not checkpoints:
         raise InputError(f"{run}: has no checkpoints; train with --validate-every above 0")
-    scored: dict[str, dict[str, Any]] = {}
+    loaded, scored = load_model(run), []
     for checkpoint in checkpoints:
         load_checkpoint(run, checkpoint, loaded.model)
         scores = _scores(loaded, test)
-        scored[checkpoint.file] = {
-            "stage": checkpoint.stage,
-            "number": checkpoint.number,
-            "accuracy": scores.accuracy,
-            "class_mean_accuracy": scores.class_mean_accuracy,
-        }
-    said = {
-        name for made in checkpoints for name, value in made.validators.items() if value is not None
+        one = {"accuracy": scores.accuracy, "class_mean_accuracy": scores.class_mean_accuracy}
+        one |= {"stage": checkpoint.stage, "number": checkpoint.number}
+        scored.append(one | {"validators": dict(checkpoint.validators)})
+    return scored
+
+
+def _choices(scored: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Let every rule choose among the checkpoints, as `qs3.training.validation.choose` does."""
+    choices = {name: scored[row] for name, row in choose_each(scored).items()}
+    return {
+        rule: {name: value for name, value in choice.items() if name != "validators"}
+        for rule, choice in choices.items()
     }
-    rules = ["last", *(name for name in VALIDATORS if name in said)]
-    choices = {rule: scored[choose(checkpoints, rule).file] for rule in rules}
-    choices["oracle"] = max(scored.values(), key=lambda choice: choice["accuracy"])
-    return choices

@@ -50,6 +50,8 @@ class Run:
     """The same of the clouds of the target."""
     threads: int | None = None
     """CPU threads of each process, in the call that ended the run; None where it is not known."""
+    chosen: Mapping[str, str | int] | None = None
+    """Checkpoint that the rule chose: its ``stage`` and ``number``; None in earlier releases."""
     preset: str | None = None
     """Preset of the rounds; None without rounds, or where the caller named none."""
     supervised: bool = False
@@ -214,7 +216,7 @@ def _fixed(settings: RunSettings) -> dict[str, Any]:
 def fingerprint(clouds: PointClouds | UnlabelledClouds) -> str:
     """SHA-256 over points, and labels and class names where there are any."""
     digest = hashlib.sha256(str(clouds.points.shape).encode())
-    digest.update(np.ascontiguousarray(clouds.points, dtype=np.float32).tobytes())
+    digest.update(np.ascontiguousarray(clouds.points, dtype=np.float32).data)
     if isinstance(clouds, PointClouds):
         digest.update(np.ascontiguousarray(clouds.labels, dtype=np.int64).tobytes())
         digest.update("\0".join(clouds.class_names).encode())

@@ -14,20 +14,12 @@ from qs3.errors import InputError
 from qs3.io.clouds import CloudKind, PointClouds, UnlabelledClouds
 from qs3.store.folder import open_folder
 from qs3.store.manifest import finished_shards, open_dataset, shard_name
-from qs3.store.shards import flat_clouds, load_shard
+from qs3.store.shards import STATISTICS, flat_clouds, load_shard
 
 KINDS: dict[CloudKind, str] = {"points": "noisy", "clean": "clean", "surface": "surface"}
 """The clouds of an object and the names by which the page calls them."""
 
 _VIEWS: dict[CloudKind, str] = {"points": "view", "clean": "clean_view"}
-
-STATISTICS = {
-    "valid_fraction": ("valid pixels", ".0%"),
-    "disparity_bias": ("disparity bias (px)", "+.3f"),
-    "disparity_sigma": ("disparity σ (px)", ".3f"),
-    "gross_share": ("gross errors", ".1%"),
-}
-"""Statistics of a scan: what the page calls them and how it writes them."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +149,7 @@ def statistics(values: Mapping[str, Any]) -> list[tuple[str, str]]:
 
     Example:
         >>> statistics({"valid_fraction": 0.5, "gross_share": None})
-        [('valid pixels', '50%')]
+        [('valid pixels of the object', '50.0%')]
     """
     return [
         (label, f"{value:{form}}")

@@ -12,7 +12,8 @@ from qs3.sensor.materials import MATERIALS, get_material
 from qs3.sensor.presets import Sensor
 from qs3.sensor.scan import scan
 from qs3.sensor.settings import ScanSettings
-from qs3.viewer.exhibits import STATISTICS, Exhibit, statistics
+from qs3.store.scan_item import mean_statistics
+from qs3.viewer.exhibits import Exhibit, statistics
 
 OWN_MATERIAL = "of the sensor"
 _SCENES = ("alone", "floor", "wall", "room")
@@ -147,11 +148,7 @@ def rescan(
         InputError: where the sensor sees nothing of it.
     """
     made = scan(mesh, settings, class_names=[class_name])
-    means = {}
-    for statistic in STATISTICS:
-        values = [v for view in made.views if (v := getattr(view, statistic)) is not None]
-        means[statistic] = sum(values) / len(values) if values else None
-    facts = [("fused points", str(made.fused_points)), *statistics(means)]
+    facts = [("fused points", str(made.fused_points)), *statistics(mean_statistics(made.views))]
     facts.append(("scanned in", f"{sum(made.seconds.values()):.1f} s"))
     return Exhibit(
         name=name,

@@ -195,7 +195,9 @@ def run_extract(
 
         with bar, executor:
             try:
-                for index, outcome in outcomes(executor, lambda: next(calls, None)):
+                for index, outcome in outcomes(
+                    executor, lambda: next(calls, None), names.__getitem__
+                ):
                     note(index, outcome)
             except KeyboardInterrupt:
                 bar.set_description("finishing what is under way")

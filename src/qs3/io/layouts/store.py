@@ -2,16 +2,18 @@
 
 import concurrent.futures
 import hashlib
+import itertools
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from tqdm import tqdm
 
 from qs3.errors import InputError
-from qs3.io.clouds import CloudKind
+from qs3.io.clouds import CloudChoice, CloudKind
 from qs3.io.guards import utf8
 from qs3.io.layouts.format import Format
 from qs3.io.ragged import RaggedClouds
@@ -33,7 +35,7 @@ _THREADS = min(os.cpu_count() or 1, 8)
 
 def read_ragged(
     where: str | Path | Folder,
-    cloud: CloudKind = "points",
+    cloud: CloudChoice = "points",
     split: str | None = None,
     partial: bool = False,
 ) -> RaggedClouds:
@@ -41,7 +43,8 @@ def read_ragged(
 
     Args:
         where: Folder of the data set, or the address of one.
-        cloud: ``points`` (noisy), ``clean`` or ``surface``.
+        cloud: ``points`` (noisy), ``clean``, ``surface``, or ``all``: three clouds of each scan,
+            named by its id, a stroke and their kind.
         split: Rows of this split only.
         partial: Accept a data set whose making has not finished.
 
@@ -57,19 +60,22 @@ def read_ragged(
             f"{folder}: unfinished, {len(shards)} of {manifest.shards} shards; run the same "
             "command again"
         )
+    kinds = get_args(CloudKind) if cloud == "all" else (cloud,)
     rows: list[tuple[str, int, str]] = []
     clouds: list[np.ndarray] = []
     splits: set[str] = set()
     digest = hashlib.sha256()
     # Reading, unpacking and hashing leave the interpreter's lock: threads share the work.
     with concurrent.futures.ThreadPoolExecutor(_THREADS) as pool:
-        read = pool.map(lambda index: _read_shard(folder, index, cloud, manifest), shards)
+        read = pool.map(lambda index: _read_shard(folder, index, kinds, manifest), shards)
         for columns, scanned, checksum in read:
             digest.update(checksum)
             splits.update(columns[2])
             chosen = [i for i, part in enumerate(columns[2]) if split in (None, part)]
-            rows += [(columns[0][i], columns[1][i], columns[2][i]) for i in chosen]
-            clouds += [scanned[i] for i in chosen]
+            for kind, own in zip(kinds, scanned, strict=True):
+                end = f"/{kind}" if cloud == "all" else ""
+                rows += [(columns[0][i] + end, columns[1][i], columns[2][i]) for i in chosen]
+                clouds += [own[i] for i in chosen]
     if not clouds:
         named = ", ".join(sorted(filter(None, splits))) or "none"
         missing = "no cloud" if split is None else f"no cloud of split {split!r}; splits: {named}"
@@ -86,24 +92,25 @@ def read_ragged(
 
 
 def _read_shard(
-    folder: Folder, index: int, cloud: CloudKind, manifest: Manifest
-) -> tuple[list[list[Any]], list[np.ndarray], bytes]:
-    """Ids, labels and splits of a shard, one kind of its clouds, and the checksum of all that."""
+    folder: Folder, index: int, kinds: Sequence[CloudKind], manifest: Manifest
+) -> tuple[list[list[Any]], list[list[np.ndarray]], bytes]:
+    """Ids, labels and splits of a shard, some kinds of its clouds, and the checksum of all that."""
     # Imported here: listing layouts does without Parquet, which weighs.
     from qs3.store.shards import flat_clouds, load_shard
 
     path = f"{folder}/{shard_name(index)}"
-    wanted = ["id", "label", "split", cloud]
+    wanted = ["id", "label", "split", *kinds]
     table = load_shard(folder, index, wanted)
     columns = [table[column].to_pylist() for column in wanted[:3]]
-    if cloud != "points" and len(table) and not len(table[cloud].combine_chunks().values):
-        raise InputError(f"{folder}: has no {cloud!r} clouds, only 'points'")
+    for kind in kinds:
+        if kind != "points" and len(table) and not len(table[kind].combine_chunks().values):
+            raise InputError(f"{folder}: has no {kind!r} clouds, only 'points'")
     for identifier, label in zip(columns[0], columns[1], strict=True):
         if not 0 <= label < len(manifest.class_names):
             raise InputError(f"{path}: label {label} of {identifier!r} has no class name")
-    scanned = flat_clouds(table, cloud, path)
+    scanned = [flat_clouds(table, kind, path) for kind in kinds]
     digest = hashlib.sha256(json.dumps(columns).encode("utf-8"))
-    for points in scanned:
+    for points in itertools.chain(*scanned):
         digest.update(points.data)
     return columns, scanned, digest.digest()
 

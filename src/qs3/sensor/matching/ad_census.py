@@ -36,6 +36,7 @@ def match_ad_census(
     left: UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"],
     right: UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"],
     settings: MatchingSettings,
+    device: str = "cpu",
 ) -> Float32[np.ndarray, "h w"]:
     """Match a rectified pair; ``quantum`` is not applied.
 
@@ -43,16 +44,17 @@ def match_ad_census(
         left: Grey levels of 8 bits, or of 10 bits in 16.
         right: The same of the other camera.
         settings: The matcher; the fields marked ``ad-census`` and those of ``ad_census``.
+        device: Where disparities are searched: ``cuda`` is a GPU through torch.
 
     Returns:
         Disparity in pixels, NaN where there is none. It needs 4 · h · w · ``num_disparities`` bytes
-        and takes as long as there are disparities of pixels, 15 ns each.
+        and takes as long as there are disparities of pixels, 10 ns each.
     """
     own, bits = settings.ad_census, 8 if left.dtype == np.uint8 else 10
     tone = (2**bits - 1) / 255  # grey levels in one of 8 bits
     images = [np.ascontiguousarray(image, dtype=np.int32) for image in (left, right)]
     left_bits, right_bits = (_bits(image, own) for image in images)
-    found = _search(images[0], images[1], left_bits, right_bits, settings, tone)
+    found = _search(images[0], images[1], left_bits, right_bits, settings, tone, device)
     best, total, less, more, second = np.moveaxis(found, 2, 0)
     columns = np.arange(left.shape[1])
     kept = (best > 0) & (best < settings.num_disparities - 1) & (best <= columns)
@@ -62,7 +64,7 @@ def match_ad_census(
         other_bits, this_bits = (
             np.ascontiguousarray(bits[:, ::-1]) for bits in (right_bits, left_bits)
         )
-        back = _search(other, this, other_bits, this_bits, settings, tone)[:, ::-1, 0]
+        back = _search(other, this, other_bits, this_bits, settings, tone, device)[:, ::-1, 0]
         agreed = np.take_along_axis(back, np.maximum(columns - best, 0), axis=1)
         kept &= np.abs(best - agreed) <= settings.left_right
     kept &= second - total >= own.second_peak * 4 * UNIT
@@ -92,6 +94,7 @@ def _search(
     right_bits: UInt64[np.ndarray, "h w"],
     settings: MatchingSettings,
     tone: float,
+    device: str,
 ) -> Int32[np.ndarray, "h w 5"]:
     """What `optimise` returns."""
     own = settings.ad_census
@@ -104,13 +107,16 @@ def _search(
         for difference, scale in ((counts, own.lambda_census), (levels, own.lambda_ad * tone))
     )
     shares = (2**16 * UNIT // (full * support_sizes(arms))).astype(np.uint32)
-    costs = mean_costs(
-        left, right, left_bits, right_bits, by_bits, by_levels, arms, shares,
-        settings.num_disparities,
-    )  # fmt: skip
     small, large = UNIT * own.penalty_small, UNIT * own.penalty_large
     penalties = np.array([small, large, small / own.edge_divisor, large / own.edge_divisor])
-    return optimise(costs, left, penalties.astype(np.uint16), own.edge * tone)
+    penalties, edge = penalties.astype(np.uint16), own.edge * tone
+    pictures = left, right, left_bits, right_bits, by_bits, by_levels, arms, shares
+    if device != "cpu":
+        from qs3.sensor.matching.on_device import search  # it imports torch
+
+        return search(*pictures, settings.num_disparities, penalties, edge, device)
+    costs = mean_costs(*pictures, settings.num_disparities)
+    return optimise(costs, left, penalties, edge)
 
 
 def _refined(
@@ -121,10 +127,18 @@ def _refined(
     tone: float,
 ) -> Float64[np.ndarray, "h w"]:
     """Disparities averaged and corrected as often as the settings say."""
-    if own.corrections == 0:
+    valid = np.isfinite(disparity)
+    if own.corrections == 0 or not valid.any():
         return disparity
-    left, right = (image / tone for image in images)
-    arms = surface_arms(disparity, longest, own.surface)
+    # Nothing is read beyond what is valid, its matches, a pixel for each correction, and the cubic.
+    around = own.corrections + 5
+    rows, columns = (np.flatnonzero(valid.any(axis=axis)) for axis in (1, 0))
+    first = max(0, columns[0] - int(np.nanmax(disparity)) - around)
+    part = np.s_[rows[0] : rows[-1] + 1, first : columns[-1] + around]
+    left, right = (image[part] / tone for image in images)
+    inner, made = disparity[part], np.full_like(disparity, np.nan)
+    arms = surface_arms(inner, longest, own.surface)
     for _ in range(own.corrections):
-        disparity = corrected(left, right, averaged(disparity, arms), arms, own.grain)
-    return disparity
+        inner = corrected(left, right, averaged(inner, arms), arms, own.grain)
+    made[part] = inner
+    return made

@@ -51,22 +51,18 @@ def window_sums(fields: Int64[np.ndarray, "h w c"], arms: Int32[np.ndarray, "4 h
     """Replace numbers by their sums over the horizontal arms of all pixels on the vertical ones."""
     height, width, count = fields.shape
     before = np.zeros((max(height, width) + 1, count), np.int64)
-    for y in range(height):
-        for x in range(width):
-            for c in range(count):
-                before[x + 1, c] = before[x, c] + fields[y, x, c]
-        for x in range(width):
-            low, high = before[x - arms[0, y, x]], before[x + arms[1, y, x] + 1]
-            for c in range(count):
-                fields[y, x, c] = high[c] - low[c]
-    for x in range(width):
-        for y in range(height):
-            for c in range(count):
-                before[y + 1, c] = before[y, c] + fields[y, x, c]
-        for y in range(height):
-            low, high = before[y - arms[2, y, x]], before[y + arms[3, y, x] + 1]
-            for c in range(count):
-                fields[y, x, c] = high[c] - low[c]
+    for vertical in range(2):  # NOTE: a slice for each pixel would cost more than the work on it
+        lines, length = (width, height) if vertical else (height, width)
+        for line in range(lines):
+            for i in range(length):
+                y, x = (i, line) if vertical else (line, i)
+                for c in range(count):
+                    before[i + 1, c] = before[i, c] + fields[y, x, c]
+            for i in range(length):
+                y, x = (i, line) if vertical else (line, i)
+                low, high = i - arms[2 * vertical, y, x], i + arms[2 * vertical + 1, y, x] + 1
+                for c in range(count):
+                    fields[y, x, c] = before[high, c] - before[low, c]
 
 
 @compiled

@@ -42,20 +42,21 @@ def grey_arms(
     """
     height, width = image.shape
     arms = np.zeros((4, height, width), np.int32)
+    most = np.int32(np.floor(threshold))
     for y in range(height):
-        for x in range(width):
-            for side in range(4):
-                dy, dx = (side >= 2) * (2 * side - 5), (side < 2) * (2 * side - 1)
-                middle = before = image[y, x]
-                for step in range(1, longest + 1):
-                    row, column = y + step * dy, x + step * dx
-                    if row < 0 or row >= height or column < 0 or column >= width:
-                        break
-                    level = image[row, column]
-                    if abs(level - middle) > threshold or abs(level - before) > threshold:
-                        break
-                    before = level
-                    arms[side, y, x] = step
+        for side in range(4):
+            dy, dx = (side >= 2) * (2 * side - 5), (side < 2) * (2 * side - 1)
+            for step in range(1, longest + 1):  # of a whole row at a time
+                row, ahead = y + step * dy, step * dx
+                first, last = max(0, -ahead), min(width, width - ahead)
+                if row < 0 or row >= height or first >= last:
+                    break
+                middle, own = image[y, first:last], arms[side, y, first:last]
+                level = image[row, first + ahead : last + ahead]
+                before = image[row - dy, first + ahead - dx : last + ahead - dx]
+                for x in range(last - first):
+                    near = (abs(level[x] - middle[x]) <= most) & (abs(level[x] - before[x]) <= most)
+                    own[x] += np.int32(near & (own[x] == step - 1))
     return arms
 
 

@@ -218,7 +218,8 @@ def kinect_rows(step: Float[np.ndarray, "n"], sigma: Float[np.ndarray, "n"]) -> 
 
 def repeats(bench: Bench) -> Judged | str:
     """T9: one wall twice with equal seeds, bit by bit the same, and once with other image noise."""
-    if not (bench.sensor.exposure.noise or bench.sensor.exposure.speckle):
+    exposure = bench.sensor.exposure
+    if not (exposure.noise or exposure.speckle or exposure.coherent):
         return "the sensor's images have no noise"
     distance = middle(bench.sensor)
     region = wall_region(bench.sensor, distance, 0.2 if bench.quick else 0.4)

@@ -147,6 +147,8 @@ class StereoPair:
     display: bool = False
     """Whether the values are grey levels in 0…1 that a view transform of the renderer made, not
     linear radiance."""
+    room: "StereoPair | None" = None
+    """The same without the projector's light, where the exposure asks for it."""
 
     def canvas(
         self, part: Region

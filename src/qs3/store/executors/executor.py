@@ -13,6 +13,7 @@ _MACHINE_IS_AT_FAULT = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO),
     *(errno.ESTALE, errno.ENOTCONN, errno.EMFILE, errno.ENFILE),
 )
+_TOO_MANY_KILLED = 5
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Failure:
     """A task that did not end well."""
 
     kind: str
-    """Class of the exception, ``ProcessDied`` or ``Timeout``."""
+    """Class of the exception, ``ProcessDied``, ``Killed`` (from outside) or ``Timeout``."""
     reason: str
     """Its message, one line."""
     fatal: bool = False
@@ -58,29 +59,43 @@ class Executor(Protocol):
 
 
 def outcomes(
-    executor: Executor, next_call: Callable[[], tuple[Any, ...] | None]
+    executor: Executor,
+    next_call: Callable[[], tuple[Any, ...] | None],
+    name_of: Callable[[Any], str] = str,
 ) -> Iterator[tuple[Any, Any]]:
     """Keep an executor busy; yield key and outcome of each call, as they end.
+
+    A call whose processes were killed from outside is not yielded: that is no fault of its own.
 
     Args:
         executor: Entered already.
         next_call: Returns key, function and arguments of one more call, or None where there is
             none at this moment; asked again after every outcome.
+        name_of: Turns a key into the name of what the call works on.
 
     Raises:
-        InputError: where a call failed as every other must.
+        InputError: where a call failed as every other must; and in the end, or after five, where
+            calls were killed.
     """
-    under_way = 0
+    under_way, killed = 0, list[str]()
     while True:
         while under_way < executor.ahead and (call := next_call()) is not None:
             executor.submit(*call)
             under_way += 1
-        if not under_way:
-            return
+        if not under_way or len(killed) == _TOO_MANY_KILLED:
+            break
         key, outcome = executor.next()
         under_way -= 1
         stop_if_fatal(outcome)
-        yield key, outcome
+        if isinstance(outcome, Failure) and outcome.kind == "Killed":
+            killed.append(f"{name_of(key)}: {outcome.reason}")
+        else:
+            yield key, outcome
+    if killed:
+        raise InputError(
+            f"this machine could not make {len(killed)}, the first {killed[0]}; give it more "
+            "memory or fewer workers and run the same command again, nothing else is lost"
+        )
 
 
 def guarded(function: Callable[..., Any], *arguments: Any) -> Any:

@@ -19,6 +19,7 @@ from qs3.errors import InputError
 from qs3.store.executors.executor import Failure, guarded
 
 _BROKEN_IN_A_ROW = 3
+_DEATHS = 3
 _KILLED_FROM_OUTSIDE = (-9, -15)
 _LOCK_SECONDS = 5.0
 """A worker waits so long for the lock that all share, held for milliseconds at a time. One that was
@@ -43,10 +44,12 @@ class _Call:
 class LocalExecutor:
     """A pool of processes started afresh (spawn).
 
-    A worker that dies is replaced, and its call is made again while no other is under way, so
-    that no want of memory for several at once is taken for its fault: once where it crashed, twice
-    where it was killed from outside. One that takes longer than ``timeout`` is killed and
-    replaced, and its call has failed. Workers end by themselves when this process is killed.
+    A worker that dies is replaced, and its call is made again, twice, while no other is under
+    way, so that no want of memory for several at once is taken for its fault. Then the call has
+    failed where the last of them crashed (``ProcessDied``); where it was killed from outside, as
+    by a system short of memory, it is no fault of the call (``Killed``). One that takes longer
+    than ``timeout`` is killed and replaced, and its call has failed. Workers end by themselves
+    when this process is killed.
     """
 
     def __init__(
@@ -119,11 +122,12 @@ class LocalExecutor:
                 value = Failure("Timeout", f"took over {self._timeout:g} s and was stopped")
             except ProcessExpired as error:
                 call = dataclasses.replace(call, deaths=call.deaths + 1)
-                if call.deaths < (3 if error.exitcode in _KILLED_FROM_OUTSIDE else 2):
+                if call.deaths < _DEATHS:
                     self._alone.append(call)
                     continue
-                how = f"its process died {call.deaths} times, at last with no other beside it"
-                value = Failure("ProcessDied", f"{how} ({_how(error.exitcode)})")
+                how = f"its process died {call.deaths} times, twice with no other beside it"
+                kind = "Killed" if error.exitcode in _KILLED_FROM_OUTSIDE else "ProcessDied"
+                value = Failure(kind, f"{how} ({_how(error.exitcode)})")
             except BrokenProcessPool as error:  # a worker died before its first call
                 self._broken += 1
                 if self._broken > _BROKEN_IN_A_ROW:
@@ -197,7 +201,8 @@ class LocalExecutor:
 def _how(code: int) -> str:
     if code < 0:
         with contextlib.suppress(ValueError):
-            return f"signal {signal.Signals(-code).name}: a crash, or no memory left"
+            what = "no memory left, or a kill" if code in _KILLED_FROM_OUTSIDE else "a crash"
+            return f"signal {signal.Signals(-code).name}: {what}"
     return f"exit code {code}"
 
 

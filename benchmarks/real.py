@@ -1,0 +1,210 @@
+"""Simulated sources and self-training on real objects: NYU Depth v2's, and SUN RGB-D's beside them.
+
+Run: python benchmarks/real.py --source DIR --shared DIR --out runs/real [--records results/real]
+         [--cells M S ...] [--seeds 0 1 2] [--workers 2] [--check] [--dry-run]
+
+DIR of --source is what `qs3 generate --recipe rooms` made; --shared holds nyuv2_objects.npz and
+sunrgbd_objects.npz. The real objects are NYU's `strict` ones. Frames are in the order of filming:
+those of the first 70 % of the frames are adapted to, without labels, and scored for development;
+those of the last 30 % are scored with --check alone. Each run is a process of one thread; one that
+was stopped goes on, one that has its records is not made again. Records are written as they come;
+docs/real.md is made from them (`docs/make_real.py`).
+"""
+
+import argparse
+import concurrent.futures
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qs3.evaluation.records import write_record
+from qs3.io import load_clouds
+from qs3.io.clouds import CloudChoice, Origin, PointClouds, UnlabelledClouds
+from qs3.io.preparation import PAPER, ROBUST, Preparation
+from qs3.training import evaluate, fit
+from qs3.training.config import Augmentation, SelfTrainingSettings, TrainSettings, changed
+
+BATCH = 32
+SIZED = replace(ROBUST, size_input=True)
+FAST: Mapping[str, Any] = {"transforms": False}
+"""PointNet without its T-Nets, the fast network: 4 ms of one core for a cloud of 256 points."""
+LIGHT = Augmentation(
+    plane=0.25, plane_share=0.25, patches=0.25, stretch=1.0, tilt=1.0, floor=0.15, noise=0.5
+)
+"""What a first look found to help: light cuts, tilt, stretch, a little floor."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A training, to be made once a seed."""
+
+    cloud: CloudChoice = "all"
+    method: str = "source-only"
+    network: str = "pointnet"
+    steps: int = 6000
+    preparation: Preparation = SIZED
+    augmentation: Augmentation = LIGHT
+    train: Mapping[str, Any] = field(default_factory=dict)
+    rounds: Mapping[str, Any] = field(default_factory=dict)
+    warm_up: str = ""
+
+
+ALL = Cell()
+CELLS: Mapping[str, Cell] = {
+    # Sources, equal numbers of steps.
+    "M": replace(ALL, cloud="surface"),
+    "C": replace(ALL, cloud="clean"),
+    "S": replace(ALL, cloud="points"),
+    "S+C+M": ALL,
+    # Adaptation, from the warm-up S+C+M of the same seed.
+    "QBST": replace(ALL, method="qbst", warm_up="S+C+M"),
+    "SPST": replace(ALL, method="spst", warm_up="S+C+M"),
+    "SD": replace(ALL, method="sd"),
+    "SD+QBST": replace(ALL, method="sd", rounds={"rule": "qbst"}, warm_up="SD"),
+    "GAST": replace(ALL, method="gast"),
+    "GAST+QBST": replace(ALL, method="gast", rounds={"rule": "qbst"}, warm_up="GAST"),
+    # Ablations of the way into the network and of the augmentation, one at a time.
+    "no size": replace(ALL, preparation=ROBUST),
+    "strays kept": replace(ALL, preparation=replace(SIZED, remove_outliers=False)),
+    "unit ball": replace(ALL, preparation=replace(SIZED, radius_share=1.0)),
+    "same points": replace(ALL, preparation=replace(SIZED, redraw=False)),
+    "paper's way": replace(ALL, preparation=PAPER, augmentation=Augmentation()),
+    "no augmentation": replace(ALL, augmentation=Augmentation()),
+    "full augmentation": replace(ALL, augmentation=Augmentation.scanned()),
+}
+
+
+def parts(shared: Path) -> dict[str, PointClouds]:
+    """NYU's strict objects, of the first 70 % of the frames and of the others, and SUN RGB-D's."""
+    path = shared / "nyuv2_objects.npz"
+    whole = load_clouds(path, num_points=None)
+    with np.load(path) as archive:
+        strict, frame = archive["strict"].astype(bool), archive["frame"]
+    frames = np.unique(frame)
+    early = frame < frames[int(0.7 * len(frames))]
+    named: dict[str, PointClouds] = {}
+    for name, rows in {"dev": strict & early, "check": strict & ~early}.items():
+        origin = Origin(path.name, f"strict-{name}", "points")
+        named[name] = replace(whole.select(rows), origin=origin)
+    named["sunrgbd"] = load_clouds(shared / "sunrgbd_objects.npz", num_points=1024)
+    return named
+
+
+def make(options: argparse.Namespace, name: str, seed: int) -> None:
+    """Train one cell with one seed and score it."""
+    cell, clouds = CELLS[name], parts(options.shared)
+    dev = clouds["dev"]
+    target = UnlabelledClouds(dev.points, dev.ids, origin=dev.origin)
+    source = load_clouds(options.source, cloud=cell.cloud, num_points=None)
+    held = 0.1
+    batches = -(-int(len(source) * (1 - held)) // BATCH)
+    train = TrainSettings(
+        model=cell.network,
+        model_settings=FAST if cell.network == "pointnet" else {},
+        num_points=256,
+        epochs=max(1, round(cell.steps / batches)),
+        batch_size=BATCH,
+        label_smoothing=0.1,
+        holdout=held,
+        validate_every=0,
+        preparation=cell.preparation,
+        augmentation=cell.augmentation,
+        seed=seed,
+        threads=1,
+    )
+    train = changed(train, cell.train)
+    needs = cell.method != "source-only"
+    rounds = None
+    if cell.rounds or cell.method in ("qbst", "spst"):
+        rounds = changed(SelfTrainingSettings(), {"rule": cell.method} | dict(cell.rounds))
+    run = options.out / f"{name}-{seed}"
+    fit(
+        cell.method,
+        source,
+        target if needs else None,
+        train,
+        rounds,
+        run_dir=run,
+        warm_up=options.out / f"{cell.warm_up}-{seed}" if cell.warm_up else None,
+    )
+    for part in scored(options):
+        fields = {"cell": name, "part": part}
+        record = evaluate(run, clouds[part], experiment=fields)
+        write_record(record_path(options, name, seed, part), record)
+
+
+def scored(options: argparse.Namespace) -> tuple[str, ...]:
+    return ("dev", "sunrgbd", "check") if options.check else ("dev", "sunrgbd")
+
+
+def record_path(options: argparse.Namespace, name: str, seed: int, part: str) -> Path:
+    return options.records / f"{name.replace(' ', '_')}-{seed}-{part}.json"
+
+
+def done(options: argparse.Namespace, name: str, seed: int) -> bool:
+    return all(record_path(options, name, seed, part).is_file() for part in scored(options))
+
+
+def call(words: list[str], name: str, seed: int) -> tuple[str, int, float, int]:
+    start = time.perf_counter()
+    alone = os.environ | {"OMP_NUM_THREADS": "1", "TQDM_DISABLE": "1"}
+    code = subprocess.run(
+        [sys.executable, __file__, *words, "--one", name, "--seeds", str(seed)], env=alone
+    ).returncode
+    return name, seed, time.perf_counter() - start, code
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--source", type=Path, required=True)
+    parser.add_argument("--shared", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--records", type=Path, default=Path("results/real"))
+    parser.add_argument("--cells", nargs="+", default=list(CELLS), choices=list(CELLS))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--check", action="store_true", help="score the last 30 % too")
+    parser.add_argument("--one", help=argparse.SUPPRESS)
+    parser.add_argument("--dry-run", action="store_true")
+    options = parser.parse_args()
+    if options.one:
+        make(options, options.one, options.seeds[0])
+        return 0
+    left = [(n, s) for s in options.seeds for n in options.cells if not done(options, n, s)]
+    print(f"{len(left)} runs are missing: {', '.join(f'{n}-{s}' for n, s in left)}", flush=True)
+    if options.dry_run:
+        return 0
+    words = []
+    for name in ("source", "shared", "out", "records"):
+        words += [f"--{name}", str(getattr(options, name))]
+    words += ["--check"] if options.check else []
+    worst = 0
+    # What starts from a warm-up comes after all warm-ups; SD and GAST serve as such too.
+    first = [item for item in left if not CELLS[item[0]].warm_up]
+    with concurrent.futures.ThreadPoolExecutor(options.workers) as pool:
+        for batch in (first, [item for item in left if item not in first]):
+            for job in concurrent.futures.as_completed(
+                [pool.submit(call, words, *item) for item in batch]
+            ):
+                name, seed, seconds, code = job.result()
+                worst = max(worst, code)
+                score = ""
+                if code == 0:
+                    value = json.loads(record_path(options, name, seed, "dev").read_text())
+                    scores = value["scores"]
+                    both = (scores["accuracy"], scores["class_mean_accuracy"])
+                    score = " / ".join(f"{100 * x:.1f}" for x in both)
+                print(f"{name}-{seed}: {seconds / 60:.1f} min, code {code}; {score}", flush=True)
+    return worst
+
+
+if __name__ == "__main__":
+    sys.exit(main())

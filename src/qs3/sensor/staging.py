@@ -1,0 +1,181 @@
+"""With what, how large and where one scan is taken: all that is drawn before the pictures."""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from qs3.errors import InputError
+from qs3.meshes import normalise
+from qs3.meshes.sizes import class_size, file_size
+from qs3.sensor.depth import gate
+from qs3.sensor.obstacles import check_views
+from qs3.sensor.presets import Sensor
+from qs3.sensor.randomise import draw_room
+from qs3.sensor.render import Body
+from qs3.sensor.render.raycast import DepthCaster
+from qs3.sensor.rooms import Room, fitting
+from qs3.sensor.scene import ArrangedScene, arrange
+from qs3.sensor.settings import ScanSettings
+from qs3.sensor.view import object_region
+from qs3.sensor.views import place_views
+
+_MOST_DRAWS = 50  # of a room, before it is given up
+
+
+def choose(
+    how: ScanSettings, rng: np.random.Generator
+) -> tuple[ScanSettings, dict[str, str | int]]:
+    """Draw one of several sensors, and a number of views where ``least_views`` asks for it.
+
+    Returns:
+        The settings with that sensor and that number, and what was drawn, by name.
+    """
+    drawn: dict[str, str | int] = {}
+    share = rng.random()  # drawn in any case: neither depends on whether the other is drawn
+    if how.least_views is not None:
+        drawn["views"] = how.least_views + int(share * (how.views - how.least_views + 1))
+        how = dataclasses.replace(how, views=drawn["views"], least_views=None)
+    if isinstance(how.sensor, tuple):
+        how = how.each_sensor()[int(rng.integers(len(how.sensor)))]
+        sensor = how.make_sensor()
+        how, drawn["sensor"] = dataclasses.replace(how, sensor=sensor), sensor.name
+    return how, drawn
+
+
+def sized(
+    mesh: trimesh.Trimesh,
+    how: ScanSettings,
+    class_name: str | None,
+    scale: float,
+    rng: np.random.Generator,
+) -> tuple[trimesh.Trimesh, float, dict[str, Any]]:
+    """Normalise a mesh and bring it to its size in the unit of the scene.
+
+    Args:
+        mesh: The mesh, in any unit.
+        how: Says whether its file or its class gives it a real size.
+        class_name: Its class; None where that is not known and need not be.
+        scale: Factor of the normalised mesh that has no real size.
+        rng: Draws the size of its class.
+
+    Returns:
+        The mesh, its factor, and what to record of its size.
+
+    Raises:
+        InputError: where no size of the class, or not the file's unit, is known.
+    """
+    made, drawn = normalise(mesh, how.chosen("size")), {}
+    if how.real_size == "file":
+        length, units = file_size(mesh, how.units)
+        drawn = {"object_size": length, "units": units}
+    elif how.real_size == "class" and class_name is not None:
+        drawn = {"object_size": class_size(mesh, class_name, rng)}
+    if drawn:
+        scale = drawn["object_size"] / float(made.extents.max())
+    made.vertices = made.vertices * scale
+    return made, scale, drawn
+
+
+def resized(sensor: Sensor, object_size: float) -> Sensor:
+    """The sensor with an object size; from a larger object than its own it stands off as much."""
+    away = max(0.0, object_size - sensor.object_size) / 2
+    near, far = sensor.placement.radius
+    placement = dataclasses.replace(sensor.placement, radius=(near + away, far + away))
+    return dataclasses.replace(sensor, object_size=object_size, placement=placement)
+
+
+def stand(
+    how: ScanSettings,
+    sensor: Sensor,
+    body: Body,
+    neighbour: trimesh.Trimesh | None,
+    rng_place: np.random.Generator,
+    rng_scene: np.random.Generator,
+) -> ArrangedScene:
+    """Place the views, and everything else about the object.
+
+    Raises:
+        InputError: where a camera or the projector stands in something.
+    """
+    poses = place_views(how.views, how.chosen("view_layout"), sensor.placement, rng_place)
+    around = arrange(how.make_scene(), body, poses, sensor.object_size, neighbour, rng_scene)
+    check_views(around, sensor)
+    return around
+
+
+def stand_in_rooms(
+    how: ScanSettings,
+    sensor: Sensor,
+    body: Body,
+    neighbour: trimesh.Trimesh | None,
+    rng_room: np.random.Generator,
+    rng_scene: np.random.Generator,
+) -> Iterator[tuple[Sensor, ArrangedScene, dict[str, Any]]]:
+    """Draw rooms that show enough of the object in each view; whoever asks for another gets one.
+
+    Layout, azimuth and table are the room's; height, distance and aim are each view's own, but for
+    ``jitter``, whose views are copies of one. Where a later view shows too little, it alone is
+    drawn again.
+
+    Yields:
+        The sensor where its first view stands, the scene, and what was drawn, ``room.redraws``
+        among it; what is another view's own has its index behind it: ``room.height.1``.
+
+    Raises:
+        InputError: where the last of 50 rooms will not do either; its fault is told.
+    """
+    bounds = np.asarray(body.mesh.bounds)
+    longest = float(body.mesh.extents.max())
+    layouts = fitting(how.room_layouts, longest, neighbour is not None)
+    if not layouts:
+        raise InputError(
+            f"randomise: none of the layouts {', '.join(how.room_layouts)} suits the object: "
+            "add floor, or name a neighbour's mesh"
+        )
+    ranges, view_layout = how.ranges | {"room.layout": layouts}, how.chosen("view_layout")
+    count = 1 if view_layout == "jitter" else how.views
+    rooms, drawn, poor, fault = [Room()] * count, {}, [0], ""
+    for redraws in range(_MOST_DRAWS):
+        for view in range(count) if 0 in poor else poor:
+            room, values = draw_room(ranges, rng_room, rooms[0] if view else None)
+            turn = room.scene(how.make_scene(), 1.0).turns(count)[view]
+            rooms[view] = dataclasses.replace(room, azimuth=room.azimuth + turn)
+            drawn |= {f"{name}.{view}" if view else name: value for name, value in values.items()}
+        scene = rooms[0].scene(how.make_scene(), sensor.object_size)
+        other, poor = neighbour if scene.needs_neighbour else None, [0]
+        try:
+            placed = [dataclasses.replace(sensor, placement=r.placement(bounds)) for r in rooms]
+            poses = [
+                room.aimed(pose, sensor.rig)
+                for room, own in zip(rooms, placed, strict=True)
+                for pose in place_views(how.views // count, view_layout, own.placement, rng_room)
+            ]
+            around = arrange(scene, body, poses, sensor.object_size, other, rng_scene)
+            check_views(around, placed[0])
+        except InputError as error:  # a camera in a neighbour, say
+            fault = str(error)
+            continue
+        seen = _seen(around, sensor)
+        poor = [view for view in range(count) if min(seen[view::count]) < how.least_pixels]
+        fault = f"it shows {min(seen)} pixels of the object, and least_pixels is {how.least_pixels}"
+        if not poor:
+            yield placed[0], around, drawn | {"room.redraws": redraws}
+            fault, poor = "the sensor saw no point of the object in it", [0]
+    raise InputError(
+        f"randomise: {_MOST_DRAWS} rooms in a row would not do, the last one because: {fault}; "
+        "narrow the ranges (room.distance=0.8:2), or lower least_pixels"
+    )
+
+
+def _seen(around: ArrangedScene, sensor: Sensor) -> list[int]:
+    """Pixels that show the object within the depth gate, in each view."""
+    caster = DepthCaster(*(body.mesh for body in around.bodies))
+    bounds, counts = np.asarray(around.bodies[0].mesh.bounds), []
+    for pose in around.poses:
+        cast = caster.cast(sensor.rig, pose, object_region(bounds, sensor, pose))
+        shown = gate(np.where(cast.mask, cast.depth, np.nan), sensor.depth)
+        counts.append(int(np.isfinite(shown).sum()))
+    return counts
