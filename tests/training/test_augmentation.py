@@ -11,6 +11,7 @@ from qs3.training import Augmentation, augment_clouds
 from qs3.training.augmentation import (
     Box,
     beyond_plane,
+    in_sight,
     lose_highest,
     near_patch,
     outside_cone,
@@ -22,7 +23,18 @@ from qs3.training.augmentation import (
     tilted,
 )
 
-CHANCES = ("plane", "cone", "patches", "stretch", "tilt", "floor", "wall", "neighbour", "noise")
+CHANCES = (
+    "sight",
+    "plane",
+    "cone",
+    "patches",
+    "stretch",
+    "tilt",
+    "floor",
+    "wall",
+    "neighbour",
+    "noise",
+)
 
 
 def generator(seed=0):
@@ -41,6 +53,24 @@ def every(chance=1.0, **others):
     return Augmentation(**dict.fromkeys(CHANCES, chance), **others)
 
 
+def test_a_camera_sees_the_near_side_alone():
+    """Of two plates one behind the other it sees the first; from beside, the near edges of both."""
+    plate = torch.rand(1, 1000, 3, generator=generator()) * torch.tensor([1.0, 0.02, 1.0])
+    pair = torch.cat([plate, plate + torch.tensor([0.0, 0.6, 0.0])], dim=1)
+    zero = torch.zeros(1, 1)
+    for azimuth, front in ((0.0, slice(0, 1000)), (torch.pi, slice(1000, 2000))):
+        seen = in_sight(pair, zero + azimuth, zero)
+        assert seen[:, front].all()
+        assert seen.float().mean() < 0.55  # all but a few at the edges
+    beside = in_sight(pair, zero + torch.pi / 2, zero)
+    assert beside[:, :1000].any() and beside[:, 1000:].any()
+    assert in_sight(plate, zero, zero).all()
+    # From above a table's top is seen, and what lies beneath it is not.
+    table = torch.cat([plate, plate - torch.tensor([0.0, 0.6, 0.0])], dim=1)[..., [0, 2, 1]]
+    assert in_sight(table, zero, zero + torch.pi / 2)[:, :1000].all()
+    assert not in_sight(table, zero, zero + torch.pi / 2)[:, 1000:].float().mean() > 0.05
+
+
 def test_off_changes_and_draws_nothing(clouds):
     source = generator()
     points, kept = augment_clouds(clouds, Augmentation(), source)
@@ -53,7 +83,12 @@ def test_off_changes_and_draws_nothing(clouds):
 def test_each_has_its_chance_per_cloud(name):
     many = torch.rand(400, 120, 3, generator=generator())
     some = replace(
-        Augmentation(), **{name: 0.3}, plane_share=1.0, cone_share=1.0, clutter_share=1.0
+        Augmentation(),
+        **{name: 0.3},
+        plane_share=1.0,
+        cone_share=1.0,
+        clutter_share=1.0,
+        least=0.02,
     )
     points, kept = augment_clouds(many, some, generator(3))
     changed = ((points != many).any(dim=2) | ~kept).any(dim=1).float().mean()

@@ -22,6 +22,12 @@ _GAP = 0.2
 """Largest distance of a wall or neighbour from the box, in radii."""
 _THICKNESS = 0.02
 """Thickness of a slab, in radii."""
+_HIGHEST = 0.7
+"""Largest elevation of a camera that looks at a cloud, in radians."""
+_CELLS = 0.62
+"""Cells along the image of that camera, for each √n of a cloud's points: a few points a cell."""
+_BEHIND = 0.12
+"""How far a point may lie behind the nearest one about it and still be seen, in radii."""
 
 
 class Box(NamedTuple):
@@ -68,6 +74,33 @@ def lose_highest(
     place = torch.arange(kept.shape[1], device=kept.device)
     lost = torch.zeros_like(kept).scatter(1, order, place < torch.minimum(count, left))
     return kept & ~lost
+
+
+def in_sight(
+    points: Float[Tensor, "b n 3"],
+    azimuth: Float[Tensor, "b 1"],
+    elevation: Float[Tensor, "b 1"],
+) -> Bool[Tensor, "b n"]:
+    """Return which points a camera far away sees: those not behind others, by a coarse depth image.
+
+    Args:
+        points: Clouds.
+        azimuth: Angle by which each is turned about z before the camera, which looks along +y.
+        elevation: Of the camera, in radians.
+    """
+    b, n, _ = points.shape
+    turned_points = turned(points, azimuth)
+    low, high = turned_points.amin(dim=1, keepdim=True), turned_points.amax(dim=1, keepdim=True)
+    x, y, z = (turned_points - (low + high) / 2).unbind(2)
+    depth = elevation.cos() * y - elevation.sin() * z
+    up = elevation.sin() * y + elevation.cos() * z
+    radius = ((high - low).norm(dim=2) / 2).clamp_min(torch.finfo(points.dtype).tiny)
+    side = math.ceil(_CELLS * math.sqrt(n))
+    column, row = (((along / radius + 1) / 2 * side).long().clamp(0, side - 1) for along in (x, up))
+    cell = row * side + column
+    image = depth.new_full((b, side * side), torch.inf).scatter_reduce(1, cell, depth, "amin")
+    nearest = -torch.nn.functional.max_pool2d(-image.view(b, 1, side, side), 3, 1, 1)
+    return depth <= nearest.view(b, -1).gather(1, cell) + _BEHIND * radius
 
 
 def beyond_plane(
@@ -291,6 +324,10 @@ def _cut(
     draw: _Draws,
 ) -> Bool[Tensor, "b n"]:
     n = points.shape[1]
+    if settings.sight > 0:
+        seen = in_sight(points, draw.angle(), draw.uniform(1, high=_HIGHEST))
+        enough = seen.float().mean(dim=1, keepdim=True) >= settings.least
+        kept = seen | ~((draw.uniform(1) < settings.sight) & enough)
     if settings.plane > 0:
         score = beyond_plane(points, draw.normal(1, 3))
         count = (draw.strength(settings.plane, settings.plane_share) * n).long()

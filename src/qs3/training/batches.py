@@ -24,7 +24,8 @@ _SHARE_OF_MEMORY = 0.25
 _BLOCK = 256
 """Clouds that are looked at together, so that no mask of all their points is made."""
 _SPARE = 2
-"""How many times the points that are needed are augmented, as some of them are lost by it."""
+"""How many times the points that are needed are augmented, as some of them are lost by it; twice
+that where half of them are turned away from a camera."""
 
 
 def require_unlabelled(target: UnlabelledClouds) -> None:
@@ -187,8 +188,8 @@ class DeviceClouds:
     ) -> Batch:
         """Return this device's share of the clouds at ``rows``, normalised, on the device.
 
-        Twice the points are drawn where clouds are augmented; what is left of them is cut to the
-        number, then normalised.
+        More points are drawn where clouds are augmented; what is left of them is cut to the number,
+        then normalised.
 
         Args:
             rows: Clouds of a batch.
@@ -203,8 +204,8 @@ class DeviceClouds:
         if generator is None or (augmentation == _NONE and not preparation.redraw):
             points = self._points(rows[mine], self._first(rows[mine]))
             return Batch(normalise_batch(points, preparation), labels)
-        count = num_points if augmentation == _NONE else _SPARE * num_points
-        chosen, distinct = self._chosen(rows, count, generator)
+        spare = 1 if augmentation == _NONE else 2 * _SPARE if augmentation.sight else _SPARE
+        chosen, distinct = self._chosen(rows, spare * num_points, generator)
         if augmentation == _NONE:
             points = self._points(rows[mine], chosen[mine])
         else:

@@ -35,6 +35,8 @@ class Augmentation:
     Lengths are relative to the cloud's radius, half the diagonal of the box of its middle 98 %.
     """
 
+    sight: float = 0.0
+    """Probability that a cloud keeps only what a camera on one side of it sees."""
     plane: float = 0.0
     """Probability that a random plane cuts a cloud."""
     plane_share: float = 0.4
@@ -50,7 +52,8 @@ class Augmentation:
     patch_radius: float = 0.25
     """Largest radius of a cloud's patches."""
     least: float = 0.25
-    """Share of the points that planes, cones and patches together always leave."""
+    """Share of the points that planes, cones and patches together always leave; a camera that would
+    see less looks from nowhere."""
     stretch: float = 0.0
     """Probability that a cloud is stretched, each axis by a factor of its own."""
     stretch_factor: float = 1.2
@@ -73,9 +76,9 @@ class Augmentation:
     """Largest standard deviation of a cloud's noise."""
 
     def __post_init__(self) -> None:
-        for name in ("plane", "cone", "patches", "stretch", "tilt", "floor", "wall", "neighbour"):
+        for name in ("sight", "plane", "cone", "patches", "stretch", "tilt", "floor", "wall"):
             _check(self, name, 0 <= getattr(self, name) <= 1, "must be in 0 to 1")
-        for name in ("noise", "plane_share", "cone_share", "clutter_share"):
+        for name in ("neighbour", "noise", "plane_share", "cone_share", "clutter_share"):
             _check(self, name, 0 <= getattr(self, name) <= 1, "must be in 0 to 1")
         for name in ("patch_radius", "noise_sigma", "tilt_degrees"):
             _check(self, name, getattr(self, name) >= 0, "must not be negative")
@@ -94,8 +97,15 @@ class Augmentation:
             >>> Augmentation.scanned(wall=0.0).plane
             0.3
         """
-        usual: dict[str, Any] = {"plane": 0.3, "cone": 0.3, "patches": 0.3, "stretch": 1.0}
-        usual |= {"tilt": 1.0, "floor": 0.2, "wall": 0.1, "neighbour": 0.2, "noise": 0.5}
+        usual: dict[str, Any] = {"sight": 0.3, "plane": 0.3, "cone": 0.3, "patches": 0.3}
+        usual |= {
+            "stretch": 1.0,
+            "tilt": 1.0,
+            "floor": 0.2,
+            "wall": 0.1,
+            "neighbour": 0.2,
+            "noise": 0.5,
+        }
         return cls(**usual | overrides)
 
 
