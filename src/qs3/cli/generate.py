@@ -5,7 +5,7 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -43,6 +43,7 @@ def generate(
     up: Literal["z", "y"] | None = None,
     per_class: int = 10,
     classes: tuple[str, ...] = (),
+    class_map: Annotated[Path | None, tyro.conf.arg(name="map")] = None,
     labels: Path | None = None,
     workers: int | None = None,
     timeout: float = 900.0,
@@ -67,6 +68,7 @@ def generate(
         per_class: Objects a class, of the built-in shapes.
         classes: Classes to scan, by the names of their folders, or pointda10 for its ten, renamed;
             all by default.
+        class_map: TOML file of what classes shall be called: stool = "chair"; others keep theirs.
         labels: CSV that tells the class of each mesh of the folder, and its split: columns file
             (or uid), class and split.
         workers: Processes, of one thread each; all cores by default. The bytes written do not
@@ -83,7 +85,7 @@ def generate(
             nothing.
         settings: How they are scanned and written. Another seed draws other shapes and poses.
     """
-    from qs3.meshes.classes import POINTDA10
+    from qs3.meshes.classes import describe_renaming, label_order
     from qs3.store.failures import read_failures
     from qs3.store.generate import generate as generate_data
     from qs3.store.plan import make_plan, resolve_renderer
@@ -92,11 +94,13 @@ def generate(
     if not match or not int(match[1]) < int(match[2]):
         raise InputError(f"--shard {shard}: give i/n with i from 0 to n - 1, such as 0/8")
     part = int(match[1]), int(match[2])
-    items = _items(meshes, up, per_class, settings.seed, classes, labels)
+    items = _items(meshes, up, per_class, settings.seed, classes, class_map, labels)
     names = {item.class_name for item in items}
+    if said := describe_renaming({i.own_class: i.class_name for i in items if i.own_class}):
+        tell(said)
     settings = dataclasses.replace(
         resolve_renderer(settings),
-        classes=POINTDA10 if names <= set(POINTDA10) else tuple(sorted(names)),
+        classes=label_order(sorted(names)),
         meshes="+".join(s if s == "shapes" else Path(s).resolve().name for s in meshes),
         per_class=per_class if "shapes" in meshes else None,
     )
@@ -132,10 +136,12 @@ def _items(
     per_class: int,
     seed: int,
     classes: tuple[str, ...],
+    class_map: Path | None,
     labels: Path | None,
 ) -> "list[MeshItem]":
     """The list of meshes."""
-    from qs3.meshes import collect
+    from qs3.meshes.classes import read_class_map
+    from qs3.meshes.collections import collect, rename_items
 
     if not meshes:
         raise InputError("--meshes: name a folder of meshes, or shapes for the built-in ones")
@@ -148,6 +154,8 @@ def _items(
         items += collect(source, per_class=per_class, seed=seed, classes=kinds, labels=named)
     if up is not None:
         items = [i if i.path is None else dataclasses.replace(i, up=up) for i in items]
+    if class_map is not None:
+        items = rename_items(items, read_class_map(class_map))
     if flat := [item.id for item in items if not item.class_name]:
         raise InputError(
             f"{' '.join(meshes)}: {flat[0]} lies flat in its folder and its class is "

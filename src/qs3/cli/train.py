@@ -83,6 +83,12 @@ class TrainOptions(Choices):
     """Part of the source, such as train; all of it by default."""
     target_split: str | None = None
     """Part of the target."""
+    classes: Literal["pointda10"] | None = None
+    """Names of the source's classes: as they stand by default, or PointDA-10's ten, onto which the
+    table of aliases maps them (stool → chair)."""
+    class_map: Annotated[Path | None, tyro.conf.arg(name="map")] = None
+    """TOML file of what classes of the source shall be called: stool = "chair"; others keep
+    theirs."""
     source_cloud: CloudChoice = "points"
     """Of generated data: noisy scans, their clean twins, samples of the whole surface, or all of
     these together."""
@@ -156,6 +162,7 @@ def train(options: Flat[TrainOptions]) -> int:
     """Train a classifier, with a method of adaptation to an unlabelled target if asked."""
     start = time.monotonic()  # reading the data counts
     from qs3.io import load_clouds, load_unlabelled
+    from qs3.meshes.classes import describe_renaming, read_class_map
     from qs3.training import Deadline, TimeUpError, fit, load_whole, parse_duration
 
     seconds = None if options.max_time is None else parse_duration(options.max_time)
@@ -174,7 +181,12 @@ def train(options: Flat[TrainOptions]) -> int:
     )
     points, target = settings.num_points, None
     part = {"split": options.source_split, "cloud": options.source_cloud}
-    source = load_whole(load_clouds, options.source, points, **part)
+    if options.classes is not None and options.class_map is not None:
+        raise InputError("--classes and --map both name the classes; give one of them")
+    called = options.classes if options.class_map is None else read_class_map(options.class_map)
+    source = load_whole(load_clouds, options.source, points, **part, class_map=called)
+    if said := describe_renaming(source.origin.renamed):
+        tell(said)
     if options.target is not None:
         part = {"split": options.target_split, "cloud": options.target_cloud}
         target = load_whole(load_unlabelled, options.target, points, **part)

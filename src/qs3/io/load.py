@@ -11,6 +11,7 @@ from qs3.io.clouds import CloudChoice, Origin, PointClouds, UnlabelledClouds
 from qs3.io.layouts import FORMATS, FORMER_NAMES, Format, point_folders
 from qs3.io.layouts.store import read_ragged
 from qs3.io.ragged import RaggedClouds
+from qs3.meshes.classes import ClassMap
 from qs3.store.folder import open_folder
 
 
@@ -21,6 +22,7 @@ def load_clouds(
     num_points: int | None = 1024,
     cloud: CloudChoice = "points",
     class_names: Sequence[str] | None = None,
+    class_map: ClassMap | None = None,
 ) -> PointClouds:
     """Read labelled clouds from whatever ``source`` is.
 
@@ -30,15 +32,17 @@ def load_clouds(
         split: Part to read; None takes all.
         num_points: Points a cloud; others are resampled. None keeps what is there.
         cloud: Which cloud of a generated data set; ``all`` takes the three of each scan.
-        class_names: Classes that the labels shall index, found by name or alias. None takes
-            PointDA-10's ten where all map onto them, else the source's own.
+        class_names: Classes that the labels shall index, found by name or alias; ``origin`` of
+            the result tells which go by another name. None takes the source's own.
+        class_map: What classes shall be called; None keeps their names.
 
     Raises:
         InputError: where the source is none of these, is damaged, has no labels, or has a class
             that is not in ``class_names``.
     """
-    clouds = read_clouds(source, split, cloud)[0].labelled(num_points, class_names, str(source))
-    return replace(clouds, origin=Origin(open_folder(source).name, split, cloud))
+    clouds = read_clouds(source, split, cloud)[0]
+    origin = Origin(open_folder(source).name, split, cloud)
+    return clouds.labelled(num_points, class_names, str(source), class_map, origin)
 
 
 def load_unlabelled(

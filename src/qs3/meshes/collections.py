@@ -13,15 +13,16 @@ from qs3.errors import InputError
 from qs3.files import sha256
 from qs3.meshes.classes import (
     POINTDA10,
+    POINTDA10_CHOICE,
     POINTDA10_OF_MODELNET,
     POINTDA10_OF_SHAPENET,
+    ClassMap,
     canonical,
+    rename,
+    require_named,
 )
 from qs3.meshes.loading import load_mesh
 from qs3.meshes.trees import MeshItem, read_tree
-
-POINTDA10_CHOICE = "pointda10"
-"""The choice that takes PointDA-10's ten classes and gives them its names."""
 
 _MOST_NAMES = 60
 
@@ -94,10 +95,26 @@ def _files(root: Path, classes: Sequence[str] | None, labels: Path | None) -> li
         return items
     names = _rename(items, classes, str(root))
     return [
-        replace(item, class_name=name)
-        for name, item in zip(names, items, strict=True)
-        if name is not None
+        _called(item, name) for name, item in zip(names, items, strict=True) if name is not None
     ]
+
+
+def rename_items(items: Sequence[MeshItem], wanted: ClassMap) -> list[MeshItem]:
+    """Give the classes of meshes the names of a map; each keeps its own beside it.
+
+    Raises:
+        InputError: where the map is of none of the classes.
+    """
+    own = sorted({item.class_name for item in items})
+    require_named(own, wanted)
+    names = dict(zip(own, rename(own, wanted), strict=True))
+    return [_called(item, names[item.class_name]) for item in items]
+
+
+def _called(item: MeshItem, name: str) -> MeshItem:
+    if name == item.class_name:
+        return item
+    return replace(item, class_name=name, own_class=item.own_class or item.class_name)
 
 
 def _chosen_names(classes: str | Sequence[str] | None) -> tuple[str, ...] | None:

@@ -9,7 +9,7 @@ import platform
 import time
 import warnings
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,8 @@ class Manifest:
     """Shards planned."""
     versions: Mapping[str, str]
     """Versions of the packages that began it."""
+    renamed: Mapping[str, str] = field(default_factory=dict)
+    """Classes of the meshes that go by another name here; not in the file where there is none."""
     schema: int = SCHEMA_VERSION
     """Version of the columns."""
 
@@ -94,7 +96,10 @@ def write_manifest(where: str | Path | Folder, manifest: Manifest) -> None:
     if folder.exists(MANIFEST):
         check_same(str(folder), open_dataset(folder), manifest)
     else:
-        folder.write(MANIFEST, json_bytes(unstructure(manifest)))
+        value = unstructure(manifest)
+        if not manifest.renamed:
+            del value["renamed"]
+        folder.write(MANIFEST, json_bytes(value))
 
 
 def check_same(where: str, present: Manifest, wanted: Manifest) -> None:

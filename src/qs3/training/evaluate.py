@@ -7,13 +7,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Int
+
 from qs3.adaptation.validators import VALIDATORS
 from qs3.errors import InputError
 from qs3.evaluation.environment import git_commit, hardware, versions
 from qs3.evaluation.records import RECORDS, RunRecord, Scores, score, write_record
 from qs3.io import load_clouds
 from qs3.io.clouds import CloudKind, PointClouds
-from qs3.io.ragged import RaggedClouds
+from qs3.io.ragged import relabel
+from qs3.meshes.classes import require_named
 from qs3.structure import unstructure
 from qs3.training.batches import load_whole, require_finite
 from qs3.training.checkpoint import LoadedModel, load_model
@@ -32,11 +36,12 @@ def evaluate(
     cloud: CloudKind = "points",
     checkpoints: bool = False,
     experiment: Mapping[str, str | int | float] | None = None,
+    class_map: Mapping[str, str] | None = None,
 ) -> RunRecord:
     """Score a run on labelled clouds, and write the record into its folder ``records``.
 
-    Labels of the data are put onto the network's classes by name; an answer that the data has no
-    cloud of stays an answer, and is wrong.
+    Labels of the data are put onto the network's classes by name or alias, and the record says
+    which (``test.renamed``); an answer that the data has no cloud of stays an answer, and is wrong.
 
     Args:
         run: Folder of a finished run.
@@ -46,14 +51,24 @@ def evaluate(
         checkpoints: Whether to score every checkpoint of the run's last stage too, and tell which
             one each validator would have chosen; ``oracle``, among them, looks at the labels.
         experiment: Place of the run in a grid of runs, for the record.
+        class_map: What classes are called in the scores, of the data and of the network: a run
+            that knows a stool is scored on data of chairs by ``{"stool": "chair"}``.
 
     Raises:
-        InputError: where the run is not finished, the data cannot be read, or classes of the data
-            are none of the network's.
+        InputError: where the run is not finished, the data cannot be read, classes of the data
+            are none of the network's, or the map is of none of either.
     """
     made, loaded = read_run(run), load_model(run)
     train = loaded.settings["train"]
-    whole = _labelled(data, split, cloud, train["num_points"], loaded.class_names)
+    called = {name: name for name in loaded.class_names}
+    called |= {name: other for name, other in (class_map or {}).items() if name in called}
+    names = tuple(dict.fromkeys(called.values()))
+    whole = _labelled(data, split, cloud, train["num_points"], names, class_map)
+    renamed = {name: other for name, other in called.items() if name != other}
+    renamed |= {} if whole.origin is None else whole.origin.renamed
+    if class_map is not None:
+        require_named([*loaded.class_names, *renamed], class_map)
+    answer_of = np.array([names.index(other) for other in called.values()])
     require_finite(whole.points, whole.ids)
     test = prepare_clouds(whole, train["num_points"], loaded.preparation)
     record = RunRecord(
@@ -62,16 +77,16 @@ def evaluate(
         settings=loaded.settings | {"preset": made.preset},
         source=made.source,
         target=made.target,
-        test=data_record(whole),
+        test=replace(data_record(whole), renamed=renamed),
         seed=train["seed"],
         selection=made.selection,
-        scores=_scores(loaded, test),
+        scores=_scores(loaded, test, answer_of),
         seconds=made.seconds,
         versions=versions(),
         hardware=hardware(),
         commit=git_commit(),
         rounds=made.rounds,
-        choices=_choices(Path(run), loaded, test) if checkpoints else {},
+        choices=_choices(Path(run), loaded, test, answer_of) if checkpoints else {},
         marks=caveats(made, test),
         experiment=experiment,
     )
@@ -92,22 +107,29 @@ def _labelled(
     cloud: CloudKind,
     num_points: int,
     class_names: tuple[str, ...],
+    class_map: Mapping[str, str] | None,
 ) -> PointClouds:
-    """Clouds with labels that index the network's classes."""
+    """Clouds with labels that index the classes of the scores."""
     if not isinstance(data, PointClouds):
-        part = {"split": split, "cloud": cloud, "class_names": class_names}
-        return load_whole(load_clouds, data, num_points, **part)
-    given = RaggedClouds(list(data.points), data.ids, data.checksum, data.labels, data.class_names)
-    return replace(given.labelled(None, class_names, "data"), origin=data.origin)
+        part = {"split": split, "cloud": cloud}
+        named = {"class_names": class_names, "class_map": class_map}
+        return load_whole(load_clouds, data, num_points, **part, **named)
+    return relabel(data, class_names, class_map, "data")
 
 
-def _scores(loaded: LoadedModel, test: Prepared[PointClouds]) -> Scores:
-    answers = describe(loaded.model, test).probabilities.argmax(axis=1)
-    return score(test.labels, answers, loaded.class_names)
+def _scores(
+    loaded: LoadedModel, test: Prepared[PointClouds], answer_of: Int[np.ndarray, "k"]
+) -> Scores:
+    """Scores, where ``answer_of`` tells which class of the data each of the network's is."""
+    answers = answer_of[describe(loaded.model, test).probabilities.argmax(axis=1)]
+    return score(test.labels, answers, test.class_names)
 
 
 def _choices(
-    run: Path, loaded: LoadedModel, test: Prepared[PointClouds]
+    run: Path,
+    loaded: LoadedModel,
+    test: Prepared[PointClouds],
+    answer_of: Int[np.ndarray, "k"],
 ) -> dict[str, dict[str, Any]]:
     """Score the checkpoints of the run's last stage, and let every rule choose among them."""
     checkpoints = read_checkpoints(run, ROUND) or read_checkpoints(run)
@@ -116,7 +138,7 @@ def _choices(
     scored: dict[str, dict[str, Any]] = {}
     for checkpoint in checkpoints:
         load_checkpoint(run, checkpoint, loaded.model)
-        scores = _scores(loaded, test)
+        scores = _scores(loaded, test, answer_of)
         scored[checkpoint.file] = {
             "stage": checkpoint.stage,
             "number": checkpoint.number,
