@@ -47,14 +47,41 @@ def write_npz(path, rng, **changes):
     return path
 
 
-def test_a_class_folder_maps_onto_the_ten_classes(folder):
+def test_names_are_kept_as_they_stand_though_all_are_aliases(folder):
     clouds = load_clouds(folder, split="test", num_points=32)
     assert isinstance(clouds, PointClouds)
     assert clouds.points.shape == (2, 32, 3)
-    assert clouds.class_names == POINTDA10
-    assert [POINTDA10[i] for i in clouds.labels] == ["cabinet", "table"]
+    assert clouds.class_names == ("Night Stand", "desk")
+    assert clouds.labels.tolist() == [0, 1]
+    assert clouds.origin.renamed == {}
     assert clouds.ids == ("Night Stand/test/a.npy", "desk/test/a.npy")
     assert len(load_clouds(folder, num_points=32)) == 4
+
+
+def test_the_ten_names_are_given_on_request_and_it_is_told(folder, rng):
+    ten = load_clouds(folder, num_points=8, class_map="pointda10")
+    assert ten.class_names == POINTDA10
+    assert [POINTDA10[i] for i in ten.labels] == ["cabinet"] * 2 + ["table"] * 2
+    assert ten.origin.renamed == {"Night Stand": "cabinet", "desk": "table"}
+    assert ten.without_labels().origin.renamed == {}
+    # A run of the ten classes is scored on aliases of them, as it always was.
+    scored = load_clouds(folder, num_points=8, class_names=POINTDA10)
+    assert scored.labels.tolist() == ten.labels.tolist()
+    assert scored.origin.renamed == ten.origin.renamed
+    (folder / "toilet").mkdir()
+    np.save(folder / "toilet" / "a.npy", rng.random((8, 3)))
+    with pytest.raises(InputError, match=r"set: class 'toilet' is none of PointDA-10's ten"):
+        load_clouds(folder, num_points=8, class_map="pointda10")
+
+
+def test_a_map_merges_what_it_names_and_keeps_the_rest(folder):
+    one = load_clouds(folder, num_points=8, class_map={"desk": "Night Stand", "mug": "cup"})
+    assert one.class_names == ("Night Stand",)
+    assert one.origin.renamed == {"desk": "Night Stand"}
+    two = load_clouds(folder, num_points=8, class_map={"desk": "bench"})
+    assert two.class_names == ("Night Stand", "bench")
+    with pytest.raises(InputError, match=r"set: the map of classes names mug, and none of Night"):
+        load_clouds(folder, num_points=8, class_map={"mug": "cup"})
 
 
 def test_other_class_names_are_kept_where_they_do_not_all_map(folder, rng):
@@ -117,7 +144,7 @@ def test_an_archive_of_clouds_of_different_sizes(rng, tmp_path):
     path = write_npz(tmp_path / "a.npz", rng)
     clouds = load_clouds(path, num_points=25)
     assert clouds.points.shape == (3, 25, 3)
-    assert [POINTDA10[i] for i in clouds.labels] == ["bed", "cabinet", "bed"]
+    assert [clouds.class_names[i] for i in clouds.labels] == ["bed", "dresser", "bed"]
     assert load_clouds(path, split="test", num_points=8).ids == ("a/00001",)
     with np.load(path) as archive:
         np.testing.assert_array_equal(clouds.points[0][:20], archive["points"][:20])
@@ -202,7 +229,7 @@ def test_a_generated_data_set(fake, tmp_path):
 
 @pytest.mark.data
 def test_the_real_depth_camera_objects(shared_data):
-    clouds = load_clouds(shared_data / "sunrgbd_objects.npz", num_points=128)
+    clouds = load_clouds(shared_data / "sunrgbd_objects.npz", num_points=128, class_map="pointda10")
     counts = {name: int((clouds.labels == i).sum()) for i, name in enumerate(clouds.class_names)}
     assert {name: n for name, n in counts.items() if n} == {
         "bed": 10,
