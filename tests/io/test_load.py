@@ -10,7 +10,7 @@ from qs3.errors import InputError
 from qs3.io import guards
 from qs3.io.clouds import PointClouds, UnlabelledClouds, digests
 from qs3.io.layouts.hdf5 import read_file
-from qs3.io.load import load_clouds, load_unlabelled
+from qs3.io.load import describe_clouds, load_clouds, load_unlabelled
 from qs3.io.point_files import cloud_bytes, read_cloud
 from qs3.meshes.classes import POINTDA10
 from qs3.store.generate import GenerateSettings, generate
@@ -278,3 +278,12 @@ def test_the_largest_file_is_named_by_the_environment(tmp_path, rng, monkeypatch
         monkeypatch.setenv(guards.LIMIT, word)
         with pytest.raises(InputError, match=f"QS3_LARGEST_FILE_GIB={word}: a number of GiB"):
             read()
+
+
+def test_a_data_set_of_any_layout_is_described(folder, rng, tmp_path):
+    contents = describe_clouds(folder)
+    assert (contents["layout"], contents["rows"], contents["points"]) == ("npy", 4, [20, 64])
+    assert contents["classes"] == {"Night Stand": 2, "desk": 2}
+    assert contents["splits"] == {"test": 2, "train": 2}
+    bare = describe_clouds(write_npz(tmp_path / "a.npz", rng, label=None, class_names=None))
+    assert (bare["layout"], bare["classes"]) == ("npz", {})

@@ -165,6 +165,23 @@ def test_a_run_of_an_earlier_release_is_read(source, target, settings, tmp_path)
 
 
 @pytest.mark.parametrize("value", [1.5, "x", True, [1], 1e12, 10**12, None, -1])
+def test_other_data_are_told_by_their_option_and_not_by_a_checksum(
+    source, target, settings, tmp_path
+):
+    bare = target.without_labels()
+    claim(tmp_path, "dann", source, bare, settings, None)
+    other = replace(source, points=source.points + 1)
+    moved = replace(bare, points=bare.points + 1)
+    for clouds, aim, said in (
+        (other, bare, "another --source: what is named now differs .* its labels or the names"),
+        (source, moved, "another --target: what is named now differs .*its points"),
+        (source, None, "begun with --target; name another folder, or do the same"),
+    ):
+        with pytest.raises(InputError, match=said) as caught:
+            claim(tmp_path, "dann", clouds, aim, settings, None)
+        assert str(tmp_path) in str(caught.value)
+
+
 def test_settings_that_are_none_are_told_in_a_line(source, settings, tmp_path, value):
     """In ``settings.json``, and in a file of weights on its own."""
     claim(tmp_path, "source-only", source, None, settings, None)

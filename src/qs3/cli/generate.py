@@ -38,7 +38,7 @@ def defaults(words: Sequence[str]) -> dict[str, Any]:
 
 def generate(
     meshes: tuple[str, ...],
-    out: str,
+    out: str = "",
     recipe: RecipeName | None = None,
     up: Literal["z", "y"] | None = None,
     per_class: int = 10,
@@ -61,7 +61,7 @@ def generate(
         meshes: Folders of meshes (one folder a class, ModelNet's or ShapeNet's tree), and `shapes`
             for the built-in ones; several go into one data set. A neighbour is another of them.
         out: Folder of the data set, or an address such as s3://bucket/folder; run the same command
-            again to go on after a stop.
+            again to go on after a stop. --dry-run needs none.
         recipe: rooms: settings for a source that is to meet scans of real rooms (cameras, sizes,
             layouts and views drawn); an option given beside it wins.
         up: Up axis of every mesh file; by default y for glTF and ShapeNet, z for all others.
@@ -91,6 +91,8 @@ def generate(
     from qs3.store.plan import make_plan, resolve_renderer
 
     match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", shard)
+    if not out and not dry_run:
+        raise InputError("--out: name the folder of the data set (--dry-run needs none)")
     if not match or not int(match[1]) < int(match[2]):
         raise InputError(f"--shard {shard}: give i/n with i from 0 to n - 1, such as 0/8")
     part = int(match[1]), int(match[2])

@@ -1,9 +1,11 @@
 """One door to every kind of data set: ours, an archive, a folder, any layout that is known."""
 
 import difflib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from qs3.errors import InputError
 from qs3.files import holds_something
@@ -13,6 +15,7 @@ from qs3.io.layouts.store import read_ragged
 from qs3.io.ragged import RaggedClouds
 from qs3.meshes.classes import ClassMap
 from qs3.store.folder import open_folder
+from qs3.store.manifest import MANIFEST
 
 
 def load_clouds(
@@ -90,6 +93,33 @@ def read_clouds(
     if cloud != "points":
         raise InputError(f"{path}: only a data set made by qs3 generate has {cloud!r} clouds")
     return layout.read(path, split), layout.name
+
+
+def is_store(source: str | Path) -> bool:
+    """Whether a source is a data set of ours: an address, or a folder with ``dataset.json``."""
+    return "://" in str(source) or (Path(source) / MANIFEST).is_file()
+
+
+def describe_clouds(source: str | Path) -> dict[str, Any]:
+    """Count what a data set of any layout holds, as its files have it.
+
+    Returns:
+        ``layout``, ``rows``, ``points`` (smallest and largest cloud), ``classes`` and ``splits``
+        (clouds by name; empty where the files tell none).
+
+    Raises:
+        InputError: where it cannot be read.
+    """
+    clouds, layout = read_clouds(source)
+    sizes = [len(cloud) for cloud in clouds.clouds]
+    labels = [] if clouds.labels is None else clouds.labels.tolist()
+    return {
+        "layout": layout,
+        "rows": len(sizes),
+        "points": [min(sizes), max(sizes)] if sizes else [],
+        "classes": dict(Counter(clouds.class_names[label] for label in sorted(labels))),
+        "splits": dict(sorted(Counter(clouds.splits).items())),
+    }
 
 
 def detect(path: Path) -> Format:

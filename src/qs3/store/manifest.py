@@ -117,6 +117,11 @@ def check_same(where: str, present: Manifest, wanted: Manifest) -> None:
         difference = first_difference(old[key], new[key], key)
         if difference is not None:
             name, was, now = difference
+            if name == "settings.work_list":  # a checksum, which would tell a reader nothing
+                raise InputError(
+                    f"{where}: made of another list of meshes (their names, classes, splits, axes "
+                    "or shape seeds differ); name another folder, or the same meshes"
+                )
             raise InputError(
                 f"{where}: made with {name.removeprefix('settings.')} = {was}, not {now}; "
                 "name another folder, or use the same settings"
