@@ -73,7 +73,7 @@ class RaggedClouds:
         renamed = {self.class_names[row]: names[called[row]] for row in present}
         renamed = {name: other for name, other in renamed.items() if name != other}
         points = stack(self.clouds, num_points, where)
-        origin = replace(origin, renamed=renamed)
+        origin = replace(origin, renamed={**origin.renamed, **renamed})
         return PointClouds(points, labels, names, self.ids, self.checksum, origin)
 
     def unlabelled(self, num_points: int | None, where: str) -> UnlabelledClouds:
