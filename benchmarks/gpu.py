@@ -180,7 +180,8 @@ def matching(options: argparse.Namespace, save: Save) -> None:
     result: dict[str, Any] = {"pairs": {}}
     found = {}
     jobs: list[tuple[Method, str]] = [(method, "cpu") for method in get_args(Method)]
-    jobs += [("ad-census", "cuda")] * (not options.cpu)
+    if not options.cpu:
+        jobs.append(("ad-census", "cuda"))
     for method, device in jobs:
         settings = MatchingSettings(method, disparities, block_size=15)
         seconds = []

@@ -73,12 +73,12 @@ def examples() -> str:
 
 
 def help_of(words: list[str]) -> str:
-    """What ``qs3 WORDS --help`` prints, on lines wide enough for everything."""
+    """What ``qs3 WORDS --help`` prints, its groups of options one below the other."""
     from qs3.cli import main
 
     out = io.StringIO()
     before = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = "2000"
+    os.environ["COLUMNS"] = "129"  # from 130 on, tyro puts groups side by side
     try:
         with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
             main([*words, "--help"])

@@ -87,6 +87,33 @@ def temporary_folder(path: Path, alone: bool = False) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+@contextlib.contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """Yield the path of a folder to make, which becomes ``path`` when the block ends well.
+
+    Raises:
+        InputError: where ``path`` is there already and no empty folder.
+        StorageError: where the disk is full; ``path`` is named.
+    """
+    path = Path(path).resolve()
+    if not path.name or (path.exists() and (not path.is_dir() or holds_something(path))):
+        raise InputError(f"{path}: is there already; name a new or empty folder")
+    with temporary_folder(path, alone=True) as folder:
+        whole = folder / path.name  # some layouts go by it
+        try:
+            yield whole
+            for inner, _, files in os.walk(whole):
+                for entry in (*files, ""):
+                    sync_entry(Path(inner) / entry)
+            if path.is_dir():
+                shutil.rmtree(path)
+            whole.rename(path)
+        except OSError as error:
+            name_fault(error, path)
+            raise
+    sync_entry(path.parent)
+
+
 def name_fault(error: OSError, path: Path) -> None:
     """Put the file's name into an error of writing; a full disk is told with what to do."""
     if error.errno in _FULL:

@@ -15,6 +15,8 @@ from qs3.io import load_clouds, load_unlabelled
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import create_model
 from qs3.training import SelfTrainingSettings, TrainSettings, fit, load_model
+from qs3.training.checkpoint import read_tensors
+from qs3.training.rounds import STATE
 from qs3.training.validation import choose, held_out_rows, read_checkpoints
 
 NETWORKS = {
@@ -29,6 +31,18 @@ NETWORKS = {
 }
 METHODS = list_methods()
 ROUNDS = SelfTrainingSettings(rounds=2, epochs=1, threshold=0.34)
+SWITCHED = SelfTrainingSettings(
+    rounds=2,
+    epochs=1,
+    teacher="average",
+    turns=2,
+    calibrate=True,
+    refine=True,
+    label_smoothing=0.0,
+    threshold_share=0.8,
+    floor=2,
+)
+"""Rounds with all that is off by default."""
 pytestmark = pytest.mark.filterwarnings("ignore::qs3.adaptation.SingleClassWarning")
 SMALLER = {"pointdan": {"nodes": 8, "neighbours": 6}, "dann": {"hidden": (16,)}}
 """Settings that only save time; all else is a method's default."""
@@ -203,14 +217,16 @@ def test_no_domain_is_truncated(count, seen_whole, tmp_path, monkeypatch):
     assert seen[seen_whole] >= whole[seen_whole]
 
 
-@pytest.mark.parametrize("method", [*METHODS, *COMPOSED])
+@pytest.mark.parametrize("method", [*METHODS, *COMPOSED, "qbst, switched"])
 @pytest.mark.parametrize("rule", [pytest.param("last", marks=pytest.mark.slow), "im"])
 def test_poisoned_labels_of_the_target_change_no_bit(method, rule, tmp_path):
     """The files' labels are all wrong; read, trained, stopped, resumed, chosen: the same bits."""
+    method, _, switched = method.partition(", ")
     truth = clouds(12, 3)
     names = np.array(truth.class_names)
     runs = []
-    for case, labels in {"true": truth.labels, "wrong": (truth.labels + 1) % 3}.items():
+    cases = {"true": truth.labels, "wrong": (truth.labels + 1) % 3}
+    for case, labels in cases.items():
         path = tmp_path / case / "target.npz"
         path.parent.mkdir()
         np.savez(path, points=truth.points, label=labels, class_names=names)
@@ -218,8 +234,8 @@ def test_poisoned_labels_of_the_target_change_no_bit(method, rule, tmp_path):
         target = load_unlabelled(path, num_points=None)
         assert isinstance(target, UnlabelledClouds)
         run = path.parent / "run"
-        rounds = None
-        if method in COMPOSED:
+        rounds = SWITCHED if switched else None
+        if method in COMPOSED and not switched:
             rounds = replace(ROUNDS, rule=COMPOSED[method][1])
         chosen = settings(method, epochs=2, rule=rule)
         result = fit_after_a_stop(method, SOURCE, target, chosen, rounds, run_dir=run)
@@ -234,6 +250,9 @@ def test_poisoned_labels_of_the_target_change_no_bit(method, rule, tmp_path):
     assert len(right.checkpoints) >= 2
     assert history == history_of_wrong
     assert kept == kept_of_wrong
+    if switched:
+        rounds, others = (read_tensors(tmp_path / case / "run" / STATE)[0] for case in cases)
+        assert same(rounds, others)
     if rule == "im":
         stage = right.checkpoints[-1].stage if method not in COMPOSED else "round"
         run = tmp_path / "true" / "run"

@@ -19,6 +19,7 @@ from qs3.adaptation.selection import (
     select_quantile,
     select_quasi_balanced,
     select_uniform,
+    with_floor,
 )
 from qs3.errors import InputError
 
@@ -116,9 +117,31 @@ def test_the_threshold_itself_is_out_unless_inclusive():
     assert select_quasi_balanced(rows, 0.75, inclusive=True).all()
 
 
+@given(probabilities(), thresholds, st.integers(0, 6), st.sampled_from(["keep", "drop"]))
+def test_floor_beside_a_reference_cloud_by_cloud(rows, threshold, floor, single_class):
+    """Clouds come in one by one, the surest of the class first, until it has enough or no more."""
+    chosen = select(rows, threshold, single_class=single_class)
+    expected = chosen.copy()
+    labels, confidence = rows.argmax(axis=1), rows.max(axis=1)
+    for label in range(rows.shape[1]):
+        while (expected & (labels == label)).sum() < floor:
+            left = np.flatnonzero(~expected & (labels == label))
+            if not len(left):
+                break
+            expected[left[confidence[left].argmax()]] = True
+    floored = with_floor(rows, chosen, floor)
+    assert np.array_equal(floored, expected)
+    assert floored[chosen].all()
+    for label in labels:
+        members = labels == label
+        count = max((chosen & members).sum(), min(floor, members.sum()))
+        assert (floored & members).sum() == count
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
+        (lambda p: with_floor(p, np.ones(len(p), dtype=bool), -1), "floor must be at least 0"),
         (lambda p: select_confident(p, 1.2), "threshold must be 0 to 1"),
         (lambda p: select_uniform(p, 0.5, quantile=1.1), "quantile must be 0 to 1"),
         (lambda p: select_quantile(p, 0.5, -0.1), "share must be 0 to 1"),

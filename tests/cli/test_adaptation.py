@@ -4,13 +4,18 @@ import json
 
 import numpy as np
 import pytest
+import torch
 import tyro
 
+from qs3.adaptation.confidence import BOUNDS
 from qs3.cli.train import TrainOptions, _note_old_name, defaults, parse_settings
 from qs3.errors import InputError
 from qs3.evaluation import read_record
+from qs3.io import load_clouds, load_unlabelled
 from qs3.meshes.classes import POINTDA10
-from qs3.training import PRESETS
+from qs3.structure import structure
+from qs3.training import PRESETS, TrainSettings, fit, load_model, save_model
+from qs3.training.run import RunSettings
 
 QUICK = ("--model", "pointnet", "--model-set", "channels=[8, 8, 16]", "hidden=[8]", "--num-points",
          64, "--batch-size", 5, "--threads", 1, "--accelerator", "cpu", "--epochs", 2,
@@ -32,7 +37,7 @@ def adapted(qs3, store, source, tmp_path_factory):
     qs3("train", "--source", source, "--target", store, "--out", run, "--method", "dann",
         "--method-set", "hidden=[8]", "gamma=5", "--self-training", "qbst",
         "--self-training.rounds", 2, "--self-training.epochs", 1, "--rule", "im",
-        *QUICK)  # fmt: skip
+        *QUICK, code=4)  # fmt: skip  # ten clouds are too few for a round
     return run
 
 
@@ -61,6 +66,73 @@ def test_every_validators_choice_is_scored_and_the_oracle_stands_apart(qs3, adap
     assert record.choices["oracle"]["accuracy"] == best
     assert {choice["stage"] for choice in record.choices.values()} == {"round"}
     assert record.selection == "im"
+
+
+@pytest.mark.filterwarnings("ignore::qs3.adaptation.SingleClassWarning")
+@pytest.mark.parametrize("method", ["sd", "gast"])
+def test_rounds_with_all_switches_after_a_method(qs3, source, tmp_path, method):
+    """From the command line to the record; Python makes the same bits."""
+    run = tmp_path / "run"
+    qs3("train", "--source", source, "--target", source, "--out", run, "--method", method,
+        "--self-training", "qbst",
+        "--self-training.rounds", 2, "--self-training.epochs", 1, "--self-training.calibrate",
+        "--self-training.turns", 2, "--self-training.teacher", "average",
+        "--self-training.threshold-share", 0.8, "--self-training.floor", 4,
+        "--self-training.refine", "--self-training.label-smoothing", 0, *QUICK,
+        "--epochs", 1)  # fmt: skip
+    done = qs3("evaluate", run, "--data", source, "--checkpoints")
+    assert "checkpoint          round 2, by rule last" in done.stdout
+    assert "known here" in done.stdout
+    record = read_record(next((run / "records").glob("*.json")))
+    assert record.method == f"{method}+qbst"
+    assert record.chosen == {"stage": "round", "number": 2}
+    assert [made["number"] for made in record.checkpoints] == [1, 2]
+    assert record.checkpoints[-1]["accuracy"] == record.scores.accuracy
+    for told in record.rounds:
+        assert not told["skipped"]
+        assert told["known"] == told["kept"]
+        assert sum(told["right"]) <= sum(told["known"])
+        assert BOUNDS[0] <= told["temperature"] <= BOUNDS[1]
+    if method == "sd":
+        settings = structure(json.loads((run / "settings.json").read_text()), RunSettings, run)
+        again = tmp_path / "again"
+        fit(method, load_clouds(source, num_points=None), load_unlabelled(source, num_points=None),
+            settings.train, settings.self_training, run_dir=again, preset="default")  # fmt: skip
+        weights = [(folder / "model.safetensors").read_bytes() for folder in (run, again)]
+        assert weights[0] == weights[1]
+
+
+def test_a_run_whose_rounds_were_all_skipped_says_what_to_change(qs3, store, source, tmp_path):
+    run = tmp_path / "run"
+    command = ("train", "--source", source, "--target", store, "--out", run, "--method", "qbst",
+               "--self-training.rounds", 2, "--self-training.threshold", 0.98,
+               "--self-training.step", 0, *QUICK)  # fmt: skip
+    for _ in range(2):  # the same command again finds the same
+        done = qs3(*command, code=4)
+        assert done.stdout == f"{run}\n"
+        last = done.stderr.rstrip().splitlines()[-1]
+        assert last.startswith("qs3: all 2 rounds were skipped, as they kept 0 of 10 clouds")
+        assert "lower --self-training.threshold, give --self-training.threshold-share" in last
+        assert "Next:" not in done.stderr
+    assert all(told["skipped"] for told in json.loads((run / "run.json").read_text())["rounds"])
+    qs3("evaluate", run, "--data", store)
+
+
+def test_one_confident_class_is_told_in_the_last_lines(qs3, source, store, tmp_path):
+    """A network of one class: the round, the class and the count stand before what is next."""
+    warm, run = tmp_path / "warm", tmp_path / "run"
+    qs3("train", "--source", source, "--out", warm, *QUICK)
+    model, class_names, settings = load_model(warm)
+    with torch.no_grad():
+        model.classify.layers[-1].bias[3] += 50.0
+    save_model(warm, model, class_names, structure(settings["train"], TrainSettings, warm))
+    done = qs3("train", "--source", source, "--target", store, "--out", run, "--method", "qbst",
+               "--warm-up", warm, "--self-training.rounds", 1, "--self-training.epochs", 1,
+               *QUICK, code=4)  # fmt: skip
+    said = done.stderr.rstrip().splitlines()[-2]
+    assert said == (
+        f"qs3: round 1: all 10 confident clouds were of one class, {POINTDA10[3]}; 10 were kept"
+    )
 
 
 def test_source_only_looks_at_a_target_without_learning_from_it(qs3, store, source, tmp_path):

@@ -16,6 +16,7 @@ import trimesh
 
 import qs3.cli
 from qs3.cli import ELSEWHERE, VERBS, doctor
+from qs3.cli.extract import extract
 from qs3.sensor.settings import ScanSettings
 
 ROOT = Path(__file__).parents[2]
@@ -26,8 +27,8 @@ def test_the_table_of_verbs_says_what_each_verb_says_of_itself(verb):
     module, _, name = ELSEWHERE.get(verb, f"{verb}.{verb}").partition(".")
     tree = ast.parse((Path(qs3.cli.__file__).parent / f"{module}.py").read_text(encoding="utf-8"))
     functions = {f.name: f for f in tree.body if isinstance(f, ast.FunctionDef)}
-    if verb == "extract":  # a function for each source
-        assert {"scannet", "sunrgbd", "depth"} <= functions.keys()
+    if verb == "extract":  # made of the library's functions
+        assert [*extract] == ["scannet", "sunrgbd", "nyuv2", "depth"]
         return
     assert (ast.get_docstring(functions[name]) or "").startswith(VERBS[verb].rstrip("."))
 
@@ -150,7 +151,7 @@ def test_train_evaluate_predict(qs3, run, store, tmp_path):
     rng = np.random.default_rng(0)
     np.save(tmp_path / "a.npy", rng.standard_normal((500, 3)))
     np.savetxt(tmp_path / "b.xyz", rng.standard_normal((20, 3)))
-    done = qs3("predict", run, tmp_path / "a.npy", tmp_path / "b.xyz", "--json")
+    done = qs3("predict", run, tmp_path / "a.npy", tmp_path / "b.xyz", "--json", "-")
     rows = json.loads(done.stdout)
     assert [row["file"] for row in rows] == [str(tmp_path / n) for n in ("a.npy", "b.xyz")]
     for row in rows:

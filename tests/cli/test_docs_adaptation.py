@@ -20,6 +20,7 @@ from qs3.adaptation.names import COMPOSED, MethodName, Normalisation, RoundRule,
 from qs3.adaptation.validators import VALIDATORS
 from qs3.cli.evaluate import evaluate_run
 from qs3.cli.train import TrainOptions, parse_settings
+from qs3.io.preparation import PAPER, ROBUST, Preparation
 from qs3.models import create_model
 from qs3.training import PRESETS, SelfTrainingSettings, TrainSettings
 
@@ -222,6 +223,17 @@ def test_settings_of_self_training():
         for cell, preset in zip(table[name], ("default", "spst"), strict=False):
             value = getattr(PRESETS[preset], name)
             assert value_of(cell, value) == value, (name, preset)
+
+
+def test_settings_of_the_preparation():
+    title = "Preparation: from a cloud to what a network takes"
+    table = rows(sections(SETTINGS, 3)[title], "setting", "default", "paper", "what it does")
+    fields = [field.name for field in dataclasses.fields(Preparation)]
+    assert [row.removeprefix("--").replace("-", "_") for row in table] == fields
+    for name, cells in zip(fields, table.values(), strict=True):
+        for cell, preparation in zip(cells, (ROBUST, PAPER), strict=False):
+            value = getattr(preparation, name)
+            assert value_of(cell, value) == value, name
 
 
 def test_columns_where_text_and_code_differ():

@@ -100,6 +100,7 @@ def test_a_bad_image_fails_alone_and_is_told(typed, pictures):
         (["sunrgbd", "D"], "no frame"),
         (["sunrgbd", "D", "--erode", "2"], "erode"),
         (["sunrgbd", "D", "--classes", "chair", "chair"], "comes twice"),
+        (["nyuv2", "D"], "nyu_depth_v2_labeled.mat: no such file"),
         (["scannet", "D"], "scene0000_00"),
         (["scannet", "D", "--classes", "all"], "name the classes"),
     ],

@@ -118,6 +118,8 @@ def test_the_recipe_is_settings_and_what_is_given_beside_it_wins(typed, monkeypa
     words = ("generate", "--recipe", "rooms", "--out", tmp_path / "out", "--dry-run",
              "--variant", "scalar_rgb")  # fmt: skip
     typed(*words, code=130)
+    help_text = typed(*words, "--help").stdout
+    assert "kinect-v1" in help_text.split("--sensor")[1].split("--image-noise")[0]
     given = ("--sensor", "d435", "--views", 1, "--per-class", 2, "--scans-per-mesh", 3)
     typed(*words, *given, "--object-size", "file", code=130)
     whole, changed = asked
@@ -130,7 +132,7 @@ def test_the_recipe_is_settings_and_what_is_given_beside_it_wins(typed, monkeypa
     assert (changed.settings.sensor.name, changed.settings.views) == ("d435", 1)
     assert (len(changed.items), changed.rows) == (20, 60)
     assert changed.settings.real_size == "file"
-    assert changed.settings.randomise == ("rooms",)
+    assert list(changed.settings.randomise) == ["rooms"]
 
 
 def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(qs3, tmp_path):

@@ -9,7 +9,7 @@ from qs3 import shapes
 from qs3.errors import InputError
 from qs3.meshes import load_mesh
 from qs3.meshes.classes import POINTDA10
-from qs3.meshes.sizes import CLASS_SIZES, _note, class_size, file_size
+from qs3.meshes.sizes import CLASS_SIZES, _note, _note_file, class_size, file_size
 
 
 def part(length: float) -> trimesh.Trimesh:
@@ -35,7 +35,19 @@ def test_a_mesh_that_tells_its_unit_is_believed(tmp_path):
     mesh = part(60.0)
     mesh.units = "0.01 * meters"  # as DAE has it
     assert file_size(mesh)[0] == pytest.approx(0.6)
+
+
+def test_a_unit_in_the_file_wins_and_says_so_once(caplog):
+    _note_file.cache_clear()
+    mesh = part(60.0)
+    mesh.units = "cm"
+    for _ in range(2):
+        assert file_size(mesh, "mm") == (pytest.approx(0.6), "cm")
+    assert caplog.messages == ["a mesh's file says that it is in cm: taken, not units mm"]
+    caplog.clear()
+    mesh.units = "millimeters"
     assert file_size(mesh, "mm")[0] == pytest.approx(0.06)
+    assert not caplog.messages
 
 
 @pytest.mark.parametrize(("length", "size", "unit"), [(2.0, 2.0, "m"), (60.0, 0.06, "mm")])

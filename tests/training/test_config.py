@@ -34,6 +34,12 @@ COMMON = {
     "quantile": 0.5,
     "portion": 0.2,
     "portion_step": 0.05,
+    "threshold_share": None,
+    "floor": 0,
+    "teacher_decay": 0.9,
+    "turns": 1,
+    "calibrate": False,
+    "label_smoothing": None,
 }
 
 
@@ -72,6 +78,26 @@ def test_overrides():
             "selection = least-confident is not read by rule spst, only by qbst",
         ),
         (lambda: SelfTrainingSettings(portion=0.3), "portion = 0.3 is not read by rule qbst"),
+        (lambda: SelfTrainingSettings(turns=0), "turns = 0 must be at least 1"),
+        (lambda: SelfTrainingSettings(floor=-1), "floor = -1 must not be negative"),
+        (lambda: SelfTrainingSettings(threshold_share=0.0), "threshold_share = 0.0 must be above"),
+        (lambda: SelfTrainingSettings(label_smoothing=1.0), "label_smoothing = 1.0"),
+        (
+            lambda: SelfTrainingSettings(threshold_share=0.5, threshold=0.7),
+            "threshold = 0.7 is not read by threshold_share 0.5, only by None; leave it out",
+        ),
+        (
+            lambda: SelfTrainingSettings(rule="quantile", threshold_share=0.5),
+            "threshold_share = 0.5 is not read by rule quantile",
+        ),
+        (
+            lambda: SelfTrainingSettings(teacher_decay=0.5),
+            "teacher_decay = 0.5 is not read by teacher latest, only by average",
+        ),
+        (
+            lambda: SelfTrainingSettings(teacher="average", init="scratch"),
+            "teacher = average has no sense over weights that start anew",
+        ),
         (lambda: TrainSettings(holdout=1.0), "holdout = 1.0"),
         (lambda: TrainSettings(rule="im", validate_every=0), "leaves no checkpoint"),
         (lambda: TrainSettings(batch_size=1), "batch_size = 1 must be at least 2"),

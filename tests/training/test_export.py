@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,12 @@ import pytest
 import torch
 
 from qs3.errors import InputError, MissingExtraError, QS3Error
-from qs3.io.preparation import unit_ball
+from qs3.io.preparation import PAPER, ROBUST, distinct_inliers, normalise
 from qs3.models import create_model
 from qs3.models.ops import farthest_point_sampling
 from qs3.models.ops.sampling import sample_in_a_loop
-from qs3.training import TrainSettings, export, predict_probabilities, save_model
+from qs3.models.sized import Sized
+from qs3.training import TrainSettings, export, load_model, predict_probabilities, save_model
 from qs3.training.batches import subsample
 from qs3.training.export import compare, export_run, subsample_in_a_graph
 from qs3.training.prepared import normalise_in_a_graph
@@ -27,13 +29,14 @@ _MODULE = importlib.util.module_from_spec(_SPEC)
 _SPEC.loader.exec_module(_MODULE)
 SMALL = _MODULE.SMALL
 
+OWN = replace(ROBUST, size_input=True)
 CLASSES = ("Stuhl", "テーブル", 'a "lamp"')
 TINY = "pointnet of each point"
 M = 40
 SIZES = [1, 2, M - 1, M, M + 1, 3 * M]
 
 
-def make_run(folder, name=TINY, num_points=M):
+def make_run(folder, name=TINY, num_points=M, preparation=PAPER):
     """A run whose network has moved statistics and decided answers."""
     torch.manual_seed(3)
     kind = name.split()[0]
@@ -45,7 +48,15 @@ def make_run(folder, name=TINY, num_points=M):
         model(0.5 * torch.randn(8, num_points, 3))
     with torch.no_grad():
         list(model.parameters())[-2].mul_(8)
-    settings = TrainSettings(model=kind, model_settings=SMALL[name], num_points=num_points)
+    if preparation.size_input:
+        model = Sized(model, preparation.radius_share)
+        torch.nn.init.normal_(model.size[2].weight)
+    settings = TrainSettings(
+        model=kind,
+        model_settings=SMALL[name],
+        num_points=num_points,
+        preparation=preparation,
+    )
     save_model(folder, model.eval(), CLASSES, settings)
     return model
 
@@ -93,10 +104,13 @@ def test_subsampling_in_a_graph_breaks_ties_and_repeats_points_alike():
         assert np.array_equal(got.numpy(), subsample(points, M).astype(np.float64))
 
 
-def test_normalise_in_a_graph_is_that_of_training():
-    points = clouds(4, 50)
-    got = normalise_in_a_graph(torch.from_numpy(points).double()).float().numpy()
-    np.testing.assert_allclose(got, unit_ball(points), rtol=0, atol=1e-7)
+@pytest.mark.parametrize("n", [50, 51])
+@pytest.mark.parametrize("preparation", [PAPER, ROBUST, OWN])
+def test_normalise_in_a_graph_is_that_of_training(preparation, n):
+    points = clouds(4, n)
+    got = normalise_in_a_graph(torch.from_numpy(points).double(), preparation).float().numpy()
+    wanted = normalise(points, preparation)
+    np.testing.assert_allclose(got, wanted, rtol=2e-7, atol=1e-7)
     same = torch.full((1, 7, 3), 0.1, dtype=torch.float64)
     assert torch.equal(normalise_in_a_graph(same), torch.zeros(1, 7, 3, dtype=torch.float64))
 
@@ -122,6 +136,30 @@ def exported(tmp_path_factory):
 def test_exports_give_our_probabilities_of_clouds_of_any_size(exported):
     check(exported[0], run_onnx(exported[1]["onnx"].path))
     check(exported[0], run_program(exported[1]["torch-export"].path))
+
+
+def test_an_export_takes_what_prediction_hands_the_network(tmp_path):
+    """Size in metres, a robust ball; strays are the caller's to remove, and the file says so."""
+    import onnx
+
+    model = make_run(tmp_path, preparation=OWN)
+    path = export_run(tmp_path, "onnx").path
+    run = run_onnx(path)
+    facts = json.loads({p.key: p.value for p in onnx.load(path).metadata_props}["qs3"])
+    assert facts["expects"] == {"outliers_removed": True}
+    assert facts["settings"]["train"]["preparation"]["radius_share"] == 0.95
+    answers = []
+    for n in (M - 9, 3 * M):
+        points = clouds(3, n, seed=n) / 1000
+        points[:, 5] += 50
+        wanted = predict_probabilities(load_model(tmp_path), points)
+        for cloud, shares in zip(points, wanted, strict=True):
+            kept = cloud[distinct_inliers(cloud, True)]
+            assert len(kept) < n
+            np.testing.assert_allclose(run(kept[None])[0], shares, rtol=0, atol=2e-5)
+            answers.append(np.abs(run(16 * kept[None])[0] - shares).max())
+    assert max(answers) > 1e-3  # sixteen times as large is another thing
+    assert model.share == 0.95
 
 
 def test_exports_tell_what_they_hold(exported):

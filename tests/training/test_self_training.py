@@ -1,3 +1,4 @@
+import copy
 import dataclasses
 import json
 import logging
@@ -7,17 +8,51 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.adaptation.selection import SingleClassWarning
+from qs3.adaptation.confidence import BOUNDS, fit_temperature, rescale
+from qs3.adaptation.graph_labels import refine_probabilities
+from qs3.adaptation.selection import SingleClassWarning, select_quasi_balanced, with_floor
 from qs3.errors import InputError
+from qs3.geometry import rotation_z
 from qs3.io.clouds import UnlabelledClouds
-from qs3.training import SelfTrainingSettings, fit, load_model, self_training_preset
+from qs3.io.preparation import ROBUST
+from qs3.training import (
+    Augmentation,
+    SelfTrainingSettings,
+    evaluate,
+    fit,
+    load_model,
+    read_run,
+    self_training_preset,
+)
 from qs3.training.batches import prepare
 from qs3.training.checkpoint import derived_seed, new_model
 from qs3.training.distributed import make_fabric
-from qs3.training.predict import predict_probabilities
+from qs3.training.predict import describe, predict_probabilities
+from qs3.training.rounds import STATE, kept_clouds, remarks
 from qs3.training.self_training import self_train
 
+WIDE = {
+    "preparation": replace(ROBUST, size_input=True),
+    "augmentation": Augmentation.scanned(),
+    "num_points": 40,
+}
+"""Outliers removed, points drawn anew, sizes told, clouds augmented."""
 ROUNDS = SelfTrainingSettings(rounds=3, epochs=2, threshold=0.4)
+
+
+SWITCHES = SelfTrainingSettings(
+    rounds=2,
+    epochs=2,
+    teacher="average",
+    teacher_decay=0.5,
+    turns=3,
+    calibrate=True,
+    refine=True,
+    label_smoothing=0.0,
+    threshold_share=0.5,
+    floor=2,
+)
+"""All that is off by default."""
 
 
 class Stop(Exception):  # noqa: N818
@@ -77,9 +112,12 @@ def test_the_type_of_the_target_has_no_labels():
     assert names == {"points", "ids", "checksum", "origin"}
 
 
-def test_labels_of_the_target_cannot_matter(source, target, settings, warm, tmp_path):
+@pytest.mark.parametrize("way", ["paper", "robust"])
+def test_labels_of_the_target_cannot_matter(source, target, settings, warm, tmp_path, way):
     """Poisoned labels leave the run bit-identical: they are not in what it is handed."""
     poisoned = replace(target, labels=(target.labels + 1) % 3)
+    if way == "robust":
+        settings, warm = replace(settings, **WIDE), None
     runs = [
         fit(
             "qbst",
@@ -93,6 +131,7 @@ def test_labels_of_the_target_cannot_matter(source, target, settings, warm, tmp_
         for name, clouds in {"true": target, "poisoned": poisoned}.items()
     ]
     assert same(runs[0].model, runs[1].model)
+    assert not hasattr(runs[0].target.clouds, "labels")
 
 
 def test_a_labelled_target_is_refused(source, target, settings, warm, tmp_path):
@@ -107,13 +146,21 @@ def test_a_labelled_target_is_refused(source, target, settings, warm, tmp_path):
         ("paper", "middle of round 2"),
         ("spst", "between rounds"),
         ("released", "middle of round 2"),
+        ("robust", "middle of round 2"),
+        ("switches", "middle of round 2"),
+        ("switches", "between rounds"),
     ],
 )
 def test_resumed_is_uninterrupted(source, target, settings, tmp_path, preset, where):
     settings = replace(settings, epochs=12, seed=1)
+    if preset == "robust":
+        settings, preset = replace(settings, **WIDE), "default"
     # From scratch, a shrinking pool is too small here to go on; `released` covers that start.
     changes = {"init": "warm-up"} if preset == "paper" else {}
-    rounds = self_training_preset(preset, rounds=3, epochs=8, threshold=0.34, **changes)
+    if preset == "switches":
+        settings, rounds = replace(settings, holdout=0.25), replace(SWITCHES, rounds=3, epochs=8)
+    else:
+        rounds = self_training_preset(preset, rounds=3, epochs=8, threshold=0.34, **changes)
     arguments = (rounds.rule, source, target.without_labels(), settings, rounds)
     whole = fit(*arguments, run_dir=tmp_path / "whole")
     seen = []
@@ -358,6 +405,154 @@ def test_single_class_is_warned_of_and_recorded(domains, settings):
             _, records = self_train(model, source, target, settings, rounds)
         assert records[0].single_class
         assert records[0].kept == (0, kept, 0)
+
+
+@pytest.fixture(scope="module")
+def adapted(source, target, settings, tmp_path_factory):
+    """A run with all switches on, what it gave, and its settings."""
+    run = tmp_path_factory.mktemp("switched") / "run"
+    chosen = replace(settings, epochs=25, holdout=0.25, label_smoothing=0.2)
+    return run, fit("qbst", source, target.without_labels(), chosen, SWITCHES, run_dir=run), chosen
+
+
+def test_python_rounds_are_those_of_fit(adapted, tmp_path):
+    run, result, chosen = adapted
+    model = load_model(run / "warm-up").model
+    given = (model, result.source, result.target, chosen, SWITCHES)
+    loop, records = self_train(*given, holdout=result.holdout, run_dir=tmp_path / "run")
+    assert same(loop, result.model)
+    assert plain(records) == plain(result.rounds)
+    assert read_run(run).chosen == read_run(tmp_path / "run").chosen == {
+        "stage": "round",
+        "number": 2,
+    }  # fmt: skip
+    with pytest.raises(InputError, match="calibrate needs a held-out part"):
+        self_train(*given)
+
+
+def answers(model, clouds, turns=1):
+    """Mean probabilities over turns, by PyTorch alone."""
+    angles = 2 * np.pi * np.arange(turns) / turns
+    told = []
+    for angle in angles:
+        matrix = torch.from_numpy(rotation_z(angle)).float()
+        with torch.no_grad():
+            logits = model.eval()(torch.from_numpy(clouds.points) @ matrix.T)
+        told.append(torch.softmax(logits.double(), dim=1).numpy())
+    return np.mean(told, axis=0)
+
+
+def test_the_first_round_by_hand(adapted):
+    """Turns, temperature, graph, quantile, QBST's counts and the floor, from the warm-up."""
+    run, result, _ = adapted
+    model = load_model(run / "warm-up").model
+    held = answers(model, result.holdout, 3)
+    temperature = fit_temperature(held, result.holdout.labels)
+    record = result.rounds[0]
+    assert record.temperature == pytest.approx(temperature, rel=1e-4)
+    spread = rescale(answers(model, result.target, 3), temperature)
+    features = [
+        describe(model, (result.target.points @ rotation_z(angle).T).astype(np.float32)).features
+        for angle in (0.0, 2 * np.pi / 3, 4 * np.pi / 3)
+    ]
+    refined = refine_probabilities(np.mean(features, axis=0), spread)
+    theta = np.sort(refined.max(axis=1))[14]
+    assert record.theta == pytest.approx(theta, abs=1e-4)
+    assert sum(record.confident) == 15
+    chosen = with_floor(refined, select_quasi_balanced(refined, record.theta), 2)
+    rows, labels = kept_clouds(run)[1][0]
+    assert np.array_equal(rows, np.flatnonzero(chosen))
+    assert np.array_equal(labels, refined[chosen].argmax(axis=1))
+    assert record.kept == tuple(np.bincount(labels, minlength=3))
+
+
+def test_a_quantile_is_a_value(source, target, settings, warm, tmp_path):
+    given = ("qbst", source, target.without_labels(), settings)
+    share = replace(ROUNDS, rounds=1, threshold=0.8, threshold_share=0.6)
+    one = fit(*given, share, run_dir=tmp_path / "share", warm_up=warm)
+    theta = one.rounds[0].theta
+    assert sum(one.rounds[0].confident) == 18
+    value = replace(ROUNDS, rounds=1, threshold=theta)
+    other = fit(*given, value, run_dir=tmp_path / "value", warm_up=warm)
+    assert same(one.model, other.model)
+    assert plain(one.rounds) == plain(other.rounds)
+
+
+def test_the_average_follows_the_network_epoch_by_epoch(domains, settings):
+    """Its labels are those of a mean of weights that is kept by hand."""
+    model, seen, decay = new_model(settings, 3, 0), [], 0.6
+    average = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+    averages = []
+
+    def on_epoch(record, method):
+        for name, tensor in method.model.state_dict().items():
+            mean = decay * average[name] + (1 - decay) * tensor
+            average[name] = mean if tensor.is_floating_point() else tensor.clone()
+        averages.append(copy.deepcopy(average))
+
+    def select(probabilities, theta):
+        seen.append(probabilities)
+        return np.ones(len(probabilities), dtype=bool)
+
+    source, target = domains
+    rounds = replace(ROUNDS, rounds=3, teacher="average", teacher_decay=decay)
+    self_train(model, source, target, settings, rounds, select=select, on_epoch=on_epoch)
+    teacher = new_model(settings, 3, 0)
+    for number, weights in enumerate((model.state_dict(), averages[1], averages[3])):
+        teacher.load_state_dict(weights)
+        assert np.allclose(seen[number], answers(teacher, target), atol=1e-5), number
+
+
+def test_label_smoothing_of_the_rounds_is_their_own(domains, settings):
+    smoothed = replace(settings, label_smoothing=0.3)
+    plain_, same_, own = (
+        one_round(domains, *how)[0] if len(how) == 1 else one_round(domains, how[0], **how[1])[0]
+        for how in (
+            (settings,),
+            (smoothed, {"label_smoothing": 0.0}),
+            (settings, {"label_smoothing": 0.3}),
+        )
+    )
+    assert same(plain_, same_)
+    assert not same(plain_, own)
+    assert same(own, one_round(domains, smoothed)[0])
+
+
+def test_evaluate_tells_how_many_pseudo_labels_were_right(adapted, target, settings):
+    run, *_ = adapted
+    before = (run / STATE).read_bytes()
+    record = evaluate(run, target)
+    for done, (rows, labels) in zip(record.rounds, kept_clouds(run)[1], strict=True):
+        right = target.labels[rows] == labels
+        assert done["known"] == list(done["kept"])
+        assert done["right"] == np.bincount(labels[right], minlength=3).tolist()
+    half = target.select(np.arange(30)[::-2])  # some, in another order
+    done = evaluate(run, half).rounds[0]
+    rows, labels = kept_clouds(run)[1][0]
+    known = rows % 2 == 1
+    assert done["known"] == np.bincount(labels[known], minlength=3).tolist()
+    right = known & (target.labels[rows] == labels)
+    assert done["right"] == np.bincount(labels[right], minlength=3).tolist()
+    other = replace(target, points=target.points[:, ::-1].copy() + 0.01)
+    assert "right" not in evaluate(run, other).rounds[0]
+    assert (run / STATE).read_bytes() == before
+
+
+def test_remarks_on_what_went_wrong(domains, settings):
+    _, records = one_round(domains, settings, lambda p, theta: np.arange(len(p)) < 2, rounds=2)
+    (line,) = remarks(records, ROUNDS, ("ball", "disc", "rod"))[-1:]
+    assert line.startswith("all 2 rounds were skipped, as they kept 2 of 30 clouds at most")
+    assert "lower --self-training.threshold, give --self-training.threshold-share," in line
+    assert "raise --self-training.threshold-share" in remarks(records, SWITCHES, "abc")[-1]
+    one = replace(records[0], single_class=True, confident=(0, 9, 0), kept=(0, 9, 0), skipped=False)
+    assert remarks([one], ROUNDS, ("ball", "disc", "rod")) == [
+        "round 1: all 9 confident clouds were of one class, disc; 9 were kept"
+    ]
+    fine = replace(one, single_class=False)
+    assert remarks([fine], ROUNDS, "abc") == []
+    (line,) = remarks([replace(fine, temperature=BOUNDS[0])], SWITCHES, "abc")
+    assert "its bound, 0.25" in line
+    assert "(--holdout)" in line
 
 
 def test_empty_target(domains, settings):

@@ -220,6 +220,34 @@ def select_quantile(
     return keep_of_classes(probabilities, confident, most)
 
 
+def with_floor(
+    probabilities: Float[np.ndarray, "m k"], chosen: Bool[np.ndarray, "m"], floor: int
+) -> Bool[np.ndarray, "m"]:
+    """Add to a selection until it has a least number of each class, so that none is lost.
+
+    Of a class with fewer than ``floor`` chosen clouds its most confident others come in, from
+    below the threshold too, as far as there are clouds with that pseudo label. Nothing is taken
+    away.
+
+    Args:
+        probabilities: Class probabilities.
+        chosen: What a rule selected of them.
+        floor: Least number of each class.
+
+    Raises:
+        InputError: where the floor is negative.
+
+    Example:
+        >>> p = np.array([0.9, 0.95, 0.6, 0.4, 0.3])
+        >>> rows = np.stack([p, 1 - p], axis=1)
+        >>> with_floor(rows, select_confident(rows, 0.8), 1).tolist()
+        [True, True, False, False, True]
+    """
+    check_range("floor", floor, 0)
+    missing = np.maximum(floor - count_labels(probabilities, chosen), 0)
+    return chosen | keep_of_classes(probabilities, ~chosen, missing.tolist())
+
+
 def count_labels(
     probabilities: Float[np.ndarray, "m k"], mask: Bool[np.ndarray, "m"]
 ) -> Int[np.ndarray, "k"]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from torch import Generator, Tensor
+from torch import Generator, Tensor, nn
 
 from qs3.adaptation import distortions
 from qs3.adaptation.method import Batch, Domain, Method, Target, Terms
@@ -51,6 +51,24 @@ def ramp(progress: float) -> float:
         (0.0067, 1.0)
     """
     return math.exp(-5.0 * (1.0 - progress) ** 2)
+
+
+@torch.no_grad()
+def follow(average: nn.Module, student: nn.Module, decay: float) -> None:
+    """Move an average by 1 − decay towards a network; integers are copied.
+
+    Example:
+        >>> average, student = torch.nn.Linear(1, 1), torch.nn.Linear(1, 1)
+        >>> follow(average, student, 0.0)
+        >>> torch.equal(average.weight, student.weight)
+        True
+    """
+    present = student.state_dict()
+    for name, tensor in average.state_dict().items():
+        if tensor.is_floating_point():
+            tensor.lerp_(present[name], 1.0 - decay)
+        else:
+            tensor.copy_(present[name])
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
@@ -156,12 +174,7 @@ class SelfDistillation(Method):
         decay = min(self.decay, 1.0 - 1.0 / (int(self.steps) + 1))
         pairs = ((self.teacher, self.model), (self.teacher_norm, self.norm))
         for average, student in pairs:
-            present = student.state_dict()
-            for name, tensor in average.state_dict().items():
-                if tensor.is_floating_point():
-                    tensor.lerp_(present[name], 1.0 - decay)
-                else:
-                    tensor.copy_(present[name])
+            follow(average, student, decay)
 
     @torch.no_grad()
     def _describe(self, points: Tensor, domain: Domain) -> Tensor:

@@ -13,12 +13,14 @@ VERBS = {
     "scan": "Photograph one mesh: noisy cloud, clean twin, a picture of every stage.",
     "sensors": "List the sensors, or show one as TOML to copy and edit.",
     "realism": "Test a simulated camera against the laws of real ones.",
+    "meshes": "Show what a folder of meshes holds: classes, sizes, faults, a contact sheet.",
     "generate": "Scan many meshes into a data set; resumes, and logs what failed.",
     "merge": "Put the parts that `qs3 generate --shard i/n` made into one data set.",
     "info": "Print what a data set holds: counts, sizes, statistics of the sensor, failures.",
     "verify": "Check a data set: checksums, finite points, labels, seeds, duplicates, counts.",
     "convert": "Convert a data set into the layout of another.",
     "extract": "Cut objects out of real scans into a data set.",
+    "segment": "Cut a scan of a table or a floor into the objects that stand on it.",
     "train": "Train a classifier, with a method of adaptation to an unlabelled target if asked.",
     "evaluate": "Score a run: accuracy, class-mean accuracy, confusion matrix.",
     "predict": "Tell the class of each file and how confident the network is.",
@@ -38,7 +40,6 @@ ELSEWHERE = {
     "info": "store.info",
     "verify": "store.verify",
     "evaluate": "evaluate.evaluate_run",
-    "predict": "evaluate.predict",
     "figure": "table.figure",
 }
 """Module and function of the other verbs."""

@@ -15,6 +15,7 @@ _PURPOSE = {
     "s3": "data sets at s3:// addresses",
     "gs": "data sets at gs:// addresses",
     "view": "qs3 view",
+    "cad": "meshes in STEP, IGES and 3MF",
     "track": "qs3 train --log tensorboard",
     "export": "qs3 export",
 }

@@ -1,4 +1,4 @@
-"""``qs3 evaluate`` and ``qs3 predict``: scores of a run, and its answers for single files."""
+"""``qs3 evaluate``: scores of a run."""
 
 from collections.abc import Mapping, Sequence
 from json import dumps
@@ -7,8 +7,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from qs3.cli.text import columns, printable, show, tell
-from qs3.errors import InputError
+from qs3.cli.text import columns, show, tell
 from qs3.evaluation.records import Scores
 from qs3.io.clouds import CloudKind
 from qs3.structure import unstructure
@@ -51,11 +50,28 @@ def evaluate_run(
     if json:
         show(dumps(unstructure(record), indent=2))
     else:
+        if record.chosen is not None:
+            stage, number = record.chosen["stage"], record.chosen["number"]
+            show(f"checkpoint          {stage} {number}, by rule {record.selection}")
         show(*scores_text(record.scores, record.marks))
+        show(*rounds_text(record.rounds))
         if record.choices:
             show(*choices_text(record.choices))
     tell(f"record: {record_path(run, record)}")
     return 0
+
+
+def rounds_text(rounds: Sequence[Mapping[str, Any]]) -> list[str]:
+    """How many pseudo labels of the clouds that are known here were right, as lines."""
+    if not any("right" in done for done in rounds):
+        return []
+    rows: list[tuple[str, ...]] = [("round", "kept", "known here", "right", "")]
+    for done in rounds:
+        known, right = sum(done["known"]), sum(done["right"])
+        share = f"{right / known:.1%}" if known else "–"
+        numbers = (done["round"], sum(done["kept"]), known, right)
+        rows.append((*map(str, numbers), share))
+    return ["", *columns(rows, 0)]
 
 
 def choices_text(choices: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -86,44 +102,3 @@ def scores_text(scores: Scores, marks: Sequence[str] = ()) -> list[str]:
         share = "–" if recall is None else f"{recall:.1%}"
         rows.append((name, share, *map(str, row[:count])))
     return [*lines, "", *columns(rows, 1)]
-
-
-def predict(
-    run: Annotated[Path, tyro.conf.Positional],
-    files: Annotated[tuple[Path, ...], tyro.conf.Positional],
-    json: bool = False,
-) -> int:
-    """Tell the class of each file and how confident the network is.
-
-    Args:
-        run: Folder of a run, or its model.safetensors.
-        files: Clouds: NPY, XYZ, PLY, PCD, or a mesh as OFF; z up.
-        json: Print JSON with the probability of every class in place of text.
-    """
-    from qs3.io import read_cloud
-    from qs3.training import load_model, predict_probabilities
-
-    if not files:
-        raise InputError("name one or more files of points after the run")
-    loaded = load_model(run)
-    clouds = [read_cloud(path) for path in files]
-    answers: list[dict[str, Any]] = []
-    for path, cloud in zip(files, clouds, strict=True):
-        shares = predict_probabilities(loaded, cloud[None])[0]
-        shares = dict(zip(loaded.class_names, shares.tolist(), strict=True))
-        best = max(shares, key=lambda name: shares[name])
-        answers.append(
-            {
-                "file": str(path),
-                "class": best,
-                "confidence": shares[best],
-                "probabilities": shares,
-            }
-        )
-    if json:
-        show(dumps(answers, indent=2))
-        return 0
-    for answer in answers:
-        names = (printable(answer[name], keep="") for name in ("file", "class"))
-        show("\t".join([*names, f"{answer['confidence']:.3f}"]))
-    return 0

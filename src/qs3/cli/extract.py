@@ -2,68 +2,41 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, get_type_hints
 
 import tyro
 
 from qs3.cli.options import Flat
 from qs3.cli.store import refuse_failures
 from qs3.cli.text import show, tell
-from qs3.io.extract.depth import DepthImageSettings, extract_depth
+from qs3.io.extract.depth import extract_depth
+from qs3.io.extract.nyuv2 import extract_nyuv2
 from qs3.io.extract.run import ExtractReport, OutputSettings
-from qs3.io.extract.scannet import ScanNetSettings, extract_scannet
-from qs3.io.extract.sunrgbd import SunRgbdSettings, extract_sunrgbd
-
-_Source = Annotated[Path, tyro.conf.Positional]
+from qs3.io.extract.scannet import extract_scannet
+from qs3.io.extract.sunrgbd import extract_sunrgbd
 
 
-def scannet(
-    root: _Source,
-    output: Flat[OutputSettings],
-    settings: Flat[ScanNetSettings] = ScanNetSettings(),  # noqa: B008
-) -> int:
-    """Cut objects from ScanNet: fused from its raw depth frames, or from its meshes.
+def _verb(function: Callable[..., ExtractReport]) -> Callable[..., int]:
+    """One of the library's functions as a verb: its settings are the options, its text the help."""
+    kind: Any = get_type_hints(function)["settings"]
 
-    Args:
-        root: A copy of the release, its folder scans, or one scene's folder.
-        output: Where the clouds go.
-        settings: What is cut.
-    """
-    return _tell(output.out, extract_scannet(root, output, settings))
+    def verb(
+        source: Annotated[Path, tyro.conf.Positional],
+        output: Flat[OutputSettings],
+        settings: Flat[kind],  # pyright: ignore[reportInvalidTypeForm]
+    ) -> int:
+        return _tell(output.out, function(source, output, settings))
 
-
-def sunrgbd(
-    root: _Source,
-    output: Flat[OutputSettings],
-    settings: Flat[SunRgbdSettings] = SunRgbdSettings(),  # noqa: B008
-) -> int:
-    """Cut objects from SUN RGB-D by its oriented boxes.
-
-    Args:
-        root: The folder SUNRGBD of the release, or the one above it.
-        output: Where the clouds go.
-        settings: What is cut.
-    """
-    return _tell(output.out, extract_sunrgbd(root, output, settings))
+    verb.__doc__ = (function.__doc__ or "").partition("Raises:")[0]
+    return verb
 
 
-def depth(
-    source: _Source,
-    output: Flat[OutputSettings],
-    settings: Flat[DepthImageSettings] = DepthImageSettings(),  # noqa: B008
-) -> int:
-    """Cut objects from depth images of any camera, or from scenes in BOP's layout.
-
-    Args:
-        source: A depth image (16-bit PNG, TIFF, npy), a folder of them, or a scene in BOP's layout
-            or a folder of such scenes, such as the frames/ of qs3 scan --frames.
-        output: Where the clouds go.
-        settings: What is cut.
-    """
-    return _tell(output.out, extract_depth(source, output, settings))
-
-
-extract: dict[str, Callable[..., int]] = {"scannet": scannet, "sunrgbd": sunrgbd, "depth": depth}
+extract: dict[str, Callable[..., int]] = {
+    "scannet": _verb(extract_scannet),
+    "sunrgbd": _verb(extract_sunrgbd),
+    "nyuv2": _verb(extract_nyuv2),
+    "depth": _verb(extract_depth),
+}
 """The sources of the verb, by name."""
 
 

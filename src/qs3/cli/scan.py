@@ -26,7 +26,8 @@ def scan(
     """Photograph one mesh: noisy cloud, clean twin, a picture of every stage.
 
     Args:
-        mesh: A mesh file (OFF, OBJ, PLY, STL, GLB, GLTF) or a built-in class (chair, …).
+        mesh: A mesh file (OFF, OBJ, PLY, STL, GLB, GLTF, STEP, IGES, 3MF) or a built-in class
+            (chair, …).
         out: Folder to write: cloud.ply, clean.ply, montage.png, scan.json.
         up: Up axis of the mesh file; by default y for glTF, z for all others.
         save_images: Also write the grey pair, the 16-bit depth and the camera of each view,

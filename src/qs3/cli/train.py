@@ -27,6 +27,8 @@ from qs3.training.config import (
 
 TIME_UP = 3
 """Exit code where --max-time stopped a run that the same command takes up again."""
+NO_ROUND = 4
+"""Exit code where no round of self-training had enough clouds to train on."""
 
 
 @functools.cache
@@ -164,6 +166,7 @@ def train(options: Flat[TrainOptions]) -> int:
     from qs3.io import load_clouds, load_unlabelled
     from qs3.meshes.classes import describe_renaming, read_class_map
     from qs3.training import Deadline, TimeUpError, fit, load_whole, parse_duration
+    from qs3.training.rounds import all_skipped, remarks
 
     seconds = None if options.max_time is None else parse_duration(options.max_time)
     try:
@@ -179,19 +182,19 @@ def train(options: Flat[TrainOptions]) -> int:
         model_settings=parse_settings("--model-set", options.model_set),
         method_settings=parse_settings("--method-set", options.method_set),
     )
-    points, target = settings.num_points, None
+    how, target = (settings.num_points, settings.preparation), None
     part = {"split": options.source_split, "cloud": options.source_cloud}
     if options.classes is not None and options.class_map is not None:
         raise InputError("--classes and --map both name the classes; give one of them")
     called = options.classes if options.class_map is None else read_class_map(options.class_map)
-    source = load_whole(load_clouds, options.source, points, **part, class_map=called)
+    source = load_whole(load_clouds, options.source, *how, **part, class_map=called)
     if said := describe_renaming(source.origin.renamed):
         tell(said)
     if options.target is not None:
         part = {"split": options.target_split, "cloud": options.target_cloud}
-        target = load_whole(load_unlabelled, options.target, points, **part)
+        target = load_whole(load_unlabelled, options.target, *how, **part)
     try:
-        fit(
+        result = fit(
             options.method,
             source,
             target,
@@ -208,5 +211,9 @@ def train(options: Flat[TrainOptions]) -> int:
         tell(f"qs3: {stop}")
         return TIME_UP
     show(options.out)
+    for line in remarks(result.rounds, options.self_training, source.class_names):
+        tell(f"qs3: {line}")
+    if all_skipped(result.rounds):
+        return NO_ROUND
     tell(f"Next: qs3 evaluate {options.out} --data DATA")
     return 0

@@ -119,7 +119,13 @@ class RunRecord:
     commit: str = ""
     """Commit of the source tree, empty where unknown."""
     rounds: tuple[Mapping[str, Any], ...] = ()
-    """What each round of self-training did."""
+    """What each round of self-training did. Where clouds that it kept are among those of the test,
+    also, by pseudo label, how many of them are ``known`` so and how many were ``right``."""
+    chosen: Mapping[str, str | int] | None = None
+    """Checkpoint of the scores: its ``stage`` and ``number``; None in earlier releases."""
+    checkpoints: tuple[Mapping[str, Any], ...] = ()
+    """Where every checkpoint of the last stage was scored: stage, number, accuracies, and what the
+    validators said of it without labels."""
     choices: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Where every checkpoint was scored: of each rule its checkpoint, accuracy and class-mean
     accuracy. ``oracle`` among them chose by the labels of the test set: an upper bound."""

@@ -222,8 +222,8 @@ def make_record(run: Run, setup: Setup, device: str = "") -> RunRecord:
         return str(part.locate(setup.out, setup.shared))
 
     def load(reader: Callable[..., Any], part: Part) -> Any:
-        points = run.train.num_points
-        return load_whole(reader, place(part), points, split=part.split, cloud=part.cloud)
+        how = run.train.num_points, run.train.preparation
+        return load_whole(reader, place(part), *how, split=part.split, cloud=part.cloud)
 
     source, target, test = run.parts(setup.own)
     labelled = load(load_clouds, source)

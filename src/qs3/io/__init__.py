@@ -6,6 +6,9 @@ from qs3.io.clouds import UnlabelledClouds as UnlabelledClouds
 from qs3.io.load import load_clouds as load_clouds
 from qs3.io.load import load_unlabelled as load_unlabelled
 from qs3.io.point_files import read_cloud as read_cloud
+from qs3.io.preparation import PAPER as PAPER
+from qs3.io.preparation import ROBUST as ROBUST
+from qs3.io.preparation import Preparation as Preparation
 from qs3.meshes.classes import POINTDA10 as POINTDA10
 from qs3.meshes.classes import canonical as canonical
 from qs3.meshes.classes import map_labels as map_labels

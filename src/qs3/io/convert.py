@@ -1,8 +1,6 @@
 """One data set into another layout."""
 
 import dataclasses
-import os
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -11,7 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from qs3.errors import InputError
-from qs3.files import holds_something, name_fault, sync_entry, temporary_folder
+from qs3.files import new_folder
 from qs3.io.clouds import CloudKind
 from qs3.io.layouts import FORMATS
 from qs3.io.layouts.store import write_store
@@ -60,32 +58,18 @@ def convert(
         written = [other.name for other in FORMATS.values() if other.write is not None]
         kin = [name for name in written if name.startswith(to)] or written
         raise InputError(f"{to}: is only read; written are {', '.join(kin)}")
-    target = Path(target).resolve()
-    if not target.name or (target.exists() and (not target.is_dir() or holds_something(target))):
-        raise InputError(f"{target}: is there already; name a new or empty folder")
-    clouds, name = read_clouds(source, split, cloud, origin)
-    if classes is not None:
-        clouds = _map_classes(clouds, classes, unmapped, str(source))
-    clouds = _plain(clouds, num_points, str(source))
-    with temporary_folder(target, alone=True) as folder:
-        whole = folder / target.name  # some layouts go by it
+    with new_folder(target) as whole:
+        clouds, name = read_clouds(source, split, cloud, origin)
+        if classes is not None:
+            clouds = _map_classes(clouds, classes, unmapped, str(source))
+        clouds = _plain(clouds, num_points, str(source))
         try:
             if layout.write is write_store:
                 write_store(whole, clouds, name)
             else:
                 layout.write(whole, clouds)
-            for inner, _, files in os.walk(whole):
-                for entry in (*files, ""):
-                    sync_entry(Path(inner) / entry)
-            if target.is_dir():
-                shutil.rmtree(target)
-            whole.rename(target)
         except InputError as error:
             raise InputError(f"{to}: {error}") from error
-        except OSError as error:
-            name_fault(error, target)
-            raise
-    sync_entry(target.parent)
     return clouds
 
 

@@ -25,6 +25,7 @@ def load_clouds(
     num_points: int | None = 1024,
     cloud: CloudChoice = "points",
     class_names: Sequence[str] | None = None,
+    most: int | None = None,
     class_map: ClassMap | None = None,
 ) -> PointClouds:
     """Read labelled clouds from whatever ``source`` is.
@@ -38,6 +39,7 @@ def load_clouds(
         class_names: Classes that the labels shall index, found by name or alias; ``origin`` of
             the result tells which go by another name. None takes the source's own.
         class_map: What classes shall be called; None keeps their names.
+        most: As in `qs3.io.preparation.stack`, where ``num_points`` is None.
 
     Raises:
         InputError: where the source is none of these, is damaged, has no labels, or has a class
@@ -45,7 +47,7 @@ def load_clouds(
     """
     clouds = read_clouds(source, split, cloud)[0]
     origin = Origin(open_folder(source).name, split, cloud)
-    return clouds.labelled(num_points, class_names, str(source), class_map, origin)
+    return clouds.labelled(num_points, class_names, str(source), most, class_map, origin)
 
 
 def load_unlabelled(
@@ -54,6 +56,7 @@ def load_unlabelled(
     split: str | None = None,
     num_points: int | None = 1024,
     cloud: CloudChoice = "points",
+    most: int | None = None,
 ) -> UnlabelledClouds:
     """Read clouds and leave any labels behind; a flat folder of point files will do too.
 
@@ -62,7 +65,7 @@ def load_unlabelled(
     Raises:
         InputError: where the source is no data set or is damaged.
     """
-    clouds = read_clouds(source, split, cloud)[0].unlabelled(num_points, str(source))
+    clouds = read_clouds(source, split, cloud)[0].unlabelled(num_points, str(source), most)
     return replace(clouds, origin=Origin(open_folder(source).name, split, cloud))
 
 

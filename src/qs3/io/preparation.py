@@ -40,6 +40,11 @@ class Preparation:
         if not 0.5 <= self.radius_share <= 1:
             raise InputError(f"setting radius_share = {self.radius_share} must be in 0.5 to 1")
 
+    @property
+    def counts_points(self) -> bool:
+        """Whether it matters which points of a cloud are strays or repeat others."""
+        return self.remove_outliers or self.redraw
+
 
 PAPER = Preparation()
 """That of the paper and of all runs before there was another."""
@@ -82,13 +87,13 @@ def _normalised(
     points: Float[np.ndarray, "b n 3"], preparation: Preparation
 ) -> Float[np.ndarray, "b n 3"]:
     share = preparation.radius_share
-    if share == 1 or not points.size:
+    if share == 1:
         centre = points.mean(axis=1, keepdims=True, dtype=np.float64)
     else:
         centre = np.median(points.astype(np.float64), axis=1, keepdims=True)
     centred = points - centre
     distance = np.linalg.norm(centred, axis=2)
-    if share == 1 or not points.size:
+    if share == 1:
         radius = distance.max(axis=1, initial=0.0)[:, None, None]
     else:
         rank = radius_rank(share, points.shape[1])
@@ -111,19 +116,36 @@ def radius_rank(share: float, count: int) -> int:
     return max(0, math.ceil(share * count) - 1)
 
 
+LARGEST = 4096
+"""Of larger clouds so many points count, or as many as the network takes, where that is more."""
+
+
+def thin(count: int, most: int) -> Int[np.ndarray, "k"]:
+    """Indices of at most so many of a cloud's points, in order; drawn, but always alike.
+
+    Example:
+        >>> thin(3, 8).tolist(), len(thin(300, 8))
+        ([0, 1, 2], 8)
+    """
+    if count <= most:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(0).permutation(count)[:most])
+
+
 def distinct_inliers(
-    cloud: Float[np.ndarray, "n 3"], preparation: Preparation
+    cloud: Float[np.ndarray, "n 3"], remove_outliers: bool, most: int = LARGEST
 ) -> Int[np.ndarray, "k"]:
     """Indices of the points that count: each place once, and no strays where they are to go.
 
     Example:
-        >>> distinct_inliers(np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 0]]), PAPER).tolist()
+        >>> distinct_inliers(np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 0]]), False).tolist()
         [0, 1]
     """
     from qs3.sensor.outliers import inliers
 
-    kept = np.sort(np.unique(cloud, axis=0, return_index=True)[1])
-    return kept[inliers(cloud[kept])] if preparation.remove_outliers else kept
+    kept = thin(len(cloud), most)
+    kept = kept[np.sort(np.unique(cloud[kept], axis=0, return_index=True)[1])]
+    return kept[inliers(cloud[kept])] if remove_outliers else kept
 
 
 def resample(
@@ -162,25 +184,40 @@ def resample(
 
 
 def stack(
-    clouds: Sequence[Float[np.ndarray, "_ 3"]], num_points: int | None, where: str
+    clouds: Sequence[Float[np.ndarray, "_ 3"]],
+    num_points: int | None,
+    where: str,
+    most: int | None = None,
 ) -> Float[np.ndarray, "b n 3"]:
     """Put clouds into one array; `resample` brings them to one size.
 
     Args:
         clouds: Clouds of any sizes.
-        num_points: Common size; None accepts only clouds that have one already.
+        num_points: Common size; None keeps what is there.
         where: What was read, for the message.
+        most: Without a common size, clouds of several sizes are brought to that of the largest, or
+            to so many points: points of smaller ones are repeated in order, larger ones are thinned
+            (`thin`). None refuses them.
 
     Raises:
-        InputError: where there is no cloud, or sizes differ and no size is asked for.
+        InputError: where there is no cloud or an empty one, or sizes differ and no size is asked
+            for.
     """
     if not clouds:
         raise InputError(f"{where}: no cloud found")
     sizes = {len(cloud) for cloud in clouds}
-    if num_points is None and len(sizes) > 1:
-        raise UnevenSizesError(
-            f"{where}: clouds have {min(sizes)} to {max(sizes)} points; name one number for all"
-        )
     if num_points is not None and sizes != {num_points}:
         clouds = [resample(cloud, num_points) for cloud in clouds]
+    elif num_points is None and len(sizes) > 1:
+        if most is None:
+            raise UnevenSizesError(
+                f"{where}: clouds have {min(sizes)} to {max(sizes)} points; name one number for all"
+            )
+        if 0 in sizes:
+            raise InputError(f"{where}: holds an empty cloud")
+        points = np.empty((len(clouds), min(most, max(sizes)), 3), dtype=np.float32)
+        for row, cloud in enumerate(clouds):
+            kept = thin(len(cloud), most)
+            points[row] = cloud[kept[np.arange(points.shape[1]) % len(kept)]]
+        return points
     return np.stack(clouds).astype(np.float32, copy=False)

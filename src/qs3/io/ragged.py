@@ -35,6 +35,7 @@ class RaggedClouds:
         num_points: int | None,
         class_names: Sequence[str] | None,
         where: str,
+        most: int | None = None,
         class_map: ClassMap | None = None,
         origin: Origin = Origin("arrays"),  # noqa: B008
     ) -> PointClouds:
@@ -45,6 +46,7 @@ class RaggedClouds:
             class_names: Classes of the result, found by name or alias; None takes the files' own,
                 see `label_order`.
             where: What was read, for messages.
+            most: As in `qs3.io.preparation.stack`.
             class_map: What the files' classes shall be called before that; None keeps their names.
             origin: Where the clouds are from; what is called otherwise is added.
 
@@ -72,11 +74,13 @@ class RaggedClouds:
         called = dict(zip(self.labels.tolist(), labels.tolist(), strict=True))
         renamed = {self.class_names[row]: names[called[row]] for row in present}
         renamed = {name: other for name, other in renamed.items() if name != other}
-        points = stack(self.clouds, num_points, where)
+        points = stack(self.clouds, num_points, where, most)
         origin = replace(origin, renamed={**origin.renamed, **renamed})
         return PointClouds(points, labels, names, self.ids, self.checksum, origin)
 
-    def unlabelled(self, num_points: int | None, where: str) -> UnlabelledClouds:
+    def unlabelled(
+        self, num_points: int | None, where: str, most: int | None = None
+    ) -> UnlabelledClouds:
         """Return clouds of one size without labels, and with numbers for names.
 
         Names of files and objects often tell the class; not even they go along. Nor does the order
@@ -86,7 +90,7 @@ class RaggedClouds:
         Raises:
             InputError: where there is no cloud, or sizes differ and no size is asked for.
         """
-        points = stack(self.clouds, num_points, where)
+        points = stack(self.clouds, num_points, where, most)
         order = np.argsort(digests(points), kind="stable")
         return UnlabelledClouds(points[order], numbered(len(points)), self.checksum)
 
@@ -99,4 +103,4 @@ def relabel(
         list(clouds.points), clouds.ids, clouds.checksum, clouds.labels, clouds.class_names
     )
     origin = clouds.origin or Origin("arrays")
-    return given.labelled(None, class_names, where, class_map, origin)
+    return given.labelled(None, class_names, where, None, class_map, origin)

@@ -1,8 +1,10 @@
 """What keeps a small file from filling the memory: announced sizes, and a limit while reading."""
 
 import contextlib
+import functools
 import struct
 import threading
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ _BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _MOST_BYTES, _MOST_BYTES_SHARE = 1 << 26, 16
 _MOST_PLACED = 1 << 22
+_MOST_PARTS = 1 << 14
 _READING, _READING_SHARE = 2 << 30, 32
 
 _limited = threading.Lock()
@@ -58,6 +61,53 @@ def check_gltf(path: Path) -> None:
             f"{path}: {len(nodes)} instances of its meshes come to {placed} vertices and corners; "
             "split or simplify it"
         )
+
+
+def check_3mf(path: Path) -> None:
+    """Refuse a 3MF that unpacks to far more than it holds, or places its parts too often.
+
+    Its components may hold one another: a hundred of them can be 10¹⁰ parts.
+
+    Raises:
+        InputError: where it does, or it is damaged.
+    """
+    from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
+    from trimesh.exchange.common import XML_PARSER_OPTIONS
+
+    inside: dict[str, list[str]] = {}
+    placed: list[str] = []
+
+    @functools.cache
+    def count(name: str) -> int:
+        return 1 + sum(count(part) for part in inside.get(name, ()))
+
+    try:
+        with zipfile.ZipFile(path) as archive:
+            announced = sum(member.file_size for member in archive.infolist())
+            size = path.stat().st_size
+            if announced > _MOST_BYTES + _MOST_BYTES_SHARE * size:
+                raise InputError(f"{path}: would unpack to {announced} bytes, and holds {size}")
+            names = [name for name in archive.namelist() if "3d/3dmodel.model" in name.lower()]
+            with archive.open(names[0]) as model:
+                tags = [f"{{*}}{tag}" for tag in ("vertices", "triangles", "object", "item")]
+                for _, element in etree.iterparse(model, tag=tags, **XML_PARSER_OPTIONS):
+                    kind = etree.QName(element).localname
+                    if kind == "item":
+                        placed.append(element.attrib["objectid"])
+                    elif kind == "object":
+                        parts = element.iter("{*}component")
+                        inside[element.attrib["id"]] = [part.attrib["objectid"] for part in parts]
+                    else:
+                        element.clear()
+        parts = sum(map(count, placed))
+    except RecursionError:
+        raise InputError(f"{path}: its components hold one another in a circle") from None
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
+        raise InputError(f"{path}: not a 3MF file ({error})") from error
+    except (LookupError, etree.XMLSyntaxError) as error:
+        raise InputError(f"{path}: damaged ({type(error).__name__}: {error})") from error
+    if parts > _MOST_PARTS:
+        raise InputError(f"{path}: places {parts} parts; split or simplify it")
 
 
 def _accessors(mesh: dict[str, Any]) -> list[int]:

@@ -1,5 +1,6 @@
 """Meshes read from files, checked before anything is done with them."""
 
+import io
 import logging
 import re
 import warnings
@@ -14,10 +15,11 @@ from trimesh.resolvers import Resolver
 
 from qs3.errors import InputError
 from qs3.geometry import y_up_to_z_up
-from qs3.meshes.announced import check_gltf, memory_limit
+from qs3.meshes.announced import check_3mf, check_gltf, memory_limit
+from qs3.meshes.cad import NEEDS, UNITS, check_extra, to_glb
 
-EXTENSIONS: tuple[str, ...] = (".off", ".obj", ".ply", ".stl", ".glb", ".gltf")
-"""Endings of the files that ``load_mesh`` reads."""
+EXTENSIONS: tuple[str, ...] = (".off", ".obj", ".ply", ".stl", ".glb", ".gltf", *NEEDS)
+"""Endings of the files that ``load_mesh`` reads, some with the extra ``cad`` alone."""
 
 _Y_UP = (".glb", ".gltf")
 
@@ -52,12 +54,13 @@ class _OwnFolder(Resolver):
 
 
 def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> trimesh.Trimesh:
-    """Read one mesh: OFF (ModelNet's too), OBJ, PLY, STL, GLB or glTF.
+    """Read one mesh: OFF (ModelNet's too), OBJ, PLY, STL, GLB, glTF; 3MF, STEP, IGES (extra cad).
 
     A scene's parts are placed by their transforms and merged; polygons are cut into triangles;
     faces without area, vertices without a face, colours, textures and materials are left out.
     Vertices that coincide stay apart, so the same file always gives the same arrays. Where the
-    format has a unit of length (glTF: metres), ``mesh.units`` tells it.
+    format has a unit of length (glTF: metres; 3MF, STEP and IGES say theirs), ``mesh.units`` tells
+    the one that the vertices are in.
 
     Convention:
         The mesh comes back with z up. glTF (.glb, .gltf) is y up by its standard and is turned
@@ -72,6 +75,7 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> trimesh.Trimes
         InputError: where the file is missing, is no mesh, is cut short or damaged, has no faces
             (a point file), has NaN or infinite vertices, has no extent, or takes far more memory
             than a mesh of its size does.
+        MissingExtraError: where its format needs the extra ``cad``, which is not installed.
     """
     path = Path(path)
     if up not in (None, "z", "y"):
@@ -85,6 +89,7 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> trimesh.Trimes
         raise InputError(f"{path}: not a mesh format; use one of {', '.join(EXTENSIONS)}")
     if path.stat().st_size == 0:
         raise InputError(f"{path}: the file is empty")
+    check_extra(ending)
     with memory_limit(path):
         read = (*_read_off(path), None) if ending == ".off" else _read_with_trimesh(path, ending)
         vertices, faces, units = read
@@ -175,15 +180,21 @@ def _read_with_trimesh(
     options: dict[str, Any] = {"process": False, "skip_materials": True}
     if ending in _Y_UP:
         check_gltf(path)
+    if ending == ".3mf":
+        check_3mf(path)
+    made = to_glb(path) if ending in UNITS else None
     if ending == ".obj":
         options |= {"maintain_order": True, "split_object": False, "group_material": False}
     try:
-        with path.open("rb") as handle, warnings.catch_warnings():
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             loaded = trimesh.load(
-                handle, file_type=ending[1:], resolver=_OwnFolder(path.parent), **options
+                io.BytesIO(path.read_bytes() if made is None else made),
+                file_type=ending[1:] if made is None else "glb",
+                resolver=_OwnFolder(path.parent),
+                **options,
             )
-            units = "meters" if ending in _Y_UP else loaded.units
+            units = "meters" if ending in _Y_UP else UNITS.get(ending) or loaded.units
             parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
         vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
         for part in parts:

@@ -90,9 +90,9 @@ def class_size(mesh: "trimesh.Trimesh", class_name: str, rng: np.random.Generato
 def file_size(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float, str]:
     """Return the longest side of a mesh in metres, and the unit that it is told or taken to be in.
 
-    Without ``unit`` it is what the mesh says (``mesh.units``: glTF's are metres, as the procedural
-    shapes are); where it says nothing, metres up to a longest side of 5, millimetres above, and
-    the log says so once.
+    It is what the mesh says (``mesh.units``: glTF's are metres, as the procedural shapes are), and
+    the log says so once where ``unit`` is another; else ``unit``; else metres up to a longest side
+    of 5, millimetres above, and the log says so once.
 
     Raises:
         InputError: where the mesh's unit is unknown, or it is smaller than 1 mm or larger than
@@ -103,20 +103,17 @@ def file_size(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float,
         >>> file_size(trimesh.creation.box((60.0, 20.0, 10.0)), "mm")
         (0.06, 'mm')
     """
-    from trimesh.units import unit_conversion
-
     side = float(mesh.extents.max())
-    name = unit or mesh.units
+    name = mesh.units or unit
+    if mesh.units and unit and not math.isclose(_metres(mesh.units), _metres(unit)):
+        _note_file(mesh.units, unit)
     if name is None:
         name = "m" if side <= _METRES_TO else "mm"
         _note(name)
         told = f"{name} (guessed)"
     else:
         told = name
-    try:
-        size = side * unit_conversion(name, "m")
-    except (KeyError, ValueError):
-        raise InputError(f"the mesh's unit {name!r} is unknown; name it: units m or mm") from None
+    size = side * _metres(name)
     if not _LEAST <= size <= _MOST:
         raise InputError(
             f"object_size file: the mesh is {side:g} {told} long, which is {size:g} m, and no "
@@ -124,6 +121,25 @@ def file_size(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float,
             "a size in metres (object_size)"
         )
     return size, told
+
+
+def _metres(unit: str) -> float:
+    """Metres of one of a unit."""
+    from trimesh.units import unit_conversion
+
+    try:
+        return unit_conversion(unit, "m")
+    except (KeyError, ValueError):
+        raise InputError(
+            f"the mesh's unit {unit!r} is unknown; write it in a format without units (STL, OBJ), "
+            "and name it: units m or mm"
+        ) from None
+
+
+@functools.cache
+def _note_file(told: str, unit: str) -> None:
+    """Say once that the file wins."""
+    _log.warning("a mesh's file says that it is in %s: taken, not units %s", told, unit)
 
 
 @functools.cache

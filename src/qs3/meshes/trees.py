@@ -1,6 +1,9 @@
 """Folders of meshes as others lay them out: ModelNet, ShapeNet, labels in a CSV, class folders."""
 
+import functools
+import logging
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +12,8 @@ from typing import Literal
 import trimesh
 
 from qs3 import shapes
-from qs3.errors import InputError
+from qs3.errors import InputError, MissingExtraError
+from qs3.meshes.cad import NEEDS, check_extra
 from qs3.meshes.classes import MODELNET40, SHAPENET
 from qs3.meshes.labels_csv import read_labels, read_shapenet_splits
 from qs3.meshes.loading import EXTENSIONS, load_mesh
@@ -19,6 +23,8 @@ SPLITS: tuple[str, ...] = ("train", "test", "val")
 """Names of folders that are splits, not classes."""
 
 Layout = Literal["modelnet", "shapenet", "folders", "labels"]
+
+_log = logging.getLogger(__name__)
 
 _SHAPENET_FILES = ("models/model_normalized.obj", "model.obj")
 
@@ -74,24 +80,33 @@ def read_tree(root: Path, labels: Path | None = None) -> list[MeshItem]:
     Convention:
         ShapeNet's meshes are y up. A file is taken for ShapeNet's by its name alone.
 
+    What lies there and is no mesh is counted in the log, by ending, but for ShapeNet's synsets, of
+    which one file a model is asked for.
+
     Raises:
-        InputError: where there is no mesh, a folder cannot be read, the CSV is at fault, or the
-            tree lies a level higher or lower than it should.
+        InputError: where there is no mesh, a folder cannot be read, the CSV is at fault, the
+            tree lies a level higher or lower than it should, or a file needs the extra ``cad``.
     """
     if not root.is_dir():
         what = "is a file; name the folder that holds it" if root.exists() else "no such folder"
         raise InputError(f"{root}: {what}")
+    others: Counter[str] = Counter()
     if labels is not None:
-        items = _labelled(root, labels)
+        items = _labelled(root, labels, others)
     else:
         synsets = _synsets(root)
         items = _shapenet(root, synsets) if synsets else []
-        items += _folders(root, walk(root, skip=synsets))
+        items += _folders(root, walk(root, synsets, others))
+    unread = ", ".join(f"{count} {ending}" for ending, count in sorted(others.items()))
     if not items:
         raise InputError(
             f"{root}: holds no mesh; expected <class>/*.ply, <class>/<train|test>/*.off, "
             f"<synset>/<id>/{_SHAPENET_FILES[0]} or a flat folder ({', '.join(EXTENSIONS)})"
+            + (f"; it has {unread}" if unread else "")
         )
+    if unread:
+        _note(root, unread)
+    _check_extras(root, items)
     items.sort(key=lambda item: item.id)
     _refuse_odd_names(root, items)
     return items
@@ -150,8 +165,8 @@ def _folders(root: Path, files: Sequence[MeshFile]) -> list[MeshItem]:
     ]
 
 
-def _labelled(root: Path, labels: Path) -> list[MeshItem]:
-    files = walk(root)
+def _labelled(root: Path, labels: Path, others: Counter[str]) -> list[MeshItem]:
+    files = walk(root, others=others)
     table = read_labels(labels, root, files) if files else {}
     places = _places([file.relative.split("/") for file in files])
     items = []
@@ -163,6 +178,8 @@ def _labelled(root: Path, labels: Path) -> list[MeshItem]:
             up = _up(file.relative)
             path = root / file.relative
             items.append(MeshItem(name, class_name, split, path, None, up, "labels"))
+    if len(items) < len(files):
+        others["meshes without a row in the labels"] = len(files) - len(items)
     return items
 
 
@@ -203,6 +220,22 @@ def _refuse_wrong_level(root: Path, paths: Sequence[list[str]]) -> None:
                 f"{root}: one synset of ShapeNet; name the folder that holds it, and the class "
                 f"{SHAPENET[root.name]}"
             )
+
+
+@functools.cache
+def _note(root: Path, unread: str) -> None:
+    """Say once what is not read."""
+    _log.warning("%s: not read: %s", root, unread)
+
+
+def _check_extras(root: Path, items: Sequence[MeshItem]) -> None:
+    """Refuse what cannot be read here: which meshes a data set has must not hang on an extra."""
+    counts = Counter(item.path.suffix.lower() for item in items if item.path)
+    for ending in NEEDS.keys() & counts.keys():
+        try:
+            check_extra(ending)
+        except MissingExtraError as error:
+            raise InputError(f"{root}: of {counts[ending]} files {ending}: {error}") from error
 
 
 def _refuse_odd_names(root: Path, items: Sequence[MeshItem]) -> None:

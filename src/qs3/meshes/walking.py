@@ -32,12 +32,15 @@ def entries(folder: str | Path) -> list[os.DirEntry[str]]:
         raise InputError(f"{folder}: cannot be listed ({error.strerror})") from error
 
 
-def walk(root: Path, skip: Container[str] = ()) -> list[MeshFile]:
+def walk(
+    root: Path, skip: Container[str] = (), others: Counter[str] | None = None
+) -> list[MeshFile]:
     """Find the meshes at any depth; symbolic links are followed, circles of them left.
 
     Args:
         root: An existing folder.
         skip: Folders right below the root that are left out.
+        others: Takes up how many other files there are of each ending.
 
     Raises:
         InputError: where a folder cannot be read, or a link that is named like a mesh leads
@@ -59,6 +62,8 @@ def walk(root: Path, skip: Container[str] = ()) -> list[MeshFile]:
                     left.append((f"{prefix}{entry.name}/", linked or is_link, (*above, real)))
             elif is_mesh(entry.name) and is_file(entry):
                 meshes.append(MeshFile(prefix + entry.name, linked or is_link))
+            elif others is not None:
+                others[os.path.splitext(entry.name)[1].lower() or entry.name] += 1  # noqa: PTH122
     return meshes
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from qs3.errors import QS3Error
 from qs3.evaluation.records import DataRecord
 from qs3.io import load_clouds
-from qs3.io.clouds import CloudKind, PointClouds
+from qs3.io.clouds import CloudChoice, PointClouds
 from qs3.store.manifest import MANIFEST
 from qs3.training.batches import load_whole
 from qs3.training.checkpoint import LoadedModel, load_model, weights_fingerprint
@@ -21,7 +21,7 @@ _LEVELS = 5
 
 
 def read_domain(
-    named: tuple[str | None, str | None, CloudKind | None],
+    named: tuple[str | None, str | None, CloudChoice | None],
     recorded: DataRecord | None,
     run: Path,
     model: LoadedModel,
@@ -44,13 +44,12 @@ def read_domain(
     given, split, cloud = named
     points, names = model.settings["train"]["num_points"], model.class_names
 
-    def load(data: str | Path, split: str | None, cloud: CloudKind) -> Prepared[PointClouds]:
+    def load(data: str | Path, split: str | None, cloud: CloudChoice) -> Prepared[PointClouds]:
         # As they were called in the run, which need not be by an alias.
         renamed = None if recorded is None else recorded.renamed or None
         part = {"split": split, "cloud": cloud, "class_names": names, "class_map": renamed}
-        return prepare_clouds(
-            load_whole(load_clouds, data, points, **part), points, model.preparation
-        )
+        clouds = load_whole(load_clouds, data, points, model.preparation, **part)
+        return prepare_clouds(clouds, points, model.preparation)
 
     if given is not None:
         if cloud is None:

@@ -96,7 +96,7 @@ RECIPES: dict[RecipeName, GenerateSettings] = {
         sensor=("d415", "d435", "d455", "kinect-v1"),
         least_views=1,
         crop="mask",
-        randomise=("rooms",),
+        randomise=["rooms"],
     )
 }
 """Whole settings by name. ``rooms``: a source that is to meet scans of real rooms.

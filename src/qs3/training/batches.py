@@ -13,7 +13,7 @@ from torch import Tensor
 from qs3.adaptation import Batch
 from qs3.errors import InputError, UnevenSizesError
 from qs3.io.clouds import PointClouds, UnlabelledClouds, numbered
-from qs3.io.preparation import PAPER, Preparation
+from qs3.io.preparation import LARGEST, PAPER, Preparation
 from qs3.models.sized import ball_radius
 from qs3.training.augmentation import augment_clouds, turned
 from qs3.training.config import Augmentation, TrainSettings
@@ -63,17 +63,27 @@ def name_few(names: Sequence[str]) -> str:
     return f"cloud{'s' if len(names) > 1 else ''} {', '.join(names[:4])}{more}"
 
 
-def load_whole(load: Callable[..., Any], data: str | Path, num_points: int, **part: Any) -> Any:
-    """Read clouds with all their points; `qs3.training.fit` subsamples them and keeps the choice.
+def load_whole(
+    load: Callable[..., Any],
+    data: str | Path,
+    num_points: int,
+    preparation: Preparation = PAPER,
+    **part: Any,
+) -> Any:
+    """Read clouds with all their points; `qs3.training.fit` chooses among them.
 
-    Clouds of several sizes fit no one array: those are subsampled as they are read.
+    Clouds of several sizes fit no one array: smaller ones get repeated points, which count once.
+    The paper's preparation knows nothing of that: there they are subsampled as they are read.
 
     Args:
         load: `qs3.io.load_clouds` or `qs3.io.load_unlabelled`.
         data: What to read.
         num_points: Points a cloud of the training.
-        part: ``split`` and ``cloud``.
+        preparation: What will be done to them.
+        part: ``split``, ``cloud`` and ``class_names``.
     """
+    if preparation.counts_points:
+        return load(data, num_points=None, most=max(LARGEST, num_points), **part)
     try:
         return load(data, num_points=None, **part)
     except UnevenSizesError:

@@ -20,6 +20,8 @@ Accelerator = Literal["auto", "cpu", "cuda"]
 """Where a training can compute."""
 PresetName = Literal["default", "spst", "paper", "released"]
 """Whole columns of settings: our defaults, SPST's, QS³'s text, QS³'s released code."""
+Teacher = Literal["latest", "best", "average"]
+"""Networks that can give the pseudo labels."""
 Prior = Literal["em", "bbse"]
 """Estimates of the target's class shares."""
 MOST_POINTS = 16_384
@@ -211,6 +213,12 @@ class SelfTrainingSettings:
     """θ₀, the confidence that a pseudo label must exceed in round 1."""
     step: float = 0.005
     """ε, added to θ after each round."""
+    threshold_share: float | None = None
+    """Share of the clouds to select from that is to be confident: θ of each round is then their
+    quantile, in place of ``threshold`` and ``step``."""
+    floor: int = 0
+    """Least number kept of each class, as far as clouds have its pseudo label: the most confident,
+    also from below θ. 0 leaves the rule's own counts."""
     rounds: int = 10
     """Number of rounds."""
     epochs: int = 10
@@ -226,9 +234,19 @@ class SelfTrainingSettings:
     read literally); or in every round the 80 % whose index modulo 10 is below 8."""
     init: Literal["warm-up", "scratch"] = "warm-up"
     """Weights that round 1 starts from; later rounds go on from there."""
-    teacher: Literal["latest", "best"] = "latest"
-    """Network that gives the pseudo labels: that of the last round, or the one that was best on
-    the fifth of the pseudo-labelled clouds that is then held out of the training."""
+    teacher: Teacher = "latest"
+    """Network that gives the pseudo labels: that of the last round; the one that was best on the
+    fifth of the pseudo-labelled clouds that is then held out of the training; or a moving average
+    of the network over the epochs of all rounds, which begins at the warm-up."""
+    teacher_decay: float = 0.9
+    """What the ``average`` keeps of itself after an epoch; the rest is the network's."""
+    turns: int = 1
+    """The teacher's answers are means over so many turns of a cloud about z, evenly spread."""
+    calibrate: bool = False
+    """Whether the teacher's confidence is calibrated before the threshold: by a temperature that is
+    fitted, in each round anew, on the held-out part of the source with its hard labels."""
+    label_smoothing: float | None = None
+    """Label smoothing in the rounds; None takes that of the training before them."""
     source_loss: bool = True
     """Whether each step takes as many labelled clouds of the source too."""
     source_weight: float = 1.0
@@ -262,27 +280,46 @@ class SelfTrainingSettings:
         _check(self, "quantile", 0 <= self.quantile <= 1, "must be in 0 to 1")
         _check(self, "portion", 0 < self.portion <= 1, "must be above 0, to 1")
         _check(self, "portion_step", self.portion_step >= 0, "must not be negative")
+        _check(self, "turns", self.turns >= 1, "must be at least 1")
+        _check(self, "floor", self.floor >= 0, "must not be negative")
+        share, smoothing = self.threshold_share, self.label_smoothing
+        _check(self, "threshold_share", share is None or 0 < share <= 1, "must be above 0, to 1")
+        good = smoothing is None or 0 <= smoothing < 1
+        _check(self, "label_smoothing", good, "must be in 0 to below 1")
+        _check(self, "teacher_decay", 0 <= self.teacher_decay < 1, "must be in 0 to below 1")
+        _check_word(self, "teacher", Teacher)
+        good = self.teacher != "average" or self.init == "warm-up"
+        _check(self, "teacher", good, "has no sense over weights that start anew; set init warm-up")
         _check_word(self, "rule", RoundRule)
         _check_word(self, "prior", Prior)
-        for names, rules in _READ_BY.items():
+        for (reader, words), names in _READ_BY.items():
+            reads = getattr(self, reader) in words
             for name in names:
-                if self.rule not in rules and getattr(self, name) != _default(type(self), name):
+                if not reads and getattr(self, name) != _default(type(self), name):
                     raise InputError(
-                        f"setting {name} = {getattr(self, name)} is not read by rule {self.rule}, "
-                        f"only by {', '.join(rules)}; leave it out"
+                        f"setting {name} = {getattr(self, name)} is not read by {reader} "
+                        f"{getattr(self, reader)}, only by {', '.join(map(str, words))}; leave it "
+                        "out"
                     )
         steps = self.steps_per_epoch
         _check(self, "steps_per_epoch", steps is None or steps > 0, "must be above 0")
 
 
-_READ_BY: Mapping[tuple[str, ...], tuple[str, ...]] = {
-    ("selection", "single_class"): ("qbst",),
-    ("prior",): ("prior",),
-    ("quantile",): ("uniform", "prior"),
-    ("portion", "portion_step"): ("quantile",),
-    ("threshold", "step", "inclusive"): ("qbst", "spst", "uniform", "prior"),
+_READ_BY: Mapping[tuple[str, tuple[Any, ...]], tuple[str, ...]] = {
+    ("rule", ("qbst",)): ("selection", "single_class"),
+    ("rule", ("prior",)): ("prior",),
+    ("rule", ("uniform", "prior")): ("quantile",),
+    ("rule", ("quantile",)): ("portion", "portion_step"),
+    ("rule", ("qbst", "spst", "uniform", "prior")): (
+        "threshold",
+        "step",
+        "inclusive",
+        "threshold_share",
+    ),
+    ("threshold_share", (None,)): ("threshold", "step"),
+    ("teacher", ("average",)): ("teacher_decay",),
 }
-"""Settings that only some rules of selection look at."""
+"""Settings that are looked at only where another one has some value."""
 
 
 def _default(kind: type, name: str) -> Any:

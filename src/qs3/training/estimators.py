@@ -38,7 +38,8 @@ class Adapter(ClassifierMixin, BaseEstimator):
         self_training: Settings of rounds after the method, as a mapping of names of
             `SelfTrainingSettings`; ``{}`` takes the defaults. None makes none, unless the method
             ends in rounds by itself.
-        train: Settings of `TrainSettings` that differ from the defaults: ``{"epochs": 50}``.
+        train: Settings of `TrainSettings` that differ from the defaults: ``{"epochs": 50}``. The
+            preparation is that of ``qs3 train``; ``{"preparation": {"redraw": False}}`` changes it.
         run_dir: Folder of the run, from which a `fit` that was stopped goes on; None uses a
             temporary one.
         random_state: Root of all random steps.

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from qs3.adaptation.validators import VALIDATORS
 from qs3.errors import InputError
 from qs3.evaluation.environment import git_commit, hardware, versions
 from qs3.evaluation.records import RECORDS, RunRecord, Scores, score, write_record
+from qs3.evaluation.regret import choose_each
 from qs3.io import load_clouds
 from qs3.io.clouds import CloudKind, PointClouds
 from qs3.io.ragged import relabel
@@ -21,11 +21,12 @@ from qs3.meshes.classes import require_named
 from qs3.structure import unstructure
 from qs3.training.batches import load_whole, require_finite
 from qs3.training.checkpoint import LoadedModel, load_model
-from qs3.training.overlap import caveats
+from qs3.training.overlap import both_checksums, caveats
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared, prepare_clouds
+from qs3.training.rounds import kept_clouds
 from qs3.training.run import data_record, read_run
-from qs3.training.validation import ROUND, choose, load_checkpoint, read_checkpoints
+from qs3.training.validation import ROUND, load_checkpoint, read_checkpoints
 
 
 def evaluate(
@@ -63,7 +64,7 @@ def evaluate(
     called = {name: name for name in loaded.class_names}
     called |= {name: other for name, other in (class_map or {}).items() if name in called}
     names = tuple(dict.fromkeys(called.values()))
-    whole = _labelled(data, split, cloud, train["num_points"], names, class_map)
+    whole = _labelled(data, split, cloud, loaded, names, class_map)
     renamed = {name: other for name, other in called.items() if name != other}
     renamed |= {} if whole.origin is None else whole.origin.renamed
     if class_map is not None:
@@ -71,6 +72,7 @@ def evaluate(
     answer_of = np.array([names.index(other) for other in called.values()])
     require_finite(whole.points, whole.ids)
     test = prepare_clouds(whole, train["num_points"], loaded.preparation)
+    scored = _scored(Path(run), test, answer_of) if checkpoints else []
     record = RunRecord(
         method=made.method,
         model=train["model"],
@@ -85,8 +87,10 @@ def evaluate(
         versions=versions(),
         hardware=hardware(),
         commit=git_commit(),
-        rounds=made.rounds,
-        choices=_choices(Path(run), loaded, test, answer_of) if checkpoints else {},
+        rounds=_count_right(Path(run), made.rounds, test, answer_of),
+        chosen=made.chosen,
+        checkpoints=tuple(scored),
+        choices=_choices(scored) if scored else {},
         marks=caveats(made, test),
         experiment=experiment,
     )
@@ -105,15 +109,16 @@ def _labelled(
     data: str | Path | PointClouds,
     split: str | None,
     cloud: CloudKind,
-    num_points: int,
+    loaded: LoadedModel,
     class_names: tuple[str, ...],
     class_map: Mapping[str, str] | None,
 ) -> PointClouds:
     """Clouds with labels that index the classes of the scores."""
     if not isinstance(data, PointClouds):
         part = {"split": split, "cloud": cloud}
-        named = {"class_names": class_names, "class_map": class_map}
-        return load_whole(load_clouds, data, num_points, **part, **named)
+        part |= {"class_names": class_names, "class_map": class_map}
+        points = loaded.settings["train"]["num_points"]
+        return load_whole(load_clouds, data, points, loaded.preparation, **part)
     return relabel(data, class_names, class_map, "data")
 
 
@@ -125,30 +130,61 @@ def _scores(
     return score(test.labels, answers, test.class_names)
 
 
-def _choices(
+def _count_right(
     run: Path,
-    loaded: LoadedModel,
+    rounds: Sequence[Mapping[str, Any]],
     test: Prepared[PointClouds],
     answer_of: Int[np.ndarray, "k"],
-) -> dict[str, dict[str, Any]]:
-    """Score the checkpoints of the run's last stage, and let every rule choose among them."""
+) -> tuple[Mapping[str, Any], ...]:
+    """Add to what rounds did how many of the pseudo labels that they kept were right.
+
+    Args:
+        run: Folder of the run.
+        rounds: What its rounds did.
+        test: Labelled clouds. Those of the target among them are known by the points that the
+            network gets.
+        answer_of: As in `_scores`.
+    """
+    found = kept_clouds(run)
+    if found is None or len(found[1]) != len(rounds):
+        return tuple(rounds)
+    clouds, kept = found
+    truth: dict[str, int] = {}
+    for texts in both_checksums(test):
+        truth |= zip(texts, test.labels.tolist(), strict=True)
+    labels = np.array([truth.get(cloud, -1) for cloud in clouds])
+    if (labels < 0).all():
+        return tuple(rounds)
+    told = []
+    for record, (rows, pseudo) in zip(rounds, kept, strict=True):
+        known, size = labels[rows] >= 0, len(record["kept"])
+        counted = {"known": pseudo[known], "right": pseudo[labels[rows] == answer_of[pseudo]]}
+        counts = {name: np.bincount(of, minlength=size).tolist() for name, of in counted.items()}
+        told.append({**record, **counts})
+    return tuple(told)
+
+
+def _scored(
+    run: Path, test: Prepared[PointClouds], answer_of: Int[np.ndarray, "k"]
+) -> list[dict[str, Any]]:
+    """Score the checkpoints of the run's last stage."""
     checkpoints = read_checkpoints(run, ROUND) or read_checkpoints(run)
     if not checkpoints:
         raise InputError(f"{run}: has no checkpoints; train with --validate-every above 0")
-    scored: dict[str, dict[str, Any]] = {}
+    loaded, scored = load_model(run), []
     for checkpoint in checkpoints:
         load_checkpoint(run, checkpoint, loaded.model)
         scores = _scores(loaded, test, answer_of)
-        scored[checkpoint.file] = {
-            "stage": checkpoint.stage,
-            "number": checkpoint.number,
-            "accuracy": scores.accuracy,
-            "class_mean_accuracy": scores.class_mean_accuracy,
-        }
-    said = {
-        name for made in checkpoints for name, value in made.validators.items() if value is not None
+        one = {"accuracy": scores.accuracy, "class_mean_accuracy": scores.class_mean_accuracy}
+        one |= {"stage": checkpoint.stage, "number": checkpoint.number}
+        scored.append(one | {"validators": dict(checkpoint.validators)})
+    return scored
+
+
+def _choices(scored: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Let every rule choose among the checkpoints, as `qs3.training.validation.choose` does."""
+    choices = {name: scored[row] for name, row in choose_each(scored).items()}
+    return {
+        rule: {name: value for name, value in choice.items() if name != "validators"}
+        for rule, choice in choices.items()
     }
-    rules = ["last", *(name for name in VALIDATORS if name in said)]
-    choices = {rule: scored[choose(checkpoints, rule).file] for rule in rules}
-    choices["oracle"] = max(scored.values(), key=lambda choice: choice["accuracy"])
-    return choices

@@ -6,6 +6,8 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from qs3.adaptation import method_class
 from qs3.adaptation.names import split_method
 from qs3.errors import InputError
@@ -22,6 +24,7 @@ from qs3.training.loop import EpochCallback
 from qs3.training.overlap import seen_clouds
 from qs3.training.prepared import Prepared, prepare_clouds
 from qs3.training.progress import Deadline
+from qs3.training.rounds import RoundCallback, RoundRecord
 from qs3.training.run import (
     RUN,
     Run,
@@ -33,9 +36,14 @@ from qs3.training.run import (
     sum_seconds,
     write_run,
 )
-from qs3.training.self_training import RoundCallback, RoundRecord
 from qs3.training.threads import choose_threads, threads, trial_step
-from qs3.training.validation import Checkpoint, held_out_rows, read_checkpoints
+from qs3.training.validation import (
+    ROUND,
+    Checkpoint,
+    held_out_rows,
+    read_checkpoints,
+    tell_choice,
+)
 
 _LOG = logging.getLogger(__name__)
 
@@ -182,11 +190,13 @@ def fit(
             )
         adapted = needs or settings.normalisation != "shared"
         adapted = adapted or settings.rule not in ("last", "source-val")
+        stage = (base, len(epochs)) if rounds_settings is None else (ROUND, len(rounds))
         if rounds_settings is not None and method == base:
             method = f"{base}+{rounds_settings.rule}"
         run = Run(
             method=method,
             selection=settings.rule,
+            chosen=tell_choice(run_dir, *stage, settings.rule),
             source=data_record(source),
             target=None if target is None else data_record(target),
             source_clouds=source_clouds,
@@ -249,9 +259,10 @@ def _require_judges(
 ) -> None:
     """Refuse, before anything is trained, what would lack something in the end."""
     by_source = settings.rule in ("source-val", "dev")
-    bbse = rounds is not None and rounds.rule == "prior" and rounds.prior == "bbse"
-    if not has_holdout and (by_source or bbse):
-        what = f"rule {settings.rule!r}" if by_source else "prior 'bbse'"
+    bbse = rounds is not None and rounds.prior == "bbse"
+    if not has_holdout and (by_source or bbse or (rounds is not None and rounds.calibrate)):
+        what = "prior 'bbse'" if bbse else "calibrate"
+        what = f"rule {settings.rule!r}" if by_source else what
         raise InputError(
             f"{what} needs a held-out part of the source that no warm-up has seen; raise holdout "
             f"above {settings.holdout}, or give a warm-up of the same source, seed and holdout"

@@ -19,7 +19,8 @@ from qs3.training.history import EpochRecord, History
 from qs3.training.loop import EpochCallback, train
 from qs3.training.prepared import Prepared
 from qs3.training.progress import Deadline
-from qs3.training.self_training import RoundCallback, RoundRecord, run_rounds
+from qs3.training.rounds import RoundCallback, RoundRecord, Task
+from qs3.training.self_training import run_rounds
 from qs3.training.validation import ROUND, Validation, choose, load_checkpoint, read_checkpoints
 
 WARM_UP = "warm-up"
@@ -138,8 +139,7 @@ def run_job(
         _save(folder, model, job, fabric)
     if job.rounds is not None and job.target is not None:
         tell_checkpoints()
-        model, records = run_rounds(
-            model,
+        task = Task(
             job.source,
             job.target,
             job.settings,
@@ -148,11 +148,12 @@ def run_job(
             holdout=job.holdout,
             run_dir=job.run_dir,
             look=look,
-            on_epoch=on_epoch,
             on_round=on_round,
+            on_epoch=on_epoch,
             history=history,
             deadline=deadline,
         )
+        model, records = run_rounds(model, task)
         validation.adapt(model)
         _follow_rule(model, ROUND, job)
         _save(job.run_dir, model, job, fabric)

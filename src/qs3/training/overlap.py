@@ -48,8 +48,15 @@ def seen_clouds(prepared: Prepared) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
     Their shapes are those of what it gets and, where that is less, of the clouds as read.
     """
-    checksums = tuple(text for block in prepared.blocks() for text in digests(block))
-    return checksums, tuple(dict.fromkeys(_both_shapes(prepared)))
+    return tuple(both_checksums(prepared)[0]), tuple(dict.fromkeys(_both_shapes(prepared)))
+
+
+def both_checksums(prepared: Prepared) -> tuple[list[str], list[str]]:
+    """Return checksums of the chosen points of each cloud, as read and in the unit ball."""
+    pairs = [(digests(block), digests(unit_ball(block))) for block in prepared.blocks()]
+    return [text for plain, _ in pairs for text in plain], [
+        text for _, ball in pairs for text in ball
+    ]
 
 
 def _both_shapes(prepared: Prepared) -> list[str]:
@@ -66,12 +73,7 @@ def caveats(run: Run, prepared: Prepared) -> tuple[str, ...]:
         run: The run.
         prepared: The tested clouds.
     """
-    checksums = {
-        text
-        for block in prepared.blocks()
-        for points in (block, unit_ball(block))
-        for text in digests(points)
-    }
+    checksums = {text for texts in both_checksums(prepared) for text in texts}
     texts = _both_shapes(prepared)
 
     def has_seen(clouds: Collection[str], known: Sequence[str]) -> bool:

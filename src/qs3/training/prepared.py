@@ -8,6 +8,7 @@ import hashlib
 import os
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -20,7 +21,7 @@ from tqdm import tqdm
 
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.io.preparation import PAPER, Preparation, distinct_inliers, normalise
+from qs3.io.preparation import LARGEST, PAPER, Preparation, distinct_inliers, normalise
 from qs3.models.sized import ball_radius
 from qs3.sensor.sampling import farthest_point_sample, farthest_point_samples
 from qs3.training.checkpoint import read_tensors, write_tensors
@@ -165,14 +166,14 @@ def _order(
     b, n, _ = points.shape
     if b and not n:
         raise InputError("cannot prepare an empty cloud")
-    counting = preparation.remove_outliers or preparation.redraw
+    counting = preparation.counts_points
     kind = np.min_scalar_type(max(n - 1, 0))
     if not b or (n == num_points and not counting):
         return None
     if n < num_points and not counting:
         index = np.broadcast_to((np.arange(num_points) % n).astype(kind), (b, num_points))
         return Order(index, np.full(b, n))
-    width = max(n, num_points) if preparation.redraw else num_points
+    width = max(min(n, LARGEST), num_points) if preparation.redraw else num_points
     path, order = None, None
     if cache is not None:
         text = f"{points.shape} {points.dtype} {num_points}"
@@ -201,23 +202,29 @@ def _order(
 def _ranked(
     points: Float[np.ndarray, "b n 3"], num_points: int, preparation: Preparation, width: int
 ) -> Order:
-    """Which points count, cloud by cloud."""
+    """Which points count, cloud by cloud, in PyTorch's number of threads."""
     index = np.empty((len(points), width), np.min_scalar_type(points.shape[1] - 1))
     counts = np.empty(len(points), np.int64)
-    quiet = "TQDM_DISABLE" in os.environ
-    every = 0.5 if sys.stderr.isatty() else 30.0
-    for row in tqdm(
-        range(len(points)), "prepare", unit="cloud", disable=quiet, mininterval=every, delay=2
-    ):
+
+    def rank(row: int) -> None:
         cloud = points[row]
         if not np.isfinite(cloud).all():
             raise InputError(f"cloud {row} has a point that is not finite")
-        kept = distinct_inliers(cloud, preparation)
+        most = max(LARGEST, num_points)
+        kept = distinct_inliers(cloud, preparation.remove_outliers, most)
         if len(kept) > num_points:
             chosen = kept[farthest_point_sample(cloud[kept], num_points)]
             others = np.setdiff1d(kept, chosen) if preparation.redraw else kept[:0]
             kept = np.concatenate([chosen, others])
         index[row], counts[row] = kept[np.arange(width) % len(kept)], len(kept)
+
+    rows = range(len(points))
+    every = 0.5 if sys.stderr.isatty() else 30.0
+    how = {"unit": "cloud", "mininterval": every, "delay": 2, "total": len(rows)}
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        done = pool.map(rank, rows)
+        for _ in tqdm(done, "outliers", disable="TQDM_DISABLE" in os.environ, **how):
+            pass
     return Order(index, counts)
 
 

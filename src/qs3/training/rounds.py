@@ -1,7 +1,7 @@
 """What one round of self-training hands on to the next, and the file that keeps it."""
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -11,7 +11,9 @@ from jaxtyping import Int
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
+from qs3.adaptation.confidence import BOUNDS
 from qs3.errors import InputError
+from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.structure import structure
 from qs3.training.checkpoint import (
@@ -21,7 +23,15 @@ from qs3.training.checkpoint import (
     without_prefix,
     write_tensors,
 )
-from qs3.training.config import SelfTrainingSettings
+from qs3.training.config import SelfTrainingSettings, TrainSettings
+from qs3.training.history import History
+from qs3.training.loop import EpochCallback
+from qs3.training.overlap import both_checksums
+from qs3.training.prepared import Prepared
+from qs3.training.progress import Deadline
+from qs3.training.rules import Select
+
+STATE = "rounds.safetensors"
 
 
 @dataclass(frozen=True)
@@ -55,12 +65,53 @@ class RoundRecord:
     """Of each epoch, as in `EpochRecord`: on the pseudo labels and the source together."""
     learning_rates: tuple[float, ...] = ()
     """Adam's learning rate in each epoch."""
+    temperature: float | None = None
+    """What calibrated the teacher; None where that is not asked for."""
 
 
-class Best(nn.Module):
-    """The network that was best on held-out pseudo labels, over all rounds."""
+RoundCallback = Callable[[RoundRecord, PointClassifier], None]
+"""Called after each round, when its state is written."""
+Look = Callable[[int, PointClassifier], None]
+"""Called on every device after each round, before its state is written."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a run of rounds works on, beside the network, and who is told of it."""
+
+    source: Prepared[PointClouds]
+    """Labelled clouds."""
+    target: Prepared[UnlabelledClouds]
+    """Clouds without labels."""
+    settings: TrainSettings
+    """How a round trains."""
+    rounds: SelfTrainingSettings
+    """How it labels and selects."""
+    fabric: Fabric
+    """Devices and number format; all devices do the rounds."""
+    holdout: Prepared[PointClouds] | None = None
+    """Part of the source that is not trained on."""
+    select: Select | None = None
+    """Selection rule, in place of the one of the settings."""
+    run_dir: Path | None = None
+    """Folder that keeps the state after each epoch and round."""
+    look: Look | None = None
+    """Looks at the network after each round."""
+    on_round: RoundCallback | None = None
+    """Called after each round."""
+    on_epoch: EpochCallback | None = None
+    """Called after each epoch."""
+    history: History | None = None
+    """Is told of epochs and rounds."""
+    deadline: Deadline | None = None
+    """Ends the rounds before an epoch that would end too late."""
+
+
+class Teacher(nn.Module):
+    """A network that is kept beside the one in training."""
 
     score: Tensor
+    """Of the ``best``: its accuracy on held-out pseudo labels."""
 
     def __init__(self, model: PointClassifier) -> None:
         super().__init__()
@@ -74,60 +125,125 @@ class Rounds:
 
     latest: PointClassifier
     """Network of the last round, Φ."""
-    best: Best | None
-    """Network that labels where the teacher is the ``best`` one."""
+    teacher: Teacher
+    """Network that labels where that is not the latest: the best one, or the average."""
     pool: Int[np.ndarray, "p"]
     """Clouds of the target to select from."""
     labels: Int[np.ndarray, "m"] | None = None
     """Pseudo labels of the last round; None before the first."""
     optimiser: dict[str, Tensor] = field(default_factory=dict)
     """Adam's state, for a schedule that goes on over the rounds."""
+    kept: list[Int[np.ndarray, "2 c"]] = field(default_factory=list)
+    """Of each round the clouds that were selected, and their pseudo labels."""
     records: list[RoundRecord] = field(default_factory=list)
     """What the rounds so far did."""
 
 
-def begin_rounds(
-    model: PointClassifier,
-    count: int,
-    rounds: SelfTrainingSettings,
-    fabric: Fabric,
-    path: Path | None,
-) -> Rounds:
+def begin_rounds(model: PointClassifier, task: Task) -> Rounds:
     """Return the state before the first round, or after the last one that was written."""
     latest = copy.deepcopy(model)
-    fabric.to_device(latest)
-    best = Best(latest) if rounds.teacher == "best" else None
-    if best is not None:
-        fabric.to_device(best)
-    index = np.arange(count)
-    state = Rounds(latest, best, index[index % 10 < 8] if rounds.pool == "split" else index)
-    if path is not None and path.is_file():
-        _read(path, state)
-    fabric.barrier()  # the first device must not write before all have read
+    teacher = Teacher(latest)
+    for network in (latest, teacher):
+        task.fabric.to_device(network)
+    index = np.arange(len(task.target))
+    pool = index[index % 10 < 8] if task.rounds.pool == "split" else index
+    state = Rounds(latest, teacher, pool)
+    if task.run_dir is not None and (task.run_dir / STATE).is_file():
+        _read(task.run_dir / STATE, state)
+    task.fabric.barrier()  # the first device must not write before all have read
     return state
 
 
-def write_rounds(path: Path, state: Rounds) -> None:
-    """Write the state after a round."""
-    assert state.labels is not None  # noqa: S101
+def write_rounds(task: Task, state: Rounds) -> None:
+    """Write the state after a round into the run's folder."""
+    assert state.labels is not None and task.run_dir is not None  # noqa: S101
     tensors = prefixed("latest", state.latest.state_dict())
     tensors |= prefixed("optimiser", state.optimiser)
-    if state.best is not None:
-        tensors |= prefixed("best", state.best.state_dict())
+    if task.rounds.teacher != "latest":
+        tensors |= prefixed("teacher", state.teacher.state_dict())
     tensors["pool"] = torch.from_numpy(state.pool)
     tensors["labels"] = torch.from_numpy(state.labels)
-    write_tensors(path, tensors, {"records": [asdict(record) for record in state.records]})
+    tensors |= prefixed("kept", {str(i): torch.from_numpy(k) for i, k in enumerate(state.kept)})
+    records = [asdict(record) for record in state.records]
+    facts = {"records": records, "clouds": both_checksums(task.target)[0]}
+    write_tensors(task.run_dir / STATE, tensors, facts)
 
 
 def _read(path: Path, state: Rounds) -> None:
     tensors, facts = read_tensors(path)
     try:
         state.pool, state.labels = tensors["pool"].numpy(), tensors["labels"].numpy()
-        records = facts["records"]
+        state.records = [structure(record, RoundRecord, path) for record in facts["records"]]
+        state.kept = [tensors[f"kept/{i}"].numpy() for i in range(len(state.records))]
     except KeyError as error:
         raise InputError(f"{path}: not a state of this version; delete the run") from error
-    state.records = [structure(record, RoundRecord, path) for record in records]
     state.optimiser = without_prefix("optimiser", tensors)
     load_tensors_into(state.latest, without_prefix("latest", tensors), path)
-    if state.best is not None:
-        load_tensors_into(state.best, without_prefix("best", tensors), path)
+    if teacher := without_prefix("teacher", tensors):
+        load_tensors_into(state.teacher, teacher, path)
+
+
+def kept_clouds(run_dir: Path) -> tuple[list[str], list[Int[np.ndarray, "2 c"]]] | None:
+    """Return what the rounds of a run selected, for a look at it afterwards.
+
+    Returns:
+        Checksums of the target's clouds, as they went into the network, and of each round indices
+        into them and pseudo labels. None where there were no rounds, or an earlier release did
+        not note it.
+
+    Raises:
+        InputError: where the file is damaged.
+    """
+    path = Path(run_dir) / STATE
+    if not path.is_file():
+        return None
+    tensors, facts = read_tensors(path)
+    clouds, kept = facts.get("clouds"), without_prefix("kept", tensors)
+    if clouds is None:
+        return None
+    rounds = [kept[name].numpy() for name in sorted(kept, key=int)]
+    if any(len(r) != 2 or (r[0] < 0).any() or (r[0] >= len(clouds)).any() for r in rounds):
+        raise InputError(f"{path}: tells of clouds that the target has not; delete the file")
+    return clouds, rounds
+
+
+def remarks(
+    records: Sequence[RoundRecord], rounds: SelfTrainingSettings, class_names: Sequence[str]
+) -> list[str]:
+    """Say, a line each, what in the rounds was not as one would wish.
+
+    That is where none trained, with what to change; rounds whose confident clouds all had one
+    class; and a calibration that the held-out clouds do not bound.
+    """
+    lines = []
+    if any(record.temperature == BOUNDS[0] for record in records):
+        lines.append(
+            f"the temperature ended at its bound, {BOUNDS[0]}, as the network is right on (nearly) "
+            "all held-out clouds of the source: its confidence is raised and not calibrated; hold "
+            "out more (--holdout)"
+        )
+    for record in records:
+        if record.single_class and any(record.kept):
+            count, name = sum(record.confident), class_names[int(np.argmax(record.confident))]
+            lines.append(
+                f"round {record.round}: all {count} confident clouds were of one class, {name}; "
+                f"{sum(record.kept)} were kept"
+            )
+    if all_skipped(records):
+        most = max(sum(record.kept) for record in records)
+        setting = "lower --self-training.threshold, give --self-training.threshold-share,"
+        if rounds.rule == "quantile":
+            setting = "raise --self-training.portion"
+        elif rounds.threshold_share is not None:
+            setting = "raise --self-training.threshold-share"
+        lines.append(
+            f"all {len(records)} rounds were skipped, as they kept {most} of {records[0].pool} "
+            "clouds at most: the network is that of the warm-up; in another folder, "
+            f"{setting} or begin with a better warm-up"
+        )
+    return lines
+
+
+def all_skipped(records: Sequence[RoundRecord]) -> bool:
+    """Tell whether there were rounds and none of them trained."""
+    return bool(records) and all(record.skipped for record in records)

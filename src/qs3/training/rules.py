@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from qs3.adaptation.confidence import threshold_of_share
 from qs3.adaptation.priors import estimate_prior_bbse, estimate_prior_em
 from qs3.adaptation.selection import (
     select_confident,
@@ -13,6 +14,7 @@ from qs3.adaptation.selection import (
     select_quantile,
     select_quasi_balanced,
     select_uniform,
+    with_floor,
 )
 from qs3.errors import InputError
 from qs3.evaluation.metrics import confusion_matrix
@@ -20,6 +22,24 @@ from qs3.training.config import SelfTrainingSettings
 
 Select = Callable[[Float[np.ndarray, "m k"], float], Bool[np.ndarray, "m"]]
 """A rule that selects among clouds by their probabilities and θ."""
+
+
+def round_threshold(
+    rounds: SelfTrainingSettings, number: int, probabilities: Float[np.ndarray, "m k"]
+) -> float:
+    """Return θ of a round; 0 where each class has a threshold of its own.
+
+    Args:
+        rounds: Its numbers.
+        number: Count of the round, from 1.
+        probabilities: Of the clouds to select from, for a θ that is their quantile.
+    """
+    if rounds.rule == "quantile":
+        return 0.0
+    if rounds.threshold_share is not None:
+        share = rounds.threshold_share
+        return threshold_of_share(probabilities, share, inclusive=rounds.inclusive)
+    return rounds.threshold + (number - 1) * rounds.step
 
 
 def make_rule(
@@ -39,6 +59,21 @@ def make_rule(
     Raises:
         InputError: where BBSE has no held-out part.
     """
+    rule = _plain_rule(rounds, number, labels, held)
+    if not rounds.floor:
+        return rule
+    return lambda probabilities, theta: with_floor(
+        probabilities, rule(probabilities, theta), rounds.floor
+    )
+
+
+def _plain_rule(
+    rounds: SelfTrainingSettings,
+    number: int,
+    labels: Int[np.ndarray, "s"],
+    held: tuple[np.ndarray, np.ndarray] | None,
+) -> Select:
+    """Return the rule without its floor."""
     if rounds.rule == "spst":
         return partial(select_confident, inclusive=rounds.inclusive)
     if rounds.rule == "uniform":

@@ -50,6 +50,8 @@ class Run:
     """The same of the clouds of the target."""
     threads: int | None = None
     """CPU threads of each process, in the call that ended the run; None where it is not known."""
+    chosen: Mapping[str, str | int] | None = None
+    """Checkpoint that the rule chose: its ``stage`` and ``number``; None in earlier releases."""
     preset: str | None = None
     """Preset of the rounds; None without rounds, or where the caller named none."""
     supervised: bool = False

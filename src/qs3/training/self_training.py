@@ -1,22 +1,18 @@
 """Self-training in rounds: label the target, select, train, raise the threshold (Algorithm 1)."""
 
-import contextlib
-import copy
 import logging
 import time
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool
 from lightning_fabric import Fabric
-from torch import Tensor
 
 from qs3.adaptation import Method, PseudoLabelled
-from qs3.adaptation.graph_labels import refine_probabilities
 from qs3.adaptation.selection import select_confident
+from qs3.adaptation.self_distillation import follow
 from qs3.errors import InputError
 from qs3.evaluation.metrics import accuracy
 from qs3.io.clouds import PointClouds, UnlabelledClouds
@@ -30,29 +26,29 @@ from qs3.training.checkpoint import (
 )
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.distributed import make_fabric
-from qs3.training.history import EpochRecord, History
+from qs3.training.history import EpochRecord
 from qs3.training.loop import EpochCallback, train
 from qs3.training.overlap import seen_clouds
-from qs3.training.predict import Description, describe
+from qs3.training.predict import describe
 from qs3.training.prepared import Prepared, as_prepared, label_clouds
-from qs3.training.progress import Deadline
-from qs3.training.rounds import RoundRecord, Rounds, begin_rounds, write_rounds
-from qs3.training.rules import Select, make_rule
+from qs3.training.rounds import (
+    RoundCallback,
+    RoundRecord,
+    Rounds,
+    Task,
+    begin_rounds,
+    write_rounds,
+)
+from qs3.training.rules import Select, make_rule, round_threshold
 from qs3.training.run import Run, RunSettings, claim_run, data_record, sum_seconds, write_run
 from qs3.training.state import CHECKPOINT
+from qs3.training.teacher import ask_teacher
 from qs3.training.threads import choose_threads, threads
-from qs3.training.validation import adapt_statistics
+from qs3.training.validation import ROUND
 
 _LOG = logging.getLogger(__name__)
-STATE = "rounds.safetensors"
 STREAM = 1
 """Sets the random draws of the rounds apart from those of the warm-up."""
-
-
-RoundCallback = Callable[[RoundRecord, PointClassifier], None]
-"""Called after each round, when its state is written."""
-Look = Callable[[int, PointClassifier], None]
-"""Called on every device after each round, before its state is written."""
 
 
 def self_train(
@@ -81,7 +77,8 @@ def self_train(
         target: Clouds without labels, likewise.
         settings: Network, batch size, rate, augmentation, seed. Its epochs are not used.
         self_training: Settings of the rounds.
-        holdout: Part of the source that is not trained on, for an estimate of the class shares.
+        holdout: Part of the source that is not trained on, prepared: for the calibration, and for
+            an estimate of the class shares.
         select: Selection rule, in place of the one of the settings.
         fabric: Device and number format; made from the settings where it is not given.
         run_dir: Folder of a run, from which a call that was killed goes on after its last epoch,
@@ -93,194 +90,129 @@ def self_train(
         The network of the last round, and a record of each round.
 
     Raises:
-        InputError: where the target is empty, its points are not finite, or the folder holds
-            another run.
+        InputError: where the target is empty, its points are not finite, a setting needs a
+            held-out part and there is none, or the folder holds another run.
     """
     source, target = as_prepared(source, settings), as_prepared(target, settings)
     require_unlabelled(target.clouds)
     if holdout is not None:
         holdout = as_prepared(holdout, settings)
     fabric = fabric or make_fabric(settings)
-    with contextlib.ExitStack() as stack:
-        choose = partial(choose_threads, settings, step=None)
-        if run_dir is None:
-            count = choose(None)
-        else:
-            run_dir, method = Path(run_dir), self_training.rule
-            given = source.clouds, target.clouds, settings, self_training
-            given = *given, weights_fingerprint(model)
-            claimed = claim_run(run_dir, RunSettings.of(method, *given), choose)
-            count = stack.enter_context(claimed).threads or 1
-        stack.enter_context(threads(count))
-        adapted, records = run_rounds(
-            model,
-            source,
-            target,
-            settings,
-            self_training,
-            fabric,
-            holdout=holdout,
-            select=select,
-            run_dir=run_dir,
-            on_round=on_round,
-            on_epoch=on_epoch,
+    run_dir = None if run_dir is None else Path(run_dir)
+    task = Task(
+        source,
+        target,
+        settings,
+        self_training,
+        fabric,
+        holdout=holdout,
+        select=select,
+        run_dir=run_dir,
+        on_round=on_round,
+        on_epoch=on_epoch,
+    )
+    choose = partial(choose_threads, settings, step=None)
+    if run_dir is None:
+        with threads(choose(None)):
+            return run_rounds(model, task)
+    method, weights = self_training.rule, weights_fingerprint(model)
+    given = source.clouds, target.clouds
+    wanted = RunSettings.of(method, *given, settings, self_training, weights)
+    with claim_run(run_dir, wanted, choose) as claimed, threads(claimed.threads or 1):
+        adapted, records = run_rounds(model, task)
+        save_model(run_dir, adapted, source.class_names, settings)
+        source_clouds, source_shapes = seen_clouds(source)
+        target_clouds, target_shapes = seen_clouds(target)
+        run = Run(
+            method=method,
+            selection="last",
+            chosen={"stage": ROUND, "number": len(records)},
+            source=data_record(source.clouds),
+            target=data_record(target.clouds),
+            source_clouds=source_clouds,
+            source_shapes=source_shapes,
+            target_clouds=target_clouds,
+            target_shapes=target_shapes,
+            threads=claimed.threads,
+            unknown_warm_up=True,
+            rounds=tuple(asdict(record) for record in records),
+            seconds=sum_seconds([], records),
+            folder=run_dir,
         )
-        if run_dir is not None:
-            save_model(run_dir, adapted, source.class_names, settings)
-            source_clouds, source_shapes = seen_clouds(source)
-            target_clouds, target_shapes = seen_clouds(target)
-            run = Run(
-                method=self_training.rule,
-                selection="last",
-                source=data_record(source.clouds),
-                target=data_record(target.clouds),
-                source_clouds=source_clouds,
-                source_shapes=source_shapes,
-                target_clouds=target_clouds,
-                target_shapes=target_shapes,
-                threads=count,
-                unknown_warm_up=True,
-                rounds=tuple(asdict(record) for record in records),
-                seconds=sum_seconds([], records),
-                folder=run_dir,
-            )
-            write_run(run)
+        write_run(run)
     return adapted, records
 
 
-def run_rounds(
-    model: PointClassifier,
-    source: Prepared[PointClouds],
-    target: Prepared[UnlabelledClouds],
-    settings: TrainSettings,
-    rounds: SelfTrainingSettings,
-    fabric: Fabric,
-    *,
-    holdout: Prepared[PointClouds] | None = None,
-    select: Select | None = None,
-    run_dir: Path | None = None,
-    look: Look | None = None,
-    on_round: RoundCallback | None = None,
-    on_epoch: EpochCallback | None = None,
-    history: History | None = None,
-    deadline: Deadline | None = None,
-) -> tuple[PointClassifier, list[RoundRecord]]:
-    """Do the rounds of `self_train` on each device; go on after the last one that is finished.
-
-    Args beside those of `self_train`:
-        look: Called after each round on every device, before its state is written.
-        history: Is told of epochs and rounds.
-        deadline: Ends the rounds before an epoch that would end too late.
-    """
+def run_rounds(model: PointClassifier, task: Task) -> tuple[PointClassifier, list[RoundRecord]]:
+    """Do the rounds of `self_train` on each device; go on after the last one that is finished."""
+    source, target, rounds = task.source, task.target, task.rounds
     if not len(target):
         raise InputError("the target has no cloud; give unlabelled clouds")
     require_finite(target.clouds.points, target.clouds.ids, "target: ")
-    path = None if run_dir is None else Path(run_dir) / STATE
-    state = begin_rounds(model, len(target), rounds, fabric, path)
+    state = begin_rounds(model, task)
     classes = len(source.class_names)
-    say = partial(_say, settings=settings, rounds=rounds, target=target, fabric=fabric)
-    if history is not None:
-        history.put("round", state.records)
+    if task.history is not None:
+        task.history.put("round", state.records)
     for number in range(len(state.records) + 1, rounds.rounds + 1):
-        start = time.perf_counter()
-        # Line 19: θ rises by ε; by ``quantile`` each class has a threshold of its own.
-        theta = rounds.threshold + (number - 1) * rounds.step if rounds.rule != "quantile" else 0.0
-
+        start, pool = time.perf_counter(), state.pool
         # Line 3: label the target.
-        probabilities = _label(say(state, target), rounds)
-        labels = probabilities.argmax(axis=1)
+        said = ask_teacher(state, task)
+        labels = said.target.argmax(axis=1)
 
-        # Lines 4 to 17: select.
-        candidates = probabilities[state.pool]
-        confident = select_confident(candidates, theta, inclusive=rounds.inclusive)
-        if select is None:
-            held = None
-            if holdout is not None and len(holdout) and rounds.prior == "bbse":
-                held = holdout.labels, say(state, holdout).probabilities
-            rule = make_rule(rounds, number, source.labels, held)
-        else:
-            rule = select
-        chosen = state.pool[rule(candidates, theta)]
+        # Lines 4 to 17: select. θ rises from round to round (line 19).
+        candidates = said.target[pool]
+        theta = round_threshold(rounds, number, candidates)
+        rule = task.select or make_rule(rounds, number, source.labels, said.held)
+        chosen = pool[rule(candidates, theta)]
 
         # Line 18: train on what was selected.
+        pseudo = label_clouds(target, chosen, labels[chosen], source.class_names)
         apart = (np.arange(len(chosen)) % 10 >= 8) & (rounds.teacher == "best")
-        skipped = _too_few(number, len(chosen) - int(apart.sum()), classes, settings.devices)
-        pool, epochs = len(state.pool), []
+        count = len(chosen) - int(apart.sum())
+        skipped = _too_few(number, count, classes, task.settings.devices)
+        epochs = []
         if not skipped:
-            epochs = _train_round(
-                state,
-                number,
-                chosen,
-                labels[chosen],
-                apart,
-                source,
-                target,
-                settings,
-                rounds,
-                fabric,
-                partial(
-                    train,
-                    fabric=fabric,
-                    run_dir=run_dir,
-                    on_epoch=on_epoch,
-                    log=None if history is None else history.training(f"round-{number}"),
-                    deadline=deadline,
-                ),
-            )
-            state.pool = chosen if rounds.pool == "shrinking" else state.pool
+            epochs = _train_round(state, task, number, pseudo, apart)
+            state.pool = chosen if rounds.pool == "shrinking" else pool
 
+        confident = select_confident(candidates, theta, inclusive=rounds.inclusive)
         over = np.bincount(candidates[confident].argmax(axis=1), minlength=classes)
         record = RoundRecord(
             round=number,
             theta=theta,
-            pool=pool,
+            pool=len(pool),
             confident=tuple(over.tolist()),
             kept=tuple(np.bincount(labels[chosen], minlength=classes).tolist()),
             agreement=None if state.labels is None else float((labels == state.labels).mean()),
             skipped=skipped,
             single_class=int(np.count_nonzero(over)) == 1,
-            held_out=None if state.best is None else float(state.best.score),
+            held_out=float(state.teacher.score) if rounds.teacher == "best" else None,
             losses=tuple(epoch.losses for epoch in epochs),
             seconds=time.perf_counter() - start,
             accuracies=tuple(epoch.accuracy for epoch in epochs),
             learning_rates=tuple(epoch.learning_rate for epoch in epochs),
+            temperature=said.temperature,
         )
         state.labels = labels
+        state.kept.append(np.stack([chosen, labels[chosen]]))
         state.records.append(record)
-        if look is not None:
-            look(number, state.latest)
-        if path is not None and fabric.is_global_zero:
-            write_rounds(path, state)
-            (path.parent / CHECKPOINT).unlink(missing_ok=True)
-        fabric.barrier()
-        if history is not None:
-            history.put("round", state.records)
-        if on_round is not None:
-            on_round(record, state.latest)
+        _finish_round(state, task)
     return state.latest, state.records
 
 
-def _say(
-    state: Rounds,
-    clouds: Prepared,
-    settings: TrainSettings,
-    rounds: SelfTrainingSettings,
-    target: Prepared[UnlabelledClouds],
-    fabric: Fabric,
-) -> Description:
-    """What the teacher says of clouds."""
-    teacher = state.latest if state.best is None else state.best.model
-    if settings.normalisation == "adabn":
-        teacher = copy.deepcopy(teacher)  # training goes on from the statistics of both domains
-        adapt_statistics(teacher, target, settings.batch_size)
-    return describe(teacher, clouds, batch_size=settings.batch_size, fabric=fabric)
-
-
-def _label(said: Description, rounds: SelfTrainingSettings) -> Float[np.ndarray, "m k"]:
-    """Probabilities of the pseudo labels, smoothed over a graph of similar clouds where asked."""
-    if not rounds.refine:
-        return said.probabilities
-    return refine_probabilities(said.features, said.probabilities)
+def _finish_round(state: Rounds, task: Task) -> None:
+    """Write the state, and tell of the round."""
+    record = state.records[-1]
+    if task.look is not None:
+        task.look(record.round, state.latest)
+    if task.run_dir is not None and task.fabric.is_global_zero:
+        write_rounds(task, state)
+        (task.run_dir / CHECKPOINT).unlink(missing_ok=True)
+    task.fabric.barrier()
+    if task.history is not None:
+        task.history.put("round", state.records)
+    if task.on_round is not None:
+        task.on_round(record, state.latest)
 
 
 def _too_few(number: int, count: int, classes: int, devices: int) -> bool:
@@ -296,61 +228,69 @@ def _too_few(number: int, count: int, classes: int, devices: int) -> bool:
 
 def _train_round(
     state: Rounds,
+    task: Task,
     number: int,
-    chosen: Int[np.ndarray, "c"],
-    labels: Int[np.ndarray, "c"],
+    pseudo: Prepared[PointClouds],
     apart: Bool[np.ndarray, "c"],
-    source: Prepared[PointClouds],
-    target: Prepared[UnlabelledClouds],
-    settings: TrainSettings,
-    rounds: SelfTrainingSettings,
-    fabric: Fabric,
-    train: Callable[..., tuple[list[EpochRecord], dict[str, Tensor]]],
 ) -> list[EpochRecord]:
-    """Train the latest network on pseudo labels; the clouds ``apart`` judge the best teacher."""
-    pseudo = label_clouds(target, chosen, labels, source.class_names).select(~apart)
+    """Train the latest network on pseudo labels, and let the teacher follow.
+
+    Args:
+        state: Holds both.
+        task: What else there is.
+        number: Count of the round.
+        pseudo: Selected clouds with their pseudo labels.
+        apart: Those that are not trained on: they judge the ``best`` teacher.
+    """
+    settings, rounds, teacher = task.settings, task.rounds, state.teacher
     before = sum(not record.skipped for record in state.records)
     if before == 0 and rounds.init == "scratch":
         seed = derived_seed(settings.seed, STREAM, 0)
-        fresh = new_model(settings, len(source.class_names), seed)
+        fresh = new_model(settings, len(task.source.class_names), seed)
         state.latest.load_state_dict(fresh.state_dict())
     continuous = rounds.schedule == "continuous"
     first = before * rounds.epochs
     # TransNorm's weights are in the network's scales already; a second time they would double.
     plain = settings.normalisation in ("shared", "adabn")
+    smoothing = rounds.label_smoothing
     method = PseudoLabelled(
         state.latest,
         source_weight=rounds.source_weight,
         weight_step=rounds.weight_step,
         epochs=range(first, first + rounds.epochs),
-        label_smoothing=settings.label_smoothing,
+        label_smoothing=settings.label_smoothing if smoothing is None else smoothing,
         normalisation="shared" if plain else "separate",
     )
+    kept, judges = pseudo.select(~apart), pseudo.select(apart)
 
-    best = state.best
-
-    def judge(method: Method, epoch: int) -> None:
-        if best is None or not apart.any():
-            return
+    def teach(method: Method, epoch: int) -> None:
         with method.norm.of("target"):
-            judged = target.select(chosen[apart])
-            said = describe(method.model, judged, batch_size=settings.batch_size, fabric=fabric)
-            score = accuracy(labels[apart], said.probabilities.argmax(axis=1))
-            if score > best.score:
-                best.score.fill_(score)
-                best.model.load_state_dict(method.model.state_dict())
+            if rounds.teacher == "average":
+                follow(teacher.model, method.model, rounds.teacher_decay)
+            elif rounds.teacher == "best" and len(judges):
+                size, fabric = settings.batch_size, task.fabric
+                said = describe(method.model, judges, batch_size=size, fabric=fabric)
+                score = accuracy(judges.labels, said.probabilities.argmax(axis=1))
+                if score > teacher.score:
+                    teacher.score.fill_(score)
+                    teacher.model.load_state_dict(method.model.state_dict())
 
     epochs, optimiser = train(
         method,
-        [pseudo, source] if rounds.source_loss else pseudo,
+        [kept, task.source] if rounds.source_loss else kept,
         None,
         replace(settings, epochs=rounds.epochs, schedule="cosine"),
+        fabric=task.fabric,
+        run_dir=task.run_dir,
         stream=(STREAM, number),
         steps_per_epoch=rounds.steps_per_epoch,
         first_epoch=first if continuous else 0,
         optimiser_state=state.optimiser if continuous else None,
-        observer=judge,
-        beside=best,
+        observer=teach,
+        beside=None if rounds.teacher == "latest" else teacher,
+        on_epoch=task.on_epoch,
+        log=None if task.history is None else task.history.training(f"round-{number}"),
+        deadline=task.deadline,
         description=f"round {number}/{rounds.rounds}",
     )
     method.norm.settle()

@@ -102,7 +102,7 @@ def _open_run(
     except (KeyError, TypeError, ValueError):
         raise InputError(f"{run}: not a finished run of qs3 train (no num_points in it)") from None
     part = {"split": split, "cloud": cloud, "class_names": loaded.class_names}
-    clouds = load_whole(_read, data, points, **part)
+    clouds = load_whole(_read, data, points, loaded.preparation, **part)
     starts = tqdm(range(0, len(clouds), 32), "predict", unit="batch", disable=None)
     shares = [predict_probabilities(loaded, clouds.points[i : i + 32]) for i in starts]
     truth = clouds.labels if isinstance(clouds, PointClouds) else None

@@ -15,8 +15,7 @@ from scipy.spatial import KDTree
 from qs3.errors import InputError
 from qs3.io.extract.run import ExtractedCloud, OutputSettings
 from qs3.io.extract.scannet import ScanNetSettings, extract_scannet
-from qs3.io.extract.scannet_frames import cut_scene
-from qs3.io.extract.scannet_masks import erode, read_mask
+from qs3.io.extract.scannet_frames import cut_scene, erode, read_mask
 from qs3.io.extract.scannet_scene import (
     ScanNetScene,
     axis_alignment,

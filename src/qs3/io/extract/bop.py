@@ -91,7 +91,7 @@ def list_bop_frames(
     if not scenes:
         raise InputError(f"{source}: no scene of BOP's layout ({CAMERAS}) in it")
     images = [image for scene in scenes for image in _images(scene)]
-    axes: Axes = "world" if all(image.camera.cam_R_w2c for image in images) else "camera"
+    axes: Axes = "world" if all(camera.cam_R_w2c for _, _, camera, _ in images) else "camera"
     axes = axes if settings.frame == "auto" else settings.frame
     return [_frame(image, axes, settings, names) for image in images], axes
 
@@ -125,14 +125,7 @@ class _Object:
     cam_t_m2c: _Triple | None = None
 
 
-@dataclass(frozen=True)
-class _Image:
-    """An image of a scene, as its files have it."""
-
-    scene: Path
-    number: int
-    camera: _Camera
-    objects: tuple[_Object, ...]
+_Image = tuple[Path, int, _Camera, list[_Object]]  # its scene, its number there, what was seen
 
 
 def _images(scene: Path) -> Iterator[_Image]:
@@ -144,7 +137,7 @@ def _images(scene: Path) -> Iterator[_Image]:
         if not isinstance(listed, list):
             raise InputError(f"{where}: not a list of objects")
         objects = [pick(item, _Object, f"{where}, object {i}") for i, item in enumerate(listed)]
-        yield _Image(scene, number, camera, tuple(objects))
+        yield scene, number, camera, objects
 
 
 def _by_image(path: Path) -> dict[int, Any]:
@@ -162,7 +155,7 @@ def _by_image(path: Path) -> dict[int, Any]:
 def _frame(
     image: _Image, axes: Axes, settings: DepthImageSettings, names: Mapping[str, str]
 ) -> Frame:
-    scene, entry, number = image.scene, image.camera, image.number
+    scene, number, entry, listed = image
     identifier = f"{scene.resolve().name}/{number:06d}"
     where = f"{scene / CAMERAS}, image {number}"
     try:
@@ -174,7 +167,7 @@ def _frame(
         )
         world = _out_of_camera(entry.cam_R_w2c, entry.cam_t_w2c, "w2c", axes == "world")
         objects = []
-        for i, item in enumerate(image.objects):
+        for i, item in enumerate(listed):
             where = f"{scene / _TRUTH}, image {number}, object {i}"
             if not 0 <= item.obj_id < 1 << 31:
                 raise InputError(f"obj_id {item.obj_id} is no model")

@@ -82,19 +82,20 @@ class DepthImageSettings:
 def extract_depth(
     source: Path, output: OutputSettings, settings: DepthImageSettings
 ) -> ExtractReport:
-    """Cut objects from depth images, or from scenes in BOP's layout, into a data set.
-
-    Convention:
-        Metres; the camera is the origin, axes as `cut.upright` says. For BOP see `bop`.
+    """Cut objects from depth images of any camera, or from scenes in BOP's layout.
 
     Args:
-        source: A depth image, a folder of them, a scene in BOP's layout, or a folder of scenes.
+        source: A depth image (16-bit PNG, TIFF, npy), a folder of them, or a scene in BOP's layout
+            or a folder of such scenes, such as the frames/ of qs3 scan --frames.
         output: Where the clouds go.
         settings: What is cut.
 
     Raises:
         InputError: where there is nothing to cut from, camera or object is not told, a setting
             does not suit the source, or as `run_extract` does.
+
+    Convention:
+        Metres; the camera is the origin, axes as `cut.upright` says. For BOP see `bop`.
     """
     from qs3.io.extract import bop
 

@@ -77,13 +77,15 @@ class ScanNetSettings:
         return wanted_classes(self.classes) or ()
 
 
-def extract_scannet(root: Path, output: OutputSettings, settings: ScanNetSettings) -> ExtractReport:
-    """Cut the objects of all scenes that are there into a data set.
+def extract_scannet(
+    source: Path, output: OutputSettings, settings: ScanNetSettings
+) -> ExtractReport:
+    """Cut objects from ScanNet: fused from its raw depth frames, or from its meshes.
 
     Args:
-        root: A copy of the release, its folder scans, or one scene's folder.
+        source: A copy of the release, its folder scans, or one scene's folder.
         output: Where the clouds go.
-        settings: How they are cut.
+        settings: What is cut.
 
     Raises:
         InputError: where a scene asked for is not there, nothing is left, or as `run_extract`
@@ -94,7 +96,7 @@ def extract_scannet(root: Path, output: OutputSettings, settings: ScanNetSetting
     from qs3.io.extract.scannet_scene import list_scenes, read_splits
 
     splits = read_splits(settings.splits_train, settings.splits_test) or None
-    scenes = list_scenes(root, settings.scenes or None, splits)
+    scenes = list_scenes(source, settings.scenes or None, splits)
     cut = partial(cut_scene, settings=settings)
     if settings.from_mesh:
         cut = partial(cut_mesh_scene, settings=settings, num_points=output.num_points)

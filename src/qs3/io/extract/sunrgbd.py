@@ -110,11 +110,13 @@ class SunFrame:
     """What is wrong with its files; such a frame fails when it is extracted."""
 
 
-def extract_sunrgbd(root: Path, output: OutputSettings, settings: SunRgbdSettings) -> ExtractReport:
-    """Cut the objects of all frames that are there into a data set.
+def extract_sunrgbd(
+    source: Path, output: OutputSettings, settings: SunRgbdSettings
+) -> ExtractReport:
+    """Cut objects from SUN RGB-D by its oriented boxes.
 
     Args:
-        root: The folder ``SUNRGBD`` of the release or the one above it.
+        source: The folder SUNRGBD of the release or the one above it.
         output: Where the clouds go.
         settings: What is cut.
 
@@ -124,7 +126,9 @@ def extract_sunrgbd(root: Path, output: OutputSettings, settings: SunRgbdSetting
     from qs3.io.extract.sunrgbd_lists import list_sunrgbd, rename_to
 
     classes = wanted_classes(settings.classes)
-    frames = list_sunrgbd(root, settings.boxes, settings.splits, settings.depth, rename_to(classes))
+    frames = list_sunrgbd(
+        source, settings.boxes, settings.splits, settings.depth, rename_to(classes)
+    )
     objects = [item for frame in frames for item in frame.objects]
     return run_extract(
         frames,

@@ -5,10 +5,11 @@ numbers are read that lie in the file itself, and only after their announced siz
 against the file's own.
 """
 
+import contextlib
 import io
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from qs3.errors import InputError
 from qs3.io.guards import DENSEST, check_announced, reason
 
 _BLOCK = 2**24
+_MOST_TEXTS, _LONGEST_TEXT = 100_000, 1000
 # gzip, shuffle, Fletcher's checksum, szip, LZF: what HDF5 and h5py bring; no plugin is loaded.
 _FILTERS = (1, 2, 3, 4, 32000)
 
@@ -38,6 +40,32 @@ def read_file(
             another kind, shape or announced size, sends the reader to another file, or holds a
             label out of range or a point that is not finite.
     """
+    with open_hdf5(path) as file:
+        data, label = (plain_dataset(file, name, path) for name in ("data", "label"))
+        shape = data.shape
+        if data.dtype.kind != "f" or len(shape) != 3 or shape[2] not in columns:
+            several = " or ".join(map(str, columns))
+            raise InputError(
+                f"data must be floats of shape [b n {several}], not {data.dtype} of shape "
+                f"{list(shape)}"
+            )
+        if label.dtype.kind not in "iu" or label.shape not in ((shape[0],), (shape[0], 1)):
+            raise InputError(
+                f"label must be whole numbers of shape [{shape[0]}], not {label.dtype} of "
+                f"shape {list(label.shape)}"
+            )
+        if 0 in shape:
+            raise InputError("holds no point")
+        numbers = label[()].reshape(-1)
+        low, high = int(numbers.min()), int(numbers.max())
+        if low < 0 or high >= classes:
+            raise InputError(f"label {min(low, 0) or high} is none of 0 to {classes - 1}")
+        return _points(data), numbers.astype(np.int64)
+
+
+@contextlib.contextmanager
+def open_hdf5(path: Path) -> Iterator[Any]:
+    """Open a file; whatever goes wrong while it is read becomes one line that names it."""
     # Imported here: layouts of other kinds do without.
     import h5py
 
@@ -45,57 +73,69 @@ def read_file(
         raise InputError(f"{path}: no such file")
     try:
         with h5py.File(path, "r") as file:
-            data, label = (_dataset(file, name, path) for name in ("data", "label"))
-            shape = data.shape
-            if data.dtype.kind != "f" or len(shape) != 3 or shape[2] not in columns:
-                several = " or ".join(map(str, columns))
-                raise InputError(
-                    f"data must be floats of shape [b n {several}], not {data.dtype} of shape "
-                    f"{list(shape)}"
-                )
-            if label.dtype.kind not in "iu" or label.shape not in ((shape[0],), (shape[0], 1)):
-                raise InputError(
-                    f"label must be whole numbers of shape [{shape[0]}], not {label.dtype} of "
-                    f"shape {list(label.shape)}"
-                )
-            if 0 in shape:
-                raise InputError("holds no point")
-            numbers = label[()].reshape(-1)
-            low, high = int(numbers.min()), int(numbers.max())
-            if low < 0 or high >= classes:
-                raise InputError(f"label {min(low, 0) or high} is none of 0 to {classes - 1}")
-            return _points(data), numbers.astype(np.int64)
+            yield file
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:  # the library raises whatever it stumbles over
         raise InputError(f"{path}: cannot be read as HDF5 ({reason(error)})") from error
 
 
-def _dataset(file: Any, name: str, path: Path) -> Any:
-    """Return a dataset of plain numbers that lie in this file, no more than it can hold."""
-    import h5py
+def plain_dataset(file: Any, name: str, path: Path, frame: tuple[int, ...] | None = None) -> Any:
+    """Return a dataset of plain numbers that lie in this file, no more than it can hold.
 
-    link = file.get(name, getlink=True)
-    if link is None:
-        others = ", ".join(ascii(other) for other in itertools.islice(file, 5))
-        raise InputError(f"has no dataset {name!r}, only {others[:200] or 'none'}")
-    if not isinstance(link, h5py.HardLink):
-        raise InputError(f"{name} is a link, which may lead to another file; links are not read")
-    dataset = file[name]
-    if not isinstance(dataset, h5py.Dataset):
-        raise InputError(f"{name} is no dataset")
-    if dataset.is_virtual or dataset.external:
-        raise InputError(f"{name} lies in another file, which is not read")
+    With ``frame``, sizes after the first, it is to be read one frame at a time: only one is held
+    against what the file can hold.
+    """
+    dataset = _own(file, name, name)
     if dataset.shape is None or dataset.dtype.kind not in "fiu" or dataset.dtype.itemsize > 8:
         raise InputError(f"{name} holds {dataset.dtype}, no plain numbers")
+    if frame is not None and dataset.shape[1:] != frame:
+        raise InputError(f"{name} has shape {list(dataset.shape)}, not [n, {str(list(frame))[1:]}")
     plist = dataset.id.get_create_plist()
     if any(plist.get_filter(i)[0] not in _FILTERS for i in range(plist.get_nfilters())):
         raise InputError(f"{name} is compressed by a plugin; write it again with gzip or none")
     # A chunk may be larger than the dataset; only chunks can be compressed.
-    cells = max(math.prod(dataset.shape), math.prod(dataset.chunks or (0,)))
+    cells = max(math.prod(frame or dataset.shape), math.prod(dataset.chunks or (0,)))
     size, stored = cells * dataset.dtype.itemsize, dataset.id.get_storage_size()
     densest = DENSEST if dataset.chunks else 1
     check_announced(name, size, min(stored, path.stat().st_size), densest)
+    return dataset
+
+
+def matlab_texts(file: Any, name: str) -> list[str]:
+    """Return a MATLAB cell of text: a dataset of references to datasets of characters."""
+    import h5py
+
+    cell = _own(file, name, name)
+    if h5py.check_ref_dtype(cell.dtype) is not h5py.Reference or cell.size > _MOST_TEXTS:
+        raise InputError(f"{name} is no cell of text, or too long a one")
+    words = []
+    for reference in cell[()].ravel():
+        letters = _own(file, reference, name)
+        if letters.dtype.kind != "u" or letters.size > _LONGEST_TEXT:
+            raise InputError(f"{name} holds something that is no text, or too long a one")
+        words.append("".join(map(chr, letters[()].ravel())).strip("\0"))  # an empty one is zeros
+    return words
+
+
+def _own(file: Any, key: Any, name: str) -> Any:
+    """The dataset at a name or a reference, if it lies in this very file."""
+    import h5py
+
+    if isinstance(key, str):
+        link = file.get(key, getlink=True)
+        if link is None:
+            others = ", ".join(ascii(other) for other in itertools.islice(file, 5))
+            raise InputError(f"has no dataset {name!r}, only {others[:200] or 'none'}")
+        if not isinstance(link, h5py.HardLink):
+            raise InputError(
+                f"{name} is a link, which may lead to another file; links are not read"
+            )
+    dataset = file[key]
+    if not isinstance(dataset, h5py.Dataset):
+        raise InputError(f"{name} is no dataset")
+    if dataset.is_virtual or dataset.external:
+        raise InputError(f"{name} lies in another file, which is not read")
     return dataset
 
 

@@ -74,7 +74,7 @@ def _cloud_folders(clouds: RaggedClouds) -> list[str]:
         return list(splits)
     names = [clouds.class_names[label] for label in sorted(set(clouds.labels.tolist()))]
     for name in names:
-        _check_class(name)
+        check_class(name)
     folded = [name.casefold() for name in names]
     if len(set(folded)) < len(folded):
         raise InputError(
@@ -88,7 +88,8 @@ def _cloud_folders(clouds: RaggedClouds) -> list[str]:
     ]
 
 
-def _check_class(name: str) -> None:
+def check_class(name: str) -> None:
+    """Refuse a class that cannot name a folder."""
     plain = name.isprintable() and not set(name) & set('/\\:*?"<>|')
     if not plain or not name or name != name.strip(" ") or name[0] == "." or name[-1] == ".":
         raise InputError(f"class {name!r} cannot name a folder; rename it")

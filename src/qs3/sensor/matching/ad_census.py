@@ -48,7 +48,7 @@ def match_ad_census(
 
     Returns:
         Disparity in pixels, NaN where there is none. It needs 4 · h · w · ``num_disparities`` bytes
-        and takes as long as there are disparities of pixels, 15 ns each.
+        and takes as long as there are disparities of pixels, 10 ns each.
     """
     own, bits = settings.ad_census, 8 if left.dtype == np.uint8 else 10
     tone = (2**bits - 1) / 255  # grey levels in one of 8 bits

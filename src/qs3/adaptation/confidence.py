@@ -1,0 +1,103 @@
+"""How sure a network is: a temperature that calibrates it, a threshold for a share of the clouds.
+
+Convention:
+    Probabilities are [m k], rows summing to 1; the confidence of a cloud is its largest one.
+"""
+
+import math
+from fractions import Fraction
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.special import log_softmax, softmax
+
+from qs3.adaptation.priors import check_probabilities
+from qs3.errors import InputError
+from qs3.models.checks import check_positive, check_range
+
+BOUNDS = (0.25, 4.0)
+"""Least and largest temperature: a network that is right on every held-out cloud asks for 0."""
+_TINY = np.finfo(np.float64).tiny
+
+
+def fit_temperature(probabilities: Float[np.ndarray, "v k"], labels: Int[np.ndarray, "v"]) -> float:
+    """Return the temperature T that calibrates a network (Guo et al., ICML 2017, §4.2).
+
+    It minimises the negative log likelihood of labelled clouds under softmax(z / T), z the logits,
+    within `BOUNDS`. The labels are hard: where the network was trained with label smoothing, which
+    keeps confidence below 1 − ε + ε/k however sure the class is, T falls below 1 and takes that
+    shift back. Logits that differ by a factor get the same calibrated probabilities.
+
+    Args:
+        probabilities: Softmax outputs on clouds that the network was not trained on.
+        labels: Their classes.
+
+    Raises:
+        InputError: where there is no cloud, or rows are not probabilities.
+
+    Example:
+        Three of four right at a confidence of 0.75 is calibrated already.
+
+        >>> rows = np.array([[0.75, 0.25]] * 4)
+        >>> round(fit_temperature(rows, np.array([0, 0, 0, 1])), 4)
+        1.0
+    """
+    from scipy.optimize import minimize_scalar  # slow to load
+
+    check_probabilities(probabilities)
+    if not len(probabilities):
+        raise InputError("there is no held-out cloud to calibrate on")
+    logits = np.log(np.maximum(probabilities, _TINY))
+
+    def loss(inverse: float) -> float:  # convex in 1/T
+        return -float(log_softmax(logits * inverse, axis=1)[np.arange(len(labels)), labels].mean())
+
+    ends = 1 / BOUNDS[1], 1 / BOUNDS[0]
+    found = minimize_scalar(loss, bounds=ends, method="bounded", options={"xatol": 1e-8})
+    # The search nears an end of its range, but never tries it.
+    return 1 / min((*ends, float(found.x)), key=loss)
+
+
+def rescale(probabilities: Float[np.ndarray, "m k"], temperature: float) -> np.ndarray:
+    """Return softmax(z / T) of softmax(z); at 1 what was given.
+
+    Example:
+        >>> rescale(np.array([[0.8, 0.2]]), 0.5).round(3).tolist()
+        [[0.941, 0.059]]
+    """
+    check_positive("temperature", temperature)
+    if temperature == 1:
+        return probabilities
+    return softmax(np.log(np.maximum(probabilities, _TINY)) / temperature, axis=1)
+
+
+def threshold_of_share(
+    probabilities: Float[np.ndarray, "m k"], share: float, *, inclusive: bool = False
+) -> float:
+    """Return the θ that keeps a share of the clouds: the ⌈share · m⌉ most confident.
+
+    Clouds as confident as the last of these are kept too.
+
+    Args:
+        probabilities: Class probabilities of one cloud at least.
+        share: Part of the clouds, above 0, to 1.
+        inclusive: Whether a confidence equal to θ is enough. Else θ is the next lower confidence,
+            or 0.
+
+    Raises:
+        InputError: where rows are not probabilities, or the share is not in 0 to 1.
+
+    Example:
+        >>> rows = np.array([[0.9, 0.1], [0.3, 0.7], [0.4, 0.6]])
+        >>> threshold_of_share(rows, 0.5), threshold_of_share(rows, 0.5, inclusive=True)
+        (0.6, 0.7)
+    """
+    check_probabilities(probabilities)
+    check_positive("share", share)
+    check_range("share", share, 0, 1)
+    confidence = probabilities.max(axis=1)
+    # The share is meant as it is written: 0.07 of 100 is 7, not 8.
+    count = math.ceil(Fraction(str(float(share))) * len(confidence))
+    last = np.sort(confidence)[len(confidence) - count]
+    theta = last if inclusive else confidence[confidence < last].max(initial=0.0)
+    return min(1.0, float(theta))

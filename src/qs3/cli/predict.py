@@ -1,0 +1,68 @@
+"""``qs3 predict``: answers of a run for files."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from qs3.cli.text import printable, show, tell
+from qs3.errors import InputError
+
+
+def predict(
+    run: Annotated[Path, tyro.conf.Positional],
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    top: int = 1,
+    csv: Path | None = None,
+    json: Path | None = None,
+    sort_into: Path | None = None,
+) -> int:
+    """Tell the class of each file and how confident the network is.
+
+    A file that cannot be read is told at the end, and the exit code is 2; all others are done.
+
+    Args:
+        run: Folder of a run, or its model.safetensors.
+        files: Clouds (NPY, XYZ, PLY, PCD, or a mesh as OFF; z up), folders of them with all below,
+            or patterns in quotes such as 'scans/*.ply'.
+        top: Classes told of each file, the likeliest first.
+        csv: File for the table as CSV.
+        json: File for the table as JSON with the probability of every class; - prints it in place
+            of text.
+        sort_into: New folder that gets a folder a class with links to the files, to put right by
+            hand and to train on.
+    """
+    from qs3.files import write_text
+    from qs3.store.progress import progress_bar
+    from qs3.training import answers as table
+
+    if not files:
+        raise InputError("name one or more files or folders of points after the run")
+    if top < 1:
+        raise InputError(f"--top {top}: must be at least 1")
+    paths = table.list_clouds(files)
+    text = "predict" if len(paths) > 1 else None
+    bar = progress_bar(len(paths), text, "cloud", items=table.predict_files(run, paths))
+    answers: list[table.Answer] = [*bar]
+    if json == Path("-"):
+        show(table.answers_json(answers), end="")
+    else:
+        for answer in answers:
+            if answer.best():
+                parts = [f"{printable(name, keep='')}\t{s:.3f}" for name, s in answer.best(top)]
+                show("\t".join([printable(str(answer.file), keep=""), *parts]))
+    if csv is not None:
+        write_text(csv, table.answers_csv(answers, top))
+    if json not in (None, Path("-")):
+        write_text(json, table.answers_json(answers))
+    if sort_into is not None:
+        table.sort_into(sort_into, answers)
+        tell(f"links by class in {sort_into}: move what is wrong, then qs3 train --source "
+             f"{sort_into}")  # fmt: skip
+    faults = [answer.fault for answer in answers if answer.fault]
+    for fault in faults[:-1]:
+        tell(f"qs3: {printable(fault, keep='')}")
+    if faults:
+        count = f" ({len(faults)} of {len(paths)} files)" if len(paths) > 1 else ""
+        raise InputError(faults[-1] + count)
+    return 0

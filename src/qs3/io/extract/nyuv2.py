@@ -1,0 +1,241 @@
+"""Objects from NYU Depth v2's labelled frames: depth, class and instance of every pixel.
+
+``nyu_depth_v2_labeled.mat`` is MATLAB's version 7.3, which is HDF5: arrays of h × w × 1449 lie
+there as [1449 w h], and a cell of text is an array of references to arrays of characters. Frames
+are read one by one.
+
+Convention:
+    Depth is aligned to the colour camera, in metres. As in the data set's toolbox
+    (``camera_params.m``, ``rgb_plane2rgb_world.m``), the colour camera's intrinsics lift it, with
+    pixels counted from 1; those of the depth camera (fx 582.62) hold for the raw dumps. Its
+    ``get_projection_mask.m`` tells where depth was measured: the rest is left out. z is up, y the
+    viewing direction as far as it is level, x to the right; z is 0 on the floor where one is found,
+    else the camera is the origin. Each object's row tells ``floor_ok``, ``strict`` and so on.
+    The file's ``accelData`` is not used: the page calls it roll, yaw, pitch, the toolbox x, y, z.
+
+Source: Silberman, Hoiem, Kohli and Fergus, "Indoor segmentation and support inference from RGBD
+images", ECCV 2012 (https://cs.nyu.edu/~silberman/datasets/nyu_depth_v2.html).
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+from jaxtyping import Bool, Float
+
+from qs3.errors import InputError
+from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
+from qs3.io.extract.intrinsics import Intrinsics
+from qs3.io.extract.matlab import read_mat
+from qs3.io.extract.plane import fit_plane, room_up
+from qs3.io.extract.run import (
+    ExtractedCloud,
+    ExtractReport,
+    OutputSettings,
+    recorded,
+    run_extract,
+    wanted_classes,
+)
+from qs3.io.extract.sunrgbd_lists import rename_to
+from qs3.io.layouts.hdf5 import matlab_texts, open_hdf5, plain_dataset
+from qs3.meshes.classes import canonical
+from qs3.meshes.sizes import CLASS_SIZES
+
+FILE, SPLITS = "nyu_depth_v2_labeled.mat", "splits.mat"
+CAMERA = Intrinsics(518.85790117450188, 519.46961112127485, 324.58244941119034, 252.73736163340047,
+                    640, 480)  # fmt: skip
+"""The colour camera, from the toolbox's ``camera_params.m``; here pixels count from 0."""
+WORDS: Mapping[str, str] = {
+    "game table": "table",
+    "light": "",  # mostly on a ceiling or a wall; what stands is called lamp
+    "piano bench": "chair",
+    "ping pong table": "table",
+    "pool table": "table",
+}
+"""Words of its annotators that the common table of class names does not hold, or not so."""
+
+_MEASURED = (slice(44, 471), slice(40, 601))
+_FLOOR = 500  # pixels of floor that tell a plane
+_UP = np.array([0.0, -1.0, 0.0])
+
+
+@dataclass(frozen=True)
+class Nyuv2Settings:
+    """What is cut from the labelled frames of NYU Depth v2."""
+
+    splits: Path | None = None
+    """The official splits.mat, which tells train from test; by default the one beside the file, if
+    there is one."""
+    classes: tuple[str, ...] = ("pointda10",)
+    """Classes to map the objects onto; pointda10 for its ten, all for the annotators' own."""
+    depth: Literal["raw", "filled"] = "raw"
+    """rawDepths as the Kinect gave them, or depths with their holes painted in."""
+    strict: bool = False
+    """Only objects that the image's border does not cut, over a floor that was found, of 2,500
+    pixels, nearer than 5 m and of a size that their class has."""
+    cut: Annotated[CutSettings, tyro.conf.arg(name="")] = field(
+        default_factory=lambda: CutSettings(far=10.0, erode=2)
+    )
+    """Which pixels are kept; at 10 m the file's depth is capped."""
+
+    def __post_init__(self) -> None:
+        wanted_classes(self.classes)
+
+
+@dataclass(frozen=True)
+class NyuFrame:
+    """One labelled frame."""
+
+    id: str
+    """Its number in the file, from 1 as in ``splits.mat``: ``nyu0001``."""
+    index: int
+    """Its place in the arrays, from 0."""
+    split: str
+    """``train``, ``test`` or empty."""
+    scene: str
+    """Where it was filmed, such as ``kitchen_0004``; empty where the file does not tell."""
+
+
+def extract_nyuv2(source: Path, output: OutputSettings, settings: Nyuv2Settings) -> ExtractReport:
+    """Cut the labelled objects from NYU Depth v2.
+
+    Args:
+        source: nyu_depth_v2_labeled.mat or its folder.
+        output: Where the clouds go.
+        settings: What is cut.
+
+    Raises:
+        InputError: where a file is missing or another, holds no object of these classes, or as
+            `run_extract` does.
+    """
+    path = source / FILE if source.is_dir() else source
+    classes = wanted_classes(settings.classes)
+    frames, words = list_nyuv2(path, settings.splits)
+    rename = rename_to(classes)
+    named = {i: rename(WORDS.get(word, word) if classes else word) for i, word in words.items()}
+    kinds = {i: (words[i], name) for i, name in named.items() if name}
+    if not kinds:
+        raise InputError(f"{path}: none of its {len(words)} classes is one of --classes")
+    floors = tuple(i for i, word in words.items() if word == "floor")
+    return run_extract(
+        frames,
+        partial(cut_frame, path=path, settings=settings, kinds=kinds, floors=floors),
+        output,
+        settings={"extract": "extract_nyuv2", **recorded(settings, "splits", "classes")},
+        class_names=classes or sorted({name for _, name in kinds.values()}),
+        min_points=settings.cut.min_points,
+    )
+
+
+def list_nyuv2(path: Path, splits: Path | None = None) -> tuple[list[NyuFrame], dict[int, str]]:
+    """List the frames of the file, and the word of each label; images are not read."""
+    with open_hdf5(path) as file:
+        count = len(plain_dataset(file, "labels", path, (640, 480)))
+        words = dict(enumerate(matlab_texts(file, "names"), start=1))
+        scenes = matlab_texts(file, "scenes") if "scenes" in file else [""] * count
+    if len(scenes) != count:
+        raise InputError(f"{path}: {len(scenes)} scenes for {count} frames")
+    beside = path.with_name(SPLITS)
+    splits = splits or (beside if beside.is_file() else None)
+    parts = dict.fromkeys(range(1, count + 1), "")
+    for name in ("train", "test"):
+        if splits is None:
+            break
+        given = np.ravel(read_mat(splits, (f"{name}Ndxs",)).get(f"{name}Ndxs", ()))
+        for number in given.tolist():
+            if given.dtype.kind not in "iuf" or parts.get(number) != "":
+                raise InputError(f"{splits}: frame {number} is none of 1 to {count}, or in twice")
+            parts[number] = name
+    if splits and not all(parts.values()):
+        raise InputError(f"{splits}: has no trainNdxs and testNdxs for all {count} frames")
+    frames = [NyuFrame(f"nyu{i:04d}", i - 1, parts[i], scenes[i - 1]) for i in parts]
+    return frames, words
+
+
+def cut_frame(
+    frame: NyuFrame,
+    path: Path,
+    settings: Nyuv2Settings,
+    kinds: Mapping[int, tuple[str, str]],
+    floors: tuple[int, ...],
+) -> Iterator[ExtractedCloud]:
+    """Cut the objects of one frame.
+
+    Args:
+        frame: The frame.
+        path: The file.
+        settings: What is cut.
+        kinds: The annotators' word and the class of each label that is wanted.
+        floors: Labels of floors.
+
+    Raises:
+        InputError: where the file is damaged or of another layout.
+    """
+    name = {"raw": "rawDepths", "filled": "depths"}[settings.depth]
+    with open_hdf5(path) as file:
+        depth, labels, instances = (
+            plain_dataset(file, array, path, (640, 480))[frame.index].T[_MEASURED]
+            for array in (name, "labels", "instances")
+        )
+    depth = np.where((depth > 0) & np.isfinite(depth), depth, np.nan).astype(np.float32)
+    camera = Intrinsics(CAMERA.fx, CAMERA.fy, CAMERA.cx - _MEASURED[1].start,
+                        CAMERA.cy - _MEASURED[0].start)  # fmt: skip
+    gate = CutSettings(settings.cut.near, settings.cut.far)
+    floor = keep_pixels(depth, np.isin(labels, floors), gate)
+    rotation, rise, floor_ok = level(depth, floor, camera)
+    wanted = np.isin(labels, list(kinds))
+    pairs = np.unique(np.stack([labels[wanted], instances[wanted]], axis=1), axis=0)
+    for label, number in pairs.tolist():
+        mask = (labels == label) & (instances == number)
+        seen = depth[keep := keep_pixels(depth, mask, settings.cut)]
+        if len(seen) < settings.cut.min_points:
+            continue
+        word, class_name = kinds[label]
+        points = turn(rotation, lift(depth, keep, camera)) + np.array([0.0, 0.0, rise])
+        facts = {
+            "raw": word,
+            "frame": frame.index + 1,
+            "scene": frame.scene,
+            "pixels": int(mask.sum()),
+            "points": len(points),
+            "depth": float(np.median(seen)),
+            "cut": sum(bool(edge.any()) for edge in (mask[0], mask[-1], mask[:, 0], mask[:, -1])),
+            "floor_ok": floor_ok,
+        }
+        facts["strict"] = _strict(facts, points, class_name)
+        if facts["strict"] or not settings.strict:
+            cloud = as_cloud(points, frame.id)
+            identifier = f"{frame.id}/{label:03d}_{number:02d}"
+            yield ExtractedCloud(identifier, class_name, cloud, frame.split, facts)
+
+
+def level(
+    depth: Float[np.ndarray, "h w"], floor: Bool[np.ndarray, "h w"], camera: Intrinsics
+) -> tuple[Float[np.ndarray, "3 3"], float, bool]:
+    """Rotation of camera points to z up, what is added to z, and whether a floor was found.
+
+    The floor is the plane of the pixels that are labelled so, within 45° of level; without one the
+    room's own surfaces tell (`plane.room_up`).
+    """
+    if floor.sum() >= _FLOOR:
+        points = lift(depth, floor, camera)
+        plane = fit_plane(points, 0.03, _UP)
+        if plane is not None and (np.abs(plane.heights(points)) <= 0.03).mean() >= 0.5:
+            return upright(tuple(-plane.normal)), -plane.offset, True
+    step = slice(None, None, 4)
+    every = lift(np.nan_to_num(depth), np.ones(depth.shape, dtype=bool), camera)
+    every[every[:, 2] == 0] = np.nan
+    up = room_up(every.reshape(*depth.shape, 3)[step, step], _UP)
+    return upright(tuple(-up)), 0.0, False
+
+
+def _strict(facts: Mapping[str, Any], points: Float[np.ndarray, "n 3"], class_name: str) -> bool:
+    """Whether a view is whole, near and of a size that its class has; of a part half is enough."""
+    low, high = CLASS_SIZES.get(canonical(class_name), ((0.0, np.inf),))[0]
+    longest = float(np.ptp(points, axis=0).max())
+    whole = facts["floor_ok"] and not facts["cut"] and facts["pixels"] >= 2500
+    return bool(whole and facts["depth"] < 5 and low / 2 <= longest <= 1.25 * high)

@@ -1,0 +1,246 @@
+"""A scene of a table or a floor cut into the objects that stand on it, without a network.
+
+The plane is found by RANSAC, its extent is the largest patch of points on it, and what rises above
+that patch falls apart into clusters (DBSCAN). Voxels of a quarter of the gap are clustered, so that
+near surfaces count no more than far ones; every measured point comes out, unaveraged.
+
+Source: Rusu, "Semantic 3D object maps for everyday manipulation in human living environments", 2009
+(table-top segmentation); Ester et al., "A density-based algorithm for discovering clusters", KDD
+1996.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from qs3.errors import InputError
+from qs3.files import new_folder, write_bytes
+from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
+from qs3.io.extract.depth_images import read_depth
+from qs3.io.extract.intrinsics import read_intrinsics
+from qs3.io.extract.plane import Plane, fit_plane
+from qs3.io.guards import load_npy, open_zip, read_member
+from qs3.io.point_files import cloud_bytes, read_cloud
+
+TABLE = "objects.csv"
+_LEAST_SHARE = 0.1  # of the points, on the plane
+_WIDEST = 1000.0  # metres
+_CORE = 5  # voxels around one that make it part of a cluster
+
+
+@dataclass(frozen=True)
+class SegmentSettings:
+    """How a scene is cut into objects."""
+
+    intrinsics: str = ""
+    """Of a depth image: fx,fy,cx,cy; a JSON file of a camera; or a text file of 3×3 numbers.
+    Without it the scene is a cloud in metres."""
+    depth_scale: float | None = None
+    """Metres a step of a depth image; None takes the camera's, else 0.001 for whole numbers and 1
+    for others."""
+    far: float = math.inf
+    """Depths of a depth image at or above are dropped, metres."""
+    gravity: tuple[float, float, float] | None = None
+    """Downward direction, roughly, in the axes of the file; None takes 0 0 -1 of a cloud (z up) and
+    0 1 0 of a depth image (the camera's y)."""
+    tilt: float = 60.0
+    """Degrees by which the plane may be off level as gravity has it; walls are at 90."""
+    tolerance: float = 0.01
+    """Metres up to which a point belongs to the plane; above it begins an object."""
+    gap: float = 0.02
+    """Metres of empty space that part two objects."""
+    height: float = 0.5
+    """Metres above the plane that objects reach at most; 2 for furniture on a floor."""
+    min_points: int = 100
+    """Objects of fewer points are left out."""
+    seed: int = 0
+    """Seed of RANSAC's draws."""
+
+    def __post_init__(self) -> None:
+        for name in ("tolerance", "gap", "height", "far"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"{name} {getattr(self, name):g}: must be positive metres")
+        if not 0 <= self.tilt <= 90:
+            raise InputError(f"tilt {self.tilt:g}: must be from 0 to 90 degrees")
+        if self.min_points < 1:
+            raise InputError(f"min-points {self.min_points}: must be at least 1")
+        upright(self.gravity or (0.0, 1.0, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentedObject:
+    """One object of a scene. z is up and 0 on the plane; x and y are the scene's, made level."""
+
+    points: Float32[np.ndarray, "n 3"]
+    """Every point that was measured of it, metres."""
+    centre: tuple[float, float, float]
+    """Of its box, the smallest upright one, that stands on the plane."""
+    size: tuple[float, float, float]
+    """Longer and shorter level side of the box, and height above the plane, metres."""
+    heading: float
+    """Degrees from x to the longer side, from 0 to below 180, counterclockwise from above."""
+
+
+def segment_scene(
+    scene: Path,
+    out: Path,
+    settings: SegmentSettings = SegmentSettings(),
+) -> list[SegmentedObject]:
+    """Cut a scene into a new folder: ``object_000.ply`` and so on, largest first, and a table.
+
+    Args:
+        scene: A cloud in metres (PLY, PCD, XYZ, NPY, NPZ), or with intrinsics a depth image (16-bit
+            PNG, TIFF, npy).
+        out: A new or empty folder.
+        settings: How it is cut.
+
+    Raises:
+        InputError: where the scene cannot be read, has no plane or nothing on it, or the folder is
+            taken.
+    """
+    # Imported here: it takes long, and the help of the verb needs none.
+    import pandas as pd
+
+    with new_folder(out) as folder:
+        try:
+            objects = segment(read_scene(scene, settings), settings)
+        except InputError as error:
+            message = str(error)
+            raise InputError(message if str(scene) in message else f"{scene}: {error}") from error
+        rows = []
+        for number, item in enumerate(objects):
+            name = f"object_{number:03d}.ply"
+            write_bytes(folder / name, cloud_bytes(item.points, ".ply"))
+            rows.append([name, len(item.points), *item.centre, *item.size, item.heading])
+        columns = ["file", "points", "x", "y", "z", "length", "width", "height", "heading"]
+        table = pd.DataFrame(rows, columns=columns).to_csv(index=False, float_format="%.4f")
+        write_bytes(folder / TABLE, table.encode())
+    return objects
+
+
+def read_scene(path: Path, settings: SegmentSettings) -> Float[np.ndarray, "n 3"]:
+    """Read a scene: metres, turned so that z is against gravity as far as that is known."""
+    if settings.intrinsics:
+        camera = read_intrinsics(settings.intrinsics)
+        scale = camera.depth_scale if settings.depth_scale is None else settings.depth_scale
+        depth = read_depth(path, scale)
+        camera.check_size(depth.shape, str(path))
+        keep = keep_pixels(depth, np.ones(depth.shape, dtype=bool), CutSettings(far=settings.far))
+        points = as_cloud(lift(depth, keep, camera), str(path)).astype(np.float64)
+        return turn(upright(settings.gravity or (0.0, 1.0, 0.0)), points)
+    if path.suffix.lower() == ".npz":
+        with open_zip(path) as archive:
+            content = read_member(archive, "points.npy")
+        array: np.ndarray = np.zeros(0) if content is None else load_npy(content)
+        if array.dtype.kind != "f" or array.ndim != 2 or array.shape[1] < 3:
+            raise InputError(f"{path}: needs points, an array of numbers of shape [n 3]: one cloud")
+        points = array[:, :3].astype(np.float64)
+        if not np.isfinite(points).all():
+            raise InputError(f"{path}: a point is not finite; remove points with NaN or infinity")
+    else:
+        points = read_cloud(path).astype(np.float64)
+    return points if settings.gravity is None else turn(upright(settings.gravity), points)
+
+
+def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list[SegmentedObject]:
+    """Cut a scene into the objects that stand on its largest level plane, by points.
+
+    Args:
+        points: The scene in metres, z up to ``tilt`` degrees.
+        settings: How it is cut; those of files are not looked at.
+
+    Raises:
+        InputError: where no plane holds a tenth of the points, or nothing stands on it.
+    """
+    if len(points) < 3 or np.ptp(points, axis=0).max() > _WIDEST:
+        raise InputError(
+            f"{len(points)} points, over {_WIDEST:g} m apart or too few; a scene is in metres"
+        )
+    up = np.array([0.0, 0.0, 1.0])
+    plane = fit_plane(points, settings.tolerance, up, settings.tilt, settings.seed)
+    held = 0.0 if plane is None else np.mean(np.abs(plane.heights(points)) <= settings.tolerance)
+    if plane is None or held < _LEAST_SHARE:
+        raise InputError(
+            f"no plane within {settings.tilt:g}° of level holds a tenth of the points to "
+            f"{settings.tolerance:g} m; tell --gravity, or raise --tolerance"
+        )
+    points = turn(_level(plane), points) - np.array([0.0, 0.0, plane.offset])
+    near = points[:, 2] <= settings.height
+    points = points[near & (points[:, 2] >= -settings.tolerance)]
+    voxels, voxel_of = _voxels(points, settings.gap / 4)
+    standing = np.flatnonzero(voxels[:, 2] > settings.tolerance)
+    patch = voxels[voxels[:, 2] <= settings.tolerance]
+    standing = standing[_over(patch, voxels[standing], settings)]
+    cluster_of = np.full(len(voxels), -1)
+    cluster_of[standing] = _clusters(voxels[standing], settings)
+    owner = cluster_of[voxel_of]
+    sizes = np.bincount(owner[owner >= 0], minlength=1)
+    order = [int(i) for i in np.argsort(-sizes, kind="stable") if sizes[i] >= settings.min_points]
+    if not order:
+        raise InputError(
+            f"nothing stands on its plane: no cluster of {settings.min_points} points up to "
+            f"{settings.height:g} m above it"
+        )
+    return [_boxed(points[owner == number]) for number in order]
+
+
+def _voxels(
+    points: Float[np.ndarray, "n 3"], edge: float
+) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "n"]]:
+    """The mean point of each occupied voxel, and the voxel of each point."""
+    cells = np.floor((points - points.min(axis=0)) / edge).astype(np.int64)
+    codes = np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1))
+    _, voxel_of, counts = np.unique(codes, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(voxel_of, column) for column in points.T], axis=1)
+    return sums / counts[:, None], voxel_of
+
+
+def _level(plane: Plane) -> Float[np.ndarray, "3 3"]:
+    """The smallest rotation that turns the plane's normal, which points upwards, to z."""
+    x, y, z = plane.normal
+    cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
+    return np.eye(3) + cross + np.einsum("ij,jk->ik", cross, cross) / (1 + z)
+
+
+def _over(
+    patch: Float[np.ndarray, "m 3"], voxels: Float[np.ndarray, "n 3"], settings: SegmentSettings
+) -> Bool[np.ndarray, "n"]:
+    """Which voxels lie over the convex hull of the largest patch of the plane."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    cluster_of = _clusters(patch, settings)
+    counts = np.bincount(cluster_of[cluster_of >= 0], minlength=1)
+    try:
+        sides = ConvexHull(patch[cluster_of == np.argmax(counts), :2]).equations
+    except (QhullError, ValueError):  # no patch, or a line
+        fault = f"its plane has no patch without gaps of {settings.gap:g} m; raise --gap"
+        raise InputError(fault) from None
+    return (np.einsum("si,ni->ns", sides[:, :2], voxels[:, :2]) <= -sides[:, 2]).all(axis=1)
+
+
+def _clusters(voxels: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> Int[np.ndarray, "n"]:
+    """Number of each voxel's cluster; −1 is none."""
+    # Imported here: it takes a second.
+    from sklearn.cluster import DBSCAN
+
+    if not len(voxels):
+        return np.zeros(0, dtype=np.int64)
+    return DBSCAN(eps=settings.gap, min_samples=_CORE).fit(voxels).labels_.astype(np.int64)
+
+
+def _boxed(points: Float[np.ndarray, "n 3"]) -> SegmentedObject:
+    """An object with the smallest upright box around it, which stands on the plane."""
+    import cv2
+
+    cloud = points.astype(np.float32)
+    rectangle = cv2.minAreaRect(np.ascontiguousarray(cloud[:, :2]))
+    corners = cv2.boxPoints(rectangle).astype(np.float64)
+    sides = corners[1:3] - corners[:2]
+    long, short = sorted(sides.tolist(), key=lambda side: -math.hypot(*side))
+    top = float(cloud[:, 2].max())
+    (x, y), size = rectangle[0], (math.hypot(*long), math.hypot(*short), top)
+    heading = math.degrees(math.atan2(long[1], long[0])) % 180.0
+    return SegmentedObject(cloud, (float(x), float(y), top / 2), size, heading)

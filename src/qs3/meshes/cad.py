@@ -1,0 +1,93 @@
+"""STEP and IGES turned into triangles by OpenCASCADE (cascadio, extra ``cad``).
+
+A process of its own does it: what makes the C++ library crash, or take all memory or time, is then
+that file's fault alone.
+"""
+
+import importlib.util
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from qs3.errors import InputError, MissingExtraError
+from qs3.meshes.announced import memory_limit
+
+UNITS = {".step": "meters", ".stp": "meters", ".iges": "millimeters", ".igs": "millimeters"}
+"""Endings, and the unit that cascadio's triangles are in, whichever the file is in: of STEP it
+writes metres, as glTF wants, of IGES OpenCASCADE's own millimetres."""
+
+NEEDS = {**dict.fromkeys(UNITS, "cascadio"), ".3mf": "lxml"}
+"""Endings that are read with the extra ``cad`` alone, and a package of it that each needs."""
+
+_DEFLECTION, _ANGLE = 0.005, 0.3
+"""How far a chord may be from its curve, in lengths of that edge, and turn in radians."""
+_SECONDS = 600
+
+
+def check_extra(ending: str) -> None:
+    """Refuse an ending that needs the extra ``cad`` where that is not installed.
+
+    Raises:
+        MissingExtraError: naming the extra.
+    """
+    package = NEEDS.get(ending)
+    if package is not None and importlib.util.find_spec(package) is None:
+        raise MissingExtraError(f"{package}, which reads {ending}", "cad")
+
+
+def to_glb(path: Path) -> bytes:
+    """Return a STEP or IGES file as GLB: an assembly's parts with their transforms, z up.
+
+    One thread does it, so that the same file always gives the same triangles.
+
+    Raises:
+        InputError: where the file is damaged, holds no surface, or takes over 600 seconds or far
+            more memory than its size.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "part.glb"
+        command = [sys.executable, "-P", "-m", __name__, str(path), str(out)]
+        try:
+            done = subprocess.run(
+                command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_SECONDS
+            )
+        except subprocess.TimeoutExpired:
+            raise InputError(f"{path}: takes over {_SECONDS} s to turn into triangles") from None
+        if done.returncode == 0:
+            return out.read_bytes()
+    lines = done.stderr.decode("utf-8", "replace").splitlines()
+    reason = lines[-1] if lines and done.returncode > 0 else f"OpenCASCADE ended: {done.returncode}"
+    raise InputError(f"{path}: cannot be read as {path.suffix[1:].upper()} ({reason})")
+
+
+def _convert(path: Path, out: Path) -> None:
+    """Do the work; whatever OpenCASCADE prints belongs to nobody."""
+    # cascadio can do without, in half the time.
+    sys.modules.setdefault("trimesh", None)  # pyright: ignore[reportArgumentType]
+    import cascadio
+
+    try:
+        import resource
+
+        most = resource.getrlimit(resource.RLIMIT_CPU)[1]
+        resource.setrlimit(resource.RLIMIT_CPU, (_SECONDS, most))
+    except ImportError:  # Windows: the caller's time limit is left
+        pass
+    kind = "step" if UNITS[path.suffix.lower()] == "meters" else "iges"
+    with memory_limit(path):
+        data = cascadio.load(
+            path.read_bytes(),
+            kind,
+            tol_linear=_DEFLECTION,
+            tol_angular=_ANGLE,
+            tol_relative=True,
+            use_parallel=False,
+        )
+    if not data:
+        sys.exit("it holds no surface")
+    out.write_bytes(data)
+
+
+if __name__ == "__main__":
+    _convert(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -1,0 +1,95 @@
+"""What a folder of meshes holds: sizes, faults, and what looks wrong though it can be read."""
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+from qs3.errors import InputError
+from qs3.meshes.normalising import sample_surface
+from qs3.meshes.sizes import Unit, file_size
+from qs3.meshes.trees import MeshItem
+
+_POINTS = 1024
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """One mesh, read and looked at."""
+
+    item: MeshItem
+    """Which one."""
+    size: float | None = None
+    """Longest side in metres; None where it cannot be told."""
+    hints: tuple[str, ...] = ()
+    """What looks wrong, in no more words than others have that look as wrong."""
+    fault: str = ""
+    """Why it cannot be read."""
+    surface: Float[np.ndarray, "n 3"] | None = None
+    """Points of its surface, of the first few of a class."""
+
+
+def inspect(
+    items: Iterable[MeshItem], units: Unit | None = None, pictured: int = 4
+) -> Iterable[Inspection]:
+    """Read meshes, and yield what each is like, in their order.
+
+    Args:
+        items: The meshes.
+        units: Of files that tell none; see ``file_size``.
+        pictured: Of so many meshes of each class the surface is sampled.
+    """
+    shown: Counter[str] = Counter()
+    for item in items:
+        try:
+            mesh = item.load()
+        except InputError as error:
+            yield Inspection(item, fault=str(error))
+            continue
+        found = [_faces(mesh), "looks y-up (stands on y = 0, centred about z = 0): --up y"]
+        found = found if looks_y_up(mesh) else found[:1]
+        size = None
+        try:
+            size, told = file_size(mesh, units)
+            if told == "mm (guessed)":
+                found.append("tells no unit, looks to be in millimetres: --units")
+        except InputError:
+            found.append(f"of no size that an object has (unit: {mesh.units or units or 'none'})")
+        surface = None
+        if shown[item.class_name] < pictured:
+            shown[item.class_name] += 1
+            surface = sample_surface(mesh, _POINTS, np.random.default_rng(0))
+        yield Inspection(item, size, tuple(filter(None, found)), surface=surface)
+
+
+def looks_y_up(mesh: trimesh.Trimesh) -> bool:
+    """Whether a mesh is placed as modellers do whose y is up: on y = 0, and centred about z = 0.
+
+    One that is placed otherwise (centred in its box, say) is not told by this.
+
+    Example:
+        >>> stool = trimesh.creation.box(bounds=[[-0.2, 0.0, -0.2], [0.2, 0.5, 0.2]])
+        >>> looks_y_up(stool), looks_y_up(trimesh.creation.box())
+        (True, False)
+    """
+    low, high = mesh.bounds / mesh.extents.max()
+    on_ground = np.abs(low) < 0.01
+    return bool(on_ground[1] and not on_ground[2] and abs(low[2] + high[2]) < 0.02)
+
+
+def _faces(mesh: trimesh.Trimesh) -> str:
+    """Tell a surface that is open, or turned in part or as a whole; vertices in one place are one.
+
+    The turn of a closed surface is the sign of its volume, ⅙ Σ a · (b × c).
+    """
+    vertices = (np.asarray(mesh.vertices) - mesh.bounds[0]) / mesh.extents.max()
+    body = trimesh.Trimesh(vertices, mesh.faces, process=False)
+    body.merge_vertices(digits_vertex=6)
+    if not body.is_watertight:
+        return "open: not a closed surface"
+    if not body.is_winding_consistent:
+        return "faces turned both ways"
+    return "inside out" if body.volume < 0 else ""

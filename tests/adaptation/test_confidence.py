@@ -1,0 +1,142 @@
+"""Temperature and threshold: laws, and a search by brute force."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from qs3.adaptation.confidence import BOUNDS, fit_temperature, rescale, threshold_of_share
+from qs3.adaptation.selection import select_confident, select_quasi_balanced
+from qs3.errors import InputError
+
+SHARES = st.sampled_from([0.01, 0.07, 0.2, 0.5, 0.9, 1.0])
+
+
+def drawn(seed, m=60, k=4, peak=2.0):
+    """Softmax of Gaussian logits."""
+    logits = peak * np.random.default_rng(seed).normal(size=(m, k))
+    return np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
+
+
+def calibrated(k=3, counts=20):
+    """Clouds whose classes are as frequent as the network says, exactly."""
+    shares = np.array([[0.7, 0.2, 0.1], [0.25, 0.6, 0.15], [0.05, 0.05, 0.9]])
+    rows = np.repeat(shares, counts, axis=0)
+    labels = [np.repeat(np.arange(k), np.round(counts * share).astype(int)) for share in shares]
+    return rows, np.concatenate(labels)
+
+
+def loss(rows, labels, temperature):
+    return -np.log(rescale(rows, temperature)[np.arange(len(rows)), labels]).mean()
+
+
+def test_temperature_is_one_where_calibrated_already():
+    assert fit_temperature(*calibrated()) == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("temperature", [0.4, 0.8, 1.7, 3.0])
+def test_a_known_temperature_is_found_and_taken_back(temperature):
+    rows, labels = calibrated()
+    spoilt = rescale(rows, 1 / temperature)
+    found = fit_temperature(spoilt, labels)
+    assert found == pytest.approx(temperature, rel=1e-5)
+    assert np.allclose(rescale(spoilt, found), rows, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_temperature_is_that_of_a_search_by_brute_force(seed):
+    rows = drawn(seed, peak=1 + seed)
+    labels = np.random.default_rng(seed).integers(4, size=len(rows))
+    labels[: 10 * seed] = rows[: 10 * seed].argmax(axis=1)
+    found = fit_temperature(rows, labels)
+    grid = np.geomspace(*BOUNDS, 2000)
+    losses = [loss(rows, labels, temperature) for temperature in grid]
+    assert loss(rows, labels, found) <= min(losses) + 1e-12
+    assert found == pytest.approx(grid[int(np.argmin(losses))], rel=2e-3)
+
+
+def test_temperature_is_bounded():
+    rows, labels = drawn(0), drawn(0).argmax(axis=1)
+    assert fit_temperature(rows, labels) == BOUNDS[0]
+    assert fit_temperature(rows, rows.argmin(axis=1)) == BOUNDS[1]
+
+
+def test_label_smoothing_is_taken_back_in_the_mean():
+    """What smoothing does to a fitted network, q = (1 − ε) p + ε/k: below the share of right."""
+    rows, labels = calibrated()
+    smoothed = 0.8 * rows + 0.2 / 3
+    right = (rows.argmax(axis=1) == labels).mean()
+    found = fit_temperature(smoothed, labels)
+    assert found < 0.9
+    before, after = (
+        abs(p.max(axis=1).mean() - right) for p in (smoothed, rescale(smoothed, found))
+    )
+    assert before > 0.07
+    assert after < 0.01
+
+
+@given(st.integers(0, 99), st.sampled_from([0.25, 0.5, 1.0, 2.0, 4.0]))
+def test_rescaled_rows_are_probabilities_of_the_same_class(seed, temperature):
+    rows = drawn(seed, peak=5.0)
+    scaled = rescale(rows, temperature)
+    assert np.allclose(scaled.sum(axis=1), 1.0)
+    assert np.array_equal(scaled.argmax(axis=1), rows.argmax(axis=1))
+    assert np.allclose(rescale(scaled, 1 / temperature), rows, atol=1e-9)
+
+
+def test_certain_answers_stay_finite():
+    rows = np.array([[1.0, 0.0], [0.0, 1.0]])
+    assert np.isfinite(rescale(rows, 0.5)).all()
+    assert np.isfinite(fit_temperature(rows, np.array([1, 0])))
+
+
+@given(st.integers(0, 99), SHARES, st.booleans(), st.integers(1, 40))
+def test_threshold_keeps_the_share(seed, share, inclusive, m):
+    """The most confident clouds, counted exactly; those as confident as the last come in."""
+    rows = np.round(drawn(seed, m=m), 1) if seed % 2 else drawn(seed, m=m)
+    rows /= rows.sum(axis=1, keepdims=True)
+    theta = threshold_of_share(rows, share, inclusive=inclusive)
+    kept = select_confident(rows, theta, inclusive=inclusive)
+    confidence = rows.max(axis=1)
+    count = next(c for c in range(m + 1) if c * 100 >= round(100 * share) * m)
+    assert kept.sum() >= count
+    assert np.array_equal(kept, confidence >= np.sort(confidence)[::-1][count - 1])
+    if seed % 2 == 0:
+        assert kept.sum() == count
+
+
+@given(st.integers(0, 99), SHARES)
+def test_rules_at_the_implied_value_select_the_same(seed, share):
+    rows = drawn(seed)
+    theta = threshold_of_share(rows, share)
+    count = int(select_confident(rows, theta).sum())
+    most = np.zeros(len(rows), dtype=bool)
+    most[np.argsort(-rows.max(axis=1), kind="stable")[:count]] = True
+    rule = partial(select_quasi_balanced, single_class="drop")
+    assert np.array_equal(rule(rows, theta)[most], rule(rows[most], 0.0))
+
+
+def test_certainty_everywhere_keeps_something():
+    rows = np.repeat([[1.0, 0.0], [0.6, 0.4]], [3, 2], axis=0)
+    for inclusive in (True, False):
+        theta = threshold_of_share(rows, 0.2, inclusive=inclusive)
+        assert (
+            select_confident(rows, theta, inclusive=inclusive).tolist() == [True] * 3 + [False] * 2
+        )
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda p: fit_temperature(p[:0], np.zeros(0, dtype=np.int64)), "no held-out cloud"),
+        (lambda p: fit_temperature(2 * p, np.array([0])), "sum to 1"),
+        (lambda p: rescale(p, 0.0), "temperature must be larger than 0"),
+        (lambda p: threshold_of_share(p, 0.0), "share must be larger than 0"),
+        (lambda p: threshold_of_share(p, 1.1), "share must be 0 to 1"),
+    ],
+)
+def test_faults(call, message):
+    with pytest.raises(InputError, match=message):
+        call(np.array([[0.9, 0.1]]))

@@ -1,0 +1,209 @@
+"""A table with boxes of known size: how many are found, how large, how they lie."""
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from qs3.errors import InputError
+from qs3.io.extract.plane import fit_plane
+from qs3.io.extract.segment import SegmentSettings, read_scene, segment, segment_scene
+from qs3.io.point_files import read_cloud
+
+from ..hostile import refused
+from .depth_scene import box
+
+UP = np.array([0.0, 0.0, 1.0])
+# Length, width, height, then x, y and heading on the table.
+BOXES = np.array([
+    [0.24, 0.10, 0.20, -0.30, 0.05, 30.0],
+    [0.15, 0.12, 0.08, 0.10, -0.15, 100.0],
+    [0.10, 0.05, 0.30, 0.35, 0.15, 0.0],
+])  # fmt: skip
+
+
+def surface(size, low, count, rng):
+    """Points on the faces of a box, but that below."""
+    faces = rng.choice(5, count, p=_shares(size))
+    points = rng.random((count, 3))
+    for face, (axis, side) in enumerate([(2, 1), (0, 0), (0, 1), (1, 0), (1, 1)]):
+        points[faces == face, axis] = side
+    return points * size + low
+
+
+def _shares(size):
+    x, y, z = size
+    areas = np.array([x * y, y * z, y * z, x * z, x * z])
+    return areas / areas.sum()
+
+
+def table_scene(rng, noise=0.001):
+    """A table of 1.2 × 0.8 m, three boxes on it, the floor below and a wall behind."""
+    parts = [np.c_[rng.random((40_000, 2)) * [1.2, 0.8] - [0.6, 0.4], np.zeros(40_000)]]
+    for length, width, height, x, y, heading in BOXES:
+        points = surface((length, width, height), (-length / 2, -width / 2, 0), 8000, rng)
+        turn = Rotation.from_euler("z", heading, degrees=True)
+        parts.append(turn.apply(points) + np.array([x, y, 0.0]))
+    parts.append(np.c_[rng.random((8000, 2)) * 2 - 1, np.full(8000, -0.7)])
+    parts.append(np.c_[rng.random(8000) * 2 - 1, np.full(8000, 0.9), rng.random(8000) * 2 - 0.7])
+    scene = np.concatenate(parts)
+    return scene + rng.normal(scale=noise, size=scene.shape)
+
+
+def check(objects, shift=0.0):
+    """The three boxes, each within a centimetre and three degrees."""
+    assert len(objects) == len(BOXES)
+    for length, width, height, x, y, heading in BOXES:
+        found = min(objects, key=lambda o: np.hypot(o.centre[0] - x, o.centre[1] - y))
+        np.testing.assert_allclose(found.size, (length, width, height), atol=0.01)
+        np.testing.assert_allclose(found.centre, (x, y, height / 2), atol=0.01)
+        off = abs(found.heading - heading) % 180
+        assert min(off, 180 - off) < 3
+        assert found.points.dtype == np.float32
+        assert found.points[:, 2].min() > 0
+
+
+def test_boxes_on_a_table_are_found_with_their_size_and_place():
+    objects = segment(table_scene(np.random.default_rng(0)), SegmentSettings())
+    check(objects)
+    counts = [len(item.points) for item in objects]
+    assert counts == sorted(counts, reverse=True)
+    assert min(counts) > 6000  # every point that was measured, not one a voxel
+
+
+@pytest.mark.parametrize("tilt", [5.0, 25.0])
+def test_convention_a_tilted_scene_becomes_level_and_is_not_mirrored(tilt):
+    rng = np.random.default_rng(1)
+    scene = Rotation.from_euler("x", tilt, degrees=True).apply(table_scene(rng)) + 2 * UP
+    # The smallest turn undoes the tilt; the table's height above the origin stays in its own axes.
+    low = Rotation.from_euler("x", -tilt, degrees=True).apply(2 * UP)
+    objects = segment(scene, SegmentSettings())
+    moved = [item.centre for item in objects]
+    for item, place in zip(objects, moved, strict=True):
+        object.__setattr__(item, "centre", (place[0] - low[0], place[1] - low[1], place[2]))
+    check(objects)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0, 40))
+def test_a_plane_is_found_among_strays_and_looks_upwards(seed, tilt):
+    rng = np.random.default_rng(seed)
+    turn = Rotation.from_euler("zx", [rng.uniform(0, 360), tilt], degrees=True)
+    flat = np.c_[rng.random((300, 2)), rng.normal(scale=0.002, size=300) + 0.4]
+    points = turn.apply(np.concatenate([flat, rng.random((200, 3))]))
+    plane = fit_plane(points, 0.01, UP, seed=seed)
+    assert plane is not None
+    assert plane.normal @ turn.apply(UP) > np.cos(np.radians(2))
+    assert plane.offset == pytest.approx(0.4, abs=0.02)
+    again = fit_plane(points, 0.01, UP, seed=seed)
+    assert again is not None
+    np.testing.assert_array_equal(plane.normal, again.normal)
+
+
+def test_a_wall_is_no_table_until_it_is_asked_for():
+    rng = np.random.default_rng(0)
+    wall = np.c_[rng.random(5000), np.full(5000, 0.3), rng.random(5000)]
+    assert fit_plane(wall, 0.01, UP) is None
+    standing = fit_plane(wall, 0.01, UP, tilt=90.0)
+    assert standing is not None
+    assert abs(standing.normal[1]) == pytest.approx(1)
+    assert fit_plane(wall[:2], 0.01, UP) is None
+
+
+def test_the_same_seed_gives_the_same_and_the_order_of_points_hardly_matters():
+    scene = table_scene(np.random.default_rng(2))
+    one, two = (segment(scene, SegmentSettings()) for _ in range(2))
+    for first, second in zip(one, two, strict=True):
+        np.testing.assert_array_equal(first.points, second.points)
+    check(segment(scene[::-1].copy(), SegmentSettings()))
+
+
+def test_small_high_and_near_things():
+    scene = table_scene(np.random.default_rng(3))
+    assert len(segment(scene, SegmentSettings(min_points=7500))) < 3
+    low = segment(scene, SegmentSettings(height=0.1))
+    assert max(item.size[2] for item in low) <= 0.1
+    assert len(segment(scene, SegmentSettings(gap=0.3))) == 1
+
+
+@pytest.mark.parametrize("ending", [".ply", ".npz", ".xyz"])
+def test_a_scene_becomes_a_folder_and_a_table(tmp_path, ending):
+    from qs3.io.point_files import cloud_bytes
+
+    scene = table_scene(np.random.default_rng(0))
+    path = tmp_path / f"scene{ending}"
+    if ending == ".npz":
+        np.savez(path, points=scene)
+    else:
+        path.write_bytes(cloud_bytes(scene, ending))
+    objects = segment_scene(path, tmp_path / "objects")
+    check(objects)
+    rows = pd.read_csv(tmp_path / "objects" / "objects.csv")
+    assert rows["file"].tolist() == [f"object_00{i}.ply" for i in range(3)]
+    for row, item in zip(rows.itertuples(), objects, strict=True):
+        np.testing.assert_array_equal(read_cloud(tmp_path / "objects" / row.file), item.points)
+        sizes = (row.length, row.width, row.height)
+        np.testing.assert_allclose(sizes, item.size, atol=1e-4)
+        assert row.points == len(item.points)
+    with refused("is there already"):
+        segment_scene(path, tmp_path / "objects")
+
+
+def test_a_depth_image_of_a_table_seen_from_above(tmp_path):
+    """Ray cast, in whole millimetres, without gravity: the camera looks down by 50°."""
+    import trimesh
+
+    parts = [box((1.2, 0.8, 0.03), (-0.6, -0.4, -0.03))]
+    for length, width, height, x, y, heading in BOXES:
+        made = box((length, width, height), (-length / 2, -width / 2, 0))
+        made.apply_transform(trimesh.transformations.rotation_matrix(np.radians(heading), UP))
+        parts.append(made.apply_translation([x, y, 0]))
+    mesh = trimesh.util.concatenate([*parts, box((4, 4, 0.1), (-2, -2, -0.8))])
+    down = np.radians(50.0)
+    s, c = np.sin(down), np.cos(down)
+    rotation = np.array([[1, 0, 0], [0, -s, c], [0, -c, -s]])
+    eye = np.array([0.0, -0.9, 1.1])
+    v, u = np.mgrid[:360, :480].reshape(2, -1)
+    rays = np.stack([(u - 239.5) / 500, (v - 179.5) / 500, np.ones(len(u))], axis=1)
+    hit, ray, _ = mesh.ray.intersects_location(
+        np.broadcast_to(eye, rays.shape), rays @ rotation.T, multiple_hits=False
+    )
+    depth = np.zeros(len(u), np.uint16)
+    depth[ray] = np.rint((hit - eye) @ rotation[:, 2] * 1000)
+    (tmp_path / "d.png").write_bytes(cv2.imencode(".png", depth.reshape(360, 480))[1].tobytes())
+    settings = SegmentSettings(intrinsics="500,500,239.5,179.5", tilt=60.0)
+    objects = segment_scene(tmp_path / "d.png", tmp_path / "o", settings)
+    assert len(objects) == 3
+    # The camera sees tops and near sides: heights are whole, tops tell the level sides.
+    for length, width, height, x, *_ in BOXES:
+        item = min(objects, key=lambda o: abs(o.centre[0] - x))
+        assert item.size[2] == pytest.approx(height, abs=0.01)
+        assert item.size[0] == pytest.approx(length, abs=0.01)
+        assert item.size[1] == pytest.approx(width, abs=0.01)
+    assert len(read_scene(tmp_path / "d.png", settings)) > 100_000
+
+
+def test_what_has_no_plane_or_nothing_on_it_is_one_line(tmp_path):
+    rng = np.random.default_rng(0)
+    np.save(tmp_path / "fog.npy", rng.random((20_000, 3)))
+    with refused("no plane within 60° of level", "fog.npy"):
+        segment_scene(tmp_path / "fog.npy", tmp_path / "o")
+    np.save(tmp_path / "bare.npy", np.c_[rng.random((20_000, 2)), np.zeros(20_000)])
+    with refused("nothing stands on its plane", "bare.npy"):
+        segment_scene(tmp_path / "bare.npy", tmp_path / "o")
+    line = np.c_[np.linspace(0, 1, 5000), np.zeros((5000, 2))] + rng.normal(scale=1e-4, size=3)
+    np.save(tmp_path / "line.npy", np.r_[line, rng.random((5000, 3)) * 9])
+    with refused("no patch without gaps", "line.npy"):
+        segment_scene(tmp_path / "line.npy", tmp_path / "o")
+    np.save(tmp_path / "mm.npy", rng.random((100, 3)) * 1200)
+    with refused("in metres", "mm.npy"):
+        segment_scene(tmp_path / "mm.npy", tmp_path / "o")
+    np.savez(tmp_path / "two.npz", points=rng.random((2, 9, 3)))
+    with refused(r"shape \[n 3\]", "two.npz"):
+        segment_scene(tmp_path / "two.npz", tmp_path / "o")
+    assert not (tmp_path / "o").exists()
+    for wrong in ({"gap": 0.0}, {"tilt": 91.0}, {"min_points": 0}, {"gravity": (0.0, 0.0, 0.0)}):
+        with pytest.raises(InputError):
+            SegmentSettings(**wrong)

@@ -1,0 +1,144 @@
+"""Boxes as STEP, IGES and 3MF, written as text: the libraries that read them write none."""
+
+import textwrap
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+FACES = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5))
+"""Corners of a box's sides, seen from outside."""
+Place = tuple[Sequence[float], Sequence[float], Sequence[float]]
+"""Where a part stands: origin, its z and its x."""
+
+
+def corners(size: Sequence[float]) -> np.ndarray:
+    return np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)]) * np.array(size)
+
+
+def step(size: Sequence[float], unit: str = "mm", places: Sequence[Place] = ()) -> str:
+    """A box (ISO 10303-21, AP214: a faceted brep); with places an assembly of as many."""
+    lines: list[str] = []
+
+    def add(text: str) -> str:
+        lines.append(text)
+        return f"#{len(lines)}"
+
+    def triple(kind: str, values: Sequence[float]) -> str:
+        return add(f"{kind}('',({','.join(str(float(value)) for value in values)}))")
+
+    def axes(origin: Sequence[float], z: Sequence[float], x: Sequence[float]) -> str:
+        turns = f"{triple('DIRECTION', z)},{triple('DIRECTION', x)}"
+        return add(f"AXIS2_PLACEMENT_3D('',{triple('CARTESIAN_POINT', origin)},{turns})")
+
+    def product(name: str) -> tuple[str, str]:
+        item = add(f"PRODUCT('{name}','','',({kind}))")
+        form = add(f"PRODUCT_DEFINITION_FORMATION('','',{item})")
+        definition = add(f"PRODUCT_DEFINITION('','',{form},{stage})")
+        return definition, add(f"PRODUCT_DEFINITION_SHAPE('','',{definition})")
+
+    prefix = "$" if unit == "m" else ".MILLI."
+    length = add(f"(LENGTH_UNIT()NAMED_UNIT(*)SI_UNIT({prefix},.METRE.))")
+    if unit == "in":
+        inch = add(f"LENGTH_MEASURE_WITH_UNIT(LENGTH_MEASURE(25.4),{length})")
+        powers = add("DIMENSIONAL_EXPONENTS(1.,0.,0.,0.,0.,0.,0.)")
+        length = add(f"(CONVERSION_BASED_UNIT('INCH',{inch})LENGTH_UNIT()NAMED_UNIT({powers}))")
+    angle = add("(NAMED_UNIT(*)PLANE_ANGLE_UNIT()SI_UNIT($,.RADIAN.))")
+    solid = add("(NAMED_UNIT(*)SI_UNIT($,.STERADIAN.)SOLID_ANGLE_UNIT())")
+    context = add(
+        f"(GEOMETRIC_REPRESENTATION_CONTEXT(3)GLOBAL_UNIT_ASSIGNED_CONTEXT(({length},{angle},"
+        f"{solid}))REPRESENTATION_CONTEXT('',''))"
+    )
+    application = add("APPLICATION_CONTEXT('')")
+    kind = add(f"PRODUCT_CONTEXT('',{application},'mechanical')")
+    stage = add(f"PRODUCT_DEFINITION_CONTEXT('part definition',{application},'design')")
+    points = corners(size)
+    names = [triple("CARTESIAN_POINT", point) for point in points]
+    sides = []
+    for side in FACES:
+        a, b, c = points[list(side[:3])]
+        plane = add(f"PLANE('',{axes(a, np.cross(b - a, c - b), b - a)})")
+        loop = add(f"POLY_LOOP('',({','.join(names[i] for i in side)}))")
+        bound = add(f"FACE_OUTER_BOUND('',{loop},.T.)")
+        sides.append(add(f"FACE_SURFACE('',({bound}),{plane},.T.)"))
+    shell = add(f"CLOSED_SHELL('',({','.join(sides)}))")
+    body = add(f"FACETED_BREP('',{shell})")
+    base = axes((0, 0, 0), (0, 0, 1), (1, 0, 0))
+    part, part_shape = product("part")
+    shape = add(f"FACETED_BREP_SHAPE_REPRESENTATION('',({body},{base}),{context})")
+    add(f"SHAPE_DEFINITION_REPRESENTATION({part_shape},{shape})")
+    if places:
+        whole, whole_shape = product("whole")
+        stands = [axes(*place) for place in places]
+        scene = add(f"SHAPE_REPRESENTATION('',({','.join([base, *stands])}),{context})")
+        add(f"SHAPE_DEFINITION_REPRESENTATION({whole_shape},{scene})")
+        for number, stand in enumerate(stands):
+            use = add(f"NEXT_ASSEMBLY_USAGE_OCCURRENCE('{number}','','',{whole},{part},$)")
+            move = add(f"ITEM_DEFINED_TRANSFORMATION('','',{base},{stand})")
+            relation = add(
+                f"(REPRESENTATION_RELATIONSHIP('','',{shape},{scene})"
+                f"REPRESENTATION_RELATIONSHIP_WITH_TRANSFORMATION({move})"
+                "SHAPE_REPRESENTATION_RELATIONSHIP())"
+            )
+            used = add(f"PRODUCT_DEFINITION_SHAPE('','',{use})")
+            add(f"CONTEXT_DEPENDENT_SHAPE_REPRESENTATION({relation},{used})")
+    data = "\n".join(f"#{number}={line};" for number, line in enumerate(lines, 1))
+    return (
+        "ISO-10303-21;\nHEADER;\nFILE_DESCRIPTION((''),'2;1');\n"
+        "FILE_NAME('','',(''),(''),'','','');\n"
+        "FILE_SCHEMA(('AUTOMOTIVE_DESIGN { 1 0 10303 214 1 1 1 1 }'));\nENDSEC;\n"
+        f"DATA;\n{data}\nENDSEC;\nEND-ISO-10303-21;\n"
+    )
+
+
+def iges(size: Sequence[float], unit: tuple[int, str] = (2, "MM")) -> str:
+    """A box of six ruled surfaces (IGES 5.3, entity 118) between lines (110)."""
+    entities: list[tuple[int, list]] = []
+    points = corners(size).tolist()
+    for a, b, c, d in FACES:
+        entities += [(110, points[a] + points[b]), (110, points[d] + points[c])]
+        entities.append((118, [2 * len(entities) - 3, 2 * len(entities) - 1, 0, 0]))
+    head = (
+        "1H,,1H;,3Hbox,3Hbox,1Hq,1Hq,32,38,6,308,15,3Hbox,1.0,"
+        f"{unit[0]},{len(unit[1])}H{unit[1]},1,1.0,15H20260101.000000,1.E-6,1000.0,1Hq,1Hq,11,0,"
+        "15H20260101.000000;"
+    )
+    sections: dict[str, list[str]] = {"S": ["box"], "G": textwrap.wrap(head, 72), "D": [], "P": []}
+    for number, (kind, values) in enumerate(entities):
+        text = textwrap.wrap(",".join(map(str, [kind, *values])) + ";", 64)
+        first, state = len(sections["P"]) + 1, "00000000" if kind == 118 else "00010000"
+        sections["P"] += [f"{line:<64}{2 * number + 1:>8}" for line in text]
+        rows = [kind, first, *[0] * 6, state], [kind, 0, 0, len(text), 0, "", "", "", 0]
+        sections["D"] += ["".join(f"{value:>8}" for value in row) for row in rows]
+    ends = "".join(f"{name}{len(lines):>7}" for name, lines in sections.items())
+    return "".join(
+        f"{line:<72}{name}{number:>7}\n"
+        for name, lines in [*sections.items(), ("T", [ends])]
+        for number, line in enumerate(lines, 1)
+    )
+
+
+def write_3mf(path: Path, objects: str, build: str, unit: str = "millimeter") -> Path:
+    """A 3MF of the objects and items given as XML (3MF core specification)."""
+    space = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(
+            "3D/3dmodel.model",
+            f'<model unit="{unit}" xmlns="{space}"><resources>{objects}</resources>'
+            f"<build>{build}</build></model>",
+        )
+    return path
+
+
+def box_3mf(size: Sequence[float], name: str = "1") -> str:
+    """A box as an object of 3MF."""
+    vertices = "".join(f'<vertex x="{x}" y="{y}" z="{z}"/>' for x, y, z in corners(size))
+    triangles = "".join(
+        f'<triangle v1="{a}" v2="{b}" v3="{c}"/><triangle v1="{a}" v2="{c}" v3="{d}"/>'
+        for a, b, c, d in FACES
+    )
+    return (
+        f'<object id="{name}" type="model"><mesh><vertices>{vertices}</vertices>'
+        f"<triangles>{triangles}</triangles></mesh></object>"
+    )

@@ -1,0 +1,138 @@
+"""STEP, IGES and 3MF: sizes of any unit, assemblies placed, hostile files refused."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qs3.errors import InputError, MissingExtraError
+from qs3.meshes import cad, collect, load_mesh
+from qs3.meshes.cad import check_extra
+from qs3.meshes.sizes import file_size
+
+from .cad_files import box_3mf, iges, step, write_3mf
+
+SIZE = (0.4, 0.3, 0.85)
+PER_METRE = {"mm": 1000, "m": 1, "in": 1 / 0.0254}
+step_and_iges = pytest.mark.skipif(
+    importlib.util.find_spec("cascadio") is None, reason="cascadio is not here (extra cad)"
+)
+threemf = pytest.mark.skipif(
+    importlib.util.find_spec("lxml") is None, reason="lxml is not here (extra cad)"
+)
+
+
+def scaled(unit: str) -> list[float]:
+    return [PER_METRE[unit] * side for side in SIZE]
+
+
+@step_and_iges
+@pytest.mark.parametrize("unit", ["mm", "m", "in"])
+def test_step_and_iges_have_the_size_that_they_tell_and_z_up(tmp_path: Path, unit: str) -> None:
+    number = {"mm": (2, "MM"), "m": (6, "M"), "in": (1, "IN")}[unit]
+    for name, text in (("a.step", step(scaled(unit), unit)), ("a.IGS", iges(scaled(unit), number))):
+        path = tmp_path / name
+        path.write_text(text)
+        mesh = load_mesh(path)
+        assert file_size(mesh, "cm")[0] == pytest.approx(0.85, rel=1e-6)
+        np.testing.assert_allclose(mesh.extents / mesh.extents[2] * 0.85, SIZE, rtol=1e-5)
+        assert mesh.area == pytest.approx(1.43 * (mesh.extents[2] / 0.85) ** 2, rel=1e-5)
+        if unit == "mm":
+            assert np.array_equal(load_mesh(path).triangles, mesh.triangles)
+
+
+@step_and_iges
+def test_an_assembly_is_merged_with_its_transforms(tmp_path: Path) -> None:
+    path = tmp_path / "two.stp"
+    upright = ((0, 0, 0), (0, 0, 1), (1, 0, 0))
+    path.write_text(step(scaled("mm"), "mm", [upright, ((2000, 0, 0), (0, 0, 1), (0, 1, 0))]))
+    mesh = load_mesh(path)
+    # The second is turned by 90° about z: its y, 0.3, goes to −x and its x, 0.4, to y.
+    np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [2, 0.4, 0.85]], atol=1e-6)
+    second = mesh.vertices[mesh.vertices[:, 0] > 1]
+    np.testing.assert_allclose(second.min(axis=0), [1.7, 0, 0], atol=1e-6)
+    assert mesh.area == pytest.approx(2 * 1.43)
+
+
+@threemf
+@pytest.mark.parametrize("unit", ["millimeter", "inch", "meter"])
+def test_3mf_places_its_parts_and_tells_its_unit(tmp_path: Path, unit: str) -> None:
+    length = {"millimeter": "mm", "inch": "in", "meter": "m"}[unit]
+    size = scaled(length)
+    nested = (
+        '<object id="2"><components><component objectid="1"/><component objectid="1" '
+        f'transform="1 0 0 0 1 0 0 0 1 {PER_METRE[length]} 0 0"/></components></object>'
+    )
+    path = write_3mf(tmp_path / "a.3mf", box_3mf(size) + nested, '<item objectid="2"/>', unit)
+    mesh = load_mesh(path)
+    expected = np.array([[0, 0, 0], [1.4, 0.3, 0.85]]) * PER_METRE[length]
+    np.testing.assert_allclose(mesh.bounds, expected, atol=1e-9)
+    assert file_size(mesh)[0] == pytest.approx(1.4)
+
+
+@threemf
+def test_a_hostile_3mf_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    tens = "".join(
+        f'<object id="{n}"><components>'
+        + f'<component objectid="{n - 1}"/>' * 10
+        + "</components></object>"
+        for n in range(2, 12)
+    )
+    circle = '<object id="2"><components><component objectid="2"/></components></object>'
+    box, item = box_3mf(SIZE), '<item objectid="{}"/>'
+    for objects, build, message in (
+        (box + tens, item.format(11), "places 11111111111 parts"),
+        (box + circle, item.format(2), "in a circle"),
+        (box + " " * 100_000_000, item.format(1), "would unpack to 1000"),
+        ("<object", "", "damaged"),
+    ):
+        path = write_3mf(tmp_path / "a.3mf", objects, build)
+        with pytest.raises(InputError, match=message) as caught:
+            load_mesh(path)
+        assert str(caught.value).startswith(f"{path}: ")
+        assert "\n" not in str(caught.value)
+    path.write_bytes(b"PK no archive")
+    with pytest.raises(InputError, match="not a 3MF file"):
+        load_mesh(path)
+
+
+@step_and_iges
+@pytest.mark.parametrize("name", ["a.step", "a.iges"])
+def test_a_damaged_cad_file_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(b"ISO-10303-21; dear reader\n\x1b[2J")
+    with pytest.raises(InputError, match=f"cannot be read as {name[2:].upper()}") as caught:
+        load_mesh(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="signals end a process elsewhere otherwise")
+def test_a_crash_of_the_library_is_that_file_s_fault(tmp_path: Path, monkeypatch) -> None:
+    """Stands in for the interpreter with a program that dies of a segmentation fault."""
+    program = tmp_path / "crash"
+    program.write_text("#!/bin/sh\nkill -SEGV $$\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(cad.sys, "executable", str(program))
+    with pytest.raises(InputError, match=r"a\.step.*ended: -11"):
+        cad.to_glb(tmp_path / "a.step")
+
+
+def test_without_the_extra_it_is_named_before_the_first_mesh(tree, monkeypatch) -> None:
+    monkeypatch.setattr(cad.importlib.util, "find_spec", lambda name: None)
+    root = tree("cup/a.off", "cup/b.step", "lid/c.STEP")
+    with pytest.raises(InputError, match=r"2 files \.step: cascadio.*extra 'cad'"):
+        collect(root)
+    for ending in cad.NEEDS:
+        with pytest.raises(MissingExtraError, match="cad"):
+            check_extra(ending)
+    check_extra(".off")
+
+
+def test_what_is_not_read_is_listed(tree, caplog) -> None:
+    root = tree("cup/a.off", "cup/a.dwg", "lid/b.obj", "lid/b.MTL", "lid/c.mtl", "README")
+    assert len(collect(root)) == 2
+    assert caplog.messages == [f"{root}: not read: 1 .dwg, 2 .mtl, 1 README"]
+    with pytest.raises(InputError, match=r"holds no mesh.*it has 1 \.dwg"):
+        collect(tree("only/x.dwg") / "only")

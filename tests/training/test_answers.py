@@ -1,0 +1,121 @@
+"""Answers of a network for files: listed, told in tables, linked by class."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from qs3.cli import main
+from qs3.io import load_clouds
+from qs3.models import create_model
+from qs3.training import TrainSettings, save_model
+from qs3.training.answers import (
+    Answer,
+    answers_csv,
+    answers_json,
+    list_clouds,
+    predict_files,
+    sort_into,
+)
+
+from ..io.hostile import refused
+
+NAMES = ("cup", "plate", "jug")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Three clouds, one of them in a folder below, one damaged, and what is no cloud."""
+    folder = tmp_path_factory.mktemp("scans")
+    rng = np.random.default_rng(0)
+    (folder / "more").mkdir()
+    for name in ("a.npy", "b.npy", "more/a.npy"):
+        np.save(folder / name, rng.standard_normal((50, 3)))
+    (folder / "bad.ply").write_text("no PLY")
+    (folder / "notes.md").write_text("no cloud")
+    (folder / ".hidden.npy").write_text("")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    torch.manual_seed(0)
+    settings = TrainSettings(model="pointnet", num_points=32)
+    return save_model(tmp_path_factory.mktemp("run"), create_model("pointnet", 3), NAMES, settings)
+
+
+def names(paths, folder):
+    return [path.relative_to(folder).as_posix() for path in paths]
+
+
+def test_files_folders_and_patterns_are_listed_once(folder):
+    every = ["a.npy", "b.npy", "bad.ply", "more/a.npy"]
+    assert names(list_clouds([folder]), folder) == every
+    assert names(list_clouds([folder / "*.npy"]), folder) == ["a.npy", "b.npy"]
+    assert names(list_clouds([folder / "**" / "a.npy"]), folder) == ["a.npy", "more/a.npy"]
+    assert names(list_clouds([folder / "b.npy", folder]), folder)[0] == "b.npy"
+    assert len(list_clouds([folder, folder / "*.npy"])) == 4
+    with refused("no cloud found", "*.pcd"):
+        list_clouds([folder / "*.pcd"])
+
+
+def test_answers_are_the_likeliest_first_and_one_bad_file_stops_no_other(folder, model):
+    answers = list(predict_files(model, list_clouds([folder])))
+    assert [bool(answer.fault) for answer in answers] == [False, False, True, False]
+    assert "bad.ply" in answers[2].fault
+    for answer in answers[:2]:
+        shares = list(answer.probabilities.values())
+        assert shares == sorted(shares, reverse=True)
+        assert sum(shares) == pytest.approx(1.0)
+        assert set(answer.probabilities) == set(NAMES)
+        assert answer.best(2) == list(answer.probabilities.items())[:2]
+
+
+def test_tables_hold_what_was_answered(folder, tmp_path, model):
+    answers = list(predict_files(model, list_clouds([folder])))
+    (tmp_path / "a.csv").write_text(answers_csv(answers, top=3))
+    rows = pd.read_csv(tmp_path / "a.csv", keep_default_na=False)
+    assert rows["class"].tolist() == [(answer.best() or [("", 0)])[0][0] for answer in answers]
+    assert set(rows.loc[0, ["class", "class_2", "class_3"]]) == set(NAMES)
+    assert rows["fault"].tolist() == [answer.fault for answer in answers]
+    entries = json.loads(answers_json(answers))
+    assert entries[0]["probabilities"] == answers[0].probabilities
+    assert entries[2] == {"file": str(folder / "bad.ply"), "fault": answers[2].fault}
+
+
+def test_links_by_class_are_a_data_set(folder, tmp_path):
+    one, two, below = (folder / name for name in ("a.npy", "b.npy", "more/a.npy"))
+    answers = [Answer(one, {"cup": 0.9, "jug": 0.1}), Answer(two, {"jug": 1.0}),
+               Answer(below, {"cup": 1.0}), Answer(folder / "bad.ply", fault="bad")]  # fmt: skip
+    sort_into(tmp_path / "sorted", answers)
+    links = {p.relative_to(tmp_path / "sorted").as_posix(): p.resolve()
+             for p in (tmp_path / "sorted").rglob("*.npy")}  # fmt: skip
+    assert links == {"cup/a.npy": one, "jug/b.npy": two, "cup/a-2.npy": below}
+    clouds = load_clouds(tmp_path / "sorted", num_points=None)
+    assert clouds.class_names == ("cup", "jug")
+    with refused("is there already"):
+        sort_into(tmp_path / "sorted", answers)
+    with refused("cannot name a folder"):
+        sort_into(tmp_path / "other", [Answer(one, {"../up": 1.0})])
+    assert not (tmp_path / "other").exists()
+
+
+def test_the_command_does_the_rest_names_every_fault_and_ends_with_2(
+    folder, model, tmp_path, capsys
+):
+    (folder / "more" / "empty.xyz").write_text("")
+    words = ["predict", model, folder, "--top", "2", "--csv", tmp_path / "t.csv", "--json",
+             tmp_path / "t.json", "--sort-into", tmp_path / "s"]  # fmt: skip
+    with pytest.raises(SystemExit) as ended:
+        main(list(map(str, words)))
+    told = capsys.readouterr()
+    assert ended.value.code == 2
+    lines = [line.split("\t") for line in told.out.splitlines()]
+    assert [len(line) for line in lines] == [5, 5, 5]
+    assert "bad.ply" in told.err
+    assert "empty.xyz: empty file (2 of 5 files)" in told.err.splitlines()[-1]
+    assert len(pd.read_csv(tmp_path / "t.csv")) == 5
+    assert len(json.loads((tmp_path / "t.json").read_text())) == 5
+    assert len(list((tmp_path / "s").rglob("*.npy"))) == 3

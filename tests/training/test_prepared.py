@@ -1,0 +1,222 @@
+"""Clouds on their way into a network: laws of `Preparation` from training to prediction."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from qs3.errors import InputError
+from qs3.io.clouds import PointClouds
+from qs3.io.preparation import PAPER, ROBUST, Preparation, distinct_inliers, normalise, resample
+from qs3.structure import structure
+from qs3.training import (
+    QBST,
+    TrainSettings,
+    evaluate,
+    fit,
+    load_model,
+    predict_probabilities,
+    prepare,
+    save_model,
+)
+from qs3.training.config import preparation_of
+from qs3.training.prepared import Prepared, label_clouds, normalise_batch, prepare_clouds
+from qs3.training.run import SETTINGS, read_settings
+
+OWN = replace(ROBUST, size_input=True)
+
+
+@pytest.fixture
+def strayed(target):
+    """Clouds of which two points lie far out, and ten repeat others."""
+    points = target.points.copy()
+    points[:, 7] += 40
+    points[:, 9, 2] -= 60
+    points[:, 20:30] = points[:, 30:40]
+    return replace(target, points=points)
+
+
+def test_outliers_go_alike_from_source_and_target(strayed):
+    """Each cloud by itself: what else is in the set, and whether it has labels, does not matter."""
+    as_source = prepare_clouds(strayed, 40, ROBUST)
+    as_target = prepare_clouds(strayed.without_labels(), 40, ROBUST)
+    assert np.array_equal(as_source.points, as_target.points)
+    alone = prepare_clouds(strayed.select(np.array([5])), 40, ROBUST)
+    assert np.array_equal(alone.points[0], as_source.points[5])
+    for row, cloud in enumerate(strayed.points):
+        kept = distinct_inliers(cloud, True)
+        assert not {7, 9} & set(kept)
+        chosen = as_source.chosen(slice(row, row + 1))[0]
+        assert np.array_equal(chosen, resample(cloud[kept], 40))
+        assert as_source.order.counts[row] == len(kept)
+        # What is drawn from holds every point that counts, and no other.
+        drawn = as_source.indices(np.array([row]))[0]
+        assert set(drawn) == set(kept)
+        assert len(set(drawn[: len(kept)])) == len(kept)
+    for share in (as_source, as_target):
+        assert np.abs(share.points).max() < 4
+
+
+@pytest.mark.parametrize("redraw", [False, True])
+@pytest.mark.parametrize("count", [20, 64, 90])
+def test_the_fixed_choice_does_not_depend_on_redrawing(strayed, redraw, count):
+    how = Preparation(remove_outliers=True, redraw=redraw)
+    prepared = prepare_clouds(strayed, count, how)
+    wanted = [resample(cloud[distinct_inliers(cloud, True)], count) for cloud in strayed.points]
+    assert np.array_equal(prepared.chosen(slice(None)), np.stack(wanted))
+    assert np.array_equal(prepared.points, normalise(np.stack(wanted), how))
+    assert np.array_equal(prepare(strayed.points, count, how), prepared.points)
+
+
+def test_nothing_is_copied(source):
+    prepared = prepare_clouds(source, 40, ROBUST)
+    part = prepared.select(np.arange(24) % 3 == 0)
+    assert part.clouds.points is source.points
+    assert np.array_equal(part.labels, source.labels[::3])
+    assert part.ids == source.ids[::3]
+    assert np.array_equal(part.points, prepared.points[::3])
+    assert np.array_equal(np.concatenate(list(part.blocks())), part.chosen(slice(None)))
+
+
+def test_pseudo_labels_go_to_their_clouds(target):
+    prepared = prepare_clouds(target.without_labels(), 40).select(np.arange(5, 25))
+    rows, given = np.array([3, 17, 4]), np.array([2, 0, 1])
+    made = label_clouds(prepared, rows, given, target.class_names)
+    assert isinstance(made.clouds, PointClouds)
+    assert made.labels.tolist() == [2, 0, 1]
+    assert made.clouds.points is target.points
+    assert np.array_equal(made.points, prepared[rows])
+
+
+def test_the_choice_is_kept_for_a_resumed_run(strayed, tmp_path, monkeypatch):
+    first = prepare_clouds(strayed, 40, ROBUST, tmp_path)
+    assert len(list(tmp_path.glob("subsample-*.safetensors"))) == 1
+    prepare_clouds(strayed, 40, PAPER, tmp_path)
+    assert len(list(tmp_path.glob("subsample-*.safetensors"))) == 2  # another choice
+
+    def forbidden(*arguments):
+        raise AssertionError("made again")
+
+    monkeypatch.setattr("qs3.training.prepared.distinct_inliers", forbidden)
+    again = prepare_clouds(strayed, 40, ROBUST, tmp_path)
+    assert np.array_equal(again.order.index, first.order.index)
+    assert np.array_equal(again.order.counts, first.order.counts)
+    with pytest.raises(AssertionError, match="made again"):
+        prepare_clouds(strayed, 41, ROBUST, tmp_path)
+
+
+@pytest.mark.parametrize("preparation", [PAPER, replace(ROBUST, redraw=False), OWN])
+def test_normalising_by_torch_is_that_of_numpy(strayed, preparation):
+    points = torch.from_numpy(strayed.points)
+    assert np.array_equal(
+        normalise_batch(points, preparation).numpy(), normalise(strayed.points, preparation)
+    )
+
+
+def test_empty_and_broken_clouds_are_refused(source):
+    points = source.points.copy()
+    points[3, 5, 1] = np.inf
+    with pytest.raises(InputError, match="cloud 3 has a point that is not finite"):
+        prepare_clouds(replace(source, points=points), 40, ROBUST)
+    with pytest.raises(InputError, match="empty cloud"):
+        prepare_clouds(replace(source, points=points[:, :0]), 40, ROBUST)
+
+
+@pytest.fixture(scope="module")
+def run(source, target, settings, tmp_path_factory):
+    """A run with all of it: outliers, robust ball, redrawn points, size."""
+    folder = tmp_path_factory.mktemp("own") / "run"
+    own = replace(settings, preparation=OWN, num_points=40)
+    fit("source-only", source, target.without_labels(), own, run_dir=folder)
+    return folder
+
+
+def test_a_run_knows_its_preparation(run, strayed, tmp_path):
+    """Scores, predictions and the lone file of weights need not be told."""
+    loaded = load_model(run)
+    assert loaded.preparation == OWN
+    prepared = prepare_clouds(strayed, 40, OWN)
+    wanted = predict_probabilities(loaded, strayed.points)
+    direct = predict_probabilities(
+        loaded.model, strayed.points, num_points=40, preparation=OWN, batch_size=7
+    )
+    np.testing.assert_allclose(wanted, direct, atol=1e-6)
+    record = evaluate(run, strayed)
+    right = (wanted.argmax(axis=1) == strayed.labels).mean()
+    assert record.scores.accuracy == pytest.approx(right)
+    assert record.settings["train"]["preparation"]["size_input"] is True
+    assert isinstance(prepared, Prepared)
+
+    (tmp_path / "alone.safetensors").write_bytes((run / "model.safetensors").read_bytes())
+    alone = load_model(tmp_path / "alone.safetensors")
+    assert alone.preparation == OWN
+    assert np.array_equal(predict_probabilities(alone, strayed.points), wanted)
+
+
+def test_predictions_of_a_told_size_differ_with_it_and_others_do_not(run, target, settings):
+    """Metres in and out: the same clouds as millimetres are other objects."""
+    loaded = load_model(run)
+    scaled = [predict_probabilities(loaded, factor * target.points) for factor in (1, 8)]
+    assert np.abs(scaled[0] - scaled[1]).max() > 1e-4
+    free = replace(OWN, size_input=False)
+    inside = loaded.model.model
+    scaled = [
+        predict_probabilities(inside, factor * target.points, num_points=40, preparation=free)
+        for factor in (1, 8)
+    ]
+    np.testing.assert_allclose(scaled[0], scaled[1], atol=1e-5)
+
+
+def test_runs_of_before_have_the_papers(source, settings, tmp_path):
+    """settings.json and weights without the field are those of the paper's preparation."""
+    result = fit("source-only", source, None, settings, run_dir=tmp_path)
+    path = tmp_path / SETTINGS
+    value = json.loads(path.read_text())
+    for name in ("preparation", "augmentation"):
+        del value["train"][name]
+    path.write_text(json.dumps(value))
+    assert structure(read_settings(tmp_path)["train"], TrainSettings, path).preparation == PAPER
+    assert load_model(tmp_path).preparation == PAPER
+    again = fit("source-only", source, None, settings, run_dir=tmp_path)  # the same run
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(
+            result.model.state_dict().values(), again.model.state_dict().values(), strict=True
+        )
+    )
+    other = replace(settings, preparation=ROBUST)
+    with pytest.raises(InputError, match=r"train\.preparation\.\w+ = \S+, not"):
+        fit("source-only", source, None, other, run_dir=tmp_path)
+
+
+def test_a_warm_up_of_another_preparation_is_refused(run, source, target, settings, tmp_path):
+    with pytest.raises(InputError, match=r"preparation\.radius_share = 0\.95, not 1\.0"):
+        fit("qbst", source, target.without_labels(), replace(settings, num_points=40),
+            run_dir=tmp_path / "run", warm_up=run)  # fmt: skip
+
+
+def test_one_place_tells_the_default(source, target, settings):
+    assert TrainSettings().preparation == PAPER
+    assert preparation_of("paper") == preparation_of("released") == PAPER
+    assert preparation_of(None) == preparation_of("default") == preparation_of("spst") == ROBUST
+    train = {"model_settings": settings.model_settings, "num_points": 40, "epochs": 1,
+             "batch_size": 8, "accelerator": "cpu", "threads": 1}  # fmt: skip
+    rounds = {"rounds": 1, "epochs": 1}
+    made = QBST("pointnet", train=train, self_training=rounds).fit(source, target.without_labels())
+    assert made.result_.source.preparation == ROBUST
+    train |= {"preparation": {"redraw": False, "size_input": True}}
+    made = QBST("pointnet", train=train, self_training=rounds).fit(source, target.without_labels())
+    assert made.result_.source.preparation == Preparation(True, 0.95, False, True)
+    wanted = predict_probabilities(
+        made.model_, target.points, num_points=40, preparation=made.result_.source.preparation
+    )
+    assert np.array_equal(made.predict_proba(target), wanted)
+
+
+def test_weights_tell_their_preparation(run, tmp_path):
+    loaded = load_model(run)
+    settings = structure(loaded.settings["train"], TrainSettings, "here")
+    save_model(tmp_path, loaded.model, loaded.class_names, settings, name="w.safetensors")
+    assert load_model(tmp_path / "w.safetensors").preparation == OWN
