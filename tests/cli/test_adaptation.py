@@ -79,7 +79,7 @@ def test_rounds_with_all_switches_after_a_method(qs3, source, tmp_path, method):
         "--self-training.turns", 2, "--self-training.teacher", "average",
         "--self-training.threshold-share", 0.8, "--self-training.floor", 4,
         "--self-training.refine", "--self-training.label-smoothing", 0, *QUICK,
-        "--epochs", 1)  # fmt: skip
+        "--epochs", 1, "--no-remove-outliers", "--radius-share", 1, "--no-redraw")  # fmt: skip
     done = qs3("evaluate", run, "--data", source, "--checkpoints")
     assert "checkpoint          round 2, by rule last" in done.stdout
     assert "known here" in done.stdout
@@ -122,10 +122,11 @@ def test_one_confident_class_is_told_in_the_last_lines(qs3, source, store, tmp_p
     """A network of one class: the round, the class and the count stand before what is next."""
     warm, run = tmp_path / "warm", tmp_path / "run"
     qs3("train", "--source", source, "--out", warm, *QUICK)
-    model, class_names, settings = load_model(warm)
+    loaded = load_model(warm)
+    model, train = loaded.model, structure(loaded.settings["train"], TrainSettings, warm)
     with torch.no_grad():
         model.classify.layers[-1].bias[3] += 50.0
-    save_model(warm, model, class_names, structure(settings["train"], TrainSettings, warm))
+    save_model(warm, model, loaded.class_names, train)
     done = qs3("train", "--source", source, "--target", store, "--out", run, "--method", "qbst",
                "--warm-up", warm, "--self-training.rounds", 1, "--self-training.epochs", 1,
                *QUICK, code=4)  # fmt: skip

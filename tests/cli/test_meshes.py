@@ -4,7 +4,7 @@ import trimesh
 from PIL import Image
 
 
-def test_a_folder_is_shown_with_its_sizes_hints_and_faults(tmp_path, typed):
+def test_a_folder_is_shown_with_its_sizes_hints_and_faults(tmp_path, typed, caplog):
     for name, length in (("cup/a.stl", 90.0), ("cup/b.obj", 0.12), ("lid/c.ply", 0.1)):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         trimesh.creation.box((length, length, length / 2)).export(tmp_path / name)
@@ -19,7 +19,7 @@ def test_a_folder_is_shown_with_its_sizes_hints_and_faults(tmp_path, typed):
     assert "1 of 4, such as cup/a: tells no unit, looks to be in millimetres" in hint
     (fault,) = [line for line in lines if line.startswith("fault")]
     assert "d.off: cut short" in fault
-    assert "not read: 1 .dwg" in done.stderr
+    assert "not read: 1 .dwg" in caplog.text
     assert lines[-1] == str(sheet)
     with Image.open(sheet) as picture:
         assert picture.width > picture.height

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from qs3.io.preparation import PAPER, Preparation, unit_ball
-from qs3.training.batches import DeviceClouds, Share, augment, batches, draw_points, make_batch
+from qs3.training.batches import DeviceClouds, Share, augment, batches, first_places, make_batch
 from qs3.training.prepared import prepare_clouds
 
 CPU = torch.device("cpu")
@@ -104,17 +104,16 @@ def test_a_device_that_holds_the_clouds_gives_what_others_are_sent(
 
 
 def test_points_are_drawn_among_those_that_are_kept():
-    points = torch.arange(30.0)[None, :, None].expand(2000, 30, 3)
     kept = torch.ones(2000, 30, dtype=torch.bool)
     kept[:, 20:] = False
     keys = torch.rand(2000, 30, generator=generator())
-    drawn = draw_points(points, kept, 15, keys)[:, :, 0].long()
+    drawn = first_places(kept, 15, keys)
     assert drawn.max() < 20
     assert all(len(set(row)) == 15 for row in drawn.tolist())  # none twice
     counts = torch.bincount(drawn.flatten(), minlength=20).double()
     # Each of 20 is drawn with probability 3/4: within five standard deviations.
     assert (counts / 2000 - 0.75).abs().max() < 5 * np.sqrt(0.75 * 0.25 / 2000)
-    few = draw_points(points, kept, 45, keys)[:, :, 0].long()
+    few = first_places(kept, 45, keys)
     assert all(
         sorted(np.bincount(row, minlength=20).tolist()) == [2] * 15 + [3] * 5 for row in few[:20]
     )

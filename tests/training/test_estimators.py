@@ -4,6 +4,7 @@ import torch
 from sklearn.base import clone, is_classifier
 
 from qs3.errors import InputError
+from qs3.io.preparation import ROBUST
 from qs3.training import QBST, SPST, Adapter, SelfTrainingSettings, TrainSettings, fit
 
 TRAIN = {
@@ -44,7 +45,7 @@ def test_the_line_of_the_readme(source, target):
 )
 def test_it_is_the_fit_of_the_function(source, target, tmp_path, made, method, rounds):
     made.fit(source, target.without_labels())
-    settings = TrainSettings(**TRAIN, model="pointnet")
+    settings = TrainSettings(**TRAIN, model="pointnet", preparation=ROBUST)
     wanted = fit(
         method,
         source,

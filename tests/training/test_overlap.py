@@ -7,11 +7,17 @@ import pytest
 
 from qs3.errors import InputError
 from qs3.evaluation.records import DataRecord
-from qs3.training.batches import subsample
+from qs3.io.clouds import UnlabelledClouds, numbered
 from qs3.training.overlap import caveats, seen_clouds, shapes
+from qs3.training.prepared import prepare_clouds
 from qs3.training.run import Run
 
 DATA = DataRecord("a", "b", 1)
+
+
+def ready(points, num_points=None):
+    clouds = UnlabelledClouds(np.asarray(points), numbered(len(points)))
+    return prepare_clouds(clouds, num_points or points.shape[1])
 
 
 def run_of(source, target=((), ())):
@@ -43,36 +49,36 @@ REWRITTEN = {
 
 @pytest.mark.parametrize("name", REWRITTEN)
 def test_a_cloud_written_anew_is_known(clouds, rng, name):
-    for cut in (clouds, subsample(clouds, 64)):  # a training on fewer points
-        seen = seen_clouds(cut, clouds)
+    for count in (200, 64):  # a training on fewer points
+        seen = seen_clouds(ready(clouds, count))
         for cloud in clouds[:5]:
-            test = REWRITTEN[name](cloud[None], rng)
+            test = ready(REWRITTEN[name](cloud[None], rng))
             assert caveats(run_of(seen), test) == ("training clouds",)
             assert caveats(run_of(((), ()), seen), test) == ("transductive",)
 
 
 def test_what_the_network_gets_is_known_too(clouds):
-    chosen = subsample(clouds, 64)
-    seen = seen_clouds(chosen, clouds)
-    assert caveats(run_of(seen), chosen[3:4] + np.float32(1e-4)) == ("training clouds",)
+    prepared = ready(clouds, 64)
+    test = prepared.chosen(slice(3, 4)) + np.float32(1e-4)
+    assert caveats(run_of(seen_clouds(prepared)), ready(test)) == ("training clouds",)
 
 
 def test_other_clouds_are_not(clouds):
-    seen = seen_clouds(clouds[:20], clouds[:20])
-    assert caveats(run_of(seen), clouds[20:]) == ()
-    half = run_of(seen_clouds(clouds[:20, :100], clouds[:20, :100]))
-    assert caveats(half, clouds[:20, 100:]) == ()  # other samples of the same objects
+    seen = seen_clouds(ready(clouds[:20]))
+    assert caveats(run_of(seen), ready(clouds[20:])) == ()
+    half = run_of(seen_clouds(ready(clouds[:20, :100])))
+    assert caveats(half, ready(clouds[:20, 100:])) == ()  # other samples of the same objects
     flat = np.ones((2, 10, 3), np.float32)
     assert shapes(flat) == []
-    assert caveats(run_of(seen_clouds(flat[:1], flat[:1])), 2 * flat) == ()
+    assert caveats(run_of(seen_clouds(ready(flat[:1]))), ready(2 * flat)) == ()
 
 
 def test_damaged_shapes_are_told(clouds):
-    seen = seen_clouds(clouds, clouds)
+    seen = seen_clouds(ready(clouds))
     for bad in ("", "00", "x" * 64, seen[1][0][:-1]):
         run = replace(run_of(seen), source_shapes=(bad,))
         with pytest.raises(InputError, match=r"shapes of clouds .* are damaged"):
-            caveats(run, clouds[:1] * 2)
+            caveats(run, ready(clouds[:1] * 2))
 
 
 @pytest.mark.slow

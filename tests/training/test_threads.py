@@ -10,7 +10,7 @@ import torch
 from qs3.errors import InputError
 from qs3.training import fit, read_run, threads
 from qs3.training.distributed import make_fabric
-from qs3.training.job import Job, fresh_model, make_method
+from qs3.training.job import fresh_model, make_method
 from qs3.training.threads import choose_threads, describe_threads, fastest, trial_step
 
 
@@ -114,9 +114,8 @@ def test_a_resumed_run_keeps_its_number(source, settings, tmp_path, caplog):
     assert read_run(tmp_path).threads == 1
 
 
-def test_a_step_to_be_timed_needs_no_clouds(source, target, settings, tmp_path):
-    job = Job("coral", source, None, target.without_labels(), settings, None, tmp_path)
-    method = make_method(fresh_model(job), job)
+def test_a_step_to_be_timed_needs_no_clouds(settings):
+    method = make_method("coral", fresh_model("coral", settings, 3), settings)
     step = trial_step(method, 3, settings, make_fabric(settings))
     before = torch.get_rng_state()
     step()

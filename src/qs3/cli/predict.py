@@ -53,7 +53,7 @@ def predict(
                 show("\t".join([printable(str(answer.file), keep=""), *parts]))
     if csv is not None:
         write_text(csv, table.answers_csv(answers, top))
-    if json not in (None, Path("-")):
+    if json is not None and json != Path("-"):
         write_text(json, table.answers_json(answers))
     if sort_into is not None:
         table.sort_into(sort_into, answers)

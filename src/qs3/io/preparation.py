@@ -75,7 +75,7 @@ def normalise(
     Example:
         >>> line = np.array([[[float(x), 0, 0] for x in (*range(20), 1000)]])
         >>> normalise(line, Preparation(radius_share=0.9))[0, [0, 19], 0].tolist()
-        [-1.0, 0.8999999761581421]
+        [-1.1111111640930176, 1.0]
     """
     balls = np.empty(points.shape, dtype=np.float32)
     for start in range(0, len(points), _CLOUDS):  # in double precision, but never all at once

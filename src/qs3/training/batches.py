@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from qs3.adaptation import Batch
@@ -21,6 +21,8 @@ from qs3.training.prepared import Prepared, normalise_batch, prepare_clouds
 
 _SHARE_OF_MEMORY = 0.25
 """Part of a GPU's free memory that the clouds may take; the network needs the rest."""
+_SPARE = 2
+"""How many times the points that are needed are augmented, as some of them are lost by it."""
 
 
 def require_unlabelled(target: UnlabelledClouds) -> None:
@@ -182,7 +184,8 @@ class DeviceClouds:
     ) -> Batch:
         """Return this device's share of the clouds at ``rows``, normalised, on the device.
 
-        The clouds are augmented whole, their points drawn from what is left, then normalised.
+        Twice the points are drawn where clouds are augmented; what is left of them is cut to the
+        number, then normalised.
 
         Args:
             rows: Clouds of a batch.
@@ -195,64 +198,80 @@ class DeviceClouds:
         mine = slice(share.rank, None, share.world)
         labels = self.labels[torch.from_numpy(rows[mine])].to(self.device)
         if generator is None or (augmentation == _NONE and not preparation.redraw):
-            return Batch(normalise_batch(self._points(rows[mine], num_points), preparation), labels)
-        width = None if preparation.redraw else num_points
+            points = self._points(rows[mine], self._first(rows[mine]))
+            return Batch(normalise_batch(points, preparation), labels)
+        count = num_points if augmentation == _NONE else _SPARE * num_points
+        chosen, distinct = self._chosen(rows, count, generator)
         if augmentation == _NONE:
-            points = self._points(rows[mine], width)
-            kept = self._distinct(rows[mine], points.shape[1])
+            points = self._points(rows[mine], chosen[mine])
         else:
-            points, kept = augment_clouds(self._points(rows, width), augmentation, generator)
-            distinct = self._distinct(rows, points.shape[1])
+            points, kept = augment_clouds(self._points(rows, chosen), augmentation, generator)
             kept = kept & distinct
-            kept = torch.where(kept.any(dim=1, keepdim=True), kept, distinct)[mine]
-            points = points[mine]
-        keys = torch.arange(float(points.shape[1]), device=self.device).expand(points.shape[:2])
-        if preparation.redraw:
-            size = len(rows), points.shape[1]
-            keys = torch.rand(size, generator=generator, device=self.device)[mine]
-        points = draw_points(points, kept, num_points, keys)
+            kept = torch.where(kept.any(dim=1, keepdim=True), kept, distinct)
+            points = _gathered(points, first_places(kept, num_points))[mine]
         return Batch(normalise_batch(points, preparation), labels)
 
-    def _points(self, rows: np.ndarray, width: int | None) -> Float[Tensor, "r w 3"]:
-        """The first points that count of clouds, or all, as read, on the device."""
-        places, index = self.clouds.rows[rows][:, None], self.clouds.indices(rows, width)
-        if self.held is None:
-            return torch.from_numpy(self.clouds.clouds.points[places, index]).to(self.device)
-        where = (torch.from_numpy(part).to(self.device) for part in (places, index))
-        return self.held[tuple(where)]
+    def _first(self, rows: np.ndarray) -> Int[Tensor, "r m"]:
+        """The fixed choice of points of clouds, not on the device yet."""
+        index = self.clouds.indices(rows, self.clouds.num_points)
+        return torch.from_numpy(index.copy())
 
-    def _distinct(self, rows: np.ndarray, width: int) -> Bool[Tensor, "r w"]:
-        """Which points of clouds repeat none before them."""
+    def _chosen(
+        self, rows: np.ndarray, count: int, generator: torch.Generator
+    ) -> tuple[Int[Tensor, "r m"], Bool[Tensor, "r m"]]:
+        """Points of clouds, drawn anew where the preparation says so; which repeat none before."""
         order = self.clouds.order
-        counts = np.full(len(rows), width)
-        if order is not None:
-            counts = order.counts[self.clouds.rows[rows]]
+        if not self.clouds.preparation.redraw or order is None:
+            chosen = self._first(rows)
+            counts = np.full(len(rows), chosen.shape[1])
+            if order is not None:
+                counts = order.counts[self.clouds.rows[rows]]
+            return chosen, self._below(counts, chosen.shape[1])
+        index = torch.from_numpy(self.clouds.indices(rows)).to(self.device)
+        counts = order.counts[self.clouds.rows[rows]]
+        kept = self._below(counts, index.shape[1])
+        keys = torch.rand(index.shape, generator=generator, device=self.device)
+        return index.gather(1, first_places(kept, count, keys)), self._below(counts, count)
+
+    def _below(self, counts: Int[np.ndarray, "r"], width: int) -> Bool[Tensor, "r w"]:
         return torch.from_numpy(np.arange(width) < counts[:, None]).to(self.device)
 
+    def _points(self, rows: np.ndarray, index: Int[Tensor, "r m"]) -> Float[Tensor, "r m 3"]:
+        """Points of clouds, as read, on the device."""
+        places = self.clouds.rows[rows][:, None]
+        if self.held is not None:
+            return self.held[torch.from_numpy(places).to(self.device), index.to(self.device)]
+        points = self.clouds.clouds.points[places, index.cpu().numpy()]
+        return torch.from_numpy(points).to(self.device)
 
-def draw_points(
-    points: Float[Tensor, "b n 3"],
-    kept: Bool[Tensor, "b n"],
-    num_points: int,
-    keys: Float[Tensor, "b n"],
-) -> Float[Tensor, "b m 3"]:
-    """Take the points with the least keys among those that are kept; too few are repeated in turn.
+
+def first_places(
+    kept: Bool[Tensor, "b n"], count: int, keys: Float[Tensor, "b n"] | None = None
+) -> Int[Tensor, "b m"]:
+    """Return the places of the first points that are kept; too few are repeated in turn.
 
     Args:
-        points: Clouds.
         kept: Points to choose from, one at least in each cloud.
-        num_points: Points to take.
-        keys: Random numbers for a random choice; ascending ones for the first points.
+        count: How many to take.
+        keys: What orders them, random numbers for a random choice; by place if None.
 
     Example:
-        >>> line = torch.arange(4.0)[None, :, None].expand(1, 4, 3)
         >>> kept = torch.tensor([[False, True, False, True]])
-        >>> draw_points(line, kept, 3, torch.tensor([[0.1, 0.9, 0.2, 0.3]]))[0, :, 0].tolist()
-        [3.0, 1.0, 3.0]
+        >>> first_places(kept, 3).tolist()
+        [[1, 3, 1]]
+        >>> first_places(kept, 3, torch.tensor([[0.1, 0.9, 0.2, 0.3]])).tolist()
+        [[3, 1, 3]]
     """
-    order = keys.masked_fill(~kept, torch.inf).argsort(dim=1, stable=True)
-    place = torch.arange(num_points, device=points.device) % kept.sum(dim=1, keepdim=True)
-    return points.gather(1, order.gather(1, place)[:, :, None].expand(-1, -1, 3))
+    if keys is None:
+        order = kept.logical_not().to(torch.uint8).argsort(dim=1, stable=True)
+    else:
+        order = keys.masked_fill(~kept, torch.inf).argsort(dim=1, stable=True)
+    place = torch.arange(count, device=kept.device) % kept.sum(dim=1, keepdim=True)
+    return order.gather(1, place)
+
+
+def _gathered(points: Float[Tensor, "b n 3"], places: Int[Tensor, "b m"]) -> Float[Tensor, "b m 3"]:
+    return points.gather(1, places[:, :, None].expand(-1, -1, 3))
 
 
 def _free_memory(device: torch.device) -> float:

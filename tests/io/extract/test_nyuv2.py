@@ -13,6 +13,7 @@ from qs3.errors import InputError
 from qs3.io.extract.cut import CutSettings
 from qs3.io.extract.nyuv2 import FILE, Nyuv2Settings, extract_nyuv2, list_nyuv2
 from qs3.io.extract.run import OutputSettings
+from qs3.io.guards import LIMIT
 
 from ..hostile import fuzz, refused
 from .depth_scene import box, off_surface, thing
@@ -188,7 +189,7 @@ def test_classes_of_ones_own_and_all_of_them(folder, tmp_path):
 
 def test_one_frame_is_read_at_a_time(folder, tmp_path, monkeypatch):
     """A file whose arrays would fill the memory is read: only one frame of each counts."""
-    monkeypatch.setattr("qs3.io.guards.MOST_BYTES", 640 * 480 * 4)
+    monkeypatch.setenv(LIMIT, str(640 * 480 * 4 / 2**30))
     assert run(folder, tmp_path / "out")[0].failed == 0
 
 
