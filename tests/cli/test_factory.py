@@ -87,10 +87,14 @@ def test_info_counts_and_verify_finds_what_is_wrong(qs3, store, tmp_path):
 
 def test_shapes_and_meshes_go_into_one_data_set(qs3, quick, cad, tmp_path):
     (cad / "sofa" / "two.off").unlink()
-    qs3("generate", "--meshes", cad, "shapes", "--per-class", 1, "--classes", "chair", "sofa",
-        "--out", tmp_path / "out", "--num-points", 64, "--dtype", "float16", *quick)  # fmt: skip
+    (tmp_path / "map.toml").write_text('sofa = "seat"\nmug = "cup"\n')
+    done = qs3("generate", "--meshes", cad, "shapes", "--per-class", 1, "--classes", "chair",
+        "sofa", "--map", tmp_path / "map.toml", "--out", tmp_path / "out", "--num-points", 64,
+        "--dtype", "float16", *quick)  # fmt: skip
+    assert "classes: sofa → seat\nclasses: none here is mug, as the map has it" in done.stderr
     contents = json.loads(qs3("info", tmp_path / "out", "--as-json").stdout)
-    assert {name: n for name, n in contents["classes"].items() if n} == {"chair": 2, "sofa": 2}
+    assert contents["classes"] == {"chair": 2, "seat": 2}
+    assert contents["renamed"] == {"sofa": "seat"}
     assert contents["settings"]["meshes"] == "cad+shapes"
     assert contents["settings"]["dtype"] == "float16"
 

@@ -76,7 +76,9 @@ def test_a_map_is_lines_of_names(tmp_path):
     path = tmp_path / "classes.toml"
     path.write_text('stool = "chair"\n"arm chair" = "chair"\n')
     assert read_class_map(path) == {"stool": "chair", "arm chair": "chair"}
-    for text in ("stool = 3", 'stool = ""', "[chair]\na = 1", "stool: chair", 'stool = "a\\nb"'):
+    twice = 'stool = "chair"\nstool = "seat"'
+    others = ("stool = 3", 'stool = " "', "[chair]\na = 1", "stool: chair", 'stool = "a\\nb"')
+    for text in (twice, *others):
         path.write_text(text)
         with pytest.raises(InputError, match=r"classes\.toml: .*stool = \"chair\""):
             read_class_map(path)

@@ -45,8 +45,7 @@ def evaluate_run(
     record = evaluate(
         run, data, split=split, cloud=cloud, checkpoints=checkpoints, class_map=called
     )
-    if said := describe_renaming(record.test.renamed):
-        tell(said)
+    tell(*describe_renaming(record.test.renamed, called))
     if json:
         show(dumps(unstructure(record), indent=2))
     else:

@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -85,7 +85,7 @@ def generate(
             nothing.
         settings: How they are scanned and written. Another seed draws other shapes and poses.
     """
-    from qs3.meshes.classes import describe_renaming, label_order
+    from qs3.meshes.classes import describe_renaming, label_order, read_class_map
     from qs3.store.failures import read_failures
     from qs3.store.generate import generate as generate_data
     from qs3.store.plan import make_plan, resolve_renderer
@@ -96,10 +96,11 @@ def generate(
     if not match or not int(match[1]) < int(match[2]):
         raise InputError(f"--shard {shard}: give i/n with i from 0 to n - 1, such as 0/8")
     part = int(match[1]), int(match[2])
-    items = _items(meshes, up, per_class, settings.seed, classes, class_map, labels)
+    called = None if class_map is None else read_class_map(class_map)
+    items = _items(meshes, up, per_class, settings.seed, classes, called, labels)
     names = {item.class_name for item in items}
-    if said := describe_renaming({i.own_class: i.class_name for i in items if i.own_class}):
-        tell(said)
+    renamed = {item.own_class: item.class_name for item in items if item.own_class}
+    tell(*describe_renaming(renamed, called))
     settings = dataclasses.replace(
         resolve_renderer(settings),
         classes=label_order(sorted(names)),
@@ -138,11 +139,10 @@ def _items(
     per_class: int,
     seed: int,
     classes: tuple[str, ...],
-    class_map: Path | None,
+    class_map: Mapping[str, str] | None,
     labels: Path | None,
 ) -> "list[MeshItem]":
     """The list of meshes."""
-    from qs3.meshes.classes import read_class_map
     from qs3.meshes.collections import collect, rename_items
 
     if not meshes:
@@ -157,7 +157,7 @@ def _items(
     if up is not None:
         items = [i if i.path is None else dataclasses.replace(i, up=up) for i in items]
     if class_map is not None:
-        items = rename_items(items, read_class_map(class_map))
+        items = rename_items(items, class_map)
     if flat := [item.id for item in items if not item.class_name]:
         raise InputError(
             f"{' '.join(meshes)}: {flat[0]} lies flat in its folder and its class is "

@@ -76,6 +76,9 @@ def _lines(contents: dict[str, Any]) -> list[str]:
         f"{points} points a cloud",
         "classes: " + _counts(contents["classes"]),
     ]
+    if contents["renamed"]:
+        names = (f"{own} → {other}" for own, other in contents["renamed"].items())
+        lines.append("renamed: " + ", ".join(names))
     if any(contents["splits"]):
         lines.append("splits: " + _counts(contents["splits"]))
     for name, value in contents["statistics"].items():

@@ -215,7 +215,7 @@ def make_record(run: Run, setup: Setup, device: str = "") -> RunRecord:
         _see_alone(device)
     from qs3.io import load_clouds, load_unlabelled
     from qs3.io.ragged import relabel
-    from qs3.meshes.classes import POINTDA10, POINTDA10_CHOICE, canonical
+    from qs3.meshes.classes import POINTDA10, canonical
     from qs3.training import evaluate, fit, load_whole
 
     def place(part: Part) -> str:
@@ -227,9 +227,9 @@ def make_record(run: Run, setup: Setup, device: str = "") -> RunRecord:
 
     source, target, test = run.parts(setup.own)
     labelled = load(load_clouds, source)
-    own = {labelled.class_names[row] for row in set(labelled.labels.tolist())}
-    if {canonical(name) for name in own} <= set(POINTDA10):  # of which the tables are
-        labelled = relabel(labelled, None, POINTDA10_CHOICE, place(source))
+    kinds = {canonical(labelled.class_names[row]) for row in set(labelled.labels.tolist())}
+    if kinds <= set(POINTDA10):  # of which the tables are
+        labelled = relabel(labelled, POINTDA10, None, place(source))
     before = warm_up_of(setup.scale, run)
     fit(
         run.kind.method,

@@ -2,7 +2,7 @@
 
 import difflib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,6 @@ from qs3.io.clouds import CloudChoice, Origin, PointClouds, UnlabelledClouds
 from qs3.io.layouts import FORMATS, FORMER_NAMES, Format, point_folders
 from qs3.io.layouts.store import read_ragged
 from qs3.io.ragged import RaggedClouds
-from qs3.meshes.classes import ClassMap
 from qs3.store.folder import open_folder
 from qs3.store.manifest import MANIFEST
 
@@ -26,7 +25,7 @@ def load_clouds(
     cloud: CloudChoice = "points",
     class_names: Sequence[str] | None = None,
     most: int | None = None,
-    class_map: ClassMap | None = None,
+    class_map: Mapping[str, str] | None = None,
 ) -> PointClouds:
     """Read labelled clouds from whatever ``source`` is.
 
@@ -38,7 +37,8 @@ def load_clouds(
         cloud: Which cloud of a generated data set; ``all`` takes the three of each scan.
         class_names: Classes that the labels shall index, found by name or alias; ``origin`` of
             the result tells which go by another name. None takes the source's own.
-        class_map: What classes shall be called; None keeps their names.
+        class_map: What classes shall be called before that: name in the source → name wanted;
+            those it does not name keep theirs.
         most: As in `qs3.io.preparation.stack`, where ``num_points`` is None.
 
     Raises:
@@ -115,12 +115,12 @@ def describe_clouds(source: str | Path) -> dict[str, Any]:
     """
     clouds, layout = read_clouds(source)
     sizes = [len(cloud) for cloud in clouds.clouds]
-    labels = [] if clouds.labels is None else clouds.labels.tolist()
+    labels = [] if clouds.labels is None else sorted(clouds.labels.tolist())
     return {
         "layout": layout,
         "rows": len(sizes),
         "points": [min(sizes), max(sizes)] if sizes else [],
-        "classes": dict(Counter(clouds.class_names[label] for label in sorted(labels))),
+        "classes": dict(Counter(clouds.class_names[label] for label in labels)),
         "splits": dict(sorted(Counter(clouds.splits).items())),
     }
 

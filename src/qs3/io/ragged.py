@@ -1,6 +1,6 @@
 """Clouds as they come out of files: of any sizes, with or without labels."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,7 +10,7 @@ from jaxtyping import Int
 from qs3.errors import InputError
 from qs3.io.clouds import Origin, PointClouds, UnlabelledClouds, digests, numbered
 from qs3.io.preparation import stack
-from qs3.meshes.classes import ClassMap, label_order, map_labels, rename, require_named
+from qs3.meshes.classes import label_order, map_labels, require_named
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class RaggedClouds:
         class_names: Sequence[str] | None,
         where: str,
         most: int | None = None,
-        class_map: ClassMap | None = None,
-        origin: Origin = Origin("arrays"),  # noqa: B008
+        class_map: Mapping[str, str] | None = None,
+        origin: Origin | None = None,
     ) -> PointClouds:
         """Return clouds of one size with labels that index ``class_names``.
 
@@ -51,30 +51,24 @@ class RaggedClouds:
             origin: Where the clouds are from; what is called otherwise is added.
 
         Raises:
-            InputError: where there are no labels, a class is not in ``class_names`` or cannot be
-                called as ``class_map`` wants it, or sizes differ and no size is asked for.
+            InputError: where there are no labels, a class is not in ``class_names``, ``class_map``
+                is of no class, or sizes differ and no size is asked for.
         """
         if self.labels is None:
             raise InputError(f"{where}: has no labels, and this needs them")
-        own = list(self.class_names)
-        present = np.unique(self.labels).tolist()
+        called = [(class_map or {}).get(name, name) for name in self.class_names]
+        names = label_order(called) if class_names is None else tuple(class_names)
         try:
-            if class_map is not None:
-                if class_names is None:
-                    require_named(own, class_map)
-                for row, name in zip(
-                    present, rename([own[row] for row in present], class_map), strict=True
-                ):
-                    own[row] = name
-            listed = own if class_map is None else [own[row] for row in present]
-            names = label_order(listed) if class_names is None else tuple(class_names)
-            labels, _ = map_labels(own, self.labels, names)
+            if class_map is not None and class_names is None:
+                require_named(self.class_names, class_map)
+            labels, _ = map_labels(called, self.labels, names)
         except InputError as error:
             raise InputError(f"{where}: {error}") from error
-        called = dict(zip(self.labels.tolist(), labels.tolist(), strict=True))
-        renamed = {self.class_names[row]: names[called[row]] for row in present}
-        renamed = {name: other for name, other in renamed.items() if name != other}
+        pairs = sorted(set(zip(self.labels.tolist(), labels.tolist(), strict=True)))
+        told = {self.class_names[row]: names[label] for row, label in pairs}
+        renamed = {name: other for name, other in told.items() if name != other}
         points = stack(self.clouds, num_points, where, most)
+        origin = origin or Origin("arrays")
         origin = replace(origin, renamed={**origin.renamed, **renamed})
         return PointClouds(points, labels, names, self.ids, self.checksum, origin)
 
@@ -96,11 +90,13 @@ class RaggedClouds:
 
 
 def relabel(
-    clouds: PointClouds, class_names: Sequence[str] | None, class_map: ClassMap | None, where: str
+    clouds: PointClouds,
+    class_names: Sequence[str],
+    class_map: Mapping[str, str] | None,
+    where: str,
 ) -> PointClouds:
     """Return labelled clouds under other names of their classes; see `RaggedClouds.labelled`."""
     given = RaggedClouds(
         list(clouds.points), clouds.ids, clouds.checksum, clouds.labels, clouds.class_names
     )
-    origin = clouds.origin or Origin("arrays")
-    return given.labelled(None, class_names, where, None, class_map, origin)
+    return given.labelled(None, class_names, where, None, class_map, clouds.origin)

@@ -2,8 +2,8 @@
 
 Convention:
     Names are kept as they stand. They change in three cases alone: a known data set's layout says
-    so, the user asks for it (``rename``: PointDA-10's ten, or a file of names), or labels are put
-    onto a list of classes that is there already, such as a run's (``map_labels``).
+    so, the user gives a map of names (``read_class_map``), or labels are put onto a list of classes
+    that is there already, PointDA-10's ten or a run's (``map_labels``).
 """
 
 import re
@@ -17,10 +17,6 @@ from jaxtyping import Bool, Int
 
 from qs3.errors import InputError
 
-POINTDA10_CHOICE = "pointda10"
-"""The choice that takes PointDA-10's ten classes and gives them its names."""
-ClassMap = Mapping[str, str] | Literal["pointda10"]
-"""What classes shall be called: name as it stands → name wanted; others keep theirs."""
 _LARGEST_MAP = 1 << 20
 
 POINTDA10: tuple[str, ...] = (
@@ -101,64 +97,51 @@ def read_class_map(path: Path) -> dict[str, str]:
     Raises:
         InputError: where the file is missing, is no TOML, or holds anything but such lines.
     """
+    hint = 'give each class one line, such as stool = "chair"'
     try:
         with path.open("rb") as file:
-            text = file.read(_LARGEST_MAP + 1)
-        if len(text) > _LARGEST_MAP:
-            raise InputError(f"{path}: larger than 1 MiB; a line a class will do")
+            text = file.read(_LARGEST_MAP)
         given = tomllib.loads(text.decode())
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f'{path}: {error}; give lines such as stool = "chair"') from error
+        raise InputError(f"{path}: {error}; {hint}") from error
     for name, wanted in given.items():
-        if not isinstance(wanted, str) or not wanted or not wanted.isprintable():
-            raise InputError(f'{path}: {name!r} is given no name; give lines as stool = "chair"')
+        if not isinstance(wanted, str) or not wanted.strip() or not wanted.isprintable():
+            raise InputError(f"{path}: {name!r} is given no name; {hint}")
     return given
 
 
-def rename(names: Sequence[str], wanted: ClassMap) -> list[str]:
-    """What each class is called where other names were asked for.
-
-    Raises:
-        InputError: where PointDA-10's are wanted and a class is none of them by the table of
-            aliases.
-
-    Example:
-        >>> rename(["stool", "mug"], {"stool": "chair"})
-        ['chair', 'mug']
-    """
-    if not isinstance(wanted, str):
-        return [wanted.get(name, name) for name in names]
-    if others := [name for name in names if canonical(name) not in POINTDA10]:
-        raise InputError(
-            f"class {', '.join(map(repr, others))} is none of PointDA-10's ten ("
-            f"{', '.join(POINTDA10)}); leave them out, or name yours in a file: --map"
-        )
-    return [canonical(name) for name in names]
-
-
-def require_named(names: Sequence[str], wanted: ClassMap) -> None:
+def require_named(names: Sequence[str], wanted: Mapping[str, str]) -> None:
     """Refuse a map that is of none of these classes."""
-    if not isinstance(wanted, str) and not set(names) & set(wanted):
+    if not set(names) & set(wanted):
         raise InputError(
             f"the map of classes names {', '.join(wanted) or 'nothing'}, and none of "
             f"{', '.join(names)}"
         )
 
 
-def describe_renaming(renamed: Mapping[str, str]) -> str:
-    """One line that says which classes go by another name; empty where none does.
+def describe_renaming(
+    renamed: Mapping[str, str], wanted: Mapping[str, str] | None = None
+) -> list[str]:
+    """Say in a line which classes go by another name, and in another what the map has in vain.
+
+    Args:
+        renamed: Name in the data → name here.
+        wanted: The map that was given.
 
     Example:
-        >>> describe_renaming({"desk": "table", "bench": "chair", "stool": "chair"})
-        'classes: desk → table; bench, stool → chair'
+        >>> describe_renaming({"desk": "table", "stool": "chair"}, {"stool": "chair", "stol": "x"})
+        ['classes: desk → table; stool → chair', 'classes: none here is stol, as the map has it']
     """
     kinds: dict[str, list[str]] = {}
     for name, other in renamed.items():
         kinds.setdefault(other, []).append(name)
-    said = (f"{', '.join(names)} → {other}" for other, names in kinds.items())
-    return f"classes: {'; '.join(said)}" if renamed else ""
+    said = [f"{', '.join(names)} → {other}" for other, names in kinds.items()]
+    unused = [name for name, to in (wanted or {}).items() if name != to and name not in renamed]
+    lines = [f"classes: {'; '.join(said)}"] if said else []
+    vain = f"classes: none here is {', '.join(unused)}, as the map has it"
+    return [*lines, vain] if unused else lines
 
 
 _MODELNET40 = """

@@ -1,6 +1,6 @@
 """Lists of meshes to scan: from a folder, or drawn from the procedural shapes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -13,16 +13,16 @@ from qs3.errors import InputError
 from qs3.files import sha256
 from qs3.meshes.classes import (
     POINTDA10,
-    POINTDA10_CHOICE,
     POINTDA10_OF_MODELNET,
     POINTDA10_OF_SHAPENET,
-    ClassMap,
     canonical,
-    rename,
     require_named,
 )
 from qs3.meshes.loading import load_mesh
 from qs3.meshes.trees import MeshItem, read_tree
+
+POINTDA10_CHOICE = "pointda10"
+"""The choice that takes PointDA-10's ten classes and gives them its names."""
 
 _MOST_NAMES = 60
 
@@ -99,16 +99,14 @@ def _files(root: Path, classes: Sequence[str] | None, labels: Path | None) -> li
     ]
 
 
-def rename_items(items: Sequence[MeshItem], wanted: ClassMap) -> list[MeshItem]:
-    """Give the classes of meshes the names of a map; each keeps its own beside it.
+def rename_items(items: Sequence[MeshItem], wanted: Mapping[str, str]) -> list[MeshItem]:
+    """Give classes of meshes the names of a map, others keep theirs; see ``MeshItem.own_class``.
 
     Raises:
         InputError: where the map is of none of the classes.
     """
-    own = sorted({item.class_name for item in items})
-    require_named(own, wanted)
-    names = dict(zip(own, rename(own, wanted), strict=True))
-    return [_called(item, names[item.class_name]) for item in items]
+    require_named(sorted({item.class_name for item in items}), wanted)
+    return [_called(item, wanted.get(item.class_name, item.class_name)) for item in items]
 
 
 def _called(item: MeshItem, name: str) -> MeshItem:

@@ -61,14 +61,13 @@ def evaluate(
     """
     made, loaded = read_run(run), load_model(run)
     train = loaded.settings["train"]
-    called = {name: name for name in loaded.class_names}
-    called |= {name: other for name, other in (class_map or {}).items() if name in called}
+    called = {name: (class_map or {}).get(name, name) for name in loaded.class_names}
     names = tuple(dict.fromkeys(called.values()))
     whole = _labelled(data, split, cloud, loaded, names, class_map)
+    tested = data_record(whole)
     renamed = {name: other for name, other in called.items() if name != other}
-    renamed |= {} if whole.origin is None else whole.origin.renamed
     if class_map is not None:
-        require_named([*loaded.class_names, *renamed], class_map)
+        require_named([*loaded.class_names, *tested.renamed], class_map)
     answer_of = np.array([names.index(other) for other in called.values()])
     require_finite(whole.points, whole.ids)
     test = prepare_clouds(whole, train["num_points"], loaded.preparation)
@@ -79,7 +78,7 @@ def evaluate(
         settings=loaded.settings | {"preset": made.preset},
         source=made.source,
         target=made.target,
-        test=replace(data_record(whole), renamed=renamed),
+        test=replace(tested, renamed={**renamed, **tested.renamed}),
         seed=train["seed"],
         selection=made.selection,
         scores=_scores(loaded, test, answer_of),
