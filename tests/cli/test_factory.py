@@ -82,7 +82,8 @@ def test_info_counts_and_verify_finds_what_is_wrong(qs3, store, tmp_path):
     assert "notes.txt: does not belong here" in done.stdout
     assert "faults, printed above" in done.stderr
     assert "not a qs3 data set" in qs3.refuses("verify", tmp_path)
-    assert "an empty folder" in qs3.refuses("info", tmp_path)
+    (tmp_path / "none").mkdir()
+    assert "an empty folder" in qs3.refuses("info", tmp_path / "none")
 
 
 def test_shapes_and_meshes_go_into_one_data_set(qs3, quick, cad, tmp_path):
