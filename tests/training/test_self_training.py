@@ -112,6 +112,7 @@ def test_the_type_of_the_target_has_no_labels():
     assert names == {"points", "ids", "checksum", "origin"}
 
 
+@pytest.mark.filterwarnings("ignore::qs3.adaptation.selection.SingleClassWarning")
 @pytest.mark.parametrize("way", ["paper", "robust"])
 def test_labels_of_the_target_cannot_matter(source, target, settings, warm, tmp_path, way):
     """Poisoned labels leave the run bit-identical: they are not in what it is handed."""

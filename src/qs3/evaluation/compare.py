@@ -1,11 +1,11 @@
-"""Is A better than B? Over the seeds that both ran, or cloud by cloud for two runs."""
+"""Is A better than B? Over the seeds that both ran, cloud by cloud for two runs, or over both."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 
 @dataclass(frozen=True)
@@ -91,3 +91,41 @@ def mcnemar(
     differing = first_only + second_only
     p = float(binomtest(first_only, differing).pvalue) if differing else 1.0
     return CloudComparison(first_only, second_only, p)
+
+
+def bootstrap_difference(
+    first_right: Bool[np.ndarray, "s b"],
+    second_right: Bool[np.ndarray, "s b"],
+    groups: Int[np.ndarray, "b"],
+    draws: int = 10_000,
+) -> SeedComparison:
+    """Compare two methods on the same clouds and seeds; the interval covers the choice of both.
+
+    Seeds, and groups of clouds that are alike for a reason, such as those of one room, are drawn
+    with replacement, each for itself (the pigeonhole bootstrap of Owen, Annals of Applied
+    Statistics 2007, which errs on the wide side).
+
+    Args:
+        first_right: Whether the first has each cloud right, by seed.
+        second_right: The same of the second.
+        groups: Number of each cloud's group.
+        draws: How often is drawn, always alike.
+
+    Returns:
+        First minus second and a 95 % interval; with one seed it covers the clouds alone.
+
+    Example:
+        >>> right, wrong = np.ones((2, 6), bool), np.zeros((2, 6), bool)
+        >>> bootstrap_difference(right, wrong, np.array([0, 0, 1, 1, 2, 2])).interval
+        (1.0, 1.0)
+    """
+    difference = first_right.astype(float) - second_right
+    names, member = np.unique(groups, return_inverse=True)
+    sums = np.stack([np.bincount(member, row, len(names)) for row in difference])
+    sizes = np.bincount(member, minlength=len(names))
+    rng, seeds = np.random.default_rng(0), len(difference)
+    seed_weights = rng.multinomial(seeds, np.full(seeds, 1 / seeds), draws) / seeds
+    group_weights = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), draws)
+    means = np.einsum("ds,sg,dg->d", seed_weights, sums, group_weights) / (group_weights @ sizes)
+    low, high = np.quantile(means, [0.025, 0.975])
+    return SeedComparison(float(difference.mean()), (float(low), float(high)), seeds)

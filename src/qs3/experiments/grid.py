@@ -228,7 +228,7 @@ def make_record(run: Run, setup: Setup, device: str = "") -> RunRecord:
     source, target, test = run.parts(setup.own)
     labelled = load(load_clouds, source)
     kinds = {canonical(labelled.class_names[row]) for row in set(labelled.labels.tolist())}
-    if kinds <= set(POINTDA10):  # of which the tables are
+    if labelled.class_names != POINTDA10 and kinds <= set(POINTDA10):  # of which the tables are
         labelled = relabel(labelled, POINTDA10, None, place(source))
     before = warm_up_of(setup.scale, run)
     fit(

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.errors import InputError, UnevenSizesError
+from qs3.io.scratch import Spool, scratch_array
 
 _CLOUDS = 256  # normalised at a time
 
@@ -215,9 +216,11 @@ def stack(
             )
         if 0 in sizes:
             raise InputError(f"{where}: holds an empty cloud")
-        points = np.empty((len(clouds), min(most, max(sizes)), 3), dtype=np.float32)
+        points = scratch_array((len(clouds), min(most, max(sizes)), 3))
         for row, cloud in enumerate(clouds):
             kept = thin(len(cloud), most)
             points[row] = cloud[kept[np.arange(points.shape[1]) % len(kept)]]
         return points
+    if isinstance(clouds, Spool):
+        return clouds.points.reshape(len(clouds), -1, 3)
     return np.stack(clouds).astype(np.float32, copy=False)

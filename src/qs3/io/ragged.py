@@ -10,6 +10,7 @@ from jaxtyping import Int
 from qs3.errors import InputError
 from qs3.io.clouds import Origin, PointClouds, UnlabelledClouds, digests, numbered
 from qs3.io.preparation import stack
+from qs3.io.scratch import scratch_array
 from qs3.meshes.classes import label_order, map_labels, require_named
 
 
@@ -86,7 +87,8 @@ class RaggedClouds:
         """
         points = stack(self.clouds, num_points, where, most)
         order = np.argsort(digests(points), kind="stable")
-        return UnlabelledClouds(points[order], numbered(len(points)), self.checksum)
+        ordered = np.take(points, order, axis=0, out=scratch_array(points.shape))
+        return UnlabelledClouds(ordered, numbered(len(points)), self.checksum)
 
 
 def relabel(

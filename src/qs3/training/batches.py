@@ -21,6 +21,8 @@ from qs3.training.prepared import Prepared, normalise_batch, prepare_clouds
 
 _SHARE_OF_MEMORY = 0.25
 """Part of a GPU's free memory that the clouds may take; the network needs the rest."""
+_BLOCK = 256
+"""Clouds that are looked at together, so that no mask of all their points is made."""
 _SPARE = 2
 """How many times the points that are needed are augmented, as some of them are lost by it."""
 
@@ -48,7 +50,8 @@ def require_finite(points: np.ndarray, ids: Sequence[str], where: str = "") -> N
     Raises:
         InputError: with the ids of the first such clouds.
     """
-    good = np.isfinite(points).all(axis=(1, 2))
+    blocks = (points[start : start + _BLOCK] for start in range(0, len(points), _BLOCK))
+    good = np.concatenate([np.isfinite(block).all(axis=(1, 2)) for block in blocks] or [[True]])
     if not good.all():
         bad = [ids[row] for row in np.flatnonzero(~good).tolist()]
         raise InputError(f"{where}points of {name_few(bad)} are not finite; leave these clouds out")

@@ -48,15 +48,18 @@ def seen_clouds(prepared: Prepared) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
     Their shapes are those of what it gets and, where that is less, of the clouds as read.
     """
-    return tuple(both_checksums(prepared)[0]), tuple(dict.fromkeys(_both_shapes(prepared)))
+    return tuple(checksums(prepared)), tuple(dict.fromkeys(_both_shapes(prepared)))
+
+
+def checksums(prepared: Prepared) -> list[str]:
+    """Return checksums of the chosen points of each cloud, as read."""
+    return [text for block in prepared.blocks() for text in digests(block)]
 
 
 def both_checksums(prepared: Prepared) -> tuple[list[str], list[str]]:
     """Return checksums of the chosen points of each cloud, as read and in the unit ball."""
-    pairs = [(digests(block), digests(unit_ball(block))) for block in prepared.blocks()]
-    return [text for plain, _ in pairs for text in plain], [
-        text for _, ball in pairs for text in ball
-    ]
+    balls = [text for block in prepared.blocks() for text in digests(unit_ball(block))]
+    return checksums(prepared), balls
 
 
 def _both_shapes(prepared: Prepared) -> list[str]:
@@ -73,11 +76,11 @@ def caveats(run: Run, prepared: Prepared) -> tuple[str, ...]:
         run: The run.
         prepared: The tested clouds.
     """
-    checksums = {text for texts in both_checksums(prepared) for text in texts}
+    tested = {text for texts in both_checksums(prepared) for text in texts}
     texts = _both_shapes(prepared)
 
     def has_seen(clouds: Collection[str], known: Sequence[str]) -> bool:
-        return not checksums.isdisjoint(clouds) or _near(known, texts, run)
+        return not tested.isdisjoint(clouds) or _near(known, texts, run)
 
     marks = {
         "transductive": has_seen(run.target_clouds, run.target_shapes),

@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ from qs3.training.checkpoint import (
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.history import History
 from qs3.training.loop import EpochCallback
-from qs3.training.overlap import both_checksums
+from qs3.training.overlap import checksums
 from qs3.training.prepared import Prepared
 from qs3.training.progress import Deadline
 from qs3.training.rules import Select
@@ -106,6 +107,11 @@ class Task:
     deadline: Deadline | None = None
     """Ends the rounds before an epoch that would end too late."""
 
+    @cached_property
+    def target_checksums(self) -> list[str]:
+        """Checksums of the target's clouds, which each round's state tells."""
+        return checksums(self.target)
+
 
 class Teacher(nn.Module):
     """A network that is kept beside the one in training."""
@@ -165,7 +171,7 @@ def write_rounds(task: Task, state: Rounds) -> None:
     tensors["labels"] = torch.from_numpy(state.labels)
     tensors |= prefixed("kept", {str(i): torch.from_numpy(k) for i, k in enumerate(state.kept)})
     records = [asdict(record) for record in state.records]
-    facts = {"records": records, "clouds": both_checksums(task.target)[0]}
+    facts = {"records": records, "clouds": task.target_checksums}
     write_tensors(task.run_dir / STATE, tensors, facts)
 
 

@@ -13,10 +13,12 @@ import numpy as np
 from tqdm import tqdm
 
 from qs3.errors import InputError
+from qs3.io import scratch
 from qs3.io.clouds import CloudChoice, CloudKind
 from qs3.io.guards import utf8
 from qs3.io.layouts.format import Format
 from qs3.io.ragged import RaggedClouds
+from qs3.io.scratch import Spool
 from qs3.store.folder import Folder, open_folder
 from qs3.store.manifest import (
     Manifest,
@@ -62,7 +64,7 @@ def read_ragged(
         )
     kinds = get_args(CloudKind) if cloud == "all" else (cloud,)
     rows: list[tuple[str, int, str]] = []
-    clouds: list[np.ndarray] = []
+    clouds: list[np.ndarray] | Spool | None = None
     splits: set[str] = set()
     digest = hashlib.sha256()
     # Reading, unpacking and hashing leave the interpreter's lock: threads share the work.
@@ -71,11 +73,14 @@ def read_ragged(
         for columns, scanned, checksum in read:
             digest.update(checksum)
             splits.update(columns[2])
+            if clouds is None:
+                size = sum(cloud.nbytes for own in scanned for cloud in own) * len(shards)
+                clouds = Spool() if size >= scratch.LARGE else []
             chosen = [i for i, part in enumerate(columns[2]) if split in (None, part)]
             for kind, own in zip(kinds, scanned, strict=True):
                 end = f"/{kind}" if cloud == "all" else ""
                 rows += [(columns[0][i] + end, columns[1][i], columns[2][i]) for i in chosen]
-                clouds += [own[i] for i in chosen]
+                clouds.extend(own[i] for i in chosen)
     if not clouds:
         named = ", ".join(sorted(filter(None, splits))) or "none"
         missing = "no cloud" if split is None else f"no cloud of split {split!r}; splits: {named}"

@@ -1,0 +1,209 @@
+"""Tables of `benchmarks/real.py`: means over seeds, differences with intervals, the goals.
+
+Run: python benchmarks/real_tables.py [--records results/real] [--out runs/real --shared DIR]
+
+With --out, the runs of that folder are asked anew which clouds they have right; that goes, as
+noughts and ones in the order of filming, into right.csv beside the records. The tables come from
+the records and right.csv alone. Intervals draw seeds, and blocks of ten frames (rooms) of clouds.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from real import parts
+
+from qs3.evaluation.compare import bootstrap_difference
+from qs3.evaluation.records import RunRecord, read_record
+from qs3.evaluation.tables import average, frame, to_markdown
+from qs3.training import load_model, predict_probabilities
+
+RIGHT = "right.csv"
+TABLES = "tables.md"
+NAMES = {"dev": "NYU, first 70 %", "check": "NYU, last 30 %", "sunrgbd": "SUN RGB-D"}
+PAIRS = (
+    ("S", "M"), ("S", "C"), ("C", "M"), ("S+C+M", "M"), ("S+C+M", "S"), ("QBST", "S+C+M"),
+    ("SPST", "S+C+M"), ("QBST", "SPST"), ("SD", "S+C+M"), ("SD+QBST", "SD"), ("GAST", "S+C+M"),
+    ("GAST+QBST", "GAST"), ("DGCNN S", "DGCNN M"), ("DGCNN S+C+M", "DGCNN M"),
+    ("DGCNN QBST", "DGCNN S+C+M"),
+)  # fmt: skip
+"""First minus second."""
+SWITCHES = {
+    "QBST": ("QBST calibrated", "QBST by share", "QBST average", "QBST turns", "QBST floor",
+             "QBST refined"),
+    "S+C+M": ("no size", "strays kept", "unit ball", "same points", "paper's way",
+              "no augmentation", "full augmentation"),
+}  # fmt: skip
+"""Against what each switch is held."""
+
+
+def read_records(folder: Path) -> list[RunRecord]:
+    return [read_record(path) for path in sorted(folder.glob("*.json"))]
+
+
+def place(record: RunRecord) -> tuple[str, str]:
+    """Cell and part of a record."""
+    assert record.experiment is not None, record.test.name
+    return str(record.experiment["cell"]), str(record.experiment["part"])
+
+
+def note_right(out: Path, shared: Path, folder: Path) -> None:
+    """Ask finished runs which real clouds they have right."""
+    clouds = parts(shared)
+    path = folder / RIGHT
+    lines = pd.read_csv(path, dtype=str).to_dict("records") if path.is_file() else []
+    known = {(line["cell"], line["part"], int(line["seed"])) for line in lines}
+    for record in read_records(folder):
+        (cell, part), seed = place(record), record.seed
+        if part not in clouds or (cell, part, seed) in known:
+            continue
+        loaded, data = load_model(out / f"{cell}-{seed}"), clouds[part]
+        names = [loaded.class_names.index(name) for name in data.class_names]
+        answers = predict_probabilities(loaded, data.points).argmax(axis=1)
+        right = np.array(names)[data.labels] == answers
+        if round(right.mean(), 9) != round(record.scores.accuracy, 9):
+            raise SystemExit(f"{cell}-{seed}, {part}: the run is not that of its record")
+        bits = "".join(str(int(bit)) for bit in right)
+        lines.append({"part": part, "cell": cell, "seed": str(seed), "right": bits})
+    with np.load(shared / "nyuv2_objects.npz") as archive:
+        strict, frame_number = archive["strict"].astype(bool), archive["frame"]
+    every = np.unique(frame_number)
+    early = frame_number < every[int(0.7 * len(every))]
+    rows = {"dev": strict & early, "check": strict & ~early}
+    lines = [line for line in lines if line["cell"] != "(block)"]
+    for part in rows:
+        blocks = np.unique(frame_number[rows[part]] // 10, return_inverse=True)[1]
+        text = " ".join(str(block) for block in blocks)
+        lines.append({"part": part, "cell": "(block)", "seed": "-1", "right": text})
+    table = pd.DataFrame(lines, columns=["part", "cell", "seed", "right"])
+    table = table.sort_values(["part", "cell", "seed"])
+    table.to_csv(path, index=False, lineterminator="\n")
+
+
+def tables(folder: Path) -> str:
+    """Return all tables as Markdown."""
+    records = read_records(folder)
+    right = pd.read_csv(folder / RIGHT, dtype=str)
+    bits = {
+        (line.part, line.cell, int(line.seed)): np.array([bit == "1" for bit in line.right])
+        for line in right.itertuples()
+        if line.cell != "(block)"
+    }
+    blocks = {
+        line.part: np.array([int(word) for word in line.right.split()])
+        for line in right.itertuples()
+        if line.cell == "(block)"
+    }
+    looked = [part for part in NAMES if any(place(record)[1] == part for record in records)]
+    text = ["Made by `python benchmarks/real_tables.py`; not written by hand.", "", "## Scores", ""]
+    text += [to_markdown(score_table(records, looked)), ""]
+    for part in looked:
+        if part in blocks:
+            text += [f"## Differences on {NAMES[part]}", "", "Points of accuracy; first minus"]
+            text[-1] += " second, on the same seeds and clouds; 95 % interval over both."
+            text += ["", to_markdown(differences(bits, blocks[part], part, PAIRS)), ""]
+            switches = [(one, base) for base, ones in SWITCHES.items() for one in ones]
+            ablations = differences(bits, blocks[part], part, switches)
+            if len(ablations):
+                text += ["Switches, one at a time:", "", to_markdown(ablations), ""]
+    rounds = round_table(records)
+    if len(rounds):
+        text += ["## Rounds of self-training, seed 0", "", to_markdown(rounds), ""]
+    for part in looked:
+        for cell in ("M", "S+C+M", "QBST"):
+            text += confusion(records, cell, part) if part != "sunrgbd" else []
+    return "\n".join(text).rstrip() + "\n"
+
+
+def score_table(records: list[RunRecord], looked: list[str]) -> pd.DataFrame:
+    fields = [dict(zip(("cell", "part"), place(record), strict=True)) for record in records]
+    means = average(frame(records, fields), ("cell", "part"))
+    by_part = {name: group.set_index("cell") for name, group in means.groupby("part")}
+    lines = []
+    for cell in dict.fromkeys(means["cell"]):
+        row = by_part["dev"].loc[cell]
+        mine = [record for record in records if place(record) == (cell, "dev")]
+        cpu = np.mean([record.seconds["total"] for record in mine]) / 60
+        line = {"cell": cell, "seeds": len(row["seeds"]), "minutes": f"{cpu:.0f}"}
+        line["own source"] = "–"
+        if cell in by_part["source"].index:
+            line["own source"] = f"{100 * by_part['source'].loc[cell]['accuracy'].mean:.1f}"
+        for part in looked:
+            group = by_part[part]
+            scores = group.loc[cell] if cell in group.index else None
+            for name, head in (("accuracy", ""), ("class_mean_accuracy", ", class mean")):
+                value = "–" if scores is None else scores[name].format()
+                line[NAMES[part] + head] = value
+        line["rounds that trained"] = (
+            f"{row['trained']} of {row['rounds']}" if row["rounds"] else "–"
+        )
+        lines.append(line)
+    return pd.DataFrame(lines)
+
+
+def differences(bits, blocks: np.ndarray, part: str, pairs) -> pd.DataFrame:
+    lines = []
+    for first, second in pairs:
+        seeds = [
+            seed for seed in range(9) if {(part, c, seed) for c in (first, second)} <= set(bits)
+        ]
+        if seeds:
+            both = [
+                np.stack([bits[part, cell, seed] for seed in seeds]) for cell in (first, second)
+            ]
+            value = bootstrap_difference(*both, blocks)
+            lines.append({"first": first, "second": second, "difference": value.format()})
+    return pd.DataFrame(lines)
+
+
+def round_table(records: list[RunRecord]) -> pd.DataFrame:
+    lines = []
+    for record in records:
+        cell, part = place(record)
+        if part == "dev" and record.seed == 0:
+            for made in record.rounds:
+                kept, right = made["kept"], made.get("right")
+                lines.append(
+                    {
+                        "cell": cell,
+                        "round": made["round"],
+                        "θ": f"{made['theta']:.3f}",
+                        "confident": sum(made["confident"]),
+                        "kept": sum(kept),
+                        "right of them": "–" if right is None else sum(right),
+                        "kept by class": " ".join(map(str, kept)),
+                        "right by class": "–" if right is None else " ".join(map(str, right)),
+                    }
+                )
+    return pd.DataFrame(lines)
+
+
+def confusion(records: list[RunRecord], cell: str, part: str) -> list[str]:
+    """Lines of the confusion matrix of a cell, summed over its seeds."""
+    mine = [record.scores for record in records if place(record) == (cell, part)]
+    if not mine:
+        return []
+    counts = np.sum([scores.confusion for scores in mine], axis=0)[:, : len(mine[0].class_names)]
+    names = mine[0].class_names
+    table = pd.DataFrame(counts, columns=[name[:4] for name in names]).astype(object)
+    table.insert(0, "true", names)
+    head = f"## Answers of {cell} on {NAMES[part]}, {len(mine)} seeds together"
+    return [head, "", to_markdown(table), ""]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--records", type=Path, default=Path("results/real"))
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--shared", type=Path)
+    options = parser.parse_args()
+    if options.out:
+        note_right(options.out, options.shared, options.records)
+    (options.records / TABLES).write_text(tables(options.records))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
