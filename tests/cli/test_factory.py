@@ -27,13 +27,15 @@ def content(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def test_a_dry_run_counts_and_writes_nothing(qs3, few, tmp_path):
-    done = qs3("generate", *few, "--scans-per-mesh", 3, "--out", tmp_path / "out", "--dry-run")
+def test_a_dry_run_counts_writes_nothing_and_needs_no_folder(qs3, few, tmp_path):
+    qs3("generate", *few, "--out", tmp_path / "out", "--dry-run")
     assert not (tmp_path / "out").exists()
+    done = qs3("generate", *few, "--scans-per-mesh", 3, "--dry-run")
     assert "chair: 2 objects" in done.stdout
     assert "12 scans, of which 12 in this part, 6 shards" in done.stdout
     assert "disk: " in done.stdout
     assert "hours with" in done.stdout
+    assert "--out: name the folder" in qs3.refuses("generate", *few)
 
 
 def test_parts_merge_into_a_sound_data_set(qs3, few, tmp_path):
@@ -79,16 +81,21 @@ def test_info_counts_and_verify_finds_what_is_wrong(qs3, store, tmp_path):
     assert "shard-00000.parquet: its checksum is not the one in SHA256SUMS" in done.stdout
     assert "notes.txt: does not belong here" in done.stdout
     assert "faults, printed above" in done.stderr
-    for verb in ("info", "verify"):
-        assert "not a qs3 data set" in qs3.refuses(verb, tmp_path)
+    assert "not a qs3 data set" in qs3.refuses("verify", tmp_path)
+    (tmp_path / "none").mkdir()
+    assert "an empty folder" in qs3.refuses("info", tmp_path / "none")
 
 
 def test_shapes_and_meshes_go_into_one_data_set(qs3, quick, cad, tmp_path):
     (cad / "sofa" / "two.off").unlink()
-    qs3("generate", "--meshes", cad, "shapes", "--per-class", 1, "--classes", "chair", "sofa",
-        "--out", tmp_path / "out", "--num-points", 64, "--dtype", "float16", *quick)  # fmt: skip
+    (tmp_path / "map.toml").write_text('sofa = "seat"\nmug = "cup"\n')
+    done = qs3("generate", "--meshes", cad, "shapes", "--per-class", 1, "--classes", "chair",
+        "sofa", "--map", tmp_path / "map.toml", "--out", tmp_path / "out", "--num-points", 64,
+        "--dtype", "float16", *quick)  # fmt: skip
+    assert "classes: sofa → seat\nclasses: none here is mug, as the map has it" in done.stderr
     contents = json.loads(qs3("info", tmp_path / "out", "--as-json").stdout)
-    assert {name: n for name, n in contents["classes"].items() if n} == {"chair": 2, "sofa": 2}
+    assert contents["classes"] == {"chair": 2, "seat": 2}
+    assert contents["renamed"] == {"sofa": "seat"}
     assert contents["settings"]["meshes"] == "cad+shapes"
     assert contents["settings"]["dtype"] == "float16"
 

@@ -10,7 +10,7 @@ from qs3.errors import InputError
 from qs3.io import guards
 from qs3.io.clouds import PointClouds, UnlabelledClouds, digests
 from qs3.io.layouts.hdf5 import read_file
-from qs3.io.load import load_clouds, load_unlabelled
+from qs3.io.load import describe_clouds, load_clouds, load_unlabelled
 from qs3.io.point_files import cloud_bytes, read_cloud
 from qs3.meshes.classes import POINTDA10
 from qs3.store.generate import GenerateSettings, generate
@@ -47,14 +47,40 @@ def write_npz(path, rng, **changes):
     return path
 
 
-def test_a_class_folder_maps_onto_the_ten_classes(folder):
+def test_names_are_kept_as_they_stand_though_all_are_aliases(folder):
     clouds = load_clouds(folder, split="test", num_points=32)
     assert isinstance(clouds, PointClouds)
     assert clouds.points.shape == (2, 32, 3)
-    assert clouds.class_names == POINTDA10
-    assert [POINTDA10[i] for i in clouds.labels] == ["cabinet", "table"]
+    assert clouds.class_names == ("Night Stand", "desk")
+    assert clouds.labels.tolist() == [0, 1]
+    assert clouds.origin.renamed == {}
     assert clouds.ids == ("Night Stand/test/a.npy", "desk/test/a.npy")
     assert len(load_clouds(folder, num_points=32)) == 4
+
+
+def test_the_ten_names_are_given_on_request_and_it_is_told(folder, rng):
+    ten = load_clouds(folder, num_points=8, class_names=POINTDA10)
+    assert ten.class_names == POINTDA10
+    assert [POINTDA10[i] for i in ten.labels] == ["cabinet"] * 2 + ["table"] * 2
+    assert ten.origin.renamed == {"Night Stand": "cabinet", "desk": "table"}
+    assert ten.without_labels().origin.renamed == {}
+    (folder / "toilet").mkdir()
+    np.save(folder / "toilet" / "a.npy", rng.random((8, 3)))
+    with pytest.raises(InputError, match=r"set: class 'toilet' is none of: bathtub.*--map"):
+        load_clouds(folder, num_points=8, class_names=POINTDA10)
+    called = {"toilet": "chair", "desk": "lamp"}  # a map comes before the table of aliases
+    ten = load_clouds(folder, num_points=8, class_names=POINTDA10, class_map=called)
+    assert ten.origin.renamed == {"Night Stand": "cabinet"} | called
+
+
+def test_a_map_merges_what_it_names_and_keeps_the_rest(folder):
+    one = load_clouds(folder, num_points=8, class_map={"desk": "Night Stand", "mug": "cup"})
+    assert one.class_names == ("Night Stand",)
+    assert one.origin.renamed == {"desk": "Night Stand"}
+    two = load_clouds(folder, num_points=8, class_map={"desk": "bench"})
+    assert two.class_names == ("Night Stand", "bench")
+    with pytest.raises(InputError, match=r"set: the map of classes names mug, and none of Night"):
+        load_clouds(folder, num_points=8, class_map={"mug": "cup"})
 
 
 def test_other_class_names_are_kept_where_they_do_not_all_map(folder, rng):
@@ -117,7 +143,7 @@ def test_an_archive_of_clouds_of_different_sizes(rng, tmp_path):
     path = write_npz(tmp_path / "a.npz", rng)
     clouds = load_clouds(path, num_points=25)
     assert clouds.points.shape == (3, 25, 3)
-    assert [POINTDA10[i] for i in clouds.labels] == ["bed", "cabinet", "bed"]
+    assert [clouds.class_names[i] for i in clouds.labels] == ["bed", "dresser", "bed"]
     assert load_clouds(path, split="test", num_points=8).ids == ("a/00001",)
     with np.load(path) as archive:
         np.testing.assert_array_equal(clouds.points[0][:20], archive["points"][:20])
@@ -202,7 +228,7 @@ def test_a_generated_data_set(fake, tmp_path):
 
 @pytest.mark.data
 def test_the_real_depth_camera_objects(shared_data):
-    clouds = load_clouds(shared_data / "sunrgbd_objects.npz", num_points=128)
+    clouds = load_clouds(shared_data / "sunrgbd_objects.npz", num_points=128, class_names=POINTDA10)
     counts = {name: int((clouds.labels == i).sum()) for i, name in enumerate(clouds.class_names)}
     assert {name: n for name, n in counts.items() if n} == {
         "bed": 10,
@@ -251,3 +277,12 @@ def test_the_largest_file_is_named_by_the_environment(tmp_path, rng, monkeypatch
         monkeypatch.setenv(guards.LIMIT, word)
         with pytest.raises(InputError, match=f"QS3_LARGEST_FILE_GIB={word}: a number of GiB"):
             read()
+
+
+def test_a_data_set_of_any_layout_is_described(folder, rng, tmp_path):
+    contents = describe_clouds(folder)
+    assert (contents["layout"], contents["rows"], contents["points"]) == ("npy", 4, [20, 64])
+    assert contents["classes"] == {"Night Stand": 2, "desk": 2}
+    assert contents["splits"] == {"test": 2, "train": 2}
+    bare = describe_clouds(write_npz(tmp_path / "a.npz", rng, label=None, class_names=None))
+    assert (bare["layout"], bare["classes"]) == ("npz", {})

@@ -2,7 +2,13 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.meshes.classes import POINTDA10, canonical, map_labels
+from qs3.meshes.classes import (
+    POINTDA10,
+    canonical,
+    label_order,
+    map_labels,
+    read_class_map,
+)
 
 
 def test_canonical_folds_case_and_follows_aliases():
@@ -49,3 +55,32 @@ def test_a_class_comes_before_its_alias_where_a_list_has_both():
     labels, kept = map_labels(["dining_table", "desk", "Arm Chair"], np.array([0, 1, 2]), to)
     assert kept.all()
     assert [to[i] for i in labels] == ["table", "desk", "chair"]
+
+
+def test_of_several_aliases_none_is_guessed():
+    for name, to in [("chair", ["armchair", "stool"]), ("bench", ["armchair", "stool"])]:
+        with pytest.raises(InputError, match=f"'{name}' is none of: armchair, stool.*--map"):
+            map_labels([name], np.array([0]), to)
+    # The one alias that a list has is meant, in either direction.
+    assert map_labels(["cabinet"], np.array([0]), ["mug", "night_stand"])[0].tolist() == [1]
+    assert map_labels(["dresser"], np.array([0]), ["mug", "night_stand"])[0].tolist() == [1]
+
+
+def test_a_part_of_the_ten_has_the_labels_of_the_whole():
+    assert label_order(["table", "chair"]) == POINTDA10
+    assert label_order(["Table", "chair"]) == ("Table", "chair")
+    assert label_order(["stool", "armchair", "chair"]) == ("stool", "armchair", "chair")
+
+
+def test_a_map_is_lines_of_names(tmp_path):
+    path = tmp_path / "classes.toml"
+    path.write_text('stool = "chair"\n"arm chair" = "chair"\n')
+    assert read_class_map(path) == {"stool": "chair", "arm chair": "chair"}
+    twice = 'stool = "chair"\nstool = "seat"'
+    others = ("stool = 3", 'stool = " "', "[chair]\na = 1", "stool: chair", 'stool = "a\\nb"')
+    for text in (twice, *others):
+        path.write_text(text)
+        with pytest.raises(InputError, match=r"classes\.toml: .*stool = \"chair\""):
+            read_class_map(path)
+    with pytest.raises(InputError, match="cannot be read"):
+        read_class_map(tmp_path / "none.toml")

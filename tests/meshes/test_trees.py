@@ -10,6 +10,9 @@ import pytest
 from qs3.errors import InputError
 from qs3.meshes import MeshItem, collect
 from qs3.meshes.classes import MODELNET40, POINTDA10, SHAPENET
+from qs3.meshes.collections import rename_items
+from qs3.store.plan import make_plan
+from qs3.store.scan_item import GenerateSettings
 
 # Folders of ModelNet40 as published, apart from the library's own list.
 FOLDERS = """airplane,bathtub,bed,bench,bookshelf,bottle,bowl,car,chair,cone,cup,curtain,desk,door,
@@ -42,6 +45,19 @@ def test_pointda10_takes_ten_folders_of_modelnet_and_renames_one(tree) -> None:
     cabinet = next(item for item in items if item.class_name == "cabinet")
     assert cabinet.id == "night_stand/test/night_stand_0000"
     assert len(cabinet.load().faces) == 1
+    assert {item.own_class for item in items} == {"", "night_stand"}
+    assert make_plan(items, GenerateSettings()).manifest().renamed == {"night_stand": "cabinet"}
+
+
+def test_a_map_merges_classes_and_a_built_in_shape_stays_what_it_is(tree) -> None:
+    items = [*collect(tree("stool/a.off", "mug/b.off")), *collect("shapes", per_class=1)]
+    named = rename_items(items, {"stool": "chair", "lamp": "light"})
+    called = {(item.own_class, item.class_name) for item in named if item.own_class}
+    assert called == {("stool", "chair"), ("lamp", "light")}
+    lamp = next(item for item in named if item.own_class == "lamp")
+    assert len(lamp.load().faces) > 0
+    with pytest.raises(InputError, match="the map of classes names sofas, and none of bathtub"):
+        rename_items(items, {"sofas": "sofa"})
 
 
 def test_modelnets_glued_header_loads(tree) -> None:

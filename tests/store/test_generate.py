@@ -91,7 +91,7 @@ def test_other_settings_or_another_work_list_are_refused(fake, tmp_path):
         other = dataclasses.replace(SETTINGS, **changed)
         with pytest.raises(InputError, match=name):
             fake.run(items(fake), tmp_path, other)
-    with pytest.raises(InputError, match="work_list"):
+    with pytest.raises(InputError, match="another list of meshes"):
         fake.run(items(fake)[::-1], tmp_path, SETTINGS)
     assert fake.content(tmp_path) == before
 

@@ -281,6 +281,22 @@ def threads_here() -> set[int]:
     return pools | {cv2.getNumThreads()}
 
 
+@pytest.mark.slow
+def test_what_is_slow_to_unpack_stops_no_other_worker():
+    """As the first call is on a busy machine: it imports what it is made of."""
+    with LocalExecutor(2) as executor:
+        for key in range(4):
+            executor.submit(key, str, SlowToUnpack())
+        assert sorted(executor.next() for _ in range(4)) == [(key, "None") for key in range(4)]
+
+
+class SlowToUnpack:
+    """Takes longer to unpack than a worker waits for the lock that all share."""
+
+    def __reduce__(self):
+        return time.sleep, (6.0,)
+
+
 def test_every_state_between_two_writes_is_mended(fake, tmp_path, monkeypatch):
     """Stop after each single write of a run with failures, and go on: always the same end."""
 

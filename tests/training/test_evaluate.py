@@ -65,6 +65,32 @@ def test_a_fitted_run_is_scored_on_any_clouds(source, target, settings, tmp_path
         evaluate(tmp_path / "run", replace(target, class_names=("ball", "disc", "sofa")))
 
 
+def test_a_run_of_own_classes_is_scored_by_a_map_on_data_that_merge_them(
+    source, target, settings, tmp_path
+):
+    names = ("chair", "armchair", "rod")  # two of which PointDA-10 would merge
+    own = replace(source, class_names=names)
+    fit("source-only", own, None, replace(settings, epochs=1), run_dir=tmp_path / "run")
+    assert load_model(tmp_path / "run").class_names == names
+    fine = evaluate(tmp_path / "run", replace(target, class_names=names))
+    assert (fine.scores.class_names, fine.test.renamed) == (names, {})
+
+    merged = replace(target, labels=target.labels // 2, class_names=("seat", "rod"))
+    with pytest.raises(InputError, match="'seat' is none of: chair, armchair, rod"):
+        evaluate(tmp_path / "run", merged)
+    called = {"chair": "seat", "armchair": "seat", "mug": "cup"}
+    record = evaluate(tmp_path / "run", merged, class_map=called)
+    assert record.scores.class_names == ("seat", "rod")
+    assert record.test.renamed == {"chair": "seat", "armchair": "seat"}
+    counts = np.array(fine.scores.confusion)[:, :3]  # the same answers, seats put together
+    together = np.array([[1, 0], [1, 0], [0, 1]])
+    expected = together.T @ counts @ together
+    assert np.array_equal(np.array(record.scores.confusion)[:, :2], expected)
+    assert read_record(record_path(tmp_path / "run", record)).test.renamed == record.test.renamed
+    with pytest.raises(InputError, match="the map of classes names mug, and none of chair"):
+        evaluate(tmp_path / "run", replace(target, class_names=names), class_map={"mug": "cup"})
+
+
 def test_self_training_and_estimators_leave_runs(source, target, settings, tmp_path):
     ready = [
         replace(clouds, points=prepare(clouds.points, 64))
@@ -136,6 +162,23 @@ def test_a_run_of_an_earlier_release_is_read(source, target, settings, tmp_path)
     (tmp_path / "run.json").write_text(json.dumps(old | {"colour": "red"}))
     with pytest.raises(InputError, match=r"run\.json.*'colour' is unknown"):
         read_run(tmp_path)
+
+
+def test_other_data_are_told_by_their_option_and_not_by_a_checksum(
+    source, target, settings, tmp_path
+):
+    bare = target.without_labels()
+    claim(tmp_path, "dann", source, bare, settings, None)
+    other = replace(source, points=source.points + 1)
+    moved = replace(bare, points=bare.points + 1)
+    for clouds, aim, said in (
+        (other, bare, "another --source: what is named now differs .* its labels or the names"),
+        (source, moved, "another --target: what is named now differs .*its points"),
+        (source, None, "begun with --target; name another folder, or do the same"),
+    ):
+        with pytest.raises(InputError, match=said) as caught:
+            claim(tmp_path, "dann", clouds, aim, settings, None)
+        assert str(tmp_path) in str(caught.value)
 
 
 @pytest.mark.parametrize("value", [1.5, "x", True, [1], 1e12, 10**12, None, -1])

@@ -3,8 +3,9 @@
 import importlib.metadata
 import json
 import platform
-import re
 from typing import Any
+
+from packaging.requirements import Requirement
 
 from qs3.cli.text import show
 from qs3.errors import QS3Error
@@ -44,7 +45,7 @@ def examine() -> dict[str, Any]:
     from qs3.sensor.render.mitsuba import VARIANTS, usable
 
     needed = _requirements()
-    packages = {name: _version(name) for name in needed.pop("")}
+    packages = {wanted.name: _version(wanted.name) for wanted in needed.pop("")}
     variants = {variant: usable(variant) for variant in VARIANTS}
     device, threads = None, None
     if packages["torch"] is not None:
@@ -63,22 +64,29 @@ def examine() -> dict[str, Any]:
         "device": device,
         "threads": threads,
         "extras": {
-            extra: all(_version(name) is not None for name in needed.get(extra, ()))
-            for extra in _PURPOSE
+            extra: extra in needed and all(map(_is_here, needed[extra])) for extra in _PURPOSE
         },
         "ready": all(packages.values()) and any(variants.values()),
     }
 
 
-def _requirements() -> dict[str, list[str]]:
-    """Packages that this version of qs3 says it needs, by extra; "" are those of all."""
-    needed: dict[str, list[str]] = {"": []}
-    for line in importlib.metadata.requires("qs3") or ():
-        name = re.match(r"[\w.-]+", line)
-        extra = re.search(r"extra == [\"']([\w-]+)", line)
-        if name:
-            needed.setdefault(extra[1] if extra else "", []).append(name[0])
+def _requirements() -> dict[str, list[Requirement]]:
+    """What the installed qs3 says it needs on this Python, by extra; "" is for all."""
+    wanted = [Requirement(line) for line in importlib.metadata.requires("qs3") or ()]
+    extras = importlib.metadata.metadata("qs3").get_all("Provides-Extra") or []
+    needed: dict[str, list[Requirement]] = {"": [], **{extra: [] for extra in extras}}
+    for one in wanted:
+        marker = one.marker
+        where = [extra for extra in needed if marker is None or marker.evaluate({"extra": extra})]
+        for extra in [""] if "" in where else where:
+            needed[extra].append(one)
     return needed
+
+
+def _is_here(wanted: Requirement) -> bool:
+    """Whether a package is installed, in a version that will do."""
+    version = _version(wanted.name)
+    return version is not None and wanted.specifier.contains(version, prereleases=True)
 
 
 def _version(package: str) -> str | None:

@@ -19,6 +19,7 @@ def evaluate_run(
     split: str | None = None,
     cloud: CloudKind = "points",
     checkpoints: bool = False,
+    class_map: Annotated[Path | None, tyro.conf.arg(name="map")] = None,
     json: bool = False,
 ) -> int:
     """Score a run: accuracy, class-mean accuracy, confusion matrix.
@@ -33,11 +34,18 @@ def evaluate_run(
         cloud: Of generated data: noisy scans, their clean twins, or samples of the whole surface.
         checkpoints: Score every checkpoint too, and tell which one each validator would have
             chosen; apart from them the oracle, an upper bound that looks at the labels of the data.
+        class_map: TOML file of what classes of the data and of the run are called in the scores:
+            stool = "chair"; others keep their names.
         json: Print the whole record as JSON in place of text.
     """
+    from qs3.meshes.classes import describe_renaming, read_class_map
     from qs3.training import evaluate, record_path
 
-    record = evaluate(run, data, split=split, cloud=cloud, checkpoints=checkpoints)
+    called = None if class_map is None else read_class_map(class_map)
+    record = evaluate(
+        run, data, split=split, cloud=cloud, checkpoints=checkpoints, class_map=called
+    )
+    tell(*describe_renaming(record.test.renamed, called))
     if json:
         show(dumps(unstructure(record), indent=2))
     else:

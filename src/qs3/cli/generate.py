@@ -3,9 +3,9 @@
 import dataclasses
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -38,11 +38,12 @@ def defaults(words: Sequence[str]) -> dict[str, Any]:
 
 def generate(
     meshes: tuple[str, ...],
-    out: str,
+    out: str = "",
     recipe: RecipeName | None = None,
     up: Literal["z", "y"] | None = None,
     per_class: int = 10,
     classes: tuple[str, ...] = (),
+    class_map: Annotated[Path | None, tyro.conf.arg(name="map")] = None,
     labels: Path | None = None,
     workers: int | None = None,
     timeout: float = 900.0,
@@ -60,13 +61,14 @@ def generate(
         meshes: Folders of meshes (one folder a class, ModelNet's or ShapeNet's tree), and `shapes`
             for the built-in ones; several go into one data set. A neighbour is another of them.
         out: Folder of the data set, or an address such as s3://bucket/folder; run the same command
-            again to go on after a stop.
+            again to go on after a stop. --dry-run needs none.
         recipe: rooms: settings for a source that is to meet scans of real rooms (cameras, sizes,
             layouts and views drawn); an option given beside it wins.
         up: Up axis of every mesh file; by default y for glTF and ShapeNet, z for all others.
         per_class: Objects a class, of the built-in shapes.
         classes: Classes to scan, by the names of their folders, or pointda10 for its ten, renamed;
             all by default.
+        class_map: TOML file of what classes shall be called: stool = "chair"; others keep theirs.
         labels: CSV that tells the class of each mesh of the folder, and its split: columns file
             (or uid), class and split.
         workers: Processes, of one thread each; all cores by default. The bytes written do not
@@ -83,20 +85,25 @@ def generate(
             nothing.
         settings: How they are scanned and written. Another seed draws other shapes and poses.
     """
-    from qs3.meshes.classes import POINTDA10
+    from qs3.meshes.classes import describe_renaming, label_order, read_class_map
     from qs3.store.failures import read_failures
     from qs3.store.generate import generate as generate_data
     from qs3.store.plan import make_plan, resolve_renderer
 
     match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", shard)
+    if not out and not dry_run:
+        raise InputError("--out: name the folder of the data set (--dry-run needs none)")
     if not match or not int(match[1]) < int(match[2]):
         raise InputError(f"--shard {shard}: give i/n with i from 0 to n - 1, such as 0/8")
     part = int(match[1]), int(match[2])
-    items = _items(meshes, up, per_class, settings.seed, classes, labels)
+    called = None if class_map is None else read_class_map(class_map)
+    items = _items(meshes, up, per_class, settings.seed, classes, called, labels)
     names = {item.class_name for item in items}
+    renamed = {item.own_class: item.class_name for item in items if item.own_class}
+    tell(*describe_renaming(renamed, called))
     settings = dataclasses.replace(
         resolve_renderer(settings),
-        classes=POINTDA10 if names <= set(POINTDA10) else tuple(sorted(names)),
+        classes=label_order(sorted(names)),
         meshes="+".join(s if s == "shapes" else Path(s).resolve().name for s in meshes),
         per_class=per_class if "shapes" in meshes else None,
     )
@@ -132,10 +139,11 @@ def _items(
     per_class: int,
     seed: int,
     classes: tuple[str, ...],
+    class_map: Mapping[str, str] | None,
     labels: Path | None,
 ) -> "list[MeshItem]":
     """The list of meshes."""
-    from qs3.meshes import collect
+    from qs3.meshes.collections import collect, rename_items
 
     if not meshes:
         raise InputError("--meshes: name a folder of meshes, or shapes for the built-in ones")
@@ -148,6 +156,8 @@ def _items(
         items += collect(source, per_class=per_class, seed=seed, classes=kinds, labels=named)
     if up is not None:
         items = [i if i.path is None else dataclasses.replace(i, up=up) for i in items]
+    if class_map is not None:
+        items = rename_items(items, class_map)
     if flat := [item.id for item in items if not item.class_name]:
         raise InputError(
             f"{' '.join(meshes)}: {flat[0]} lies flat in its folder and its class is "

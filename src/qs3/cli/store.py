@@ -29,12 +29,18 @@ def info(folder: _Folder, as_json: bool = False) -> int:
     """Print what a data set holds: counts, sizes, statistics of the sensor, failures.
 
     Args:
-        folder: Folder of a data set, or an address such as s3://bucket/folder.
+        folder: Folder of a data set, or an address such as s3://bucket/folder; or clouds in any
+            layout that qs3 train reads, of which there is less to tell.
         as_json: Print everything, settings and versions too, as one JSON object.
     """
+    from qs3.io.load import describe_clouds, is_store
     from qs3.store.failures import read_failures
     from qs3.store.info import info as count
 
+    if not is_store(folder):
+        clouds = describe_clouds(folder)
+        show(*([json.dumps(clouds, indent=2)] if as_json else _cloud_lines(clouds)))
+        return 0
     contents = count(folder)
     failures = read_failures(folder)
     if as_json:
@@ -49,6 +55,15 @@ def info(folder: _Folder, as_json: bool = False) -> int:
     return 0
 
 
+def _cloud_lines(contents: dict[str, Any]) -> list[str]:
+    lines = [
+        f"{contents['rows']} clouds, read as {contents['layout']}",
+        f"{' to '.join(map(str, dict.fromkeys(contents['points'])))} points a cloud",
+    ]
+    parts = ((name, contents[name]) for name in ("classes", "splits"))
+    return [*lines, *(f"{name}: {_counts(found)}" for name, found in parts if found)]
+
+
 def _lines(contents: dict[str, Any]) -> list[str]:
     from qs3.store.shards import STATISTICS
 
@@ -61,6 +76,9 @@ def _lines(contents: dict[str, Any]) -> list[str]:
         f"{points} points a cloud",
         "classes: " + _counts(contents["classes"]),
     ]
+    if contents["renamed"]:
+        names = (f"{own} → {other}" for own, other in contents["renamed"].items())
+        lines.append("renamed: " + ", ".join(names))
     if any(contents["splits"]):
         lines.append("splits: " + _counts(contents["splits"]))
     for name, value in contents["statistics"].items():

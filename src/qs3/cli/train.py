@@ -85,6 +85,12 @@ class TrainOptions(Choices):
     """Part of the source, such as train; all of it by default."""
     target_split: str | None = None
     """Part of the target."""
+    classes: Literal["pointda10"] | None = None
+    """Names of the source's classes: as they stand by default, or PointDA-10's ten, onto which the
+    table of aliases maps them (stool → chair)."""
+    class_map: Annotated[Path | None, tyro.conf.arg(name="map")] = None
+    """TOML file of what classes of the source shall be called: stool = "chair"; others keep
+    theirs. With --classes it comes first."""
     source_cloud: CloudChoice = "points"
     """Of generated data: noisy scans, their clean twins, samples of the whole surface, or all of
     these together."""
@@ -158,6 +164,7 @@ def train(options: Flat[TrainOptions]) -> int:
     """Train a classifier, with a method of adaptation to an unlabelled target if asked."""
     start = time.monotonic()  # reading the data counts
     from qs3.io import load_clouds, load_unlabelled
+    from qs3.meshes.classes import POINTDA10, describe_renaming, read_class_map
     from qs3.training import Deadline, TimeUpError, fit, load_whole, parse_duration
     from qs3.training.rounds import all_skipped, remarks
 
@@ -176,8 +183,11 @@ def train(options: Flat[TrainOptions]) -> int:
         method_settings=parse_settings("--method-set", options.method_set),
     )
     how, target = (settings.num_points, settings.preparation), None
-    part = {"split": options.source_split, "cloud": options.source_cloud}
+    called = None if options.class_map is None else read_class_map(options.class_map)
+    part = {"split": options.source_split, "cloud": options.source_cloud, "class_map": called}
+    part |= {"class_names": None if options.classes is None else POINTDA10}
     source = load_whole(load_clouds, options.source, *how, **part)
+    tell(*describe_renaming(source.origin.renamed, called))
     if options.target is not None:
         part = {"split": options.target_split, "cloud": options.target_cloud}
         target = load_whole(load_unlabelled, options.target, *how, **part)

@@ -45,12 +45,15 @@ class DataRecord:
     """Part of the data; None is all of it."""
     cloud: CloudChoice = "points"
     """Which cloud of a generated data set."""
+    renamed: Mapping[str, str] = field(default_factory=dict, compare=False)
+    """Classes that are called otherwise than in the data: name there → name in the run. Earlier
+    releases did not say, so two records are compared without it."""
 
     @classmethod
     def of(cls, origin: Origin | None, checksum: str, clouds: int) -> "DataRecord":
         """Return what a record says of clouds; those made in memory are called ``arrays``."""
         origin = origin or Origin("arrays")
-        return cls(origin.name, checksum, clouds, origin.split, origin.cloud)
+        return cls(origin.name, checksum, clouds, origin.split, origin.cloud, dict(origin.renamed))
 
     @property
     def label(self) -> str:

@@ -214,6 +214,8 @@ def make_record(run: Run, setup: Setup, device: str = "") -> RunRecord:
     if device:
         _see_alone(device)
     from qs3.io import load_clouds, load_unlabelled
+    from qs3.io.ragged import relabel
+    from qs3.meshes.classes import POINTDA10, canonical
     from qs3.training import evaluate, fit, load_whole
 
     def place(part: Part) -> str:
@@ -224,10 +226,14 @@ def make_record(run: Run, setup: Setup, device: str = "") -> RunRecord:
         return load_whole(reader, place(part), *how, split=part.split, cloud=part.cloud)
 
     source, target, test = run.parts(setup.own)
+    labelled = load(load_clouds, source)
+    kinds = {canonical(labelled.class_names[row]) for row in set(labelled.labels.tolist())}
+    if labelled.class_names != POINTDA10 and kinds <= set(POINTDA10):  # of which the tables are
+        labelled = relabel(labelled, POINTDA10, None, place(source))
     before = warm_up_of(setup.scale, run)
     fit(
         run.kind.method,
-        load(load_clouds, source),
+        labelled,
         None if target is None else load(load_unlabelled, target),
         run.train,
         run.self_training,

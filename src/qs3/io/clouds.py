@@ -1,7 +1,8 @@
 """Point clouds in memory: with labels, and a type that cannot carry any."""
 
 import hashlib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -23,6 +24,8 @@ class Origin:
     """Part of the data; None is all of it."""
     cloud: CloudChoice = "points"
     """Which cloud of a generated data set."""
+    renamed: Mapping[str, str] = field(default_factory=dict)
+    """Classes that are called otherwise than in the data: name there → name here."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,8 @@ class PointClouds:
 
     def without_labels(self) -> UnlabelledClouds:
         """Return the same clouds without labels, nor names, which may tell them."""
-        return UnlabelledClouds(self.points, numbered(len(self)), self.checksum, self.origin)
+        origin = None if self.origin is None else replace(self.origin, renamed={})
+        return UnlabelledClouds(self.points, numbered(len(self)), self.checksum, origin)
 
 
 def numbered(count: int) -> tuple[str, ...]:

@@ -1,9 +1,11 @@
 """One door to every kind of data set: ours, an archive, a folder, any layout that is known."""
 
 import difflib
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from qs3.errors import InputError
 from qs3.files import holds_something
@@ -12,6 +14,7 @@ from qs3.io.layouts import FORMATS, FORMER_NAMES, Format, point_folders
 from qs3.io.layouts.store import read_ragged
 from qs3.io.ragged import RaggedClouds
 from qs3.store.folder import open_folder
+from qs3.store.manifest import MANIFEST
 
 
 def load_clouds(
@@ -22,6 +25,7 @@ def load_clouds(
     cloud: CloudChoice = "points",
     class_names: Sequence[str] | None = None,
     most: int | None = None,
+    class_map: Mapping[str, str] | None = None,
 ) -> PointClouds:
     """Read labelled clouds from whatever ``source`` is.
 
@@ -31,17 +35,19 @@ def load_clouds(
         split: Part to read; None takes all.
         num_points: Points a cloud; others are resampled. None keeps what is there.
         cloud: Which cloud of a generated data set; ``all`` takes the three of each scan.
-        class_names: Classes that the labels shall index, found by name or alias. None takes
-            PointDA-10's ten where all map onto them, else the source's own.
+        class_names: Classes that the labels shall index, found by name or alias; ``origin`` of
+            the result tells which go by another name. None takes the source's own.
+        class_map: What classes shall be called before that: name in the source → name wanted;
+            those it does not name keep theirs.
         most: As in `qs3.io.preparation.stack`, where ``num_points`` is None.
 
     Raises:
         InputError: where the source is none of these, is damaged, has no labels, or has a class
             that is not in ``class_names``.
     """
-    read = read_clouds(source, split, cloud)[0]
-    clouds = read.labelled(num_points, class_names, str(source), most)
-    return replace(clouds, origin=Origin(open_folder(source).name, split, cloud))
+    clouds = read_clouds(source, split, cloud)[0]
+    origin = Origin(open_folder(source).name, split, cloud)
+    return clouds.labelled(num_points, class_names, str(source), most, class_map, origin)
 
 
 def load_unlabelled(
@@ -90,6 +96,33 @@ def read_clouds(
     if cloud != "points":
         raise InputError(f"{path}: only a data set made by qs3 generate has {cloud!r} clouds")
     return layout.read(path, split), layout.name
+
+
+def is_store(source: str | Path) -> bool:
+    """Whether a source is a data set of ours: an address, or a folder with ``dataset.json``."""
+    return "://" in str(source) or (Path(source) / MANIFEST).is_file()
+
+
+def describe_clouds(source: str | Path) -> dict[str, Any]:
+    """Count what a data set of any layout holds, as its files have it.
+
+    Returns:
+        ``layout``, ``rows``, ``points`` (smallest and largest cloud), ``classes`` and ``splits``
+        (clouds by name; empty where the files tell none).
+
+    Raises:
+        InputError: where it cannot be read.
+    """
+    clouds, layout = read_clouds(source)
+    sizes = [len(cloud) for cloud in clouds.clouds]
+    labels = [] if clouds.labels is None else sorted(clouds.labels.tolist())
+    return {
+        "layout": layout,
+        "rows": len(sizes),
+        "points": [min(sizes), max(sizes)] if sizes else [],
+        "classes": dict(Counter(clouds.class_names[label] for label in labels)),
+        "splits": dict(sorted(Counter(clouds.splits).items())),
+    }
 
 
 def detect(path: Path) -> Format:

@@ -1,17 +1,17 @@
 """Clouds as they come out of files: of any sizes, with or without labels."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Int
 
 from qs3.errors import InputError
-from qs3.io.clouds import PointClouds, UnlabelledClouds, digests, numbered
+from qs3.io.clouds import Origin, PointClouds, UnlabelledClouds, digests, numbered
 from qs3.io.preparation import stack
 from qs3.io.scratch import scratch_array
-from qs3.meshes.classes import POINTDA10, map_labels
+from qs3.meshes.classes import label_order, map_labels, require_named
 
 
 @dataclass(frozen=True)
@@ -37,31 +37,41 @@ class RaggedClouds:
         class_names: Sequence[str] | None,
         where: str,
         most: int | None = None,
+        class_map: Mapping[str, str] | None = None,
+        origin: Origin | None = None,
     ) -> PointClouds:
         """Return clouds of one size with labels that index ``class_names``.
 
         Args:
             num_points: Points a cloud; None keeps what is there.
-            class_names: Classes of the result; None takes PointDA-10's ten where every class maps
-                onto them, else the files' own.
+            class_names: Classes of the result, found by name or alias; None takes the files' own,
+                see `label_order`.
             where: What was read, for messages.
             most: As in `qs3.io.preparation.stack`.
+            class_map: What the files' classes shall be called before that; None keeps their names.
+            origin: Where the clouds are from; what is called otherwise is added.
 
         Raises:
-            InputError: where there are no labels, a class is not in ``class_names``, or sizes
-                differ and no size is asked for.
+            InputError: where there are no labels, a class is not in ``class_names``, ``class_map``
+                is of no class, or sizes differ and no size is asked for.
         """
         if self.labels is None:
             raise InputError(f"{where}: has no labels, and this needs them")
+        called = [(class_map or {}).get(name, name) for name in self.class_names]
+        names = label_order(called) if class_names is None else tuple(class_names)
         try:
-            names = POINTDA10 if class_names is None else tuple(class_names)
-            labels, _ = map_labels(self.class_names, self.labels, names)
+            if class_map is not None and class_names is None:
+                require_named(self.class_names, class_map)
+            labels, _ = map_labels(called, self.labels, names)
         except InputError as error:
-            if class_names is not None:
-                raise InputError(f"{where}: {error}") from error
-            names, labels = self.class_names, self.labels.astype(np.int64)
+            raise InputError(f"{where}: {error}") from error
+        pairs = sorted(set(zip(self.labels.tolist(), labels.tolist(), strict=True)))
+        told = {self.class_names[row]: names[label] for row, label in pairs}
+        renamed = {name: other for name, other in told.items() if name != other}
         points = stack(self.clouds, num_points, where, most)
-        return PointClouds(points, labels, names, self.ids, self.checksum)
+        origin = origin or Origin("arrays")
+        origin = replace(origin, renamed={**origin.renamed, **renamed})
+        return PointClouds(points, labels, names, self.ids, self.checksum, origin)
 
     def unlabelled(
         self, num_points: int | None, where: str, most: int | None = None
@@ -79,3 +89,16 @@ class RaggedClouds:
         order = np.argsort(digests(points), kind="stable")
         ordered = np.take(points, order, axis=0, out=scratch_array(points.shape))
         return UnlabelledClouds(ordered, numbered(len(points)), self.checksum)
+
+
+def relabel(
+    clouds: PointClouds,
+    class_names: Sequence[str],
+    class_map: Mapping[str, str] | None,
+    where: str,
+) -> PointClouds:
+    """Return labelled clouds under other names of their classes; see `RaggedClouds.labelled`."""
+    given = RaggedClouds(
+        list(clouds.points), clouds.ids, clouds.checksum, clouds.labels, clouds.class_names
+    )
+    return given.labelled(None, class_names, where, None, class_map, clouds.origin)

@@ -1,17 +1,23 @@
 """Names of classes, their aliases, and labels put from one list of classes onto another.
 
 Convention:
-    The ten classes of PointDA-10 in alphabetical order are the common tongue of all data sets.
+    Names are kept as they stand. They change in three cases alone: a known data set's layout says
+    so, the user gives a map of names (``read_class_map``), or labels are put onto a list of classes
+    that is there already, PointDA-10's ten or a run's (``map_labels``).
 """
 
 import re
-from collections.abc import Sequence
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Int
 
 from qs3.errors import InputError
+
+_LARGEST_MAP = 1 << 20
 
 POINTDA10: tuple[str, ...] = (
     "bathtub",
@@ -72,6 +78,72 @@ def canonical(name: str) -> str:
     return _CANONICAL.get(folded, folded)
 
 
+def label_order(names: Sequence[str]) -> tuple[str, ...]:
+    """Classes in the order of the label.
+
+    PointDA-10's ten where all names are among them as they stand, so that a part of the ten has the
+    labels of the whole; else the names themselves.
+
+    Example:
+        >>> len(label_order(["table", "chair"])), label_order(["stool", "chair"])
+        (10, ('stool', 'chair'))
+    """
+    return POINTDA10 if set(names) <= set(POINTDA10) else tuple(dict.fromkeys(names))
+
+
+def read_class_map(path: Path) -> dict[str, str]:
+    """Read what classes shall be called: a TOML file of lines such as ``stool = "chair"``.
+
+    Raises:
+        InputError: where the file is missing, is no TOML, or holds anything but such lines.
+    """
+    hint = 'give each class one line, such as stool = "chair"'
+    try:
+        with path.open("rb") as file:
+            text = file.read(_LARGEST_MAP)
+        given = tomllib.loads(text.decode())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: {error}; {hint}") from error
+    for name, wanted in given.items():
+        if not isinstance(wanted, str) or not wanted.strip() or not wanted.isprintable():
+            raise InputError(f"{path}: {name!r} is given no name; {hint}")
+    return given
+
+
+def require_named(names: Sequence[str], wanted: Mapping[str, str]) -> None:
+    """Refuse a map that is of none of these classes."""
+    if not set(names) & set(wanted):
+        raise InputError(
+            f"the map of classes names {', '.join(wanted) or 'nothing'}, and none of "
+            f"{', '.join(names)}"
+        )
+
+
+def describe_renaming(
+    renamed: Mapping[str, str], wanted: Mapping[str, str] | None = None
+) -> list[str]:
+    """Say in a line which classes go by another name, and in another what the map has in vain.
+
+    Args:
+        renamed: Name in the data → name here.
+        wanted: The map that was given.
+
+    Example:
+        >>> describe_renaming({"desk": "table", "stool": "chair"}, {"stool": "chair", "stol": "x"})
+        ['classes: desk → table; stool → chair', 'classes: none here is stol, as the map has it']
+    """
+    kinds: dict[str, list[str]] = {}
+    for name, other in renamed.items():
+        kinds.setdefault(other, []).append(name)
+    said = [f"{', '.join(names)} → {other}" for other, names in kinds.items()]
+    unused = [name for name, to in (wanted or {}).items() if name != to and name not in renamed]
+    lines = [f"classes: {'; '.join(said)}"] if said else []
+    vain = f"classes: none here is {', '.join(unused)}, as the map has it"
+    return [*lines, vain] if unused else lines
+
+
 _MODELNET40 = """
 airplane bathtub bed bench bookshelf bottle bowl car chair cone cup curtain desk door dresser
 flower_pot glass_box guitar keyboard lamp laptop mantel monitor night_stand person piano plant
@@ -120,7 +192,8 @@ def map_labels(
 ) -> tuple[Int[np.ndarray, "m"], Bool[np.ndarray, "b"]]:
     """Put labels onto another list of classes by the table of aliases.
 
-    A name that the other list has as it is keeps it; otherwise aliases are followed on both sides.
+    A name that the other list has as it is keeps it. Otherwise the table is followed to the class
+    of PointDA-10 where the list has it, else to its alias in the list where that is the only one.
 
     Args:
         class_names: Names that the labels index.
@@ -145,7 +218,7 @@ def map_labels(
         missing = sorted({class_names[int(i)] for i in np.unique(labels[~kept])})
         raise InputError(
             f"class {', '.join(map(repr, missing))} is none of: {', '.join(to)}; rename it, or "
-            "name the classes to use"
+            "name the classes to use, or what each is called: --map"
         )
     return mapped[kept], kept
 
@@ -154,9 +227,11 @@ def _positions(names: Sequence[str], to: Sequence[str]) -> Int[np.ndarray, "k"]:
     """Position in ``to`` of each name, −1 where it is in none: as it is, else by the table.
 
     A list may hold a class beside its alias (ScanObjectNN: table and desk): the class comes first.
+    Of several aliases (armchair and stool) none is meant.
     """
     exact = {name: position for position, name in enumerate(to)}
-    merged = {canonical(name): position for position, name in reversed(list(enumerate(to)))}
+    kinds = [canonical(name) for name in to]
+    merged = {kind: kinds.index(kind) for kind in kinds if kinds.count(kind) == 1}
     folded = [(name, canonical(name)) for name in names]
     rows = [exact.get(n, exact.get(fold, merged.get(fold, -1))) for n, fold in folded]
     return np.array(rows, dtype=np.int64)

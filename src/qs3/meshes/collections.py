@@ -1,6 +1,6 @@
 """Lists of meshes to scan: from a folder, or drawn from the procedural shapes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -16,6 +16,7 @@ from qs3.meshes.classes import (
     POINTDA10_OF_MODELNET,
     POINTDA10_OF_SHAPENET,
     canonical,
+    require_named,
 )
 from qs3.meshes.loading import load_mesh
 from qs3.meshes.trees import MeshItem, read_tree
@@ -94,10 +95,24 @@ def _files(root: Path, classes: Sequence[str] | None, labels: Path | None) -> li
         return items
     names = _rename(items, classes, str(root))
     return [
-        replace(item, class_name=name)
-        for name, item in zip(names, items, strict=True)
-        if name is not None
+        _called(item, name) for name, item in zip(names, items, strict=True) if name is not None
     ]
+
+
+def rename_items(items: Sequence[MeshItem], wanted: Mapping[str, str]) -> list[MeshItem]:
+    """Give classes of meshes the names of a map, others keep theirs; see ``MeshItem.own_class``.
+
+    Raises:
+        InputError: where the map is of none of the classes.
+    """
+    require_named(sorted({item.class_name for item in items}), wanted)
+    return [_called(item, wanted.get(item.class_name, item.class_name)) for item in items]
+
+
+def _called(item: MeshItem, name: str) -> MeshItem:
+    if name == item.class_name:
+        return item
+    return replace(item, class_name=name, own_class=item.own_class or item.class_name)
 
 
 def _chosen_names(classes: str | Sequence[str] | None) -> tuple[str, ...] | None:

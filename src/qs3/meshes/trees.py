@@ -48,6 +48,8 @@ class MeshItem:
     """Up axis of the file, or None to go by its format; see ``load_mesh``."""
     layout: Layout | None = None
     """What the file was recognised as, or None for a procedural shape."""
+    own_class: str = ""
+    """Name of the class in the collection, where it goes by another one; else empty."""
 
     def load(self) -> trimesh.Trimesh:
         """Read or make the mesh.
@@ -59,7 +61,7 @@ class MeshItem:
             return load_mesh(self.path, up=self.up)
         if self.shape_seed is None:
             raise InputError(f"{self.id}: has neither a file nor a shape seed")
-        return shapes.make(self.class_name, self.shape_seed)
+        return shapes.make(self.own_class or self.class_name, self.shape_seed)
 
 
 def read_tree(root: Path, labels: Path | None = None) -> list[MeshItem]:

@@ -155,7 +155,7 @@ def _of_run(run: Run, holdings: Holdings, settings: ReportSettings) -> Report:
                 f"{place}: knows other classes than {run.folder}; name another --before"
             )
         models = {_name_before(place, run.method): before} | models
-    record = _record_in(run.folder, holdings.records)
+    record = _record_in(run.folder, holdings.records, loaded.class_names)
     test = None if record is None else record.test
     named = settings.source, settings.source_split, settings.source_cloud
     source = read_domain(named, run.source, run.folder, loaded)
@@ -176,7 +176,8 @@ def _of_run(run: Run, holdings: Holdings, settings: ReportSettings) -> Report:
     else:
         marks = () if record is None else record.marks
         if record is not None:
-            first = None if place is None else _record_in(place, holdings.records, record.test)
+            own = holdings.records, loaded.class_names, record.test
+            first = None if place is None else _record_in(place, *own)
             pairs = zip(models, (first, record)[-len(models) :], strict=True)
             networks = [Scored(name, made.scores) for name, made in pairs if made is not None]
         notes.append(
@@ -213,12 +214,16 @@ def _name_before(place: Path, after: str) -> str:
 
 
 def _record_in(
-    folder: Path, records: Sequence[NamedRecord], test: DataRecord | None = None
+    folder: Path,
+    records: Sequence[NamedRecord],
+    class_names: Sequence[str],
+    test: DataRecord | None = None,
 ) -> RunRecord | None:
-    """The first record in a run's own folder, of these data if they are named."""
+    """The first record in a run's own folder, of these classes, of these data if they are named."""
     for named in records:
         inside = Path(named.name).resolve().is_relative_to(folder.resolve())
-        if inside and test in (None, named.record.test):
+        same = named.record.scores.class_names == tuple(class_names)
+        if inside and same and test in (None, named.record.test):
             return named.record
     return None
 

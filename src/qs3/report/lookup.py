@@ -45,7 +45,9 @@ def read_domain(
     points, names = model.settings["train"]["num_points"], model.class_names
 
     def load(data: str | Path, split: str | None, cloud: CloudChoice) -> Prepared[PointClouds]:
-        part = {"split": split, "cloud": cloud, "class_names": names}
+        # As they were called in the run, which need not be by an alias.
+        renamed = None if recorded is None else recorded.renamed or None
+        part = {"split": split, "cloud": cloud, "class_names": names, "class_map": renamed}
         clouds = load_whole(load_clouds, data, points, model.preparation, **part)
         return prepare_clouds(clouds, points, model.preparation)
 

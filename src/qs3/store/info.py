@@ -17,9 +17,9 @@ def info(where: str | Path | Folder) -> dict[str, Any]:
 
     Returns:
         ``rows``, ``objects``, ``rows_planned``, ``shards``, ``shards_planned``, ``failed``,
-        ``bytes`` (of all shards), ``classes`` and ``splits`` (rows by name), ``points`` (smallest
-        and largest noisy cloud), ``statistics`` (median of each over the rows that have it),
-        ``settings`` and ``versions``.
+        ``bytes`` (of all shards), ``classes`` and ``splits`` (rows by name), ``renamed`` (classes
+        of the meshes that go by another name), ``points`` (smallest and largest noisy cloud),
+        ``statistics`` (median of each over the rows that have it), ``settings`` and ``versions``.
 
     Raises:
         InputError: where the folder is not a data set or a shard is damaged.
@@ -55,6 +55,7 @@ def info(where: str | Path | Folder) -> dict[str, Any]:
         "shards_planned": manifest.shards,
         "bytes": total,
         "classes": classes,
+        "renamed": dict(manifest.renamed),
         "splits": dict(sorted(splits.items())),
         "points": [int(points.min()), int(points.max())] if len(points) else [],
         "statistics": {name: float(np.median(v)) for name, v in medians.items() if len(v)},

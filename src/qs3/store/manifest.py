@@ -9,7 +9,7 @@ import platform
 import time
 import warnings
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,8 @@ class Manifest:
     """Shards planned."""
     versions: Mapping[str, str]
     """Versions of the packages that began it."""
+    renamed: Mapping[str, str] = field(default_factory=dict)
+    """Classes of the meshes that go by another name here; not in the file where there is none."""
     schema: int = SCHEMA_VERSION
     """Version of the columns."""
 
@@ -94,7 +96,10 @@ def write_manifest(where: str | Path | Folder, manifest: Manifest) -> None:
     if folder.exists(MANIFEST):
         check_same(str(folder), open_dataset(folder), manifest)
     else:
-        folder.write(MANIFEST, json_bytes(unstructure(manifest)))
+        value = unstructure(manifest)
+        if not manifest.renamed:
+            del value["renamed"]
+        folder.write(MANIFEST, json_bytes(value))
 
 
 def check_same(where: str, present: Manifest, wanted: Manifest) -> None:
@@ -112,6 +117,11 @@ def check_same(where: str, present: Manifest, wanted: Manifest) -> None:
         difference = first_difference(old[key], new[key], key)
         if difference is not None:
             name, was, now = difference
+            if name == "settings.work_list":  # a checksum, which would tell a reader nothing
+                raise InputError(
+                    f"{where}: made of another list of meshes (their names, classes, splits, axes "
+                    "or shape seeds differ); name another folder, or the same meshes"
+                )
             raise InputError(
                 f"{where}: made with {name.removeprefix('settings.')} = {was}, not {now}; "
                 "name another folder, or use the same settings"

@@ -98,6 +98,11 @@ class Plan:
         return Manifest(
             settings={**self.settings.as_dict(), "work_list": work_list_checksum(self.items)},
             class_names=self.settings.classes,
+            renamed={
+                own: item.class_name
+                for item in self.items
+                if (own := getattr(item, "own_class", ""))
+            },
             rows=self.rows,
             shards=self.shards,
             versions=package_versions(),

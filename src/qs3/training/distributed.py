@@ -64,6 +64,11 @@ def make_fabric(settings: TrainSettings, rank: int = 0) -> Fabric:
     accelerator = settings.accelerator
     if accelerator == "auto":  # not Lightning's own choice, which may be one without float64
         accelerator = "cuda" if torch.cuda.is_available() else "cpu"
+    if accelerator == "cuda" and (seen := torch.cuda.device_count()) < count:
+        raise InputError(
+            f"accelerator 'cuda' with devices = {count}: PyTorch sees {seen or 'no'} NVIDIA GPU"
+            f"{'s' * (seen > 1)} here; take --accelerator cpu or fewer --devices (qs3 doctor tells)"
+        )
     if settings.precision == "16-mixed" and accelerator == "cpu":
         # Lightning would take bf16 in its place, and the record would tell something else.
         raise InputError("precision 16-mixed needs a GPU; on a CPU take 32-true or bf16-mixed")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int
 
 from qs3.errors import InputError
 from qs3.evaluation.environment import git_commit, hardware, versions
@@ -15,7 +16,8 @@ from qs3.evaluation.records import RECORDS, RunRecord, Scores, score, write_reco
 from qs3.evaluation.regret import choose_each
 from qs3.io import load_clouds
 from qs3.io.clouds import CloudKind, PointClouds
-from qs3.io.ragged import RaggedClouds
+from qs3.io.ragged import relabel
+from qs3.meshes.classes import require_named
 from qs3.structure import unstructure
 from qs3.training.batches import load_whole, require_finite
 from qs3.training.checkpoint import LoadedModel, load_model
@@ -35,11 +37,12 @@ def evaluate(
     cloud: CloudKind = "points",
     checkpoints: bool = False,
     experiment: Mapping[str, str | int | float] | None = None,
+    class_map: Mapping[str, str] | None = None,
 ) -> RunRecord:
     """Score a run on labelled clouds, and write the record into its folder ``records``.
 
-    Labels of the data are put onto the network's classes by name; an answer that the data has no
-    cloud of stays an answer, and is wrong.
+    Labels of the data are put onto the network's classes by name or alias, and the record says
+    which (``test.renamed``); an answer that the data has no cloud of stays an answer, and is wrong.
 
     Args:
         run: Folder of a finished run.
@@ -49,32 +52,41 @@ def evaluate(
         checkpoints: Whether to score every checkpoint of the run's last stage too, and tell which
             one each validator would have chosen; ``oracle``, among them, looks at the labels.
         experiment: Place of the run in a grid of runs, for the record.
+        class_map: What classes are called in the scores, of the data and of the network: a run
+            that knows a stool is scored on data of chairs by ``{"stool": "chair"}``.
 
     Raises:
-        InputError: where the run is not finished, the data cannot be read, or classes of the data
-            are none of the network's.
+        InputError: where the run is not finished, the data cannot be read, classes of the data
+            are none of the network's, or the map is of none of either.
     """
     made, loaded = read_run(run), load_model(run)
     train = loaded.settings["train"]
-    whole = _labelled(data, split, cloud, loaded)
+    called = {name: (class_map or {}).get(name, name) for name in loaded.class_names}
+    names = tuple(dict.fromkeys(called.values()))
+    whole = _labelled(data, split, cloud, loaded, names, class_map)
+    tested = data_record(whole)
+    renamed = {name: other for name, other in called.items() if name != other}
+    if class_map is not None:
+        require_named([*loaded.class_names, *tested.renamed], class_map)
+    answer_of = np.array([names.index(other) for other in called.values()])
     require_finite(whole.points, whole.ids)
     test = prepare_clouds(whole, train["num_points"], loaded.preparation)
-    scored = _scored(Path(run), test) if checkpoints else []
+    scored = _scored(Path(run), test, answer_of) if checkpoints else []
     record = RunRecord(
         method=made.method,
         model=train["model"],
         settings=loaded.settings | {"preset": made.preset},
         source=made.source,
         target=made.target,
-        test=data_record(whole),
+        test=replace(tested, renamed={**renamed, **tested.renamed}),
         seed=train["seed"],
         selection=made.selection,
-        scores=_scores(loaded, test),
+        scores=_scores(loaded, test, answer_of),
         seconds=made.seconds,
         versions=versions(),
         hardware=hardware(),
         commit=git_commit(),
-        rounds=_count_right(Path(run), made.rounds, test),
+        rounds=_count_right(Path(run), made.rounds, test, answer_of),
         chosen=made.chosen,
         checkpoints=tuple(scored),
         choices=_choices(scored) if scored else {},
@@ -93,24 +105,35 @@ def record_path(run: Path, record: RunRecord) -> Path:
 
 
 def _labelled(
-    data: str | Path | PointClouds, split: str | None, cloud: CloudKind, loaded: LoadedModel
+    data: str | Path | PointClouds,
+    split: str | None,
+    cloud: CloudKind,
+    loaded: LoadedModel,
+    class_names: tuple[str, ...],
+    class_map: Mapping[str, str] | None,
 ) -> PointClouds:
-    """Clouds with labels that index the network's classes."""
+    """Clouds with labels that index the classes of the scores."""
     if not isinstance(data, PointClouds):
-        part = {"split": split, "cloud": cloud, "class_names": loaded.class_names}
+        part = {"split": split, "cloud": cloud}
+        part |= {"class_names": class_names, "class_map": class_map}
         points = loaded.settings["train"]["num_points"]
         return load_whole(load_clouds, data, points, loaded.preparation, **part)
-    given = RaggedClouds(list(data.points), data.ids, data.checksum, data.labels, data.class_names)
-    return replace(given.labelled(None, loaded.class_names, "data"), origin=data.origin)
+    return relabel(data, class_names, class_map, "data")
 
 
-def _scores(loaded: LoadedModel, test: Prepared[PointClouds]) -> Scores:
-    answers = describe(loaded.model, test).probabilities.argmax(axis=1)
-    return score(test.labels, answers, loaded.class_names)
+def _scores(
+    loaded: LoadedModel, test: Prepared[PointClouds], answer_of: Int[np.ndarray, "k"]
+) -> Scores:
+    """Scores, where ``answer_of`` tells which class of the data each of the network's is."""
+    answers = answer_of[describe(loaded.model, test).probabilities.argmax(axis=1)]
+    return score(test.labels, answers, test.class_names)
 
 
 def _count_right(
-    run: Path, rounds: Sequence[Mapping[str, Any]], test: Prepared[PointClouds]
+    run: Path,
+    rounds: Sequence[Mapping[str, Any]],
+    test: Prepared[PointClouds],
+    answer_of: Int[np.ndarray, "k"],
 ) -> tuple[Mapping[str, Any], ...]:
     """Add to what rounds did how many of the pseudo labels that they kept were right.
 
@@ -119,6 +142,7 @@ def _count_right(
         rounds: What its rounds did.
         test: Labelled clouds. Those of the target among them are known by the points that the
             network gets.
+        answer_of: As in `_scores`.
     """
     found = kept_clouds(run)
     if found is None or len(found[1]) != len(rounds):
@@ -133,13 +157,15 @@ def _count_right(
     told = []
     for record, (rows, pseudo) in zip(rounds, kept, strict=True):
         known, size = labels[rows] >= 0, len(record["kept"])
-        counted = {"known": pseudo[known], "right": pseudo[labels[rows] == pseudo]}
+        counted = {"known": pseudo[known], "right": pseudo[labels[rows] == answer_of[pseudo]]}
         counts = {name: np.bincount(of, minlength=size).tolist() for name, of in counted.items()}
         told.append({**record, **counts})
     return tuple(told)
 
 
-def _scored(run: Path, test: Prepared[PointClouds]) -> list[dict[str, Any]]:
+def _scored(
+    run: Path, test: Prepared[PointClouds], answer_of: Int[np.ndarray, "k"]
+) -> list[dict[str, Any]]:
     """Score the checkpoints of the run's last stage."""
     checkpoints = read_checkpoints(run, ROUND) or read_checkpoints(run)
     if not checkpoints:
@@ -147,7 +173,7 @@ def _scored(run: Path, test: Prepared[PointClouds]) -> list[dict[str, Any]]:
     loaded, scored = load_model(run), []
     for checkpoint in checkpoints:
         load_checkpoint(run, checkpoint, loaded.model)
-        scores = _scores(loaded, test)
+        scores = _scores(loaded, test, answer_of)
         one = {"accuracy": scores.accuracy, "class_mean_accuracy": scores.class_mean_accuracy}
         one |= {"stage": checkpoint.stage, "number": checkpoint.number}
         scored.append(one | {"validators": dict(checkpoint.validators)})

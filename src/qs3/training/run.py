@@ -171,6 +171,13 @@ def find_runs(folder: Path) -> list[Path]:
     return runs
 
 
+_BY_CHECKSUM = {
+    "source": "its points, its labels or the names of its classes",
+    "target": "its points",
+    "warm_up": "its weights",
+}
+
+
 @contextlib.contextmanager
 def claim_run(
     folder: Path, wanted: RunSettings, threads: Callable[[int | None], int]
@@ -196,6 +203,8 @@ def claim_run(
         begun = _settings(path) if path.is_file() else None
         if begun is not None and (difference := first_difference(_fixed(begun), _fixed(wanted))):
             name, theirs, ours = difference
+            if name in _BY_CHECKSUM:  # which would tell a reader nothing
+                raise InputError(f"{folder}: {_other_data(name, theirs, ours)}")
             raise InputError(
                 f"{folder}: holds a run with {name} = {theirs!r}, not {ours!r}; name another "
                 "folder or use its settings"
@@ -204,6 +213,18 @@ def claim_run(
         if begun is None:
             write_json(path, unstructure(ready))
         yield ready
+
+
+def _other_data(name: str, begun: str | None, now: str | None) -> str:
+    """What to tell where a run goes on with other data than it was begun with."""
+    option = f"--{name.replace('_', '-')}"
+    if begun is None or now is None:
+        how = "without" if begun is None else "with"
+        return f"holds a run that was begun {how} {option}; name another folder, or do the same"
+    return (
+        f"holds a run with another {option}: what is named now differs from what it was begun "
+        f"with ({_BY_CHECKSUM[name]}); name another folder, or that {option} again"
+    )
 
 
 def _fixed(settings: RunSettings) -> dict[str, Any]:

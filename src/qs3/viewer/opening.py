@@ -10,6 +10,7 @@ import trimesh
 from qs3 import shapes
 from qs3.errors import InputError, UnevenSizesError
 from qs3.io.clouds import CloudKind, PointClouds, UnlabelledClouds
+from qs3.io.load import is_store
 from qs3.viewer.exhibits import Answers, ArrayExhibits, Exhibits, StoreExhibits
 
 _LOG = logging.getLogger(__name__)
@@ -66,7 +67,7 @@ def open_exhibits(
     refuse_data(what, data)
     if path.is_file() and path.suffix.lower() in POINT_FILES:
         return ArrayExhibits(read_cloud(path)[None], (path.name,), ("",)), None
-    if _is_store(what):
+    if is_store(what):
         return StoreExhibits(what, split), None
     try:
         clouds = _read(what, split, num_points=None)
@@ -106,7 +107,7 @@ def _open_run(
     shares = [predict_probabilities(loaded, clouds.points[i : i + 32]) for i in starts]
     truth = clouds.labels if isinstance(clouds, PointClouds) else None
     answers = Answers(np.concatenate(shares), loaded.class_names, truth, cloud)
-    if _is_store(data):
+    if is_store(data):
         return StoreExhibits(data, split), answers
     return ArrayExhibits.of(clouds), answers
 
@@ -123,7 +124,3 @@ def _read(
         if "has no labels" not in str(error):
             raise
     return load_unlabelled(source, split=split, **how)
-
-
-def _is_store(source: str) -> bool:
-    return "://" in source or (Path(source) / "dataset.json").is_file()

@@ -7,6 +7,7 @@ import ctypes
 import dataclasses
 import multiprocessing
 import os
+import pickle
 import signal
 import sys
 import threading
@@ -84,15 +85,14 @@ class LocalExecutor:
     def _schedule(self, call: _Call) -> None:
         # The first call starts the processes, from threads that inherit what is blocked here:
         # Ctrl-C reaches every process of the terminal, and only the first is to act on it.
-        arguments = (call.function, *call.arguments)
-        try:
-            ForkingPickler.dumps(arguments)  # in pebble's own thread a fault would go unseen
+        try:  # in pebble's own thread a fault would go unseen
+            packed = bytes(ForkingPickler.dumps((call.function, *call.arguments)))
         except Exception as error:
             raise InputError(f"a call cannot be sent to another process ({error})") from error
         for _ in range(_BROKEN_IN_A_ROW):
             try:
                 with _interrupt_blocked():
-                    future = self._pool.schedule(guarded, args=arguments, timeout=self._timeout)
+                    future = self._pool.schedule(_call, args=(packed,), timeout=self._timeout)
             except RuntimeError:  # the pool broke while nobody looked: an idle process died
                 self._reopen()
                 continue
@@ -217,6 +217,14 @@ def _interrupt_blocked() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _call(packed: bytes) -> Any:
+    """Call what was sent. It is unpacked here, since pebble unpacks under the lock that all share.
+
+    The first call imports the modules of what it is made of, for seconds on a busy machine.
+    """
+    return guarded(*pickle.loads(packed))  # noqa: S301
 
 
 def _prepare_worker() -> None:
