@@ -5,6 +5,7 @@ from qs3.adaptation import Batch, create_method
 from qs3.adaptation.names import METHODS
 from qs3.errors import InputError
 from qs3.models import create_model
+from qs3.models.aligned import Aligned, aligned
 from qs3.models.sized import Sized, ball_radius, log_extents, unit_of
 
 SMALL = {"channels": (16, 16, 32), "hidden": (16,), "transforms": False}
@@ -126,3 +127,34 @@ def test_what_distorts_in_the_unit_ball_does_so_in_the_clouds_own(clouds, method
     assert len(seen[0]) > 2
     for one, other in zip(*seen, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("angle", [0.3, 2.0, -2.8])
+def test_alignment_leaves_two_headings(clouds, angle):
+    """Of all turns of a cloud two remain, a half turn apart; nothing else moves."""
+    plain, other = aligned(clouds), aligned(turned(clouds, angle))
+    half = plain * torch.tensor([-1.0, -1.0, 1.0])
+    for one, same, turn in zip(other, plain, half, strict=True):
+        assert torch.allclose(one, same, atol=1e-5) or torch.allclose(one, turn, atol=1e-5)
+    torch.testing.assert_close(aligned(turned(clouds, torch.pi)), half)
+    centred = plain[:, :, :2] - plain[:, :, :2].mean(dim=1, keepdim=True)
+    variance = centred.transpose(1, 2) @ centred
+    assert (variance[:, 0, 0] > variance[:, 1, 1]).all()
+    torch.testing.assert_close(variance[:, 0, 1], torch.zeros(6), atol=1e-4, rtol=0)
+    distances = [
+        torch.cdist(part, part, compute_mode="donot_use_mm_for_euclid_dist")
+        for part in (plain, clouds)
+    ]
+    torch.testing.assert_close(*distances)
+    assert aligned(torch.zeros(1, 3, 3)).isfinite().all()
+
+
+def test_aligned_network_answers_to_two_headings(clouds):
+    network = Aligned(make()).eval()
+    torch.testing.assert_close(network(clouds), make().eval()(aligned(clouds)))
+    sized = Sized(network, 0.95).eval()
+    answers = [
+        sized(turned(clouds, angle)) + sized(turned(clouds, angle + torch.pi))
+        for angle in (0.0, 1.3)
+    ]
+    torch.testing.assert_close(*answers, atol=1e-4, rtol=1e-4)

@@ -29,7 +29,7 @@ _MODULE = importlib.util.module_from_spec(_SPEC)
 _SPEC.loader.exec_module(_MODULE)
 SMALL = _MODULE.SMALL
 
-OWN = replace(ROBUST, size_input=True)
+OWN = replace(ROBUST, size_input=True, align=True)
 CLASSES = ("Stuhl", "テーブル", 'a "lamp"')
 TINY = "pointnet of each point"
 M = 40

@@ -32,7 +32,7 @@ from qs3.training.rounds import STATE, kept_clouds, remarks
 from qs3.training.self_training import self_train
 
 WIDE = {
-    "preparation": replace(ROBUST, size_input=True),
+    "preparation": replace(ROBUST, size_input=True, align=True),
     "augmentation": Augmentation.scanned(),
     "num_points": 40,
 }

@@ -37,6 +37,11 @@ class Preparation:
     """Whether the network is told how large a cloud is (`qs3.models.sized.Sized`): for data in
     metres, of objects that have their real sizes."""
 
+    align: bool = False
+    """Whether the network gets clouds turned to their main horizontal axis
+    (`qs3.models.aligned.Aligned`): fewer headings to learn. Methods that ask how a cloud is turned
+    about z learn nothing from it."""
+
     def __post_init__(self) -> None:
         if not 0.5 <= self.radius_share <= 1:
             raise InputError(f"setting radius_share = {self.radius_share} must be in 0.5 to 1")

@@ -16,6 +16,7 @@ from qs3.errors import InputError
 from qs3.files import parse_json, write_bytes
 from qs3.io.preparation import PAPER, Preparation
 from qs3.models import PointClassifier, create_model
+from qs3.models.aligned import Aligned
 from qs3.models.sized import Sized
 from qs3.structure import structure, unstructure
 from qs3.training.config import TrainSettings
@@ -153,6 +154,7 @@ def _make(
     name: str, num_classes: int, arguments: Mapping[str, Any], preparation: Preparation
 ) -> PointClassifier:
     model = create_model(name, num_classes, **arguments)
+    model = Aligned(model) if preparation.align else model
     return Sized(model, preparation.radius_share) if preparation.size_input else model
 
 
