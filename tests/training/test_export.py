@@ -17,6 +17,7 @@ from qs3.io.preparation import PAPER, ROBUST, distinct_inliers, normalise
 from qs3.models import create_model
 from qs3.models.ops import farthest_point_sampling
 from qs3.models.ops.sampling import sample_in_a_loop
+from qs3.models.aligned import Aligned
 from qs3.models.sized import Sized
 from qs3.training import TrainSettings, export, load_model, predict_probabilities, save_model
 from qs3.training.batches import subsample
@@ -48,6 +49,8 @@ def make_run(folder, name=TINY, num_points=M, preparation=PAPER):
         model(0.5 * torch.randn(8, num_points, 3))
     with torch.no_grad():
         list(model.parameters())[-2].mul_(8)
+    if preparation.align:
+        model = Aligned(model)
     if preparation.size_input:
         model = Sized(model, preparation.radius_share)
         torch.nn.init.normal_(model.size[2].weight)
