@@ -15,9 +15,9 @@ import torch
 from qs3.errors import InputError, MissingExtraError, QS3Error
 from qs3.io.preparation import PAPER, ROBUST, distinct_inliers, normalise
 from qs3.models import create_model
+from qs3.models.aligned import Aligned
 from qs3.models.ops import farthest_point_sampling
 from qs3.models.ops.sampling import sample_in_a_loop
-from qs3.models.aligned import Aligned
 from qs3.models.sized import Sized
 from qs3.training import TrainSettings, export, load_model, predict_probabilities, save_model
 from qs3.training.batches import subsample
