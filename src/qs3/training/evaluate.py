@@ -24,6 +24,7 @@ from qs3.training.predict import describe
 from qs3.training.prepared import Prepared, prepare_clouds
 from qs3.training.rounds import kept_clouds
 from qs3.training.run import data_record, read_run
+from qs3.training.shipped import workplace
 from qs3.training.validation import ROUND, load_checkpoint, read_checkpoints
 
 
@@ -38,11 +39,13 @@ def evaluate(
 ) -> RunRecord:
     """Score a run on labelled clouds, and write the record into its folder ``records``.
 
+    That of a network that comes with qs3 goes into ``records`` of the working directory.
+
     Labels of the data are put onto the network's classes by name; an answer that the data has no
     cloud of stays an answer, and is wrong.
 
     Args:
-        run: Folder of a finished run.
+        run: Folder of a finished run, or the name of a network that comes with qs3.
         data: Labelled clouds, or where they lie: whatever `qs3.io.load_clouds` reads.
         split: Part of the data, where they are read here.
         cloud: Which cloud of generated data, likewise.
@@ -55,11 +58,12 @@ def evaluate(
             are none of the network's.
     """
     made, loaded = read_run(run), load_model(run)
+    run = made.folder
     train = loaded.settings["train"]
     whole = _labelled(data, split, cloud, loaded)
     require_finite(whole.points, whole.ids)
     test = prepare_clouds(whole, train["num_points"], loaded.preparation)
-    scored = _scored(Path(run), test) if checkpoints else []
+    scored = _scored(run, test) if checkpoints else []
     record = RunRecord(
         method=made.method,
         model=train["model"],
@@ -74,7 +78,7 @@ def evaluate(
         versions=versions(),
         hardware=hardware(),
         commit=git_commit(),
-        rounds=_count_right(Path(run), made.rounds, test),
+        rounds=_count_right(run, made.rounds, test),
         chosen=made.chosen,
         checkpoints=tuple(scored),
         choices=_choices(scored) if scored else {},
@@ -89,7 +93,7 @@ def record_path(run: Path, record: RunRecord) -> Path:
     """Return where `evaluate` writes a record: name of the data, checksum of the record."""
     text = json.dumps(unstructure(record), sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:10]
-    return Path(run) / RECORDS / f"{Path(record.test.name).stem}-{digest}.json"
+    return workplace(run) / RECORDS / f"{Path(record.test.name).stem}-{digest}.json"
 
 
 def _labelled(
