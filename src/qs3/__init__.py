@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from qs3.sensor.rig import StereoRig as StereoRig
     from qs3.sensor.scan import Scan as Scan
     from qs3.sensor.scan import scan as scan
+    from qs3.training.estimators import load as load
 
 # OpenMP's threads, which PyTorch loads with, spin while they wait for one another. Beside another
 # busy program the wait is long, and training keeps a quarter of its rate or less; brief spinning
@@ -29,6 +30,7 @@ _LAZY = {
     "StereoRig": "qs3.sensor.rig",
     "Scan": "qs3.sensor.scan",
     "scan": "qs3.sensor.scan",
+    "load": "qs3.training.estimators",
 }
 
 

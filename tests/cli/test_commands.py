@@ -183,21 +183,3 @@ def test_doctor_knows_every_extra_that_a_user_may_want(capsys):
         "absent  ray (qs3 generate --executor ray): in a checkout, pip install -e '.[ray]'" in text
     )
     assert "ok      view (qs3 view)\n" in text
-
-
-def test_a_demo_of_the_smallest_size(qs3, tmp_path):
-    out = tmp_path / "demo"
-    size = ("--source-per-class", 2, "--target-per-class", 2,
-            "--source-views", 1, "--samples", 1,
-            "--variant", "scalar_rgb", "--model", "pointnet",
-            "--num-points", 64, "--epochs", 3, "--rounds", 2,
-            "--round-epochs", 1, "--workers", 1)  # fmt: skip
-    done = qs3("demo", "--out", out, *size)
-    assert str(out / "report.html") in done.stdout
-    assert done.stdout.count("accuracy on the target") == 2
-    page = (out / "report.html").read_text(encoding="utf-8")
-    assert "http://" not in page.replace("http://www.w3.org", "")
-    assert "source-only" in page
-    assert "qbst" in page
-    again = qs3("demo", "--out", out, *size)
-    assert again.stdout == done.stdout

@@ -24,10 +24,10 @@ def evaluate_run(
 ) -> int:
     """Score a run: accuracy, class-mean accuracy, confusion matrix.
 
-    It leaves a record in the run; no other verb reads labels of a target.
+    It leaves a record in the run, or in ./records; no other verb reads labels of a target.
 
     Args:
-        run: Folder of a run.
+        run: Folder of a run, or a network that comes with qs3: rooms.
         data: Labelled clouds: a folder that qs3 generate made, a folder of class folders, an npz
             file.
         split: Part of the data, such as test; all of it by default.

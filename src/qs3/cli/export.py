@@ -19,7 +19,7 @@ def export(
     the file is compared with the run first.
 
     Args:
-        run: Folder of a run, or its model.safetensors.
+        run: Folder of a run, its model.safetensors, or a network that comes with qs3: rooms.
         to: onnx, which many programs run; or torch-export, which PyTorch runs without qs3.
         out: The file; model.onnx or model.pt2 in the run by default.
     """

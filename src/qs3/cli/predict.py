@@ -22,7 +22,7 @@ def predict(
     A file that cannot be read is told at the end, and the exit code is 2; all others are done.
 
     Args:
-        run: Folder of a run, or its model.safetensors.
+        run: Folder of a run, its model.safetensors, or a network that comes with qs3: rooms.
         files: Clouds (NPY, XYZ, PLY, PCD, or a mesh as OFF; z up), folders of them with all below,
             or patterns in quotes such as 'scans/*.ply'.
         top: Classes told of each file, the likeliest first.

@@ -37,8 +37,9 @@ def report(
     """
     from qs3.report.collect import collect, look
     from qs3.report.page import write_report
+    from qs3.training.shipped import workplace
 
-    out = folder / "report.html" if out is None else out
+    out = workplace(folder) / "report.html" if out is None else out
     if out.is_dir():
         raise InputError(f"{out}: is a folder; name a file for --out")
     published, source = _published()

@@ -24,6 +24,8 @@ from qs3.training.config import (
     TrainSettings,
     preparation_of,
 )
+from qs3.training.run import is_run, train_settings
+from qs3.training.shipped import find_run
 
 TIME_UP = 3
 """Exit code where --max-time stopped a run that the same command takes up again."""
@@ -59,6 +61,14 @@ _METHOD = PrimitiveConstructorSpec(
 class Choices:
     """What settings of self-training are in force before any of them is given by itself."""
 
+    source: str | None = None
+    """Labelled clouds: what qs3 generate made (also at an address such as s3://bucket/set), or any
+    layout that qs3 convert --list tells. With --warm-up it may be left out: rounds of self-training
+    then learn from the target alone."""
+    warm_up: Path | None = None
+    """Run whose network self-training starts from, in place of training first, or the name of a
+    network that comes with qs3, such as rooms. How it was trained is the default of the settings
+    below."""
     method: Annotated[MethodName, _METHOD] = "source-only"
     """How the target takes part; spst, qbst and gast-spst end in rounds of self-training."""
     rounds_rule: Annotated[RoundRule | None, tyro.conf.arg(name="self-training")] = None
@@ -73,9 +83,6 @@ class Choices:
 class TrainOptions(Choices):
     """Train a classifier on labelled clouds; most methods adapt it to clouds without labels."""
 
-    source: str
-    """Labelled clouds: what qs3 generate made (also at an address such as s3://bucket/set), or any
-    layout that qs3 convert --list tells."""
     out: Path
     """Folder of the run; run the same command again to go on after a stop."""
     target: str | None = None
@@ -98,8 +105,6 @@ class TrainOptions(Choices):
     """The same of the target."""
     supervised: bool = False
     """Mark the run as supervised: its source is the labelled training part of the target."""
-    warm_up: Path | None = None
-    """Run whose network self-training starts from, in place of training first."""
     model_set: tuple[str, ...] = ()
     """Settings of the network that differ from its defaults: k=10 dropout=0.3."""
     method_set: tuple[str, ...] = ()
@@ -119,7 +124,8 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
     """Return the defaults of ``qs3 train`` under what a command line chooses.
 
     A preset sets the defaults of all self-training settings, so that one given beside it wins and
-    the help shows what is in force. SPST has its own; the paper's two have its preparation too.
+    the help shows what is in force. SPST has its own; the paper's two have its preparation too. A
+    warm-up sets those of the training.
 
     Example:
         >>> words = ["--method", "gast-spst", "--self-training.rounds", "2"]
@@ -132,8 +138,13 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
     preset = chosen.preset or ("spst" if rule == "spst" else "default")
     rounds = PRESETS[preset] if rule is None else replace(PRESETS[preset], rule=rule)
     how = TrainSettings(preparation=preparation_of(preset))
-    options = TrainOptions(source="", out=Path(), preset=preset, train=how, self_training=rounds)
-    for name in ("source", "out"):  # must be given: tyro's marker for that is neither text nor path
+    if chosen.warm_up is not None and is_run(run := find_run(chosen.warm_up)):
+        how = train_settings(run)
+    if alone := rule is not None and chosen.warm_up is not None and chosen.source is None:
+        rounds = replace(rounds, source_loss=False)
+    options = TrainOptions(out=Path(), preset=preset, train=how, self_training=rounds)
+    # What must be given: tyro's marker for that is neither text nor path.
+    for name in ("out",) if alone else ("source", "out"):
         object.__setattr__(options, name, tyro.MISSING)
     return {"options": options}
 
@@ -179,15 +190,18 @@ def train(options: Flat[TrainOptions]) -> int:
         raise InputError(f"method {options.method} needs --target: unlabelled clouds")
     settings = replace(
         options.train,
-        model_settings=parse_settings("--model-set", options.model_set),
-        method_settings=parse_settings("--method-set", options.method_set),
+        model_settings=dict(options.train.model_settings)
+        | parse_settings("--model-set", options.model_set),
+        method_settings=dict(options.train.method_settings)
+        | parse_settings("--method-set", options.method_set),
     )
-    how, target = (settings.num_points, settings.preparation), None
-    called = None if options.class_map is None else read_class_map(options.class_map)
-    part = {"split": options.source_split, "cloud": options.source_cloud, "class_map": called}
-    part |= {"class_names": None if options.classes is None else POINTDA10}
-    source = load_whole(load_clouds, options.source, *how, **part)
-    tell(*describe_renaming(source.origin.renamed, called))
+    how, source, target = (settings.num_points, settings.preparation), None, None
+    if options.source is not None:
+        called = None if options.class_map is None else read_class_map(options.class_map)
+        part = {"split": options.source_split, "cloud": options.source_cloud, "class_map": called}
+        part |= {"class_names": None if options.classes is None else POINTDA10}
+        source = load_whole(load_clouds, options.source, *how, **part)
+        tell(*describe_renaming(source.origin.renamed, called))
     if options.target is not None:
         part = {"split": options.target_split, "cloud": options.target_cloud}
         target = load_whole(load_unlabelled, options.target, *how, **part)
@@ -209,7 +223,7 @@ def train(options: Flat[TrainOptions]) -> int:
         tell(f"qs3: {stop}")
         return TIME_UP
     show(options.out)
-    for line in remarks(result.rounds, options.self_training, source.class_names):
+    for line in remarks(result.rounds, options.self_training, result.source.class_names):
         tell(f"qs3: {line}")
     if all_skipped(result.rounds):
         return NO_ROUND

@@ -17,6 +17,7 @@ from qs3.report.settings import ReportSettings
 from qs3.training.checkpoint import load_model
 from qs3.training.overlap import caveats
 from qs3.training.run import RUN, Run, data_record, find_runs, read_run
+from qs3.training.shipped import find_run
 
 _OLD_NAME = re.compile(r"([^-]+-.+)_([^_]+)_seed-\d+")
 _MEANING = {
@@ -55,7 +56,7 @@ def look(folder: Path, published: Mapping[str, Mapping[str, str]] | None = None)
         InputError: where the folder is missing, is an unfinished run, or holds nothing that can be
             read.
     """
-    folder = Path(folder)
+    folder = find_run(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; name the folder of a run, of runs or records")
     runs: list[Run] = []

@@ -14,6 +14,7 @@ from qs3.io.layouts.point_folders import check_class
 from qs3.io.point_files import POINT_FILES, read_cloud
 from qs3.training.checkpoint import load_model
 from qs3.training.predict import predict_probabilities
+from qs3.training.prepared import note_size
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ def predict_files(run: Path, files: Iterable[Path]) -> Iterator[Answer]:
     """Tell the class of each file, one after another; one that cannot be read has a fault.
 
     Args:
-        run: Folder of a run, or its model.safetensors.
+        run: Folder of a run, its model.safetensors, or the name of a network that comes with qs3.
         files: Files of points, z up.
 
     Raises:
@@ -67,7 +68,9 @@ def predict_files(run: Path, files: Iterable[Path]) -> Iterator[Answer]:
     loaded = load_model(run)
     for path in files:
         try:
-            shares = predict_probabilities(loaded, read_cloud(path)[None])[0].tolist()
+            points = read_cloud(path)[None]
+            note_size(points, loaded.preparation)
+            shares = predict_probabilities(loaded, points)[0].tolist()
         except InputError as error:
             text = str(error)
             yield Answer(path, fault=text if str(path) in text else f"{path}: {text}")

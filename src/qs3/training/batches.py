@@ -17,7 +17,7 @@ from qs3.io.preparation import LARGEST, PAPER, Preparation
 from qs3.models.sized import ball_radius
 from qs3.training.augmentation import augment_clouds, turned
 from qs3.training.config import Augmentation, TrainSettings
-from qs3.training.prepared import Prepared, normalise_batch, prepare_clouds
+from qs3.training.prepared import Prepared, normalise_batch, note_size, prepare_clouds
 
 _SHARE_OF_MEMORY = 0.25
 """Part of a GPU's free memory that the clouds may take; the network needs the rest."""
@@ -89,7 +89,9 @@ def load_whole(
         part: ``split``, ``cloud`` and ``class_names``.
     """
     if preparation.counts_points:
-        return load(data, num_points=None, most=max(LARGEST, num_points), **part)
+        clouds = load(data, num_points=None, most=max(LARGEST, num_points), **part)
+        note_size(clouds.points, preparation)
+        return clouds
     try:
         return load(data, num_points=None, **part)
     except UnevenSizesError:

@@ -21,6 +21,7 @@ from qs3.models.sized import Sized
 from qs3.structure import structure, unstructure
 from qs3.training.config import TrainSettings
 from qs3.training.run import MODEL, SETTINGS, read_settings
+from qs3.training.shipped import find_run, not_a_run
 
 FORMAT = 1
 
@@ -199,17 +200,18 @@ def load_model(run_dir: Path) -> LoadedModel:
     """Read the network of a run.
 
     Args:
-        run_dir: Folder of the run, or a ``.safetensors`` file that `save_model` wrote. Without a
-            ``settings.json`` beside the file, the settings hold what the file itself tells:
-            network, its settings and number of points, under ``train``.
+        run_dir: Folder of the run, the name of a network that comes with qs3, or a
+            ``.safetensors`` file that `save_model` wrote. Without a ``settings.json`` beside the
+            file, the settings hold what the file itself tells: network, its settings and number of
+            points, under ``train``.
 
     Raises:
         InputError: where files are missing, damaged or do not belong together.
     """
-    run_dir = Path(run_dir)
+    run_dir = find_run(run_dir)
     path = run_dir if run_dir.is_file() else run_dir / MODEL
     if not path.is_file():
-        state = "the run is not finished" if (run_dir / SETTINGS).is_file() else "not a run of qs3"
+        state = "the run is not finished" if (run_dir / SETTINGS).is_file() else not_a_run()
         raise InputError(f"{run_dir}: no {MODEL} here; {state}")
     tensors, facts = read_tensors(path)
     try:

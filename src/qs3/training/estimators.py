@@ -16,6 +16,9 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from qs3.adaptation.names import split_method
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.io.point_files import read_cloud
+from qs3.training.answers import list_clouds
+from qs3.training.checkpoint import load_model
 from qs3.training.config import (
     PRESETS,
     SelfTrainingSettings,
@@ -25,8 +28,20 @@ from qs3.training.config import (
 )
 from qs3.training.fit import FitResult, fit
 from qs3.training.predict import predict_probabilities
+from qs3.training.prepared import note_size
 
 _Adapter = TypeVar("_Adapter", bound="Adapter")
+Clouds = (
+    PointClouds
+    | UnlabelledClouds
+    | Float[np.ndarray, "b n 3"]
+    | Float[np.ndarray, "n 3"]
+    | Sequence[Float[np.ndarray, "_ 3"]]
+    | str
+    | Path
+)
+"""Clouds to tell the class of: many in one array or one, of different sizes in a list, or a file of
+points or a folder of them."""
 
 
 class Adapter(ClassifierMixin, BaseEstimator):
@@ -114,26 +129,31 @@ class Adapter(ClassifierMixin, BaseEstimator):
         given = self.self_training
         return self.method, None if given is None else _rounds(given, split_method(self.method)[1])
 
-    def predict_proba(
-        self, clouds: PointClouds | UnlabelledClouds | Float[np.ndarray, "b n 3"]
-    ) -> Float[np.ndarray, "b k"]:
-        """Return class probabilities, in the order of ``classes_``.
+    def predict_proba(self, clouds: Clouds) -> Float[np.ndarray, "b k"]:
+        """Return class probabilities, in the order of ``classes_``; a row a cloud, of one too.
 
         Raises:
-            InputError: before `fit`.
+            InputError: before `fit`, or where a file cannot be read or a point is not finite.
         """
         if not hasattr(self, "model_"):
             raise InputError(f"this {type(self).__name__} is not fitted yet; call fit first")
-        points = clouds if isinstance(clouds, np.ndarray) else clouds.points
-        return predict_probabilities(self.model_, points, **self._how)
+        if isinstance(clouds, str | Path):
+            clouds = [read_cloud(path) for path in list_clouds([Path(clouds)])]
+        points = clouds.points if isinstance(clouds, PointClouds | UnlabelledClouds) else clouds
+        if isinstance(points, np.ndarray):
+            batches = [points if points.ndim == 3 else points[None]]
+        else:
+            batches = [cloud[None] for cloud in points]
+        for batch in batches:
+            note_size(batch, self._how["preparation"])
+        shares = [predict_probabilities(self.model_, batch, **self._how) for batch in batches]
+        return np.concatenate(shares)
 
-    def predict(
-        self, clouds: PointClouds | UnlabelledClouds | Float[np.ndarray, "b n 3"]
-    ) -> np.ndarray:
+    def predict(self, clouds: Clouds) -> np.ndarray:
         """Return the name of the most probable class of each cloud.
 
         Raises:
-            InputError: before `fit`.
+            InputError: as `predict_proba`.
         """
         probabilities = self.predict_proba(clouds)
         return self.classes_[probabilities.argmax(axis=1)]
@@ -147,6 +167,29 @@ class Adapter(ClassifierMixin, BaseEstimator):
         """
         truth = np.array(clouds.class_names)[clouds.labels] if y is None else np.asarray(y)
         return float((self.predict(clouds) == truth).mean())
+
+
+def load(run: str | Path) -> Adapter:
+    """Return the classifier of a run, ready to `Adapter.predict`.
+
+    Args:
+        run: Folder of a run, or the name of a network that comes with qs3, such as ``rooms``.
+
+    Raises:
+        InputError: where there is neither.
+
+    Example:
+        >>> import qs3
+        >>> points = np.random.default_rng(0).uniform(size=(500, 3))  # a box of a metre, z up
+        >>> qs3.load("rooms").predict(points).shape
+        (1,)
+    """
+    loaded = load_model(Path(run))
+    train, method = loaded.settings["train"], loaded.settings.get("method", "source-only")
+    adapter = Adapter(method, train["model"], random_state=train.get("seed", 0))
+    adapter.model_, adapter.classes_ = loaded.model, np.array(loaded.class_names)
+    adapter._how = {"num_points": loaded.num_points, "preparation": loaded.preparation}
+    return adapter
 
 
 class QBST(Adapter):

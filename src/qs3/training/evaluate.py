@@ -26,6 +26,7 @@ from qs3.training.predict import describe
 from qs3.training.prepared import Prepared, prepare_clouds
 from qs3.training.rounds import kept_clouds
 from qs3.training.run import data_record, read_run
+from qs3.training.shipped import workplace
 from qs3.training.validation import ROUND, load_checkpoint, read_checkpoints
 
 
@@ -41,11 +42,13 @@ def evaluate(
 ) -> RunRecord:
     """Score a run on labelled clouds, and write the record into its folder ``records``.
 
+    That of a network that comes with qs3 goes into ``records`` of the working directory.
+
     Labels of the data are put onto the network's classes by name or alias, and the record says
     which (``test.renamed``); an answer that the data has no cloud of stays an answer, and is wrong.
 
     Args:
-        run: Folder of a finished run.
+        run: Folder of a finished run, or the name of a network that comes with qs3.
         data: Labelled clouds, or where they lie: whatever `qs3.io.load_clouds` reads.
         split: Part of the data, where they are read here.
         cloud: Which cloud of generated data, likewise.
@@ -60,6 +63,7 @@ def evaluate(
             are none of the network's, or the map is of none of either.
     """
     made, loaded = read_run(run), load_model(run)
+    run = made.folder
     train = loaded.settings["train"]
     called = {name: (class_map or {}).get(name, name) for name in loaded.class_names}
     names = tuple(dict.fromkeys(called.values()))
@@ -71,7 +75,7 @@ def evaluate(
     answer_of = np.array([names.index(other) for other in called.values()])
     require_finite(whole.points, whole.ids)
     test = prepare_clouds(whole, train["num_points"], loaded.preparation)
-    scored = _scored(Path(run), test, answer_of) if checkpoints else []
+    scored = _scored(run, test, answer_of) if checkpoints else []
     record = RunRecord(
         method=made.method,
         model=train["model"],
@@ -86,7 +90,7 @@ def evaluate(
         versions=versions(),
         hardware=hardware(),
         commit=git_commit(),
-        rounds=_count_right(Path(run), made.rounds, test, answer_of),
+        rounds=_count_right(run, made.rounds, test, answer_of),
         chosen=made.chosen,
         checkpoints=tuple(scored),
         choices=_choices(scored) if scored else {},
@@ -101,7 +105,7 @@ def record_path(run: Path, record: RunRecord) -> Path:
     """Return where `evaluate` writes a record: name of the data, checksum of the record."""
     text = json.dumps(unstructure(record), sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:10]
-    return Path(run) / RECORDS / f"{Path(record.test.name).stem}-{digest}.json"
+    return workplace(run) / RECORDS / f"{Path(record.test.name).stem}-{digest}.json"
 
 
 def _labelled(

@@ -25,6 +25,7 @@ from qs3.models.ops.sampling import sample_in_a_loop
 from qs3.training.checkpoint import load_model
 from qs3.training.predict import predict_probabilities
 from qs3.training.prepared import normalise_in_a_graph
+from qs3.training.shipped import workplace
 
 SUFFIXES: Mapping[str, str] = {"onnx": ".onnx", "torch-export": ".pt2"}
 """The formats, and how the names of their files end."""
@@ -122,8 +123,9 @@ def export_run(run: Path, to: str, out: Path | None = None) -> Exported:
     Args:
         run: Folder of the run, or a ``.safetensors`` file that training wrote.
         to: The format, onnx or torch-export.
-        out: The file; ``model.onnx`` or ``model.pt2`` beside the weights where None. An earlier
-            export there is replaced.
+        out: The file; where None, ``model.onnx`` or ``model.pt2`` beside the weights, or for a
+            network that comes with qs3 in the working directory. An earlier export there is
+            replaced.
 
     Raises:
         InputError: where the run or the name of the file is not usable.
@@ -134,10 +136,8 @@ def export_run(run: Path, to: str, out: Path | None = None) -> Exported:
         raise InputError(f"unknown format {to!r}; choose {' or '.join(SUFFIXES)}")
     if to == "onnx":
         _require_onnx()
-    run = Path(run)
     loaded = load_model(run)
-    folder = run.parent if run.is_file() else run
-    path = folder / f"model{SUFFIXES[to]}" if out is None else Path(out)
+    path = workplace(run) / f"model{SUFFIXES[to]}" if out is None else Path(out)
     _check_place(path, to)
     num_points = loaded.settings["train"].get("num_points")
     if num_points is None:

@@ -36,6 +36,7 @@ from qs3.training.run import (
     sum_seconds,
     write_run,
 )
+from qs3.training.shipped import find_run
 from qs3.training.threads import choose_threads, threads, trial_step
 from qs3.training.validation import (
     ROUND,
@@ -74,7 +75,7 @@ class FitResult:
 
 def fit(
     method: str,
-    source: PointClouds,
+    source: PointClouds | None,
     target: UnlabelledClouds | None,
     settings: TrainSettings,
     self_training: SelfTrainingSettings | None = None,
@@ -97,6 +98,7 @@ def fit(
         method: One of `qs3.adaptation.names.MethodName`; ``spst``, ``qbst`` and ``gast-spst`` end
             in self-training.
         source: Labelled clouds, as read. A share of ``settings.holdout`` is kept for validators.
+            None where the rounds go on from a warm-up by the target alone (``source_loss`` off).
         target: Clouds without labels, as read. ``source-only`` takes them for validators and AdaBN
             alone.
         settings: How to train.
@@ -105,8 +107,8 @@ def fit(
         run_dir: Folder of the run: ``settings.json``, ``model.safetensors``, ``history.jsonl``;
             ``checkpoints/``; the warm-up's own in ``warm-up/``; where clouds were subsampled, the
             choice of points; at the end ``run.json``.
-        warm_up: Folder of a finished run on the same classes, whose network takes the place of the
-            training before self-training.
+        warm_up: Folder of a finished run on the same classes, or the name of a network that comes
+            with qs3; its network takes the place of the training before self-training.
         preset: Name of the rounds' preset, for the record.
         supervised: Whether the source is the labelled training part of the target, for the record.
         deadline: Time for this call; it stops before an epoch that would end later, but never
@@ -138,10 +140,13 @@ def fit(
     if target is not None:
         require_unlabelled(target)
         require_finite(target.points, target.ids, "target: ")
+    if warm_up is not None:
+        warm_up = find_run(warm_up)
+    if source is None:
+        source = _no_clouds(warm_up, rounds_settings)
     require_finite(source.points, source.ids, "source: ")
     weights, before, unseen = None, None, True
     if warm_up is not None:
-        warm_up = Path(warm_up)
         weights, unseen = _check_warm_up(warm_up, base, source, settings)
         before = read_run(warm_up) if (warm_up / RUN).is_file() else None
     run_dir = Path(run_dir)
@@ -197,7 +202,7 @@ def fit(
             method=method,
             selection=settings.rule,
             chosen=tell_choice(run_dir, *stage, settings.rule),
-            source=data_record(source),
+            source=before.source if before and not len(source) else data_record(source),
             target=None if target is None else data_record(target),
             source_clouds=source_clouds,
             source_shapes=source_shapes,
@@ -231,6 +236,17 @@ def _with_warm_up(run: Run, before: Run) -> Run:
     both = {name: tuple(sorted({*getattr(run, name), *getattr(before, name)})) for name in names}
     supervised = run.supervised or before.supervised
     return replace(run, **both, supervised=supervised, unknown_warm_up=before.unknown_warm_up)
+
+
+def _no_clouds(warm_up: Path | None, rounds: SelfTrainingSettings | None) -> PointClouds:
+    """An empty source of the warm-up's classes."""
+    if warm_up is None or rounds is None:
+        raise InputError("without a source there is nothing to train on; give labelled clouds")
+    if rounds.source_loss or rounds.rule == "prior":
+        name = "source_loss" if rounds.source_loss else "rule prior"
+        raise InputError(f"{name} needs labelled clouds of the source; give some, or leave it out")
+    names = load_model(warm_up).class_names
+    return PointClouds(np.zeros((0, 1, 3), np.float32), np.zeros(0, np.int64), names, ())
 
 
 def _plan(
@@ -300,7 +316,7 @@ def _check_warm_up(
         )
     same = all(trained.get(name) == ours[name] for name in ("seed", "holdout"))
     unseen = same and its.get("source") == fingerprint(source)
-    if not unseen and settings.holdout > 0:
+    if not unseen and settings.holdout > 0 and len(source):
         _LOG.warning(
             "%s: was trained on another part of the source, so that none of it is left to "
             "validate on; same source, seed and holdout would leave one",

@@ -4,7 +4,9 @@ Only the clouds as read are held, and the numbers of the points that count: batc
 they are asked for.
 """
 
+import functools
 import hashlib
+import logging
 import os
 import sys
 from collections.abc import Iterator
@@ -29,6 +31,8 @@ from qs3.training.checkpoint import read_tensors, write_tensors
 from qs3.training.config import TrainSettings
 
 Kind = TypeVar("Kind", PointClouds, UnlabelledClouds)
+_LOG = logging.getLogger(__name__)
+_HUGE = 20.0  # metres, more than any object of a room
 _BLOCK = 256  # clouds that are handed out at a time where all are asked for
 
 
@@ -109,6 +113,23 @@ class Prepared(Generic[Kind]):
         """Yield `chosen` of all clouds, some at a time."""
         for start in range(0, len(self), _BLOCK):
             yield self.chosen(slice(start, start + _BLOCK))
+
+
+def note_size(points: Float[np.ndarray, "b n 3"], preparation: Preparation) -> None:
+    """Say once where clouds look like millimetres to a network that is told their size."""
+    if preparation.size_input and len(points):
+        extents = np.ptp(points, axis=1).max(axis=1)
+        if float(np.median(extents)) > _HUGE:
+            _tell_size()
+
+
+@functools.cache
+def _tell_size() -> None:
+    _LOG.warning(
+        "clouds are larger than %.0f m, and the network is told their size in metres: points in "
+        "millimetres are to be divided by 1000",
+        _HUGE,
+    )
 
 
 def prepare_clouds(

@@ -15,6 +15,7 @@ from qs3.files import claim_folder, folder_lock, read_json, write_json
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.structure import first_difference, structure, unstructure
 from qs3.training.config import SelfTrainingSettings, TrainSettings
+from qs3.training.shipped import find_run, not_a_run
 
 RUN = "run.json"
 SETTINGS = "settings.json"
@@ -113,13 +114,16 @@ def write_run(run: Run) -> None:
 def read_run(folder: Path) -> Run:
     """Read a finished run; one of an older version is brought up to date.
 
+    Args:
+        folder: Its folder, or the name of a network that comes with qs3.
+
     Raises:
         InputError: where it is not finished, or a file is not that of a run.
     """
-    folder = Path(folder)
+    folder = find_run(folder)
     path = folder / RUN
     if not is_run(folder):
-        raise InputError(f"{folder}: no {RUN} here; not a run of qs3")
+        raise InputError(f"{folder}: no {RUN} here; {not_a_run()}")
     if not path.is_file() or not (folder / MODEL).is_file():
         raise InputError(
             f"{folder}: the run is not finished; run its qs3 train command again to go on"
@@ -144,6 +148,18 @@ def read_settings(folder: Path) -> dict[str, Any]:
         InputError: where the file is missing, or holds what cannot be a setting.
     """
     return unstructure(_settings(Path(folder) / SETTINGS))
+
+
+def train_settings(run: Path) -> TrainSettings:
+    """Read how a run was trained, without what fits its machine alone: threads, devices, format.
+
+    Raises:
+        InputError: where its ``settings.json`` is missing, or is none.
+    """
+    machine = ("threads", "devices", "accelerator", "precision")
+    default = TrainSettings()
+    train = _settings(find_run(run) / SETTINGS).train
+    return replace(train, **{name: getattr(default, name) for name in machine})
 
 
 def _settings(path: Path) -> RunSettings:

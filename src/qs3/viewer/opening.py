@@ -11,6 +11,7 @@ from qs3 import shapes
 from qs3.errors import InputError, UnevenSizesError
 from qs3.io.clouds import CloudKind, PointClouds, UnlabelledClouds
 from qs3.io.load import is_store
+from qs3.training.shipped import find_run, shipped
 from qs3.viewer.exhibits import Answers, ArrayExhibits, Exhibits, StoreExhibits
 
 _LOG = logging.getLogger(__name__)
@@ -29,9 +30,10 @@ def open_mesh(what: str, up: Literal["z", "y"] | None) -> trimesh.Trimesh | None
     from qs3.meshes.loading import EXTENSIONS
 
     path = Path(what)
-    if "://" not in what and not path.exists():
+    if "://" not in what and not find_run(what).exists():
         raise InputError(
-            f"{what}: no such file or folder, nor a built-in class ({', '.join(shapes.CLASSES)})"
+            f"{what}: no such file or folder, nor a built-in class ({', '.join(shapes.CLASSES)}), "
+            f"nor a network that comes with qs3 ({', '.join(shipped())})"
         )
     ending = path.suffix.lower()
     if not path.is_file() or ending not in EXTENSIONS:
@@ -61,7 +63,7 @@ def open_exhibits(
     from qs3.io import read_cloud
     from qs3.io.point_files import POINT_FILES
 
-    path = Path(what)
+    path = find_run(what)
     if path.suffix == ".safetensors" or any((path / name).is_file() for name in _RUN_FILES):
         return _open_run(path, data, split, cloud)
     refuse_data(what, data)

@@ -1,0 +1,145 @@
+"""A trained run as a network that comes with qs3: weights in half precision, and its card.
+
+Run: python benchmarks/ship.py RUN [--out src/qs3/weights/rooms] [--records results/real]
+
+Writes model.safetensors (float16), settings.json, run.json without the shapes of the clouds, and
+the parts of README.md between markers; the rest of the card is written by hand. RUN may be the
+folder itself, to fill in the scores of records that were made since.
+"""
+
+import argparse
+import copy
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from qs3.evaluation.records import RunRecord, find_records
+from qs3.files import write_json, write_text
+from qs3.models import PointClassifier
+from qs3.structure import unstructure
+from qs3.training.batches import count_batches
+from qs3.training.checkpoint import LoadedModel, load_model, read_facts, save_model
+from qs3.training.config import Augmentation, TrainSettings
+from qs3.training.export import compare
+from qs3.training.predict import predict_probabilities
+from qs3.training.run import MODEL, SETTINGS, Run, read_run, train_settings, write_run
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--out", type=Path, default=Path("src/qs3/weights/rooms"))
+    parser.add_argument("--source", default="rooms", help="what the record calls the source")
+    parser.add_argument("--records", type=Path, default=Path("results/real"))
+    options = parser.parse_args()
+    ship(options.run, options.out, options.source, options.records)
+    for path in sorted(options.out.iterdir()):
+        print(f"{path.stat().st_size / 1e3:8.0f} kB  {path}")
+
+
+def ship(place: Path, out: Path, source: str, records: Path) -> None:
+    """Write the folder of a network from a run."""
+    run, loaded = read_run(place), load_model(place)
+    if run.target is not None:
+        raise SystemExit(f"{place}: was adapted to {run.target.label}; ship what saw no target")
+    settings = train_settings(place)
+    facts = {"rounding": read_facts(place / MODEL).get("rounding") or rounding(loaded, settings)}
+    half = copy.deepcopy(loaded.model).half()
+    out.mkdir(parents=True, exist_ok=True)
+    save_model(out, half, loaded.class_names, settings, facts=facts)
+    write_json(out / SETTINGS, loaded.settings)
+    named = dataclasses.replace(run.source, name=source)
+    write_run(dataclasses.replace(run, folder=out, source=named, source_shapes=()))
+    parts = {"facts": facts_of(run, loaded, facts["rounding"]), "scores": scores_of(run, records)}
+    card = (out / "README.md").read_text("utf-8")
+    for name, lines in parts.items():
+        before, _, rest = card.partition(f"<!-- {name}: benchmarks/ship.py -->\n")
+        _, end, after = rest.partition(f"<!-- end of {name} -->")
+        card = "\n".join([f"{before}<!-- {name}: benchmarks/ship.py -->", *lines, end + after])
+    write_text(out / "README.md", card)
+
+
+def rounding(loaded: LoadedModel, settings: TrainSettings) -> dict[str, float]:
+    """Largest difference of a probability that half precision makes, over random clouds."""
+    rounded: PointClassifier = copy.deepcopy(loaded.model).half().float()
+    if not all(torch.isfinite(value).all() for value in rounded.state_dict().values()):
+        raise SystemExit("a weight is too large for half precision")
+    inside = dataclasses.replace(settings.preparation, remove_outliers=False)
+    how = {"num_points": settings.num_points, "preparation": inside}
+    differences = compare(
+        loaded.model,
+        settings.num_points,
+        lambda points: predict_probabilities(rounded, points, **how),
+        inside,
+    )
+    return {"clouds": len(differences), "largest": float(differences.max())}
+
+
+def facts_of(run: Run, loaded: LoadedModel, moved: dict[str, float]) -> list[str]:
+    """Lines of what was trained, how and on how much."""
+    train = loaded.settings["train"]
+    count = sum(value.numel() for value in loaded.model.parameters())
+    default = unstructure(Augmentation())
+    on = {name: one for name, one in train["augmentation"].items() if one != default[name]}
+    steps = train["epochs"] * count_batches(
+        round(run.source.clouds * (1 - train["holdout"])), train["batch_size"]
+    )
+    plain = ("model_settings", "preparation", "batch_size", "learning_rate", "schedule")
+    plain += ("weight_decay", "label_smoothing", "holdout", "rotate_z", "jitter_sigma")
+    return [
+        "| | |",
+        "|---|---|",
+        f"| classes | {', '.join(loaded.class_names)} |",
+        f"| network | {train['model']}, {count / 1e6:.2f} million parameters, "
+        f"{train['num_points']} points a cloud |",
+        f"| method | {run.method}; network of the last epoch |",
+        f"| source | {run.source.clouds} clouds ({run.source.cloud}), "
+        f"SHA-256 `{run.source.checksum[:16]}…` |",
+        f"| training | {train['epochs']} epochs, some {steps} steps, seed {train['seed']} |",
+        *(f"| `{name}` | {told(train[name])} |" for name in plain),
+        f"| `augmentation` | {told(on)} |",
+        f"| half precision | moves a probability by at most {moved['largest']:.1e} on "
+        f"{moved['clouds']} random clouds |",
+    ]
+
+
+def told(value: object) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {one}" for name, one in value.items()) or "default"
+    return str(value)
+
+
+def scores_of(run: Run, folder: Path) -> list[str]:
+    """Lines of the scores of this run, by record; they are those before the rounding."""
+    lines = []
+    for path, record in found(run, folder):
+        scores = record.scores
+        low, high = scores.interval
+        part = str((record.experiment or {}).get("part", ""))
+        lines.append(
+            f"| {record.test.label} {f'({part})' if part else ''} | {scores.clouds} "
+            f"| {scores.accuracy:.1%} ({low:.0%} to {high:.0%}) "
+            f"| {scores.class_mean_accuracy:.1%} | `{path.name}` |"
+        )
+    if not lines:
+        return [f"No record of this run is in `{folder.name}` yet."]
+    head = "| data | clouds | accuracy (95 % interval) | class mean | record |"
+    return [head, "|---|---|---|---|---|", *lines]
+
+
+def found(run: Run, folder: Path) -> Sequence[tuple[Path, RunRecord]]:
+    """Records of the same training (method, source and all settings) on data new to it."""
+
+    def same(record: RunRecord) -> bool:
+        one, other = record.settings["train"], unstructure(run.settings["train"])
+        seen = record.method != run.method or "training clouds" in record.marks
+        return not seen and record.source.checksum == run.source.checksum and one == other
+
+    pairs = find_records(folder, every_json=True)[0] if folder.is_dir() else []
+    return [(path, record) for path, record in pairs if same(record)]
+
+
+if __name__ == "__main__":
+    main()

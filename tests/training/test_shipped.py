@@ -1,0 +1,162 @@
+"""Networks that come with qs3: their files, their names, and how they are made from a run."""
+
+import importlib.util
+import json
+import logging
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+
+import qs3
+from qs3.errors import InputError
+from qs3.evaluation.records import find_records
+from qs3.io.preparation import ROBUST
+from qs3.training import evaluate, fit, load_model, read_run
+from qs3.training.checkpoint import load_tensors_into
+from qs3.training.export import export_run
+from qs3.training.prepared import _tell_size, note_size
+from qs3.training.shipped import WEIGHTS, find_run, shipped, workplace
+
+ROOT = Path(__file__).parents[2]
+CLOUDS = np.random.default_rng(0).uniform(size=(6, 300, 3)).astype(np.float32)
+
+
+def ship_module():
+    spec = importlib.util.spec_from_file_location("ship", ROOT / "benchmarks" / "ship.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_files_are_small_half_precision_and_tell_no_path(name):
+    files = {path.name: path for path in (WEIGHTS / name).iterdir()}
+    assert set(files) == {"README.md", "model.safetensors", "run.json", "settings.json"}
+    assert sum(path.stat().st_size for path in files.values()) < 4e6
+    tensors = safetensors.torch.load_file(files["model.safetensors"])
+    assert {t.dtype for t in tensors.values() if t.is_floating_point()} == {torch.float16}
+    for file in ("README.md", "run.json", "settings.json"):
+        assert not re.search(r"(?<![\w.])/\w+/", files[file].read_text("utf-8"))
+    card = files["README.md"].read_text("utf-8")
+    assert all(f"<!-- {part}: benchmarks/ship.py -->" in card for part in ("facts", "scores"))
+    loaded, run = load_model(Path(name)), read_run(Path(name))
+    assert {value.dtype for value in loaded.model.parameters()} == {torch.float32}
+    assert run.target is None
+    assert not run.target_clouds
+    assert len(run.source_clouds) == run.source.clouds
+
+
+def test_wheel_and_sdist_hold_them():
+    sdist = pytest.importorskip("hatchling.builders.sdist").SdistBuilder(str(ROOT))
+    wheel = pytest.importorskip("hatchling.builders.wheel").WheelBuilder(str(ROOT))
+    packed = {file.distribution_path for file in wheel.recurse_included_files()}
+    source = {file.relative_path for file in sdist.recurse_included_files()}
+    for path in WEIGHTS.rglob("*.*"):
+        inside = path.relative_to(ROOT / "src").as_posix()
+        assert inside in packed
+        assert f"src/{inside}" in source
+
+
+def test_a_file_of_the_name_wins_and_others_are_told_what_there_is(tmp_path):
+    assert find_run("rooms") == WEIGHTS / "rooms"
+    with pytest.raises(InputError, match=r"rooms2: .*networks that come with it.*: rooms"):
+        load_model(Path("rooms2"))
+    with pytest.raises(InputError, match=r"networks that come with it.*: rooms"):
+        read_run(Path("rooms2"))
+    (tmp_path / "rooms").mkdir()
+    assert find_run("rooms") == Path("rooms")
+    assert workplace("rooms") == Path("rooms")
+    with pytest.raises(InputError, match="where no file has their name"):
+        qs3.load("rooms")
+
+
+def test_load_takes_clouds_of_every_form(tmp_path):
+    network = qs3.load("rooms")
+    names = network.predict(CLOUDS)
+    assert names.shape == (6,)
+    assert set(names) <= set(network.classes_)
+    assert network.predict(CLOUDS[0]).tolist() == [names[0]]
+    shares = network.predict_proba([CLOUDS[0], CLOUDS[1, :100]])
+    assert shares.shape == (2, 10)
+    assert shares[0] == pytest.approx(network.predict_proba(CLOUDS)[0], abs=1e-6)
+    for row, cloud in enumerate(CLOUDS):
+        np.save(tmp_path / f"{row}.npy", cloud)
+    assert network.predict(tmp_path).tolist() == names.tolist()
+    assert network.predict(str(tmp_path / "3.npy")).tolist() == [names[3]]
+
+
+def test_what_is_made_from_it_goes_into_the_working_directory(tmp_path):
+    before = {path: path.stat().st_mtime_ns for path in WEIGHTS.rglob("*")}
+    names = load_model(Path("rooms")).class_names
+    np.savez("labelled.npz", points=CLOUDS, label=np.arange(6), class_names=np.array(names))
+    record = evaluate(Path("rooms"), "labelled.npz")
+    assert record.method == "source-only"
+    assert record.marks == ()
+    assert [one for _, one in find_records(tmp_path / "records")[0]] == [record]
+    done = export_run(Path("rooms"), "torch-export")
+    assert done.path == Path("model.pt2")
+    assert {path: path.stat().st_mtime_ns for path in WEIGHTS.rglob("*")} == before
+
+
+def test_millimetres_are_told_once(caplog):
+    sized = replace(ROBUST, size_input=True)
+    _tell_size.cache_clear()
+    with caplog.at_level(logging.WARNING):
+        note_size(CLOUDS, sized)
+        note_size(1000 * CLOUDS, ROBUST)
+        note_size(CLOUDS[:0], sized)
+        assert not caplog.messages
+        note_size(1000 * CLOUDS, sized)
+        note_size(1000 * CLOUDS, sized)
+    assert len(caplog.messages) == 1
+    assert "divided by 1000" in caplog.messages[0]
+
+
+def test_a_run_becomes_one(source, target, settings, tmp_path):
+    ship = ship_module()
+    fit("source-only", source, None, settings, run_dir=tmp_path / "run")
+    evaluate(tmp_path / "run", target)
+    evaluate(tmp_path / "run", source)  # marked: the network has learnt from it
+    out = tmp_path / "mine"
+    out.mkdir()
+    parts = "".join(
+        f"<!-- {part}: benchmarks/ship.py -->\n<!-- end of {part} -->\n"
+        for part in ("facts", "scores")
+    )
+    (out / "README.md").write_text(f"# mine\n{parts}The end.\n")
+    ship.ship(tmp_path / "run", out, "balls", tmp_path / "run" / "records")
+    first = {path.name: path.read_bytes() for path in out.iterdir()}
+    card = first["README.md"].decode()
+    assert card.startswith("# mine\n<!-- facts")
+    assert card.endswith("<!-- end of scores -->\nThe end.\n")
+    assert card.count("| arrays  | 30 |") == 1
+    assert "| 24 |" not in card
+    assert json.loads(first["run.json"])["source"]["name"] == "balls"
+    answers = [load_model(place).model.state_dict() for place in (tmp_path / "run", out)]
+    for name, value in answers[0].items():
+        torch.testing.assert_close(answers[1][name], value, rtol=1e-3, atol=1e-4)
+    # From itself: the same bytes, the figure of the rounding too.
+    ship.ship(out, out, "balls", tmp_path / "run" / "records")
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == first
+    fit("mmd", source, target.without_labels(), settings, run_dir=tmp_path / "adapted")
+    with pytest.raises(SystemExit, match="saw no target"):
+        ship.ship(tmp_path / "adapted", out, "balls", tmp_path)
+
+
+def test_a_weight_too_large_for_half_precision_is_refused(source, settings, tmp_path):
+    fit("source-only", source, None, settings, run_dir=tmp_path / "run")
+    loaded = load_model(tmp_path / "run")
+    state = {name: value * 1e6 for name, value in loaded.model.state_dict().items()}
+    load_tensors_into(loaded.model, state, tmp_path)
+    with pytest.raises(SystemExit, match="too large"):
+        ship_module().rounding(loaded, settings)
