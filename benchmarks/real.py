@@ -57,7 +57,9 @@ class Cell:
     warm_up: str = ""
 
 
+SEEN = replace(LIGHT, sight=1.0)
 ALL = Cell()
+ROOMS = replace(ALL, preparation=replace(SIZED, align=True), augmentation=SEEN)
 DGCNN = replace(ALL, network="dgcnn", steps=2000)
 CELLS: Mapping[str, Cell] = {
     # Sources, equal numbers of steps.
@@ -72,6 +74,13 @@ CELLS: Mapping[str, Cell] = {
     "SD+QBST": replace(ALL, method="sd", rounds={"rule": "qbst"}, warm_up="SD"),
     "GAST": replace(ALL, method="gast"),
     "GAST+QBST": replace(ALL, method="gast", rounds={"rule": "qbst"}, warm_up="GAST"),
+    # The network that comes with qs3, and self-training from it.
+    "rooms": ROOMS,
+    "rooms QBST": replace(ROOMS, method="qbst", warm_up="rooms"),
+    "rooms QBST average": replace(
+        ROOMS, method="qbst", rounds={"teacher": "average"}, warm_up="rooms"
+    ),
+    "rooms SPST": replace(ROOMS, method="spst", warm_up="rooms"),
     # Switches of self-training, one at a time.
     "QBST calibrated": replace(ALL, method="qbst", rounds={"calibrate": True}, warm_up="S+C+M"),
     "QBST by share": replace(ALL, method="qbst", rounds={"threshold_share": 0.5}, warm_up="S+C+M"),
@@ -90,6 +99,9 @@ CELLS: Mapping[str, Cell] = {
     "unit ball": replace(ALL, preparation=replace(SIZED, radius_share=1.0)),
     "same points": replace(ALL, preparation=replace(SIZED, redraw=False)),
     "paper's way": replace(ALL, preparation=PAPER, augmentation=Augmentation()),
+    "aligned": replace(ALL, preparation=replace(SIZED, align=True)),
+    "sight": replace(ALL, augmentation=SEEN),
+    "M sight": replace(ALL, cloud="surface", augmentation=SEEN),
     "no augmentation": replace(ALL, augmentation=Augmentation()),
     "full augmentation": replace(ALL, augmentation=Augmentation.scanned()),
 }

@@ -28,13 +28,15 @@ PAIRS = (
     ("SPST", "S+C+M"), ("QBST", "SPST"), ("SD", "S+C+M"), ("SD+QBST", "SD"), ("GAST", "S+C+M"),
     ("GAST+QBST", "GAST"), ("DGCNN S", "DGCNN M"), ("DGCNN S+C+M", "DGCNN M"),
     ("DGCNN QBST", "DGCNN S+C+M"),
+    ("rooms", "S+C+M"), ("rooms", "M"), ("M sight", "M"), ("rooms QBST", "rooms"),
+    ("rooms QBST average", "rooms"), ("rooms SPST", "rooms"), ("rooms QBST", "rooms SPST"),
 )  # fmt: skip
 """First minus second."""
 SWITCHES = {
     "QBST": ("QBST calibrated", "QBST by share", "QBST average", "QBST turns", "QBST floor",
              "QBST refined"),
     "S+C+M": ("no size", "strays kept", "unit ball", "same points", "paper's way",
-              "no augmentation", "full augmentation"),
+              "no augmentation", "full augmentation", "aligned", "sight"),
 }  # fmt: skip
 """Against what each switch is held."""
 
@@ -112,7 +114,7 @@ def tables(folder: Path) -> str:
     if len(rounds):
         text += ["## Rounds of self-training, seed 0", "", to_markdown(rounds), ""]
     for part in looked:
-        for cell in ("M", "S+C+M", "QBST"):
+        for cell in ("M", "S+C+M", "QBST", "rooms", "rooms QBST average"):
             text += confusion(records, cell, part) if part != "sunrgbd" else []
     return "\n".join(text).rstrip() + "\n"
 
