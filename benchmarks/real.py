@@ -29,6 +29,7 @@ from qs3.evaluation.records import write_record
 from qs3.io import load_clouds
 from qs3.io.clouds import CloudChoice, Origin, PointClouds, UnlabelledClouds
 from qs3.io.preparation import PAPER, ROBUST, Preparation
+from qs3.meshes.classes import POINTDA10
 from qs3.training import evaluate, fit
 from qs3.training.config import Augmentation, SelfTrainingSettings, TrainSettings, changed
 
@@ -110,7 +111,7 @@ CELLS: Mapping[str, Cell] = {
 def parts(shared: Path) -> dict[str, PointClouds]:
     """NYU's strict objects, of the first 70 % of the frames and of the others, and SUN RGB-D's."""
     path = shared / "nyuv2_objects.npz"
-    whole = load_clouds(path, num_points=None)
+    whole = load_clouds(path, num_points=None, class_names=POINTDA10)
     with np.load(path) as archive:
         strict, frame = archive["strict"].astype(bool), archive["frame"]
     frames = np.unique(frame)
@@ -119,7 +120,8 @@ def parts(shared: Path) -> dict[str, PointClouds]:
     for name, rows in {"dev": strict & early, "check": strict & ~early}.items():
         origin = Origin(path.name, f"strict-{name}", "points")
         named[name] = replace(whole.select(rows), origin=origin)
-    named["sunrgbd"] = load_clouds(shared / "sunrgbd_objects.npz", num_points=1024)
+    other = shared / "sunrgbd_objects.npz"
+    named["sunrgbd"] = load_clouds(other, num_points=1024, class_names=POINTDA10)
     return named
 
 

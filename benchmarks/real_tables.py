@@ -22,6 +22,9 @@ from qs3.training import load_model, predict_probabilities
 
 RIGHT = "right.csv"
 TABLES = "tables.md"
+ROOT = Path(__file__).parents[1]
+PAGES = (ROOT / "docs" / "real.md", ROOT / "README.md")
+"""What shows tables, between marks."""
 NAMES = {"dev": "NYU, first 70 %", "check": "NYU, last 30 %", "sunrgbd": "SUN RGB-D"}
 PAIRS = (
     ("S", "M"), ("S", "C"), ("C", "M"), ("S+C+M", "M"), ("S+C+M", "S"), ("QBST", "S+C+M"),
@@ -126,9 +129,7 @@ def score_table(records: list[RunRecord], looked: list[str]) -> pd.DataFrame:
     lines = []
     for cell in dict.fromkeys(means["cell"]):
         row = by_part["dev"].loc[cell]
-        mine = [record for record in records if place(record) == (cell, "dev")]
-        cpu = np.mean([record.seconds["total"] for record in mine]) / 60
-        line = {"cell": cell, "seeds": len(row["seeds"]), "minutes": f"{cpu:.0f}"}
+        line = {"cell": cell, "seeds": len(row["seeds"])}
         line["own source"] = "–"
         if cell in by_part["source"].index:
             line["own source"] = f"{100 * by_part['source'].loc[cell]['accuracy'].mean:.1f}"
@@ -195,6 +196,24 @@ def confusion(records: list[RunRecord], cell: str, part: str) -> list[str]:
     return [head, "", to_markdown(table), ""]
 
 
+def fill(page: str, name: str, table: str) -> str:
+    """Put a table between its marks in a page, if it has them."""
+    begin, end = f"<!-- real: {name} -->\n", "<!-- real: end -->"
+    head, mark, rest = page.partition(begin)
+    if not mark:
+        return page
+    return head + begin + "\n" + table + "\n\n" + rest[rest.index(end) :]
+
+
+def filled(page: str, folder: Path) -> str:
+    """Return a page of the documentation with its tables anew."""
+    text = tables(folder)
+    scores = text.partition("## Scores\n\n")[2].partition("\n\n##")[0]
+    differences = text.partition("over both.\n\n")[2]
+    page = fill(page, "scores", scores)
+    return fill(page, "differences", differences.partition("\n\n")[0])
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--records", type=Path, default=Path("results/real"))
@@ -204,6 +223,8 @@ def main() -> int:
     if options.out:
         note_right(options.out, options.shared, options.records)
     (options.records / TABLES).write_text(tables(options.records))
+    for path in PAGES:
+        path.write_text(filled(path.read_text(), options.records))
     return 0
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import importlib
 import json
 import re
 from collections.abc import Sequence
@@ -105,28 +106,6 @@ def test_a_setting_that_is_added_leaves_all_records_readable(monkeypatch):
         read_record(path)
 
 
-def test_the_readme_shows_numbers_of_the_tables():
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    value = r"(\d+\.\d ± \d+\.\d \(n=\d\))"
-    shown = re.findall(rf"^\| ([\w-]+) \| {value} \| {value} \|$", text, re.M)
-    assert len(shown) > 4
-    filled = filled_like(ROOT / "results" / "bench" / "adaptation-bench.csv")
-    for row, *cells in shown:
-        for column, cell in zip(("M-D", "S-D"), cells, strict=True):
-            assert filled.means[row, column]["accuracy"].format() == cell
-    networks = filled_like(ROOT / "results" / "laptop" / "ordinary.csv")
-    titles = {row.title: row.key for row in networks.table.headings()[0]}
-    cell = r"(\d+\.\d ± \d+\.\d) \((\d+\.\d)\)"
-    lines = re.findall(rf"^\| ([\w+-]+) \| {cell} \| {cell} \|$", text, re.M)
-    assert [line[0] for line in lines] == list(titles)
-    for title, *cells in lines:
-        for index, column in enumerate(("M-D", "S-D")):
-            place = (titles[title], column)
-            mean = networks.means[place]["accuracy"].format(count=False)
-            published = networks.table.experiment.published_cell(*place)
-            assert [mean, str(published[0])] == cells[2 * index : 2 * index + 2]
-
-
 def test_the_networks_page_shows_what_the_records_of_modelnet10_say():
     text = (ROOT / "docs" / "models.md").read_text(encoding="utf-8")
     part = text.partition("## ModelNet10")[2].partition("\n## ")[0]
@@ -145,3 +124,14 @@ def test_records_hold_no_path_of_a_machine():
         text = path.read_text(encoding="utf-8")
         assert not re.search(r'"/[a-z]+/', text), path
         json.loads(text)
+
+
+def test_real_tables_and_their_page_are_what_the_records_say(monkeypatch):
+    folder = ROOT / "results" / "real"
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    made = importlib.import_module("real_tables")
+    assert (folder / "tables.md").read_text(encoding="utf-8") == made.tables(folder)
+    for path in made.PAGES:
+        page = path.read_text(encoding="utf-8")
+        assert "| M |" in page
+        assert made.filled(page, folder) == page
