@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from qs3.sensor.rig import StereoRig as StereoRig
     from qs3.sensor.scan import Scan as Scan
     from qs3.sensor.scan import scan as scan
+    from qs3.training.adapt import adapt as adapt
     from qs3.training.estimators import load as load
 
 # OpenMP's threads, which PyTorch loads with, spin while they wait for one another. Beside another
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 _LAZY = {
+    "adapt": "qs3.training.adapt",
     "load_mesh": "qs3.meshes",
     "Sensor": "qs3.sensor.presets",
     "Pose": "qs3.sensor.rig",

@@ -18,7 +18,7 @@ from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.point_files import read_cloud
 from qs3.training.answers import list_clouds
-from qs3.training.checkpoint import load_model
+from qs3.training.checkpoint import load_model, save_model
 from qs3.training.config import (
     PRESETS,
     SelfTrainingSettings,
@@ -121,8 +121,22 @@ class Adapter(ClassifierMixin, BaseEstimator):
             self.result_ = fit(method, source, target, settings, rounds, run_dir=folder)
         self.model_ = self.result_.model
         self.classes_ = np.array(source.class_names)
+        self._settings = settings
         self._how = {"num_points": settings.num_points, "preparation": settings.preparation}
         return self
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the network to ``model.safetensors`` in a folder, for `load` and every command.
+
+        Raises:
+            InputError: before `fit`.
+        """
+        self._require_fitted()
+        return save_model(Path(folder), self.model_, tuple(self.classes_), self._settings)
+
+    def _require_fitted(self) -> None:
+        if not hasattr(self, "model_"):
+            raise InputError(f"this {type(self).__name__} is not fitted yet; call fit first")
 
     def _plan(self) -> tuple[str, SelfTrainingSettings | None]:
         """The method, and the settings of the rounds that follow it."""
@@ -135,8 +149,7 @@ class Adapter(ClassifierMixin, BaseEstimator):
         Raises:
             InputError: before `fit`, or where a file cannot be read or a point is not finite.
         """
-        if not hasattr(self, "model_"):
-            raise InputError(f"this {type(self).__name__} is not fitted yet; call fit first")
+        self._require_fitted()
         if isinstance(clouds, str | Path):
             clouds = [read_cloud(path) for path in list_clouds([Path(clouds)])]
         points = clouds.points if isinstance(clouds, PointClouds | UnlabelledClouds) else clouds
@@ -189,6 +202,12 @@ def load(run: str | Path) -> Adapter:
     adapter = Adapter(method, train["model"], random_state=train.get("seed", 0))
     adapter.model_, adapter.classes_ = loaded.model, np.array(loaded.class_names)
     adapter._how = {"num_points": loaded.num_points, "preparation": loaded.preparation}
+    adapter._settings = TrainSettings(
+        model=train["model"],
+        model_settings=train.get("model_settings", {}),
+        num_points=loaded.num_points or TrainSettings.num_points,
+        preparation=loaded.preparation,
+    )
     return adapter
 
 

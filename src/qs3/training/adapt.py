@@ -1,0 +1,115 @@
+"""The whole way in one call: CAD models and unlabelled scans in, a classifier of the scans out."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qs3.errors import InputError
+from qs3.io import load_clouds, load_unlabelled
+from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.io.load import is_store
+from qs3.io.preparation import LARGEST
+from qs3.io.ragged import RaggedClouds
+from qs3.meshes import collect
+from qs3.meshes.classes import canonical
+from qs3.meshes.sizes import CLASS_SIZES
+from qs3.structure import unstructure
+from qs3.training.batches import load_whole
+from qs3.training.estimators import Adapter, Clouds
+from qs3.training.run import train_settings
+
+_STEPS = 4000
+"""Optimiser steps on the source: those of ``rooms``."""
+_ROUNDS: Mapping[str, Any] = {"threshold_share": 0.5, "teacher": "average"}
+
+
+def adapt(
+    cad: str | Path | PointClouds,
+    scans: Clouds,
+    out: str | Path = "adapted",
+    *,
+    method: str = "qbst",
+    train: Mapping[str, Any] | None = None,
+    self_training: Mapping[str, Any] | None = None,
+    workers: int | None = None,
+    seed: int = 0,
+) -> Adapter:
+    """Make a classifier for a depth camera from CAD models and scans without labels.
+
+    The models are scanned as ``qs3 generate --recipe rooms --views 1`` does, in sizes of their
+    class, or in those of their files where the size of a class is not known. A network like
+    ``rooms`` learns from scans, clean twins and surfaces, and is adapted to the scans by rounds of
+    quasi-balanced self-training (QS³, Algorithm 1) with a teacher that is the average of the
+    network. What was done stays in ``out``; the same call goes on after a stop.
+
+    Args:
+        cad: Folder of meshes, one folder a class, or ``"shapes"`` for the built-in ones; or what is
+            to be learnt from without a scan: a data set of qs3, or labelled clouds.
+        scans: Clouds of the camera, one object each, z up, in metres. Labels are left behind.
+        out: Folder for the data set (``source``) and the run (``run``).
+        method: As in `Adapter`.
+        train: Settings of `TrainSettings` that differ from those of ``rooms``.
+        self_training: Settings of the rounds that differ.
+        workers: Processes that scan; None takes one a core.
+        seed: Root of all random steps.
+
+    Raises:
+        InputError: where something cannot be read, or settings do not go together.
+    """
+    source, target = _source(cad, Path(out) / "source", workers, seed), _target(scans)
+    settings = unstructure(train_settings(Path("rooms")))
+    batches = max(1, len(source) // settings["batch_size"])
+    settings |= {"epochs": max(1, round(_STEPS / batches))} | dict(train or {})
+    for name in ("model", "seed"):
+        if name in (train or {}):
+            raise InputError(f"{name} cannot be given in train here; use qs3.training.Adapter")
+    model = settings.pop("model")
+    del settings["seed"]
+    adapter = Adapter(
+        method,
+        model,
+        self_training=dict(_ROUNDS) | dict(self_training or {})
+        if method == "qbst"
+        else self_training,
+        train=settings,
+        run_dir=Path(out) / "run",
+        random_state=seed,
+    )
+    return adapter.fit(source, target)
+
+
+def _source(
+    cad: str | Path | PointClouds, folder: Path, workers: int | None, seed: int
+) -> PointClouds:
+    from qs3.store.generate import generate
+    from qs3.store.scan_item import RECIPES
+
+    if isinstance(cad, PointClouds):
+        return cad
+    if not is_store(cad):
+        items = collect(cad, per_class=60, seed=seed)
+        known = all(canonical(item.class_name) in CLASS_SIZES for item in items)
+        size = "class" if known else "file"
+        recipe = replace(RECIPES["rooms"], views=1, seed=seed, object_size=size)
+        generate(items, folder, recipe, workers=workers or os.cpu_count() or 1)
+        cad = folder
+    return load_clouds(cad, num_points=None, cloud="all")
+
+
+def _target(scans: Clouds) -> UnlabelledClouds:
+    if isinstance(scans, UnlabelledClouds):
+        return scans
+    if isinstance(scans, PointClouds):
+        return scans.without_labels()
+    if isinstance(scans, str | Path):
+        settings = train_settings(Path("rooms"))
+        return load_whole(load_unlabelled, scans, settings.num_points, settings.preparation)
+    clouds = [np.asarray(cloud, np.float32) for cloud in scans]
+    if any(cloud.ndim != 2 or cloud.shape[1:] != (3,) for cloud in clouds):
+        raise InputError("scans: give clouds of shape [n 3], several of them")
+    names = tuple(f"{row:06d}" for row in range(len(clouds)))
+    return RaggedClouds(clouds, names, "").unlabelled(None, "scans", LARGEST)

@@ -1,0 +1,80 @@
+"""CAD models and unlabelled scans in, a classifier out, in one call."""
+
+import json
+
+import numpy as np
+import pytest
+
+import qs3
+from qs3.errors import InputError
+from qs3.io.clouds import PointClouds
+
+SMALL = {
+    "model_settings": {"channels": [8, 8, 16], "hidden": [8], "transforms": False},
+    "num_points": 32,
+    "epochs": 2,
+    "batch_size": 8,
+}
+ROUNDS = {"rounds": 1, "epochs": 1}
+
+
+@pytest.fixture
+def boxes(rng):
+    """Flat and tall boxes of points, in metres."""
+    shapes = np.where(np.arange(24)[:, None] % 2, [1.0, 1.0, 0.1], [0.3, 0.3, 1.5])
+    points = (rng.random((24, 80, 3)) * shapes[:, None]).astype(np.float32)
+    ids = tuple(f"box/{row}" for row in range(24))
+    return PointClouds(points, np.arange(24) % 2, ("post", "slab"), ids)
+
+
+def adapt(boxes, scans, tmp_path, **settings):
+    settings = {"train": SMALL, "self_training": ROUNDS} | settings
+    return qs3.adapt(boxes, scans, tmp_path / "out", **settings)
+
+
+@pytest.mark.filterwarnings("ignore::qs3.adaptation.selection.SingleClassWarning")
+def test_three_lines(boxes, tmp_path):
+    model = adapt(boxes, list(boxes.points), tmp_path)
+    assert set(model.predict(boxes.points[:3])) <= {"post", "slab"}
+    model.save(tmp_path / "mine")
+    again = qs3.load(tmp_path / "mine")
+    assert np.array_equal(again.predict_proba(boxes.points), model.predict_proba(boxes.points))
+    made = json.loads((tmp_path / "out" / "run" / "settings.json").read_text())
+    assert made["method"] == "qbst"
+    assert made["self_training"]["teacher"] == "average"
+    assert made["train"]["preparation"]["size_input"]
+    assert made["train"]["augmentation"]["stretch"] == 1.0
+
+
+def test_scans_of_any_kind_are_the_same_target(boxes, tmp_path):
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    for name, cloud in zip(boxes.ids, boxes.points, strict=True):
+        np.save(folder / f"{name.replace('/', '-')}.npy", cloud)
+    asked = []
+    for number, scans in enumerate((folder, list(boxes.points), boxes.points, boxes)):
+        model = adapt(boxes, scans, tmp_path / str(number), method="source-only")
+        asked.append(model.predict_proba(boxes.points))
+    assert all(np.array_equal(asked[0], other) for other in asked[1:])
+
+
+def test_what_cannot_be_is_told(boxes, tmp_path):
+    with pytest.raises(InputError, match="no cloud found"):
+        adapt(boxes, [], tmp_path)
+    with pytest.raises(InputError, match="model"):
+        adapt(boxes, boxes, tmp_path, train={"model": "dgcnn"})
+    with pytest.raises(InputError, match="not fitted"):
+        qs3.training.Adapter().save(tmp_path)
+
+
+@pytest.mark.slow
+def test_meshes_are_scanned_first(boxes, tmp_path):
+    import trimesh
+
+    for name, size in {"slab": (0.5, 0.5, 0.05), "post": (0.2, 0.2, 1.0)}.items():
+        place = tmp_path / "cad" / name
+        place.mkdir(parents=True)
+        trimesh.creation.box(size).export(place / "one.stl")
+    model = adapt(tmp_path / "cad", boxes, tmp_path, workers=1, method="source-only")
+    assert list(model.classes_) == ["post", "slab"]
+    assert (tmp_path / "out" / "source" / "dataset.json").is_file()
