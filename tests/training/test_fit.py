@@ -58,7 +58,7 @@ def test_other_settings_in_the_folder_are_refused(source, settings, tmp_path, ch
 
 def test_other_data_or_method_in_the_folder_are_refused(source, target, settings, tmp_path):
     fit("source-only", source, None, settings, run_dir=tmp_path)
-    with pytest.raises(InputError, match="source = "):
+    with pytest.raises(InputError, match="another --source"):
         fit("source-only", target, None, settings, run_dir=tmp_path)
     with pytest.raises(InputError, match="method = 'source-only', not 'qbst'"):
         fit("qbst", source, target.without_labels(), settings, ROUNDS, run_dir=tmp_path)
