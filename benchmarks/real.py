@@ -81,6 +81,13 @@ CELLS: Mapping[str, Cell] = {
     "rooms QBST average": replace(
         ROOMS, method="qbst", rounds={"teacher": "average"}, warm_up="rooms"
     ),
+    "rooms QBST gentle": replace(
+        ROOMS,
+        method="qbst",
+        rounds={"teacher": "average", "threshold_share": 0.5, "rounds": 5, "epochs": 4},
+        train={"learning_rate": 1e-4},
+        warm_up="rooms",
+    ),
     "rooms SPST": replace(ROOMS, method="spst", warm_up="rooms"),
     # Switches of self-training, one at a time.
     "QBST calibrated": replace(ALL, method="qbst", rounds={"calibrate": True}, warm_up="S+C+M"),
