@@ -32,7 +32,8 @@ PAIRS = (
     ("GAST+QBST", "GAST"), ("DGCNN S", "DGCNN M"), ("DGCNN S+C+M", "DGCNN M"),
     ("DGCNN QBST", "DGCNN S+C+M"),
     ("rooms", "S+C+M"), ("rooms", "M"), ("M sight", "M"), ("rooms QBST", "rooms"),
-    ("rooms QBST average", "rooms"), ("rooms QBST gentle", "rooms"), ("rooms SPST", "rooms"), ("rooms QBST", "rooms SPST"),
+    ("rooms QBST average", "rooms"), ("rooms QBST gentle", "rooms"),
+    ("rooms SPST", "rooms"), ("rooms QBST", "rooms SPST"),
 )  # fmt: skip
 """First minus second."""
 SWITCHES = {
