@@ -566,3 +566,20 @@ def test_empty_target(domains, settings):
 def test_derived_seeds_differ():
     paths = [(0, 0), (0, 1), (1, 0), (0, 1, 0), (0, 1, 1)]
     assert len({derived_seed(*path) for path in paths}) == len(paths)
+
+
+def test_rounds_have_a_learning_rate_of_their_own(source, target, settings, warm, tmp_path):
+    """Each round's first epoch starts at it."""
+    gentle = replace(ROUNDS, learning_rate=1e-4)
+    result = fit(
+        "qbst",
+        source,
+        target.without_labels(),
+        settings,
+        gentle,
+        run_dir=tmp_path / "run",
+        warm_up=warm,
+    )
+    assert [record.learning_rates[0] for record in result.rounds] == pytest.approx([1e-4] * 3)
+    with pytest.raises(InputError, match="learning_rate"):
+        replace(ROUNDS, learning_rate=0.0)

@@ -136,12 +136,12 @@ def _adapt(target: Path, before: Path, settings: DemoSettings, folder: Path) -> 
     from qs3.training.run import train_settings
 
     train = dataclasses.replace(train_settings(before), seed=settings.seed)
-    # Of what was tried on the development objects of NYU (docs/start.md) an averaging teacher and
-    # a small source alone did no harm there.
+    # Of what was tried on the development objects of NYU (docs/real.md) these did no harm there.
     rounds = self_training_preset(
         "default",
         threshold_share=settings.share,
         teacher="average",
+        learning_rate=1e-4,
         rounds=settings.rounds,
         epochs=settings.round_epochs,
         source_loss=settings.source_per_class > 0,

@@ -257,6 +257,8 @@ class SelfTrainingSettings:
     fitted, in each round anew, on the held-out part of the source with its hard labels."""
     label_smoothing: float | None = None
     """Label smoothing in the rounds; None takes that of the training before them."""
+    learning_rate: float | None = None
+    """Adam's learning rate at the start of a round; None takes that of the training before."""
     source_loss: bool = True
     """Whether each step takes as many labelled clouds of the source too."""
     source_weight: float = 1.0
@@ -296,6 +298,8 @@ class SelfTrainingSettings:
         _check(self, "threshold_share", share is None or 0 < share <= 1, "must be above 0, to 1")
         good = smoothing is None or 0 <= smoothing < 1
         _check(self, "label_smoothing", good, "must be in 0 to below 1")
+        rate = self.learning_rate
+        _check(self, "learning_rate", rate is None or rate > 0, "must be above 0")
         _check(self, "teacher_decay", 0 <= self.teacher_decay < 1, "must be in 0 to below 1")
         _check_word(self, "teacher", Teacher)
         good = self.teacher != "average" or self.init == "warm-up"

@@ -243,6 +243,8 @@ def _train_round(
         apart: Those that are not trained on: they judge the ``best`` teacher.
     """
     settings, rounds, teacher = task.settings, task.rounds, state.teacher
+    if rounds.learning_rate is not None:
+        settings = replace(settings, learning_rate=rounds.learning_rate)
     before = sum(not record.skipped for record in state.records)
     if before == 0 and rounds.init == "scratch":
         seed = derived_seed(settings.seed, STREAM, 0)
