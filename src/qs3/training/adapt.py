@@ -15,7 +15,7 @@ from qs3.io.load import is_store
 from qs3.io.preparation import LARGEST
 from qs3.io.ragged import RaggedClouds
 from qs3.meshes import collect
-from qs3.meshes.classes import canonical
+from qs3.meshes.classes import canonical, label_order
 from qs3.meshes.sizes import CLASS_SIZES
 from qs3.structure import unstructure
 from qs3.training.batches import load_whole
@@ -100,9 +100,19 @@ def _source(
         return cad
     if not is_store(cad):
         items = collect(cad, per_class=60, seed=seed)
-        known = all(canonical(item.class_name) in CLASS_SIZES for item in items)
-        size = "class" if known else "file"
-        recipe = replace(RECIPES["rooms"], views=1, seed=seed, object_size=size)
+        names = {item.class_name for item in items}
+        shapes = str(cad) == "shapes"
+        recipe = replace(
+            RECIPES["rooms"],
+            views=1,
+            seed=seed,
+            meshes="shapes" if shapes else Path(cad).resolve().name,
+            per_class=60 if shapes else None,
+            classes=label_order(sorted(names)),
+            object_size="class"
+            if {canonical(name) for name in names} <= {*CLASS_SIZES}
+            else "file",
+        )
         generate(items, folder, recipe, workers=workers or os.cpu_count() or 1)
         cad = folder
     return load_clouds(cad, num_points=None, cloud="all")
