@@ -40,6 +40,7 @@ COMMON = {
     "turns": 1,
     "calibrate": False,
     "label_smoothing": None,
+    "learning_rate": None,
 }
 
 

@@ -132,20 +132,14 @@ def _renderer(settings: DemoSettings) -> Any:
 def _adapt(target: Path, before: Path, settings: DemoSettings, folder: Path) -> None:
     from qs3.io import load_clouds, load_unlabelled
     from qs3.training import fit, load_model, load_whole, self_training_preset
+    from qs3.training.config import GENTLE
     from qs3.training.rounds import remarks
     from qs3.training.run import train_settings
 
     train = dataclasses.replace(train_settings(before), seed=settings.seed)
-    # Of what was tried on the development objects of NYU (docs/real.md) these did no harm there.
-    rounds = self_training_preset(
-        "default",
-        threshold_share=settings.share,
-        teacher="average",
-        learning_rate=1e-4,
-        rounds=settings.rounds,
-        epochs=settings.round_epochs,
-        source_loss=settings.source_per_class > 0,
-    )
+    own = {"threshold_share": settings.share, "rounds": settings.rounds}
+    own |= {"epochs": settings.round_epochs, "source_loss": settings.source_per_class > 0}
+    rounds = self_training_preset("default", **{**GENTLE, **own})
     size, source = (train.num_points, train.preparation), None
     if settings.source_per_class:
         names = load_model(before).class_names

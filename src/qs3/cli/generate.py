@@ -13,7 +13,7 @@ from qs3.cli.options import Flat
 from qs3.cli.store import refuse_failures
 from qs3.cli.text import show, tell
 from qs3.errors import InputError
-from qs3.store.scan_item import RECIPES, GenerateSettings, RecipeName
+from qs3.store.scan_item import RECIPES, GenerateSettings, RecipeName, settings_for
 
 if TYPE_CHECKING:
     from qs3.meshes import MeshItem
@@ -85,7 +85,7 @@ def generate(
             nothing.
         settings: How they are scanned and written. Another seed draws other shapes and poses.
     """
-    from qs3.meshes.classes import describe_renaming, label_order, read_class_map
+    from qs3.meshes.classes import describe_renaming, read_class_map
     from qs3.store.failures import read_failures
     from qs3.store.generate import generate as generate_data
     from qs3.store.plan import make_plan, resolve_renderer
@@ -98,15 +98,9 @@ def generate(
     part = int(match[1]), int(match[2])
     called = None if class_map is None else read_class_map(class_map)
     items = _items(meshes, up, per_class, settings.seed, classes, called, labels)
-    names = {item.class_name for item in items}
     renamed = {item.own_class: item.class_name for item in items if item.own_class}
     tell(*describe_renaming(renamed, called))
-    settings = dataclasses.replace(
-        resolve_renderer(settings),
-        classes=label_order(sorted(names)),
-        meshes="+".join(s if s == "shapes" else Path(s).resolve().name for s in meshes),
-        per_class=per_class if "shapes" in meshes else None,
-    )
+    settings = settings_for(resolve_renderer(settings), items, meshes, per_class)
     settings.as_dict()  # a scene or a range that makes no sense stops here
     usable = getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count() or 1))(0)
     processes = len(usable) if workers is None else workers

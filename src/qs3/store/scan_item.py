@@ -5,12 +5,13 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import tyro
 
-from qs3.meshes.classes import POINTDA10, map_labels
+from qs3.meshes.classes import POINTDA10, label_order, map_labels
 from qs3.sensor.checks import check_range
 from qs3.sensor.presets import settings_dict
 from qs3.sensor.scene import SceneSettings
@@ -86,6 +87,28 @@ class GenerateSettings(ScanSettings):
         if not isinstance(self.renderer, str):
             plain["renderer"] = renderer_dict(self.renderer)
         return plain
+
+
+def settings_for(
+    settings: GenerateSettings,
+    items: Sequence[Item],
+    meshes: Sequence[str | Path],
+    per_class: int,
+) -> GenerateSettings:
+    """Return settings that tell what is scanned: its classes, and where the meshes are from.
+
+    Args:
+        settings: All others.
+        items: The work list.
+        meshes: ``shapes`` and folders that it was collected from.
+        per_class: Objects a class of the shapes.
+    """
+    return dataclasses.replace(
+        settings,
+        classes=label_order(sorted({item.class_name for item in items})),
+        meshes="+".join(str(s) if str(s) == "shapes" else Path(s).resolve().name for s in meshes),
+        per_class=per_class if "shapes" in map(str, meshes) else None,
+    )
 
 
 RECIPES: dict[RecipeName, GenerateSettings] = {

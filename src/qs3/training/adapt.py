@@ -10,28 +10,23 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.io import load_clouds, load_unlabelled
-from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.io.clouds import PointClouds, UnlabelledClouds, numbered
 from qs3.io.load import is_store
 from qs3.io.preparation import LARGEST
 from qs3.io.ragged import RaggedClouds
 from qs3.meshes import collect
-from qs3.meshes.classes import canonical, label_order
+from qs3.meshes.classes import canonical
 from qs3.meshes.sizes import CLASS_SIZES
 from qs3.structure import unstructure
 from qs3.training.batches import load_whole
+from qs3.training.config import GENTLE
 from qs3.training.estimators import Adapter, Clouds
 from qs3.training.run import train_settings
 
 _STEPS = 4000
 """Optimiser steps on the source: those of ``rooms``."""
-_ROUNDS: Mapping[str, Any] = {
-    "threshold_share": 0.5,
-    "teacher": "average",
-    "learning_rate": 1e-4,
-    "rounds": 5,
-    "epochs": 4,
-}
-"""What did no harm on NYU's development objects (docs/real.md)."""
+_PER_CLASS = 60
+"""Built-in shapes a class."""
 
 
 def adapt(
@@ -80,7 +75,7 @@ def adapt(
     adapter = Adapter(
         method,
         model,
-        self_training=dict(_ROUNDS) | dict(self_training or {})
+        self_training=dict(GENTLE) | dict(self_training or {})
         if method == "qbst"
         else self_training,
         train=settings,
@@ -94,25 +89,16 @@ def _source(
     cad: str | Path | PointClouds, folder: Path, workers: int | None, seed: int
 ) -> PointClouds:
     from qs3.store.generate import generate
-    from qs3.store.scan_item import RECIPES
+    from qs3.store.scan_item import RECIPES, settings_for
 
     if isinstance(cad, PointClouds):
         return cad
     if not is_store(cad):
-        items = collect(cad, per_class=60, seed=seed)
-        names = {item.class_name for item in items}
-        shapes = str(cad) == "shapes"
-        recipe = replace(
-            RECIPES["rooms"],
-            views=1,
-            seed=seed,
-            meshes="shapes" if shapes else Path(cad).resolve().name,
-            per_class=60 if shapes else None,
-            classes=label_order(sorted(names)),
-            object_size="class"
-            if {canonical(name) for name in names} <= {*CLASS_SIZES}
-            else "file",
-        )
+        items = collect(cad, per_class=_PER_CLASS, seed=seed)
+        known = {canonical(item.class_name) for item in items} <= {*CLASS_SIZES}
+        size = "class" if known else "file"
+        recipe = replace(RECIPES["rooms"], views=1, seed=seed, object_size=size)
+        recipe = settings_for(recipe, items, [cad], _PER_CLASS)
         generate(items, folder, recipe, workers=workers or os.cpu_count() or 1)
         cad = folder
     return load_clouds(cad, num_points=None, cloud="all")
@@ -129,5 +115,4 @@ def _target(scans: Clouds) -> UnlabelledClouds:
     clouds = [np.asarray(cloud, np.float32) for cloud in scans]
     if any(cloud.ndim != 2 or cloud.shape[1:] != (3,) for cloud in clouds):
         raise InputError("scans: give clouds of shape [n 3], several of them")
-    names = tuple(f"{row:06d}" for row in range(len(clouds)))
-    return RaggedClouds(clouds, names, "").unlabelled(None, "scans", LARGEST)
+    return RaggedClouds(clouds, numbered(len(clouds)), "").unlabelled(None, "scans", LARGEST)

@@ -383,6 +383,16 @@ def preparation_of(preset: str | None) -> Preparation:
     return PAPER if preset in ("paper", "released") else ROBUST
 
 
+GENTLE: Mapping[str, Any] = {
+    "threshold_share": 0.5,
+    "teacher": "average",
+    "learning_rate": 1e-4,
+    "rounds": 5,
+    "epochs": 4,
+}
+"""Rounds of `SelfTrainingSettings` that did no harm on NYU's development objects (docs/real.md)."""
+
+
 def self_training_preset(name: str, **overrides: Any) -> SelfTrainingSettings:
     """Return a preset with some settings changed.
 
