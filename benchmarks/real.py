@@ -89,6 +89,7 @@ CELLS: Mapping[str, Cell] = {
         warm_up="rooms",
     ),
     "rooms SPST": replace(ROOMS, method="spst", warm_up="rooms"),
+    "rooms DGCNN": replace(ROOMS, network="dgcnn", steps=3000),
     # Switches of self-training, one at a time.
     "QBST calibrated": replace(ALL, method="qbst", rounds={"calibrate": True}, warm_up="S+C+M"),
     "QBST by share": replace(ALL, method="qbst", rounds={"threshold_share": 0.5}, warm_up="S+C+M"),
