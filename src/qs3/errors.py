@@ -1,5 +1,10 @@
 """Errors that a user can act on: one line that names what is wrong and the fix."""
 
+import functools
+import logging
+
+_log = logging.getLogger(__name__)
+
 
 class QS3Error(Exception):
     """Base of every error whose message is meant for the user; the command line prints it alone."""
@@ -25,3 +30,9 @@ class MissingExtraError(QS3Error, ImportError):
             f"{package} is not installed; it comes with the extra {extra!r}: in a checkout of qs3, "
             f"pip install -e '.[{extra}]'"
         )
+
+
+@functools.cache
+def say_once(text: str) -> None:
+    """Log a warning, once in the life of the process."""
+    _log.warning("%s", text)

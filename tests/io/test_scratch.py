@@ -10,8 +10,7 @@ from qs3.io import scratch
 from qs3.io.clouds import UnlabelledClouds
 from qs3.io.load import load_clouds, load_unlabelled
 from qs3.io.preparation import ROBUST
-from qs3.training.batches import require_finite
-from qs3.training.prepared import prepare_clouds
+from qs3.training.prepared import prepare_clouds, require_finite
 
 from ..stores import write_store
 

@@ -6,10 +6,10 @@ import trimesh
 from scipy import stats
 
 from qs3 import shapes
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.meshes import load_mesh
 from qs3.meshes.classes import POINTDA10
-from qs3.meshes.sizes import CLASS_SIZES, _note, _note_file, class_size, file_size
+from qs3.meshes.sizes import CLASS_SIZES, class_size, file_size
 
 
 def part(length: float) -> trimesh.Trimesh:
@@ -38,7 +38,7 @@ def test_a_mesh_that_tells_its_unit_is_believed(tmp_path):
 
 
 def test_a_unit_in_the_file_wins_and_says_so_once(caplog):
-    _note_file.cache_clear()
+    say_once.cache_clear()
     mesh = part(60.0)
     mesh.units = "cm"
     for _ in range(2):
@@ -52,7 +52,7 @@ def test_a_unit_in_the_file_wins_and_says_so_once(caplog):
 
 @pytest.mark.parametrize(("length", "size", "unit"), [(2.0, 2.0, "m"), (60.0, 0.06, "mm")])
 def test_a_guess_says_so_once(caplog, length, size, unit):
-    _note.cache_clear()
+    say_once.cache_clear()
     for _ in range(2):
         assert file_size(part(length)) == (pytest.approx(size), f"{unit} (guessed)")
     assert [f"taken for {unit}" in line for line in caplog.messages] == [True]

@@ -13,14 +13,13 @@ import pytest
 import torch
 
 from qs3.errors import InputError, MissingExtraError, QS3Error
-from qs3.io.preparation import PAPER, ROBUST, distinct_inliers, normalise
+from qs3.io.preparation import PAPER, ROBUST, distinct_inliers, normalise, resample
 from qs3.models import create_model
 from qs3.models.aligned import Aligned
 from qs3.models.ops import farthest_point_sampling
 from qs3.models.ops.sampling import sample_in_a_loop
 from qs3.models.sized import Sized
 from qs3.training import TrainSettings, export, load_model, predict_probabilities, save_model
-from qs3.training.batches import subsample
 from qs3.training.export import compare, export_run, subsample_in_a_graph
 from qs3.training.prepared import normalise_in_a_graph
 
@@ -92,11 +91,15 @@ def check(model, run):
             np.testing.assert_allclose(got, wanted, rtol=0, atol=2e-5)
 
 
+def resampled(points):
+    return np.stack([resample(cloud, M) for cloud in points]).astype(np.float64)
+
+
 @pytest.mark.parametrize("n", SIZES)
 def test_subsampling_in_a_graph_takes_the_same_points(n):
     points = clouds(3, n)
     got = subsample_in_a_graph(torch.from_numpy(points).double(), M)
-    assert np.array_equal(got.numpy(), subsample(points, M).astype(np.float64))
+    assert np.array_equal(got.numpy(), resampled(points))
 
 
 def test_subsampling_in_a_graph_breaks_ties_and_repeats_points_alike():
@@ -104,7 +107,7 @@ def test_subsampling_in_a_graph_breaks_ties_and_repeats_points_alike():
     few = np.repeat(grid[:, :7], 20, axis=1)
     for points in (grid.astype(np.float32), few.astype(np.float32)):
         got = subsample_in_a_graph(torch.from_numpy(points).double(), M)
-        assert np.array_equal(got.numpy(), subsample(points, M).astype(np.float64))
+        assert np.array_equal(got.numpy(), resampled(points))
 
 
 @pytest.mark.parametrize("n", [50, 51])

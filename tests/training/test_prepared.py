@@ -18,7 +18,6 @@ from qs3.training import (
     fit,
     load_model,
     predict_probabilities,
-    prepare,
     save_model,
 )
 from qs3.training.config import preparation_of
@@ -67,7 +66,6 @@ def test_the_fixed_choice_does_not_depend_on_redrawing(strayed, redraw, count):
     wanted = [resample(cloud[distinct_inliers(cloud, True)], count) for cloud in strayed.points]
     assert np.array_equal(prepared.chosen(slice(None)), np.stack(wanted))
     assert np.array_equal(prepared.points, normalise(np.stack(wanted), how))
-    assert np.array_equal(prepare(strayed.points, count, how), prepared.points)
 
 
 def test_nothing_is_copied(source):

@@ -13,13 +13,13 @@ import safetensors.torch
 import torch
 
 import qs3
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.evaluation.records import find_records
 from qs3.io.preparation import ROBUST
 from qs3.training import evaluate, fit, load_model, read_run
 from qs3.training.checkpoint import load_tensors_into
 from qs3.training.export import export_run
-from qs3.training.prepared import _tell_size, note_size
+from qs3.training.prepared import note_size
 from qs3.training.shipped import WEIGHTS, find_run, shipped, workplace
 
 ROOT = Path(__file__).parents[2]
@@ -110,7 +110,7 @@ def test_what_is_made_from_it_goes_into_the_working_directory(tmp_path):
 
 def test_millimetres_are_told_once(caplog):
     sized = replace(ROBUST, size_input=True)
-    _tell_size.cache_clear()
+    say_once.cache_clear()
     with caplog.at_level(logging.WARNING):
         note_size(CLOUDS, sized)
         note_size(1000 * CLOUDS, ROBUST)

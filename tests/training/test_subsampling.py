@@ -2,10 +2,20 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
+from qs3.io.clouds import UnlabelledClouds, numbered
 from qs3.io.preparation import resample, unit_ball
 from qs3.sensor.sampling import farthest_point_sample, farthest_point_samples
 from qs3.training import prepared
-from qs3.training.batches import prepare, subsample
+from qs3.training.prepared import prepare_clouds
+
+
+def prepare(points, count, cache=None):
+    clouds = UnlabelledClouds(points, numbered(len(points)))
+    return prepare_clouds(clouds, count, cache=cache)
+
+
+def subsample(points, count, cache=None):
+    return prepare(points, count, cache).chosen(slice(None))
 
 
 @pytest.fixture
@@ -28,7 +38,7 @@ def test_subsampled_and_normalised_is_what_evaluation_reads(clouds, count):
     """`load_clouds` subsamples cloud by cloud, then the network gets the unit ball."""
     expected = np.stack([resample(cloud, count) for cloud in clouds])
     assert np.array_equal(subsample(clouds, count), expected)
-    assert np.array_equal(prepare(clouds, count), unit_ball(expected))
+    assert np.array_equal(prepare(clouds, count).points, unit_ball(expected))
 
 
 def test_choice_is_made_once(clouds, tmp_path, monkeypatch):

@@ -13,7 +13,8 @@ from jaxtyping import Float, Int
 from qs3.errors import InputError, UnevenSizesError
 from qs3.io.scratch import Spool, scratch_array
 
-_CLOUDS = 256  # normalised at a time
+BLOCK = 256
+"""Clouds that are looked at together, so that nothing of the size of them all is made."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +85,8 @@ def normalise(
         [-1.1111111640930176, 1.0]
     """
     balls = np.empty(points.shape, dtype=np.float32)
-    for start in range(0, len(points), _CLOUDS):  # in double precision, but never all at once
-        balls[start : start + _CLOUDS] = _normalised(points[start : start + _CLOUDS], preparation)
+    for start in range(0, len(points), BLOCK):  # in double precision, but never all at once
+        balls[start : start + BLOCK] = _normalised(points[start : start + BLOCK], preparation)
     return balls
 
 

@@ -1,13 +1,11 @@
 """How large things are: what a mesh's own unit says, and what its class measures in homes."""
 
-import functools
-import logging
 import math
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.meshes.classes import canonical
 
 if TYPE_CHECKING:
@@ -42,7 +40,6 @@ _METRES_TO = 5.0
 """A longest side up to which a number without a unit is taken for metres: no furniture is longer,
 and as millimetres no part that a depth camera shows is smaller."""
 _LEAST, _MOST = 1e-3, 10.0
-_log = logging.getLogger(__name__)
 
 
 def class_ranges(class_name: str) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -106,10 +103,14 @@ def file_size(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float,
     side = float(mesh.extents.max())
     name = mesh.units or unit
     if mesh.units and unit and not math.isclose(_metres(mesh.units), _metres(unit)):
-        _note_file(mesh.units, unit)
+        say_once(f"a mesh's file says that it is in {mesh.units}: taken, not units {unit}")
     if name is None:
         name = "m" if side <= _METRES_TO else "mm"
-        _note(name)
+        where = "up to" if name == "m" else "longer than"
+        say_once(
+            f"a mesh does not tell its unit: taken for {name}, as it is {where} {_METRES_TO:g} of "
+            "them long; say it with units (m, cm, mm or in)"
+        )
         told = f"{name} (guessed)"
     else:
         told = name
@@ -134,22 +135,3 @@ def _metres(unit: str) -> float:
             f"the mesh's unit {unit!r} is unknown; write it in a format without units (STL, OBJ), "
             "and name it: units m or mm"
         ) from None
-
-
-@functools.cache
-def _note_file(told: str, unit: str) -> None:
-    """Say once that the file wins."""
-    _log.warning("a mesh's file says that it is in %s: taken, not units %s", told, unit)
-
-
-@functools.cache
-def _note(unit: str) -> None:
-    """Say once what is guessed."""
-    where = "up to" if unit == "m" else "longer than"
-    _log.warning(
-        "a mesh does not tell its unit: taken for %s, as it is %s %g of them long; say it with "
-        "units (m, cm, mm or in)",
-        unit,
-        where,
-        _METRES_TO,
-    )

@@ -1,7 +1,5 @@
 """Folders of meshes as others lay them out: ModelNet, ShapeNet, labels in a CSV, class folders."""
 
-import functools
-import logging
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -12,7 +10,7 @@ from typing import Literal
 import trimesh
 
 from qs3 import shapes
-from qs3.errors import InputError, MissingExtraError
+from qs3.errors import InputError, MissingExtraError, say_once
 from qs3.meshes.cad import NEEDS, check_extra
 from qs3.meshes.classes import MODELNET40, SHAPENET
 from qs3.meshes.labels_csv import read_labels, read_shapenet_splits
@@ -23,8 +21,6 @@ SPLITS: tuple[str, ...] = ("train", "test", "val")
 """Names of folders that are splits, not classes."""
 
 Layout = Literal["modelnet", "shapenet", "folders", "labels"]
-
-_log = logging.getLogger(__name__)
 
 _SHAPENET_FILES = ("models/model_normalized.obj", "model.obj")
 
@@ -105,7 +101,7 @@ def read_tree(root: Path, labels: Path | None = None) -> list[MeshItem]:
             + (f"; it has {unread}" if unread else "")
         )
     if unread:
-        _note(root, unread)
+        say_once(f"{root}: not read: {unread}")
     _check_extras(root, items)
     items.sort(key=lambda item: item.id)
     _refuse_odd_names(root, items)
@@ -220,12 +216,6 @@ def _refuse_wrong_level(root: Path, paths: Sequence[list[str]]) -> None:
                 f"{root}: one synset of ShapeNet; name the folder that holds it, and the class "
                 f"{SHAPENET[root.name]}"
             )
-
-
-@functools.cache
-def _note(root: Path, unread: str) -> None:
-    """Say once what is not read."""
-    _log.warning("%s: not read: %s", root, unread)
 
 
 def _check_extras(root: Path, items: Sequence[MeshItem]) -> None:

@@ -12,8 +12,6 @@ from qs3.lazy import loader, names_of
 if TYPE_CHECKING:
     from qs3.training.augmentation import augment_clouds as augment_clouds
     from qs3.training.batches import load_whole as load_whole
-    from qs3.training.batches import prepare as prepare
-    from qs3.training.batches import subsample as subsample
     from qs3.training.checkpoint import LoadedModel as LoadedModel
     from qs3.training.checkpoint import load_model as load_model
     from qs3.training.checkpoint import save_model as save_model
@@ -47,7 +45,7 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "augmentation": "augment_clouds",
-    "batches": "load_whole prepare subsample",
+    "batches": "load_whole",
     "checkpoint": "LoadedModel load_model save_model",
     "config": "PRESETS Augmentation SelfTrainingSettings TrainSettings self_training_preset",
     "estimators": "QBST SPST Adapter",

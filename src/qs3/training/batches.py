@@ -12,17 +12,15 @@ from torch import Tensor
 
 from qs3.adaptation import Batch
 from qs3.errors import InputError, UnevenSizesError
-from qs3.io.clouds import PointClouds, UnlabelledClouds, numbered
+from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.preparation import LARGEST, PAPER, Preparation
 from qs3.models.sized import ball_radius
 from qs3.training.augmentation import augment_clouds, turned
 from qs3.training.config import Augmentation, TrainSettings
-from qs3.training.prepared import Prepared, normalise_batch, note_size, prepare_clouds
+from qs3.training.prepared import Prepared, normalise_batch, note_size
 
 _SHARE_OF_MEMORY = 0.25
 """Part of a GPU's free memory that the clouds may take; the network needs the rest."""
-_BLOCK = 256
-"""Clouds that are looked at together, so that no mask of all their points is made."""
 _SPARE = 2
 """How many times the points that are needed are augmented, as some of them are lost by it; twice
 that where half of them are turned away from a camera."""
@@ -38,35 +36,6 @@ def require_unlabelled(target: UnlabelledClouds) -> None:
         raise InputError(
             f"a target is UnlabelledClouds, not {type(target).__name__}; use .without_labels()"
         )
-
-
-def require_finite(points: np.ndarray, ids: Sequence[str], where: str = "") -> None:
-    """Refuse clouds with coordinates that are not finite.
-
-    Args:
-        points: Clouds [b n 3].
-        ids: What each is called.
-        where: What they are, at the head of the message.
-
-    Raises:
-        InputError: with the ids of the first such clouds.
-    """
-    blocks = (points[start : start + _BLOCK] for start in range(0, len(points), _BLOCK))
-    good = np.concatenate([np.isfinite(block).all(axis=(1, 2)) for block in blocks] or [[True]])
-    if not good.all():
-        bad = [ids[row] for row in np.flatnonzero(~good).tolist()]
-        raise InputError(f"{where}points of {name_few(bad)} are not finite; leave these clouds out")
-
-
-def name_few(names: Sequence[str]) -> str:
-    """Name clouds, four of them at most.
-
-    Example:
-        >>> name_few(["a"]), name_few(["a", "b", "c", "d", "e"])
-        ('cloud a', 'clouds a, b, c, d and 1 more')
-    """
-    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
-    return f"cloud{'s' if len(names) > 1 else ''} {', '.join(names[:4])}{more}"
 
 
 def load_whole(
@@ -98,42 +67,6 @@ def load_whole(
         return load(data, num_points=num_points, **part)
 
 
-def prepare(
-    points: Float[np.ndarray, "b n 3"], num_points: int, preparation: Preparation = PAPER
-) -> Float[np.ndarray, "b m 3"]:
-    """Return clouds as a network takes them: ``num_points`` points each, normalised.
-
-    Args:
-        points: Clouds, as read.
-        num_points: Points a cloud.
-        preparation: What is done to them.
-
-    Example:
-        >>> prepare(np.random.default_rng(0).normal(size=(2, 50, 3)), 16).shape
-        (2, 16, 3)
-    """
-    clouds = UnlabelledClouds(points, numbered(len(points)))
-    return prepare_clouds(clouds, num_points, preparation).points
-
-
-def subsample(
-    points: Float[np.ndarray, "b n 3"], num_points: int, cache: Path | None = None
-) -> Float[np.ndarray, "b m 3"]:
-    """Bring clouds to ``num_points`` points each, as `qs3.io.preparation.resample` does.
-
-    Args:
-        points: Clouds, as read.
-        num_points: Points a cloud. Fewer points than that are repeated in order.
-        cache: Folder where the choice is kept, as in `prepare_clouds`.
-
-    Example:
-        >>> subsample(np.zeros((2, 50, 3)), 16).shape
-        (2, 16, 3)
-    """
-    clouds = UnlabelledClouds(points, numbered(len(points)))
-    return prepare_clouds(clouds, num_points, cache=cache).chosen(slice(None))
-
-
 _NONE = Augmentation()
 
 
@@ -157,16 +90,12 @@ class DeviceClouds:
         clouds: Prepared clouds, with labels or without.
         device: Where to train. A GPU takes them where a quarter of its free memory is enough; else
             each batch is sent.
-
-    Raises:
-        InputError: where points are not finite.
     """
 
     def __init__(
         self, clouds: Prepared[PointClouds] | Prepared[UnlabelledClouds], device: torch.device
     ) -> None:
         whole = clouds.clouds
-        require_finite(whole.points, whole.ids)
         self.clouds, self.device = clouds, device
         self.ids = clouds.ids
         labels = (

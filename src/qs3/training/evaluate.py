@@ -19,11 +19,11 @@ from qs3.io.clouds import CloudKind, PointClouds
 from qs3.io.ragged import relabel
 from qs3.meshes.classes import require_named
 from qs3.structure import unstructure
-from qs3.training.batches import load_whole, require_finite
+from qs3.training.batches import load_whole
 from qs3.training.checkpoint import LoadedModel, load_model
 from qs3.training.overlap import both_checksums, caveats
 from qs3.training.predict import describe
-from qs3.training.prepared import Prepared, prepare_clouds
+from qs3.training.prepared import Prepared, prepare_clouds, require_finite
 from qs3.training.rounds import kept_clouds
 from qs3.training.run import data_record, read_run
 from qs3.training.shipped import workplace

@@ -65,8 +65,8 @@ class Exported:
 class CloudClassifier(nn.Module):
     """A network that takes clouds of any size in any unit, and gives probabilities.
 
-    Inside are the steps of `qs3.training.batches.prepare`, in double precision as there: clouds of
-    more than ``num_points`` points are subsampled from point 0 on, points of
+    Inside are the steps of `qs3.training.prepared.prepare_clouds`, in double precision as there:
+    clouds of more than ``num_points`` points are subsampled from point 0 on, points of
     smaller ones are repeated in order; then they are normalised. Outliers must be gone before.
 
     Convention:
@@ -98,7 +98,7 @@ class CloudClassifier(nn.Module):
 
 
 def subsample_in_a_graph(points: Float[Tensor, "b n 3"], num_points: int) -> Float[Tensor, "b m 3"]:
-    """Bring clouds to one size as `qs3.training.batches.subsample`, in one graph for every n.
+    """Bring clouds to one size as `qs3.io.preparation.resample`, in one graph for every n.
 
     Example:
         >>> subsample_in_a_graph(torch.tensor([[[0.0, 0, 0], [1, 0, 0]]]), 3)[0, :, 0].tolist()

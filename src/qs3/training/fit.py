@@ -14,7 +14,7 @@ from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.structure import first_difference, unstructure
-from qs3.training.batches import require_finite, require_unlabelled
+from qs3.training.batches import require_unlabelled
 from qs3.training.checkpoint import load_model, weights_fingerprint
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
 from qs3.training.distributed import all_devices, make_fabric
@@ -22,7 +22,7 @@ from qs3.training.history import EpochRecord, History
 from qs3.training.job import Job, fresh_model, make_method, run_job
 from qs3.training.loop import EpochCallback
 from qs3.training.overlap import seen_clouds
-from qs3.training.prepared import Prepared, prepare_clouds
+from qs3.training.prepared import Prepared, prepare_clouds, require_finite
 from qs3.training.progress import Deadline
 from qs3.training.rounds import RoundCallback, RoundRecord
 from qs3.training.run import (

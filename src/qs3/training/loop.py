@@ -21,13 +21,12 @@ from qs3.training.batches import (
     count_batches,
     endless_batches,
     make_batch,
-    name_few,
 )
 from qs3.training.checkpoint import load_optimiser, optimiser_tensors, seed_sequence
 from qs3.training.config import TrainSettings
 from qs3.training.distributed import make_equal, make_fabric
 from qs3.training.history import EpochRecord, Log
-from qs3.training.prepared import Prepared, as_prepared
+from qs3.training.prepared import Prepared, as_prepared, name_few
 from qs3.training.progress import Deadline, Progress, TimeUpError
 from qs3.training.schedules import cosine, plateau
 from qs3.training.state import TrainingState, averaged, make_average

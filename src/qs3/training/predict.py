@@ -11,10 +11,9 @@ from lightning_fabric import Fabric
 from qs3.io.clouds import UnlabelledClouds, numbered
 from qs3.io.preparation import PAPER, Preparation
 from qs3.models import PointClassifier
-from qs3.training.batches import require_finite
 from qs3.training.checkpoint import LoadedModel
 from qs3.training.distributed import gather_rows
-from qs3.training.prepared import Prepared, prepare_clouds
+from qs3.training.prepared import Prepared, prepare_clouds, require_finite
 
 
 class Description(NamedTuple):

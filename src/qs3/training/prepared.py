@@ -4,12 +4,10 @@ Only the clouds as read are held, and the numbers of the points that count: batc
 they are asked for.
 """
 
-import functools
 import hashlib
-import logging
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,9 +19,9 @@ from jaxtyping import Float, Int, UInt
 from torch import Tensor
 from tqdm import tqdm
 
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.io.preparation import LARGEST, PAPER, Preparation, distinct_inliers, normalise
+from qs3.io.preparation import BLOCK, LARGEST, PAPER, Preparation, distinct_inliers, normalise
 from qs3.io.scratch import scratch_array
 from qs3.models.sized import ball_radius
 from qs3.sensor.sampling import farthest_point_sample, farthest_point_samples
@@ -31,9 +29,7 @@ from qs3.training.checkpoint import read_tensors, write_tensors
 from qs3.training.config import TrainSettings
 
 Kind = TypeVar("Kind", PointClouds, UnlabelledClouds)
-_LOG = logging.getLogger(__name__)
 _HUGE = 20.0  # metres, more than any object of a room
-_BLOCK = 256  # clouds that are handed out at a time where all are asked for
 
 
 @dataclass(frozen=True)
@@ -111,8 +107,37 @@ class Prepared(Generic[Kind]):
 
     def blocks(self) -> Iterator[Float[np.ndarray, "r m 3"]]:
         """Yield `chosen` of all clouds, some at a time."""
-        for start in range(0, len(self), _BLOCK):
-            yield self.chosen(slice(start, start + _BLOCK))
+        for start in range(0, len(self), BLOCK):
+            yield self.chosen(slice(start, start + BLOCK))
+
+
+def require_finite(points: np.ndarray, ids: Sequence[str], where: str = "") -> None:
+    """Refuse clouds with coordinates that are not finite.
+
+    Args:
+        points: Clouds [b n 3].
+        ids: What each is called.
+        where: What they are, at the head of the message.
+
+    Raises:
+        InputError: with the ids of the first such clouds.
+    """
+    blocks = (points[start : start + BLOCK] for start in range(0, len(points), BLOCK))
+    good = np.concatenate([np.isfinite(block).all(axis=(1, 2)) for block in blocks] or [[True]])
+    if not good.all():
+        bad = [ids[row] for row in np.flatnonzero(~good).tolist()]
+        raise InputError(f"{where}points of {name_few(bad)} are not finite; leave these clouds out")
+
+
+def name_few(names: Sequence[str]) -> str:
+    """Name clouds, four of them at most.
+
+    Example:
+        >>> name_few(["a"]), name_few(["a", "b", "c", "d", "e"])
+        ('cloud a', 'clouds a, b, c, d and 1 more')
+    """
+    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+    return f"cloud{'s' if len(names) > 1 else ''} {', '.join(names[:4])}{more}"
 
 
 def note_size(points: Float[np.ndarray, "b n 3"], preparation: Preparation) -> None:
@@ -120,16 +145,10 @@ def note_size(points: Float[np.ndarray, "b n 3"], preparation: Preparation) -> N
     if preparation.size_input and len(points):
         extents = np.ptp(points, axis=1).max(axis=1)
         if float(np.median(extents)) > _HUGE:
-            _tell_size()
-
-
-@functools.cache
-def _tell_size() -> None:
-    _LOG.warning(
-        "clouds are larger than %.0f m, and the network is told their size in metres: points in "
-        "millimetres are to be divided by 1000",
-        _HUGE,
-    )
+            say_once(
+                f"clouds are larger than {_HUGE:.0f} m, and the network is told their size in "
+                "metres: points in millimetres are to be divided by 1000"
+            )
 
 
 def prepare_clouds(
@@ -158,9 +177,14 @@ def prepare_clouds(
 
 
 def as_prepared(clouds: Kind | Prepared[Kind], settings: TrainSettings) -> Prepared[Kind]:
-    """Prepare clouds as the settings say, unless they are already."""
+    """Prepare clouds as the settings say, unless they are already.
+
+    Raises:
+        InputError: where points are not finite.
+    """
     if isinstance(clouds, Prepared):
         return clouds
+    require_finite(clouds.points, clouds.ids)
     return prepare_clouds(clouds, settings.num_points, settings.preparation)
 
 

@@ -17,7 +17,7 @@ from qs3.errors import InputError
 from qs3.evaluation.metrics import accuracy
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
-from qs3.training.batches import require_finite, require_unlabelled
+from qs3.training.batches import require_unlabelled
 from qs3.training.checkpoint import (
     derived_seed,
     new_model,
@@ -30,7 +30,7 @@ from qs3.training.history import EpochRecord
 from qs3.training.loop import EpochCallback, train
 from qs3.training.overlap import seen_clouds
 from qs3.training.predict import describe
-from qs3.training.prepared import Prepared, as_prepared, label_clouds
+from qs3.training.prepared import Prepared, as_prepared, label_clouds, require_finite
 from qs3.training.rounds import (
     RoundCallback,
     RoundRecord,
