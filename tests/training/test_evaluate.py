@@ -22,8 +22,8 @@ from qs3.training import (
     save_model,
     self_train,
 )
-from qs3.training.batches import prepare
 from qs3.training.checkpoint import load_model, new_model, read_tensors, write_tensors
+from qs3.training.prepared import prepare_clouds
 from qs3.training.run import RunSettings, claim_run
 
 ROUNDS = SelfTrainingSettings(rounds=1, epochs=1, threshold=0.34)
@@ -93,7 +93,7 @@ def test_a_run_of_own_classes_is_scored_by_a_map_on_data_that_merge_them(
 
 def test_self_training_and_estimators_leave_runs(source, target, settings, tmp_path):
     ready = [
-        replace(clouds, points=prepare(clouds.points, 64))
+        replace(clouds, points=prepare_clouds(clouds, 64).points)
         for clouds in (source, target.without_labels())
     ]
     model = new_model(settings, 3, 0)

@@ -7,10 +7,11 @@ import torch
 
 from qs3.adaptation import Method, SourceOnly
 from qs3.errors import InputError
-from qs3.training.batches import batches, count_batches, prepare
+from qs3.training.batches import batches, count_batches
 from qs3.training.checkpoint import new_model
 from qs3.training.loop import train
 from qs3.training.predict import predict_probabilities
+from qs3.training.prepared import prepare_clouds
 from qs3.training.schedules import cosine
 from qs3.training.state import CHECKPOINT
 
@@ -43,7 +44,7 @@ def losses_of(history):
 
 
 def test_learns_the_training_set(source, settings):
-    source = replace(source, points=prepare(source.points, 64))
+    source = replace(source, points=prepare_clouds(source, 64).points)
     model, history = run(source, replace(settings, epochs=40))
     predictions = predict_probabilities(model, source.points).argmax(axis=1)
     assert (predictions == source.labels).mean() >= 0.95

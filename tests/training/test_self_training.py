@@ -24,10 +24,10 @@ from qs3.training import (
     read_run,
     self_training_preset,
 )
-from qs3.training.batches import prepare
 from qs3.training.checkpoint import derived_seed, new_model
 from qs3.training.distributed import make_fabric
 from qs3.training.predict import describe, predict_probabilities
+from qs3.training.prepared import prepare_clouds
 from qs3.training.rounds import STATE, kept_clouds, remarks
 from qs3.training.self_training import self_train
 
@@ -80,7 +80,7 @@ def warm(source, settings, tmp_path_factory):
 @pytest.fixture(scope="module")
 def domains(source, target, settings):
     def ready(clouds):
-        return replace(clouds, points=prepare(clouds.points, settings.num_points))
+        return replace(clouds, points=prepare_clouds(clouds, settings.num_points).points)
 
     return ready(source), ready(target.without_labels())
 

@@ -1,19 +1,20 @@
 """Class probabilities of clouds."""
 
 from contextlib import nullcontext
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from lightning_fabric import Fabric
 
 from qs3.io.clouds import UnlabelledClouds, numbered
 from qs3.io.preparation import PAPER, Preparation
 from qs3.models import PointClassifier
 from qs3.training.checkpoint import LoadedModel
-from qs3.training.distributed import gather_rows
 from qs3.training.prepared import Prepared, prepare_clouds, require_finite
+
+if TYPE_CHECKING:
+    from lightning_fabric import Fabric
 
 
 class Description(NamedTuple):
@@ -32,7 +33,7 @@ def predict_probabilities(
     num_points: int | None = None,
     preparation: Preparation | None = None,
     batch_size: int = 32,
-    fabric: Fabric | None = None,
+    fabric: "Fabric | None" = None,
 ) -> Float[np.ndarray, "b k"]:
     """Predict the class probabilities of clouds, without augmentation.
 
@@ -74,7 +75,7 @@ def describe(
     points: Float[np.ndarray, "b n 3"] | Prepared,
     *,
     batch_size: int = 32,
-    fabric: Fabric | None = None,
+    fabric: "Fabric | None" = None,
 ) -> Description:
     """Return class probabilities and pooled features of clouds, without augmentation.
 
@@ -106,11 +107,13 @@ def describe(
         model.train(training)
     rows = np.concatenate([np.zeros((0, classes + width)), *answers])
     if fabric is not None:
+        from qs3.training.distributed import gather_rows  # slow to load, and for devices alone
+
         rows = gather_rows(rows, mine, len(points), fabric)
     return Description(rows[:, :classes], rows[:, classes:])
 
 
-def _part(count: int, fabric: Fabric | None) -> slice:
+def _part(count: int, fabric: "Fabric | None") -> slice:
     """This device's part of the clouds."""
     rank, world = (0, 1) if fabric is None else (fabric.global_rank, fabric.world_size)
     return slice(rank * count // world, (rank + 1) * count // world)
