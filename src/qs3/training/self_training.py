@@ -30,7 +30,7 @@ from qs3.training.history import EpochRecord
 from qs3.training.loop import EpochCallback, train
 from qs3.training.overlap import seen_clouds
 from qs3.training.predict import describe
-from qs3.training.prepared import Prepared, as_prepared, label_clouds, require_finite
+from qs3.training.prepared import Prepared, as_prepared, label_clouds
 from qs3.training.rounds import (
     RoundCallback,
     RoundRecord,
@@ -148,7 +148,6 @@ def run_rounds(model: PointClassifier, task: Task) -> tuple[PointClassifier, lis
     source, target, rounds = task.source, task.target, task.rounds
     if not len(target):
         raise InputError("the target has no cloud; give unlabelled clouds")
-    require_finite(target.clouds.points, target.clouds.ids, "target: ")
     state = begin_rounds(model, task)
     classes = len(source.class_names)
     if task.history is not None:
