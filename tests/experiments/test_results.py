@@ -22,12 +22,9 @@ from qs3.experiments.text import FORMATS
 from qs3.training import config
 
 ROOT = Path(__file__).parents[2]
-RECORDS = sorted((ROOT / "results").rglob("results/*.json"))
-FILES = [
-    path
-    for path in sorted((ROOT / "results").glob("*/*.csv"))
-    if (path.parent / "bench.json").is_file()
-]
+FOLDERS = sorted(path.parent for path in (ROOT / "results").glob("*/bench.json"))
+RECORDS = [path for folder in FOLDERS for path in sorted((folder / "results").glob("*.json"))]
+FILES = [path for folder in FOLDERS for path in sorted(folder.glob("*.csv"))]
 
 
 def filled_like(path: Path) -> FilledTable:
@@ -57,15 +54,13 @@ def test_a_table_is_what_its_records_say(path):
 
 
 def test_every_record_is_of_a_run_of_a_table():
-    for folder in ("bench", "laptop", "smoke"):
-        place = read_setup(ROOT / "results" / folder)
+    for folder in FOLDERS:
         names = set()
         for name in TABLES:
-            columns = ("M-D", "S-D", "M-R", "S-R") if name == "adaptation-bench" else ()
-            filled = Table(name, place, columns=columns).read()
+            filled = Table(name, read_setup(folder)).read()
             assert filled.faults == ()
             names |= set(filled.records)
-        assert names == {path.stem for path in RECORDS if path.parts[-3] == folder}
+        assert names == {path.stem for path in (folder / "results").glob("*.json")}
 
 
 def wider(kind: type, modules: Sequence[Any], patch: pytest.MonkeyPatch, **types: type) -> type:
@@ -92,8 +87,8 @@ def test_a_setting_that_is_added_leaves_all_records_readable(monkeypatch):
     }
     monkeypatch.setattr(runs, "PRESETS", presets)
     count = 0
-    for folder in ("bench", "laptop", "smoke"):
-        place = read_setup(ROOT / "results" / folder)
+    for folder in FOLDERS:
+        place = read_setup(folder)
         assert place.scale.novelty == 0.5
         for name in TABLES:
             filled = Table(name, place).read()
@@ -101,8 +96,8 @@ def test_a_setting_that_is_added_leaves_all_records_readable(monkeypatch):
             for record in filled.records.values():
                 assert record.settings["train"]["novelty"] == 0.5
                 count += 1
-    assert count > 300
-    for path in RECORDS:
+    assert count >= len(RECORDS) > 20  # some stand in several tables
+    for path in sorted((ROOT / "results" / "real").glob("*.json")):
         read_record(path)
 
 
