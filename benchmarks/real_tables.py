@@ -19,6 +19,7 @@ from qs3.evaluation.compare import bootstrap_difference
 from qs3.evaluation.records import RunRecord, read_record
 from qs3.evaluation.tables import average, frame, to_markdown
 from qs3.training import load_model, predict_probabilities
+from qs3.training.run import completed
 
 RIGHT = "right.csv"
 TABLES = "tables.md"
@@ -46,7 +47,7 @@ SWITCHES = {
 
 
 def read_records(folder: Path) -> list[RunRecord]:
-    return [read_record(path) for path in sorted(folder.glob("*.json"))]
+    return [completed(read_record(path), path) for path in sorted(folder.glob("*.json"))]
 
 
 def place(record: RunRecord) -> tuple[str, str]:

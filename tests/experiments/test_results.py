@@ -13,13 +13,13 @@ import pytest
 
 from qs3 import structure
 from qs3.evaluation.records import read_record
-from qs3.experiments import TABLES, grid, runs, scales, setup
+from qs3.experiments import TABLES, runs, scales, setup
 from qs3.experiments.experiment import load_experiment
 from qs3.experiments.figures import draw
 from qs3.experiments.setup import read_setup
 from qs3.experiments.table import FilledTable, Table
 from qs3.experiments.text import FORMATS
-from qs3.training import config
+from qs3.training import config, run
 
 ROOT = Path(__file__).parents[2]
 FOLDERS = sorted(path.parent for path in (ROOT / "results").glob("*/bench.json"))
@@ -78,8 +78,8 @@ def wider(kind: type, modules: Sequence[Any], patch: pytest.MonkeyPatch, **types
 def test_a_setting_that_is_added_leaves_all_records_readable(monkeypatch):
     for name in TABLES:
         load_experiment(name)  # before its module could see a wider scale
-    train = wider(config.TrainSettings, (config, grid, scales), monkeypatch)
-    rounds = wider(config.SelfTrainingSettings, (config, grid), monkeypatch)
+    train = wider(config.TrainSettings, (config, run, scales), monkeypatch)
+    rounds = wider(config.SelfTrainingSettings, (config, run), monkeypatch)
     scale = wider(scales.Scale, (scales, setup), monkeypatch, train=train)
     wider(setup.Marker, (setup,), monkeypatch, scale=scale)
     presets = {

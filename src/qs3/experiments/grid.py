@@ -14,8 +14,8 @@ from qs3.experiments.runs import ORDINARY, SUPERVISED, Run, warm_up_of
 from qs3.experiments.setup import RESULTS, Setup
 from qs3.store.executors import Executor, Failure
 from qs3.store.executors.executor import stop_if_fatal
-from qs3.structure import structure, unstructure
-from qs3.training.config import SelfTrainingSettings, TrainSettings
+from qs3.structure import unstructure
+from qs3.training.run import completed
 
 RUNS = "runs"
 """Folder of the runs, in that of a reproduction."""
@@ -69,12 +69,8 @@ def read_result(run: Run, setup: Setup) -> RunRecord:
         InputError: where it is damaged, or that of another run; the file is named.
     """
     path = record_path(run, setup)
-    record = read_record(path)
-    settings = dict(record.settings)
-    kinds = {"train": TrainSettings, "self_training": SelfTrainingSettings}
-    for name, kind in kinds.items():
-        if settings.get(name) is not None:
-            settings[name] = unstructure(structure(settings[name], kind, path))
+    record = completed(read_record(path), path)
+    settings = record.settings
     source, target, test = run.parts(setup.own)
     differing = {
         "method": record.method != run.kind.method,
@@ -95,7 +91,7 @@ def read_result(run: Run, setup: Setup) -> RunRecord:
                 f"{path}: is not the record of {run.folder} ({name} differs); delete it and run "
                 "the same command again"
             )
-    return replace(record, settings=settings, experiment=run.fields)
+    return replace(record, experiment=run.fields)
 
 
 def _part(data: DataRecord | Part | None) -> tuple[str, str | None, str] | None:

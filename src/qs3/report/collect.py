@@ -16,7 +16,7 @@ from qs3.report.lookup import find_before, read_domain
 from qs3.report.settings import ReportSettings
 from qs3.training.checkpoint import load_model
 from qs3.training.overlap import caveats
-from qs3.training.run import RUN, Run, data_record, find_runs, read_run
+from qs3.training.run import RUN, Run, completed, data_record, find_runs, read_run
 from qs3.training.shipped import find_run
 
 _OLD_NAME = re.compile(r"([^-]+-.+)_([^_]+)_seed-\d+")
@@ -74,6 +74,7 @@ def look(folder: Path, published: Mapping[str, Mapping[str, str]] | None = None)
     for path, record in pairs:
         try:
             _require_sound(path, record)
+            record = completed(record, path)
         except InputError as error:
             faults.append(str(error))
             continue

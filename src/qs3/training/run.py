@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from qs3.errors import InputError
-from qs3.evaluation.records import DataRecord, rename_method, rename_settings, walk
+from qs3.evaluation.records import DataRecord, RunRecord, rename_method, rename_settings, walk
 from qs3.files import claim_folder, folder_lock, read_json, write_json
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.structure import first_difference, structure, unstructure
@@ -167,6 +167,23 @@ def _settings(path: Path) -> RunSettings:
     return structure(
         rename_settings(value) if isinstance(value, dict) else value, RunSettings, path
     )
+
+
+def completed(record: RunRecord, where: str | Path) -> RunRecord:
+    """Return a record with all settings: those that an earlier release had not by their defaults.
+
+    Args:
+        record: A record.
+        where: Its file, for the message.
+
+    Raises:
+        InputError: where a setting is unknown, or its value is none.
+    """
+    settings = dict(record.settings)
+    for name, kind in (("train", TrainSettings), ("self_training", SelfTrainingSettings)):
+        if settings.get(name) is not None:
+            settings[name] = unstructure(structure(settings[name], kind, where))
+    return replace(record, settings=settings)
 
 
 def is_run(folder: Path) -> bool:
