@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3.adaptation import method_class
+from qs3.adaptation.confidence import Known
 from qs3.adaptation.names import split_method
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
@@ -41,7 +42,7 @@ from qs3.training.threads import choose_threads, threads, trial_step
 from qs3.training.validation import (
     ROUND,
     Checkpoint,
-    held_out_rows,
+    held_out,
     read_checkpoints,
     tell_choice,
 )
@@ -71,6 +72,8 @@ class FitResult:
     """The held-out part of the source; None where there is none."""
     target: Prepared[UnlabelledClouds] | None
     """The target."""
+    known: Known | None = None
+    """How the network answers the held-out part; None where there is none."""
 
 
 def fit(
@@ -150,8 +153,7 @@ def fit(
         weights, unseen = _check_warm_up(warm_up, base, source, settings)
         before = read_run(warm_up) if (warm_up / RUN).is_file() else None
     run_dir = Path(run_dir)
-    scans, rows = np.unique(source.scan_rows(), return_inverse=True)
-    held = held_out_rows(source.labels[scans], settings)[rows]  # a scan's clouds stay together
+    held = held_out(source, settings)
     has_holdout = unseen and bool(held.any())
     _require_judges(settings, rounds_settings, target, has_holdout)
     # What cannot be made must not leave a folder behind that refuses the corrected call.
@@ -227,6 +229,7 @@ def fit(
         source=job.source,
         holdout=job.holdout,
         target=job.target,
+        known=load_model(run_dir).known,
     )
 
 
@@ -291,7 +294,7 @@ def _check_warm_up(
     folder: Path, base: str, source: PointClouds, settings: TrainSettings
 ) -> tuple[str, bool]:
     """Return the checksum of a warm-up's weights, and whether the held-out part is new to it."""
-    model, class_names, its, _ = load_model(folder)
+    model, class_names, its, *_ = load_model(folder)
     if class_names != source.class_names:
         raise InputError(
             f"{folder}: its classes ({', '.join(class_names)}) are not those of the source "
