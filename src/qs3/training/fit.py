@@ -12,6 +12,7 @@ from qs3.adaptation import method_class
 from qs3.adaptation.confidence import Known
 from qs3.adaptation.names import split_method
 from qs3.errors import InputError
+from qs3.files import write_text
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.structure import first_difference, unstructure
@@ -27,6 +28,7 @@ from qs3.training.prepared import Prepared, prepare_clouds
 from qs3.training.progress import Deadline
 from qs3.training.rounds import RoundCallback, RoundRecord
 from qs3.training.run import (
+    CONFIG,
     RUN,
     Run,
     RunSettings,
@@ -89,6 +91,7 @@ def fit(
     supervised: bool = False,
     deadline: Deadline | None = None,
     tensorboard: bool = False,
+    config: str | None = None,
     on_epoch: EpochCallback | None = None,
     on_round: RoundCallback | None = None,
 ) -> FitResult:
@@ -117,6 +120,7 @@ def fit(
         deadline: Time for this call; it stops before an epoch that would end later, but never
             before its first.
         tensorboard: Whether to write event files too, in ``tensorboard/``.
+        config: Text of ``run.toml``, from which the command line repeats the run.
         on_epoch: Called after each epoch.
         on_round: Called after each round.
 
@@ -163,6 +167,8 @@ def fit(
     wanted = RunSettings.of(method, source, target, settings, rounds_settings, weights)
     step = partial(trial_step, trial, len(source.class_names), settings, device)
     with claim_run(run_dir, wanted, partial(choose_threads, settings, step=step)) as claimed:
+        if config is not None:
+            write_text(run_dir / CONFIG, config)
         count = claimed.threads or 1
         settings = replace(settings, threads=count)
         how = settings.num_points, settings.preparation, run_dir
