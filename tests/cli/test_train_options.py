@@ -139,3 +139,22 @@ def test_a_run_writes_the_file_that_repeats_it(qs3, store, tmp_path):
         assert (one / name).read_bytes() == (other / name).read_bytes()
     assert read_run(Path(other)).source == read_run(Path(one)).source
     qs3("train", "--config", one / "run.toml", "--out", other)  # finished: nothing to do
+
+
+def test_a_dry_run_tells_what_would_be_trained_and_writes_nothing(
+    qs3, store, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    before = set(store.rglob("*"))
+    words = ("train", "--source", store, *QUICK, "--epochs", 3, "--holdout", 0, "--dry-run")
+    told = qs3(*words).stdout
+    for part in ("10 clouds, 0 of them held out", "chair 1", "3 epochs of 2 steps of 5 clouds: 6",
+                 "pointnet, 3.4", "64 points", "holdout 0.0", "threads here"):  # fmt: skip
+        assert part in told, told
+    rounds = ("--target", store, "--method", "qbst", "--self-training.rounds", 2,
+              "--self-training.epochs", 4)  # fmt: skip
+    told = qs3(*words, *rounds).stdout
+    assert "qbst, 2 rounds of 4 epochs of at most 2 steps: 16" in told
+    assert set(store.rglob("*")) == before
+    assert not list(tmp_path.iterdir())
+    assert "--target" in qs3.refuses(*words, "--method", "mmd")

@@ -26,6 +26,7 @@ from qs3.training.config import (
     TrainSettings,
     preparation_of,
 )
+from qs3.training.history import Tracker
 from qs3.training.run import is_run, train_settings
 from qs3.training.shipped import find_run
 
@@ -117,8 +118,12 @@ class TrainOptions(Choices):
     max_time: str | None = None
     """Time for this call, as hours, minutes and seconds: 00:30:00. It stops before an epoch that
     would end later, with exit code 3; the same command goes on."""
-    log: Literal["jsonl", "tensorboard"] = "jsonl"
-    """history.jsonl is always written; tensorboard adds event files in OUT/tensorboard."""
+    log: Tracker = "jsonl"
+    """history.jsonl is always written; tensorboard adds event files in OUT/tensorboard, wandb runs
+    of Weights & Biases in OUT/wandb, offline unless WANDB_MODE says otherwise."""
+    dry_run: bool = False
+    """Print what would be trained, and about how long it takes, by a step that is timed here; write
+    nothing. --out may be left out."""
     train: Flat[TrainSettings] = field(default_factory=TrainSettings)
     """How the network is trained."""
     self_training: SelfTrainingSettings = field(default_factory=SelfTrainingSettings)
@@ -153,7 +158,8 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
         if options.self_training.rule != rounds.rule:
             raise InputError(f"{chosen.config}: self_training.rule: name it by rounds_rule instead")
     # What must be given: tyro's marker for that is neither text nor path.
-    for name in ("out",) if alone or options.source else ("source", "out"):
+    needed = {"out": "--dry-run" not in words, "source": not alone and not options.source}
+    for name in (name for name, missing in needed.items() if missing):
         object.__setattr__(options, name, tyro.MISSING)
     return {"options": options}
 
@@ -190,7 +196,15 @@ def _without_none(value: Any) -> Any:
 
 def run_toml(options: TrainOptions) -> str:
     """Return the options of a run as a file for ``--config``."""
-    not_its_own = {"config", "out", "max_time", "model_set", "method_set", "self_training.rule"}
+    not_its_own = {
+        "config",
+        "out",
+        "max_time",
+        "dry_run",
+        "model_set",
+        "method_set",
+        "self_training.rule",
+    }
     head = (
         "# qs3 train --config THIS_FILE --out FOLDER repeats the run. Paths are as they were given."
     )
@@ -225,6 +239,7 @@ def train(options: Flat[TrainOptions]) -> int:
     from qs3.io import load_clouds, load_unlabelled
     from qs3.meshes.classes import POINTDA10, describe_renaming, read_class_map
     from qs3.training import Deadline, TimeUpError, fit, load_whole, parse_duration
+    from qs3.training.plan import describe_plan
     from qs3.training.rounds import all_skipped, remarks
 
     seconds = None if options.max_time is None else parse_duration(options.max_time)
@@ -253,19 +268,23 @@ def train(options: Flat[TrainOptions]) -> int:
     if options.target is not None:
         part = {"split": options.target_split, "cloud": options.target_cloud}
         target = load_whole(load_unlabelled, options.target, *how, **part)
+    rounds = None if rule is None else options.self_training
+    if options.dry_run:
+        show(*describe_plan(base, source, target, settings, rounds, options.warm_up is not None))
+        return 0
     try:
         result = fit(
             options.method,
             source,
             target,
             settings,
-            None if rule is None else options.self_training,
+            rounds,
             run_dir=options.out,
             warm_up=options.warm_up,
             preset=options.preset,
             supervised=options.supervised,
             deadline=Deadline(seconds, start),
-            tensorboard=options.log == "tensorboard",
+            tracker=options.log,
             config=run_toml(replace(options, train=settings)),
         )
     except TimeUpError as stop:
