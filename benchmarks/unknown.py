@@ -11,6 +11,7 @@ refused where 5 % of the held-out source is; and how well calibrated the confide
 
 import argparse
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,22 +20,24 @@ os.environ["OMP_NUM_THREADS"] = "1"  # before anything counts the cores
 
 import numpy as np
 from real import ROOMS, parts, settings_of
-from scipy.special import logsumexp, softmax
 from sklearn.metrics import roc_auc_score
+from sklearn.neighbors import NearestNeighbors
+from sklearn.preprocessing import normalize
 
-from qs3.adaptation.confidence import fit_temperature, rescale
+from qs3.adaptation.confidence import energy, fit_temperature, rescale
 from qs3.files import write_json
 from qs3.io import load_clouds
 from qs3.io.clouds import PointClouds
 from qs3.training import fit
-from qs3.training.predict import describe
+from qs3.training.predict import Description, describe
 from qs3.training.prepared import prepare_clouds
 
 SHARE = 0.05
+FEW, MANY, NEIGHBOURS = 300, 3000, 50
 SCORES = {
-    "energy": lambda logits: logsumexp(logits, axis=1),
-    "max logit": lambda logits: logits.max(axis=1),
-    "max softmax": lambda logits: softmax(logits, axis=1).max(axis=1),
+    "energy": lambda said: energy(said.logits),
+    "max logit": lambda said: said.logits.max(axis=1),
+    "max softmax": lambda said: said.probabilities.max(axis=1),
 }
 """Higher of known objects: Liu et al. 2020, Hendrycks et al. 2022, Hendrycks & Gimpel 2017."""
 
@@ -57,21 +60,32 @@ def main() -> None:
 def measure(options: argparse.Namespace, left_out: list[str]) -> dict[str, Any]:
     """Train without two classes, and tell known from unknown objects."""
     cell = replace(ROOMS, steps=options.steps)
-    source = without(load_clouds(options.source, cloud=cell.cloud, num_points=None), left_out)
+    whole = load_clouds(options.source, cloud=cell.cloud, num_points=None)
+    source = without(whole, left_out)
     settings = settings_of(cell, len(source), 0)
     run = options.out / "-".join(left_out)
     result = fit("source-only", source, None, settings, run_dir=run)
-    real = parts(options.shared)["dev"]
-    clouds = prepare_clouds(real, settings.num_points, settings.preparation)
-    said, held = describe(result.model, clouds), describe(result.model, result.holdout)
+    real, rng = parts(options.shared)["dev"], np.random.default_rng(0)
+    # Clouds of the classes that were left out, as the source has them: no gap between the domains.
+    others = whole.select(np.isin(np.array(whole.class_names)[whole.labels], left_out))
+    others = others.select(np.sort(rng.permutation(len(others))[:FEW]))
+    clouds, others = (
+        prepare_clouds(one, settings.num_points, settings.preparation) for one in (real, others)
+    )
+    rows = np.sort(rng.permutation(len(result.source))[:MANY])
+    said, held, simulated, seen = (
+        describe(result.model, one)
+        for one in (clouds, result.holdout, others, result.source.select(rows))
+    )
     unknown = np.isin(np.array(real.class_names)[real.labels], left_out)
     truth = np.array([(*source.class_names, *left_out).index(name) for name in real.class_names])
     truth = truth[real.labels]
     scores = {}
-    for name, score in SCORES.items():
-        values = score(said.logits)
-        refused = values < np.quantile(score(held.logits), SHARE)
+    for name, score in (SCORES | {"neighbour": nearness(seen.features)}).items():
+        values, known, new = score(said), score(held), score(simulated)
+        refused = values < np.quantile(known, SHARE)
         scores[name] = {
+            "auroc_simulated": roc_auc_score([1] * len(known) + [0] * len(new), [*known, *new]),
             "auroc": roc_auc_score(~unknown, values),
             "refused_known": refused[~unknown].mean(),
             "refused_unknown": refused[unknown].mean(),
@@ -102,6 +116,12 @@ def measure(options: argparse.Namespace, left_out: list[str]) -> dict[str, Any]:
         "calibration_error": errors,
     }
     return plain(record)
+
+
+def nearness(seen: np.ndarray) -> Callable[[Description], np.ndarray]:
+    """Minus the distance to the k-th nearest training cloud, of features of length 1 (Sun 2022)."""
+    index = NearestNeighbors(n_neighbors=NEIGHBOURS).fit(normalize(seen))
+    return lambda said: -index.kneighbors(normalize(said.features))[0][:, -1]
 
 
 def without(clouds: PointClouds, left_out: list[str]) -> PointClouds:
