@@ -133,14 +133,10 @@ def parts(shared: Path) -> dict[str, PointClouds]:
     return named
 
 
-def make(options: argparse.Namespace, name: str, seed: int) -> None:
-    """Train one cell with one seed and score it."""
-    cell, clouds = CELLS[name], parts(options.shared)
-    dev = clouds["dev"]
-    target = UnlabelledClouds(dev.points, dev.ids, origin=dev.origin)
-    source = load_clouds(options.source, cloud=cell.cloud, num_points=None)
+def settings_of(cell: Cell, clouds: int, seed: int) -> TrainSettings:
+    """How a cell is trained on a source of so many clouds."""
     held = 0.1
-    batches = -(-int(len(source) * (1 - held)) // BATCH)
+    batches = -(-int(clouds * (1 - held)) // BATCH)
     train = TrainSettings(
         model=cell.network,
         model_settings=FAST if cell.network == "pointnet" else {},
@@ -155,7 +151,16 @@ def make(options: argparse.Namespace, name: str, seed: int) -> None:
         seed=seed,
         threads=1,
     )
-    train = changed(train, cell.train)
+    return changed(train, cell.train)
+
+
+def make(options: argparse.Namespace, name: str, seed: int) -> None:
+    """Train one cell with one seed and score it."""
+    cell, clouds = CELLS[name], parts(options.shared)
+    dev = clouds["dev"]
+    target = UnlabelledClouds(dev.points, dev.ids, origin=dev.origin)
+    source = load_clouds(options.source, cloud=cell.cloud, num_points=None)
+    train = settings_of(cell, len(source), seed)
     needs = cell.method != "source-only"
     rounds = None
     if cell.rounds or cell.method in ("qbst", "spst"):

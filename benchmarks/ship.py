@@ -1,10 +1,13 @@
 """A trained run as a network that comes with qs3: weights in half precision, and its card.
 
 Run: python benchmarks/ship.py RUN [--out src/qs3/weights/rooms] [--records results/real]
+         [--data DIR --cloud all]
 
 Writes model.safetensors (float16), settings.json, run.json without the shapes of the clouds, and
 the parts of README.md between markers; the rest of the card is written by hand. RUN may be the
-folder itself, to fill in the scores of records that were made since.
+folder itself, to fill in the scores of records that were made since. With --data, the source of
+RUN, what is unknown to the rounded network is measured on the part of it that was held out;
+else this is kept as RUN has it.
 """
 
 import argparse
@@ -12,19 +15,24 @@ import copy
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import get_args
 
 import torch
 
 from qs3.evaluation.records import RunRecord, find_records
 from qs3.files import write_json, write_text
+from qs3.io import load_clouds
+from qs3.io.clouds import CloudChoice, PointClouds
 from qs3.models import PointClassifier
 from qs3.structure import unstructure
 from qs3.training.batches import count_batches
 from qs3.training.checkpoint import LoadedModel, load_model, read_facts, save_model
 from qs3.training.config import Augmentation, TrainSettings
 from qs3.training.export import compare
-from qs3.training.predict import predict_probabilities
-from qs3.training.run import MODEL, SETTINGS, Run, read_run, train_settings, write_run
+from qs3.training.predict import describe_known, predict_probabilities
+from qs3.training.prepared import prepare_clouds
+from qs3.training.run import MODEL, SETTINGS, Run, fingerprint, read_run, train_settings, write_run
+from qs3.training.validation import held_out
 
 
 def main() -> None:
@@ -33,22 +41,35 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("src/qs3/weights/rooms"))
     parser.add_argument("--source", default="rooms", help="what the record calls the source")
     parser.add_argument("--records", type=Path, default=Path("results/real"))
+    parser.add_argument("--data", help="source of the run, to measure what is unknown")
+    parser.add_argument("--cloud", choices=get_args(CloudChoice), default="all")
     options = parser.parse_args()
-    ship(options.run, options.out, options.source, options.records)
+    data = None
+    if options.data is not None:
+        data = load_clouds(options.data, cloud=options.cloud, num_points=None)
+    ship(options.run, options.out, options.source, options.records, data)
     for path in sorted(options.out.iterdir()):
         print(f"{path.stat().st_size / 1e3:8.0f} kB  {path}")
 
 
-def ship(place: Path, out: Path, source: str, records: Path) -> None:
+def ship(
+    place: Path, out: Path, source: str, records: Path, data: PointClouds | None = None
+) -> None:
     """Write the folder of a network from a run."""
     run, loaded = read_run(place), load_model(place)
     if run.target is not None:
         raise SystemExit(f"{place}: was adapted to {run.target.label}; ship what saw no target")
     settings = train_settings(place)
     facts = {"rounding": read_facts(place / MODEL).get("rounding") or rounding(loaded, settings)}
-    half = copy.deepcopy(loaded.model).half()
+    half, known = copy.deepcopy(loaded.model).half(), loaded.known
+    if data is not None:
+        if fingerprint(data) != loaded.settings["source"]:
+            raise SystemExit(f"{place}: was not trained on this source")
+        rows = held_out(data, settings)
+        held = prepare_clouds(data.select(rows), settings.num_points, settings.preparation)
+        known = describe_known(copy.deepcopy(half).float(), held)
     out.mkdir(parents=True, exist_ok=True)
-    save_model(out, half, loaded.class_names, settings, facts=facts)
+    save_model(out, half, loaded.class_names, settings, known=known, facts=facts)
     write_json(out / SETTINGS, loaded.settings)
     named = dataclasses.replace(run.source, name=source)
     write_run(dataclasses.replace(run, folder=out, source=named, source_shapes=()))

@@ -24,7 +24,14 @@ PACKAGES = (
     "qs3.viewer",
     "qs3.experiments",
 )
-_ROOT_MODULES = ("qs3.errors", "qs3.geometry", "qs3.files", "qs3.lazy", "qs3.structure")
+_ROOT_MODULES = (
+    "qs3.errors",
+    "qs3.geometry",
+    "qs3.files",
+    "qs3.lazy",
+    "qs3.structure",
+    "qs3.toml_files",
+)
 _DEFINITIONS = (ast.FunctionDef, ast.ClassDef)
 
 

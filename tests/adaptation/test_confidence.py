@@ -7,7 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qs3.adaptation.confidence import BOUNDS, fit_temperature, rescale, threshold_of_share
+from qs3.adaptation.confidence import (
+    BOUNDS,
+    energy,
+    fit_temperature,
+    measure_known,
+    rescale,
+    threshold_of_share,
+)
 from qs3.adaptation.selection import select_confident, select_quasi_balanced
 from qs3.errors import InputError
 
@@ -127,9 +134,35 @@ def test_certainty_everywhere_keeps_something():
         )
 
 
+@given(st.integers(0, 99), st.sampled_from([0.0, 0.05, 0.123, 0.5, 1.0]))
+def test_the_share_of_held_out_clouds_that_is_refused_is_the_one_asked_for(seed, share):
+    logits = np.random.default_rng(seed).normal(size=(200, 4)) * 3
+    known = measure_known(logits, logits.argmax(axis=1))
+    familiarity = known.familiarity(logits)
+    assert abs((familiarity < share).mean() - share) <= 2 / 200
+    order = np.argsort(energy(logits))
+    assert (np.diff(familiarity[order]) >= 0).all()
+    assert known.familiarity(logits - 1e3).tolist() == [0.0] * 200
+    assert known.familiarity(logits + 1e3).tolist() == [1.0] * 200
+
+
+def test_of_new_clouds_of_the_same_kind_the_same_share_is_refused():
+    rng = np.random.default_rng(0)
+    held, new = rng.normal(size=(2, 4000, 5))
+    refused = measure_known(held, held.argmax(axis=1)).familiarity(new) < 0.05
+    assert abs(refused.mean() - 0.05) < 4 * np.sqrt(2 * 0.05 * 0.95 / 4000)
+
+
+def test_energy_takes_any_logits_and_is_the_plain_sum():
+    logits = np.array([[1.0, 2.0, -1.0], [1e4, 0.0, 0.0]])
+    assert energy(logits)[0] == pytest.approx(np.log(np.exp(logits[0]).sum()))
+    assert energy(logits)[1] == 1e4
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
+        (lambda p: measure_known(p[:0], np.zeros(0, dtype=np.int64)), "no held-out cloud"),
         (lambda p: fit_temperature(p[:0], np.zeros(0, dtype=np.int64)), "no held-out cloud"),
         (lambda p: fit_temperature(2 * p, np.array([0])), "sum to 1"),
         (lambda p: rescale(p, 0.0), "temperature must be larger than 0"),

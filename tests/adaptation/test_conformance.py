@@ -247,6 +247,8 @@ def test_poisoned_labels_of_the_target_change_no_bit(method, rule, tmp_path):
     (right, history, kept), (wrong, history_of_wrong, kept_of_wrong) = runs
     assert same(state(right), state(wrong))
     assert right.checkpoints == wrong.checkpoints
+    assert right.known == wrong.known
+    assert right.known is not None
     assert len(right.checkpoints) >= 2
     assert history == history_of_wrong
     assert kept == kept_of_wrong

@@ -6,6 +6,7 @@ import json
 import cv2
 import numpy as np
 import pyarrow.parquet as pq
+import pytest
 import trimesh
 
 
@@ -90,6 +91,25 @@ def test_generate_refuses_a_class_without_a_real_size_before_it_begins(typed, tm
                          "--variant", "scalar_rgb")  # fmt: skip
     assert "'toilet'" in said
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("folder", "called"),
+    [("dresser", "storage"), ("gizmo", "cabinet")],  # the size of its own name, that of its new one
+)
+def test_real_sizes_are_known_by_either_name_of_a_mapped_class(
+    qs3, quick, tmp_path, folder, called
+):
+    meshes = tmp_path / "meshes" / folder
+    meshes.mkdir(parents=True)
+    trimesh.creation.box((40.0, 40.0, 40.0)).export(meshes / "a.ply")
+    (tmp_path / "map.toml").write_text(f'{folder} = "{called}"')
+    qs3("generate", "--meshes", meshes.parent, "--map", tmp_path / "map.toml", "--sensor", "d435",
+        "--object-size", "class", "--scans-per-mesh", 1, "--num-points", 64, "--workers", 0,
+        "--out", tmp_path / "out", *quick)  # fmt: skip
+    (row,) = pq.read_table(tmp_path / "out" / "shard-00000.parquet").to_pylist()
+    assert row["class_name"] == called
+    assert 0.45 <= json.loads(row["drawn"])["object_size"] <= 2.2  # CLASS_SIZES["cabinet"]
 
 
 def test_scan_takes_the_size_of_a_file_and_tells_its_guess(qs3, quick, tmp_path):

@@ -121,6 +121,20 @@ def test_records_hold_no_path_of_a_machine():
         json.loads(text)
 
 
+def test_what_docs_say_of_unknown_objects_is_what_was_measured():
+    page = (ROOT / "docs" / "real.md").read_text(encoding="utf-8")
+    for path in sorted((ROOT / "results" / "unknown").glob("*.json")):
+        told = json.loads(path.read_text(encoding="utf-8"))
+        for score in told["scores"].values():
+            before, after = (
+                f"{100 * score[name]:.1f}"
+                for name in ("accuracy_of_known", "accuracy_of_known_not_refused")
+            )
+            aurocs = f"| {score['auroc_simulated']:.2f} | {score['auroc']:.2f} |"
+            refused = f" {score['refused_known']:.0%} | {score['refused_unknown']:.0%} |"
+            assert f"{aurocs}{refused.replace('%', ' %')} {before} → {after} |" in page
+
+
 def test_real_tables_and_their_page_are_what_the_records_say(monkeypatch):
     folder = ROOT / "results" / "real"
     monkeypatch.syspath_prepend(ROOT / "benchmarks")

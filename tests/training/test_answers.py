@@ -1,6 +1,7 @@
 """Answers of a network for files: listed, told in tables, linked by class."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -10,7 +11,7 @@ import torch
 from qs3.cli import main
 from qs3.io import load_clouds
 from qs3.models import create_model
-from qs3.training import TrainSettings, save_model
+from qs3.training import TrainSettings, fit, load_model, save_model
 from qs3.training.answers import (
     Answer,
     answers_csv,
@@ -19,6 +20,7 @@ from qs3.training.answers import (
     predict_files,
     sort_into,
 )
+from qs3.training.run import train_settings
 
 from ..io.hostile import refused
 
@@ -44,6 +46,14 @@ def model(tmp_path_factory):
     torch.manual_seed(0)
     settings = TrainSettings(model="pointnet", num_points=32)
     return save_model(tmp_path_factory.mktemp("run"), create_model("pointnet", 3), NAMES, settings)
+
+
+@pytest.fixture(scope="module")
+def knowing(tmp_path_factory, source, settings):
+    """A run whose source has a held-out part."""
+    run = tmp_path_factory.mktemp("knowing") / "run"
+    fit("source-only", source, None, replace(settings, holdout=0.3), run_dir=run)
+    return run
 
 
 def names(paths, folder):
@@ -83,6 +93,72 @@ def test_tables_hold_what_was_answered(folder, tmp_path, model):
     entries = json.loads(answers_json(answers))
     assert entries[0]["probabilities"] == answers[0].probabilities
     assert entries[2] == {"file": str(folder / "bad.ply"), "fault": answers[2].fault}
+
+
+def test_what_is_too_little_familiar_is_unknown(knowing, folder, tmp_path):
+    files = list_clouds([folder])
+    plain, refused = [], {}
+    for share in (None, 0.0, 0.5, 1.0):
+        answers = list(predict_files(knowing, files, unknown=share))
+        plain = plain or answers
+        assert [a.probabilities for a in answers] == [a.probabilities for a in plain]
+        assert bool(answers[2].fault)
+        refused[share] = {a.file for a in answers if a.refused}
+        for answer in answers if share is not None else []:
+            assert answer.fault or answer.refused == (answer.familiarity < share)
+            if answer.refused:
+                assert answer.best(2) == [("unknown", 1 - answer.familiarity), *plain_best(answer)]
+    assert refused[None] == refused[0.0] == set()
+    assert refused[0.5] <= refused[1.0]
+    assert refused[1.0]
+    (tmp_path / "a.csv").write_text(answers_csv(answers, top=2))
+    rows = pd.read_csv(tmp_path / "a.csv", keep_default_na=False)
+    entries = json.loads(answers_json(answers))
+    sort_into(tmp_path / "sorted", answers)
+    for row, entry, answer in zip(rows.to_dict("records"), entries, answers, strict=True):
+        assert (row["class"] == "unknown") == answer.refused == (entry.get("class") == "unknown")
+        if answer.refused:
+            assert row["class_2"] == plain_best(answer)[0][0]
+            assert float(row["familiarity"]) == pytest.approx(answer.familiarity, abs=1e-6)
+            assert entry["familiarity"] == answer.familiarity
+            assert (tmp_path / "sorted" / "unknown" / answer.file.name).exists()
+
+
+def plain_best(answer):
+    return list(answer.probabilities.items())[:1]
+
+
+def test_calibrated_probabilities_keep_their_order(knowing, folder):
+    files = list_clouds([folder / "*.npy"])
+    plain, calibrated = (
+        list(predict_files(knowing, files, calibrated=asked)) for asked in (False, True)
+    )
+    temperature = load_model(knowing).known.temperature
+    for one, other in zip(plain, calibrated, strict=True):
+        assert list(one.probabilities) == list(other.probabilities)
+        powers = np.array(list(one.probabilities.values())) ** (1 / temperature)
+        assert list(other.probabilities.values()) == pytest.approx(powers / powers.sum())
+
+
+def test_a_network_without_held_out_source_says_so(model, folder, capsys):
+    for words in (["--unknown", "0.05"], ["--calibrated"]):
+        with pytest.raises(SystemExit) as ended:
+            main(["predict", str(model), str(folder), *words])
+        assert ended.value.code == 2
+        told = capsys.readouterr().err.splitlines()
+        assert "holdout above 0" in told[-1]
+        assert sum("Traceback" in line for line in told) == 0
+
+
+def test_a_share_that_is_none_and_a_class_of_that_name_are_refused(knowing, folder, tmp_path):
+    for share in (-0.1, 1.5, float("nan")):
+        with refused("unknown must be 0 to 1"):
+            list(predict_files(knowing, [folder / "a.npy"], unknown=share))
+    loaded, named = load_model(knowing), ("ball", "unknown", "rod")
+    how = train_settings(knowing)
+    other = save_model(tmp_path, loaded.model, named, how, known=loaded.known)
+    with refused("has a class unknown itself"):
+        list(predict_files(other, [folder / "a.npy"], unknown=0.1))
 
 
 def test_links_by_class_are_a_data_set(folder, tmp_path):

@@ -3,6 +3,7 @@ import pytest
 import torch
 from sklearn.base import clone, is_classifier
 
+import qs3
 from qs3.errors import InputError
 from qs3.io.preparation import ROBUST
 from qs3.training import QBST, SPST, Adapter, SelfTrainingSettings, TrainSettings, fit
@@ -79,6 +80,23 @@ def test_run_folder_stays_and_is_taken_up(source, target, tmp_path):
     again = clone(made).fit(source)
     for name, value in made.model_.state_dict().items():
         assert torch.equal(value, again.model_.state_dict()[name])
+
+
+def test_unknown_is_an_answer_that_is_saved_with_the_network(source, target, tmp_path):
+    made = Adapter(model="pointnet", train=TRAIN | {"holdout": 0.3}).fit(source)
+    plain, asked = made.predict(target), made.predict(target, unknown=0.5)
+    assert "unknown" not in plain
+    assert 0 < (asked == "unknown").sum() < 30
+    assert (asked == plain)[asked != "unknown"].all()
+    loaded = qs3.load(made.save(tmp_path))
+    assert loaded.predict(target, unknown=0.5).tolist() == asked.tolist()
+    shares = made.predict_proba(target, calibrated=True)
+    assert np.allclose(shares.sum(axis=1), 1)
+    assert not np.allclose(shares, made.predict_proba(target))
+    assert made.result_.known.clouds == 6
+    without = Adapter(model="pointnet", train=TRAIN | {"holdout": 0.0}).fit(source)
+    with pytest.raises(InputError, match="this network: cannot tell what is unknown"):
+        without.predict(target, unknown=0.05)
 
 
 def test_faults(source, target):

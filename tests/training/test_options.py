@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from dataclasses import asdict, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -231,8 +232,8 @@ def test_tensorboard_shows_each_epoch_once(source, target, settings, tmp_path):
             raise Stop
 
     with pytest.raises(Stop):
-        fit(*arguments, run_dir=tmp_path, tensorboard=True, on_epoch=stop)
-    result = fit(*arguments, run_dir=tmp_path, tensorboard=True)
+        fit(*arguments, run_dir=tmp_path, tracker="tensorboard", on_epoch=stop)
+    result = fit(*arguments, run_dir=tmp_path, tracker="tensorboard")
     shown = reader.EventAccumulator(str(tmp_path / "tensorboard" / "warm-up")).Reload()
     assert set(shown.Tags()["scalars"]) == {
         "loss/source", "accuracy", "learning_rate", "samples_per_second",
@@ -245,10 +246,41 @@ def test_tensorboard_shows_each_epoch_once(source, target, settings, tmp_path):
     assert len(shown.Scalars("accuracy")) == 2
 
 
-def test_absent_tensorboard_names_the_extra(source, settings, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard.writer", None)
+def test_wandb_is_told_each_epoch_and_stays_offline(source, settings, tmp_path, monkeypatch):
+    told = []
+
+    def init(**how):
+        told.append((how, [], []))
+        _, steps, ended = told[-1]
+        return SimpleNamespace(
+            log=lambda values, step: steps.append((step, values)), finish=lambda: ended.append(True)
+        )
+
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init))
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    result = fit("source-only", source, None, settings, run_dir=tmp_path / "a", tracker="wandb")
+    monkeypatch.setenv("WANDB_MODE", "online")
+    fit("source-only", source, None, settings, run_dir=tmp_path / "b", tracker="wandb")
+    (how, steps, ended), (other, _, _) = told
+    assert (how["mode"], other["mode"]) == ("offline", "online")
+    assert (how["name"], how["dir"]) == ("a/source-only", str(tmp_path / "a"))
+    assert [step for step, _ in steps] == list(range(settings.epochs))
+    assert [values["loss/source"] for _, values in steps] == [
+        record.losses["source"] for record in result.history
+    ]
+    assert ended == [True]
+
+
+@pytest.mark.parametrize(
+    ("tracker", "module"),
+    [("tensorboard", "torch.utils.tensorboard.writer"), ("wandb", "wandb")],
+)
+def test_an_absent_tracker_names_the_extra(
+    source, settings, tmp_path, monkeypatch, tracker, module
+):
+    monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(MissingExtraError, match="track"):
-        fit("source-only", source, None, settings, run_dir=tmp_path / "run", tensorboard=True)
+        fit("source-only", source, None, settings, run_dir=tmp_path / "run", tracker=tracker)
     assert not (tmp_path / "run").exists()
 
 

@@ -51,6 +51,7 @@ def test_files_are_small_half_precision_and_tell_no_path(name):
     assert all(f"<!-- {part}: benchmarks/ship.py -->" in card for part in ("facts", "scores"))
     loaded, run = load_model(Path(name)), read_run(Path(name))
     assert {value.dtype for value in loaded.model.parameters()} == {torch.float32}
+    assert loaded.known.clouds == pytest.approx(0.1 * run.source.clouds, rel=0.02)
     assert run.target is None
     assert not run.target_clouds
     assert len(run.source_clouds) == run.source.clouds
@@ -124,7 +125,8 @@ def test_millimetres_are_told_once(caplog):
 
 def test_a_run_becomes_one(source, target, settings, tmp_path):
     ship = ship_module()
-    fit("source-only", source, None, settings, run_dir=tmp_path / "run")
+    settings = replace(settings, holdout=0.3)
+    made = fit("source-only", source, None, settings, run_dir=tmp_path / "run")
     evaluate(tmp_path / "run", target)
     evaluate(tmp_path / "run", source)  # marked: the network has learnt from it
     out = tmp_path / "mine"
@@ -145,9 +147,17 @@ def test_a_run_becomes_one(source, target, settings, tmp_path):
     answers = [load_model(place).model.state_dict() for place in (tmp_path / "run", out)]
     for name, value in answers[0].items():
         torch.testing.assert_close(answers[1][name], value, rtol=1e-3, atol=1e-4)
+    assert load_model(out).known == made.known
     # From itself: the same bytes, the figure of the rounding too.
     ship.ship(out, out, "balls", tmp_path / "run" / "records")
     assert {path.name: path.read_bytes() for path in out.iterdir()} == first
+    # Measured anew on the rounded network, which is hardly another.
+    ship.ship(tmp_path / "run", out, "balls", tmp_path / "run" / "records", source)
+    known = load_model(out).known
+    assert known.clouds == made.known.clouds
+    assert known.energies == pytest.approx(made.known.energies, rel=1e-2, abs=1e-2)
+    with pytest.raises(SystemExit, match="not trained on this source"):
+        ship.ship(tmp_path / "run", out, "balls", tmp_path, target)
     fit("mmd", source, target.without_labels(), settings, run_dir=tmp_path / "adapted")
     with pytest.raises(SystemExit, match="saw no target"):
         ship.ship(tmp_path / "adapted", out, "balls", tmp_path)

@@ -1,10 +1,11 @@
-"""How sure a network is: a temperature that calibrates it, a threshold for a share of the clouds.
+"""How sure a network is: a temperature, a threshold for a share of the clouds, what is unknown.
 
 Convention:
     Probabilities are [m k], rows summing to 1; the confidence of a cloud is its largest one.
 """
 
 import math
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
@@ -18,6 +19,54 @@ from qs3.models.checks import check_positive, check_range
 BOUNDS = (0.25, 4.0)
 """Least and largest temperature: a network that is right on every held-out cloud asks for 0."""
 _TINY = np.finfo(np.float64).tiny
+UNKNOWN = "unknown"
+"""The answer for a cloud that is of none of the classes."""
+_LEVELS = np.linspace(0, 1, 201)
+
+
+@dataclass(frozen=True)
+class Known:
+    """How a network answers clouds of its classes that it has not been trained on."""
+
+    temperature: float
+    """Temperature that calibrates its probabilities (`fit_temperature`)."""
+    energies: tuple[float, ...]
+    """Evenly spaced quantiles of `energy`, from the least to the largest."""
+    clouds: int
+    """Held-out clouds of the source that both come from."""
+
+    def familiarity(self, logits: Float[np.ndarray, "b k"]) -> Float[np.ndarray, "b"]:
+        """Return the share of the held-out clouds whose energy is below that of each cloud.
+
+        Of new clouds of the known classes it is spread evenly over 0 to 1, so that to answer
+        `UNKNOWN` where it is below a share refuses that share of them (a conformal p-value).
+        """
+        return np.interp(energy(logits), self.energies, np.linspace(0, 1, len(self.energies)))
+
+
+def energy(logits: Float[np.ndarray, "b k"]) -> Float[np.ndarray, "b"]:
+    """Return log Σ exp z, higher of known objects: −E at T = 1 in Liu et al. (NeurIPS 2020), Eq. 4.
+
+    Example:
+        >>> energy(np.array([[0.0, 0.0], [5.0, 0.0]])).round(3).tolist()
+        [0.693, 5.007]
+    """
+    return np.logaddexp.reduce(logits, axis=1)
+
+
+def measure_known(logits: Float[np.ndarray, "v k"], labels: Int[np.ndarray, "v"]) -> Known:
+    """Return what held-out clouds of the source tell of a network.
+
+    Args:
+        logits: Its answers to clouds that it was not trained on.
+        labels: Their classes.
+
+    Raises:
+        InputError: where there is no cloud.
+    """
+    temperature = fit_temperature(softmax(logits, axis=1), labels)
+    quantiles = np.quantile(energy(logits), _LEVELS).round(5)
+    return Known(round(temperature, 5), tuple(quantiles.tolist()), len(labels))
 
 
 def fit_temperature(probabilities: Float[np.ndarray, "v k"], labels: Int[np.ndarray, "v"]) -> float:

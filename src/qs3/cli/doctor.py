@@ -16,7 +16,7 @@ _PURPOSE = {
     "gs": "data sets at gs:// addresses",
     "view": "qs3 view",
     "cad": "meshes in STEP, IGES and 3MF",
-    "track": "qs3 train --log tensorboard",
+    "track": "qs3 train --log tensorboard|wandb",
     "export": "qs3 export",
 }
 _ADVICE = {

@@ -29,7 +29,8 @@ def run_verb(verb: str, place: str, text: str, words: list[str]) -> int:
     if isinstance(function, dict):
         return tyro.extras.subcommand_cli_from_dict(function, description=text, **how)
     if hasattr(module, "defaults"):
-        function = functools.partial(function, **module.defaults(words))
+        asked = [] if "--tyro-print-completion" in words else words
+        function = functools.partial(function, **module.defaults(asked))
     return tyro.cli(function, **how)
 
 

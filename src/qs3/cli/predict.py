@@ -16,6 +16,8 @@ def predict(
     csv: Path | None = None,
     json: Path | None = None,
     sort_into: Path | None = None,
+    unknown: float | None = None,
+    calibrated: bool = False,
 ) -> int:
     """Tell the class of each file and how confident the network is.
 
@@ -31,6 +33,10 @@ def predict(
             of text.
         sort_into: New folder that gets a folder a class with links to the files, to put right by
             hand and to train on.
+        unknown: Share of the objects of its own classes that the network may answer by "unknown",
+            such as 0.05: so it answers whatever is less familiar to it than this share of the
+            objects that were held out of its training, with the share that is more familiar.
+        calibrated: Tell the confidence that is calibrated on held-out source.
     """
     from qs3.files import write_text
     from qs3.store.progress import progress_bar
@@ -42,7 +48,8 @@ def predict(
         raise InputError(f"--top {top}: must be at least 1")
     paths = table.list_clouds(files)
     text = "predict" if len(paths) > 1 else None
-    bar = progress_bar(len(paths), text, "cloud", items=table.predict_files(run, paths))
+    said = table.predict_files(run, paths, unknown=unknown, calibrated=calibrated)
+    bar = progress_bar(len(paths), text, "cloud", items=said)
     answers: list[table.Answer] = [*bar]
     if json == Path("-"):
         show(table.answers_json(answers), end="")

@@ -4,7 +4,7 @@ import functools
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -17,6 +17,8 @@ from qs3.cli.text import show, tell
 from qs3.errors import InputError
 from qs3.evaluation.records import rename_method
 from qs3.io.clouds import CloudChoice
+from qs3.structure import structure, unstructure
+from qs3.toml_files import merged, read_toml, toml_lines
 from qs3.training.config import (
     PRESETS,
     PresetName,
@@ -24,6 +26,7 @@ from qs3.training.config import (
     TrainSettings,
     preparation_of,
 )
+from qs3.training.history import Tracker
 from qs3.training.run import is_run, train_settings
 from qs3.training.shipped import find_run
 
@@ -61,6 +64,9 @@ _METHOD = PrimitiveConstructorSpec(
 class Choices:
     """What settings of self-training are in force before any of them is given by itself."""
 
+    config: Path | None = None
+    """TOML file of these options and the settings below. Each run writes its own, run.toml, which
+    repeats it: --config runs/x/run.toml --out runs/y. What the command line has besides wins."""
     source: str | None = None
     """Labelled clouds: what qs3 generate made (also at an address such as s3://bucket/set), or any
     layout that qs3 convert --list tells. With --warm-up it may be left out: rounds of self-training
@@ -112,8 +118,12 @@ class TrainOptions(Choices):
     max_time: str | None = None
     """Time for this call, as hours, minutes and seconds: 00:30:00. It stops before an epoch that
     would end later, with exit code 3; the same command goes on."""
-    log: Literal["jsonl", "tensorboard"] = "jsonl"
-    """history.jsonl is always written; tensorboard adds event files in OUT/tensorboard."""
+    log: Tracker = "jsonl"
+    """history.jsonl is always written; tensorboard adds event files in OUT/tensorboard, wandb runs
+    of Weights & Biases in OUT/wandb, offline unless WANDB_MODE says otherwise."""
+    dry_run: bool = False
+    """Print what would be trained, and about how long it takes, by a step that is timed here; write
+    nothing. --out may be left out."""
     train: Flat[TrainSettings] = field(default_factory=TrainSettings)
     """How the network is trained."""
     self_training: SelfTrainingSettings = field(default_factory=SelfTrainingSettings)
@@ -133,7 +143,7 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
         >>> chosen.preset, chosen.self_training.weight_step
         ('spst', 0.005)
     """
-    chosen, _ = tyro.cli(Choices, args=list(words), return_unknown_args=True, add_help=False)
+    chosen, given = _choices(words)
     rule = chosen.rounds_rule or COMPOSED.get(chosen.method, ("", None))[1]
     preset = chosen.preset or ("spst" if rule == "spst" else "default")
     rounds = PRESETS[preset] if rule is None else replace(PRESETS[preset], rule=rule)
@@ -143,10 +153,62 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
     if alone := rule is not None and chosen.warm_up is not None and chosen.source is None:
         rounds = replace(rounds, source_loss=False)
     options = TrainOptions(out=Path(), preset=preset, train=how, self_training=rounds)
+    if chosen.config is not None:
+        options = structure(merged(unstructure(options), given), TrainOptions, chosen.config)
+        if options.self_training.rule != rounds.rule:
+            raise InputError(f"{chosen.config}: self_training.rule: name it by rounds_rule instead")
     # What must be given: tyro's marker for that is neither text nor path.
-    for name in ("out",) if alone else ("source", "out"):
+    needed = {"out": "--dry-run" not in words, "source": not alone and not options.source}
+    for name in (name for name, missing in needed.items() if missing):
         object.__setattr__(options, name, tyro.MISSING)
     return {"options": options}
+
+
+def _choices(words: Sequence[str]) -> tuple[Choices, dict[str, Any]]:
+    """Return what a command line chooses, and what its file gives for all else."""
+    ask = functools.partial(
+        tyro.cli, Choices, args=list(words), return_unknown_args=True, add_help=False
+    )
+    chosen, _ = ask()
+    if chosen.config is None:
+        return chosen, {}
+    given = _without_none(read_toml(chosen.config))
+    names = {part.name for part in fields(Choices)}
+    filed = structure({n: v for n, v in given.items() if n in names}, Choices, chosen.config)
+    chosen, _ = ask(default=replace(filed, config=chosen.config))
+    # Other rounds than the file's have defaults of their own.
+    if chosen.preset != filed.preset:
+        if isinstance(train := given.get("train"), dict):
+            train.pop("preparation", None)
+    elif (chosen.method, chosen.rounds_rule) != (filed.method, filed.rounds_rule):
+        chosen = replace(chosen, preset=None)
+    else:
+        return chosen, given
+    return chosen, {name: value for name, value in given.items() if name != "self_training"}
+
+
+def _without_none(value: Any) -> Any:
+    """Read ``"None"`` as the command line does: TOML has no word for it."""
+    if isinstance(value, dict):
+        return {name: _without_none(inner) for name, inner in value.items()}
+    return None if value == "None" else value
+
+
+def run_toml(options: TrainOptions) -> str:
+    """Return the options of a run as a file for ``--config``."""
+    not_its_own = {
+        "config",
+        "out",
+        "max_time",
+        "dry_run",
+        "model_set",
+        "method_set",
+        "self_training.rule",
+    }
+    head = (
+        "# qs3 train --config THIS_FILE --out FOLDER repeats the run. Paths are as they were given."
+    )
+    return "\n".join([head, "", *toml_lines(options, leave_out=not_its_own, none="None"), ""])
 
 
 def parse_settings(option: str, given: Sequence[str]) -> dict[str, Any]:
@@ -177,6 +239,7 @@ def train(options: Flat[TrainOptions]) -> int:
     from qs3.io import load_clouds, load_unlabelled
     from qs3.meshes.classes import POINTDA10, describe_renaming, read_class_map
     from qs3.training import Deadline, TimeUpError, fit, load_whole, parse_duration
+    from qs3.training.plan import describe_plan
     from qs3.training.rounds import all_skipped, remarks
 
     seconds = None if options.max_time is None else parse_duration(options.max_time)
@@ -205,19 +268,24 @@ def train(options: Flat[TrainOptions]) -> int:
     if options.target is not None:
         part = {"split": options.target_split, "cloud": options.target_cloud}
         target = load_whole(load_unlabelled, options.target, *how, **part)
+    rounds = None if rule is None else options.self_training
+    if options.dry_run:
+        show(*describe_plan(base, source, target, settings, rounds, options.warm_up is not None))
+        return 0
     try:
         result = fit(
             options.method,
             source,
             target,
             settings,
-            None if rule is None else options.self_training,
+            rounds,
             run_dir=options.out,
             warm_up=options.warm_up,
             preset=options.preset,
             supervised=options.supervised,
             deadline=Deadline(seconds, start),
-            tensorboard=options.log == "tensorboard",
+            tracker=options.log,
+            config=run_toml(replace(options, train=settings)),
         )
     except TimeUpError as stop:
         tell(f"qs3: {stop}")

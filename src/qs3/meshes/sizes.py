@@ -57,6 +57,21 @@ def class_ranges(class_name: str) -> tuple[tuple[float, float], tuple[float, flo
     return CLASS_SIZES[canonical(class_name)]
 
 
+def size_name(class_name: str, own_class: str = "") -> str:
+    """Return the class whose real size counts: its name, or its own where only that size is known.
+
+    Args:
+        class_name: Name of the class.
+        own_class: Name that it has in the collection, where it goes by another one.
+
+    Example:
+        >>> size_name("seat", "stool"), size_name("chair", "thing"), size_name("seat")
+        ('stool', 'chair', 'seat')
+    """
+    known = [canonical(name) in CLASS_SIZES for name in (class_name, own_class)]
+    return own_class if known == [False, True] else class_name
+
+
 def class_size(mesh: "trimesh.Trimesh", class_name: str, rng: np.random.Generator) -> float:
     """Draw a longest side in metres for a mesh of a class, uniform in the logarithm.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.meshes.classes import map_labels
-from qs3.meshes.sizes import class_ranges
+from qs3.meshes.sizes import class_ranges, size_name
 from qs3.store.executors import Failure, LocalExecutor
 from qs3.store.manifest import Manifest, package_versions
 from qs3.store.parts import Place
@@ -128,8 +128,8 @@ def make_plan(items: Sequence[Item], settings: GenerateSettings) -> Plan:
         )
     names = sorted({item.class_name for item in items})
     if settings.real_size == "class":
-        for name in names:
-            class_ranges(name)
+        for item in items:
+            class_ranges(size_name(item.class_name, getattr(item, "own_class", "")))
     map_labels(names, np.arange(len(names)), settings.classes)
     return Plan(items, settings)
 

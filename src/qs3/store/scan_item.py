@@ -172,11 +172,16 @@ def scan_item(
         InputError: where the mesh is unusable or the sensor sees nothing of it.
     """
     from qs3.meshes import sample_surface
+    from qs3.meshes.sizes import size_name
     from qs3.sensor.scan import scan
 
     seed = scan_seed(settings.seed, item.id, scan_index)
     beside = None if neighbour is None else neighbour.load()
-    classes = [one.class_name for one in (item, neighbour) if one is not None]
+    classes = [
+        size_name(one.class_name, getattr(one, "own_class", ""))
+        for one in (item, neighbour)
+        if one is not None
+    ]
     result = scan(item.load(), settings, seed=seed, neighbour=beside, class_names=classes)
     # The scan draws from children of `seed`; the key keeps this stream apart from them.
     surface_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0x50BF,)))

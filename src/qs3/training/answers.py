@@ -7,13 +7,14 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from qs3.adaptation.confidence import UNKNOWN, rescale
 from qs3.errors import InputError
 from qs3.files import json_bytes, new_folder
 from qs3.io.guards import utf8
 from qs3.io.layouts.point_folders import check_class
 from qs3.io.point_files import POINT_FILES, read_cloud
 from qs3.training.checkpoint import load_model
-from qs3.training.predict import predict_probabilities
+from qs3.training.predict import ask
 from qs3.training.prepared import note_size
 
 
@@ -27,10 +28,19 @@ class Answer:
     """Of every class, the likeliest first; empty where the file cannot be read."""
     fault: str = ""
     """Why it cannot be read."""
+    familiarity: float | None = None
+    """Share of held-out clouds of the source that are less familiar; None where not asked for."""
+    refused: bool = False
+    """Whether that is too little for any of the classes."""
 
     def best(self, count: int = 1) -> list[tuple[str, float]]:
-        """Return the likeliest classes and their probabilities."""
-        return list(self.probabilities.items())[:count]
+        """Return the likeliest classes and their probabilities.
+
+        Before them stands ``unknown`` where no class was answered, with the share of the held-out
+        clouds that are more familiar.
+        """
+        refused = [(UNKNOWN, 1 - (self.familiarity or 0.0))] if self.refused else []
+        return [*refused, *self.probabilities.items()][:count]
 
 
 def list_clouds(given: Sequence[Path]) -> list[Path]:
@@ -55,33 +65,50 @@ def list_clouds(given: Sequence[Path]) -> list[Path]:
     return list(dict.fromkeys(files))
 
 
-def predict_files(run: Path, files: Iterable[Path]) -> Iterator[Answer]:
+def predict_files(
+    run: Path, files: Iterable[Path], *, unknown: float | None = None, calibrated: bool = False
+) -> Iterator[Answer]:
     """Tell the class of each file, one after another; one that cannot be read has a fault.
 
     Args:
         run: Folder of a run, its model.safetensors, or the name of a network that comes with qs3.
         files: Files of points, z up.
+        unknown: Share of objects of the known classes that may be refused, by held-out source: what
+            is less familiar is answered by `UNKNOWN`. None always answers a class.
+        calibrated: Whether probabilities are those that held-out source calibrates.
 
     Raises:
-        InputError: where the run cannot be read.
+        InputError: where the run cannot be read, or does not hold what was asked for.
     """
     loaded = load_model(run)
+    known = loaded.require_known(run, unknown) if calibrated or unknown is not None else None
     for path in files:
         try:
             points = read_cloud(path)[None]
             note_size(points, loaded.preparation)
-            shares = predict_probabilities(loaded, points)[0].tolist()
+            said = ask(loaded, points)
         except InputError as error:
             text = str(error)
             yield Answer(path, fault=text if str(path) in text else f"{path}: {text}")
             continue
-        named = zip(loaded.class_names, shares, strict=True)
-        yield Answer(path, dict(sorted(named, key=lambda item: -item[1])))
+        shares, familiarity = said.probabilities, None
+        if known is not None:
+            shares = rescale(shares, known.temperature) if calibrated else shares
+            familiarity = float(known.familiarity(said.logits)[0])
+        named = zip(loaded.class_names, shares[0].tolist(), strict=True)
+        probabilities = dict(sorted(named, key=lambda item: -item[1]))
+        refused = familiarity is not None and familiarity < (unknown or 0)
+        yield Answer(path, probabilities, familiarity=familiarity, refused=refused)
 
 
 def answers_csv(answers: Iterable[Answer], top: int = 1) -> str:
-    """A table: file, class, confidence, the next of ``top`` classes, and the fault if any."""
+    """A table: file, class, confidence, the next of ``top`` classes, and the fault if any.
+
+    Where it was asked for, the familiarity too.
+    """
+    answers = list(answers)
     more = [f"{word}_{i}" for i in range(2, top + 1) for word in ("class", "confidence")]
+    more += ["familiarity"] if any(answer.familiarity is not None for answer in answers) else []
     buffer = io.StringIO()
     rows = csv.DictWriter(buffer, ["file", "class", "confidence", *more, "fault"])
     rows.writeheader()
@@ -90,6 +117,8 @@ def answers_csv(answers: Iterable[Answer], top: int = 1) -> str:
         for i, (name, share) in enumerate(answer.best(top), start=1):
             ending = "" if i == 1 else f"_{i}"
             row |= {f"class{ending}": name, f"confidence{ending}": f"{share:.6f}"}
+        if answer.familiarity is not None:
+            row["familiarity"] = f"{answer.familiarity:.6f}"
         rows.writerow(row)
     return buffer.getvalue()
 
@@ -101,6 +130,8 @@ def answers_json(answers: Iterable[Answer]) -> str:
         row: dict[str, object] = {"file": utf8(str(answer.file))}
         for name, share in answer.best():
             row |= {"class": name, "confidence": share, "probabilities": answer.probabilities}
+        if answer.familiarity is not None:
+            row["familiarity"] = answer.familiarity
         rows.append(row | ({"fault": answer.fault} if answer.fault else {}))
     return json_bytes(rows).decode()
 

@@ -12,11 +12,13 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
+from qs3.adaptation.confidence import UNKNOWN, Known
 from qs3.errors import InputError
 from qs3.files import parse_json, write_bytes
 from qs3.io.preparation import PAPER, Preparation
 from qs3.models import PointClassifier, create_model
 from qs3.models.aligned import Aligned
+from qs3.models.checks import check_range
 from qs3.models.sized import Sized
 from qs3.structure import structure, unstructure
 from qs3.training.config import TrainSettings
@@ -37,11 +39,32 @@ class LoadedModel(NamedTuple):
     """The content of ``settings.json``."""
     preparation: Preparation = PAPER
     """What is done to clouds before the network gets them."""
+    known: Known | None = None
+    """How it answers clouds of its classes that it was not trained on; None where no part of the
+    source was held out, and in runs of earlier releases."""
 
     @property
     def num_points(self) -> int | None:
         """Points a cloud; None where nothing tells."""
         return self.settings["train"].get("num_points")
+
+    def require_known(self, run: Path | str, share: float | None = None) -> Known:
+        """Return what held-out source tells of it, where a share of it may be refused.
+
+        Raises:
+            InputError: where there is none, the share is not in 0 to 1, or a class has the
+                name of what is no class.
+        """
+        if share is not None:
+            check_range("unknown", share, 0, 1)
+            if UNKNOWN in self.class_names:
+                raise InputError(f"{run}: has a class {UNKNOWN} itself; leave the share out")
+        if self.known is None:
+            raise InputError(
+                f"{run}: cannot tell what is unknown to it, nor calibrate: no part of the source "
+                "was held out of its training; train it anew with holdout above 0"
+            )
+        return self.known
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> None:
@@ -166,6 +189,7 @@ def save_model(
     settings: TrainSettings,
     *,
     name: str = MODEL,
+    known: Known | None = None,
     facts: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write the weights to ``model.safetensors`` in a run's folder.
@@ -178,6 +202,7 @@ def save_model(
         class_names: Names of the classes, in the order of the logits.
         settings: How it was trained.
         name: Another name for the file.
+        known: How the network answers held-out clouds of the source.
         facts: Written beside the network's own.
 
     Returns:
@@ -192,6 +217,7 @@ def save_model(
         "num_points": settings.num_points,
         "preparation": unstructure(settings.preparation),
     }
+    own |= {} if known is None else {"known": unstructure(known)}
     write_tensors(path, model.state_dict(), {**(facts or {}), **own})
     return path
 
@@ -220,6 +246,7 @@ def load_model(run_dir: Path) -> LoadedModel:
         class_names = tuple(str(name) for name in facts["class_names"])
         name, arguments = facts["model"], dict(facts["model_settings"])
         preparation = structure(facts.get("preparation", {}), Preparation, path)
+        known = structure(facts["known"], Known, path) if "known" in facts else None
         with torch.random.fork_rng(devices=[]):
             model = _make(name, len(class_names), arguments, preparation)
     except (KeyError, TypeError) as error:
@@ -231,7 +258,7 @@ def load_model(run_dir: Path) -> LoadedModel:
         kept = ("model", "model_settings", "num_points", "preparation")
         settings = {"train": {key: facts[key] for key in kept if key in facts}}
         structure(settings["train"], TrainSettings, path)  # refuses what is none
-    return LoadedModel(model.eval(), class_names, settings, preparation)
+    return LoadedModel(model.eval(), class_names, settings, preparation, known)
 
 
 def weights_fingerprint(model: PointClassifier) -> str:

@@ -13,12 +13,14 @@ import numpy as np
 from jaxtyping import Float
 from sklearn.base import BaseEstimator, ClassifierMixin
 
+from qs3.adaptation.confidence import UNKNOWN, rescale
 from qs3.adaptation.names import split_method
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.point_files import read_cloud
+from qs3.structure import unstructure
 from qs3.training.answers import list_clouds
-from qs3.training.checkpoint import load_model, save_model
+from qs3.training.checkpoint import LoadedModel, load_model, save_model
 from qs3.training.config import (
     PRESETS,
     SelfTrainingSettings,
@@ -27,7 +29,7 @@ from qs3.training.config import (
     preparation_of,
 )
 from qs3.training.fit import FitResult, fit
-from qs3.training.predict import predict_probabilities
+from qs3.training.predict import Description, ask
 from qs3.training.prepared import note_size
 
 _Adapter = TypeVar("_Adapter", bound="Adapter")
@@ -118,11 +120,12 @@ class Adapter(ClassifierMixin, BaseEstimator):
         method, rounds = self._plan()
         with tempfile.TemporaryDirectory(prefix="qs3-") as temporary:
             folder = Path(temporary) / "run" if self.run_dir is None else Path(self.run_dir)
-            self.result_ = fit(method, source, target, settings, rounds, run_dir=folder)
-        self.model_ = self.result_.model
+            done = fit(method, source, target, settings, rounds, run_dir=folder)
+        self.result_, self.model_ = done, done.model
         self.classes_ = np.array(source.class_names)
+        plain, names = {"train": unstructure(settings)}, source.class_names
+        self._loaded = LoadedModel(done.model, names, plain, settings.preparation, done.known)
         self._settings = settings
-        self._how = {"num_points": settings.num_points, "preparation": settings.preparation}
         return self
 
     def save(self, folder: str | Path) -> Path:
@@ -132,7 +135,8 @@ class Adapter(ClassifierMixin, BaseEstimator):
             InputError: before `fit`.
         """
         self._require_fitted()
-        return save_model(Path(folder), self.model_, tuple(self.classes_), self._settings)
+        names, known = tuple(self.classes_), self._loaded.known
+        return save_model(Path(folder), self.model_, names, self._settings, known=known)
 
     def _require_fitted(self) -> None:
         if not hasattr(self, "model_"):
@@ -143,12 +147,7 @@ class Adapter(ClassifierMixin, BaseEstimator):
         given = self.self_training
         return self.method, None if given is None else _rounds(given, split_method(self.method)[1])
 
-    def predict_proba(self, clouds: Clouds) -> Float[np.ndarray, "b k"]:
-        """Return class probabilities, in the order of ``classes_``; a row a cloud, of one too.
-
-        Raises:
-            InputError: before `fit`, or where a file cannot be read or a point is not finite.
-        """
+    def _ask(self, clouds: Clouds) -> Description:
         self._require_fitted()
         if isinstance(clouds, str | Path):
             clouds = [read_cloud(path) for path in list_clouds([Path(clouds)])]
@@ -158,18 +157,45 @@ class Adapter(ClassifierMixin, BaseEstimator):
         else:
             batches = [cloud[None] for cloud in points]
         for batch in batches:
-            note_size(batch, self._how["preparation"])
-        shares = [predict_probabilities(self.model_, batch, **self._how) for batch in batches]
-        return np.concatenate(shares)
+            note_size(batch, self._loaded.preparation)
+        said = [ask(self._loaded, batch) for batch in batches]
+        return Description(*map(np.concatenate, zip(*said, strict=True)))
 
-    def predict(self, clouds: Clouds) -> np.ndarray:
+    def predict_proba(
+        self, clouds: Clouds, *, calibrated: bool = False
+    ) -> Float[np.ndarray, "b k"]:
+        """Return class probabilities, in the order of ``classes_``; a row a cloud, of one too.
+
+        Args:
+            clouds: Clouds, as read.
+            calibrated: Whether they are those that held-out source calibrates.
+
+        Raises:
+            InputError: before `fit`, or where a file cannot be read or a point is not finite; where
+                they are to be calibrated and no part of the source was held out.
+        """
+        shares = self._ask(clouds).probabilities
+        if not calibrated:
+            return shares
+        return rescale(shares, self._loaded.require_known("this network").temperature)
+
+    def predict(self, clouds: Clouds, *, unknown: float | None = None) -> np.ndarray:
         """Return the name of the most probable class of each cloud.
+
+        Args:
+            clouds: Clouds, as read.
+            unknown: Share of objects of the known classes that may be refused, by held-out source:
+                what is less familiar is ``"unknown"``. None always answers a class.
 
         Raises:
             InputError: as `predict_proba`.
         """
-        probabilities = self.predict_proba(clouds)
-        return self.classes_[probabilities.argmax(axis=1)]
+        said = self._ask(clouds)
+        names = self.classes_[said.probabilities.argmax(axis=1)]
+        if unknown is None:
+            return names
+        known = self._loaded.require_known("this network", unknown)
+        return np.where(known.familiarity(said.logits) < unknown, UNKNOWN, names)
 
     def score(self, clouds: PointClouds, y: Sequence[str] | None = None) -> float:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return the accuracy on labelled clouds; for testing, never for choosing.
@@ -201,7 +227,7 @@ def load(run: str | Path) -> Adapter:
     train, method = loaded.settings["train"], loaded.settings.get("method", "source-only")
     adapter = Adapter(method, train["model"], random_state=train.get("seed", 0))
     adapter.model_, adapter.classes_ = loaded.model, np.array(loaded.class_names)
-    adapter._how = {"num_points": loaded.num_points, "preparation": loaded.preparation}
+    adapter._loaded = loaded
     adapter._settings = TrainSettings(
         model=train["model"],
         model_settings=train.get("model_settings", {}),

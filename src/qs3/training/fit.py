@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from qs3.adaptation import method_class
+from qs3.adaptation.confidence import Known
 from qs3.adaptation.names import split_method
 from qs3.errors import InputError
+from qs3.files import write_text
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.structure import first_difference, unstructure
@@ -18,7 +20,7 @@ from qs3.training.batches import require_unlabelled
 from qs3.training.checkpoint import load_model, weights_fingerprint
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
 from qs3.training.distributed import all_devices, make_fabric
-from qs3.training.history import EpochRecord, History
+from qs3.training.history import EpochRecord, History, Tracker
 from qs3.training.job import Job, fresh_model, make_method, run_job
 from qs3.training.loop import EpochCallback
 from qs3.training.overlap import seen_clouds
@@ -26,6 +28,7 @@ from qs3.training.prepared import Prepared, prepare_clouds, require_finite
 from qs3.training.progress import Deadline
 from qs3.training.rounds import RoundCallback, RoundRecord
 from qs3.training.run import (
+    CONFIG,
     RUN,
     Run,
     RunSettings,
@@ -41,7 +44,7 @@ from qs3.training.threads import choose_threads, threads, trial_step
 from qs3.training.validation import (
     ROUND,
     Checkpoint,
-    held_out_rows,
+    held_out,
     read_checkpoints,
     tell_choice,
 )
@@ -71,6 +74,8 @@ class FitResult:
     """The held-out part of the source; None where there is none."""
     target: Prepared[UnlabelledClouds] | None
     """The target."""
+    known: Known | None = None
+    """How the network answers the held-out part; None where there is none."""
 
 
 def fit(
@@ -85,7 +90,8 @@ def fit(
     preset: str | None = None,
     supervised: bool = False,
     deadline: Deadline | None = None,
-    tensorboard: bool = False,
+    tracker: Tracker = "jsonl",
+    config: str | None = None,
     on_epoch: EpochCallback | None = None,
     on_round: RoundCallback | None = None,
 ) -> FitResult:
@@ -113,7 +119,8 @@ def fit(
         supervised: Whether the source is the labelled training part of the target, for the record.
         deadline: Time for this call; it stops before an epoch that would end later, but never
             before its first.
-        tensorboard: Whether to write event files too, in ``tensorboard/``.
+        tracker: What is told of the epochs beside ``history.jsonl``.
+        config: Text of ``run.toml``, from which the command line repeats the run.
         on_epoch: Called after each epoch.
         on_round: Called after each round.
 
@@ -121,7 +128,7 @@ def fit(
         InputError: where arguments do not go together, points are not finite, or the folder holds
             another run.
         TimeUpError: where the time is up; the same call goes on.
-        MissingExtraError: where TensorBoard is asked for and absent.
+        MissingExtraError: where the tracker is absent.
         QS3Error: where a loss or a gradient is not finite, or the process of another device ended.
     """
     base, rounds_settings = _plan(method, self_training)
@@ -150,17 +157,18 @@ def fit(
         weights, unseen = _check_warm_up(warm_up, base, source, settings)
         before = read_run(warm_up) if (warm_up / RUN).is_file() else None
     run_dir = Path(run_dir)
-    scans, rows = np.unique(source.scan_rows(), return_inverse=True)
-    held = held_out_rows(source.labels[scans], settings)[rows]  # a scan's clouds stay together
+    held = held_out(source, settings)
     has_holdout = unseen and bool(held.any())
     _require_judges(settings, rounds_settings, target, has_holdout)
     # What cannot be made must not leave a folder behind that refuses the corrected call.
     model = fresh_model(base, settings, len(source.class_names))
     trial, device = make_method(base, model, settings), make_fabric(settings)
-    history = History(run_dir, tensorboard)
+    history = History(run_dir, tracker)
     wanted = RunSettings.of(method, source, target, settings, rounds_settings, weights)
     step = partial(trial_step, trial, len(source.class_names), settings, device)
     with claim_run(run_dir, wanted, partial(choose_threads, settings, step=step)) as claimed:
+        if config is not None:
+            write_text(run_dir / CONFIG, config)
         count = claimed.threads or 1
         settings = replace(settings, threads=count)
         how = settings.num_points, settings.preparation, run_dir
@@ -227,6 +235,7 @@ def fit(
         source=job.source,
         holdout=job.holdout,
         target=job.target,
+        known=load_model(run_dir).known,
     )
 
 
@@ -291,7 +300,7 @@ def _check_warm_up(
     folder: Path, base: str, source: PointClouds, settings: TrainSettings
 ) -> tuple[str, bool]:
     """Return the checksum of a warm-up's weights, and whether the held-out part is new to it."""
-    model, class_names, its, _ = load_model(folder)
+    model, class_names, its, *_ = load_model(folder)
     if class_names != source.class_names:
         raise InputError(
             f"{folder}: its classes ({', '.join(class_names)}) are not those of the source "

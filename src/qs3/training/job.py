@@ -17,6 +17,7 @@ from qs3.training.checkpoint import derived_seed, load_model, new_model, save_mo
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.history import EpochRecord, History
 from qs3.training.loop import EpochCallback, train
+from qs3.training.predict import describe_known
 from qs3.training.prepared import Prepared
 from qs3.training.progress import Deadline
 from qs3.training.rounds import RoundCallback, RoundRecord, Task
@@ -168,6 +169,11 @@ def _follow_rule(model: PointClassifier, stage: str, job: Job) -> None:
 
 
 def _save(folder: Path, model: PointClassifier, job: Job, fabric: Fabric) -> None:
+    known = None
+    if job.holdout is not None:
+        known = describe_known(
+            model, job.holdout, batch_size=job.settings.batch_size, fabric=fabric
+        )
     if fabric.is_global_zero:
-        save_model(folder, model, job.source.class_names, job.settings)
+        save_model(folder, model, job.source.class_names, job.settings, known=known)
     fabric.barrier()

@@ -7,7 +7,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from qs3.io.clouds import UnlabelledClouds, numbered
+from qs3.adaptation.confidence import Known, measure_known
+from qs3.io.clouds import PointClouds, UnlabelledClouds, numbered
 from qs3.io.preparation import PAPER, Preparation
 from qs3.models import PointClassifier
 from qs3.training.checkpoint import LoadedModel
@@ -24,6 +25,8 @@ class Description(NamedTuple):
     """Softmax in float64; rows sum to 1 to rounding."""
     features: Float[np.ndarray, "b c"]
     """Pooled features, float64."""
+    logits: Float[np.ndarray, "b k"]
+    """What the probabilities are the softmax of, float64."""
 
 
 def predict_probabilities(
@@ -60,13 +63,27 @@ def predict_probabilities(
         >>> predict_probabilities(create_model("pointnet", 4), points, num_points=16).shape
         (3, 4)
     """
+    how = {"num_points": num_points, "preparation": preparation}
+    return ask(model, points, **how, batch_size=batch_size, fabric=fabric).probabilities
+
+
+def ask(
+    model: PointClassifier | LoadedModel,
+    points: Float[np.ndarray, "b n 3"],
+    *,
+    num_points: int | None = None,
+    preparation: Preparation | None = None,
+    batch_size: int = 32,
+    fabric: Fabric | None = None,
+) -> Description:
+    """Return all that a network says of clouds as read; arguments are `predict_probabilities`'."""
     if isinstance(model, LoadedModel):
         num_points, preparation = num_points or model.num_points, preparation or model.preparation
         model = model.model
     clouds = UnlabelledClouds(points, numbered(len(points)))
     require_finite(points, [str(row) for row in range(len(points))])
     prepared = prepare_clouds(clouds, num_points or points.shape[1], preparation or PAPER)
-    return describe(model, prepared, batch_size=batch_size, fabric=fabric).probabilities
+    return describe(model, prepared, batch_size=batch_size, fabric=fabric)
 
 
 @torch.no_grad()
@@ -77,7 +94,7 @@ def describe(
     batch_size: int = 32,
     fabric: "Fabric | None" = None,
 ) -> Description:
-    """Return class probabilities and pooled features of clouds, without augmentation.
+    """Return class probabilities, pooled features and logits of clouds, without augmentation.
 
     Args:
         model: The network; its mode is put back afterwards, its device stays.
@@ -101,16 +118,39 @@ def describe(
             with context():
                 encoded = model.encode(batch.to(parameter.device, parameter.dtype))
                 logits = model.head(encoded)
-            parts = (torch.softmax(logits.double(), dim=1), encoded.pooled.double())
+            logits = logits.double()
+            parts = (torch.softmax(logits, dim=1), encoded.pooled.double(), logits)
             answers.append(torch.cat(parts, dim=1).cpu().numpy())
     finally:
         model.train(training)
-    rows = np.concatenate([np.zeros((0, classes + width)), *answers])
+    rows = np.concatenate([np.zeros((0, 2 * classes + width)), *answers])
     if fabric is not None:
         from qs3.training.distributed import gather_rows  # slow to load, and for devices alone
 
         rows = gather_rows(rows, mine, len(points), fabric)
-    return Description(rows[:, :classes], rows[:, classes:])
+    return Description(*np.split(rows, [classes, classes + width], axis=1))
+
+
+def describe_known(
+    model: PointClassifier,
+    holdout: Prepared[PointClouds],
+    *,
+    batch_size: int = 32,
+    fabric: Fabric | None = None,
+) -> Known:
+    """Return how a network answers labelled clouds of the source that it was not trained on.
+
+    Args:
+        model: The network.
+        holdout: The clouds, prepared.
+        batch_size: Clouds in a forward pass.
+        fabric: As in `predict_probabilities`.
+
+    Raises:
+        InputError: where there is no cloud.
+    """
+    said = describe(model, holdout, batch_size=batch_size, fabric=fabric)
+    return measure_known(said.logits, holdout.labels)
 
 
 def _part(count: int, fabric: "Fabric | None") -> slice:

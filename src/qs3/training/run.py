@@ -19,6 +19,7 @@ from qs3.training.shipped import find_run, not_a_run
 
 RUN = "run.json"
 SETTINGS = "settings.json"
+CONFIG = "run.toml"
 MODEL = "model.safetensors"
 SCHEMA_VERSION = 2
 

@@ -250,6 +250,12 @@ def load_checkpoint(run_dir: Path, checkpoint: Checkpoint, model: PointClassifie
     load_tensors_into(model, read_tensors(path)[0], path)
 
 
+def held_out(source: PointClouds, settings: TrainSettings) -> Bool[np.ndarray, "b"]:
+    """Tell which clouds of the source are kept for the validators; a scan's stay together."""
+    scans, rows = np.unique(source.scan_rows(), return_inverse=True)
+    return held_out_rows(source.labels[scans], settings)[rows]
+
+
 def held_out_rows(labels: Int[np.ndarray, "b"], settings: TrainSettings) -> Bool[np.ndarray, "b"]:
     """Tell which clouds of the source are kept for the validators, by the seed alone.
 

@@ -67,6 +67,25 @@ def test_the_release_is_read(released):
     np.testing.assert_array_equal(test.points, expected[8:])
 
 
+def test_one_file_is_read_alone(released):
+    root, _, labels = released
+    whole = read_modelnet_h5(root)
+    file = root / "ply_data_train1.h5"
+    assert detect(file).name == "modelnet40-h5"
+    clouds = read_modelnet_h5(file)
+    np.testing.assert_array_equal(clouds.clouds, whole.clouds[4:8])
+    np.testing.assert_array_equal(clouds.labels, labels[4:8])
+    assert (clouds.class_names, set(clouds.splits)) == (CLASSES, {"train"})
+    assert len(load_clouds(file, split="train")) == 4
+    with refused("has no split 'test'"):
+        read_modelnet_h5(file, "test")
+    (root / "shape_names.txt").write_text("".join(f"thing {i}\n" for i in range(40)))
+    assert read_modelnet_h5(file).class_names[0] == "thing 0"
+    file.rename(root / "other.h5")
+    with refused("looks like no layout"):
+        detect(root / "other.h5")
+
+
 def test_the_forty_names_are_alphabetical_as_published():
     assert len(CLASSES) == 40
     assert list(CLASSES) == sorted(CLASSES)

@@ -20,6 +20,7 @@ Source: Wu et al., "3D ShapeNets", CVPR 2015; Qi et al., "PointNet", CVPR 2017
 
 import hashlib
 import os
+import re
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -29,7 +30,13 @@ from jaxtyping import Float32
 
 from qs3.errors import InputError
 from qs3.files import write_text
-from qs3.io.layouts.class_folders import choose_split, entries, list_folder, read_files
+from qs3.io.layouts.class_folders import (
+    CloudFile,
+    choose_split,
+    entries,
+    list_folder,
+    read_files,
+)
 from qs3.io.layouts.format import POINTS, SPLITS, Format, labels_as
 from qs3.io.layouts.hdf5_sets import list_parts, named, read_parts, text_lines, write_parts
 from qs3.io.ragged import RaggedClouds
@@ -47,9 +54,16 @@ _PAGE = "http://modelnet.cs.princeton.edu/ModelNet40.zip"
 
 
 def read_modelnet_h5(path: Path, split: str | None = None) -> RaggedClouds:
-    """Read the folder of .h5 files; without ``shape_names.txt`` the names are ModelNet40's."""
-    parts = list_parts(path, _FILES, "ply_data_train<i>.h5 or ply_data_test<i>.h5", split)
-    listed = path / _NAMES
+    """Read the folder of .h5 files, or one of them.
+
+    Without ``shape_names.txt`` beside them the names are ModelNet40's.
+    """
+    if match := _one_file(path):
+        parts = choose_split(path, [CloudFile(path, "", match[1])], split)
+        listed = path.parent / _NAMES
+    else:
+        parts = list_parts(path, _FILES, "ply_data_train<i>.h5 or ply_data_test<i>.h5", split)
+        listed = path / _NAMES
     if listed.is_file():
         names = text_lines(listed)
         if not 0 < len(set(names)) == len(names):
@@ -77,6 +91,10 @@ def write_modelnet_h5(path: Path, clouds: RaggedClouds) -> None:
     write_text(path / _NAMES, "".join(f"{name}\n" for name in names))
     files = ("ply_data_train{}.h5", "ply_data_test{}.h5")
     write_parts(path, clouds, labels, files, listed=_LISTED)
+
+
+def _one_file(path: Path) -> re.Match[str] | None:
+    return re.fullmatch(_FILES, path.name) if path.is_file() else None
 
 
 def _names(class_names: Sequence[str]) -> Sequence[str]:
@@ -149,7 +167,7 @@ FORMATS = (
     Format(
         name="modelnet40-h5",
         layout="ModelNet as HDF5: ply_data_<train|test>*.h5 with data and label, shape_names.txt",
-        detect=lambda path: named(path, _FILES),
+        detect=lambda path: named(path, _FILES) or _one_file(path) is not None,
         read=read_modelnet_h5,
         write=write_modelnet_h5,
         page=_PAGE,

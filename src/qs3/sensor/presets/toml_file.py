@@ -6,26 +6,17 @@ Convention:
     file's folder. A whole number stands for a number with a point, not the other way round.
 """
 
-import ast
-import dataclasses
 import difflib
 import functools
-import inspect
-import itertools
-import json
 import logging
-import math
-import tomllib
-from collections.abc import Mapping
 from pathlib import Path
-from textwrap import wrap
 from typing import Any
 
 from qs3.errors import InputError
 from qs3.sensor.presets.settings import Sensor, changed
 from qs3.structure import structure, unstructure
+from qs3.toml_files import merged, read_toml, toml_lines
 
-_WIDTH = 96
 _FORMER = {"qs3": "paper"}
 """Sensors that had another name in version 0.1."""
 _log = logging.getLogger(__name__)
@@ -109,21 +100,13 @@ def sensor_toml(sensor: Sensor) -> str:
     """
     head = "A sensor of qs3. Change what you like, give it a name of its own, and use it with"
     lines = [f"# {head}", "# --sensor THIS_FILE.toml. Unknown keys are errors.", ""]
-    lines += _lines(sensor, "")
+    lines += toml_lines(sensor)
     return "\n".join(lines) + "\n"
 
 
 def _read(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise InputError(
-            f"{path}: no such file; name a TOML file or one of {', '.join(SENSORS)} "
-            "(qs3 sensors show d435 > my_camera.toml makes one)"
-        )
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"), parse_float=_finite)
-    except (ValueError, RecursionError) as error:  # broken TOML, or not UTF-8
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: not a TOML file: {reason}") from None
+    hint = f"name a TOML file or one of {', '.join(SENSORS)} "
+    return read_toml(path, f"{hint}(qs3 sensors show d435 > my_camera.toml makes one)")
 
 
 def _sensor(table: dict[str, Any], name: str, path: Path) -> Sensor:
@@ -139,64 +122,7 @@ def _sensor(table: dict[str, Any], name: str, path: Path) -> Sensor:
         whole |= {"name": name, "description": f"after {sensor_name(base)}"}
     elif isinstance(table["name"], str):
         table["name"] = sensor_name(table["name"])
-    return structure(_merged(whole, table), Sensor, path)
-
-
-def _finite(text: str) -> float:
-    if not math.isfinite(number := float(text)):
-        raise ValueError(f"{text} is not a finite number")
-    return number
-
-
-def _merged(whole: Mapping[str, Any], table: Mapping[str, Any]) -> dict[str, Any]:
-    """What a file gives over what it leaves out, table by table."""
-    merged = {**whole, **table}
-    for key in whole.keys() & table.keys():
-        if isinstance(whole[key], dict) and isinstance(table[key], dict):
-            merged[key] = _merged(whole[key], table[key])
-    return merged
-
-
-def _lines(settings: Any, name: str) -> list[str]:
-    """One table: its own values, then the tables within."""
-    comments = _field_docstrings(type(settings))
-    lines, tables = [], []
-    for part in dataclasses.fields(settings):
-        value, inner = getattr(settings, part.name), f"{name}.{part.name}".lstrip(".")
-        comment = [f"# {line}" for line in wrap(comments.get(part.name, ""), _WIDTH)]
-        if dataclasses.is_dataclass(value):
-            tables += ["", *comment, f"[{inner}]", *_lines(value, inner)]
-        elif value is None:
-            lines += [*comment, f'# {part.name} = ""']
-        else:
-            lines += [*comment, f"{part.name} = {_written(value)}"]
-    return lines + tables
-
-
-def _written(value: Any) -> str:
-    if isinstance(value, str):
-        # JSON's escapes are TOML's, but for the one control character that JSON lets through.
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007F")
-    if isinstance(value, tuple):
-        return f"[{', '.join(_written(item) for item in value)}]"
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    return repr(value)
-
-
-def _field_docstrings(cls: type) -> dict[str, str]:
-    """The text under each field of a class; empty where its source is not at hand."""
-    try:
-        body = ast.parse(inspect.getsource(cls)).body[0]
-    except (OSError, TypeError, SyntaxError):
-        return {}
-    docstrings: dict[str, str] = {}
-    statements = body.body if isinstance(body, ast.ClassDef) else []
-    for field, text in itertools.pairwise(statements):
-        match field, text:
-            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(ast.Constant(str(words))):
-                docstrings[name] = " ".join(words.replace("``", "").split())
-    return docstrings
+    return structure(merged(whole, table), Sensor, path)
 
 
 _CAMERAS = Path(__file__).with_name("cameras.toml")

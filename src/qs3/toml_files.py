@@ -1,0 +1,112 @@
+"""TOML files of settings: read, laid over defaults, written with what each setting means."""
+
+import ast
+import dataclasses
+import inspect
+import itertools
+import json
+import math
+import tomllib
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from textwrap import wrap
+from typing import Any
+
+from qs3.errors import InputError
+
+_WIDTH = 96
+
+
+def read_toml(path: Path, hint: str = "name a TOML file") -> dict[str, Any]:
+    """Read a TOML file whose numbers are finite.
+
+    Raises:
+        InputError: where it cannot be read or is no TOML; ``hint`` ends what is told of a missing
+            one.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; {hint}")
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"), parse_float=_finite)
+    except (ValueError, RecursionError) as error:  # broken TOML, or not UTF-8
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path}: not a TOML file: {reason}") from None
+
+
+def _finite(text: str) -> float:
+    if not math.isfinite(number := float(text)):
+        raise ValueError(f"{text} is not a finite number")
+    return number
+
+
+def merged(whole: Mapping[str, Any], table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a file gives over what it leaves out, table by table.
+
+    Example:
+        >>> merged({"a": 1, "b": {"c": 2, "d": 3}}, {"b": {"c": 4}})
+        {'a': 1, 'b': {'c': 4, 'd': 3}}
+    """
+    both = {**whole, **table}
+    for key in whole.keys() & table.keys():
+        if isinstance(whole[key], dict) and isinstance(table[key], dict):
+            both[key] = merged(whole[key], table[key])
+    return both
+
+
+def toml_lines(
+    settings: Any, name: str = "", leave_out: Collection[str] = (), none: str | None = None
+) -> list[str]:
+    """Return settings as TOML, each below what its docstring says: own values, then inner tables.
+
+    Args:
+        settings: A dataclass.
+        name: Its table; empty at the top.
+        leave_out: Dotted names of what is not written.
+        none: How a setting that is None is written, for which TOML has no word; as a comment where
+            this is None.
+    """
+    comments = _field_docstrings(type(settings))
+    lines, tables = [], []
+    for part in dataclasses.fields(settings):
+        value, inner = getattr(settings, part.name), f"{name}.{part.name}".lstrip(".")
+        if inner in leave_out:
+            continue
+        comment = [f"# {line}" for line in wrap(comments.get(part.name, ""), _WIDTH)]
+        if dataclasses.is_dataclass(value):
+            within = toml_lines(value, inner, leave_out, none)
+            tables += ["", *comment, f"[{inner}]", *within]
+        elif value is None and none is None:
+            lines += [*comment, f'# {part.name} = ""']
+        else:
+            lines += [*comment, f"{part.name} = {_written(none if value is None else value)}"]
+    return lines + tables
+
+
+def _written(value: Any) -> str:
+    if isinstance(value, str | Path):
+        # JSON's escapes are TOML's, but for the one control character that JSON lets through.
+        return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007F")
+    if isinstance(value, Mapping):
+        pairs = (f"{_written(str(key))} = {_written(item)}" for key, item in value.items())
+        return f"{{{', '.join(pairs)}}}"
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(_written(item) for item in value)}]"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return repr(value)
+
+
+def _field_docstrings(cls: type) -> dict[str, str]:
+    """The text under each field of a class and its bases; empty where its source is not at hand."""
+    docstrings: dict[str, str] = {}
+    for kind in reversed(cls.__mro__):
+        try:
+            body = ast.parse(inspect.getsource(kind)).body[0]
+        except (OSError, TypeError, SyntaxError):
+            continue
+        statements = body.body if isinstance(body, ast.ClassDef) else []
+        for field, text in itertools.pairwise(statements):
+            match field, text:
+                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(ast.Constant(str(words))):
+                    docstrings[name] = " ".join(words.replace("``", "").split())
+    return docstrings
