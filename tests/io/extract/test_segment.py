@@ -10,7 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from qs3.errors import InputError
 from qs3.io.extract.plane import fit_plane
-from qs3.io.extract.segment import SegmentSettings, read_scene, segment, segment_scene
+from qs3.io.extract.segment import (
+    SceneSettings,
+    SegmentSettings,
+    read_scene,
+    segment,
+    segment_scene,
+)
 from qs3.io.point_files import read_cloud
 
 from ..hostile import refused
@@ -173,7 +179,7 @@ def test_a_depth_image_of_a_table_seen_from_above(tmp_path):
     depth = np.zeros(len(u), np.uint16)
     depth[ray] = np.rint((hit - eye) @ rotation[:, 2] * 1000)
     (tmp_path / "d.png").write_bytes(cv2.imencode(".png", depth.reshape(360, 480))[1].tobytes())
-    settings = SegmentSettings(intrinsics="500,500,239.5,179.5", tilt=60.0)
+    settings = SceneSettings(intrinsics="500,500,239.5,179.5", tilt=60.0)
     objects = segment_scene(tmp_path / "d.png", tmp_path / "o", settings)
     assert len(objects) == 3
     # The camera sees tops and near sides: heights are whole, tops tell the level sides.

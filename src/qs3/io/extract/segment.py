@@ -20,7 +20,7 @@ from qs3.errors import InputError
 from qs3.files import new_folder, write_bytes
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.io.extract.depth_images import read_depth
-from qs3.io.extract.intrinsics import read_intrinsics
+from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
 from qs3.io.extract.plane import Plane, fit_plane
 from qs3.io.guards import load_npy, open_zip, read_member
 from qs3.io.point_files import cloud_bytes, read_cloud
@@ -35,12 +35,6 @@ _CORE = 5  # voxels around one that make it part of a cluster
 class SegmentSettings:
     """How a scene is cut into objects."""
 
-    intrinsics: str = ""
-    """Of a depth image: fx,fy,cx,cy; a JSON file of a camera; or a text file of 3×3 numbers.
-    Without it the scene is a cloud in metres."""
-    depth_scale: float | None = None
-    """Metres a step of a depth image; None takes the camera's, else 0.001 for whole numbers and 1
-    for others."""
     far: float = math.inf
     """Depths of a depth image at or above are dropped, metres."""
     gravity: tuple[float, float, float] | None = None
@@ -70,6 +64,18 @@ class SegmentSettings:
         upright(self.gravity or (0.0, 1.0, 0.0))
 
 
+@dataclass(frozen=True)
+class SceneSettings(SegmentSettings):
+    """How the scene of a file is read and cut into objects."""
+
+    intrinsics: str = ""
+    """Of a depth image: fx,fy,cx,cy; a JSON file of a camera; or a text file of 3×3
+    numbers; or the folder that has one. Without it the scene is a cloud in metres."""
+    depth_scale: float | None = None
+    """Metres a step of a depth image; None takes the camera's, else 0.001 for whole numbers and 1
+    for others."""
+
+
 @dataclass(frozen=True, eq=False)
 class SegmentedObject:
     """One object of a scene. z is up and 0 on the plane; x and y are the scene's, made level."""
@@ -87,7 +93,7 @@ class SegmentedObject:
 def segment_scene(
     scene: Path,
     out: Path,
-    settings: SegmentSettings = SegmentSettings(),
+    settings: SceneSettings = SceneSettings(),
 ) -> list[SegmentedObject]:
     """Cut a scene into a new folder: ``object_000.ply`` and so on, largest first, and a table.
 
@@ -121,16 +127,14 @@ def segment_scene(
     return objects
 
 
-def read_scene(path: Path, settings: SegmentSettings) -> Float[np.ndarray, "n 3"]:
+def read_scene(path: Path, settings: SceneSettings) -> Float[np.ndarray, "n 3"]:
     """Read a scene: metres, turned so that z is against gravity as far as that is known."""
     if settings.intrinsics:
         camera = read_intrinsics(settings.intrinsics)
         scale = camera.depth_scale if settings.depth_scale is None else settings.depth_scale
         depth = read_depth(path, scale)
         camera.check_size(depth.shape, str(path))
-        keep = keep_pixels(depth, np.ones(depth.shape, dtype=bool), CutSettings(far=settings.far))
-        points = as_cloud(lift(depth, keep, camera), str(path)).astype(np.float64)
-        return turn(upright(settings.gravity or (0.0, 1.0, 0.0)), points)
+        return lift_scene(depth, camera, settings, str(path))
     if path.suffix.lower() == ".npz":
         with open_zip(path) as archive:
             content = read_member(archive, "points.npy")
@@ -145,12 +149,21 @@ def read_scene(path: Path, settings: SegmentSettings) -> Float[np.ndarray, "n 3"
     return points if settings.gravity is None else turn(upright(settings.gravity), points)
 
 
+def lift_scene(
+    depth: Float32[np.ndarray, "h w"], camera: Intrinsics, settings: SegmentSettings, where: str
+) -> Float[np.ndarray, "n 3"]:
+    """Lift a depth image to a scene, z against gravity; a fault names ``where``."""
+    keep = keep_pixels(depth, np.ones(depth.shape, dtype=bool), CutSettings(far=settings.far))
+    points = as_cloud(lift(depth, keep, camera), where).astype(np.float64)
+    return turn(upright(settings.gravity or (0.0, 1.0, 0.0)), points)
+
+
 def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list[SegmentedObject]:
     """Cut a scene into the objects that stand on its largest level plane, by points.
 
     Args:
         points: The scene in metres, z up to ``tilt`` degrees.
-        settings: How it is cut; those of files are not looked at.
+        settings: How it is cut.
 
     Raises:
         InputError: where no plane holds a tenth of the points, or nothing stands on it.
