@@ -16,7 +16,7 @@ from qs3.io.extract.segment import SegmentSettings
 def watch(
     run: Annotated[Path, tyro.conf.Positional],
     camera: Flat[CameraSettings],
-    settings: Flat[SegmentSettings] = SegmentSettings(),  # noqa: B008
+    settings: Flat[SegmentSettings] = SegmentSettings(stride=2),  # noqa: B008
     json_lines: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
     """Tell what stands on the table or floor before a depth camera, frame by frame, until Ctrl-C.

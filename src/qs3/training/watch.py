@@ -13,6 +13,9 @@ from qs3.io.preparation import LARGEST, stack
 from qs3.training.checkpoint import LoadedModel, load_model
 from qs3.training.predict import predict_probabilities
 
+_DENSER = 4
+"""Of an object so many times the points of the network count; strays take longer in more."""
+
 STAGES = ("read", "segment", "predict")
 
 
@@ -58,7 +61,7 @@ def watch(
     Raises:
         InputError: where the run or the camera cannot be read.
     """
-    loaded = load_model(run)
+    loaded = load_model(Path(run))
     with closing(camera):
         while True:
             begin = time.perf_counter()
@@ -86,7 +89,8 @@ def predict_objects(
     """Tell the class of each object of a frame, all in one pass."""
     if not items:
         return ()
-    clouds = stack([item.points for item in items], None, "frame", LARGEST)
+    most = min(LARGEST, _DENSER * (loaded.num_points or LARGEST))
+    clouds = stack([item.points for item in items], None, "frame", most)
     shares = predict_probabilities(loaded, clouds).tolist()
     names = loaded.class_names
     return tuple(

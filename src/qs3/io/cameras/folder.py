@@ -34,6 +34,8 @@ def folder_camera(folder: Path, intrinsics: str = "", colour: bool = True) -> Ca
     Raises:
         InputError: where there is no depth image or no camera, or a file is damaged.
     """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder")
     images = list_images(folder / DEPTH if (folder / DEPTH).is_dir() else folder)
     if not images:
         raise InputError(f"{folder}: no depth image in it or in its folder {DEPTH}")

@@ -1,6 +1,9 @@
 """RealSense cameras and their recordings, by librealsense (extra ``realsense``)."""
 
+import dataclasses
+import functools
 import logging
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -33,15 +36,18 @@ def realsense_camera(serial: str = "", file: Path | None = None, colour: bool = 
         MissingExtraError: where pyrealsense2 is not installed.
     """
     try:
-        import pyrealsense2 as rs  # pyright: ignore[reportMissingImports]
+        import pyrealsense2
     except ImportError:
         raise MissingExtraError("pyrealsense2", "realsense") from None
+    rs: Any = pyrealsense2  # its names are made as it is loaded
     where = str(file or f"realsense {serial}".strip())
     if file is not None and not file.is_file():
         raise InputError(f"{file}: no such file")
     pipeline = rs.pipeline()
     try:
         profile = pipeline.start(_config(rs, pipeline, serial, file, colour))
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
     except RuntimeError as error:
         raise InputError(f"{where}: librealsense cannot open it ({reason(error)})") from error
     try:
@@ -59,6 +65,10 @@ def _config(rs: Any, pipeline: Any, serial: str, file: Path | None, colour: bool
         device = config.resolve(rs.pipeline_wrapper(pipeline)).get_device()
         device.as_playback().set_real_time(False)
         return config
+    devices = rs.context().query_devices()
+    there = [device.get_info(rs.camera_info.serial_number) for device in devices]
+    if not there or (serial and serial not in there):
+        raise InputError(f"is not connected; connected are: {', '.join(there) or 'none'}")
     if serial:
         config.enable_device(serial)
     config.enable_stream(rs.stream.depth)
@@ -70,36 +80,70 @@ def _config(rs: Any, pipeline: Any, serial: str, file: Path | None, colour: bool
 
 
 def _frames(rs: Any, pipeline: Any, profile: Any, where: str, colour: bool) -> Camera:
-    device = profile.get_device()
-    playback = device.as_playback() if device.is_playback() else None
+    """Depth frames, each once, with the colour of the same moment.
+
+    Where depth comes first, librealsense gives it twice: with the colour before, then with its own.
+    """
     align, number, before = rs.align(rs.stream.depth), 0, -1
+    held: DepthFrame | None = None
+    for frames in _framesets(rs, pipeline, profile.get_device(), where):
+        depth = frames.get_depth_frame()
+        fresh = bool(depth) and depth.get_frame_number() != before
+        if held is not None and fresh:
+            yield held
+            held = None
+        if not depth or not (fresh or held is not None):
+            continue
+        if fresh:
+            before, number = depth.get_frame_number(), number + 1
+        frame = _depth_frame(depth, f"{number - 1:06d}")
+        picture = frames.get_color_frame() if colour else None
+        if picture and not _together(depth, picture):
+            held = frame
+            continue
+        seen = _colour(rs, align.process(frames).get_color_frame()) if picture else None
+        held = None
+        yield dataclasses.replace(frame, colour=seen)
+    if held is not None:
+        yield held
+
+
+def _framesets(rs: Any, pipeline: Any, device: Any, where: str) -> Iterator[Any]:
+    """What comes from a camera, or from a recording until it ends."""
+    playback = device.as_playback() if device.is_playback() else None
     while True:
         arrived, frames = pipeline.try_wait_for_frames(_PATIENCE if playback is None else 200)
-        if not arrived:
-            if playback is None:
-                raise InputError(f"{where}: no frame in {_PATIENCE / 1000:g} s; check its cable")
-            if playback.current_status() == rs.playback_status.stopped:
-                return
-            continue
-        depth = frames.get_depth_frame()
-        # Streams of several rates repeat the frames of the slower ones.
-        if not depth or depth.get_frame_number() == before:
-            continue
-        before = depth.get_frame_number()
-        picture = None
-        if colour and frames.get_color_frame():
-            picture = _colour(rs, align.process(frames).get_color_frame())
-        lens = depth.profile.as_video_stream_profile().intrinsics
-        if not number and any(lens.coeffs):
-            _LOG.warning("%s: its depth has lens distortion, which is not undone", where)
-        step = float(f"{depth.get_units():.6g}")  # kept in single precision
-        camera = Intrinsics(
-            lens.fx, lens.fy, lens.ppx, lens.ppy, lens.width, lens.height, depth_scale=step
-        )
-        raw = np.asanyarray(depth.get_data())
-        time = depth.get_timestamp() / 1000
-        yield DepthFrame(to_metres(raw, step), camera, f"{number:06d}", time, picture)
-        number += 1
+        if arrived:
+            yield frames
+        elif playback is None:
+            raise InputError(f"{where}: no frame in {_PATIENCE / 1000:g} s; check its cable")
+        elif playback.current_status() == rs.playback_status.stopped:
+            return
+
+
+def _depth_frame(depth: Any, name: str) -> DepthFrame:
+    lens = depth.profile.as_video_stream_profile().intrinsics
+    if any(lens.coeffs):
+        _tell_distortion()
+    step = float(f"{depth.get_units():.6g}")  # kept in single precision
+    camera = Intrinsics(
+        lens.fx, lens.fy, lens.ppx, lens.ppy, lens.width, lens.height, depth_scale=step
+    )
+    metres = to_metres(np.asanyarray(depth.get_data()), step)
+    return DepthFrame(metres, camera, name, depth.get_timestamp() / 1000)
+
+
+@functools.cache
+def _tell_distortion() -> None:
+    _LOG.warning("the depth of this camera has lens distortion, which is not undone")
+
+
+def _together(depth: Any, colour: Any) -> bool:
+    """Whether both are of one moment, as far as one clock tells."""
+    if depth.get_frame_timestamp_domain() != colour.get_frame_timestamp_domain():
+        return True
+    slower = min(depth.profile.fps(), colour.profile.fps())
+    return abs(depth.get_timestamp() - colour.get_timestamp()) < 750 / slower
 
 
 def _colour(rs: Any, frame: Any) -> UInt8[np.ndarray, "h w 3"] | None:
