@@ -99,12 +99,15 @@ def _messages(store, frame, encoding, change, lens, big, padding, stamp):
     return image, info
 
 
-def _fill(writer, store, pack, frames, encoding, topics, info, change, lens, big, padding):
+def _fill(
+    writer, store, pack, frames, encoding, topics, info, change, lens, big, padding, brings=None
+):
     packed = encoding == "compressedDepth"
     kind = "sensor_msgs/msg/CompressedImage" if packed else "sensor_msgs/msg/Image"
     for topic in topics:
         ending = "/compressedDepth" if packed else ""
-        ways = [writer.add_connection(topic + ending, kind, typestore=store)]
+        how = {"msgdef": brings, "md5sum": "0" * 32} if brings else {"typestore": store}
+        ways = [writer.add_connection(topic + ending, kind, **how)]
         if info:
             beside = f"{topic.rpartition('/')[0]}/camera_info"
             kind_of_info = "sensor_msgs/msg/CameraInfo"
@@ -117,7 +120,7 @@ def _fill(writer, store, pack, frames, encoding, topics, info, change, lens, big
 
 
 def write_ros1(path, frames, encoding, kind, name=_TOPIC, info=True, lens=(0.0,) * 5, big=False,
-               padding=0, **change):  # fmt: skip
+               padding=0, brings=None, **change):  # fmt: skip
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -130,7 +133,7 @@ def write_ros1(path, frames, encoding, kind, name=_TOPIC, info=True, lens=(0.0,)
         writer.compressor = lambda data: _bomb()
     with writer:
         _fill(writer, store, store.serialize_ros1, frames, encoding, (name,), info, change, lens,
-              big, padding)  # fmt: skip
+              big, padding, brings)  # fmt: skip
     return path
 
 

@@ -194,6 +194,13 @@ def test_convention_ros_rows_are_padded_big_endian_and_rectified(tmp_path, caplo
     assert not caplog.text
 
 
+def test_definitions_that_a_bag_brings_are_not_looked_at(tmp_path):
+    shots = list(frames(1, 64, 48))
+    for brings in ("import os", "uint8[] data\n", "string encoding=__import__('os')\n"):
+        path = write_ros1(tmp_path / str(len(brings)), shots, "16UC1", "ros1", brings=brings)
+        same(read(f"rosbag:{path}")[0], shots[0], colour=False)
+
+
 def test_topics_are_found_or_asked_for(tmp_path):
     shots = list(frames(1, 64, 48))
     two = write_ros2(tmp_path / "two", shots, "16UC1", "db3", topics=("/a/depth", "/b/depth"))
