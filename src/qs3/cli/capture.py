@@ -12,7 +12,7 @@ from qs3.io.extract.depth_images import list_images
 
 
 def capture(settings: Flat[CameraSettings], out: Path) -> int:
-    """Write the frames of a depth camera as files, until it ends or Ctrl-C.
+    """Write the frames of a depth camera, live or recorded, as files, until Ctrl-C or its end.
 
     Args:
         settings: Which camera, and which of its frames.

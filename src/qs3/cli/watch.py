@@ -19,7 +19,7 @@ def watch(
     settings: Flat[SegmentSettings] = SegmentSettings(stride=2),  # noqa: B008
     json_lines: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
-    """Tell what stands on the table or floor before a depth camera, frame by frame, until Ctrl-C.
+    """Tell what stands before a depth camera, frame by frame, until Ctrl-C or its end.
 
     Args:
         run: Folder of a run, its model.safetensors, or a network that comes with qs3: rooms.

@@ -120,7 +120,8 @@ def plain(frame: SeenFrame) -> dict[str, Any]:
 
 def rate(frames: Sequence[SeenFrame]) -> str:
     """A line: how many frames a second, and the mean time of each stage."""
-    means = [sum(part) / len(frames) for part in zip(*(f.seconds for f in frames), strict=True)]
+    timed = frames[1:] or frames  # what the first one loads, the others find there
+    means = [sum(part) / len(timed) for part in zip(*(f.seconds for f in timed), strict=True)]
     parts = ", ".join(
         f"{name} {1000 * mean:.0f} ms" for name, mean in zip(STAGES, means, strict=True)
     )
