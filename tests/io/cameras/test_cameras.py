@@ -216,6 +216,9 @@ def test_topics_are_found_or_asked_for(tmp_path):
     with refused("no CameraInfo", "--intrinsics"):
         read(f"rosbag:{alone}")
     assert len(read(f"rosbag:{alone}", intrinsics="44.8,44.8,31.5,23.5")) == 1
+    own = write_ros1(tmp_path / "own", shots, "16UC1", "ros1", name="/device_0/sensor_0/Depth_0/x")
+    with refused("recorded by a RealSense", f"bag:{own}"):
+        read(f"rosbag:{own}")
     with refused("is 64×48 pixels, the camera 9×9"):
         (tmp_path / "k.json").write_text(
             json.dumps({"fx": 9, "fy": 9, "cx": 4, "cy": 4, "width": 9, "height": 9})

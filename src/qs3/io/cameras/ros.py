@@ -85,6 +85,8 @@ class _Bag:
         self._reader = self.guarded(rosbag1.Reader if old else rosbag2.Reader, path)
         self.guarded(stack.enter_context, self._reader)
         self.topics = {one.topic: one.msgtype for one in self._reader.connections}
+        if old and any(topic.startswith("/device_0/") for topic in self.topics):
+            raise InputError(f"{path}: recorded by a RealSense, not by ROS: read it as bag:{path}")
 
     def guarded(self, work: Any, *given: Any) -> Any:
         """Do a step; whatever a damaged bag makes the library stumble over is one line."""
@@ -144,12 +146,8 @@ def _depth_topic(bag: _Bag, topic: str) -> str:
         raise InputError(
             f"{bag.path}: several topics of depth images; name one by --topic: {there}"
         )
-    own = any(name.startswith("/device_0/") for name in bag.topics)
-    raise InputError(
-        f"{bag.path}: "
-        + ("recorded by a RealSense, not by ROS: read it as bag:FILE" if own else
-           f"no depth images (16UC1, 32FC1); topics of images: {', '.join(images) or 'none'}")
-    )  # fmt: skip
+    there = ", ".join(images) or "none"
+    raise InputError(f"{bag.path}: no depth images (16UC1, 32FC1); topics of images: {there}")
 
 
 def _is_depth(message: Any) -> bool:
