@@ -16,6 +16,8 @@ _PURPOSE = {
     "gs": "data sets at gs:// addresses",
     "view": "qs3 view",
     "cad": "meshes in STEP, IGES and 3MF",
+    "realsense": "a RealSense and its recordings",
+    "ros": "recordings of ROS",
     "track": "qs3 train --log tensorboard|wandb",
     "export": "qs3 export",
 }

@@ -6,9 +6,11 @@ from typing import Annotated, Any, get_type_hints
 
 import tyro
 
+from qs3.cli.capture import capture
 from qs3.cli.options import Flat
 from qs3.cli.store import refuse_failures
 from qs3.cli.text import show, tell
+from qs3.io.cameras.frames import CameraSettings
 from qs3.io.extract.depth import extract_depth
 from qs3.io.extract.nyuv2 import extract_nyuv2
 from qs3.io.extract.run import ExtractReport, OutputSettings
@@ -31,11 +33,52 @@ def _verb(function: Callable[..., ExtractReport]) -> Callable[..., int]:
     return verb
 
 
+def _bag(
+    source: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    frames: int | None = None,
+    every: float = 0.0,
+) -> int:
+    """Write the frames of a RealSense's recording as files.
+
+    Args:
+        source: The recording: .bag, or .db3 of later versions.
+        out: New folder for depth/, color/, intrinsics.json and times.csv.
+        frames: Frames to take at most; all by default.
+        every: Seconds from one frame to the next at least.
+    """
+    return capture(CameraSettings(f"bag:{source}", frames=frames, every=every), out)
+
+
+def _rosbag(
+    source: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    topic: str = "",
+    intrinsics: str = "",
+    frames: int | None = None,
+    every: float = 0.0,
+) -> int:
+    """Write the depth images of a recording of ROS 1 or ROS 2 as files.
+
+    Args:
+        source: A .bag of ROS 1; of ROS 2 the folder with metadata.yaml, a .db3 or a .mcap.
+        out: New folder for depth/, intrinsics.json and times.csv.
+        topic: Which topic of depth images, where there are several.
+        intrinsics: Where the bag has no CameraInfo: fx,fy,cx,cy or a file.
+        frames: Frames to take at most; all by default.
+        every: Seconds from one frame to the next at least.
+    """
+    camera = CameraSettings(f"rosbag:{source}", intrinsics, topic, frames, every)
+    return capture(camera, out)
+
+
 extract: dict[str, Callable[..., int]] = {
     "scannet": _verb(extract_scannet),
     "sunrgbd": _verb(extract_sunrgbd),
     "nyuv2": _verb(extract_nyuv2),
     "depth": _verb(extract_depth),
+    "bag": _bag,
+    "rosbag": _rosbag,
 }
 """The sources of the verb, by name."""
 

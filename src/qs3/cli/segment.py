@@ -7,13 +7,13 @@ import tyro
 
 from qs3.cli.options import Flat
 from qs3.cli.text import columns, show, tell
-from qs3.io.extract.segment import TABLE, SegmentSettings, segment_scene
+from qs3.io.extract.segment import TABLE, SceneSettings, segment_scene
 
 
 def segment(
     scene: Annotated[Path, tyro.conf.Positional],
     out: Path,
-    settings: Flat[SegmentSettings] = SegmentSettings(),  # noqa: B008
+    settings: Flat[SceneSettings] = SceneSettings(),  # noqa: B008
 ) -> int:
     """Cut a scan of a table or a floor into the objects that stand on it.
 

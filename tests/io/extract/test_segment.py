@@ -1,5 +1,7 @@
 """A table with boxes of known size: how many are found, how large, how they lie."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pandas as pd
@@ -10,7 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from qs3.errors import InputError
 from qs3.io.extract.plane import fit_plane
-from qs3.io.extract.segment import SegmentSettings, read_scene, segment, segment_scene
+from qs3.io.extract.segment import (
+    SceneSettings,
+    SegmentSettings,
+    _clusters,
+    read_scene,
+    segment,
+    segment_scene,
+)
 from qs3.io.point_files import read_cloud
 
 from ..hostile import refused
@@ -120,6 +129,19 @@ def test_the_same_seed_gives_the_same_and_the_order_of_points_hardly_matters():
     check(segment(scene[::-1].copy(), SegmentSettings()))
 
 
+@given(st.integers(0, 2**32 - 1), st.integers(1, 200))
+def test_clusters_are_those_of_dbscan(seed, count):
+    from sklearn.cluster import DBSCAN
+
+    points = np.random.default_rng(seed).random((count, 3))
+    fitted = DBSCAN(eps=0.15, min_samples=5).fit(points)
+    ours = _clusters(points, 0.15)
+    np.testing.assert_array_equal(ours < 0, fitted.labels_ < 0)
+    core = fitted.core_sample_indices_  # what lies between two clusters may go to either
+    pairs = set(zip(ours[core].tolist(), fitted.labels_[core].tolist(), strict=True))
+    assert len(pairs) == len(set(fitted.labels_[core].tolist())) == len(set(ours[core].tolist()))
+
+
 def test_small_high_and_near_things():
     scene = table_scene(np.random.default_rng(3))
     assert len(segment(scene, SegmentSettings(min_points=7500))) < 3
@@ -173,7 +195,7 @@ def test_a_depth_image_of_a_table_seen_from_above(tmp_path):
     depth = np.zeros(len(u), np.uint16)
     depth[ray] = np.rint((hit - eye) @ rotation[:, 2] * 1000)
     (tmp_path / "d.png").write_bytes(cv2.imencode(".png", depth.reshape(360, 480))[1].tobytes())
-    settings = SegmentSettings(intrinsics="500,500,239.5,179.5", tilt=60.0)
+    settings = SceneSettings(intrinsics="500,500,239.5,179.5", tilt=60.0)
     objects = segment_scene(tmp_path / "d.png", tmp_path / "o", settings)
     assert len(objects) == 3
     # The camera sees tops and near sides: heights are whole, tops tell the level sides.
@@ -183,6 +205,11 @@ def test_a_depth_image_of_a_table_seen_from_above(tmp_path):
         assert item.size[0] == pytest.approx(length, abs=0.01)
         assert item.size[1] == pytest.approx(width, abs=0.01)
     assert len(read_scene(tmp_path / "d.png", settings)) > 100_000
+    half = dataclasses.replace(settings, stride=2)
+    few = segment(read_scene(tmp_path / "d.png", half), half)
+    for one, other in zip(objects, few, strict=True):
+        assert len(other.points) == pytest.approx(len(one.points) / 4, rel=0.05)
+        np.testing.assert_allclose(other.centre, one.centre, atol=0.01)
 
 
 def test_what_has_no_plane_or_nothing_on_it_is_one_line(tmp_path):
@@ -204,6 +231,12 @@ def test_what_has_no_plane_or_nothing_on_it_is_one_line(tmp_path):
     with refused(r"shape \[n 3\]", "two.npz"):
         segment_scene(tmp_path / "two.npz", tmp_path / "o")
     assert not (tmp_path / "o").exists()
-    for wrong in ({"gap": 0.0}, {"tilt": 91.0}, {"min_points": 0}, {"gravity": (0.0, 0.0, 0.0)}):
+    for wrong in (
+        {"gap": 0.0},
+        {"tilt": 91.0},
+        {"min_points": 0},
+        {"stride": 0},
+        {"gravity": (0.0, 0.0, 0.0)},
+    ):
         with pytest.raises(InputError):
             SegmentSettings(**wrong)

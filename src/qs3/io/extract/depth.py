@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 
 from qs3.errors import InputError
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
-from qs3.io.extract.depth_images import DEPTH_FILES, read_depth, read_mask
+from qs3.io.extract.depth_images import DEPTH_FILES, list_images, read_depth, read_mask
 from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
 from qs3.io.extract.run import (
     ExtractedCloud,
@@ -165,7 +165,7 @@ def list_frames(source: Path, camera: Intrinsics, settings: DepthImageSettings) 
     mask = settings.mask
     if not source.exists():
         raise InputError(f"{source}: no such file or folder")
-    paths = _images(source) if source.is_dir() else {source.stem: source}
+    paths = list_images(source) if source.is_dir() else {source.stem: source}
     if not paths:
         raise InputError(
             f"{source}: no depth image ({', '.join(DEPTH_FILES)}) and no scene of BOP's layout "
@@ -174,7 +174,7 @@ def list_frames(source: Path, camera: Intrinsics, settings: DepthImageSettings) 
     if mask is not None and not mask.exists():
         raise InputError(f"{mask}: no such file or folder")
     if mask is not None and mask.is_dir():
-        masks = _images(mask)
+        masks = list_images(mask)
         for name, path in paths.items():
             if name not in masks:
                 raise InputError(f"{mask}: no mask {name}.png for {path}")
@@ -191,17 +191,6 @@ def list_frames(source: Path, camera: Intrinsics, settings: DepthImageSettings) 
         item = FrameObject(utf8(name), masks[name], level, source=source_of)
         frames.append(Frame(item.id, path, camera, (item,)))
     return frames
-
-
-def _images(folder: Path) -> dict[str, Path]:
-    images: dict[str, Path] = {}
-    for path in sorted(folder.iterdir()):
-        if path.name.startswith(".") or path.suffix.lower() not in DEPTH_FILES:
-            continue
-        if path.stem in images:
-            raise InputError(f"{path}: {images[path.stem].name} has the same name; rename one")
-        images[path.stem] = path
-    return images
 
 
 def cut_frame(

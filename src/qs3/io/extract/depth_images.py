@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int32, UInt8, UInt16
+from jaxtyping import Float32, Int32, Shaped, UInt8, UInt16
 
 from qs3.errors import InputError
 from qs3.io.guards import check_pixels, load_npy, read_image, read_small
@@ -32,13 +32,31 @@ def read_depth(path: Path, depth_scale: float | None = None) -> Float32[np.ndarr
     Raises:
         InputError: where the file is missing, damaged, too large or no depth image.
     """
-    raw = read_raw(path)
+    return to_metres(read_raw(path), depth_scale)
+
+
+def to_metres(
+    raw: Shaped[np.ndarray, "h w"], depth_scale: float | None = None
+) -> Float32[np.ndarray, "h w"]:
+    """Turn the numbers of a depth image into metres, as `read_depth` says."""
     if depth_scale is not None and not 0 < depth_scale < math.inf:
         raise InputError(f"depth-scale {depth_scale:g}: must be positive metres a step")
     scale = depth_scale or (MILLIMETRE if raw.dtype.kind in "iu" else 1.0)
     with np.errstate(over="ignore", invalid="ignore"):
         depth = raw.astype(np.float32) * np.float32(scale)
         return np.where((depth > 0) & np.isfinite(depth), depth, np.float32(np.nan))
+
+
+def list_images(folder: Path) -> dict[str, Path]:
+    """List the images of a folder by their names without ending; two of one name are refused."""
+    images: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if path.name.startswith(".") or path.suffix.lower() not in DEPTH_FILES:
+            continue
+        if path.stem in images:
+            raise InputError(f"{path}: {images[path.stem].name} has the same name; rename one")
+        images[path.stem] = path
+    return images
 
 
 def read_raw(path: Path) -> np.ndarray:

@@ -11,6 +11,9 @@ from jaxtyping import Float
 from qs3.errors import InputError
 from qs3.io.guards import Numbers, as_array, pick, read_numbers, read_small_json
 
+CAMERA_FILES = ("intrinsics.json", "intrinsics.txt", "camera.json", "K.txt")
+"""Names of the file that tells the camera of a folder of images."""
+
 _LARGEST = 1 << 20
 _FORMS = "give fx,fy,cx,cy, a JSON file, or a text file of 3×3 numbers"
 
@@ -92,7 +95,7 @@ def read_intrinsics(given: str | Path) -> Intrinsics:
             ``cam_K`` or ``K`` row by row, or with ``intrinsic_matrix`` column by column (Open3D);
             or a text file of 4, 9 (3×3) or 16 (4×4) numbers row by row. A JSON file may also tell
             ``width``, ``height`` and ``depth_scale`` (millimetres a step, as BOP) or
-            ``depth_unit`` (metres a step).
+            ``depth_unit`` (metres a step). Of a folder it is the first of `CAMERA_FILES` in it.
 
     Raises:
         InputError: where it is none of these, or no camera.
@@ -109,6 +112,12 @@ def read_intrinsics(given: str | Path) -> Intrinsics:
     if len(numbers) == 4:
         fx, fy, cx, cy = numbers
         return Intrinsics(fx, fy, cx, cy)
+    if not numbers and path.is_dir():
+        there = [path / name for name in CAMERA_FILES if (path / name).is_file()]
+        if not there:
+            names = ", ".join(CAMERA_FILES)
+            raise InputError(f"{path}: does not tell its camera ({names}); {_FORMS}")
+        path = there[0]
     if numbers or not path.is_file():
         raise InputError(f"intrinsics {text!r}: {'' if numbers else 'no such file; '}{_FORMS}")
     try:

@@ -20,14 +20,16 @@ from qs3.errors import InputError
 from qs3.files import new_folder, write_bytes
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.io.extract.depth_images import read_depth
-from qs3.io.extract.intrinsics import read_intrinsics
+from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
 from qs3.io.extract.plane import Plane, fit_plane
 from qs3.io.guards import load_npy, open_zip, read_member
 from qs3.io.point_files import cloud_bytes, read_cloud
+from qs3.io.preparation import thin
 
 TABLE = "objects.csv"
 _LEAST_SHARE = 0.1  # of the points, on the plane
 _WIDEST = 1000.0  # metres
+_FITTED = 2000  # points that the plane is fitted to
 _CORE = 5  # voxels around one that make it part of a cluster
 
 
@@ -35,14 +37,10 @@ _CORE = 5  # voxels around one that make it part of a cluster
 class SegmentSettings:
     """How a scene is cut into objects."""
 
-    intrinsics: str = ""
-    """Of a depth image: fx,fy,cx,cy; a JSON file of a camera; or a text file of 3×3 numbers.
-    Without it the scene is a cloud in metres."""
-    depth_scale: float | None = None
-    """Metres a step of a depth image; None takes the camera's, else 0.001 for whole numbers and 1
-    for others."""
     far: float = math.inf
     """Depths of a depth image at or above are dropped, metres."""
+    stride: int = 1
+    """Of a depth image, every so many-th row and column is taken: 2 is four times as fast."""
     gravity: tuple[float, float, float] | None = None
     """Downward direction, roughly, in the axes of the file; None takes 0 0 -1 of a cloud (z up) and
     0 1 0 of a depth image (the camera's y)."""
@@ -65,9 +63,24 @@ class SegmentSettings:
                 raise InputError(f"{name} {getattr(self, name):g}: must be positive metres")
         if not 0 <= self.tilt <= 90:
             raise InputError(f"tilt {self.tilt:g}: must be from 0 to 90 degrees")
-        if self.min_points < 1:
-            raise InputError(f"min-points {self.min_points}: must be at least 1")
+        for name in ("min_points", "stride"):
+            if getattr(self, name) < 1:
+                raise InputError(
+                    f"{name.replace('_', '-')} {getattr(self, name)}: must be 1 or more"
+                )
         upright(self.gravity or (0.0, 1.0, 0.0))
+
+
+@dataclass(frozen=True)
+class SceneSettings(SegmentSettings):
+    """How the scene of a file is read and cut into objects."""
+
+    intrinsics: str = ""
+    """Of a depth image: fx,fy,cx,cy; a JSON file of a camera; or a text file of 3×3
+    numbers; or the folder that has one. Without it the scene is a cloud in metres."""
+    depth_scale: float | None = None
+    """Metres a step of a depth image; None takes the camera's, else 0.001 for whole numbers and 1
+    for others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +100,7 @@ class SegmentedObject:
 def segment_scene(
     scene: Path,
     out: Path,
-    settings: SegmentSettings = SegmentSettings(),
+    settings: SceneSettings = SceneSettings(),
 ) -> list[SegmentedObject]:
     """Cut a scene into a new folder: ``object_000.ply`` and so on, largest first, and a table.
 
@@ -121,16 +134,14 @@ def segment_scene(
     return objects
 
 
-def read_scene(path: Path, settings: SegmentSettings) -> Float[np.ndarray, "n 3"]:
+def read_scene(path: Path, settings: SceneSettings) -> Float[np.ndarray, "n 3"]:
     """Read a scene: metres, turned so that z is against gravity as far as that is known."""
     if settings.intrinsics:
         camera = read_intrinsics(settings.intrinsics)
         scale = camera.depth_scale if settings.depth_scale is None else settings.depth_scale
         depth = read_depth(path, scale)
         camera.check_size(depth.shape, str(path))
-        keep = keep_pixels(depth, np.ones(depth.shape, dtype=bool), CutSettings(far=settings.far))
-        points = as_cloud(lift(depth, keep, camera), str(path)).astype(np.float64)
-        return turn(upright(settings.gravity or (0.0, 1.0, 0.0)), points)
+        return lift_scene(depth, camera, settings, str(path))
     if path.suffix.lower() == ".npz":
         with open_zip(path) as archive:
             content = read_member(archive, "points.npy")
@@ -145,12 +156,23 @@ def read_scene(path: Path, settings: SegmentSettings) -> Float[np.ndarray, "n 3"
     return points if settings.gravity is None else turn(upright(settings.gravity), points)
 
 
+def lift_scene(
+    depth: Float32[np.ndarray, "h w"], camera: Intrinsics, settings: SegmentSettings, where: str
+) -> Float[np.ndarray, "n 3"]:
+    """Lift a depth image to a scene, z against gravity; a fault names ``where``."""
+    every = np.zeros(depth.shape, dtype=bool)
+    every[:: settings.stride, :: settings.stride] = True
+    keep = keep_pixels(depth, every, CutSettings(far=settings.far))
+    points = as_cloud(lift(depth, keep, camera), where).astype(np.float64)
+    return turn(upright(settings.gravity or (0.0, 1.0, 0.0)), points)
+
+
 def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list[SegmentedObject]:
     """Cut a scene into the objects that stand on its largest level plane, by points.
 
     Args:
         points: The scene in metres, z up to ``tilt`` degrees.
-        settings: How it is cut; those of files are not looked at.
+        settings: How it is cut.
 
     Raises:
         InputError: where no plane holds a tenth of the points, or nothing stands on it.
@@ -160,8 +182,9 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
             f"{len(points)} points, over {_WIDEST:g} m apart or too few; a scene is in metres"
         )
     up = np.array([0.0, 0.0, 1.0])
-    plane = fit_plane(points, settings.tolerance, up, settings.tilt, settings.seed)
-    held = 0.0 if plane is None else np.mean(np.abs(plane.heights(points)) <= settings.tolerance)
+    few = points[thin(len(points), _FITTED)]
+    plane = fit_plane(few, settings.tolerance, up, settings.tilt, settings.seed)
+    held = 0.0 if plane is None else np.mean(np.abs(plane.heights(few)) <= settings.tolerance)
     if plane is None or held < _LEAST_SHARE:
         raise InputError(
             f"no plane within {settings.tilt:g}° of level holds a tenth of the points to "
@@ -170,13 +193,12 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
     points = turn(_level(plane), points) - np.array([0.0, 0.0, plane.offset])
     near = points[:, 2] <= settings.height
     points = points[near & (points[:, 2] >= -settings.tolerance)]
+    above = points[:, 2] > settings.tolerance
+    patch, _ = _voxels(points[~above, :2], settings.gap / 2)
+    points = points[above]
+    points = points[_over(patch, points, settings)]
     voxels, voxel_of = _voxels(points, settings.gap / 4)
-    standing = np.flatnonzero(voxels[:, 2] > settings.tolerance)
-    patch = voxels[voxels[:, 2] <= settings.tolerance]
-    standing = standing[_over(patch, voxels[standing], settings)]
-    cluster_of = np.full(len(voxels), -1)
-    cluster_of[standing] = _clusters(voxels[standing], settings)
-    owner = cluster_of[voxel_of]
+    owner = _clusters(voxels, settings.gap)[voxel_of]
     sizes = np.bincount(owner[owner >= 0], minlength=1)
     order = [int(i) for i in np.argsort(-sizes, kind="stable") if sizes[i] >= settings.min_points]
     if not order:
@@ -188,9 +210,11 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
 
 
 def _voxels(
-    points: Float[np.ndarray, "n 3"], edge: float
-) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "n"]]:
-    """The mean point of each occupied voxel, and the voxel of each point."""
+    points: Float[np.ndarray, "n d"], edge: float
+) -> tuple[Float[np.ndarray, "v d"], Int[np.ndarray, "n"]]:
+    """The mean point of each occupied voxel or square, and the one of each point."""
+    if not len(points):
+        return points, np.zeros(0, dtype=np.int64)
     cells = np.floor((points - points.min(axis=0)) / edge).astype(np.int64)
     codes = np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1))
     _, voxel_of, counts = np.unique(codes, return_inverse=True, return_counts=True)
@@ -206,29 +230,44 @@ def _level(plane: Plane) -> Float[np.ndarray, "3 3"]:
 
 
 def _over(
-    patch: Float[np.ndarray, "m 3"], voxels: Float[np.ndarray, "n 3"], settings: SegmentSettings
+    patch: Float[np.ndarray, "m 2"], points: Float[np.ndarray, "n 3"], settings: SegmentSettings
 ) -> Bool[np.ndarray, "n"]:
-    """Which voxels lie over the convex hull of the largest patch of the plane."""
+    """Which points lie over the convex hull of the largest patch of the plane."""
     from scipy.spatial import ConvexHull, QhullError
 
-    cluster_of = _clusters(patch, settings)
+    cluster_of = _clusters(patch, settings.gap)
     counts = np.bincount(cluster_of[cluster_of >= 0], minlength=1)
     try:
-        sides = ConvexHull(patch[cluster_of == np.argmax(counts), :2]).equations
+        sides = ConvexHull(patch[cluster_of == np.argmax(counts)]).equations
     except (QhullError, ValueError):  # no patch, or a line
         fault = f"its plane has no patch without gaps of {settings.gap:g} m; raise --gap"
         raise InputError(fault) from None
-    return (np.einsum("si,ni->ns", sides[:, :2], voxels[:, :2]) <= -sides[:, 2]).all(axis=1)
+    over = np.ones(len(points), dtype=bool)
+    for x, y, offset in sides:
+        over &= x * points[:, 0] + y * points[:, 1] <= -offset
+    return over
 
 
-def _clusters(voxels: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> Int[np.ndarray, "n"]:
-    """Number of each voxel's cluster; −1 is none."""
-    # Imported here: it takes a second.
-    from sklearn.cluster import DBSCAN
+def _clusters(voxels: Float[np.ndarray, "n d"], gap: float) -> Int[np.ndarray, "n"]:
+    """Number of each voxel's cluster by DBSCAN; −1 is none.
 
-    if not len(voxels):
-        return np.zeros(0, dtype=np.int64)
-    return DBSCAN(eps=settings.gap, min_samples=_CORE).fit(voxels).labels_.astype(np.int64)
+    By a k-d tree and one thread: scikit-learn's takes several times as long beside other programs.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    n = len(voxels)
+    pairs = KDTree(voxels).query_pairs(gap, output_type="ndarray") if n else np.zeros((0, 2), int)
+    core = np.bincount(pairs.ravel(), minlength=n) + 1 >= _CORE
+    inner = pairs[core[pairs].all(axis=1)]
+    links = coo_array((np.ones(len(inner), bool), inner.T), shape=(n, n))
+    number = connected_components(links, directed=False)[1] if n else np.zeros(0, int)
+    edge = np.concatenate([pairs, pairs[:, ::-1]])
+    edge = edge[core[edge[:, 0]] & ~core[edge[:, 1]]]
+    cluster_of = np.where(core, number, -1)
+    cluster_of[edge[:, 1]] = number[edge[:, 0]]
+    return cluster_of.astype(np.int64)
 
 
 def _boxed(points: Float[np.ndarray, "n 3"]) -> SegmentedObject:

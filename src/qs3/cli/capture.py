@@ -1,0 +1,27 @@
+"""``qs3 capture``: frames of a depth camera, live or recorded, as files."""
+
+import contextlib
+from pathlib import Path
+
+from qs3.cli.options import Flat
+from qs3.cli.text import show, tell
+from qs3.io.cameras.folder import DEPTH
+from qs3.io.cameras.folder import capture as write_frames
+from qs3.io.cameras.frames import CameraSettings, open_camera
+from qs3.io.extract.depth_images import list_images
+
+
+def capture(settings: Flat[CameraSettings], out: Path) -> int:
+    """Write the frames of a depth camera, live or recorded, as files, until Ctrl-C or its end.
+
+    Args:
+        settings: Which camera, and which of its frames.
+        out: New folder for depth/, color/, intrinsics.json and times.csv.
+    """
+    with contextlib.suppress(KeyboardInterrupt):
+        write_frames(open_camera(settings), out)
+    count = len(list_images(out / DEPTH)) if (out / DEPTH).is_dir() else 0
+    show(out)
+    tell(f"{count} frames. Next: qs3 segment {out / DEPTH}/FRAME --intrinsics {out} --out OBJECTS; "
+         f"qs3 watch RUN --camera folder:{out}")  # fmt: skip
+    return 0

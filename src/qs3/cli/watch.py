@@ -1,0 +1,47 @@
+"""``qs3 watch``: what stands before a camera, frame by frame."""
+
+import contextlib
+import json
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from qs3.cli.options import Flat
+from qs3.cli.text import printable, show, tell
+from qs3.io.cameras.frames import CameraSettings, open_camera
+from qs3.io.extract.segment import SegmentSettings
+
+
+def watch(
+    run: Annotated[Path, tyro.conf.Positional],
+    camera: Flat[CameraSettings],
+    settings: Flat[SegmentSettings] = SegmentSettings(stride=2),  # noqa: B008
+    json_lines: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> int:
+    """Tell what stands before a depth camera, frame by frame, until Ctrl-C or its end.
+
+    Args:
+        run: Folder of a run, its model.safetensors, or a network that comes with qs3: rooms.
+        camera: Which camera, and which of its frames.
+        settings: How a frame is cut into objects.
+        json_lines: Print a line of JSON a frame, with every class's probability and the boxes.
+    """
+    from qs3.training import watch as watching
+
+    seen: list[watching.SeenFrame] = []
+    with contextlib.suppress(KeyboardInterrupt):
+        for frame in watching.watch(run, open_camera(camera, colour=False), settings):
+            seen.append(frame._replace(objects=()))
+            if json_lines:
+                show(json.dumps(watching.plain(frame), ensure_ascii=False))
+                continue
+            found = [
+                f"{printable(one.best[0], keep='')} {one.best[1]:.2f} at {x:.2f} {y:.2f}"
+                for one in frame.objects
+                for x, y, _ in [one.item.centre]
+            ]
+            show(f"{printable(frame.name, keep='')}\t{', '.join(found) or frame.fault}")
+    if seen:
+        tell(watching.rate(seen))
+    return 0

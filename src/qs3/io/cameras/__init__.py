@@ -1,0 +1,1 @@
+"""Frames of a depth camera: live, from its recordings, and from folders."""

@@ -1,0 +1,144 @@
+"""Frames as files: the layout that `capture` writes and ``folder:DIR`` reads.
+
+``depth/000000.png`` and so on, ``color/000000.png`` where there is colour, ``intrinsics.json``, and
+``times.csv`` with the columns frame and time.
+"""
+
+import csv
+import dataclasses
+import io
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from qs3.errors import InputError
+from qs3.files import holds_something, write_bytes, write_json, write_text
+from qs3.io.cameras.frames import Camera, DepthFrame
+from qs3.io.extract.depth_images import MILLIMETRE, list_images, read_raw, to_metres
+from qs3.io.extract.intrinsics import CAMERA_FILES, read_intrinsics
+from qs3.io.guards import read_image, read_small, read_text
+
+DEPTH, COLOUR, TIMES = "depth", "color", "times.csv"
+_LARGEST = 1 << 28
+
+
+def folder_camera(folder: Path, intrinsics: str = "", colour: bool = True) -> Camera:
+    """Yield the depth images of a folder, in the order of their names.
+
+    Args:
+        folder: As `capture` writes it, or with the depth images directly in it.
+        intrinsics: Of the camera; empty takes the folder's own file, one of `CAMERA_FILES`.
+        colour: Whether to read colour where there is some.
+
+    Raises:
+        InputError: where there is no depth image or no camera, or a file is damaged.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder")
+    images = list_images(folder / DEPTH if (folder / DEPTH).is_dir() else folder)
+    if not images:
+        raise InputError(f"{folder}: no depth image in it or in its folder {DEPTH}")
+    camera = read_intrinsics(intrinsics or folder)
+    times = _read_times(folder / TIMES)
+    for name, path in images.items():
+        raw = read_raw(path)
+        camera.check_size(raw.shape, str(path))
+        step = None if raw.dtype.kind == "f" else camera.depth_scale or MILLIMETRE
+        depth = to_metres(raw, camera.depth_scale)
+        picture = folder / COLOUR / f"{name}.png"
+        seen = _read_colour(picture, depth.shape) if colour and picture.is_file() else None
+        own = dataclasses.replace(camera, depth_scale=step)
+        yield DepthFrame(depth, own, name, times.get(name), seen)
+
+
+def capture(frames: Camera, out: Path) -> int:
+    """Write frames into a new folder, each file whole; what stops it leaves what is there.
+
+    Depth becomes a PNG of 16 bits in the step in which it was measured, numbers with a point npy
+    in metres.
+
+    Args:
+        frames: A camera; it is closed at the end.
+        out: A new or empty folder.
+
+    Returns:
+        How many were written.
+
+    Raises:
+        InputError: where the folder is taken, or the camera gives no frame.
+    """
+    if out.exists() and (not out.is_dir() or holds_something(out)):
+        raise InputError(f"{out}: is there already; name a new or empty folder")
+    times: dict[str, float] = {}
+    count = 0
+    try:
+        for count, frame in enumerate(frames, start=1):
+            name = f"{count - 1:06d}"
+            if count == 1:
+                write_json(out / CAMERA_FILES[0], _camera_json(frame))
+            if frame.colour is not None:
+                bgr = np.ascontiguousarray(frame.colour[..., ::-1])
+                write_bytes(out / COLOUR / f"{name}.png", _png(bgr))
+            if frame.timestamp is not None:
+                times[name] = frame.timestamp
+            _write_depth(out / DEPTH / name, frame)
+    finally:
+        frames.close()
+        if times:
+            rows = "".join(f"{name},{time:.6f}\n" for name, time in times.items())
+            write_text(out / TIMES, f"frame,time\n{rows}")
+    if not count:
+        raise InputError("the camera gave no frame")
+    return count
+
+
+def _camera_json(frame: DepthFrame) -> dict[str, float | int]:
+    height, width = frame.depth.shape
+    camera = frame.camera
+    own = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    step = {} if camera.depth_scale is None else {"depth_unit": camera.depth_scale}
+    return {**own, "width": width, "height": height, **step}
+
+
+def _write_depth(stem: Path, frame: DepthFrame) -> None:
+    step = frame.camera.depth_scale
+    depth = np.nan_to_num(frame.depth, nan=0.0)
+    if step is None:
+        buffer = io.BytesIO()
+        np.save(buffer, depth, allow_pickle=False)
+        write_bytes(stem.with_suffix(".npy"), buffer.getvalue())
+        return
+    steps = np.rint(depth / np.float32(step))
+    steps[steps > np.iinfo(np.uint16).max] = 0  # beyond what a PNG holds: no depth
+    write_bytes(stem.with_suffix(".png"), _png(steps.astype(np.uint16)))
+
+
+def _png(image: np.ndarray) -> bytes:
+    # Imported here: the help of the verbs needs none.
+    import cv2
+
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def _read_colour(path: Path, shape: tuple[int, ...]) -> UInt8[np.ndarray, "h w 3"]:
+    try:
+        image, mode = read_image(read_small(path, _LARGEST, "a picture"), "PNG")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    if mode != "RGB" or image.shape != (*shape, 3) or image.dtype != np.uint8:
+        raise InputError(f"{path}: no colour picture of the depth image's size")
+    return image[..., ::-1]
+
+
+def _read_times(path: Path) -> dict[str, float]:
+    """Seconds by the name of each frame; none where there is no such file."""
+    if not path.is_file():
+        return {}
+    try:
+        rows = list(csv.DictReader(io.StringIO(read_text(path, 1 << 26), newline="")))
+        return {row["frame"]: float(row["time"]) for row in rows}
+    except (csv.Error, KeyError, TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: not a CSV with the columns frame,time") from error

@@ -1,0 +1,104 @@
+"""What a depth camera gives, whichever it is, and the cameras by name.
+
+A camera is a generator of `DepthFrame`; closing it lets go of the device or file. So a camera of
+your own is a function with ``yield``.
+"""
+
+from collections.abc import Generator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from qs3.errors import InputError
+from qs3.io.extract.intrinsics import Intrinsics
+
+
+@dataclass(frozen=True, eq=False)
+class DepthFrame:
+    """One picture of a depth camera."""
+
+    depth: Float32[np.ndarray, "h w"]
+    """Metres along the optical axis, NaN where there is none."""
+    camera: Intrinsics
+    """Of the depth, with metres a step of the whole numbers it was measured in; None for numbers
+    with a point."""
+    name: str
+    """Its file, or its number from 000000."""
+    timestamp: float | None = None
+    """Seconds, by the camera's clock; None where nothing tells."""
+    colour: UInt8[np.ndarray, "h w 3"] | None = None
+    """Red, green and blue of the same pixels; None where there is none."""
+
+
+Camera = Generator[DepthFrame, None, None]
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """Which camera, and which of its frames."""
+
+    camera: str
+    """realsense, or realsense:SERIAL; bag:FILE, a recording of one; rosbag:PATH, a recording of
+    ROS; folder:DIR, depth images as qs3 capture writes them."""
+    intrinsics: str = ""
+    """Of a folder or a ROS bag that does not tell its own: fx,fy,cx,cy or a file."""
+    topic: str = ""
+    """Of a ROS bag with several topics of depth images: which."""
+    frames: int | None = None
+    """Frames to take at most; all by default, of a live camera until Ctrl-C."""
+    every: float = 0.0
+    """Seconds from one frame to the next at least, by the camera's clock."""
+
+    def __post_init__(self) -> None:
+        if self.frames is not None and self.frames < 1:
+            raise InputError(f"--frames {self.frames}: must be at least 1")
+        if not 0 <= self.every < float("inf"):
+            raise InputError(f"--every {self.every:g}: must be 0 or more seconds")
+
+
+def open_camera(settings: CameraSettings, colour: bool = True) -> Camera:
+    """Yield frames of a camera, as many and as often as the settings say.
+
+    Args:
+        settings: Which camera, and which of its frames.
+        colour: Whether colour is asked for, where the camera has it.
+
+    Raises:
+        InputError: where there is no such camera or file, or it is damaged.
+        MissingExtraError: where its package is not installed.
+    """
+    last, count = -np.inf, 0
+    with closing(_camera(settings, colour)) as camera:
+        for frame in camera:
+            if frame.timestamp is not None:
+                # A step backwards begins anew: clocks are set, and recordings put together.
+                if last <= frame.timestamp < last + settings.every * (1 - 1e-6):
+                    continue
+                last = frame.timestamp
+            yield frame
+            count += 1
+            if count == settings.frames:
+                return
+
+
+def _camera(settings: CameraSettings, colour: bool) -> Camera:
+    from qs3.io.cameras.folder import folder_camera
+    from qs3.io.cameras.realsense import realsense_camera
+    from qs3.io.cameras.ros import ros_camera
+
+    kind, _, rest = settings.camera.partition(":")
+    if kind == "realsense":
+        return realsense_camera(rest, colour=colour)
+    if kind == "bag" and rest:
+        return realsense_camera(file=Path(rest), colour=colour)
+    if kind == "rosbag" and rest:
+        return ros_camera(Path(rest), settings.topic, settings.intrinsics)
+    if kind == "folder" and rest:
+        return folder_camera(Path(rest), settings.intrinsics, colour)
+    raise InputError(
+        f"--camera {settings.camera}: name realsense, realsense:SERIAL, bag:FILE, rosbag:PATH or "
+        "folder:DIR"
+    )

@@ -1,0 +1,155 @@
+"""RealSense cameras and their recordings, by librealsense (extra ``realsense``)."""
+
+import dataclasses
+import functools
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from qs3.errors import InputError, MissingExtraError
+from qs3.io.cameras.frames import Camera, DepthFrame
+from qs3.io.extract.depth_images import to_metres
+from qs3.io.extract.intrinsics import Intrinsics
+from qs3.io.guards import reason
+
+_LOG = logging.getLogger(__name__)
+_PATIENCE = 5000  # milliseconds to the next frame
+
+
+def realsense_camera(serial: str = "", file: Path | None = None, colour: bool = True) -> Camera:
+    """Yield frames of a RealSense, live or recorded; colour is aligned to depth.
+
+    A recording gives each of its frames, however long the work on one takes; a live camera drops
+    those for which there is no time.
+
+    Args:
+        serial: Number of the camera; empty takes the first.
+        file: A recording (.bag, or .db3 of librealsense 2.58 and later) in place of a camera.
+        colour: Whether to give colour where there is some.
+
+    Raises:
+        InputError: where there is no such camera or file, it is damaged, or it gives no depth.
+        MissingExtraError: where pyrealsense2 is not installed.
+    """
+    try:
+        import pyrealsense2
+    except ImportError:
+        raise MissingExtraError("pyrealsense2", "realsense") from None
+    rs: Any = pyrealsense2  # its names are made as it is loaded
+    where = str(file or f"realsense {serial}".strip())
+    if file is not None and not file.is_file():
+        raise InputError(f"{file}: no such file")
+    pipeline = rs.pipeline()
+    try:
+        profile = pipeline.start(_config(rs, pipeline, serial, file, colour))
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+    except RuntimeError as error:
+        raise InputError(f"{where}: librealsense cannot open it ({reason(error)})") from error
+    try:
+        yield from _frames(rs, pipeline, profile, where, colour)
+    except RuntimeError as error:
+        raise InputError(f"{where}: librealsense stopped ({reason(error)})") from error
+    finally:
+        pipeline.stop()
+
+
+def _config(rs: Any, pipeline: Any, serial: str, file: Path | None, colour: bool) -> Any:
+    config = rs.config()
+    if file is not None:
+        config.enable_device_from_file(str(file), False)
+        device = config.resolve(rs.pipeline_wrapper(pipeline)).get_device()
+        device.as_playback().set_real_time(False)
+        return config
+    devices = rs.context().query_devices()
+    there = [device.get_info(rs.camera_info.serial_number) for device in devices]
+    if not there or (serial and serial not in there):
+        raise InputError(f"is not connected; connected are: {', '.join(there) or 'none'}")
+    if serial:
+        config.enable_device(serial)
+    config.enable_stream(rs.stream.depth)
+    if colour:
+        config.enable_stream(rs.stream.color, rs.format.rgb8)
+        if not config.can_resolve(rs.pipeline_wrapper(pipeline)):
+            config.disable_stream(rs.stream.color)
+    return config
+
+
+def _frames(rs: Any, pipeline: Any, profile: Any, where: str, colour: bool) -> Camera:
+    """Depth frames, each once, with the colour of the same moment.
+
+    Where depth comes first, librealsense gives it twice: with the colour before, then with its own.
+    """
+    align, number, before = rs.align(rs.stream.depth), 0, -1
+    held: DepthFrame | None = None
+    for frames in _framesets(rs, pipeline, profile.get_device(), where):
+        depth = frames.get_depth_frame()
+        fresh = bool(depth) and depth.get_frame_number() != before
+        if held is not None and fresh:
+            yield held
+            held = None
+        if not depth or not (fresh or held is not None):
+            continue
+        if fresh:
+            before, number = depth.get_frame_number(), number + 1
+        frame = _depth_frame(depth, f"{number - 1:06d}")
+        picture = frames.get_color_frame() if colour else None
+        if picture and not _together(depth, picture):
+            held = frame
+            continue
+        seen = _colour(rs, align.process(frames).get_color_frame()) if picture else None
+        held = None
+        yield dataclasses.replace(frame, colour=seen)
+    if held is not None:
+        yield held
+
+
+def _framesets(rs: Any, pipeline: Any, device: Any, where: str) -> Iterator[Any]:
+    """What comes from a camera, or from a recording until it ends."""
+    playback = device.as_playback() if device.is_playback() else None
+    while True:
+        arrived, frames = pipeline.try_wait_for_frames(_PATIENCE if playback is None else 200)
+        if arrived:
+            yield frames
+        elif playback is None:
+            raise InputError(f"{where}: no frame in {_PATIENCE / 1000:g} s; check its cable")
+        elif playback.current_status() == rs.playback_status.stopped:
+            return
+
+
+def _depth_frame(depth: Any, name: str) -> DepthFrame:
+    lens = depth.profile.as_video_stream_profile().intrinsics
+    if any(lens.coeffs):
+        _tell_distortion()
+    step = float(f"{depth.get_units():.6g}")  # kept in single precision
+    camera = Intrinsics(
+        lens.fx, lens.fy, lens.ppx, lens.ppy, lens.width, lens.height, depth_scale=step
+    )
+    metres = to_metres(np.asanyarray(depth.get_data()), step)
+    return DepthFrame(metres, camera, name, depth.get_timestamp() / 1000)
+
+
+@functools.cache
+def _tell_distortion() -> None:
+    _LOG.warning("the depth of this camera has lens distortion, which is not undone")
+
+
+def _together(depth: Any, colour: Any) -> bool:
+    """Whether both are of one moment, as far as one clock tells."""
+    if depth.get_frame_timestamp_domain() != colour.get_frame_timestamp_domain():
+        return True
+    slower = min(depth.profile.fps(), colour.profile.fps())
+    return abs(depth.get_timestamp() - colour.get_timestamp()) < 750 / slower
+
+
+def _colour(rs: Any, frame: Any) -> UInt8[np.ndarray, "h w 3"] | None:
+    """Red, green and blue; None of a format that is neither this nor the reverse."""
+    kind = frame.profile.format() if frame else None
+    if kind not in (rs.format.rgb8, rs.format.bgr8):
+        return None
+    image = np.array(frame.get_data())
+    return image if kind == rs.format.rgb8 else image[..., ::-1]

@@ -1,0 +1,128 @@
+"""Frames of a depth camera cut into objects, and what a network says of each."""
+
+import time
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from qs3.errors import InputError
+from qs3.io.cameras.frames import Camera
+from qs3.io.extract.segment import SegmentedObject, SegmentSettings, lift_scene, segment
+from qs3.io.preparation import LARGEST, stack
+from qs3.training.checkpoint import LoadedModel, load_model
+from qs3.training.predict import predict_probabilities
+
+_DENSER = 4
+"""Of an object so many times the points of the network count; strays take longer in more."""
+
+STAGES = ("read", "segment", "predict")
+
+
+class SeenObject(NamedTuple):
+    """An object on the table and what the network says of it."""
+
+    item: SegmentedObject
+    """Its points and its box."""
+    probabilities: Mapping[str, float]
+    """Of every class, the likeliest first."""
+
+    @property
+    def best(self) -> tuple[str, float]:
+        """The likeliest class and its probability."""
+        return next(iter(self.probabilities.items()))
+
+
+class SeenFrame(NamedTuple):
+    """What was seen in a frame."""
+
+    name: str
+    """The frame's."""
+    timestamp: float | None
+    """Seconds, by the camera's clock."""
+    objects: tuple[SeenObject, ...]
+    """The largest first."""
+    seconds: tuple[float, float, float]
+    """That reading, segmenting and predicting took."""
+    fault: str = ""
+    """Why there is no object."""
+
+
+def watch(
+    run: str | Path, camera: Camera, settings: SegmentSettings
+) -> Generator[SeenFrame, None, None]:
+    """Yield what stands before a camera, frame by frame; closing it closes the camera.
+
+    Args:
+        run: Folder of a run, its model.safetensors, or the name of a network that comes with qs3.
+        camera: Gives the frames.
+        settings: How a frame is cut into objects.
+
+    Raises:
+        InputError: where the run or the camera cannot be read.
+    """
+    loaded = load_model(Path(run))
+    with closing(camera):
+        while True:
+            begin = time.perf_counter()
+            frame = next(camera, None)
+            if frame is None:
+                return
+            read, fault = time.perf_counter(), ""
+            try:
+                items = segment(
+                    lift_scene(frame.depth, frame.camera, settings, frame.name), settings
+                )
+            except InputError as error:  # an empty table, a hand before the lens
+                items, fault = [], str(error)
+            cut = time.perf_counter()
+            objects = predict_objects(loaded, items)
+            end = time.perf_counter()
+            yield SeenFrame(
+                frame.name, frame.timestamp, objects, (read - begin, cut - read, end - cut), fault
+            )
+
+
+def predict_objects(
+    loaded: LoadedModel, items: Sequence[SegmentedObject]
+) -> tuple[SeenObject, ...]:
+    """Tell the class of each object of a frame, all in one pass."""
+    if not items:
+        return ()
+    most = min(LARGEST, _DENSER * (loaded.num_points or LARGEST))
+    clouds = stack([item.points for item in items], None, "frame", most)
+    shares = predict_probabilities(loaded, clouds).tolist()
+    names = loaded.class_names
+    return tuple(
+        SeenObject(item, dict(sorted(zip(names, row, strict=True), key=lambda pair: -pair[1])))
+        for item, row in zip(items, shares, strict=True)
+    )
+
+
+def plain(frame: SeenFrame) -> dict[str, Any]:
+    """A frame as plain values, for JSON; lengths in metres."""
+    objects = [
+        {
+            "class": one.best[0],
+            "confidence": one.best[1],
+            "points": len(one.item.points),
+            "centre": one.item.centre,
+            "size": one.item.size,
+            "heading": one.item.heading,
+            "probabilities": one.probabilities,
+        }
+        for one in frame.objects
+    ]
+    seconds = dict(zip(STAGES, frame.seconds, strict=True))
+    told = {"frame": frame.name, "time": frame.timestamp, "objects": objects, "seconds": seconds}
+    return told | ({"fault": frame.fault} if frame.fault else {})
+
+
+def rate(frames: Sequence[SeenFrame]) -> str:
+    """A line: how many frames a second, and the mean time of each stage."""
+    timed = frames[1:] or frames  # what the first one loads, the others find there
+    means = [sum(part) / len(timed) for part in zip(*(f.seconds for f in timed), strict=True)]
+    parts = ", ".join(
+        f"{name} {1000 * mean:.0f} ms" for name, mean in zip(STAGES, means, strict=True)
+    )
+    return f"{len(frames)} frames, {1 / sum(means):.1f} a second; of each: {parts}"

@@ -1,0 +1,66 @@
+"""A table with things on it, photographed by ray casting, as a recorded camera gives it."""
+
+import numpy as np
+import trimesh
+
+from qs3 import shapes
+from qs3.io.cameras.frames import DepthFrame
+from qs3.io.extract.intrinsics import Intrinsics
+
+from ..extract.depth_scene import box
+
+THINGS = (("chair", -0.35, 0.1), ("table", 0.0, -0.1), ("sofa", 0.35, 0.1), ("lamp", 0.05, 0.25))
+"""Class, and place on the table in metres."""
+SIZE = 0.2
+"""Longest side of each."""
+
+
+def thing(name: str, x: float, y: float) -> trimesh.Trimesh:
+    mesh = shapes.make(name, seed=1)
+    mesh.apply_scale(SIZE / mesh.extents.max())
+    low, high = mesh.bounds
+    middle = (low + high) / 2
+    return mesh.apply_translation([x - middle[0], y - middle[1], -low[2]])
+
+
+def table() -> trimesh.Trimesh:
+    """A table of 1.2 × 0.8 m, z up and 0 on it, with ``THINGS``; the floor 0.7 m below."""
+    floor = box((4, 4, 0.1), (-2, -2, -0.8))
+    parts = [box((1.2, 0.8, 0.03), (-0.6, -0.4, -0.03)), floor, *(thing(*one) for one in THINGS)]
+    return trimesh.util.concatenate(parts)
+
+
+def photograph(mesh: trimesh.Trimesh, camera: Intrinsics, down: float = 50.0, x: float = 0.0):
+    """Depth in metres, 0 for none, of a camera before the table that looks down by degrees."""
+    s, c = np.sin(np.radians(down)), np.cos(np.radians(down))
+    rotation = np.array([[1, 0, 0], [0, -s, -c], [0, c, -s]])  # rows: right, down, ahead
+    eye = np.array([x, -0.55, 0.65])
+    v, u = np.mgrid[: camera.height, : camera.width].reshape(2, -1)
+    rays = np.stack(
+        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], axis=1
+    )
+    start = np.broadcast_to(eye, rays.shape)
+    hit, ray, _ = mesh.ray.intersects_location(start, rays @ rotation, multiple_hits=False)
+    depth = np.zeros(len(u))
+    depth[ray] = (hit - eye) @ rotation[2]
+    return depth.reshape(camera.height, camera.width)
+
+
+def frames(count: int, width: int = 320, height: int = 240, noise: float = 0.0):
+    """Frames of a camera that moves along the table, in whole millimetres, 30 a second."""
+    focal = 0.7 * width
+    camera = Intrinsics(
+        focal, focal, (width - 1) / 2, (height - 1) / 2, width, height, depth_scale=0.001
+    )
+    mesh, rng = table(), np.random.default_rng(0)
+    for number in range(count):
+        depth = photograph(mesh, camera, x=0.01 * number)
+        depth += noise * rng.normal(size=depth.shape) * depth**2
+        steps = np.rint(np.where(depth > 0, depth, 0) * 1000).astype(np.uint16)
+        metres = steps.astype(np.float32) * np.float32(0.001)
+        red = np.repeat(np.minimum(steps // 8, 255).astype(np.uint8)[..., None], 3, axis=2)
+        red[..., 1:] //= 2
+        yield DepthFrame(
+            np.where(steps > 0, metres, np.float32(np.nan)),
+            camera, f"{number:06d}", 100 + number / 30, red,
+        )  # fmt: skip

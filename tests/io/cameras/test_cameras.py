@@ -1,0 +1,292 @@
+"""Frames of cameras: folders, a RealSense's recordings, ROS bags; all become one layout."""
+
+import dataclasses
+import json
+import shutil
+import time
+
+import numpy as np
+import pytest
+
+from qs3.errors import InputError, MissingExtraError
+from qs3.io.cameras.folder import capture
+from qs3.io.cameras.frames import CameraSettings, DepthFrame, open_camera
+from qs3.io.extract.depth import DepthImageSettings, extract_depth
+from qs3.io.extract.depth_images import read_depth
+from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
+from qs3.io.extract.run import OutputSettings
+from qs3.io.extract.segment import SceneSettings, segment_scene
+
+from ..hostile import fuzz, mutated, refused
+from .bags import RATE, write_realsense, write_ros1, write_ros2
+from .table import frames
+
+
+def read(camera: str, **more) -> list[DepthFrame]:
+    return list(open_camera(CameraSettings(camera, **more)))
+
+
+def same(one: DepthFrame, other: DepthFrame, colour: bool = True) -> None:
+    """Equal depths, to the bit, camera and times."""
+    np.testing.assert_array_equal(one.depth, other.depth)
+    assert dataclasses.astuple(one.camera) == pytest.approx(dataclasses.astuple(other.camera))
+    assert one.timestamp == pytest.approx(other.timestamp, abs=1e-6)
+    assert (one.colour is None) == (not colour)
+    if colour:
+        np.testing.assert_array_equal(one.colour, other.colour)
+
+
+def test_what_is_captured_is_what_the_folder_gives_back(tmp_path):
+    shots = list(frames(3))
+    assert capture((frame for frame in shots), tmp_path / "shots") == 3
+    for one, two in zip(shots, read(f"folder:{tmp_path / 'shots'}"), strict=True):
+        same(two, one)
+        assert one.name == two.name
+    with refused("is there already"):
+        capture(frames(1), tmp_path / "shots")
+
+
+def test_segment_and_extract_read_what_was_captured(tmp_path):
+    out = tmp_path / "shots"
+    capture(frames(2), out)
+    picture = out / "depth" / "000000.png"
+    objects = segment_scene(picture, tmp_path / "objects", SceneSettings(intrinsics=str(out)))
+    assert len(objects) >= 3
+    settings = DepthImageSettings(intrinsics=str(out), box=(100, 60, 220, 180))
+    report = extract_depth(out / "depth", OutputSettings(str(tmp_path / "d"), workers=0), settings)
+    assert (report.objects, report.failed) == (2, 0)
+
+
+def test_numbers_with_a_point_lose_nothing_and_every_step_has_its_unit(tmp_path):
+    rng = np.random.default_rng(0)
+    for step in (None, 0.0001, 0.00025):
+        camera = Intrinsics(50.0, 50.0, 4.0, 3.0, 9, 7, depth_scale=step)
+        depth = rng.random((7, 9)).astype(np.float32) + np.float32(0.1)
+        if step is not None:
+            depth = np.rint(depth / np.float32(step)) * np.float32(step)
+        depth[2, 3] = np.nan
+        capture((frame for frame in [DepthFrame(depth, camera, "a")]), tmp_path / str(step))
+        (back,) = read(f"folder:{tmp_path / str(step)}")
+        np.testing.assert_array_equal(back.depth, depth)
+        assert back.camera == camera
+        assert back.timestamp is None
+
+
+def test_what_no_png_holds_is_no_depth(tmp_path):
+    camera = Intrinsics(50.0, 50.0, 0.0, 0.0, 2, 1, depth_scale=0.001)
+    far = np.array([[65.535, 65.536]], np.float32)
+    capture((frame for frame in [DepthFrame(far, camera, "a")]), tmp_path / "far")
+    depth = read_depth(tmp_path / "far" / "depth" / "000000.png")
+    assert depth[0, 0] == np.float32(65.535)
+    assert np.isnan(depth[0, 1])
+
+
+def test_a_stop_keeps_what_is_there(tmp_path):
+    closed = []
+
+    def stopped():
+        try:
+            yield from frames(2)
+            raise KeyboardInterrupt
+        finally:
+            closed.append(True)
+
+    with pytest.raises(KeyboardInterrupt):
+        capture(stopped(), tmp_path / "shots")
+    assert closed
+    assert len(read(f"folder:{tmp_path / 'shots'}")) == 2
+    left = {path.name for path in (tmp_path / "shots").rglob("*") if path.is_file()}
+    assert left == {"000000.png", "000001.png", "intrinsics.json", "times.csv"}
+
+
+def test_frames_and_every_choose(tmp_path):
+    capture(frames(7), tmp_path / "shots")
+    folder = f"folder:{tmp_path / 'shots'}"
+    assert [frame.name for frame in read(folder, frames=2)] == ["000000", "000001"]
+    chosen = [frame.name for frame in read(folder, every=3 / RATE)]
+    assert chosen == ["000000", "000003", "000006"]
+    (tmp_path / "shots" / "times.csv").unlink()
+    assert len(read(folder, every=9.0)) == 7  # nothing tells when they were taken
+    for wrong in ({"frames": 0}, {"every": -1.0}, {"every": float("nan")}):
+        with pytest.raises(InputError):
+            CameraSettings("realsense", **wrong)
+
+
+def test_a_folder_of_images_with_a_camera_beside_them(tmp_path):
+    capture(frames(2), tmp_path / "shots")
+    for path in (tmp_path / "shots" / "depth").iterdir():
+        path.rename(tmp_path / path.name)
+    with refused("does not tell its camera", tmp_path):
+        read(f"folder:{tmp_path}")
+    assert len(read(f"folder:{tmp_path}", intrinsics="224,224,159.5,119.5")) == 2
+    (tmp_path / "K.txt").write_text("224 0 159.5 0 224 119.5 0 0 1")
+    assert read_intrinsics(tmp_path).fx == 224
+    assert len(read(f"folder:{tmp_path}")) == 2
+
+
+def test_a_recording_of_a_realsense_gives_every_frame(tmp_path):
+    """Recorded by librealsense itself, of a camera made of software."""
+    pytest.importorskip("pyrealsense2")
+    shots = list(frames(8))
+    path = write_realsense(tmp_path / "shots", shots)
+    got = []
+    for frame in open_camera(CameraSettings(f"bag:{path}")):
+        got.append(frame)
+        time.sleep(0.05)  # slower than the camera
+    for one, two in zip(shots, got, strict=True):
+        same(two, dataclasses.replace(one, colour=two.colour))
+        # librealsense lays colour over depth: all but what edges hide.
+        assert (one.colour == two.colour).mean() > 0.99
+    assert len(read(f"bag:{path}", every=3 / RATE)) == 3
+    without = next(open_camera(CameraSettings(f"bag:{path}"), colour=False))
+    assert without.colour is None
+    assert capture(open_camera(CameraSettings(f"bag:{path}")), tmp_path / "out") == 8
+    for one, two in zip(got, read(f"folder:{tmp_path / 'out'}"), strict=True):
+        same(two, one)
+
+
+def test_damaged_recordings_of_a_realsense_are_one_line(tmp_path):
+    pytest.importorskip("pyrealsense2")
+    with refused("no such file", "none.bag"):
+        read(f"bag:{tmp_path / 'none.bag'}")
+    for ending in (".bag", ".db3"):
+        path = tmp_path / f"noise{ending}"
+        path.write_bytes(np.random.default_rng(0).bytes(5000))
+        with refused("librealsense", path):
+            read(f"bag:{path}")
+    with refused("is not connected", "realsense 000000000000"):
+        read("realsense:000000000000")
+
+
+@pytest.mark.parametrize("kind", ["ros1", "ros1-lz4", "db3", "mcap", "mcap-zstd", "message-zstd"])
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1", "compressedDepth"])
+def test_bags_of_ros_give_the_frames_that_went_in(tmp_path, kind, encoding):
+    shots = list(frames(3, 64, 48))
+    write = write_ros1 if kind.startswith("ros1") else write_ros2
+    path = write(tmp_path / "bag", shots, encoding, kind)
+    got = read(f"rosbag:{path}")
+    if encoding == "32FC1":
+        shots = [_in_metres(frame) for frame in shots]
+    for one, two in zip(shots, got, strict=True):
+        same(two, one, colour=False)
+    capture(open_camera(CameraSettings(f"rosbag:{path}")), tmp_path / "out")
+    for one, two in zip(shots, read(f"folder:{tmp_path / 'out'}"), strict=True):
+        same(two, one, colour=False)
+
+
+def _in_metres(frame: DepthFrame) -> DepthFrame:
+    camera = dataclasses.replace(frame.camera, depth_scale=None)
+    return dataclasses.replace(frame, camera=camera)
+
+
+def test_convention_ros_rows_are_padded_big_endian_and_rectified(tmp_path, caplog):
+    shots = list(frames(1, 64, 48))
+    path = write_ros1(tmp_path / "bag", shots, "16UC1", "ros1", big=True, padding=6)
+    same(read(f"rosbag:{path}")[0], shots[0], colour=False)
+    # K and D are those of the lens; what is rectified has P.
+    path = write_ros1(tmp_path / "raw", shots, "16UC1", "ros1", lens=(0.1, 0, 0, 0, 0))
+    read(f"rosbag:{path}")
+    assert "lens distortion" in caplog.text
+    caplog.clear()
+    more = {"lens": (0.1, 0, 0, 0, 0), "name": "/camera/depth/image_rect_raw"}
+    path = write_ros1(tmp_path / "rect", shots, "16UC1", "ros1", **more)
+    assert read(f"rosbag:{path}")[0].camera.fx == pytest.approx(shots[0].camera.fx + 1)
+    assert not caplog.text
+
+
+def test_definitions_that_a_bag_brings_are_not_looked_at(tmp_path):
+    shots = list(frames(1, 64, 48))
+    for brings in ("import os", "uint8[] data\n", "string encoding=__import__('os')\n"):
+        path = write_ros1(tmp_path / str(len(brings)), shots, "16UC1", "ros1", brings=brings)
+        same(read(f"rosbag:{path}")[0], shots[0], colour=False)
+
+
+def test_topics_are_found_or_asked_for(tmp_path):
+    shots = list(frames(1, 64, 48))
+    two = write_ros2(tmp_path / "two", shots, "16UC1", "db3", topics=("/a/depth", "/b/depth"))
+    with refused("several topics", "/a/depth, /b/depth", "--topic"):
+        read(f"rosbag:{two}")
+    assert len(read(f"rosbag:{two}", topic="/b/depth")) == 1
+    with refused("/c is no topic of depth images", "/a/depth"):
+        read(f"rosbag:{two}", topic="/c")
+    colour = write_ros1(tmp_path / "colour", shots, "rgb8", "ros1")
+    with refused("no depth images", "/camera/depth/image_raw"):
+        read(f"rosbag:{colour}")
+    alone = write_ros1(tmp_path / "alone", shots, "16UC1", "ros1", info=False)
+    with refused("no CameraInfo", "--intrinsics"):
+        read(f"rosbag:{alone}")
+    assert len(read(f"rosbag:{alone}", intrinsics="44.8,44.8,31.5,23.5")) == 1
+    own = write_ros1(tmp_path / "own", shots, "16UC1", "ros1", name="/device_0/sensor_0/Depth_0/x")
+    with refused("recorded by a RealSense", f"bag:{own}"):
+        read(f"rosbag:{own}")
+    with refused("is 64×48 pixels, the camera 9×9"):
+        (tmp_path / "k.json").write_text(
+            json.dumps({"fx": 9, "fy": 9, "cx": 4, "cy": 4, "width": 9, "height": 9})
+        )
+        read(f"rosbag:{alone}", intrinsics=str(tmp_path / "k.json"))
+
+
+def test_what_a_message_announces_is_held_against_what_it_holds(tmp_path):
+    shots = list(frames(1, 64, 48))
+    for change, message in (
+        ({"width": 60_000, "height": 60_000}, "announces 60000×60000 pixels"),
+        ({"width": 65}, "an image of 65×48 pixels with rows of 128 bytes"),
+        ({"height": 49}, "6144 bytes of it"),
+        ({"step": 0}, "rows of 0 bytes"),
+    ):
+        path = write_ros1(tmp_path / str(len(message)), shots, "16UC1", "ros1", **change)
+        with refused(message, path):
+            read(f"rosbag:{path}")
+
+
+def test_a_bomb_ends_at_the_limit_of_memory(tmp_path):
+    path = write_ros1(tmp_path / "bag", list(frames(1, 64, 48)), "16UC1", "bomb")
+    assert path.stat().st_size < 1 << 26  # eight GiB of zeros
+    with refused(r"cannot be read as a ROS bag \(MemoryError\)", path):
+        read(f"rosbag:{path}")
+
+
+@pytest.mark.parametrize("kind", ["ros1", "db3", "mcap"])
+def test_damaged_bags_of_ros_are_one_line(tmp_path, kind):
+    write = write_ros1 if kind == "ros1" else write_ros2
+    path = write(tmp_path / "bag", list(frames(2, 16, 12)), "16UC1", kind)
+    files = [path] if path.is_file() else sorted(one for one in path.iterdir())
+    rng = np.random.default_rng(0)
+    fuzz(files, lambda _: read(f"rosbag:{path}"), rng, 60, mutated)
+
+
+def test_what_is_no_camera_is_one_line(tmp_path, monkeypatch):
+    for camera in ("kinect", "bag:", "folder:", "rosbag:"):
+        with refused("name realsense, realsense:SERIAL, bag:FILE"):
+            read(camera)
+    with refused("no such file or folder"):
+        read(f"rosbag:{tmp_path / 'x'}")
+    with refused("no such folder", "x"):
+        read(f"folder:{tmp_path / 'x'}")
+    with refused("no depth image"):
+        read(f"folder:{tmp_path}")
+    with refused("gave no frame"):
+        capture((frame for frame in ()), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    import sys
+
+    for module, camera, extra in (
+        ("pyrealsense2", "realsense", "realsense"),
+        ("rosbags", f"rosbag:{tmp_path}", "ros"),
+    ):
+        monkeypatch.setitem(sys.modules, module, None)
+        with pytest.raises(MissingExtraError, match=rf"'.\[{extra}\]'"):
+            read(camera)
+
+
+def test_colour_of_another_size_and_bad_times_are_told(tmp_path):
+    out = tmp_path / "shots"
+    capture(frames(2), out)
+    (out / "times.csv").write_text("name,when\na,b\n")
+    with refused("columns frame,time", "times.csv"):
+        read(f"folder:{out}")
+    (out / "times.csv").unlink()
+    (out / "depth" / "000001.png").replace(out / "color" / "000001.png")
+    shutil.copy(out / "depth" / "000000.png", out / "depth" / "000001.png")
+    with refused("no colour picture of the depth image's size", "000001.png"):
+        read(f"folder:{out}")

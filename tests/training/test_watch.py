@@ -1,0 +1,108 @@
+"""What stands before a camera: frames of a table to classes and places."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qs3.cli import main
+from qs3.io.cameras.folder import capture
+from qs3.io.cameras.frames import CameraSettings, DepthFrame, open_camera
+from qs3.io.extract.intrinsics import Intrinsics
+from qs3.io.extract.segment import SegmentSettings, lift_scene, segment
+from qs3.training.checkpoint import load_model
+from qs3.training.predict import predict_probabilities
+from qs3.training.watch import plain, predict_objects, rate, watch
+
+from ..io.cameras.bags import write_ros1
+from ..io.cameras.table import frames
+
+
+@pytest.fixture(scope="module")
+def shots(tmp_path_factory):
+    out = tmp_path_factory.mktemp("watch") / "shots"
+    capture(frames(3), out)
+    return out
+
+
+def test_the_objects_of_a_frame_get_the_answers_that_each_gets_alone():
+    loaded = load_model(Path("rooms"))
+    (frame,) = frames(1)
+    settings = SegmentSettings()
+    items = segment(lift_scene(frame.depth, frame.camera, settings, "frame"), settings)
+    assert len({len(item.points) for item in items}) > 2
+    for item, one in zip(items, predict_objects(loaded, items), strict=True):
+        assert one.item is item
+        if len(item.points) <= 1024:
+            alone = predict_probabilities(loaded, item.points[None])[0]
+            told = [one.probabilities[name] for name in loaded.class_names]
+            np.testing.assert_allclose(told, alone, atol=1e-6)
+        assert one.best[1] == max(one.probabilities.values())
+        assert list(one.probabilities.values()) == sorted(one.probabilities.values(), reverse=True)
+
+
+def test_a_frame_without_objects_is_told_and_the_next_one_seen():
+    (good,) = frames(1)
+    camera = Intrinsics(50.0, 50.0, 4.0, 4.0, 9, 9)
+    blind = DepthFrame(np.full((9, 9), np.nan, np.float32), camera, "blind")
+    closed = []
+
+    def camera_of_mine():
+        try:
+            yield blind
+            yield good
+            yield blind
+        finally:
+            closed.append(True)
+
+    seen = []
+    for frame in watch("rooms", camera_of_mine(), SegmentSettings()):
+        seen.append(frame)
+        if frame.objects:
+            break
+    assert [bool(frame.objects) for frame in seen] == [False, True]
+    assert "too few" in seen[0].fault
+    del frame
+    assert closed
+    assert rate(seen).startswith("2 frames, ")
+    json.dumps([plain(frame) for frame in seen])
+
+
+def test_places_move_against_the_camera(shots):
+    """The camera goes 1 cm to the right a frame: what stands there goes to the left."""
+    folder = CameraSettings(f"folder:{shots}")
+    seen = list(watch("rooms", open_camera(folder), SegmentSettings()))
+    largest = np.array([frame.objects[0].item.centre for frame in seen])
+    np.testing.assert_allclose(np.diff(largest[:, 0]), -0.01, atol=0.003)
+    np.testing.assert_allclose(np.diff(largest[:, 1:], axis=0), 0, atol=0.003)
+
+
+def run(capsys, *words):
+    with pytest.raises(SystemExit) as ended:
+        main([str(word) for word in words])
+    told = capsys.readouterr()
+    return ended.value.code, told.out, told.err
+
+
+def test_the_verbs_from_a_bag_to_answers(tmp_path, capsys):
+    bag = write_ros1(tmp_path / "bag", list(frames(3)), "16UC1", "ros1-lz4")
+    code, out, err = run(capsys, "extract", "rosbag", bag, "--out", tmp_path / "a", "--frames", 2)
+    assert (code, out.strip()) == (0, str(tmp_path / "a"))
+    assert err.startswith("2 frames.")
+    folder = f"folder:{tmp_path / 'a'}"
+    code, *_ = run(capsys, "capture", "--camera", folder, "--out", tmp_path / "b")
+    assert code == 0
+    assert (tmp_path / "b/depth/000001.png").read_bytes() == (
+        tmp_path / "a/depth/000001.png"
+    ).read_bytes()
+    code, out, err = run(capsys, "watch", "rooms", "--camera", f"folder:{tmp_path / 'b'}", "--json")
+    rows = [json.loads(line) for line in out.splitlines()]
+    assert [row["frame"] for row in rows] == ["000000", "000001"]
+    assert len(rows[0]["objects"]) >= 3
+    assert len(rows[0]["objects"][0]["probabilities"]) == 10
+    assert "a second; of each: read" in err
+    code, out, _ = run(capsys, "watch", "rooms", "--camera", folder, "--frames", 1)
+    assert out.startswith(f"000000\t{rows[0]['objects'][0]['class']} 0.")
+    code, _, err = run(capsys, "extract", "bag", tmp_path / "none.bag", "--out", tmp_path / "c")
+    assert (code, err.count("\n")) == (2, 1)
