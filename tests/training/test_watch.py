@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from qs3.cli import main
+from qs3.errors import InputError
 from qs3.io.cameras.folder import capture
 from qs3.io.cameras.frames import CameraSettings, DepthFrame, open_camera
 from qs3.io.extract.intrinsics import Intrinsics
@@ -40,6 +41,36 @@ def test_the_objects_of_a_frame_get_the_answers_that_each_gets_alone():
             np.testing.assert_allclose(told, alone, atol=1e-6)
         assert one.best[1] == max(one.probabilities.values())
         assert list(one.probabilities.values()) == sorted(one.probabilities.values(), reverse=True)
+
+
+def test_what_is_unfamiliar_is_answered_by_unknown():
+    loaded = load_model(Path("rooms"))
+    (frame,) = frames(1)
+    items = segment(
+        lift_scene(frame.depth, frame.camera, SegmentSettings(), "frame"), SegmentSettings()
+    )
+    plainly = [one.best for one in predict_objects(loaded, items)]
+    assert [one.best for one in predict_objects(loaded, items, 0.0)] == plainly
+    refused = predict_objects(loaded, items, 1.0)
+    assert {one.best[0] for one in refused} == {"unknown"}
+    assert [next(iter(one.probabilities.items())) for one in refused] == plainly
+    with pytest.raises(InputError, match="unknown"):
+        next(watch("rooms", frames(1), SegmentSettings(), 1.5))
+
+
+def test_noise_of_a_camera_far_away_is_no_object():
+    """At 2.5 m it is larger than the tolerance; the boxes stand out from it all the same."""
+    rng = np.random.default_rng(0)
+    floor = np.c_[rng.random((60_000, 2)) * 2.0 - 1.0, np.zeros(60_000)]
+    things = [rng.random((4000, 3)) * 0.4 + [x, y, 0.0] for x, y in ((-0.6, -0.5), (0.3, 0.2))]
+    scene = np.concatenate([floor, *things]) - [0.0, -2.0, 1.5]  # the camera is at the origin
+    reach = np.linalg.norm(scene, axis=1, keepdims=True)
+    scene += 0.003 * reach * rng.normal(size=(len(scene), 1)) * scene  # along the rays
+    far = {"height": 1.0, "gap": 0.05}
+    assert len(segment(scene, SegmentSettings(noise=0.003, **far))) == 2
+    assert len(segment(scene, SegmentSettings(**far))) != 2
+    with pytest.raises(InputError, match="noise"):
+        SegmentSettings(noise=-1.0)
 
 
 def test_a_frame_without_objects_is_told_and_the_next_one_seen():

@@ -16,7 +16,8 @@ from qs3.io.extract.segment import SegmentSettings
 def watch(
     run: Annotated[Path, tyro.conf.Positional],
     camera: Flat[CameraSettings],
-    settings: Flat[SegmentSettings] = SegmentSettings(stride=2),  # noqa: B008
+    settings: Flat[SegmentSettings] = SegmentSettings(stride=2, noise=0.003),  # noqa: B008
+    unknown: float | None = None,
     json_lines: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
     """Tell what stands before a depth camera, frame by frame, until Ctrl-C or its end.
@@ -25,13 +26,15 @@ def watch(
         run: Folder of a run, its model.safetensors, or a network that comes with qs3: rooms.
         camera: Which camera, and which of its frames.
         settings: How a frame is cut into objects.
+        unknown: Share of the objects of its own classes that the network may answer by "unknown",
+            as in qs3 predict.
         json_lines: Print a line of JSON a frame, with every class's probability and the boxes.
     """
     from qs3.training import watch as watching
 
     seen: list[watching.SeenFrame] = []
     with contextlib.suppress(KeyboardInterrupt):
-        for frame in watching.watch(run, open_camera(camera, colour=False), settings):
+        for frame in watching.watch(run, open_camera(camera, colour=False), settings, unknown):
             seen.append(frame._replace(objects=()))
             if json_lines:
                 show(json.dumps(watching.plain(frame), ensure_ascii=False))

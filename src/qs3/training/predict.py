@@ -74,7 +74,7 @@ def ask(
     num_points: int | None = None,
     preparation: Preparation | None = None,
     batch_size: int = 32,
-    fabric: Fabric | None = None,
+    fabric: "Fabric | None" = None,
 ) -> Description:
     """Return all that a network says of clouds as read; arguments are `predict_probabilities`'."""
     if isinstance(model, LoadedModel):
@@ -136,7 +136,7 @@ def describe_known(
     holdout: Prepared[PointClouds],
     *,
     batch_size: int = 32,
-    fabric: Fabric | None = None,
+    fabric: "Fabric | None" = None,
 ) -> Known:
     """Return how a network answers labelled clouds of the source that it was not trained on.
 

@@ -6,12 +6,13 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from qs3.adaptation.confidence import UNKNOWN
 from qs3.errors import InputError
 from qs3.io.cameras.frames import Camera
 from qs3.io.extract.segment import SegmentedObject, SegmentSettings, lift_scene, segment
 from qs3.io.preparation import LARGEST, stack
 from qs3.training.checkpoint import LoadedModel, load_model
-from qs3.training.predict import predict_probabilities
+from qs3.training.predict import ask
 
 _DENSER = 4
 """Of an object so many times the points of the network count; strays take longer in more."""
@@ -26,10 +27,14 @@ class SeenObject(NamedTuple):
     """Its points and its box."""
     probabilities: Mapping[str, float]
     """Of every class, the likeliest first."""
+    unfamiliar: float | None = None
+    """Where no class is answered, the share of held-out clouds that are more familiar."""
 
     @property
     def best(self) -> tuple[str, float]:
-        """The likeliest class and its probability."""
+        """The likeliest class and its probability, or ``unknown`` and `unfamiliar`."""
+        if self.unfamiliar is not None:
+            return UNKNOWN, self.unfamiliar
         return next(iter(self.probabilities.items()))
 
 
@@ -49,7 +54,7 @@ class SeenFrame(NamedTuple):
 
 
 def watch(
-    run: str | Path, camera: Camera, settings: SegmentSettings
+    run: str | Path, camera: Camera, settings: SegmentSettings, unknown: float | None = None
 ) -> Generator[SeenFrame, None, None]:
     """Yield what stands before a camera, frame by frame; closing it closes the camera.
 
@@ -57,11 +62,15 @@ def watch(
         run: Folder of a run, its model.safetensors, or the name of a network that comes with qs3.
         camera: Gives the frames.
         settings: How a frame is cut into objects.
+        unknown: As in `predict_objects`.
 
     Raises:
-        InputError: where the run or the camera cannot be read.
+        InputError: where the run or the camera cannot be read, or the run does not hold what is
+            known to it.
     """
     loaded = load_model(Path(run))
+    if unknown is not None:
+        loaded.require_known(run, unknown)
     with closing(camera):
         while True:
             begin = time.perf_counter()
@@ -76,7 +85,7 @@ def watch(
             except InputError as error:  # an empty table, a hand before the lens
                 items, fault = [], str(error)
             cut = time.perf_counter()
-            objects = predict_objects(loaded, items)
+            objects = predict_objects(loaded, items, unknown)
             end = time.perf_counter()
             yield SeenFrame(
                 frame.name, frame.timestamp, objects, (read - begin, cut - read, end - cut), fault
@@ -84,19 +93,32 @@ def watch(
 
 
 def predict_objects(
-    loaded: LoadedModel, items: Sequence[SegmentedObject]
+    loaded: LoadedModel, items: Sequence[SegmentedObject], unknown: float | None = None
 ) -> tuple[SeenObject, ...]:
-    """Tell the class of each object of a frame, all in one pass."""
+    """Tell the class of each object of a frame, all in one pass.
+
+    Args:
+        loaded: The network.
+        items: The objects.
+        unknown: Share of objects of the known classes that may be refused; None always answers.
+    """
     if not items:
         return ()
     most = min(LARGEST, _DENSER * (loaded.num_points or LARGEST))
     clouds = stack([item.points for item in items], None, "frame", most)
-    shares = predict_probabilities(loaded, clouds).tolist()
-    names = loaded.class_names
+    said, names = ask(loaded, clouds), loaded.class_names
+    shares, unfamiliar = said.probabilities.tolist(), [None] * len(items)
+    if unknown is not None:
+        familiar = loaded.require_known("this network", unknown).familiarity(said.logits).tolist()
+        unfamiliar = [1 - share if share < unknown else None for share in familiar]
     return tuple(
-        SeenObject(item, dict(sorted(zip(names, row, strict=True), key=lambda pair: -pair[1])))
-        for item, row in zip(items, shares, strict=True)
+        SeenObject(item, dict(sorted(zip(names, row, strict=True), key=_less)), strange)
+        for item, row, strange in zip(items, shares, unfamiliar, strict=True)
     )
+
+
+def _less(pair: tuple[str, float]) -> float:
+    return -pair[1]
 
 
 def plain(frame: SeenFrame) -> dict[str, Any]:

@@ -48,6 +48,9 @@ class SegmentSettings:
     """Degrees by which the plane may be off level as gravity has it; walls are at 90."""
     tolerance: float = 0.01
     """Metres up to which a point belongs to the plane; above it begins an object."""
+    noise: float = 0.0
+    """Of a depth image, the camera's noise in metres at 1 m, which grows with the square of the
+    distance: the tolerance is three times that at least. Of a D435 0.003 to 0.005."""
     gap: float = 0.02
     """Metres of empty space that part two objects."""
     height: float = 0.5
@@ -61,6 +64,8 @@ class SegmentSettings:
         for name in ("tolerance", "gap", "height", "far"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name} {getattr(self, name):g}: must be positive metres")
+        if not 0 <= self.noise < math.inf:
+            raise InputError(f"noise {self.noise:g}: must be metres, 0 or more")
         if not 0 <= self.tilt <= 90:
             raise InputError(f"tilt {self.tilt:g}: must be from 0 to 90 degrees")
         for name in ("min_points", "stride"):
@@ -171,7 +176,8 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
     """Cut a scene into the objects that stand on its largest level plane, by points.
 
     Args:
-        points: The scene in metres, z up to ``tilt`` degrees.
+        points: The scene in metres, z up to ``tilt`` degrees; where ``noise`` is set, the camera at
+            the origin.
         settings: How it is cut.
 
     Raises:
@@ -182,18 +188,20 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
             f"{len(points)} points, over {_WIDEST:g} m apart or too few; a scene is in metres"
         )
     up = np.array([0.0, 0.0, 1.0])
-    few = points[thin(len(points), _FITTED)]
-    plane = fit_plane(few, settings.tolerance, up, settings.tilt, settings.seed)
-    held = 0.0 if plane is None else np.mean(np.abs(plane.heights(few)) <= settings.tolerance)
+    noise = 3 * settings.noise * (points**2).sum(axis=1)
+    tolerance = np.maximum(settings.tolerance, noise)
+    fitted = thin(len(points), _FITTED)
+    few, middle = points[fitted], float(np.median(tolerance[fitted]))
+    plane = fit_plane(few, middle, up, settings.tilt, settings.seed)
+    held = 0.0 if plane is None else np.mean(np.abs(plane.heights(few)) <= tolerance[fitted])
     if plane is None or held < _LEAST_SHARE:
         raise InputError(
             f"no plane within {settings.tilt:g}° of level holds a tenth of the points to "
-            f"{settings.tolerance:g} m; tell --gravity, or raise --tolerance"
+            f"{middle:g} m; tell --gravity, or raise --tolerance"
         )
     points = turn(_level(plane), points) - np.array([0.0, 0.0, plane.offset])
-    near = points[:, 2] <= settings.height
-    points = points[near & (points[:, 2] >= -settings.tolerance)]
-    above = points[:, 2] > settings.tolerance
+    near = (points[:, 2] <= settings.height) & (points[:, 2] >= -tolerance)
+    points, above = points[near], points[near, 2] > tolerance[near]
     patch, _ = _voxels(points[~above, :2], settings.gap / 2)
     points = points[above]
     points = points[_over(patch, points, settings)]
