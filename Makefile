@@ -35,8 +35,9 @@ check: $(VENV)/.installed-dev
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 
-examples: $(VENV)/.installed
+examples: $(VENV)/.installed-dev
 	set -e; for file in examples/*.py; do echo "$$file"; $(BIN)/python "$$file"; done
+	$(BIN)/python -m pytest -q -m slow tests/test_notebook.py
 
 # The site, in site/; needs no network once the packages are there.
 docs: $(VENV)/.installed-docs

@@ -45,7 +45,10 @@ def test_page_of_several_runs_has_every_part(qs3, grid, tmp_path):
         "How to make it again",
     ]
     assert re.findall(r'<div class="score">([\w-]+)<b>', page) == ["source-only", "qbst"]
-    assert len(re.findall(r'<i data-class="\d+"', page)) == 20
+    assert len(re.findall(r'<i data-class="\d+"', page)) > 20  # twenty by class, and the pairs
+    tabs = re.findall(r'role="tab" [^>]*>(.*?)</button>', page)
+    assert tabs[0] == "By class"
+    assert tabs[-1] == "Beside the nearest source scan"
     assert re.search(r'data-note="Taken for \w+ \(source-only\), \w+ \(qbst\)"', page)
     assert str(grid) not in page
 

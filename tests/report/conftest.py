@@ -54,6 +54,8 @@ def report() -> Report:
         montage_title=f"mesh {HOSTILE}",
         data={"source": DataRecord(f"data {HOSTILE}", "0a" * 32, 30)},
         clouds={"source": [*clouds, *clouds], f"target {HOSTILE}": clouds},
+        mistakes={f"scan {HOSTILE}": clouds[1:], "source": clouds[:2]},
+        nearest={"lone": clouds[:1]},
         maps=(
             FeatureMap(
                 f"map {HOSTILE}",

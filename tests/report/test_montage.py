@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from qs3.report.figure import NO_VALUE, png_bytes, write_png
-from qs3.report.montage import MontageView, montage
+from qs3.report.montage import MontageView, montage, montage_columns
 
 HEIGHT, WIDTH = 40, 60
 
@@ -119,3 +119,16 @@ def test_bytes_depend_on_the_view_alone(view, tmp_path):
     assert not any(word in first for word in (b"Software", b"matplotlib", b"tIME", b"Creation"))
     write_png(tmp_path / "new" / "a.png", Figure(figsize=(2, 1)), dpi=50)
     assert imread(tmp_path / "new" / "a.png").shape[:2] == (50, 100)
+
+
+def test_columns_for_a_phone_hold_the_same_panels(view):
+    """Two panels a row, and letters that are still letters where 358 px are all there is."""
+    whole = [*axes_of(montage(view))]
+    stages, clouds = montage_columns(view)
+    panels = [a for figure in (stages, clouds) for a in figure.axes if a.get_title()]
+    assert sorted(a.get_title() for a in panels) == sorted(whole)
+    for figure in (stages, clouds):
+        a_point = 358 / figure.get_figwidth() / 72  # pixels
+        assert min(a.title.get_fontsize() for a in figure.axes if a.get_title()) * a_point > 8
+        grids = [a.get_subplotspec() for a in figure.axes if a.get_title()]
+        assert {spec.get_gridspec().ncols for spec in grids if spec is not None} == {2}

@@ -82,6 +82,8 @@ def test_hostile_text_is_shown_as_it_is_wherever_it_comes_from(source):
         assert f"{start} {HOSTILE}" in text
     for start in ("Note", "chair", "data", "line", "theta", "mark", "paper"):
         assert f"{start} {HOSTILE}" in text
+    for heading in ("target", "scan", "mesh"):
+        assert f"{heading} {HOSTILE}" in text
     assert any(f["data-domain"] == f"target {HOSTILE}" for f in Page(source).named("figure")
                if "data-domain" in f)  # fmt: skip
     alternatives = [i["alt"] for i in Page(source).named("img")]
@@ -90,8 +92,8 @@ def test_hostile_text_is_shown_as_it_is_wherever_it_comes_from(source):
 
 def test_images_decode_and_are_described(source):
     images = Page(source).named("img")
-    # montage, two galleries, curves, map, selection, two matrices, bars
-    assert len(images) == 9
+    # two of the scan, two galleries, curves, map, selection, two matrices, bars
+    assert len(images) == 10
     for image in images:
         data = base64.b64decode(image["src"].split(",")[1], validate=True)
         pixels = imread(io.BytesIO(data), format="png")
@@ -123,7 +125,8 @@ def bare(report, **parts):
     empty = dict.fromkeys(("before", "after", "montage")) | dict.fromkeys(
         ("maps", "scores", "curves", "rounds", "notes"), ()
     )
-    none = {part: {} for part in ("clouds", "data", "settings", "versions")}
+    none = ("clouds", "mistakes", "nearest", "data", "settings", "versions")
+    none = {part: {} for part in none}
     return dataclasses.replace(report, **empty | none | parts)
 
 
@@ -141,10 +144,19 @@ def test_bad_news_is_told_as_it_is(report, kind):
 def test_table_of_rounds_holds_every_number(source):
     rows = re.findall(r"<tr>(.*?)</tr>", source)
     cells = [re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row) for row in rows]
-    assert cells[0][:6] == ["round", "θ", "above θ", "selected", "agreement", "note"]
-    assert cells[1] == ["1", "0.800", "8", "4", "50.0 %", "", "2 / 5", "0 / 0", "2 / 3"]
-    assert cells[2][:5] == ["2", "0.805", "1", "0", "–"]
-    assert cells[2][6:] == ["0 / 1", "0 / 0", "0 / 0"]
+    assert cells[:5] == [
+        ["round", "1", "2"],
+        ["θ", "0.800", "0.805"],
+        ["above θ", "8", "1"],
+        ["selected", "4", "0"],
+        ["agreement", "50 %", "–"],
+    ]
+    assert [row[1:] for row in cells[5:8]] == [
+        ["2 / 5", "0 / 1"],
+        ["0 / 0"] * 2,
+        ["2 / 3", "0 / 0"],
+    ]
+    assert any(word.startswith("Round 2: ") for word in Page(source).words)
 
 
 def test_settings_are_folded_away_and_complete(source):
@@ -205,13 +217,19 @@ def test_matrix_of_a_line_holds_its_counts_shaded_by_share(source):
 def test_viewer_has_every_cloud_of_every_domain(report, source):
     page = Page(source)
     assert "hidden" in next(a for a in page.named("div") if a.get("id") == "viewer")
-    assert len(page.named("canvas")) == len(report.clouds) == 2
-    clouds = page.named("i")
-    assert [c["data-class"] for c in clouds] == list("001122012")  # two of each, then one
-    for item, cloud in zip(clouds[-3:], list(report.clouds.values())[1], strict=True):
+    columns = [
+        own for part in (report.clouds, report.mistakes, report.nearest) for own in part.values()
+    ]
+    assert len(page.named("canvas")) == len(columns) == 5
+    clouds = [cloud for own in columns for cloud in own]
+    for item, cloud in zip(page.named("i"), clouds, strict=True):
+        assert report.class_names[int(item["data-class"])] == cloud.class_name
         assert item["data-points"] == encode_points(cloud.points)
         assert item["data-note"] == cloud.note
-    assert len(page.named("option")) == 1 + len(report.class_names)
+        spans = cloud.points.max(axis=0) - cloud.points.min(axis=0)
+        assert spans.max() / 2 <= float(item["data-radius"]) * 1.001
+        assert float(item["data-radius"]) <= np.linalg.norm(spans) / 2 * 1.001
+    assert len(page.named("option")) == 3 * (1 + len(report.class_names))
 
 
 def test_class_without_a_cloud_cannot_be_chosen(report):

@@ -107,3 +107,11 @@ def test_no_global_state_of_pyplot():
     code = "import sys, qs3.report.page; "
     code += "sys.exit('matplotlib.pyplot' in sys.modules or 'torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_accuracy_begins_at_zero_however_few_points_it_differs_by():
+    scores = Curve("a", np.arange(3), np.array([0.91, 0.94, 0.93]), "accuracy in training")
+    (axes,) = training_curves([scores]).axes
+    assert axes.get_ylim()[0] == 0
+    assert axes.get_ylim()[1] >= 1
+    assert axes.yaxis.get_major_formatter()(0.5) == "50%"

@@ -146,7 +146,8 @@ class TestDisplay:
             compose(exhibit(rng), "points", "right or wrong", answers, row) for row in (0, 1)
         )
         assert (wrong.colouring.colours[0] != right.colouring.colours[0]).any()
-        assert dict(wrong.facts)["this is"] == "wrong"
+        assert dict(wrong.facts)["its answer"] == "wrong: bed, labelled chair"
+        assert dict(right.facts)["its answer"] == right.colouring.title == "right: chair"
         assert dict(wrong.facts)["network, of the noisy cloud"] == "bed 90.0%, chair 10.0%"
         shown = compose(exhibit(rng), "points", "predicted class", answers, 1)
         assert shown.colouring.swatches == ((PALETTE[1], "chair"),)

@@ -15,13 +15,14 @@ from qs3.report.settings import ReportSettings
 
 if TYPE_CHECKING:
     from qs3.report.contents import Report
+    from qs3.training.run import Run
 
 
 def report(
     folder: Annotated[Path, tyro.conf.Positional],
     settings: Flat[ReportSettings] = ReportSettings(),  # noqa: B008
-    mesh: str = "chair",
-    sensor: str = "paper",
+    mesh: str = "",
+    sensor: str = "",
     out: Path | None = None,
 ) -> int:
     """Write one self-contained HTML page.
@@ -31,11 +32,13 @@ def report(
     Args:
         folder: Folder of a run, of several runs, or of records alone.
         settings: What to tell.
-        mesh: Mesh file or built-in class whose scan is shown step by step; none leaves it out.
-        sensor: Preset of the sensor for that scan, or your own TOML file.
+        mesh: Mesh file or built-in class whose scan is shown step by step; none leaves it out. By
+            default the first of the run's own source that lies near it, else the built-in chair.
+        sensor: Preset of the sensor for that scan, or your own TOML file; by default that of the
+            source, else paper.
         out: The page; report.html in the folder by default.
     """
-    from qs3.report.collect import collect, look
+    from qs3.report.collect import collect, look, told_run
     from qs3.report.page import write_report
     from qs3.training.shipped import workplace
 
@@ -49,7 +52,10 @@ def report(
     tell(*(f"qs3: left out: {fault}" for fault in faults))
     command = command_of(folder, settings, mesh, sensor)
     page = replace(page, command=command, published_source=source)
-    verdict = write_report(out, page if mesh == "none" else _with_scan(page, mesh, sensor))
+    verdict = write_report(
+        out,
+        page if mesh == "none" else _with_scan(page, told_run(holdings, settings), mesh, sensor),
+    )
     show(out)
     if verdict is not None:
         tell(verdict.opening)
@@ -74,15 +80,25 @@ def _published() -> tuple[dict[str, dict[str, str]], str]:
     return tasks, figures["source"]
 
 
-def _with_scan(page: "Report", name: str, sensor: str) -> "Report":
+def _with_scan(page: "Report", told: "Run | None", name: str, sensor: str) -> "Report":
     """Add a scan step by step, or a note where none can be made here."""
     from qs3.meshes.collections import load_named
+    from qs3.report.lookup import find_mesh
     from qs3.report.montage import montage_view
     from qs3.sensor.scan import ScanSettings, scan
 
-    mesh, origin = load_named(name, 0)
-    settings = ScanSettings(sensor=sensor, views=2)
-    settings = replace(settings, sensor=settings.make_sensor())  # a bad one is refused
+    own = None if told is None else find_mesh(told)
+    settings = ScanSettings() if own is None else own.settings
+    if own is not None and not name:
+        mesh, title = own.mesh, own.name
+    else:
+        mesh, origin = load_named(name or "chair", 0)
+        title = origin["name"]
+    if sensor:
+        settings = replace(settings, sensor=sensor)
+    if not (made := settings.make_sensor()).metric:  # a bad one is refused
+        settings = replace(settings, object_size=None)
+    settings = replace(settings, sensor=made, views=2)
     try:
         settings = replace(settings, renderer=settings.make_renderer())
     except QS3Error as error:
@@ -91,12 +107,10 @@ def _with_scan(page: "Report", name: str, sensor: str) -> "Report":
         return replace(page, notes=(*page.notes, note))
     tell("scanning for the pictures …")
     view, _ = montage_view(scan(mesh, settings, keep_images=True))
-    return replace(page, montage=view, montage_title=f"{origin['name']} · sensor {sensor}")
+    return replace(page, montage=view, montage_title=f"{title} · sensor {made.name}")
 
 
-def command_of(
-    folder: Path, settings: ReportSettings, mesh: str = "chair", sensor: str = "paper"
-) -> str:
+def command_of(folder: Path, settings: ReportSettings, mesh: str = "", sensor: str = "") -> str:
     """The command that makes the page again, with paths as given.
 
     Of an absolute path or an address the last part alone is told: the page is passed on, and what
@@ -108,7 +122,7 @@ def command_of(
     """
     words = ["qs3", "report", _as_given(folder)]
     values = {f.name: (getattr(settings, f.name), f.default) for f in fields(settings)}
-    values |= {"mesh": (mesh, "chair"), "sensor": (sensor, "paper")}
+    values |= {"mesh": (mesh, ""), "sensor": (sensor, "")}
     for name, (value, default) in values.items():
         if value != default:
             words += ["--" + name.replace("_", "-"), _as_given(value)]

@@ -1,5 +1,8 @@
 """Point clouds drawn as plain scatter plots: own orthographic view, painter's order, shading.
 
+Each has ground (a shadow, or a line from the side) and scale: a bar whose length is told, in the
+unit of the points.
+
 Convention:
     World: right-handed, z up. A viewer at azimuth 0 and elevation 0 stands on −y and sees +x to
     the right and +z upwards (*front*); azimuth 90 stands on +x (*side*); elevation 90 looks down
@@ -21,6 +24,8 @@ SIDES = {"front": (0.0, 0.0), "side": (90.0, 0.0), "top": (0.0, 90.0)}
 
 _OBLIQUE = (30.0, 20.0)
 _MAP = matplotlib.colormaps["viridis"]
+_GROUND, _SHADOW = "#999999", "#dddddd"
+_FILLED, _RAISED = 0.84, 0.06  # of a cell: what a cloud takes, and how far above its middle
 
 
 def project(
@@ -50,8 +55,8 @@ def shade(
         height: World z; its range spans the colour map.
         nearness: Coordinate towards the viewer; its range spans the fade.
     """
-    colours = np.array(_MAP(0.9 * _unit(height)))
-    fade = 0.5 * (1.0 - _unit(nearness))[:, None]
+    colours = np.array(_MAP(0.8 * _unit(height)))  # the map's end is too light for white paper
+    fade = 0.25 * (1.0 - _unit(nearness))[:, None]
     colours[:, :3] = colours[:, :3] * (1.0 - fade) + fade
     return colours
 
@@ -77,7 +82,7 @@ def draw_cloud(
     seen = project(points, azimuth, elevation)
     order = np.argsort(seen[:, 2], kind="stable")
     colours = shade(points[:, 2], seen[:, 2])
-    axes.scatter(seen[order, 0], seen[order, 1], s=4.0, c=colours[order], linewidths=0)
+    axes.scatter(seen[order, 0], seen[order, 1], s=7.0, c=colours[order], linewidths=0)
     axes.set_aspect("equal")
     without_frame(axes)
     if limits is None and len(points):
@@ -86,9 +91,13 @@ def draw_cloud(
         corners = np.stack(np.meshgrid(*np.stack(limits, axis=1)), axis=-1).reshape(-1, 3)
         shadow = project(corners, azimuth, elevation)
         low, high = shadow.min(axis=0), shadow.max(axis=0)
-        pad = 0.04 * float((high - low)[:2].max()) + 1e-9
+        pad = 0.06 * float((high - low)[:2].max()) + 1e-9
         axes.set_xlim(float(low[0]) - pad, float(high[0]) + pad)
-        axes.set_ylim(float(low[1]) - pad, float(high[1]) + pad)
+        axes.set_ylim(float(low[1]) - 2 * pad, float(high[1]) + pad)
+        if not elevation:
+            axes.axhline(float(limits[0][2]), color=_GROUND, linewidth=0.8, zorder=0)
+        bar = bar_length(float(high[0] - low[0]))
+        _draw_bar(axes, float(low[0]), float(low[1]) - pad, bar, f"{bar:g}")
 
 
 def samples_per_class(
@@ -124,11 +133,12 @@ def gallery(
         columns: Clouds a row; more are left out.
     """
     names, rows = [short(name) for name in samples], len(samples)
-    cell, left, top = 0.95, 0.25 + 0.09 * max(map(len, names)), 0.35  # inches
+    # Inches.
+    cell, left, top = 1.05, 0.25 + 0.09 * max(map(len, names), default=0), 0.35 * bool(title)
     width, height = left + cell * columns, top + cell * rows
     figure = Figure(figsize=(width, height))
     axes = figure.add_axes((left / width, 0.0, 1.0 - left / width, 1.0 - top / height))
-    spots, colours = [], []
+    spots, shadows, colours = [], [], []
     for row, clouds in enumerate(samples.values()):
         if not clouds:
             axes.text(0.0, -row, "none", ha="center", va="center", color="#666666")
@@ -136,16 +146,24 @@ def gallery(
             cloud = cloud[np.isfinite(cloud).all(axis=1)]
             if not len(cloud):
                 continue
-            seen = project(np.asarray(cloud, np.float64), *_OBLIQUE)
-            low, high = seen.min(axis=0), seen.max(axis=0)
-            scale = 0.92 / max(float((high - low)[:2].max()), 1e-12)
-            flat = (seen - (low + high) / 2.0)[:, :2] * scale + [column, -row]
+            cloud = np.asarray(cloud, np.float64)
+            ground = np.c_[cloud[:, :2], np.full(len(cloud), cloud[:, 2].min())]
+            seen, shadow = project(cloud, *_OBLIQUE), project(ground, *_OBLIQUE)
+            both = np.concatenate([seen, shadow])[:, :2]
+            low, high = both.min(axis=0), both.max(axis=0)
+            scale = _FILLED / max(float((high - low).max()), 1e-12)
+            place = np.array([column, -row + _RAISED])
             order = np.argsort(seen[:, 2], kind="stable")
-            spots.append(flat[order])
+            spots.append(((seen[:, :2] - (low + high) / 2.0) * scale + place)[order])
+            shadows.append((shadow[:, :2] - (low + high) / 2.0) * scale + place)
             colours.append(shade(cloud[:, 2], seen[:, 2])[order])
+            bar = bar_length(0.9 / scale)
+            if _FILLED / scale > 1e-9:
+                _draw_bar(axes, column - 0.45, -row - 0.43, bar * scale, f"{bar:g}")
     if spots:
-        spot = np.concatenate(spots)
-        axes.scatter(spot[:, 0], spot[:, 1], s=1.6, c=np.concatenate(colours), linewidths=0)
+        spot, shadow = np.concatenate(spots), np.concatenate(shadows)
+        axes.scatter(spot[:, 0], spot[:, 1], s=4.0, c=np.concatenate(colours), linewidths=0)
+        axes.scatter(shadow[:, 0], shadow[:, 1], s=5.0, c=_SHADOW, linewidths=0, zorder=0.5)
     axes.set_xlim(-0.5, columns - 0.5)
     axes.set_ylim(0.5 - rows, 0.5)
     axes.set_title(short(title, 40))
@@ -153,6 +171,26 @@ def gallery(
     axes.set_yticks(-np.arange(rows), names)
     axes.tick_params(axis="y", length=0)
     return figure
+
+
+def bar_length(room: float) -> float:
+    """Length of a bar for scale: 1, 2 or 5 times a power of ten, at most 0.4 of the room there is.
+
+    Example:
+        >>> bar_length(1.0), bar_length(0.06)
+        (0.2, 0.02)
+    """
+    power = 10.0 ** np.floor(np.log10(max(0.4 * room, 1e-12)))
+    step = max((s for s in (1, 2, 5) if s * power <= 0.4 * room), default=1)
+    return float(f"{step * power:.3g}")
+
+
+def _draw_bar(axes: Axes, x: float, y: float, length: float, text: str) -> None:
+    axes.plot([x, x + length], [y, y], color="#333333", linewidth=1.4, solid_capstyle="butt")
+    axes.annotate(
+        text, (x + length, y), (3, 0), textcoords="offset points", va="center", fontsize=7.5,
+        color="#333333", annotation_clip=False,
+    )  # fmt: skip
 
 
 def _unit(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:

@@ -123,10 +123,7 @@ def collect(holdings: Holdings, settings: ReportSettings) -> tuple[Report, tuple
         InputError: where what the user named cannot be read or does not fit the run.
     """
     lines, refused = score_lines(holdings.records)
-    if settings.run is not None:
-        run = read_run(settings.run)
-    else:
-        run = min(holdings.runs, key=lambda run: _rank(run.method, run.supervised), default=None)
+    run = told_run(holdings, settings)
     if run is None:
         report = _of_records([named.record for named in holdings.records])
     else:
@@ -137,6 +134,13 @@ def collect(holdings: Holdings, settings: ReportSettings) -> tuple[Report, tuple
         what = "run or record" if len(faults) == 1 else "runs or records"
         notes.append(f"{len(faults)} {what} could not be used; not on this page.")
     return replace(report, scores=lines, notes=tuple(notes)), faults
+
+
+def told_run(holdings: Holdings, settings: ReportSettings) -> Run | None:
+    """The run that is told about in full; None where there are records alone."""
+    if settings.run is not None:
+        return read_run(settings.run)
+    return min(holdings.runs, key=lambda run: _rank(run.method, run.supervised), default=None)
 
 
 def _rank(method: str, supervised: bool) -> int:
@@ -169,11 +173,16 @@ def _of_run(run: Run, holdings: Holdings, settings: ReportSettings) -> Report:
     networks: list[Scored] = []
     answers: dict[str, Any] = {}
     notes: list[str] = []
+    shown = settings.clouds // 2
+    mistakes, nearest = {}, {}
     if target is not None:
         test = data_record(target.clouds)
         for name, model in models.items():
-            scored, answers[name] = parts.score_network(name, model, target)
+            scored, said = parts.score_network(name, model, target)
             networks.append(scored)
+            answers[name] = said.probabilities.argmax(axis=1)
+            if model is loaded and shown:
+                mistakes, nearest = parts.beside_source(model, said, target, source)
         marks = caveats(run, target)
     else:
         marks = () if record is None else record.marks
@@ -188,7 +197,6 @@ def _of_run(run: Run, holdings: Holdings, settings: ReportSettings) -> Report:
         )
     curves, marks_of_rounds = parts.curves([*([] if place is None else [place]), run.folder])
     hardware = {} if record is None else {"hardware": record.hardware}
-    shown = settings.clouds // 2
     return Report(
         title=f"{run.method} with {loaded.settings['train']['model']}: a report",
         summary=_summary(run, test) + _others(run, holdings),
@@ -199,6 +207,8 @@ def _of_run(run: Run, holdings: Holdings, settings: ReportSettings) -> Report:
         versions=versions() if record is None else _versions(record),
         data=_data(source=run.source, target=run.target, test=test),
         clouds=parts.show_clouds(domains, shown, {"target": answers}) if shown else {},
+        mistakes=mistakes,
+        nearest=nearest,
         maps=parts.feature_maps(models, domains) if len(domains) == 2 else (),
         curves=curves,
         marks=marks_of_rounds,

@@ -103,6 +103,11 @@ class Report:
     """What the runs read, by role: source, target or test."""
     clouds: Mapping[str, Sequence[Cloud]] = field(default_factory=dict)
     """Clouds to look at, by domain."""
+    mistakes: Mapping[str, Sequence[Cloud]] = field(default_factory=dict)
+    """Clouds of the target that the network is surest of and gets wrong, the surest first, and
+    beside each the scan of the source nearest to it: columns of the same length, by heading."""
+    nearest: Mapping[str, Sequence[Cloud]] = field(default_factory=dict)
+    """The same of clouds of the target whether they are right or not."""
     maps: tuple[FeatureMap, ...] = ()
     """Features of the networks, before and after."""
     scores: tuple[ScoreLine, ...] = ()

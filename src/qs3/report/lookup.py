@@ -4,13 +4,21 @@ import contextlib
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import trimesh
 
 from qs3.errors import QS3Error
 from qs3.evaluation.records import DataRecord
 from qs3.io import load_clouds
 from qs3.io.clouds import CloudChoice, PointClouds
-from qs3.store.manifest import MANIFEST
+from qs3.meshes import collect
+from qs3.sensor.presets import Sensor
+from qs3.sensor.settings import ScanSettings
+from qs3.store.folder import open_folder
+from qs3.store.manifest import MANIFEST, open_dataset
+from qs3.store.shards import load_shard
+from qs3.structure import structure
 from qs3.training.batches import load_whole
 from qs3.training.checkpoint import LoadedModel, load_model, weights_fingerprint
 from qs3.training.prepared import Prepared, prepare_clouds
@@ -59,15 +67,55 @@ def read_domain(
         return load(given, split=split, cloud=cloud)
     if recorded is None:
         return None
-    bases = [run.resolve(), *run.resolve().parents][: _LEVELS + 1]
-    for base, inner in itertools.product(bases, (".", "data")):
-        place = base / inner / recorded.name
-        if place.exists():
-            with contextlib.suppress(QS3Error):
-                clouds = load(place, split=recorded.split, cloud=recorded.cloud)
-                if clouds.clouds.checksum == recorded.checksum:
-                    return clouds
+    for place in _near(run, recorded.name):
+        with contextlib.suppress(QS3Error):
+            clouds = load(place, split=recorded.split, cloud=recorded.cloud)
+            if clouds.clouds.checksum == recorded.checksum:
+                return clouds
     return None
+
+
+class OwnMesh(NamedTuple):
+    """A mesh that a run's source was scanned from, and the camera that did it."""
+
+    mesh: trimesh.Trimesh
+    """The first one of the source that is found."""
+    name: str
+    """Its name in the source."""
+    settings: ScanSettings
+    """Sensor, size of objects and units as the source has them."""
+
+
+def find_mesh(run: Run) -> OwnMesh | None:
+    """A mesh of the run's source, where both lie near the run; None where they do not."""
+    store = next((place for place in _near(run.folder, run.source.name)
+                  if (place / MANIFEST).is_file()), None)  # fmt: skip
+    if store is None:
+        return None
+    with contextlib.suppress(QS3Error):
+        made = open_dataset(store).settings
+        sensors = made["sensor"] if isinstance(made["sensor"], list) else [made["sensor"]]
+        settings = ScanSettings(
+            sensor=structure(sensors[0], Sensor, store),
+            object_size="file" if made.get("object_size") == "file" else None,
+            units=made.get("units"),
+        )
+        objects = set(load_shard(open_folder(store), 0, ("object",))["object"].to_pylist())
+        for name in str(made.get("meshes", "")).split("+"):
+            places = ["shapes"] if name == "shapes" else _near(store, name)
+            for place in places:
+                items = collect(place, per_class=made.get("per_class") or 1, seed=made["seed"])
+                for item in items:
+                    if item.id in objects:
+                        return OwnMesh(item.load(), item.id, settings)
+    return None
+
+
+def _near(folder: Path, name: str) -> list[Path]:
+    """What has this name in a folder, above it or in ``data`` beside it, the nearest first."""
+    bases = [folder.resolve(), *folder.resolve().parents][: _LEVELS + 1]
+    places = (base / inner / name for base, inner in itertools.product(bases, (".", "data")))
+    return [place for place in places if place.exists()]
 
 
 def find_before(after: Run, others: Sequence[Run]) -> Path | None:

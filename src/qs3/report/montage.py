@@ -5,6 +5,7 @@ Convention:
     error is depth − true depth: red is too far, blue is too near.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import matplotlib
@@ -72,10 +73,29 @@ def montage_view(made: Scan) -> tuple[MontageView, int]:
 
 @house_style
 def montage(view: MontageView, title: str = "") -> Figure:
-    """Draw one scan: four pictures, four of its depth, and each cloud from three sides.
+    """Draw one scan: four pictures, four of its depth, and each cloud from three sides."""
+    figure = Figure(figsize=(12.0, 12.0), layout="constrained")
+    upper, lower = figure.subfigures(2, 1, squeeze=False)[:, 0]
+    if title:
+        figure.suptitle(short(title, 90), fontsize=13)
+    _draw_stages(upper.subplots(2, 4).ravel(), view)
+    _draw_clouds(lower.subplots(2, 3), view)
+    return figure
 
-    Of the pictures the part that shows the object is drawn, with a margin; all where none does.
-    """
+
+@house_style
+def montage_columns(view: MontageView) -> tuple[Figure, Figure]:
+    """The same as two narrow figures, two panels a row, for a page that a phone reads too."""
+    stages = Figure(figsize=(5.2, 9.8), layout="constrained")
+    _draw_stages(stages.subplots(4, 2).ravel(), view)
+    clouds = Figure(figsize=(5.2, 8.0), layout="constrained")
+    _draw_clouds(clouds.subplots(3, 2).T, view)
+    return stages, clouds
+
+
+def _draw_stages(places: Iterable[Axes], view: MontageView) -> None:
+    """Draw the part of the pictures that shows the object, with a margin; all where none does."""
+    cells = list(places)
     y, x = np.isfinite(view.true_depth).nonzero()
     shown = [(max(i.min() - _MARGIN, 0), i.max() + 1 + _MARGIN) for i in (y, x) if len(i)]
     part = tuple(slice(*ends) for ends in shown) or (slice(None), slice(None))
@@ -85,14 +105,6 @@ def montage(view: MontageView, title: str = "") -> Figure:
     extent = (x0 - 0.5, x1 - 0.5, y1 - 0.5, y0 - 0.5)
     depth, true = view.depth[part], view.true_depth[part]
     error = (depth - true).astype(np.float64)
-
-    clouds = [("noisy cloud", view.cloud), ("clean twin", view.clean)]
-    figure = Figure(figsize=(12.0, 12.0), layout="constrained")
-    upper, lower = figure.subfigures(2, 1, squeeze=False)[:, 0]
-    cells = upper.subplots(2, 4).ravel()
-    places = lower.subplots(2, 3)
-    if title:
-        figure.suptitle(short(title, 90), fontsize=13)
 
     _pattern(cells[0], view.pattern)
     _picture(cells[1], view.left[part], "left image", extent)
@@ -106,13 +118,16 @@ def montage(view: MontageView, title: str = "") -> Figure:
     _histogram(cells[7], error, true, view.unit)
     cells[7].set_box_aspect(error.shape[0] / error.shape[1])
 
+
+def _draw_clouds(places: Iterable[Iterable[Axes]], view: MontageView) -> None:
+    """Draw each cloud from its sides, all to one scale."""
+    clouds = [("noisy cloud", view.cloud), ("clean twin", view.clean)]
     frame = next((c for c in reversed(clouds) if len(c[1])), None)
     limits = None if frame is None else (frame[1].min(axis=0), frame[1].max(axis=0))
     for (name, points), row in zip(clouds, places, strict=True):
         for axes, (side, angles) in zip(row, SIDES.items(), strict=True):
-            axes.set_title(f"{name} ({len(points)} points), {side}")
+            axes.set_title(f"{name} ({len(points)} points), {side}", fontsize=9.0)
             draw_cloud(axes, points, *angles, limits=limits)
-    return figure
 
 
 def _pattern(axes: Axes, pattern: Shaped[np.ndarray, "ph pw"] | None) -> None:

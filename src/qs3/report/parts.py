@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Int
+from scipy.spatial import KDTree
 
 from qs3.errors import InputError
 from qs3.evaluation.records import score
@@ -16,20 +17,22 @@ from qs3.report.embedding import embed
 from qs3.report.plots import Curve, SelectionRound
 from qs3.training.checkpoint import LoadedModel
 from qs3.training.history import HISTORY
-from qs3.training.predict import describe
+from qs3.training.predict import Description, describe
 from qs3.training.prepared import Prepared, prepare_clouds
 
 _ACCURACY = "accuracy in training", "labelled clouds, augmented"
+_COMPARED = 24  # clouds beside their nearest of the source
 _MAPPED = 400  # clouds of a domain on a map: beyond that dots hide one another
 
 
 def score_network(
     name: str, loaded: LoadedModel, target: Prepared[PointClouds]
-) -> tuple[Scored, Int[np.ndarray, "b"]]:
-    """Score a network on labelled clouds, and return its answers too."""
-    answers = describe(loaded.model, _for(loaded, target)).probabilities.argmax(axis=1)
+) -> tuple[Scored, Description]:
+    """Score a network on labelled clouds, and return what it says of them too."""
+    said = describe(loaded.model, _for(loaded, target))
+    answers = said.probabilities.argmax(axis=1)
     scores = score(target.labels, answers, target.class_names)
-    return Scored(name, scores, answers == target.labels), answers
+    return Scored(name, scores, answers == target.labels), said
 
 
 def show_clouds(
@@ -55,6 +58,52 @@ def show_clouds(
             points = clouds.chosen(slice(row, row + 1))[0]
             shown[domain].append(Cloud(points, names[labels[row]], note))
     return shown
+
+
+def beside_source(
+    loaded: LoadedModel,
+    said: Description,
+    target: Prepared[PointClouds],
+    source: Prepared[PointClouds] | None,
+) -> tuple[dict[str, list[Cloud]], dict[str, list[Cloud]]]:
+    """The most confident mistakes, and scans of every class, each beside its nearest source scan.
+
+    Nearest is the smallest Euclidean distance between the network's features, among as many clouds
+    of the source as a map of features shows.
+
+    Args:
+        loaded: The network.
+        said: What it says of the target.
+        target: Labelled clouds.
+        source: Labelled clouds that it learnt from, where they are at hand.
+
+    Returns:
+        `Report.mistakes` and `Report.nearest`.
+    """
+    names, labels = loaded.class_names, target.labels
+    answers, sure = said.probabilities.argmax(axis=1), said.probabilities.max(axis=1)
+    order = np.argsort(-sure, kind="stable")
+    wrong = order[answers[order] != labels[order]][:_COMPARED].tolist()
+    closest = np.zeros(len(target), np.int64)
+    if source is not None:
+        source = source.select(np.array(even_rows(source.labels, _MAPPED), np.int64))
+        features = describe(loaded.model, _for(loaded, source)).features
+        closest = np.asarray(KDTree(features).query(said.features)[1])
+
+    def columns(rows: list[int]) -> dict[str, list[Cloud]]:
+        scans, beside = [], []
+        for row in rows:
+            note = f"Taken for {names[answers[row]]}, {sure[row]:.0%}"
+            points = target.chosen(slice(row, row + 1))[0]
+            scans.append(Cloud(points, names[labels[row]], note))
+            if source is not None:
+                near = int(closest[row])
+                points = source.chosen(slice(near, near + 1))[0]
+                beside.append(Cloud(points, names[source.labels[near]]))
+        found = {"scan of the target": scans, "nearest scan of the source": beside}
+        return {heading: clouds for heading, clouds in found.items() if clouds}
+
+    return columns(wrong), columns(even_rows(labels, _COMPARED)) if source is not None else {}
 
 
 def even_rows(labels: Int[np.ndarray, "b"], count: int) -> list[int]:

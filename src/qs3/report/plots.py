@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int, Num
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from qs3.errors import InputError
 from qs3.report.figure import AFTER, BEFORE, PALETTE, class_colour, house_style, short
@@ -69,6 +69,9 @@ def training_curves(curves: Sequence[Curve], marks: Sequence[float] = ()) -> Fig
             axes.plot(curve.x, curve.y, label=label, linewidth=1.8, marker=marker, markersize=3.5)
         axes.set_ylabel(short(panel, 24))
         axes.margins(y=0.08)
+        if panel.startswith("accuracy"):
+            axes.set_ylim(0.0, 1.02)  # from 0: noise of a few points must not look like a cliff
+            axes.yaxis.set_major_formatter(PercentFormatter(1.0))
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, fontsize=9)
     grid[-1, 0].set_xlabel("epoch" + (" (grey line: round begins)" if len(marks) else ""))
     grid[-1, 0].xaxis.set_major_locator(MaxNLocator(8, integer=True))
@@ -107,7 +110,7 @@ def selection_counts(rounds: Sequence[SelectionRound], class_names: Sequence[str
     lower.set_xticks(places, [f"{place}\n{kept}/{total}" for place, kept, total in totals])
     lower.tick_params(axis="x", labelsize=9 if len(rounds) < 9 else 7.5)
     lower.yaxis.set_major_locator(MaxNLocator(6, integer=True))
-    lower.margins(y=0.12)
+    lower.set_ylim(0, 1.12 * max(1, int(above.max(initial=0)), int(floor.max(initial=0))))
     figure.legend(loc="outside lower center", ncols=3, fontsize=9)
     return figure
 

@@ -9,11 +9,13 @@ import numpy as np
 
 from qs3.errors import QS3Error
 from qs3.io.clouds import CloudKind
+from qs3.report.clouds import bar_length
 from qs3.viewer.display import compose, frame_of, modes
 from qs3.viewer.exhibits import KINDS, Answers, Exhibit
 
 _LOG = logging.getLogger(__name__)
 _CAMERA = (-0.9, -1.5, 0.7)
+_GROUND = 2.0  # side, in lengths of the object
 _BLOCK = '<div style="padding:0.2em 0.9em;font-size:0.85em;line-height:1.45">{}</div>'
 
 
@@ -32,6 +34,7 @@ class Canvas:
         self._shown: tuple[Exhibit, int] | None = None
         server.initial_camera.position = _CAMERA
         server.initial_camera.look_at = (0.0, 0.0, 0.0)
+        server.on_client_connect(_make_way)
         self._state = server.gui.add_html("")
         self._text = server.gui.add_html("")
 
@@ -48,9 +51,9 @@ class Canvas:
             first = "error" if mesh else ("predicted class" if self._answers else "view")
             self._mode = gui.add_dropdown("Colour by", offered, initial_value=first)
             self._limit = gui.add_number(
-                "Error at last colour", 0.0, min=0.0, step=0.001, hint="0: as each cloud needs it"
+                "Error scale up to", 0.0, min=0.0, step=0.001, hint="0: as each cloud needs it"
             )
-            self._size = gui.add_slider("Point size", 0.002, 0.04, 0.001, 0.012)
+            self._size = gui.add_slider("Point size", 0.002, 0.04, 0.001, 0.015)
             self._mesh = gui.add_checkbox("Show the mesh", False, visible=mesh)
             self._legend = gui.add_html("")
         for handle in (self._kind, self._mode, self._limit, self._size, self._mesh):
@@ -95,15 +98,27 @@ class Canvas:
         limit = float(self._limit.value) or None
         shown = compose(exhibit, kind, self._mode.value, self._answers, row, limit)
         middle, side = frame_of(exhibit)
+        drawn = (shown.points - middle) / side
+        cell = bar_length(side)
+        ground = f"ground: squares of {cell:g}{exhibit.unit}"
         with self._server.atomic():
             self._server.scene.add_point_cloud(
                 "/cloud",
-                ((shown.points - middle) / side).astype(np.float32),
+                drawn.astype(np.float32),
                 shown.colouring.colours,
                 point_size=float(self._size.value),
-                point_shape="circle",
+                point_shape="square",  # more of a disc is rim, which is blended with white
                 point_shading="flat",
                 precision="float32",
+            )
+            self._server.scene.add_grid(
+                "/ground",
+                width=_GROUND,
+                height=_GROUND,
+                cell_size=cell / side,
+                section_size=_GROUND,
+                shadow_opacity=0.0,
+                position=(0.0, 0.0, float(drawn[:, 2].min())),
             )
             if exhibit.mesh is not None:
                 self._server.scene.add_mesh_simple(
@@ -117,4 +132,11 @@ class Canvas:
                     visible=bool(self._mesh.value),
                 )
             self._text.content = _BLOCK.format(shown.text())
-            self._legend.content = _BLOCK.format(shown.colouring.legend())
+            self._legend.content = _BLOCK.format(shown.colouring.legend() + f"<div>{ground}</div>")
+
+
+def _make_way(client: Any) -> None:
+    """On a phone, whose lower half the panel takes, show the object above it."""
+    if client.camera.aspect < 1:
+        client.camera.position = tuple(1.9 * value for value in _CAMERA)
+        client.camera.look_at = (0.0, 0.0, -1.1)

@@ -66,7 +66,7 @@ def compose(
         mode: What colours say; grey, with the reason, where that is not known.
         answers: Of a network, where there is one.
         row: The object's row in ``answers``.
-        limit: Error at the last colour; by default as the cloud needs it.
+        limit: Where the scale of errors ends; by default as the cloud needs it.
     """
     if kind not in exhibit.clouds:
         kind = next(iter(exhibit.clouds))
@@ -77,7 +77,7 @@ def compose(
     if answers is not None:
         facts += answers.facts(row)
         if answers.truth is not None:
-            facts += [("this is", "wrong" if answers.wrong[row] else "right")]
+            facts += [("its answer", answers.verdict(row))]
     colouring = flat(len(points), f"{mode}: not known for this cloud")
     if mode == "error":
         colouring, measured = _error(exhibit, kind, limit, colouring)
@@ -91,9 +91,9 @@ def compose(
         named = ((colour, answers.class_names[answers.best(row)]),)
         colouring = flat(len(points), mode, colour, named)
     elif mode == "right or wrong" and answers is not None and answers.truth is not None:
-        verdicts = ((RIGHT, "right"), (WRONG, "wrong"))
-        colour, verdict = verdicts[int(answers.wrong[row])]
-        colouring = flat(len(points), f"prediction: {verdict}", colour, verdicts)
+        verdicts = ((RIGHT, "answer is the label"), (WRONG, "answer is another class"))
+        colour, _ = verdicts[int(answers.wrong[row])]
+        colouring = flat(len(points), answers.verdict(row), colour, verdicts)
     return Display(points, colouring, (*facts, *exhibit.facts))
 
 

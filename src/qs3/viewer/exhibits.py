@@ -186,6 +186,13 @@ class Answers:
             return np.zeros(len(self.probabilities), dtype=bool)
         return self.probabilities.argmax(axis=1) != self.truth
 
+    def verdict(self, row: int) -> str:
+        """Whether the answer for a row is right, in words; not known without labels."""
+        if self.truth is None:
+            return "no label"
+        given, true = self.class_names[self.best(row)], self.class_names[self.truth[row]]
+        return f"right: {given}" if given == true else f"wrong: {given}, labelled {true}"
+
     def facts(self, row: int, count: int = 3) -> tuple[tuple[str, str], ...]:
         """The classes it holds likeliest for a row, with their probabilities."""
         order = np.argsort(-self.probabilities[row], kind="stable")[:count]

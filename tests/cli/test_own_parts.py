@@ -1,0 +1,40 @@
+"""The page "Your own parts", command by command, on twelve parts and six objects on a table."""
+
+import importlib.util
+import shlex
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def _story():
+    spec = importlib.util.spec_from_file_location("own", ROOT / "benchmarks" / "own_parts.py")
+    assert spec is not None
+    assert spec.loader is not None
+    story = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(story)
+    return story
+
+
+def test_the_page_tells_the_whole_way():
+    """Every verb of the way, in its order."""
+    lines = [line.strip() for block in _story().commands() for line in block.splitlines()]
+    verbs = [shlex.split(line)[1] for line in lines if line.startswith("qs3 ")]
+    assert list(dict.fromkeys(verbs)) == [
+        "meshes", "generate", "info", "train", "segment", "predict", "evaluate", "report",
+    ]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_every_command_of_the_page_runs(tmp_path):
+    """Twelve parts in four own classes, whose names stay; each part that was cut out is scored."""
+    story = _story()
+    story.make(tmp_path)
+    story.run(tmp_path)
+    assert {p.name for p in (tmp_path / "sorted").iterdir()} <= {*story.CLASSES}
+    assert (tmp_path / "runs" / "adapted" / "report.html").is_file()
+    table = story.scores(tmp_path)
+    assert set(table.reset_index()["class"]) == {*story.CLASSES, "cup"}
+    assert (table["adapted"] <= table["cut_out"]).all()
