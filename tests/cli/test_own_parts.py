@@ -23,7 +23,8 @@ def test_the_page_tells_the_whole_way():
     lines = [line.strip() for block in _story().commands() for line in block.splitlines()]
     verbs = [shlex.split(line)[1] for line in lines if line.startswith("qs3 ")]
     assert list(dict.fromkeys(verbs)) == [
-        "meshes", "generate", "info", "train", "segment", "predict", "evaluate", "report",
+        "meshes", "generate", "info", "train", "capture", "segment", "predict", "watch", "evaluate",
+        "report",
     ]  # fmt: skip
 
 
@@ -33,7 +34,7 @@ def test_every_command_of_the_page_runs(tmp_path):
     story = _story()
     story.make(tmp_path)
     story.run(tmp_path)
-    assert {p.name for p in (tmp_path / "sorted").iterdir()} <= {*story.CLASSES}
+    assert {p.name for p in (tmp_path / "sorted").iterdir()} <= {*story.CLASSES, "unknown"}
     assert (tmp_path / "runs" / "adapted" / "report.html").is_file()
     table = story.scores(tmp_path)
     assert set(table.reset_index()["class"]) == {*story.CLASSES, "cup"}
