@@ -86,7 +86,7 @@ def make(folder: Path) -> None:
         seen = (centres @ to_camera[:3, :3].T + to_camera[:3, 3]) @ upright().T
         level = _level(Plane(upright() @ to_camera[:3, 2], 0.0))
         places = (seen @ level.T)[:, :2]
-        truth[f"{number:03d}"] = [
+        truth[f"{number:06d}"] = [
             [name, *place.tolist()] for (name, *_), place in zip(STANDING, places, strict=True)
         ]
     rig = sensor.rig
