@@ -2,8 +2,9 @@
 
 import contextlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -12,6 +13,9 @@ from qs3.cli.text import printable, show, tell
 from qs3.io.cameras.frames import CameraSettings, open_camera
 from qs3.io.extract.segment import SegmentSettings
 
+if TYPE_CHECKING:
+    from qs3.viewer.live import Live
+
 
 def watch(
     run: Annotated[Path, tyro.conf.Positional],
@@ -19,6 +23,8 @@ def watch(
     settings: Flat[SegmentSettings] = SegmentSettings(stride=2, noise=0.003),  # noqa: B008
     unknown: float | None = None,
     json_lines: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    view: bool = False,
+    port: int = 8080,
 ) -> int:
     """Tell what stands before a depth camera, frame by frame, until Ctrl-C or its end.
 
@@ -29,13 +35,18 @@ def watch(
         unknown: Share of the objects of its own classes that the network may answer by "unknown",
             as in qs3 predict.
         json_lines: Print a line of JSON a frame, with every class's probability and the boxes.
+        view: Show the objects in a browser on this machine too (extra view).
+        port: Port of 127.0.0.1 for that; 0 takes a free one.
     """
     from qs3.training import watch as watching
 
     seen: list[watching.SeenFrame] = []
-    with contextlib.suppress(KeyboardInterrupt):
+    with contextlib.suppress(KeyboardInterrupt), contextlib.ExitStack() as stack:
+        page = stack.enter_context(_page(str(run), port)) if view else None
         for frame in watching.watch(run, open_camera(camera, colour=False), settings, unknown):
             seen.append(frame._replace(objects=()))
+            if page is not None:
+                page.show(frame, watching.rate(seen))
             if json_lines:
                 show(json.dumps(watching.plain(frame), ensure_ascii=False))
                 continue
@@ -48,3 +59,16 @@ def watch(
     if seen:
         tell(watching.rate(seen))
     return 0
+
+
+@contextlib.contextmanager
+def _page(run: str, port: int) -> "Iterator[Live]":
+    from qs3.viewer.serving import require_free, require_viser, serve, url_of
+
+    require_viser()
+    require_free(port)
+    from qs3.viewer.live import Live
+
+    with serve(port, f"qs3 watch · {Path(run).name}") as server:
+        tell(f"open {url_of(server)} in a browser")
+        yield Live(server)
