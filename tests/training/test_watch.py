@@ -9,12 +9,12 @@ import pytest
 from qs3.cli import main
 from qs3.errors import InputError
 from qs3.io.cameras.folder import capture
-from qs3.io.cameras.frames import CameraSettings, DepthFrame, open_camera
+from qs3.io.cameras.frames import CaptureSettings, DepthFrame, open_camera
 from qs3.io.extract.intrinsics import Intrinsics
 from qs3.io.extract.segment import SegmentSettings, lift_scene, segment
 from qs3.training.checkpoint import load_model
 from qs3.training.predict import predict_probabilities
-from qs3.training.watch import plain, predict_objects, rate, watch
+from qs3.training.watch import Rate, plain, predict_objects, watch
 
 from ..io.cameras.bags import write_ros1
 from ..io.cameras.table import frames
@@ -37,10 +37,11 @@ def test_the_objects_of_a_frame_get_the_answers_that_each_gets_alone():
         assert one.item is item
         if len(item.points) <= 1024:
             alone = predict_probabilities(loaded, item.points[None])[0]
-            told = [one.probabilities[name] for name in loaded.class_names]
+            told = [one.answer.probabilities[name] for name in loaded.class_names]
             np.testing.assert_allclose(told, alone, atol=1e-6)
-        assert one.best[1] == max(one.probabilities.values())
-        assert list(one.probabilities.values()) == sorted(one.probabilities.values(), reverse=True)
+        shares = list(one.answer.probabilities.values())
+        assert one.answer.best()[0][1] == max(shares)
+        assert shares == sorted(shares, reverse=True)
 
 
 def test_what_is_unfamiliar_is_answered_by_unknown():
@@ -49,11 +50,11 @@ def test_what_is_unfamiliar_is_answered_by_unknown():
     items = segment(
         lift_scene(frame.depth, frame.camera, SegmentSettings(), "frame"), SegmentSettings()
     )
-    plainly = [one.best for one in predict_objects(loaded, items)]
-    assert [one.best for one in predict_objects(loaded, items, 0.0)] == plainly
+    plainly = [one.answer.best() for one in predict_objects(loaded, items)]
+    assert [one.answer.best() for one in predict_objects(loaded, items, 0.0)] == plainly
     refused = predict_objects(loaded, items, 1.0)
-    assert {one.best[0] for one in refused} == {"unknown"}
-    assert [next(iter(one.probabilities.items())) for one in refused] == plainly
+    assert {one.answer.best()[0][0] for one in refused} == {"unknown"}
+    assert [[*one.answer.probabilities.items()][:1] for one in refused] == plainly
     with pytest.raises(InputError, match="unknown"):
         next(watch("rooms", frames(1), SegmentSettings(), 1.5))
 
@@ -96,13 +97,16 @@ def test_a_frame_without_objects_is_told_and_the_next_one_seen():
     assert "too few" in seen[0].fault
     del frame
     assert closed
-    assert rate(seen).startswith("2 frames, ")
+    rate = Rate()
+    for frame in seen:
+        rate.add(frame)
+    assert str(rate).startswith("2 frames, ")
     json.dumps([plain(frame) for frame in seen])
 
 
 def test_places_move_against_the_camera(shots):
     """The camera goes 1 cm to the right a frame: what stands there goes to the left."""
-    folder = CameraSettings(f"folder:{shots}")
+    folder = CaptureSettings(f"folder:{shots}")
     seen = list(watch("rooms", open_camera(folder), SegmentSettings()))
     largest = np.array([frame.objects[0].item.centre for frame in seen])
     np.testing.assert_allclose(np.diff(largest[:, 0]), -0.01, atol=0.003)

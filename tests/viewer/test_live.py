@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from qs3.io.extract.segment import SegmentedObject
+from qs3.training.answers import Answer
 from qs3.training.watch import SeenFrame, SeenObject
 
 pytest.importorskip("viser")
@@ -16,7 +17,9 @@ HOSTILE = "<img src=x onerror=alert(1)>"
 def seen(x, shares, unfamiliar=None):
     points = np.random.default_rng(0).random((50, 3)).astype(np.float32)
     item = SegmentedObject(points, (x, 0.5, 0.1), (0.2, 0.1, 0.2), 0.0)
-    return SeenObject(item, shares, unfamiliar)
+    familiarity = None if unfamiliar is None else 1 - unfamiliar
+    answer = Answer(probabilities=shares, familiarity=familiarity, refused=unfamiliar is not None)
+    return SeenObject(item, answer)
 
 
 def test_the_last_frame_is_drawn_and_told():

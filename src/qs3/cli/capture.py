@@ -7,11 +7,11 @@ from qs3.cli.options import Flat
 from qs3.cli.text import show, tell
 from qs3.io.cameras.folder import DEPTH
 from qs3.io.cameras.folder import capture as write_frames
-from qs3.io.cameras.frames import CameraSettings, open_camera
+from qs3.io.cameras.frames import CaptureSettings, open_camera
 from qs3.io.extract.depth_images import list_images
 
 
-def capture(settings: Flat[CameraSettings], out: Path) -> int:
+def capture(settings: Flat[CaptureSettings], out: Path) -> int:
     """Write the frames of a depth camera, live or recorded, as files, until Ctrl-C or its end.
 
     Args:

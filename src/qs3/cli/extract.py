@@ -1,6 +1,7 @@
 """``qs3 extract``: objects out of real scans, into a data set."""
 
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
@@ -10,7 +11,7 @@ from qs3.cli.capture import capture
 from qs3.cli.options import Flat
 from qs3.cli.store import refuse_failures
 from qs3.cli.text import show, tell
-from qs3.io.cameras.frames import CameraSettings
+from qs3.io.cameras.frames import CaptureSettings, FrameSettings
 from qs3.io.extract.depth import extract_depth
 from qs3.io.extract.nyuv2 import extract_nyuv2
 from qs3.io.extract.run import ExtractReport, OutputSettings
@@ -36,18 +37,16 @@ def _verb(function: Callable[..., ExtractReport]) -> Callable[..., int]:
 def _bag(
     source: Annotated[Path, tyro.conf.Positional],
     out: Path,
-    frames: int | None = None,
-    every: float = 0.0,
+    settings: Flat[FrameSettings] = FrameSettings(),  # noqa: B008
 ) -> int:
     """Write the frames of a RealSense's recording as files.
 
     Args:
         source: The recording: .bag, or .db3 of later versions.
         out: New folder for depth/, color/, intrinsics.json and times.csv.
-        frames: Frames to take at most; all by default.
-        every: Seconds from one frame to the next at least.
+        settings: Which of its frames.
     """
-    return capture(CameraSettings(f"bag:{source}", frames=frames, every=every), out)
+    return capture(CaptureSettings(f"bag:{source}", **asdict(settings)), out)
 
 
 def _rosbag(
@@ -55,8 +54,7 @@ def _rosbag(
     out: Path,
     topic: str = "",
     intrinsics: str = "",
-    frames: int | None = None,
-    every: float = 0.0,
+    settings: Flat[FrameSettings] = FrameSettings(),  # noqa: B008
 ) -> int:
     """Write the depth images of a recording of ROS 1 or ROS 2 as files.
 
@@ -65,10 +63,9 @@ def _rosbag(
         out: New folder for depth/, intrinsics.json and times.csv.
         topic: Which topic of depth images, where there are several.
         intrinsics: Where the bag has no CameraInfo: fx,fy,cx,cy or a file.
-        frames: Frames to take at most; all by default.
-        every: Seconds from one frame to the next at least.
+        settings: Which of its frames.
     """
-    camera = CameraSettings(f"rosbag:{source}", intrinsics, topic, frames, every)
+    camera = CaptureSettings(f"rosbag:{source}", intrinsics, topic, **asdict(settings))
     return capture(camera, out)
 
 

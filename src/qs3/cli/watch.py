@@ -10,7 +10,7 @@ import tyro
 
 from qs3.cli.options import Flat
 from qs3.cli.text import printable, show, tell
-from qs3.io.cameras.frames import CameraSettings, open_camera
+from qs3.io.cameras.frames import CaptureSettings, open_camera
 from qs3.io.extract.segment import SegmentSettings
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def watch(
     run: Annotated[Path, tyro.conf.Positional],
-    camera: Flat[CameraSettings],
+    camera: Flat[CaptureSettings],
     settings: Flat[SegmentSettings] = SegmentSettings(stride=2, noise=0.003),  # noqa: B008
     unknown: float | None = None,
     json_lines: Annotated[bool, tyro.conf.arg(name="json")] = False,
@@ -40,34 +40,30 @@ def watch(
     """
     from qs3.training import watch as watching
 
-    seen: list[watching.SeenFrame] = []
+    rate = watching.Rate()
     with contextlib.suppress(KeyboardInterrupt), contextlib.ExitStack() as stack:
         page = stack.enter_context(_page(str(run), port)) if view else None
         for frame in watching.watch(run, open_camera(camera, colour=False), settings, unknown):
-            seen.append(frame._replace(objects=()))
+            rate.add(frame)
             if page is not None:
-                page.show(frame, watching.rate(seen))
+                page.show(frame, str(rate))
             if json_lines:
                 show(json.dumps(watching.plain(frame), ensure_ascii=False))
                 continue
-            found = [
-                f"{printable(one.best[0], keep='')} {one.best[1]:.2f} at {x:.2f} {y:.2f}"
-                for one in frame.objects
-                for x, y, _ in [one.item.centre]
-            ]
+            found = []
+            for item, answer in frame.objects:
+                ((name, share),), (x, y, _) = answer.best(), item.centre
+                found.append(f"{printable(name, keep='')} {share:.2f} at {x:.2f} {y:.2f}")
             show(f"{printable(frame.name, keep='')}\t{', '.join(found) or frame.fault}")
-    if seen:
-        tell(watching.rate(seen))
+    if str(rate):
+        tell(str(rate))
     return 0
 
 
 @contextlib.contextmanager
 def _page(run: str, port: int) -> "Iterator[Live]":
-    from qs3.viewer.serving import require_free, require_viser, serve, url_of
-
-    require_viser()
-    require_free(port)
     from qs3.viewer.live import Live
+    from qs3.viewer.serving import serve, url_of
 
     with serve(port, f"qs3 watch · {Path(run).name}") as server:
         tell(f"open {url_of(server)} in a browser")

@@ -1,5 +1,6 @@
 """How large things are: what a mesh's own unit says, and what its class measures in homes."""
 
+import functools
 import math
 from typing import TYPE_CHECKING, Literal
 
@@ -57,6 +58,7 @@ def class_ranges(class_name: str) -> tuple[tuple[float, float], tuple[float, flo
     return CLASS_SIZES[canonical(class_name)]
 
 
+@functools.cache
 def size_name(class_name: str, own_class: str = "") -> str:
     """Return the class whose real size counts: its name, or its own where only that size is known.
 

@@ -13,11 +13,18 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.meshes.classes import map_labels
-from qs3.meshes.sizes import class_ranges, size_name
+from qs3.meshes.sizes import class_ranges
 from qs3.store.executors import Failure, LocalExecutor
 from qs3.store.manifest import Manifest, package_versions
 from qs3.store.parts import Place
-from qs3.store.scan_item import GenerateSettings, Item, neighbour_of, row_id, scan_item
+from qs3.store.scan_item import (
+    GenerateSettings,
+    Item,
+    neighbour_of,
+    row_id,
+    scan_item,
+    size_class,
+)
 from qs3.store.shards import DType, shard_bytes, table_of
 
 
@@ -128,8 +135,8 @@ def make_plan(items: Sequence[Item], settings: GenerateSettings) -> Plan:
         )
     names = sorted({item.class_name for item in items})
     if settings.real_size == "class":
-        for item in items:
-            class_ranges(size_name(item.class_name, getattr(item, "own_class", "")))
+        for name in sorted(set(map(size_class, items))):
+            class_ranges(name)
     map_labels(names, np.arange(len(names)), settings.classes)
     return Plan(items, settings)
 

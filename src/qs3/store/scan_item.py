@@ -12,6 +12,7 @@ import numpy as np
 import tyro
 
 from qs3.meshes.classes import POINTDA10, label_order, map_labels
+from qs3.meshes.sizes import size_name
 from qs3.sensor.checks import check_range
 from qs3.sensor.presets import settings_dict
 from qs3.sensor.scene import SceneSettings
@@ -87,6 +88,11 @@ class GenerateSettings(ScanSettings):
         if not isinstance(self.renderer, str):
             plain["renderer"] = renderer_dict(self.renderer)
         return plain
+
+
+def size_class(item: Item) -> str:
+    """Return the class whose real size an object has, see `qs3.meshes.sizes.size_name`."""
+    return size_name(item.class_name, getattr(item, "own_class", ""))
 
 
 def settings_for(
@@ -172,16 +178,11 @@ def scan_item(
         InputError: where the mesh is unusable or the sensor sees nothing of it.
     """
     from qs3.meshes import sample_surface
-    from qs3.meshes.sizes import size_name
     from qs3.sensor.scan import scan
 
     seed = scan_seed(settings.seed, item.id, scan_index)
     beside = None if neighbour is None else neighbour.load()
-    classes = [
-        size_name(one.class_name, getattr(one, "own_class", ""))
-        for one in (item, neighbour)
-        if one is not None
-    ]
+    classes = [size_class(one) for one in (item, neighbour) if one is not None]
     result = scan(item.load(), settings, seed=seed, neighbour=beside, class_names=classes)
     # The scan draws from children of `seed`; the key keeps this stream apart from them.
     surface_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0x50BF,)))

@@ -4,8 +4,11 @@ import csv
 import glob
 import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
 
 from qs3.adaptation.confidence import UNKNOWN, rescale
 from qs3.errors import InputError
@@ -13,17 +16,17 @@ from qs3.files import json_bytes, new_folder
 from qs3.io.guards import utf8
 from qs3.io.layouts.point_folders import check_class
 from qs3.io.point_files import POINT_FILES, read_cloud
-from qs3.training.checkpoint import load_model
+from qs3.training.checkpoint import LoadedModel, load_model
 from qs3.training.predict import ask
 from qs3.training.prepared import note_size
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What the network says of one file."""
+    """What a network says of one cloud."""
 
-    file: Path
-    """The file."""
+    file: Path = Path()
+    """Where it was read from; the working directory where from none."""
     probabilities: Mapping[str, float] = field(default_factory=dict)
     """Of every class, the likeliest first; empty where the file cannot be read."""
     fault: str = ""
@@ -81,24 +84,44 @@ def predict_files(
         InputError: where the run cannot be read, or does not hold what was asked for.
     """
     loaded = load_model(run)
-    known = loaded.require_known(run, unknown) if calibrated or unknown is not None else None
+    if calibrated or unknown is not None:
+        loaded.require_known(run, unknown)
     for path in files:
         try:
             points = read_cloud(path)[None]
             note_size(points, loaded.preparation)
-            said = ask(loaded, points)
+            (answer,) = answer_clouds(loaded, points, unknown, calibrated)
         except InputError as error:
             text = str(error)
             yield Answer(path, fault=text if str(path) in text else f"{path}: {text}")
             continue
-        shares, familiarity = said.probabilities, None
-        if known is not None:
-            shares = rescale(shares, known.temperature) if calibrated else shares
-            familiarity = float(known.familiarity(said.logits)[0])
-        named = zip(loaded.class_names, shares[0].tolist(), strict=True)
+        yield replace(answer, file=path)
+
+
+def answer_clouds(
+    loaded: LoadedModel,
+    points: Float[np.ndarray, "b n 3"],
+    unknown: float | None = None,
+    calibrated: bool = False,
+) -> list[Answer]:
+    """Tell the class of each cloud, all in one pass; arguments are those of `predict_files`.
+
+    Raises:
+        InputError: where a point is not finite, or the network does not hold what was asked for.
+    """
+    said = ask(loaded, points)
+    shares, familiar = said.probabilities, [None] * len(points)
+    if calibrated or unknown is not None:
+        known = loaded.require_known("this network", unknown)
+        shares = rescale(shares, known.temperature) if calibrated else shares
+        familiar = known.familiarity(said.logits).tolist()
+    answers = []
+    for row, familiarity in zip(shares.tolist(), familiar, strict=True):
+        named = zip(loaded.class_names, row, strict=True)
         probabilities = dict(sorted(named, key=lambda item: -item[1]))
         refused = familiarity is not None and familiarity < (unknown or 0)
-        yield Answer(path, probabilities, familiarity=familiarity, refused=refused)
+        answers.append(Answer(Path(), probabilities, familiarity=familiarity, refused=refused))
+    return answers
 
 
 def answers_csv(answers: Iterable[Answer], top: int = 1) -> str:

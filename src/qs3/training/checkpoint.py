@@ -222,6 +222,11 @@ def save_model(
     return path
 
 
+def known_of(facts: Mapping[str, Any], path: Path) -> Known | None:
+    """Return what a file of weights tells of held-out source; None where it tells nothing."""
+    return structure(facts["known"], Known, path) if "known" in facts else None
+
+
 def load_model(run_dir: Path) -> LoadedModel:
     """Read the network of a run.
 
@@ -246,7 +251,7 @@ def load_model(run_dir: Path) -> LoadedModel:
         class_names = tuple(str(name) for name in facts["class_names"])
         name, arguments = facts["model"], dict(facts["model_settings"])
         preparation = structure(facts.get("preparation", {}), Preparation, path)
-        known = structure(facts["known"], Known, path) if "known" in facts else None
+        known = known_of(facts, path)
         with torch.random.fork_rng(devices=[]):
             model = _make(name, len(class_names), arguments, preparation)
     except (KeyError, TypeError) as error:

@@ -17,7 +17,7 @@ from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.structure import first_difference, unstructure
 from qs3.training.batches import require_unlabelled
-from qs3.training.checkpoint import load_model, weights_fingerprint
+from qs3.training.checkpoint import known_of, load_model, read_facts, weights_fingerprint
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
 from qs3.training.distributed import all_devices, make_fabric
 from qs3.training.history import EpochRecord, History, Tracker
@@ -29,6 +29,7 @@ from qs3.training.progress import Deadline
 from qs3.training.rounds import RoundCallback, RoundRecord
 from qs3.training.run import (
     CONFIG,
+    MODEL,
     RUN,
     Run,
     RunSettings,
@@ -235,7 +236,7 @@ def fit(
         source=job.source,
         holdout=job.holdout,
         target=job.target,
-        known=load_model(run_dir).known,
+        known=known_of(read_facts(run_dir / MODEL), run_dir / MODEL),
     )
 
 

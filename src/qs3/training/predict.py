@@ -63,27 +63,28 @@ def predict_probabilities(
         >>> predict_probabilities(create_model("pointnet", 4), points, num_points=16).shape
         (3, 4)
     """
-    how = {"num_points": num_points, "preparation": preparation}
-    return ask(model, points, **how, batch_size=batch_size, fabric=fabric).probabilities
-
-
-def ask(
-    model: PointClassifier | LoadedModel,
-    points: Float[np.ndarray, "b n 3"],
-    *,
-    num_points: int | None = None,
-    preparation: Preparation | None = None,
-    batch_size: int = 32,
-    fabric: "Fabric | None" = None,
-) -> Description:
-    """Return all that a network says of clouds as read; arguments are `predict_probabilities`'."""
     if isinstance(model, LoadedModel):
         num_points, preparation = num_points or model.num_points, preparation or model.preparation
         model = model.model
+    prepared = _prepared(points, num_points, preparation)
+    return describe(model, prepared, batch_size=batch_size, fabric=fabric).probabilities
+
+
+def ask(loaded: LoadedModel, points: Float[np.ndarray, "b n 3"]) -> Description:
+    """Return all that a network says of clouds as read; it knows how it was trained.
+
+    Raises:
+        InputError: where a point is not finite.
+    """
+    return describe(loaded.model, _prepared(points, loaded.num_points, loaded.preparation))
+
+
+def _prepared(
+    points: Float[np.ndarray, "b n 3"], num_points: int | None, preparation: Preparation | None
+) -> Prepared[UnlabelledClouds]:
     clouds = UnlabelledClouds(points, numbered(len(points)))
     require_finite(points, [str(row) for row in range(len(points))])
-    prepared = prepare_clouds(clouds, num_points or points.shape[1], preparation or PAPER)
-    return describe(model, prepared, batch_size=batch_size, fabric=fabric)
+    return prepare_clouds(clouds, num_points or points.shape[1], preparation or PAPER)
 
 
 @torch.no_grad()

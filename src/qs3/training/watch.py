@@ -1,18 +1,17 @@
 """Frames of a depth camera cut into objects, and what a network says of each."""
 
 import time
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from qs3.adaptation.confidence import UNKNOWN
 from qs3.errors import InputError
 from qs3.io.cameras.frames import Camera
 from qs3.io.extract.segment import SegmentedObject, SegmentSettings, lift_scene, segment
 from qs3.io.preparation import LARGEST, stack
+from qs3.training.answers import Answer, answer_clouds
 from qs3.training.checkpoint import LoadedModel, load_model
-from qs3.training.predict import ask
 
 _DENSER = 4
 """Of an object so many times the points of the network count; strays take longer in more."""
@@ -25,17 +24,8 @@ class SeenObject(NamedTuple):
 
     item: SegmentedObject
     """Its points and its box."""
-    probabilities: Mapping[str, float]
-    """Of every class, the likeliest first."""
-    unfamiliar: float | None = None
-    """Where no class is answered, the share of held-out clouds that are more familiar."""
-
-    @property
-    def best(self) -> tuple[str, float]:
-        """The likeliest class and its probability, or ``unknown`` and `unfamiliar`."""
-        if self.unfamiliar is not None:
-            return UNKNOWN, self.unfamiliar
-        return next(iter(self.probabilities.items()))
+    answer: Answer
+    """What the network says of it."""
 
 
 class SeenFrame(NamedTuple):
@@ -106,45 +96,42 @@ def predict_objects(
         return ()
     most = min(LARGEST, _DENSER * (loaded.num_points or LARGEST))
     clouds = stack([item.points for item in items], None, "frame", most)
-    said, names = ask(loaded, clouds), loaded.class_names
-    shares, unfamiliar = said.probabilities.tolist(), [None] * len(items)
-    if unknown is not None:
-        familiar = loaded.require_known("this network", unknown).familiarity(said.logits).tolist()
-        unfamiliar = [1 - share if share < unknown else None for share in familiar]
-    return tuple(
-        SeenObject(item, dict(sorted(zip(names, row, strict=True), key=_less)), strange)
-        for item, row, strange in zip(items, shares, unfamiliar, strict=True)
-    )
-
-
-def _less(pair: tuple[str, float]) -> float:
-    return -pair[1]
+    return tuple(map(SeenObject, items, answer_clouds(loaded, clouds, unknown)))
 
 
 def plain(frame: SeenFrame) -> dict[str, Any]:
     """A frame as plain values, for JSON; lengths in metres."""
-    objects = [
-        {
-            "class": one.best[0],
-            "confidence": one.best[1],
-            "points": len(one.item.points),
-            "centre": one.item.centre,
-            "size": one.item.size,
-            "heading": one.item.heading,
-            "probabilities": one.probabilities,
-        }
-        for one in frame.objects
-    ]
+    objects = []
+    for item, answer in frame.objects:
+        ((name, share),) = answer.best()
+        box = {"centre": item.centre, "size": item.size, "heading": item.heading}
+        told = {"class": name, "confidence": share, "points": len(item.points), **box}
+        objects.append(told | {"probabilities": answer.probabilities})
     seconds = dict(zip(STAGES, frame.seconds, strict=True))
     told = {"frame": frame.name, "time": frame.timestamp, "objects": objects, "seconds": seconds}
     return told | ({"fault": frame.fault} if frame.fault else {})
 
 
-def rate(frames: Sequence[SeenFrame]) -> str:
-    """A line: how many frames a second, and the mean time of each stage."""
-    timed = frames[1:] or frames  # what the first one loads, the others find there
-    means = [sum(part) / len(timed) for part in zip(*(f.seconds for f in timed), strict=True)]
-    parts = ", ".join(
-        f"{name} {1000 * mean:.0f} ms" for name, mean in zip(STAGES, means, strict=True)
-    )
-    return f"{len(frames)} frames, {1 / sum(means):.1f} a second; of each: {parts}"
+class Rate:
+    """How many frames a second, and the mean time of each stage."""
+
+    def __init__(self) -> None:
+        self._frames, self._timed, self._sums = 0, 0, [0.0, 0.0, 0.0]
+
+    def add(self, frame: SeenFrame) -> None:
+        """Count a frame."""
+        self._frames += 1
+        if self._frames == 2:  # what the first one loads, the others find there
+            self._timed, self._sums = 0, [0.0, 0.0, 0.0]
+        self._timed += 1
+        self._sums = [one + part for one, part in zip(self._sums, frame.seconds, strict=True)]
+
+    def __str__(self) -> str:
+        """A line; nothing before the first frame."""
+        if not self._frames:
+            return ""
+        means = [part / self._timed for part in self._sums]
+        parts = ", ".join(
+            f"{name} {1000 * mean:.0f} ms" for name, mean in zip(STAGES, means, strict=True)
+        )
+        return f"{self._frames} frames, {1 / sum(means):.1f} a second; of each: {parts}"

@@ -16,7 +16,8 @@ from qs3.viewer.exhibits import KINDS, Answers, Exhibit
 _LOG = logging.getLogger(__name__)
 _CAMERA = (-0.9, -1.5, 0.7)
 _GROUND = 2.0  # side, in lengths of the object
-_BLOCK = '<div style="padding:0.2em 0.9em;font-size:0.85em;line-height:1.45">{}</div>'
+BLOCK = '<div style="padding:0.2em 0.9em;font-size:0.85em;line-height:1.45">{}</div>'
+"""A text of a panel."""
 
 
 class Canvas:
@@ -68,7 +69,7 @@ class Canvas:
 
     def say(self, text: str) -> None:
         """State what is under way, such as a scan; empty takes it away."""
-        self._state.content = _BLOCK.format(f"<i>{html.escape(text)}</i>") if text else ""
+        self._state.content = BLOCK.format(f"<i>{html.escape(text)}</i>") if text else ""
 
     def fail(self, error: Exception) -> None:
         """State a fault; it stays until something is shown or said again."""
@@ -79,7 +80,7 @@ class Canvas:
             _LOG.error("the viewer could not show something", exc_info=error)
         with self._lock:
             before = "<br>What is drawn is from before." if self._shown else ""
-            self._state.content = _BLOCK.format(
+            self._state.content = BLOCK.format(
                 f'<div style="color:#b00020" role="alert"><b>{html.escape(text)}</b>{before}</div>'
             )
 
@@ -131,8 +132,8 @@ class Canvas:
                     flat_shading=True,
                     visible=bool(self._mesh.value),
                 )
-            self._text.content = _BLOCK.format(shown.text())
-            self._legend.content = _BLOCK.format(shown.colouring.legend() + f"<div>{ground}</div>")
+            self._text.content = BLOCK.format(shown.text())
+            self._legend.content = BLOCK.format(shown.colouring.legend() + f"<div>{ground}</div>")
 
 
 def _make_way(client: Any) -> None:

@@ -74,7 +74,7 @@ def by_view(view: UInt8[np.ndarray, "n"]) -> Colouring:
         (class_colour(number), f"view {number + 1} ({count} point{'s' * (count != 1)})")
         for number, count in zip(numbers.tolist(), counts.tolist(), strict=True)
     )
-    palette = np.array([_rgb(colour) for colour in PALETTE])
+    palette = np.array([rgb(colour) for colour in PALETTE])
     return Colouring(palette[view % len(PALETTE)], "view", swatches)
 
 
@@ -117,12 +117,13 @@ def flat(
         >>> flat(2, "predicted class", "#332288", (("#332288", "chair"),)).colours.tolist()
         [[51, 34, 136], [51, 34, 136]]
     """
-    return Colouring(np.tile(_rgb(colour), (count, 1)), title, swatches)
+    return Colouring(np.tile(rgb(colour), (count, 1)), title, swatches)
 
 
 def _viridis(share: Float[np.ndarray, "n"]) -> UInt8[np.ndarray, "n 3"]:
     return np.asarray(_MAP(np.clip(share, 0, 1), bytes=True))[:, :3]
 
 
-def _rgb(colour: str) -> UInt8[np.ndarray, "3"]:
+def rgb(colour: str) -> UInt8[np.ndarray, "3"]:
+    """Red, green and blue of a colour such as #332288."""
     return np.frombuffer(bytes.fromhex(colour[1:]), np.uint8)

@@ -3,14 +3,13 @@
 import html
 from typing import Any
 
-import numpy as np
-
 from qs3.adaptation.confidence import UNKNOWN
 from qs3.report.figure import class_colour
 from qs3.training.watch import SeenFrame
+from qs3.viewer.canvas import BLOCK
+from qs3.viewer.colouring import rgb
 
 _GREY = "#8c8c8c"
-_BLOCK = '<div style="padding:0.2em 0.9em;font-size:0.85em;line-height:1.45">{}</div>'
 
 
 class Live:
@@ -40,18 +39,17 @@ class Live:
             for handle in self._drawn:
                 handle.remove()
             self._drawn = []
-            for number, one in enumerate(frame.objects):
-                (name, share), (x, y, _) = one.best, one.item.centre
-                names = sorted(one.probabilities)
+            for number, (item, answer) in enumerate(frame.objects):
+                ((name, share),), (x, y, _) = answer.best(), item.centre
+                names = sorted(answer.probabilities)
                 colour = _GREY if name == UNKNOWN else class_colour(names.index(name))
                 told = f"{name} {share:.2f}"
                 lines.append(f'<span style="color:{colour}">■</span> {html.escape(told)}')
-                scene, points = self._server.scene, one.item.points
-                rgb = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)], np.uint8)
+                scene, drawn = self._server.scene, (item.points, rgb(colour))
                 self._drawn += [
-                    scene.add_point_cloud(f"/object/{number}", points, rgb, point_size=0.002),
-                    scene.add_label(f"/label/{number}", told, position=(x, y, one.item.size[2])),
+                    scene.add_point_cloud(f"/object/{number}", *drawn, point_size=0.002),
+                    scene.add_label(f"/label/{number}", told, position=(x, y, item.size[2])),
                 ]
         lines = lines or [html.escape(frame.fault)]
         head = f"<b>{html.escape(frame.name)}</b><br>"
-        self._text.content = _BLOCK.format(head + "<br>".join([*lines, html.escape(rate)]))
+        self._text.content = BLOCK.format(head + "<br>".join([*lines, html.escape(rate)]))

@@ -63,9 +63,11 @@ def serve(port: int, title: str) -> Iterator[Any]:
         title: Heading of the page's panel.
 
     Raises:
-        InputError: where viser is not installed, or its server cannot be guarded.
+        InputError: where viser is not installed, the port is in use, or the server cannot be
+            guarded.
     """
     viser = require_viser()
+    require_free(port)
     import rich
     from websockets.asyncio import server as library
 

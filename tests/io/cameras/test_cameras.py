@@ -10,7 +10,7 @@ import pytest
 
 from qs3.errors import InputError, MissingExtraError
 from qs3.io.cameras.folder import capture
-from qs3.io.cameras.frames import CameraSettings, DepthFrame, open_camera
+from qs3.io.cameras.frames import CaptureSettings, DepthFrame, open_camera
 from qs3.io.extract.depth import DepthImageSettings, extract_depth
 from qs3.io.extract.depth_images import read_depth
 from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
@@ -23,7 +23,7 @@ from .table import frames
 
 
 def read(camera: str, **more) -> list[DepthFrame]:
-    return list(open_camera(CameraSettings(camera, **more)))
+    return list(open_camera(CaptureSettings(camera, **more)))
 
 
 def same(one: DepthFrame, other: DepthFrame, colour: bool = True) -> None:
@@ -109,7 +109,7 @@ def test_frames_and_every_choose(tmp_path):
     assert len(read(folder, every=9.0)) == 7  # nothing tells when they were taken
     for wrong in ({"frames": 0}, {"every": -1.0}, {"every": float("nan")}):
         with pytest.raises(InputError):
-            CameraSettings("realsense", **wrong)
+            CaptureSettings("realsense", **wrong)
 
 
 def test_a_folder_of_images_with_a_camera_beside_them(tmp_path):
@@ -130,7 +130,7 @@ def test_a_recording_of_a_realsense_gives_every_frame(tmp_path):
     shots = list(frames(8))
     path = write_realsense(tmp_path / "shots", shots)
     got = []
-    for frame in open_camera(CameraSettings(f"bag:{path}")):
+    for frame in open_camera(CaptureSettings(f"bag:{path}")):
         got.append(frame)
         time.sleep(0.05)  # slower than the camera
     for one, two in zip(shots, got, strict=True):
@@ -138,9 +138,9 @@ def test_a_recording_of_a_realsense_gives_every_frame(tmp_path):
         # librealsense lays colour over depth: all but what edges hide.
         assert (one.colour == two.colour).mean() > 0.99
     assert len(read(f"bag:{path}", every=3 / RATE)) == 3
-    without = next(open_camera(CameraSettings(f"bag:{path}"), colour=False))
+    without = next(open_camera(CaptureSettings(f"bag:{path}"), colour=False))
     assert without.colour is None
-    assert capture(open_camera(CameraSettings(f"bag:{path}")), tmp_path / "out") == 8
+    assert capture(open_camera(CaptureSettings(f"bag:{path}")), tmp_path / "out") == 8
     for one, two in zip(got, read(f"folder:{tmp_path / 'out'}"), strict=True):
         same(two, one)
 
@@ -169,7 +169,7 @@ def test_bags_of_ros_give_the_frames_that_went_in(tmp_path, kind, encoding):
         shots = [_in_metres(frame) for frame in shots]
     for one, two in zip(shots, got, strict=True):
         same(two, one, colour=False)
-    capture(open_camera(CameraSettings(f"rosbag:{path}")), tmp_path / "out")
+    capture(open_camera(CaptureSettings(f"rosbag:{path}")), tmp_path / "out")
     for one, two in zip(shots, read(f"folder:{tmp_path / 'out'}"), strict=True):
         same(two, one, colour=False)
 

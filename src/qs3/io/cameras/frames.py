@@ -36,17 +36,10 @@ class DepthFrame:
 Camera = Generator[DepthFrame, None, None]
 
 
-@dataclass(frozen=True)
-class CameraSettings:
-    """Which camera, and which of its frames."""
+@dataclass(frozen=True, kw_only=True)
+class FrameSettings:
+    """Which frames of a camera."""
 
-    camera: str
-    """realsense, or realsense:SERIAL; bag:FILE, a recording of one; rosbag:PATH, a recording of
-    ROS; folder:DIR, depth images as qs3 capture writes them."""
-    intrinsics: str = ""
-    """Of a folder or a ROS bag that does not tell its own: fx,fy,cx,cy or a file."""
-    topic: str = ""
-    """Of a ROS bag with several topics of depth images: which."""
     frames: int | None = None
     """Frames to take at most; all by default, of a live camera until Ctrl-C."""
     every: float = 0.0
@@ -59,7 +52,20 @@ class CameraSettings:
             raise InputError(f"--every {self.every:g}: must be 0 or more seconds")
 
 
-def open_camera(settings: CameraSettings, colour: bool = True) -> Camera:
+@dataclass(frozen=True)
+class CaptureSettings(FrameSettings):
+    """Which camera, and which of its frames."""
+
+    camera: str
+    """realsense, or realsense:SERIAL; bag:FILE, a recording of one; rosbag:PATH, a recording of
+    ROS; folder:DIR, depth images as qs3 capture writes them."""
+    intrinsics: str = ""
+    """Of a folder or a ROS bag that does not tell its own: fx,fy,cx,cy or a file."""
+    topic: str = ""
+    """Of a ROS bag with several topics of depth images: which."""
+
+
+def open_camera(settings: CaptureSettings, colour: bool = True) -> Camera:
     """Yield frames of a camera, as many and as often as the settings say.
 
     Args:
@@ -84,7 +90,7 @@ def open_camera(settings: CameraSettings, colour: bool = True) -> Camera:
                 return
 
 
-def _camera(settings: CameraSettings, colour: bool) -> Camera:
+def _camera(settings: CaptureSettings, colour: bool) -> Camera:
     from qs3.io.cameras.folder import folder_camera
     from qs3.io.cameras.realsense import realsense_camera
     from qs3.io.cameras.ros import ros_camera

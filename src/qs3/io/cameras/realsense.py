@@ -1,8 +1,6 @@
 """RealSense cameras and their recordings, by librealsense (extra ``realsense``)."""
 
 import dataclasses
-import functools
-import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,13 +8,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from qs3.errors import InputError, MissingExtraError
+from qs3.errors import InputError, MissingExtraError, say_once
 from qs3.io.cameras.frames import Camera, DepthFrame
 from qs3.io.extract.depth_images import to_metres
 from qs3.io.extract.intrinsics import Intrinsics
 from qs3.io.guards import reason
 
-_LOG = logging.getLogger(__name__)
 _PATIENCE = 5000  # milliseconds to the next frame
 
 
@@ -124,18 +121,13 @@ def _framesets(rs: Any, pipeline: Any, device: Any, where: str) -> Iterator[Any]
 def _depth_frame(depth: Any, name: str) -> DepthFrame:
     lens = depth.profile.as_video_stream_profile().intrinsics
     if any(lens.coeffs):
-        _tell_distortion()
+        say_once("the depth of this camera has lens distortion, which is not undone")
     step = float(f"{depth.get_units():.6g}")  # kept in single precision
     camera = Intrinsics(
         lens.fx, lens.fy, lens.ppx, lens.ppy, lens.width, lens.height, depth_scale=step
     )
     metres = to_metres(np.asanyarray(depth.get_data()), step)
     return DepthFrame(metres, camera, name, depth.get_timestamp() / 1000)
-
-
-@functools.cache
-def _tell_distortion() -> None:
-    _LOG.warning("the depth of this camera has lens distortion, which is not undone")
 
 
 def _together(depth: Any, colour: Any) -> bool:
