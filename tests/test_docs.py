@@ -24,6 +24,7 @@ try:
 finally:
     sys.path.remove(str(DOCS))
 
+from qs3 import shapes  # noqa: E402
 from qs3.adaptation.names import MethodName  # noqa: E402
 
 PAGES = sorted(DOCS.rglob("*.md"))
@@ -186,6 +187,23 @@ def test_the_check_of_commands_sees_commands():
     assert len(commands(DOCS / "commands.md")) >= len(verbs())
     assert "--no-such-option" not in options("train")
     assert "--self-training.rounds" in options("train")
+
+
+SCANS = sorted(
+    {c for page in ALL for c in commands(page) if c.startswith("scan ") and "cycles" not in c}
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", SCANS)
+def test_scans_of_the_pages_run_as_written(command, tmp_path):
+    qs3 = [sys.executable, "-m", "qs3"]
+    sensor = subprocess.run([*qs3, "sensors", "show", "d435"], capture_output=True, check=True)
+    (tmp_path / "my_camera.toml").write_bytes(sensor.stdout)
+    (tmp_path / "my_part.obj").write_text(shapes.make("chair", seed=0).export(file_type="obj"))
+    words = shlex.split(command)
+    subprocess.run([*qs3, *words, "--num-points", "64"], cwd=tmp_path, check=True)
+    assert (tmp_path / words[words.index("--out") + 1] / "cloud.ply").is_file()
 
 
 def test_the_page_of_commands_lists_exactly_the_verbs():

@@ -27,7 +27,7 @@ def check_views(arranged: ArrangedScene, sensor: Sensor) -> None:
                 if where := _blocked(stands.position, body, name):
                     raise InputError(
                         f"view {index}: the {eye} stands {where}; give placement a larger radius "
-                        "or another elevation, or make the object smaller (object_size)"
+                        "or another elevation, or make object and neighbour smaller (object_size)"
                     )
     if sensor.light.projector > 0 and not any(
         _lit(arranged.bodies[0].mesh, sensor, pose) for pose in arranged.poses
