@@ -15,6 +15,7 @@ import argparse
 import concurrent.futures
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -31,7 +32,7 @@ from qs3.io.clouds import CloudChoice, Origin, PointClouds, UnlabelledClouds
 from qs3.io.preparation import PAPER, ROBUST, Preparation
 from qs3.meshes.classes import POINTDA10
 from qs3.training import evaluate, fit
-from qs3.training.config import Augmentation, SelfTrainingSettings, TrainSettings, changed
+from qs3.training.config import GENTLE, Augmentation, SelfTrainingSettings, TrainSettings, changed
 
 BATCH = 32
 SIZED = replace(ROBUST, size_input=True)
@@ -61,6 +62,7 @@ class Cell:
 SEEN = replace(LIGHT, sight=1.0)
 ALL = Cell()
 ROOMS = replace(ALL, preparation=replace(SIZED, align=True), augmentation=SEEN)
+GENTLY = replace(ROOMS, method="qbst", warm_up="rooms")
 DGCNN = replace(ALL, network="dgcnn", steps=2000)
 CELLS: Mapping[str, Cell] = {
     # Sources, equal numbers of steps.
@@ -87,6 +89,24 @@ CELLS: Mapping[str, Cell] = {
         rounds={"teacher": "average", "threshold_share": 0.5, "rounds": 5, "epochs": 4},
         train={"learning_rate": 1e-4},
         warm_up="rooms",
+    ),
+    "rooms SPST gentle": replace(
+        ROOMS, method="spst", rounds={**GENTLE, "rule": "spst"}, warm_up="rooms"
+    ),
+    # Further such rounds, chosen after the ones before had been scored.
+    "rooms QBST gentle, refined": replace(GENTLY, rounds={**GENTLE, "refine": True}),
+    "rooms QBST gentle, more": replace(GENTLY, rounds={**GENTLE, "threshold_share": 0.8}),
+    "rooms QBST gentle, faster": replace(GENTLY, rounds={**GENTLE, "learning_rate": 3e-4}),
+    # Every round is a checkpoint: which validator picks the best?
+    "rooms QBST checked": replace(
+        ROOMS,
+        method="qbst",
+        rounds={"teacher": "average"},
+        train={"validate_every": 1},
+        warm_up="rooms",
+    ),
+    "rooms QBST gentle, checked": replace(
+        GENTLY, rounds={**GENTLE, "rounds": 10}, train={"validate_every": 1}
     ),
     "rooms SPST": replace(ROOMS, method="spst", warm_up="rooms"),
     "rooms DGCNN": replace(ROOMS, network="dgcnn", steps=3000),
@@ -180,7 +200,8 @@ def make(options: argparse.Namespace, name: str, seed: int) -> None:
     clouds["source"] = source.select(np.sort(rows))
     for part in ("source", *scored(options)):
         fields = {"cell": name, "part": part}
-        record = evaluate(run, clouds[part], experiment=fields)
+        checkpoints = train.validate_every > 0 and part != "source"
+        record = evaluate(run, clouds[part], checkpoints=checkpoints, experiment=fields)
         write_record(record_path(options, name, seed, part), record)
 
 
@@ -189,7 +210,7 @@ def scored(options: argparse.Namespace) -> tuple[str, ...]:
 
 
 def record_path(options: argparse.Namespace, name: str, seed: int, part: str) -> Path:
-    return options.records / f"{name.replace(' ', '_')}-{seed}-{part}.json"
+    return options.records / f"{re.sub('[^-+A-Za-z0-9]+', '_', name)}-{seed}-{part}.json"
 
 
 def done(options: argparse.Namespace, name: str, seed: int) -> bool:
