@@ -10,6 +10,7 @@ import torch
 
 from qs3.cli import main
 from qs3.io import load_clouds
+from qs3.io.convert import convert
 from qs3.models import create_model
 from qs3.training import TrainSettings, fit, load_model, save_model
 from qs3.training.answers import (
@@ -69,6 +70,26 @@ def test_files_folders_and_patterns_are_listed_once(folder):
     assert len(list_clouds([folder, folder / "*.npy"])) == 4
     with refused("no cloud found", "*.pcd"):
         list_clouds([folder / "*.pcd"])
+
+
+def test_a_data_set_is_answered_cloud_by_cloud(folder, model, tmp_path):
+    points = np.stack([np.load(folder / f"{name}.npy") for name in "ab"]).astype(np.float32)
+    data = tmp_path / "data.npz"
+    named = {"name": np.array(["one", "two"]), "class_names": np.array(NAMES)}
+    np.savez(data, points=points, label=np.array([0, 1]), **named)
+    convert(data, tmp_path / "store", "store")
+    plain = list(predict_files(model, [folder / "a.npy", folder / "b.npy"]))
+    for path in (data, tmp_path / "store"):
+        assert list_clouds([path]) == [path]
+        answers = list(predict_files(model, list_clouds([path])))
+        assert [answer.file.name for answer in answers] == ["one", "two"]
+        assert [a.probabilities for a in answers] == [a.probabilities for a in plain]
+        with refused("one", "qs3 convert"):
+            sort_into(tmp_path / "sorted", answers)
+    (tmp_path / "store" / "shard-00000.parquet").write_bytes(b"")
+    damaged, good = predict_files(model, [tmp_path / "store", folder / "a.npy"])
+    assert "store" in damaged.fault
+    assert good.probabilities == plain[0].probabilities
 
 
 def test_answers_are_the_likeliest_first_and_one_bad_file_stops_no_other(folder, model):

@@ -26,7 +26,7 @@ def predict(
     Args:
         run: Folder of a run, its model.safetensors, or a network that comes with qs3: rooms.
         files: Clouds (NPY, XYZ, PLY, PCD, or a mesh as OFF; z up), folders of them with all below,
-            or patterns in quotes such as 'scans/*.ply'.
+            patterns in quotes such as 'scans/*.ply', or data sets of any layout.
         top: Classes told of each file, the likeliest first.
         csv: File for the table as CSV.
         json: File for the table as JSON with the probability of every class; - prints it in place
@@ -47,9 +47,10 @@ def predict(
     if top < 1:
         raise InputError(f"--top {top}: must be at least 1")
     paths = table.list_clouds(files)
-    text = "predict" if len(paths) > 1 else None
+    sets = any(map(table.is_data_set, paths))
+    text = "predict" if sets or len(paths) > 1 else None
     said = table.predict_files(run, paths, unknown=unknown, calibrated=calibrated)
-    bar = progress_bar(len(paths), text, "cloud", items=said)
+    bar = progress_bar(None if sets else len(paths), text, "cloud", items=said)
     answers: list[table.Answer] = [*bar]
     if json == Path("-"):
         show(table.answers_json(answers), end="")
@@ -70,6 +71,7 @@ def predict(
     for fault in faults[:-1]:
         tell(f"qs3: {printable(fault, keep='')}")
     if faults:
-        count = f" ({len(faults)} of {len(paths)} files)" if len(paths) > 1 else ""
+        kind = "clouds" if sets else "files"
+        count = f" ({len(faults)} of {len(answers)} {kind})" if len(answers) > 1 else ""
         raise InputError(faults[-1] + count)
     return 0

@@ -10,7 +10,7 @@ _IN_A_LOG = 10.0  # seconds between two lines where nobody watches
 
 
 def progress_bar(
-    total: int,
+    total: int | None,
     text: str | None,
     unit: str,
     initial: int = 0,
@@ -18,7 +18,8 @@ def progress_bar(
 ) -> "tqdm[Any]":
     """Return a bar; ``text`` None shows none. In a log file it writes every ten seconds at most.
 
-    It is moved by hand, or by going through it where it has ``items``.
+    It is moved by hand, or by going through it where it has ``items``; ``total`` None tells a count
+    alone.
     """
     return tqdm(
         items,

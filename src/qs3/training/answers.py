@@ -14,7 +14,9 @@ from qs3.adaptation.confidence import UNKNOWN, rescale
 from qs3.errors import InputError
 from qs3.files import json_bytes, new_folder
 from qs3.io.guards import utf8
+from qs3.io.layouts import FORMATS
 from qs3.io.layouts.point_folders import check_class
+from qs3.io.load import read_clouds
 from qs3.io.point_files import POINT_FILES, read_cloud
 from qs3.training.checkpoint import LoadedModel, load_model
 from qs3.training.predict import ask
@@ -49,6 +51,9 @@ class Answer:
 def list_clouds(given: Sequence[Path]) -> list[Path]:
     """List files of points: files as they are named, folders with all below them, patterns.
 
+    A folder without such files that has a layout of `qs3.io.layouts` stays as it is, for
+    `read_listed`.
+
     Raises:
         InputError: where a folder or a pattern has none.
     """
@@ -57,6 +62,7 @@ def list_clouds(given: Sequence[Path]) -> list[Path]:
         if path.is_dir():
             paths = [p for p in sorted(path.rglob("*")) if p.suffix.lower() in POINT_FILES]
             paths = [p for p in paths if p.is_file() and p.name[0] != "."]
+            paths = paths or [path] * is_data_set(path)
         elif path.exists() or not glob.has_magic(str(path)):
             paths = [path]
         else:
@@ -68,14 +74,33 @@ def list_clouds(given: Sequence[Path]) -> list[Path]:
     return list(dict.fromkeys(files))
 
 
+def is_data_set(path: Path) -> bool:
+    """Whether a listed path is a data set of several clouds, not a file of points."""
+    if path.suffix.lower() in POINT_FILES or not path.exists():
+        return False
+    return any(layout.detect(path) for layout in FORMATS.values())
+
+
+def read_listed(path: Path) -> list[tuple[Path, Float[np.ndarray, "n 3"]]]:
+    """Read a listed path: the cloud of a file, or all of a data set, named by their ids below it.
+
+    Raises:
+        InputError: where it cannot be read.
+    """
+    if not is_data_set(path):
+        return [(path, read_cloud(path))]
+    data = read_clouds(path)[0]
+    return [(path / name, cloud) for name, cloud in zip(data.ids, data.clouds, strict=True)]
+
+
 def predict_files(
     run: Path, files: Iterable[Path], *, unknown: float | None = None, calibrated: bool = False
 ) -> Iterator[Answer]:
-    """Tell the class of each file, one after another; one that cannot be read has a fault.
+    """Tell the class of each cloud, one after another; a file that cannot be read has a fault.
 
     Args:
         run: Folder of a run, its model.safetensors, or the name of a network that comes with qs3.
-        files: Files of points, z up.
+        files: Files of points, z up, and data sets.
         unknown: Share of objects of the known classes that may be refused, by held-out source: what
             is less familiar is answered by `UNKNOWN`. None always answers a class.
         calibrated: Whether probabilities are those that held-out source calibrates.
@@ -88,14 +113,23 @@ def predict_files(
         loaded.require_known(run, unknown)
     for path in files:
         try:
-            points = read_cloud(path)[None]
-            note_size(points, loaded.preparation)
-            (answer,) = answer_clouds(loaded, points, unknown, calibrated)
+            clouds = read_listed(path)
         except InputError as error:
-            text = str(error)
-            yield Answer(path, fault=text if str(path) in text else f"{path}: {text}")
+            yield _fault(path, error)
             continue
-        yield replace(answer, file=path)
+        for name, points in clouds:
+            try:
+                note_size(points[None], loaded.preparation)
+                (answer,) = answer_clouds(loaded, points[None], unknown, calibrated)
+            except InputError as error:
+                yield _fault(name, error)
+            else:
+                yield replace(answer, file=name)
+
+
+def _fault(path: Path, error: InputError) -> Answer:
+    text = str(error)
+    return Answer(path, fault=text if str(path) in text else f"{path}: {text}")
 
 
 def answer_clouds(
@@ -167,8 +201,16 @@ def sort_into(folder: Path, answers: Iterable[Answer]) -> None:
         answers: What is sorted; files that could not be read are left out.
 
     Raises:
-        InputError: where the folder is taken, or a class cannot name a folder.
+        InputError: where the folder is taken, a class cannot name a folder, or a cloud is one of
+            a data set, without a file.
     """
+    answers = list(answers)
+    for answer in answers:
+        if not answer.fault and not answer.file.is_file():
+            raise InputError(
+                f"{answer.file}: is no file to link to but a cloud of a data set; write files of "
+                "it first: qs3 convert DATA FOLDER --to ply"
+            )
     with new_folder(folder) as whole:
         whole.mkdir()
         for answer in answers:

@@ -17,9 +17,8 @@ from qs3.adaptation.confidence import UNKNOWN, rescale
 from qs3.adaptation.names import split_method
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.io.point_files import read_cloud
 from qs3.structure import unstructure
-from qs3.training.answers import list_clouds
+from qs3.training.answers import list_clouds, read_listed
 from qs3.training.checkpoint import LoadedModel, load_model, save_model
 from qs3.training.config import (
     PRESETS,
@@ -150,7 +149,8 @@ class Adapter(ClassifierMixin, BaseEstimator):
     def _ask(self, clouds: Clouds) -> Description:
         self._require_fitted()
         if isinstance(clouds, str | Path):
-            clouds = [read_cloud(path) for path in list_clouds([Path(clouds)])]
+            listed = list_clouds([Path(clouds)])
+            clouds = [points for path in listed for _, points in read_listed(path)]
         points = clouds.points if isinstance(clouds, PointClouds | UnlabelledClouds) else clouds
         if isinstance(points, np.ndarray):
             batches = [points if points.ndim == 3 else points[None]]

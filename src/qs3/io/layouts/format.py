@@ -44,7 +44,10 @@ def labels_as(clouds: RaggedClouds, class_names: Sequence[str]) -> Int[np.ndarra
     if clouds.labels is None:
         raise InputError("this layout needs labels, and the clouds have none")
     if not clouds.splits or any(split not in SPLITS for split in clouds.splits):
-        raise InputError("this layout needs train or test for every cloud, and some have neither")
+        raise InputError(
+            "this layout needs train or test for every cloud, and some have neither; write one "
+            "that needs none, such as --to ply"
+        )
     return map_labels(clouds.class_names, clouds.labels, class_names)[0]
 
 
