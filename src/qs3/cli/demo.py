@@ -89,7 +89,7 @@ def demo(
         seed, sensor = 1000 + settings.seed, settings.sensor
         _scan(folder / "target", settings, settings.per_class, seed, sensor=sensor)
     else:
-        tell(f"[2/4] read {len(files)} scans")
+        tell(f"[2/4] read {scans}")
     tell("[3/4] adapt to the target without labels")
     _adapt(scans or folder / "target", before, settings, folder)
     tell("[4/4] report")
@@ -196,10 +196,9 @@ def _score(folder: Path, settings: DemoSettings, path: Path) -> None:
 
 def _tell_scans(folder: Path, files: list[Path], settings: DemoSettings, path: Path) -> None:
     """Tell what both networks take the user's scans for, and write table and page."""
-    from qs3.io import read_cloud
     from qs3.report.contents import Cloud
     from qs3.report.page import write_report
-    from qs3.training.answers import answers_csv, predict_files
+    from qs3.training.answers import answers_csv, predict_files, read_listed
 
     before, after = (list(predict_files(folder / name, files)) for name in ("before", "qbst"))
     write_text(folder / "predictions.csv", answers_csv(after, top=3))
@@ -212,14 +211,15 @@ def _tell_scans(folder: Path, files: list[Path], settings: DemoSettings, path: P
         count = sum(taken == name for taken, _ in best["before"])
         median = f"{statistics.median(sure):.0%}" if sure else "–"
         rows.append((name, str(count), str(len(sure)), median))
+    scans = [scan for file in files for scan in read_listed(file)]
     clouds = [
-        Cloud(read_cloud(file), name, f"{file.name}: {name}, {share:.0%}")
-        for file, (name, share) in list(zip(files, best["after"], strict=True))[:_SHOWN]
+        Cloud(points, name, f"{file.name}: {name}, {share:.0%}")
+        for (file, points), (name, share) in list(zip(scans, best["after"], strict=True))[:_SHOWN]
     ]
     page = dataclasses.replace(
         page,
         summary=f"{settings.network}, which comes with qs3, was adapted by quasi-balanced "
-        f"self-training to {len(files)} scans without labels. Clouds stand below the class that "
+        f"self-training to {len(scans)} scans without labels. Clouds stand below the class that "
         "the adapted network takes them for; whether that is right nobody has told it.",
         clouds={"scans, by predicted class": clouds},
         notes=tuple(
