@@ -250,33 +250,6 @@ def test_a_machine_that_cannot_compile_is_told_so_in_one_line(monkeypatch):
         match(*pair((40, 100), 5.0), SETTINGS)
 
 
-@pytest.mark.parametrize(
-    "fault",
-    [
-        {"census_width": 8},
-        {"census_height": 0},
-        {"census_width": 11, "census_height": 7},
-        {"lambda_census": 0.0},
-        {"lambda_ad": -1.0},
-        {"arm": 0},
-        {"arm": 16},
-        {"arm_threshold": -1.0},
-        {"penalty_small": 6.0},
-        {"penalty_large": 7.0},
-        {"edge": float("nan")},
-        {"edge_divisor": 0.5},
-        {"second_peak": -0.1},
-        {"corrections": -1},
-        {"surface": -1.0},
-        {"grain": 0.0},
-    ],
-    ids=str,
-)
-def test_each_faulty_setting_is_named(fault):
-    with pytest.raises(InputError, match=f"matching: .*{next(iter(fault))}"):
-        AdCensusSettings(**fault)
-
-
 @pytest.mark.data
 def test_a_real_d435_pair_is_matched_as_the_camera_does(d435_pair):
     left, right, camera = d435_pair

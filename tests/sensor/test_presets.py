@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.sensor.depth import DepthSettings
 from qs3.sensor.exposure import ExposureSettings
 from qs3.sensor.lens import blur
 from qs3.sensor.matching import MatchingSettings
@@ -26,7 +25,6 @@ from qs3.sensor.realism.bench import VIEW, painted, wall
 from qs3.sensor.rig import Region, StereoRig
 from qs3.sensor.speckle import PatternSettings, rosette_places
 from qs3.sensor.view import scene_of
-from qs3.sensor.views import Placement
 
 REAL = ("d415", "d435", "d455", "kinect-v1")
 
@@ -277,19 +275,3 @@ def test_missing_and_unreadable_files_are_told(tmp_path):
 def test_an_unknown_sensor_offers_the_nearest():
     with pytest.raises(InputError, match=r"no sensor 'd453'.*did you mean d4.5.*kinect-v1"):
         get_sensor("d453")
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        lambda: Placement(radius=(0.0, 1.0)),
-        lambda: Placement(radius=(math.nan, 1.0)),
-        lambda: Placement(elevation=(50.0, 20.0)),
-        lambda: DepthSettings(near=1.0, far=1.0),
-        lambda: DepthSettings(far=math.inf),
-        lambda: DepthSettings(stride=-4),
-    ],
-)
-def test_impossible_ranges_are_refused(settings):
-    with pytest.raises(InputError):
-        settings()

@@ -153,23 +153,6 @@ def test_nothing_stands_in_anything(layout, seed):
         assert other.vertices[:, 2].min() == pytest.approx(mesh.vertices[:, 2].min())
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"layout": "kitchen"}, "kitchen.*alone, floor"),
-        ({"layout": "alone+floor"}, "alone"),
-        ({"layout": "behind+beside"}, "not both"),
-        ({"wall_gap": -1.0}, "wall_gap"),
-        ({"neighbour_size": 0.0}, "neighbour_size"),
-        ({"cover": 1.5}, "cover"),
-        ({"arc": 200.0}, "arc"),
-    ],
-)
-def test_impossible_scenes_are_refused(change, message):
-    with pytest.raises(InputError, match=message):
-        SceneSettings(**change)
-
-
 def test_a_neighbour_too_many_or_too_few_is_refused(renderer):
     box = trimesh.creation.box(extents=[1, 1, 1])
     with pytest.raises(InputError, match="needs a neighbour"):
