@@ -3,7 +3,7 @@
 import dataclasses
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from typing import ClassVar
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -185,13 +185,7 @@ def test_a_device_that_is_not_there_is_told(monkeypatch):
     ("cuda", "scalar_rgb", "cuda"),
 ])  # fmt: skip
 def test_matching_follows_the_renderer_unless_it_is_told(device, variant, wanted):
-    class Other:
-        description: ClassVar = {"name": "mitsuba", "variant": variant}
-
-        def render(self):
-            raise NotImplementedError
-
-    renderer = Other()
+    renderer = SimpleNamespace(description={"name": "mitsuba", "variant": variant}, render=print)
     assert ScanSettings(device=device).matching_device(renderer) == wanted
 
 

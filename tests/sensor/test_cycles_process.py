@@ -214,8 +214,6 @@ def test_only_what_is_seen_is_rendered(stand_in):
     assert CyclesRenderer().render(SCENE, kinect, [POSE], [0])[0].right.size == 0
     whole = CyclesRenderer(full_frame=True).render(SCENE, RIG, [POSE], [0])[0]
     assert whole.left_region == RIG.full_frame
-    with pytest.raises(ValueError, match="seeds"):
-        CyclesRenderer().render(SCENE, RIG, [POSE], [1, 2])
 
 
 def test_settings_are_values(stand_in):

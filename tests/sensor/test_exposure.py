@@ -1,4 +1,5 @@
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -146,18 +147,14 @@ def test_coherent_speckle_spares_the_rooms_light():
 def test_a_view_is_taken_without_the_projector_where_speckle_needs_it(coherent):
     lit = []
 
-    class Lamp:
-        @property
-        def description(self):
-            return {}
+    def render(scene, rig, poses, seeds, regions=None):
+        lit.append((scene.light.projector, *seeds))
+        return [pair_of(np.full((2, 2), scene.light.projector)) for _ in poses]
 
-        def render(self, scene, rig, poses, seeds, regions=None):
-            lit.append((scene.light.projector, *seeds))
-            return [pair_of(np.full((2, 2), scene.light.projector)) for _ in poses]
-
+    lamp = SimpleNamespace(description={}, render=render)
     sensor = dataclasses.replace(get_sensor("d415"), exposure=ExposureSettings(coherent=coherent))
     pose = Pose(np.eye(4))
-    pairs = photograph(Lamp(), scene_of((), sensor), sensor, [pose] * 2, [3, 4])
+    pairs = photograph(lamp, scene_of((), sensor), sensor, [pose] * 2, [3, 4])
     assert [pair.left.max() for pair in pairs] == [1.0, 1.0]
     assert lit == ([(1.0, 3, 4), (0.0, 3, 4)] if coherent else [(1.0, 3, 4)])
     assert all((pair.room is None) == (coherent == 0) for pair in pairs)

@@ -1,6 +1,7 @@
 """Where floor, wall and neighbour stand, what is seen of the object, and what is refused."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -196,17 +197,10 @@ BOX = trimesh.creation.box(extents=[1.0, 0.9, 0.8])
     ],
 )
 def test_a_rig_in_the_way_is_refused_before_rendering(sensor, scene, message):
-    class NoRenderer:
-        @property
-        def description(self):
-            return {"name": "none"}
-
-        def render(self, *_, **__):
-            raise AssertionError("rendered all the same")
-
+    none = SimpleNamespace(description={"name": "none"}, render=lambda *_: pytest.fail("rendered"))
     other = BOX if "be" in scene else None
     with pytest.raises(InputError, match=message):
-        scan(BOX, sensor=sensor, scene=scene, neighbour=other, renderer=NoRenderer(), views=1)
+        scan(BOX, sensor=sensor, scene=scene, neighbour=other, renderer=none, views=1)
 
 
 def test_a_projector_inside_the_object_is_refused():
