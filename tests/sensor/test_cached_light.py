@@ -155,12 +155,6 @@ def test_embree_takes_diffuse_bodies_only():
         EmbreePhotographer(corner(MATERIALS["metal"]), 1, 3, 4, 32)
 
 
-@pytest.mark.parametrize("name", ["samples", "max_depth", "cache_cell", "cache_rays"])
-def test_senseless_renderers_are_refused(name):
-    with pytest.raises(InputError, match=f"renderer: {name}"):
-        MitsubaRenderer(variant="scalar_rgb", **{name: 0})
-
-
 @needs_llvm
 def test_turns_are_those_of_mitsuba():
     import mitsuba as mi

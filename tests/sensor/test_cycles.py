@@ -18,6 +18,8 @@ from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
 from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.scan import scan
 
+from .test_render import asymmetric
+
 pytestmark = pytest.mark.skipif(
     interpreter() is None, reason="no Cycles here: make cycles, or set QS3_BLENDER"
 )
@@ -44,17 +46,15 @@ def box(extents, centre) -> trimesh.Trimesh:
     return trimesh.creation.box(extents=extents).apply_translation(centre)
 
 
-def asymmetric() -> trimesh.Trimesh:
-    """An L with a tower: no mirror image of it is itself, and some faces share a plane."""
-    parts = [([1, 0.4, 0.1], [0, 0, -0.2]), ([0.2, 0.3, 0.1], [0.4, 0.25, -0.2])]
-    parts += [([0.2, 0.2, 0.5], [-0.4, 0.0, 0.05])]
-    return trimesh.util.concatenate([box(*part) for part in parts])
-
-
 def wall(material: Material | None = None, light: LightSettings = DARK) -> Scene:
     """A wall square to the rig that fills the frame."""
     body = Body(box([9, 0.02, 9], [0, 0.01, 0]), material or Material())
     return Scene((body,), light, WHITE, 0.625, 0.625)
+
+
+def shot(renderer, scene: Scene, region: Region = RIG.full_frame, pose: Pose = LEVEL):
+    """The left image of a region."""
+    return renderer.render(scene, RIG, [pose], [0], [region])[0].left
 
 
 def chart_scene(light: LightSettings | None = None) -> Scene:
@@ -88,23 +88,19 @@ def displacement(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     ids=["projector", "ambient", "sky"],
 )
 def test_each_light_is_as_bright_as_mitsubas(light, samples):
-    images = [
-        renderer.render(wall(light=light), RIG, [LEVEL], [0], [RIG.full_frame])[0].left
-        for renderer in (mitsuba(samples), CyclesRenderer(samples=samples))
-    ]
+    renderers = mitsuba(samples), CyclesRenderer(samples=samples)
+    images = [shot(renderer, wall(light=light)) for renderer in renderers]
     thirds = [cv2.resize(i, (3, 3), interpolation=cv2.INTER_AREA) for i in images]
     np.testing.assert_allclose(thirds[1], thirds[0], rtol=0.02)
 
 
 def test_the_projector_keeps_the_law_of_a_point_light():
     # A wall of albedo ρ at distance z has radiance ρ/π · I·cos³θ/z²; the setting is I/π.
-    image = CyclesRenderer(samples=4).render(
-        wall(light=replace(DARK, projector=45.6)), RIG, [LEVEL], [0], [RIG.full_frame]
-    )
+    image = shot(CyclesRenderer(samples=4), wall(light=replace(DARK, projector=45.6)))
     u, v = np.meshgrid((np.arange(96) - 47.5) / 110, (np.arange(64) - 31.5) / 110)
     u = u - 0.5 * RIG.baseline / 3  # from the projector, half a baseline to the right
     expected = 0.8 * 45.6 / 9 / (1 + u**2 + v**2) ** 1.5
-    np.testing.assert_allclose(image[0].left, expected, rtol=5e-3)
+    np.testing.assert_allclose(image, expected, rtol=5e-3)
 
 
 def test_convention_the_chart_lies_where_mitsuba_has_it():
@@ -128,14 +124,10 @@ def test_faces_that_share_a_plane_do_not_shade_each_other():
     both, one = trimesh.util.concatenate(plates), plates[0]
     above = Pose.looking_at(np.array([0.0, -1.0, 3.0]), np.zeros(3))
     light = LightSettings(ambient=0.3, sky=0.0)
-    region = Region(40, 26, 16, 12)
-    images = [
-        CyclesRenderer(samples=64).render(
-            Scene((Body(mesh),), light, WHITE, 0.6, 0.6), RIG, [above], [0], [region]
-        )[0]
-        for mesh in (one, both)
-    ]
-    np.testing.assert_allclose(images[1].left, images[0].left, rtol=0.05)
+    scenes = [Scene((Body(mesh),), light, WHITE, 0.6, 0.6) for mesh in (one, both)]
+    region, renderer = Region(40, 26, 16, 12), CyclesRenderer(samples=64)
+    alone, shared = (shot(renderer, scene, region, above) for scene in scenes)
+    np.testing.assert_allclose(shared, alone, rtol=0.05)
 
 
 def test_equal_seeds_give_equal_bits_and_others_do_not():
@@ -207,7 +199,7 @@ def test_blackman_harris_blurs():
     widths = []
     for kind in ("box", "blackman-harris"):
         renderer = CyclesRenderer(samples=256, pixel_filter=kind)
-        image = renderer.render(scene, RIG, [LEVEL], [0], [Region(30, 28, 40, 8)])[0].left
+        image = shot(renderer, scene, Region(30, 28, 40, 8))
         row = image.mean(axis=0) / image.max()
         widths.append(int(((row > 0.002) & (row < 0.9)).sum()))
     assert widths[0] <= 2
@@ -224,9 +216,7 @@ def test_either_side_of_a_face_is_the_same_surface(name):
     for faces in (plate.faces, plate.faces[:, ::-1]):
         mesh = trimesh.Trimesh(plate.vertices, faces, process=False)
         scene = Scene((Body(mesh, get_material(name)),), light, WHITE, 0.6, 0.6)
-        part = [Region(32, 16, 32, 32)]
-        pair = CyclesRenderer(samples=64).render(scene, RIG, [LEVEL], [0], part)[0]
-        means.append(pair.left.mean())
+        means.append(shot(CyclesRenderer(samples=64), scene, Region(32, 16, 32, 32)).mean())
     assert means[0] == pytest.approx(means[1], rel=0.01)
 
 
@@ -258,12 +248,8 @@ def test_glass_is_a_thin_pane():
         0.6,
     )
     bare = replace(pane, bodies=pane.bodies[1:])
-    dimmed, plain = (
-        CyclesRenderer(samples=64, max_bounces=0)
-        .render(scene, RIG, [LEVEL], [0], [Region(44, 28, 8, 8)])[0]
-        .left.mean()
-        for scene in (pane, bare)
-    )
+    direct, middle = CyclesRenderer(samples=64, max_bounces=0), Region(44, 28, 8, 8)
+    dimmed, plain = (shot(direct, scene, middle).mean() for scene in (pane, bare))
     reflected = 2 * 0.04 / 1.04
     # Two faces of the box, each a pane; there and back.
     assert dimmed / plain == pytest.approx((1 - reflected) ** 4, abs=0.01)
@@ -272,8 +258,7 @@ def test_glass_is_a_thin_pane():
 def test_a_mirror_shows_no_dots():
     lit = LightSettings(sky=0.0, ambient=0.1)
     scene = wall(Material("mirror", albedo=0.95), lit)
-    pair = CyclesRenderer(samples=8).render(scene, RIG, [LEVEL], [0], [RIG.full_frame])[0]
-    np.testing.assert_allclose(pair.left, 0.095, rtol=1e-3)
+    np.testing.assert_allclose(shot(CyclesRenderer(samples=8), scene), 0.095, rtol=1e-3)
 
 
 def test_bounces_end_where_mitsubas_do():
@@ -286,10 +271,9 @@ def test_bounces_end_where_mitsubas_do():
     for bounces in (0, 1, 2):
         theirs = replace(mitsuba(64), max_depth=2 + bounces)
         ours = CyclesRenderer(samples=32, max_bounces=bounces)
-        part = [Region(32, 16, 32, 32)]
-        pair = [r.render(scene, RIG, [LEVEL], [0], part)[0] for r in (theirs, ours)]
-        assert pair[1].left.mean() == pytest.approx(pair[0].left.mean(), rel=0.01)
-        levels.append(pair[1].left.mean())
+        both = [shot(r, scene, Region(32, 16, 32, 32)).mean() for r in (theirs, ours)]
+        assert both[1] == pytest.approx(both[0], rel=0.01)
+        levels.append(both[1])
     assert levels[1] > 1.03 * levels[0]
     assert levels[2] > 1.003 * levels[1]
 

@@ -214,8 +214,6 @@ def test_only_what_is_seen_is_rendered(stand_in):
     assert CyclesRenderer().render(SCENE, kinect, [POSE], [0])[0].right.size == 0
     whole = CyclesRenderer(full_frame=True).render(SCENE, RIG, [POSE], [0])[0]
     assert whole.left_region == RIG.full_frame
-    with pytest.raises(ValueError, match="seeds"):
-        CyclesRenderer().render(SCENE, RIG, [POSE], [1, 2])
 
 
 def test_settings_are_values(stand_in):
@@ -225,9 +223,6 @@ def test_settings_are_values(stand_in):
     assert pickle.loads(pickle.dumps(renderer)) == renderer  # noqa: S301
     assert hash(renderer) == hash(CyclesRenderer(samples=4))
     assert renderer.description["name"] == "cycles"
-    for name, value in {"samples": 0, "max_bounces": -1, "timeout": 0.0}.items():
-        with pytest.raises(InputError, match=f"renderer: {name}"):
-            CyclesRenderer(**{name: value})
 
 
 def test_the_interpreter_is_looked_up_in_order(tmp_path, monkeypatch):

@@ -1,7 +1,7 @@
 """Rooms: drawn within their ranges, from the scan's seed alone, and again where little shows."""
 
 import dataclasses
-from typing import Any
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -170,25 +170,19 @@ def test_a_room_that_shows_little_is_drawn_again_and_counted(renderer):
         chair(randomise=ALL, least_pixels=424 * 240, renderer=renderer)
 
 
-@dataclasses.dataclass(frozen=True)
-class Shutter:
-    """A renderer whose first pictures are all black."""
+def shutter(renderer, dark):
+    """A renderer whose first pictures are all black, and how many it took each time."""
+    taken = []
 
-    inner: Any
-    dark: int
-    taken: list[int] = dataclasses.field(default_factory=list)
-
-    @property
-    def description(self):
-        return self.inner.description
-
-    def render(self, scene, rig, poses, seeds, regions=None):
-        pairs = self.inner.render(scene, rig, poses, seeds, regions)
-        self.taken.append(len(pairs))
-        if len(self.taken) > self.dark:
+    def render(*how):
+        pairs = renderer.render(*how)
+        taken.append(len(pairs))
+        if len(taken) > dark:
             return pairs
         black = [{n: 0 * getattr(p, n) for n in ("left", "right", "background")} for p in pairs]
         return [dataclasses.replace(p, **b) for p, b in zip(pairs, black, strict=True)]
+
+    return SimpleNamespace(description=renderer.description, render=render), taken
 
 
 def test_a_room_of_which_the_sensor_gets_no_point_is_drawn_again_up_to_the_same_limit(
@@ -197,15 +191,15 @@ def test_a_room_of_which_the_sensor_gets_no_point_is_drawn_again_up_to_the_same_
     still = dataclasses.replace(TINY, exposure=dataclasses.replace(TINY.exposure, noise=0.0))
     how = {"sensor": still, "randomise": ALL, "seed": 3, "crop": "mask"}
     free = chair(renderer=renderer, **how)
-    shutter = Shutter(renderer, dark=2)
-    again = chair(renderer=shutter, **how)
+    slow, taken = shutter(renderer, dark=2)
+    again = chair(renderer=slow, **how)
     assert (free.drawn["room.redraws"], again.drawn["room.redraws"]) == (0, 2)
-    assert len(shutter.taken) == 3
+    assert len(taken) == 3
     assert again.drawn["room.height"] != free.drawn["room.height"]
     assert again.drawn["object_size"] == free.drawn["object_size"]
     monkeypatch.setattr(staging, "_MOST_DRAWS", 3)
     with pytest.raises(InputError, match=r"3 rooms in a row.*saw no point of the object"):
-        chair(renderer=Shutter(renderer, dark=99), **how)
+        chair(renderer=shutter(renderer, dark=99)[0], **how)
 
 
 def test_each_view_of_a_room_has_a_height_a_distance_and_an_aim_of_its_own(renderer):

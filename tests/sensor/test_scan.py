@@ -1,6 +1,7 @@
 """The whole chain: what goes in comes back where it was."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -111,13 +112,6 @@ def test_every_view_gives_points_and_statistics(scanned):
         assert view.gross_share < 0.03
         assert view.ring_fraction is not None
         assert view.ring_fraction > 0.3  # half a block of fattening is there
-
-
-def test_box_crop_keeps_to_the_turned_box(scanned):
-    turned = scanned.points.astype(np.float64) @ rotation_z(scanned.yaw).T
-    bounds = normalise(asymmetric()).vertices @ rotation_z(scanned.yaw).T
-    assert (turned >= bounds.min(axis=0) - 1e-6).all()
-    assert (turned <= bounds.max(axis=0) + 1e-6).all()
 
 
 def test_without_the_crop_points_lie_outside_too(renderer):
@@ -291,18 +285,13 @@ def test_a_caster_of_several_bodies_tells_which_is_in_front():
 
 
 def test_the_renderer_is_asked_for_no_more_than_is_matched(renderer):
-    class Watching:
-        asked: list = []  # noqa: RUF012
+    asked = []
 
-        @property
-        def description(self):
-            return renderer.description
+    def render(scene, rig, poses, seeds, regions=None):
+        asked.append(regions)
+        return renderer.render(scene, rig, poses, seeds, regions)
 
-        def render(self, scene, rig, poses, seeds, regions=None):
-            self.asked.append(regions)
-            return renderer.render(scene, rig, poses, seeds, regions)
-
-    watching = Watching()
+    watching = SimpleNamespace(description=renderer.description, render=render)
     small = dataclasses.replace(
         SMALL,
         rig=StereoRig(width=270, height=270, focal=375.0, baseline=0.2),
@@ -312,9 +301,8 @@ def test_the_renderer_is_asked_for_no_more_than_is_matched(renderer):
     part = scan(asymmetric(), scene="room", keep_images=True, **how)
     whole = scan(asymmetric(), scene="room", full_frames=True, **how)
     scan(asymmetric(), **how)
-    assert watching.asked[0][0].width < 270
-    assert watching.asked[1] == [small.rig.full_frame]
-    assert watching.asked[2] is None
+    assert asked[0][0].width < 270
+    assert asked[1:] == [[small.rig.full_frame], None]
     # The part holds what the whole frame holds there, up to the renderer's own noise.
     inner = part.images[0].region.slices
     np.testing.assert_array_equal(whole.images[0].true_depth[inner], part.images[0].true_depth)

@@ -182,24 +182,6 @@ def test_pictures_of_spots_are_fine_enough_and_not_too_large(spot_size):
         image[0, 0] = 1
 
 
-@pytest.mark.parametrize(
-    ("changed", "match"),
-    [
-        ({"columns": 31}, "multiples of 3"),
-        ({"rows": 0}, "multiples of 3"),
-        ({"kind": "rosettes", "columns": 630, "rows": 498}, "multiples of 15"),
-        ({"spot_size": 0.0}, "spot_size"),
-        ({"spot_size": 2.5}, "spot_size"),
-        ({"tan_half_width": 0.0}, "tan_half_width"),
-        ({"tan_half_height": float("nan")}, "tan_half_height"),
-        ({"seed": -1}, "seed"),
-    ],
-)
-def test_pattern_settings_are_checked(changed, match):
-    with pytest.raises(InputError, match=f"pattern: .*{match}"):
-        PatternSettings(**changed)
-
-
 def test_spots_too_fine_for_any_picture_are_refused():
     fine = PatternSettings(columns=3000, rows=300, kind="spots", spot_size=0.5)
     with pytest.raises(InputError, match="enlarge spot_size"):

@@ -1,4 +1,4 @@
-"""Strays: how they are measured, and each step that drops them."""
+"""What is measured of a view and of a cloud; strays, and each step that drops them."""
 
 import dataclasses
 
@@ -13,9 +13,38 @@ from qs3.sensor.realism.clouds import ratio_rows
 from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.scan import scan
 from qs3.sensor.settings import ScanSettings
-from qs3.sensor.statistics import radius_ratio
+from qs3.sensor.statistics import radius_ratio, view_statistics
 from qs3.sensor.view import ViewImages, measure
 from qs3.shapes import make
+
+
+def test_statistics_measure_what_they_say():
+    rig = StereoRig()
+    rng = np.random.default_rng(0)
+    depth = np.full((120, 120), np.nan)
+    depth[30:90, 30:90] = 3.0
+    disparity = np.full((120, 120), np.nan)
+    disparity[30:90, 30:90] = 50.0 + 0.1 + 0.2 * rng.standard_normal((60, 60))
+    disparity[30:36, 30:90] = np.nan  # a tenth of the object is not matched
+    disparity[36:42, 30:60] += 20.0  # a twentieth of it is grossly wrong
+    disparity[20:30, 30:90] = 50.0  # one of four sides of the ring is fattened
+    measured = view_statistics(disparity, depth, rig)
+    assert measured.object_pixels == 3600
+    assert measured.valid_fraction == pytest.approx(0.9)
+    assert measured.gross_share == pytest.approx(180 / 3240)
+    assert measured.disparity_bias == pytest.approx(0.1, abs=0.03)
+    assert measured.disparity_sigma == pytest.approx(0.2, rel=0.15)
+    assert measured.ring_fraction == pytest.approx(0.22, abs=0.03)
+
+
+@pytest.mark.parametrize("shape", [(5, 5), (0, 0)])
+def test_statistics_of_nothing_are_none(shape):
+    empty = np.full(shape, np.nan)
+    measured = view_statistics(empty, empty, StereoRig())
+    assert measured.object_pixels == 0
+    assert measured.valid_fraction is None
+    assert measured.disparity_sigma is None
+    assert measured.ring_fraction is None
 
 
 def sphere(count, rng):

@@ -4,7 +4,6 @@ import contextlib
 import http.client
 import socket
 import threading
-import time
 import urllib.request
 
 import numpy as np
@@ -17,6 +16,8 @@ from qs3.viewer.exhibits import Answers, ArrayExhibits, Exhibit
 from qs3.viewer.pages import gallery_page, scan_page
 from qs3.viewer.scan_controls import resolve
 from qs3.viewer.serving import require_free, serve, tunnel_of, url_of
+
+from ..browser import until
 
 viser = pytest.importorskip("viser", reason="viser is not installed: pip install 'qs3[view]'")
 
@@ -130,10 +131,10 @@ def test_scan_page_shows_faults_and_recovers(server, rng):
     start = resolve(ScanSettings(renderer=MitsubaRenderer(variant="scalar_rgb")))
     with scan_page(server, scan, start, 3) as canvas:
         assert calls.acquire(timeout=10)
-        wait_for(lambda: "too many views" in canvas._state.content)
+        until(lambda: "too many views" in canvas._state.content)
         controls(server)["Views"].value = 2
         assert calls.acquire(timeout=10)
-        wait_for(lambda: "chair" in canvas._text.content)
+        until(lambda: "chair" in canvas._text.content)
         assert canvas._state.content == ""
         controls(server)["Sensor"].value = "d435"
         assert calls.acquire(timeout=10)
@@ -149,22 +150,15 @@ def test_gallery_steps_and_filters(server, rng):
     answers = Answers(np.array([[1.0, 0]] * 4), ("a", "b"), np.array([0, 1, 0, 1]))
     with gallery_page(server, items, answers, "b") as canvas:
         handles = controls(server)
-        wait_for(lambda: "b0" in canvas._text.content)
+        until(lambda: "b0" in canvas._text.content)
         assert handles["Object"].max == 2
         handles["Object"].value = 2
-        wait_for(lambda: "b1" in canvas._text.content)
+        until(lambda: "b1" in canvas._text.content)
         handles["Wrong ones only"].value = True
-        wait_for(lambda: "b0" in canvas._text.content)
+        until(lambda: "b0" in canvas._text.content)
         handles["Class"].value = "a"
-        wait_for(lambda: "none of this class is wrong" in canvas._state.content)
+        until(lambda: "none of this class is wrong" in canvas._state.content)
     server.gui.reset()
     with pytest.raises(InputError, match="--class-name c: no object of it; classes here: a, b"):
         gallery_page(server, items, None, "c").__enter__()
     server.gui.reset()
-
-
-def wait_for(met, seconds=10.0):
-    end = time.monotonic() + seconds
-    while not met():
-        assert time.monotonic() < end, "did not come about"
-        time.sleep(0.02)

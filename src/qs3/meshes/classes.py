@@ -19,50 +19,22 @@ from qs3.errors import InputError
 
 _LARGEST_MAP = 1 << 20
 
-POINTDA10: tuple[str, ...] = (
-    "bathtub",
-    "bed",
-    "bookshelf",
-    "cabinet",
-    "chair",
-    "lamp",
-    "monitor",
-    "plant",
-    "sofa",
-    "table",
-)
+_POINTDA10 = "bathtub bed bookshelf cabinet chair lamp monitor plant sofa table"
+POINTDA10: tuple[str, ...] = tuple(_POINTDA10.split())
 
-_ALIASES: dict[str, tuple[str, ...]] = {
-    "bathtub": ("bath", "bath_tub", "tub"),
-    "bookshelf": ("shelf", "bookcase", "book_shelf", "shelves"),
-    "cabinet": (
-        "night_stand",
-        "nightstand",
-        "bedside_table",
-        "dresser",
-        "wardrobe",
-        "cupboard",
-        "chest_of_drawers",
-        "file_cabinet",
-        "filing_cabinet",
-    ),
-    "chair": (
-        "armchair",
-        "arm_chair",
-        "office_chair",
-        "swivel_chair",
-        "stool",
-        "bar_stool",
-        "barstool",
-        "bench",
-    ),
-    "lamp": ("floor_lamp", "desk_lamp", "table_lamp", "light"),
-    "monitor": ("television", "tv", "tv_monitor", "tvmonitor", "display", "screen"),
-    "plant": ("potted_plant", "pottedplant", "house_plant", "houseplant"),
-    "sofa": ("couch", "settee", "loveseat"),
-    "table": ("desk", "dining_table", "diningtable", "coffee_table", "side_table", "end_table"),
+_ALIASES = {
+    "bathtub": "bath bath_tub tub",
+    "bookshelf": "shelf bookcase book_shelf shelves",
+    "cabinet": "night_stand nightstand bedside_table dresser wardrobe cupboard chest_of_drawers "
+    "file_cabinet filing_cabinet",
+    "chair": "armchair arm_chair office_chair swivel_chair stool bar_stool barstool bench",
+    "lamp": "floor_lamp desk_lamp table_lamp light",
+    "monitor": "television tv tv_monitor tvmonitor display screen",
+    "plant": "potted_plant pottedplant house_plant houseplant",
+    "sofa": "couch settee loveseat",
+    "table": "desk dining_table diningtable coffee_table side_table end_table",
 }
-_CANONICAL = {alias: name for name, aliases in _ALIASES.items() for alias in aliases}
+_CANONICAL = {alias: name for name, aliases in _ALIASES.items() for alias in aliases.split()}
 
 
 def canonical(name: str) -> str:

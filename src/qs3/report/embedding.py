@@ -103,8 +103,6 @@ def feature_map(
     axes.set_title(short(title, 40))
     axes.set_aspect("equal", adjustable="datalim")
     without_frame(axes)
-    for spine in axes.spines.values():
-        spine.set_visible(True)
-        spine.set_color("#dddddd")
+    axes.spines[:].set(visible=True, color="#dddddd")
     figure.legend(handles=legend, loc="outside lower center", ncols=3, fontsize=9)
     return figure

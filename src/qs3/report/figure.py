@@ -13,18 +13,8 @@ from matplotlib.figure import Figure
 
 from qs3.files import write_bytes
 
-PALETTE = (
-    "#332288",
-    "#88ccee",
-    "#44aa99",
-    "#117733",
-    "#999933",
-    "#ddcc77",
-    "#cc6677",
-    "#882255",
-    "#aa4499",
-    "#c4c4c4",
-)
+_MUTED = "#332288 #88ccee #44aa99 #117733 #999933 #ddcc77 #cc6677 #882255 #aa4499 #c4c4c4"
+PALETTE = tuple(_MUTED.split())
 """Paul Tol's `muted` scheme, distinct for colour-blind readers (https://personal.sron.nl/~pault);
 its pale grey is a shade darker here, to be seen on white."""
 
@@ -118,7 +108,5 @@ def short(name: str, length: int = 16) -> str:
 
 def without_frame(axes: Axes) -> None:
     """Take ticks and frame away from ``axes``, but keep the title."""
-    axes.set_xticks([])
-    axes.set_yticks([])
-    for spine in axes.spines.values():
-        spine.set_visible(False)
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)

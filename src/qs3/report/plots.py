@@ -104,8 +104,7 @@ def selection_counts(rounds: Sequence[SelectionRound], class_names: Sequence[str
     above = np.array([int(r.confident.sum()) for r in rounds])
     outline = {"color": "none", "edgecolor": "#555555", "linestyle": ":", "linewidth": 1.2}
     lower.bar(places, above, 0.83, label="above θ", zorder=0, **outline)
-    lower.set_ylabel("selected clouds")
-    lower.set_xlabel("round, and selected / above θ")
+    lower.set(xlabel="round, and selected / above θ", ylabel="selected clouds")
     totals = zip(places, floor.astype(int), above, strict=True)
     lower.set_xticks(places, [f"{place}\n{kept}/{total}" for place, kept, total in totals])
     lower.tick_params(axis="x", labelsize=9 if len(rounds) < 9 else 7.5)
@@ -147,12 +146,8 @@ def confusion_heatmap(
     axes.set_yticks(np.arange(k - 1) + 0.5, minor=True)
     axes.grid(which="minor", color="#dddddd", linewidth=0.6)
     axes.tick_params(which="both", length=0)
-    for spine in axes.spines.values():
-        spine.set_visible(True)
-        spine.set_color("#bbbbbb")
-    axes.set_xlabel("predicted")
-    axes.set_ylabel("true")
-    axes.set_title(short(title, 40))
+    axes.spines[:].set(visible=True, color="#bbbbbb")
+    axes.set(xlabel="predicted", ylabel="true", title=short(title, 40))
     return figure
 
 
@@ -189,9 +184,7 @@ def class_accuracy(
                 axes.text(100.0 * lengths[row] + 1, row + offset, text, va="center", fontsize=8.5)
     axes.set_yticks(rows, [f"{short(n)} ({c})" for n, c in zip(class_names, counts, strict=True)])
     axes.invert_yaxis()
-    axes.set_xlim(0, 108)
-    axes.set_xticks(range(0, 101, 20))
-    axes.set_xlabel("accuracy of the class [%]")
+    axes.set(xlim=(0, 108), xticks=range(0, 101, 20), xlabel="accuracy of the class [%]")
     axes.tick_params(axis="y", length=0)
     figure.legend(loc="outside upper center", ncols=2)
     return figure

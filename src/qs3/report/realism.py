@@ -37,12 +37,8 @@ def realism_plot(result: _Result, sensor: Sensor) -> Figure | None:
 def rms_plot(result: _Result, sensor: Sensor) -> Figure:
     """RMS about the wall's plane against distance (T1), with the law and the fitted slope."""
     z, rms = _series(result, "z"), _series(result, "rms_mm")
-    figure, axes = _plot(
-        sensor,
-        "noise of a facing wall",
-        _length("distance", "m", sensor),
-        _length("RMS about the plane", "mm", sensor),
-    )
+    x, y = _length("distance", "m", sensor), _length("RMS about the plane", "mm", sensor)
+    figure, axes = _plot(sensor, "noise of a facing wall", x, y)
     reach = np.geomspace(z.min() / 1.1, z.max() * 1.1, 50)
     law = 1000 * LAW_PIXELS * reach**2 / (sensor.rig.focal * sensor.rig.baseline)
     axes.plot(reach, law, "--", color=_LAW, label=f"law: {LAW_PIXELS} px · z²/(f·b)")
@@ -52,8 +48,7 @@ def rms_plot(result: _Result, sensor: Sensor) -> Figure:
         fitted = np.exp(start) * reach**slope
         axes.plot(reach, fitted, "-", color=NO_VALUE, label=f"fit: slope {slope:.2f}")
     axes.plot(z, rms, "o", color=_MEASURED, label="measured")
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+    axes.set(xscale="log", yscale="log")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.set_major_formatter("{x:g}")
@@ -67,16 +62,11 @@ def bias_plot(result: _Result, sensor: Sensor) -> Figure:
     """Mean error of disparity against its fraction of a pixel (T2), with the median's bounds."""
     fraction, bias = _series(result, "fraction"), _series(result, "bias")
     order = np.argsort(fraction)
-    figure, axes = _plot(
-        sensor,
-        "bias over a pixel",
-        "fraction of the true disparity [px]",
-        "error of disparity [px]",
-    )
+    across = "fraction of the true disparity [px]"
+    figure, axes = _plot(sensor, "bias over a pixel", across, "error of disparity [px]")
     axes.axhspan(-0.01, 0.01, color=_SECOND, alpha=0.25, label="bounds of the median")
-    axes.plot(
-        fraction[order], bias[order], "o-", color=_MEASURED, markersize=4, label="mean of a wall"
-    )
+    style = {"color": _MEASURED, "markersize": 4, "label": "mean of a wall"}
+    axes.plot(fraction[order], bias[order], "o-", **style)
     median = next((r["measured"] for r in result["rows"] if "median disparity" in r["what"]), None)
     if median is not None:
         axes.axhline(median, color=_LAW, linestyle="--", label=f"median of all: {median:+.4f} px")
@@ -109,18 +99,13 @@ def fill_plot(result: _Result, sensor: Sensor) -> Figure:
     figure = Figure(figsize=(1.4 * _WIDTH, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
     left.plot(_series(result, "albedo"), _series(result, "fill_albedo"), "o-", color=_MEASURED)
-    left.set_xscale("log")
+    left.set(xscale="log", xticks=_series(result, "albedo"), xlabel="albedo of a patch")
     left.invert_xaxis()
-    left.set_xticks(_series(result, "albedo"))
     left.xaxis.set_major_formatter("{x:g}")
     left.xaxis.set_minor_locator(NullLocator())
-    left.set_xlabel("albedo of a patch")
-    left.set_ylabel("share of pixels with a depth")
+    left.set(ylim=(-0.03, 1.05), ylabel="share of pixels with a depth")  # of both
     right.plot(_series(result, "angle"), _series(result, "fill_angle"), "o-", color=_MEASURED)
-    right.set_xticks(_series(result, "angle"))
-    right.set_xlabel("turn of a wall [°]")
-    for axes in (left, right):
-        axes.set_ylim(-0.03, 1.05)
+    right.set(xticks=_series(result, "angle"), xlabel="turn of a wall [°]")
     figure.suptitle(f"{sensor.name}: darker and more glancing", fontsize=10.5)
     return figure
 

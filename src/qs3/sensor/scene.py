@@ -86,10 +86,7 @@ class SceneSettings:
             >>> sorted(SceneSettings("room+beside").parts)
             ['beside', 'floor', 'wall']
         """
-        named = self.layout.split("+")
-        return frozenset(part for part in named if part != "room") | (
-            {"floor", "wall"} if "room" in named else frozenset()
-        )
+        return frozenset(self.layout.replace("room", "floor+wall").split("+"))
 
     @property
     def needs_neighbour(self) -> bool:
@@ -151,7 +148,7 @@ def arrange(
     parts = settings.parts
     if parts & _ARCED:
         poses = _on_arc(poses, np.radians(settings.arc))
-    bodies, names = [body], ["object"]
+    bodies = {"object": body}
     front, up = _front(poses[0]), np.array([0.0, 0.0, 1.0])
     across = np.array([-front[1], front[0], 0.0])
     half = settings.extent * size / 2
@@ -170,25 +167,21 @@ def arrange(
             turned.vertices += shift
         if "floor" in parts:
             turned.vertices[:, 2] += max(0.0, ground - turned.vertices[:, 2].min())
-        bodies.append(Body(turned, settings.neighbour or body.material))
-        names.append("neighbour")
+        bodies["neighbour"] = Body(turned, settings.neighbour or body.material)
     if "table" in parts:
-        bodies.append(Body(_table_top([b.mesh for b in bodies], front, across), settings.floor))
-        bodies[-1].mesh.vertices += up * ground
-        names.append("table")
+        top = _table_top([b.mesh for b in bodies.values()], front, across)
+        top.vertices += up * ground
+        bodies["table"] = Body(top, settings.floor)
         ground -= settings.table_height
     if "wall" in parts:
-        reach = max(float((body.mesh.vertices @ -front).max()) for body in bodies)
+        reach = max(float((b.mesh.vertices @ -front).max()) for b in bodies.values())
         centre = -front * (reach + settings.wall_gap * size)
         if "floor" in parts:  # it stands on the floor
             centre = centre + up * (ground + half)
-        bodies.append(Body(rectangle(centre, across * half, up * half), settings.wall))
-        names.append("wall")
+        bodies["wall"] = Body(rectangle(centre, across * half, up * half), settings.wall)
     if "floor" in parts:
-        centre = up * ground
-        bodies.append(Body(rectangle(centre, front * half, across * half), settings.floor))
-        names.append("floor")
-    return ArrangedScene(tuple(bodies), tuple(names), tuple(poses))
+        bodies["floor"] = Body(rectangle(up * ground, front * half, across * half), settings.floor)
+    return ArrangedScene(tuple(bodies.values()), tuple(bodies), tuple(poses))
 
 
 def _on_arc(poses: Sequence[Pose], arc: float) -> list[Pose]:

@@ -90,16 +90,14 @@ def speckle_pattern(columns: int, rows: int, seed: int) -> Bool[np.ndarray, "row
     dots = np.zeros((rows + 2, columns + 2), dtype=bool)  # one empty cell all round
     # Tiles of one colour of a 2×2 chequer never touch, so each colour is drawn at once; the cell
     # in the middle of a tile touches no other tile, so there is always a free one.
-    for first_row in (0, 1):
-        for first_column in (0, 1):
-            r, c = np.mgrid[first_row:down:2, first_column:across:2].reshape(2, -1)
-            cells = np.arange(_TILE * _TILE)
-            y = 1 + _TILE * r[:, None] + cells // _TILE
-            x = 1 + _TILE * c[:, None] + cells % _TILE
-            taken = cv2.dilate(dots.astype(np.uint8), np.ones((3, 3), np.uint8))[y, x] > 0
-            choice = np.where(taken, -1.0, rng.random(y.shape)).argmax(axis=1)
-            rows_of = np.arange(len(r))
-            dots[y[rows_of, choice], x[rows_of, choice]] = True
+    cells = np.arange(_TILE * _TILE)
+    for first_row, first_column in np.ndindex(2, 2):
+        r, c = np.mgrid[first_row:down:2, first_column:across:2].reshape(2, -1)
+        y, x = 1 + _TILE * r[:, None] + cells // _TILE, 1 + _TILE * c[:, None] + cells % _TILE
+        taken = cv2.dilate(dots.astype(np.uint8), np.ones((3, 3), np.uint8))[y, x] > 0
+        choice = np.where(taken, -1.0, rng.random(y.shape)).argmax(axis=1)
+        tile = np.arange(len(r))
+        dots[y[tile, choice], x[tile, choice]] = True
     return dots[1:-1, 1:-1]
 
 
@@ -129,7 +127,7 @@ def spot_places(columns: int, rows: int, seed: int) -> Float[np.ndarray, "n 2"]:
     places[1:-1, 1:-1] = _TILE * (np.stack([c, r], axis=-1) + 0.5)
     for _ in range(_SWEEPS):
         # Spots of every second tile each way are 3 cells apart at least and are moved at once.
-        for first_row, first_column in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        for first_row, first_column in np.ndindex(2, 2):
             r, c = np.mgrid[first_row:down:2, first_column:across:2]
             tried = _TILE * (np.stack([c, r], axis=-1) + rng.random((*r.shape, 2)))
             free = np.ones(r.shape, dtype=bool)

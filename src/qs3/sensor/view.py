@@ -106,17 +106,10 @@ def measure(
     if margin is not None:
         noise = NOISE * truth**2 / float(sensor.rig.disparity(1.0))
         depth = np.where(np.abs(depth - truth) <= margin + 3 * noise, depth, np.nan)
-    noisy, true = (
-        backproject(images.part(image, part), sensor.rig, part, pose, sensor.depth)
-        for image in (depth, truth)
-    )
-    statistics = view_statistics(
-        images.part(images.disparity, part),
-        images.part(images.true_depth, part),
-        sensor.rig,
-        images.part(images.mask, part),
-    )
-    return noisy, true, statistics
+    whole = depth, truth, images.disparity, images.true_depth, images.mask
+    depth, truth, disparity, true_depth, mask = (images.part(image, part) for image in whole)
+    noisy, true = (backproject(z, sensor.rig, part, pose, sensor.depth) for z in (depth, truth))
+    return noisy, true, view_statistics(disparity, true_depth, sensor.rig, mask)
 
 
 def take_view(

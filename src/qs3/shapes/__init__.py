@@ -72,11 +72,9 @@ def make(class_name: str, seed: int = 0, family: str | None = None) -> trimesh.T
     mirrored = bool(rng.integers(2))
     build = _FAMILIES[class_name][names.index(family or drawn)]
     mesh = assemble(build(Dice(rng)))
-    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    vertices = vertices - [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    mesh.vertices -= [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]
     if mirrored:
-        vertices, faces = vertices * [-1.0, 1.0, 1.0], faces[:, ::-1]
-    made = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
-    made.units = "meters"
-    return made
+        mesh.vertices, mesh.faces = mesh.vertices * [-1.0, 1.0, 1.0], mesh.faces[:, ::-1]
+    mesh.units = "meters"
+    return mesh

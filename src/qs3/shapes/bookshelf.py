@@ -177,8 +177,7 @@ def wall_board(dice: Dice) -> list[Solid]:
             parts += fill(dice, within(x, 0.02), y, z + board, room)
     if count > 1:
         heights = (0.0, drop + (count - 1) * step + 0.1)
-        for px in brackets:
-            parts.append(block(around(px, wide / 2), (rear - 0.02, rear), heights))
+        parts += [block(around(px, wide / 2), (rear - 0.02, rear), heights) for px in brackets]
     return parts
 
 

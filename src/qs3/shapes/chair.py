@@ -81,8 +81,7 @@ def four_legs(dice: Dice) -> list[Solid]:
     if dice.chance(0.3) and splay == 0.0:
         z = dice.between(0.1, 0.25)
         (left, front), (_, rear), (right, _), _ = spots
-        for px in (left, right):
-            parts.append(beam((px, front, z), (px, rear, z), 0.02, 0.02))
+        parts += [beam((px, front, z), (px, rear, z), 0.02, 0.02) for px in (left, right)]
         parts.append(beam((left, 0, z), (right, 0, z), 0.02, 0.02))
     if dice.chance(0.4):
         z = (seat - 0.01, seat + dice.between(0.02, 0.07))
@@ -209,17 +208,5 @@ def shell(dice: Dice) -> list[Solid]:
     return parts
 
 
-FAMILIES = (
-    four_legs,
-    swivel,
-    armchair,
-    wing,
-    recliner,
-    lounge,
-    cantilever,
-    shell,
-    stool,
-    bar_stool,
-    bench,
-    tub,
-)
+FAMILIES = (four_legs, swivel, armchair, wing, recliner, lounge, cantilever, shell)
+FAMILIES += (stool, bar_stool, bench, tub)

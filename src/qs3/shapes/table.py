@@ -236,15 +236,5 @@ def panel(dice: Dice) -> list[Solid]:
     return parts
 
 
-FAMILIES = (
-    four_legs,
-    pedestal,
-    trestle,
-    desk,
-    writing_desk,
-    corner_desk,
-    coffee,
-    folding,
-    panel,
-    counter,
-)
+FAMILIES = (four_legs, pedestal, trestle, desk, writing_desk, corner_desk)
+FAMILIES += (coffee, folding, panel, counter)

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, get_args
 
 import trimesh
@@ -110,18 +111,13 @@ def with_controls(settings: ScanSettings, values: Mapping[str, Any]) -> ScanSett
     places: dict[str, Any] = {}
     for name, value in values.items():
         if name in _FACTORS:
-            places |= {place: value * _read(sensor, place) for place in _FACTORS[name]}
+            places |= {place: value * attrgetter(place)(sensor) for place in _FACTORS[name]}
         elif name == "material":
             places |= {} if value == OWN_MATERIAL else {name: get_material(value)}
         elif name not in changes and name != "samples":
             places[name] = value
     made = settings.with_sensor(_replaced(sensor, places), renderer)
     return dataclasses.replace(made, **changes)
-
-
-def _read(sensor: Sensor, place: str) -> float:
-    section, _, name = place.partition(".")
-    return getattr(getattr(sensor, section), name)
 
 
 def _replaced(sensor: Sensor, places: Mapping[str, Any]) -> Sensor:

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 from jaxtyping import Float32
+from numpy.lib.stride_tricks import sliding_window_view
 
 _CONNECTED = 16  # neighbours of up to 1 px difference, in the 1/16 px that the regions are told by
 _NONE = -(2**15)
@@ -38,16 +39,12 @@ def median_of_valid(disparity: Float32[np.ndarray, "h w"], side: int) -> Float32
     half = side // 2
     valid = np.isfinite(disparity)
     # Where the whole square is valid OpenCV's filter is right, and fast.
-    whole = cv2.erode(
-        valid.astype(np.uint8), np.ones((side, side), np.uint8), borderValue=0
-    ).astype(bool)
+    block = np.ones((side, side), np.uint8)
+    whole = cv2.erode(valid.astype(np.uint8), block, borderValue=0).astype(bool)
     filtered = cv2.medianBlur(np.where(valid, disparity, np.float32(0)), side)
     padded = np.pad(disparity, half, constant_values=np.nan)
     rows, columns = np.nonzero(valid & ~whole)
-    offsets = np.arange(side)
-    square = padded[
-        rows[:, None, None] + offsets[:, None], columns[:, None, None] + offsets
-    ].reshape(len(rows), side * side)
+    square = sliding_window_view(padded, (side, side))[rows, columns].reshape(len(rows), side**2)
     square.sort(axis=1)  # NaN last
     middle = (np.isfinite(square).sum(axis=1) - 1) // 2
     filtered[rows, columns] = square[np.arange(len(rows)), middle]

@@ -55,15 +55,12 @@ class AdCensusSettings:
     """Noise in grey levels below which no contrast counts as such."""
 
     def __post_init__(self) -> None:
-        compared = self.census_width * self.census_height - 1
-        if (
-            min(self.census_width, self.census_height) < 1
-            or compared % 2
-            or not 2 <= compared <= 64
-        ):
+        width, height = self.census_width, self.census_height
+        compared = width * height - 1
+        if min(width, height) < 1 or compared % 2 or not 2 <= compared <= 64:
             raise InputError(
-                f"matching: census_width {self.census_width} and census_height "
-                f"{self.census_height} must be odd and leave 2 to 64 pixels to compare"
+                f"matching: census_width {width} and census_height {height} must be odd and leave "
+                "2 to 64 pixels to compare"
             )
         check_range(self, "matching", "arm", low=1, high=15)
         check_range(self, "matching", "lambda_census", "lambda_ad", "grain", above=True)

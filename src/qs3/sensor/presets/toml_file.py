@@ -7,19 +7,16 @@ Convention:
 """
 
 import difflib
-import functools
-import logging
 from pathlib import Path
 from typing import Any
 
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.sensor.presets.settings import Sensor, changed
 from qs3.structure import structure, unstructure
 from qs3.toml_files import merged, read_toml, toml_lines
 
 _FORMER = {"qs3": "paper"}
 """Sensors that had another name in version 0.1."""
-_log = logging.getLogger(__name__)
 
 SENSORS: dict[str, Sensor] = {"paper": Sensor()}
 """Sensors by name: the released scanner, and those of ``cameras.toml``."""
@@ -40,7 +37,7 @@ def get_sensor(name: str) -> Sensor:
         1500.0
     """
     if name in _FORMER:
-        _note(name)
+        say_once(f"the sensor {name} is called {_FORMER[name]} now")
         name = _FORMER[name]
     if name in SENSORS:
         return SENSORS[name]
@@ -52,12 +49,6 @@ def get_sensor(name: str) -> Sensor:
         f"no sensor {name!r}; {hint}choose one of {', '.join(SENSORS)}, or name a file "
         "that ends in .toml"
     )
-
-
-@functools.cache
-def _note(name: str) -> None:
-    """Say once that a sensor has another name now."""
-    _log.warning("the sensor %s is called %s now", name, _FORMER[name])
 
 
 def sensor_name(name: str) -> str:

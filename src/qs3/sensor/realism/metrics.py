@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from qs3.sensor.rig import Region, StereoRig
+from qs3.sensor.depth import DepthSettings, backproject
+from qs3.sensor.rig import Pose, Region, StereoRig
 
 _TRIM = 0.005
 
@@ -36,11 +37,7 @@ def camera_points(
     depth: Float[np.ndarray, "h w"], rig: StereoRig, region: Region
 ) -> Float[np.ndarray, "n 3"]:
     """Lift every valid pixel of ``region`` to the left camera's frame."""
-    row, column = np.nonzero(np.isfinite(depth))
-    z = depth[row, column]
-    cx, cy = rig.principal_point
-    x = (region.x + column - cx) * z / rig.focal
-    return np.stack([x, (region.y + row - cy) * z / rig.focal, z], axis=1)
+    return backproject(depth, rig, region, Pose(np.eye(4)), DepthSettings(stride=1))
 
 
 def fit_plane(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], float]:

@@ -137,13 +137,8 @@ class SoftLight(ABC):
         arrays = self.camera.arrays
         x, y = arrays.clip(x, 0, self.columns - 1), arrays.clip(y, 0, self.rows - 1)
         left, top = arrays.floor(x), arrays.floor(y)
-        fx, fy = x - left, y - top
-        taps = [
-            (0, 0, (1 - fx) * (1 - fy)),
-            (1, 0, fx * (1 - fy)),
-            (0, 1, (1 - fx) * fy),
-            (1, 1, fx * fy),
-        ]
+        across, down = (1 - (x - left), x - left), (1 - (y - top), y - top)
+        taps = [(i, j, across[i] * down[j]) for j in (0, 1) for i in (0, 1)]
         corner = arrays.whole(left), arrays.whole(top)
         return self._average(points, normals, depth, corner, taps, self.mean, active)
 

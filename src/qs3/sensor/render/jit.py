@@ -91,16 +91,15 @@ class JitPhotographer(Photographer):
         row = index // width
         u, v = mi.Float(index - row * width) * side, mi.Float(row) * side
 
-        def seek_on(k: Any, shown: Any, _: Any) -> Any:
-            return ~shown & (k < TRIES)
-
         def seek(k: Any, _: Any, __: Any) -> Any:
             here = mi.Point2f(*(_fraction(dr, 0.5 + mi.Float(k) * a) * side for a in R2))
             shown = self._shapes.ray_test(self._ray(camera, u + here.x, v + here.y))
             return k + 1, shown, here
 
         start = (mi.UInt32(0), dr.full(mi.Bool, False, count), mi.Point2f(0))
-        _, shown, place = dr.while_loop(start, seek_on, seek, labels=("k", "shown", "place"))
+        _, shown, place = dr.while_loop(
+            start, lambda k, shown, _: ~shown & (k < TRIES), seek, labels=("k", "shown", "place")
+        )
         si = self._shapes.ray_intersect(self._ray(camera, u + place.x, v + place.y), shown)
         shown &= si.is_valid()
         bsdf = si.bsdf()
@@ -111,9 +110,6 @@ class JitPhotographer(Photographer):
         turn_x, turn_y = (mi.Float(word >> 8) * 2**-24 for word in turn)
         total = self._count(self._rays)
 
-        def gather_on(k: Any, _: Any) -> Any:
-            return shown & (k < total)
-
         def gather(k: Any, light: Any) -> Any:
             share = _fraction(dr, (mi.Float(k) + 0.5) / mi.Float(total) + turn_x)
             around = _fraction(dr, mi.Float(k) * GOLDEN + turn_y)
@@ -123,8 +119,7 @@ class JitPhotographer(Photographer):
             way = si.to_world(sample.wo)
             ray, beta, alive = si.spawn_ray(way), weight[0], shown & (weight[0] > 0)
             for bounce in range(self._bounces + 1):
-                last = bounce == self._bounces
-                if last:
+                if bounce == self._bounces:
                     free = alive & ~self._shapes.ray_test(ray, alive)
                     light += dr.select(free, beta * self._environment(way), 0)
                     break
@@ -146,7 +141,7 @@ class JitPhotographer(Photographer):
 
         _, light = dr.while_loop(
             (mi.UInt32(0), mi.Float(0) + dr.zeros(mi.Float, count)),
-            gather_on,
+            lambda k, _: shown & (k < total),
             gather,
             labels=("k", "light"),
         )
@@ -172,9 +167,6 @@ class JitPhotographer(Photographer):
         across, down = (mi.Float(np.ascontiguousarray(axis)) for axis in places(self._samples).T)
         none = dr.zeros(mi.Float, region.width * region.height)
 
-        def go_on(k: Any, *_: Any) -> Any:
-            return k < total
-
         def step(k: Any, sharp: Any, seen: Any, place: Any, facing: Any) -> Any:
             right, below = (dr.gather(mi.Float, axis, k) for axis in (across, down))
             ray = self._ray(camera, u + right, v + below)
@@ -190,7 +182,9 @@ class JitPhotographer(Photographer):
 
         state = (mi.UInt32(0), mi.Float(none), mi.Float(none), mi.Vector3f(none), mi.Vector3f(none))
         labels = ("k", "sharp", "seen", "place", "facing")
-        _, sharp, seen, place, facing = dr.while_loop(state, go_on, step, labels=labels)
+        _, sharp, seen, place, facing = dr.while_loop(
+            state, lambda k, *_: k < total, step, labels=labels
+        )
         shown = seen > 0
         place = place / dr.maximum(seen, 1)
         facing = facing * dr.rsqrt(dr.maximum(dr.squared_norm(facing), 1e-12))

@@ -102,8 +102,5 @@ class DepthCaster:
                 unit = normal / np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-300)
                 unit = -np.sign(slope)[:, None] * unit @ pose.camera_to_world[:3, :3]
                 towards[hit] = np.where(good[:, None], unit, np.nan)
-        return Cast(
-            depth.reshape(shape),
-            body.reshape(shape),
-            None if towards is None else towards.reshape(*shape, 3),
-        )
+        towards = None if towards is None else towards.reshape(*shape, 3)
+        return Cast(depth.reshape(shape), body.reshape(shape), towards)
