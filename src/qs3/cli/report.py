@@ -88,9 +88,9 @@ def _with_scan(page: "Report", told: "Run | None", name: str, sensor: str) -> "R
     from qs3.sensor.scan import ScanSettings, scan
 
     own = None if told is None else find_mesh(told)
-    settings = ScanSettings() if own is None else own[2]
+    settings = ScanSettings() if own is None else own.settings
     if own is not None and not name:
-        mesh, title, _ = own
+        mesh, title = own.mesh, own.name
     else:
         mesh, origin = load_named(name or "chair", 0)
         title = origin["name"]

@@ -4,7 +4,7 @@ import contextlib
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import trimesh
 
@@ -75,12 +75,19 @@ def read_domain(
     return None
 
 
-def find_mesh(run: Run) -> tuple[trimesh.Trimesh, str, ScanSettings] | None:
-    """The first mesh of the run's source that is found, its name there, and its camera.
+class OwnMesh(NamedTuple):
+    """A mesh that a run's source was scanned from, and the camera that did it."""
 
-    The camera has sensor, size of objects and units as the source has them. None where source and
-    mesh do not lie near the run.
-    """
+    mesh: trimesh.Trimesh
+    """The first one of the source that is found."""
+    name: str
+    """Its name in the source."""
+    settings: ScanSettings
+    """Sensor, size of objects and units as the source has them."""
+
+
+def find_mesh(run: Run) -> OwnMesh | None:
+    """A mesh of the run's source, where both lie near the run; None where they do not."""
     store = next((place for place in _near(run.folder, run.source.name)
                   if (place / MANIFEST).is_file()), None)  # fmt: skip
     if store is None:
@@ -100,7 +107,7 @@ def find_mesh(run: Run) -> tuple[trimesh.Trimesh, str, ScanSettings] | None:
                 items = collect(place, per_class=made.get("per_class") or 1, seed=made["seed"])
                 for item in items:
                     if item.id in objects:
-                        return item.load(), item.id, settings
+                        return OwnMesh(item.load(), item.id, settings)
     return None
 
 
