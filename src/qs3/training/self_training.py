@@ -252,7 +252,7 @@ def _train_round(
     continuous = rounds.schedule == "continuous"
     first = before * rounds.epochs
     # TransNorm's weights are in the network's scales already; a second time they would double.
-    plain = settings.normalisation in ("shared", "adabn")
+    plain, frozen = settings.normalisation in ("shared", "adabn"), rounds.frozen_statistics
     smoothing = rounds.label_smoothing
     method = PseudoLabelled(
         state.latest,
@@ -260,7 +260,7 @@ def _train_round(
         weight_step=rounds.weight_step,
         epochs=range(first, first + rounds.epochs),
         label_smoothing=settings.label_smoothing if smoothing is None else smoothing,
-        normalisation="shared" if plain else "separate",
+        normalisation="frozen" if frozen else "shared" if plain else "separate",
     )
     kept, judges = pseudo.select(~apart), pseudo.select(apart)
 
