@@ -32,7 +32,11 @@ COLUMNS = ("M-D", "S-D", "S-F")
 def comparable(folder):
     records = {path.name: read_record(path) for path in sorted((folder / "results").iterdir())}
     return {
-        name: (run.scores, run.choices, [{**done, "seconds": 0} for done in run.rounds])
+        name: (
+            run.scores,
+            run.choices,
+            [{**done, "seconds": 0, "cpu_seconds": 0} for done in run.rounds],
+        )
         for name, run in records.items()
     }
 

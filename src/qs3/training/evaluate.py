@@ -87,6 +87,8 @@ def evaluate(
         selection=made.selection,
         scores=_scores(loaded, test, answer_of),
         seconds=made.seconds,
+        cpu_seconds=made.cpu_seconds,
+        steps=made.steps,
         versions=versions(),
         hardware=hardware(),
         commit=git_commit(),
