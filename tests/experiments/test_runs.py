@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from qs3 import shapes
+from qs3.adaptation import method_class
+from qs3.adaptation.names import split_method
 from qs3.errors import InputError
 from qs3.experiments import TABLES
 from qs3.experiments.cost import run_seconds
@@ -243,6 +245,10 @@ def test_rounds_start_from_one_training_of_the_source():
         }
         also = warm_up_of(scale, make_run(scale, S, R, PAPER, network=network)).folder
         assert first == {also} == {make_run(scale, S, D, ORDINARY, network=network).folder}
+    sized = {row: make_run(scale, S, D, row).train.preparation.size_input for row in ROWS}
+    assert {row for row, told in sized.items() if not told} == {
+        row for row, kind in ROWS.items() if method_class(split_method(kind.method)[0]).in_unit_ball
+    }
     gentle = make_run(SCALES["smoke"], S, D, "qbst-gentle").self_training
     assert gentle.threshold_share == 0.5 and gentle.threshold == 0.8  # the scale's has no say
     rows, _ = Table("uda", Setup(Path(), scale)).headings()

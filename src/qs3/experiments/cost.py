@@ -17,16 +17,14 @@ _CLASSES = 10
 
 def step_costs(runs: Iterable[Run], settings: TrainSettings, points: int) -> dict[str, Cost]:
     """Measure each method of some runs of one network, on spheres of so many points."""
-    names = ["source-only", *(split_method(run.kind.method)[0] for run in runs)]
+    each = {"source-only": settings}
+    each |= {split_method(run.kind.method)[0]: run.train for run in runs}
     clouds = np.random.default_rng(0).normal(size=(settings.batch_size, points, 3))
     clouds /= 2 * np.linalg.norm(clouds, axis=2, keepdims=True)
     labels = np.arange(len(clouds)) % _CLASSES
     classes = tuple(map(str, range(_CLASSES)))
     source = PointClouds(clouds.astype(np.float32), labels, classes, numbered(len(clouds)))
-    return {
-        name: measure(name, source, source.without_labels(), settings)
-        for name in dict.fromkeys(names)
-    }
+    return {name: measure(name, source, source.without_labels(), own) for name, own in each.items()}
 
 
 def run_seconds(

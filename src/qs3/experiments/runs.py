@@ -31,6 +31,8 @@ class Row:
     """Row whose network self-training starts from; empty without rounds."""
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the rounds that differ from the preset."""
+    sized: bool = True
+    """Whether the network may be told sizes; a method in the unit ball knows none."""
 
 
 _QBST = Row("qbst", warm_up=ORDINARY)
@@ -38,8 +40,8 @@ ROWS: Mapping[str, Row] = {
     SUPERVISED: Row(),
     "source-only": Row(),
     "pointdan": Row("pointdan"),
-    "defrec": Row("defrec"),
-    "defrec-pcm": Row("defrec-pcm"),
+    "defrec": Row("defrec", sized=False),
+    "defrec-pcm": Row("defrec-pcm", sized=False),
     "gast": Row("gast"),
     "gast-spst": Row("gast-spst", "spst", "gast"),
     "qbst": _QBST,
@@ -185,6 +187,8 @@ def make_run(
     if row == ORDINARY:
         # No target that checkpoints could be rated on; the last network is taken.
         train = replace(train, validate_every=0)
+    if not kind.sized:
+        train = replace(train, preparation=replace(train.preparation, size_input=False))
     rounds = None
     if kind.warm_up:
         own = {**scale.rounds, **kind.changes}

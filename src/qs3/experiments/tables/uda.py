@@ -60,6 +60,7 @@ EXPERIMENT = Experiment(
         f"{PAPER}@dgcnn": "qbst",
     },
     pairs=lambda scale: _PAIRS,
+    notes=("DefRec and PCM work in the unit ball: their networks are told no sizes.",),
     corner="method",
 )
 """The paper's second table, with the supplement's column."""
