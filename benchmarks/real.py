@@ -28,20 +28,23 @@ import numpy as np
 
 from qs3.evaluation.records import write_record
 from qs3.io import load_clouds
-from qs3.io.clouds import CloudChoice, Origin, PointClouds, UnlabelledClouds
+from qs3.io.clouds import CloudChoice, PointClouds, UnlabelledClouds
 from qs3.io.preparation import PAPER, ROBUST, Preparation
 from qs3.meshes.classes import POINTDA10
 from qs3.training import evaluate, fit
-from qs3.training.config import GENTLE, Augmentation, SelfTrainingSettings, TrainSettings, changed
+from qs3.training.config import (
+    GENTLE,
+    LIGHT,
+    Augmentation,
+    SelfTrainingSettings,
+    TrainSettings,
+    changed,
+)
 
 BATCH = 32
 SIZED = replace(ROBUST, size_input=True)
 FAST: Mapping[str, Any] = {"transforms": False}
 """PointNet without its T-Nets, the fast network: 4 ms of one core for a cloud of 256 points."""
-LIGHT = Augmentation(
-    plane=0.25, plane_share=0.25, patches=0.25, stretch=1.0, tilt=1.0, floor=0.15, noise=0.5
-)
-"""What a first look found to help: light cuts, tilt, stretch, a little floor."""
 
 
 @dataclass(frozen=True)
@@ -142,19 +145,13 @@ CELLS: Mapping[str, Cell] = {
 
 def parts(shared: Path) -> dict[str, PointClouds]:
     """NYU's strict objects, of the first 70 % of the frames and of the others, and SUN RGB-D's."""
-    path = shared / "nyuv2_objects.npz"
-    whole = load_clouds(path, num_points=None, class_names=POINTDA10)
-    with np.load(path) as archive:
-        strict, frame = archive["strict"].astype(bool), archive["frame"]
-    frames = np.unique(frame)
-    early = frame < frames[int(0.7 * len(frames))]
-    named: dict[str, PointClouds] = {}
-    for name, rows in {"dev": strict & early, "check": strict & ~early}.items():
-        origin = Origin(path.name, f"strict-{name}", "points")
-        named[name] = replace(whole.select(rows), origin=origin)
-    other = shared / "sunrgbd_objects.npz"
-    named["sunrgbd"] = load_clouds(other, num_points=1024, class_names=POINTDA10)
-    return named
+    path, other = shared / "nyuv2_objects.npz", shared / "sunrgbd_objects.npz"
+    split = {name: f"strict-{name}" for name in ("dev", "check")}
+    named = {
+        name: load_clouds(path, split=part, num_points=None, class_names=POINTDA10)
+        for name, part in split.items()
+    }
+    return named | {"sunrgbd": load_clouds(other, num_points=1024, class_names=POINTDA10)}
 
 
 def settings_of(cell: Cell, clouds: int, seed: int) -> TrainSettings:

@@ -18,6 +18,7 @@ from real import parts
 from qs3.evaluation.compare import bootstrap_difference
 from qs3.evaluation.records import RunRecord, read_record
 from qs3.evaluation.tables import average, frame, to_markdown
+from qs3.io.layouts.npz import frame_parts
 from qs3.training import load_model, predict_probabilities
 from qs3.training.run import completed
 
@@ -76,12 +77,10 @@ def note_right(out: Path, shared: Path, folder: Path) -> None:
         lines.append({"part": part, "cell": cell, "seed": str(seed), "right": bits})
     with np.load(shared / "nyuv2_objects.npz") as archive:
         strict, frame_number = archive["strict"].astype(bool), archive["frame"]
-    every = np.unique(frame_number)
-    early = frame_number < every[int(0.7 * len(every))]
-    rows = {"dev": strict & early, "check": strict & ~early}
     lines = [line for line in lines if line["cell"] != "(block)"]
-    for part in rows:
-        blocks = np.unique(frame_number[rows[part]] // 10, return_inverse=True)[1]
+    for name, rows in frame_parts(frame_number, strict).items():
+        part = name.removeprefix("strict-")
+        blocks = np.unique(frame_number[rows] // 10, return_inverse=True)[1]
         text = " ".join(str(block) for block in blocks)
         lines.append({"part": part, "cell": "(block)", "seed": "-1", "right": text})
     table = pd.DataFrame(lines, columns=["part", "cell", "seed", "right"])

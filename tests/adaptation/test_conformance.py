@@ -242,6 +242,7 @@ def test_poisoned_labels_of_the_target_change_no_bit(method, rule, tmp_path):
         history = [json.loads(line) for line in (run / "history.jsonl").read_text().splitlines()]
         for line in history:
             line.pop("seconds", None)
+            line.pop("cpu_seconds", None)
             line.pop("samples_per_second", None)
         runs.append((result, history, (run / "settings.json").read_text()))
     (right, history, kept), (wrong, history_of_wrong, kept_of_wrong) = runs

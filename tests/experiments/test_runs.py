@@ -1,10 +1,14 @@
 """Which runs make a table: their fields, their data, and the figures beside them."""
 
 import dataclasses
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from qs3 import shapes
+from qs3.adaptation import method_class
+from qs3.adaptation.names import split_method
 from qs3.errors import InputError
 from qs3.experiments import TABLES
 from qs3.experiments.cost import run_seconds
@@ -16,6 +20,11 @@ from qs3.experiments.reproduce import collect_runs, products
 from qs3.experiments.runs import ORDINARY, PAPER, ROWS, SUPERVISED, make_run, warm_up_of
 from qs3.experiments.scales import SCALES
 from qs3.experiments.setup import Setup
+from qs3.experiments.table import Table
+from qs3.io import load_clouds, load_unlabelled
+from qs3.io.clouds import digests
+from qs3.training.batches import count_batches
+from qs3.training.plan import Cost
 
 from .conftest import TINY
 
@@ -66,7 +75,9 @@ def test_runs_have_the_settings_of_their_row():
     base = make_run(TINY, S, D, "qbst").self_training
     for name, row in ROWS.items():
         if row.changes:
-            changed = dataclasses.replace(base, **row.changes)
+            # A share of the clouds sets the threshold itself.
+            plain = {"threshold": 0.8} if "threshold_share" in row.changes else {}
+            changed = dataclasses.replace(base, **plain, **row.changes)
             assert make_run(TINY, S, D, name).self_training == changed != base
     assert warm_up_of(TINY, make_run(TINY, S, D, "gast-spst")).row == "gast"
 
@@ -187,15 +198,87 @@ def test_a_path_through_a_link_and_a_name_of_ours_are_the_user_s(tmp_path):
 
 
 def test_hours_follow_the_number_of_steps():
-    steps = {"source-only": 1.0, "dann": 3.0}
+    costs = {name: Cost(step, 0.25, 0.5) for name, step in (("source-only", 1.0), ("dann", 3.0))}
     scale = dataclasses.replace(TINY, train=dataclasses.replace(TINY.train, epochs=10))
     counts = (40, 64, 16)  # 36 trained on: 3 batches; 4 of the target
-    looks = 10 * (40 + 64 + 16) / 16 / 3
+    looks = 10 * (40 + 64 + 16) * 0.25
+    judged = (40 + 16) * 0.75 + (40 + 64) * 0.5
     seconds = {
-        row: run_seconds(make_run(scale, S, D, row), counts, steps)
-        for row in ("source-only", "dann", "qbst")
+        row: run_seconds(make_run(scale, S, D, row), counts, costs)
+        for row in ("source-only", "dann", "qbst", "qbst-gentle")
     }
-    assert seconds["source-only"] == pytest.approx(30 + looks)
-    assert seconds["dann"] == pytest.approx(10 * 4 * 3 + looks)
-    # Two rounds of an epoch, on both domains.
-    assert seconds["qbst"] == pytest.approx(2 * 4 * 2 + 4 * 120 / 16 / 3)
+    assert seconds["source-only"] == pytest.approx(30 + looks + judged)
+    assert seconds["dann"] == pytest.approx(10 * 4 * 3 + looks + judged)
+    # Two rounds of an epoch, on both domains; what was kept is judged too.
+    judged += 64 * 0.75
+    assert seconds["qbst"] == pytest.approx(2 * 4 * 2 + 4 * 120 * 0.25 + judged)
+    # Half of the target is kept.
+    assert seconds["qbst-gentle"] == pytest.approx(5 * 4 * 2 * 2 + 10 * 120 * 0.25 + judged)
+    again = run_seconds(make_run(scale, S, D, "dann"), counts, costs, only_scores=True)
+    assert again == pytest.approx(56 * 0.75)
+
+
+def test_laptop_judges():
+    scale = SCALES["laptop"]
+    assert not scale.smoke and scale.source_per_class >= 60
+    sides = choose_meshes(dataclasses.replace(scale, source_per_class=1), None)
+    assert sum(item.split == "test" for item in sides.target) >= 400
+    # Equal numbers of steps, whatever the source.
+    for kind, clouds in (("S", 600), ("S+C+M", 1800), ("D", 420)):
+        train = make_run(scale, Domain(kind), D, ORDINARY).train
+        batches = count_batches(clouds - int(0.1 * clouds), train.batch_size)
+        assert train.epochs * batches == pytest.approx(4000, rel=0.01)
+    assert make_run(scale, S, D, SUPERVISED).train.epochs == train.epochs
+    plans = make_plans(scale, sides, data_sets([make_run(scale, S, D, ORDINARY)]))
+    sensors = {name: plan.settings.as_dict()["sensor"] for name, plan in plans.items()}
+    learnt = {sensor["name"] for sensor in sensors["source"]}
+    assert sensors["target"]["name"] == "kinect-v1" not in learnt
+    assert {plan.settings.real_size for plan in plans.values()} == {"class"}
+
+
+def test_rounds_start_from_one_training_of_the_source():
+    scale = SCALES["laptop"]
+    rows = ("spst", PAPER, "qbst", "qbst-gentle")
+    for network in ("", "dgcnn"):
+        first = {
+            warm_up_of(scale, make_run(scale, S, D, row, network=network)).folder for row in rows
+        }
+        also = warm_up_of(scale, make_run(scale, S, R, PAPER, network=network)).folder
+        assert first == {also} == {make_run(scale, S, D, ORDINARY, network=network).folder}
+    sized = {row: make_run(scale, S, D, row).train.preparation.size_input for row in ROWS}
+    assert {row for row, told in sized.items() if not told} == {
+        row for row, kind in ROWS.items() if method_class(split_method(kind.method)[0]).in_unit_ball
+    }
+    gentle = make_run(SCALES["smoke"], S, D, "qbst-gentle").self_training
+    assert gentle.threshold_share == 0.5 and gentle.threshold == 0.8  # the scale's has no say
+    rows, _ = Table("uda", Setup(Path(), scale)).headings()
+    keys = {row.key for row in rows}
+    assert {*(f"{row}@dgcnn" for row in ("ordinary", "spst", PAPER, "qbst"))} <= keys
+    rows, _ = Table("uda", Setup(Path(), SCALES["small"])).headings()
+    assert not any("@" in row.key for row in rows)  # its network is the paper's already
+
+
+def test_real_objects_are_adapted_to_in_early_frames_and_scored_in_late_ones(tmp_path):
+    rng = np.random.default_rng(0)
+    frame, strict = np.repeat(np.arange(10), 3), np.arange(30) % 3 > 0
+    np.savez(
+        tmp_path / "nyuv2_objects.npz",
+        points=rng.normal(size=(30, 40, 3)).astype(np.float16),
+        label=np.arange(30) % 2, class_names=np.array(["bed", "chair"]), frame=frame, strict=strict,
+    )  # fmt: skip
+    run = make_run(SCALES["laptop"], S, R, PAPER)
+    _, target, test = run.parts()
+    files = {part.locate(tmp_path, tmp_path) for part in (target, test)}
+    assert files == {tmp_path / "nyuv2_objects.npz"}
+    (path,) = files
+    whole = load_clouds(path, num_points=None)
+    for part, rows in ((target, strict & (frame < 7)), (test, strict & (frame >= 7))):
+        clouds = load_clouds(path, split=part.split, num_points=None)
+        assert np.array_equal(clouds.points, whole.points[rows])
+        assert np.array_equal(clouds.labels, whole.labels[rows])
+        assert clouds.origin.split == part.split and clouds.checksum == whole.checksum
+    unlabelled = load_unlabelled(path, split=target.split, num_points=None)
+    # In an order that tells no label.
+    assert set(digests(unlabelled.points)) == set(digests(whole.points[strict & (frame < 7)]))
+    with pytest.raises(InputError, match="strict-dev and strict-check"):
+        load_clouds(path, split="train")

@@ -74,7 +74,10 @@ def test_the_bench_tells_every_rule_and_what_rounds_kept(whole):
         shown = line.strip("| ").split(" | ")[1:]
         assert sorted(shown[:-1]) == sorted(cells[:-1]) and shown[-1] == cells[-1]
     kept = run.rounds[-1]
-    cells = [*(f"{count:.1f}" for count in kept["kept"])]
+    # All that was kept is of the target's clouds, whose labels were looked at afterwards.
+    assert kept["known"] == kept["kept"] and sum(kept["right"]) <= sum(kept["kept"])
+    pairs = zip(kept["kept"], kept["right"], strict=True)
+    cells = [f"{count:.1f} / {right:.1f}" for count, right in pairs]
     cells.append(f"{sum(kept['kept']):.1f} of {sum(kept['confident']):.1f}")
     assert f"| qbst | {' | '.join(cells)} | " in text
     assert "oracle \\*" in text and "an upper bound, not a rule" in text
@@ -99,6 +102,13 @@ def test_one_training_of_a_source_serves_all_targets(whole):
     assert records[0].seconds == records[1].seconds
     settings = json.loads((whole / "runs/S-D/qbst/seed-0/settings.json").read_text())
     assert settings["warm_up"] is not None
+    warm_up, rounds = (record(whole, f"S-D_{row}_seed-0") for row in ("ordinary", "qbst"))
+    assert rounds.steps["warm-up"] == warm_up.steps["total"] > 0
+    minutes = (rounds.cpu_seconds["total"] + rounds.cpu_seconds["warm-up"]) / 60
+    steps = rounds.steps["total"] + rounds.steps["warm-up"]
+    own = f"{100 * rounds.source_accuracy:.1f} %"
+    text = (whole / "adaptation-bench.md").read_text()
+    assert f"| qbst | {minutes:.1f} · {steps:,} · {own} |" in text
     assert not (whole / "runs/S-D/qbst/seed-0/warm-up").exists()
 
 
@@ -188,6 +198,9 @@ def test_caveats_of_runs_stand_below_the_table(finished):
     change(path, "rounds", value=rounds)
     text = markdown(read(finished, "thresholds"))
     assert "- 1 of 2 rounds skipped, confident clouds too few: QBST, M → D on θ₀ = 0.2" in text
+    change(path, "rounds", value=[done | {"skipped": True} for done in rounds])
+    for kind in ("md", "tex"):
+        assert FORMATS[kind](read(finished, "thresholds")).count("(n=1) (no round trained)") >= 1
     assert "Self-training here: threshold 0.0, rounds 2, epochs 1 (paper: 0.8, 10, 10)." in text
 
 

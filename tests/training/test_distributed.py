@@ -118,7 +118,9 @@ def test_resumed_is_uninterrupted(source, target, two, tmp_path):
     assert same(whole.model, resumed.model)
 
     def plain(records):
-        return [{**dataclasses.asdict(record), "seconds": 0} for record in records]
+        return [
+            {**dataclasses.asdict(record), "seconds": 0, "cpu_seconds": 0} for record in records
+        ]
 
     assert plain(whole.rounds) == plain(resumed.rounds)
 

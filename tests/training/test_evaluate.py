@@ -46,6 +46,9 @@ def test_a_fitted_run_is_scored_on_any_clouds(source, target, settings, tmp_path
     assert (run.source.name, run.source.clouds) == ("arrays", 24)
     assert len(run.rounds) == 1
     assert run.seconds["total"] == pytest.approx(run.seconds["source"] + run.seconds["rounds"])
+    assert sum(record.steps for record in result.history) == run.steps["source"] > 0
+    assert run.steps["total"] == run.steps["source"] + result.rounds[0].steps
+    assert 0 < run.cpu_seconds["source"] < run.cpu_seconds["total"]
     assert len(result.source) == 24
     assert result.target.points.shape == (30, 64, 3)
 
@@ -53,6 +56,7 @@ def test_a_fitted_run_is_scored_on_any_clouds(source, target, settings, tmp_path
     assert read_record(record_path(tmp_path / "run", record)) == record
     assert record.marks == ("transductive", "supervised")
     assert record.experiment == {"row": "dann"}
+    assert (record.cpu_seconds, record.steps) == (run.cpu_seconds, run.steps)
     assert record.scores.accuracy == record.choices["last"]["accuracy"]
     best = max(choice["accuracy"] for choice in record.choices.values())
     assert record.choices["oracle"]["accuracy"] == best

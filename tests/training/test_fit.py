@@ -140,6 +140,8 @@ def test_given_warm_up_is_the_trained_one(source, target, settings, tmp_path):
     trained = fit("qbst", source, unlabelled, settings, ROUNDS, run_dir=tmp_path / "b")
     assert same(handed.model, trained.model)
     assert same(load_model(tmp_path / "b" / "warm-up").model, load_model(tmp_path / "warm").model)
+    steps = [read_run(tmp_path / name).steps for name in ("warm", "a", "b")]
+    assert steps[1]["warm-up"] == steps[0]["total"] == steps[2]["source"] > steps[1]["source"] == 0
 
 
 def test_threads_are_put_back(source, settings, tmp_path):

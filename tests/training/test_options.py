@@ -203,7 +203,7 @@ def test_stopped_in_time_again_and_again_is_uninterrupted(source, target, settin
 
 def plain(lines):
     """Lines without what a clock tells."""
-    clock = {"seconds", "samples_per_second"}
+    clock = {"seconds", "samples_per_second", "cpu_seconds"}
     return [{key: value for key, value in line.items() if key not in clock} for line in lines]
 
 

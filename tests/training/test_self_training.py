@@ -67,7 +67,7 @@ def same(a, b):
 
 def plain(records):
     """Records without what a clock tells."""
-    return [{**dataclasses.asdict(record), "seconds": 0} for record in records]
+    return [{**dataclasses.asdict(record), "seconds": 0, "cpu_seconds": 0} for record in records]
 
 
 @pytest.fixture(scope="module")

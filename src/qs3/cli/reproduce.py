@@ -30,20 +30,20 @@ class ReproduceOptions:
     """Folder; all may share one. Run the same command again to go on after a stop. With
     QS3_SHARED_DATA set, artists' meshes and real objects take part."""
     scale: ScaleName = "small"
-    """smoke: shows that everything runs; laptop: hours on one core, networks that learn something;
-    small: the least that ranks methods, hours on a GPU; paper: the paper's size, days."""
+    """smoke: shows that everything runs; laptop: the least that judges, days of processors; small:
+    the paper's way into the networks, hours on a GPU; paper: the paper's size, days."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the trainings."""
     methods: tuple[str, ...] = ()
     """Lines of the tables; all by default."""
     tasks: tuple[str, ...] = ()
     """Columns of the tables, such as S-D; all by default. M surfaces, S scans, D simulated target,
-    F its noise-free fusion, R real objects."""
+    F its noise-free fusion, R real objects of NYU Depth v2, U of SUN RGB-D."""
     data: tuple[str, ...] = ()
     """Data sets of yours in place of what is made here, as NAME=PATH or NAME=PATH:TRAIN:TEST with
     two parts of it: D=scans/depth."""
     dry_run: bool = False
-    """Print counts and hours, measured on a few scans and steps; write nothing."""
+    """Print counts and hours, by a few scans and steps in processor time; write nothing."""
     threads: int = 1
     """CPU threads of a training; numbers are the same for the same count."""
     workers: Flat[Workers] = field(default_factory=Workers)

@@ -120,7 +120,8 @@ class RunRecord:
     """Commit of the source tree, empty where unknown."""
     rounds: tuple[Mapping[str, Any], ...] = ()
     """What each round of self-training did. Where clouds that it kept are among those of the test,
-    also, by pseudo label, how many of them are ``known`` so and how many were ``right``."""
+    or somebody scored the target too, also, by pseudo label, how many of them are ``known`` so and
+    how many were ``right``."""
     chosen: Mapping[str, str | int] | None = None
     """Checkpoint of the scores: its ``stage`` and ``number``; None in earlier releases."""
     checkpoints: tuple[Mapping[str, Any], ...] = ()
@@ -133,6 +134,14 @@ class RunRecord:
     """Caveats printed with the number: ``transductive``, ``supervised`` …"""
     experiment: Mapping[str, str | int | float] | None = None
     """Place of the run in a grid of runs, by fields; None outside of one."""
+    cpu_seconds: Mapping[str, float] = field(default_factory=dict)
+    """Processor seconds by part, and beside the ``total`` those of a ``warm-up`` that was given;
+    empty in earlier releases."""
+    steps: Mapping[str, int] = field(default_factory=dict)
+    """Optimiser steps, as the processor seconds."""
+    source_accuracy: float | None = None
+    """Accuracy on the labelled clouds that the network learnt from, its held-out part among them;
+    None where nobody asked."""
     schema: int = SCHEMA_VERSION
     """Version of these fields."""
 

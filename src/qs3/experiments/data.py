@@ -58,12 +58,15 @@ def choose_meshes(scale: Scale, shared: Path | None) -> Sides:
 
     Args:
         scale: How many.
-        shared: Folder with artists' meshes in ``cad``; None takes shapes alone.
+        shared: Folder with artists' meshes in its folders; None takes shapes alone.
     """
     parts: dict[tuple[str, str], list[MeshItem]] = {}
-    folder = None if shared is None else shared / "cad"
-    if folder is not None and folder.is_dir():
-        files = collect(folder, classes="pointda10")
+    folders = [] if shared is None else [shared / name for name in scale.meshes]
+    for folder in filter(Path.is_dir, folders):
+        files = [
+            item if folder.name == "cad" else replace(item, id=f"{folder.name}/{item.id}")
+            for item in collect(folder, classes="pointda10")
+        ]
         counts = Counter(item.class_name for item in files)
         for item in files:
             if counts[item.class_name] >= _LEAST:
@@ -129,10 +132,11 @@ def make_plans(scale: Scale, sides: Sides, sets: Iterable[DataSet]) -> dict[str,
 def _plan(data: DataSet, scale: Scale, sides: Sides) -> tuple[list[MeshItem], Mapping[str, Any]]:
     """Return the meshes of a data set and the settings that are its own."""
     scored = [item for item in sides.target if item.split == "test"]
-    source = {"views": scale.source_views, "seed": _SEEDS["source"]}
+    source = {"views": scale.source_views, "seed": _SEEDS["source"], **scale.source_scan}
     # As annotated frames are cut: by the object's mask, and by its box with a margin, or a few
     # flying pixels would set the scale of the whole cloud.
-    room = {"sensor": TARGET_SENSOR, "scene": _ROOM, "box_margin": 0.05, "crop": "both"}
+    room: dict[str, Any] = {"sensor": TARGET_SENSOR, "scene": _ROOM, "box_margin": 0.05}
+    room = dict(scale.target_scan) or room | {"crop": "both"}
     match data.kind:
         case "source":
             return sides.source, source
@@ -148,11 +152,12 @@ def _plan(data: DataSet, scale: Scale, sides: Sides) -> tuple[list[MeshItem], Ma
             return sides.target, room | {"views": scale.source_views, "seed": _SEEDS["fused"]}
         case "second":
             own = {"meshes": "shapes", "views": 1, "seed": _SEEDS["second"]}
-            return _further_shapes(scale), own
+            return _further_shapes(scale), source | own
         case "sensor":
             # Both sides count their shapes from 0.
             items = sides.source + [replace(item, id=f"{item.id}-scored") for item in scored]
-            return items, {"sensor": data.sensor, "views": 1, "seed": _SEEDS["sensor"]}
+            own = {"sensor": data.sensor, "views": 1, "seed": _SEEDS["sensor"]}
+            return items, source | own
 
 
 def _further_shapes(scale: Scale) -> list[MeshItem]:

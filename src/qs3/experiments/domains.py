@@ -11,19 +11,22 @@ from pathlib import Path
 from typing import Literal
 
 from qs3.errors import InputError
-from qs3.io.clouds import CloudKind
+from qs3.io.clouds import CloudChoice
 from qs3.store.manifest import MANIFEST
 
-REAL = "sunrgbd_objects.npz"
-REAL_CLOUDS = 32
-"""Objects in that file."""
+REAL_CLOUDS: Mapping[Path, Mapping[str | None, int]] = {
+    Path("nyuv2_objects.npz"): {"strict-dev": 520, "strict-check": 300},
+    Path("sunrgbd_objects.npz"): {None: 32},
+}
+"""Files of real objects in the shared folder, and how many each part of them has."""
 DATA = "data"
 """Folder of the data sets that are made here, in that of a reproduction."""
-Kind = Literal["M", "S", "D", "F", "N", "C", "J", "R", "V", "A"]
-"""M: samples of the meshes' surfaces; S: scans of the same meshes by the simulated sensor; D: scans
-of other meshes by another sensor; F: their fusion without noise; N: surfaces of further meshes; J
-and C: scans from one side with and without noise; V: scans from a number of views; A: scans by a
-named sensor; R: real objects."""
+Kind = Literal["M", "S", "S+C+M", "D", "F", "N", "C", "J", "R", "U", "V", "A"]
+"""M: samples of the meshes' surfaces; S: scans of the same meshes by the simulated sensor; S+C+M:
+both, and the scans' clean twins; D: scans of other meshes by another sensor; F: their fusion
+without noise; N: surfaces of further meshes; J and C: scans from one side with and without noise;
+V: scans from a number of views; A: scans by a named sensor; R and U: real objects of NYU Depth v2
+and of SUN RGB-D."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +77,13 @@ class Part:
     """Made here, or a path of the user's; the real objects are a file of the shared folder."""
     split: str | None
     """Part of the data; None takes all."""
-    cloud: CloudKind
+    cloud: CloudChoice
     """Which cloud of a generated data set."""
+
+    def at_hand(self, shared: Path | None) -> bool:
+        """Whether these are no real objects, or are there."""
+        real = self.data in REAL_CLOUDS
+        return not real or (shared is not None and (shared / str(self.data)).is_file())
 
     def locate(self, out: Path, shared: Path | None) -> Path:
         """Return where the clouds lie.
@@ -89,14 +97,14 @@ class Part:
         """
         if isinstance(self.data, DataSet):
             return out / DATA / self.data.name
-        if self.data != Path(REAL):
+        if self.data not in REAL_CLOUDS:
             return self.data
-        if shared is None or not (shared / REAL).is_file():
+        if shared is None or not self.at_hand(shared):
             raise InputError(
-                f"domain R needs {REAL}; set QS3_SHARED_DATA to the folder that has it, or choose "
-                "--tasks without R"
+                f"domains R and U need {self.data}; set QS3_SHARED_DATA to the folder that has "
+                "it, or choose --tasks without them"
             )
-        return shared / REAL
+        return shared / self.data
 
 
 @dataclass(frozen=True)
@@ -123,7 +131,7 @@ def _made(
     title: str,
     train: DataSet,
     test: DataSet | None,
-    cloud: CloudKind = "points",
+    cloud: CloudChoice = "points",
     stands_for: str = "",
 ) -> DomainData:
     test_part = None if test is None else Part(test, "test", cloud)
@@ -132,7 +140,7 @@ def _made(
 
 _SOURCE, _HELD, _TARGET = DataSet("source"), DataSet("held"), DataSet("target")
 _FUSED, _SECOND, _JITTER = DataSet("fused"), DataSet("second"), DataSet("jitter")
-_REAL = Part(Path(REAL), None, "points")
+_NYU, _SUN = REAL_CLOUDS
 _MADE: Mapping[str, DomainData] = {
     "M": _made("M: surface samples", _SOURCE, _HELD, "surface", "ModelNet10"),
     "S": _made("S: scans", _SOURCE, _HELD, stands_for="SpeckleNet10"),
@@ -141,7 +149,16 @@ _MADE: Mapping[str, DomainData] = {
     "N": _made("N: surface samples of other meshes", _SECOND, _SECOND, "surface", "ShapeNet10"),
     "C": _made("C: one-sided, without noise", _JITTER, None, "clean"),
     "J": _made("J: one-sided scans", _JITTER, None),
-    "R": DomainData("R: real SUN RGB-D objects", _REAL, _REAL),
+    "S+C+M": _made("S+C+M: scans, their clean twins, surface samples", _SOURCE, None, "all"),
+    # Blocks of frames in the order of filming, so that no room is on both sides.
+    "R": DomainData(
+        "R: real NYU Depth v2 objects",
+        Part(_NYU, "strict-dev", "points"),
+        Part(_NYU, "strict-check", "points"),
+    ),
+    "U": DomainData(
+        "U: real SUN RGB-D objects", Part(_SUN, None, "points"), Part(_SUN, None, "points")
+    ),
 }
 
 
@@ -195,7 +212,7 @@ def parse_own(given: Sequence[str]) -> dict[str, DomainData]:
 
 
 def own_data(
-    kind: str, path: Path, cloud: CloudKind, train_split: str | None, test_split: str | None
+    kind: str, path: Path, cloud: CloudChoice, train_split: str | None, test_split: str | None
 ) -> DomainData:
     """Return a domain whose clouds are the user's: one data set with two parts."""
     train, test = (Part(path, split, cloud) for split in (train_split, test_split))

@@ -238,14 +238,17 @@ def make_record(run: Run, setup: Setup, device: str = "") -> RunRecord:
         preset=run.kind.preset,
         supervised=run.row == SUPERVISED,
     )
-    return evaluate(
-        setup.out / RUNS / run.folder,
-        place(test),
-        split=test.split,
-        cloud=test.cloud,
-        checkpoints=run.row != ORDINARY,
-        experiment=run.fields,
-    )
+    folder = setup.out / RUNS / run.folder
+
+    def score(part: Part, **options: Any) -> RunRecord:
+        return evaluate(folder, place(part), split=part.split, cloud=part.cloud, **options)
+
+    record = score(test, checkpoints=run.row != ORDINARY, experiment=run.fields)
+    if (
+        target is not None and record.rounds
+    ):  # what they kept, by the labels of what they chose from
+        record = replace(record, rounds=score(target).rounds)
+    return replace(record, source_accuracy=evaluate(folder, labelled).scores.accuracy)
 
 
 def _see_alone(device: str) -> None:

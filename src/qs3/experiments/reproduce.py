@@ -9,7 +9,7 @@ from unittest import mock
 
 from qs3.errors import InputError
 from qs3.experiments import GALLERIES
-from qs3.experiments.domains import DATA, REAL, REAL_CLOUDS, DataSet, Domain, Part
+from qs3.experiments.domains import DATA, REAL_CLOUDS, DataSet, Part, data_of
 from qs3.experiments.experiment import load_experiment
 from qs3.experiments.grid import Tell, data_sets, missing, run_grid
 from qs3.experiments.runs import Run
@@ -108,10 +108,13 @@ def products(
 
 
 def _at_hand(name: str, setup: Setup) -> tuple[str, ...]:
-    """Return the usual columns, those on real objects only where there are any."""
-    real = setup.shared is not None and (setup.shared / REAL).is_file()
-    columns = Table(name, setup).headings()[1]
-    return tuple(c.key for c in columns if real or c.fields.get("target") != Domain("R"))
+    """Return the usual columns, those on real objects only where they are at hand."""
+    shown: list[str] = []
+    for column in Table(name, setup).headings()[1]:
+        target = column.fields.get("target")
+        if target is None or data_of(target, setup.own).train.at_hand(setup.shared):
+            shown.append(column.key)
+    return tuple(shown)
 
 
 def collect_runs(products: Sequence[Product]) -> list[Run]:
@@ -204,15 +207,17 @@ def measure(
     """Estimate what is left, from a few timed scans and a few timed steps of each kind.
 
     Returns:
-        Seconds on one core or device: of all scans, and of each run by its name.
+        Processor seconds, of runs on a GPU those of the clock: of all scans, and of each run by its
+        name.
     """
-    from qs3.experiments.cost import run_seconds, step_seconds
+    from qs3.experiments.cost import run_seconds, step_costs
     from qs3.store.plan import estimate
 
     steps = {
-        network: step_seconds(
+        network: step_costs(
             [run for run in left if run.network == network],
             setup.scale.train_with(setup.threads, network=network),
+            setup.scale.data_points,
         )
         for network in dict.fromkeys(run.network for run in left)
     }
@@ -227,7 +232,7 @@ def measure(
     absent = [
         plan for name, plan in plans.items() if not (setup.out / DATA / name / MANIFEST).is_file()
     ]
-    return sum((estimate(plan).seconds for plan in absent), 0.0), expected
+    return sum((estimate(plan, scans=6).cpu_seconds for plan in absent), 0.0), expected
 
 
 def _size(part: Part | None, plans: Mapping[str, Plan]) -> int:
@@ -235,5 +240,7 @@ def _size(part: Part | None, plans: Mapping[str, Plan]) -> int:
     if part is None:
         return 0
     if isinstance(part.data, DataSet):
-        return sum(item.split == part.split for item in plans[part.data.name].items)
-    return REAL_CLOUDS if part.data == Path(REAL) else 1000
+        plan = plans[part.data.name]
+        count = sum(item.split == part.split for item in plan.items) * plan.settings.scans_per_mesh
+        return count * (3 if part.cloud == "all" else 1)
+    return REAL_CLOUDS.get(part.data, {}).get(part.split, 1000)

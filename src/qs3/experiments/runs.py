@@ -8,13 +8,13 @@ from qs3.adaptation.names import MethodName
 from qs3.errors import InputError
 from qs3.experiments.domains import Domain, Own, Part, data_of
 from qs3.experiments.scales import Scale
-from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
+from qs3.training.config import GENTLE, PRESETS, SelfTrainingSettings, TrainSettings
 
 SUPERVISED = "supervised"
 """Row of the network that is trained on the labelled training part of the target."""
 ORDINARY = "ordinary"
 """Row of a network that is trained on the source and sees no cloud of the target: one training
-serves all test sets."""
+serves all test sets, and is the warm-up of all rounds that start from the source alone."""
 PAPER = "qbst-paper"
 """Row of QBST as the paper's text has it (preset ``paper``)."""
 
@@ -31,15 +31,17 @@ class Row:
     """Row whose network self-training starts from; empty without rounds."""
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the rounds that differ from the preset."""
+    sized: bool = True
+    """Whether the network may be told sizes; a method in the unit ball knows none."""
 
 
-_QBST = Row("qbst", warm_up="source-only")
+_QBST = Row("qbst", warm_up=ORDINARY)
 ROWS: Mapping[str, Row] = {
     SUPERVISED: Row(),
     "source-only": Row(),
     "pointdan": Row("pointdan"),
-    "defrec": Row("defrec"),
-    "defrec-pcm": Row("defrec-pcm"),
+    "defrec": Row("defrec", sized=False),
+    "defrec-pcm": Row("defrec-pcm", sized=False),
     "gast": Row("gast"),
     "gast-spst": Row("gast-spst", "spst", "gast"),
     "qbst": _QBST,
@@ -47,13 +49,14 @@ ROWS: Mapping[str, Row] = {
     "mmd": Row("mmd"),
     "coral": Row("coral"),
     "sd": Row("sd"),
-    "spst": Row("spst", "spst", "source-only"),
+    "spst": Row("spst", "spst", ORDINARY),
+    # What did no harm on real objects.
+    "qbst-gentle": replace(_QBST, changes=GENTLE),
     "qbst-least-confident": replace(_QBST, changes={"selection": "least-confident"}),
     "qbst-scratch": replace(_QBST, changes={"init": "scratch"}),
     "qbst-best-labeller": replace(_QBST, changes={"teacher": "best"}),
     "qbst-no-source-loss": replace(_QBST, changes={"source_loss": False}),
     ORDINARY: Row(),
-    # The paper's tables have one training of the source alone for all targets.
     PAPER: Row("qbst", "paper", ORDINARY),
 }
 """Every line by name."""
@@ -179,16 +182,21 @@ def make_run(
     if row not in ROWS:
         raise InputError(f"unknown row {row!r}; choose from {', '.join(ROWS)}")
     kind = ROWS[row]
-    train = scale.train_with(threads, seed, network)
+    source = target if row == SUPERVISED else source
+    train = scale.train_with(threads, seed, network, source.kind)
     if row == ORDINARY:
         # No target that checkpoints could be rated on; the last network is taken.
         train = replace(train, validate_every=0)
+    if not kind.sized:
+        train = replace(train, preparation=replace(train.preparation, size_input=False))
     rounds = None
     if kind.warm_up:
-        usual = replace(PRESETS[kind.preset], **{**scale.rounds, **kind.changes})
+        own = {**scale.rounds, **kind.changes}
+        if "threshold_share" in own:
+            own.pop("threshold", None)
+        usual = replace(PRESETS[kind.preset], **own)
         changes = {name: value for name, value in changes.items() if getattr(usual, name) != value}
-        rounds = replace(PRESETS[kind.preset], **{**scale.rounds, **kind.changes, **changes})
-    source = target if row == SUPERVISED else source
+        rounds = replace(usual, **changes)
     return Run(source, target, row, seed, train, rounds, network, changes)
 
 

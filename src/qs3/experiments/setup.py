@@ -9,7 +9,7 @@ from qs3.errors import InputError
 from qs3.experiments.domains import DomainData, Own, own_data
 from qs3.experiments.scales import Scale
 from qs3.files import claim_folder, read_json, write_json
-from qs3.io.clouds import CloudKind
+from qs3.io.clouds import CloudChoice
 from qs3.structure import structure, unstructure
 
 MARKER = "bench.json"
@@ -41,7 +41,7 @@ class OwnRecord:
 
     name: str
     """Last part of its path."""
-    cloud: CloudKind
+    cloud: CloudChoice
     """Which cloud of a generated data set."""
     train_split: str | None
     """Part to train on."""

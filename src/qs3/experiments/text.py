@@ -26,9 +26,14 @@ def markdown(filled: FilledTable) -> str:
         text += [paragraph, ""]
     text += ["Accuracy:", "", to_markdown(_scores(filled, "accuracy", True)), ""]
     text += ["Class-mean accuracy:", "", to_markdown(_scores(filled, "class_mean_accuracy")), ""]
-    if experiment.rules:
-        for column in table.headings()[1]:
-            text += _by_rule(filled, column)
+    cost = _scores(filled, "cost")
+    if cost.iloc[:, 1:].map(lambda cell: cell[0].isdigit()).any(axis=None):
+        text += [
+            "CPU minutes of a run and its warm-up · steps of both · accuracy on its own source:"
+        ]
+        text += ["", to_markdown(cost), ""]
+    for column in table.headings()[1]:
+        text += _further(filled, column)
     if filled.waiting:
         text += [
             f"{len(filled.waiting)} cells wait for runs (… or few seeds); this command makes them, "
@@ -106,9 +111,26 @@ def _scores(filled: FilledTable, score: str, with_published: bool = False) -> pd
 
 
 def _value(filled: FilledTable, place: Place, score: str) -> str:
-    if place in filled.means:
-        return filled.means[place][score].format()
-    return "…" if filled.runs[place] else "–"
+    if place not in filled.means:
+        return "…" if filled.runs[place] else "–"
+    if score == "cost":
+        return _cost(filled.records_of(place))
+    mean = filled.means[place]
+    never = " (no round trained)" if mean["rounds"] and not mean["trained"] else ""
+    return mean[score].format() + never
+
+
+def _cost(records: Sequence[RunRecord]) -> str:
+    """What a cell cost, mean over its seeds, and how well it fits its source."""
+    if not all(record.cpu_seconds for record in records):
+        return "–"
+    minutes, steps = (
+        sum(cost.get("total", 0) + cost.get("warm-up", 0) for cost in costs) / len(records)
+        for costs in zip(*((r.cpu_seconds, r.steps) for r in records), strict=True)
+    )
+    fits = [r.source_accuracy for r in records if r.source_accuracy is not None]
+    own = f"{100 * sum(fits) / len(fits):.1f} %" if fits else "–"
+    return f"{minutes / 60:.1f} · {steps:,.0f} · {own}"
 
 
 def _published(filled: FilledTable, place: Place) -> str:
@@ -131,18 +153,30 @@ def _caveats(filled: FilledTable) -> list[str]:
     return [f"{mark}: {'; '.join(places)}" for mark, places in cells.items()]
 
 
-def _by_rule(filled: FilledTable, column: Heading) -> list[str]:
-    """Tell of a column the score by every rule, the oracle apart, and what the last round kept."""
+def _further(filled: FilledTable, column: Heading) -> list[str]:
+    """Tell of a column what rounds kept and, where asked for, the score by every rule."""
     rows = filled.table.headings()[0]
     cells = {row.title: filled.records_of((row.key, column.key)) for row in rows}
     cells = {title: records for title, records in cells.items() if records}
+    text = _by_rule(filled, column, cells) if filled.table.experiment.rules else []
+    kept = _kept(cells)
+    if not kept.empty:
+        text += [f"{column.title}, clouds kept in the last round / right of them, by pseudo label:"]
+        text += ["", to_markdown(kept), ""]
+    return text
+
+
+def _by_rule(
+    filled: FilledTable, column: Heading, cells: Mapping[str, Sequence[RunRecord]]
+) -> list[str]:
+    """Tell of a column the score by every rule, the oracle apart."""
     rules = dict.fromkeys(rule for cell in cells.values() for run in cell for rule in run.choices)
     order = sorted(rules, key=lambda rule: rule == _ORACLE)
     if not order:
         return []
     body = [[title, *(_choice(cell, rule) for rule in order)] for title, cell in cells.items()]
     head = [rule.replace(_ORACLE, f"{_ORACLE} \\*") for rule in order]
-    text = [
+    return [
         f"{column.title}, accuracy % at the checkpoint that each rule chooses:",
         "",
         to_markdown(pd.DataFrame(body, columns=[filled.table.experiment.corner, *head])),
@@ -150,11 +184,6 @@ def _by_rule(filled: FilledTable, column: Heading) -> list[str]:
         "\\* looks at the labels of the scored clouds: an upper bound, not a rule.",
         "",
     ]
-    kept = _kept(cells)
-    if not kept.empty:
-        text += [f"{column.title}, clouds kept in the last round, by pseudo label:", ""]
-        text += [to_markdown(kept), ""]
-    return text
 
 
 def _choice(records: Sequence[RunRecord], rule: str) -> str:
@@ -176,12 +205,16 @@ def _kept(cells: Mapping[str, Sequence[RunRecord]]) -> pd.DataFrame:
         last = [record.rounds[-1] for record in records if record.rounds]
         if last:
             counts = pd.DataFrame([done["kept"] for done in last]).mean()
+            right = [""] * len(counts)
+            if all("right" in done for done in last):
+                means = pd.DataFrame([done["right"] for done in last]).mean()
+                right = [f" / {mean:.1f}" for mean in means]
             confident = sum(sum(done["confident"]) for done in last) / len(last)
             trained, rounds = count_rounds(records)
             names = records[0].scores.class_names
             lines.append(
                 {"method": title}
-                | {name: f"{count:.1f}" for name, count in zip(names, counts, strict=True)}
+                | {n: f"{c:.1f}{r}" for n, c, r in zip(names, counts, right, strict=True)}
                 | {"kept of confident": f"{counts.sum():.1f} of {confident:.1f}"}
                 | {"rounds that trained": f"{trained} of {rounds}"}
             )
@@ -208,11 +241,14 @@ def _intro(filled: FilledTable) -> list[str]:
     train = runs[0].train  # the same for all but for network and seed
     sources = [run.source for run in runs if run.row != SUPERVISED]
     data = [data_of(domain, own) for domain in dict.fromkeys([*sources, *(r.target for r in runs)])]
+    steps = scale.optimiser_steps
+    epochs = f"{train.epochs} epochs" if steps is None else f"about {steps:,} steps"
     made = any(domain.train.data == DataSet("source") for domain in data)
     objects = f", {scale.source_per_class} objects a class of M and S" if made else ""
     text = [
         f"Scale {scale.name}{objects}: {train.num_points} points, "
-        f"{train.epochs} epochs, batches of {train.batch_size}, schedule {train.schedule}; "
+        f"{epochs}, batches of {train.batch_size}, schedule {train.schedule}, network "
+        f"{train.model} unless a line says otherwise; "
         f"seeds {', '.join(map(str, setup.seeds))}. Per cent, mean ± standard error "
         "(ddof = 1) over n seeds, from the records alone; the network is the last epoch's.",
         " ".join(["; ".join(domain.title for domain in data) + ".", *_scored(filled)]),
@@ -231,7 +267,7 @@ def _intro(filled: FilledTable) -> list[str]:
         text.append(scale.describe_rounds())
     if scale.smoke:
         text.append(
-            "Below 40 training objects a class, 512 points or the whole networks: shows that "
+            "Below 40 training objects a class, 256 points or the whole networks: shows that "
             "everything runs, ranks nothing."
         )
     return text

@@ -172,6 +172,8 @@ class Estimate:
     """Size of the part's shards."""
     seconds: float
     """Time of the part with one worker."""
+    cpu_seconds: float
+    """The same in processor seconds, which do not tell how busy the machine is now."""
     measured: int
     """Scans that this was measured on."""
 
@@ -195,7 +197,7 @@ def estimate(
         objects[" ".join(filter(None, (item.class_name, item.split)))] += 1
     chosen = np.linspace(0, len(plan.items) - 1, min(scans, len(plan.items))).astype(int).tolist()
     sizes: list[int] = []
-    seconds: list[float] = []
+    seconds: list[tuple[float, float]] = []
     failure: Failure | None = None
     with LocalExecutor(1, timeout) as executor:
         for index in [chosen[0], *chosen]:  # the first scan of a process compiles and loads
@@ -212,17 +214,19 @@ def estimate(
         )
     rows = sum(plan.size(shard) for shard in range(part[0], plan.shards, part[1]))
     kept = slice(1, None) if len(seconds) > 1 else slice(None)
+    wall, cpu = np.mean(seconds[kept], axis=0).tolist()
     return Estimate(
         objects=dict(sorted(objects.items())),
         rows=plan.rows,
         part_rows=rows,
         bytes=rows * float(np.mean(sizes)),
-        seconds=rows * float(np.mean(seconds[kept])),
+        seconds=rows * wall,
+        cpu_seconds=rows * cpu,
         measured=len(seconds[kept]),
     )
 
 
-def _timed(arguments: tuple[Any, ...], dtype: DType) -> tuple[float, int]:
-    start = time.perf_counter()
+def _timed(arguments: tuple[Any, ...], dtype: DType) -> tuple[tuple[float, float], int]:
+    wall, cpu = time.perf_counter(), time.process_time()
     size = len(shard_bytes(table_of([scan_item(*arguments)], dtype)))
-    return time.perf_counter() - start, size
+    return (time.perf_counter() - wall, time.process_time() - cpu), size

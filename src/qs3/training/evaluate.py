@@ -15,7 +15,7 @@ from qs3.evaluation.environment import git_commit, hardware, versions
 from qs3.evaluation.records import RECORDS, RunRecord, Scores, score, write_record
 from qs3.evaluation.regret import choose_each
 from qs3.io import load_clouds
-from qs3.io.clouds import CloudKind, PointClouds
+from qs3.io.clouds import CloudChoice, PointClouds
 from qs3.io.ragged import relabel
 from qs3.meshes.classes import require_named
 from qs3.structure import unstructure
@@ -35,7 +35,7 @@ def evaluate(
     data: str | Path | PointClouds,
     *,
     split: str | None = None,
-    cloud: CloudKind = "points",
+    cloud: CloudChoice = "points",
     checkpoints: bool = False,
     experiment: Mapping[str, str | int | float] | None = None,
     class_map: Mapping[str, str] | None = None,
@@ -87,6 +87,8 @@ def evaluate(
         selection=made.selection,
         scores=_scores(loaded, test, answer_of),
         seconds=made.seconds,
+        cpu_seconds=made.cpu_seconds,
+        steps=made.steps,
         versions=versions(),
         hardware=hardware(),
         commit=git_commit(),
@@ -111,7 +113,7 @@ def record_path(run: Path, record: RunRecord) -> Path:
 def _labelled(
     data: str | Path | PointClouds,
     split: str | None,
-    cloud: CloudKind,
+    cloud: CloudChoice,
     loaded: LoadedModel,
     class_names: tuple[str, ...],
     class_map: Mapping[str, str] | None,

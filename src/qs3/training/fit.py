@@ -5,6 +5,7 @@ import logging
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,7 +38,7 @@ from qs3.training.run import (
     data_record,
     fingerprint,
     read_run,
-    sum_seconds,
+    sum_cost,
     write_run,
 )
 from qs3.training.shipped import find_run
@@ -220,7 +221,7 @@ def fit(
             threads=count,
             unknown_warm_up=warm_up is not None and before is None,
             rounds=tuple(asdict(record) for record in rounds),
-            seconds=sum_seconds(epochs, rounds),
+            **sum_cost(epochs, rounds),
             preset=None if rounds_settings is None else preset,
             supervised=supervised,
             folder=run_dir,
@@ -241,9 +242,14 @@ def fit(
 
 
 def _with_warm_up(run: Run, before: Run) -> Run:
-    """Add what the network has seen in its warm-up, for the marks of its scores."""
+    """Add what the network has seen in its warm-up, for the marks of its scores, and its cost."""
     names = ("source_clouds", "source_shapes", "target_clouds", "target_shapes")
-    both = {name: tuple(sorted({*getattr(run, name), *getattr(before, name)})) for name in names}
+    both: dict[str, Any] = {
+        name: tuple(sorted({*getattr(run, name), *getattr(before, name)})) for name in names
+    }
+    for name in ("cpu_seconds", "steps"):
+        if spent := getattr(before, name):
+            both[name] = getattr(run, name) | {"warm-up": spent["total"]}
     supervised = run.supervised or before.supervised
     return replace(run, **both, supervised=supervised, unknown_warm_up=before.unknown_warm_up)
 

@@ -35,6 +35,10 @@ class EpochRecord:
     a method does not call the network on them."""
     samples_per_second: float = 0.0
     """Labelled clouds a second, over all devices."""
+    cpu_seconds: float = 0.0
+    """Processor seconds of the first device's process, all threads together."""
+    steps: int = 0
+    """Optimiser steps."""
 
 
 Log = Callable[[Sequence[EpochRecord]], None]

@@ -196,6 +196,8 @@ def train(
                 seconds=bar.seconds(),
                 accuracy=bar.accuracy(),
                 samples_per_second=bar.rate(),
+                cpu_seconds=bar.cpu_seconds(),
+                steps=bar.steps,
             )
             history.append(record)
             make_equal(method.state_dict().values(), fabric)

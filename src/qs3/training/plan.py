@@ -1,24 +1,71 @@
 """What a training would do and about how long it takes, before it is begun."""
 
-import statistics
+import os
 import time
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from unittest import mock
 
+import numpy as np
 import torch
 
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.models import PointClassifier
 from qs3.structure import unstructure
 from qs3.training.batches import count_batches
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.distributed import make_fabric
 from qs3.training.job import fresh_model, make_method
-from qs3.training.threads import threads, trial_step
+from qs3.training.loop import train
+from qs3.training.predict import describe
+from qs3.training.prepared import prepare_clouds
+from qs3.training.threads import threads
 from qs3.training.validation import held_out
 
-_STEPS = 4
-"""Timed steps; the first, which warms up, does not count."""
+_STEPS = 3
+"""Steps of each of two epochs; the first, which warms up, does not count."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Seconds that parts of a training take here: of the processor, or by the clock on a GPU."""
+
+    step: float
+    """An optimiser step, its batch made and augmented."""
+    look: float
+    """The answer to a cloud."""
+    preparation: float
+    """The preparation of a cloud."""
+
+
+def measure(
+    method: str, source: PointClouds, target: UnlabelledClouds, settings: TrainSettings
+) -> Cost:
+    """Train for a few steps on the first clouds of each domain, and tell what that took.
+
+    Processor seconds, since those of the clock tell how busy a machine is now; threads divide them.
+    """
+    count = settings.threads if isinstance(settings.threads, int) else torch.get_num_threads()
+    settings = replace(settings, epochs=2, devices=1)
+    few = slice(settings.batch_size)
+    source = source.select(np.arange(len(source))[few])
+    target = UnlabelledClouds(target.points[few], target.ids[few])
+    fabric = make_fabric(settings)
+    cuda = fabric.device.type == "cuda"
+    clock, share = (time.perf_counter, 1) if cuda else (time.process_time, 1 / count)
+    with threads(count), mock.patch.dict(os.environ, TQDM_DISABLE="1"):
+        how = settings.num_points, settings.preparation
+        prepare_clouds(source.select(np.arange(2)), *how)  # compiles
+        began = clock()
+        prepared = prepare_clouds(source, *how), prepare_clouds(target, *how)
+        preparation = (clock() - began) / (len(source) + len(target))
+        model = fresh_model(method, settings, len(source.class_names))
+        trained = make_method(method, model, settings)
+        last = train(trained, *prepared, settings, fabric=fabric, steps_per_epoch=_STEPS)[0][-1]
+        began = clock()
+        describe(trained.model, prepared[0], fabric=fabric)
+        look = (clock() - began) / len(source)
+    step = (last.seconds if cuda else last.cpu_seconds) / last.steps
+    return Cost(step * share, look * share, preparation * share)
 
 
 def describe_plan(
@@ -31,8 +78,8 @@ def describe_plan(
 ) -> list[str]:
     """Return lines that say what would be trained, on how much, in how many steps and how long.
 
-    The time is that of forward and backward passes alone, on this machine as busy as it is now;
-    that of rounds is the most: every cloud of the target selected.
+    The time is that of steps, taken here on the first clouds, and of the preparation; that of
+    rounds is the most: every cloud of the target selected.
 
     Args:
         method: Method before the rounds, if there are any.
@@ -70,26 +117,16 @@ def describe_plan(
     plain, usual = unstructure(settings), unstructure(TrainSettings())
     others = [f"{name} {plain[name]}" for name in plain if plain[name] != usual[name]]
     lines.append(f"settings  {', '.join(others) or 'defaults'}")
-    seconds, count = _time_step(method, model, settings, classes)
-    hours, minutes = divmod(round(steps * seconds / 60), 60)
+    if source is None:
+        assert target is not None  # noqa: S101
+        names = tuple(map(str, range(classes)))
+        labels = np.arange(len(target)) % classes
+        source = PointClouds(target.points, labels, names, target.ids)
+    cost = measure(method, source, source.without_labels() if target is None else target, settings)
+    clouds = len(source) + (0 if target is None else len(target))
+    hours, minutes = divmod(round((steps * cost.step + clouds * cost.preparation) / 60), 60)
     lines.append(
-        f"time      about {hours} h {minutes:02} min with {count} threads here, at least: "
-        f"{seconds:.2g} s a step"
+        f"time      about {hours} h {minutes:02} min of processor time here, or more where "
+        f"validators look often: {cost.step:.2g} s a step"
     )
     return lines
-
-
-def _time_step(
-    method: str, model: PointClassifier, settings: TrainSettings, classes: int
-) -> tuple[float, int]:
-    """Return the seconds of a step, and with how many threads."""
-    count = settings.threads if isinstance(settings.threads, int) else torch.get_num_threads()
-    taken = []
-    with threads(count):
-        fabric = make_fabric(replace(settings, devices=1))
-        step = trial_step(make_method(method, model, settings), classes, settings, fabric)
-        for _ in range(_STEPS):
-            start = time.perf_counter()
-            step()
-            taken.append(time.perf_counter() - start)
-    return statistics.median(taken[1:]), count

@@ -60,7 +60,7 @@ class Progress:
 
     def begin_epoch(self) -> None:
         """Set the sums to zero."""
-        self.began = time.perf_counter()
+        self.began, self.cpu_began = time.perf_counter(), time.process_time()
         self.sums: dict[str, float] = {}
         self.steps = self.seen = 0
         self.hits: float | None = 0.0
@@ -114,6 +114,10 @@ class Progress:
     def seconds(self) -> float:
         """Wall-clock seconds of this epoch."""
         return time.perf_counter() - self.began
+
+    def cpu_seconds(self) -> float:
+        """Processor seconds of this process in this epoch."""
+        return time.process_time() - self.cpu_began
 
     def rate(self) -> float:
         """Labelled clouds a second in this epoch."""

@@ -68,6 +68,10 @@ class RoundRecord:
     """Adam's learning rate in each epoch."""
     temperature: float | None = None
     """What calibrated the teacher; None where that is not asked for."""
+    cpu_seconds: float = 0.0
+    """As ``seconds``, of the first device's processor."""
+    steps: int = 0
+    """Optimiser steps."""
 
 
 RoundCallback = Callable[[RoundRecord, PointClassifier], None]

@@ -46,6 +46,11 @@ class Run:
     """What each round of self-training did."""
     seconds: Mapping[str, float]
     """Wall-clock seconds: ``source``, ``rounds``, ``total``."""
+    cpu_seconds: Mapping[str, float] = field(default_factory=dict)
+    """Processor seconds of the first device's process, likewise; beside them those of a given
+    ``warm-up``, where they are known. Empty in earlier releases."""
+    steps: Mapping[str, int] = field(default_factory=dict)
+    """Optimiser steps, likewise."""
     source_shapes: tuple[str, ...] = ()
     """What the labelled clouds look like, so that one written anew is known too."""
     target_shapes: tuple[str, ...] = ()
@@ -283,10 +288,11 @@ def data_record(clouds: PointClouds | UnlabelledClouds) -> DataRecord:
     return DataRecord.of(clouds.origin, clouds.checksum or fingerprint(clouds), len(clouds))
 
 
-def sum_seconds(epochs: Sequence[Any], rounds: Sequence[Any]) -> dict[str, float]:
-    """Return the seconds of a run, from the records of its epochs and rounds."""
-    seconds = {
-        "source": float(sum(epoch.seconds for epoch in epochs)),
-        "rounds": float(sum(record.seconds for record in rounds)),
-    }
-    return seconds | {"total": sum(seconds.values())}
+def sum_cost(epochs: Sequence[Any], rounds: Sequence[Any]) -> dict[str, Any]:
+    """Return seconds, processor seconds and steps of a run, as its fields have them."""
+    cost = {}
+    for name, kind in (("seconds", float), ("cpu_seconds", float), ("steps", int)):
+        parts = {"source": epochs, "rounds": rounds}
+        sums = {part: kind(sum(getattr(one, name) for one in of)) for part, of in parts.items()}
+        cost[name] = sums | {"total": sum(sums.values())}
+    return cost

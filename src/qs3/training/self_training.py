@@ -40,7 +40,7 @@ from qs3.training.rounds import (
     write_rounds,
 )
 from qs3.training.rules import Select, make_rule, round_threshold
-from qs3.training.run import Run, RunSettings, claim_run, data_record, sum_seconds, write_run
+from qs3.training.run import Run, RunSettings, claim_run, data_record, sum_cost, write_run
 from qs3.training.state import CHECKPOINT
 from qs3.training.teacher import ask_teacher
 from qs3.training.threads import choose_threads, threads
@@ -136,7 +136,7 @@ def self_train(
             threads=claimed.threads,
             unknown_warm_up=True,
             rounds=tuple(asdict(record) for record in records),
-            seconds=sum_seconds([], records),
+            **sum_cost([], records),
             folder=run_dir,
         )
         write_run(run)
@@ -153,7 +153,7 @@ def run_rounds(model: PointClassifier, task: Task) -> tuple[PointClassifier, lis
     if task.history is not None:
         task.history.put("round", state.records)
     for number in range(len(state.records) + 1, rounds.rounds + 1):
-        start, pool = time.perf_counter(), state.pool
+        start, cpu_start, pool = time.perf_counter(), time.process_time(), state.pool
         # Line 3: label the target.
         said = ask_teacher(state, task)
         labels = said.target.argmax(axis=1)
@@ -191,6 +191,8 @@ def run_rounds(model: PointClassifier, task: Task) -> tuple[PointClassifier, lis
             accuracies=tuple(epoch.accuracy for epoch in epochs),
             learning_rates=tuple(epoch.learning_rate for epoch in epochs),
             temperature=said.temperature,
+            cpu_seconds=time.process_time() - cpu_start,
+            steps=sum(epoch.steps for epoch in epochs),
         )
         state.labels = labels
         state.kept.append(np.stack([chosen, labels[chosen]]))

@@ -4,7 +4,7 @@ Paper: main table of adaptation methods of QS³ (ECCV 2022), whose figures stand
 """
 
 from qs3.experiments.experiment import Experiment, lines, tasks
-from qs3.experiments.runs import SUPERVISED
+from qs3.experiments.runs import PAPER, SUPERVISED
 
 _ROWS = (
     SUPERVISED,
@@ -15,6 +15,8 @@ _ROWS = (
     "gast",
     "gast-spst",
     "qbst",
+    PAPER,
+    "qbst-gentle",
     # The paper's table lacks these.
     "dann",
     "mmd",
@@ -25,13 +27,16 @@ _ROWS = (
 _PAIRS = (
     ("S over M on D", "S-D", "M-D"),
     ("S over M on R", "S-R", "M-R"),
+    ("S over M on U", "S-U", "M-U"),
     *((f"QBST over {row}", "qbst", row) for row in _ROWS if row not in (SUPERVISED, "qbst")),
 )
 
 EXPERIMENT = Experiment(
     title="Adaptation bench",
     rows=lambda scale: lines({row: row for row in _ROWS}),
-    columns=lambda scale: tasks(("M", "D"), ("S", "D"), ("M", "R"), ("S", "R")),
+    columns=lambda scale: tasks(
+        ("M", "D"), ("S", "D"), ("M", "R"), ("S", "R"), ("M", "U"), ("S", "U")
+    ),
     published="methods",
     pairs=lambda scale: _PAIRS,
     corner="method",

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool, Int
 
 from qs3.errors import InputError
 from qs3.files import sha256
@@ -10,18 +11,38 @@ from qs3.io.guards import check_announced, load_npy, open_zip, read_member
 from qs3.io.layouts.format import SPLITS, Format
 from qs3.io.ragged import RaggedClouds
 
+_PER_CLOUD = ("label", "is_train", "name", "strict", "frame")
+
+
+def frame_parts(
+    frame: Int[np.ndarray, "b"], strict: Bool[np.ndarray, "b"]
+) -> dict[str, Bool[np.ndarray, "b"]]:
+    """Cut the ``strict`` objects of filmed rooms in two, so that hardly a room is on both sides.
+
+    Returns:
+        ``strict-dev``, of the first 70 % of the frames in the order of filming, ``strict-check``.
+
+    Example:
+        >>> parts = frame_parts(np.array([0, 1, 1, 7]), np.array([True, True, False, True]))
+        >>> {name: np.flatnonzero(rows).tolist() for name, rows in parts.items()}
+        {'strict-dev': [0, 1], 'strict-check': [3]}
+    """
+    frames = np.unique(frame)
+    early = frame < frames[int(0.7 * len(frames))]
+    return {"strict-dev": strict & early, "strict-check": strict & ~early}
+
 
 def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
     """Read an archive of clouds.
 
     Arrays: ``points`` of shape [b n 3], or [m 3] with ``offset`` [b + 1] such that cloud i is
     ``points[offset[i]:offset[i + 1]]``; optional ``label`` [b] with ``class_names`` [k];
-    ``is_train`` [b] where a split is asked for; ``name`` [b] where there are names. Nothing
-    pickled is loaded.
+    ``is_train`` [b], or ``strict`` and ``frame`` [b], where a split is asked for; ``name`` [b]
+    where there are names. Nothing pickled is loaded.
 
     Args:
         path: The file.
-        split: ``train`` or ``test`` by ``is_train``; None takes all.
+        split: ``train`` or ``test`` by ``is_train``; a part of `frame_parts`; None takes all.
 
     Raises:
         InputError: where the file is missing, damaged, announces more than it can hold, or holds
@@ -32,7 +53,7 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
     try:
         clouds = _clouds(arrays)
         count = len(clouds)
-        for name in ("label", "is_train", "name"):
+        for name in _PER_CLOUD:
             if name in arrays and arrays[name].shape != (count,):
                 raise InputError(f"{name} has shape {arrays[name].shape} for {count} clouds")
         labels, names = _labels(arrays)
@@ -56,7 +77,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     arrays, whole = {}, 0
     try:
         with open_zip(path) as archive:
-            for name in ("points", "offset", "label", "class_names", "is_train", "name"):
+            for name in ("points", "offset", "class_names", *_PER_CLOUD):
                 content = read_member(archive, f"{name}.npy")
                 if content is not None:
                     whole += len(content)
@@ -110,11 +131,15 @@ def _labels(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, tuple[str
 def _rows(arrays: dict[str, np.ndarray], split: str | None, count: int) -> list[int]:
     if split is None:
         return list(range(count))
-    train = arrays.get("is_train")
-    if train is None or split not in SPLITS:
-        parts = "no split" if train is None else "train and test"
-        raise InputError(f"has no split {split!r}; it has {parts}")
-    rows = np.flatnonzero(train.astype(bool) == (split == "train"))
+    parts: dict[str, np.ndarray] = {}
+    if "is_train" in arrays:
+        train = arrays["is_train"].astype(bool)
+        parts = dict(zip(SPLITS, (train, ~train), strict=True))
+    if {"frame", "strict"} <= arrays.keys() and arrays["frame"].dtype.kind in "iu":
+        parts |= frame_parts(arrays["frame"], arrays["strict"].astype(bool))
+    if split not in parts:
+        raise InputError(f"has no split {split!r}; it has {' and '.join(parts) or 'no split'}")
+    rows = np.flatnonzero(parts[split])
     if not len(rows):
         raise InputError(f"split {split!r} is empty")
     return rows.tolist()
