@@ -22,6 +22,8 @@ CELLS = SIDE**3
 """Number of cells."""
 _VARIANCE = 0.001
 """Variance along each axis of the Gaussian that points collapse to."""
+_IN_CELL, _IN_BALL, _RADIUS = 40, 20, 0.5
+"""Points that a cell and a ball should have, and the radius of a ball."""
 _SEEDS = 32
 """Seeds whose neighbours are counted at a time."""
 _FLOOR = 0.05
@@ -95,15 +97,10 @@ def deform_cells(
     return _scatter(points, moved, cell_centres().to(points)[chosen, None], generator)
 
 
-def deform_voxels(
-    points: Float[Tensor, "b n 3"], generator: torch.Generator, least: int = 40
-) -> Deformed:
+def deform_voxels(points: Float[Tensor, "b n 3"], generator: torch.Generator) -> Deformed:
     """Collapse the points of a random cell to its centre: volume-based, as released ("voxels").
 
-    Args:
-        points: Clouds.
-        generator: Source of the draws.
-        least: Points that a cell should have; see `pick_cells`.
+    The cell should have 40 points; see `pick_cells`.
 
     Example:
         >>> clouds = torch.rand(2, 64, 3) * 2 - 1
@@ -111,23 +108,14 @@ def deform_voxels(
         >>> torch.equal(points[~moved], clouds[~moved])
         True
     """
-    return deform_cells(points, pick_cells(points, least, generator), generator)
+    return deform_cells(points, pick_cells(points, _IN_CELL, generator), generator)
 
 
-def deform_radius(
-    points: Float[Tensor, "b n 3"],
-    generator: torch.Generator,
-    radius: float = 0.5,
-    least: int = 20,
-) -> Deformed:
+def deform_radius(points: Float[Tensor, "b n 3"], generator: torch.Generator) -> Deformed:
     """Collapse a ball around a random point to that point: volume-based, as released ("radius").
 
-    Args:
-        points: Clouds.
-        generator: Source of the draws.
-        radius: Of the ball.
-        least: Points that the ball should have, the seed among them. Where none has so many, the
-            seed is the first of those with most points, in a random order.
+    The ball, of radius 0.5, should have 20 points, the seed among them. Where none has so many, the
+    seed is the first of those with most points, in a random order.
     """
     b, n, _ = points.shape
     order = torch.rand((b, n), generator=generator).argsort(dim=1).to(points.device)
@@ -135,17 +123,17 @@ def deform_radius(
     seed = order[:, 0]
     for start in range(0, n, _SEEDS):
         candidates = order[:, start : start + _SEEDS]
-        near = _within(gather_points(points, candidates), points, radius)
-        counts = near.sum(dim=2).clamp_max(least)
+        near = _within(gather_points(points, candidates), points)
+        counts = near.sum(dim=2).clamp_max(_IN_BALL)
         place = torch.arange(counts.shape[1], device=points.device)
         first = (counts * _SEEDS - place).argmax(dim=1, keepdim=True)
         count = counts.gather(1, first)[:, 0]
         seed = torch.where(count > best, candidates.gather(1, first)[:, 0], seed)
         best = torch.maximum(best, count)
-        if bool((best >= least).all()):
+        if bool((best >= _IN_BALL).all()):
             break
     centre = gather_points(points, seed[:, None])
-    return _scatter(points, _within(centre, points, radius)[:, 0], centre, generator)
+    return _scatter(points, _within(centre, points)[:, 0], centre, generator)
 
 
 def deform_features(
@@ -239,12 +227,12 @@ def _directions(points: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def _within(
-    centres: Float[Tensor, "b s 3"], points: Float[Tensor, "b n 3"], radius: float
+    centres: Float[Tensor, "b s 3"], points: Float[Tensor, "b n 3"]
 ) -> Bool[Tensor, "b s n"]:
     squared = torch.zeros((), dtype=points.dtype, device=points.device)
     for axis in range(3):
         squared = squared + (centres[:, :, None, axis] - points[:, None, :, axis]).square()
-    return squared <= radius * radius
+    return squared <= _RADIUS * _RADIUS
 
 
 def _scatter(points: Tensor, moved: Tensor, goal: Tensor, generator: torch.Generator) -> Deformed:

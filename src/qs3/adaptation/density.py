@@ -21,7 +21,6 @@ def density_ratio(
     target: Float[np.ndarray, "m c"],
     points: Float[np.ndarray, "v c"],
     strength: float | None = None,
-    seed: int = 0,
 ) -> Float[np.ndarray, "v"]:
     """Return p_target / p_source at points, from a logistic classifier of the domain.
 
@@ -36,7 +35,6 @@ def density_ratio(
             (not of the constant). None chooses it by the log loss on a held-out third of the
             clouds, from strong to weak until the loss rises: wide features separate any two finite
             sets, and ratios without a strong penalty would be 0 or huge.
-        seed: Draws the third.
 
     Raises:
         InputError: where a set is empty or λ is negative.
@@ -58,17 +56,17 @@ def density_ratio(
     both = (both[:, use] - mean[use]) / spread[use]
     is_target = np.repeat([0, 1], [len(source), len(target)])
     if strength is None:
-        strength = _choose(both, is_target, seed)
+        strength = _choose(both, is_target)
     classifier = _fit(both, is_target, strength)
     log_ratio = classifier.decision_function((points[:, use] - mean[use]) / spread[use])
     log_ratio = log_ratio + np.log(len(source) / len(target))
     return np.exp(np.clip(log_ratio, -_LARGEST_LOG_RATIO, _LARGEST_LOG_RATIO))
 
 
-def _choose(rows: np.ndarray, is_target: np.ndarray, seed: int) -> float:
+def _choose(rows: np.ndarray, is_target: np.ndarray) -> float:
     """Return the penalty of the least log loss on a held-out third."""
     held_out = np.zeros(len(rows), dtype=bool)
-    held_out[np.random.default_rng(seed).permutation(len(rows))[: len(rows) // 3]] = True
+    held_out[np.random.default_rng(0).permutation(len(rows))[: len(rows) // 3]] = True
     train = (rows[~held_out], is_target[~held_out])
     best, least = _STRENGTHS[0], np.inf
     if len(np.unique(train[1])) == 2 and held_out.any():

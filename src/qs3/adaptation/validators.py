@@ -168,9 +168,7 @@ def dev(
     return -controlled_risk(weights, wrong.astype(np.float64))
 
 
-def class_ami(
-    features: Float[np.ndarray, "m c"], predicted: Int[np.ndarray, "m"], k: int, seed: int = 0
-) -> float:
+def class_ami(features: Float[np.ndarray, "m c"], predicted: Int[np.ndarray, "m"], k: int) -> float:
     """Return the agreement of predicted classes with clusters (Musgrave et al., 2208.07360).
 
     Adjusted mutual information (arithmetic mean) of the predictions and of scikit-learn's k-means
@@ -181,7 +179,6 @@ def class_ami(
         features: Pooled features.
         predicted: Predicted classes.
         k: Number of clusters: the number of classes.
-        seed: Start of k-means.
 
     Raises:
         InputError: where there is no cloud, a value is not finite or k is not at least 1.
@@ -201,7 +198,7 @@ def class_ami(
         return 0.0
     rows = rows - rows.mean(axis=0)
     k = min(k, len(np.unique(rows, axis=0)))
-    means = KMeans(k, n_init=4, random_state=seed)  # pyright: ignore[reportArgumentType]
+    means = KMeans(k, n_init=4, random_state=0)  # pyright: ignore[reportArgumentType]
     clusters = means.fit_predict(rows)
     return float(adjusted_mutual_info_score(clusters, predicted))
 

@@ -124,13 +124,12 @@ def mean_sem(values: Sequence[float]) -> MeanSEM:
     return MeanSEM(mean=float(data.mean()), sem=sem, n=len(data))
 
 
-def wilson_interval(correct: int, total: int, level: float = 0.95) -> tuple[float, float]:
-    """Wilson's score interval of an accuracy: close to the stated cover on small test sets.
+def wilson_interval(correct: int, total: int) -> tuple[float, float]:
+    """Wilson's 95 % score interval of an accuracy: close to the stated cover on small test sets.
 
     Args:
         correct: Number of right answers.
         total: Size of the test set.
-        level: Cover.
 
     Raises:
         ValueError: where ``correct`` is not in 0 to ``total`` or ``total`` is 0.
@@ -143,5 +142,5 @@ def wilson_interval(correct: int, total: int, level: float = 0.95) -> tuple[floa
 
     if not (total > 0 and 0 <= correct <= total):
         raise ValueError(f"{correct} right of {total} is not a score")
-    interval = binomtest(correct, total).proportion_ci(level, method="wilson")
+    interval = binomtest(correct, total).proportion_ci(0.95, method="wilson")
     return float(interval.low), float(interval.high)

@@ -10,6 +10,7 @@ import torch
 from lightning_fabric import Fabric
 
 from qs3.adaptation import Method, create_method, method_class
+from qs3.adaptation.confidence import measure_known
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier, feature_widths
@@ -17,7 +18,7 @@ from qs3.training.checkpoint import derived_seed, load_model, new_model, save_mo
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.history import EpochRecord, History
 from qs3.training.loop import EpochCallback, train
-from qs3.training.predict import describe_known
+from qs3.training.predict import describe
 from qs3.training.prepared import Prepared
 from qs3.training.progress import Deadline
 from qs3.training.rounds import RoundCallback, RoundRecord, Task
@@ -171,9 +172,9 @@ def _follow_rule(model: PointClassifier, stage: str, job: Job) -> None:
 def _save(folder: Path, model: PointClassifier, job: Job, fabric: Fabric) -> None:
     known = None
     if job.holdout is not None:
-        known = describe_known(
-            model, job.holdout, batch_size=job.settings.batch_size, fabric=fabric
-        )
+        size = job.settings.batch_size
+        said = describe(model, job.holdout, batch_size=size, fabric=fabric)
+        known = measure_known(said.logits, job.holdout.labels)
     if fabric.is_global_zero:
         save_model(folder, model, job.source.class_names, job.settings, known=known)
     fabric.barrier()

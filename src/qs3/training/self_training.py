@@ -28,7 +28,7 @@ from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.distributed import make_fabric
 from qs3.training.history import EpochRecord
 from qs3.training.loop import EpochCallback, train
-from qs3.training.overlap import seen_clouds
+from qs3.training.overlap import data_of
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared, as_prepared, label_clouds
 from qs3.training.rounds import (
@@ -40,7 +40,7 @@ from qs3.training.rounds import (
     write_rounds,
 )
 from qs3.training.rules import Select, make_rule, round_threshold
-from qs3.training.run import Run, RunSettings, claim_run, data_record, sum_seconds, write_run
+from qs3.training.run import Run, RunSettings, claim_run, sum_seconds, write_run
 from qs3.training.state import CHECKPOINT
 from qs3.training.teacher import ask_teacher
 from qs3.training.threads import choose_threads, threads
@@ -121,18 +121,11 @@ def self_train(
     with claim_run(run_dir, wanted, choose) as claimed, threads(claimed.threads or 1):
         adapted, records = run_rounds(model, task)
         save_model(run_dir, adapted, source.class_names, settings)
-        source_clouds, source_shapes = seen_clouds(source)
-        target_clouds, target_shapes = seen_clouds(target)
         run = Run(
             method=method,
             selection="last",
             chosen={"stage": ROUND, "number": len(records)},
-            source=data_record(source.clouds),
-            target=data_record(target.clouds),
-            source_clouds=source_clouds,
-            source_shapes=source_shapes,
-            target_clouds=target_clouds,
-            target_shapes=target_shapes,
+            **data_of(source, target, has_seen_target=True),
             threads=claimed.threads,
             unknown_warm_up=True,
             rounds=tuple(asdict(record) for record in records),

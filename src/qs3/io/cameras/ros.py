@@ -17,7 +17,7 @@ from qs3.errors import InputError, MissingExtraError
 from qs3.io.cameras.frames import Camera, DepthFrame
 from qs3.io.extract.depth_images import MILLIMETRE, to_metres
 from qs3.io.extract.intrinsics import Intrinsics, intrinsics_from_matrix, read_intrinsics
-from qs3.io.guards import check_pixels, read_image, read_text, reason
+from qs3.io.guards import check_pixels, naming, read_image, read_text
 from qs3.meshes.announced import memory_limit
 
 IMAGE, PACKED, CAMERA = (
@@ -90,15 +90,8 @@ class _Bag:
 
     def guarded(self, work: Any, *given: Any) -> Any:
         """Do a step; whatever a damaged bag makes the library stumble over is one line."""
-        with memory_limit(self._largest):
-            try:
-                return work(*given)
-            except InputError as error:
-                raise InputError(f"{self.path}: {error}") from error
-            except Exception as error:
-                raise InputError(
-                    f"{self.path}: cannot be read as a ROS bag ({reason(error)})"
-                ) from error
+        with memory_limit(self._largest), naming(self.path, "cannot be read as a ROS bag"):
+            return work(*given)
 
     def messages(self, topic: str) -> Iterator[tuple[float, Any]]:
         """Yield the messages of a topic with the time at which they were recorded, seconds."""

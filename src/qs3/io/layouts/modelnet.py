@@ -30,6 +30,7 @@ from jaxtyping import Float32
 
 from qs3.errors import InputError
 from qs3.files import write_text
+from qs3.io.guards import naming
 from qs3.io.layouts.class_folders import (
     CloudFile,
     choose_split,
@@ -131,11 +132,8 @@ def _sample(root: Path, path: Path) -> Float32[np.ndarray, "n 3"]:
     digest = hashlib.sha256(name.encode(errors="surrogateescape")).digest()
     rng = np.random.default_rng(np.frombuffer(digest, dtype="<u4"))
     mesh = load_mesh(path)
-    try:
-        with np.errstate(over="ignore", invalid="ignore"):
-            points = sample_surface(mesh, POINTS, rng)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+    with naming(path), np.errstate(over="ignore", invalid="ignore"):
+        points = sample_surface(mesh, POINTS, rng)
     if not np.isfinite(points).all():
         raise InputError(f"{path}: its coordinates are too large")
     return points
