@@ -26,7 +26,7 @@ from qs3.training.loop import EpochCallback
 from qs3.training.overlap import data_of
 from qs3.training.prepared import Prepared, prepare_clouds, require_finite
 from qs3.training.progress import Deadline
-from qs3.training.rounds import RoundCallback, RoundRecord
+from qs3.training.rounds import RoundCallback, RoundRecord, Told
 from qs3.training.run import (
     CONFIG,
     MODEL,
@@ -189,14 +189,8 @@ def fit(
             contextlib.closing(history),
             all_devices(settings, partial(run_job, job)) as fabric,
         ):
-            model, epochs, rounds = run_job(
-                job,
-                fabric,
-                history=history,
-                deadline=deadline,
-                on_epoch=on_epoch,
-                on_round=on_round,
-            )
+            told = Told(history, deadline, on_epoch, on_round)
+            model, epochs, rounds = run_job(job, fabric, told)
         adapted = needs or settings.normalisation != "shared"
         adapted = adapted or settings.rule not in ("last", "source-val")
         data = data_of(prepared, prepared_target, adapted)

@@ -36,6 +36,7 @@ from qs3.training.rounds import (
     RoundRecord,
     Rounds,
     Task,
+    Told,
     begin_rounds,
     write_rounds,
 )
@@ -100,16 +101,15 @@ def self_train(
     fabric = fabric or make_fabric(settings)
     run_dir = None if run_dir is None else Path(run_dir)
     task = Task(
-        source,
-        target,
-        settings,
-        self_training,
-        fabric,
+        source=source,
+        target=target,
+        settings=settings,
+        rounds=self_training,
+        fabric=fabric,
         holdout=holdout,
         select=select,
         run_dir=run_dir,
-        on_round=on_round,
-        on_epoch=on_epoch,
+        told=Told(on_epoch=on_epoch, on_round=on_round),
     )
     choose = partial(choose_threads, settings, step=None)
     if run_dir is None:
@@ -143,8 +143,8 @@ def run_rounds(model: PointClassifier, task: Task) -> tuple[PointClassifier, lis
         raise InputError("the target has no cloud; give unlabelled clouds")
     state = begin_rounds(model, task)
     classes = len(source.class_names)
-    if task.history is not None:
-        task.history.put("round", state.records)
+    if task.told.history is not None:
+        task.told.history.put("round", state.records)
     for number in range(len(state.records) + 1, rounds.rounds + 1):
         start, pool = time.perf_counter(), state.pool
         # Line 3: label the target.
@@ -201,10 +201,10 @@ def _finish_round(state: Rounds, task: Task) -> None:
         write_rounds(task, state)
         (task.run_dir / CHECKPOINT).unlink(missing_ok=True)
     task.fabric.barrier()
-    if task.history is not None:
-        task.history.put("round", state.records)
-    if task.on_round is not None:
-        task.on_round(record, state.latest)
+    if task.told.history is not None:
+        task.told.history.put("round", state.records)
+    if task.told.on_round is not None:
+        task.told.on_round(record, state.latest)
 
 
 def _too_few(number: int, count: int, classes: int, devices: int) -> bool:
@@ -282,9 +282,9 @@ def _train_round(
         optimiser_state=state.optimiser if continuous else None,
         observer=teach,
         beside=None if rounds.teacher == "latest" else teacher,
-        on_epoch=task.on_epoch,
-        log=None if task.history is None else task.history.training(f"round-{number}"),
-        deadline=task.deadline,
+        on_epoch=task.told.on_epoch,
+        log=task.told.log(f"round-{number}"),
+        deadline=task.told.deadline,
         description=f"round {number}/{rounds.rounds}",
     )
     method.norm.settle()

@@ -180,6 +180,7 @@ def _in_metres(frame: DepthFrame) -> DepthFrame:
 
 
 def test_convention_ros_rows_are_padded_big_endian_and_rectified(tmp_path, caplog):
+    say_once.cache_clear()
     shots = list(frames(1, 64, 48))
     path = write_ros1(tmp_path / "bag", shots, "16UC1", "ros1", big=True, padding=6)
     same(read(f"rosbag:{path}")[0], shots[0], colour=False)

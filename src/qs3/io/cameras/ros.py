@@ -3,7 +3,6 @@
 Messages are read as the standard types; definitions that a bag brings along are not looked at.
 """
 
-import logging
 import re
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped
 
-from qs3.errors import InputError, MissingExtraError
+from qs3.errors import InputError, MissingExtraError, say_once
 from qs3.io.cameras.frames import Camera, DepthFrame
 from qs3.io.extract.depth_images import MILLIMETRE, to_metres
 from qs3.io.extract.intrinsics import Intrinsics, intrinsics_from_matrix, read_intrinsics
@@ -26,7 +25,6 @@ IMAGE, PACKED, CAMERA = (
 _KINDS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _PACKED = re.compile(r"16UC1;\s*compressedDepth(\s+png)?")
 _HEADER = 12  # bytes before the PNG of compressedDepth
-_LOG = logging.getLogger(__name__)
 
 
 def ros_camera(path: Path, topic: str = "", intrinsics: str = "") -> Camera:
@@ -122,7 +120,7 @@ def _intrinsics(info: Any, topic: str) -> Intrinsics:
     if "rect" in topic:  # those pixels are of P, without distortion
         matrix = np.reshape(fields["p"], (3, 4))[:, :3]
     elif lens.any():
-        _LOG.warning("%s: its images have lens distortion, which is not undone", topic)
+        say_once(f"{topic}: its images have lens distortion, which is not undone")
     return intrinsics_from_matrix(matrix.astype(np.float64))
 
 
