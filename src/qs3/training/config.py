@@ -287,10 +287,11 @@ class SelfTrainingSettings:
         _check(self, "teacher", good, "has no sense over weights that start anew; set init warm-up")
         _check_word(self, "rule", RoundRule)
         _check_word(self, "prior", Prior)
+        defaults = {field.name: field.default for field in fields(self)}
         for (reader, words), names in _READ_BY.items():
             reads = getattr(self, reader) in words
             for name in names:
-                if not reads and getattr(self, name) != _default(type(self), name):
+                if not reads and getattr(self, name) != defaults[name]:
                     raise InputError(
                         f"setting {name} = {getattr(self, name)} is not read by {reader} "
                         f"{getattr(self, reader)}, only by {', '.join(map(str, words))}; leave it "
@@ -313,10 +314,6 @@ _READ_BY: Mapping[tuple[str, tuple[Any, ...]], tuple[str, ...]] = {
     ("teacher", ("average",)): ("teacher_decay",),
 }
 """Settings that are looked at only where another one has some value."""
-
-
-def _default(kind: type, name: str) -> Any:
-    return next(field.default for field in fields(kind) if field.name == name)
 
 
 _RANGES: Mapping[str, Callable[[float], bool]] = {

@@ -106,7 +106,8 @@ def describe(
     context = nullcontext if fabric is None else fabric.autocast
     training = model.training
     model.eval()
-    mine = _part(len(points), fabric)
+    rank, world = (0, 1) if fabric is None else (fabric.global_rank, fabric.world_size)
+    mine = slice(rank * len(points) // world, (rank + 1) * len(points) // world)
     answers: list[np.ndarray] = []
     try:
         # A lone point tells the widths where this device has no cloud.
@@ -129,9 +130,3 @@ def describe(
 
         rows = gather_rows(rows, mine, len(points), fabric)
     return Description(*np.split(rows, [classes, classes + width], axis=1))
-
-
-def _part(count: int, fabric: "Fabric | None") -> slice:
-    """This device's part of the clouds."""
-    rank, world = (0, 1) if fabric is None else (fabric.global_rank, fabric.world_size)
-    return slice(rank * count // world, (rank + 1) * count // world)

@@ -61,12 +61,6 @@ def scatter_points(
     return _Scatter.apply(values, index, n)
 
 
-def _take(values: Tensor, index: Tensor) -> Tensor:
-    b, n, c = values.shape
-    flat = flat_indices(index.reshape(b, -1, 1), n).view(-1)
-    return values.reshape(b * n, c).index_select(0, flat).view(*index.shape, c)
-
-
 def _sum_into(values: Tensor, index: Tensor, n: int) -> Tensor:
     b, c = len(values), values.shape[-1]
     flat = flat_indices(index.reshape(b, -1, 1), n).view(-1)
@@ -82,8 +76,9 @@ class _Gather(torch.autograd.Function):
     @staticmethod
     def forward(ctx, values: Tensor, index: Tensor) -> Tensor:
         ctx.save_for_backward(index)
-        ctx.n = values.shape[1]
-        return _take(values, index)
+        b, ctx.n, c = values.shape
+        flat = flat_indices(index.reshape(b, -1, 1), ctx.n).view(-1)
+        return values.reshape(-1, c).index_select(0, flat).view(*index.shape, c)
 
     @staticmethod
     def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
