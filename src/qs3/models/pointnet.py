@@ -40,7 +40,8 @@ def linear_max(
 
 def _blocks(points: Tensor, width: int) -> Iterator[tuple[slice, slice]]:
     """Cut [b n] into blocks whose products fit the cache (CPU) or 256 MiB (GPU)."""
-    return blocks(*points.shape[:2], width, 2**26 if points.is_cuda else 2**20)
+    b, n, _ = points.shape
+    return blocks(b, n, width, 2**26 if points.is_cuda else 2**20)
 
 
 def _product(points: Float[Tensor, "b n c"], weight: Float[Tensor, "d c"]) -> Tensor:
