@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from qs3.errors import InputError, MissingExtraError
+from qs3.errors import InputError, MissingExtraError, say_once
 from qs3.io.cameras.folder import capture
 from qs3.io.cameras.frames import CaptureSettings, DepthFrame, open_camera
 from qs3.io.extract.depth import DepthImageSettings, extract_depth
