@@ -19,6 +19,7 @@ from typing import get_args
 
 import torch
 
+from qs3.adaptation.confidence import measure_known
 from qs3.evaluation.records import RunRecord, find_records
 from qs3.files import write_json, write_text
 from qs3.io import load_clouds
@@ -29,7 +30,7 @@ from qs3.training.batches import count_batches
 from qs3.training.checkpoint import LoadedModel, load_model, read_facts, save_model
 from qs3.training.config import Augmentation, TrainSettings
 from qs3.training.export import compare
-from qs3.training.predict import describe_known, predict_probabilities
+from qs3.training.predict import describe, predict_probabilities
 from qs3.training.prepared import prepare_clouds
 from qs3.training.run import MODEL, SETTINGS, Run, fingerprint, read_run, train_settings, write_run
 from qs3.training.validation import held_out
@@ -67,7 +68,7 @@ def ship(
             raise SystemExit(f"{place}: was not trained on this source")
         rows = held_out(data, settings)
         held = prepare_clouds(data.select(rows), settings.num_points, settings.preparation)
-        known = describe_known(copy.deepcopy(half).float(), held)
+        known = measure_known(describe(copy.deepcopy(half).float(), held).logits, held.labels)
     out.mkdir(parents=True, exist_ok=True)
     save_model(out, half, loaded.class_names, settings, known=known, facts=facts)
     write_json(out / SETTINGS, loaded.settings)

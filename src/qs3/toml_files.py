@@ -14,6 +14,7 @@ from typing import Any
 
 from qs3.errors import InputError
 
+_LARGEST = 1 << 20
 _WIDTH = 96
 
 
@@ -21,16 +22,18 @@ def read_toml(path: Path, hint: str = "name a TOML file") -> dict[str, Any]:
     """Read a TOML file whose numbers are finite.
 
     Raises:
-        InputError: where it cannot be read or is no TOML; ``hint`` ends what is told of a missing
-            one.
+        InputError: where it cannot be read, is no TOML or longer than a MiB; ``hint`` ends the
+            message.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; {hint}")
+    if (size := path.stat().st_size) > _LARGEST:
+        raise InputError(f"{path}: {size} bytes, too long for a TOML file; {hint}")
     try:
         return tomllib.loads(path.read_text(encoding="utf-8-sig"), parse_float=_finite)
-    except (ValueError, RecursionError) as error:  # broken TOML, or not UTF-8
+    except (OSError, ValueError, RecursionError) as error:  # broken TOML, or not UTF-8
         reason = " ".join(str(error).split())
-        raise InputError(f"{path}: not a TOML file: {reason}") from None
+        raise InputError(f"{path}: not a TOML file: {reason}; {hint}") from None
 
 
 def _finite(text: str) -> float:

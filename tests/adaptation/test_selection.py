@@ -85,11 +85,6 @@ def test_counts_are_exact(total, members):
     assert balanced_count(members, total) == ceil(members * (1 - Fraction(members, total)))
 
 
-def test_the_floating_point_form_would_be_wrong():
-    assert balanced_count(9, 27) == 6
-    assert ceil(9 * (1 - 9 / 27)) == 7
-
-
 def one_class(m=5):
     confidence = np.linspace(0.85, 0.95, m)
     return np.stack([1 - confidence, confidence], axis=1)

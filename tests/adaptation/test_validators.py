@@ -289,10 +289,6 @@ def test_refusals():
         class_ami(np.ones((2, 3)), np.arange(2), 0)
 
 
-def test_zeros_have_no_entropy():
-    assert entropy(np.array([[1.0, 0.0, 0.0]])) == 0.0
-
-
 def test_snd_in_blocks(monkeypatch):
     features = np.random.default_rng(1).normal(size=(50, 6))
     whole = snd(features)

@@ -1,6 +1,8 @@
 """Damaged and hostile files: whatever is done to them, they are read or refused in one line."""
 
 import contextlib
+import struct
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -60,3 +62,15 @@ def fuzz(
             count += 1
         path.write_bytes(content)
     assert count > rounds / 20
+
+
+def png_bytes(width, height, bits=16, colour=0, data=b"\0" * 32):
+    """A PNG whose header may announce anything."""
+
+    def chunk(name, body):
+        check = struct.pack(">I", zlib.crc32(name + body))
+        return struct.pack(">I", len(body)) + name + body + check
+
+    header = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)
+    parts = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(data)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + parts

@@ -7,6 +7,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -121,6 +122,15 @@ def textbook_of(name: str, model: Any, points: Tensor) -> tuple[Any, Callable[[T
         images = depth_images(points, model.resolution, model.projection).double()
         return slow, lambda given: slow(given, images)
     return slow, slow
+
+
+def normed(layer, rows):
+    """Batch normalisation in NumPy, by a layer's own mode."""
+    mean, variance = layer.running_mean.numpy(), layer.running_var.numpy()
+    if layer.training:
+        mean, variance = rows.mean(axis=0), rows.var(axis=0)
+    weight, bias = layer.weight.detach().numpy(), layer.bias.detach().numpy()
+    return (rows - mean) / np.sqrt(variance + layer.eps) * weight + bias
 
 
 def error(value: Tensor, reference: Tensor) -> float:

@@ -7,13 +7,7 @@ from torch import nn
 
 from qs3.models.pointmlp import PointMLPElite, Stage
 
-
-def normed(layer, rows):
-    mean, variance = layer.running_mean.numpy(), layer.running_var.numpy()
-    if layer.training:
-        mean, variance = rows.mean(axis=0), rows.var(axis=0)
-    weight, bias = layer.weight.detach().numpy(), layer.bias.detach().numpy()
-    return (rows - mean) / np.sqrt(variance + layer.eps) * weight + bias
+from .common import normed
 
 
 def linear(layer, rows):

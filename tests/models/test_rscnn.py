@@ -6,7 +6,7 @@ import torch
 
 from qs3.models.rscnn import RSCNN
 
-from .common import randomise
+from .common import normed, randomise
 
 SMALL = {
     "centres": (12, 5),
@@ -30,16 +30,6 @@ def make(**settings):
 def clouds(b=4, n=40):
     points = torch.randn(b, n, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     return points * 0.6
-
-
-def normed(layer, rows):
-    mean, variance = layer.running_mean, layer.running_var
-    if layer.training:
-        mean, variance = rows.mean(axis=0), rows.var(axis=0)
-    else:
-        mean, variance = mean.numpy(), variance.numpy()
-    weight, bias = layer.weight.detach().numpy(), layer.bias.detach().numpy()
-    return (rows - mean) / np.sqrt(variance + layer.eps) * weight + bias
 
 
 def edge_by_edge(layer, points, features, samples, neighbours, relative):

@@ -120,22 +120,15 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         store: dict = {}  # noqa: RUF012
         pseudo_dirs = [""]  # noqa: RUF012
 
-        def cat_file(self, *arguments, **how):
+    def failing_now(plain):
+        def question(*arguments, **how):
             asked()
-            return super().cat_file(*arguments, **how)
+            return plain(*arguments, **how)
 
-        def pipe_file(self, *arguments, **how):
-            asked()
-            return super().pipe_file(*arguments, **how)
+        return question
 
-        def ls(self, *arguments, **how):
-            asked()
-            return super().ls(*arguments, **how)
-
-        def info(self, *arguments, **how):
-            asked()
-            return super().info(*arguments, **how)
-
+    for name in ("cat_file", "pipe_file", "ls", "info"):
+        setattr(Failing, name, failing_now(getattr(MemoryFileSystem, name)))
     fsspec.register_implementation("failing", Failing, clobber=True)
     _file_system.cache_clear()
     monkeypatch.setattr("qs3.store.folder._PAUSES", (0.0, 0.0))

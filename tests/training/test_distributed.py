@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from qs3.adaptation import SourceOnly
-from qs3.errors import InputError, QS3Error
+from qs3.errors import InputError, QS3Error, say_once
 from qs3.training import SelfTrainingSettings, fit, load_model
 from qs3.training import distributed as module
 from qs3.training.batches import DeviceClouds, Share, make_batch
@@ -23,14 +23,7 @@ from qs3.training.distributed import all_devices, gather_rows, has_bf16_units, m
 from qs3.training.prepared import prepare_clouds
 from qs3.training.state import CHECKPOINT
 
-
-class Stop(Exception):  # noqa: N818
-    """Ends a run from a callback, as a kill would."""
-
-
-def same(a, b):
-    a, b = a.state_dict(), b.state_dict()
-    return all(torch.equal(a[name], b[name]) for name in a)
+from .common import Stop, same
 
 
 @pytest.fixture
@@ -160,7 +153,7 @@ def test_a_number_format_that_a_cpu_lacks_is_refused(settings):
 
 def test_slow_bf16_is_told_once(settings, monkeypatch, caplog):
     monkeypatch.setattr(module, "has_bf16_units", lambda: False)
-    module._warn_of_slow_bf16.cache_clear()
+    say_once.cache_clear()
     for _ in range(2):
         make_fabric(replace(settings, precision="bf16-mixed"))
     make_fabric(settings)

@@ -17,12 +17,9 @@ from qs3.training import (
 from qs3.training.checkpoint import new_model, read_tensors, write_tensors
 from qs3.training.run import MODEL, fingerprint, read_run
 
+from .common import same
+
 ROUNDS = SelfTrainingSettings(rounds=1, epochs=1, threshold=0.4)
-
-
-def same(a, b):
-    a, b = a.state_dict(), b.state_dict()
-    return all(torch.equal(a[name], b[name]) for name in a)
 
 
 def test_source_only(source, settings, tmp_path):
@@ -110,15 +107,8 @@ def test_warm_up_must_fit(source, target, settings, tmp_path):
         ]
     ):
         with pytest.raises(InputError, match=message):
-            fit(
-                "qbst",
-                clouds,
-                unlabelled,
-                changed,
-                ROUNDS,
-                run_dir=tmp_path / str(case),
-                warm_up=tmp_path / "warm",
-            )
+            given = ("qbst", clouds, unlabelled, changed, ROUNDS)
+            fit(*given, run_dir=tmp_path / str(case), warm_up=tmp_path / "warm")
     with pytest.raises(InputError, match=r"no model\.safetensors"):
         load_model(tmp_path / "0")
 
@@ -128,16 +118,9 @@ def test_given_warm_up_is_the_trained_one(source, target, settings, tmp_path):
     unlabelled = target.without_labels()
     settings = replace(settings, epochs=20)
     fit("source-only", source, None, settings, run_dir=tmp_path / "warm")
-    handed = fit(
-        "qbst",
-        source,
-        unlabelled,
-        settings,
-        ROUNDS,
-        run_dir=tmp_path / "a",
-        warm_up=tmp_path / "warm",
-    )
-    trained = fit("qbst", source, unlabelled, settings, ROUNDS, run_dir=tmp_path / "b")
+    given = ("qbst", source, unlabelled, settings, ROUNDS)
+    handed = fit(*given, run_dir=tmp_path / "a", warm_up=tmp_path / "warm")
+    trained = fit(*given, run_dir=tmp_path / "b")
     assert same(handed.model, trained.model)
     assert same(load_model(tmp_path / "b" / "warm-up").model, load_model(tmp_path / "warm").model)
     steps = [read_run(tmp_path / name).steps for name in ("warm", "a", "b")]

@@ -15,28 +15,13 @@ from qs3.training.prepared import prepare_clouds
 from qs3.training.schedules import cosine
 from qs3.training.state import CHECKPOINT
 
-
-class Stop(Exception):  # noqa: N818
-    """Ends a training from a callback, as a kill would."""
-
-
-def stop_after(epoch):
-    def callback(record, method):
-        if record.epoch == epoch:
-            raise Stop
-
-    return callback
+from .common import Stop, same, stop_after
 
 
 def run(source, settings, seed=0, **arguments):
     method = SourceOnly(new_model(settings, 3, seed))
     history, _ = train(method, source, None, settings, **arguments)
     return method.model, history
-
-
-def same(a, b):
-    a, b = a.state_dict(), b.state_dict()
-    return all(torch.equal(a[name], b[name]) for name in a)
 
 
 def losses_of(history):

@@ -29,18 +29,7 @@ from qs3.training import (
 from qs3.training.checkpoint import new_model
 from qs3.training.loop import train
 
-
-class Stop(Exception):  # noqa: N818
-    """Ends a run from a callback, as a kill would."""
-
-
-def same(a, b):
-    a, b = a.state_dict(), b.state_dict()
-    return all(torch.equal(a[name], b[name]) for name in a)
-
-
-def history_of(run_dir):
-    return [json.loads(line) for line in (run_dir / history.HISTORY).read_text().splitlines()]
+from .common import Stop, history_of, same, stop_after
 
 
 @pytest.mark.parametrize("norm", [1e-3, 1e6])
@@ -227,12 +216,8 @@ def test_tensorboard_shows_each_epoch_once(source, target, settings, tmp_path):
     rounds = SelfTrainingSettings(rounds=1, epochs=2, threshold=0.34)
     arguments = ("qbst", source, target.without_labels(), replace(settings, epochs=12), rounds)
 
-    def stop(record, method):
-        if record.epoch == 2:
-            raise Stop
-
     with pytest.raises(Stop):
-        fit(*arguments, run_dir=tmp_path, tracker="tensorboard", on_epoch=stop)
+        fit(*arguments, run_dir=tmp_path, tracker="tensorboard", on_epoch=stop_after(2))
     result = fit(*arguments, run_dir=tmp_path, tracker="tensorboard")
     shown = reader.EventAccumulator(str(tmp_path / "tensorboard" / "warm-up")).Reload()
     assert set(shown.Tags()["scalars"]) == {

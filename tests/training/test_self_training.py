@@ -1,6 +1,6 @@
+import contextlib
 import copy
 import dataclasses
-import json
 import logging
 from dataclasses import replace
 
@@ -32,6 +32,8 @@ from qs3.training.prepared import prepare_clouds
 from qs3.training.rounds import STATE, kept_clouds, remarks
 from qs3.training.self_training import self_train
 
+from .common import Stop, history_of, same
+
 WIDE = {
     "preparation": replace(ROBUST, size_input=True, align=True),
     "augmentation": Augmentation.scanned(),
@@ -56,15 +58,6 @@ SWITCHES = SelfTrainingSettings(
 """All that is off by default."""
 
 
-class Stop(Exception):  # noqa: N818
-    """Ends a run from a callback, as a kill would."""
-
-
-def same(a, b):
-    a, b = a.state_dict(), b.state_dict()
-    return all(torch.equal(a[name], b[name]) for name in a)
-
-
 def plain(records):
     """Records without what a clock tells."""
     return [{**dataclasses.asdict(record), "seconds": 0, "cpu_seconds": 0} for record in records]
@@ -86,16 +79,14 @@ def domains(source, target, settings):
     return ready(source), ready(target.without_labels())
 
 
-def test_improves_or_keeps_an_easy_target(source, target, settings, warm, tmp_path):
-    result = fit(
-        "qbst",
-        source,
-        target.without_labels(),
-        settings,
-        ROUNDS,
-        run_dir=tmp_path / "run",
-        warm_up=warm,
-    )
+@pytest.fixture
+def given(source, target, settings):
+    """What is adapted, and how, but for the rounds."""
+    return "qbst", source, target.without_labels(), settings
+
+
+def test_improves_or_keeps_an_easy_target(given, target, warm, tmp_path):
+    result = fit(*given, ROUNDS, run_dir=tmp_path / "run", warm_up=warm)
     predictions = predict_probabilities(result.model, target.points).argmax(axis=1)
     assert (predictions == target.labels).mean() >= 0.9
     assert [record.round for record in result.rounds] == [1, 2, 3]
@@ -120,18 +111,10 @@ def test_labels_of_the_target_cannot_matter(source, target, settings, warm, tmp_
     poisoned = replace(target, labels=(target.labels + 1) % 3)
     if way == "robust":
         settings, warm = replace(settings, **WIDE), None
-    runs = [
-        fit(
-            "qbst",
-            source,
-            clouds.without_labels(),
-            settings,
-            ROUNDS,
-            run_dir=tmp_path / name,
-            warm_up=warm,
-        )
-        for name, clouds in {"true": target, "poisoned": poisoned}.items()
-    ]
+    runs = []
+    for name, clouds in {"true": target, "poisoned": poisoned}.items():
+        given = ("qbst", source, clouds.without_labels(), settings, ROUNDS)
+        runs.append(fit(*given, run_dir=tmp_path / name, warm_up=warm))
     assert same(runs[0].model, runs[1].model)
     assert not hasattr(runs[0].target.clouds, "labels")
 
@@ -193,36 +176,25 @@ def test_resumed_is_uninterrupted(source, target, settings, tmp_path, preset, wh
     assert done + len(redone) == 12 + 8 * trained  # nothing is done twice
 
 
-def test_a_finished_run_is_not_done_again(source, target, settings, warm, tmp_path):
-    arguments = ("qbst", source, target.without_labels(), settings, ROUNDS)
-    first = fit(*arguments, run_dir=tmp_path / "run", warm_up=warm)
+def test_a_finished_run_is_not_done_again(given, source, warm, tmp_path):
+    where = {"run_dir": tmp_path / "run", "warm_up": warm}
+    first = fit(*given, ROUNDS, **where)
     epochs = []
-    again = fit(
-        *arguments,
-        run_dir=tmp_path / "run",
-        warm_up=warm,
-        on_epoch=lambda r, m: epochs.append(r),
-    )
+    again = fit(*given, ROUNDS, **where, on_epoch=lambda r, m: epochs.append(r))
     assert not epochs
     assert same(first.model, again.model)
     loaded = load_model(tmp_path / "run")
     assert same(loaded.model, first.model)
     assert loaded.class_names == source.class_names
     assert loaded.settings["self_training"]["rounds"] == 3
-    lines = (tmp_path / "run" / "history.jsonl").read_text().splitlines()
-    kinds = [json.loads(line)["kind"] for line in lines]
+    kinds = [line["kind"] for line in history_of(tmp_path / "run")]
     assert sorted(kinds) == ["checkpoint"] * 3 + ["round"] * 3
 
 
-def test_history_keeps_finished_rounds_over_stops(source, target, settings, warm, tmp_path):
+def test_history_keeps_finished_rounds_over_stops(given, warm, tmp_path):
     """Stopped in round 2, and again right after going on: round 1's line stays."""
     run = tmp_path / "run"
     rounds = replace(ROUNDS, rounds=2, epochs=3, threshold=0.34)
-    arguments = ("qbst", source, target.without_labels(), settings, rounds)
-
-    def history_of():
-        return [json.loads(line) for line in (run / "history.jsonl").read_text().splitlines()]
-
     for calls in (4, 1):
         seen = []
 
@@ -232,25 +204,22 @@ def test_history_keeps_finished_rounds_over_stops(source, target, settings, warm
                 raise Stop
 
         with pytest.raises(Stop):
-            fit(*arguments, run_dir=run, warm_up=warm, on_epoch=stop)
-        lines = [line for line in history_of() if line["kind"] != "checkpoint"]
+            fit(*given, rounds, run_dir=run, warm_up=warm, on_epoch=stop)
+        lines = [line for line in history_of(run) if line["kind"] != "checkpoint"]
         kinds = [(line["kind"], line.get("stage", line.get("round"))) for line in lines]
         assert kinds == [("round", 1)] + [("epoch", "round-2")] * (2 if calls == 1 else 1)
         if calls == 4:
             first = seen[:3]
-    done = next(line for line in history_of() if line["kind"] == "round")
+    done = next(line for line in history_of(run) if line["kind"] == "round")
     assert done["accuracies"] == [epoch.accuracy for epoch in first]
     assert done["learning_rates"] == [epoch.learning_rate for epoch in first]
     assert done["losses"] == [epoch.losses for epoch in first]
 
 
 def test_too_few_selected_keeps_the_network(domains, settings, caplog):
-    source, target = domains
     model = new_model(settings, 3, 0)
     with caplog.at_level(logging.WARNING):
-        adapted, records = self_train(
-            model, source, target, settings, replace(ROUNDS, threshold=0.98)
-        )
+        adapted, records = self_train(model, *domains, settings, replace(ROUNDS, threshold=0.98))
     assert same(model, adapted)
     assert adapted is not model
     assert [record.skipped for record in records] == [True] * 3
@@ -259,24 +228,20 @@ def test_too_few_selected_keeps_the_network(domains, settings, caplog):
 
 @pytest.mark.parametrize(("count", "skipped"), [(5, True), (6, False)])
 def test_the_limit_is_two_a_class(domains, settings, count, skipped):
-    source, target = domains
-
-    def first(probabilities, theta):
-        return np.arange(len(probabilities)) < count
-
     model = new_model(settings, 3, 0)
-    rounds = replace(ROUNDS, rounds=1)
-    adapted, records = self_train(model, source, target, settings, rounds, select=first)
+    adapted, records = one_round(
+        domains, settings, lambda p, theta: np.arange(len(p)) < count, model
+    )
     assert records[0].skipped is skipped
     assert same(model, adapted) is skipped
 
 
-def one_round(domains, settings, select=None, model=None, **changes):
-    source, target = domains
+def one_round(domains, settings, select=None, model=None, on_epoch=None, **changes):
+    """One round, or more, on all clouds unless a rule says otherwise."""
     rounds = replace(ROUNDS, **({"rounds": 1} | changes))
     model = model or new_model(settings, 3, 0)
     select = select or (lambda probabilities, theta: np.ones(len(probabilities), dtype=bool))
-    return self_train(model, source, target, settings, rounds, select=select)
+    return self_train(model, *domains, settings, rounds, select=select, on_epoch=on_epoch)
 
 
 def test_source_labels_matter_only_with_a_source_loss(domains, settings):
@@ -361,21 +326,14 @@ def test_pool_shrinks_to_what_was_kept(domains, settings):
 
 
 def test_continuous_schedule_rises_again_in_round_two(domains, settings):
-    source, target = domains
-    rates = {}
-    for schedule in ("per-round", "continuous"):
-        seen = rates.setdefault(schedule, [])
-        self_train(
-            new_model(settings, 3, 0),
-            source,
-            target,
-            settings,
-            replace(ROUNDS, schedule=schedule),
-            select=lambda p, theta: np.ones(len(p), dtype=bool),
-            on_epoch=lambda r, m, seen=seen: seen.append(r.learning_rate / 0.01),
-        )
-    assert rates["per-round"] == pytest.approx([1.0, 0.5] * 3)
-    assert rates["continuous"] == pytest.approx([1.0, 0.5, 0.0, 0.5, 1.0, 0.5])
+    rates = {"per-round": [1.0, 0.5] * 3, "continuous": [1.0, 0.5, 0.0, 0.5, 1.0, 0.5]}
+    for schedule, expected in rates.items():
+        seen = []
+        one_round(
+            domains, settings, on_epoch=lambda r, m, seen=seen: seen.append(r.learning_rate / 0.01),
+            rounds=3, schedule=schedule,
+        )  # fmt: skip
+        assert seen == pytest.approx(expected)
 
 
 def test_best_teacher_holds_a_fifth_out(domains, settings):
@@ -397,14 +355,11 @@ def test_single_class_is_warned_of_and_recorded(domains, settings):
     model = new_model(settings, 3, 0)
     with torch.no_grad():
         model.classify.layers[-1].bias.copy_(torch.tensor([0.0, 9.0, 0.0]))
-    source, target = domains
     for rule, kept in (("keep", 30), ("drop", 0)):
         rounds = replace(ROUNDS, rounds=1, single_class=rule)
-        if rule == "keep":
-            with pytest.warns(SingleClassWarning):
-                _, records = self_train(model, source, target, settings, rounds)
-        else:
-            _, records = self_train(model, source, target, settings, rounds)
+        warned = pytest.warns(SingleClassWarning) if kept else contextlib.nullcontext()
+        with warned:
+            _, records = self_train(model, *domains, settings, rounds)
         assert records[0].single_class
         assert records[0].kept == (0, kept, 0)
 
@@ -468,8 +423,7 @@ def test_the_first_round_by_hand(adapted):
     assert record.kept == tuple(np.bincount(labels, minlength=3))
 
 
-def test_a_quantile_is_a_value(source, target, settings, warm, tmp_path):
-    given = ("qbst", source, target.without_labels(), settings)
+def test_a_quantile_is_a_value(given, warm, tmp_path):
     share = replace(ROUNDS, rounds=1, threshold=0.8, threshold_share=0.6)
     one = fit(*given, share, run_dir=tmp_path / "share", warm_up=warm)
     theta = one.rounds[0].theta
@@ -496,9 +450,9 @@ def test_the_average_follows_the_network_epoch_by_epoch(domains, settings):
         seen.append(probabilities)
         return np.ones(len(probabilities), dtype=bool)
 
-    source, target = domains
-    rounds = replace(ROUNDS, rounds=3, teacher="average", teacher_decay=decay)
-    self_train(model, source, target, settings, rounds, select=select, on_epoch=on_epoch)
+    _, target = domains
+    average_of = {"rounds": 3, "teacher": "average", "teacher_decay": decay}
+    one_round(domains, settings, select, model, on_epoch, **average_of)
     teacher = new_model(settings, 3, 0)
     for number, weights in enumerate((model.state_dict(), averages[1], averages[3])):
         teacher.load_state_dict(weights)
@@ -592,18 +546,10 @@ def test_derived_seeds_differ():
     assert len({derived_seed(*path) for path in paths}) == len(paths)
 
 
-def test_rounds_have_a_learning_rate_of_their_own(source, target, settings, warm, tmp_path):
+def test_rounds_have_a_learning_rate_of_their_own(given, warm, tmp_path):
     """Each round's first epoch starts at it."""
     gentle = replace(ROUNDS, learning_rate=1e-4)
-    result = fit(
-        "qbst",
-        source,
-        target.without_labels(),
-        settings,
-        gentle,
-        run_dir=tmp_path / "run",
-        warm_up=warm,
-    )
+    result = fit(*given, gentle, run_dir=tmp_path / "run", warm_up=warm)
     assert [record.learning_rates[0] for record in result.rounds] == pytest.approx([1e-4] * 3)
     with pytest.raises(InputError, match="learning_rate"):
         replace(ROUNDS, learning_rate=0.0)

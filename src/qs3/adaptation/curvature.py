@@ -9,6 +9,7 @@ from torch import Tensor
 
 from qs3.errors import InputError
 from qs3.models.ops import gather_points, knn
+from qs3.models.ops.gathering import blocks
 
 _BLOCK = 2**22
 """Neighbour coordinates held at a time."""
@@ -56,15 +57,11 @@ def surface(points: Float[Tensor, "b n 3"], neighbours: int = 32) -> Surface:
         # Double precision: the smallest eigenvalue of a flat patch is a small difference.
         exact = points.double()
         near = knn(points, k)
-        clouds = max(1, _BLOCK // (3 * n * k))
-        rows = max(1, min(n, _BLOCK // (3 * k)))
         parts = []
-        for first in range(0, b, clouds):
-            cloud = slice(first, first + clouds)
-            for start in range(0, n, rows):
-                around = gather_points(exact[cloud], near[cloud, start : start + rows])
-                around = around - around.mean(dim=2, keepdim=True)
-                parts.append((around.transpose(2, 3) @ around / k).flatten(0, 1))
+        for cloud, row in blocks(b, n, 3 * k, _BLOCK):
+            around = gather_points(exact[cloud], near[cloud, row])
+            around = around - around.mean(dim=2, keepdim=True)
+            parts.append((around.transpose(2, 3) @ around / k).flatten(0, 1))
         normals, share = smallest_axis(torch.cat(parts))
         normals = normals.view(b, n, 3)
         outward = ((exact - exact.mean(dim=1, keepdim=True)) * normals).sum(dim=2, keepdim=True)

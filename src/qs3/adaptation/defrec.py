@@ -12,6 +12,7 @@ from qs3.adaptation.method import Batch, Domain, Method, Target, Terms
 from qs3.models import Features, feature_widths
 from qs3.models.checks import check_range
 from qs3.models.ops import gather_points
+from qs3.models.ops.gathering import blocks
 
 _SCALE = 20.0
 """Factor of the released code, which brings the distance to the size of a cross entropy."""
@@ -89,21 +90,15 @@ def _nearest(
     m = points.shape[1]
     nearest = torch.zeros((b, n), dtype=torch.int64, device=queries.device)
     columns = points.transpose(1, 2).contiguous()
-    budget = _CUDA_BLOCK if queries.is_cuda else _BLOCK
-    clouds = max(1, budget // (n * m))
-    rows = n if clouds > 1 else max(1, min(n, budget // m))
-    for first in range(0, b, clouds):
-        cloud = slice(first, first + clouds)
-        absent = ~valid[cloud, None]
-        for start in range(0, n, rows):
-            block = queries[cloud, start : start + rows]
-            total = block[:, :, 0, None] - columns[cloud, None, 0]
-            total.mul_(total)
-            for axis in (1, 2):
-                difference = block[:, :, axis, None] - columns[cloud, None, axis]
-                total.add_(difference.mul_(difference))
-            total.masked_fill_(absent, torch.inf)
-            nearest[cloud, start : start + rows] = total.min(dim=2).indices
+    for cloud, row in blocks(b, n, m, _CUDA_BLOCK if queries.is_cuda else _BLOCK):
+        block = queries[cloud, row]
+        total = block[:, :, 0, None] - columns[cloud, None, 0]
+        total.mul_(total)
+        for axis in (1, 2):
+            difference = block[:, :, axis, None] - columns[cloud, None, axis]
+            total.add_(difference.mul_(difference))
+        total.masked_fill_(~valid[cloud, None], torch.inf)
+        nearest[cloud, row] = total.min(dim=2).indices
     return nearest
 
 

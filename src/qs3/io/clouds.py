@@ -90,14 +90,8 @@ class PointClouds:
     def select(self, rows: np.ndarray) -> "PointClouds":
         """Return the clouds at ``rows`` (indices or a mask), in that order."""
         index = np.arange(len(self))[rows]
-        return PointClouds(
-            points=self.points[index],
-            labels=self.labels[index],
-            class_names=self.class_names,
-            ids=tuple(self.ids[i] for i in index),
-            checksum=self.checksum,
-            origin=self.origin,
-        )
+        ids = tuple(self.ids[i] for i in index)
+        return replace(self, points=self.points[index], labels=self.labels[index], ids=ids)
 
     def without_labels(self) -> UnlabelledClouds:
         """Return the same clouds without labels, nor names, which may tell them."""

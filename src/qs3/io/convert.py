@@ -6,19 +6,18 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from tqdm import tqdm
 
 from qs3.errors import InputError
 from qs3.files import new_folder
 from qs3.io.clouds import CloudKind
+from qs3.io.guards import naming
 from qs3.io.layouts import FORMATS
 from qs3.io.layouts.store import write_store
 from qs3.io.load import format_named, read_clouds
 from qs3.io.preparation import resample
 from qs3.io.ragged import RaggedClouds
 from qs3.meshes.classes import map_labels
-
-_MANY = 500
+from qs3.store.progress import cloud_bar
 
 
 def convert(
@@ -63,13 +62,11 @@ def convert(
         if classes is not None:
             clouds = _map_classes(clouds, classes, unmapped, str(source))
         clouds = _plain(clouds, num_points, str(source))
-        try:
+        with naming(to):
             if layout.write is write_store:
                 write_store(whole, clouds, name)
             else:
                 layout.write(whole, clouds)
-        except InputError as error:
-            raise InputError(f"{to}: {error}") from error
     return clouds
 
 
@@ -104,15 +101,8 @@ def _plain(clouds: RaggedClouds, num_points: int | None, where: str) -> RaggedCl
     if not clouds.clouds:
         raise InputError(f"{where}: holds no cloud")
     prepared = []
-    count = len(clouds.clouds)
-    slow = num_points is not None and count > _MANY
-    for cloud, name in tqdm(
-        zip(clouds.clouds, clouds.ids, strict=True),
-        "resample",
-        count,
-        unit="cloud",
-        disable=None if slow else True,
-    ):
+    pairs = zip(clouds.clouds, clouds.ids, strict=True)
+    for cloud, name in cloud_bar(pairs, "resample", len(clouds.clouds), num_points is not None):
         with np.errstate(over="ignore"):
             points = np.asarray(cloud, dtype=np.float32)
         if not len(points) or not np.isfinite(points).all():

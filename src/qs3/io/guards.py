@@ -51,6 +51,25 @@ def reason(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 
+@contextlib.contextmanager
+def naming(where: Any, fault: str = "") -> Iterator[None]:
+    """Put a name before the `InputError` of a block, unless it stands there.
+
+    Args:
+        where: What is read.
+        fault: What any other exception is told as, with its reason: for libraries that raise
+            whatever they stumble over. Without it such an exception passes.
+    """
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{where}: {str(error).removeprefix(f'{where}: ')}") from error
+    except Exception as error:
+        if not fault:
+            raise
+        raise InputError(f"{where}: {fault} ({reason(error)})") from error
+
+
 def utf8(name: str) -> str:
     r"""The name of a file as it is; bytes of it that are no UTF-8 as escapes.
 
@@ -109,10 +128,10 @@ def read_small(path: Path, largest: int | None = None, what: str = "the file") -
     return path.read_bytes()
 
 
-def read_text(path: Path, largest: int = _LONGEST_TEXT, what: str = "a list or a table") -> str:
+def read_text(path: Path, largest: int = _LONGEST_TEXT) -> str:
     """Read a short text in UTF-8; anything else is refused."""
     try:
-        return read_small(path, largest, what).decode("utf-8-sig")
+        return read_small(path, largest, "a list or a table").decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"{path}: no text in UTF-8") from None
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from qs3.errors import InputError
-from qs3.io.guards import load_npy, read_small, reason
+from qs3.io.guards import load_npy, naming, read_small
 from qs3.io.pcd import parse_pcd, pcd_bytes
 from qs3.io.ply import load_ply, ply_bytes
 from qs3.meshes.announced import memory_limit
@@ -39,7 +39,7 @@ def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np
     content = read_small(path)
     if not content.strip():
         raise InputError(f"{path}: empty file")
-    try:
+    with naming(path, f"cannot be read as {suffix[1:]}"):
         if suffix == ".npy":
             points = load_npy(content, _accept)[:, :3]
         elif suffix == ".pcd":
@@ -49,10 +49,6 @@ def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np
         else:
             with memory_limit(path):
                 points = _trimesh(content, suffix[1:], mesh_points, seed)
-    except InputError as error:
-        raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
-    except Exception as error:  # parsers of damaged files raise whatever they stumble over
-        raise InputError(f"{path}: cannot be read as {suffix[1:]} ({reason(error)})") from error
     if not len(points):
         raise InputError(f"{path}: holds no point")
     with np.errstate(over="ignore"):

@@ -9,6 +9,7 @@ from jaxtyping import Int
 
 from qs3.errors import InputError
 from qs3.io.clouds import Origin, PointClouds, UnlabelledClouds, digests, numbered
+from qs3.io.guards import naming
 from qs3.io.preparation import stack
 from qs3.io.scratch import scratch_array
 from qs3.meshes.classes import label_order, map_labels, require_named
@@ -59,12 +60,10 @@ class RaggedClouds:
             raise InputError(f"{where}: has no labels, and this needs them")
         called = [(class_map or {}).get(name, name) for name in self.class_names]
         names = label_order(called) if class_names is None else tuple(class_names)
-        try:
+        with naming(where):
             if class_map is not None and class_names is None:
                 require_named(self.class_names, class_map)
             labels, _ = map_labels(called, self.labels, names)
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from error
         pairs = sorted(set(zip(self.labels.tolist(), labels.tolist(), strict=True)))
         told = {self.class_names[row]: names[label] for row, label in pairs}
         renamed = {name: other for name, other in told.items() if name != other}

@@ -5,7 +5,7 @@ Names of classes load alone; trimesh comes with the first name that needs it.
 
 from typing import TYPE_CHECKING
 
-from qs3.lazy import loader
+from qs3.lazy import handed_on, loader
 from qs3.meshes.classes import POINTDA10 as POINTDA10
 from qs3.meshes.classes import canonical as canonical
 
@@ -17,11 +17,4 @@ if TYPE_CHECKING:
     from qs3.meshes.normalising import normalise as normalise
     from qs3.meshes.normalising import sample_surface as sample_surface
 
-__getattr__ = loader(
-    __name__,
-    {
-        "collections": "MeshItem collect",
-        "loading": "EXTENSIONS load_mesh",
-        "normalising": "normalise sample_surface",
-    },
-)
+__getattr__ = loader(__name__, handed_on(__file__))

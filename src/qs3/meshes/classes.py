@@ -7,7 +7,6 @@ Convention:
 """
 
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
@@ -16,8 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from qs3.errors import InputError
-
-_LARGEST_MAP = 1 << 20
+from qs3.toml_files import read_toml
 
 _POINTDA10 = "bathtub bed bookshelf cabinet chair lamp monitor plant sofa table"
 POINTDA10: tuple[str, ...] = tuple(_POINTDA10.split())
@@ -70,14 +68,7 @@ def read_class_map(path: Path) -> dict[str, str]:
         InputError: where the file is missing, is no TOML, or holds anything but such lines.
     """
     hint = 'give each class one line, such as stool = "chair"'
-    try:
-        with path.open("rb") as file:
-            text = file.read(_LARGEST_MAP)
-        given = tomllib.loads(text.decode())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: {error}; {hint}") from error
+    given = read_toml(path, hint)
     for name, wanted in given.items():
         if not isinstance(wanted, str) or not wanted.strip() or not wanted.isprintable():
             raise InputError(f"{path}: {name!r} is given no name; {hint}")

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from qs3.lazy import loader
+from qs3.lazy import handed_on, loader
 
 if TYPE_CHECKING:
     from qs3.models.classifier import Features as Features
@@ -20,18 +20,4 @@ if TYPE_CHECKING:
     from qs3.models.rscnn import RSCNN as RSCNN
     from qs3.models.simpleview import SimpleView as SimpleView
 
-__getattr__ = loader(
-    __name__,
-    {
-        "classifier": "Features PointClassifier describe_point feature_widths",
-        "dgcnn": "DGCNN",
-        "factory": "create_model list_models",
-        "pointmlp": "PointMLPElite",
-        "pointnet": "PointNet",
-        "pointnet2": "PointNet2",
-        "pointnet_sa": "PointNetSA",
-        "releases": "load_reference",
-        "rscnn": "RSCNN",
-        "simpleview": "SimpleView",
-    },
-)
+__getattr__ = loader(__name__, handed_on(__file__))

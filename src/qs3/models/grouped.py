@@ -263,17 +263,11 @@ class _LinearMax(torch.autograd.Function):
         k, m, c = edges.shape
         rows = edges.view(k * m, c)
         source = winner.long().mul_(m).add_(torch.arange(m, device=winner.device)[:, None])
-        of_weight = _weighted_sums(source.t(), rows, gradient.t())
+        # Of each channel Σ_s gradient_s · edge_s over the edges that it was won by.
+        of_weight = nn.functional.embedding_bag(
+            source.t().contiguous(), rows, mode="sum", per_sample_weights=gradient.t().contiguous()
+        )
         return _of_edges(gradient, source, weight, k * m).view_as(edges), of_weight
-
-
-def _weighted_sums(
-    index: Int[Tensor, "r s"], table: Float[Tensor, "n c"], weights: Float[Tensor, "r s"]
-) -> Float[Tensor, "r c"]:
-    """Return Σ_s weight_rs · table[index_rs]."""
-    return nn.functional.embedding_bag(
-        index.contiguous(), table, mode="sum", per_sample_weights=weights.contiguous()
-    )
 
 
 def _of_edges(

@@ -12,6 +12,7 @@ from qs3.errors import InputError
 from qs3.models.checks import check_range
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
 from qs3.models.normalisation import FoldedLayer, fold_norm, row_moments, uses_batch
+from qs3.models.ops.gathering import blocks
 
 
 def linear_max(
@@ -40,11 +41,7 @@ def linear_max(
 def _blocks(points: Tensor, width: int) -> Iterator[tuple[slice, slice]]:
     """Cut [b n] into blocks whose products fit the cache (CPU) or 256 MiB (GPU)."""
     b, n, _ = points.shape
-    budget = max(1, (2**26 if points.is_cuda else 2**20) // width)
-    clouds, rows = max(1, budget // n), min(n, budget)
-    for cloud in range(0, b, clouds):
-        for row in range(0, n, rows):
-            yield slice(cloud, cloud + clouds), slice(row, row + rows)
+    return blocks(b, n, width, 2**26 if points.is_cuda else 2**20)
 
 
 def _product(points: Float[Tensor, "b n c"], weight: Float[Tensor, "d c"]) -> Tensor:
@@ -72,7 +69,7 @@ class _LinearMax(torch.autograd.Function):
             value = product.gather(2, index)[:, :, 0].to(best.dtype)
             better = (value > best[cloud]) | value.isnan()  # NaN must not go unseen
             best[cloud] = torch.where(better, value, best[cloud])
-            winner[cloud] = torch.where(better, index[:, :, 0] + row.start, winner[cloud])
+            winner[cloud] = torch.where(better, index[:, :, 0] + (row.start or 0), winner[cloud])
         ctx.save_for_backward(points, weight, winner)
         return best
 

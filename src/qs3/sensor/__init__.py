@@ -5,7 +5,7 @@ Names load when they are first used: settings and their help need no OpenCV, Sci
 
 from typing import TYPE_CHECKING
 
-from qs3.lazy import loader
+from qs3.lazy import handed_on, loader
 
 if TYPE_CHECKING:
     from qs3.sensor.presets import SENSORS as SENSORS
@@ -15,6 +15,4 @@ if TYPE_CHECKING:
     from qs3.sensor.rig import Region as Region
     from qs3.sensor.rig import StereoRig as StereoRig
 
-__getattr__ = loader(
-    __name__, {"presets": "SENSORS Sensor get_sensor", "rig": "Pose Region StereoRig"}
-)
+__getattr__ = loader(__name__, handed_on(__file__))

@@ -6,7 +6,16 @@ from typing import Any
 
 from tqdm import tqdm
 
+_MANY = 500
 _IN_A_LOG = 10.0  # seconds between two lines where nobody watches
+
+
+def cloud_bar(
+    items: Iterable[Any] | None, text: str, count: int, shown: bool = True
+) -> "tqdm[Any]":
+    """Return a bar over clouds; there is none for few of them, nor where nobody watches."""
+    hidden = None if shown and count > _MANY else True
+    return tqdm(items, text, count, unit="cloud", disable=hidden)
 
 
 def progress_bar(

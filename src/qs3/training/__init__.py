@@ -7,7 +7,7 @@ import sys
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from qs3.lazy import loader, names_of
+from qs3.lazy import handed_on, loader
 
 if TYPE_CHECKING:
     from qs3.training.augmentation import augment_clouds as augment_clouds
@@ -43,24 +43,7 @@ if TYPE_CHECKING:
     from qs3.training.validation import adapt_statistics as adapt_statistics
     from qs3.training.validation import read_checkpoints as read_checkpoints
 
-_MODULES = {
-    "augmentation": "augment_clouds",
-    "batches": "load_whole",
-    "checkpoint": "LoadedModel load_model save_model",
-    "config": "PRESETS Augmentation SelfTrainingSettings TrainSettings self_training_preset",
-    "estimators": "QBST SPST Adapter",
-    "evaluate": "evaluate record_path",
-    "fit": "FitResult fit",
-    "history": "EpochRecord",
-    "loop": "train",
-    "predict": "predict_probabilities",
-    "progress": "Deadline TimeUpError parse_duration",
-    "rounds": "RoundRecord",
-    "run": "Run find_runs is_run read_run",
-    "self_training": "self_train",
-    "validation": "Checkpoint adapt_statistics read_checkpoints",
-}
-_NAMES = names_of(_MODULES)
+_MODULES = handed_on(__file__)
 
 __getattr__ = loader(__name__, _MODULES)
 
@@ -69,7 +52,7 @@ class _Package(ModuleType):
     """Keeps `fit` and `evaluate` the functions, when the modules of these names are imported."""
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if not (name in _NAMES and isinstance(value, ModuleType)):
+        if not (name in _MODULES and isinstance(value, ModuleType)):
             super().__setattr__(name, value)
 
 

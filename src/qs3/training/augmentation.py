@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from qs3.models.ops import gather_points
 from qs3.training.config import Augmentation
 
 _OUTSIDE = 0.01
@@ -221,7 +222,7 @@ def piece_beside(
     place = box.centre + distance * ahead + aside[:, None] * box.radius * across
     foot = box.low + scale * (theirs.high - theirs.low) / 2
     place = torch.cat([place[..., :2], foot[..., 2:]], dim=2)
-    return piece.gather(1, order[..., None].expand_as(piece)) + place
+    return gather_points(piece, order) + place
 
 
 def replaced(
@@ -382,5 +383,4 @@ def _clutter(
 
 def _take(points: Float[Tensor, "b n 3"], uniform: Float[Tensor, "b k"]) -> Float[Tensor, "b k 3"]:
     """Points of each cloud at places in 0 to 1."""
-    index = (uniform * points.shape[1]).long()
-    return points.gather(1, index[..., None].expand(-1, -1, 3))
+    return gather_points(points, (uniform * points.shape[1]).long())

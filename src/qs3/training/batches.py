@@ -14,6 +14,7 @@ from qs3.adaptation import Batch
 from qs3.errors import InputError, UnevenSizesError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.preparation import LARGEST, PAPER, Preparation
+from qs3.models.ops import gather_points
 from qs3.models.sized import ball_radius
 from qs3.training.augmentation import augment_clouds, turned
 from qs3.training.config import Augmentation, TrainSettings
@@ -143,7 +144,7 @@ class DeviceClouds:
             points, kept = augment_clouds(self._points(rows, chosen), augmentation, generator)
             kept = kept & distinct
             kept = torch.where(kept.any(dim=1, keepdim=True), kept, distinct)
-            points = _gathered(points, first_places(kept, num_points))[mine]
+            points = gather_points(points, first_places(kept, num_points))[mine]
         return Batch(normalise_batch(points, preparation), labels)
 
     def _first(self, rows: np.ndarray) -> Int[Tensor, "r m"]:
@@ -203,10 +204,6 @@ def first_places(
         order = keys.masked_fill(~kept, torch.inf).argsort(dim=1, stable=True)
     place = torch.arange(count, device=kept.device) % kept.sum(dim=1, keepdim=True)
     return order.gather(1, place)
-
-
-def _gathered(points: Float[Tensor, "b n 3"], places: Int[Tensor, "b m"]) -> Float[Tensor, "b m 3"]:
-    return points.gather(1, places[:, :, None].expand(-1, -1, 3))
 
 
 def _free_memory(device: torch.device) -> float:

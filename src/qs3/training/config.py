@@ -1,7 +1,7 @@
 """Settings of a training and of the self-training after it."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
@@ -76,15 +76,11 @@ class Augmentation:
     """Largest standard deviation of a cloud's noise."""
 
     def __post_init__(self) -> None:
-        for name in ("sight", "plane", "cone", "patches", "stretch", "tilt", "floor", "wall"):
-            _check(self, name, 0 <= getattr(self, name) <= 1, "must be in 0 to 1")
-        for name in ("neighbour", "noise", "plane_share", "cone_share", "clutter_share"):
-            _check(self, name, 0 <= getattr(self, name) <= 1, "must be in 0 to 1")
-        for name in ("patch_radius", "noise_sigma", "tilt_degrees"):
-            _check(self, name, getattr(self, name) >= 0, "must not be negative")
-        _check(self, "least", 0 < self.least <= 1, "must be above 0, to 1")
-        _check(self, "patch_count", self.patch_count > 0, "must be above 0")
-        _check(self, "stretch_factor", self.stretch_factor >= 1, "must be at least 1")
+        chances = "sight plane cone patches stretch tilt floor wall neighbour noise"
+        ranges = {"must be in 0 to 1": f"{chances} plane_share cone_share clutter_share"}
+        ranges |= {"must not be negative": "patch_radius noise_sigma tilt_degrees"}
+        ranges |= {"must be above 0, to 1": "least", "must be above 0": "patch_count"}
+        _check_ranges(self, ranges | {"must be at least 1": "stretch_factor"})
 
     @classmethod
     def scanned(cls, **overrides: Any) -> "Augmentation":
@@ -181,8 +177,11 @@ class TrainSettings:
     on at most two devices (DDP sums the first step's gradients of three in another order)."""
 
     def __post_init__(self) -> None:
-        for name in ("num_points", "epochs", "learning_rate", "devices"):
-            _check(self, name, getattr(self, name) > 0, "must be above 0")
+        ranges = {"must be above 0": "num_points epochs learning_rate devices clip_norm"}
+        ranges |= {"must be in 0 to below 1": "label_smoothing holdout"}
+        ranges |= {"must be between 0 and 1": "ema_decay"}
+        least = "weight_decay jitter_sigma jitter_clip seed validate_every"
+        _check_ranges(self, ranges | {"must not be negative": least})
         points = self.num_points
         fault = f"must be at most {MOST_POINTS}; the distances among the points of one cloud alone "
         fault += f"would take {points**2 / 2**28:.3g} GiB"
@@ -190,14 +189,6 @@ class TrainSettings:
         least = 2 * self.devices
         fault = f"must be at least {least}" + (", 2 a device" if self.devices > 1 else "")
         _check(self, "batch_size", self.batch_size >= least, fault)
-        _check(self, "clip_norm", self.clip_norm is None or self.clip_norm > 0, "must be above 0")
-        decay = self.ema_decay
-        _check(self, "ema_decay", decay is None or 0 < decay < 1, "must be between 0 and 1")
-        for name in ("weight_decay", "jitter_sigma", "jitter_clip", "seed"):
-            _check(self, name, getattr(self, name) >= 0, "must not be negative")
-        for name in ("label_smoothing", "holdout"):
-            _check(self, name, 0 <= getattr(self, name) < 1, "must be in 0 to below 1")
-        _check(self, "validate_every", self.validate_every >= 0, "must not be negative")
         words = {"accelerator": Accelerator, "schedule": Schedule, "rule": Rule}
         for name, kind in (words | {"normalisation": Normalisation}).items():
             _check_word(self, name, kind)
@@ -282,48 +273,35 @@ class SelfTrainingSettings:
     """What becomes of the confident clouds where all have one class: kept, or none selected."""
 
     def __post_init__(self) -> None:
-        _check(self, "threshold", 0 <= self.threshold <= 1, "must be in 0 to 1")
+        ranges = {"must be in 0 to 1": "threshold quantile", "must be at least 1": "turns"}
+        ranges |= {"must be above 0": "rounds epochs source_weight steps_per_epoch learning_rate"}
+        ranges |= {"must be above 0, to 1": "portion threshold_share"}
+        ranges |= {"must be in 0 to below 1": "label_smoothing teacher_decay"}
+        _check_ranges(self, ranges | {"must not be negative": "portion_step floor"})
         last = self.threshold + self.step * (self.rounds - 1)
         _check(
             self, "step", self.step >= 0 and last <= 1, "takes θ out of 0 to 1 within the rounds"
         )
-        for name in ("rounds", "epochs", "source_weight"):
-            _check(self, name, getattr(self, name) > 0, "must be above 0")
         decay = self.weight_step * (self.rounds * self.epochs - 1)
         good = self.weight_step >= 0 and decay < min(1.0, self.source_weight)
         _check(self, "weight_step", good, "takes a factor of the losses to 0 within the rounds")
-        _check(self, "quantile", 0 <= self.quantile <= 1, "must be in 0 to 1")
-        _check(self, "portion", 0 < self.portion <= 1, "must be above 0, to 1")
-        _check(self, "portion_step", self.portion_step >= 0, "must not be negative")
-        _check(self, "turns", self.turns >= 1, "must be at least 1")
-        _check(self, "floor", self.floor >= 0, "must not be negative")
-        share, smoothing = self.threshold_share, self.label_smoothing
-        _check(self, "threshold_share", share is None or 0 < share <= 1, "must be above 0, to 1")
-        good = smoothing is None or 0 <= smoothing < 1
-        _check(self, "label_smoothing", good, "must be in 0 to below 1")
-        rate = self.learning_rate
-        _check(self, "learning_rate", rate is None or rate > 0, "must be above 0")
-        _check(self, "teacher_decay", 0 <= self.teacher_decay < 1, "must be in 0 to below 1")
         _check_word(self, "teacher", Teacher)
         good = self.teacher != "average" or self.init == "warm-up"
         _check(self, "teacher", good, "has no sense over weights that start anew; set init warm-up")
         good = self.init == "warm-up" or not self.frozen_statistics
-        _check(
-            self, "frozen_statistics", good, "needs those of a warm-up; set init warm-up"
-        )
+        _check(self, "frozen_statistics", good, "needs those of a warm-up; set init warm-up")
         _check_word(self, "rule", RoundRule)
         _check_word(self, "prior", Prior)
+        defaults = {field.name: field.default for field in fields(self)}
         for (reader, words), names in _READ_BY.items():
             reads = getattr(self, reader) in words
             for name in names:
-                if not reads and getattr(self, name) != _default(type(self), name):
+                if not reads and getattr(self, name) != defaults[name]:
                     raise InputError(
                         f"setting {name} = {getattr(self, name)} is not read by {reader} "
                         f"{getattr(self, reader)}, only by {', '.join(map(str, words))}; leave it "
                         "out"
                     )
-        steps = self.steps_per_epoch
-        _check(self, "steps_per_epoch", steps is None or steps > 0, "must be above 0")
 
 
 _READ_BY: Mapping[tuple[str, tuple[Any, ...]], tuple[str, ...]] = {
@@ -343,8 +321,23 @@ _READ_BY: Mapping[tuple[str, tuple[Any, ...]], tuple[str, ...]] = {
 """Settings that are looked at only where another one has some value."""
 
 
-def _default(kind: type, name: str) -> Any:
-    return next(field.default for field in fields(kind) if field.name == name)
+_RANGES: Mapping[str, Callable[[float], bool]] = {
+    "must be in 0 to 1": lambda value: 0 <= value <= 1,
+    "must be in 0 to below 1": lambda value: 0 <= value < 1,
+    "must be between 0 and 1": lambda value: 0 < value < 1,
+    "must be above 0, to 1": lambda value: 0 < value <= 1,
+    "must be above 0": lambda value: value > 0,
+    "must not be negative": lambda value: value >= 0,
+    "must be at least 1": lambda value: value >= 1,
+}
+
+
+def _check_ranges(settings: Any, ranges: Mapping[str, str]) -> None:
+    """Check numbers: their names by one of `_RANGES`; None is none."""
+    for fault, names in ranges.items():
+        for name in names.split():
+            value = getattr(settings, name)
+            _check(settings, name, value is None or _RANGES[fault](value), fault)
 
 
 def _check_word(settings: Any, name: str, kind: Any) -> None:

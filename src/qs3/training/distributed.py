@@ -7,9 +7,6 @@ interface alone.
 """
 
 import contextlib
-import functools
-import logging
-import multiprocessing
 import os
 import signal
 import socket
@@ -37,12 +34,12 @@ from torch.multiprocessing.spawn import (
     start_processes,
 )
 
-from qs3.errors import InputError, QS3Error
+from qs3.errors import InputError, QS3Error, say_once
+from qs3.store.executors.local import end_with_parent
 from qs3.training.config import TrainSettings
 from qs3.training.progress import TimeUpError
 from qs3.training.threads import threads
 
-_LOG = logging.getLogger(__name__)
 _GRACE = 60.0
 """Seconds that this process gets to notice by itself that another one has died."""
 
@@ -86,7 +83,9 @@ def make_fabric(settings: TrainSettings, rank: int = 0) -> Fabric:
             f"accelerator {settings.accelerator!r} with devices = {count}: {reason}"
         ) from error
     if settings.precision == "bf16-mixed" and fabric.device.type == "cpu" and not has_bf16_units():
-        _warn_of_slow_bf16()
+        say_once(
+            "bf16-mixed on a CPU without bf16 units is slower than 32-true, with coarser rounding"
+        )
     return fabric
 
 
@@ -96,13 +95,6 @@ def has_bf16_units() -> bool:
     if capabilities.get("architecture") != "x86_64":
         return True
     return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
-
-
-@functools.cache
-def _warn_of_slow_bf16() -> None:
-    _LOG.warning(
-        "bf16-mixed on a CPU without bf16 units is slower than 32-true, with coarser rounding"
-    )
 
 
 class _OneMachine(LightningEnvironment):
@@ -243,7 +235,7 @@ def _do(index: int, folder: str, settings: TrainSettings, work: Work) -> None:
     """Work on one further device, with the processes that meet in the folder."""
     # Ctrl-C reaches every process of a terminal: the first decides, and ends this one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_the_first, daemon=True).start()
+    end_with_parent()
     silence = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):  # the first process talks
         os.dup2(silence, stream)
@@ -254,13 +246,6 @@ def _do(index: int, folder: str, settings: TrainSettings, work: Work) -> None:
         _joined(settings, index + 1, folder) as fabric,
     ):
         work(fabric)
-
-
-def _end_with_the_first() -> None:
-    first = multiprocessing.parent_process()
-    assert first is not None  # noqa: S101
-    first.join()
-    os._exit(1)
 
 
 def make_equal(tensors: Iterable[Tensor], fabric: Fabric) -> None:

@@ -285,13 +285,7 @@ class QBST(Adapter):
 class SPST(QBST):
     """Self-paced self-training (GAST's second phase): every cloud over the threshold is kept.
 
-    Args:
-        model: Network, one of `qs3.models.list_models`.
-        warm_up: Method before the rounds.
-        self_training: Settings of the rounds that differ from SPST's.
-        train: As in `Adapter`.
-        run_dir: As in `Adapter`.
-        random_state: As in `Adapter`.
+    The arguments are those of `QBST`; settings of the rounds are those that differ from SPST's.
     """
 
     rule: ClassVar[str] = "spst"

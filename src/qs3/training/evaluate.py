@@ -76,6 +76,7 @@ def evaluate(
     require_finite(whole.points, whole.ids)
     test = prepare_clouds(whole, train["num_points"], loaded.preparation)
     scored = _scored(run, test, answer_of) if checkpoints else []
+    picked = choose_each(scored) if scored else {}
     record = RunRecord(
         method=made.method,
         model=train["model"],
@@ -95,7 +96,7 @@ def evaluate(
         rounds=_count_right(run, made.rounds, test, answer_of),
         chosen=made.chosen,
         checkpoints=tuple(scored),
-        choices=_choices(scored) if scored else {},
+        choices={rule: _plain(scored[row]) for rule, row in picked.items()},
         marks=caveats(made, test),
         experiment=experiment,
     )
@@ -186,10 +187,5 @@ def _scored(
     return scored
 
 
-def _choices(scored: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Let every rule choose among the checkpoints, as `qs3.training.validation.choose` does."""
-    choices = {name: scored[row] for name, row in choose_each(scored).items()}
-    return {
-        rule: {name: value for name, value in choice.items() if name != "validators"}
-        for rule, choice in choices.items()
-    }
+def _plain(scored: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in scored.items() if name != "validators"}

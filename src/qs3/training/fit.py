@@ -24,10 +24,10 @@ from qs3.training.distributed import all_devices, make_fabric
 from qs3.training.history import EpochRecord, History, Tracker
 from qs3.training.job import Job, fresh_model, make_method, run_job
 from qs3.training.loop import EpochCallback
-from qs3.training.overlap import seen_clouds
+from qs3.training.overlap import data_of
 from qs3.training.prepared import Prepared, prepare_clouds, require_finite
 from qs3.training.progress import Deadline
-from qs3.training.rounds import RoundCallback, RoundRecord
+from qs3.training.rounds import RoundCallback, RoundRecord, Told
 from qs3.training.run import (
     CONFIG,
     MODEL,
@@ -35,7 +35,6 @@ from qs3.training.run import (
     Run,
     RunSettings,
     claim_run,
-    data_record,
     fingerprint,
     read_run,
     sum_cost,
@@ -174,12 +173,8 @@ def fit(
         count = claimed.threads or 1
         settings = replace(settings, threads=count)
         how = settings.num_points, settings.preparation, run_dir
-        prepared, prepared_target = prepare_clouds(source, *how), None
-        source_clouds, source_shapes = seen_clouds(prepared)
-        target_clouds, target_shapes = (), ()
-        if target is not None:
-            prepared_target = prepare_clouds(target, *how)
-            target_clouds, target_shapes = seen_clouds(prepared_target)
+        prepared = prepare_clouds(source, *how)
+        prepared_target = None if target is None else prepare_clouds(target, *how)
         job = Job(
             base,
             prepared.select(~held),
@@ -195,16 +190,13 @@ def fit(
             contextlib.closing(history),
             all_devices(settings, partial(run_job, job)) as fabric,
         ):
-            model, epochs, rounds = run_job(
-                job,
-                fabric,
-                history=history,
-                deadline=deadline,
-                on_epoch=on_epoch,
-                on_round=on_round,
-            )
+            told = Told(history, deadline, on_epoch, on_round)
+            model, epochs, rounds = run_job(job, fabric, told)
         adapted = needs or settings.normalisation != "shared"
         adapted = adapted or settings.rule not in ("last", "source-val")
+        data = data_of(prepared, prepared_target, adapted)
+        if before and not len(source):
+            data["source"] = before.source
         stage = (base, len(epochs)) if rounds_settings is None else (ROUND, len(rounds))
         if rounds_settings is not None and method == base:
             method = f"{base}+{rounds_settings.rule}"
@@ -212,12 +204,7 @@ def fit(
             method=method,
             selection=settings.rule,
             chosen=tell_choice(run_dir, *stage, settings.rule),
-            source=before.source if before and not len(source) else data_record(source),
-            target=None if target is None else data_record(target),
-            source_clouds=source_clouds,
-            source_shapes=source_shapes,
-            target_clouds=target_clouds if adapted else (),
-            target_shapes=target_shapes if adapted else (),
+            **data,
             threads=count,
             unknown_warm_up=warm_up is not None and before is None,
             rounds=tuple(asdict(record) for record in rounds),

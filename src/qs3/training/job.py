@@ -10,21 +10,22 @@ import torch
 from lightning_fabric import Fabric
 
 from qs3.adaptation import Method, create_method, method_class
+from qs3.adaptation.confidence import measure_known
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier, feature_widths
 from qs3.training.checkpoint import derived_seed, load_model, new_model, save_model
 from qs3.training.config import SelfTrainingSettings, TrainSettings
-from qs3.training.history import EpochRecord, History
-from qs3.training.loop import EpochCallback, train
-from qs3.training.predict import describe_known
+from qs3.training.history import EpochRecord
+from qs3.training.loop import train
+from qs3.training.predict import describe
 from qs3.training.prepared import Prepared
-from qs3.training.progress import Deadline
-from qs3.training.rounds import RoundCallback, RoundRecord, Task
+from qs3.training.rounds import NOBODY, RoundRecord, Task, Told
 from qs3.training.self_training import run_rounds
 from qs3.training.validation import ROUND, Validation, choose, load_checkpoint, read_checkpoints
 
 WARM_UP = "warm-up"
+_OF_JOB = ("method", "warm_up")  # alone; rounds know what else there is
 
 
 @dataclass(frozen=True)
@@ -81,15 +82,9 @@ def new_model_for(method: str, settings: TrainSettings, count: int, seed: int) -
 def run_job(
     job: Job,
     fabric: Fabric,
-    *,
-    history: History | None = None,
-    deadline: Deadline | None = None,
-    on_epoch: EpochCallback | None = None,
-    on_round: RoundCallback | None = None,
+    told: Told = NOBODY,
 ) -> tuple[PointClassifier, list[EpochRecord], list[RoundRecord]]:
     """Train the method, then in rounds if asked; go on where an earlier call stopped.
-
-    Only the first device is handed a history, a deadline and callbacks.
 
     Returns:
         The network, a record of each epoch before the rounds, and one of each round.
@@ -99,8 +94,8 @@ def run_job(
     validation = Validation(job.run_dir, job.source, job.holdout, job.target, job.settings, fabric)
 
     def tell_checkpoints() -> None:
-        if history is not None:
-            history.put("checkpoint", read_checkpoints(job.run_dir))
+        if told.history is not None:
+            told.history.put("checkpoint", read_checkpoints(job.run_dir))
 
     def look(number: int, model: PointClassifier) -> None:
         adapted = copy.deepcopy(model)  # the next round goes on from the plain network
@@ -124,36 +119,24 @@ def run_job(
             run_dir=folder,
             stream=(0,),
             observer=partial(validation.after_epoch, stage),
-            on_epoch=on_epoch,
-            log=None if history is None else history.training(stage),
-            deadline=deadline,
+            on_epoch=told.on_epoch,
+            log=told.log(stage),
+            deadline=told.deadline,
             description=stage,
         )
         method.norm.settle()
         model = method.result()
         validation.adapt(model)
-        if history is not None:
-            history.source(stage, epochs)
+        if told.history is not None:
+            told.history.source(stage, epochs)
         tell_checkpoints()
         if job.rounds is None:
             _follow_rule(model, stage, job)
         _save(folder, model, job, fabric)
     if job.rounds is not None and job.target is not None:
         tell_checkpoints()
-        task = Task(
-            job.source,
-            job.target,
-            job.settings,
-            job.rounds,
-            fabric,
-            holdout=job.holdout,
-            run_dir=job.run_dir,
-            look=look,
-            on_round=on_round,
-            on_epoch=on_epoch,
-            history=history,
-            deadline=deadline,
-        )
+        shared = {name: value for name, value in vars(job).items() if name not in _OF_JOB}
+        task = Task(**shared, fabric=fabric, look=look, told=told)
         model, records = run_rounds(model, task)
         validation.adapt(model)
         _follow_rule(model, ROUND, job)
@@ -171,9 +154,9 @@ def _follow_rule(model: PointClassifier, stage: str, job: Job) -> None:
 def _save(folder: Path, model: PointClassifier, job: Job, fabric: Fabric) -> None:
     known = None
     if job.holdout is not None:
-        known = describe_known(
-            model, job.holdout, batch_size=job.settings.batch_size, fabric=fabric
-        )
+        size = job.settings.batch_size
+        said = describe(model, job.holdout, batch_size=size, fabric=fabric)
+        known = measure_known(said.logits, job.holdout.labels)
     if fabric.is_global_zero:
         save_model(folder, model, job.source.class_names, job.settings, known=known)
     fabric.barrier()

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Iterable, Sequence
 from itertools import combinations_with_replacement
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -10,7 +11,7 @@ from qs3.errors import InputError
 from qs3.io.clouds import digests
 from qs3.io.preparation import unit_ball
 from qs3.training.prepared import Prepared
-from qs3.training.run import Run
+from qs3.training.run import Run, data_record
 
 TOLERANCE = 1e-3
 """Largest difference of a moment between a cloud and the same one written anew. The nearest two
@@ -49,6 +50,20 @@ def seen_clouds(prepared: Prepared) -> tuple[tuple[str, ...], tuple[str, ...]]:
     Their shapes are those of what it gets and, where that is less, of the clouds as read.
     """
     return tuple(checksums(prepared)), tuple(dict.fromkeys(_both_shapes(prepared)))
+
+
+def data_of(source: Prepared, target: Prepared | None, has_seen_target: bool) -> dict[str, Any]:
+    """Return the fields of a `Run` that tell of its data, prepared but whole."""
+    source_clouds, source_shapes = seen_clouds(source)
+    seen = ((), ()) if target is None or not has_seen_target else seen_clouds(target)
+    return {
+        "source": data_record(source.clouds),
+        "target": None if target is None else data_record(target.clouds),
+        "source_clouds": source_clouds,
+        "source_shapes": source_shapes,
+        "target_clouds": seen[0],
+        "target_shapes": seen[1],
+    }
 
 
 def checksums(prepared: Prepared) -> list[str]:

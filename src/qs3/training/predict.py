@@ -7,8 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from qs3.adaptation.confidence import Known, measure_known
-from qs3.io.clouds import PointClouds, UnlabelledClouds, numbered
+from qs3.io.clouds import UnlabelledClouds, numbered
 from qs3.io.preparation import PAPER, Preparation
 from qs3.models import PointClassifier
 from qs3.training.checkpoint import LoadedModel
@@ -107,7 +106,8 @@ def describe(
     context = nullcontext if fabric is None else fabric.autocast
     training = model.training
     model.eval()
-    mine = _part(len(points), fabric)
+    rank, world = (0, 1) if fabric is None else (fabric.global_rank, fabric.world_size)
+    mine = slice(rank * len(points) // world, (rank + 1) * len(points) // world)
     answers: list[np.ndarray] = []
     try:
         # A lone point tells the widths where this device has no cloud.
@@ -130,31 +130,3 @@ def describe(
 
         rows = gather_rows(rows, mine, len(points), fabric)
     return Description(*np.split(rows, [classes, classes + width], axis=1))
-
-
-def describe_known(
-    model: PointClassifier,
-    holdout: Prepared[PointClouds],
-    *,
-    batch_size: int = 32,
-    fabric: "Fabric | None" = None,
-) -> Known:
-    """Return how a network answers labelled clouds of the source that it was not trained on.
-
-    Args:
-        model: The network.
-        holdout: The clouds, prepared.
-        batch_size: Clouds in a forward pass.
-        fabric: As in `predict_probabilities`.
-
-    Raises:
-        InputError: where there is no cloud.
-    """
-    said = describe(model, holdout, batch_size=batch_size, fabric=fabric)
-    return measure_known(said.logits, holdout.labels)
-
-
-def _part(count: int, fabric: "Fabric | None") -> slice:
-    """This device's part of the clouds."""
-    rank, world = (0, 1) if fabric is None else (fabric.global_rank, fabric.world_size)
-    return slice(rank * count // world, (rank + 1) * count // world)

@@ -5,7 +5,6 @@ import re
 import sys
 import time
 from collections.abc import Sequence
-from types import TracebackType
 
 import torch
 from lightning_fabric import Fabric
@@ -50,12 +49,7 @@ class Progress:
     def __enter__(self) -> "Progress":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.bar.close()
 
     def begin_epoch(self) -> None:

@@ -25,7 +25,7 @@ from qs3.training.checkpoint import (
     write_tensors,
 )
 from qs3.training.config import SelfTrainingSettings, TrainSettings
-from qs3.training.history import History
+from qs3.training.history import History, Log
 from qs3.training.loop import EpochCallback
 from qs3.training.overlap import checksums
 from qs3.training.prepared import Prepared
@@ -81,6 +81,28 @@ Look = Callable[[int, PointClassifier], None]
 
 
 @dataclass(frozen=True)
+class Told:
+    """Who is told of a run, and when it has to end; on the first device alone."""
+
+    history: History | None = None
+    """Is told of epochs, checkpoints and rounds."""
+    deadline: Deadline | None = None
+    """Ends the run before an epoch that would end too late."""
+    on_epoch: EpochCallback | None = None
+    """Called after each epoch."""
+    on_round: RoundCallback | None = None
+    """Called after each round."""
+
+    def log(self, stage: str) -> Log | None:
+        """Return what is handed the epochs of a stage."""
+        return None if self.history is None else self.history.training(stage)
+
+
+NOBODY = Told()
+"""The other devices tell nobody."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Task:
     """What a run of rounds works on, beside the network, and who is told of it."""
 
@@ -102,14 +124,8 @@ class Task:
     """Folder that keeps the state after each epoch and round."""
     look: Look | None = None
     """Looks at the network after each round."""
-    on_round: RoundCallback | None = None
-    """Called after each round."""
-    on_epoch: EpochCallback | None = None
-    """Called after each epoch."""
-    history: History | None = None
-    """Is told of epochs and rounds."""
-    deadline: Deadline | None = None
-    """Ends the rounds before an epoch that would end too late."""
+    told: Told = NOBODY
+    """Who is told of it."""
 
     @cached_property
     def target_checksums(self) -> list[str]:

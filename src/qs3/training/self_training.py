@@ -28,7 +28,7 @@ from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.distributed import make_fabric
 from qs3.training.history import EpochRecord
 from qs3.training.loop import EpochCallback, train
-from qs3.training.overlap import seen_clouds
+from qs3.training.overlap import data_of
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared, as_prepared, label_clouds
 from qs3.training.rounds import (
@@ -36,11 +36,12 @@ from qs3.training.rounds import (
     RoundRecord,
     Rounds,
     Task,
+    Told,
     begin_rounds,
     write_rounds,
 )
 from qs3.training.rules import Select, make_rule, round_threshold
-from qs3.training.run import Run, RunSettings, claim_run, data_record, sum_cost, write_run
+from qs3.training.run import Run, RunSettings, claim_run, sum_cost, write_run
 from qs3.training.state import CHECKPOINT
 from qs3.training.teacher import ask_teacher
 from qs3.training.threads import choose_threads, threads
@@ -100,16 +101,15 @@ def self_train(
     fabric = fabric or make_fabric(settings)
     run_dir = None if run_dir is None else Path(run_dir)
     task = Task(
-        source,
-        target,
-        settings,
-        self_training,
-        fabric,
+        source=source,
+        target=target,
+        settings=settings,
+        rounds=self_training,
+        fabric=fabric,
         holdout=holdout,
         select=select,
         run_dir=run_dir,
-        on_round=on_round,
-        on_epoch=on_epoch,
+        told=Told(on_epoch=on_epoch, on_round=on_round),
     )
     choose = partial(choose_threads, settings, step=None)
     if run_dir is None:
@@ -121,18 +121,11 @@ def self_train(
     with claim_run(run_dir, wanted, choose) as claimed, threads(claimed.threads or 1):
         adapted, records = run_rounds(model, task)
         save_model(run_dir, adapted, source.class_names, settings)
-        source_clouds, source_shapes = seen_clouds(source)
-        target_clouds, target_shapes = seen_clouds(target)
         run = Run(
             method=method,
             selection="last",
             chosen={"stage": ROUND, "number": len(records)},
-            source=data_record(source.clouds),
-            target=data_record(target.clouds),
-            source_clouds=source_clouds,
-            source_shapes=source_shapes,
-            target_clouds=target_clouds,
-            target_shapes=target_shapes,
+            **data_of(source, target, has_seen_target=True),
             threads=claimed.threads,
             unknown_warm_up=True,
             rounds=tuple(asdict(record) for record in records),
@@ -150,8 +143,8 @@ def run_rounds(model: PointClassifier, task: Task) -> tuple[PointClassifier, lis
         raise InputError("the target has no cloud; give unlabelled clouds")
     state = begin_rounds(model, task)
     classes = len(source.class_names)
-    if task.history is not None:
-        task.history.put("round", state.records)
+    if task.told.history is not None:
+        task.told.history.put("round", state.records)
     for number in range(len(state.records) + 1, rounds.rounds + 1):
         start, cpu_start, pool = time.perf_counter(), time.process_time(), state.pool
         # Line 3: label the target.
@@ -210,10 +203,10 @@ def _finish_round(state: Rounds, task: Task) -> None:
         write_rounds(task, state)
         (task.run_dir / CHECKPOINT).unlink(missing_ok=True)
     task.fabric.barrier()
-    if task.history is not None:
-        task.history.put("round", state.records)
-    if task.on_round is not None:
-        task.on_round(record, state.latest)
+    if task.told.history is not None:
+        task.told.history.put("round", state.records)
+    if task.told.on_round is not None:
+        task.told.on_round(record, state.latest)
 
 
 def _too_few(number: int, count: int, classes: int, devices: int) -> bool:
@@ -291,9 +284,9 @@ def _train_round(
         optimiser_state=state.optimiser if continuous else None,
         observer=teach,
         beside=None if rounds.teacher == "latest" else teacher,
-        on_epoch=task.on_epoch,
-        log=None if task.history is None else task.history.training(f"round-{number}"),
-        deadline=task.deadline,
+        on_epoch=task.told.on_epoch,
+        log=task.told.log(f"round-{number}"),
+        deadline=task.told.deadline,
         description=f"round {number}/{rounds.rounds}",
     )
     method.norm.settle()

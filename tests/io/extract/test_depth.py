@@ -24,7 +24,7 @@ from qs3.io.extract.depth import (
 from qs3.io.extract.depth_images import read_depth, read_mask
 from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
 
-from ..hostile import fuzz, mutated, refused
+from ..hostile import fuzz, mutated, png_bytes, refused
 from .depth_scene import (
     HEIGHT,
     MATRIX,
@@ -269,17 +269,6 @@ def test_bad_camera_files_are_refused_by_name(tmp_path, name, text, message):
         read_intrinsics(path)
 
 
-def png(width, height, bits=16, colour=0, data=b"\0" * 32):
-    def chunk(name, body):
-        return (
-            struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
-        )
-
-    header = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)
-    parts = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(data)) + chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + parts
-
-
 def npy(header: str, body=b""):
     text = header.encode() + b" " * (117 - len(header)) + b"\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + body
@@ -291,10 +280,10 @@ def encoded(ending, image):
 
 GREY16 = np.arange(600, dtype=np.uint16).reshape(20, 30)
 BAD_IMAGES = {
-    "huge.png": (png(60000, 60000), "announces more than"),
-    "hollow.png": (png(5000, 5000), "announces 5000×5000 pixels but has"),
-    "negative.png": (png(2**32 - 1, 1), "announces"),
-    "zero.png": (png(0, 5), "announces|not a PNG"),
+    "huge.png": (png_bytes(60000, 60000), "announces more than"),
+    "hollow.png": (png_bytes(5000, 5000), "announces 5000×5000 pixels but has"),
+    "negative.png": (png_bytes(2**32 - 1, 1), "announces"),
+    "zero.png": (png_bytes(0, 5), "announces|not a PNG"),
     "grey8.png": (encoded(".png", GREY16.astype(np.uint8)), "8 bits.*save depth as 16-bit PNG"),
     "colour.png": (encoded(".png", np.zeros((4, 4, 3), np.uint8)), "colour picture"),
     "short.png": (encoded(".png", GREY16)[:-30], "cut off"),
@@ -302,7 +291,7 @@ BAD_IMAGES = {
                     "damaged"),
     "jpeg.png": (encoded(".jpg", GREY16.astype(np.uint8)), "not a PNG file"),
     "empty.png": (b"", "not a PNG file"),
-    "odd.png": (png(4, 4, bits=7), "damaged"),
+    "odd.png": (png_bytes(4, 4, bits=7), "damaged"),
     "short.tif": (encoded(".tiff", GREY16)[:100], "cut off|damaged"),
     "grey8.tif": (encoded(".tiff", GREY16.astype(np.uint8)), "8 bits"),
     "text.tif": (b"II+\0 and so on", "not a TIFF"),

@@ -115,36 +115,12 @@ def group(file, arrays, folder):
     file.create_group("data")
 
 
-def never_written(file, arrays, folder):
-    del file["data"]
-    file.create_dataset("data", shape=(10**5, 2048, 6), dtype="<f8")
-
-
-def never_written_chunks(file, arrays, folder):
-    del file["data"]
-    file.create_dataset("data", shape=(10**5, 2048, 6), dtype="<f8", chunks=(1, 2048, 6))
-
-
-def huge_label(file, arrays, folder):
-    del file["label"]
-    file.create_dataset("label", shape=(10**12,), dtype="<i8", chunks=(1000,))
-
-
-def bomb(file, arrays, folder):
-    del file["data"]
-    zeros = np.zeros((6, 200000, 6), dtype=np.float32)
-    file.create_dataset("data", data=zeros, compression="gzip", compression_opts=9)
-
-
-def huge_chunk(file, arrays, folder):
-    del file["data"]
-    size = {"shape": (6, 8, 6), "maxshape": (None, None, 6), "chunks": (60000, 2048, 6)}
-    file.create_dataset("data", dtype="<f4", compression="gzip", **size)
-
-
-def vlen(file, arrays, folder):
-    del file["data"]
-    file.create_dataset("data", shape=(6, 8, 3), dtype=h5py.vlen_dtype(np.float32))
+MANY = {"shape": (10**5, 2048, 6), "dtype": "<f8"}
+VLEN = {"shape": (6, 8, 3), "dtype": h5py.vlen_dtype(np.float32)}
+LABELS = {"shape": (10**12,), "dtype": "<i8", "chunks": (1000,)}
+BOMB = {"data": np.zeros((6, 200000, 6), np.float32), "compression": "gzip", "compression_opts": 9}
+CHUNK = {"shape": (6, 8, 6), "maxshape": (None, None, 6), "chunks": (60000, 2048, 6),
+         "dtype": "<f4", "compression": "gzip"}  # fmt: skip
 
 
 def plugin(file, arrays, folder):
@@ -177,7 +153,7 @@ HOSTILE = {
         replace("data", data=np.zeros((6, 8, 3), [("x", "f4"), ("y", "f4")])),
         "no plain numbers",
     ),
-    "variable length": (vlen, "no plain numbers"),
+    "variable length": (replace("data", **VLEN), "no plain numbers"),
     "nothing": (replace("data", data=h5py.Empty("f4")), "no plain numbers"),
     "one number": (replace("data", data=np.float32(1)), "must be floats of shape"),
     "no cloud": (replace("data", shape=(0, 8, 3), dtype="f4"), "label must be"),
@@ -199,11 +175,11 @@ HOSTILE = {
     "external storage": (external_storage, "data lies in another file"),
     "virtual": (virtual, "data lies in another file"),
     "group": (group, "data is no dataset"),
-    "announced only": (never_written, r"announces 9830400000 bytes"),
-    "announced chunks": (never_written_chunks, r"announces 9830400000 bytes"),
-    "labels announced": (huge_label, r"label announces 8000000000000 bytes"),
-    "bomb": (bomb, r"announces 28800000 bytes"),
-    "huge chunk": (huge_chunk, r"announces 2949120000 bytes"),
+    "announced only": (replace("data", **MANY), r"announces 9830400000 bytes"),
+    "announced chunks": (replace("data", **MANY, chunks=(1, 2048, 6)), "announces 9830400000 byte"),
+    "labels announced": (replace("label", **LABELS), r"label announces 8000000000000 bytes"),
+    "bomb": (replace("data", **BOMB), r"announces 28800000 bytes"),
+    "huge chunk": (replace("data", **CHUNK), r"announces 2949120000 bytes"),
     "plugin": (plugin, "compressed by a plugin"),
 }
 

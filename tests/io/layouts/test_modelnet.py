@@ -173,35 +173,21 @@ def test_names_are_modelnet40s_where_the_file_is_missing(tmp_path, rng):
         read_modelnet_h5(root)
 
 
-def few_names(root):
-    (root / "shape_names.txt").write_text("\n".join(CLASSES[:30]))
-
-
-def names_twice(root):
-    (root / "shape_names.txt").write_text("chair\nchair\n")
-
-
-def no_names(root):
-    (root / "shape_names.txt").write_text("\n \n")
-
-
-def no_files(root):
-    for path in root.iterdir():
-        path.unlink()
-
-
 @pytest.mark.parametrize(
-    ("damage", "message"),
+    ("names", "message"),
     [
-        (few_names, r"ply_data_test0\.h5: label 33 is none of 0 to 29$"),
-        (names_twice, "one class name a line, none twice"),
-        (no_names, "one class name a line"),
-        (no_files, "holds no ply_data_train<i>.h5"),
+        ("\n".join(CLASSES[:30]), r"ply_data_test0\.h5: label 33 is none of 0 to 29$"),
+        ("chair\nchair\n", "one class name a line, none twice"),
+        ("\n \n", "one class name a line"),
+        (None, "holds no ply_data_train<i>.h5"),
     ],
 )
-def test_hostile_folders_are_refused_in_one_line(released, damage, message):
+def test_hostile_folders_are_refused_in_one_line(released, names, message):
     root = released[0]
-    damage(root)
+    for path in root.iterdir() if names is None else ():
+        path.unlink()
+    if names is not None:
+        (root / "shape_names.txt").write_text(names)
     with refused(message):
         read_modelnet_h5(root)
 

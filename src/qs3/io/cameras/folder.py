@@ -17,7 +17,7 @@ from qs3.files import holds_something, write_bytes, write_json, write_text
 from qs3.io.cameras.frames import Camera, DepthFrame
 from qs3.io.extract.depth_images import MILLIMETRE, list_images, read_raw, to_metres
 from qs3.io.extract.intrinsics import CAMERA_FILES, read_intrinsics
-from qs3.io.guards import read_image, read_small, read_text
+from qs3.io.guards import naming, read_image, read_small, read_text
 
 DEPTH, COLOUR, TIMES = "depth", "color", "times.csv"
 _LARGEST = 1 << 28
@@ -122,10 +122,8 @@ def _png(image: np.ndarray) -> bytes:
 
 
 def _read_colour(path: Path, shape: tuple[int, ...]) -> UInt8[np.ndarray, "h w 3"]:
-    try:
+    with naming(path):
         image, mode = read_image(read_small(path, _LARGEST, "a picture"), "PNG")
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
     if mode != "RGB" or image.shape != (*shape, 3) or image.dtype != np.uint8:
         raise InputError(f"{path}: no colour picture of the depth image's size")
     return image[..., ::-1]

@@ -14,6 +14,7 @@ from jaxtyping import Float32, UInt8
 
 from qs3.errors import InputError
 from qs3.io.extract.intrinsics import Intrinsics
+from qs3.sensor.checks import check_range
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +49,7 @@ class FrameSettings:
     def __post_init__(self) -> None:
         if self.frames is not None and self.frames < 1:
             raise InputError(f"--frames {self.frames}: must be at least 1")
-        if not 0 <= self.every < float("inf"):
-            raise InputError(f"--every {self.every:g}: must be 0 or more seconds")
+        check_range(self, "frames", "every")
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 Messages are read as the standard types; definitions that a bag brings along are not looked at.
 """
 
-import logging
 import re
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -13,11 +12,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped
 
-from qs3.errors import InputError, MissingExtraError
+from qs3.errors import InputError, MissingExtraError, say_once
 from qs3.io.cameras.frames import Camera, DepthFrame
 from qs3.io.extract.depth_images import MILLIMETRE, to_metres
 from qs3.io.extract.intrinsics import Intrinsics, intrinsics_from_matrix, read_intrinsics
-from qs3.io.guards import check_pixels, read_image, read_text, reason
+from qs3.io.guards import check_pixels, naming, read_image, read_text
 from qs3.meshes.announced import memory_limit
 
 IMAGE, PACKED, CAMERA = (
@@ -26,7 +25,6 @@ IMAGE, PACKED, CAMERA = (
 _KINDS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _PACKED = re.compile(r"16UC1;\s*compressedDepth(\s+png)?")
 _HEADER = 12  # bytes before the PNG of compressedDepth
-_LOG = logging.getLogger(__name__)
 
 
 def ros_camera(path: Path, topic: str = "", intrinsics: str = "") -> Camera:
@@ -90,15 +88,8 @@ class _Bag:
 
     def guarded(self, work: Any, *given: Any) -> Any:
         """Do a step; whatever a damaged bag makes the library stumble over is one line."""
-        with memory_limit(self._largest):
-            try:
-                return work(*given)
-            except InputError as error:
-                raise InputError(f"{self.path}: {error}") from error
-            except Exception as error:
-                raise InputError(
-                    f"{self.path}: cannot be read as a ROS bag ({reason(error)})"
-                ) from error
+        with memory_limit(self._largest), naming(self.path, "cannot be read as a ROS bag"):
+            return work(*given)
 
     def messages(self, topic: str) -> Iterator[tuple[float, Any]]:
         """Yield the messages of a topic with the time at which they were recorded, seconds."""
@@ -129,7 +120,7 @@ def _intrinsics(info: Any, topic: str) -> Intrinsics:
     if "rect" in topic:  # those pixels are of P, without distortion
         matrix = np.reshape(fields["p"], (3, 4))[:, :3]
     elif lens.any():
-        _LOG.warning("%s: its images have lens distortion, which is not undone", topic)
+        say_once(f"{topic}: its images have lens distortion, which is not undone")
     return intrinsics_from_matrix(matrix.astype(np.float64))
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Float32
 
 from qs3.errors import InputError
 from qs3.io.extract.intrinsics import Intrinsics
+from qs3.sensor.checks import check_range
 
 _FARTHEST = 1e6
 
@@ -39,12 +40,9 @@ class CutSettings:
             raise InputError(
                 f"near {self.near:g} and far {self.far:g} must be 0 or above, in order"
             )
-        if not 0 <= self.erode <= 100:
-            raise InputError(f"erode {self.erode}: must be from 0 to 100 pixels")
-        if not 0 <= self.flying < math.inf:
-            raise InputError(f"flying {self.flying:g}: must be 0 or metres")
-        if self.min_points < 1:
-            raise InputError(f"min-points {self.min_points}: must be at least 1")
+        check_range(self, "cut", "erode", high=100)
+        check_range(self, "cut", "flying")
+        check_range(self, "cut", "min_points", low=1)
 
 
 def keep_pixels(

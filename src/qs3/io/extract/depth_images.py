@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, Shaped, UInt8, UInt16
 
 from qs3.errors import InputError
-from qs3.io.guards import check_pixels, load_npy, read_image, read_small
+from qs3.io.guards import check_pixels, load_npy, naming, read_image, read_small
 
 DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
 """Endings of depth images and of masks."""
@@ -137,9 +137,7 @@ def _read(path: Path, npy_kinds: str) -> tuple[np.ndarray, str]:
             )
         check_pixels(shape[1], shape[0])
 
-    try:
+    with naming(path):
         if ending == ".npy":
             return load_npy(content, accept), ""
         return read_image(content, "PNG" if ending == ".png" else "TIFF")
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.errors import InputError
-from qs3.io.guards import Numbers, as_array, pick, read_numbers, read_small_json
+from qs3.io.guards import Numbers, as_array, naming, pick, read_numbers, read_small_json
 
 CAMERA_FILES = ("intrinsics.json", "intrinsics.txt", "camera.json", "K.txt")
 """Names of the file that tells the camera of a folder of images."""
@@ -120,7 +120,7 @@ def read_intrinsics(given: str | Path) -> Intrinsics:
         path = there[0]
     if numbers or not path.is_file():
         raise InputError(f"intrinsics {text!r}: {'' if numbers else 'no such file; '}{_FORMS}")
-    try:
+    with naming(path):
         if path.suffix.lower() == ".json":
             return _from_json(pick(read_small_json(path, _LARGEST), _CameraFile, "camera"))
         numbers = read_numbers(path, (4, 9, 16)).tolist()
@@ -128,9 +128,6 @@ def read_intrinsics(given: str | Path) -> Intrinsics:
             return read_intrinsics(",".join(map(str, numbers)))
         side = math.isqrt(len(numbers))
         return intrinsics_from_matrix(np.reshape(numbers, (side, side))[:3, :3])
-    except InputError as error:
-        message = str(error)
-        raise InputError(message if str(path) in message else f"{path}: {message}") from error
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from qs3.errors import InputError
-from qs3.io.guards import check_announced, read_small, reason
+from qs3.io.guards import check_announced, naming, read_small
 
 _LARGEST_FILE = 1 << 30
 _DEFLATE_AT_BEST = 1032
@@ -50,13 +50,9 @@ def read_mat(path: Path, names: tuple[str, ...]) -> dict[str, Any]:
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
     if order is None:
         raise InputError(f"{path}: not a MAT file of version 5 to 7")
-    try:
+    with naming(path, "damaged"):
         _check_file(memoryview(content), order, names)
         values = loadmat(io.BytesIO(content), variable_names=names, simplify_cells=True)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    except Exception as error:  # whatever damage makes SciPy stumble over
-        raise InputError(f"{path}: damaged ({reason(error)})") from error
     return {name: values[name] for name in names if name in values}
 
 

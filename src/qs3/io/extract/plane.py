@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+_TRIALS = 1000  # planes that are tried, each through three points
 _SCORED = 4000  # points that a candidate is tried on
 _NARROWING = np.cos(np.radians(np.repeat([45.0, 15.0], 5)))
 
@@ -36,7 +37,6 @@ def fit_plane(
     up: Float[np.ndarray, "3"],
     tilt: float = 45.0,
     seed: int = 0,
-    trials: int = 1000,
 ) -> Plane | None:
     """Find the plane that holds the most points by RANSAC, then fit it to these by least squares.
 
@@ -48,7 +48,6 @@ def fit_plane(
         up: Upward direction, roughly, of unit length.
         tilt: Degrees by which the plane's normal may be off ``up``; 90 takes walls too.
         seed: Seed of the draws.
-        trials: Planes that are tried, each through three points.
 
     Returns:
         The plane; None where three points never gave one that is level enough.
@@ -62,7 +61,7 @@ def fit_plane(
     if len(points) < 3:
         return None
     rng = np.random.default_rng(seed)
-    first, second, third = points[rng.integers(len(points), size=(3, trials))].astype(np.float64)
+    first, second, third = points[rng.integers(len(points), size=(3, _TRIALS))].astype(np.float64)
     normals = np.cross(second - first, third - first)
     lengths = np.linalg.norm(normals, axis=1)
     upward = along(normals, up)

@@ -13,6 +13,7 @@ from qs3.errors import InputError
 from qs3.io.guards import utf8
 from qs3.io.preparation import resample
 from qs3.meshes.classes import POINTDA10, map_labels
+from qs3.sensor.checks import check_range
 from qs3.store.executors import Failure, InlineExecutor, LocalExecutor, guarded, outcomes
 from qs3.store.executors.executor import failure_of
 from qs3.store.failures import read_failures, write_failures
@@ -46,10 +47,8 @@ class OutputSettings:
     """Do again what failed before."""
 
     def __post_init__(self) -> None:
-        if self.num_points < 1:
-            raise InputError(f"--num-points {self.num_points}: must be at least 1")
-        if self.workers < 0:
-            raise InputError(f"--workers {self.workers}: must be 0 or more")
+        check_range(self, "data set", "num_points", low=1)
+        check_range(self, "data set", "workers")
 
 
 @dataclass(frozen=True)
@@ -124,7 +123,6 @@ def run_extract(
     class_names: Sequence[str],
     planned: int | None = None,
     min_points: int = 0,
-    progress: bool = True,
 ) -> ExtractReport:
     """Extract the objects of every unit into the data set at ``output.out``.
 
@@ -138,7 +136,6 @@ def run_extract(
         class_names: Classes in the order of the label; an object of any other class is a fault.
         planned: Objects that the source announces, for the report.
         min_points: Size below which ``extract_one`` leaves objects out, for the report.
-        progress: Show a bar on the standard error stream.
 
     Raises:
         InputError: where there is no unit or two have one name, the folder holds something else,
@@ -173,8 +170,7 @@ def run_extract(
         make = functools.partial(_put_unit, folder, extract_one, tuple(class_names), num_points)
         todo = [index for index in range(len(units)) if index not in settled]
         calls = ((index, make, index, units[index]) for index in todo)
-        text = folder.name if progress else None
-        bar = progress_bar(len(units), text, "scene", len(settled))
+        bar = progress_bar(len(units), folder.name, "scene", len(settled))
         objects = 0
 
         def note(index: int, outcome: tuple[str, int] | Failure) -> None:

@@ -15,6 +15,7 @@ from qs3.io.extract.run import (
     run_extract,
     wanted_classes,
 )
+from qs3.sensor.checks import check_range
 
 
 @dataclass(frozen=True)
@@ -59,15 +60,11 @@ class ScanNetSettings:
     """Seed of every choice."""
 
     def __post_init__(self) -> None:
-        low = {"every": 1, "erode": 0, "max_points": 1, "max_frames": 0, "min_pixels": 1}
-        for name, least in {**low, "min_points": 1, "seed": 0}.items():
-            if getattr(self, name) < least:
-                raise InputError(f"{name} {getattr(self, name)}: has to be at least {least}")
+        check_range(self, "scannet", "erode", "max_frames", "seed")
+        check_range(self, "scannet", "every", "max_points", "min_pixels", "min_points", low=1)
+        check_range(self, "scannet", "distance", "voxel", low=1e-4, high=1)
         if not 0 <= self.near < self.far < np.inf:
             raise InputError(f"near {self.near}, far {self.far}: need 0 ≤ near < far, metres")
-        for name in ("distance", "voxel"):
-            if not 1e-4 <= getattr(self, name) <= 1:
-                raise InputError(f"{name} {getattr(self, name)}: has to lie from 0.0001 to 1 m")
         if wanted_classes(self.classes) is None:
             raise InputError("--classes all: ScanNet's labels are free words; name the classes")
 

@@ -30,7 +30,7 @@ from qs3.io.extract.scannet_scene import (
     read_objects,
     rest,
 )
-from qs3.io.guards import read_small
+from qs3.io.guards import naming, read_small
 from qs3.io.ply import load_ply
 
 NO_OBJECT = -1
@@ -47,10 +47,8 @@ def read_scene_mesh(
     """
     path = scene.file(_MESH)
     content = read_small(path, what="a scene's decimated mesh")
-    try:
+    with naming(path):
         loaded = load_ply(content)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
     vertices = np.asarray(getattr(loaded, "vertices", np.zeros((0, 3))), dtype=np.float64)
     if not len(vertices) or not (np.abs(vertices) < 1e4).all():
         raise InputError(f"{path}: has no vertices, or some are not finite")

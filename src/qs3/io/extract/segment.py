@@ -22,9 +22,10 @@ from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, u
 from qs3.io.extract.depth_images import read_depth
 from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
 from qs3.io.extract.plane import Plane, fit_plane
-from qs3.io.guards import load_npy, open_zip, read_member
+from qs3.io.guards import load_npy, naming, open_zip, read_member
 from qs3.io.point_files import cloud_bytes, read_cloud
 from qs3.io.preparation import thin
+from qs3.sensor.checks import check_range
 
 TABLE = "objects.csv"
 _LEAST_SHARE = 0.1  # of the points, on the plane
@@ -64,15 +65,9 @@ class SegmentSettings:
         for name in ("tolerance", "gap", "height", "far"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name} {getattr(self, name):g}: must be positive metres")
-        if not 0 <= self.noise < math.inf:
-            raise InputError(f"noise {self.noise:g}: must be metres, 0 or more")
-        if not 0 <= self.tilt <= 90:
-            raise InputError(f"tilt {self.tilt:g}: must be from 0 to 90 degrees")
-        for name in ("min_points", "stride"):
-            if getattr(self, name) < 1:
-                raise InputError(
-                    f"{name.replace('_', '-')} {getattr(self, name)}: must be 1 or more"
-                )
+        check_range(self, "scene", "noise")
+        check_range(self, "scene", "tilt", high=90)
+        check_range(self, "scene", "min_points", "stride", low=1)
         upright(self.gravity or (0.0, 1.0, 0.0))
 
 
@@ -123,11 +118,8 @@ def segment_scene(
     import pandas as pd
 
     with new_folder(out) as folder:
-        try:
+        with naming(scene):
             objects = segment(read_scene(scene, settings), settings)
-        except InputError as error:
-            message = str(error)
-            raise InputError(message if str(scene) in message else f"{scene}: {error}") from error
         rows = []
         for number, item in enumerate(objects):
             name = f"object_{number:03d}.ply"

@@ -41,6 +41,7 @@ from qs3.io.extract.run import (
     run_extract,
     wanted_classes,
 )
+from qs3.io.guards import naming
 
 CAPPED = 8.0
 """Metres; the toolbox moves all that is farther to this depth, here it is no depth."""
@@ -163,11 +164,9 @@ def cut_frame(frame: SunFrame, settings: SunRgbdSettings) -> Iterator[ExtractedC
     """
     if frame.fault:
         raise InputError(frame.fault)
-    try:
+    with naming(frame.id):
         from_one = intrinsics_from_matrix(frame.matrix)
         check_rotation(frame.tilt, "Rtilt")
-    except InputError as error:
-        raise InputError(f"{frame.id}: {error}") from error
     camera = dataclasses.replace(from_one, cx=from_one.cx - 1, cy=from_one.cy - 1)
     raw = read_raw(frame.depth)
     if raw.dtype != np.uint16:
@@ -177,10 +176,8 @@ def cut_frame(frame: SunFrame, settings: SunRgbdSettings) -> Iterator[ExtractedC
     x, y, z = lift(depth, keep, camera).T
     world = turn(frame.tilt, np.stack([x, z, -y], axis=1))
     for item in frame.objects:
-        try:
+        with naming(f"{frame.id}, object {item.number}"):
             points = world[inside_box(world, item.box, settings.margin)]
-        except InputError as error:
-            raise InputError(f"{frame.id}, object {item.number}: {error}") from error
         if len(points) < settings.cut.min_points:
             continue
         source = {

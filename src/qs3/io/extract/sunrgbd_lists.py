@@ -23,7 +23,7 @@ from qs3.io.extract.cut import OrientedBox
 from qs3.io.extract.matlab import read_mat, struct_rows
 from qs3.io.extract.scannet_scene import class_of
 from qs3.io.extract.sunrgbd import DepthKind, SunFrame, SunObject
-from qs3.io.guards import Numbers, as_array, pick, read_numbers, read_small_json
+from qs3.io.guards import Numbers, as_array, naming, pick, read_numbers, read_small_json
 
 META = "SUNRGBDMeta3DBB_v2.mat"
 DEPTH_FOLDERS: dict[DepthKind, str] = {"refined": "depth_bfx", "raw": "depth"}
@@ -164,10 +164,8 @@ def _from_mat(base: Path, path: Path, depth: DepthKind, rename: Rename) -> Itera
         if len(given.parts) < 3 and not given.is_absolute():
             raise InputError(f"{where}: depthpath {str(given)!r} names no depth picture of a frame")
         folder = given.parent.parent
-        try:
+        with naming(path):
             picture = below(base, str(folder / DEPTH_FOLDERS[depth] / given.name))
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from error
         if not picture.is_file():
             continue
         row = pick(value, _MetaRow, where)
@@ -190,10 +188,8 @@ def _from_json(base: Path, path: Path, depth: DepthKind, rename: Rename) -> Iter
         raise InputError(f"{path}: not a JSON object of frames")
     for name in sorted(value):
         where = f"{path}: frame {name[:200]!r}"
-        try:
+        with naming(where):
             folder = below(base, name)
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from error
         if not isinstance(value[name], list) or not all(isinstance(e, dict) for e in value[name]):
             raise InputError(f"{where}: not a list of boxes")
         rows = [{**entry, "classname": entry.get("class")} for entry in value[name]]

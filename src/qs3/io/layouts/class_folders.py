@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from qs3.errors import InputError
 from qs3.files import sha256
@@ -15,8 +14,7 @@ from qs3.io.guards import utf8
 from qs3.io.layouts.format import SPLITS
 from qs3.io.point_files import POINT_FILES, read_cloud
 from qs3.io.ragged import RaggedClouds
-
-_MANY = 500
+from qs3.store.progress import cloud_bar
 
 
 @dataclass(frozen=True)
@@ -123,7 +121,7 @@ def read_files(
     names = tuple(class_names)
     digest = hashlib.sha256(kind.encode())
     clouds, ids = [], []
-    for file in tqdm(files, "read", unit="cloud", disable=None if len(files) > _MANY else True):
+    for file in cloud_bar(files, "read", len(files)):
         ids.append(utf8(file.path.relative_to(root).as_posix()))
         digest.update(f"{ids[-1]} {sha256(file.path)}\n".encode())
         clouds.append(read(file.path))

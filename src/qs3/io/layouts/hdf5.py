@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from qs3.errors import InputError
-from qs3.io.guards import DENSEST, check_announced, reason
+from qs3.io.guards import DENSEST, check_announced, naming
 
 _BLOCK = 2**24
 _MOST_TEXTS, _LONGEST_TEXT = 100_000, 1000
@@ -71,13 +71,8 @@ def open_hdf5(path: Path) -> Iterator[Any]:
 
     if not path.is_file():
         raise InputError(f"{path}: no such file")
-    try:
-        with h5py.File(path, "r") as file:
-            yield file
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    except Exception as error:  # the library raises whatever it stumbles over
-        raise InputError(f"{path}: cannot be read as HDF5 ({reason(error)})") from error
+    with naming(path, "cannot be read as HDF5"), h5py.File(path, "r") as file:
+        yield file
 
 
 def plain_dataset(file: Any, name: str, path: Path, frame: tuple[int, ...] | None = None) -> Any:

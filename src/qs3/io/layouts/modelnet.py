@@ -30,6 +30,7 @@ from jaxtyping import Float32
 
 from qs3.errors import InputError
 from qs3.files import write_text
+from qs3.io.guards import naming
 from qs3.io.layouts.class_folders import (
     CloudFile,
     choose_split,
@@ -131,11 +132,8 @@ def _sample(root: Path, path: Path) -> Float32[np.ndarray, "n 3"]:
     digest = hashlib.sha256(name.encode(errors="surrogateescape")).digest()
     rng = np.random.default_rng(np.frombuffer(digest, dtype="<u4"))
     mesh = load_mesh(path)
-    try:
-        with np.errstate(over="ignore", invalid="ignore"):
-            points = sample_surface(mesh, POINTS, rng)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+    with naming(path), np.errstate(over="ignore", invalid="ignore"):
+        points = sample_surface(mesh, POINTS, rng)
     if not np.isfinite(points).all():
         raise InputError(f"{path}: its coordinates are too large")
     return points
@@ -145,15 +143,15 @@ def _detect_meshes(path: Path) -> bool:
     try:
         folders = [f for f in entries(path, os.DirEntry.is_dir) if f.name[0] != "_"]
         return bool(folders) and all(
-            folder.name in MODELNET40 and any(_has_mesh(folder / part) for part in SPLITS)
+            folder.name in MODELNET40
+            and any(
+                entries(folder / part, lambda entry: entry.name.lower().endswith(".off"))
+                for part in SPLITS
+            )
             for folder in folders
         )
     except OSError:  # a folder that cannot be listed
         return False
-
-
-def _has_mesh(folder: Path) -> bool:
-    return bool(entries(folder, lambda entry: entry.name.lower().endswith(".off")))
 
 
 FORMATS = (

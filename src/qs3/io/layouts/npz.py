@@ -7,7 +7,7 @@ from jaxtyping import Bool, Int
 
 from qs3.errors import InputError
 from qs3.files import sha256
-from qs3.io.guards import check_announced, load_npy, open_zip, read_member
+from qs3.io.guards import check_announced, load_npy, naming, open_zip, read_member
 from qs3.io.layouts.format import SPLITS, Format
 from qs3.io.ragged import RaggedClouds
 
@@ -50,7 +50,7 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
     """
     path = Path(path)
     arrays = _read(path)
-    try:
+    with naming(path):
         clouds = _clouds(arrays)
         count = len(clouds)
         for name in _PER_CLOUD:
@@ -58,8 +58,6 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
                 raise InputError(f"{name} has shape {arrays[name].shape} for {count} clouds")
         labels, names = _labels(arrays)
         rows = _rows(arrays, split, count)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
     given, train = arrays.get("name"), arrays.get("is_train")
     ids = [f"{path.stem}/{i:05d}" for i in range(count)] if given is None else given.tolist()
     return RaggedClouds(

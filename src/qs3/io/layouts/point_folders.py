@@ -11,17 +11,15 @@ import urllib.parse
 from collections.abc import Sequence
 from pathlib import Path
 
-from tqdm import tqdm
-
 from qs3.errors import InputError
 from qs3.io.layouts.class_folders import read_folder
 from qs3.io.layouts.format import SPLITS, Format
 from qs3.io.point_files import POINT_FILES, WRITTEN_FILES, cloud_bytes
 from qs3.io.ragged import RaggedClouds
+from qs3.store.progress import cloud_bar
 
 _LONGEST_NAME = 180
 _DEPTH = 3
-_MANY = 500
 
 
 def write_folder(root: Path, clouds: RaggedClouds, ending: str) -> None:
@@ -44,13 +42,10 @@ def write_folder(root: Path, clouds: RaggedClouds, ending: str) -> None:
 def write_files(root: Path, clouds: RaggedClouds, folders: Sequence[str], ending: str) -> None:
     """Write each cloud as one file into its own of ``folders`` below ``root`` (``class/train``)."""
     taken: set[str] = set()
-    count = len(clouds.clouds)
     for folder in sorted(set(folders)):
         (root / folder).mkdir(parents=True, exist_ok=True)
     rows = zip(clouds.clouds, clouds.ids, folders, strict=True)
-    for cloud, identifier, folder in tqdm(
-        rows, "write", count, unit="cloud", disable=None if count > _MANY else True
-    ):
+    for cloud, identifier, folder in cloud_bar(rows, "write", len(clouds.clouds)):
         stem = name = f"{folder}/{file_stem(identifier, folder)}".lstrip("/")
         number = 1
         while name.casefold() in taken:

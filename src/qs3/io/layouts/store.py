@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from tqdm import tqdm
 
 from qs3.errors import InputError
 from qs3.io import scratch
@@ -29,9 +28,9 @@ from qs3.store.manifest import (
     write_manifest,
     write_sums,
 )
+from qs3.store.progress import cloud_bar
 
 ROWS_PER_SHARD = 64
-_MANY = 500
 _THREADS = min(os.cpu_count() or 1, 8)
 
 
@@ -153,8 +152,7 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
     )
     write_manifest(folder, manifest)
     sums = {}
-    bar = tqdm(total=count, desc="write", unit="cloud", disable=None if count > _MANY else True)
-    with bar:
+    with cloud_bar(None, "write", count) as bar:
         for index, start in enumerate(starts):
             rows = []
             for i in range(start, min(start + ROWS_PER_SHARD, count)):

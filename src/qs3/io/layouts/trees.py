@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3.errors import InputError
+from qs3.io.guards import naming
 from qs3.io.layouts.class_folders import (
     CloudFile,
     choose_split,
@@ -53,10 +54,8 @@ def read_ten_classes(root: Path, split: str | None, ending: str) -> RaggedClouds
         if file.split not in SPLITS or not file.class_name:
             raise InputError(f"{file.path}: lies outside <class>/<train|test>/ of this layout")
     names = sorted({file.class_name for file in files})
-    try:
+    with naming(root):
         positions, _ = map_labels(names, np.arange(len(names)))
-    except InputError as error:
-        raise InputError(f"{root}: {error}") from error
     clouds = read_files(root, choose_split(root, files, split), names)
     return dataclasses.replace(clouds, labels=positions[clouds.labels], class_names=POINTDA10)
 

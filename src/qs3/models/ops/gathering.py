@@ -1,5 +1,7 @@
 """Values at indices, and their sums and maxima over neighbours."""
 
+from collections.abc import Iterator
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -13,6 +15,21 @@ def is_exporting() -> bool:
     tracing alone.
     """
     return getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)()
+
+
+def blocks(b: int, m: int, n: int, budget: int) -> Iterator[tuple[slice, slice]]:
+    """Cut b × m rows of n values into blocks of clouds and rows that keep within a budget.
+
+    A row of more values than that is a block of its own.
+    """
+    if is_exporting():  # blocks would fix the number of clouds
+        yield slice(None), slice(None)
+        return
+    clouds = max(1, budget // (m * n))
+    rows = m if clouds > 1 else max(1, min(m, budget // n))
+    for cloud in range(0, b, clouds):
+        for row in range(0, m, rows):
+            yield slice(cloud, cloud + clouds), slice(row, row + rows)
 
 
 def in_single_precision(points: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
@@ -44,12 +61,6 @@ def scatter_points(
     return _Scatter.apply(values, index, n)
 
 
-def _take(values: Tensor, index: Tensor) -> Tensor:
-    b, n, c = values.shape
-    flat = flat_indices(index.reshape(b, -1, 1), n).view(-1)
-    return values.reshape(b * n, c).index_select(0, flat).view(*index.shape, c)
-
-
 def _sum_into(values: Tensor, index: Tensor, n: int) -> Tensor:
     b, c = len(values), values.shape[-1]
     flat = flat_indices(index.reshape(b, -1, 1), n).view(-1)
@@ -65,8 +76,9 @@ class _Gather(torch.autograd.Function):
     @staticmethod
     def forward(ctx, values: Tensor, index: Tensor) -> Tensor:
         ctx.save_for_backward(index)
-        ctx.n = values.shape[1]
-        return _take(values, index)
+        b, ctx.n, c = values.shape
+        flat = flat_indices(index.reshape(b, -1, 1), ctx.n).view(-1)
+        return values.reshape(-1, c).index_select(0, flat).view(*index.shape, c)
 
     @staticmethod
     def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]

@@ -1,13 +1,12 @@
 """Neighbours of points: the k nearest, those within a ball, and features between the nearest."""
 
-from collections.abc import Iterator
 from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from qs3.models.ops.gathering import gather_points, in_single_precision, is_exporting
+from qs3.models.ops.gathering import blocks, gather_points, in_single_precision
 
 BallOrder = Literal["nearest", "first"]
 """Which points a ball keeps that has too many: its nearest, or those first in the cloud."""
@@ -51,7 +50,7 @@ def knn(
         squared = points.square().sum(dim=2)
         m = queries.shape[1]
         indices = torch.zeros((b, m, k), dtype=torch.int64, device=points.device)
-        for cloud, row in _blocks(b, m, n, points.is_cuda):
+        for cloud, row in blocks(b, m, n, _budget(points)):
             # |x|² is the same for the whole row, so it is left out.
             distances = torch.baddbmm(
                 squared[cloud, None, :],
@@ -102,7 +101,7 @@ def ball_query(
         points = in_single_precision(points)
         centres = centres.to(points.dtype)
         indices = torch.zeros((b, m, k), dtype=torch.int64, device=points.device)
-        for cloud, row in _blocks(b, m, n, points.is_cuda):
+        for cloud, row in blocks(b, m, n, _budget(points)):
             squared = _squared_distances(points[cloud], centres[cloud, row])
             pick = _nearest_in_ball if order == "nearest" else _first_in_ball
             indices[cloud, row] = pick(squared, radius * radius, k)
@@ -139,6 +138,11 @@ def three_nn_interpolate(
         around = gather_points(features, neighbours[:, :, t])
         mean = torch.addcmul(mean, around, weights[:, :, t, None])
     return mean
+
+
+def _budget(points: Tensor) -> int:
+    """Distances at a time: they fit the cache (CPU) or 1 GiB (GPU)."""
+    return 2**28 if points.is_cuda else 2**20
 
 
 def _check(n: int, k: int) -> None:
@@ -178,19 +182,6 @@ def _first_in_ball(squared: Float[Tensor, "b r n"], limit: float, k: int) -> Int
     first = chosen[:, :, :1]
     first = torch.where(first < n, first, squared.argmin(dim=2, keepdim=True))
     return torch.where(chosen < n, chosen, first)
-
-
-def _blocks(b: int, m: int, n: int, cuda: bool) -> Iterator[tuple[slice, slice]]:
-    """Cut b × m rows of n distances into blocks that fit the cache (CPU) or 1 GiB (GPU)."""
-    if is_exporting():  # blocks would fix the number of clouds
-        yield slice(None), slice(None)
-        return
-    budget = 2**28 if cuda else 2**20
-    clouds = max(1, budget // (m * n))
-    rows = m if clouds > 1 else max(1, min(m, budget // n))
-    for cloud in range(0, b, clouds):
-        for row in range(0, m, rows):
-            yield slice(cloud, cloud + clouds), slice(row, row + rows)
 
 
 def _smallest(values: Float[Tensor, "b r n"], k: int) -> Int[Tensor, "b r k"]:
