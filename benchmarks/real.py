@@ -100,10 +100,6 @@ CELLS: Mapping[str, Cell] = {
     "rooms QBST gentle, refined": replace(GENTLY, rounds={**GENTLE, "refine": True}),
     "rooms QBST gentle, more": replace(GENTLY, rounds={**GENTLE, "threshold_share": 0.8}),
     "rooms QBST gentle, faster": replace(GENTLY, rounds={**GENTLE, "learning_rate": 3e-4}),
-    "rooms QBST gentle, frozen": replace(GENTLY, rounds={**GENTLE, "frozen_statistics": True}),
-    "rooms QBST frozen": replace(
-        GENTLY, rounds={"teacher": "average", "threshold_share": 0.5, "frozen_statistics": True}
-    ),
     # Every round is a checkpoint: which validator picks the best?
     "rooms QBST checked": replace(
         ROOMS,

@@ -94,10 +94,6 @@ def test_default_preset_is_the_default():
             lambda: SelfTrainingSettings(teacher="average", init="scratch"),
             "teacher = average has no sense over weights that start anew",
         ),
-        (
-            lambda: SelfTrainingSettings(frozen_statistics=True, init="scratch"),
-            "frozen_statistics = True needs those of a warm-up",
-        ),
         (lambda: TrainSettings(holdout=1.0), "holdout = 1.0"),
         (lambda: TrainSettings(rule="im", validate_every=0), "leaves no checkpoint"),
         (lambda: TrainSettings(batch_size=1), "batch_size = 1 must be at least 2"),

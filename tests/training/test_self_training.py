@@ -10,7 +10,6 @@ import torch
 
 from qs3.adaptation.confidence import BOUNDS, fit_temperature, rescale
 from qs3.adaptation.graph_labels import refine_probabilities
-from qs3.adaptation.pseudo_labelled import PseudoLabelled
 from qs3.adaptation.selection import SingleClassWarning, select_quasi_balanced, with_floor
 from qs3.errors import InputError
 from qs3.geometry import rotation_z
@@ -457,29 +456,6 @@ def test_the_average_follows_the_network_epoch_by_epoch(domains, settings):
     for number, weights in enumerate((model.state_dict(), averages[1], averages[3])):
         teacher.load_state_dict(weights)
         assert np.allclose(seen[number], answers(teacher, target), atol=1e-5), number
-
-
-def test_frozen_statistics_stay_and_train_the_network_as_it_answers(domains, settings):
-    """Weights move, running statistics do not; an answer in training is that of evaluation."""
-    settings = replace(settings, model_settings={**settings.model_settings, "dropout": 0.0})
-    model, how = (
-        new_model(settings, 3, 0),
-        SelfTrainingSettings(rule="spst", rounds=1, epochs=2, threshold_share=0.9),
-    )
-    moved, frozen = (
-        self_train(model, *domains, settings, replace(how, frozen_statistics=freeze))[0]
-        for freeze in (False, True)
-    )
-    before, after = model.state_dict(), frozen.state_dict()
-    statistics = [name for name in before if "running" in name]
-    assert statistics
-    assert all(torch.equal(before[name], after[name]) for name in statistics)
-    assert not all(torch.equal(before[name], moved.state_dict()[name]) for name in statistics)
-    assert any(not torch.equal(before[name], after[name]) for name in before)
-    points = torch.randn(4, 32, 3)
-    method = PseudoLabelled(model.train(), normalisation="frozen")
-    assert torch.equal(method.logits(points), model.eval()(points))
-    assert not torch.equal(PseudoLabelled(model.train()).logits(points), model.eval()(points))
 
 
 def test_label_smoothing_of_the_rounds_is_their_own(domains, settings):

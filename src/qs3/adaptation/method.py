@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Generator, Tensor, nn
 
-from qs3.adaptation.names import Frozen, Normalisation
+from qs3.adaptation.names import Normalisation
 from qs3.adaptation.normalisation import make_norm
 from qs3.errors import InputError
 from qs3.models import Features, PointClassifier, feature_widths
@@ -79,7 +79,7 @@ class Method(nn.Module, ABC):
     """The network to train."""
     label_smoothing: float = 0.0
     """ε of `cross_entropy` on the source."""
-    normalisation: Normalisation | Frozen = "shared"
+    normalisation: Normalisation = "shared"
     """How the network normalises the two domains."""
 
     def __new__(cls, *args: object, **settings: object):

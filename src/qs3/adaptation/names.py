@@ -35,9 +35,6 @@ separate: each domain has its own; the trained network keeps the target's. adabn
 computed anew over the target (Li et al., 2018). transnorm: as separate, and channels that differ
 less between the domains weigh more (Wang et al., NeurIPS 2019)."""
 
-Frozen = Literal["frozen"]
-"""Batch statistics that stay those of the network that a training starts from."""
-
 Rule = Literal["last", "source-val", "entropy", "im", "bnm", "snd", "dev", "class-ami"]
 """How the network is chosen among a run's checkpoints; no rule looks at a label of the target."""
 

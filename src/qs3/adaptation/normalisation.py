@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
-from qs3.adaptation.names import Frozen, Normalisation
+from qs3.adaptation.names import Normalisation
 from qs3.errors import InputError
 from qs3.models import PointClassifier
 
@@ -132,26 +132,6 @@ class TransNorm(SeparateNorm):
         super().settle()
 
 
-class FrozenNorm(DomainNorm):
-    """Running statistics that stay, and normalise in training too: a few clouds cannot move them.
-
-    For a network that was trained before.
-    """
-
-    @contextmanager
-    def of(self, domain: str) -> Iterator[None]:
-        """Let the layers use their running statistics for a while."""
-        modes = [layer.training for layer in self._layers]
-        for layer in self._layers:
-            layer.eval()
-        try:
-            with super().of(domain):
-                yield
-        finally:
-            for layer, training in zip(self._layers, modes, strict=True):
-                layer.train(training)
-
-
 def channel_weights(
     source: tuple[Tensor, Tensor], target: tuple[Tensor, Tensor], eps: float = 1e-5
 ) -> Tensor:
@@ -172,14 +152,15 @@ def channel_weights(
     return len(closeness) * closeness / closeness.sum()
 
 
-def make_norm(name: Normalisation | Frozen, model: PointClassifier) -> DomainNorm:
+def make_norm(name: Normalisation, model: PointClassifier) -> DomainNorm:
     """Return the treatment of a name.
 
     Raises:
         InputError: where the name is unknown.
     """
-    names = (*get_args(Normalisation), *get_args(Frozen))
-    if name not in names:
-        raise InputError(f"unknown normalisation {name!r}; choose one of {', '.join(names)}")
-    kinds = {"separate": SeparateNorm, "transnorm": TransNorm, "frozen": FrozenNorm}
+    if name not in get_args(Normalisation):
+        raise InputError(
+            f"unknown normalisation {name!r}; choose one of {', '.join(get_args(Normalisation))}"
+        )
+    kinds = {"separate": SeparateNorm, "transnorm": TransNorm}
     return kinds.get(name, DomainNorm)(model)

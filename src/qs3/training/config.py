@@ -250,9 +250,6 @@ class SelfTrainingSettings:
     """Label smoothing in the rounds; None takes that of the training before them."""
     learning_rate: float | None = None
     """Adam's learning rate at the start of a round; None takes that of the training before."""
-    frozen_statistics: bool = False
-    """Whether batch normalisation keeps the running statistics that the rounds start from, and
-    trains with them: the statistics of a few clouds of some classes are not those of the target."""
     source_loss: bool = True
     """Whether each step takes as many labelled clouds of the source too."""
     source_weight: float = 1.0
@@ -288,8 +285,6 @@ class SelfTrainingSettings:
         _check_word(self, "teacher", Teacher)
         good = self.teacher != "average" or self.init == "warm-up"
         _check(self, "teacher", good, "has no sense over weights that start anew; set init warm-up")
-        good = self.init == "warm-up" or not self.frozen_statistics
-        _check(self, "frozen_statistics", good, "needs those of a warm-up; set init warm-up")
         _check_word(self, "rule", RoundRule)
         _check_word(self, "prior", Prior)
         defaults = {field.name: field.default for field in fields(self)}

@@ -247,7 +247,7 @@ def _train_round(
     continuous = rounds.schedule == "continuous"
     first = before * rounds.epochs
     # TransNorm's weights are in the network's scales already; a second time they would double.
-    plain, frozen = settings.normalisation in ("shared", "adabn"), rounds.frozen_statistics
+    plain = settings.normalisation in ("shared", "adabn")
     smoothing = rounds.label_smoothing
     method = PseudoLabelled(
         state.latest,
@@ -255,7 +255,7 @@ def _train_round(
         weight_step=rounds.weight_step,
         epochs=range(first, first + rounds.epochs),
         label_smoothing=settings.label_smoothing if smoothing is None else smoothing,
-        normalisation="frozen" if frozen else "shared" if plain else "separate",
+        normalisation="shared" if plain else "separate",
     )
     kept, judges = pseudo.select(~apart), pseudo.select(apart)
 
