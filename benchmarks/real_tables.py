@@ -33,9 +33,11 @@ PAIRS = (
     ("SPST", "S+C+M"), ("QBST", "SPST"), ("SD", "S+C+M"), ("SD+QBST", "SD"), ("GAST", "S+C+M"),
     ("GAST+QBST", "GAST"), ("DGCNN S", "DGCNN M"), ("DGCNN S+C+M", "DGCNN M"),
     ("DGCNN QBST", "DGCNN S+C+M"),
-    ("rooms", "S+C+M"), ("rooms", "M"), ("M sight", "M"), ("rooms QBST", "rooms"),
+    ("rooms", "S+C+M"), ("rooms", "M"), ("M sight", "M"),
     ("rooms QBST average", "rooms"), ("rooms QBST gentle", "rooms"),
-    ("rooms SPST", "rooms"), ("rooms QBST", "rooms SPST"),
+    ("rooms SPST gentle", "rooms"), ("rooms QBST gentle", "rooms SPST gentle"),
+    ("rooms QBST gentle, refined", "rooms"), ("rooms QBST gentle, more", "rooms"),
+    ("rooms SPST", "rooms"), ("rooms QBST average", "rooms SPST"), ("rooms DGCNN", "rooms"),
 )  # fmt: skip
 """First minus second."""
 SWITCHES = {
@@ -109,9 +111,14 @@ def tables(folder: Path) -> str:
         if part in blocks:
             text += [f"## Differences on {NAMES[part]}", "", "Points of accuracy; first minus"]
             text[-1] += " second, on the same seeds and clouds; 95 % interval over both."
-            text += ["", to_markdown(differences(bits, blocks[part], part, PAIRS)), ""]
+            means = {
+                (place(record)[0], record.seed): record.scores.class_mean_accuracy
+                for record in records
+                if place(record)[1] == part
+            }
+            text += ["", to_markdown(differences(bits, blocks[part], part, PAIRS, means)), ""]
             switches = [(one, base) for base, ones in SWITCHES.items() for one in ones]
-            ablations = differences(bits, blocks[part], part, switches)
+            ablations = differences(bits, blocks[part], part, switches, means)
             if len(ablations):
                 text += ["Switches, one at a time:", "", to_markdown(ablations), ""]
     rounds = round_table(records)
@@ -147,7 +154,8 @@ def score_table(records: list[RunRecord], looked: list[str]) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def differences(bits, blocks: np.ndarray, part: str, pairs) -> pd.DataFrame:
+def differences(bits, blocks: np.ndarray, part: str, pairs, means) -> pd.DataFrame:
+    """Lines of pairs; the class mean's is the mean over their seeds, without an interval."""
     lines = []
     for first, second in pairs:
         seeds = [
@@ -158,7 +166,9 @@ def differences(bits, blocks: np.ndarray, part: str, pairs) -> pd.DataFrame:
                 np.stack([bits[part, cell, seed] for seed in seeds]) for cell in (first, second)
             ]
             value = bootstrap_difference(*both, blocks)
-            lines.append({"first": first, "second": second, "difference": value.format()})
+            mean = np.mean([means[first, seed] - means[second, seed] for seed in seeds])
+            line = {"first": first, "second": second, "difference": value.format()}
+            lines.append(line | {"class mean": f"{100 * mean:+.1f}"})
     return pd.DataFrame(lines)
 
 

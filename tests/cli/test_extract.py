@@ -96,7 +96,7 @@ def test_a_bad_image_fails_alone_and_is_told(typed, pictures):
         (["depth", "D", "--intrinsics", "5,5,2,1", "--box", "0", "0", "4", "6", "--instances"],
          "needs --mask"),
         (["depth", "D", "--intrinsics", "5,5,2,1", "--mask", "M", "--num-points", "0"],
-         "num-points"),
+         "num_points 0 must be at least 1"),
         (["sunrgbd", "D"], "no frame"),
         (["sunrgbd", "D", "--erode", "2"], "erode"),
         (["sunrgbd", "D", "--classes", "chair", "chair"], "comes twice"),

@@ -66,12 +66,12 @@ def test_blocks_do_not_matter(find, monkeypatch):
     points = torch.from_numpy(random_clouds(3, 256))
     whole = find(points)
 
-    def small_blocks(b, m, n, cuda):
+    def small_blocks(b, m, n, budget):
         for cloud in range(b):
             for row in range(0, m, 40):
                 yield slice(cloud, cloud + 1), slice(row, row + 40)
 
-    monkeypatch.setattr(search, "_blocks", small_blocks)
+    monkeypatch.setattr(search, "blocks", small_blocks)
     assert torch.equal(find(points), whole)
 
 
@@ -80,7 +80,7 @@ def test_blocks_do_not_matter(find, monkeypatch):
 )
 def test_blocks_cover_every_row_once_in_bounded_memory(b, m, n):
     seen = np.zeros((b, m), dtype=int)
-    for cloud, row in search._blocks(b, m, n, cuda=False):
+    for cloud, row in search.blocks(b, m, n, 2**20):
         size = seen[cloud, row].size * n
         assert size <= max(2**20, n)
         seen[cloud, row] += 1
