@@ -8,6 +8,7 @@ the records and right.csv alone. Intervals draw seeds, and blocks of ten frames 
 """
 
 import argparse
+import functools
 import sys
 from pathlib import Path
 
@@ -17,9 +18,12 @@ from real import parts
 
 from qs3.evaluation.compare import bootstrap_difference
 from qs3.evaluation.records import RunRecord, read_record
+from qs3.evaluation.regret import validator_regret
 from qs3.evaluation.tables import average, frame, to_markdown
 from qs3.io.layouts.npz import frame_parts
-from qs3.training import load_model, predict_probabilities
+from qs3.training import load_model
+from qs3.training.predict import describe
+from qs3.training.prepared import prepare_clouds
 from qs3.training.run import completed
 
 RIGHT = "right.csv"
@@ -47,6 +51,7 @@ SWITCHES = {
               "no augmentation", "full augmentation", "aligned", "sight"),
 }  # fmt: skip
 """Against what each switch is held."""
+VALIDATORS = "## Rounds that rules choose, NYU, first 70 %"
 
 
 def read_records(folder: Path) -> list[RunRecord]:
@@ -65,13 +70,15 @@ def note_right(out: Path, shared: Path, folder: Path) -> None:
     path = folder / RIGHT
     lines = pd.read_csv(path, dtype=str).to_dict("records") if path.is_file() else []
     known = {(line["cell"], line["part"], int(line["seed"])) for line in lines}
+    prepare = functools.cache(lambda part, *how: prepare_clouds(clouds[part], *how))
     for record in read_records(folder):
         (cell, part), seed = place(record), record.seed
         if part not in clouds or (cell, part, seed) in known:
             continue
         loaded, data = load_model(out / f"{cell}-{seed}"), clouds[part]
         names = [loaded.class_names.index(name) for name in data.class_names]
-        answers = predict_probabilities(loaded, data.points).argmax(axis=1)
+        prepared = prepare(part, loaded.num_points, loaded.preparation)
+        answers = describe(loaded.model, prepared).probabilities.argmax(axis=1)
         right = np.array(names)[data.labels] == answers
         if round(right.mean(), 9) != round(record.scores.accuracy, 9):
             raise SystemExit(f"{cell}-{seed}, {part}: the run is not that of its record")
@@ -124,6 +131,9 @@ def tables(folder: Path) -> str:
     rounds = round_table(records)
     if len(rounds):
         text += ["## Rounds of self-training, seed 0", "", to_markdown(rounds), ""]
+    judged = validator_table(records)
+    if len(judged):
+        text += [VALIDATORS, "", to_markdown(judged), ""]
     for part in looked:
         for cell in ("M", "S+C+M", "QBST", "rooms", "rooms QBST average"):
             text += confusion(records, cell, part) if part != "sunrgbd" else []
@@ -194,6 +204,17 @@ def round_table(records: list[RunRecord]) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
+def validator_table(records: list[RunRecord]) -> pd.DataFrame:
+    """Lines of rules: what the round of their choice loses on NYU's first 70 %, without labels."""
+    table = validator_regret([record for record in records if place(record)[1] == "dev"])
+    if table.empty:
+        return table
+    table["correlation"] = [
+        f"{c.mean:+.2f}" if c is not None else "–" for c in table["correlation"]
+    ]
+    return table.drop(columns="test")
+
+
 def confusion(records: list[RunRecord], cell: str, part: str) -> list[str]:
     """Lines of the confusion matrix of a cell, summed over its seeds."""
     mine = [record.scores for record in records if place(record) == (cell, part)]
@@ -222,6 +243,7 @@ def filled(page: str, folder: Path) -> str:
     scores = text.partition("## Scores\n\n")[2].partition("\n\n##")[0]
     differences = text.partition("over both.\n\n")[2]
     page = fill(page, "scores", scores)
+    page = fill(page, "validators", text.partition(f"{VALIDATORS}\n\n")[2].partition("\n\n")[0])
     return fill(page, "differences", differences.partition("\n\n")[0])
 
 

@@ -23,6 +23,8 @@ def main() -> None:
     records = []
     for folder in parser.parse_args().runs:
         found, faults = find_records(folder)
+        if not found:  # a folder of nothing but records, as results/real
+            found, faults = find_records(folder, every_json=True)
         records += [record for _, record in found]
         for fault in faults:
             print(fault, file=sys.stderr)

@@ -50,7 +50,7 @@ ROWS: Mapping[str, Row] = {
     "coral": Row("coral"),
     "sd": Row("sd"),
     "spst": Row("spst", "spst", ORDINARY),
-    # What did no harm on real objects.
+    # What lost least on real objects.
     "qbst-gentle": replace(_QBST, changes=GENTLE),
     "qbst-least-confident": replace(_QBST, changes={"selection": "least-confident"}),
     "qbst-scratch": replace(_QBST, changes={"init": "scratch"}),

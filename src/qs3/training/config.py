@@ -385,7 +385,7 @@ GENTLE: Mapping[str, Any] = {
     "rounds": 5,
     "epochs": 4,
 }
-"""Rounds of `SelfTrainingSettings` that did no harm on NYU's development objects (docs/real.md)."""
+"""Rounds of `SelfTrainingSettings` that lost least on NYU's real objects (docs/real.md)."""
 
 
 def self_training_preset(name: str, **overrides: Any) -> SelfTrainingSettings:

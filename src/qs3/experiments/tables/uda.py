@@ -3,7 +3,7 @@
 Paper: QS³ (ECCV 2022), main table of adaptation and supplement, Table 2: M→D, S→D, S→S*, DGCNN.
 Published: QBST 66.4 on M→D; QS³ 72.4 on S→D and 57.4 on S→S*, 8.4 and 6.3 over no adaptation.
 
-QBST has the settings of the paper's text (preset ``paper``), ours, and those that did no harm on
+QBST has the settings of the paper's text (preset ``paper``), ours, and those that lost least on
 real objects; the bench of adaptation (`qs3.experiments.tables.adaptation_bench`) has more methods.
 """
 
