@@ -1,6 +1,7 @@
 """The whole chain: what goes in comes back where it was."""
 
 import dataclasses
+import threading
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,7 @@ from qs3.geometry import rotation_z
 from qs3.meshes import normalise, sample_surface
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.exposure import ExposureSettings
-from qs3.sensor.matching import MatchingSettings
+from qs3.sensor.matching import MatchingSettings, match
 from qs3.sensor.presets import Sensor
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, StereoRig
@@ -243,6 +244,27 @@ def test_equal_seeds_scan_alike_and_image_noise_changes_the_cloud(renderer):
     np.testing.assert_array_equal(first.clean, again.clean)
     assert first.yaw == again.yaw != other.yaw
     assert first.views[0].disparity_sigma > 1.1 * clear.views[0].disparity_sigma
+
+
+def test_views_that_are_matched_side_by_side_have_the_bits_of_one_after_another(
+    renderer, monkeypatch
+):
+    grainy = dataclasses.replace(SMALL, exposure=ExposureSettings(noise=6.0))
+    matched = []
+
+    def noted(*pair):
+        matched.append(threading.get_ident())
+        return match(*pair)
+
+    monkeypatch.setattr("qs3.sensor.view.match", noted)
+    clouds = []
+    for threads in ("1", "3"):
+        monkeypatch.setenv("OMP_NUM_THREADS", threads)
+        how = {"sensor": grainy, "views": 3, "seed": 3, "num_points": 256, "renderer": renderer}
+        clouds.append(scan(asymmetric(), **how).points)
+    np.testing.assert_array_equal(*clouds)
+    assert len(matched) == 6
+    assert len(set(matched[:3])) == 1
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ from qs3.sensor.view import (
     object_region,
     photograph,
     scene_of,
-    take_view,
+    take_views,
 )
 
 
@@ -215,7 +215,4 @@ def _photograph(
         casters = [DepthCaster(*(body.mesh for body in around.bodies))]
         casters += [DepthCaster(around.bodies[0].mesh)] if full_frames else []
     device = how.matching_device(renderer)
-    return [
-        take_view(pair, sensor, region, part, casters, rng_noise, clock, device)
-        for pair, region, part in zip(pairs, regions, parts, strict=True)
-    ]
+    return take_views(pairs, sensor, regions, parts, casters, rng_noise, clock, device)

@@ -1,9 +1,12 @@
 """One view of a scan: its pictures, and the part of them that becomes points."""
 
+import os
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import repeat
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Shaped, UInt
@@ -112,45 +115,68 @@ def measure(
     return noisy, true, view_statistics(disparity, true_depth, sensor.rig, mask)
 
 
-def take_view(
-    pair: StereoPair,
+def take_views(
+    pairs: Sequence[StereoPair],
     sensor: Sensor,
-    region: Region,
-    focus: Region,
+    regions: Sequence[Region],
+    focuses: Sequence[Region],
     casters: Sequence[DepthCaster],
     rng: np.random.Generator,
     clock: "Clock",
     device: str = "cpu",
-) -> ViewImages:
-    """Expose and match ``region`` of one view, with auto-exposure on ``focus``; cast its depth.
+) -> list[ViewImages]:
+    """Expose and match a region of each view, with auto-exposure on its focus; cast its depth.
 
-    The first of ``casters`` holds the scene; a second one, of the object alone, makes the view
-    one of whole frames, with silhouette and normals.
+    The first of ``casters`` holds the scene; a second one, of the object alone, makes the views
+    ones of whole frames, with silhouette and normals. Views are matched side by side, on as many
+    threads as there are processors or ``OMP_NUM_THREADS`` says.
     """
     rig = sensor.rig
-    canvas = matching_canvas(region, rig, sensor.matching)
-    inner = region.within(canvas)
+    canvases = [matching_canvas(region, rig, sensor.matching) for region in regions]
+    lefts, rights = [], []
     with clock("exposure"):
-        left, right = expose_pair(pair, canvas, focus, rig, sensor.exposure, rng)
-        if rig.second == "pattern":
-            right = stored_pattern(rig, sensor.pattern, canvas, sensor.exposure.bits)
-    with clock("matching"):
-        disparity = match(left, right, sensor.matching, device)[inner]
-    with clock("true_depth"):
-        whole = len(casters) > 1
-        cast = casters[0].cast(rig, pair.pose, region, normals=whole)
-        silhouette = casters[1].cast(rig, pair.pose, region).mask if whole else None
-    return ViewImages(
-        region=region,
-        left=left[inner],
-        right=right[inner],
-        disparity=disparity,
-        depth=depth_from_disparity(disparity, rig, sensor.depth),
-        true_depth=cast.depth,
-        mask=cast.mask,
-        silhouette=silhouette,
-        normals=cast.normals,
-    )
+        for pair, canvas, focus in zip(pairs, canvases, focuses, strict=True):
+            left, right = expose_pair(pair, canvas, focus, rig, sensor.exposure, rng)
+            if rig.second == "pattern":
+                right = stored_pattern(rig, sensor.pattern, canvas, sensor.exposure.bits)
+            lefts.append(left)
+            rights.append(right)
+    with clock("matching"), ThreadPoolExecutor(_threads(device)) as pool:
+        how = repeat(sensor.matching), repeat(device)
+        disparities = list(pool.map(match, lefts, rights, *how))
+    views = []
+    for pair, canvas, region, left, right, disparity in zip(
+        pairs, canvases, regions, lefts, rights, disparities, strict=True
+    ):
+        inner = region.within(canvas)
+        with clock("true_depth"):
+            whole = len(casters) > 1
+            cast = casters[0].cast(rig, pair.pose, region, normals=whole)
+            silhouette = casters[1].cast(rig, pair.pose, region).mask if whole else None
+        view = ViewImages(
+            region=region,
+            left=left[inner],
+            right=right[inner],
+            disparity=disparity[inner],
+            depth=depth_from_disparity(disparity[inner], rig, sensor.depth),
+            true_depth=cast.depth,
+            mask=cast.mask,
+            silhouette=silhouette,
+            normals=cast.normals,
+        )
+        views.append(view)
+    return views
+
+
+def _threads(device: str) -> int:
+    """How many views are matched at once: on a GPU one."""
+    if device != "cpu":
+        return 1
+    wanted = os.environ.get("OMP_NUM_THREADS", "")
+    if wanted.isdigit() and int(wanted):
+        return int(wanted)
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 class Clock:

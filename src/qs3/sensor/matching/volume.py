@@ -12,6 +12,8 @@ UNIT = 2000
 """What a mean cost of 1.0 is in whole numbers."""
 MOST = 2
 """Greatest cost: 1 for census, 1 for absolute difference."""
+_COLUMNS = 4
+"""Summed downwards side by side: one at a time waits for memory, 1.8 times as long."""
 
 
 @compiled
@@ -132,16 +134,20 @@ def mean_costs(
             to = out[y, x]
             for d in range(count):
                 to[d] = np.uint16(high[d] - low[d])
-    before_y = np.zeros((height + 1, count), np.uint16)
-    for x in range(width):
+    before_y = np.zeros((height + 1, _COLUMNS, count), np.uint16)
+    for first in range(0, width, _COLUMNS):
+        columns = min(_COLUMNS, width - first)
         for y in range(height):
-            here, after, row = before_y[y], before_y[y + 1], out[y, x]
-            for d in range(count):
-                after[d] = np.uint16(here[d] + row[d])
+            for i in range(columns):
+                here, after, row = before_y[y, i], before_y[y + 1, i], out[y, first + i]
+                for d in range(count):
+                    after[d] = np.uint16(here[d] + row[d])
         for y in range(height):
-            low, high = before_y[y - arms[2, y, x]], before_y[y + arms[3, y, x] + 1]
-            to, share = out[y, x], shares[y, x]
-            for d in range(count):
-                total = np.uint32(np.uint16(high[d] - low[d]))
-                to[d] = np.uint16(np.uint32(total * share) >> np.uint32(16))
+            for i in range(columns):
+                x = first + i
+                low, high = before_y[y - arms[2, y, x], i], before_y[y + arms[3, y, x] + 1, i]
+                to, share = out[y, x], shares[y, x]
+                for d in range(count):
+                    total = np.uint32(np.uint16(high[d] - low[d]))
+                    to[d] = np.uint16(np.uint32(total * share) >> np.uint32(16))
     return out

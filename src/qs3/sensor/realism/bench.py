@@ -20,7 +20,7 @@ from qs3.sensor.render import Body, Renderer
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.scene import rectangle
-from qs3.sensor.view import Clock, ViewImages, photograph, scene_of, take_view
+from qs3.sensor.view import Clock, ViewImages, photograph, scene_of, take_views
 
 if TYPE_CHECKING:
     import trimesh
@@ -76,10 +76,10 @@ class Bench:
         wide = Region(x0, y0, x1 - x0, y1 - y0)
         wide = wide.grown(blur_reach(sensor.exposure.psf), rig.width, rig.height)
         scene = scene_of(bodies, sensor)
-        pair = photograph(self.renderer, scene, sensor, [VIEW], [self.seed + index], [wide])[0]
+        pairs = photograph(self.renderer, scene, sensor, [VIEW], [self.seed + index], [wide])
         rng = np.random.default_rng(self.seed + (index if noise is None else noise))
         caster = DepthCaster(*(body.mesh for body in bodies))
-        return take_view(pair, sensor, region, focus, [caster], rng, Clock())
+        return take_views(pairs, sensor, [region], [focus], [caster], rng, Clock())[0]
 
     def refined(self, samples: int) -> "Bench":
         """The bench with more rays a pixel and longer paths, where the renderer has such settings.
