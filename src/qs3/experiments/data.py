@@ -18,7 +18,14 @@ from qs3.store.generate import GenerateSettings, generate
 from qs3.store.plan import Plan, make_plan, resolve_renderer
 
 TARGET_SENSOR = "d435"
-_ROOM = SceneSettings("floor+behind", neighbour_size=0.5)
+# As annotated frames are cut: by the object's mask, and by its box with a margin, or a few flying
+# pixels would set the scale of the whole cloud.
+_ROOM: Mapping[str, Any] = {
+    "sensor": TARGET_SENSOR,
+    "scene": SceneSettings("floor+behind", neighbour_size=0.5),
+    "box_margin": 0.05,
+    "crop": "both",
+}
 _LEAST = 4
 """A class with fewer meshes is made of shapes alone: a mesh on one side would leave none."""
 _FAILED_SHARE = 0.05
@@ -133,10 +140,7 @@ def _plan(data: DataSet, scale: Scale, sides: Sides) -> tuple[list[MeshItem], Ma
     """Return the meshes of a data set and the settings that are its own."""
     scored = [item for item in sides.target if item.split == "test"]
     source = {"views": scale.source_views, "seed": _SEEDS["source"], **scale.source_scan}
-    # As annotated frames are cut: by the object's mask, and by its box with a margin, or a few
-    # flying pixels would set the scale of the whole cloud.
-    room: dict[str, Any] = {"sensor": TARGET_SENSOR, "scene": _ROOM, "box_margin": 0.05}
-    room = dict(scale.target_scan) or room | {"crop": "both"}
+    room = scale.target_scan or _ROOM
     match data.kind:
         case "source":
             return sides.source, source
@@ -147,9 +151,9 @@ def _plan(data: DataSet, scale: Scale, sides: Sides) -> tuple[list[MeshItem], Ma
         case "views":
             return sides.source, source | {"views": data.views}
         case "target":
-            return sides.target, room | {"views": 1, "seed": _SEEDS["target"]}
+            return sides.target, {**room, "views": 1, "seed": _SEEDS["target"]}
         case "fused":
-            return sides.target, room | {"views": scale.source_views, "seed": _SEEDS["fused"]}
+            return sides.target, {**room, "views": scale.source_views, "seed": _SEEDS["fused"]}
         case "second":
             own = {"meshes": "shapes", "views": 1, "seed": _SEEDS["second"]}
             return _further_shapes(scale), source | own

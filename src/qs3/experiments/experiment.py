@@ -103,7 +103,7 @@ class Experiment:
         Real objects have no supervised row: there are none to spare for a training.
         """
         fields = {**self.fields, **row.fields, **column.fields}
-        if fields["row"] == SUPERVISED and fields["target"].kind in "RU":
+        if fields["row"] == SUPERVISED and fields["target"].kind in ("R", "U"):
             return None
         return make_run(scale, **fields, seed=seed, threads=threads)
 

@@ -244,9 +244,8 @@ def make_record(run: Run, setup: Setup, device: str = "") -> RunRecord:
         return evaluate(folder, place(part), split=part.split, cloud=part.cloud, **options)
 
     record = score(test, checkpoints=run.row != ORDINARY, experiment=run.fields)
-    if (
-        target is not None and record.rounds
-    ):  # what they kept, by the labels of what they chose from
+    if target is not None and record.rounds:
+        # Right by the labels of what they chose from, which a record alone is told.
         record = replace(record, rounds=score(target).rounds)
     return replace(record, source_accuracy=evaluate(folder, labelled).scores.accuracy)
 

@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from qs3 import shapes
 from qs3.errors import InputError
 from qs3.experiments import ScaleName
 from qs3.io.preparation import ROBUST
+from qs3.meshes.classes import POINTDA10
 from qs3.training.config import LIGHT, PRESETS, TrainSettings
 
 NETWORKS = ("pointnet2", "dgcnn", "rscnn", "simpleview")
@@ -113,9 +113,8 @@ class Scale:
     def _clouds(self, source: str) -> int:
         """How many clouds a domain has to learn from."""
         if source in ("D", "F"):
-            classes = shapes.CLASSES
-            return sum(self.target_count(name, self.target_per_class) for name in classes)
-        return self.source_per_class * len(shapes.CLASSES) * (3 if source == "S+C+M" else 1)
+            return sum(self.target_count(name, self.target_per_class) for name in POINTDA10)
+        return self.source_per_class * len(POINTDA10) * (3 if source == "S+C+M" else 1)
 
     def describe_rounds(self) -> str:
         """Say where self-training is not the paper's; empty where it is.

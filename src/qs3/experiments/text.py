@@ -26,12 +26,11 @@ def markdown(filled: FilledTable) -> str:
         text += [paragraph, ""]
     text += ["Accuracy:", "", to_markdown(_scores(filled, "accuracy", True)), ""]
     text += ["Class-mean accuracy:", "", to_markdown(_scores(filled, "class_mean_accuracy")), ""]
-    cost = _scores(filled, "cost")
-    if cost.iloc[:, 1:].map(lambda cell: cell[0].isdigit()).any(axis=None):
+    if any(all(record.cpu_seconds for record in filled.records_of(at)) for at in filled.means):
         text += [
             "CPU minutes of a run and its warm-up · steps of both · accuracy on its own source:"
         ]
-        text += ["", to_markdown(cost), ""]
+        text += ["", to_markdown(_scores(filled, "cost")), ""]
     for column in table.headings()[1]:
         text += _further(filled, column)
     if filled.waiting:

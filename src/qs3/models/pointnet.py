@@ -69,7 +69,7 @@ class _LinearMax(torch.autograd.Function):
             value = product.gather(2, index)[:, :, 0].to(best.dtype)
             better = (value > best[cloud]) | value.isnan()  # NaN must not go unseen
             best[cloud] = torch.where(better, value, best[cloud])
-            winner[cloud] = torch.where(better, index[:, :, 0] + (row.start or 0), winner[cloud])
+            winner[cloud] = torch.where(better, index[:, :, 0] + row.start, winner[cloud])
         ctx.save_for_backward(points, weight, winner)
         return best
 

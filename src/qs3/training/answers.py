@@ -62,7 +62,8 @@ def list_clouds(given: Sequence[Path]) -> list[Path]:
         if path.is_dir():
             paths = [p for p in sorted(path.rglob("*")) if p.suffix.lower() in POINT_FILES]
             paths = [p for p in paths if p.is_file() and p.name[0] != "."]
-            paths = paths or [path] * is_data_set(path)
+            if not paths and is_data_set(path):
+                paths = [path]
         elif path.exists() or not glob.has_magic(str(path)):
             paths = [path]
         else:

@@ -169,6 +169,7 @@ def compare(
     num_points: int,
     runner: _Runner,
     preparation: Preparation = PAPER,
+    seed: int = 0,
 ) -> Float[np.ndarray, "m"]:
     """Return for each of many clouds the largest difference of an exported network's probability.
 
@@ -181,8 +182,9 @@ def compare(
         num_points: Points a cloud that it was trained on.
         runner: From clouds to probabilities, by the exported network.
         preparation: What it does to the clouds.
+        seed: Of the clouds.
     """
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     differences: list[float] = []
     sizes = {1, 2, max(1, num_points // 3), num_points - 1, num_points, num_points + 1}
     for n in sorted({*sizes, 2 * num_points + 5} - {0}):

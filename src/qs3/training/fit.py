@@ -24,10 +24,10 @@ from qs3.training.distributed import all_devices, make_fabric
 from qs3.training.history import EpochRecord, History, Tracker
 from qs3.training.job import Job, fresh_model, make_method, run_job
 from qs3.training.loop import EpochCallback
-from qs3.training.overlap import data_of
+from qs3.training.overlap import data_fields
 from qs3.training.prepared import Prepared, prepare_clouds, require_finite
 from qs3.training.progress import Deadline
-from qs3.training.rounds import RoundCallback, RoundRecord, Told
+from qs3.training.rounds import Hooks, RoundCallback, RoundRecord
 from qs3.training.run import (
     CONFIG,
     MODEL,
@@ -190,11 +190,11 @@ def fit(
             contextlib.closing(history),
             all_devices(settings, partial(run_job, job)) as fabric,
         ):
-            told = Told(history, deadline, on_epoch, on_round)
-            model, epochs, rounds = run_job(job, fabric, told)
+            hooks = Hooks(history, deadline, on_epoch, on_round)
+            model, epochs, rounds = run_job(job, fabric, hooks)
         adapted = needs or settings.normalisation != "shared"
         adapted = adapted or settings.rule not in ("last", "source-val")
-        data = data_of(prepared, prepared_target, adapted)
+        data = data_fields(prepared, prepared_target, adapted)
         if before and not len(source):
             data["source"] = before.source
         stage = (base, len(epochs)) if rounds_settings is None else (ROUND, len(rounds))

@@ -20,12 +20,11 @@ from qs3.training.history import EpochRecord
 from qs3.training.loop import train
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared
-from qs3.training.rounds import NOBODY, RoundRecord, Task, Told
+from qs3.training.rounds import NO_HOOKS, Hooks, RoundRecord, Task
 from qs3.training.self_training import run_rounds
 from qs3.training.validation import ROUND, Validation, choose, load_checkpoint, read_checkpoints
 
 WARM_UP = "warm-up"
-_OF_JOB = ("method", "warm_up")  # alone; rounds know what else there is
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,7 @@ def new_model_for(method: str, settings: TrainSettings, count: int, seed: int) -
 def run_job(
     job: Job,
     fabric: Fabric,
-    told: Told = NOBODY,
+    hooks: Hooks = NO_HOOKS,
 ) -> tuple[PointClassifier, list[EpochRecord], list[RoundRecord]]:
     """Train the method, then in rounds if asked; go on where an earlier call stopped.
 
@@ -94,8 +93,8 @@ def run_job(
     validation = Validation(job.run_dir, job.source, job.holdout, job.target, job.settings, fabric)
 
     def tell_checkpoints() -> None:
-        if told.history is not None:
-            told.history.put("checkpoint", read_checkpoints(job.run_dir))
+        if hooks.history is not None:
+            hooks.history.put("checkpoint", read_checkpoints(job.run_dir))
 
     def look(number: int, model: PointClassifier) -> None:
         adapted = copy.deepcopy(model)  # the next round goes on from the plain network
@@ -119,24 +118,33 @@ def run_job(
             run_dir=folder,
             stream=(0,),
             observer=partial(validation.after_epoch, stage),
-            on_epoch=told.on_epoch,
-            log=told.log(stage),
-            deadline=told.deadline,
+            on_epoch=hooks.on_epoch,
+            log=hooks.log(stage),
+            deadline=hooks.deadline,
             description=stage,
         )
         method.norm.settle()
         model = method.result()
         validation.adapt(model)
-        if told.history is not None:
-            told.history.source(stage, epochs)
+        if hooks.history is not None:
+            hooks.history.source(stage, epochs)
         tell_checkpoints()
         if job.rounds is None:
             _follow_rule(model, stage, job)
         _save(folder, model, job, fabric)
     if job.rounds is not None and job.target is not None:
         tell_checkpoints()
-        shared = {name: value for name, value in vars(job).items() if name not in _OF_JOB}
-        task = Task(**shared, fabric=fabric, look=look, told=told)
+        task = Task(
+            source=job.source,
+            target=job.target,
+            settings=job.settings,
+            rounds=job.rounds,
+            fabric=fabric,
+            holdout=job.holdout,
+            run_dir=job.run_dir,
+            look=look,
+            hooks=hooks,
+        )
         model, records = run_rounds(model, task)
         validation.adapt(model)
         _follow_rule(model, ROUND, job)

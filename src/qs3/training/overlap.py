@@ -52,7 +52,7 @@ def seen_clouds(prepared: Prepared) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return tuple(checksums(prepared)), tuple(dict.fromkeys(_both_shapes(prepared)))
 
 
-def data_of(source: Prepared, target: Prepared | None, has_seen_target: bool) -> dict[str, Any]:
+def data_fields(source: Prepared, target: Prepared | None, has_seen_target: bool) -> dict[str, Any]:
     """Return the fields of a `Run` that tell of its data, prepared but whole."""
     source_clouds, source_shapes = seen_clouds(source)
     seen = ((), ()) if target is None or not has_seen_target else seen_clouds(target)

@@ -81,7 +81,7 @@ Look = Callable[[int, PointClassifier], None]
 
 
 @dataclass(frozen=True)
-class Told:
+class Hooks:
     """Who is told of a run, and when it has to end; on the first device alone."""
 
     history: History | None = None
@@ -98,8 +98,8 @@ class Told:
         return None if self.history is None else self.history.training(stage)
 
 
-NOBODY = Told()
-"""The other devices tell nobody."""
+NO_HOOKS = Hooks()
+"""Of the other devices."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,8 +124,8 @@ class Task:
     """Folder that keeps the state after each epoch and round."""
     look: Look | None = None
     """Looks at the network after each round."""
-    told: Told = NOBODY
-    """Who is told of it."""
+    hooks: Hooks = NO_HOOKS
+    """Who is told of it, and when it has to end."""
 
     @cached_property
     def target_checksums(self) -> list[str]:

@@ -28,15 +28,15 @@ from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.distributed import make_fabric
 from qs3.training.history import EpochRecord
 from qs3.training.loop import EpochCallback, train
-from qs3.training.overlap import data_of
+from qs3.training.overlap import data_fields
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared, as_prepared, label_clouds
 from qs3.training.rounds import (
+    Hooks,
     RoundCallback,
     RoundRecord,
     Rounds,
     Task,
-    Told,
     begin_rounds,
     write_rounds,
 )
@@ -109,7 +109,7 @@ def self_train(
         holdout=holdout,
         select=select,
         run_dir=run_dir,
-        told=Told(on_epoch=on_epoch, on_round=on_round),
+        hooks=Hooks(on_epoch=on_epoch, on_round=on_round),
     )
     choose = partial(choose_threads, settings, step=None)
     if run_dir is None:
@@ -125,7 +125,7 @@ def self_train(
             method=method,
             selection="last",
             chosen={"stage": ROUND, "number": len(records)},
-            **data_of(source, target, has_seen_target=True),
+            **data_fields(source, target, has_seen_target=True),
             threads=claimed.threads,
             unknown_warm_up=True,
             rounds=tuple(asdict(record) for record in records),
@@ -143,8 +143,8 @@ def run_rounds(model: PointClassifier, task: Task) -> tuple[PointClassifier, lis
         raise InputError("the target has no cloud; give unlabelled clouds")
     state = begin_rounds(model, task)
     classes = len(source.class_names)
-    if task.told.history is not None:
-        task.told.history.put("round", state.records)
+    if task.hooks.history is not None:
+        task.hooks.history.put("round", state.records)
     for number in range(len(state.records) + 1, rounds.rounds + 1):
         start, cpu_start, pool = time.perf_counter(), time.process_time(), state.pool
         # Line 3: label the target.
@@ -203,10 +203,10 @@ def _finish_round(state: Rounds, task: Task) -> None:
         write_rounds(task, state)
         (task.run_dir / CHECKPOINT).unlink(missing_ok=True)
     task.fabric.barrier()
-    if task.told.history is not None:
-        task.told.history.put("round", state.records)
-    if task.told.on_round is not None:
-        task.told.on_round(record, state.latest)
+    if task.hooks.history is not None:
+        task.hooks.history.put("round", state.records)
+    if task.hooks.on_round is not None:
+        task.hooks.on_round(record, state.latest)
 
 
 def _too_few(number: int, count: int, classes: int, devices: int) -> bool:
@@ -284,9 +284,9 @@ def _train_round(
         optimiser_state=state.optimiser if continuous else None,
         observer=teach,
         beside=None if rounds.teacher == "latest" else teacher,
-        on_epoch=task.told.on_epoch,
-        log=task.told.log(f"round-{number}"),
-        deadline=task.told.deadline,
+        on_epoch=task.hooks.on_epoch,
+        log=task.hooks.log(f"round-{number}"),
+        deadline=task.hooks.deadline,
         description=f"round {number}/{rounds.rounds}",
     )
     method.norm.settle()

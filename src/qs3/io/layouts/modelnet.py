@@ -143,15 +143,15 @@ def _detect_meshes(path: Path) -> bool:
     try:
         folders = [f for f in entries(path, os.DirEntry.is_dir) if f.name[0] != "_"]
         return bool(folders) and all(
-            folder.name in MODELNET40
-            and any(
-                entries(folder / part, lambda entry: entry.name.lower().endswith(".off"))
-                for part in SPLITS
-            )
+            folder.name in MODELNET40 and any(_has_mesh(folder / part) for part in SPLITS)
             for folder in folders
         )
     except OSError:  # a folder that cannot be listed
         return False
+
+
+def _has_mesh(folder: Path) -> bool:
+    return bool(entries(folder, lambda entry: entry.name.lower().endswith(".off")))
 
 
 FORMATS = (
