@@ -51,6 +51,13 @@ SWITCHES = {
               "no augmentation", "full augmentation", "aligned", "sight"),
 }  # fmt: skip
 """Against what each switch is held."""
+TITLES = {
+    "M": "whole surfaces (M)", "C": "what a camera sees, without noise (C)", "S": "our scans (S)",
+    "S+C+M": "all three", "QBST": "all three, then QBST", "SPST": "all three, then SPST",
+    "rooms": "**`rooms`**", "rooms QBST gentle": "`rooms`, then gentle QBST",
+    "rooms SPST gentle": "`rooms`, then gentle SPST", "rooms DGCNN": "`rooms` with a DGCNN",
+}  # fmt: skip
+"""Lines of README's table, which has no room for all."""
 VALIDATORS = "## Rounds that rules choose, NYU, first 70 %"
 
 
@@ -164,6 +171,21 @@ def score_table(records: list[RunRecord], looked: list[str]) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
+def short_table(records: list[RunRecord]) -> pd.DataFrame:
+    """Lines of README: accuracy / class mean of each part, mean and standard error over seeds."""
+    fields = [dict(zip(("cell", "part"), place(record), strict=True)) for record in records]
+    means = average(frame(records, fields), ("cell", "part")).set_index(["cell", "part"])
+    lines = []
+    for cell, title in TITLES.items():
+        line = {"learnt from": title}
+        for part, name in NAMES.items():
+            scores = means.loc[(cell, part)]
+            both = (scores[score] for score in ("accuracy", "class_mean_accuracy"))
+            line[name] = " / ".join(mean.format(count=False) for mean in both)
+        lines.append(line | {"seeds": len(means.loc[(cell, "dev")]["seeds"])})
+    return pd.DataFrame(lines)
+
+
 def differences(bits, blocks: np.ndarray, part: str, pairs, means) -> pd.DataFrame:
     """Lines of pairs; the class mean's is the mean over their seeds, without an interval."""
     lines = []
@@ -243,6 +265,7 @@ def filled(page: str, folder: Path) -> str:
     scores = text.partition("## Scores\n\n")[2].partition("\n\n##")[0]
     differences = text.partition("over both.\n\n")[2]
     page = fill(page, "scores", scores)
+    page = fill(page, "short", to_markdown(short_table(read_records(folder))))
     page = fill(page, "validators", text.partition(f"{VALIDATORS}\n\n")[2].partition("\n\n")[0])
     return fill(page, "differences", differences.partition("\n\n")[0])
 

@@ -311,7 +311,23 @@ def test_any_warm_up_goes_with_any_self_training(method, rule, tmp_path):
     rounds = replace(ROUNDS, rule=rule, refine=rule == "spst")
     result = fit(method, SOURCE, TARGET, settings(method, epochs=1), rounds, run_dir=tmp_path)
     assert len(result.rounds) == 2
-    assert [c.stage for c in result.checkpoints] == ["round", "round", "warm-up"]
+    assert [(c.stage, c.number) for c in result.checkpoints] == [
+        *(("round", number) for number in range(3)),
+        ("warm-up", 1),
+    ]
+    began_with = read_tensors(tmp_path / result.checkpoints[0].file)[0]
+    assert same(began_with, load_model(tmp_path / "warm-up").model.state_dict())
+
+
+def test_a_rule_may_keep_the_network_that_the_rounds_began_with(monkeypatch, tmp_path):
+    """A validator that likes what was there first: then no round may have moved the answers."""
+    said = itertools.count()
+    monkeypatch.setattr("qs3.training.validation.validate", lambda seen: {"im": -float(next(said))})
+    chosen = replace(settings("source-only", epochs=1, validate_every=5), rule="im")
+    result = fit("source-only", SOURCE, TARGET, chosen, ROUNDS, run_dir=tmp_path)
+    assert any(not record.skipped for record in result.rounds)
+    assert json.loads((tmp_path / "run.json").read_text())["chosen"]["number"] == 0
+    assert same(state(result), load_model(tmp_path / "warm-up").model.state_dict())
 
 
 @pytest.mark.parametrize(

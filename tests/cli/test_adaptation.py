@@ -51,7 +51,7 @@ def test_a_method_its_settings_and_rounds_after_it(adapted):
     assert (told["method"], told["selection"], told["preset"]) == ("dann+qbst", "im", "default")
     assert len(told["target_clouds"]) == 10
     names = sorted(path.name for path in (adapted / "checkpoints").iterdir())
-    rounds, warm_up = (["round-0001", "round-0002"], ["warm-up-0001", "warm-up-0002"])
+    rounds, warm_up = (["round-0000", "round-0001", "round-0002"], ["warm-up-0001", "warm-up-0002"])
     assert names == [f"{name}.safetensors" for name in rounds + warm_up]
 
 
@@ -86,7 +86,7 @@ def test_rounds_with_all_switches_after_a_method(qs3, source, tmp_path, method):
     record = read_record(next((run / "records").glob("*.json")))
     assert record.method == f"{method}+qbst"
     assert record.chosen == {"stage": "round", "number": 2}
-    assert [made["number"] for made in record.checkpoints] == [1, 2]
+    assert [made["number"] for made in record.checkpoints] == [0, 1, 2]
     assert record.checkpoints[-1]["accuracy"] == record.scores.accuracy
     for told in record.rounds:
         assert not told["skipped"]

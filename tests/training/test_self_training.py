@@ -187,7 +187,7 @@ def test_a_finished_run_is_not_done_again(given, source, warm, tmp_path):
     assert loaded.class_names == source.class_names
     assert loaded.settings["self_training"]["rounds"] == 3
     kinds = [line["kind"] for line in history_of(tmp_path / "run")]
-    assert sorted(kinds) == ["checkpoint"] * 3 + ["round"] * 3
+    assert sorted(kinds) == ["checkpoint"] * 4 + ["round"] * 3
 
 
 def test_history_keeps_finished_rounds_over_stops(given, warm, tmp_path):

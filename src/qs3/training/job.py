@@ -133,7 +133,10 @@ def run_job(
             _follow_rule(model, stage, job)
         _save(folder, model, job, fabric)
     if job.rounds is not None and job.target is not None:
-        tell_checkpoints()
+        if not read_checkpoints(job.run_dir, ROUND):
+            look(0, model)  # a rule may find that no round is better
+        else:
+            tell_checkpoints()
         task = Task(
             source=job.source,
             target=job.target,

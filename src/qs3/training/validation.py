@@ -43,7 +43,7 @@ class Checkpoint:
     stage: str
     """``round`` for self-training, else the stage of the epochs."""
     number: int
-    """Epochs, or rounds, that were done."""
+    """Epochs, or rounds, that were done; of rounds 0 is what they began with."""
     validators: Mapping[str, float | None]
     """What each validator says, higher is better; None where it lacks something."""
     file: str
