@@ -102,9 +102,9 @@ def fit_temperature(probabilities: Float[np.ndarray, "v k"], labels: Int[np.ndar
         return -float(log_softmax(logits * inverse, axis=1)[np.arange(len(labels)), labels].mean())
 
     ends = 1 / BOUNDS[1], 1 / BOUNDS[0]
-    found = minimize_scalar(loss, bounds=ends, method="bounded", options={"xatol": 1e-8})
+    best = minimize_scalar(loss, bounds=ends, method="bounded", options={"xatol": 1e-8})
     # The search nears an end of its range, but never tries it.
-    return 1 / min((*ends, float(found.x)), key=loss)
+    return 1 / min((*ends, float(best.x)), key=loss)
 
 
 def rescale(probabilities: Float[np.ndarray, "m k"], temperature: float) -> np.ndarray:

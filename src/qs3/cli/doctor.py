@@ -77,11 +77,11 @@ def _requirements() -> dict[str, list[Requirement]]:
     wanted = [Requirement(line) for line in importlib.metadata.requires("qs3") or ()]
     extras = importlib.metadata.metadata("qs3").get_all("Provides-Extra") or []
     needed: dict[str, list[Requirement]] = {"": [], **{extra: [] for extra in extras}}
-    for one in wanted:
-        marker = one.marker
+    for requirement in wanted:
+        marker = requirement.marker
         where = [extra for extra in needed if marker is None or marker.evaluate({"extra": extra})]
         for extra in [""] if "" in where else where:
-            needed[extra].append(one)
+            needed[extra].append(requirement)
     return needed
 
 

@@ -66,9 +66,9 @@ def rounds_text(rounds: Sequence[Mapping[str, Any]]) -> list[str]:
         return []
     rows: list[tuple[str, ...]] = [("round", "kept", "known here", "right", "")]
     for done in rounds:
-        known, right = sum(done["known"]), sum(done["right"])
-        share = f"{right / known:.1%}" if known else "–"
-        numbers = (done["round"], sum(done["kept"]), known, right)
+        labelled, right = sum(done["known"]), sum(done["right"])
+        share = f"{right / labelled:.1%}" if labelled else "–"
+        numbers = (done["round"], sum(done["kept"]), labelled, right)
         rows.append((*map(str, numbers), share))
     return ["", *columns(rows, 0)]
 

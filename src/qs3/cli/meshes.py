@@ -46,22 +46,22 @@ def meshes(
     if up is not None:
         items = [dataclasses.replace(item, up=up) for item in items]
     looks = inspect(items, units, _PICTURED)
-    found = list(tqdm(looks, total=len(items), unit="mesh", leave=False, disable=None))
+    inspections = list(tqdm(looks, total=len(items), unit="mesh", leave=False, disable=None))
     groups: dict[str, list[Inspection]] = {}
-    for one in sorted(found, key=lambda one: one.item.class_name):
-        groups.setdefault(one.item.class_name or "no class", []).append(one)
+    for look in sorted(inspections, key=lambda look: look.item.class_name):
+        groups.setdefault(look.item.class_name or "no class", []).append(look)
     rows = [("class", "meshes", "longest side (m)", "with hints", "faults")]
     show(*columns(rows + [_row(name, group) for name, group in groups.items()], right=1))
-    examples = {hint: one.item.id for one in reversed(found) for hint in one.hints}
-    counts = Counter(hint for one in found for hint in one.hints)
+    examples = {hint: look.item.id for look in reversed(inspections) for hint in look.hints}
+    counts = Counter(hint for look in inspections for hint in look.hints)
     for hint, count in counts.most_common():
-        show(f"hint: {count} of {len(found)}, such as {examples[hint]}: {hint}")
-    faults = [one.fault for one in found if one.fault]
+        show(f"hint: {count} of {len(inspections)}, such as {examples[hint]}: {hint}")
+    faults = [look.fault for look in inspections if look.fault]
     show(*(f"fault: {fault}" for fault in faults[:_LISTED]))
     if len(faults) > _LISTED:
         show(f"fault: and {len(faults) - _LISTED} more")
     pictures = {
-        name: [one.surface for one in group if one.surface is not None]
+        name: [look.surface for look in group if look.surface is not None]
         for name, group in groups.items()
     }
     wide = max(4, *map(len, pictures.values()))
@@ -72,7 +72,13 @@ def meshes(
 
 
 def _row(name: str, group: "list[Inspection]") -> tuple[str, ...]:
-    sizes = [one.size for one in group if one.size is not None]
+    sizes = [look.size for look in group if look.size is not None]
     span = f"{min(sizes):.3g} to {max(sizes):.3g}" if sizes else "unknown"
-    hinted = sum(bool(one.hints) for one in group)
-    return name, str(len(group)), span, str(hinted), str(sum(bool(one.fault) for one in group))
+    hinted = sum(bool(look.hints) for look in group)
+    return (
+        name,
+        str(len(group)),
+        span,
+        str(hinted),
+        str(sum(bool(look.fault) for look in group)),
+    )

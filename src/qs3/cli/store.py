@@ -61,7 +61,7 @@ def _cloud_lines(contents: dict[str, Any]) -> list[str]:
         f"{' to '.join(map(str, dict.fromkeys(contents['points'])))} points a cloud",
     ]
     parts = ((name, contents[name]) for name in ("classes", "splits"))
-    return [*lines, *(f"{name}: {_counts(found)}" for name, found in parts if found)]
+    return [*lines, *(f"{name}: {_counts(counts)}" for name, counts in parts if counts)]
 
 
 def _lines(contents: dict[str, Any]) -> list[str]:
@@ -85,9 +85,9 @@ def _lines(contents: dict[str, Any]) -> list[str]:
         label, form = STATISTICS[name]
         lines.append(f"{label} (median): {value:{form}}")
     sensor = contents["settings"].get("sensor")
-    sensors = [one for one in (sensor if isinstance(sensor, list) else [sensor]) if one]
-    if sensors and all(isinstance(one, dict) and "name" in one for one in sensors):
-        lines.append("sensor: " + ", ".join(str(one["name"]) for one in sensors))
+    sensors = [preset for preset in (sensor if isinstance(sensor, list) else [sensor]) if preset]
+    if sensors and all(isinstance(preset, dict) and "name" in preset for preset in sensors):
+        lines.append("sensor: " + ", ".join(str(preset["name"]) for preset in sensors))
     return [*lines, f"failed: {contents['failed']}"]
 
 

@@ -50,11 +50,11 @@ def watch(
             if json_lines:
                 show(json.dumps(watching.plain(frame), ensure_ascii=False))
                 continue
-            found = []
+            objects = []
             for item, answer in frame.objects:
                 ((name, share),), (x, y, _) = answer.best(), item.centre
-                found.append(f"{printable(name, keep='')} {share:.2f} at {x:.2f} {y:.2f}")
-            show(f"{printable(frame.name, keep='')}\t{', '.join(found) or frame.fault}")
+                objects.append(f"{printable(name, keep='')} {share:.2f} at {x:.2f} {y:.2f}")
+            show(f"{printable(frame.name, keep='')}\t{', '.join(objects) or frame.fault}")
     if str(rate):
         tell(str(rate))
     return 0

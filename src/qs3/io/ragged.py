@@ -65,8 +65,8 @@ class RaggedClouds:
                 require_named(self.class_names, class_map)
             labels, _ = map_labels(called, self.labels, names)
         pairs = sorted(set(zip(self.labels.tolist(), labels.tolist(), strict=True)))
-        told = {self.class_names[row]: names[label] for row, label in pairs}
-        renamed = {name: other for name, other in told.items() if name != other}
+        new_names = {self.class_names[row]: names[label] for row, label in pairs}
+        renamed = {name: other for name, other in new_names.items() if name != other}
         points = stack(self.clouds, num_points, where, most)
         origin = origin or Origin("arrays")
         origin = replace(origin, renamed={**origin.renamed, **renamed})

@@ -41,7 +41,7 @@ def check_gltf(path: Path) -> None:
     try:
         files = [path.parent / str(buffer.get("uri", "")) for buffer in tree.get("buffers", [])]
         size = sum(file.stat().st_size for file in {path, *files} if _is_file(file))
-        sizes = [_count(one["count"]) for one in tree.get("accessors", [])]
+        sizes = [_count(accessor["count"]) for accessor in tree.get("accessors", [])]
         announced = sum(
             count * _BYTES[accessor["componentType"]] * _WIDTHS[accessor["type"]]
             for count, accessor in zip(sizes, tree.get("accessors", []), strict=True)

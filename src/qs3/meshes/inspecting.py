@@ -49,20 +49,20 @@ def inspect(
         except InputError as error:
             yield Inspection(item, fault=str(error))
             continue
-        found = [_faces(mesh), "looks y-up (stands on y = 0, centred about z = 0): --up y"]
-        found = found if looks_y_up(mesh) else found[:1]
+        hints = [_faces(mesh), "looks y-up (stands on y = 0, centred about z = 0): --up y"]
+        hints = hints if looks_y_up(mesh) else hints[:1]
         size = None
         try:
-            size, told = file_size(mesh, units)
-            if told == "mm (guessed)":
-                found.append("tells no unit, looks to be in millimetres: --units")
+            size, unit = file_size(mesh, units)
+            if unit == "mm (guessed)":
+                hints.append("tells no unit, looks to be in millimetres: --units")
         except InputError:
-            found.append(f"of no size that an object has (unit: {mesh.units or units or 'none'})")
+            hints.append(f"of no size that an object has (unit: {mesh.units or units or 'none'})")
         surface = None
         if shown[item.class_name] < pictured:
             shown[item.class_name] += 1
             surface = sample_surface(mesh, _POINTS, np.random.default_rng(0))
-        yield Inspection(item, size, tuple(filter(None, found)), surface=surface)
+        yield Inspection(item, size, tuple(filter(None, hints)), surface=surface)
 
 
 def looks_y_up(mesh: trimesh.Trimesh) -> bool:

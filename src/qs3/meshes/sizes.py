@@ -70,8 +70,8 @@ def size_name(class_name: str, own_class: str = "") -> str:
         >>> size_name("seat", "stool"), size_name("chair", "thing"), size_name("seat")
         ('stool', 'chair', 'seat')
     """
-    known = [canonical(name) in CLASS_SIZES for name in (class_name, own_class)]
-    return own_class if known == [False, True] else class_name
+    has_size = [canonical(name) in CLASS_SIZES for name in (class_name, own_class)]
+    return own_class if has_size == [False, True] else class_name
 
 
 def class_size(mesh: "trimesh.Trimesh", class_name: str, rng: np.random.Generator) -> float:
@@ -128,17 +128,17 @@ def file_size(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float,
             f"a mesh does not tell its unit: taken for {name}, as it is {where} {_METRES_TO:g} of "
             "them long; say it with units (m, cm, mm or in)"
         )
-        told = f"{name} (guessed)"
+        title = f"{name} (guessed)"
     else:
-        told = name
+        title = name
     size = side * _metres(name)
     if not _LEAST <= size <= _MOST:
         raise InputError(
-            f"object_size file: the mesh is {side:g} {told} long, which is {size:g} m, and no "
+            f"object_size file: the mesh is {side:g} {title} long, which is {size:g} m, and no "
             f"object of {_LEAST:g} to {_MOST:g} m; name its unit (units m, cm, mm or in), or give "
             "a size in metres (object_size)"
         )
-    return size, told
+    return size, title
 
 
 def _metres(unit: str) -> float:

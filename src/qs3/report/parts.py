@@ -100,8 +100,8 @@ def beside_source(
                 near = int(closest[row])
                 points = source.chosen(slice(near, near + 1))[0]
                 beside.append(Cloud(points, names[source.labels[near]]))
-        found = {"scan of the target": scans, "nearest scan of the source": beside}
-        return {heading: clouds for heading, clouds in found.items() if clouds}
+        shown = {"scan of the target": scans, "nearest scan of the source": beside}
+        return {heading: clouds for heading, clouds in shown.items() if clouds}
 
     return columns(wrong), columns(even_rows(labels, _COMPARED)) if source is not None else {}
 

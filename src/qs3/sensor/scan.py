@@ -151,7 +151,7 @@ def scan(
         with clock("fusion"):
             beyond = how.depth_margin if crop in ("mask", "both") else None
             shown = zip(images, parts, around.poses, strict=True)
-            measured = [measure(*one, sensor, beyond) for one in shown]
+            measured = [measure(*view, sensor, beyond) for view in shown]
             clouds, cleans, statistics = zip(*measured, strict=True)
             margin = np.array([[-how.box_margin], [how.box_margin]])
             box = bounds + margin if crop in ("box", "both") else None

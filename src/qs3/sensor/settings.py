@@ -101,7 +101,7 @@ class CameraSettings:
             InputError: where there is no such sensor, it takes no such value, or there are several.
         """
         if isinstance(self.sensor, tuple):
-            names = ", ".join(str(getattr(one, "name", one)) for one in self.sensor)
+            names = ", ".join(str(getattr(preset, "name", preset)) for preset in self.sensor)
             raise InputError(f"sensor: one is needed here, not several ({names}); name one")
         sensor = get_sensor(self.sensor) if isinstance(self.sensor, str) else self.sensor
         for name, place in self._changes.items():
@@ -114,7 +114,7 @@ class CameraSettings:
         """The settings with each sensor alone; themselves where there is one."""
         if not isinstance(self.sensor, tuple):
             return (self,)
-        return tuple(dataclasses.replace(self, sensor=one) for one in self.sensor)
+        return tuple(dataclasses.replace(self, sensor=preset) for preset in self.sensor)
 
     def with_sensor(self: _Camera, sensor: Sensor, renderer: Renderer) -> _Camera:
         """The settings with a sensor and a renderer as they are: what would change it is gone."""
@@ -299,7 +299,10 @@ class ScanSettings(CameraSettings):
         apart = {*(f.name for f in dataclasses.fields(CameraSettings)), *self._CHANGES, "preset"}
         apart |= {"crop", "floor_material", "wall_material", "device", "seed"}
         names = [f.name for f in dataclasses.fields(ScanSettings) if f.name not in apart]
-        crop, ranges = self.chosen("crop"), [dict(one.ranges) for one in self.each_sensor()]
+        crop, ranges = (
+            self.chosen("crop"),
+            [dict(settings.ranges) for settings in self.each_sensor()],
+        )
         return {name: self.chosen(name) for name in names} | {
             "object_size": self.object_size if isinstance(self.object_size, str) else None,
             "box_crop": crop in ("box", "both"),

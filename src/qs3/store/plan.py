@@ -143,7 +143,7 @@ def make_plan(items: Sequence[Item], settings: GenerateSettings) -> Plan:
 
 def resolve_renderer(settings: GenerateSettings) -> GenerateSettings:
     """Choose sensor and renderer where they are but named: the same ones for every worker."""
-    made = tuple(one.make_sensor() for one in settings.each_sensor())
+    made = tuple(each.make_sensor() for each in settings.each_sensor())
     sensor = made if isinstance(settings.sensor, tuple) else made[0]
     return dataclasses.replace(settings, sensor=sensor, renderer=settings.make_renderer())
 

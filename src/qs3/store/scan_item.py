@@ -82,7 +82,7 @@ class GenerateSettings(ScanSettings):
         }
         plain = super().as_dict() | {name: getattr(self, name) for name in sorted(own)}
         plain |= {"classes": list(self.classes), "seed": self.seed}
-        sensors = [settings_dict(one.make_sensor()) for one in self.each_sensor()]
+        sensors = [settings_dict(settings.make_sensor()) for settings in self.each_sensor()]
         plain["sensor"] = sensors if isinstance(self.sensor, tuple) else sensors[0]
         plain["renderer"] = None
         if not isinstance(self.renderer, str):
@@ -182,7 +182,7 @@ def scan_item(
 
     seed = scan_seed(settings.seed, item.id, scan_index)
     beside = None if neighbour is None else neighbour.load()
-    classes = [size_class(one) for one in (item, neighbour) if one is not None]
+    classes = [size_class(member) for member in (item, neighbour) if member is not None]
     result = scan(item.load(), settings, seed=seed, neighbour=beside, class_names=classes)
     # The scan draws from children of `seed`; the key keeps this stream apart from them.
     surface_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0x50BF,)))
@@ -220,6 +220,6 @@ def mean_statistics(views: Sequence[object]) -> dict[str, float | None]:
     """Mean of each of `STATISTICS` over the views that have it; None where none has."""
     means: dict[str, float | None] = {}
     for name in STATISTICS:
-        known = [value for view in views if (value := getattr(view, name)) is not None]
-        means[name] = float(np.mean(known)) if known else None
+        values = [value for view in views if (value := getattr(view, name)) is not None]
+        means[name] = float(np.mean(values)) if values else None
     return means

@@ -95,8 +95,8 @@ def _source(
         return cad
     if not is_store(cad):
         items = collect(cad, per_class=_PER_CLASS, seed=seed)
-        known = {canonical(item.class_name) for item in items} <= {*CLASS_SIZES}
-        size = "class" if known else "file"
+        have_sizes = {canonical(item.class_name) for item in items} <= {*CLASS_SIZES}
+        size = "class" if have_sizes else "file"
         recipe = replace(RECIPES["rooms"], views=1, seed=seed, object_size=size)
         recipe = settings_for(recipe, items, [cad], _PER_CLASS)
         generate(items, folder, recipe, workers=workers or os.cpu_count() or 1)

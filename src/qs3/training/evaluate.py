@@ -151,23 +151,23 @@ def _count_right(
             network gets.
         answer_of: As in `_scores`.
     """
-    found = kept_clouds(run)
-    if found is None or len(found[1]) != len(rounds):
+    selected = kept_clouds(run)
+    if selected is None or len(selected[1]) != len(rounds):
         return tuple(rounds)
-    clouds, kept = found
+    clouds, kept = selected
     truth: dict[str, int] = {}
     for texts in both_checksums(test):
         truth |= zip(texts, test.labels.tolist(), strict=True)
     labels = np.array([truth.get(cloud, -1) for cloud in clouds])
     if (labels < 0).all():
         return tuple(rounds)
-    told = []
+    counted_rounds = []
     for record, (rows, pseudo) in zip(rounds, kept, strict=True):
-        known, size = labels[rows] >= 0, len(record["kept"])
-        counted = {"known": pseudo[known], "right": pseudo[labels[rows] == answer_of[pseudo]]}
+        is_known, size = labels[rows] >= 0, len(record["kept"])
+        counted = {"known": pseudo[is_known], "right": pseudo[labels[rows] == answer_of[pseudo]]}
         counts = {name: np.bincount(of, minlength=size).tolist() for name, of in counted.items()}
-        told.append({**record, **counts})
-    return tuple(told)
+        counted_rounds.append({**record, **counts})
+    return tuple(counted_rounds)
 
 
 def _scored(
@@ -181,9 +181,9 @@ def _scored(
     for checkpoint in checkpoints:
         load_checkpoint(run, checkpoint, loaded.model)
         scores = _scores(loaded, test, answer_of)
-        one = {"accuracy": scores.accuracy, "class_mean_accuracy": scores.class_mean_accuracy}
-        one |= {"stage": checkpoint.stage, "number": checkpoint.number}
-        scored.append(one | {"validators": dict(checkpoint.validators)})
+        line = {"accuracy": scores.accuracy, "class_mean_accuracy": scores.class_mean_accuracy}
+        line |= {"stage": checkpoint.stage, "number": checkpoint.number}
+        scored.append(line | {"validators": dict(checkpoint.validators)})
     return scored
 
 

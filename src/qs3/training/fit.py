@@ -303,7 +303,7 @@ def _check_warm_up(
     ours, trained = unstructure(settings), its.get("train", {})
     names = ["model", "model_settings", "num_points", "preparation"]
     names += ["method_settings"] if "method_settings" in trained else []
-    theirs, wanted = ({name: one.get(name) for name in names} for one in (trained, ours))
+    theirs, wanted = ({name: each.get(name) for name in names} for each in (trained, ours))
     if difference := first_difference(theirs, wanted):
         name, old, new = difference
         raise InputError(

@@ -99,15 +99,15 @@ def describe_plan(
         if not warm_up:
             steps = settings.epochs * batches
             size = settings.batch_size
-            told = f"{settings.epochs} epochs of {batches} steps of {size} clouds: {steps}"
-            lines.append(f"training  {method}, {told}")
+            work = f"{settings.epochs} epochs of {batches} steps of {size} clouds: {steps}"
+            lines.append(f"training  {method}, {work}")
     if target is not None:
         lines.append(f"target    {len(target)} clouds")
     if rounds is not None and target is not None:
         each = rounds.steps_per_epoch or count_batches(len(target), settings.batch_size)
         most = rounds.rounds * rounds.epochs * each
-        told = f"{rounds.rounds} rounds of {rounds.epochs} epochs of at most {each} steps: {most}"
-        lines.append(f"rounds    {rounds.rule}, {told}")
+        work = f"{rounds.rounds} rounds of {rounds.epochs} epochs of at most {each} steps: {most}"
+        lines.append(f"rounds    {rounds.rule}, {work}")
         steps += most * (2 if rounds.source_loss else 1)  # as many clouds of the source
     model = fresh_model(method, settings, classes)
     size = sum(value.numel() for value in model.parameters()) / 1e6

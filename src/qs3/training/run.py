@@ -293,6 +293,8 @@ def sum_cost(epochs: Sequence[Any], rounds: Sequence[Any]) -> dict[str, Any]:
     cost = {}
     for name, kind in (("seconds", float), ("cpu_seconds", float), ("steps", int)):
         parts = {"source": epochs, "rounds": rounds}
-        sums = {part: kind(sum(getattr(one, name) for one in of)) for part, of in parts.items()}
+        sums = {
+            part: kind(sum(getattr(record, name) for record in of)) for part, of in parts.items()
+        }
         cost[name] = sums | {"total": sum(sums.values())}
     return cost

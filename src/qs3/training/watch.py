@@ -105,11 +105,11 @@ def plain(frame: SeenFrame) -> dict[str, Any]:
     for item, answer in frame.objects:
         ((name, share),) = answer.best()
         box = {"centre": item.centre, "size": item.size, "heading": item.heading}
-        told = {"class": name, "confidence": share, "points": len(item.points), **box}
-        objects.append(told | {"probabilities": answer.probabilities})
+        fields = {"class": name, "confidence": share, "points": len(item.points), **box}
+        objects.append(fields | {"probabilities": answer.probabilities})
     seconds = dict(zip(STAGES, frame.seconds, strict=True))
-    told = {"frame": frame.name, "time": frame.timestamp, "objects": objects, "seconds": seconds}
-    return told | ({"fault": frame.fault} if frame.fault else {})
+    line = {"frame": frame.name, "time": frame.timestamp, "objects": objects, "seconds": seconds}
+    return line | ({"fault": frame.fault} if frame.fault else {})
 
 
 class Rate:
@@ -124,7 +124,7 @@ class Rate:
         if self._frames == 2:  # what the first one loads, the others find there
             self._timed, self._sums = 0, [0.0, 0.0, 0.0]
         self._timed += 1
-        self._sums = [one + part for one, part in zip(self._sums, frame.seconds, strict=True)]
+        self._sums = [total + part for total, part in zip(self._sums, frame.seconds, strict=True)]
 
     def __str__(self) -> str:
         """A line; nothing before the first frame."""

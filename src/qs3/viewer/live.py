@@ -43,12 +43,12 @@ class Live:
                 ((name, share),), (x, y, _) = answer.best(), item.centre
                 names = sorted(answer.probabilities)
                 colour = _GREY if name == UNKNOWN else class_colour(names.index(name))
-                told = f"{name} {share:.2f}"
-                lines.append(f'<span style="color:{colour}">■</span> {html.escape(told)}')
+                text = f"{name} {share:.2f}"
+                lines.append(f'<span style="color:{colour}">■</span> {html.escape(text)}')
                 scene, drawn = self._server.scene, (item.points, rgb(colour))
                 self._drawn += [
                     scene.add_point_cloud(f"/object/{number}", *drawn, point_size=0.002),
-                    scene.add_label(f"/label/{number}", told, position=(x, y, item.size[2])),
+                    scene.add_label(f"/label/{number}", text, position=(x, y, item.size[2])),
                 ]
         lines = lines or [html.escape(frame.fault)]
         head = f"<b>{html.escape(frame.name)}</b><br>"

@@ -63,9 +63,9 @@ def _config(rs: Any, pipeline: Any, serial: str, file: Path | None, colour: bool
         device.as_playback().set_real_time(False)
         return config
     devices = rs.context().query_devices()
-    there = [device.get_info(rs.camera_info.serial_number) for device in devices]
-    if not there or (serial and serial not in there):
-        raise InputError(f"is not connected; connected are: {', '.join(there) or 'none'}")
+    serials = [device.get_info(rs.camera_info.serial_number) for device in devices]
+    if not serials or (serial and serial not in serials):
+        raise InputError(f"is not connected; connected are: {', '.join(serials) or 'none'}")
     if serial:
         config.enable_device(serial)
     config.enable_stream(rs.stream.depth)

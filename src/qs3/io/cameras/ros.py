@@ -75,14 +75,16 @@ class _Bag:
         if metadata.is_file() and re.search(r"compression_mode:\W*file", read_text(metadata), re.I):
             raise InputError(f"{path}: its files are packed whole; unpack them first (unzstd)")
         self.path = path
-        files = [path] if path.is_file() else [one for one in path.iterdir() if one.is_file()]
-        self._largest = max(files, key=lambda one: one.stat().st_size, default=path)
+        files = [path] if path.is_file() else [file for file in path.iterdir() if file.is_file()]
+        self._largest = max(files, key=lambda file: file.stat().st_size, default=path)
         old = path.suffix == ".bag"
         self._types = get_typestore(Stores.ROS1_NOETIC if old else Stores.ROS2_HUMBLE)
         self._read = self._types.deserialize_ros1 if old else self._types.deserialize_cdr
         self._reader = self.guarded(rosbag1.Reader if old else rosbag2.Reader, path)
         self.guarded(stack.enter_context, self._reader)
-        self.topics = {one.topic: one.msgtype for one in self._reader.connections}
+        self.topics = {
+            connection.topic: connection.msgtype for connection in self._reader.connections
+        }
         if old and any(topic.startswith("/device_0/") for topic in self.topics):
             raise InputError(f"{path}: recorded by a RealSense, not by ROS: read it as bag:{path}")
 
@@ -93,7 +95,9 @@ class _Bag:
 
     def messages(self, topic: str) -> Iterator[tuple[float, Any]]:
         """Yield the messages of a topic with the time at which they were recorded, seconds."""
-        wanted = [one for one in self._reader.connections if one.topic == topic]
+        wanted = [
+            connection for connection in self._reader.connections if connection.topic == topic
+        ]
         rows = iter(self._reader.messages(wanted))
         while (row := self.guarded(next, rows, None)) is not None:
             yield row[1] / 1e9, self.guarded(self._read, row[2], row[0].msgtype)
@@ -127,18 +131,18 @@ def _intrinsics(info: Any, topic: str) -> Intrinsics:
 def _depth_topic(bag: _Bag, topic: str) -> str:
     """The topic asked for, or the only one whose first message is a depth image."""
     images = [name for name, kind in bag.topics.items() if kind in (IMAGE, PACKED)]
-    found = [name for name in images if _is_depth(next(bag.messages(name), (0.0, None))[1])]
-    if topic in found or (not topic and len(found) == 1):
-        return topic or found[0]
-    there = ", ".join(found) or "none"
+    topics = [name for name in images if _is_depth(next(bag.messages(name), (0.0, None))[1])]
+    if topic in topics or (not topic and len(topics) == 1):
+        return topic or topics[0]
+    names = ", ".join(topics) or "none"
     if topic:
-        raise InputError(f"{bag.path}: {topic} is no topic of depth images; such are {there}")
-    if found:
+        raise InputError(f"{bag.path}: {topic} is no topic of depth images; such are {names}")
+    if topics:
         raise InputError(
-            f"{bag.path}: several topics of depth images; name one by --topic: {there}"
+            f"{bag.path}: several topics of depth images; name one by --topic: {names}"
         )
-    there = ", ".join(images) or "none"
-    raise InputError(f"{bag.path}: no depth images (16UC1, 32FC1); topics of images: {there}")
+    names = ", ".join(images) or "none"
+    raise InputError(f"{bag.path}: no depth images (16UC1, 32FC1); topics of images: {names}")
 
 
 def _is_depth(message: Any) -> bool:

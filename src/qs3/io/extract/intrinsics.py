@@ -113,11 +113,11 @@ def read_intrinsics(given: str | Path) -> Intrinsics:
         fx, fy, cx, cy = numbers
         return Intrinsics(fx, fy, cx, cy)
     if not numbers and path.is_dir():
-        there = [path / name for name in CAMERA_FILES if (path / name).is_file()]
-        if not there:
+        files = [path / name for name in CAMERA_FILES if (path / name).is_file()]
+        if not files:
             names = ", ".join(CAMERA_FILES)
             raise InputError(f"{path}: does not tell its camera ({names}); {_FORMS}")
-        path = there[0]
+        path = files[0]
     if numbers or not path.is_file():
         raise InputError(f"intrinsics {text!r}: {'' if numbers else 'no such file; '}{_FORMS}")
     with naming(path):

@@ -109,6 +109,6 @@ def room_up(
         near = np.abs(along(normals, up))
         level, upright = normals[near > cosine], normals[near < math.sqrt(1 - cosine**2)]
         spread = np.einsum("ni,nj->ij", upright, upright) - np.einsum("ni,nj->ij", level, level)
-        found = np.linalg.eigh(spread)[1][:, 0]
-        up = found * math.copysign(1.0, float(found @ up))
+        normal = np.linalg.eigh(spread)[1][:, 0]
+        up = normal * math.copysign(1.0, float(normal @ up))
     return up

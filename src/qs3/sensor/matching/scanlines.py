@@ -34,7 +34,7 @@ def optimise(
     """
     height, width, count = costs.shape
     totals = np.zeros((height, width, count), np.uint16)
-    found = np.zeros((height, width, 5), np.int32)
+    minima = np.zeros((height, width, 5), np.int32)
     # Of the vertical path of each column and, last, of the horizontal one; a pad at either end.
     paths = np.full((width + 1, count + 2), _FAR, np.uint16)
     leasts = np.zeros(width + 1, np.uint16)
@@ -84,13 +84,13 @@ def optimise(
                 at = 0
                 while total[at] != least:
                     at += 1
-                found[y, x, 0], found[y, x, 1] = at, least
-                found[y, x, 2] = total[at - 1] if at > 0 else least
-                found[y, x, 3] = total[at + 1] if at < count - 1 else least
+                minima[y, x, 0], minima[y, x, 1] = at, least
+                minima[y, x, 2] = total[at - 1] if at > 0 else least
+                minima[y, x, 3] = total[at + 1] if at < count - 1 else least
                 for d in range(max(0, at - 1), min(count, at + 2)):
                     total[d] = np.uint16(65535)
                 second = np.uint16(65535)
                 for d in range(count):
                     second = total[d] if total[d] < second else second
-                found[y, x, 4] = second
-    return found
+                minima[y, x, 4] = second
+    return minima

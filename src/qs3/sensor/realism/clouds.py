@@ -18,7 +18,7 @@ def strays(bench: Bench) -> Judged:
     from qs3 import shapes
     from qs3.sensor.scan import scan
 
-    found = []
+    ratios = []
     for index in range((1 if bench.quick else 4) * len(shapes.CLASSES)):
         number, label = divmod(index, len(shapes.CLASSES))
         made = scan(
@@ -30,8 +30,8 @@ def strays(bench: Bench) -> Judged:
             crop="mask",
             seed=bench.seed + index,
         )
-        found.append((radius_ratio(made.points), radius_ratio(made.clean)))
-    noisy, clean = zip(*found, strict=True)
+        ratios.append((radius_ratio(made.points), radius_ratio(made.clean)))
+    noisy, clean = zip(*ratios, strict=True)
     return ratio_rows(noisy, clean)
 
 

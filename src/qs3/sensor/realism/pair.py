@@ -110,9 +110,9 @@ def compare(pair: InfraredPair, settings: MatchingSettings) -> Comparison:
     camera = pair.disparity
     settings = search_range(pair, settings)
     ours = match(pair.left, pair.right, settings).astype(np.float64)
-    seen, told = np.isfinite(ours), np.isfinite(camera)
+    seen, theirs = np.isfinite(ours), np.isfinite(camera)
     both = in_sight(camera)
-    off = np.abs(ours - camera)[both & seen & told]
+    off = np.abs(ours - camera)[both & seen & theirs]
     edges = find_edges(pair.left, camera)
     spills = {"ours": spill(ours, edges), "camera": spill(camera, edges)}
     patches = planar_patches(camera)
@@ -132,9 +132,9 @@ def compare(pair: InfraredPair, settings: MatchingSettings) -> Comparison:
         notes.append(f"no plane of {PATCH[0]} × {PATCH[1]} px in the camera's depth: no noise")
     figures = {
         "valid": _share(seen, both),
-        "camera_valid": _share(told, both),
-        "holes": _share(told & ~seen, both),
-        "camera_holes": _share(seen & ~told, both),
+        "camera_valid": _share(theirs, both),
+        "holes": _share(theirs & ~seen, both),
+        "camera_holes": _share(seen & ~theirs, both),
         "median_abs_px": plain(np.median(off)) if off.size else None,
         "over_1px": _share(off > 1),
         "over_3px": _share(off > _OFF),
@@ -170,8 +170,10 @@ def in_sight(camera: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """
     following = _following(camera)
     columns = np.arange(camera.shape[1])
-    known = np.take_along_axis(camera, np.minimum(following, columns[-1]), axis=1)
-    return np.where(following <= columns[-1], columns >= known, columns >= np.nanmedian(camera))
+    next_depth = np.take_along_axis(camera, np.minimum(following, columns[-1]), axis=1)
+    return np.where(
+        following <= columns[-1], columns >= next_depth, columns >= np.nanmedian(camera)
+    )
 
 
 def _following(disparity: Float[np.ndarray, "h w"]) -> Int[np.ndarray, "h w"]:
@@ -195,14 +197,14 @@ def find_edges(image: Image, camera: Float[np.ndarray, "h w"]) -> Edges:
     """
     grey = image.astype(np.float64) * (255 / (255 if image.dtype == np.uint8 else 1023))
     rows, columns = np.indices(camera.shape)
-    found: list[tuple[float, ...]] = []
+    edges: list[tuple[float, ...]] = []
     for turns in range(4):  # each side in turn becomes the right one
         u, v = np.rot90(columns, turns), np.rot90(rows, turns)
         for y, x, level, slope, shift in _rims(np.rot90(grey, turns), np.rot90(camera, turns)):
             du, dv = u[y, x + 1] - u[y, x], v[y, x + 1] - v[y, x]
             place = (u[y, x] + du * shift, v[y, x] + dv * shift)
-            found.append((*place, du, dv, level, 1 / math.hypot(1, slope)))
-    table = np.array(found, dtype=np.float64).reshape(-1, 6)
+            edges.append((*place, du, dv, level, 1 / math.hypot(1, slope)))
+    table = np.array(edges, dtype=np.float64).reshape(-1, 6)
     return Edges(table[:, :2], table[:, 2:4].astype(int), table[:, 4], table[:, 5])
 
 
@@ -216,7 +218,7 @@ def _rims(
     height, width = camera.shape
     margin, reach = _OUTSIDE, _ALONG + 2
     along, across = np.arange(-_ALONG, _ALONG + 1), np.arange(-_ACROSS, _ACROSS + 1)
-    found = []
+    rims = []
     for y, x in np.argwhere(steps).tolist():
         if not (margin <= x < width - margin and margin <= y < height - margin):
             continue
@@ -245,8 +247,8 @@ def _rims(
                 continue
             top = slice(max(0, peak - 2), peak + 3)
             shift = start + float(np.average(across[top], weights=change[top]))
-            found.append((y, x, float(level[y, x]), float(slope), shift))
-    return found
+            rims.append((y, x, float(level[y, x]), float(slope), shift))
+    return rims
 
 
 def _steps(
@@ -281,8 +283,8 @@ def spill(disparity: Float[np.ndarray, "h w"], edges: Edges) -> Float[np.ndarray
     sides = np.where(np.isfinite(part), np.where(part > edges.level[:, None], 1, -1), 0)
     last = across[np.cumsum(sides, axis=1).argmax(axis=1)]
     rest = ((middle - edges.place) * edges.outward).sum(axis=1)
-    known = np.isfinite(part[:, :_INSIDE]).mean(axis=1) >= 0.5
-    return np.where(known, (last + 0.5 + rest) * edges.cosine, np.nan)
+    is_filled = np.isfinite(part[:, :_INSIDE]).mean(axis=1) >= 0.5
+    return np.where(is_filled, (last + 0.5 + rest) * edges.cosine, np.nan)
 
 
 def _spread(spills: Float[np.ndarray, "n"], edges: Edges) -> dict[str, float | None]:
