@@ -44,6 +44,23 @@ def test_three_lines(boxes, tmp_path):
     assert made["self_training"]["teacher"] == "average"
     assert made["train"]["preparation"]["size_input"]
     assert made["train"]["augmentation"]["stretch"] == 1.0
+    assert model.result_.chosen["stage"] == "round"
+
+
+@pytest.mark.filterwarnings("ignore::qs3.adaptation.selection.SingleClassWarning")
+def test_rounds_are_kept_where_they_lose_nothing_on_held_out_source(boxes, tmp_path):
+    rounds = {"rounds": 2, "epochs": 1}
+    result = adapt(boxes, boxes, tmp_path, self_training=rounds).result_
+    assert result.selection == "source-val"
+    shares = {
+        c.number: c.validators["source-val"] for c in result.checkpoints if c.stage == "round"
+    }
+    assert list(shares) == [0, 1, 2]
+    assert result.chosen["number"] == max(shares, key=shares.get)
+    last = adapt(boxes, boxes, tmp_path / "last", train=SMALL | {"rule": "last"}).result_
+    assert last.chosen == {"stage": "round", "number": 1}
+    few = boxes.select(np.arange(8))  # too few to hold any out
+    assert adapt(few, boxes, tmp_path / "few").result_.selection == "last"
 
 
 def test_scans_of_any_kind_are_the_same_target(boxes, tmp_path):

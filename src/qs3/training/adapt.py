@@ -19,9 +19,10 @@ from qs3.meshes.classes import canonical
 from qs3.meshes.sizes import CLASS_SIZES
 from qs3.structure import unstructure
 from qs3.training.batches import load_whole
-from qs3.training.config import GENTLE
+from qs3.training.config import GENTLE, TrainSettings
 from qs3.training.estimators import Adapter, Clouds
 from qs3.training.run import train_settings
+from qs3.training.validation import held_out
 
 _STEPS = 4000
 """Optimiser steps on the source: those of ``rooms``."""
@@ -46,8 +47,10 @@ def adapt(
     class, or in those of their files where the size of a class is not known. A network like
     ``rooms`` learns from scans, clean twins and surfaces, and is adapted to the scans by rounds of
     quasi-balanced self-training (QS³, Algorithm 1) with a teacher that is the average of the
-    network, at a tenth of the learning rate. What was done stays in ``out``; the same call goes on
-    after a stop.
+    network, at a tenth of the learning rate. Of these rounds and the network before them the one is
+    kept that is best on a held-out tenth of the source (rule ``source-val``): on real objects no
+    other rule lost less (docs/real.md). What was done stays in ``out``; the same call goes on after
+    a stop.
 
     Args:
         cad: Folder of meshes, one folder a class, or ``"shapes"`` for the built-in ones; or what is
@@ -55,7 +58,8 @@ def adapt(
         scans: Clouds of the camera, one object each, z up, in metres. Labels are left behind.
         out: Folder for the data set (``source``) and the run (``run``).
         method: As in `Adapter`.
-        train: Settings of `TrainSettings` that differ from those of ``rooms``.
+        train: Settings of `TrainSettings` that differ from those of ``rooms``; with ``rule`` "last"
+            the last round is kept.
         self_training: Settings of the rounds that differ.
         workers: Processes that scan; None takes one a core.
         seed: Root of all random steps.
@@ -67,6 +71,10 @@ def adapt(
     settings = unstructure(train_settings(Path("rooms")))
     batches = max(1, len(source) // settings["batch_size"])
     settings |= {"epochs": max(1, round(_STEPS / batches))} | dict(train or {})
+    # By the source alone, as long as a class has enough clouds for a part to be held out.
+    held = held_out(source, TrainSettings(holdout=settings["holdout"]))
+    if "rule" not in (train or {}) and held.any():
+        settings |= {"rule": "source-val", "validate_every": settings["epochs"]}
     for name in ("model", "seed"):
         if name in (train or {}):
             raise InputError(f"{name} cannot be given in train here; use qs3.training.Adapter")

@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -65,6 +66,8 @@ class FitResult:
     """Rounds of self-training."""
     selection: str
     """Rule that chose the network among the checkpoints; no label of the target looked at."""
+    chosen: Mapping[str, str | int]
+    """Stage and number of the network that it chose; round 0 is the one before the rounds."""
     checkpoints: tuple[Checkpoint, ...]
     """Networks along the way, with what each validator says of them."""
     adapted: bool
@@ -200,10 +203,11 @@ def fit(
         stage = (base, len(epochs)) if rounds_settings is None else (ROUND, len(rounds))
         if rounds_settings is not None and method == base:
             method = f"{base}+{rounds_settings.rule}"
+        chosen = tell_choice(run_dir, *stage, settings.rule)
         run = Run(
             method=method,
             selection=settings.rule,
-            chosen=tell_choice(run_dir, *stage, settings.rule),
+            chosen=chosen,
             **data,
             threads=count,
             unknown_warm_up=warm_up is not None and before is None,
@@ -219,6 +223,7 @@ def fit(
         history=tuple(epochs),
         rounds=tuple(rounds),
         selection=settings.rule,
+        chosen=chosen,
         checkpoints=tuple(read_checkpoints(run_dir)),
         adapted=adapted,
         source=job.source,
