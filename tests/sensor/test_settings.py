@@ -41,6 +41,23 @@ def test_a_preset_is_a_whole_column_and_what_is_given_beside_it_wins():
     assert ScanSettings(preset="paper").as_dict()["box_crop"] is False
 
 
+@pytest.mark.parametrize(
+    ("settings", "crop"),
+    [
+        ({}, "box"),
+        ({"sensor": "kinect-v1"}, "box"),
+        ({"sensor": "d435"}, "both"),
+        ({"sensor": ("kinect-v1", "d415")}, "both"),
+        ({"matching": "ad-census"}, "both"),
+        ({"sensor": "d435", "crop": "box"}, "box"),
+        ({"sensor": "d435", "preset": "paper"}, "none"),
+        ({"sensor": "d435", "preset": "released"}, "box"),
+    ],
+)
+def test_a_matcher_that_fills_the_dark_is_cropped_by_the_mask_too(settings, crop):
+    assert ScanSettings(**settings).chosen("crop") == crop
+
+
 def test_changes_go_where_they_belong_in_the_sensor():
     changes = {"image_noise": 2.0, "matching": "opencv-bm", "object_size": 0.5, "material": "dark"}
     sensor, base = ScanSettings(sensor="d435", **changes).make_sensor(), SENSORS["d435"]

@@ -168,7 +168,7 @@ class ScanSettings(CameraSettings):
     default by preset."""
     crop: Literal["box", "mask", "both", "none"] | None = None
     """Keep points inside the object's box (as released), or pixels that truly show the object, or
-    what is both, or all; default by preset."""
+    what is both, or all; default by preset, and both for cameras with the matcher ad-census."""
     box_margin: float = 0.0
     """Enlarge the box of the crop on every side, in the unit of the scene."""
     depth_margin: float = 0.1
@@ -233,9 +233,20 @@ class ScanSettings(CameraSettings):
         check_range(self, "scan", "box_margin", "depth_margin", "seed")
 
     def chosen(self, name: str) -> Any:
-        """A setting by its name, or the preset's where it is None."""
+        """A setting by its name, or the preset's where it is None.
+
+        Where the preset has ``box``, ``both`` is taken for cameras with the matcher ``ad-census``,
+        which has a depth for the darkness around an object, too: it would fill the box.
+        """
         value = getattr(self, name)
-        return PRESETS[self.preset].get(name) if value is None else value
+        if value is not None:
+            return value
+        value = PRESETS[self.preset].get(name)
+        if name == "crop" and value == "box" and self.preset == "default":
+            sensors = (settings.make_sensor() for settings in self.each_sensor())
+            if any(sensor.matching.method == "ad-census" for sensor in sensors):
+                return "both"
+        return value
 
     @property
     def _changes(self) -> dict[str, str]:
@@ -299,10 +310,8 @@ class ScanSettings(CameraSettings):
         apart = {*(f.name for f in dataclasses.fields(CameraSettings)), *self._CHANGES, "preset"}
         apart |= {"crop", "floor_material", "wall_material", "device", "seed"}
         names = [f.name for f in dataclasses.fields(ScanSettings) if f.name not in apart]
-        crop, ranges = (
-            self.chosen("crop"),
-            [dict(settings.ranges) for settings in self.each_sensor()],
-        )
+        ranges = [dict(settings.ranges) for settings in self.each_sensor()]
+        crop = self.chosen("crop")
         return {name: self.chosen(name) for name in names} | {
             "object_size": self.object_size if isinstance(self.object_size, str) else None,
             "box_crop": crop in ("box", "both"),
