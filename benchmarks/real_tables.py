@@ -58,6 +58,7 @@ TITLES = {
     "rooms SPST gentle": "`rooms`, then gentle SPST", "rooms DGCNN": "`rooms` with a DGCNN",
 }  # fmt: skip
 """Lines of README's table, which has no room for all."""
+SHORT, SCORES = "## In short, accuracy / class mean", "## Scores"
 VALIDATORS = "## Rounds that rules choose, NYU, first 70 %"
 
 
@@ -119,8 +120,11 @@ def tables(folder: Path) -> str:
         if line.cell == "(block)"
     }
     looked = [part for part in NAMES if any(place(record)[1] == part for record in records)]
-    text = ["Made by `python benchmarks/real_tables.py`; not written by hand.", "", "## Scores", ""]
-    text += [to_markdown(score_table(records, looked)), ""]
+    fields = [dict(zip(("cell", "part"), place(record), strict=True)) for record in records]
+    averages = average(frame(records, fields), ("cell", "part"))
+    text = ["Made by `python benchmarks/real_tables.py`; not written by hand.", "", SHORT, ""]
+    text += [to_markdown(short_table(averages)), "", SCORES, ""]
+    text += [to_markdown(score_table(averages, looked)), ""]
     for part in looked:
         if part in blocks:
             text += [f"## Differences on {NAMES[part]}", "", "Points of accuracy; first minus"]
@@ -147,9 +151,7 @@ def tables(folder: Path) -> str:
     return "\n".join(text).rstrip() + "\n"
 
 
-def score_table(records: list[RunRecord], looked: list[str]) -> pd.DataFrame:
-    fields = [dict(zip(("cell", "part"), place(record), strict=True)) for record in records]
-    means = average(frame(records, fields), ("cell", "part"))
+def score_table(means: pd.DataFrame, looked: list[str]) -> pd.DataFrame:
     by_part = {name: group.set_index("cell") for name, group in means.groupby("part")}
     lines = []
     for cell in dict.fromkeys(means["cell"]):
@@ -171,11 +173,9 @@ def score_table(records: list[RunRecord], looked: list[str]) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def short_table(records: list[RunRecord]) -> pd.DataFrame:
+def short_table(averages: pd.DataFrame) -> pd.DataFrame:
     """Lines of README: accuracy / class mean of each part, mean and standard error over seeds."""
-    fields = [dict(zip(("cell", "part"), place(record), strict=True)) for record in records]
-    means = average(frame(records, fields), ("cell", "part")).set_index(["cell", "part"])
-    lines = []
+    means, lines = averages.set_index(["cell", "part"]), []
     for cell, title in TITLES.items():
         line = {"learnt from": title}
         for part, name in NAMES.items():
@@ -259,15 +259,13 @@ def fill(page: str, name: str, table: str) -> str:
     return head + begin + "\n" + table + "\n\n" + rest[rest.index(end) :]
 
 
-def filled(page: str, folder: Path) -> str:
-    """Return a page of the documentation with its tables anew."""
-    text = tables(folder)
-    scores = text.partition("## Scores\n\n")[2].partition("\n\n##")[0]
-    differences = text.partition("over both.\n\n")[2]
-    page = fill(page, "scores", scores)
-    page = fill(page, "short", to_markdown(short_table(read_records(folder))))
-    page = fill(page, "validators", text.partition(f"{VALIDATORS}\n\n")[2].partition("\n\n")[0])
-    return fill(page, "differences", differences.partition("\n\n")[0])
+def filled(page: str, text: str) -> str:
+    """Return a page of the documentation with its tables anew, out of what `tables` returned."""
+    heads = {"short": SHORT, "scores": SCORES, "validators": VALIDATORS}
+    starts = {name: f"{head}\n\n" for name, head in heads.items()}
+    for name, start in (starts | {"differences": "over both.\n\n"}).items():
+        page = fill(page, name, text.partition(start)[2].partition("\n\n")[0])
+    return page
 
 
 def main() -> int:
@@ -278,9 +276,10 @@ def main() -> int:
     options = parser.parse_args()
     if options.out:
         note_right(options.out, options.shared, options.records)
-    (options.records / TABLES).write_text(tables(options.records))
+    text = tables(options.records)
+    (options.records / TABLES).write_text(text)
     for path in PAGES:
-        path.write_text(filled(path.read_text(), options.records))
+        path.write_text(filled(path.read_text(), text))
     return 0
 
 

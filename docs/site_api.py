@@ -29,6 +29,7 @@ _ROOT_MODULES = (
     "qs3.geometry",
     "qs3.files",
     "qs3.lazy",
+    "qs3.processors",
     "qs3.structure",
     "qs3.toml_files",
 )

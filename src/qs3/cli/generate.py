@@ -1,7 +1,6 @@
 """``qs3 generate``: many meshes in, one data set out."""
 
 import dataclasses
-import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from qs3.cli.options import Flat
 from qs3.cli.store import refuse_failures
 from qs3.cli.text import show, tell
 from qs3.errors import InputError
+from qs3.processors import usable_processors
 from qs3.store.scan_item import RECIPES, GenerateSettings, RecipeName, settings_for
 
 if TYPE_CHECKING:
@@ -102,8 +102,7 @@ def generate(
     tell(*describe_renaming(renamed, called))
     settings = settings_for(resolve_renderer(settings), items, meshes, per_class)
     settings.as_dict()  # a scene or a range that makes no sense stops here
-    usable = getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count() or 1))(0)
-    processes = len(usable) if workers is None else workers
+    processes = usable_processors() if workers is None else workers
     if dry_run:
         plan = make_plan(items, settings)
         show(*_expected(plan, part, timeout, processes if executor == "local" else None))

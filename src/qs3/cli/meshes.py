@@ -75,10 +75,5 @@ def _row(name: str, group: "list[Inspection]") -> tuple[str, ...]:
     sizes = [look.size for look in group if look.size is not None]
     span = f"{min(sizes):.3g} to {max(sizes):.3g}" if sizes else "unknown"
     hinted = sum(bool(look.hints) for look in group)
-    return (
-        name,
-        str(len(group)),
-        span,
-        str(hinted),
-        str(sum(bool(look.fault) for look in group)),
-    )
+    faulty = sum(bool(look.fault) for look in group)
+    return name, str(len(group)), span, str(hinted), str(faulty)

@@ -1,6 +1,5 @@
 """Where a run took place: versions, hardware and commit, without importing torch."""
 
-import os
 import platform
 import re
 import shutil
@@ -8,6 +7,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+from qs3.processors import usable_processors
 from qs3.store.manifest import package_versions
 
 versions = package_versions
@@ -21,9 +21,7 @@ def hardware() -> dict[str, Any]:
         >>> sorted(hardware())
         ['cores', 'cpu', 'gpus']
     """
-    affinity = getattr(os, "sched_getaffinity", None)
-    cores = len(affinity(0)) if affinity is not None else os.cpu_count() or 1
-    return {"cpu": _cpu(), "cores": cores, "gpus": _gpus()}
+    return {"cpu": _cpu(), "cores": usable_processors(), "gpus": _gpus()}
 
 
 def _cpu() -> str:

@@ -116,17 +116,15 @@ def scan(
     """
     how = dataclasses.replace(settings or ScanSettings(), **changes)
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence(how.seed).spawn(9)]
-    crop = how.chosen("crop")  # of all sensors that may be drawn
     how, chosen = choose(how, streams.pop())
     rng_place, rng_render, rng_noise, rng_sample, rng_scene, rng_settings, rng_size, rng_room = (
         streams
     )
-    scene = how.make_scene()
-    sensor = how.make_sensor()
+    scene, sensor = how.make_scene(), how.make_sensor()
     sensor = sensor if rig is None else dataclasses.replace(sensor, rig=rig)
     # A file of one's own is read once, and a renderer that does not work here stops this first.
     how = dataclasses.replace(how, sensor=sensor, renderer=how.make_renderer())
-    clock = Clock()
+    clock, crop = Clock(), how.chosen("crop")
 
     sensor, drawn = draw(sensor, how.ranges, rng_settings)
     own_class, other_class = (*class_names, "", "")[:2]

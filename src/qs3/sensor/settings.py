@@ -21,8 +21,14 @@ from qs3.sensor.scene import SceneSettings
 from qs3.sensor.speckle import pattern_image
 from qs3.sensor.views import ViewLayout
 
+_BY_MATCHER = "by matcher"
 PRESETS: dict[str, dict[str, Any]] = {
-    "default": {"size": "box", "view_layout": "orbit", "crop": "box", "principal_point": None},
+    "default": {
+        "size": "box",
+        "view_layout": "orbit",
+        "crop": _BY_MATCHER,
+        "principal_point": None,
+    },
     "paper": {"size": "ball", "view_layout": "orbit", "crop": "none", "principal_point": None},
     "released": {
         "size": "box",
@@ -233,20 +239,16 @@ class ScanSettings(CameraSettings):
         check_range(self, "scan", "box_margin", "depth_margin", "seed")
 
     def chosen(self, name: str) -> Any:
-        """A setting by its name, or the preset's where it is None.
-
-        Where the preset has ``box``, ``both`` is taken for cameras with the matcher ``ad-census``,
-        which has a depth for the darkness around an object, too: it would fill the box.
-        """
+        """A setting by its name, or the preset's where it is None."""
         value = getattr(self, name)
-        if value is not None:
-            return value
-        value = PRESETS[self.preset].get(name)
-        if name == "crop" and value == "box" and self.preset == "default":
-            sensors = (settings.make_sensor() for settings in self.each_sensor())
-            if any(sensor.matching.method == "ad-census" for sensor in sensors):
-                return "both"
-        return value
+        value = PRESETS[self.preset].get(name) if value is None else value
+        return self._crop_by_matcher() if value == _BY_MATCHER else value
+
+    def _crop_by_matcher(self) -> str:
+        """AD-Census has a depth for the darkness around an object, too: it would fill the box."""
+        sensors = (settings.make_sensor() for settings in self.each_sensor())
+        fills = any(sensor.matching.method == "ad-census" for sensor in sensors)
+        return "both" if fills else "box"
 
     @property
     def _changes(self) -> dict[str, str]:

@@ -39,9 +39,10 @@ def choose(
         drawn["views"] = how.least_views + int(share * (how.views - how.least_views + 1))
         how = dataclasses.replace(how, views=drawn["views"], least_views=None)
     if isinstance(how.sensor, tuple):
+        crop = how.chosen("crop")  # one for all of them
         how = how.each_sensor()[int(rng.integers(len(how.sensor)))]
         sensor = how.make_sensor()
-        how, drawn["sensor"] = dataclasses.replace(how, sensor=sensor), sensor.name
+        how, drawn["sensor"] = dataclasses.replace(how, sensor=sensor, crop=crop), sensor.name
     return how, drawn
 
 

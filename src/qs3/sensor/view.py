@@ -1,6 +1,5 @@
 """One view of a scan: its pictures, and the part of them that becomes points."""
 
-import os
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,6 +10,7 @@ from itertools import repeat
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Shaped, UInt
 
+from qs3.processors import asked_threads, usable_processors
 from qs3.sensor.depth import backproject, depth_from_disparity, gate
 from qs3.sensor.exposure import expose_pair
 from qs3.sensor.matching import match, matching_canvas
@@ -129,7 +129,7 @@ def take_views(
 
     The first of ``casters`` holds the scene; a second one, of the object alone, makes the views
     ones of whole frames, with silhouette and normals. Views are matched side by side, on as many
-    threads as there are processors or ``OMP_NUM_THREADS`` says.
+    threads as there are processors or ``OMP_NUM_THREADS`` says; for a GPU on one.
     """
     rig = sensor.rig
     canvases = [matching_canvas(region, rig, sensor.matching) for region in regions]
@@ -141,16 +141,16 @@ def take_views(
                 right = stored_pattern(rig, sensor.pattern, canvas, sensor.exposure.bits)
             lefts.append(left)
             rights.append(right)
-    with clock("matching"), ThreadPoolExecutor(_threads(device)) as pool:
+    threads = asked_threads() or usable_processors() if device == "cpu" else 1
+    with clock("matching"), ThreadPoolExecutor(threads) as pool:
         how = repeat(sensor.matching), repeat(device)
         disparities = list(pool.map(match, lefts, rights, *how))
-    views = []
+    views, whole = [], len(casters) > 1
     for pair, canvas, region, left, right, disparity in zip(
         pairs, canvases, regions, lefts, rights, disparities, strict=True
     ):
         inner = region.within(canvas)
         with clock("true_depth"):
-            whole = len(casters) > 1
             cast = casters[0].cast(rig, pair.pose, region, normals=whole)
             silhouette = casters[1].cast(rig, pair.pose, region).mask if whole else None
         view = ViewImages(
@@ -166,17 +166,6 @@ def take_views(
         )
         views.append(view)
     return views
-
-
-def _threads(device: str) -> int:
-    """How many views are matched at once: on a GPU one."""
-    if device != "cpu":
-        return 1
-    wanted = os.environ.get("OMP_NUM_THREADS", "")
-    if wanted.isdigit() and int(wanted):
-        return int(wanted)
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 class Clock:

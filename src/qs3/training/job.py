@@ -1,7 +1,6 @@
 """The work of a run, the same on each of its devices."""
 
 import contextlib
-import copy
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -97,9 +96,7 @@ def run_job(
             hooks.history.put("checkpoint", read_checkpoints(job.run_dir))
 
     def look(number: int, model: PointClassifier) -> None:
-        adapted = copy.deepcopy(model)  # the next round goes on from the plain network
-        validation.adapt(adapted)
-        validation.look(ROUND, number, adapted)
+        validation.look(ROUND, number, model)
         tell_checkpoints()
 
     if job.warm_up is not None:

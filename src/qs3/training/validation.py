@@ -83,14 +83,15 @@ class Validation:
         if every and (done == self.settings.epochs or done % every == 0):
             copied = copy.deepcopy(method)  # the training goes on from its own statistics
             copied.norm.settle()
-            model = copied.result()
-            self.adapt(model)
-            self.look(stage, done, model)
+            self.look(stage, done, copied.result())
 
     def look(self, stage: str, number: int, model: PointClassifier) -> None:
-        """Measure a network and keep its weights."""
+        """Measure a network, adapted as it would be at the end, and keep those weights."""
         if not self.settings.validate_every:
             return
+        model = copy.deepcopy(model)  # what follows goes on from its own statistics
+        self.fabric.to_device(model)
+        self.adapt(model)
         target, holdout, source = (
             None
             if clouds is None or not len(clouds)

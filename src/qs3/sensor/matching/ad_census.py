@@ -54,8 +54,8 @@ def match_ad_census(
     tone = (2**bits - 1) / 255  # grey levels in one of 8 bits
     images = [np.ascontiguousarray(image, dtype=np.int32) for image in (left, right)]
     left_bits, right_bits = (_bits(image, own) for image in images)
-    totals = _search(images[0], images[1], left_bits, right_bits, settings, tone, device)
-    best, total, less, more, second = np.moveaxis(totals, 2, 0)
+    minima = _search(images[0], images[1], left_bits, right_bits, settings, tone, device)
+    best, total, less, more, second = np.moveaxis(minima, 2, 0)
     columns = np.arange(left.shape[1])
     kept = (best > 0) & (best < settings.num_disparities - 1) & (best <= columns)
     if settings.left_right > 0:

@@ -170,10 +170,8 @@ def in_sight(camera: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """
     following = _following(camera)
     columns = np.arange(camera.shape[1])
-    next_depth = np.take_along_axis(camera, np.minimum(following, columns[-1]), axis=1)
-    return np.where(
-        following <= columns[-1], columns >= next_depth, columns >= np.nanmedian(camera)
-    )
+    nearest = np.take_along_axis(camera, np.minimum(following, columns[-1]), axis=1)
+    return np.where(following <= columns[-1], columns >= nearest, columns >= np.nanmedian(camera))
 
 
 def _following(disparity: Float[np.ndarray, "h w"]) -> Int[np.ndarray, "h w"]:

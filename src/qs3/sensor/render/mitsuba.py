@@ -1,7 +1,6 @@
 """The default renderer: Mitsuba 3, on CUDA, LLVM or plain C++, whichever is here."""
 
 import functools
-import os
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -9,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from qs3.errors import InputError
+from qs3.processors import asked_threads
 from qs3.sensor.checks import check_choices, check_range
 from qs3.sensor.render.cache import Photographer
 from qs3.sensor.render.embree import EmbreePhotographer
@@ -138,9 +138,8 @@ def _mitsuba(variant: str) -> Any:
     if mi.variant() != variant:
         mi.set_variant(variant)
         mi.set_log_level(mi.LogLevel.Error)
-        threads = os.environ.get("OMP_NUM_THREADS", "")
-        if threads.isdigit() and int(threads):  # Dr.Jit does not look at it
+        if threads := asked_threads():  # Dr.Jit does not look for it
             import drjit as dr
 
-            dr.set_thread_count(int(threads))
+            dr.set_thread_count(threads)
     return mi
