@@ -59,7 +59,8 @@ def match_ad_census(
     columns = np.arange(left.shape[1])
     kept = (best > 0) & (best < settings.num_disparities - 1) & (best <= columns)
     if settings.left_right > 0:
-        # The right image is searched as a left one is, both mirrored.
+        # The right image is searched as a left one is, both mirrored. The least of the totals that
+        # are here already would take 0.7 of the time, and lose bars of 5 px in 4 rows of 10.
         other, this = (np.ascontiguousarray(image[:, ::-1]) for image in (images[1], images[0]))
         other_bits, this_bits = (
             np.ascontiguousarray(bits[:, ::-1]) for bits in (right_bits, left_bits)
