@@ -1,6 +1,5 @@
 """The whole way in one call: CAD models and unlabelled scans in, a classifier of the scans out."""
 
-import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from qs3.io.ragged import RaggedClouds
 from qs3.meshes import collect
 from qs3.meshes.classes import canonical
 from qs3.meshes.sizes import CLASS_SIZES
+from qs3.processors import usable_processors
 from qs3.structure import unstructure
 from qs3.training.batches import load_whole
 from qs3.training.config import GENTLE, TrainSettings
@@ -107,7 +107,7 @@ def _source(
         size = "class" if have_sizes else "file"
         recipe = replace(RECIPES["rooms"], views=1, seed=seed, object_size=size)
         recipe = settings_for(recipe, items, [cad], _PER_CLASS)
-        generate(items, folder, recipe, workers=workers or os.cpu_count() or 1)
+        generate(items, folder, recipe, workers=workers or usable_processors())
         cad = folder
     return load_clouds(cad, num_points=None, cloud="all")
 

@@ -4,7 +4,6 @@ import concurrent.futures
 import hashlib
 import itertools
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -18,6 +17,7 @@ from qs3.io.guards import utf8
 from qs3.io.layouts.format import Format
 from qs3.io.ragged import RaggedClouds
 from qs3.io.scratch import Spool
+from qs3.processors import usable_processors
 from qs3.store.folder import Folder, open_folder
 from qs3.store.manifest import (
     Manifest,
@@ -31,7 +31,7 @@ from qs3.store.manifest import (
 from qs3.store.progress import cloud_bar
 
 ROWS_PER_SHARD = 64
-_THREADS = min(os.cpu_count() or 1, 8)
+_THREADS = min(usable_processors(), 8)
 
 
 def read_ragged(
