@@ -389,6 +389,28 @@ def test_a_warm_up_must_be_of_the_method_and_leave_the_held_out_part_unseen(tmp_
         fit("dann", SOURCE, TARGET, chosen, ROUNDS, run_dir=tmp_path / "f", warm_up=tmp_path / "c")
 
 
+def test_clouds_that_a_warm_up_has_not_seen_may_judge_it(tmp_path):
+    chosen = settings("dann", epochs=1)
+    wider = SOURCE.points * np.float32([1, 2, 0.5])
+    before = fit("dann", replace(SOURCE, points=wider), TARGET, chosen, run_dir=tmp_path / "dann")
+
+    def adapt(name, rounds, **changes):
+        changed, warm = replace(chosen, **changes), tmp_path / "dann"
+        run = tmp_path / name
+        return fit("dann", SOURCE, TARGET, changed, rounds, run_dir=run, warm_up=warm)
+
+    made = adapt("new", ROUNDS, rule="source-val")
+    assert made.checkpoints[-1].validators["source-val"] is not None
+    # Where no round trains, the network is the warm-up's, and so is what is known of it.
+    skipping = replace(ROUNDS, threshold=0.99)
+    with pytest.raises(InputError, match="raise holdout above 0"):
+        adapt("none", skipping, holdout=0.0, rule="source-val")
+    made = adapt("skipped", skipping, holdout=0.0)
+    assert all(record.skipped for record in made.rounds)
+    assert made.known is not None
+    assert made.known == before.known
+
+
 def test_a_held_out_part_takes_of_every_class_and_never_its_last_cloud():
     rare = SOURCE.select(np.flatnonzero((SOURCE.labels < 2) | (np.arange(len(SOURCE)) == 2)))
     for seed in range(5):

@@ -191,6 +191,8 @@ def test_settings_are_json_or_words():
         (["--method", "gast", "--self-training", "spst"], "spst"),
         (["--method", "gast", "--self-training", "qbst"], "default"),
         (["--method", "qbst", "--preset", "paper"], "paper"),
+        (["--method", "qbst", "--source", "a", "--warm-up", "rooms"], "gentle"),
+        (["--method", "spst", "--source", "a", "--warm-up", "rooms"], "spst"),
     ],
 )
 def test_a_preset_follows_the_method(arguments, preset):

@@ -53,6 +53,10 @@ def test_a_demo_on_ones_own_scans_tells_answers_and_no_score(qs3, scans, tmp_pat
     assert "scans, by predicted class" in page
     assert "Labels of the target" not in page
     assert not list((out / "before").glob("records/*"))
+    size = ("--source-per-class", 0, *SIZE, "--share", 0.01)
+    none = qs3("demo", "--out", tmp_path / "none", "--scans", scans, *size, code=4)
+    assert "raise --share" in none.stderr
+    assert "report.html" in none.stdout
 
 
 @pytest.mark.filterwarnings("ignore::qs3.adaptation.selection.SingleClassWarning")

@@ -155,6 +155,7 @@ def test_a_dry_run_tells_what_would_be_trained_and_writes_nothing(
               "--self-training.epochs", 4)  # fmt: skip
     told = qs3(*words, *rounds).stdout
     assert "qbst, 2 rounds of 4 epochs of at most 2 steps: 16" in told
+    assert "10 clouds, 0 of them held out" in qs3(*words[:-1], "--dry_run").stdout
     assert set(store.rglob("*")) == before
     assert not list(tmp_path.iterdir())
     assert "--target" in qs3.refuses(*words, "--method", "mmd")

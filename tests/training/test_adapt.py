@@ -59,8 +59,18 @@ def test_rounds_are_kept_where_they_lose_nothing_on_held_out_source(boxes, tmp_p
     assert result.chosen["number"] == max(shares, key=shares.get)
     last = adapt(boxes, boxes, tmp_path / "last", train=SMALL | {"rule": "last"}).result_
     assert last.chosen == {"stage": "round", "number": 1}
-    few = boxes.select(np.arange(8))  # too few to hold any out
+
+
+@pytest.mark.filterwarnings("ignore::qs3.adaptation.selection.SingleClassWarning")
+def test_what_adapt_could_not_do_is_told(boxes, tmp_path, caplog):
+    few = boxes.select(np.arange(8))
     assert adapt(few, boxes, tmp_path / "few").result_.selection == "last"
+    assert "the last round is kept" in caplog.text
+    caplog.clear()
+    never = ROUNDS | {"threshold_share": None, "threshold": 0.999}
+    made = adapt(boxes, boxes, tmp_path / "never", self_training=never).result_
+    assert [record.skipped for record in made.rounds] == [True]
+    assert "all 1 rounds were skipped" in caplog.text
 
 
 def test_scans_of_any_kind_are_the_same_target(boxes, tmp_path):

@@ -60,7 +60,10 @@ def test_default_preset_is_the_default():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: self_training_preset("papers"), "choose one of default, spst, paper, released"),
+        (
+            lambda: self_training_preset("papers"),
+            "choose one of default, gentle, spst, paper, released",
+        ),
         (lambda: self_training_preset("paper", theta=0.9), "unknown setting 'theta'.*threshold"),
         (lambda: SelfTrainingSettings(threshold=1.5), "threshold = 1.5 must be in 0 to 1"),
         (lambda: SelfTrainingSettings(threshold=0.9, step=0.02), "step = 0.02 takes θ out"),

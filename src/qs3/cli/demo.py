@@ -69,6 +69,7 @@ def demo(
             each, z up, in metres. Nothing is scored then, as they have no labels.
         settings: Size of the demo.
     """
+    from qs3.cli.train import NO_ROUND
     from qs3.training.answers import list_clouds
     from qs3.training.shipped import find_run
 
@@ -91,13 +92,13 @@ def demo(
     else:
         tell(f"[2/4] read {scans}")
     tell("[3/4] adapt to the target without labels")
-    _adapt(scans or folder / "target", before, settings, folder)
+    has_trained = _adapt(scans or folder / "target", before, settings, folder)
     tell("[4/4] report")
     path = folder / "report.html"
     _score(folder, settings, path) if scans is None else _tell_scans(folder, files, settings, path)
     show(f"report: {path}")
     tell(f"{time.perf_counter() - start:.0f} s. Open {path} in a browser.")
-    return 0
+    return 0 if has_trained else NO_ROUND
 
 
 def _scan(folder: Path, settings: DemoSettings, per_class: int, seed: int, **how: Any) -> None:
@@ -129,26 +130,28 @@ def _renderer(settings: DemoSettings) -> Any:
     return CameraSettings(samples=settings.samples, variant=settings.variant).make_renderer()
 
 
-def _adapt(target: Path, before: Path, settings: DemoSettings, folder: Path) -> None:
+def _adapt(target: Path, before: Path, settings: DemoSettings, folder: Path) -> bool:
+    """Adapt the network; tells whether any round trained it."""
     from qs3.io import load_clouds, load_unlabelled
     from qs3.training import fit, load_model, load_whole, self_training_preset
-    from qs3.training.config import GENTLE
-    from qs3.training.rounds import remarks
+    from qs3.training.rounds import all_skipped, remarks
     from qs3.training.run import train_settings
 
     train = dataclasses.replace(train_settings(before), seed=settings.seed)
     own = {"threshold_share": settings.share, "rounds": settings.rounds}
     own |= {"epochs": settings.round_epochs, "source_loss": settings.source_per_class > 0}
-    rounds = self_training_preset("default", **{**GENTLE, **own})
+    rounds = self_training_preset("gentle", **own)
     size, source = (train.num_points, train.preparation), None
     if settings.source_per_class:
         names = load_model(before).class_names
         part: dict[str, Any] = {"cloud": "all", "class_names": names}
         source = load_whole(load_clouds, folder / "source", *size, **part)
     clouds = load_whole(load_unlabelled, target, *size)
-    how = {"run_dir": folder / "qbst", "warm_up": before, "preset": "default"}
+    how = {"run_dir": folder / "qbst", "warm_up": before, "preset": "gentle"}
     done = fit("qbst", source, clouds, train, rounds, **how)
-    tell(*(f"qs3: {line}" for line in remarks(done.rounds, rounds, done.source.class_names)))
+    lines = remarks(done.rounds, rounds, done.source.class_names, share="--share")
+    tell(*(f"qs3: {line}" for line in lines))
+    return not all_skipped(done.rounds)
 
 
 def _score(folder: Path, settings: DemoSettings, path: Path) -> None:

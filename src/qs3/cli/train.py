@@ -28,7 +28,7 @@ from qs3.training.config import (
 )
 from qs3.training.history import Tracker
 from qs3.training.run import is_run, train_settings
-from qs3.training.shipped import find_run
+from qs3.training.shipped import find_run, shipped
 
 TIME_UP = 3
 """Exit code where --max-time stopped a run that the same command takes up again."""
@@ -81,8 +81,9 @@ class Choices:
     """Rounds of self-training after the method, by this rule: --method gast --self-training
     qbst."""
     preset: PresetName | None = None
-    """Settings of the self-training: ours (default), GAST's SPST (the default of that rule), QS³'s
-    text (paper), or its released code (released). A setting given beside it wins."""
+    """Settings of the self-training: ours (default), what lost least on real scans (gentle, from a
+    network that comes with qs3), GAST's SPST (the default of that rule), QS³'s text (paper), or its
+    released code (released). A setting given beside it wins."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,11 +146,16 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
     """
     chosen, given = _choices(words)
     rule = chosen.rounds_rule or COMPOSED.get(chosen.method, ("", None))[1]
-    preset = chosen.preset or ("spst" if rule == "spst" else "default")
+    usual: dict[str | None, PresetName] = {"spst": "spst"}
+    if str(chosen.warm_up) in shipped():
+        usual["qbst"] = "gentle"
+    preset = chosen.preset or usual.get(rule, "default")
     rounds = PRESETS[preset] if rule is None else replace(PRESETS[preset], rule=rule)
     how = TrainSettings(preparation=preparation_of(preset))
     if chosen.warm_up is not None and is_run(run := find_run(chosen.warm_up)):
         how = train_settings(run)
+        if not how.validate_every:  # each round is a checkpoint that a rule may choose
+            how = replace(how, validate_every=TrainSettings.validate_every)
     if alone := rule is not None and chosen.warm_up is not None and chosen.source is None:
         rounds = replace(rounds, source_loss=False)
     options = TrainOptions(out=Path(), preset=preset, train=how, self_training=rounds)
@@ -158,7 +164,8 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
         if options.self_training.rule != rounds.rule:
             raise InputError(f"{chosen.config}: self_training.rule: name it by rounds_rule instead")
     # What must be given: tyro's marker for that is neither text nor path.
-    needed = {"out": "--dry-run" not in words, "source": not alone and not options.source}
+    dry = options.dry_run or any(word.replace("_", "-") == "--dry-run" for word in words)
+    needed = {"out": not dry, "source": not alone and not options.source}
     for name in (name for name, missing in needed.items() if missing):
         object.__setattr__(options, name, tyro.MISSING)
     return {"options": options}

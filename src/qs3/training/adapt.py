@@ -1,5 +1,6 @@
 """The whole way in one call: CAD models and unlabelled scans in, a classifier of the scans out."""
 
+import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -19,11 +20,13 @@ from qs3.meshes.sizes import CLASS_SIZES
 from qs3.processors import usable_processors
 from qs3.structure import unstructure
 from qs3.training.batches import load_whole
-from qs3.training.config import GENTLE, TrainSettings
+from qs3.training.config import GENTLE, SelfTrainingSettings, TrainSettings, changed
 from qs3.training.estimators import Adapter, Clouds
+from qs3.training.rounds import remarks
 from qs3.training.run import train_settings
 from qs3.training.validation import held_out
 
+_LOG = logging.getLogger(__name__)
 _STEPS = 4000
 """Optimiser steps on the source: those of ``rooms``."""
 _PER_CLASS = 60
@@ -75,6 +78,8 @@ def adapt(
     held = held_out(source, TrainSettings(holdout=settings["holdout"]))
     if "rule" not in (train or {}) and held.any():
         settings |= {"rule": "source-val", "validate_every": settings["epochs"]}
+    elif "rule" not in (train or {}):
+        _LOG.warning("no class has clouds enough to hold some out: the last round is kept")
     for name in ("model", "seed"):
         if name in (train or {}):
             raise InputError(f"{name} cannot be given in train here; use qs3.training.Adapter")
@@ -90,7 +95,11 @@ def adapt(
         run_dir=Path(out) / "run",
         random_state=seed,
     )
-    return adapter.fit(source, target)
+    adapter.fit(source, target)
+    rounds = changed(SelfTrainingSettings(), adapter.self_training or {}, " in self_training")
+    for line in remarks(adapter.result_.rounds, rounds, source.class_names, "threshold_share"):
+        _LOG.warning(line)
+    return adapter
 
 
 def _source(

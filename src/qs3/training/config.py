@@ -18,7 +18,7 @@ Precision = Literal["32-true", "bf16-mixed", "16-mixed", "64-true"]
 """Number formats that Lightning Fabric offers here."""
 Accelerator = Literal["auto", "cpu", "cuda"]
 """Where a training can compute."""
-PresetName = Literal["default", "spst", "paper", "released"]
+PresetName = Literal["default", "gentle", "spst", "paper", "released"]
 """Whole columns of settings: our defaults, SPST's, QS³'s text, QS³'s released code."""
 Teacher = Literal["latest", "best", "average"]
 """Networks that can give the pseudo labels."""
@@ -346,8 +346,17 @@ def _check(settings: Any, name: str, good: bool, fault: str) -> None:
         raise InputError(f"setting {name} = {getattr(settings, name)} {fault}")
 
 
+GENTLE: Mapping[str, Any] = {
+    "threshold_share": 0.5,
+    "teacher": "average",
+    "learning_rate": 1e-4,
+    "rounds": 5,
+    "epochs": 4,
+}
+"""Rounds of `SelfTrainingSettings` that lost least on NYU's real objects (docs/real.md)."""
 PRESETS: Mapping[str, SelfTrainingSettings] = {
     "default": SelfTrainingSettings(),
+    "gentle": SelfTrainingSettings(**GENTLE),
     # GAST's SPST: every confident cloud, both losses weighted alike and falling.
     "spst": SelfTrainingSettings(rule="spst", weight_step=0.005),
     # Algorithm 1 takes Φ_init as an input of its own beside the warm-up Φ_0: fresh weights.
@@ -376,16 +385,6 @@ def preparation_of(preset: str | None) -> Preparation:
         (False, True)
     """
     return PAPER if preset in ("paper", "released") else ROBUST
-
-
-GENTLE: Mapping[str, Any] = {
-    "threshold_share": 0.5,
-    "teacher": "average",
-    "learning_rate": 1e-4,
-    "rounds": 5,
-    "epochs": 4,
-}
-"""Rounds of `SelfTrainingSettings` that lost least on NYU's real objects (docs/real.md)."""
 
 
 def self_training_preset(name: str, **overrides: Any) -> SelfTrainingSettings:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from qs3.adaptation import method_class
 from qs3.adaptation.confidence import Known
@@ -25,7 +26,7 @@ from qs3.training.distributed import all_devices, make_fabric
 from qs3.training.history import EpochRecord, History, Tracker
 from qs3.training.job import Job, fresh_model, make_method, run_job
 from qs3.training.loop import EpochCallback
-from qs3.training.overlap import data_fields
+from qs3.training.overlap import caveats, data_fields
 from qs3.training.prepared import Prepared, prepare_clouds, require_finite
 from qs3.training.progress import Deadline
 from qs3.training.rounds import Hooks, RoundCallback, RoundRecord
@@ -156,14 +157,15 @@ def fit(
     if source is None:
         source = _no_clouds(warm_up, rounds_settings)
     require_finite(source.points, source.ids, "source: ")
+    held = held_out(source, settings)
     weights, before, unseen = None, None, True
     if warm_up is not None:
-        weights, unseen = _check_warm_up(warm_up, base, source, settings)
+        weights = _check_warm_up(warm_up, base, source, settings)
         before = read_run(warm_up) if (warm_up / RUN).is_file() else None
+        unseen = _is_new(source, held, settings, warm_up, before)
     run_dir = Path(run_dir)
-    held = held_out(source, settings)
     has_holdout = unseen and bool(held.any())
-    _require_judges(settings, rounds_settings, target, has_holdout)
+    _require_judges(settings, rounds_settings, target, has_holdout, held)
     # What cannot be made must not leave a folder behind that refuses the corrected call.
     model = fresh_model(base, settings, len(source.class_names))
     trial, device = make_method(base, model, settings), make_fabric(settings)
@@ -280,6 +282,7 @@ def _require_judges(
     rounds: SelfTrainingSettings | None,
     target: UnlabelledClouds | None,
     has_holdout: bool,
+    held: Bool[np.ndarray, "b"],
 ) -> None:
     """Refuse, before anything is trained, what would lack something in the end."""
     by_source = settings.rule in ("source-val", "dev")
@@ -287,18 +290,20 @@ def _require_judges(
     if not has_holdout and (by_source or bbse or (rounds is not None and rounds.calibrate)):
         what = "prior 'bbse'" if bbse else "calibrate"
         what = f"rule {settings.rule!r}" if by_source else what
+        remedy = f"raise holdout above {settings.holdout:g}, or give more clouds a class"
+        if not len(held):
+            remedy = "give a source"
+        elif held.any():
+            remedy = "give a source that it has not, or a warm-up of this source, seed and holdout"
         raise InputError(
-            f"{what} needs a held-out part of the source that no warm-up has seen; raise holdout "
-            f"above {settings.holdout}, or give a warm-up of the same source, seed and holdout"
+            f"{what} needs a held-out part of the source that no warm-up has seen; {remedy}"
         )
     if target is None and settings.rule not in ("last", "source-val"):
         raise InputError(f"rule {settings.rule!r} needs a target: give unlabelled clouds")
 
 
-def _check_warm_up(
-    folder: Path, base: str, source: PointClouds, settings: TrainSettings
-) -> tuple[str, bool]:
-    """Return the checksum of a warm-up's weights, and whether the held-out part is new to it."""
+def _check_warm_up(folder: Path, base: str, source: PointClouds, settings: TrainSettings) -> str:
+    """Return the checksum of a warm-up's weights."""
     model, class_names, its, *_ = load_model(folder)
     if class_names != source.class_names:
         raise InputError(
@@ -322,12 +327,31 @@ def _check_warm_up(
             f"{folder}: is a run of method {method}, not {base}; choose method {method} with "
             "self-training after it"
         )
-    same = all(trained.get(name) == ours[name] for name in ("seed", "holdout"))
-    unseen = same and its.get("source") == fingerprint(source)
-    if not unseen and settings.holdout > 0 and len(source):
-        _LOG.warning(
-            "%s: was trained on another part of the source, so that none of it is left to "
-            "validate on; same source, seed and holdout would leave one",
-            folder,
-        )
-    return weights_fingerprint(model), unseen
+    return weights_fingerprint(model)
+
+
+def _is_new(
+    source: PointClouds,
+    held: Bool[np.ndarray, "b"],
+    settings: TrainSettings,
+    warm_up: Path,
+    before: Run | None,
+) -> bool:
+    """Tell whether the held-out part of the source is new to the warm-up.
+
+    It is where the warm-up held out the same part, or has seen none of its clouds.
+    """
+    its = load_model(warm_up).settings
+    trained = its.get("train", {})
+    same = all(trained.get(name) == getattr(settings, name) for name in ("seed", "holdout"))
+    if not held.any() or (same and its.get("source") == fingerprint(source)):
+        return True
+    part = prepare_clouds(source.select(held), settings.num_points, settings.preparation)
+    if before is not None and not {"training clouds", "transductive"} & {*caveats(before, part)}:
+        return not before.unknown_warm_up
+    _LOG.warning(
+        "%s: was trained on another part of the source, so that none of it is left to validate "
+        "on; same source, seed and holdout would leave one",
+        warm_up,
+    )
+    return False

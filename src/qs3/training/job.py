@@ -13,7 +13,13 @@ from qs3.adaptation.confidence import measure_known
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier, feature_widths
-from qs3.training.checkpoint import derived_seed, load_model, new_model, save_model
+from qs3.training.checkpoint import (
+    derived_seed,
+    load_model,
+    new_model,
+    save_model,
+    weights_fingerprint,
+)
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.history import EpochRecord
 from qs3.training.loop import train
@@ -165,6 +171,10 @@ def _save(folder: Path, model: PointClassifier, job: Job, fabric: Fabric) -> Non
         size = job.settings.batch_size
         said = describe(model, job.holdout, batch_size=size, fabric=fabric)
         known = measure_known(said.logits, job.holdout.labels)
+    elif job.warm_up is not None:
+        before = load_model(job.warm_up)
+        if weights_fingerprint(before.model) == weights_fingerprint(model):  # no round trained it
+            known = before.known
     if fabric.is_global_zero:
         save_model(folder, model, job.source.class_names, job.settings, known=known)
     fabric.barrier()

@@ -234,12 +234,16 @@ def kept_clouds(run_dir: Path) -> tuple[list[str], list[Int[np.ndarray, "2 c"]]]
 
 
 def remarks(
-    records: Sequence[RoundRecord], rounds: SelfTrainingSettings, class_names: Sequence[str]
+    records: Sequence[RoundRecord],
+    rounds: SelfTrainingSettings,
+    class_names: Sequence[str],
+    share: str = "--self-training.threshold-share",
 ) -> list[str]:
     """Say, a line each, what in the rounds was not as one would wish.
 
     That is where none trained, with what to change; rounds whose confident clouds all had one
-    class; and a calibration that the held-out clouds do not bound.
+    class; and a calibration that the held-out clouds do not bound. ``share`` is what the caller
+    calls ``threshold_share``.
     """
     lines = []
     if any(record.temperature == BOUNDS[0] for record in records):
@@ -257,11 +261,11 @@ def remarks(
             )
     if all_skipped(records):
         most = max(sum(record.kept) for record in records)
-        setting = "lower --self-training.threshold, give --self-training.threshold-share,"
+        setting = f"lower --self-training.threshold, give {share},"
         if rounds.rule == "quantile":
             setting = "raise --self-training.portion"
         elif rounds.threshold_share is not None:
-            setting = "raise --self-training.threshold-share"
+            setting = f"raise {share}"
         lines.append(
             f"all {len(records)} rounds were skipped, as they kept {most} of {records[0].pool} "
             "clouds at most: the network is that of the warm-up; in another folder, "
