@@ -157,8 +157,7 @@ def folder_lock(path: Path) -> Iterator[None]:
 def _open_lock(file: Path) -> int:
     """Open and lock a file that nobody else holds."""
     while True:
-        if file.is_symlink():
-            raise InputError(f"{file}: is a link, which qs3 does not follow; remove it")
+        refuse_link(file)
         handle = os.open(file, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
         try:
             _lock(handle, file)
@@ -298,6 +297,16 @@ def remove_left_overs(path: Path) -> None:
 
 def _is_left_over(name: str) -> bool:
     return name == LOCK or bool(_LEFT_OVER.match(name))
+
+
+def refuse_link(path: Path) -> None:
+    """Refuse a link where a file or folder of ours belongs: it leads to somebody else's.
+
+    Raises:
+        InputError: where it is one.
+    """
+    if path.is_symlink():
+        raise InputError(f"{path}: is a link, which qs3 does not follow; remove it")
 
 
 def claim_folder(path: Path, marker: str) -> Path:

@@ -73,6 +73,20 @@ def test_a_run_that_was_stopped_goes_on_and_ends_the_same(fake, tmp_path):
     assert again == GenerateReport(done=0, skipped=15, failed=0)
 
 
+@pytest.mark.parametrize("link", [".parts", ".parts/00000", ".parts/00000/000000.parquet"])
+def test_a_link_among_the_parts_is_not_followed(fake, tmp_path, link):
+    out, victim = tmp_path / "out", tmp_path / "victim"
+    fake.run(items(fake), out, SETTINGS)
+    (out / "shard-00000.parquet").unlink()
+    (victim / "00000").mkdir(parents=True)
+    (victim / "00000" / "keep.txt").touch()
+    (out / link).parent.mkdir(parents=True, exist_ok=True)
+    (out / link).symlink_to(victim)
+    with pytest.raises(InputError, match=rf"{link}: is a link, which qs3 does not follow"):
+        fake.run(items(fake), out, SETTINGS)
+    assert (victim / "00000" / "keep.txt").exists()
+
+
 def test_other_settings_or_another_work_list_are_refused(fake, tmp_path):
     from qs3.sensor.scene import SceneSettings
 
