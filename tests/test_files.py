@@ -16,6 +16,7 @@ from qs3.files import (
     claim_folder,
     folder_lock,
     holds_something,
+    new_folder,
     parse_json,
     read_json,
     remove_left_overs,
@@ -102,6 +103,21 @@ def test_a_temporary_folder_is_fresh_and_goes(tmp_path: Path) -> None:
         (first / "half").touch()
     assert names(tmp_path) == [".data.aaaaaaaa.tmp", ".data.bbbbbbbb.tmp", "elsewhere"]
     assert (elsewhere / "mine").exists()
+
+
+def test_what_comes_into_a_new_folder_meanwhile_stays(tmp_path: Path) -> None:
+    target = tmp_path / "data"
+    target.mkdir()
+    (target / LOCK).touch()  # a killed process's
+    with new_folder(target) as whole:
+        whole.mkdir()
+        (target / ".a.json.4242.tmp.json").touch()
+    assert names(target) == []
+    refused = pytest.raises(InputError, match="data: was empty, but something has come meanwhile")
+    with refused, new_folder(target) as whole:
+        whole.mkdir()
+        (target / "mine").touch()
+    assert (names(tmp_path), names(target)) == (["data"], ["mine"])
 
 
 @pytest.mark.parametrize("name", ["a" * 255, "ä" * 127, "a." + "b" * 253])

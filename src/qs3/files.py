@@ -92,7 +92,8 @@ def new_folder(path: Path) -> Iterator[Path]:
     """Yield the path of a folder to make, which becomes ``path`` when the block ends well.
 
     Raises:
-        InputError: where ``path`` is there already and no empty folder.
+        InputError: where ``path`` is there already and no empty folder, at the beginning or at the
+            end: what has come meanwhile stays, and what was made goes.
         StorageError: where the disk is full; ``path`` is named.
     """
     path = Path(path).resolve()
@@ -106,7 +107,14 @@ def new_folder(path: Path) -> Iterator[Path]:
                 for entry in (*files, ""):
                     sync_entry(Path(inner) / entry)
             if path.is_dir():
-                shutil.rmtree(path)
+                with folder_lock(path):
+                    remove_left_overs(path)
+                if any(path.iterdir()):
+                    raise InputError(
+                        f"{path}: was empty, but something has come meanwhile, which is left as it "
+                        "is; nothing was written, name a new or empty folder and run it again"
+                    )
+                path.rmdir()
             whole.rename(path)
         except OSError as error:
             name_fault(error, path)
