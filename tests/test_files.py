@@ -20,6 +20,7 @@ from qs3.files import (
     parse_json,
     read_json,
     remove_left_overs,
+    sub_folder,
     temporary_folder,
     write_json,
 )
@@ -136,6 +137,15 @@ def test_a_link_in_place_of_the_lock_is_not_followed(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"\.lock: is a link"), folder_lock(tmp_path):
         pass
     assert (tmp_path / "mine").read_text() == "precious"
+
+
+def test_a_link_in_place_of_a_sub_folder_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "records").symlink_to(tmp_path / "mine")
+    with pytest.raises(InputError, match="records: is a link, which qs3 does not follow"):
+        sub_folder(tmp_path / "records")
+    for _ in range(2):
+        assert sub_folder(tmp_path / "others").is_dir()
 
 
 def test_a_folder_has_one_holder_at_a_time(tmp_path: Path) -> None:

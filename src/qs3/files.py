@@ -317,6 +317,17 @@ def refuse_link(path: Path) -> None:
         raise InputError(f"{path}: is a link, which qs3 does not follow; remove it")
 
 
+def sub_folder(path: Path) -> Path:
+    """Return a folder of ours within another, made if absent.
+
+    Raises:
+        InputError: where it is a link: what is written there would land elsewhere.
+    """
+    refuse_link(path)
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
 def claim_folder(path: Path, marker: str) -> Path:
     """Return ``path`` as an output folder: made if absent, accepted if empty or ours.
 
