@@ -72,12 +72,25 @@ def hold(folder: Path, _: object) -> None:
         pass
 
 
+LARGE = "1" + "0" * 400 + ".0"
 LONE = r'{"a": "\ud83d"}'
 
 
 @pytest.mark.parametrize(
     "text",
-    ["", "{", "NaN", "[Infinity]", "[1e999]", "9" * 5000, "[" * 100_000, LONE, "\udc80", b"\xff"],
+    [
+        "",
+        "{",
+        "NaN",
+        "[Infinity]",
+        "[1e999]",
+        LARGE,
+        LONE,
+        "9" * 5000,
+        "[" * 100_000,
+        "\udc80",
+        b"\xff",
+    ],
 )
 def test_json_is_strict(text: str | bytes) -> None:
     with pytest.raises(InputError, match=r"^a\.json: not a JSON file") as caught:

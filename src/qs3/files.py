@@ -5,6 +5,7 @@ import errno
 import glob
 import hashlib
 import json
+import math
 import os
 import re
 import secrets
@@ -21,8 +22,8 @@ LOCK = ".lock"
 """Name of the file that tells who writes into a folder; it is there only meanwhile."""
 
 _LEFT_OVER = re.compile(r"\..+\.(\d+|[0-9a-f]{8})\.tmp(\.\w+)?$")
-_SUSPECT = re.compile(r"\\u[dD][89a-fA-F]|[eE]\+?\d{3}")
-"""What halves of surrogate pairs and numbers that end as infinity look like in JSON."""
+_SUSPECT = re.compile(r"\\u[dD][89a-fA-F]")
+"""What halves of surrogate pairs look like in JSON."""
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LONGEST_STEM = 100  # bytes of a name that go into a temporary one; the longest name may have 143
 
@@ -271,9 +272,9 @@ def parse_json(data: bytes | str, where: str | Path) -> Any:
     """
     try:
         text = data.decode() if isinstance(data, bytes) else data.encode().decode()
-        value = json.loads(text, parse_constant=_refuse)
+        value = json.loads(text, parse_constant=_refuse, parse_float=_finite)
         if _SUSPECT.search(text):
-            json.dumps(value, allow_nan=False, ensure_ascii=False).encode()
+            json.dumps(value, ensure_ascii=False).encode()
         return value
     except RecursionError:
         raise InputError(f"{where}: not a JSON file (nested too deep)") from None
@@ -283,6 +284,13 @@ def parse_json(data: bytes | str, where: str | Path) -> Any:
 
 def _refuse(constant: str) -> Any:
     raise ValueError(f"{constant} is no number of JSON")
+
+
+def _finite(word: str) -> float:
+    number = float(word)
+    if math.isinf(number):
+        raise ValueError(f"{word[:40]} is too large a number")
+    return number
 
 
 def sha256(path: Path) -> str:
