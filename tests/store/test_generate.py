@@ -38,6 +38,13 @@ def test_processes_and_none_write_the_same_bytes(fake, tmp_path):
         assert os.uname().nodename.encode() not in data
 
 
+def test_the_bar_tells_a_folders_name_without_moving_a_terminal(fake, tmp_path, capfd):
+    fake.run(items(fake, 1), tmp_path / "a\x1b[31mb", SETTINGS, progress=True)
+    told = capfd.readouterr().err
+    assert r"a\x1b[31mb: scans" in told
+    assert "\x1b" not in told
+
+
 def test_a_broken_object_is_logged_and_stops_nothing(fake, tmp_path):
     work = items(fake, bad=[1])
     fake.run(work, tmp_path, SETTINGS, row=fake.flaky_row)
