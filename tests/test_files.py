@@ -16,9 +16,11 @@ from qs3.files import (
     claim_folder,
     folder_lock,
     holds_something,
+    new_folder,
     parse_json,
     read_json,
     remove_left_overs,
+    sub_folder,
     temporary_folder,
     write_json,
 )
@@ -70,12 +72,25 @@ def hold(folder: Path, _: object) -> None:
         pass
 
 
+LARGE = "1" + "0" * 400 + ".0"
 LONE = r'{"a": "\ud83d"}'
 
 
 @pytest.mark.parametrize(
     "text",
-    ["", "{", "NaN", "[Infinity]", "[1e999]", "9" * 5000, "[" * 100_000, LONE, "\udc80", b"\xff"],
+    [
+        "",
+        "{",
+        "NaN",
+        "[Infinity]",
+        "[1e999]",
+        LARGE,
+        LONE,
+        "9" * 5000,
+        "[" * 100_000,
+        "\udc80",
+        b"\xff",
+    ],
 )
 def test_json_is_strict(text: str | bytes) -> None:
     with pytest.raises(InputError, match=r"^a\.json: not a JSON file") as caught:
@@ -104,6 +119,21 @@ def test_a_temporary_folder_is_fresh_and_goes(tmp_path: Path) -> None:
     assert (elsewhere / "mine").exists()
 
 
+def test_what_comes_into_a_new_folder_meanwhile_stays(tmp_path: Path) -> None:
+    target = tmp_path / "data"
+    target.mkdir()
+    (target / LOCK).touch()  # a killed process's
+    with new_folder(target) as whole:
+        whole.mkdir()
+        (target / ".a.json.4242.tmp.json").touch()
+    assert names(target) == []
+    refused = pytest.raises(InputError, match="data: was empty, but something has come meanwhile")
+    with refused, new_folder(target) as whole:
+        whole.mkdir()
+        (target / "mine").touch()
+    assert (names(tmp_path), names(target)) == (["data"], ["mine"])
+
+
 @pytest.mark.parametrize("name", ["a" * 255, "ä" * 127, "a." + "b" * 253])
 def test_a_name_of_any_length_has_a_temporary_one(tmp_path: Path, name: str) -> None:
     for _ in range(2):
@@ -120,6 +150,15 @@ def test_a_link_in_place_of_the_lock_is_not_followed(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"\.lock: is a link"), folder_lock(tmp_path):
         pass
     assert (tmp_path / "mine").read_text() == "precious"
+
+
+def test_a_link_in_place_of_a_sub_folder_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "records").symlink_to(tmp_path / "mine")
+    with pytest.raises(InputError, match="records: is a link, which qs3 does not follow"):
+        sub_folder(tmp_path / "records")
+    for _ in range(2):
+        assert sub_folder(tmp_path / "others").is_dir()
 
 
 def test_a_folder_has_one_holder_at_a_time(tmp_path: Path) -> None:

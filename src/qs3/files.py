@@ -5,6 +5,7 @@ import errno
 import glob
 import hashlib
 import json
+import math
 import os
 import re
 import secrets
@@ -21,8 +22,8 @@ LOCK = ".lock"
 """Name of the file that tells who writes into a folder; it is there only meanwhile."""
 
 _LEFT_OVER = re.compile(r"\..+\.(\d+|[0-9a-f]{8})\.tmp(\.\w+)?$")
-_SUSPECT = re.compile(r"\\u[dD][89a-fA-F]|[eE]\+?\d{3}")
-"""What halves of surrogate pairs and numbers that end as infinity look like in JSON."""
+_SUSPECT = re.compile(r"\\u[dD][89a-fA-F]")
+"""What halves of surrogate pairs look like in JSON."""
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LONGEST_STEM = 100  # bytes of a name that go into a temporary one; the longest name may have 143
 
@@ -92,7 +93,8 @@ def new_folder(path: Path) -> Iterator[Path]:
     """Yield the path of a folder to make, which becomes ``path`` when the block ends well.
 
     Raises:
-        InputError: where ``path`` is there already and no empty folder.
+        InputError: where ``path`` is there already and no empty folder, at the beginning or at the
+            end: what has come meanwhile stays, and what was made goes.
         StorageError: where the disk is full; ``path`` is named.
     """
     path = Path(path).resolve()
@@ -106,7 +108,14 @@ def new_folder(path: Path) -> Iterator[Path]:
                 for entry in (*files, ""):
                     sync_entry(Path(inner) / entry)
             if path.is_dir():
-                shutil.rmtree(path)
+                with folder_lock(path):
+                    remove_left_overs(path)
+                if any(path.iterdir()):
+                    raise InputError(
+                        f"{path}: was empty, but something has come meanwhile, which is left as it "
+                        "is; nothing was written, name a new or empty folder and run it again"
+                    )
+                path.rmdir()
             whole.rename(path)
         except OSError as error:
             name_fault(error, path)
@@ -157,8 +166,7 @@ def folder_lock(path: Path) -> Iterator[None]:
 def _open_lock(file: Path) -> int:
     """Open and lock a file that nobody else holds."""
     while True:
-        if file.is_symlink():
-            raise InputError(f"{file}: is a link, which qs3 does not follow; remove it")
+        refuse_link(file)
         handle = os.open(file, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
         try:
             _lock(handle, file)
@@ -264,9 +272,9 @@ def parse_json(data: bytes | str, where: str | Path) -> Any:
     """
     try:
         text = data.decode() if isinstance(data, bytes) else data.encode().decode()
-        value = json.loads(text, parse_constant=_refuse)
+        value = json.loads(text, parse_constant=_refuse, parse_float=_finite)
         if _SUSPECT.search(text):
-            json.dumps(value, allow_nan=False, ensure_ascii=False).encode()
+            json.dumps(value, ensure_ascii=False).encode()
         return value
     except RecursionError:
         raise InputError(f"{where}: not a JSON file (nested too deep)") from None
@@ -276,6 +284,13 @@ def parse_json(data: bytes | str, where: str | Path) -> Any:
 
 def _refuse(constant: str) -> Any:
     raise ValueError(f"{constant} is no number of JSON")
+
+
+def _finite(word: str) -> float:
+    number = float(word)
+    if math.isinf(number):
+        raise ValueError(f"{word[:40]} is too large a number")
+    return number
 
 
 def sha256(path: Path) -> str:
@@ -298,6 +313,27 @@ def remove_left_overs(path: Path) -> None:
 
 def _is_left_over(name: str) -> bool:
     return name == LOCK or bool(_LEFT_OVER.match(name))
+
+
+def refuse_link(path: Path) -> None:
+    """Refuse a link where a file or folder of ours belongs: it leads to somebody else's.
+
+    Raises:
+        InputError: where it is one.
+    """
+    if path.is_symlink():
+        raise InputError(f"{path}: is a link, which qs3 does not follow; remove it")
+
+
+def sub_folder(path: Path) -> Path:
+    """Return a folder of ours within another, made if absent.
+
+    Raises:
+        InputError: where it is a link: what is written there would land elsewhere.
+    """
+    refuse_link(path)
+    path.mkdir(parents=True, exist_ok=True)
+    return path
 
 
 def claim_folder(path: Path, marker: str) -> Path:

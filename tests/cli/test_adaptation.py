@@ -175,6 +175,8 @@ def test_a_setting_that_the_rule_does_not_read_is_refused(qs3, store, tmp_path):
 
 
 def test_settings_are_json_or_words():
+    deep = "[" * 100_000
+    assert parse_settings("--x", [f"a={deep}", "b=NaN"]) == {"a": deep, "b": "NaN"}
     given = parse_settings("--x", ["a=1.5", "b=true", "c=[1, 2]", "d=voxels", "e="])
     assert given == {"a": 1.5, "b": True, "c": [1, 2], "d": "voxels", "e": ""}
     with pytest.raises(InputError, match="--x a=2: give each setting once"):

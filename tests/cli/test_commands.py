@@ -154,6 +154,11 @@ def test_train_evaluate_predict(qs3, run, store, tmp_path):
     done = qs3("predict", run, tmp_path / "a.npy", tmp_path / "b.xyz", "--json", "-")
     rows = json.loads(done.stdout)
     assert [row["file"] for row in rows] == [str(tmp_path / n) for n in ("a.npy", "b.xyz")]
+    hostile = tmp_path / "a\x85\u202eb.npy"
+    (tmp_path / "a.npy").rename(hostile)
+    done = qs3("predict", run, hostile, "--json", "-")
+    assert done.stdout.isascii()
+    assert json.loads(done.stdout)[0]["file"] == str(hostile)
     for row in rows:
         assert sum(row["probabilities"].values()) == pytest.approx(1.0)
         assert row["confidence"] == max(row["probabilities"].values())

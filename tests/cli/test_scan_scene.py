@@ -37,6 +37,12 @@ def test_scan_writes_frames_of_a_scene_and_records_it(qs3, quick, tmp_path):
     assert mask.shape == (1080, 1080)
     assert (mask > 0).sum() == record["views"][0]["object_pixels"]
 
+    (out / "frames").rename(tmp_path / "mine")
+    (out / "frames").symlink_to(tmp_path / "mine")
+    before = sorted(tmp_path.glob("mine/**/*"))
+    assert "frames: is a link" in qs3.refuses("scan", "chair", "--out", out, "--frames", *quick)
+    assert sorted(tmp_path.glob("mine/**/*")) == before
+
 
 def test_generate_draws_neighbours_and_settings_and_records_them(qs3, quick, tmp_path):
     common = ("generate", "--meshes", "shapes", "--classes", "chair", "lamp",

@@ -109,6 +109,18 @@ def test_a_pcd_pixel_that_saw_nothing_is_left_out(tmp_path):
     np.testing.assert_array_equal(read_cloud(tmp_path / "a.pcd"), POINTS)
 
 
+def byte_header(data: str, count: int) -> bytes:
+    text = f"FIELDS x y z\nSIZE 1 1 1\nTYPE U U U\nPOINTS {count}\nDATA {data}\n"
+    return text.encode()
+
+
+def pcd_of_zeros(count: int) -> bytes:
+    """One byte for each number, packed as well as LZF packs."""
+    packed = bytes([0, 0]) + bytes([0b111_00000, 255, 0]) * (3 * count // 264)
+    sizes = struct.pack("<II", len(packed), 3 * count)
+    return byte_header("binary_compressed", count) + sizes + packed
+
+
 def bad_cases() -> dict[str, tuple[str, bytes, str]]:
     nan = POINTS.copy()
     nan[1, 1] = np.nan
@@ -141,7 +153,23 @@ def bad_cases() -> dict[str, tuple[str, bytes, str]]:
         "pcd data": ("a.pcd", pcd_header("zip"), "DATA zip is unknown"),
         "pcd cut": ("a.pcd", pcd_binary()[:-1], "cut off"),
         "pcd compressed cut": ("a.pcd", pcd_compressed()[:-1], "cut off"),
+        "pcd bytes": ("a.pcd", pcd_of_zeros(6_000_000), "made to fill the memory"),
+        "long line": ("a.xyz", b"1," * 600_000, "line 1 has 1200000 characters"),
+        "pcd long line": ("a.pcd", header + b" " * 1_100_000 + b"1", "1100001 characters"),
     }
+
+
+@pytest.mark.parametrize("data", ["ascii", "binary", "text"])
+def test_small_numbers_count_as_the_floats_that_they_become(tmp_path, monkeypatch, data):
+    monkeypatch.setenv("QS3_LARGEST_FILE_GIB", "1e-6")
+    path = tmp_path / ("a.xyz" if data == "text" else "a.pcd")
+    for count in (10, 60):
+        content = bytes(3 * count) if data == "binary" else b"1 2 3\n" * count
+        path.write_bytes((b"" if data == "text" else byte_header(data, count)) + content)
+        if count == 10:
+            assert read_cloud(path).shape == (10, 3)
+    with refused("announces 1[0-9]{3} bytes; read are 1073 at most", path):
+        read_cloud(path)
 
 
 @pytest.mark.parametrize("case", bad_cases())

@@ -38,6 +38,13 @@ def test_processes_and_none_write_the_same_bytes(fake, tmp_path):
         assert os.uname().nodename.encode() not in data
 
 
+def test_the_bar_tells_a_folders_name_without_moving_a_terminal(fake, tmp_path, capfd):
+    fake.run(items(fake, 1), tmp_path / "a\x1b[31mb", SETTINGS, progress=True)
+    told = capfd.readouterr().err
+    assert r"a\x1b[31mb: scans" in told
+    assert "\x1b" not in told
+
+
 def test_a_broken_object_is_logged_and_stops_nothing(fake, tmp_path):
     work = items(fake, bad=[1])
     fake.run(work, tmp_path, SETTINGS, row=fake.flaky_row)
@@ -71,6 +78,20 @@ def test_a_run_that_was_stopped_goes_on_and_ends_the_same(fake, tmp_path):
     assert fake.content(whole) == fake.content(folder)
     again = fake.run(items(fake), folder, SETTINGS)
     assert again == GenerateReport(done=0, skipped=15, failed=0)
+
+
+@pytest.mark.parametrize("link", [".parts", ".parts/00000", ".parts/00000/000000.parquet"])
+def test_a_link_among_the_parts_is_not_followed(fake, tmp_path, link):
+    out, victim = tmp_path / "out", tmp_path / "victim"
+    fake.run(items(fake), out, SETTINGS)
+    (out / "shard-00000.parquet").unlink()
+    (victim / "00000").mkdir(parents=True)
+    (victim / "00000" / "keep.txt").touch()
+    (out / link).parent.mkdir(parents=True, exist_ok=True)
+    (out / link).symlink_to(victim)
+    with pytest.raises(InputError, match=rf"{link}: is a link, which qs3 does not follow"):
+        fake.run(items(fake), out, SETTINGS)
+    assert (victim / "00000" / "keep.txt").exists()
 
 
 def test_other_settings_or_another_work_list_are_refused(fake, tmp_path):

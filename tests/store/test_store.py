@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import time
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from qs3.store.folder import open_folder
 from qs3.store.generate import GenerateSettings
 from qs3.store.info import info
 from qs3.store.manifest import MANIFEST, Manifest, open_dataset, shard_name, write_manifest
+from qs3.store.merge import merge
 from qs3.store.shards import CloudRow, load_shard, put_shard, table_of
 from qs3.store.verify import verify
 from qs3.structure import unstructure
@@ -115,6 +117,24 @@ def test_an_unfinished_data_set_is_not_taken_for_a_whole_one(fake, tmp_path):
     with pytest.raises(InputError, match="unfinished, 1 of 2 shards"):
         read_ragged(tmp_path)
     assert len(read_ragged(tmp_path, partial=True).ids) == 4
+
+
+def test_a_plan_of_any_size_is_not_counted_through(fake, tmp_path):
+    make(tmp_path / "a", fake)
+    (tmp_path / "a" / "shard-000001.parquet").touch()  # no name of ours
+    path = tmp_path / "a" / MANIFEST
+    many = 10**9 - 1
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"shards": many, "rows": many}))
+    start = time.monotonic()
+    assert info(tmp_path / "a")["shards"] == 2
+    faults = verify(tmp_path / "a", progress=False)
+    assert faults[0].startswith(f"{many - 2} of {many} shards are missing, the first shard-00002.")
+    assert faults[1] == "shard-000001.parquet: does not belong here"
+    with pytest.raises(InputError, match=f"unfinished, 2 of {many} shards"):
+        read_ragged(tmp_path / "a")
+    with pytest.raises(InputError, match=rf"{many - 2} of {many} shards .*numbers 2, 3, .*, 9 …"):
+        merge([tmp_path / "a"], tmp_path / "b", progress=False)
+    assert time.monotonic() - start < 20
 
 
 def test_the_checksum_follows_the_bytes(fake, tmp_path):

@@ -69,6 +69,15 @@ def test_a_fitted_run_is_scored_on_any_clouds(source, target, settings, tmp_path
         evaluate(tmp_path / "run", replace(target, class_names=("ball", "disc", "sofa")))
 
 
+def test_a_record_goes_through_no_link(source, target, settings, tmp_path):
+    fit("source-only", source, None, replace(settings, epochs=1), run_dir=tmp_path / "run")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "run" / "records").symlink_to(tmp_path / "mine")
+    with pytest.raises(InputError, match="records: is a link"):
+        evaluate(tmp_path / "run", target)
+    assert not list((tmp_path / "mine").iterdir())
+
+
 def test_a_run_of_own_classes_is_scored_by_a_map_on_data_that_merge_them(
     source, target, settings, tmp_path
 ):

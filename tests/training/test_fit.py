@@ -153,6 +153,16 @@ def test_weights_of_another_kind_are_told(settings, tmp_path):
         load_model(path)
 
 
+@pytest.mark.parametrize("width", [60_000_000, 10**18])
+def test_settings_that_are_not_the_weights_take_no_memory(settings, tmp_path, width):
+    path = save_model(tmp_path, new_model(settings, 3, 0), ("a", "b", "c"), settings)
+    tensors, facts = read_tensors(path)
+    other = {"model": "dgcnn", "model_settings": {"embedding": width}}
+    write_tensors(path, tensors, facts | other)
+    with pytest.raises(InputError, match=rf"{path}: weights are of another network \("):
+        load_model(path)
+
+
 def test_tensors_round_trip(tmp_path):
     tensors = {"a": torch.arange(3), "b": torch.zeros(2, 2)[:, 0], "c": torch.tensor(1.5)}
     write_tensors(tmp_path / "x.safetensors", tensors, {"n": [1, 2]})

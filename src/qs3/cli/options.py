@@ -1,13 +1,20 @@
 """From words of a command line to the library's own settings, by tyro."""
 
+import contextlib
 import dataclasses
 import functools
 import importlib
+import io
 import types
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+from qs3.cli.text import printable, tell
+from qs3.errors import QS3Error
 
 _Settings = TypeVar("_Settings")
 Flat = Annotated[_Settings, tyro.conf.arg(name="")]
@@ -26,12 +33,61 @@ def run_verb(verb: str, place: str, text: str, words: list[str]) -> int:
     module = importlib.import_module(f"qs3.cli.{name}")
     function: Any = getattr(module, function_name)
     how: dict[str, Any] = {"prog": f"qs3 {verb}", "args": words, "registry": _registry}
-    if isinstance(function, dict):
-        return tyro.extras.subcommand_cli_from_dict(function, description=text, **how)
-    if hasattr(module, "defaults"):
-        asked = [] if "--tyro-print-completion" in words else words
-        function = functools.partial(function, **module.defaults(asked))
-    return tyro.cli(function, **how)
+    with _own_words(words):
+        if isinstance(function, dict):
+            verbs = {name: _later(each) for name, each in function.items()}
+            call = tyro.extras.subcommand_cli_from_dict(verbs, description=text, **how)
+        else:
+            asked = [] if "--tyro-print-completion" in words else words
+            given = module.defaults(asked) if hasattr(module, "defaults") else {}
+            call = tyro.cli(functools.partial(_later(function), **given), **how)
+    return call()
+
+
+def _later(function: Callable[..., int]) -> Callable[..., Callable[[], int]]:
+    """A function of the same options that hands back its call: it runs when all is parsed."""
+
+    @functools.wraps(function)
+    def call(*given: Any, **named: Any) -> Callable[[], int]:
+        return functools.partial(function, *given, **named)
+
+    return call
+
+
+@contextlib.contextmanager
+def _own_words(words: list[str]) -> Iterator[None]:
+    """Where a word would move a terminal, escape what is told of it, and the colours with it."""
+    if all(printable(word) == word for word in words):
+        yield
+        return
+    with io.StringIO() as heard:
+        try:
+            with contextlib.redirect_stderr(heard):
+                yield
+        finally:
+            if heard.getvalue():
+                tell(heard.getvalue().rstrip("\n"))
+
+
+@_registry.primitive_rule
+def _named(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """A path, which an empty word does not name: Python would take it for this folder."""
+    if info.type is not Path:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="PATH",
+        instance_from_str=lambda words: _read_path(words[0]),
+        is_instance=lambda value: isinstance(value, Path),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+def _read_path(word: str) -> Path:
+    if not word:
+        # No InputError, a ValueError: of those tyro makes a box of its own.
+        raise QS3Error('"": an empty path; name a file or a folder, or leave its option out')
+    return Path(word)
 
 
 _LISTED: PrimitiveConstructorSpec[Any] = PrimitiveConstructorSpec(

@@ -53,7 +53,7 @@ def predict(
     bar = progress_bar(None if sets else len(paths), text, "cloud", items=said)
     answers: list[table.Answer] = [*bar]
     if json == Path("-"):
-        show(table.answers_json(answers), end="")
+        show(table.answers_json(answers, ascii=True), end="")
     else:
         for answer in answers:
             if answer.best():

@@ -1,7 +1,6 @@
 """``qs3 train``: a classifier from labelled clouds, adapted to unlabelled ones if asked."""
 
 import functools
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -16,6 +15,7 @@ from qs3.cli.options import Flat
 from qs3.cli.text import show, tell
 from qs3.errors import InputError
 from qs3.evaluation.records import rename_method
+from qs3.files import parse_json
 from qs3.io.clouds import CloudChoice
 from qs3.structure import structure, unstructure
 from qs3.toml_files import merged, read_toml, toml_lines
@@ -234,7 +234,7 @@ def parse_settings(option: str, given: Sequence[str]) -> dict[str, Any]:
         if not equals or not name or name in settings:
             raise InputError(f"{option} {pair}: give each setting once, as name=value")
         try:
-            settings[name] = json.loads(value)
+            settings[name] = parse_json(value, option)
         except ValueError:
             settings[name] = value
     return settings

@@ -14,7 +14,7 @@ from qs3.io.guards import naming
 from qs3.io.layouts import FORMATS
 from qs3.io.layouts.store import write_store
 from qs3.io.load import format_named, read_clouds
-from qs3.io.preparation import resample
+from qs3.io.preparation import MOST_POINTS, resample
 from qs3.io.ragged import RaggedClouds
 from qs3.meshes.classes import map_labels
 from qs3.store.progress import cloud_bar
@@ -96,8 +96,8 @@ def _map_classes(
 
 def _plain(clouds: RaggedClouds, num_points: int | None, where: str) -> RaggedClouds:
     """Clouds of float32, finite, and of one size where one is asked for."""
-    if num_points is not None and num_points < 1:
-        raise InputError(f"--num-points {num_points}: must be at least 1")
+    if num_points is not None and not 1 <= num_points <= MOST_POINTS:
+        raise InputError(f"--num-points {num_points}: must be in 1 to {MOST_POINTS}")
     if not clouds.clouds:
         raise InputError(f"{where}: holds no cloud")
     prepared = []

@@ -38,6 +38,7 @@ LARGEST_IMAGE = 1 << 25
 _Kind = TypeVar("_Kind")
 _SLACK = 1 << 26  # labels of many clouds compress by more
 _LONGEST_TEXT = 1 << 20
+_LONGEST_LINE = 1 << 20
 _MOST_MEMBERS = 50_000
 _DEFLATE_AT_BEST = 1032
 _DEEP = {"I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}  # bits a pixel, by Pillow's mode
@@ -134,6 +135,21 @@ def read_text(path: Path, largest: int = _LONGEST_TEXT) -> str:
         return read_small(path, largest, "a list or a table").decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"{path}: no text in UTF-8") from None
+
+
+def text_lines(content: bytes) -> Iterator[tuple[int, str]]:
+    """Yield the lines of a long text in UTF-8 with their numbers from 1; nothing holds them all.
+
+    Raises:
+        InputError: where a line is too long for a row of numbers.
+    """
+    for number, line in enumerate(io.TextIOWrapper(io.BytesIO(content), "utf-8"), start=1):
+        if len(line) > _LONGEST_LINE:
+            raise InputError(
+                f"line {number} has {len(line)} characters; read are {_LONGEST_LINE} at most, one "
+                "line a point"
+            )
+        yield number, line
 
 
 def read_numbers(path: Path, counts: tuple[int, ...]) -> Float[np.ndarray, "n"]:

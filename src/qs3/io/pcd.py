@@ -1,14 +1,17 @@
 """PCD files (Point Cloud Library): reads ascii, binary and binary_compressed, writes binary."""
 
+import itertools
+
 import numpy as np
 from jaxtyping import Float, Float32
 
 from qs3.errors import InputError
-from qs3.io.guards import check_announced
+from qs3.io.guards import check_announced, text_lines
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _LONGEST_HEADER = 2**20
 _LZF_AT_BEST = 88
+_POINT = 12  # bytes of three float32
 
 
 def parse_pcd(content: bytes) -> Float32[np.ndarray, "n 3"]:
@@ -17,11 +20,13 @@ def parse_pcd(content: bytes) -> Float32[np.ndarray, "n 3"]:
     A point with a NaN is left out: it is how PCD marks a pixel that saw nothing.
 
     Raises:
-        InputError: where more is announced than the file holds.
+        InputError: where more is announced than the file holds, or than is read into memory.
         ValueError: where the content is not such a file or is cut off.
     """
     record, count, data, body = _header(content)
     size = count * record.itemsize
+    whole = size + 2 * _POINT * count  # what is made of it, and once more without the NaN
+    check_announced(f"{count} points", whole, whole)
     if data == "ascii":
         columns = _ascii(record, count, body)
     elif data == "binary":
@@ -31,9 +36,10 @@ def parse_pcd(content: bytes) -> Float32[np.ndarray, "n 3"]:
         columns = _uncompressed(record, count, body)
     else:
         raise ValueError(f"DATA {data} is unknown; save it as binary")
-    axes = [columns[axis].reshape(count, -1)[:, 0].astype(np.float64) for axis in "xyz"]
-    points = np.stack(axes, axis=1)
-    return points[~np.isnan(points).any(axis=1)].astype(np.float32)
+    points = np.empty((count, 3), dtype=np.float32)
+    for index, axis in enumerate("xyz"):
+        points[:, index] = columns[axis].reshape(count, -1)[:, 0]
+    return points[~np.isnan(points).any(axis=1)]
 
 
 def pcd_bytes(points: Float[np.ndarray, "n 3"]) -> bytes:
@@ -89,12 +95,15 @@ def _ascii(record: np.dtype, count: int, body: bytes) -> dict[str, np.ndarray]:
     names = record.names or ()
     widths = [record[name].shape[0] for name in names]
     starts = dict(zip(names, np.cumsum([0, *widths[:-1]]).tolist(), strict=True))
-    rows = [line.split() for line in body.decode("ascii").splitlines() if line.strip()][:count]
-    if len(rows) < count:
-        raise ValueError(f"cut off: {len(rows)} of {count} points")
-    if any(len(row) != sum(widths) for row in rows):
-        raise ValueError(f"a line has not the {sum(widths)} numbers that the header announces")
-    return {axis: np.array([float(row[starts[axis]]) for row in rows]) for axis in "xyz"}
+    points, found = np.empty((3, count), dtype=np.float32), 0
+    lines = (line.split() for _, line in text_lines(body) if line.strip())
+    for found, row in enumerate(itertools.islice(lines, count), start=1):
+        if len(row) != sum(widths):
+            raise ValueError(f"a line has not the {sum(widths)} numbers that the header announces")
+        points[:, found - 1] = [float(row[starts[axis]]) for axis in "xyz"]
+    if found < count:
+        raise ValueError(f"cut off: {found} of {count} points")
+    return dict(zip("xyz", points, strict=True))
 
 
 def _uncompressed(record: np.dtype, count: int, body: bytes) -> dict[str, np.ndarray]:
@@ -104,7 +113,8 @@ def _uncompressed(record: np.dtype, count: int, body: bytes) -> dict[str, np.nda
     packed, size = (int(word) for word in np.frombuffer(body[:8], dtype="<u4"))
     if len(body) < 8 + packed or size != count * record.itemsize:
         raise ValueError("cut off, or of another size than the header says")
-    check_announced(f"{count} points", size, packed, _LZF_AT_BEST)
+    # Bytes become floats: that must not fill the memory either.
+    check_announced(f"{count} points", max(size, _POINT * count), packed, _LZF_AT_BEST)
     raw = lzf_decompress(body[8 : 8 + packed], size)
     columns, begin = {}, 0
     for name in record.names or ():

@@ -1,5 +1,6 @@
 """Point clouds from single files: npy, xyz, txt, ply, pcd, off."""
 
+import array
 import io
 import warnings
 from pathlib import Path
@@ -8,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from qs3.errors import InputError
-from qs3.io.guards import load_npy, naming, read_small
+from qs3.io.guards import check_announced, load_npy, naming, read_small, text_lines
 from qs3.io.pcd import parse_pcd, pcd_bytes
 from qs3.io.ply import load_ply, ply_bytes
 from qs3.meshes.announced import memory_limit
@@ -95,6 +96,8 @@ def _accept(shape: tuple[int, ...], kind: np.dtype) -> None:
 
 def _text(content: bytes) -> np.ndarray:
     """Rows of numbers apart by spaces or commas; ``#`` begins a comment."""
+    size = 24 * (1 + max(content.count(b"\n"), content.count(b"\r")))
+    check_announced("the table of its lines", size, size)
     try:
         # Ten times as fast; whatever it does not take is told line by line.
         with warnings.catch_warnings():
@@ -108,9 +111,9 @@ def _text(content: bytes) -> np.ndarray:
 
 
 def _lines(content: bytes) -> np.ndarray:
-    rows: list[list[float]] = []
+    numbers = array.array("d")  # a list of lists takes ten times the room
     columns = 0
-    for number, line in enumerate(content.decode("utf-8").splitlines(), start=1):
+    for number, line in text_lines(content):
         words = line.split("#")[0].replace(",", " ").replace(";", " ").split()
         if not words:
             continue
@@ -121,10 +124,10 @@ def _lines(content: bytes) -> np.ndarray:
                 "at least 3"
             )
         try:
-            rows.append([float(word) for word in words[:3]])
+            numbers.extend([float(word) for word in words[:3]])
         except ValueError:
             raise InputError(f"line {number} is not three numbers: {line.strip()[:40]!r}") from None
-    return np.array(rows, dtype=np.float64).reshape(-1, 3)
+    return np.array(numbers, dtype=np.float64).reshape(-1, 3)
 
 
 def _trimesh(content: bytes, file_type: str, mesh_points: int, seed: int) -> np.ndarray:

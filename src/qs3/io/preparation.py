@@ -13,6 +13,8 @@ from jaxtyping import Float, Int
 from qs3.errors import InputError, UnevenSizesError
 from qs3.io.scratch import Spool, scratch_array
 
+MOST_POINTS = 1_000_000
+"""Most points that one cloud is brought to, as a scan has."""
 BLOCK = 256
 """Clouds that are looked at together, so that nothing of the size of them all is made."""
 
@@ -171,7 +173,7 @@ def resample(
         rng: Draws the first point of the sample; without it, it is point 0.
 
     Raises:
-        InputError: where the cloud is empty or ``num_points`` is not positive.
+        InputError: where the cloud is empty or ``num_points`` is not in 1 to ``MOST_POINTS``.
 
     Example:
         >>> resample(np.array([[0.0, 0, 0], [1, 0, 0]]), 3)[:, 0].tolist()
@@ -183,8 +185,8 @@ def resample(
     count = len(cloud)
     if count == 0:
         raise InputError("cannot sample an empty cloud")
-    if num_points < 1:
-        raise InputError(f"num_points must be at least 1, not {num_points}")
+    if not 1 <= num_points <= MOST_POINTS:
+        raise InputError(f"num_points must be in 1 to {MOST_POINTS}, not {num_points}")
     if count <= num_points:
         index = np.arange(num_points) % count
     else:

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
 from qs3.errors import InputError, MissingExtraError, StorageError
-from qs3.files import claim_folder, folder_lock, remove_left_overs, write_bytes
+from qs3.files import claim_folder, folder_lock, refuse_link, remove_left_overs, write_bytes
 
 PARTS = ".parts"
 """Sub-folder of what is on its way into a data set."""
@@ -120,8 +120,8 @@ class Folder:
         be written goes again. Object stores have no locks.
 
         Raises:
-            InputError: where it holds something else than ours, which ``marker`` tells; another
-                process holds it; or the disk fails.
+            InputError: where it holds something else than ours, which ``marker`` tells, or a link
+                among the parts; another process holds it; or the disk fails.
         """
         path = self.path
         if path is None:
@@ -133,6 +133,9 @@ class Folder:
         try:
             claim_folder(path, marker)
             with folder_lock(path):
+                refuse_link(path / PARTS)
+                for part in path.glob(f"{PARTS}/**/*"):  # they will be removed
+                    refuse_link(part)
                 self._remove_left_overs(path)
                 yield
                 if path.is_dir():  # and was not given another name

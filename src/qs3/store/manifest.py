@@ -6,6 +6,7 @@ import hashlib
 import itertools
 import json
 import platform
+import re
 import time
 import warnings
 from collections.abc import Iterable, Mapping
@@ -24,8 +25,8 @@ SUMS = "SHA256SUMS"
 MESHES = "meshes.json"
 SCHEMA_VERSION = 3
 _READABLE = (1, 2, 3)  # 2 has the column `drawn`; 3 checksums, half precision, unknown row counts
-_LARGEST = 10**9  # rows and shards; what is planned is counted through
-
+_LARGEST = 10**9  # rows and shards
+_SHARD = re.compile(r"shard-(\d{5,18})\.parquet", re.ASCII)
 _SUMS_EVERY = 5.0  # seconds; the whole file is written anew each time
 _PACKAGES = (
     "qs3",
@@ -170,8 +171,10 @@ def shard_name(index: int) -> str:
 
 def finished_shards(folder: Folder, count: int) -> list[int]:
     """Indices of the shards, of ``count`` planned, that are there."""
+    # The plan may say anything; what is there tells how much there is to do.
     names = set(folder.names())
-    return [index for index in range(count) if shard_name(index) in names]
+    numbers = {int(match[1]) for match in map(_SHARD.fullmatch, names) if match}
+    return sorted(n for n in numbers if n < count and shard_name(n) in names)
 
 
 def write_sums(folder: Folder, sums: Mapping[str, str]) -> None:

@@ -1,6 +1,7 @@
 """Parts of one data set, made on several machines, put into one folder."""
 
 import contextlib
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import sha256
@@ -121,11 +122,12 @@ def _sources(folders: Sequence[Folder], shards: int) -> dict[str, tuple[Folder, 
             if digest and sums.get(name, digest) != digest:
                 raise InputError(f"{name} differs between {first} and {folder}")
             sources[name] = first, digest or sums.get(name)
-    missing = [index for index in range(shards) if shard_name(index) not in sources]
+    missing = shards - len(sources)
     if missing:
-        some = ", ".join(map(str, missing[:8])) + (" …" if len(missing) > 8 else "")
+        lost = (index for index in range(shards) if shard_name(index) not in sources)
+        some = ", ".join(map(str, itertools.islice(lost, 8))) + (" …" if missing > 8 else "")
         raise InputError(
-            f"{len(missing)} of {shards} shards are in none of the {len(folders)} parts "
+            f"{missing} of {shards} shards are in none of the {len(folders)} parts "
             f"(numbers {some}); finish those parts first"
         )
     return sources

@@ -30,6 +30,8 @@ def progress_bar(
     It is moved by hand, or by going through it where it has ``items``; ``total`` None tells a count
     alone.
     """
+    if text is not None:  # it begins with a folder's name, which may move a terminal
+        text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
     return tqdm(
         items,
         total=total,

@@ -88,11 +88,12 @@ def verify(where: str | Path, *, progress: bool = True) -> list[str]:
 def _files(
     folder: Folder, manifest: Manifest, present: list[int], sums: dict[str, str]
 ) -> Iterator[str]:
-    missing = sorted(set(range(manifest.shards)) - set(present))
-    if missing:
+    if len(present) < manifest.shards:
+        there = {*present}
+        first = next(index for index in itertools.count() if index not in there)
         yield (
-            f"{len(missing)} of {manifest.shards} shards are missing, the first "
-            f"{shard_name(missing[0])}: unfinished, run the same command again"
+            f"{manifest.shards - len(present)} of {manifest.shards} shards are missing, the first "
+            f"{shard_name(first)}: unfinished, run the same command again"
         )
     shards = {shard_name(index) for index in present}
     ours = {MANIFEST, SUMS, FAILURES, MESHES, LOCK} | shards

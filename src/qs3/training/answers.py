@@ -3,6 +3,7 @@
 import csv
 import glob
 import io
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -181,8 +182,11 @@ def answers_csv(answers: Iterable[Answer], top: int = 1) -> str:
     return buffer.getvalue()
 
 
-def answers_json(answers: Iterable[Answer]) -> str:
-    """A list of objects: file, class, confidence and the probability of every class; or a fault."""
+def answers_json(answers: Iterable[Answer], ascii: bool = False) -> str:
+    """A list of objects: file, class, confidence and the probability of every class; or a fault.
+
+    In ``ascii`` alone, nothing in it moves a terminal.
+    """
     rows = []
     for answer in answers:
         row: dict[str, object] = {"file": utf8(str(answer.file))}
@@ -191,6 +195,8 @@ def answers_json(answers: Iterable[Answer]) -> str:
         if answer.familiarity is not None:
             row["familiarity"] = answer.familiarity
         rows.append(row | ({"fault": answer.fault} if answer.fault else {}))
+    if ascii:
+        return f"{json.dumps(rows, indent=2, allow_nan=False)}\n"
     return json_bytes(rows).decode()
 
 

@@ -182,6 +182,31 @@ def _make(
     return Sized(model, preparation.radius_share) if preparation.size_input else model
 
 
+def _check_shapes(
+    name: str,
+    num_classes: int,
+    arguments: Mapping[str, Any],
+    preparation: Preparation,
+    tensors: Mapping[str, Tensor],
+    where: Path,
+) -> None:
+    """Refuse a network that is not that of the weights, before its own take any memory."""
+    try:
+        with torch.device("meta"):
+            wanted = create_model(name, num_classes, **arguments).state_dict()
+    except (RuntimeError, OverflowError) as error:  # sizes beyond any number
+        raise InputError(f"{where}: weights are of another network ({error})") from error
+    inside = "model." * (preparation.align + preparation.size_input)
+    for key, tensor in wanted.items():
+        held = tensors.get(f"{inside}{key}")
+        if held is None or held.shape != tensor.shape:
+            size = "is missing" if held is None else f"is {list(held.shape)}"
+            raise InputError(
+                f"{where}: weights are of another network ({inside}{key} {size}, the settings of "
+                f"{name} want {list(tensor.shape)})"
+            )
+
+
 def save_model(
     run_dir: Path,
     model: PointClassifier,
@@ -253,6 +278,7 @@ def load_model(run_dir: Path) -> LoadedModel:
         preparation = structure(facts.get("preparation", {}), Preparation, path)
         known = known_of(facts, path)
         with torch.random.fork_rng(devices=[]):
+            _check_shapes(name, len(class_names), arguments, preparation, tensors, path)
             model = _make(name, len(class_names), arguments, preparation)
     except (KeyError, TypeError) as error:
         raise InputError(f"{path}: does not say which network it holds ({error})") from error

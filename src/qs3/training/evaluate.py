@@ -14,6 +14,7 @@ from qs3.errors import InputError
 from qs3.evaluation.environment import git_commit, hardware, versions
 from qs3.evaluation.records import RECORDS, RunRecord, Scores, score, write_record
 from qs3.evaluation.regret import choose_each
+from qs3.files import sub_folder
 from qs3.io import load_clouds
 from qs3.io.clouds import CloudChoice, PointClouds
 from qs3.io.ragged import relabel
@@ -60,7 +61,7 @@ def evaluate(
 
     Raises:
         InputError: where the run is not finished, the data cannot be read, classes of the data
-            are none of the network's, or the map is of none of either.
+            are none of the network's, the map is of none of either, or ``records`` is a link.
     """
     made, loaded = read_run(run), load_model(run)
     run = made.folder
@@ -100,7 +101,8 @@ def evaluate(
         marks=caveats(made, test),
         experiment=experiment,
     )
-    write_record(record_path(run, record), record)
+    path = record_path(run, record)
+    write_record(sub_folder(path.parent) / path.name, record)
     return record
 
 

@@ -96,8 +96,9 @@ def test_one_number_of_points(rng, tmp_path):
     written = convert(tmp_path / "a", tmp_path / "b", "xyz", num_points=8)
     assert [len(cloud) for cloud in written.clouds] == [8, 8, 8]
     assert {len(np.loadtxt(path)) for path in (tmp_path / "b" / "bed").iterdir()} == {8}
-    with pytest.raises(InputError, match="--num-points 0"):
-        convert(tmp_path / "a", tmp_path / "c", "xyz", num_points=0)
+    for bad in (0, 10**12):
+        with pytest.raises(InputError, match=f"--num-points {bad}: must be in 1 to 1000000"):
+            convert(tmp_path / "a", tmp_path / "c", "xyz", num_points=bad)
 
 
 def test_coordinates_beyond_float32_are_refused(tmp_path):
