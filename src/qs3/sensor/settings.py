@@ -21,12 +21,12 @@ from qs3.sensor.scene import SceneSettings
 from qs3.sensor.speckle import pattern_image
 from qs3.sensor.views import ViewLayout
 
-_BY_MATCHER = "by matcher"
+_BY_SENSOR = "by sensor"
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {
         "size": "box",
         "view_layout": "orbit",
-        "crop": _BY_MATCHER,
+        "crop": _BY_SENSOR,
         "principal_point": None,
     },
     "paper": {"size": "ball", "view_layout": "orbit", "crop": "none", "principal_point": None},
@@ -174,7 +174,7 @@ class ScanSettings(CameraSettings):
     default by preset."""
     crop: Literal["box", "mask", "both", "none"] | None = None
     """Keep points inside the object's box (as released), or pixels that truly show the object, or
-    what is both, or all; default by preset, and both for cameras with the matcher ad-census."""
+    what is both, or all; default by preset, and both for cameras in metres."""
     box_margin: float = 0.0
     """Enlarge the box of the crop on every side, in the unit of the scene."""
     depth_margin: float = 0.1
@@ -242,13 +242,12 @@ class ScanSettings(CameraSettings):
         """A setting by its name, or the preset's where it is None."""
         value = getattr(self, name)
         value = PRESETS[self.preset].get(name) if value is None else value
-        return self._crop_by_matcher() if value == _BY_MATCHER else value
+        return self._crop_by_sensor() if value == _BY_SENSOR else value
 
-    def _crop_by_matcher(self) -> str:
-        """AD-Census has a depth for the darkness around an object, too: it would fill the box."""
+    def _crop_by_sensor(self) -> str:
+        """The box of a real camera's scan holds floor, too, and depths of the dark by AD-Census."""
         sensors = (settings.make_sensor() for settings in self.each_sensor())
-        fills = any(sensor.matching.method == "ad-census" for sensor in sensors)
-        return "both" if fills else "box"
+        return "both" if any(sensor.metric for sensor in sensors) else "box"
 
     @property
     def _changes(self) -> dict[str, str]:
