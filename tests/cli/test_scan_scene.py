@@ -36,6 +36,8 @@ def test_scan_writes_frames_of_a_scene_and_records_it(qs3, quick, tmp_path):
     mask = cv2.imread(str(scene / "mask_visib" / "000000_000000.png"), cv2.IMREAD_UNCHANGED)
     assert mask.shape == (1080, 1080)
     assert (mask > 0).sum() == record["views"][0]["object_pixels"]
+    qs3("scan", "chair", "--out", out, "--num-points", 64, *quick)
+    assert not (out / "frames").exists()
 
 
 def test_generate_draws_neighbours_and_settings_and_records_them(qs3, quick, tmp_path):

@@ -43,7 +43,7 @@ def scan(
     from qs3.meshes.collections import load_named
     from qs3.report.figure import write_png
     from qs3.report.montage import montage, montage_view
-    from qs3.sensor.frames import write_frames, write_parts
+    from qs3.sensor.frames import remove_frames, write_frames, write_parts
     from qs3.sensor.scan import scan as scan_mesh
 
     start = time.perf_counter()
@@ -75,6 +75,7 @@ def scan(
     write_json(folder / "scan.json", record)
     for stale in folder.glob("view-*-*.*"):  # of an earlier scan into this folder
         stale.unlink()
+    remove_frames(folder / "frames")
     write_ply(folder / "cloud.ply", result.points, result.view)
     write_ply(folder / "clean.ply", result.clean, result.clean_view)
     write_png(folder / "montage.png", figure)
