@@ -29,12 +29,15 @@ def test_a_length_in_a_unit_is_that_many_metres(length, unit, metres):
 def test_a_mesh_that_tells_its_unit_is_believed(tmp_path):
     part(2.0).export(tmp_path / "part.glb")
     part(2.0).export(tmp_path / "part.off")
-    assert file_size(load_mesh(tmp_path / "part.glb")) == (2.0, "meters")
+    assert file_size(load_mesh(tmp_path / "part.glb")) == (2.0, "m")
     assert load_mesh(tmp_path / "part.off").units is None
-    assert file_size(shapes.make("bed"))[1] == "meters"
+    assert file_size(shapes.make("bed"))[1] == "m"
     mesh = part(60.0)
     mesh.units = "0.01 * meters"  # as DAE has it
-    assert file_size(mesh)[0] == pytest.approx(0.6)
+    assert file_size(mesh) == (pytest.approx(0.6), "cm")
+    mesh.units = "feet"
+    mesh.apply_scale(0.1)
+    assert file_size(mesh) == (pytest.approx(6 * 0.3048), "feet")
 
 
 def test_a_unit_in_the_file_wins_and_says_so_once(caplog):

@@ -69,7 +69,8 @@ def scan(
         f"{origin['name']} · sensor {result.sensor.name} · view {best + 1} of {len(result.views)}"
     )
     figure = montage(view, title)
-    record = _record(settings, origin, result)
+    origin |= {"up": up, "class_name": names[0]}
+    record = _record(settings, origin, result) | {"frames": frames}
     folder = claim_folder(out, "scan.json")
     # The record first: it marks the folder as ours, should this be stopped in between.
     write_json(folder / "scan.json", record)
@@ -115,7 +116,7 @@ def _record(settings: ScanSettings, origin: dict[str, Any], result: Any) -> dict
         "fused_points": result.fused_points,
         "views": views,
         "seconds": {name: round(value, 4) for name, value in result.seconds.items()},
-        "versions": versions(),
+        "versions": versions("numba", "llvmlite"),  # what compiles the matcher
     }
 
 

@@ -2,7 +2,7 @@
 
 import functools
 import math
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
@@ -130,7 +130,7 @@ def file_size(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float,
         )
         title = f"{name} (guessed)"
     else:
-        title = name
+        title = _short(name)
     size = side * _metres(name)
     if not _LEAST <= size <= _MOST:
         raise InputError(
@@ -139,6 +139,11 @@ def file_size(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float,
             "a size in metres (object_size)"
         )
     return size, title
+
+
+def _short(unit: str) -> str:
+    """A unit as users name it, ``m`` for ``meters``; one that they cannot name as it is."""
+    return next((u for u in get_args(Unit) if math.isclose(_metres(u), _metres(unit))), unit)
 
 
 def _metres(unit: str) -> float:
