@@ -195,8 +195,8 @@ class ScanSettings(CameraSettings):
     """Size of every object, in metres for real cameras; or the size that the mesh's file gives it;
     or one drawn from the real sizes of its class; default by sensor, class in rooms."""
     units: Unit | None = None
-    """Unit of the meshes whose files tell none (glTF, STEP, IGES and 3MF do), for the object size
-    file; by default m up to a longest side of 5 and mm above."""
+    """Unit of the meshes, for the object size file, whatever glTF and 3MF say (that of STEP and
+    IGES is known); where nothing tells it, m up to a longest side of 5 and mm above."""
     material: Material | str | None = None
     """Surface of the object by name: diffuse, principled, rough-specular, glossy-plastic, metal,
     dark, mirror or glass; default by sensor."""
