@@ -241,6 +241,8 @@ def test_a_real_pair_is_held_against_its_own_depth(realism, camera, flat, tmp_pa
         ({"--pair": ("left8.png", "right.png")}, "uint16"),
         ({"--pair": ("left8.png", "K.txt")}, "K.txt"),
         ({"--tests": "T1"}, "--tests"),
+        ({"--samples": 4, "--image-noise": 1.0}, "takes no --image-noise, --samples"),
+        ({"--pattern": "absent.png"}, "takes no --pattern"),
         ({"--matching": "opencv-bm"}, "8 bits"),
     ],
     ids=str,

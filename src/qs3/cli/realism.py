@@ -1,5 +1,6 @@
 """``qs3 realism``: the simulated camera against what real ones are known to do."""
 
+import dataclasses
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -41,6 +42,14 @@ def realism(
     if pair is not None:
         if strict or settings != RealismSettings():
             raise InputError("--pair: takes none of --strict, --quick, --seed and --tests")
+        unused = [
+            f"--{field.name.replace('_', '-')}"
+            for field in dataclasses.fields(camera)
+            if field.name not in ("sensor", "matching", "bias_correction")
+            and getattr(camera, field.name) != field.default
+        ]
+        if unused:
+            raise InputError(f"--pair: renders nothing, and takes no {', '.join(unused)}")
         return _pair(out, pair, camera)
     from tqdm import tqdm
 

@@ -231,6 +231,19 @@ class ScanSettings(CameraSettings):
         super().__post_init__()
         if isinstance(self.object_size, str) and self.object_size not in ("file", "class"):
             raise InputError(f"scan: object_size {self.object_size!r}: file, class or a number")
+        if self.units is not None and self.object_size != "file":
+            raise InputError(
+                f"scan: units {self.units} goes with --object-size file alone: name that, too, or "
+                "leave the units out"
+            )
+        words = [self.randomise] if isinstance(self.randomise, str) else self.randomise or ()
+        if any(word == "rooms" or word.startswith("room.") for word in words):
+            layout = self.make_scene().layout
+            if layout != "alone":
+                raise InputError(
+                    f"scan: scene {layout} beside randomise rooms, which draws layouts: name "
+                    f"room.layout={layout} beside rooms in its place"
+                )
         check_range(self, "scan", "least_pixels", low=1)
         check_range(self, "scan", "num_points", low=1, high=1_000_000)
         check_range(self, "scan", "views", low=1, high=256)
