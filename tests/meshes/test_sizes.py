@@ -143,6 +143,8 @@ def test_sizes_are_uniform_in_the_logarithm_at_any_scale_of_the_mesh():
 def test_a_class_without_a_size_is_refused():
     with pytest.raises(InputError, match=r"'toilet'.*bathtub"):
         class_size(part(1.0), "toilet", np.random.default_rng(0))
+    with pytest.raises(InputError, match=r"no class.*--class-name"):
+        class_size(part(1.0), "", np.random.default_rng(0))
 
 
 def test_the_table_holds_published_means_and_what_real_views_show(shared_data):

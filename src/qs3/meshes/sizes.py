@@ -53,6 +53,12 @@ def class_ranges(class_name: str) -> tuple[tuple[float, float], tuple[float, flo
     Raises:
         InputError: where no size of the class is known.
     """
+    if not class_name:
+        raise InputError(
+            "object_size class: the object has no class; name it (--class-name chair, or another "
+            f"of {', '.join(CLASS_SIZES)}), or take the size in the mesh's file (--object-size "
+            "file), or a number of metres"
+        )
     if canonical(class_name) not in CLASS_SIZES:
         raise InputError(
             f"object_size class: no real size is known of class {class_name!r}, only of "
