@@ -1,6 +1,7 @@
 """``qs3 realism`` on a small camera: the command itself, in this process but for the killed one."""
 
 import functools
+import hashlib
 import json
 import signal
 import subprocess
@@ -204,14 +205,21 @@ def test_a_real_pair_is_held_against_its_own_depth(realism, camera, flat, tmp_pa
     out = tmp_path / "out"
     common = ("--sensor", camera, "--matching", "zncc", "--out", out)
     done = realism(*flat, *common)
-    made = (out / "pair.json").read_bytes()
-    record = json.loads(made)
+    record = json.loads((out / "pair.json").read_text())
     assert record["camera_valid"] == pytest.approx(1 - 1500 / (150 * 188), abs=1e-3)
     assert record["camera_holes"] == pytest.approx(1500 / (150 * 188), abs=1e-3)
     assert record["valid"] > 0.85  # half a block of the frame's rim has no match
     assert record["holes"] == pytest.approx(1 - record["valid"], abs=1e-6)
     assert record["over_3px"] == 0
     assert record["median_abs_px"] < 0.05
+    assert abs(record["difference_px"]) <= record["median_abs_px"]
+    assert record["scale"] == pytest.approx(1, abs=0.005)
+    assert (record["sensor"], record["matching"]["method"]) == ("small", "zncc")
+    digests = {name: hashlib.sha256((tmp_path / f"{name}.png").read_bytes()).hexdigest()
+               for name in ("left", "right", "depth")}  # fmt: skip
+    assert record["images"] == {
+        name: {"name": f"{name}.png", "sha256": digest} for name, digest in digests.items()
+    }
     assert record["plane_rms_px"] < 0.05
     assert record["edge_spill_px"]["median"] is None
     assert "0 pixels of edges" in record["notes"][0]
@@ -221,7 +229,14 @@ def test_a_real_pair_is_held_against_its_own_depth(realism, camera, flat, tmp_pa
     depth = tmp_path / "depth.npy"  # in metres
     np.save(depth, cv2.imread(str(tmp_path / "depth.png"), cv2.IMREAD_UNCHANGED) / 1000)
     realism(*flat[:4], depth, *flat[5:], *common)
-    assert (out / "pair.json").read_bytes() == made
+    again = json.loads((out / "pair.json").read_text())
+    assert again.pop("images")["depth"]["name"] == "depth.npy"
+    assert again == {name: value for name, value in record.items() if name != "images"}
+    longer = realism(*flat[:-1], 0.05 * 1.03, *common)  # another camera's baseline
+    assert "focal length or baseline" in longer.stderr
+    changed = json.loads((out / "pair.json").read_text())
+    assert changed["scale"] == pytest.approx(1 / 1.03, abs=0.005)
+    assert changed["difference_px"] == pytest.approx(-0.36, abs=0.05)
     swapped = realism(flat[0], flat[2], flat[1], *flat[3:], *common)
     assert "LEFT and RIGHT swapped" in swapped.stderr
 
@@ -241,6 +256,8 @@ def test_a_real_pair_is_held_against_its_own_depth(realism, camera, flat, tmp_pa
         ({"--pair": ("left8.png", "right.png")}, "uint16"),
         ({"--pair": ("left8.png", "K.txt")}, "K.txt"),
         ({"--tests": "T1"}, "--tests"),
+        ({"--samples": 4, "--image-noise": 1.0}, "takes no --image-noise, --samples"),
+        ({"--pattern": "absent.png"}, "takes no --pattern"),
         ({"--matching": "opencv-bm"}, "8 bits"),
     ],
     ids=str,

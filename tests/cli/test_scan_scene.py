@@ -36,6 +36,8 @@ def test_scan_writes_frames_of_a_scene_and_records_it(qs3, quick, tmp_path):
     mask = cv2.imread(str(scene / "mask_visib" / "000000_000000.png"), cv2.IMREAD_UNCHANGED)
     assert mask.shape == (1080, 1080)
     assert (mask > 0).sum() == record["views"][0]["object_pixels"]
+    qs3("scan", "chair", "--out", out, "--num-points", 64, *quick)
+    assert not (out / "frames").exists()
 
     (out / "frames").rename(tmp_path / "mine")
     (out / "frames").symlink_to(tmp_path / "mine")
@@ -122,11 +124,15 @@ def test_scan_takes_the_size_of_a_file_and_tells_its_guess(qs3, quick, tmp_path)
     mesh = tmp_path / "part.stl"
     trimesh.creation.box((400.0, 300.0, 200.0)).export(mesh)
     how = ("--sensor", "d435", "--object-size", "file", "--num-points", 64, *quick)
-    done = qs3("scan", mesh, "--out", tmp_path / "guessed", *how)
+    told = ("--up", "y", "--class-name", "pump")
+    done = qs3("scan", mesh, "--out", tmp_path / "guessed", *told, *how)
     assert "does not tell its unit: taken for mm" in done.stderr
     record = json.loads((tmp_path / "guessed" / "scan.json").read_text())
     assert record["drawn"] == {"object_size": 0.4, "units": "mm (guessed)"}
     assert record["settings"]["object_size"] == "file"
+    assert (record["mesh"]["up"], record["mesh"]["class_name"]) == ("y", "pump")
+    assert record["frames"] is False
+    assert {"numba", "llvmlite"} < set(record["versions"])
     assert "400 m" in qs3.refuses("scan", mesh, "--out", tmp_path / "x", "--units", "m", *how)
 
 

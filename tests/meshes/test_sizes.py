@@ -1,5 +1,7 @@
 """Real sizes: a mesh's own unit in metres, and lengths drawn from the ranges of its class."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
@@ -7,9 +9,11 @@ from scipy import stats
 
 from qs3 import shapes
 from qs3.errors import InputError, say_once
-from qs3.meshes import load_mesh
+from qs3.meshes import collect, load_mesh
 from qs3.meshes.classes import POINTDA10
 from qs3.meshes.sizes import CLASS_SIZES, class_size, file_size
+from qs3.store.plan import make_plan
+from qs3.store.scan_item import GenerateSettings
 
 
 def part(length: float) -> trimesh.Trimesh:
@@ -29,25 +33,60 @@ def test_a_length_in_a_unit_is_that_many_metres(length, unit, metres):
 def test_a_mesh_that_tells_its_unit_is_believed(tmp_path):
     part(2.0).export(tmp_path / "part.glb")
     part(2.0).export(tmp_path / "part.off")
-    assert file_size(load_mesh(tmp_path / "part.glb")) == (2.0, "meters")
+    assert file_size(load_mesh(tmp_path / "part.glb")) == (2.0, "m")
     assert load_mesh(tmp_path / "part.off").units is None
-    assert file_size(shapes.make("bed"))[1] == "meters"
+    assert file_size(shapes.make("bed"))[1] == "m"
     mesh = part(60.0)
     mesh.units = "0.01 * meters"  # as DAE has it
-    assert file_size(mesh)[0] == pytest.approx(0.6)
+    assert file_size(mesh) == (pytest.approx(0.6), "cm")
+    mesh.units = "feet"
+    mesh.apply_scale(0.1)
+    assert file_size(mesh) == (pytest.approx(6 * 0.3048), "feet")
 
 
-def test_a_unit_in_the_file_wins_and_says_so_once(caplog):
+def test_a_mesh_of_a_known_unit_is_believed_and_says_so_once(caplog):
     say_once.cache_clear()
     mesh = part(60.0)
     mesh.units = "cm"
     for _ in range(2):
         assert file_size(mesh, "mm") == (pytest.approx(0.6), "cm")
-    assert caplog.messages == ["a mesh's file says that it is in cm: taken, not units mm"]
+    assert caplog.messages == ["a mesh is in cm by what it says: taken, not units mm"]
     caplog.clear()
     mesh.units = "millimeters"
     assert file_size(mesh, "mm")[0] == pytest.approx(0.06)
     assert not caplog.messages
+
+
+def test_a_unit_that_is_named_wins_over_what_a_file_says_and_says_so_once(caplog, tmp_path):
+    say_once.cache_clear()
+    for name in ("a.glb", "b.glb"):
+        part(60.0).export(tmp_path / name)
+        mesh = load_mesh(tmp_path / name)
+        assert file_size(mesh, "mm") == (pytest.approx(0.06), "mm")
+    (line,) = caplog.messages
+    assert line.startswith(f"{tmp_path / 'a.glb'} is in meters")
+    assert "taken for mm" in line
+    with pytest.raises(InputError, match="name its unit"):
+        file_size(mesh)
+    mesh.metadata["file_name"] = "a.step"  # its numbers are the reader's, not the file's
+    with pytest.raises(InputError, match="m; give a size"):
+        file_size(mesh, "mm")
+
+
+def test_guesses_that_differ_within_a_collection_are_refused(tmp_path):
+    (tmp_path / "things").mkdir()
+    for name, length in (("bracket", 600.0), ("plate", 90.0), ("broken", 1.0)):
+        part(length).export(tmp_path / "things" / f"{name}.stl")
+    (tmp_path / "things" / "broken.stl").write_text("solid")
+    settings = GenerateSettings(sensor="d435", object_size="file", classes=("things",))
+    make_plan(collect(tmp_path), settings)
+    part(3.0).export(tmp_path / "things" / "screw.stl")
+    with pytest.raises(InputError, match=r"things/screw .*metres.*things/bracket .*--units"):
+        make_plan(collect(tmp_path), settings)
+    make_plan(collect(tmp_path), dataclasses.replace(settings, units="mm"))
+    part(0.3).export(tmp_path / "things" / "screw.glb")  # tells its unit
+    (tmp_path / "things" / "screw.stl").unlink()
+    make_plan(collect(tmp_path), settings)
 
 
 @pytest.mark.parametrize(("length", "size", "unit"), [(2.0, 2.0, "m"), (60.0, 0.06, "mm")])
@@ -104,6 +143,8 @@ def test_sizes_are_uniform_in_the_logarithm_at_any_scale_of_the_mesh():
 def test_a_class_without_a_size_is_refused():
     with pytest.raises(InputError, match=r"'toilet'.*bathtub"):
         class_size(part(1.0), "toilet", np.random.default_rng(0))
+    with pytest.raises(InputError, match=r"no class.*--class-name"):
+        class_size(part(1.0), "", np.random.default_rng(0))
 
 
 def test_the_table_holds_published_means_and_what_real_views_show(shared_data):

@@ -13,7 +13,7 @@ from qs3 import shapes
 from qs3.errors import InputError
 from qs3.meshes import sample_surface
 from qs3.sensor.depth import DepthSettings
-from qs3.sensor.frames import depth_scale, encode_depth, write_frames
+from qs3.sensor.frames import depth_scale, encode_depth, remove_frames, write_frames
 from qs3.sensor.matching import MatchingSettings
 from qs3.sensor.presets import Sensor
 from qs3.sensor.render.mitsuba import MitsubaRenderer
@@ -201,6 +201,26 @@ def test_a_second_scan_leaves_no_picture_of_the_first(folder, made, tmp_path):
     one = dataclasses.replace(made, images=made.images[:1], poses=made.poses[:1])
     write_frames(tmp_path, one)
     assert len(list(tmp_path.glob("000000/*/*.png"))) == len(KINDS)
+
+
+def test_frames_are_removed_but_nobody_elses_files_and_no_link_is_followed(made, tmp_path):
+    frames, other = tmp_path / "frames", tmp_path / "other"
+    write_frames(frames, made)
+    write_frames(other, made)
+    kept = sorted(other.rglob("*"))
+    remove_frames(frames)
+    assert not frames.exists()
+    remove_frames(frames)
+    write_frames(frames, made)
+    (frames / "000000" / "notes.txt").write_text("x")
+    (frames / "000000" / "more").symlink_to(other / "000000" / "depth")
+    remove_frames(frames)
+    assert [path.name for path in frames.rglob("*")] == ["000000", "notes.txt"]
+    link = tmp_path / "link"
+    link.symlink_to(other)
+    remove_frames(link)
+    assert not link.is_symlink()
+    assert sorted(other.rglob("*")) == kept
 
 
 def test_frames_that_were_not_written_to_the_end_have_no_json(made, tmp_path, monkeypatch):

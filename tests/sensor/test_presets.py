@@ -229,6 +229,7 @@ def test_a_picture_is_looked_for_beside_the_file(tmp_path, monkeypatch):
         ("[rig]\nprojector_offset = 40.0", "projector_offset 40"),
         ("[rig]\nsecond = 'pattern'", "projector_offset"),
         ("[placement]\nradius = [3, 2]", "placement: radius"),
+        ('base = "d435"\nobject_size = 60.0', r"placement.radius: 1.2 … 2 lies within.*size 60"),
         ("[depth]\nnear = 3.0\nfar = 2.0", "depth: near"),
         ("[matching]\nblock_size = 8", "block_size"),
         # What does not go together.

@@ -54,6 +54,12 @@ def test_the_sensor_has_what_was_drawn_and_nothing_else_changed():
     assert 0.1 <= drawn["material.roughness"] <= 0.2
 
 
+def test_rooms_draw_what_default_does_and_may_be_named_beside_it():
+    rooms, both = (resolve_ranges(SENSORS["d435"], w) for w in (["rooms"], ["rooms", "default"]))
+    assert rooms == both
+    assert rooms.items() >= resolve_ranges(SENSORS["d435"], "default").items()
+
+
 def test_nothing_is_drawn_without_ranges():
     rng = np.random.default_rng(3)
     assert draw(Sensor(), None, rng) == (Sensor(), {})

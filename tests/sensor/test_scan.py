@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.geometry import rotation_z
 from qs3.meshes import normalise, sample_surface
 from qs3.sensor.depth import DepthSettings
@@ -271,7 +271,8 @@ def test_views_that_are_matched_side_by_side_have_the_bits_of_one_after_another(
     ("change", "message"),
     [
         ({"depth": DepthSettings(near=5.9)}, "saw no point"),
-        ({"object_size": 1e-3}, "saw no point"),  # smaller than a pixel
+        # Smaller than a pixel.
+        ({"object_size": 1e-3}, "saw no point.*0.001 large.* 3 to 5 away; set placement.radius"),
         ({"object_size": 0.0}, "object_size"),
         ({"object_size": float("nan")}, "object_size"),
     ],
@@ -279,6 +280,18 @@ def test_views_that_are_matched_side_by_side_have_the_bits_of_one_after_another(
 def test_what_cannot_be_seen_is_refused(change, message, renderer):
     with pytest.raises(InputError, match=message):
         scan(asymmetric(), sensor=dataclasses.replace(SMALL, **change), views=1, renderer=renderer)
+
+
+def test_few_points_are_told_with_size_distance_and_what_to_change(renderer, caplog):
+    say_once.cache_clear()
+    for size, told in ((1.0, 0), (0.06, 1), (0.062, 1)):
+        scan(
+            asymmetric(), sensor=SMALL, object_size=size, views=1, num_points=512, renderer=renderer
+        )
+        assert len(caplog.messages) == told
+    (line,) = caplog.messages
+    assert "num_points 512" in line
+    assert "about 0.06 large and is seen from 3 to 5 away; set placement.radius" in line
 
 
 def test_wrong_matches_within_the_gate_make_no_cloud_of_an_object_beyond_it(renderer):

@@ -45,16 +45,16 @@ def test_a_preset_is_a_whole_column_and_what_is_given_beside_it_wins():
     ("settings", "crop"),
     [
         ({}, "box"),
-        ({"sensor": "kinect-v1"}, "box"),
-        ({"sensor": "d435"}, "both"),
-        ({"sensor": ("kinect-v1", "d415")}, "both"),
-        ({"matching": "ad-census"}, "both"),
+        ({"matching": "ad-census"}, "box"),
+        ({"sensor": "kinect-v1"}, "both"),
+        ({"sensor": "d435", "matching": "zncc"}, "both"),
+        ({"sensor": ("paper", "d415")}, "both"),
         ({"sensor": "d435", "crop": "box"}, "box"),
         ({"sensor": "d435", "preset": "paper"}, "none"),
         ({"sensor": "d435", "preset": "released"}, "box"),
     ],
 )
-def test_a_matcher_that_fills_the_dark_is_cropped_by_the_mask_too(settings, crop):
+def test_scans_by_cameras_in_metres_are_cropped_by_the_mask_too(settings, crop):
     assert ScanSettings(**settings).chosen("crop") == crop
 
 

@@ -31,7 +31,8 @@ def meshes(
             shapes.
         out: The contact sheet to write, PNG: the first eight of each class.
         up: Up axis of the meshes; by default y for glTF and ShapeNet, z for all others.
-        units: Unit of the files that tell none; by default m up to a longest side of 5, mm above.
+        units: Unit of the files, but STEP and IGES; by default what they tell, else m up to a
+            longest side of 5, mm above.
         classes: Look at these classes only, or pointda10 for its ten; all by default.
         labels: CSV that tells the class of each mesh.
     """

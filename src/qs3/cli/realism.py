@@ -1,5 +1,6 @@
 """``qs3 realism``: the simulated camera against what real ones are known to do."""
 
+import dataclasses
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -41,7 +42,15 @@ def realism(
     if pair is not None:
         if strict or settings != RealismSettings():
             raise InputError("--pair: takes none of --strict, --quick, --seed and --tests")
-        return _pair(out, pair, camera)
+        unused = [
+            f"--{field.name.replace('_', '-')}"
+            for field in dataclasses.fields(camera)
+            if field.name not in ("sensor", "matching", "bias_correction")
+            and getattr(camera, field.name) != field.default
+        ]
+        if unused:
+            raise InputError(f"--pair: renders nothing, and takes no {', '.join(unused)}")
+        return _pair(out, pair, camera, files)
     from tqdm import tqdm
 
     from qs3.report.realism_folder import test_camera
@@ -57,11 +66,11 @@ def realism(
     return 1 if strict and missed else 0
 
 
-def _pair(out: Path, pair: InfraredPair, camera: CameraSettings) -> int:
+def _pair(out: Path, pair: InfraredPair, camera: CameraSettings, files: PairFiles) -> int:
     """Hold the matcher against a real camera's own depth."""
     from qs3.report.pair import PAIR_PLOT, PAIR_RECORD, compare_pair
 
-    record = compare_pair(out, pair, camera.make_sensor().matching)
+    record = compare_pair(out, pair, camera.make_sensor(), files.checksums())
     show(*pair_table(record))
     tell(*record["notes"], f"Look at {out / PAIR_PLOT} and {out / PAIR_RECORD}")
     return 0
@@ -87,6 +96,8 @@ def pair_table(record: Mapping[str, Any]) -> list[str]:
     ):
         rows.append((what, cell(record[name], unit), cell(record[f"camera_{name}"], unit)))
     rows.append(("median |difference of disparity| [px]", cell(record["median_abs_px"]), ""))
+    rows.append(("median difference, ours − the camera's [px]", cell(record["difference_px"]), ""))
+    rows.append(("scale, ours / the camera's", cell(record["scale"]), ""))
     rows.append(("more than 1 px off", cell(record["over_1px"], "%"), ""))
     rows.append(("more than 3 px off", cell(record["over_3px"], "%"), ""))
     return columns(rows)

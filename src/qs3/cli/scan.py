@@ -43,7 +43,7 @@ def scan(
     from qs3.meshes.collections import load_named
     from qs3.report.figure import write_png
     from qs3.report.montage import montage, montage_view
-    from qs3.sensor.frames import write_frames, write_parts
+    from qs3.sensor.frames import remove_frames, write_frames, write_parts
     from qs3.sensor.scan import scan as scan_mesh
 
     start = time.perf_counter()
@@ -69,12 +69,14 @@ def scan(
         f"{origin['name']} · sensor {result.sensor.name} · view {best + 1} of {len(result.views)}"
     )
     figure = montage(view, title)
-    record = _record(settings, origin, result)
+    origin |= {"up": up, "class_name": names[0]}
+    record = _record(settings, origin, result) | {"frames": frames}
     folder = claim_folder(out, "scan.json")
     # The record first: it marks the folder as ours, should this be stopped in between.
     write_json(folder / "scan.json", record)
     for stale in folder.glob("view-*-*.*"):  # of an earlier scan into this folder
         stale.unlink()
+    remove_frames(folder / "frames")
     write_ply(folder / "cloud.ply", result.points, result.view)
     write_ply(folder / "clean.ply", result.clean, result.clean_view)
     write_png(folder / "montage.png", figure)
@@ -114,7 +116,7 @@ def _record(settings: ScanSettings, origin: dict[str, Any], result: Any) -> dict
         "fused_points": result.fused_points,
         "views": views,
         "seconds": {name: round(value, 4) for name, value in result.seconds.items()},
-        "versions": versions(),
+        "versions": versions("numba", "llvmlite"),  # what compiles the matcher
     }
 
 

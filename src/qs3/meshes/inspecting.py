@@ -39,7 +39,7 @@ def inspect(
 
     Args:
         items: The meshes.
-        units: Of files that tell none; see ``file_size``.
+        units: Unit of the files; see ``file_size``.
         pictured: Of so many meshes of each class the surface is sampled.
     """
     shown: Counter[str] = Counter()

@@ -99,6 +99,7 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> trimesh.Trimes
     mesh = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
     if units is not None:
         mesh.units = units
+    mesh.metadata["file_name"] = str(path)  # for what is said of it
     return mesh
 
 

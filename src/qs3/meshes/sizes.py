@@ -1,12 +1,16 @@
 """How large things are: what a mesh's own unit says, and what its class measures in homes."""
 
+import contextlib
 import functools
 import math
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
 from qs3.errors import InputError, say_once
+from qs3.meshes.cad import UNITS
 from qs3.meshes.classes import canonical
 
 if TYPE_CHECKING:
@@ -49,6 +53,12 @@ def class_ranges(class_name: str) -> tuple[tuple[float, float], tuple[float, flo
     Raises:
         InputError: where no size of the class is known.
     """
+    if not class_name:
+        raise InputError(
+            "object_size class: the object has no class; name it (--class-name chair, or another "
+            f"of {', '.join(CLASS_SIZES)}), or take the size in the mesh's file (--object-size "
+            "file), or a number of metres"
+        )
     if canonical(class_name) not in CLASS_SIZES:
         raise InputError(
             f"object_size class: no real size is known of class {class_name!r}, only of "
@@ -104,9 +114,10 @@ def class_size(mesh: "trimesh.Trimesh", class_name: str, rng: np.random.Generato
 def file_size(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float, str]:
     """Return the longest side of a mesh in metres, and the unit that it is told or taken to be in.
 
-    It is what the mesh says (``mesh.units``: glTF's are metres, as the procedural shapes are), and
-    the log says so once where ``unit`` is another; else ``unit``; else metres up to a longest side
-    of 5, millimetres above, and the log says so once.
+    It is ``unit``, also where a mesh's file (glTF, 3MF) says another; else what the mesh says
+    (``mesh.units``: the procedural shapes and what was turned from STEP and IGES are in a known
+    unit, whatever ``unit`` is); else metres up to a longest side of 5, millimetres above. The log
+    says once, of the first such mesh, where two differ or a unit is guessed.
 
     Raises:
         InputError: where the mesh's unit is unknown, or it is smaller than 1 mm or larger than
@@ -118,27 +129,68 @@ def file_size(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float,
         (0.06, 'mm')
     """
     side = float(mesh.extents.max())
-    name = mesh.units or unit
+    file = str(mesh.metadata.get("file_name", ""))
+    is_known = bool(mesh.units) and (not file or Path(file).suffix.lower() in UNITS)
+    name = mesh.units if is_known else unit or mesh.units
     if mesh.units and unit and not math.isclose(_metres(mesh.units), _metres(unit)):
-        say_once(f"a mesh's file says that it is in {mesh.units}: taken, not units {unit}")
+        taken = f"taken, not units {unit}" if is_known else f"taken for {unit}, as units says"
+        _say(file, f"is in {mesh.units} by what it says: {taken}")
     if name is None:
         name = "m" if side <= _METRES_TO else "mm"
         where = "up to" if name == "m" else "longer than"
-        say_once(
-            f"a mesh does not tell its unit: taken for {name}, as it is {where} {_METRES_TO:g} of "
-            "them long; say it with units (m, cm, mm or in)"
-        )
         title = f"{name} (guessed)"
+        _say(
+            file,
+            f"does not tell its unit: taken for {name}, as it is {where} {_METRES_TO:g} of them "
+            "long; say it with units (m, cm, mm or in)",
+        )
     else:
-        title = name
+        title = _short(name)
     size = side * _metres(name)
     if not _LEAST <= size <= _MOST:
         raise InputError(
             f"object_size file: the mesh is {side:g} {title} long, which is {size:g} m, and no "
-            f"object of {_LEAST:g} to {_MOST:g} m; name its unit (units m, cm, mm or in), or give "
-            "a size in metres (object_size)"
+            f"object of {_LEAST:g} to {_MOST:g} m; "
+            + ("" if is_known else "name its unit (units m, cm, mm or in), or ")
+            + "give a size in metres (object_size)"
         )
     return size, title
+
+
+def check_guesses(items: Iterable[Any]) -> None:
+    """Refuse meshes whose units would be guessed, and not all alike: a small part of many.
+
+    A mesh that cannot be used is left to its scan.
+
+    Raises:
+        InputError: naming a mesh of either guess.
+    """
+    guesses: dict[str, str] = {}
+    for item in items:
+        if getattr(item, "path", None) is None:
+            continue
+        with contextlib.suppress(InputError):
+            title = file_size(item.load())[1]
+            if title.endswith("(guessed)"):
+                guesses.setdefault(title.split()[0], item.id)
+        if len(guesses) > 1:
+            raise InputError(
+                f"object_size file: {guesses['m']} would be taken for metres and {guesses['mm']} "
+                "for millimetres, by their lengths; name the unit of all of them: --units mm, say"
+            )
+
+
+_first: dict[str, str] = {}
+
+
+def _say(file: str, text: str) -> None:
+    """Say something of a mesh's file once, of the first of which it is true."""
+    say_once(f"{_first.setdefault(text, file) or 'a mesh'} {text}")
+
+
+def _short(unit: str) -> str:
+    """A unit as users name it, ``m`` for ``meters``; one that they cannot name as it is."""
+    return next((u for u in get_args(Unit) if math.isclose(_metres(u), _metres(unit))), unit)
 
 
 def _metres(unit: str) -> float:

@@ -95,10 +95,11 @@ def find_mesh(run: Run) -> OwnMesh | None:
     with contextlib.suppress(QS3Error):
         made = open_dataset(store).settings
         sensors = made["sensor"] if isinstance(made["sensor"], list) else [made["sensor"]]
+        sized = made.get("object_size") == "file"
         settings = ScanSettings(
             sensor=structure(sensors[0], Sensor, store),
-            object_size="file" if made.get("object_size") == "file" else None,
-            units=made.get("units"),
+            object_size="file" if sized else None,
+            units=made.get("units") if sized else None,
         )
         objects = set(load_shard(open_folder(store), 0, ("object",))["object"].to_pylist())
         for name in str(made.get("meshes", "")).split("+"):

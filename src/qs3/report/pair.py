@@ -1,6 +1,7 @@
 """The folder of a real infrared pair held against its camera's own depth: a record, a picture."""
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from matplotlib.figure import Figure
 from qs3.evaluation import versions
 from qs3.files import claim_folder, write_json
 from qs3.report.figure import NO_VALUE, PALETTE, house_style, without_frame, write_png
-from qs3.sensor.matching import MatchingSettings
+from qs3.sensor.presets import Sensor
 from qs3.sensor.realism.pair import Comparison, InfraredPair, compare
 
 PAIR_RECORD, PAIR_PLOT = "pair.json", "pair.png"
@@ -18,13 +19,16 @@ _OURS, _CAMERA = PALETTE[0], PALETTE[6]
 _OFF = 2.0  # pixels of disparity at which the difference has its full colour
 
 
-def compare_pair(out: Path, pair: InfraredPair, settings: MatchingSettings) -> dict[str, Any]:
+def compare_pair(
+    out: Path, pair: InfraredPair, sensor: Sensor, images: Mapping[str, Any]
+) -> dict[str, Any]:
     """Compare, and write figures and picture.
 
     Args:
         out: New or empty folder, or one of an earlier comparison.
         pair: The pair.
-        settings: The matcher.
+        sensor: Whose matcher it is.
+        images: What the record tells of the files, as `PairFiles.checksums` returns it.
 
     Returns:
         The record.
@@ -32,12 +36,14 @@ def compare_pair(out: Path, pair: InfraredPair, settings: MatchingSettings) -> d
     Raises:
         InputError: where the folder holds something else, or as `compare` does.
     """
-    comparison = compare(pair, settings)
+    comparison = compare(pair, sensor.matching)
     record = comparison.figures | {
         "width": pair.left.shape[1],
         "height": pair.left.shape[0],
         "focal": pair.focal,
         "baseline": pair.baseline,
+        "images": dict(images),
+        "sensor": sensor.name,
         "matching": dataclasses.asdict(comparison.matching),
         "versions": versions(),
     }

@@ -17,6 +17,8 @@ Convention:
     normal is v/32767.5 − 1 in the camera's axes, towards the camera; (0, 0, 0) is none.
 """
 
+import contextlib
+import os
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +35,7 @@ from qs3.sensor.view import ViewImages
 
 MM_PER_UNIT = 1000.0
 _SCENE = "000000"
+_WRITTEN = ("/models/obj_000001.ply", f"/{_SCENE}/scene_*.json", f"/{_SCENE}/*/*.png")
 
 
 def write_frames(folder: Path, scan: Scan) -> None:
@@ -71,6 +74,21 @@ def write_frames(folder: Path, scan: Scan) -> None:
     written = {"camera": cameras, "gt": truth, "gt_info": facts}
     for name, value in written.items():
         write_json(scene / f"scene_{name}.json", value)
+
+
+def remove_frames(folder: Path) -> None:
+    """Remove what `write_frames` wrote, and the folders that are empty then.
+
+    A link is never followed: it is removed.
+    """
+    if folder.is_symlink():
+        folder.unlink()
+    for place, folders, files in os.walk(folder, topdown=False):
+        for path in (Path(place) / name for name in (*folders, *files)):
+            if path.is_symlink() or any(map(("/" / path.relative_to(folder)).match, _WRITTEN)):
+                path.unlink()
+        with contextlib.suppress(OSError):  # somebody else's files are in it
+            Path(place).rmdir()
 
 
 def write_parts(folder: Path, scan: Scan) -> list[Path]:

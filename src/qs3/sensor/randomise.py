@@ -58,8 +58,9 @@ def resolve_ranges(
         randomise: ``(low, high)`` (uniform) or ``(low, high, "log")`` (uniform in the logarithm)
             by name, and ``material`` a list of names; or such ranges as words:
             ``light.ambient=0:0.1``, ``exposure.gain=0.5:2:log``, ``material=diffuse,metal``;
-            ``"default"`` is `default_ranges`, and ``"rooms"`` these and all of ``ROOM_RANGES``,
-            in part replaced by the words beside it. One range of a room brings all of them.
+            ``"default"`` is `default_ranges`, and ``"rooms"`` these (with or without ``"default"``
+            beside it) and all of ``ROOM_RANGES``, in part replaced by the words beside it. One
+            range of a room brings all of them.
 
     Raises:
         InputError: for a name that is no number of the sensor, a range that is none, or one at
@@ -76,7 +77,7 @@ def resolve_ranges(
         if words == ["default"]:
             randomise = default_ranges(sensor)
         elif "rooms" in words:
-            words.remove("rooms")
+            words = [word for word in words if word not in ("rooms", "default")]
             randomise = default_ranges(sensor) | ROOM_RANGES | _parsed(words)
         else:
             randomise = _parsed(words)

@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float32, UInt8
 
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.geometry import rotation_z
 from qs3.sensor.depth import fuse
 from qs3.sensor.lens import blur_reach
@@ -165,7 +165,13 @@ def scan(
     else:
         raise InputError(
             "the sensor saw no point of the object: it is too thin, hidden, out of the depth gate, "
-            "or outside the image; check the mesh, the scene and the sensor's placement"
+            "or outside the image; check the mesh, the scene and the sensor's placement: "
+            + _standing(how, sensor, normalised)
+        )
+    if 4 * len(points) < how.num_points:
+        say_once(
+            f"fewer points were fused than a quarter of num_points {how.num_points}, and the rest "
+            f"repeats them: {_standing(how, sensor, normalised)}"
         )
     with clock("sampling"):
         kept = resample(points, how.num_points, rng_sample)
@@ -185,6 +191,17 @@ def scan(
         sensor=sensor,
         drawn=drawn,
         images=tuple(images) if keep_images or full_frames else (),
+    )
+
+
+def _standing(how: ScanSettings, sensor: Sensor, mesh: trimesh.Trimesh) -> str:
+    """How large the object is and how far away, and what changes that; in digits that repeat."""
+    unit = " m" if sensor.metric else ""
+    name = "room.distance" if how.room_layouts else "placement.radius"
+    near, far, *_ = how.ranges.get(name, sensor.placement.radius)
+    return (
+        f"the object is about {mesh.extents.max():.1g}{unit} large and is seen "
+        f"from {near:.2g} to {far:.2g}{unit} away; set {name} to see it from nearer"
     )
 
 

@@ -21,12 +21,12 @@ from qs3.sensor.scene import SceneSettings
 from qs3.sensor.speckle import pattern_image
 from qs3.sensor.views import ViewLayout
 
-_BY_MATCHER = "by matcher"
+_BY_SENSOR = "by sensor"
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {
         "size": "box",
         "view_layout": "orbit",
-        "crop": _BY_MATCHER,
+        "crop": _BY_SENSOR,
         "principal_point": None,
     },
     "paper": {"size": "ball", "view_layout": "orbit", "crop": "none", "principal_point": None},
@@ -174,7 +174,7 @@ class ScanSettings(CameraSettings):
     default by preset."""
     crop: Literal["box", "mask", "both", "none"] | None = None
     """Keep points inside the object's box (as released), or pixels that truly show the object, or
-    what is both, or all; default by preset, and both for cameras with the matcher ad-census."""
+    what is both, or all; default by preset, and both for cameras in metres."""
     box_margin: float = 0.0
     """Enlarge the box of the crop on every side, in the unit of the scene."""
     depth_margin: float = 0.1
@@ -195,8 +195,8 @@ class ScanSettings(CameraSettings):
     """Size of every object, in metres for real cameras; or the size that the mesh's file gives it;
     or one drawn from the real sizes of its class; default by sensor, class in rooms."""
     units: Unit | None = None
-    """Unit of the meshes whose files tell none (glTF, STEP, IGES and 3MF do), for the object size
-    file; by default m up to a longest side of 5 and mm above."""
+    """Unit of the meshes, for the object size file, whatever glTF and 3MF say (that of STEP and
+    IGES is known); where nothing tells it, m up to a longest side of 5 and mm above."""
     material: Material | str | None = None
     """Surface of the object by name: diffuse, principled, rough-specular, glossy-plastic, metal,
     dark, mirror or glass; default by sensor."""
@@ -231,6 +231,19 @@ class ScanSettings(CameraSettings):
         super().__post_init__()
         if isinstance(self.object_size, str) and self.object_size not in ("file", "class"):
             raise InputError(f"scan: object_size {self.object_size!r}: file, class or a number")
+        if self.units is not None and self.object_size != "file":
+            raise InputError(
+                f"scan: units {self.units} goes with --object-size file alone: name that, too, or "
+                "leave the units out"
+            )
+        words = [self.randomise] if isinstance(self.randomise, str) else self.randomise or ()
+        if any(word == "rooms" or word.startswith("room.") for word in words):
+            layout = self.make_scene().layout
+            if layout != "alone":
+                raise InputError(
+                    f"scan: scene {layout} beside randomise rooms, which draws layouts: name "
+                    f"room.layout={layout} beside rooms in its place"
+                )
         check_range(self, "scan", "least_pixels", low=1)
         check_range(self, "scan", "num_points", low=1, high=1_000_000)
         check_range(self, "scan", "views", low=1, high=256)
@@ -242,13 +255,12 @@ class ScanSettings(CameraSettings):
         """A setting by its name, or the preset's where it is None."""
         value = getattr(self, name)
         value = PRESETS[self.preset].get(name) if value is None else value
-        return self._crop_by_matcher() if value == _BY_MATCHER else value
+        return self._crop_by_sensor() if value == _BY_SENSOR else value
 
-    def _crop_by_matcher(self) -> str:
-        """AD-Census has a depth for the darkness around an object, too: it would fill the box."""
+    def _crop_by_sensor(self) -> str:
+        """The box of a real camera's scan holds floor, too, and depths of the dark by AD-Census."""
         sensors = (settings.make_sensor() for settings in self.each_sensor())
-        fills = any(sensor.matching.method == "ad-census" for sensor in sensors)
-        return "both" if fills else "box"
+        return "both" if any(sensor.metric for sensor in sensors) else "box"
 
     @property
     def _changes(self) -> dict[str, str]:

@@ -69,17 +69,17 @@ class Manifest:
                 raise InputError(f"settings.{name} must be a whole number from 0, not {value!r}")
 
 
-def package_versions() -> dict[str, str]:
+def package_versions(*more: str) -> dict[str, str]:
     """Return the versions of Python and of the packages that a result depends on, by name.
 
-    Read from the packages' metadata; nothing is imported.
+    Read from the packages' metadata; nothing is imported. ``more`` names other packages.
 
     Example:
         >>> sorted(package_versions())[:2]
         ['mitsuba', 'numpy']
     """
     versions = {"python": platform.python_version()}
-    for name in _PACKAGES:
+    for name in (*_PACKAGES, *more):
         try:
             versions[name] = version(name)
         except PackageNotFoundError:

@@ -13,7 +13,7 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.meshes.classes import map_labels
-from qs3.meshes.sizes import class_ranges
+from qs3.meshes.sizes import check_guesses, class_ranges
 from qs3.store.executors import Failure, LocalExecutor
 from qs3.store.manifest import Manifest, package_versions
 from qs3.store.parts import Place
@@ -120,7 +120,8 @@ def make_plan(items: Sequence[Item], settings: GenerateSettings) -> Plan:
     """Check a work list and resolve the renderer, once for all workers.
 
     Raises:
-        InputError: where the list is empty or has equal ids, or a class is unknown.
+        InputError: where the list is empty or has equal ids, a class is unknown, or not all units
+            would be guessed alike.
     """
     if not items:
         raise InputError(f"{settings.meshes}: no mesh to scan")
@@ -137,6 +138,8 @@ def make_plan(items: Sequence[Item], settings: GenerateSettings) -> Plan:
     if settings.real_size == "class":
         for name in sorted(set(map(size_class, items))):
             class_ranges(name)
+    if settings.real_size == "file" and settings.units is None:
+        check_guesses(items)
     map_labels(names, np.arange(len(names)), settings.classes)
     return Plan(items, settings)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3.errors import InputError
+from qs3.files import sha256
 from qs3.io.extract.depth_images import read_depth, read_infrared
 from qs3.io.extract.intrinsics import read_intrinsics
 from qs3.sensor.realism.pair import InfraredPair
@@ -38,6 +39,12 @@ class PairFiles:
                 f"a real pair also needs {names}: --pair LEFT RIGHT --depth DEPTH --intrinsics K "
                 "--baseline METRES belong together"
             )
+
+    def checksums(self) -> dict[str, dict[str, str]]:
+        """Name (not the path) and SHA-256 of each image, for records; none where none is named."""
+        left, right = self.pair or (None, None)
+        paths = {"left": left, "right": right, "depth": self.depth}
+        return {n: {"name": p.name, "sha256": sha256(p)} for n, p in paths.items() if p is not None}
 
     def read(self) -> InfraredPair | None:
         """Read the pair; None where none is named.

@@ -69,11 +69,18 @@ def load_sensor(path: Path | str) -> Sensor:
 
     Raises:
         InputError: in one line that names the file, and the key by its dotted name, where the file
-            cannot be read, a key is unknown or of another type, or the settings make no sensor.
+            cannot be read, a key is unknown or of another type, the settings make no sensor, or
+            every place of it is inside the object.
     """
     path = Path(path)
     table = _read(path)
     sensor = _sensor(table, path.stem, path)
+    near, far = sensor.placement.radius
+    if far <= sensor.object_size / 2:
+        raise InputError(
+            f"{path}: placement.radius: {near:g} … {far:g} lies within an object of object_size "
+            f"{sensor.object_size:g}; bring both into one unit, or stand farther off"
+        )
     if isinstance(table.get("pattern"), dict) and "image" in table["pattern"]:
         picture = (path.parent / str(sensor.pattern.image)).resolve()
         if not picture.is_file():

@@ -33,6 +33,7 @@ _INSIDE, _OUTSIDE = 8, 20  # columns about an edge in which a surface may end
 _FEWEST = 20  # pixels of edges, and of these on a side, that a median is told of
 _FLAT = 0.5  # pixels of disparity off a plane that are its noise: 3 to 4 σ of a D4xx
 _OFF = 3.0  # pixels of disparity beyond which a match is simply wrong
+_SCALE = 0.01  # of all disparities, beyond which f·b is not the camera's
 _SIDES = {(1, 0): "right", (0, 1): "lower", (-1, 0): "left", (0, -1): "upper"}
 
 
@@ -112,7 +113,10 @@ def compare(pair: InfraredPair, settings: MatchingSettings) -> Comparison:
     ours = match(pair.left, pair.right, settings).astype(np.float64)
     seen, theirs = np.isfinite(ours), np.isfinite(camera)
     both = in_sight(camera)
-    off = np.abs(ours - camera)[both & seen & theirs]
+    common = both & seen & theirs
+    difference = (ours - camera)[common]
+    off = np.abs(difference)
+    scale = float(np.median(ours[common] / camera[common])) if off.size else None
     edges = find_edges(pair.left, camera)
     spills = {"ours": spill(ours, edges), "camera": spill(camera, edges)}
     patches = planar_patches(camera)
@@ -122,6 +126,11 @@ def compare(pair: InfraredPair, settings: MatchingSettings) -> Comparison:
         notes.append(
             "most disparities are more than 3 px off the camera's: are LEFT and RIGHT swapped, or "
             "focal length, baseline or depth scale another camera's?"
+        )
+    elif scale is not None and abs(scale - 1) > _SCALE:
+        notes.append(
+            f"our disparities are {scale:.3f} times the camera's: is the focal length or baseline "
+            "another camera's?"
         )
     if len(edges.level) < _FEWEST:
         notes.append(
@@ -136,6 +145,8 @@ def compare(pair: InfraredPair, settings: MatchingSettings) -> Comparison:
         "holes": _share(theirs & ~seen, both),
         "camera_holes": _share(seen & ~theirs, both),
         "median_abs_px": plain(np.median(off)) if off.size else None,
+        "difference_px": plain(np.median(difference)) if off.size else None,
+        "scale": scale,
         "over_1px": _share(off > 1),
         "over_3px": _share(off > _OFF),
         "edge_spill_px": _spread(spills["ours"], edges),
