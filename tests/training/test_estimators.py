@@ -6,7 +6,18 @@ from sklearn.base import clone, is_classifier
 import qs3
 from qs3.errors import InputError
 from qs3.io.preparation import ROBUST
-from qs3.training import QBST, SPST, Adapter, SelfTrainingSettings, TrainSettings, fit
+from qs3.report.collect import look
+from qs3.training import (
+    QBST,
+    SPST,
+    Adapter,
+    SelfTrainingSettings,
+    TrainSettings,
+    evaluate,
+    fit,
+    read_run,
+)
+from qs3.training.run import fingerprint, train_settings
 
 TRAIN = {
     "model_settings": {"channels": (16, 16, 32), "hidden": (16,), "transforms": False},
@@ -97,6 +108,39 @@ def test_unknown_is_an_answer_that_is_saved_with_the_network(source, target, tmp
     without = Adapter(model="pointnet", train=TRAIN | {"holdout": 0.0}).fit(source)
     with pytest.raises(InputError, match="this network: cannot tell what is unknown"):
         without.predict(target, unknown=0.05)
+
+
+def test_a_saved_network_is_a_run(source, target, tmp_path):
+    """What `evaluate`, ``qs3 report`` and a warm-up ask of a run is there, after `load` too."""
+    made = Adapter(model="pointnet", train=TRAIN | {"holdout": 0.0}).fit(source)
+    made.save(tmp_path / "saved")
+    qs3.load(tmp_path / "saved").save(tmp_path / "again")
+    for folder in (tmp_path / "saved", tmp_path / "again"):
+        run = read_run(folder)
+        assert (run.method, run.source.clouds) == ("source-only", 24)
+        assert run.settings["source"] == fingerprint(source)
+        assert evaluate(folder, target).scores.accuracy == made.score(target)
+        assert look(folder).runs == (run,)
+        assert train_settings(folder).learning_rate == 1e-2
+    arguments = ("qbst", source, target.without_labels(), train_settings(tmp_path / "saved"))
+    rounds = SelfTrainingSettings(**ROUNDS)
+    after = fit(*arguments, rounds, run_dir=tmp_path / "run", warm_up=tmp_path / "saved")
+    assert not read_run(tmp_path / "run").unknown_warm_up
+    assert len(after.rounds) == 2
+    with pytest.raises(InputError, match="run: holds another run; name another folder"):
+        made.save(tmp_path / "run")
+
+
+def test_weights_alone_say_what_is_missing(source, target, tmp_path):
+    path = Adapter(model="pointnet", train=TRAIN).fit(source).save(tmp_path / "saved")
+    (tmp_path / "bare.safetensors").write_bytes(path.read_bytes())
+    bare = qs3.load(tmp_path / "bare.safetensors")
+    with pytest.raises(InputError, match="holds another run"):
+        bare.save(tmp_path / "saved")
+    bare.save(tmp_path / "alone")
+    for ask in (look, lambda folder: evaluate(folder, target)):
+        with pytest.raises(InputError, match=r"weights alone; settings.json and run.json are miss"):
+            ask(tmp_path / "alone")
 
 
 def test_faults(source, target):

@@ -6,6 +6,7 @@ underscore at their end.
 
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -16,8 +17,8 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from qs3.adaptation.confidence import UNKNOWN, rescale
 from qs3.adaptation.names import split_method
 from qs3.errors import InputError
+from qs3.files import write_json
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.structure import unstructure
 from qs3.training.answers import list_clouds, read_listed
 from qs3.training.checkpoint import LoadedModel, load_model, save_model
 from qs3.training.config import (
@@ -28,8 +29,20 @@ from qs3.training.config import (
     preparation_of,
 )
 from qs3.training.fit import FitResult, fit
+from qs3.training.history import HISTORY
 from qs3.training.predict import Description, ask
 from qs3.training.prepared import note_size
+from qs3.training.run import (
+    MODEL,
+    RUN,
+    SETTINGS,
+    Run,
+    is_run,
+    read_run,
+    read_settings,
+    write_run,
+)
+from qs3.training.shipped import find_run
 
 _Adapter = TypeVar("_Adapter", bound="Adapter")
 Clouds = (
@@ -73,6 +86,7 @@ class Adapter(ClassifierMixin, BaseEstimator):
     model_: Any
     classes_: np.ndarray
     result_: FitResult
+    _run: Run | None
 
     def __init__(
         self,
@@ -120,22 +134,34 @@ class Adapter(ClassifierMixin, BaseEstimator):
         with tempfile.TemporaryDirectory(prefix="qs3-") as temporary:
             folder = Path(temporary) / "run" if self.run_dir is None else Path(self.run_dir)
             done = fit(method, source, target, settings, rounds, run_dir=folder)
+            self._run, told = read_run(folder), read_settings(folder)
         self.result_, self.model_ = done, done.model
         self.classes_ = np.array(source.class_names)
-        plain, names = {"train": unstructure(settings)}, source.class_names
-        self._loaded = LoadedModel(done.model, names, plain, settings.preparation, done.known)
+        names = source.class_names
+        self._loaded = LoadedModel(done.model, names, told, settings.preparation, done.known)
         self._settings = settings
         return self
 
     def save(self, folder: str | Path) -> Path:
         """Write the network to ``model.safetensors`` in a folder, for `load` and every command.
 
+        Beside it go ``settings.json`` and ``run.json``, which tell what it learnt from; a network
+        that was loaded without them is saved without, for `load`, prediction and export alone.
+
         Raises:
-            InputError: before `fit`.
+            InputError: before `fit`, or where the folder holds another run.
         """
         self._require_fitted()
+        folder, told = Path(folder), self._loaded.settings
+        trained = (folder / HISTORY).is_file() or self._run is None
+        if is_run(folder) and trained and read_settings(folder) != told:
+            raise InputError(f"{folder}: holds another run; name another folder")
         names, known = tuple(self.classes_), self._loaded.known
-        return save_model(Path(folder), self.model_, names, self._settings, known=known)
+        path = save_model(folder, self.model_, names, self._settings, known=known)
+        if self._run is not None:
+            write_json(folder / SETTINGS, told)
+            write_run(replace(self._run, folder=folder))
+        return path
 
     def _require_fitted(self) -> None:
         if not hasattr(self, "model_"):
@@ -215,7 +241,7 @@ def load(run: str | Path) -> Adapter:
         run: Folder of a run, or the name of a network that comes with qs3, such as ``rooms``.
 
     Raises:
-        InputError: where there is neither.
+        InputError: where there is neither, or a file of it is damaged.
 
     Example:
         >>> import qs3
@@ -228,6 +254,9 @@ def load(run: str | Path) -> Adapter:
     adapter = Adapter(method, train["model"], random_state=train.get("seed", 0))
     adapter.model_, adapter.classes_ = loaded.model, np.array(loaded.class_names)
     adapter._loaded = loaded
+    place = find_run(run)
+    place = place.parent if place.name == MODEL else place
+    adapter._run = read_run(place) if (place / RUN).is_file() else None
     adapter._settings = TrainSettings(
         model=train["model"],
         model_settings=train.get("model_settings", {}),
