@@ -12,6 +12,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator, ClassifierMixin
 
 from qs3.adaptation.confidence import UNKNOWN, rescale
@@ -31,7 +32,7 @@ from qs3.training.config import (
 from qs3.training.fit import FitResult, fit
 from qs3.training.history import HISTORY
 from qs3.training.predict import Description, ask
-from qs3.training.prepared import note_size
+from qs3.training.prepared import note_clouds, require_finite
 from qs3.training.run import (
     MODEL,
     RUN,
@@ -51,11 +52,14 @@ Clouds = (
     | Float[np.ndarray, "b n 3"]
     | Float[np.ndarray, "n 3"]
     | Sequence[Float[np.ndarray, "_ 3"]]
-    | str
+    | ArrayLike
+    | Sequence[ArrayLike]
     | Path
 )
 """Clouds to tell the class of: many in one array or one, of different sizes in a list, or a file of
-points or a folder of them."""
+points or a folder of them. What NumPy takes for such arrays will do: nested lists, tensors on the
+CPU."""
+_EXPECTED = "a cloud is [n 3] numbers, in metres, z up"
 
 
 class Adapter(ClassifierMixin, BaseEstimator):
@@ -178,12 +182,8 @@ class Adapter(ClassifierMixin, BaseEstimator):
             listed = list_clouds([Path(clouds)])
             clouds = [points for path in listed for _, points in read_listed(path)]
         points = clouds.points if isinstance(clouds, PointClouds | UnlabelledClouds) else clouds
-        if isinstance(points, np.ndarray):
-            batches = [points if points.ndim == 3 else points[None]]
-        else:
-            batches = [cloud[None] for cloud in points]
-        for batch in batches:
-            note_size(batch, self._loaded.preparation)
+        batches = _batches(points)
+        note_clouds(batches, self._loaded.preparation)
         said = [ask(self._loaded, batch) for batch in batches]
         return Description(*map(np.concatenate, zip(*said, strict=True)))
 
@@ -197,8 +197,9 @@ class Adapter(ClassifierMixin, BaseEstimator):
             calibrated: Whether they are those that held-out source calibrates.
 
         Raises:
-            InputError: before `fit`, or where a file cannot be read or a point is not finite; where
-                they are to be calibrated and no part of the source was held out.
+            InputError: before `fit`, or where a file cannot be read, a cloud is not [n 3] or empty,
+                or a point is not finite; where they are to be calibrated and no part of the source
+                was held out.
         """
         shares = self._ask(clouds).probabilities
         if not calibrated:
@@ -223,15 +224,75 @@ class Adapter(ClassifierMixin, BaseEstimator):
         known = self._loaded.require_known("this network", unknown)
         return np.where(known.familiarity(said.logits) < unknown, UNKNOWN, names)
 
-    def score(self, clouds: PointClouds, y: Sequence[str] | None = None) -> float:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def score(self, clouds: Clouds, y: ArrayLike | None = None) -> float:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return the accuracy on labelled clouds; for testing, never for choosing.
 
         Args:
             clouds: Clouds whose class names are among those of the source.
             y: Names of the classes in place of the clouds' own.
+
+        Raises:
+            InputError: as `predict`; where there are no labels, not one a cloud, or a label is not
+                the name of one of the ``classes_``.
         """
-        truth = np.array(clouds.class_names)[clouds.labels] if y is None else np.asarray(y)
-        return float((self.predict(clouds) == truth).mean())
+        if y is not None:
+            truth = np.asarray(y)
+        elif isinstance(clouds, PointClouds):
+            truth = np.array(clouds.class_names)[clouds.labels]
+        else:
+            raise InputError("these clouds have no labels; give the names of their classes as y")
+        said, known = self.predict(clouds), self.classes_.tolist()
+        for label in truth.ravel().tolist():
+            if label not in known:
+                names = ", ".join(known)
+                raise InputError(f"label {label!r} is not the name of a class; known are {names}")
+        if said.shape != truth.shape:
+            raise InputError(f"{len(said)} clouds have labels of shape {list(truth.shape)}")
+        return float((said == truth).mean())
+
+
+def _batches(given: Any) -> list[Float[np.ndarray, "_ _ 3"]]:
+    """Return clouds as arrays to be asked about together, in their order.
+
+    Args:
+        given: An array of one cloud or many, or what NumPy takes for one; or clouds in a list.
+
+    Raises:
+        InputError: where there is none, or with the place of the first that is not finite points.
+    """
+    whole = _array(given)
+    if whole is not None and whole.ndim in (2, 3):
+        batches = [whole if whole.ndim == 3 else whole[None]]
+    elif whole is not None:
+        raise InputError(f"no cloud in an array of shape {list(whole.shape)}; {_EXPECTED}")
+    else:
+        arrays = [_array(cloud) for cloud in given] if np.iterable(given) else [None]
+        for place, cloud in enumerate(arrays):
+            if cloud is None:
+                raise InputError(f"cloud {place} is no array of numbers; {_EXPECTED}")
+        batches = [cloud[None] for cloud in arrays if cloud is not None]
+    start = 0
+    for batch in batches:
+        names = [str(start + row) for row in range(len(batch))]
+        start += len(batch)
+        if batch.ndim != 3 or batch.shape[2] != 3 or (len(batch) and not batch.shape[1]):
+            shape = list(batch.shape[1:])
+            raise InputError(f"cloud {names[0] if names else 0} has shape {shape}; {_EXPECTED}")
+        require_finite(batch, names)
+    return batches
+
+
+def _array(given: Any) -> np.ndarray | None:
+    """Return numbers as an array of floats; None where there are none, or of several sizes."""
+    try:
+        if isinstance(given, list | tuple):  # NumPy warns of tensors in lists
+            given = [np.asarray(each) if hasattr(each, "__array__") else each for each in given]
+        array = np.asarray(given)
+    except (ValueError, TypeError, RuntimeError):  # the last two by tensors that are elsewhere
+        return None
+    if array.dtype.kind not in "fiu":
+        return None
+    return array if array.dtype.kind == "f" else array.astype(np.float64)
 
 
 def load(run: str | Path) -> Adapter:
