@@ -5,7 +5,7 @@ underscore at their end.
 """
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -52,8 +52,8 @@ Clouds = (
     | Float[np.ndarray, "b n 3"]
     | Float[np.ndarray, "n 3"]
     | Sequence[Float[np.ndarray, "_ 3"]]
-    | ArrayLike
-    | Sequence[ArrayLike]
+    | Iterable[ArrayLike]
+    | str
     | Path
 )
 """Clouds to tell the class of: many in one array or one, of different sizes in a list, or a file of
