@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from qs3.io.preparation import ROBUST
 from qs3.models import create_model
 from qs3.training import TrainSettings, predict_probabilities, save_model
 
@@ -37,6 +38,19 @@ def test_export_writes_a_file_that_answers_as_the_run(qs3, network, tmp_path):
     (found,) = session.run(None, {"points": points})
     wanted = predict_probabilities(model, points, num_points=32)
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-5)
+
+
+def test_export_tells_what_has_to_go_before(qs3, network, tmp_path):
+    model = network[1]
+    settings = TrainSettings(
+        model="pointnet",
+        model_settings={"channels": (8, 8, 16), "hidden": (8,), "transforms": False},
+        num_points=32,
+        preparation=ROBUST,
+    )
+    save_model(tmp_path, model, ("bed", "lamp", "sofa"), settings)
+    done = qs3("export", tmp_path, "--to", "torch-export")
+    assert "distinct_inliers(cloud, True, 4096)" in done.stderr.splitlines()[-1]
 
 
 def test_export_keeps_what_it_did_not_write(qs3, network, tmp_path):

@@ -8,6 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from qs3.errors import InputError
+from qs3.io.layouts.npz import read_npz
 from qs3.io.layouts.store import read_ragged
 from qs3.io.load import load_clouds
 from qs3.store.folder import open_folder
@@ -109,6 +110,30 @@ def test_split_and_size_are_chosen(fake, tmp_path):
     assert train.ids == ("m0#0", "m2#0", "m4#0")
     with pytest.raises(InputError, match="no cloud of split 'dev'; splits: test, train"):
         read_ragged(tmp_path, split="dev")
+
+
+def test_rows_that_tell_their_frame_have_the_splits_of_an_archive(fake, tmp_path):
+    """What `qs3 extract nyuv2` writes is cut as the archive of the same objects is."""
+    frames, strict = [9, 1, 4, 4, 7, 2], [True, True, False, True, True, True]
+    made = make(tmp_path / "store", fake)
+    names = np.array(["bed", "chair", "sofa"])
+    for index, part in enumerate((slice(0, 4), slice(4, 6))):
+        told = zip(made[part], frames[part], strict[part], strict=True)
+        facts = [(row, {"frame": frame, "strict": sure}) for row, frame, sure in told]
+        own = [dataclasses.replace(row, drawn=json.dumps(fact)) for row, fact in facts]
+        put(tmp_path / "store", index, own)
+    arrays = {"frame": np.array(frames), "strict": np.array(strict)}
+    arrays |= {"label": np.zeros(6, int), "class_names": names}
+    arrays |= {"points": np.zeros((6, 4, 3)), "name": np.array([row.id for row in made])}
+    np.savez(tmp_path / "a.npz", **arrays)
+    for split, wanted in (("strict-dev", "m1#0 m3#0 m5#0"), ("strict-check", "m0#0 m4#0")):
+        read = read_ragged(tmp_path / "store", split=split)
+        assert sorted(read.ids) == sorted(read_npz(tmp_path / "a.npz", split).ids)
+        assert read.ids == tuple(wanted.split())
+        assert read.checksum == read_ragged(tmp_path / "store").checksum
+    assert len(read_ragged(tmp_path / "store", "all", "strict-dev").ids) == 9
+    with pytest.raises(InputError, match="splits: strict-check, strict-dev, test, train"):
+        read_ragged(tmp_path / "store", split="dev")
 
 
 def test_an_unfinished_data_set_is_not_taken_for_a_whole_one(fake, tmp_path):

@@ -6,7 +6,18 @@ from sklearn.base import clone, is_classifier
 import qs3
 from qs3.errors import InputError
 from qs3.io.preparation import ROBUST
-from qs3.training import QBST, SPST, Adapter, SelfTrainingSettings, TrainSettings, fit
+from qs3.report.collect import look
+from qs3.training import (
+    QBST,
+    SPST,
+    Adapter,
+    SelfTrainingSettings,
+    TrainSettings,
+    evaluate,
+    fit,
+    read_run,
+)
+from qs3.training.run import fingerprint, train_settings
 
 TRAIN = {
     "model_settings": {"channels": (16, 16, 32), "hidden": (16,), "transforms": False},
@@ -97,6 +108,90 @@ def test_unknown_is_an_answer_that_is_saved_with_the_network(source, target, tmp
     without = Adapter(model="pointnet", train=TRAIN | {"holdout": 0.0}).fit(source)
     with pytest.raises(InputError, match="this network: cannot tell what is unknown"):
         without.predict(target, unknown=0.05)
+
+
+def test_a_saved_network_is_a_run(source, target, tmp_path):
+    """What `evaluate`, ``qs3 report`` and a warm-up ask of a run is there, after `load` too."""
+    made = Adapter(model="pointnet", train=TRAIN | {"holdout": 0.0}).fit(source)
+    made.save(tmp_path / "saved")
+    qs3.load(tmp_path / "saved").save(tmp_path / "again")
+    for folder in (tmp_path / "saved", tmp_path / "again"):
+        run = read_run(folder)
+        assert (run.method, run.source.clouds) == ("source-only", 24)
+        assert run.settings["source"] == fingerprint(source)
+        assert evaluate(folder, target).scores.accuracy == made.score(target)
+        assert look(folder).runs == (run,)
+        assert train_settings(folder).learning_rate == 1e-2
+    arguments = ("qbst", source, target.without_labels(), train_settings(tmp_path / "saved"))
+    rounds = SelfTrainingSettings(**ROUNDS)
+    after = fit(*arguments, rounds, run_dir=tmp_path / "run", warm_up=tmp_path / "saved")
+    assert not read_run(tmp_path / "run").unknown_warm_up
+    assert len(after.rounds) == 2
+    with pytest.raises(InputError, match="run: holds another run; name another folder"):
+        made.save(tmp_path / "run")
+
+
+def test_weights_alone_say_what_is_missing(source, target, tmp_path):
+    path = Adapter(model="pointnet", train=TRAIN).fit(source).save(tmp_path / "saved")
+    (tmp_path / "bare.safetensors").write_bytes(path.read_bytes())
+    bare = qs3.load(tmp_path / "bare.safetensors")
+    with pytest.raises(InputError, match="holds another run"):
+        bare.save(tmp_path / "saved")
+    bare.save(tmp_path / "alone")
+    for ask in (look, lambda folder: evaluate(folder, target)):
+        with pytest.raises(InputError, match=r"weights alone; settings.json and run.json are miss"):
+            ask(tmp_path / "alone")
+
+
+def test_clouds_may_be_what_numpy_takes_for_them(source, target):
+    made = Adapter(model="pointnet", train=TRAIN).fit(source)
+    points = target.points[:4]
+    wanted = made.predict(points).tolist()
+    tensor = torch.from_numpy(points)
+    for given in (points.tolist(), tensor, list(tensor), list(points), points.astype(np.float64)):
+        assert made.predict(given).tolist() == wanted
+    for given in (points[1].tolist(), tensor[1]):
+        assert made.predict(given).tolist() == wanted[1:2]
+    several = [points[0], points[1, :50].tolist(), tensor[2]]
+    assert made.predict(several).tolist() == made.predict([*map(np.asarray, several)]).tolist()
+    assert made.predict(np.round(100 * points).astype(int)).shape == (4,)
+
+
+def test_what_is_no_cloud_is_refused(source, target):
+    made = Adapter(model="pointnet", train=TRAIN).fit(source)
+    good, expected = target.points[0], r"a cloud is \[n 3\] numbers, in metres, z up"
+    bad = good.copy()
+    bad[3, 0] = np.nan
+    for given, said in (
+        (np.zeros((50, 6)), r"cloud 0 has shape \[50, 6\]; "),
+        (np.zeros((2, 50, 2)), r"cloud 0 has shape \[50, 2\]; "),
+        ([], r"no cloud in an array of shape \[0\]; "),
+        (np.zeros(3), r"no cloud in an array of shape \[3\]; "),
+        (np.zeros((0, 3)), r"cloud 0 has shape \[0, 3\]; "),
+        ([good, good[:50], np.zeros((0, 3))], r"cloud 2 has shape \[0, 3\]; "),
+        ([good, good[:50, :2]], r"cloud 1 has shape \[50, 2\]; "),
+        ([good, "chair"], "cloud 1 is no array of numbers; "),
+        (np.zeros((1, 1, 9, 3)), r"no cloud in an array of shape \[1, 1, 9, 3\]; "),
+    ):
+        with pytest.raises(InputError, match=said + expected):
+            made.predict(given)
+    for given in ([good, bad, good], np.stack([good, bad, good]), [good, bad, good[:50]]):
+        with pytest.raises(InputError, match="points of cloud 1 are not finite"):
+            made.predict(given)
+
+
+def test_score_takes_names_of_classes_alone(source, target):
+    made = Adapter(model="pointnet", train=TRAIN).fit(source)
+    names = np.array(target.class_names)[target.labels]
+    assert made.score(target.points, names) == made.score(target)
+    for labels, said in (
+        (target.labels, "label 0 is not the name of a class; known are ball, disc, rod"),
+        (["stool"] * 30, "label 'stool' is not the name"),
+        (names[:3], r"30 clouds have labels of shape \[3\]"),
+        (None, "these clouds have no labels"),
+    ):
+        with pytest.raises(InputError, match=said):
+            made.score(target.points, labels)
 
 
 def test_faults(source, target):

@@ -152,7 +152,7 @@ def test_an_export_takes_what_prediction_hands_the_network(tmp_path):
     path = export_run(tmp_path, "onnx").path
     run = run_onnx(path)
     facts = json.loads({p.key: p.value for p in onnx.load(path).metadata_props}["qs3"])
-    assert facts["expects"] == {"outliers_removed": True}
+    assert facts["expects"] == {"distinct": True, "outliers_removed": True, "most": 4096}
     assert facts["settings"]["train"]["preparation"]["radius_share"] == 0.95
     answers = []
     for n in (M - 9, 3 * M):
@@ -232,6 +232,22 @@ def test_comparison_sees_a_wrong_answer():
     # Subsampled from another point, only clouds of more than M points give other answers.
     other = compare(model, M, lambda points: right(points[:, ::-1])) > export.ROUNDING
     assert export.STRAYS[0] < other.sum() <= 8
+
+
+def test_comparison_goes_the_whole_way_of_raw_clouds(monkeypatch):
+    """Strays and repeated points go before the file, and an export that misses it is seen."""
+    torch.manual_seed(0)
+    model = create_model("pointnet", 3, **SMALL[TINY]).eval()
+    inside = replace(ROBUST, remove_outliers=False, redraw=False)
+
+    def runner(points):
+        return predict_probabilities(model, points, num_points=M, preparation=inside)
+
+    assert compare(model, M, runner, ROBUST).max() <= export.ROUNDING
+    monkeypatch.setattr(export, "distinct_inliers", lambda cloud, *_: np.arange(len(cloud)))
+    strayed = compare(model, M, runner, ROBUST)
+    assert len(strayed) == 28
+    assert (strayed > 1e-3).sum() >= 4
 
 
 def test_nothing_is_written_where_answers_differ(tmp_path, monkeypatch):

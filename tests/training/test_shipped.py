@@ -17,6 +17,7 @@ from qs3.errors import InputError, say_once
 from qs3.evaluation.records import find_records
 from qs3.io.preparation import ROBUST
 from qs3.training import evaluate, fit, load_model, read_run
+from qs3.training.answers import predict_files
 from qs3.training.checkpoint import load_tensors_into
 from qs3.training.export import export_run
 from qs3.training.prepared import note_size
@@ -121,6 +122,38 @@ def test_millimetres_are_told_once(caplog):
         note_size(1000 * CLOUDS, sized)
     assert len(caplog.messages) == 1
     assert "divided by 1000" in caplog.messages[0]
+
+
+def test_a_stray_makes_no_millimetres_and_centimetres_are_told(caplog):
+    sized = replace(ROBUST, size_input=True)
+    say_once.cache_clear()
+    with caplog.at_level(logging.WARNING):
+        strayed = CLOUDS.copy()
+        strayed[:, 0] += 40
+        note_size(strayed, sized)
+        note_size(CLOUDS / 100, ROBUST)
+        assert not caplog.messages
+        note_size(CLOUDS / 100, sized)
+        note_size(CLOUDS / 100, sized)
+    (message,) = caplog.messages
+    assert "smaller than 5 cm" in message
+    assert "are to be in metres" in message
+
+
+def test_too_few_points_are_told_once(caplog, tmp_path):
+    say_once.cache_clear()
+    network, few = qs3.load("rooms"), np.tile(CLOUDS[0, :31], (4, 1))
+    np.save(tmp_path / "few.npy", few)
+    with caplog.at_level(logging.WARNING):
+        network.predict([CLOUDS[0], CLOUDS[0, :32]])
+        assert not caplog.messages
+        network.predict([CLOUDS[0], few])
+        network.predict(few)
+        assert len(caplog.messages) == 1
+        say_once.cache_clear()
+        list(predict_files(Path("rooms"), [tmp_path / "few.npy"]))
+    assert len(caplog.messages) == 2
+    assert "fewer than 32 distinct points" in caplog.messages[1]
 
 
 def test_a_run_becomes_one(source, target, settings, tmp_path):

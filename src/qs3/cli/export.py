@@ -16,7 +16,7 @@ def export(
     """Export a network as ONNX or for PyTorch.
 
     It takes points of any number, with the run's pre-processing inside, and gives probabilities;
-    the file is compared with the run first.
+    the file is compared with the run first. It tells what is to be done to a cloud before.
 
     Args:
         run: Folder of a run, its model.safetensors, or a network that comes with qs3: rooms.
@@ -32,4 +32,10 @@ def export(
         f"clouds its probabilities differ from the run's by at most {done.difference:.1e}, "
         f"on {done.strays} by more than {ROUNDING:.0e}"
     )
+    if done.expects["distinct"]:
+        outliers, most = done.expects["outliers_removed"], done.expects["most"]
+        tell(
+            "before the file gets a cloud: cloud = cloud[qs3.io.preparation.distinct_inliers("
+            f"cloud, {outliers}, {most})]; without it answers differ from qs3 predict"
+        )
     return 0

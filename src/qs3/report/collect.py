@@ -16,7 +16,7 @@ from qs3.report.lookup import find_before, read_domain
 from qs3.report.settings import ReportSettings
 from qs3.training.checkpoint import load_model
 from qs3.training.overlap import caveats
-from qs3.training.run import RUN, Run, completed, data_record, find_runs, read_run
+from qs3.training.run import MODEL, RUN, Run, completed, data_record, find_runs, read_run
 from qs3.training.shipped import find_run
 
 _OLD_NAME = re.compile(r"([^-]+-.+)_([^_]+)_seed-\d+")
@@ -83,6 +83,8 @@ def look(folder: Path, published: Mapping[str, Mapping[str, str]] | None = None)
     if not runs and not records:
         if faults:
             raise InputError(f"{faults[0]} (and nothing else to report in {folder})")
+        if (folder / MODEL).is_file():
+            read_run(folder)  # which says what is missing
         raise InputError(f"{folder}: holds neither a finished run nor a record; train one first")
     return Holdings(folder, tuple(runs), tuple(records), tuple(faults))
 

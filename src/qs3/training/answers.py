@@ -21,7 +21,7 @@ from qs3.io.load import read_clouds
 from qs3.io.point_files import POINT_FILES, read_cloud
 from qs3.training.checkpoint import LoadedModel, load_model
 from qs3.training.predict import ask
-from qs3.training.prepared import note_size
+from qs3.training.prepared import note_clouds
 
 
 @dataclass(frozen=True)
@@ -121,8 +121,8 @@ def predict_files(
             continue
         for name, points in clouds:
             try:
-                note_size(points[None], loaded.preparation)
                 (answer,) = answer_clouds(loaded, points[None], unknown, calibrated)
+                note_clouds([points[None]], loaded.preparation)
             except InputError as error:
                 yield _fault(name, error)
             else:

@@ -5,19 +5,21 @@ underscore at their end.
 """
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator, ClassifierMixin
 
 from qs3.adaptation.confidence import UNKNOWN, rescale
 from qs3.adaptation.names import split_method
 from qs3.errors import InputError
+from qs3.files import write_json
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.structure import unstructure
 from qs3.training.answers import list_clouds, read_listed
 from qs3.training.checkpoint import LoadedModel, load_model, save_model
 from qs3.training.config import (
@@ -28,8 +30,20 @@ from qs3.training.config import (
     preparation_of,
 )
 from qs3.training.fit import FitResult, fit
+from qs3.training.history import HISTORY
 from qs3.training.predict import Description, ask
-from qs3.training.prepared import note_size
+from qs3.training.prepared import note_clouds, require_finite
+from qs3.training.run import (
+    MODEL,
+    RUN,
+    SETTINGS,
+    Run,
+    is_run,
+    read_run,
+    read_settings,
+    write_run,
+)
+from qs3.training.shipped import find_run
 
 _Adapter = TypeVar("_Adapter", bound="Adapter")
 Clouds = (
@@ -38,11 +52,14 @@ Clouds = (
     | Float[np.ndarray, "b n 3"]
     | Float[np.ndarray, "n 3"]
     | Sequence[Float[np.ndarray, "_ 3"]]
+    | Iterable[ArrayLike]
     | str
     | Path
 )
 """Clouds to tell the class of: many in one array or one, of different sizes in a list, or a file of
-points or a folder of them."""
+points or a folder of them. What NumPy takes for such arrays will do: nested lists, tensors on the
+CPU."""
+_EXPECTED = "a cloud is [n 3] numbers, in metres, z up"
 
 
 class Adapter(ClassifierMixin, BaseEstimator):
@@ -73,6 +90,7 @@ class Adapter(ClassifierMixin, BaseEstimator):
     model_: Any
     classes_: np.ndarray
     result_: FitResult
+    _run: Run | None
 
     def __init__(
         self,
@@ -120,22 +138,34 @@ class Adapter(ClassifierMixin, BaseEstimator):
         with tempfile.TemporaryDirectory(prefix="qs3-") as temporary:
             folder = Path(temporary) / "run" if self.run_dir is None else Path(self.run_dir)
             done = fit(method, source, target, settings, rounds, run_dir=folder)
+            self._run, told = read_run(folder), read_settings(folder)
         self.result_, self.model_ = done, done.model
         self.classes_ = np.array(source.class_names)
-        plain, names = {"train": unstructure(settings)}, source.class_names
-        self._loaded = LoadedModel(done.model, names, plain, settings.preparation, done.known)
+        names = source.class_names
+        self._loaded = LoadedModel(done.model, names, told, settings.preparation, done.known)
         self._settings = settings
         return self
 
     def save(self, folder: str | Path) -> Path:
         """Write the network to ``model.safetensors`` in a folder, for `load` and every command.
 
+        Beside it go ``settings.json`` and ``run.json``, which tell what it learnt from; a network
+        that was loaded without them is saved without, for `load`, prediction and export alone.
+
         Raises:
-            InputError: before `fit`.
+            InputError: before `fit`, or where the folder holds another run.
         """
         self._require_fitted()
+        folder, told = Path(folder), self._loaded.settings
+        trained = (folder / HISTORY).is_file() or self._run is None
+        if is_run(folder) and trained and read_settings(folder) != told:
+            raise InputError(f"{folder}: holds another run; name another folder")
         names, known = tuple(self.classes_), self._loaded.known
-        return save_model(Path(folder), self.model_, names, self._settings, known=known)
+        path = save_model(folder, self.model_, names, self._settings, known=known)
+        if self._run is not None:
+            write_json(folder / SETTINGS, told)
+            write_run(replace(self._run, folder=folder))
+        return path
 
     def _require_fitted(self) -> None:
         if not hasattr(self, "model_"):
@@ -152,12 +182,8 @@ class Adapter(ClassifierMixin, BaseEstimator):
             listed = list_clouds([Path(clouds)])
             clouds = [points for path in listed for _, points in read_listed(path)]
         points = clouds.points if isinstance(clouds, PointClouds | UnlabelledClouds) else clouds
-        if isinstance(points, np.ndarray):
-            batches = [points if points.ndim == 3 else points[None]]
-        else:
-            batches = [cloud[None] for cloud in points]
-        for batch in batches:
-            note_size(batch, self._loaded.preparation)
+        batches = _batches(points)
+        note_clouds(batches, self._loaded.preparation)
         said = [ask(self._loaded, batch) for batch in batches]
         return Description(*map(np.concatenate, zip(*said, strict=True)))
 
@@ -171,8 +197,9 @@ class Adapter(ClassifierMixin, BaseEstimator):
             calibrated: Whether they are those that held-out source calibrates.
 
         Raises:
-            InputError: before `fit`, or where a file cannot be read or a point is not finite; where
-                they are to be calibrated and no part of the source was held out.
+            InputError: before `fit`, or where a file cannot be read, a cloud is not [n 3] or empty,
+                or a point is not finite; where they are to be calibrated and no part of the source
+                was held out.
         """
         shares = self._ask(clouds).probabilities
         if not calibrated:
@@ -197,15 +224,75 @@ class Adapter(ClassifierMixin, BaseEstimator):
         known = self._loaded.require_known("this network", unknown)
         return np.where(known.familiarity(said.logits) < unknown, UNKNOWN, names)
 
-    def score(self, clouds: PointClouds, y: Sequence[str] | None = None) -> float:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def score(self, clouds: Clouds, y: ArrayLike | None = None) -> float:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return the accuracy on labelled clouds; for testing, never for choosing.
 
         Args:
             clouds: Clouds whose class names are among those of the source.
             y: Names of the classes in place of the clouds' own.
+
+        Raises:
+            InputError: as `predict`; where there are no labels, not one a cloud, or a label is not
+                the name of one of the ``classes_``.
         """
-        truth = np.array(clouds.class_names)[clouds.labels] if y is None else np.asarray(y)
-        return float((self.predict(clouds) == truth).mean())
+        if y is not None:
+            truth = np.asarray(y)
+        elif isinstance(clouds, PointClouds):
+            truth = np.array(clouds.class_names)[clouds.labels]
+        else:
+            raise InputError("these clouds have no labels; give the names of their classes as y")
+        said, known = self.predict(clouds), self.classes_.tolist()
+        for label in truth.ravel().tolist():
+            if label not in known:
+                names = ", ".join(known)
+                raise InputError(f"label {label!r} is not the name of a class; known are {names}")
+        if said.shape != truth.shape:
+            raise InputError(f"{len(said)} clouds have labels of shape {list(truth.shape)}")
+        return float((said == truth).mean())
+
+
+def _batches(given: Any) -> list[Float[np.ndarray, "_ _ 3"]]:
+    """Return clouds as arrays to be asked about together, in their order.
+
+    Args:
+        given: An array of one cloud or many, or what NumPy takes for one; or clouds in a list.
+
+    Raises:
+        InputError: where there is none, or with the place of the first that is not finite points.
+    """
+    whole = _array(given)
+    if whole is not None and whole.ndim in (2, 3):
+        batches = [whole if whole.ndim == 3 else whole[None]]
+    elif whole is not None:
+        raise InputError(f"no cloud in an array of shape {list(whole.shape)}; {_EXPECTED}")
+    else:
+        arrays = [_array(cloud) for cloud in given] if np.iterable(given) else [None]
+        for place, cloud in enumerate(arrays):
+            if cloud is None:
+                raise InputError(f"cloud {place} is no array of numbers; {_EXPECTED}")
+        batches = [cloud[None] for cloud in arrays if cloud is not None]
+    start = 0
+    for batch in batches:
+        names = [str(start + row) for row in range(len(batch))]
+        start += len(batch)
+        if batch.ndim != 3 or batch.shape[2] != 3 or (len(batch) and not batch.shape[1]):
+            shape = list(batch.shape[1:])
+            raise InputError(f"cloud {names[0] if names else 0} has shape {shape}; {_EXPECTED}")
+        require_finite(batch, names)
+    return batches
+
+
+def _array(given: Any) -> np.ndarray | None:
+    """Return numbers as an array of floats; None where there are none, or of several sizes."""
+    try:
+        if isinstance(given, list | tuple):  # NumPy warns of tensors in lists
+            given = [np.asarray(each) if hasattr(each, "__array__") else each for each in given]
+        array = np.asarray(given)
+    except (ValueError, TypeError, RuntimeError):  # the last two by tensors that are elsewhere
+        return None
+    if array.dtype.kind not in "fiu":
+        return None
+    return array if array.dtype.kind == "f" else array.astype(np.float64)
 
 
 def load(run: str | Path) -> Adapter:
@@ -215,7 +302,7 @@ def load(run: str | Path) -> Adapter:
         run: Folder of a run, or the name of a network that comes with qs3, such as ``rooms``.
 
     Raises:
-        InputError: where there is neither.
+        InputError: where there is neither, or a file of it is damaged.
 
     Example:
         >>> import qs3
@@ -228,6 +315,9 @@ def load(run: str | Path) -> Adapter:
     adapter = Adapter(method, train["model"], random_state=train.get("seed", 0))
     adapter.model_, adapter.classes_ = loaded.model, np.array(loaded.class_names)
     adapter._loaded = loaded
+    place = find_run(run)
+    place = place.parent if place.name == MODEL else place
+    adapter._run = read_run(place) if (place / RUN).is_file() else None
     adapter._settings = TrainSettings(
         model=train["model"],
         model_settings=train.get("model_settings", {}),

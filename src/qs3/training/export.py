@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from qs3.errors import InputError, MissingExtraError, QS3Error
 from qs3.files import write_bytes
-from qs3.io.preparation import PAPER, Preparation
+from qs3.io.preparation import LARGEST, PAPER, Preparation, distinct_inliers
 from qs3.models import PointClassifier
 from qs3.models.ops.sampling import sample_in_a_loop
 from qs3.training.checkpoint import load_model
@@ -60,6 +60,9 @@ class Exported:
     """Number of those clouds in all."""
     seconds: float
     """Time of the export, without verification."""
+    expects: Mapping[str, Any]
+    """What `qs3.io.preparation.distinct_inliers` is to do to a cloud before: its ``most`` and
+    whether ``outliers_removed``; ``distinct`` is false where nothing is to be done."""
 
 
 class CloudClassifier(nn.Module):
@@ -67,7 +70,8 @@ class CloudClassifier(nn.Module):
 
     Inside are the steps of `qs3.training.prepared.prepare_clouds`, in double precision as there:
     clouds of more than ``num_points`` points are subsampled from point 0 on, points of
-    smaller ones are repeated in order; then they are normalised. Outliers must be gone before.
+    smaller ones are repeated in order; then they are normalised. Outliers and points that repeat
+    others must be gone before (`distinct_inliers`).
 
     Convention:
         Points are [b n 3], finite, z up; all clouds of a batch have the same n.
@@ -142,17 +146,22 @@ def export_run(run: Path, to: str, out: Path | None = None) -> Exported:
     num_points = loaded.settings["train"].get("num_points")
     if num_points is None:
         raise InputError(f"{run}: does not tell the number of points a cloud (num_points)")
+    # What a caller has to do to a cloud first; the rest is inside.
+    expects = {
+        "distinct": loaded.preparation.counts_points,
+        "outliers_removed": loaded.preparation.remove_outliers,
+        "most": max(LARGEST, num_points),
+    }
     facts = {
         "class_names": list(loaded.class_names),
         "settings": loaded.settings,
-        # What a caller has to do to a cloud first; the rest is inside.
-        "expects": {"outliers_removed": loaded.preparation.remove_outliers},
+        "expects": expects,
     }
     start = time.perf_counter()
     inside = replace(loaded.preparation, remove_outliers=False)
     data, runner = _serialise(loaded.model, num_points, inside, facts, to)
     seconds = time.perf_counter() - start
-    differences = compare(loaded.model, num_points, runner, inside)
+    differences = compare(loaded.model, num_points, runner, loaded.preparation)
     worst, strays = float(differences.max()), int((differences > ROUNDING).sum())
     if strays > STRAYS[0] or worst > STRAYS[1]:
         raise QS3Error(
@@ -161,7 +170,7 @@ def export_run(run: Path, to: str, out: Path | None = None) -> Exported:
             "format"
         )
     write_bytes(path, data)
-    return Exported(path, worst, strays, len(differences), seconds)
+    return Exported(path, worst, strays, len(differences), seconds, expects)
 
 
 def compare(
@@ -174,29 +183,36 @@ def compare(
     """Return for each of many clouds the largest difference of an exported network's probability.
 
     The clouds have one point, few, as many as the network takes, one fewer, one more, and many;
-    they lie off the origin, are as large as 0.001 to 1000, and come alone and by threes. An answer
-    of the wrong shape, or one that is not finite, differs infinitely.
+    they lie off the origin, are as large as 0.001 to 1000, and come alone and by threes. Where the
+    preparation removes points, those alone are raw: each point is there twice, and strays are; what
+    is left of them by `distinct_inliers` is what the network gets. An answer of the wrong shape, or
+    one that is not finite, differs infinitely.
 
     Args:
         model: The source.
         num_points: Points a cloud that it was trained on.
         runner: From clouds to probabilities, by the exported network.
-        preparation: What it does to the clouds.
+        preparation: What the source does to the clouds.
         seed: Of the clouds.
     """
     rng = np.random.default_rng(seed)
     differences: list[float] = []
+    inside = replace(preparation, remove_outliers=False, redraw=False)
     sizes = {1, 2, max(1, num_points // 3), num_points - 1, num_points, num_points + 1}
     for n in sorted({*sizes, 2 * num_points + 5} - {0}):
         for b in (1, 3):
             # Boxes of many shapes and sizes, away from the origin.
             points = rng.normal(size=(b, n, 3)) * rng.uniform(0.1, 1, size=(b, 1, 3))
             points = (points + rng.normal(size=(b, 1, 3))) * 10.0 ** rng.uniform(-3, 3)
-            points = points.astype(np.float32)
-            wanted = predict_probabilities(
-                model, points, num_points=num_points, preparation=preparation
-            )
-            got = runner(points)
+            points, how = points.astype(np.float32), inside
+            given = points
+            if b == 1 and preparation.counts_points:
+                cloud, how = points[0], preparation
+                cloud = np.concatenate([cloud, cloud, cloud[:2] + 50 * np.ptp(cloud, axis=0)])
+                kept = distinct_inliers(cloud, how.remove_outliers, max(LARGEST, num_points))
+                points, given = cloud[None], cloud[kept][None]
+            wanted = predict_probabilities(model, points, num_points=num_points, preparation=how)
+            got = runner(given)
             if got.shape != wanted.shape or not np.isfinite(got).all():
                 differences += [float("inf")] * b
             else:

@@ -30,6 +30,8 @@ from qs3.training.config import TrainSettings
 
 Kind = TypeVar("Kind", PointClouds, UnlabelledClouds)
 _HUGE = 20.0  # metres, more than any object of a room
+_TINY = 0.05  # metres, less than any
+_FEW = 32  # points; fewer have no shape
 
 
 @dataclass(frozen=True)
@@ -141,13 +143,37 @@ def name_few(names: Sequence[str]) -> str:
 
 
 def note_size(points: Float[np.ndarray, "b n 3"], preparation: Preparation) -> None:
-    """Say once where clouds look like millimetres to a network that is told their size."""
-    if preparation.size_input and len(points):
-        extents = np.ptp(points, axis=1).max(axis=1)
-        if float(np.median(extents)) > _HUGE:
+    """Say once where clouds are not in metres, by the looks, and the network is told their size."""
+    if preparation.size_input and points.size:
+        some = points[:: max(1, len(points) // BLOCK)]
+        # Strays are not gone yet: a twentieth of the points does not count on either side.
+        extents = np.ptp(np.quantile(some, (0.05, 0.95), axis=1), axis=0).max(axis=1)
+        size = float(np.median(extents))
+        if size > _HUGE:
             say_once(
                 f"clouds are larger than {_HUGE:.0f} m, and the network is told their size in "
                 "metres: points in millimetres are to be divided by 1000"
+            )
+        if size < _TINY:
+            say_once(
+                f"clouds are smaller than {100 * _TINY:.0f} cm, and the network is told their "
+                "size: points are to be in metres"
+            )
+
+
+def note_clouds(clouds: Sequence[Float[np.ndarray, "_ _ 3"]], preparation: Preparation) -> None:
+    """Say once where a network is asked about what can have no answer: `note_size`, and few points.
+
+    Args:
+        clouds: Arrays of clouds.
+        preparation: What is done to them.
+    """
+    for points in clouds:
+        note_size(points, preparation)
+        if any(len(distinct_inliers(cloud, False)) < _FEW for cloud in points):
+            say_once(
+                f"a cloud has fewer than {_FEW} distinct points, too few to tell its class: its "
+                "answer means little"
             )
 
 

@@ -128,6 +128,11 @@ def read_run(folder: Path) -> Run:
     """
     folder = find_run(folder)
     path = folder / RUN
+    if not is_run(folder) and (folder / MODEL).is_file():
+        raise InputError(
+            f"{folder}: weights alone; {SETTINGS} and {RUN} are missing, which tell what the "
+            "network learnt from: copy them from the folder of its run"
+        )
     if not is_run(folder):
         raise InputError(f"{folder}: no {RUN} here; {not_a_run()}")
     if not path.is_file() or not (folder / MODEL).is_file():

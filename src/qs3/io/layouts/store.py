@@ -9,12 +9,15 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+from jaxtyping import Bool
 
 from qs3.errors import InputError
+from qs3.files import parse_json
 from qs3.io import scratch
 from qs3.io.clouds import CloudChoice, CloudKind
 from qs3.io.guards import utf8
-from qs3.io.layouts.format import Format
+from qs3.io.layouts.format import SPLITS, Format
+from qs3.io.layouts.npz import frame_parts
 from qs3.io.ragged import RaggedClouds
 from qs3.io.scratch import Spool
 from qs3.processors import usable_processors
@@ -46,7 +49,9 @@ def read_ragged(
         where: Folder of the data set, or the address of one.
         cloud: ``points`` (noisy), ``clean``, ``surface``, or ``all``: three clouds of each scan,
             named by its id, a stroke and their kind.
-        split: Rows of this split only.
+        split: Rows of this split only; where every row tells its ``frame`` and whether it is
+            ``strict``, as those of ``qs3 extract nyuv2``, also a part of
+            `qs3.io.layouts.npz.frame_parts`.
         partial: Accept a data set whose making has not finished.
 
     Raises:
@@ -64,7 +69,8 @@ def read_ragged(
     kinds = get_args(CloudKind) if cloud == "all" else (cloud,)
     rows: list[tuple[str, int, str]] = []
     clouds: list[np.ndarray] | Spool | None = None
-    splits: set[str] = set()
+    parts = {} if split in (None, *SPLITS) else _frame_parts(folder, shards)
+    splits, done = {*parts}, 0
     digest = hashlib.sha256()
     # Reading, unpacking and hashing leave the interpreter's lock: threads share the work.
     with concurrent.futures.ThreadPoolExecutor(_THREADS) as pool:
@@ -76,6 +82,9 @@ def read_ragged(
                 size = sum(cloud.nbytes for own in scanned for cloud in own) * len(shards)
                 clouds = Spool() if size >= scratch.LARGE else []
             chosen = [i for i, part in enumerate(columns[2]) if split in (None, part)]
+            if split in parts:
+                chosen = np.flatnonzero(parts[split][done : done + len(columns[0])]).tolist()
+            done += len(columns[0])
             for kind, own in zip(kinds, scanned, strict=True):
                 end = f"/{kind}" if cloud == "all" else ""
                 rows += [(columns[0][i] + end, columns[1][i], columns[2][i]) for i in chosen]
@@ -84,15 +93,32 @@ def read_ragged(
         named = ", ".join(sorted(filter(None, splits))) or "none"
         missing = "no cloud" if split is None else f"no cloud of split {split!r}; splits: {named}"
         raise InputError(f"{folder}: {missing}")
-    ids, labels, parts = zip(*rows, strict=True)
+    ids, labels, own_splits = zip(*rows, strict=True)
     return RaggedClouds(
         clouds=clouds,
         ids=ids,
         checksum=digest.hexdigest(),
         labels=np.array(labels, dtype=np.int64),
         class_names=manifest.class_names,
-        splits=parts,
+        splits=own_splits,
     )
+
+
+def _frame_parts(folder: Folder, shards: Sequence[int]) -> dict[str, Bool[np.ndarray, "b"]]:
+    """Splits of all rows by frames; none where a row does not tell of its frame."""
+    from qs3.store.shards import load_shard
+
+    facts = []
+    for index in shards:
+        texts = load_shard(folder, index, ["drawn"])["drawn"].to_pylist()
+        facts += [parse_json(text, f"{folder}/{shard_name(index)}") for text in texts]
+    if not all(
+        isinstance(row, dict) and type(row.get("frame")) is int and type(row.get("strict")) is bool
+        for row in facts
+    ):
+        return {}
+    frame, strict = (np.array([row[name] for row in facts]) for name in ("frame", "strict"))
+    return frame_parts(frame, strict) if len(facts) else {}
 
 
 def _read_shard(
