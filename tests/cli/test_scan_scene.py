@@ -39,7 +39,8 @@ def test_scan_writes_frames_of_a_scene_and_records_it(qs3, quick, tmp_path):
     qs3("scan", "chair", "--out", out, "--num-points", 64, *quick)
     assert not (out / "frames").exists()
 
-    (out / "frames").rename(tmp_path / "mine")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
     (out / "frames").symlink_to(tmp_path / "mine")
     before = sorted(tmp_path.glob("mine/**/*"))
     assert "frames: is a link" in qs3.refuses("scan", "chair", "--out", out, "--frames", *quick)

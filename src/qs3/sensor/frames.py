@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt16
 
 from qs3.errors import InputError
-from qs3.files import atomic_path, write_bytes, write_json
+from qs3.files import atomic_path, refuse_link, write_bytes, write_json
 from qs3.geometry import invert_rigid, rotation_z
 from qs3.sensor.presets import Sensor
 from qs3.sensor.scan import Scan
@@ -79,12 +79,16 @@ def write_frames(folder: Path, scan: Scan) -> None:
 def remove_frames(folder: Path) -> None:
     """Remove what `write_frames` wrote, and the folders that are empty then.
 
-    A link is never followed: it is removed.
+    A link within is never followed: it is removed.
+
+    Raises:
+        InputError: where the folder itself is a link.
     """
-    if folder.is_symlink():
-        folder.unlink()
+    refuse_link(folder)
     for place, folders, files in os.walk(folder, topdown=False):
-        for path in (Path(place) / name for name in (*folders, *files)):
+        links = [path for name in folders if (path := Path(place) / name).is_symlink()]
+        written = (Path(place) / name for name in files)
+        for path in (*links, *written):
             if path.is_symlink() or any(map(("/" / path.relative_to(folder)).match, _WRITTEN)):
                 path.unlink()
         with contextlib.suppress(OSError):  # somebody else's files are in it

@@ -185,14 +185,14 @@ HOSTILE = {
     "ply endless header": ("a.ply", b"ply\n" + (b"comment ".ljust(60) + b"\n") * 20_000,
                            "no end_header"),
     "pcd of 10 GB": ("a.pcd", b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\n"
-                     b"POINTS 900000000\nDATA binary\n" + bytes(60), "announces 10800000000 bytes"),
+                     b"POINTS 900000000\nDATA binary\n" + bytes(60), "announces 32400000000 bytes"),
     "pcd wide": ("a.pcd", b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 2000000000\n"
                  b"POINTS 1\nDATA binary\n" + bytes(60), "cannot be read as pcd"),
     "pcd negative": ("a.pcd", b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS -2\nDATA binary\n"
                      + bytes(60), "header is incomplete"),
     "pcd bomb": ("a.pcd", b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 357000000\n"
                  b"DATA binary_compressed\n" + struct.pack("<II", 52, 357000000 * 12) + bytes(52),
-                 "announces 4284000000"),
+                 "announces 12852000000"),
     "pcd endless header": ("a.pcd", (b"#".ljust(60) + b"\n") * 20_000, "no DATA line"),
     "npy of 10 GB": ("a.npy", npy_header("(900000000, 3)") + bytes(60), "announces 10800000000"),
     "npy beyond 64 bits": ("a.npy", npy_header(f"({10**30}, 3)"), "announces"),
