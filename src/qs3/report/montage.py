@@ -227,7 +227,7 @@ def _histogram(
     seen = 100.0 * len(errors) / max(int(np.isfinite(true).sum()), 1)
     text = f"depth − true depth [{unit}]\nmedian {median:+.2g}, robust σ {sigma:.2g}\n"
     axes.set_xlabel(text + f"{seen:.0f} % of the object seen", fontsize=9)
-    axes.locator_params(axis="x", nbins=5)
+    axes.locator_params(axis="x", nbins=3)
 
 
 def _colour_bar(
