@@ -33,7 +33,8 @@ def scan(
         save_images: Also write the grey pair, the 16-bit depth and the camera of each view,
             object's part.
         frames: Also write whole frames in BOP's scene layout, into frames/: grey pair, depth, true
-            depth, masks, normals, cameras and poses.
+            depth, masks, normals, cameras and poses. Whole frames are matched then, so that the
+            cloud differs by a few points from that of the object's part.
         neighbour: Mesh file or built-in class that stands in front (scene behind) or beside.
         class_name: Class of a mesh file (chair, …), for --object-size class.
         settings: How it is scanned.

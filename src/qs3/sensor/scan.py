@@ -98,7 +98,8 @@ def scan(
             class); a neighbour without one is as large as the object.
         keep_images: Return the pictures too.
         full_frames: Match whole frames and return them, with normals and silhouettes, for
-            `qs3.sensor.frames.write_frames`.
+            `qs3.sensor.frames.write_frames`. A matcher that looks along whole lines gives a few
+            other points then.
         changes: Fields of `ScanSettings` by name, in place of those of ``settings``: ``sensor``,
             ``views``, ``preset``, ``seed``, …. With and without ``randomise`` the same seed gives
             the same poses, turn and sampling.
