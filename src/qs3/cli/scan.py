@@ -39,7 +39,7 @@ def scan(
         class_name: Class of a mesh file (chair, …), for --object-size class.
         settings: How it is scanned.
     """
-    from qs3.files import claim_folder, sub_folder, write_json
+    from qs3.files import claim_folder, write_json
     from qs3.io.ply import write_ply
     from qs3.meshes.collections import load_named
     from qs3.report.figure import write_png
@@ -84,7 +84,7 @@ def scan(
     written = [folder / n for n in ("cloud.ply", "clean.ply", "montage.png", "scan.json")]
     written += write_parts(folder, result) if save_images else []
     if frames:
-        write_frames(sub_folder(folder / "frames"), result)
+        write_frames(folder / "frames", result)
         written.append(folder / "frames")
     show(*written)
     tell(f"{_summary(result)}; {time.perf_counter() - start:.1f} s. "

@@ -7,14 +7,13 @@ would hide or turn the text around, is written as an escape.
 import logging
 import os
 import sys
-import unicodedata
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-_OBEYED = {"Cc", "Cf", "Cs", "Zl", "Zp"}
-"""Categories of Unicode: control, format (turns of direction), surrogates, breaks of lines."""
+from qs3.errors import printable as printable
+
 _format_warning = warnings.formatwarning
 
 
@@ -26,21 +25,6 @@ def show(*lines: object, end: str = "\n") -> None:
 def tell(*lines: object) -> None:
     """Print talk: what is under way, what comes next, faults."""
     _print(sys.stderr, lines, "\n")
-
-
-def printable(text: str, keep: str = "\n\t") -> str:
-    r"""Write control characters, but those to ``keep``, and what cannot be encoded as escapes.
-
-    Example:
-        >>> print(printable("a\x1b[2Jb"))
-        a\x1b[2Jb
-    """
-    return "".join(
-        letter
-        if letter in keep or unicodedata.category(letter) not in _OBEYED
-        else letter.encode("unicode_escape").decode()
-        for letter in text
-    )
 
 
 def columns(rows: Sequence[Sequence[str]], right: int | None = None) -> list[str]:

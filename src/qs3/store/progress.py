@@ -6,6 +6,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from qs3.errors import printable
+
 _MANY = 500
 _IN_A_LOG = 10.0  # seconds between two lines where nobody watches
 
@@ -31,7 +33,7 @@ def progress_bar(
     alone.
     """
     if text is not None:  # it begins with a folder's name, which may move a terminal
-        text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+        text = printable(text, keep="")
     return tqdm(
         items,
         total=total,

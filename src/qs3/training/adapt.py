@@ -76,10 +76,11 @@ def adapt(
     settings |= {"epochs": max(1, round(_STEPS / batches))} | dict(train or {})
     # By the source alone, as long as a class has enough clouds for a part to be held out.
     held = held_out(source, TrainSettings(holdout=settings["holdout"]))
-    if "rule" not in (train or {}) and held.any():
-        settings |= {"rule": "source-val", "validate_every": settings["epochs"]}
-    elif "rule" not in (train or {}):
-        _LOG.warning("no class has clouds enough to hold some out: the last round is kept")
+    if "rule" not in (train or {}):
+        if held.any():
+            settings |= {"rule": "source-val", "validate_every": settings["epochs"]}
+        else:
+            _LOG.warning("no class has clouds enough to hold some out: the last round is kept")
     for name in ("model", "seed"):
         if name in (train or {}):
             raise InputError(f"{name} cannot be given in train here; use qs3.training.Adapter")

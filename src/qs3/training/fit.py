@@ -20,7 +20,13 @@ from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.structure import first_difference, unstructure
 from qs3.training.batches import require_unlabelled
-from qs3.training.checkpoint import known_of, load_model, read_facts, weights_fingerprint
+from qs3.training.checkpoint import (
+    LoadedModel,
+    known_of,
+    load_model,
+    read_facts,
+    weights_fingerprint,
+)
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
 from qs3.training.distributed import all_devices, make_fabric
 from qs3.training.history import EpochRecord, History, Tracker
@@ -160,9 +166,11 @@ def fit(
     held = held_out(source, settings)
     weights, before, unseen = None, None, True
     if warm_up is not None:
-        weights = _check_warm_up(warm_up, base, source, settings)
+        loaded = load_model(warm_up)
+        _check_warm_up(loaded, warm_up, base, source, settings)
+        weights = weights_fingerprint(loaded.model)
         before = read_run(warm_up) if (warm_up / RUN).is_file() else None
-        unseen = _is_new(source, held, settings, warm_up, before)
+        unseen = _is_new(source, held, settings, warm_up, loaded.settings, before)
     run_dir = Path(run_dir)
     has_holdout = unseen and bool(held.any())
     _require_judges(settings, rounds_settings, target, has_holdout, held)
@@ -302,9 +310,11 @@ def _require_judges(
         raise InputError(f"rule {settings.rule!r} needs a target: give unlabelled clouds")
 
 
-def _check_warm_up(folder: Path, base: str, source: PointClouds, settings: TrainSettings) -> str:
-    """Return the checksum of a warm-up's weights."""
-    model, class_names, its, *_ = load_model(folder)
+def _check_warm_up(
+    loaded: LoadedModel, folder: Path, base: str, source: PointClouds, settings: TrainSettings
+) -> None:
+    """Refuse a warm-up that is not one of this training."""
+    class_names, its = loaded.class_names, loaded.settings
     if class_names != source.class_names:
         raise InputError(
             f"{folder}: its classes ({', '.join(class_names)}) are not those of the source "
@@ -327,7 +337,6 @@ def _check_warm_up(folder: Path, base: str, source: PointClouds, settings: Train
             f"{folder}: is a run of method {method}, not {base}; choose method {method} with "
             "self-training after it"
         )
-    return weights_fingerprint(model)
 
 
 def _is_new(
@@ -335,13 +344,13 @@ def _is_new(
     held: Bool[np.ndarray, "b"],
     settings: TrainSettings,
     warm_up: Path,
+    its: Mapping[str, Any],
     before: Run | None,
 ) -> bool:
     """Tell whether the held-out part of the source is new to the warm-up.
 
     It is where the warm-up held out the same part, or has seen none of its clouds.
     """
-    its = load_model(warm_up).settings
     trained = its.get("train", {})
     same = all(trained.get(name) == getattr(settings, name) for name in ("seed", "holdout"))
     if not held.any() or (same and its.get("source") == fingerprint(source)):

@@ -170,11 +170,17 @@ def note_clouds(clouds: Sequence[Float[np.ndarray, "_ _ 3"]], preparation: Prepa
     """
     for points in clouds:
         note_size(points, preparation)
-        if any(len(distinct_inliers(cloud, False)) < _FEW for cloud in points):
+        if any(map(_has_few, points)):
             say_once(
                 f"a cloud has fewer than {_FEW} distinct points, too few to tell its class: its "
                 "answer means little"
             )
+
+
+def _has_few(cloud: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether few of the points are distinct; mostly the first tell that they are not."""
+    parts = (cloud[: 2 * _FEW], cloud)
+    return all(len(distinct_inliers(part, False)) < _FEW for part in parts)
 
 
 def prepare_clouds(
