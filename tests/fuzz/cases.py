@@ -11,12 +11,13 @@ import subprocess
 import sys
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..meshes.test_announced import glb, tree
 from .layouts import build_generated, build_run, clouds
 
 
@@ -247,6 +248,108 @@ def streams(folder: Path, words: str) -> None:
     )  # fmt: skip
     assert done.returncode == 0, done.stderr.decode(errors="replace")[-200:]
     assert b"d435" in done.stdout
+
+
+_THREE = np.zeros((3000, 3), np.float32).tobytes()
+_ANNOUNCED = {
+    "corners": (tree(count=500_000_000), _THREE),
+    "instances": (tree(nodes=20_000, vertices=3000), _THREE),
+}
+
+
+@case("refused", scene=_ANNOUNCED)
+def glb_that_announces(folder: Path, scene: tuple[dict, bytes]) -> None:
+    command("scan", glb(folder / "a.glb", *scene), "--out", folder / "out")
+
+
+@case("refused")
+def archive_of_many_members(folder: Path) -> None:
+    import zipfile
+
+    with zipfile.ZipFile(folder / "a.npz", "w") as archive:
+        for index in range(100_000):
+            archive.writestr(f"{index}.npy", b"")
+    command("info", folder / "a.npz")
+
+
+@case("ok")
+def planted_link(folder: Path) -> None:
+    theirs = folder.parent / "own" / "theirs"
+    theirs.mkdir(parents=True, exist_ok=True)
+    (theirs / "a.txt").write_text("keep")
+    source = _npy(folder)
+    for name in (".out.unfinished", ".out.0123abcd.tmp"):
+        (folder / name).symlink_to(theirs)
+    command("convert", source, folder / "out", "--to", "ply")
+    assert [path.name for path in theirs.iterdir()] == ["a.txt"]
+
+
+@case("ok", name={"long": "x" * 250, "bytes": os.fsdecode(b"\xff\xfe")})
+def folder_name(folder: Path, name: str) -> None:
+    target = folder / name
+    command("convert", _npy(folder), target, "--to", "ply")
+    command("info", target)
+
+
+@case("refused")
+def two_trainings(folder: Path) -> None:
+    from qs3.files import folder_lock
+
+    (folder / "run").mkdir()
+    with folder_lock(folder / "run"):
+        command("train", "--source", _npy(folder), "--num-points", 16, "--out", folder / "run")
+
+
+@case("refused", verb={"info": ("info",), "train": ("train", "--out", "run", "--source")})
+def store_that_is_away(folder: Path, verb: tuple[str, ...]) -> None:
+    from qs3.errors import QS3Error
+
+    os.chdir(folder)
+    try:
+        command(*verb, "nowhere://bucket/clouds")
+    except QS3Error as error:
+        assert "not a qs3 data set" not in str(error), error
+        raise
+
+
+@case("refused")
+def full_disk(folder: Path) -> None:
+    """The largest file that may be written is one of 4 KiB, as on a disk that is nearly full."""
+    import resource
+    import signal
+
+    from qs3.errors import QS3Error
+
+    before = (
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN),
+        resource.getrlimit(resource.RLIMIT_FSIZE),
+    )
+    source = _npy(folder)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (300, before[1][1]))
+        command("convert", source, folder / "out", "--to", "ply")
+    except QS3Error as error:
+        assert str(folder / "out") in str(error), error
+        raise
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before[1])
+        signal.signal(signal.SIGXFSZ, before[0])
+        left = [path.name for path in folder.iterdir() if path.name != "src"]
+        assert left in ([], [".printed"]), left
+
+
+@case("ok")
+def clouds_moved_by_a_hair(folder: Path) -> None:
+    """Test clouds that are those of the training, but for 1e-4: their record is marked."""
+    from qs3.io.layouts import FORMATS
+    from qs3.io.load import read_clouds
+    from qs3.training import evaluate
+
+    run, seen = _run(folder), read_clouds(folder.parent / "own" / "made-run-data")[0]
+    write = FORMATS["npy"].write
+    assert write is not None
+    write(folder / "moved", replace(seen, clouds=[cloud + 1e-4 for cloud in seen.clouds]))
+    assert "training clouds" in evaluate(run, folder / "moved", split="train").marks
 
 
 # That the attack sees what it is there to see: each of these is found out.
