@@ -170,8 +170,8 @@ def test_a_room_that_shows_little_is_drawn_again_and_counted(renderer):
         chair(randomise=ALL, least_pixels=424 * 240, renderer=renderer)
 
 
-def shutter(renderer, dark):
-    """A renderer whose first pictures are all black, and how many it took each time."""
+def shutter(renderer, dark, rows=slice(None)):
+    """A renderer whose first pictures are black in some rows, and how many it took each time."""
     taken = []
 
     def render(*how):
@@ -179,8 +179,9 @@ def shutter(renderer, dark):
         taken.append(len(pairs))
         if len(taken) > dark:
             return pairs
-        black = [{n: 0 * getattr(p, n) for n in ("left", "right", "background")} for p in pairs]
-        return [dataclasses.replace(p, **b) for p, b in zip(pairs, black, strict=True)]
+        for pair in pairs:
+            pair.left[rows], pair.right[rows] = 0, 0
+        return [dataclasses.replace(pair, background=0.0) for pair in pairs]
 
     return SimpleNamespace(description=renderer.description, render=render), taken
 
@@ -195,11 +196,24 @@ def test_a_room_of_which_the_sensor_gets_no_point_is_drawn_again_up_to_the_same_
     again = chair(renderer=slow, **how)
     assert (free.drawn["room.redraws"], again.drawn["room.redraws"]) == (0, 2)
     assert len(taken) == 3
-    assert again.drawn["room.height"] != free.drawn["room.height"]
+    for name in ("room.height", "light.ambient"):
+        assert again.drawn[name] != free.drawn[name]
     assert again.drawn["object_size"] == free.drawn["object_size"]
     monkeypatch.setattr(staging, "_MOST_DRAWS", 3)
-    with pytest.raises(InputError, match=r"3 rooms in a row.*saw no point of the object"):
+    with pytest.raises(InputError, match=r"3 rooms in a row.*saw too few points of"):
         chair(renderer=shutter(renderer, dark=99)[0], **how)
+
+
+def test_a_room_of_which_the_sensor_gets_little_is_drawn_again(renderer):
+    still = dataclasses.replace(TINY, exposure=dataclasses.replace(TINY.exposure, noise=0.0))
+    how = {"sensor": still, "randomise": ALL, "seed": 3, "crop": "mask"}
+    whole, poor, again = (
+        chair(renderer=shutter(renderer, dark, slice(8, None))[0], least_valid=least, **how)
+        for dark, least in ((0, 0.5), (1, 0.0), (1, 0.5))
+    )
+    assert 0 < poor.views[0].valid_fraction < 0.5 < again.views[0].valid_fraction
+    assert poor.drawn == whole.drawn
+    assert (poor.drawn["room.redraws"], again.drawn["room.redraws"]) == (0, 1)
 
 
 def test_each_view_of_a_room_has_a_height_a_distance_and_an_aim_of_its_own(renderer):
@@ -237,7 +251,7 @@ def test_a_later_view_that_shows_little_is_drawn_again_alone():
         for least in (20, 2000):
             how = ScanSettings(sensor=TINY, views=3, least_pixels=least, randomise=ALL)
             streams = (np.random.default_rng(seed) for _ in range(2))
-            drawn.append(next(staging.stand_in_rooms(how, TINY, mesh, None, *streams))[2])
+            drawn.append(next(staging.stand_in_rooms(how, TINY, mesh, None, *streams, dict))[2])
         free, strict = drawn
         if free["room.height"] == strict["room.height"]:  # the first view would do
             alone += free["room.redraws"] < strict["room.redraws"]
@@ -290,6 +304,7 @@ def test_a_large_object_is_stood_off_from_as_much_as_it_is_larger():
         ({"sensor": "paper", "randomise": "rooms"}, "in metres, and the sensor paper is not"),
         ({"sensor": "paper", "object_size": "class"}, "in metres, and the sensor paper is not"),
         ({"least_pixels": 0, "randomise": "rooms"}, "least_pixels"),
+        ({"least_valid": 1.5, "randomise": "rooms"}, "least_valid"),
         ({"randomise": "rooms", "class_names": ["toilet"]}, "toilet"),
         ({"randomise": "rooms", "class_names": ()}, "object_size class"),
         ({"randomise": {"room.height": (-1, 1)}}, "height"),

@@ -127,10 +127,11 @@ def scan(
     how = dataclasses.replace(how, sensor=sensor, renderer=how.make_renderer())
     clock, crop = Clock(), how.chosen("crop")
 
-    sensor, drawn = draw(sensor, how.ranges, rng_settings)
+    given, (sensor, drawn) = sensor, draw(sensor, how.ranges, rng_settings)
     own_class, other_class = (*class_names, "", "")[:2]
     normalised, scale, size = sized(mesh, how, own_class, sensor.object_size, rng_size)
-    sensor, drawn = resized(sensor, scale), drawn | size | chosen
+    own = size | chosen
+    sensor, drawn = resized(sensor, scale), drawn | own
     yaw = float(rng_place.uniform(0, 2 * np.pi))
     turned = normalised.copy()
     turned.vertices = turned.vertices @ rotation_z(yaw).T
@@ -141,10 +142,15 @@ def scan(
         drawn |= {f"neighbour_{name}": value for name, value in size.items()}
     body = Body(turned, sensor.material)
     if how.room_layouts:
-        rooms = stand_in_rooms(how, sensor, body, neighbour, rng_room, rng_scene)
+
+        def redraw() -> tuple[Sensor, dict[str, Any]]:
+            other, values = draw(given, how.ranges, rng_settings)
+            return resized(other, scale), values | own
+
+        rooms = stand_in_rooms(how, sensor, body, neighbour, rng_room, rng_scene, redraw)
     else:
         rooms = [(sensor, stand(how, sensor, body, neighbour, rng_place, rng_scene), {})]
-    # A room of which the sensor got no point is drawn again, as one that shows too little is.
+    # A room of which the sensor got little is drawn again, as one that shows too little is.
     for sensor, around, room in rooms:
         parts = [object_region(bounds, sensor, pose) for pose in around.poses]
         images = _photograph(how, sensor, around, parts, full_frames, rng_render, rng_noise, clock)
@@ -160,7 +166,9 @@ def scan(
                 inside = inliers(points)
                 points, view = points[inside], view[inside]
             clean_points, clean_view = fuse(cleans)
-        if len(points) and len(clean_points):
+        valid = np.mean([view.valid_fraction or 0.0 for view in statistics])
+        enough = not how.room_layouts or valid >= how.least_valid
+        if enough and len(points) and len(clean_points):
             drawn |= room
             break
     else:

@@ -214,6 +214,9 @@ class ScanSettings(CameraSettings):
     and the camera's place: height, distance, aim; room.distance=1:2 beside it narrows one."""
     least_pixels: int = 1000
     """Pixels of the object that each view of a room must show; else it is drawn again."""
+    least_valid: float = 0.2
+    """Share of them, as a mean over the views, of which the sensor must get a depth; else room,
+    material and light are drawn again, as mostly where the object is of metal."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where ad-census searches, to the same bits: cuda is a GPU through torch, which auto takes
     where Mitsuba renders on one too."""
@@ -245,6 +248,7 @@ class ScanSettings(CameraSettings):
                     f"room.layout={layout} beside rooms in its place"
                 )
         check_range(self, "scan", "least_pixels", low=1)
+        check_range(self, "scan", "least_valid", high=1)
         check_range(self, "scan", "num_points", low=1, high=1_000_000)
         check_range(self, "scan", "views", low=1, high=256)
         if self.least_views is not None:

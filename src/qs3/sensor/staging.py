@@ -1,7 +1,7 @@
 """With what, how large and where one scan is taken: all that is drawn before the pictures."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -114,12 +114,13 @@ def stand_in_rooms(
     neighbour: trimesh.Trimesh | None,
     rng_room: np.random.Generator,
     rng_scene: np.random.Generator,
+    redraw: Callable[[], tuple[Sensor, dict[str, Any]]],
 ) -> Iterator[tuple[Sensor, ArrangedScene, dict[str, Any]]]:
     """Draw rooms that show enough of the object in each view; whoever asks for another gets one.
 
-    Layout, azimuth and table are the room's; height, distance and aim are each view's own, but for
-    ``jitter``, whose views are copies of one. Where a later view shows too little, it alone is
-    drawn again.
+    The sensor and the material of another are those of ``redraw``. Layout, azimuth and table are
+    the room's; height, distance and aim are each view's own, but for ``jitter``, whose views are
+    copies of one. Where a later view shows too little, it alone is drawn again.
 
     Yields:
         The sensor where its first view stands, the scene, and what was drawn, ``room.redraws``
@@ -164,7 +165,9 @@ def stand_in_rooms(
         fault = f"it shows {min(seen)} pixels of the object, and least_pixels is {how.least_pixels}"
         if not poor:
             yield placed[0], around, drawn | {"room.redraws": redraws}
-            fault, poor = "the sensor saw no point of the object in it", [0]
+            fault, poor = "the sensor saw too few points of the object in it (least_valid)", [0]
+            sensor, values = redraw()
+            body, drawn = Body(body.mesh, sensor.material), drawn | values
     raise InputError(
         f"randomise: {_MOST_DRAWS} rooms in a row would not do, the last one because: {fault}; "
         "narrow the ranges (room.distance=0.8:2), or lower least_pixels"
