@@ -197,11 +197,16 @@ SCALES: Mapping[ScaleName, Scale] = {
     "laptop": Scale(
         name="laptop",
         source_per_class=60,
-        target_per_class=30,
+        target_per_class=100,
         test_per_class=30,
         meshes=("cad", "cad_more"),
-        source_scan={"sensor": ("d415", "d435", "d455"), "object_size": "class"},
-        target_scan={"sensor": "kinect-v1", "randomise": ("rooms",), "crop": "mask"},
+        source_scan={"sensor": "d435", "object_size": "class"},
+        target_scan={
+            "sensor": "kinect-v1",
+            "randomise": ("rooms",),
+            "crop": "mask",
+            "least_pixels": 2500,  # as of NYU's strict objects
+        },
         optimiser_steps=4000,
         train=TrainSettings(
             model="pointnet",
