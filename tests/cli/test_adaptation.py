@@ -11,9 +11,11 @@ from qs3.adaptation.confidence import BOUNDS
 from qs3.cli.train import TrainOptions, _note_old_name, defaults, parse_settings
 from qs3.errors import InputError
 from qs3.evaluation import read_record
+from qs3.files import write_json
 from qs3.io import load_clouds, load_unlabelled
 from qs3.meshes.classes import POINTDA10
-from qs3.structure import structure
+from qs3.models import create_model
+from qs3.structure import structure, unstructure
 from qs3.training import PRESETS, TrainSettings, fit, load_model, save_model
 from qs3.training.run import RunSettings
 
@@ -201,6 +203,29 @@ def test_a_preset_follows_the_method(arguments, preset):
     chosen = defaults(arguments)["options"]
     assert chosen.preset == preset
     assert chosen.self_training == PRESETS[preset]
+
+
+def test_what_a_warm_up_tells_of_its_training_is_the_default(tmp_path):
+    settings = TrainSettings(
+        model="pointnet",
+        model_settings={"channels": [4, 4, 8]},
+        num_points=32,
+        epochs=3,
+        learning_rate=0.5,
+    )
+    network = create_model("pointnet", 10, channels=[4, 4, 8])
+    save_model(tmp_path, network, POINTDA10, settings)
+    write_json(
+        tmp_path / "settings.json", unstructure(RunSettings("source-only", settings, POINTDA10))
+    )
+    bare = tmp_path / "bare" / "weights.safetensors"
+    bare.parent.mkdir()
+    bare.write_bytes((tmp_path / "model.safetensors").read_bytes())
+    for warm_up, rate in ((tmp_path, 0.5), (tmp_path / "model.safetensors", 0.5), (bare, 1e-3)):
+        words = ["--source", "a", "--method", "qbst", "--warm-up", str(warm_up)]
+        train = defaults(words)["options"].train
+        assert (train.model, train.num_points, train.learning_rate) == ("pointnet", 32, rate)
+        assert train.model_settings == {"channels": [4, 4, 8]}
 
 
 def test_a_method_of_an_earlier_release_is_taken_with_a_note(capsys):

@@ -45,7 +45,7 @@ def realism(
         unused = [
             f"--{field.name.replace('_', '-')}"
             for field in dataclasses.fields(camera)
-            if field.name not in ("sensor", "matching", "bias_correction")
+            if field.name not in ("sensor", "matching", "bias_correction", "device")
             and getattr(camera, field.name) != field.default
         ]
         if unused:
@@ -59,7 +59,9 @@ def realism(
         cost = "done before" if before else f"{result['seconds']:.1f} s"
         tqdm.write(f"{result['id']} {_VERDICTS[result['passed']]}, {cost}", file=sys.stderr)
 
-    results = test_camera(out, camera.make_sensor(), camera.make_renderer(), settings, say)
+    renderer = camera.make_renderer()
+    device = camera.matching_device(renderer)
+    results = test_camera(out, camera.make_sensor(), renderer, settings, say, device)
     show(*table(results))
     tell(*_summary(results, out))
     missed = any(result["passed"] is False for result in results)
@@ -70,7 +72,8 @@ def _pair(out: Path, pair: InfraredPair, camera: CameraSettings, files: PairFile
     """Hold the matcher against a real camera's own depth."""
     from qs3.report.pair import PAIR_PLOT, PAIR_RECORD, compare_pair
 
-    record = compare_pair(out, pair, camera.make_sensor(), files.checksums())
+    device = "cuda" if camera.device == "cuda" else "cpu"  # no renderer to follow
+    record = compare_pair(out, pair, camera.make_sensor(), files.checksums(), device)
     show(*pair_table(record))
     tell(*record["notes"], f"Look at {out / PAIR_PLOT} and {out / PAIR_RECORD}")
     return 0

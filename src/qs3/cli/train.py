@@ -27,7 +27,7 @@ from qs3.training.config import (
     preparation_of,
 )
 from qs3.training.history import Tracker
-from qs3.training.run import is_run, train_settings
+from qs3.training.run import MODEL, is_run, train_settings
 from qs3.training.shipped import find_run, shipped
 
 TIME_UP = 3
@@ -152,10 +152,8 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
     preset = chosen.preset or usual.get(rule, "default")
     rounds = PRESETS[preset] if rule is None else replace(PRESETS[preset], rule=rule)
     how = TrainSettings(preparation=preparation_of(preset))
-    if chosen.warm_up is not None and is_run(run := find_run(chosen.warm_up)):
-        how = train_settings(run)
-        if not how.validate_every:  # each round is a checkpoint that a rule may choose
-            how = replace(how, validate_every=TrainSettings.validate_every)
+    if chosen.warm_up is not None:
+        how = _as_trained(find_run(chosen.warm_up), how)
     if alone := rule is not None and chosen.warm_up is not None and chosen.source is None:
         rounds = replace(rounds, source_loss=False)
     options = TrainOptions(out=Path(), preset=preset, train=how, self_training=rounds)
@@ -169,6 +167,21 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
     for name in (name for name, missing in needed.items() if missing):
         object.__setattr__(options, name, tyro.MISSING)
     return {"options": options}
+
+
+def _as_trained(run: Path, usual: TrainSettings) -> TrainSettings:
+    """Return how a warm-up was trained, as far as its folder or its file of weights tells."""
+    folder = run.parent if run.is_file() else run
+    if is_run(folder):
+        how = train_settings(folder)
+    elif run.is_file() or (run / MODEL).is_file():
+        from qs3.training.checkpoint import load_model  # it imports torch
+
+        return structure(load_model(run).settings["train"], TrainSettings, run)
+    else:
+        return usual
+    # Each round is a checkpoint that a rule may choose.
+    return replace(how, validate_every=how.validate_every or TrainSettings.validate_every)
 
 
 def _choices(words: Sequence[str]) -> tuple[Choices, dict[str, Any]]:

@@ -20,7 +20,7 @@ _OFF = 2.0  # pixels of disparity at which the difference has its full colour
 
 
 def compare_pair(
-    out: Path, pair: InfraredPair, sensor: Sensor, images: Mapping[str, Any]
+    out: Path, pair: InfraredPair, sensor: Sensor, images: Mapping[str, Any], device: str = "cpu"
 ) -> dict[str, Any]:
     """Compare, and write figures and picture.
 
@@ -29,6 +29,7 @@ def compare_pair(
         pair: The pair.
         sensor: Whose matcher it is.
         images: What the record tells of the files, as `PairFiles.checksums` returns it.
+        device: Where ``ad-census`` searches, ``cpu`` or ``cuda``.
 
     Returns:
         The record.
@@ -36,7 +37,7 @@ def compare_pair(
     Raises:
         InputError: where the folder holds something else, or as `compare` does.
     """
-    comparison = compare(pair, sensor.matching)
+    comparison = compare(pair, sensor.matching, device)
     record = comparison.figures | {
         "width": pair.left.shape[1],
         "height": pair.left.shape[0],

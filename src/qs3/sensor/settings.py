@@ -77,6 +77,9 @@ class CameraSettings:
     view_transform: Literal["raw", "Standard", "Filmic", "AgX"] = "raw"
     """Of cycles: raw hands radiance to the sensor's exposure; the others take Blender's own grey
     levels in its place (the released images have Filmic)."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where ad-census searches, to the same bits: cuda is a GPU through torch, which auto takes
+    where Mitsuba renders on one too."""
 
     # Where in the sensor each setting that changes it belongs.
     _CHANGES: ClassVar[Mapping[str, str]] = {
@@ -130,6 +133,12 @@ class CameraSettings:
     def chosen(self, name: str) -> Any:
         """A setting by its name."""
         return getattr(self, name)
+
+    def matching_device(self, renderer: Renderer) -> str:
+        """Where to match, ``cpu`` or ``cuda``, beside what renders."""
+        if self.device != "auto":
+            return self.device
+        return "cuda" if renderer.description.get("variant", "").startswith("cuda") else "cpu"
 
     def make_renderer(self) -> Renderer:
         """The renderer asked for.
@@ -217,9 +226,6 @@ class ScanSettings(CameraSettings):
     least_valid: float = 0.2
     """Share of them, as a mean over the views, of which the sensor must get a depth; else room,
     material and light are drawn again, as mostly where the object is of metal."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where ad-census searches, to the same bits: cuda is a GPU through torch, which auto takes
-    where Mitsuba renders on one too."""
     seed: int = 0
     """All random steps follow from it."""
 
@@ -310,12 +316,6 @@ class ScanSettings(CameraSettings):
             not layouts and self.make_scene().needs_neighbour
         )
 
-    def matching_device(self, renderer: Renderer) -> str:
-        """Where to match, ``cpu`` or ``cuda``, beside what renders."""
-        if self.device != "auto":
-            return self.device
-        return "cuda" if renderer.description.get("variant", "").startswith("cuda") else "cpu"
-
     def make_scene(self) -> SceneSettings:
         """What stands around the object."""
         scene = SceneSettings(self.scene) if isinstance(self.scene, str) else self.scene
@@ -326,7 +326,7 @@ class ScanSettings(CameraSettings):
     def as_dict(self) -> dict[str, Any]:
         """Plain values for records; what the sensor and the renderer say of themselves is apart."""
         apart = {*(f.name for f in dataclasses.fields(CameraSettings)), *self._CHANGES, "preset"}
-        apart |= {"crop", "floor_material", "wall_material", "device", "seed"}
+        apart |= {"crop", "floor_material", "wall_material", "seed"}
         names = [f.name for f in dataclasses.fields(ScanSettings) if f.name not in apart]
         ranges = [dict(settings.ranges) for settings in self.each_sensor()]
         crop = self.chosen("crop")
