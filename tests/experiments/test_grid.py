@@ -83,7 +83,7 @@ def test_a_stop_between_training_and_record_loses_nothing(finished, whole, monke
     monkeypatch.setattr(grid, "make_record", make_record)
     make_tables(finished, ["ordinary"], columns=COLUMNS)
     found, wanted = comparable(finished), comparable(whole)
-    assert len(found) == 6 and found == {name: wanted[name] for name in found}
+    assert len(found) == 12 and found == {name: wanted[name] for name in found}
 
 
 def test_a_folder_of_other_settings_is_refused(finished):

@@ -22,6 +22,7 @@ Pair = tuple[str, str, str]
 """What is compared, and the keys of two rows or columns: first minus second, rows in every column
 and columns in every row."""
 _TITLES = {
+    "pointnet": "PointNet",
     "pointnet2": "PointNet++",
     "dgcnn": "DGCNN",
     "rscnn": "RS-CNN",
@@ -120,9 +121,11 @@ def load_experiment(name: str) -> Experiment:
 
 
 def networks(scale: Scale) -> Headings:
-    """Return the paper's networks as lines of a table."""
+    """Return the paper's networks as lines of a table, first the bench's where it is another."""
     names = [name for name in NETWORKS if name in scale.networks]
-    return tuple(Heading(name, _TITLES[name], {"network": name}) for name in names)
+    own = scale.train.model
+    bench = () if own in NETWORKS else (Heading(own, _TITLES.get(own, own), {}),)
+    return bench + tuple(Heading(name, _TITLES[name], {"network": name}) for name in names)
 
 
 def tasks(*pairs: tuple[Kind, Kind]) -> Headings:
