@@ -22,8 +22,8 @@ def _columns(scale: Scale) -> Headings:
 
 
 def _pairs(scale: Scale) -> list[Pair]:
-    first, last = str(scale.fused_views[0]), str(scale.fused_views[-1])
-    return [(f"{last} views over {first}", last, first)]
+    first, *more = map(str, scale.fused_views)
+    return [(f"{count} views over {first}", count, first) for count in more]
 
 
 EXPERIMENT = Experiment(
