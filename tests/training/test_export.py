@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import pickletools
 import subprocess
 import sys
 import zipfile
@@ -182,10 +183,18 @@ def test_exports_tell_what_they_hold(exported):
     assert json.loads(extra["qs3"]) == facts
 
 
+def is_pickle(data):
+    """Whether it is one from end to end: numbers of a tensor may begin with the same byte."""
+    try:
+        return data.startswith(b"\x80") and bool(list(pickletools.genops(data)))
+    except ValueError:
+        return False
+
+
 def test_program_holds_nothing_pickled(exported):
     with zipfile.ZipFile(exported[1]["torch-export"].path) as archive:
         parts = {name: archive.read(name) for name in archive.namelist()}
-    assert not any(data.startswith((b"PK", b"\x80")) for data in parts.values())
+    assert not [name for name, data in parts.items() if data.startswith(b"PK") or is_pickle(data)]
     configs = [data for name, data in parts.items() if name.endswith("_config.json")]
     assert len(configs) == 2
     entries = [entry for data in configs for entry in json.loads(data)["config"].values()]
