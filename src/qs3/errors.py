@@ -2,11 +2,8 @@
 
 import functools
 import logging
-import unicodedata
 
 _log = logging.getLogger(__name__)
-_OBEYED = {"Cc", "Cf", "Cs", "Zl", "Zp"}
-"""Categories of Unicode: control, format (turns of direction), surrogates, breaks of lines."""
 
 
 class QS3Error(Exception):
@@ -39,18 +36,3 @@ class MissingExtraError(QS3Error, ImportError):
 def say_once(text: str) -> None:
     """Log a warning, once in the life of the process."""
     _log.warning("%s", text)
-
-
-def printable(text: str, keep: str = "\n\t") -> str:
-    r"""Write control characters, but those to ``keep``, and what cannot be encoded as escapes.
-
-    Example:
-        >>> print(printable("a\x1b[2Jb"))
-        a\x1b[2Jb
-    """
-    return "".join(
-        letter
-        if letter in keep or unicodedata.category(letter) not in _OBEYED
-        else letter.encode("unicode_escape").decode()
-        for letter in text
-    )

@@ -37,7 +37,7 @@ def test_help_and_version_import_no_verb():
     code = "import sys, qs3.cli; qs3.cli._run(sys.argv[1:]); print(sorted(sys.modules))"
     for option in ("--help", "--version"):
         done = subprocess.run([sys.executable, "-c", code, option], capture_output=True, text=True)
-        for module in ("tyro", "numpy", "torch", "qs3.cli.scan", "qs3.files"):
+        for module in ("tyro", "numpy", "torch", "qs3.cli.scan", "qs3.errors"):
             assert f"'{module}'" not in done.stdout
     assert f"qs3 {version('qs3')}\n" in done.stdout
 

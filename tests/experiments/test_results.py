@@ -7,6 +7,7 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import fmean, stdev
 from typing import Any
 
 import pytest
@@ -133,6 +134,20 @@ def test_what_docs_say_of_unknown_objects_is_what_was_measured():
             aurocs = f"| {score['auroc_simulated']:.2f} | {score['auroc']:.2f} |"
             refused = f" {score['refused_known']:.0%} | {score['refused_unknown']:.0%} |"
             assert f"{aurocs}{refused.replace('%', ' %')} {before} → {after} |" in page
+
+
+def test_what_docs_say_of_views_is_what_was_measured():
+    page = (ROOT / "docs" / "real.md").read_text(encoding="utf-8")
+    folder = ROOT / "results" / "views-on-real"
+    means = []
+    for source in ("V1", "S", "M"):
+        records = [read_record(path) for path in sorted(folder.glob(f"{source}_seed-*.json"))]
+        assert {record.test.split for record in records} == {"strict-dev"} and len(records) == 3
+        values = [100 * record.scores.accuracy for record in records]
+        means.append(f"{fmean(values):.1f} ± {stdev(values) / 3**0.5:.1f}")
+    one, five, surfaces = means
+    text = f"{one} % on the first part of NYU from one view, {five} fused from five all around and "
+    assert text + f"{surfaces} as surfaces" in " ".join(page.split())
 
 
 def test_real_tables_and_their_page_are_what_the_records_say(monkeypatch):

@@ -5,10 +5,13 @@ import io
 import json
 import os
 import pickle
+import resource
 import shutil
+import signal
 import struct
 import subprocess
 import sys
+import zipfile
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,7 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from ..meshes.test_announced import glb, tree
+from qs3.io.ragged import RaggedClouds
+
+from ..meshes.test_announced import TRIANGLE, glb, tree
 from .layouts import build_generated, build_run, clouds
 
 
@@ -88,13 +93,13 @@ def _run(folder: Path) -> Path:
     return Path(shutil.copytree(made, folder / "run"))
 
 
-def _npy(folder: Path) -> Path:
+def _npy(folder: Path, given: RaggedClouds | None = None) -> Path:
     """A valid data set of the smallest layout."""
     from qs3.io.layouts import FORMATS
 
     write = FORMATS["npy"].write
     assert write is not None
-    write(folder / "src", clouds())
+    write(folder / "src", given or clouds())
     return folder / "src"
 
 
@@ -250,10 +255,9 @@ def streams(folder: Path, words: str) -> None:
     assert b"d435" in done.stdout
 
 
-_THREE = np.zeros((3000, 3), np.float32).tobytes()
 _ANNOUNCED = {
-    "corners": (tree(count=500_000_000), _THREE),
-    "instances": (tree(nodes=20_000, vertices=3000), _THREE),
+    "corners": (tree(count=500_000_000), TRIANGLE),
+    "instances": (tree(nodes=20_000, vertices=3000), bytes(3000 * 12)),
 }
 
 
@@ -264,8 +268,6 @@ def glb_that_announces(folder: Path, scene: tuple[dict, bytes]) -> None:
 
 @case("refused")
 def archive_of_many_members(folder: Path) -> None:
-    import zipfile
-
     with zipfile.ZipFile(folder / "a.npz", "w") as archive:
         for index in range(100_000):
             archive.writestr(f"{index}.npy", b"")
@@ -300,13 +302,13 @@ def two_trainings(folder: Path) -> None:
         command("train", "--source", _npy(folder), "--num-points", 16, "--out", folder / "run")
 
 
-@case("refused", verb={"info": ("info",), "train": ("train", "--out", "run", "--source")})
-def store_that_is_away(folder: Path, verb: tuple[str, ...]) -> None:
+@case("refused", verb={"info": ["info"], "train": ["train", "--num-points", "16", "--source"]})
+def store_that_is_away(folder: Path, verb: list[str]) -> None:
     from qs3.errors import QS3Error
 
-    os.chdir(folder)
+    out = ["--out", folder / "run"] if verb[0] == "train" else []
     try:
-        command(*verb, "nowhere://bucket/clouds")
+        command(*verb, "nowhere://bucket/clouds", *out)
     except QS3Error as error:
         assert "not a qs3 data set" not in str(error), error
         raise
@@ -314,10 +316,7 @@ def store_that_is_away(folder: Path, verb: tuple[str, ...]) -> None:
 
 @case("refused")
 def full_disk(folder: Path) -> None:
-    """The largest file that may be written is one of 4 KiB, as on a disk that is nearly full."""
-    import resource
-    import signal
-
+    """The largest file that may be written has 300 bytes, as on a disk that is nearly full."""
     from qs3.errors import QS3Error
 
     before = (
@@ -341,15 +340,12 @@ def full_disk(folder: Path) -> None:
 @case("ok")
 def clouds_moved_by_a_hair(folder: Path) -> None:
     """Test clouds that are those of the training, but for 1e-4: their record is marked."""
-    from qs3.io.layouts import FORMATS
     from qs3.io.load import read_clouds
     from qs3.training import evaluate
 
     run, seen = _run(folder), read_clouds(folder.parent / "own" / "made-run-data")[0]
-    write = FORMATS["npy"].write
-    assert write is not None
-    write(folder / "moved", replace(seen, clouds=[cloud + 1e-4 for cloud in seen.clouds]))
-    assert "training clouds" in evaluate(run, folder / "moved", split="train").marks
+    moved = _npy(folder, replace(seen, clouds=[cloud + 1e-4 for cloud in seen.clouds]))
+    assert "training clouds" in evaluate(run, moved, split="train").marks
 
 
 # That the attack sees what it is there to see: each of these is found out.

@@ -72,7 +72,7 @@ def _pair(out: Path, pair: InfraredPair, camera: CameraSettings, files: PairFile
     """Hold the matcher against a real camera's own depth."""
     from qs3.report.pair import PAIR_PLOT, PAIR_RECORD, compare_pair
 
-    device = "cuda" if camera.device == "cuda" else "cpu"  # no renderer to follow
+    device = camera.matching_device(None)
     record = compare_pair(out, pair, camera.make_sensor(), files.checksums(), device)
     show(*pair_table(record))
     tell(*record["notes"], f"Look at {out / PAIR_PLOT} and {out / PAIR_RECORD}")

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from qs3.errors import printable as printable
+from qs3.escapes import printable as printable
 
 _format_warning = warnings.formatwarning
 

@@ -134,11 +134,12 @@ class CameraSettings:
         """A setting by its name."""
         return getattr(self, name)
 
-    def matching_device(self, renderer: Renderer) -> str:
-        """Where to match, ``cpu`` or ``cuda``, beside what renders."""
+    def matching_device(self, renderer: Renderer | None) -> str:
+        """Where to match, ``cpu`` or ``cuda``, beside what renders; None where nothing does."""
         if self.device != "auto":
             return self.device
-        return "cuda" if renderer.description.get("variant", "").startswith("cuda") else "cpu"
+        variant = "" if renderer is None else renderer.description.get("variant", "")
+        return "cuda" if variant.startswith("cuda") else "cpu"
 
     def make_renderer(self) -> Renderer:
         """The renderer asked for.

@@ -6,7 +6,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from qs3.errors import printable
+from qs3.escapes import printable
 
 _MANY = 500
 _IN_A_LOG = 10.0  # seconds between two lines where nobody watches
