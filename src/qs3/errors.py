@@ -1,6 +1,5 @@
 """Errors that a user can act on: one line that names what is wrong and the fix."""
 
-import functools
 import logging
 
 _log = logging.getLogger(__name__)
@@ -32,7 +31,12 @@ class MissingExtraError(QS3Error, ImportError):
         )
 
 
-@functools.cache
-def say_once(text: str) -> None:
-    """Log a warning, once in the life of the process."""
-    _log.warning("%s", text)
+TOLD: set[str] = set()
+"""What `say_once` has said in this process."""
+
+
+def say_once(text: str, kind: str = "") -> None:
+    """Log a warning, once in the life of the process; of several of one ``kind``, the first."""
+    if (kind or text) not in TOLD:
+        TOLD.add(kind or text)
+        _log.warning("%s", text)

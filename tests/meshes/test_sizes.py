@@ -8,7 +8,7 @@ import trimesh
 from scipy import stats
 
 from qs3 import shapes
-from qs3.errors import InputError, say_once
+from qs3.errors import TOLD, InputError
 from qs3.meshes import collect, load_mesh
 from qs3.meshes.classes import POINTDA10
 from qs3.meshes.sizes import CLASS_SIZES, class_size, file_size
@@ -45,7 +45,7 @@ def test_a_mesh_that_tells_its_unit_is_believed(tmp_path):
 
 
 def test_a_mesh_of_a_known_unit_is_believed_and_says_so_once(caplog):
-    say_once.cache_clear()
+    TOLD.clear()
     mesh = part(60.0)
     mesh.units = "cm"
     for _ in range(2):
@@ -58,7 +58,7 @@ def test_a_mesh_of_a_known_unit_is_believed_and_says_so_once(caplog):
 
 
 def test_a_unit_that_is_named_wins_over_what_a_file_says_and_says_so_once(caplog, tmp_path):
-    say_once.cache_clear()
+    TOLD.clear()
     for name in ("a.glb", "b.glb"):
         part(60.0).export(tmp_path / name)
         mesh = load_mesh(tmp_path / name)
@@ -91,7 +91,7 @@ def test_guesses_that_differ_within_a_collection_are_refused(tmp_path):
 
 @pytest.mark.parametrize(("length", "size", "unit"), [(2.0, 2.0, "m"), (60.0, 0.06, "mm")])
 def test_a_guess_says_so_once(caplog, length, size, unit):
-    say_once.cache_clear()
+    TOLD.clear()
     for _ in range(2):
         assert file_size(part(length)) == (pytest.approx(size), f"{unit} (guessed)")
     assert [f"taken for {unit}" in line for line in caplog.messages] == [True]

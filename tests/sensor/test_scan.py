@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from qs3.errors import InputError, say_once
+from qs3.errors import TOLD, InputError
 from qs3.geometry import rotation_z
 from qs3.meshes import normalise, sample_surface
 from qs3.sensor.depth import DepthSettings
@@ -283,11 +283,12 @@ def test_what_cannot_be_seen_is_refused(change, message, renderer):
 
 
 def test_few_points_are_told_with_size_distance_and_what_to_change(renderer, caplog):
-    say_once.cache_clear()
-    for size, told in ((1.0, 0), (0.06, 1), (0.062, 1)):
-        scan(
+    TOLD.clear()
+    for size, told in ((1.0, 0), (0.06, 1), (0.08, 1)):
+        made = scan(
             asymmetric(), sensor=SMALL, object_size=size, views=1, num_points=512, renderer=renderer
         )
+        assert (4 * made.fused_points < 512) == bool(told)
         assert len(caplog.messages) == told
     (line,) = caplog.messages
     assert "num_points 512" in line

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from qs3.adaptation import SourceOnly
-from qs3.errors import InputError, QS3Error, say_once
+from qs3.errors import TOLD, InputError, QS3Error
 from qs3.training import SelfTrainingSettings, fit, load_model
 from qs3.training import distributed as module
 from qs3.training.batches import DeviceClouds, Share, make_batch
@@ -153,7 +153,7 @@ def test_a_number_format_that_a_cpu_lacks_is_refused(settings):
 
 def test_slow_bf16_is_told_once(settings, monkeypatch, caplog):
     monkeypatch.setattr(module, "has_bf16_units", lambda: False)
-    say_once.cache_clear()
+    TOLD.clear()
     for _ in range(2):
         make_fabric(replace(settings, precision="bf16-mixed"))
     make_fabric(settings)

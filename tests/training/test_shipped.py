@@ -13,7 +13,7 @@ import safetensors.torch
 import torch
 
 import qs3
-from qs3.errors import InputError, say_once
+from qs3.errors import TOLD, InputError
 from qs3.evaluation.records import find_records
 from qs3.io.preparation import ROBUST
 from qs3.training import evaluate, fit, load_model, read_run
@@ -112,7 +112,7 @@ def test_what_is_made_from_it_goes_into_the_working_directory(tmp_path):
 
 def test_millimetres_are_told_once(caplog):
     sized = replace(ROBUST, size_input=True)
-    say_once.cache_clear()
+    TOLD.clear()
     with caplog.at_level(logging.WARNING):
         note_size(CLOUDS, sized)
         note_size(1000 * CLOUDS, ROBUST)
@@ -126,7 +126,7 @@ def test_millimetres_are_told_once(caplog):
 
 def test_a_stray_makes_no_millimetres_and_centimetres_are_told(caplog):
     sized = replace(ROBUST, size_input=True)
-    say_once.cache_clear()
+    TOLD.clear()
     with caplog.at_level(logging.WARNING):
         strayed = CLOUDS.copy()
         strayed[:, 0] += 40
@@ -141,7 +141,7 @@ def test_a_stray_makes_no_millimetres_and_centimetres_are_told(caplog):
 
 
 def test_too_few_points_are_told_once(caplog, tmp_path):
-    say_once.cache_clear()
+    TOLD.clear()
     network, few = qs3.load("rooms"), np.tile(CLOUDS[0, :31], (4, 1))
     np.save(tmp_path / "few.npy", few)
     with caplog.at_level(logging.WARNING):
@@ -150,7 +150,7 @@ def test_too_few_points_are_told_once(caplog, tmp_path):
         network.predict([CLOUDS[0], few])
         network.predict(few)
         assert len(caplog.messages) == 1
-        say_once.cache_clear()
+        TOLD.clear()
         list(predict_files(Path("rooms"), [tmp_path / "few.npy"]))
     assert len(caplog.messages) == 2
     assert "fewer than 32 distinct points" in caplog.messages[1]

@@ -180,12 +180,9 @@ def check_guesses(items: Iterable[Any]) -> None:
             )
 
 
-_first: dict[str, str] = {}
-
-
 def _say(file: str, text: str) -> None:
     """Say something of a mesh's file once, of the first of which it is true."""
-    say_once(f"{_first.setdefault(text, file) or 'a mesh'} {text}")
+    say_once(f"{file or 'a mesh'} {text}", kind=text)
 
 
 def _short(unit: str) -> str:

@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from qs3.errors import InputError, MissingExtraError, say_once
+from qs3.errors import TOLD, InputError, MissingExtraError
 from qs3.io.cameras.folder import capture
 from qs3.io.cameras.frames import CaptureSettings, DepthFrame, open_camera
 from qs3.io.extract.depth import DepthImageSettings, extract_depth
@@ -180,7 +180,7 @@ def _in_metres(frame: DepthFrame) -> DepthFrame:
 
 
 def test_convention_ros_rows_are_padded_big_endian_and_rectified(tmp_path, caplog):
-    say_once.cache_clear()
+    TOLD.clear()
     shots = list(frames(1, 64, 48))
     path = write_ros1(tmp_path / "bag", shots, "16UC1", "ros1", big=True, padding=6)
     same(read(f"rosbag:{path}")[0], shots[0], colour=False)
