@@ -54,7 +54,12 @@ def match_ad_census(
     tone = (2**bits - 1) / 255  # grey levels in one of 8 bits
     images = [np.ascontiguousarray(image, dtype=np.int32) for image in (left, right)]
     left_bits, right_bits = (_bits(image, own) for image in images)
-    minima = _search(images[0], images[1], left_bits, right_bits, settings, tone, device)
+    # NumPy asks for large pages, numba does not: taking these two by small pages, and anew in each
+    # search, would be a third of the time.
+    shape = (2, *left.shape, settings.num_disparities)
+    volumes = np.empty(shape if device == "cpu" else 0, np.uint16)
+    how = settings, tone, device, volumes
+    minima = _search(images[0], images[1], left_bits, right_bits, *how)
     best, total, less, more, second = np.moveaxis(minima, 2, 0)
     columns = np.arange(left.shape[1])
     kept = (best > 0) & (best < settings.num_disparities - 1) & (best <= columns)
@@ -65,7 +70,7 @@ def match_ad_census(
         other_bits, this_bits = (
             np.ascontiguousarray(bits[:, ::-1]) for bits in (right_bits, left_bits)
         )
-        back = _search(other, this, other_bits, this_bits, settings, tone, device)[:, ::-1, 0]
+        back = _search(other, this, other_bits, this_bits, *how)[:, ::-1, 0]
         agreed = np.take_along_axis(back, np.maximum(columns - best, 0), axis=1)
         kept &= np.abs(best - agreed) <= settings.left_right
     kept &= second - total >= own.second_peak * 4 * UNIT
@@ -96,8 +101,9 @@ def _search(
     settings: MatchingSettings,
     tone: float,
     device: str,
+    volumes: UInt16[np.ndarray, "..."],
 ) -> Int32[np.ndarray, "h w 5"]:
-    """What `optimise` returns."""
+    """What `optimise` returns; ``volumes`` are room for its costs and totals."""
     own = settings.ad_census
     arms = grey_arms(left, own.arm, own.arm_threshold * tone)
     # The greatest that the sum over the largest support still fits 16 bits.
@@ -116,8 +122,9 @@ def _search(
         from qs3.sensor.matching.on_device import search  # it imports torch
 
         return search(*pictures, settings.num_disparities, penalties, edge, device)
-    costs = mean_costs(*pictures, settings.num_disparities)
-    return optimise(costs, left, penalties, edge)
+    costs, totals = volumes
+    mean_costs(*pictures, costs)
+    return optimise(costs, left, penalties, edge, totals)
 
 
 def _refined(

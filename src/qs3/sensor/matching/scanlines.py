@@ -19,6 +19,7 @@ def optimise(
     image: Int32[np.ndarray, "h w"],
     penalties: UInt16[np.ndarray, "4"],
     edge: float,
+    totals: UInt16[np.ndarray, "h w d"],
 ) -> Int32[np.ndarray, "h w 5"]:
     """Sum the costs of the paths from the left, top, right and bottom.
 
@@ -27,13 +28,13 @@ def optimise(
         image: Grey levels.
         penalties: The small and the large one, and both at an edge of the image.
         edge: Difference in grey levels between neighbours that is an edge.
+        totals: Filled with the sums.
 
     Returns:
         Of each pixel the disparity of the least total (of equal ones the smallest), that total,
         those of one disparity less and more, and the least total further away.
     """
     height, width, count = costs.shape
-    totals = np.zeros((height, width, count), np.uint16)
     minima = np.zeros((height, width, 5), np.int32)
     # Of the vertical path of each column and, last, of the horizontal one; a pad at either end.
     paths = np.full((width + 1, count + 2), _FAR, np.uint16)

@@ -84,9 +84,9 @@ def mean_costs(
     by_levels: UInt16[np.ndarray, "l"],
     arms: Int32[np.ndarray, "4 h w"],
     shares: UInt32[np.ndarray, "h w"],
-    count: int,
-) -> UInt16[np.ndarray, "h w d"]:
-    """Mean cost over the support of each pixel, times ``UNIT``, of ``count`` disparities.
+    out: UInt16[np.ndarray, "h w d"],
+) -> None:
+    """Write the mean cost over each pixel's support, times ``UNIT``, of all disparities.
 
     Left of the right image its first column goes on. Sums wrap around at 2¹⁶ on their way; their
     differences do not, as costs are small enough.
@@ -100,10 +100,9 @@ def mean_costs(
         by_levels: Cost of a difference in grey levels.
         arms: Of each pixel.
         shares: 2¹⁶ · ``UNIT`` over a support's size and the cost that stands for 1.0.
-        count: Disparities, from 0.
+        out: Filled, of disparities from 0.
     """
-    height, width = left.shape
-    out = np.empty((height, width, count), np.uint16)
+    height, width, count = out.shape
     before_x = np.zeros((width + 1, count), np.uint16)
     cost = np.zeros(count, np.uint16)
     # Mirrored, so that a pixel's disparities lie one after the other.
@@ -150,4 +149,3 @@ def mean_costs(
                 for d in range(count):
                     total = np.uint32(np.uint16(high[d] - low[d]))
                     to[d] = np.uint16(np.uint32(total * share) >> np.uint32(16))
-    return out
