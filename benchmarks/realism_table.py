@@ -6,7 +6,7 @@
 
 The first form puts one row a test and one column a record between the page's first markers. The
 second photographs one wall of albedo 0.6 with the d435 at four distances, each once, hands the same
-images to both matchers with blocks of 15 and 21, and fills the second markers: once with Gaussian
+images to all matchers, and fills the second markers: once with Gaussian
 noise of 1.5 grey levels alone, and once with the preset's noise. Either form leaves the rest of the
 page as it is.
 """
@@ -16,7 +16,7 @@ import dataclasses
 import re
 import time
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,21 +26,22 @@ from qs3.sensor.depth import depth_from_disparity
 from qs3.sensor.exposure import expose_pair
 from qs3.sensor.lens import blur_reach
 from qs3.sensor.matching import match, matching_canvas
+from qs3.sensor.matching.settings import Method
 from qs3.sensor.presets import get_sensor
 from qs3.sensor.realism import LAWS
 from qs3.sensor.realism.bench import VIEW, painted, wall, wall_region
 from qs3.sensor.realism.metrics import plane_metrics
-from qs3.sensor.render import Scene
 from qs3.sensor.render.mitsuba import MitsubaRenderer
-from qs3.sensor.speckle import pattern_image
+from qs3.sensor.view import photograph, scene_of
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "realism.md"
 DISTANCES = (0.6, 1.0, 1.5, 2.0)
-MATCHERS: tuple[tuple[Literal["opencv-bm", "zncc"], int], ...] = (
+MATCHERS: tuple[tuple[Method, int], ...] = (
     ("opencv-bm", 15),
     ("opencv-bm", 21),
     ("zncc", 15),
     ("zncc", 21),
+    ("ad-census", 19),
 )
 TOLD = ("autocorrelation", "locking", "share kept", "fall over")
 Record = dict[str, Any]
@@ -128,12 +129,14 @@ def realism_table(records: list[Record]) -> str:
 def walls_table(samples: int, seed: int) -> str:
     """RMS, bias, fill and time of each matcher on the same images."""
     sensor = get_sensor("d435")
-    rig, thrown = sensor.rig, sensor.pattern
+    rig = sensor.rig
     renderer = MitsubaRenderer(samples=samples)
     own = sensor.exposure
     noises = {
-        "1.5 grey levels": dataclasses.replace(own, noise=1.5, offset=0.0, speckle=0.0),
-        f"the preset's: {own.noise:g} grey levels, speckle {own.speckle:g}": own,
+        "1.5 grey levels": dataclasses.replace(
+            own, noise=1.5, offset=0.0, speckle=0.0, coherent=0.0
+        ),
+        f"the preset's: {own.noise:g} grey levels, speckle {own.coherent:g} of the dots": own,
     }
     settings = {
         (noise, method, block): dataclasses.replace(
@@ -142,20 +145,14 @@ def walls_table(samples: int, seed: int) -> str:
         for noise in noises
         for method, block in MATCHERS
     }
-    widest = max(settings.values(), key=lambda one: (one.method == "zncc", one.block_size))
     seen: dict[tuple[str, str, int], list[tuple[float, ...]]] = {key: [] for key in settings}
     for index, z in enumerate(DISTANCES):
         region = wall_region(sensor, z)
-        canvas = matching_canvas(region, rig, widest)
+        canvases = (matching_canvas(region, rig, matching) for matching in settings.values())
+        canvas = max(canvases, key=lambda one: one.width * one.height)
         wide = canvas.grown(blur_reach(sensor.exposure.psf), rig.width, rig.height)
-        scene = Scene(
-            (painted(wall(z)),),
-            sensor.light,
-            pattern_image(thrown),
-            thrown.tan_half_width,
-            thrown.tan_half_height,
-        )
-        pair = renderer.render(scene, rig, [VIEW], [seed + index], regions=[wide])[0]
+        scene = scene_of([painted(wall(z))], sensor)
+        pair = photograph(renderer, scene, sensor, [VIEW], [seed + index], [wide])[0]
         images = {
             noise: expose_pair(
                 pair, canvas, region, rig, exposure, np.random.default_rng(seed + index)
@@ -203,7 +200,7 @@ def walls_table(samples: int, seed: int) -> str:
         lines.append("| " + " | ".join(cells) + " |")
     note = (
         f"`d435`, albedo 0.6, {renderer.variant}, {samples} rays a pixel, seed {seed}; the same "
-        f"images for all four; {cv2.getNumThreads()} threads. RMS and bias in pixels: total RMS of "
+        f"images for all; {cv2.getNumThreads()} threads. RMS and bias in pixels: total RMS of "
         "errors below 1 px about the true disparity, the rest are gross errors; sub-pixel RMS by "
         "librealsense's definition. No rounding after the matcher."
     )

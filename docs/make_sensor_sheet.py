@@ -7,21 +7,32 @@ Usage: ``python docs/make_sensor_sheet.py [--sensor d435] [--out docs/images/sen
 
 import argparse
 import dataclasses
+import hashlib
+import json
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from qs3 import shapes
 from qs3.errors import InputError
 from qs3.sensor.materials import MATERIALS
-from qs3.sensor.presets import SENSORS, Sensor, get_sensor
+from qs3.sensor.presets import SENSORS, Sensor, get_sensor, settings_dict
 from qs3.sensor.render.mitsuba import MitsubaRenderer
 from qs3.sensor.scan import scan
 
 _SCENES = ("alone", "floor", "wall", "room", "behind", "beside")
 _CELL, _LINE = 190, 22
+PICTURE = Path(__file__).parent / "images" / "sensor.png"
+
+
+def presets() -> str:
+    """Fingerprint of all presets: by what the picture tells whether it is of them."""
+    plain = {name: settings_dict(sensor) for name, sensor in SENSORS.items()}
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 
 def cell(title: str, sensor: Sensor, scene: str = "alone") -> UInt8[np.ndarray, "h w 3"]:
@@ -113,11 +124,13 @@ def main() -> None:
     """Write the sheet that the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sensor", default="d435")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "images" / "sensor.png")
+    parser.add_argument("--out", type=Path, default=PICTURE)
     args = parser.parse_args()
     picture = sheet(get_sensor(args.sensor))
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(args.out), picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    about = PngInfo()
+    about.add_text("presets", presets())
+    Image.fromarray(picture[..., ::-1]).save(args.out, pnginfo=about, optimize=True)
 
 
 if __name__ == "__main__":

@@ -13,12 +13,14 @@ from typing import get_args
 
 import pytest
 import yaml
+from PIL import Image
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 sys.path.insert(0, str(DOCS))
 try:
     import make_method_pages
+    import make_sensor_sheet
     import site_api
     import site_hooks
 finally:
@@ -230,6 +232,12 @@ def test_tables_of_options_are_filled_in():
 def test_python_on_the_pages_compiles(page):
     for code in blocks(page, "python"):
         compile(code, str(page), "exec")
+
+
+def test_the_picture_of_the_sensors_is_of_the_presets_as_they_are():
+    """Else `python docs/make_sensor_sheet.py` draws it anew."""
+    with Image.open(make_sensor_sheet.PICTURE) as picture:
+        assert picture.info["presets"] == make_sensor_sheet.presets()
 
 
 def test_every_method_has_a_page_in_step_with_the_others():

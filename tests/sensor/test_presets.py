@@ -21,7 +21,7 @@ from qs3.sensor.presets import (
     sensor_toml,
     settings_dict,
 )
-from qs3.sensor.realism.bench import VIEW, painted, wall
+from qs3.sensor.realism.bench import VIEW, Bench, painted, wall
 from qs3.sensor.rig import Region, StereoRig
 from qs3.sensor.speckle import PatternSettings, rosette_places
 from qs3.sensor.view import scene_of
@@ -94,6 +94,26 @@ def test_the_d415_throws_a_dot_per_105_to_150_pixels_that_adds_as_much_as_measur
         before, peak, after = np.log([spots[y, x + k] for k in range(3)])
         widths = np.sqrt(8 * np.log(2) / (2 * peak - before - after))
         assert np.median(widths) == pytest.approx(3.3, abs=0.2)
+
+
+def quietest(image) -> float:
+    """Noise from pixel to pixel of the quietest twentieth of patches at 50 to 100 grey levels."""
+    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]]) / 6  # of planes it leaves nothing
+    grey = image.astype(np.float64)
+    apart = cv2.filter2D(grey, -1, kernel)
+    mean, square = (cv2.blur(x, (7, 7))[5:-5:6, 5:-5:6] for x in (grey, apart**2))
+    return float(np.sqrt(np.quantile(square[(mean > 50) & (mean < 100)], 0.05)))
+
+
+@pytest.mark.parametrize("name", ["d435", "d455"])
+def test_the_rooms_light_is_as_quiet_as_in_a_real_pair(name, d435_pair, renderer):
+    """A laser's speckle lies on its own light alone; on all light it gave 28 grey levels."""
+    sensor = changed(SENSORS[name], "light.projector", 0.0)
+    region = Region(320, 160, 200, 160)
+    image = Bench(sensor, renderer).shoot([painted(wall(1.5), 0.4)], region).left
+    image = (image * (75 / image.mean())).astype(np.float32)  # at the real one's exposure
+    assert quietest(d435_pair[0]) == pytest.approx(0.8, abs=0.2)
+    assert quietest(image) == pytest.approx(quietest(d435_pair[0]), abs=0.3)
 
 
 @pytest.mark.parametrize("name", REAL)

@@ -447,13 +447,18 @@ def test_a_sensor_without_steps_and_one_without_noise_are_told(renderer, small):
     free = dataclasses.replace(
         small,
         matching=dataclasses.replace(small.matching, quantum=0.0),
-        exposure=dataclasses.replace(small.exposure, noise=0.0, speckle=0.0),
+        exposure=dataclasses.replace(small.exposure, noise=0.0, speckle=0.0, coherent=0.0),
     )
     results = realism(free, renderer, RealismSettings(tests=("T3", "T9")), progress=False)
     assert [result["passed"] for result in results] == [None, None]
 
 
 @pytest.mark.slow
-def test_the_d435_passes_all_tests(renderer):
-    for result in realism(get_sensor("d435"), renderer, RealismSettings(quick=True)):
-        assert result["passed"] is not False, result
+def test_the_d435_passes_all_tests_but_that_it_fills_glancing_walls(renderer):
+    misses = [
+        row["what"]
+        for result in realism(get_sensor("d435"), renderer, RealismSettings(quick=True))
+        for row in result["rows"]
+        if row["passed"] is False
+    ]
+    assert misses == ["fall over all of angle"]  # 95 % at 80°: told in docs/realism.md

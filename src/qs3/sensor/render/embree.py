@@ -205,6 +205,8 @@ class EmbreePhotographer(Photographer):
     ) -> Float32[np.ndarray, "n"]:
         """Radiance that diffuse points give back of the projector's light."""
         scene = self._scene
+        if not scene.light.projector:
+            return np.zeros(len(points), np.float32)
         x, y, z = projector.seen(points)
         with np.errstate(divide="ignore", invalid="ignore"):
             u = x / z * np.float32(0.5 / scene.tan_half_width) + np.float32(0.5)
