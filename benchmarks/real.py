@@ -113,6 +113,10 @@ CELLS: Mapping[str, Cell] = {
     ),
     "rooms SPST": replace(ROOMS, method="spst", warm_up="rooms"),
     "rooms DGCNN": replace(ROOMS, network="dgcnn", steps=3000),
+    # The recipe since the D435 and D455 stand in a lit room, and rooms of little depth are redrawn.
+    "S lit": replace(ALL, cloud="points"),
+    "S+C+M lit": ALL,
+    "rooms lit": ROOMS,
     # Switches of self-training, one at a time.
     "QBST calibrated": replace(ALL, method="qbst", rounds={"calibrate": True}, warm_up="S+C+M"),
     "QBST by share": replace(ALL, method="qbst", rounds={"threshold_share": 0.5}, warm_up="S+C+M"),

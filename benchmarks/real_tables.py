@@ -42,6 +42,8 @@ PAIRS = (
     ("rooms SPST gentle", "rooms"), ("rooms QBST gentle", "rooms SPST gentle"),
     ("rooms QBST gentle, refined", "rooms"), ("rooms QBST gentle, more", "rooms"),
     ("rooms SPST", "rooms"), ("rooms QBST average", "rooms SPST"), ("rooms DGCNN", "rooms"),
+    ("S lit", "S"), ("S lit", "M"), ("S+C+M lit", "S+C+M"), ("rooms lit", "rooms"),
+    ("rooms lit", "S lit"),
 )  # fmt: skip
 """First minus second."""
 SWITCHES = {
@@ -53,6 +55,7 @@ SWITCHES = {
 """Against what each switch is held."""
 TITLES = {
     "M": "whole surfaces (M)", "C": "what a camera sees, without noise (C)", "S": "our scans (S)",
+    "S lit": "the same, the D4xx in a lit room, as they are now",
     "S+C+M": "all three", "QBST": "all three, then QBST", "SPST": "all three, then SPST",
     "rooms": "**`rooms`**", "rooms QBST gentle": "`rooms`, then gentle QBST",
     "rooms SPST gentle": "`rooms`, then gentle SPST", "rooms DGCNN": "`rooms` with a DGCNN",
