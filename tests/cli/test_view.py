@@ -145,19 +145,27 @@ def test_a_mesh_is_scanned_with_the_settings_of_the_page(tmp_path):
 
 
 def test_serves_until_ctrl_c(archive):
-    command = [sys.executable, "-m", "qs3", "view", str(archive), "--port", "0"]
+    # A shell's background jobs ignore the interrupt, and what they start inherits that.
+    script = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "from qs3.cli import main; main()"
+    )
+    command = [sys.executable, "-c", script, "view", str(archive), "--port", "0"]
     # A process group of its own, so that the interrupt reaches this process alone.
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
         env=dict(os.environ, PYTHONWARNINGS=""),
     ) as process:  # fmt: skip
-        assert process.stdout is not None
-        address = process.stdout.readline().strip()
-        port = int(address.rsplit(":", 1)[1].partition("/")[0])
-        with urllib.request.urlopen(address, timeout=30) as page:  # noqa: S310
-            assert page.status == 200
-        process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=60)
+        try:
+            assert process.stdout is not None
+            address = process.stdout.readline().strip()
+            port = int(address.rsplit(":", 1)[1].partition("/")[0])
+            with urllib.request.urlopen(address, timeout=30) as page:  # noqa: S310
+                assert page.status == 200
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=60)
+        finally:
+            process.kill()
     assert process.returncode == 0
     assert out == ""  # the address was all
     assert err.endswith("stopped\n")
