@@ -24,10 +24,10 @@ demo: $(VENV)/.installed
 	$(BIN)/qs3 demo $(if $(SCANS),--out demo-scans --scans "$(SCANS)",--out demo)
 
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -q -n auto --dist loadfile
+	$(BIN)/python -m pytest -q -n auto --dist loadfile --max-worker-restart 0
 
 slow: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -q -m slow --timeout 3600 -n auto --dist loadfile
+	$(BIN)/python -m pytest -q -m slow --timeout 3600 -n auto --dist loadfile --max-worker-restart 0
 
 check: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

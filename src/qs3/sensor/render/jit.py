@@ -22,7 +22,10 @@ from qs3.sensor.rig import Region
 class JitPhotographer(Photographer):
     """Holds geometry, pattern and light as Dr.Jit arrays.
 
-    Values that change between images are opaque: literals would compile a kernel each.
+    Values that change between images are opaque: literals would compile a kernel each. It must be
+    in no circle of references: Dr.Jit traces calls of all shapes that live in the process, and
+    aborts it (1.5.0: "invalid redefinition of function") where those of an earlier scene are
+    collected while a kernel is traced.
     """
 
     def __init__(self, mi: Any, scene: Scene, *settings: int) -> None:
@@ -31,8 +34,12 @@ class JitPhotographer(Photographer):
         super().__init__(scene, *settings)
         self._mi, self._dr = mi, dr
         self._shapes = mi.load_dict({"type": "scene", **mitsuba_bodies(mi, scene)})
+
+        def number(value: float | int) -> Any:
+            return dr.opaque(mi.Float, float(value))
+
         self.arrays = Arrays(
-            number=self._number,
+            number=number,
             whole=mi.Int32,
             floor=dr.floor,
             clip=dr.clip,
@@ -47,15 +54,12 @@ class JitPhotographer(Photographer):
             wrap_mode=dr.WrapMode.Clamp,
         )
         light = scene.light
-        self._intensity = self._number(light.projector * np.pi)
+        self._intensity = number(light.projector * np.pi)
         tangents = scene.tan_half_width, scene.tan_half_height
-        self._half = [self._number(0.5 / tangent) for tangent in tangents]
-        self._sky = self._number(light.sky)
-        self._ambient = self._number(light.ambient)
-        self._sky_z = self._number(np.sin(np.radians(light.sky_elevation)))
-
-    def _number(self, value: float | int) -> Any:
-        return self._dr.opaque(self._mi.Float, float(value))
+        self._half = [number(0.5 / tangent) for tangent in tangents]
+        self._sky = number(light.sky)
+        self._ambient = number(light.ambient)
+        self._sky_z = number(np.sin(np.radians(light.sky_elevation)))
 
     def _count(self, value: int) -> Any:
         return self._dr.opaque(self._mi.UInt32, int(value))
