@@ -14,6 +14,7 @@ from qs3.sensor.materials import MATERIALS, Material
 from qs3.sensor.render import Body, LightSettings, Scene
 from qs3.sensor.render.cache import places
 from qs3.sensor.render.embree import EmbreePhotographer, _turns
+from qs3.sensor.render.jit import JitPhotographer
 from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
 from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.speckle import PatternSettings, pattern_image
@@ -139,6 +140,37 @@ def test_no_scene_outlives_its_pictures(monkeypatch, indirect):
         assert [photographer() for photographer in made] == [None]
     finally:
         gc.enable()
+
+
+@needs_llvm
+def test_nothing_is_collected_while_pictures_are_taken(monkeypatch):
+    busy, when = [], []
+
+    class Ring:
+        def __init__(self):
+            self.ring = self
+
+        def __del__(self):
+            when.append(bool(busy))
+
+    take = JitPhotographer.photograph
+
+    def taking(*arguments):
+        busy.append(Ring() and None)
+        images = take(*arguments)
+        busy.clear()
+        return images
+
+    monkeypatch.setattr(JitPhotographer, "photograph", taking)
+    often = gc.get_threshold()
+    gc.set_threshold(1, 1, 1)
+    try:
+        pair(corner(), "llvm_ad_mono", samples=1)
+    finally:
+        gc.set_threshold(*often)
+    gc.collect()
+    assert when == [False]
+    assert gc.isenabled()
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

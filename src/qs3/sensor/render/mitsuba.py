@@ -1,9 +1,11 @@
 """The default renderer: Mitsuba 3, on CUDA, LLVM or plain C++, whichever is here."""
 
 import functools
+import gc
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -111,11 +113,12 @@ class MitsubaRenderer:
     ) -> list[StereoPair]:
         """Photograph ``scene`` once from each pose: `qs3.sensor.render.Renderer`."""
         views = view_regions(scene, rig, poses, seeds, regions, self.full_frame)
-        photographer = self._photographer(_mitsuba(self.variant), scene)
         pairs = []
-        for pose, seed, parts in zip(poses, seeds, views, strict=True):
-            left, right = photographer.photograph(rig, pose, parts, seed)
-            pairs.append(StereoPair(left, right, *parts, scene.light.ambient, pose))
+        with _collected_later():
+            photographer = self._photographer(_mitsuba(self.variant), scene)
+            for pose, seed, parts in zip(poses, seeds, views, strict=True):
+                left, right = photographer.photograph(rig, pose, parts, seed)
+                pairs.append(StereoPair(left, right, *parts, scene.light.ambient, pose))
         return pairs
 
     def _photographer(self, mi: Any, scene: Scene) -> Photographer | PathPhotographer:
@@ -129,6 +132,22 @@ class MitsubaRenderer:
         if scalar:
             return EmbreePhotographer(scene, *settings)
         return JitPhotographer(mi, scene, *settings)
+
+
+@contextmanager
+def _collected_later() -> Iterator[None]:
+    """Let the garbage collector rest: Dr.Jit aborts where it frees a scene amid a kernel's trace.
+
+    Photographers are in no circle of references; a user's own scenes, and those that an exception
+    holds, may be.
+    """
+    running = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if running:
+            gc.enable()
 
 
 def _mitsuba(variant: str) -> Any:
