@@ -44,3 +44,11 @@ def test_every_path_that_is_named_is_there():
     assert len(paths) > 8
     for path in paths:
         assert (ROOT / path).exists(), path
+
+
+def test_every_picture_has_a_command_that_makes_it():
+    rows = re.findall(r"^\| ([a-z, -]+) \| `python (\S+)[^`]*` \|$", TEXT, re.MULTILINE)
+    named = [name for names, _ in rows for name in names.split(", ")]
+    assert sorted(named) == sorted(path.stem for path in (ROOT / "docs/images").iterdir())
+    for _, script in rows:
+        assert (ROOT / script).is_file()

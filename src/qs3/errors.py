@@ -31,6 +31,10 @@ class MissingExtraError(QS3Error, ImportError):
         )
 
 
+class CannotCompileError(QS3Error, ImportError):
+    """This machine cannot compile what is compiled when first used: no fault of one object."""
+
+
 TOLD: set[str] = set()
 """What `say_once` has said in this process."""
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from qs3.files import write_bytes
 from qs3.meshes.classes import POINTDA10
+from qs3.sensor.compiled import compiled
 from qs3.store.folder import Folder
 from qs3.store.generate import GenerateReport, GenerateSettings, Item, generate, scan_seed
 from qs3.store.shards import CloudRow
@@ -79,6 +80,11 @@ def flaky_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
 
 def unavailable_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
     raise ModuleNotFoundError("No module named 'nowhere'")
+
+
+def compiling_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    compiled(fake_row)
+    return fake_row(item, scan, settings)
 
 
 class Interrupting:

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import sys
 
 import numpy as np
 import pytest
@@ -62,6 +63,18 @@ def test_a_missing_package_stops_the_run_at_once(fake, tmp_path):
     with pytest.raises(InputError, match="nowhere"):
         fake.run(items(fake), tmp_path, SETTINGS, row=fake.unavailable_row)
     assert sorted(fake.content(tmp_path)) == [MANIFEST]
+
+
+def test_a_machine_that_cannot_compile_stops_the_run_and_fails_no_object(
+    fake, tmp_path, monkeypatch
+):
+    monkeypatch.setitem(sys.modules, "numba", None)
+    with pytest.raises(InputError, match=r"^this machine cannot compile.*constraints.txt$"):
+        fake.run(items(fake), tmp_path, SETTINGS, row=fake.compiling_row)
+    assert sorted(fake.content(tmp_path)) == [MANIFEST]
+    monkeypatch.undo()
+    report = fake.run(items(fake), tmp_path, SETTINGS, row=fake.compiling_row)
+    assert report == GenerateReport(done=15, skipped=0, failed=0)
 
 
 def test_a_run_that_was_stopped_goes_on_and_ends_the_same(fake, tmp_path):

@@ -9,7 +9,7 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
-from qs3.errors import QS3Error
+from qs3.errors import CannotCompileError
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -19,7 +19,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     long as the process; the environment variable NUMBA_CACHE_DIR names another folder.
 
     Raises:
-        QS3Error: where this machine cannot compile.
+        CannotCompileError: where this machine cannot compile.
     """
     plain = inspect.unwrap(function)  # of the checks of types that tests put around it
     try:
@@ -31,7 +31,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
             return njit(nogil=True, error_model="numpy")(plain)
     except Exception as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise QS3Error(
+        raise CannotCompileError(
             f"this machine cannot compile ({reason}), as {function.__module__} needs it; install "
             "numba and llvmlite in the versions of constraints.txt"
         ) from error

@@ -25,7 +25,7 @@ def farthest_point_sample(
 
     Raises:
         InputError: where the cloud has fewer points than asked for, or a point is not finite.
-        QS3Error: on a machine that cannot compile.
+        CannotCompileError: on a machine that cannot compile.
 
     Example:
         >>> farthest_point_sample(np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]]), 2).tolist()

@@ -34,7 +34,7 @@ def match(
     Raises:
         InputError: where the images are too small for the search range or have too many bits, or
             there is no such device.
-        QS3Error: where ``ad-census`` is asked for on a machine that cannot compile.
+        CannotCompileError: where ``ad-census`` is asked for on a machine that cannot compile.
     """
     from qs3.sensor.matching.filters import quantise
     from qs3.sensor.matching.opencv_bm import match_opencv
