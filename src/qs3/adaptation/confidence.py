@@ -4,15 +4,13 @@ Convention:
     Probabilities are [m k], rows summing to 1; the confidence of a cloud is its largest one.
 """
 
-import math
 from dataclasses import dataclass
-from fractions import Fraction
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import log_softmax, softmax
 
-from qs3.adaptation.priors import check_probabilities
+from qs3.adaptation.priors import check_probabilities, count_of_share
 from qs3.errors import InputError
 from qs3.models.checks import check_positive, check_range
 
@@ -55,15 +53,7 @@ def energy(logits: Float[np.ndarray, "b k"]) -> Float[np.ndarray, "b"]:
 
 
 def measure_known(logits: Float[np.ndarray, "v k"], labels: Int[np.ndarray, "v"]) -> Known:
-    """Return what held-out clouds of the source tell of a network.
-
-    Args:
-        logits: Its answers to clouds that it was not trained on.
-        labels: Their classes.
-
-    Raises:
-        InputError: where there is no cloud.
-    """
+    """Return what held-out clouds of the source, which must not be none, tell of a network."""
     temperature = fit_temperature(softmax(logits, axis=1), labels)
     quantiles = np.quantile(energy(logits), _LEVELS).round(5)
     return Known(round(temperature, 5), tuple(quantiles.tolist()), len(labels))
@@ -145,8 +135,6 @@ def threshold_of_share(
     check_positive("share", share)
     check_range("share", share, 0, 1)
     confidence = probabilities.max(axis=1)
-    # The share is meant as it is written: 0.07 of 100 is 7, not 8.
-    count = math.ceil(Fraction(str(float(share))) * len(confidence))
-    last = np.sort(confidence)[len(confidence) - count]
+    last = np.sort(confidence)[len(confidence) - count_of_share(share, len(confidence))]
     theta = last if inclusive else confidence[confidence < last].max(initial=0.0)
     return min(1.0, float(theta))

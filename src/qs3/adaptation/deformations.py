@@ -84,13 +84,7 @@ def pick_cells(
 def deform_cells(
     points: Float[Tensor, "b n 3"], chosen: Int[Tensor, "b"], generator: torch.Generator
 ) -> Deformed:
-    """Collapse the points of one cell of each cloud to N(centre of the cell, 0.001 I).
-
-    Args:
-        points: Clouds.
-        chosen: A cell a cloud.
-        generator: Source of the draws.
-    """
+    """Collapse the points of one cell of each cloud to N(centre of the cell, 0.001 I)."""
     moved = cells(points) == chosen[:, None]
     return _scatter(points, moved, cell_centres().to(points)[chosen, None], generator)
 
@@ -98,12 +92,7 @@ def deform_cells(
 def deform_voxels(
     points: Float[Tensor, "b n 3"], generator: torch.Generator, least: int = 40
 ) -> Deformed:
-    """Collapse the points of a random cell to its centre: volume-based, as released ("voxels").
-
-    Args:
-        points: Clouds.
-        generator: Source of the draws.
-        least: Points that a cell should have; see `pick_cells`.
+    """Collapse the points of a cell of `pick_cells` to its centre: volume-based, as released.
 
     Example:
         >>> clouds = torch.rand(2, 64, 3) * 2 - 1
@@ -122,12 +111,8 @@ def deform_radius(
 ) -> Deformed:
     """Collapse a ball around a random point to that point: volume-based, as released ("radius").
 
-    Args:
-        points: Clouds.
-        generator: Source of the draws.
-        radius: Of the ball.
-        least: Points that the ball should have, the seed among them. Where none has so many, the
-            seed is the first of those with most points, in a random order.
+    The ball should have ``least`` points, the seed among them; where none has so many, the seed is
+    the first of those with most points, in a random order.
     """
     b, n, _ = points.shape
     order = torch.rand((b, n), generator=generator).argsort(dim=1).to(points.device)
@@ -156,11 +141,7 @@ def deform_features(
 ) -> Deformed:
     """Collapse the points most alike a random one, in a feature space, to that one: feature-based.
 
-    Args:
-        points: Clouds.
-        features: A vector a point, in which neighbours are sought.
-        generator: Source of the draws.
-        share: Part of the points that move; one at least.
+    A share of the points moves, one at least.
     """
     b, n, _ = points.shape
     seed = torch.randint(n, (b, 1), generator=generator).to(points.device)
@@ -210,13 +191,9 @@ def drop_points(
 ) -> Deformed:
     """Drop points at random, and let each that is dropped move to one that survives.
 
-    It lands at N(point that survives, 0.001 I): the cloud keeps its size, and no two points become
-    the same. Of each cloud, one point at least survives and one is dropped.
-
-    Args:
-        points: Clouds.
-        keep: Probability of each point to survive.
-        generator: Source of the draws.
+    ``keep`` is the probability to survive. A dropped point lands at N(point that survives,
+    0.001 I): the cloud keeps its size, and no two points become the same. Of each cloud, one point
+    at least survives and one is dropped.
     """
     b, n, _ = points.shape
     draw = torch.rand((b, n), generator=generator).to(points.device)

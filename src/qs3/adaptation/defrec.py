@@ -191,7 +191,6 @@ class DefRec(Method):
     """Probability of dropping a hidden unit of the reconstruction head."""
 
     def __post_init__(self) -> None:
-        """Check the settings and make the reconstruction head."""
         super().__post_init__()
         check_range("weight", self.weight, 0, 1)
         check_range("dropout", self.dropout, 0, 1)

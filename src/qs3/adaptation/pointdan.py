@@ -28,11 +28,7 @@ def reversal_coefficient(progress: float) -> float:
 
 
 def classifier_discrepancy(p1: Float[Tensor, "b k"], p2: Float[Tensor, "b k"]) -> Float[Tensor, ""]:
-    """Mean |p₁ − p₂| over clouds and classes (Saito et al., CVPR 2018, eq. 2).
-
-    Args:
-        p1: Class probabilities of one classifier.
-        p2: Those of the other, of the same clouds.
+    """Mean |p₁ − p₂| over clouds and classes of probabilities (Saito et al., CVPR 2018, eq. 2).
 
     Example:
         >>> float(classifier_discrepancy(torch.tensor([[1.0, 0.0]]), torch.tensor([[0.5, 0.5]])))
@@ -159,7 +155,6 @@ class PointDAN(Method):
     1e-4."""
 
     def __post_init__(self) -> None:
-        """Check the settings; make the second classifier, the nodes and the attention."""
         super().__post_init__()
         check_range("discrepancy_weight", self.discrepancy_weight, 0, 1e6)
         check_range("node_weight", self.node_weight, 0, 1e6)
