@@ -96,12 +96,7 @@ class ClassifierHead(nn.Module):
     """
 
     def __init__(
-        self,
-        channels: int,
-        hidden: tuple[int, ...],
-        num_classes: int,
-        dropout: float,
-        slope: float,
+        self, channels: int, hidden: tuple[int, ...], num_classes: int, dropout: float, slope: float
     ) -> None:
         super().__init__()
         check_range("num_classes", num_classes)
@@ -145,10 +140,7 @@ class LinearNorm(nn.Module):
 class PointwiseLayer(LinearNorm):
     """The same linear map at every point, batch normalisation over all points, leaky ReLU.
 
-    Args:
-        channels: Width of the input.
-        width: Width of the output.
-        slope: Slope of the leaky ReLU below zero; 0 is a plain ReLU.
+    ``slope`` is that of the leaky ReLU below zero; 0 is a plain ReLU.
     """
 
     def __init__(self, channels: int, width: int, slope: float) -> None:

@@ -21,11 +21,7 @@ class RSConv(nn.Module):
     For a centre x_i and a point x_j around it, a small network maps the ten numbers
     h_ij = (|x_j − x_i|, x_i, x_j, x_j − x_i) to a weight for each channel of the point; weighted
     features are normalised, rectified and reduced by their maximum over j; a last layer raises the
-    number of channels.
-
-    Args:
-        channels: Width of the input features; 0 where there are none but the coordinates.
-        width: Width of the output.
+    number of channels. Where these are 0, there are no features but the coordinates.
     """
 
     def __init__(self, channels: int, width: int) -> None:

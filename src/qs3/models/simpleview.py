@@ -103,12 +103,8 @@ class BasicBlock(nn.Module):
     """Two 3×3 convolutions beside a shortcut (He et al., Fig. 5 left).
 
     The second normalisation's scale starts at 0, so that the block starts as its shortcut
-    (Goyal et al., 2017, §5.1), as in SimpleView's release.
-
-    Args:
-        channels: Width of the input.
-        width: Width of the output.
-        stride: Stride of the first convolution and, where there is one, of the 1×1 shortcut.
+    (Goyal et al., 2017, §5.1), as in SimpleView's release. The stride is that of the first
+    convolution and, where there is one, of the 1×1 shortcut.
     """
 
     def __init__(self, channels: int, width: int, stride: int) -> None:
