@@ -65,11 +65,8 @@ def fit_temperature(probabilities: Float[np.ndarray, "v k"], labels: Int[np.ndar
     It minimises the negative log likelihood of labelled clouds under softmax(z / T), z the logits,
     within `BOUNDS`. The labels are hard: where the network was trained with label smoothing, which
     keeps confidence below 1 − ε + ε/k however sure the class is, T falls below 1 and takes that
-    shift back. Logits that differ by a factor get the same calibrated probabilities.
-
-    Args:
-        probabilities: Softmax outputs on clouds that the network was not trained on.
-        labels: Their classes.
+    shift back. Logits that differ by a factor get the same calibrated probabilities. The clouds
+    must be ones that the network was not trained on.
 
     Raises:
         InputError: where there is no cloud, or rows are not probabilities.
@@ -115,16 +112,11 @@ def threshold_of_share(
 ) -> float:
     """Return the θ that keeps a share of the clouds: the ⌈share · m⌉ most confident.
 
-    Clouds as confident as the last of these are kept too.
-
-    Args:
-        probabilities: Class probabilities of one cloud at least.
-        share: Part of the clouds, above 0, to 1.
-        inclusive: Whether a confidence equal to θ is enough. Else θ is the next lower confidence,
-            or 0.
+    Clouds as confident as the last of these are kept too. Where a confidence equal to θ is not
+    enough (``inclusive``), θ is the next lower confidence, or 0.
 
     Raises:
-        InputError: where rows are not probabilities, or the share is not in 0 to 1.
+        InputError: where rows are not probabilities, or the share is not above 0 and at most 1.
 
     Example:
         >>> rows = np.array([[0.9, 0.1], [0.3, 0.7], [0.4, 0.6]])

@@ -24,6 +24,8 @@ _VARIANCE = 0.001
 """Variance along each axis of the Gaussian that points collapse to."""
 _SEEDS = 32
 """Seeds whose neighbours are counted at a time."""
+_RADIUS, _IN_BALL = 0.5, 20
+"""Radius of a ball that collapses, and points that it should have."""
 _FLOOR = 0.05
 """Least probability with which a point survives an uneven sampling."""
 
@@ -89,10 +91,8 @@ def deform_cells(
     return _scatter(points, moved, cell_centres().to(points)[chosen, None], generator)
 
 
-def deform_voxels(
-    points: Float[Tensor, "b n 3"], generator: torch.Generator, least: int = 40
-) -> Deformed:
-    """Collapse the points of a cell of `pick_cells` to its centre: volume-based, as released.
+def deform_voxels(points: Float[Tensor, "b n 3"], generator: torch.Generator) -> Deformed:
+    """Collapse a random cell, of 40 points if there is one, to its centre: volume-based, "voxels".
 
     Example:
         >>> clouds = torch.rand(2, 64, 3) * 2 - 1
@@ -100,19 +100,14 @@ def deform_voxels(
         >>> torch.equal(points[~moved], clouds[~moved])
         True
     """
-    return deform_cells(points, pick_cells(points, least, generator), generator)
+    return deform_cells(points, pick_cells(points, 40, generator), generator)
 
 
-def deform_radius(
-    points: Float[Tensor, "b n 3"],
-    generator: torch.Generator,
-    radius: float = 0.5,
-    least: int = 20,
-) -> Deformed:
+def deform_radius(points: Float[Tensor, "b n 3"], generator: torch.Generator) -> Deformed:
     """Collapse a ball around a random point to that point: volume-based, as released ("radius").
 
-    The ball should have ``least`` points, the seed among them; where none has so many, the seed is
-    the first of those with most points, in a random order.
+    The ball, of radius 0.5, should have 20 points, the seed among them; where none has so many, the
+    seed is the first of those with most points, in a random order.
     """
     b, n, _ = points.shape
     order = torch.rand((b, n), generator=generator).argsort(dim=1).to(points.device)
@@ -120,17 +115,16 @@ def deform_radius(
     seed = order[:, 0]
     for start in range(0, n, _SEEDS):
         candidates = order[:, start : start + _SEEDS]
-        near = _within(gather_points(points, candidates), points, radius)
-        counts = near.sum(dim=2).clamp_max(least)
+        counts = _within(gather_points(points, candidates), points).sum(dim=2).clamp_max(_IN_BALL)
         place = torch.arange(counts.shape[1], device=points.device)
         first = (counts * _SEEDS - place).argmax(dim=1, keepdim=True)
         count = counts.gather(1, first)[:, 0]
         seed = torch.where(count > best, candidates.gather(1, first)[:, 0], seed)
         best = torch.maximum(best, count)
-        if bool((best >= least).all()):
+        if bool((best >= _IN_BALL).all()):
             break
     centre = gather_points(points, seed[:, None])
-    return _scatter(points, _within(centre, points, radius)[:, 0], centre, generator)
+    return _scatter(points, _within(centre, points)[:, 0], centre, generator)
 
 
 def deform_features(
@@ -216,12 +210,12 @@ def _directions(points: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def _within(
-    centres: Float[Tensor, "b s 3"], points: Float[Tensor, "b n 3"], radius: float
+    centres: Float[Tensor, "b s 3"], points: Float[Tensor, "b n 3"]
 ) -> Bool[Tensor, "b s n"]:
     squared = torch.zeros((), dtype=points.dtype, device=points.device)
     for axis in range(3):
         squared = squared + (centres[:, :, None, axis] - points[:, None, :, axis]).square()
-    return squared <= radius * radius
+    return squared <= _RADIUS**2
 
 
 def _scatter(points: Tensor, moved: Tensor, goal: Tensor, generator: torch.Generator) -> Deformed:

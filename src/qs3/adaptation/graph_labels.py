@@ -34,13 +34,10 @@ def refine_probabilities(
 
     Args:
         features: Pooled features of the clouds.
-        probabilities: Their class probabilities.
+        probabilities: Their class probabilities; the refined ones are in double precision.
         k: Neighbours of each cloud; more than m − 1 are as m − 1.
         alpha: Weight of the neighbours, 0 to below 1; at 0 nothing changes.
         iterations: Number of steps.
-
-    Returns:
-        Refined probabilities, in double precision.
 
     Raises:
         InputError: where rows are not probabilities, features are not finite, or a setting is

@@ -135,12 +135,7 @@ class TransNorm(SeparateNorm):
 def channel_weights(
     source: tuple[Tensor, Tensor], target: tuple[Tensor, Tensor], eps: float = 1e-5
 ) -> Tensor:
-    """Return TransNorm's α of each channel; their mean is 1.
-
-    Args:
-        source: Mean and variance of each channel, [c] each.
-        target: The same on the target.
-        eps: Added to the variances.
+    """Return TransNorm's α [c] of each domain's mean and variance of the channels; their mean is 1.
 
     Example:
         >>> one, zero = torch.ones(2), torch.zeros(2)

@@ -14,6 +14,7 @@ from qs3.adaptation.method import Batch, Method, Target, Terms, cross_entropy
 from qs3.adaptation.mmd import mmd
 from qs3.models import Features, PointClassifier, describe_point
 from qs3.models.checks import check_positive, check_range
+from qs3.models.classifier import evaluating
 from qs3.models.pointnet_sa import SANode, fill_nodes
 
 
@@ -71,11 +72,9 @@ def head_parameters(model: PointClassifier) -> list[nn.Parameter]:
         [10, 10]
     """
     parameters = [p for p in model.parameters() if p.requires_grad]
-    training, features = model.training, describe_point(model)
-    model.eval()
-    with torch.enable_grad():
+    features = describe_point(model)
+    with evaluating(model), torch.enable_grad():
         total = model.head(features).sum()
-    model.train(training)
     gradients = torch.autograd.grad(total, parameters, allow_unused=True)
     return [p for p, gradient in zip(parameters, gradients, strict=True) if gradient is not None]
 

@@ -1,6 +1,8 @@
 """What every network of this package offers."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -59,15 +61,22 @@ class Widths(NamedTuple):
     """Of the earlier layers."""
 
 
-@torch.no_grad()
-def describe_point(model: PointClassifier) -> Features:
-    """Describe a cloud of one point, to see what a network gives; it stays as it was."""
+@contextmanager
+def evaluating(model: nn.Module) -> Iterator[None]:
+    """Put a network into evaluation mode for a while."""
     training = model.training
     model.eval()
     try:
-        return model.encode(torch.zeros(1, 1, 3).to(next(model.parameters())))
+        yield
     finally:
         model.train(training)
+
+
+@torch.no_grad()
+def describe_point(model: PointClassifier) -> Features:
+    """Describe a cloud of one point, to see what a network gives; it stays as it was."""
+    with evaluating(model):
+        return model.encode(torch.zeros(1, 1, 3).to(next(model.parameters())))
 
 
 def feature_widths(model: PointClassifier) -> Widths:

@@ -47,14 +47,9 @@ class RSConv(nn.Module):
         neighbours: Int[Tensor, "b m k"],
         relative: bool,
     ) -> Float[Tensor, "b m d"]:
-        """Return the new features of the centres.
+        """Return the new features of the centres, given by index as are the points around them.
 
-        Args:
-            points: The cloud of this level.
-            features: Its features; None before the first convolution.
-            samples: Indices of the centres.
-            neighbours: Indices of the points around each.
-            relative: Whether h_ij holds x_i and x_j as seen from x_i, as the release has it.
+        Relative, h_ij holds x_i and x_j as seen from x_i, as the release has it.
         """
         around = gather_points(points, neighbours)
         centre = gather_points(points, samples)[:, :, None].expand_as(around)
