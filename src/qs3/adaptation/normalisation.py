@@ -25,8 +25,7 @@ _AFFINE = ("weight", "bias")
 class DomainNorm(nn.Module):
     """One set of running statistics, which follows every batch of either domain.
 
-    Args:
-        model: The network. It is not registered here: its method owns it.
+    The network is not registered here: its method owns it.
     """
 
     def __init__(self, model: PointClassifier) -> None:

@@ -42,11 +42,8 @@ def classifier_discrepancy(p1: Float[Tensor, "b k"], p2: Float[Tensor, "b k"]) -
 class NodeAttention(nn.Module):
     """Weigh the channels of all nodes, as one vector, and normalise them over the batch (§3.2).
 
-    y = x · sigmoid(MLP(x)) + x with a bottleneck, then batch normalisation.
-
-    Args:
-        channels: Nodes times the width of a node's feature.
-        reduction: Divisor of the width inside.
+    y = x · sigmoid(MLP(x)) + x, its inner width divided by ``reduction``, then batch normalisation.
+    ``channels`` are the nodes times the width of a node's feature.
     """
 
     def __init__(self, channels: int, reduction: int = 8) -> None:

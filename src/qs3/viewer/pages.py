@@ -21,13 +21,9 @@ ALL = "all classes"
 def gallery_page(
     server: Any, exhibits: Exhibits, answers: Answers | None = None, class_name: str | None = None
 ) -> Iterator[Canvas]:
-    """Put controls on a server to step through objects, until the block ends.
+    """Put controls on a `viser.ViserServer` to step through objects, until the block ends.
 
-    Args:
-        server: A `viser.ViserServer`.
-        exhibits: The objects.
-        answers: Of a network, row by row, where there is one.
-        class_name: Show this class first; None shows all.
+    Answers are those of a network, row by row; objects of ``class_name`` are shown first.
 
     Raises:
         InputError: where there is no object of that class.
