@@ -1,5 +1,6 @@
 """The viewer without its server: what is shown is right, and the last change wins."""
 
+import dataclasses
 import threading
 import time
 
@@ -12,6 +13,7 @@ from qs3.errors import InputError
 from qs3.report.figure import PALETTE
 from qs3.sensor.presets import SENSORS
 from qs3.sensor.render.mitsuba import MitsubaRenderer
+from qs3.sensor.scene import SceneSettings
 from qs3.sensor.settings import ScanSettings
 from qs3.viewer.colouring import by_error, by_height, by_view, round_limit
 from qs3.viewer.display import compose, frame_of, modes
@@ -247,6 +249,20 @@ class TestScanControls:
         same = with_controls(start, values_of(start))
         assert same == start
         assert same.make_sensor() == SENSORS[name]
+
+    def test_a_scene_and_a_renderer_of_ones_own_stay(self):
+        @dataclasses.dataclass(frozen=True)
+        class OwnRenderer:
+            """It has no rays to count."""
+
+            description = ()
+
+            def render(self, *scene): ...
+
+        scene = SceneSettings("floor", neighbour_size=0.5)
+        start = resolve(ScanSettings(scene=scene, renderer=OwnRenderer()))
+        assert with_controls(start, values_of(start)) == start
+        assert with_controls(start, values_of(start) | {"scene": "wall"}).scene == "wall"
 
     def test_every_control_does_something(self):
         start = resolve(ScanSettings(renderer=MitsubaRenderer(variant="scalar_rgb")))

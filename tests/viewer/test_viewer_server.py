@@ -162,3 +162,15 @@ def test_gallery_steps_and_filters(server, rng):
     with pytest.raises(InputError, match="--class-name c: no object of it; classes here: a, b"):
         gallery_page(server, items, None, "c").__enter__()
     server.gui.reset()
+
+
+def test_wrong_answers_are_counted_once_and_not_for_each_object(server, monkeypatch):
+    counted, wrong = [], Answers.wrong.fget
+    monkeypatch.setattr(Answers, "wrong", property(lambda own: counted.append(1) or wrong(own)))
+    items = ArrayExhibits(np.zeros((50, 6, 3)), ("a",) * 50, ("a",) * 50)
+    answers = Answers(np.array([[1.0, 0]] * 50), ("a", "b"), np.arange(50) % 2)
+    with gallery_page(server, items, answers):
+        controls(server)["Wrong ones only"].value = True
+        until(lambda: controls(server)["Object"].max == 25)
+    assert len(counted) < 25
+    server.gui.reset()

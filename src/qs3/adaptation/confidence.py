@@ -4,15 +4,13 @@ Convention:
     Probabilities are [m k], rows summing to 1; the confidence of a cloud is its largest one.
 """
 
-import math
 from dataclasses import dataclass
-from fractions import Fraction
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import log_softmax, softmax
 
-from qs3.adaptation.priors import check_probabilities
+from qs3.adaptation.priors import check_probabilities, count_of_share
 from qs3.errors import InputError
 from qs3.models.checks import check_positive, check_range
 
@@ -55,15 +53,7 @@ def energy(logits: Float[np.ndarray, "b k"]) -> Float[np.ndarray, "b"]:
 
 
 def measure_known(logits: Float[np.ndarray, "v k"], labels: Int[np.ndarray, "v"]) -> Known:
-    """Return what held-out clouds of the source tell of a network.
-
-    Args:
-        logits: Its answers to clouds that it was not trained on.
-        labels: Their classes.
-
-    Raises:
-        InputError: where there is no cloud.
-    """
+    """Return what held-out clouds of the source, which must not be none, tell of a network."""
     temperature = fit_temperature(softmax(logits, axis=1), labels)
     quantiles = np.quantile(energy(logits), _LEVELS).round(5)
     return Known(round(temperature, 5), tuple(quantiles.tolist()), len(labels))
@@ -75,11 +65,8 @@ def fit_temperature(probabilities: Float[np.ndarray, "v k"], labels: Int[np.ndar
     It minimises the negative log likelihood of labelled clouds under softmax(z / T), z the logits,
     within `BOUNDS`. The labels are hard: where the network was trained with label smoothing, which
     keeps confidence below 1 − ε + ε/k however sure the class is, T falls below 1 and takes that
-    shift back. Logits that differ by a factor get the same calibrated probabilities.
-
-    Args:
-        probabilities: Softmax outputs on clouds that the network was not trained on.
-        labels: Their classes.
+    shift back. Logits that differ by a factor get the same calibrated probabilities. The clouds
+    must be ones that the network was not trained on.
 
     Raises:
         InputError: where there is no cloud, or rows are not probabilities.
@@ -125,16 +112,11 @@ def threshold_of_share(
 ) -> float:
     """Return the θ that keeps a share of the clouds: the ⌈share · m⌉ most confident.
 
-    Clouds as confident as the last of these are kept too.
-
-    Args:
-        probabilities: Class probabilities of one cloud at least.
-        share: Part of the clouds, above 0, to 1.
-        inclusive: Whether a confidence equal to θ is enough. Else θ is the next lower confidence,
-            or 0.
+    Clouds as confident as the last of these are kept too. Where a confidence equal to θ is not
+    enough (``inclusive``), θ is the next lower confidence, or 0.
 
     Raises:
-        InputError: where rows are not probabilities, or the share is not in 0 to 1.
+        InputError: where rows are not probabilities, or the share is not above 0 and at most 1.
 
     Example:
         >>> rows = np.array([[0.9, 0.1], [0.3, 0.7], [0.4, 0.6]])
@@ -145,8 +127,6 @@ def threshold_of_share(
     check_positive("share", share)
     check_range("share", share, 0, 1)
     confidence = probabilities.max(axis=1)
-    # The share is meant as it is written: 0.07 of 100 is 7, not 8.
-    count = math.ceil(Fraction(str(float(share))) * len(confidence))
-    last = np.sort(confidence)[len(confidence) - count]
+    last = np.sort(confidence)[len(confidence) - count_of_share(share, len(confidence))]
     theta = last if inclusive else confidence[confidence < last].max(initial=0.0)
     return min(1.0, float(theta))

@@ -20,10 +20,6 @@ def coral(x: Float[Tensor, "b c"], y: Float[Tensor, "m c"]) -> Float[Tensor, ""]
 
     C is the unbiased covariance over the rows (eqs. 2 and 3); in single precision at least.
 
-    Args:
-        x: One sample, a row a cloud.
-        y: The other.
-
     Raises:
         InputError: where a sample has fewer than two rows.
 
@@ -61,7 +57,6 @@ class CORAL(Method):
     """Whose covariance is matched."""
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         super().__post_init__()
         check_range("coral_weight", self.coral_weight, 0, 1e6)
 

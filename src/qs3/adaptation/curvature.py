@@ -92,7 +92,8 @@ def smallest_axis(
     spread = (shifted.square().sum(dim=(1, 2)) / 6).sqrt()
     tiny = 64 * torch.finfo(unit.dtype).eps
     round_ = spread <= tiny
-    cosine = _determinant(shifted / spread.where(~round_, 1.0)[:, None, None]) / 2
+    a, b, c = (shifted / spread.where(~round_, 1.0)[:, None, None]).unbind(dim=1)
+    cosine = (a * torch.linalg.cross(b, c, dim=1)).sum(dim=1) / 2  # half of the determinant
     angle = cosine.clamp(-1, 1).acos() / 3
     least = mean + 2 * spread * (angle + 2 * math.pi / 3).cos()
     rest = unit - least[:, None, None] * eye
@@ -116,8 +117,3 @@ def _longest(rows: Float[Tensor, "r 3 3"]) -> tuple[Float[Tensor, "r 3"], Float[
     length, which = lengths.max(dim=1)
     longest = rows.gather(1, which[:, None, None].expand(-1, 1, 3))[:, 0]
     return longest / length.where(length > 0, 1.0)[:, None], length
-
-
-def _determinant(matrices: Float[Tensor, "r 3 3"]) -> Float[Tensor, "r"]:
-    first, second, third = matrices.unbind(dim=1)
-    return (first * torch.linalg.cross(second, third, dim=1)).sum(dim=1)

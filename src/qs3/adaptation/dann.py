@@ -18,10 +18,6 @@ def reverse_gradient(x: Float[Tensor, "*shape"], coefficient: float) -> Float[Te
 
     What comes after minimises a loss while what comes before maximises it, in one backward pass.
 
-    Args:
-        x: Features, of any shape and type.
-        coefficient: λ; with 0 nothing before learns from what comes after.
-
     Example:
         >>> x = torch.tensor([3.0], requires_grad=True)
         >>> reverse_gradient(x, 0.5).square().backward()
@@ -45,10 +41,6 @@ class _Reverse(torch.autograd.Function):
 def reversal_coefficient(progress: float, gamma: float = 10.0) -> float:
     """Return λ = 2 / (1 + exp(−γ p)) − 1, from 0 at the start to nearly 1 (JMLR 2016, §5.2.2).
 
-    Args:
-        progress: p, the share of the training that is done.
-        gamma: γ, how fast λ rises.
-
     Example:
         >>> [round(reversal_coefficient(p), 3) for p in (0.0, 0.1, 0.5, 1.0)]
         [0.0, 0.462, 0.987, 1.0]
@@ -59,9 +51,7 @@ def reversal_coefficient(progress: float, gamma: float = 10.0) -> float:
 def domain_loss(source: Float[Tensor, "b"], target: Float[Tensor, "b_t"]) -> Float[Tensor, ""]:
     """Logistic loss of a domain discriminator, mean over each domain, summed (JMLR 2016, eq. 9).
 
-    Args:
-        source: Its scores of source clouds, which it should make negative.
-        target: Its scores of target clouds, which it should make positive.
+    It should make its scores of the source negative and those of the target positive.
 
     Example:
         >>> round(float(domain_loss(torch.zeros(3), torch.zeros(2))), 4)  # 2 log 2
@@ -93,7 +83,6 @@ class DANN(Method):
     """Factor of the domain loss."""
 
     def __post_init__(self) -> None:
-        """Check the settings and make the discriminator."""
         super().__post_init__()
         check_range("hidden", (1, *self.hidden))
         check_positive("gamma", self.gamma)

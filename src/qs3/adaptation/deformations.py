@@ -24,6 +24,8 @@ _VARIANCE = 0.001
 """Variance along each axis of the Gaussian that points collapse to."""
 _SEEDS = 32
 """Seeds whose neighbours are counted at a time."""
+_RADIUS, _IN_BALL = 0.5, 20
+"""Radius of a ball that collapses, and points that it should have."""
 _FLOOR = 0.05
 """Least probability with which a point survives an uneven sampling."""
 
@@ -84,26 +86,13 @@ def pick_cells(
 def deform_cells(
     points: Float[Tensor, "b n 3"], chosen: Int[Tensor, "b"], generator: torch.Generator
 ) -> Deformed:
-    """Collapse the points of one cell of each cloud to N(centre of the cell, 0.001 I).
-
-    Args:
-        points: Clouds.
-        chosen: A cell a cloud.
-        generator: Source of the draws.
-    """
+    """Collapse the points of one cell of each cloud to N(centre of the cell, 0.001 I)."""
     moved = cells(points) == chosen[:, None]
     return _scatter(points, moved, cell_centres().to(points)[chosen, None], generator)
 
 
-def deform_voxels(
-    points: Float[Tensor, "b n 3"], generator: torch.Generator, least: int = 40
-) -> Deformed:
-    """Collapse the points of a random cell to its centre: volume-based, as released ("voxels").
-
-    Args:
-        points: Clouds.
-        generator: Source of the draws.
-        least: Points that a cell should have; see `pick_cells`.
+def deform_voxels(points: Float[Tensor, "b n 3"], generator: torch.Generator) -> Deformed:
+    """Collapse a random cell, of 40 points if there is one, to its centre: volume-based, "voxels".
 
     Example:
         >>> clouds = torch.rand(2, 64, 3) * 2 - 1
@@ -111,23 +100,14 @@ def deform_voxels(
         >>> torch.equal(points[~moved], clouds[~moved])
         True
     """
-    return deform_cells(points, pick_cells(points, least, generator), generator)
+    return deform_cells(points, pick_cells(points, 40, generator), generator)
 
 
-def deform_radius(
-    points: Float[Tensor, "b n 3"],
-    generator: torch.Generator,
-    radius: float = 0.5,
-    least: int = 20,
-) -> Deformed:
+def deform_radius(points: Float[Tensor, "b n 3"], generator: torch.Generator) -> Deformed:
     """Collapse a ball around a random point to that point: volume-based, as released ("radius").
 
-    Args:
-        points: Clouds.
-        generator: Source of the draws.
-        radius: Of the ball.
-        least: Points that the ball should have, the seed among them. Where none has so many, the
-            seed is the first of those with most points, in a random order.
+    The ball, of radius 0.5, should have 20 points, the seed among them; where none has so many, the
+    seed is the first of those with most points, in a random order.
     """
     b, n, _ = points.shape
     order = torch.rand((b, n), generator=generator).argsort(dim=1).to(points.device)
@@ -135,17 +115,16 @@ def deform_radius(
     seed = order[:, 0]
     for start in range(0, n, _SEEDS):
         candidates = order[:, start : start + _SEEDS]
-        near = _within(gather_points(points, candidates), points, radius)
-        counts = near.sum(dim=2).clamp_max(least)
+        counts = _within(gather_points(points, candidates), points).sum(dim=2).clamp_max(_IN_BALL)
         place = torch.arange(counts.shape[1], device=points.device)
         first = (counts * _SEEDS - place).argmax(dim=1, keepdim=True)
         count = counts.gather(1, first)[:, 0]
         seed = torch.where(count > best, candidates.gather(1, first)[:, 0], seed)
         best = torch.maximum(best, count)
-        if bool((best >= least).all()):
+        if bool((best >= _IN_BALL).all()):
             break
     centre = gather_points(points, seed[:, None])
-    return _scatter(points, _within(centre, points, radius)[:, 0], centre, generator)
+    return _scatter(points, _within(centre, points)[:, 0], centre, generator)
 
 
 def deform_features(
@@ -156,11 +135,7 @@ def deform_features(
 ) -> Deformed:
     """Collapse the points most alike a random one, in a feature space, to that one: feature-based.
 
-    Args:
-        points: Clouds.
-        features: A vector a point, in which neighbours are sought.
-        generator: Source of the draws.
-        share: Part of the points that move; one at least.
+    A share of the points moves, one at least.
     """
     b, n, _ = points.shape
     seed = torch.randint(n, (b, 1), generator=generator).to(points.device)
@@ -210,13 +185,9 @@ def drop_points(
 ) -> Deformed:
     """Drop points at random, and let each that is dropped move to one that survives.
 
-    It lands at N(point that survives, 0.001 I): the cloud keeps its size, and no two points become
-    the same. Of each cloud, one point at least survives and one is dropped.
-
-    Args:
-        points: Clouds.
-        keep: Probability of each point to survive.
-        generator: Source of the draws.
+    ``keep`` is the probability to survive. A dropped point lands at N(point that survives,
+    0.001 I): the cloud keeps its size, and no two points become the same. Of each cloud, one point
+    at least survives and one is dropped.
     """
     b, n, _ = points.shape
     draw = torch.rand((b, n), generator=generator).to(points.device)
@@ -239,12 +210,12 @@ def _directions(points: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def _within(
-    centres: Float[Tensor, "b s 3"], points: Float[Tensor, "b n 3"], radius: float
+    centres: Float[Tensor, "b s 3"], points: Float[Tensor, "b n 3"]
 ) -> Bool[Tensor, "b s n"]:
     squared = torch.zeros((), dtype=points.dtype, device=points.device)
     for axis in range(3):
         squared = squared + (centres[:, :, None, axis] - points[:, None, :, axis]).square()
-    return squared <= radius * radius
+    return squared <= _RADIUS**2
 
 
 def _scatter(points: Tensor, moved: Tensor, goal: Tensor, generator: torch.Generator) -> Deformed:

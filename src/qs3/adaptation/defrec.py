@@ -11,13 +11,12 @@ from qs3.adaptation.deformations import DEFORMATIONS, Deformation, Deformed, def
 from qs3.adaptation.method import Batch, Domain, Method, Target, Terms
 from qs3.models import Features, feature_widths
 from qs3.models.checks import check_range
+from qs3.models.classifier import evaluating
 from qs3.models.ops import gather_points
 from qs3.models.ops.gathering import blocks
 
 _SCALE = 20.0
 """Factor of the released code, which brings the distance to the size of a cross entropy."""
-
-
 _BLOCK = 2**18
 """Distances held at a time on a CPU: they fit its cache."""
 _CUDA_BLOCK = 2**26
@@ -34,13 +33,8 @@ def chamfer(
 
     mean_i min_j |x_i − y_j|² + mean_j min_i |x_i − y_j|² (Fan et al., CVPR 2017, with means in
     place of sums). Nearest neighbours are found without a gradient, a block of distances at a
-    time; the gradient passes through the n + m pairs alone. No [b n m] tensor ever exists.
-
-    Args:
-        x: Clouds.
-        y: Clouds to compare with, one each.
-        x_mask: Points of ``x`` that count; all where None.
-        y_mask: Points of ``y`` that count; all where None.
+    time; the gradient passes through the n + m pairs alone. No [b n m] tensor ever exists. Where
+    there is no mask all points count.
 
     Returns:
         One distance a pair; 0 where one of the two has no point that counts.
@@ -191,7 +185,6 @@ class DefRec(Method):
     """Probability of dropping a hidden unit of the reconstruction head."""
 
     def __post_init__(self) -> None:
-        """Check the settings and make the reconstruction head."""
         super().__post_init__()
         check_range("weight", self.weight, 0, 1)
         check_range("dropout", self.dropout, 0, 1)
@@ -226,12 +219,7 @@ class DefRec(Method):
         if self.deformation != "features":
             return DEFORMATIONS[self.deformation](points, generator)
         # In evaluation mode, so that this look leaves no trace in the running statistics.
-        training = self.model.training
-        self.model.eval()
-        try:
-            with torch.no_grad():
-                local = self.features(points, domain).local
-        finally:
-            self.model.train(training)
+        with evaluating(self.model), torch.no_grad():
+            local = self.features(points, domain).local
         assert local is not None  # noqa: S101
         return deform_features(points, local, generator)

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.errors import InputError
+from qs3.models.checks import check_range
 
 if TYPE_CHECKING:
     from sklearn.linear_model import LogisticRegression
@@ -48,8 +49,7 @@ def density_ratio(
     """
     if not (len(source) and len(target)):
         raise InputError("a ratio of densities needs clouds of both domains")
-    if strength is not None and not strength >= 0:
-        raise InputError(f"strength must be at least 0, not {strength}")
+    check_range("strength", strength or 0, 0)
     both = np.concatenate([source, target]).astype(np.float64)
     mean, spread = both.mean(axis=0), both.std(axis=0)
     use = spread > 1e-9 * np.maximum(1.0, np.abs(mean))

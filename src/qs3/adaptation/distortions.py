@@ -3,6 +3,7 @@
 Convention:
     Clouds are [b n 3] in the unit ball. Every draw comes from the given generator on the CPU and is
     made in single precision, so that it does not depend on the device. Each cloud draws its own.
+    Angles are in radians.
 """
 
 import math
@@ -12,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from qs3.errors import InputError
+from qs3.models.checks import check_range
 
 _REACH = 1.0
 """Half the side of the cube over which `elastic` draws its displacements."""
@@ -57,13 +59,7 @@ def tilt(
     sigma: float = 0.06,
     clip: float = 0.18,
 ) -> Float[Tensor, "b n 3"]:
-    """Turn each cloud by small angles about x, then y, then z.
-
-    Args:
-        points: Clouds.
-        generator: Source of the draws.
-        sigma: Standard deviation of each angle, in radians.
-        clip: Largest angle, in radians.
+    """Turn each cloud about x, then y, then z, by angles of this deviation, cut at ``clip``.
 
     Example:
         >>> tilt(torch.zeros(2, 5, 3), torch.Generator()).shape
@@ -87,11 +83,6 @@ def occlude(
 
     The ⌈keep · n⌉ points farthest along a direction drawn evenly from the sphere stay where they
     are in the order; every other one becomes one of them, drawn evenly.
-
-    Args:
-        points: Clouds.
-        generator: Source of the draws.
-        keep: Share of the points that is kept, above 0; 1 changes nothing.
 
     Raises:
         InputError: where ``keep`` is not above 0 and at most 1.
@@ -125,15 +116,10 @@ def elastic(
 ) -> Float[Tensor, "b n 3"]:
     """Bend each cloud by a smooth random field of displacements (Simard et al., 2003, in 3D).
 
-    Standard normal vectors are drawn on a cubic grid of this spacing, averaged twice over 3³ nodes,
-    multiplied by the strength and interpolated linearly at the points. The grid covers the unit
-    ball; points beyond move as its border does.
-
-    Args:
-        points: Clouds.
-        generator: Source of the draws.
-        grain: Distance of the grid's nodes.
-        strength: Factor on the displacements; their deviation is about 0.11 of it.
+    Standard normal vectors are drawn on a cubic grid whose nodes are ``grain`` apart, averaged
+    twice over 3³ nodes, multiplied by the strength (their deviation is then about 0.11 of it) and
+    interpolated linearly at the points. The grid covers the unit ball; points beyond move as its
+    border does.
 
     Raises:
         InputError: where the grain is below 0.05, which would need too large a grid.
@@ -142,8 +128,7 @@ def elastic(
         >>> elastic(torch.zeros(2, 5, 3), torch.Generator(), 0.8, 0.0).abs().max()
         tensor(0.)
     """
-    if not grain >= 0.05:
-        raise InputError(f"grain must be at least 0.05, not {grain}")
+    check_range("grain", grain, 0.05)
     nodes = 2 * math.ceil(_REACH / grain) + 3
     noise = torch.randn(len(points), 3, nodes, nodes, nodes, generator=generator)
     for _ in range(2):

@@ -48,12 +48,7 @@ def mix_rotations(
     """Mix each cloud turned about x with itself turned about y; the classes are quarter turns.
 
     round(λ n) farthest points come from the first, the rest from the second; λ is drawn once a
-    batch, both turns for each cloud.
-
-    Args:
-        points: Clouds.
-        generator: Source of the draws.
-        concentration: Of the Beta distribution of λ; see `qs3.adaptation.pcm.draw_share`.
+    batch (`qs3.adaptation.pcm.draw_share`), both turns for each cloud.
     """
     share = draw_share(concentration, generator)
     # Two arrays: the released code writes both turns into one.
@@ -137,7 +132,6 @@ class GAST(Method):
     """γ of λ ~ Beta(γ, γ)."""
 
     def __post_init__(self) -> None:
-        """Check the settings and make a linear layer for each task."""
         super().__post_init__()
         if not (self.rotation or self.location):
             raise InputError("rotation and location are both off; choose source-only instead")

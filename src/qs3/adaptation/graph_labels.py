@@ -8,6 +8,7 @@ from scipy import sparse
 
 from qs3.adaptation.priors import check_probabilities
 from qs3.errors import InputError
+from qs3.models.checks import check_range
 
 _BLOCK = 2**22
 """Similarities that are held at a time."""
@@ -33,13 +34,10 @@ def refine_probabilities(
 
     Args:
         features: Pooled features of the clouds.
-        probabilities: Their class probabilities.
+        probabilities: Their class probabilities; the refined ones are in double precision.
         k: Neighbours of each cloud; more than m − 1 are as m − 1.
         alpha: Weight of the neighbours, 0 to below 1; at 0 nothing changes.
         iterations: Number of steps.
-
-    Returns:
-        Refined probabilities, in double precision.
 
     Raises:
         InputError: where rows are not probabilities, features are not finite, or a setting is
@@ -57,8 +55,7 @@ def refine_probabilities(
         raise InputError(f"{len(features)} features for {len(probabilities)} probabilities")
     if not 0.0 <= alpha < 1.0:
         raise InputError(f"alpha must be 0 to below 1, not {alpha}")
-    if iterations < 0:
-        raise InputError(f"iterations must be at least 0, not {iterations}")
+    check_range("iterations", iterations, 0)
     start = probabilities.astype(np.float64)
     graph = neighbour_graph(features, k)
     degree = np.asarray(graph.sum(axis=1)).ravel()
@@ -79,19 +76,11 @@ def neighbour_graph(features: Float[np.ndarray, "m c"], k: int = 10) -> sparse.c
     their features; where it is not positive there is no link. Memory is bounded: similarities are
     held for a block of rows at a time.
 
-    Args:
-        features: One row a cloud.
-        k: Neighbours of each.
-
-    Raises:
-        InputError: where features are not finite or k is not at least 1.
-
     Example:
         >>> neighbour_graph(np.array([[1.0, 0.0], [2.0, 0.0], [0.0, 1.0]]), 1).toarray().tolist()
         [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
     """
-    if k < 1:
-        raise InputError(f"k must be at least 1, not {k}")
+    check_range("k", k)
     check_features(features)
     m = len(features)
     k = min(k, m - 1)

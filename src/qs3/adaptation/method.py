@@ -89,7 +89,6 @@ class Method(nn.Module, ABC):
         return method
 
     def __post_init__(self) -> None:
-        """Refuse unusable settings; make what else is trained."""
         if self.needs_local and feature_widths(self.model).local is None:
             raise InputError(
                 f"{type(self).__name__} needs features of single points, which "

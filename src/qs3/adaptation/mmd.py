@@ -29,12 +29,8 @@ def mmd(
     k(u, v) = Σ_σ exp(−|u − v|² / 2σ²), and MMD² = mean k(x, x') + mean k(y, y') − 2 mean k(x, y)
     (Gretton et al., JMLR 2012: eq. 5 biased, eq. 3 unbiased).
 
-    Args:
-        x: One sample.
-        y: The other.
-        bandwidths: σ of each kernel, in the unit of the features.
-        biased: Whether a row's pair with itself counts; then the value is never negative. Without,
-            its expectation is 0 for samples of one distribution.
+    In the biased estimate a row's pair with itself counts, and the value is never negative; the
+    expectation of the other is 0 for samples of one distribution.
 
     Raises:
         InputError: where a sample is empty, or has a single row and the estimate is unbiased.
@@ -89,11 +85,6 @@ def median_bandwidths(
 
     No gradient passes through them.
 
-    Args:
-        x: One sample.
-        y: The other.
-        factors: One a kernel.
-
     Example:
         >>> median_bandwidths(torch.tensor([[0.0]]), torch.tensor([[2.0]]), (2.0,)).tolist()
         [2.0]
@@ -124,7 +115,6 @@ class MMD(Method):
     """See `mmd`."""
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         super().__post_init__()
         check_range("mmd_weight", self.mmd_weight, 0, 1e6)
         check_positive("factors", self.factors)

@@ -66,9 +66,7 @@ WITHOUT_TARGET = ("source-only", "pcm")
 def split_method(method: str, rounds: str | None = None) -> tuple[str, str | None]:
     """Return the warm-up and the rule of self-training that a method stands for.
 
-    Args:
-        method: A name.
-        rounds: A rule that is asked for beside it.
+    ``rounds`` is a rule that is asked for beside it.
 
     Raises:
         ValueError: where the method has a rule of its own and another one is asked for.

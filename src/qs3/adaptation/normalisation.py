@@ -25,8 +25,7 @@ _AFFINE = ("weight", "bias")
 class DomainNorm(nn.Module):
     """One set of running statistics, which follows every batch of either domain.
 
-    Args:
-        model: The network. It is not registered here: its method owns it.
+    The network is not registered here: its method owns it.
     """
 
     def __init__(self, model: PointClassifier) -> None:
@@ -135,12 +134,7 @@ class TransNorm(SeparateNorm):
 def channel_weights(
     source: tuple[Tensor, Tensor], target: tuple[Tensor, Tensor], eps: float = 1e-5
 ) -> Tensor:
-    """Return TransNorm's α of each channel; their mean is 1.
-
-    Args:
-        source: Mean and variance of each channel, [c] each.
-        target: The same on the target.
-        eps: Added to the variances.
+    """Return TransNorm's α [c] of each domain's mean and variance of the channels; their mean is 1.
 
     Example:
         >>> one, zero = torch.ones(2), torch.zeros(2)

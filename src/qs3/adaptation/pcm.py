@@ -28,11 +28,7 @@ class Mixed(NamedTuple):
 
 
 def draw_share(concentration: float, generator: Generator) -> float:
-    """Draw λ from Beta(a, a).
-
-    Args:
-        concentration: a; 1 is uniform over 0 to 1.
-        generator: Source of the draw.
+    """Draw λ from Beta(a, a); a = 1 is uniform over 0 to 1.
 
     Example:
         >>> 0.0 <= draw_share(1.0, torch.Generator().manual_seed(0)) <= 1.0
@@ -61,12 +57,6 @@ def mix_halves(
 ) -> tuple[Float[Tensor, "b n 3"], float]:
     """Join round(λ n) farthest points of each first cloud and n − round(λ n) of its second.
 
-    Args:
-        first: Clouds.
-        second: Partners, of as many points.
-        share: λ.
-        generator: Source of the draws.
-
     Returns:
         The mixed clouds in a random order of points, and the share that rounding left.
     """
@@ -85,14 +75,8 @@ def mix_clouds(
 ) -> Mixed:
     """Mix each cloud of a batch with one drawn from the same batch.
 
-    λ is drawn once a batch; the partners are a permutation of the batch, which may leave a cloud to
-    itself.
-
-    Args:
-        points: Clouds.
-        labels: Their classes.
-        generator: Source of the draws.
-        concentration: Of the Beta distribution of λ; see `draw_share`.
+    λ is drawn once a batch (`draw_share`); the partners are a permutation of the batch, which may
+    leave a cloud to itself.
 
     Example:
         >>> clouds, classes = torch.rand(2, 8, 3), torch.tensor([0, 1])
@@ -113,11 +97,7 @@ def mixed_cross_entropy(
 ) -> Float[Tensor, ""]:
     """λ times the cross entropy with the first labels plus 1 − λ times that with the second.
 
-    Args:
-        of_first: Logits for the first labels.
-        of_second: Logits for the second labels; where one layer gives both, the same.
-        mixed: The clouds that they are of.
-        label_smoothing: ε of `cross_entropy`.
+    Where one layer gives the logits for both, they are the same.
 
     Example:
         >>> logits = torch.tensor([[0.0, 1.0]])
@@ -128,20 +108,6 @@ def mixed_cross_entropy(
     first = cross_entropy(of_first, mixed.first, label_smoothing)
     second = cross_entropy(of_second, mixed.second, label_smoothing)
     return mixed.share * first + (1 - mixed.share) * second
-
-
-def mixed_classification(
-    method: Method, batch: Batch, generator: Generator, concentration: float
-) -> Float[Tensor, ""]:
-    """Return PCM's loss on the source, and let the method count what the network had right.
-
-    A mixed cloud counts as right where it is given the class of its larger part.
-    """
-    mixed = mix_clouds(batch.points, batch.labels, generator, concentration)
-    logits = method.logits(mixed.points, "source")
-    larger = mixed.first if mixed.share >= 0.5 else mixed.second
-    method.classification(logits.detach(), Batch(mixed.points, larger))
-    return mixed_cross_entropy(logits, logits, mixed, method.label_smoothing)
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
@@ -157,13 +123,23 @@ class PCM(Method):
     """γ of λ ~ Beta(γ, γ); 1 is the paper's."""
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         super().__post_init__()
         check_positive("concentration", self.concentration)
 
     def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of mixed source clouds."""
-        return {"pcm": mixed_classification(self, source, generator, self.concentration)}
+        return {"pcm": self.mixed(source, generator)}
+
+    def mixed(self, batch: Batch, generator: Generator) -> Float[Tensor, ""]:
+        """Return the loss on the source, and note how many clouds the network had right.
+
+        A mixed cloud counts as right where it is given the class of its larger part.
+        """
+        mixed = mix_clouds(batch.points, batch.labels, generator, self.concentration)
+        logits = self.logits(mixed.points)
+        larger = mixed.first if mixed.share >= 0.5 else mixed.second
+        self.classification(logits.detach(), Batch(mixed.points, larger))
+        return mixed_cross_entropy(logits, logits, mixed, self.label_smoothing)
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
@@ -177,6 +153,5 @@ class DefRecPCM(PCM, DefRec):
 
     def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of mixed source clouds and the distance of rebuilt parts."""
-        mixed = mixed_classification(self, source, generator, self.concentration)
-        rebuilt = self.rebuilding(source.points, target, generator)
-        return {"pcm": (1 - self.weight) * mixed, **rebuilt}
+        mixed = (1 - self.weight) * self.mixed(source, generator)
+        return {"pcm": mixed, **self.rebuilding(source.points, target, generator)}

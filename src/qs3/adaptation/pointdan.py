@@ -14,6 +14,7 @@ from qs3.adaptation.method import Batch, Method, Target, Terms, cross_entropy
 from qs3.adaptation.mmd import mmd
 from qs3.models import Features, PointClassifier, describe_point
 from qs3.models.checks import check_positive, check_range
+from qs3.models.classifier import evaluating
 from qs3.models.pointnet_sa import SANode, fill_nodes
 
 
@@ -28,11 +29,7 @@ def reversal_coefficient(progress: float) -> float:
 
 
 def classifier_discrepancy(p1: Float[Tensor, "b k"], p2: Float[Tensor, "b k"]) -> Float[Tensor, ""]:
-    """Mean |p₁ − p₂| over clouds and classes (Saito et al., CVPR 2018, eq. 2).
-
-    Args:
-        p1: Class probabilities of one classifier.
-        p2: Those of the other, of the same clouds.
+    """Mean |p₁ − p₂| over clouds and classes of probabilities (Saito et al., CVPR 2018, eq. 2).
 
     Example:
         >>> float(classifier_discrepancy(torch.tensor([[1.0, 0.0]]), torch.tensor([[0.5, 0.5]])))
@@ -45,11 +42,8 @@ def classifier_discrepancy(p1: Float[Tensor, "b k"], p2: Float[Tensor, "b k"]) -
 class NodeAttention(nn.Module):
     """Weigh the channels of all nodes, as one vector, and normalise them over the batch (§3.2).
 
-    y = x · sigmoid(MLP(x)) + x with a bottleneck, then batch normalisation.
-
-    Args:
-        channels: Nodes times the width of a node's feature.
-        reduction: Divisor of the width inside.
+    y = x · sigmoid(MLP(x)) + x, its inner width divided by ``reduction``, then batch normalisation.
+    ``channels`` are the nodes times the width of a node's feature.
     """
 
     def __init__(self, channels: int, reduction: int = 8) -> None:
@@ -75,11 +69,9 @@ def head_parameters(model: PointClassifier) -> list[nn.Parameter]:
         [10, 10]
     """
     parameters = [p for p in model.parameters() if p.requires_grad]
-    training, features = model.training, describe_point(model)
-    model.eval()
-    with torch.enable_grad():
+    features = describe_point(model)
+    with evaluating(model), torch.enable_grad():
         total = model.head(features).sum()
-    model.train(training)
     gradients = torch.autograd.grad(total, parameters, allow_unused=True)
     return [p for p, gradient in zip(parameters, gradients, strict=True) if gradient is not None]
 
@@ -159,7 +151,6 @@ class PointDAN(Method):
     1e-4."""
 
     def __post_init__(self) -> None:
-        """Check the settings; make the second classifier, the nodes and the attention."""
         super().__post_init__()
         check_range("discrepancy_weight", self.discrepancy_weight, 0, 1e6)
         check_range("node_weight", self.node_weight, 0, 1e6)

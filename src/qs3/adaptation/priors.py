@@ -1,8 +1,11 @@
-"""Estimates of the target's class prior (NumPy only).
+"""Estimates of the target's class prior, and checks of probabilities (NumPy only).
 
 Convention:
     Probabilities are [m k], one row an unlabelled cloud, rows summing to 1.
 """
+
+import math
+from fractions import Fraction
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -133,3 +136,13 @@ def check_probabilities(probabilities: Float[np.ndarray, "m k"]) -> None:
         raise InputError("probabilities are negative; hand in softmax outputs, not logits")
     if (np.abs(probabilities.sum(axis=1, dtype=np.float64) - 1.0) > _TOLERANCE).any():
         raise InputError("probabilities do not sum to 1; hand in softmax outputs, not logits")
+
+
+def count_of_share(share: float, total: int) -> int:
+    """Return ⌈share · total⌉ for a share as it is written: 0.07 of 100 is 7, not 8.
+
+    Example:
+        >>> count_of_share(0.07, 100)
+        7
+    """
+    return math.ceil(Fraction(str(float(share))) * total)

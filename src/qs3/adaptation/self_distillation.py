@@ -27,13 +27,7 @@ def distillation_loss(
     """Return the cross entropy of the teacher's sharpened description to the student's.
 
     Mean over clouds of −Σ_c softmax(t/τ_t)_c ln softmax(s/τ_s)_c, the softmax over the channels of
-    the feature; no gradient goes to the teacher.
-
-    Args:
-        student: Pooled features of the strong distortions.
-        teacher: Pooled features of the weak distortions.
-        student_temperature: τ_s.
-        teacher_temperature: τ_t; below τ_s it sharpens.
+    the feature; no gradient goes to the teacher. A τ_t below τ_s sharpens.
 
     Example:
         >>> float(distillation_loss(torch.zeros(1, 4), torch.zeros(1, 4)).exp())
@@ -127,7 +121,6 @@ class SelfDistillation(Method):
     """Standard deviation of the jitter of both views, cut at five times it."""
 
     def __post_init__(self) -> None:
-        """Check the settings and make the teacher."""
         super().__post_init__()
         for name in ("weight", "distortion", "tilt", "sigma"):
             check_range(name, getattr(self, name), 0, 1e6)

@@ -2,7 +2,8 @@
 
 Convention:
     Higher is better, for every score. Probabilities are [m k], rows summing to 1; features are
-    [m c], as the network pools them. No function takes a label of the target.
+    [m c], as the network pools them. No function takes a label of the target. A score raises
+    InputError where there is no cloud, rows are not probabilities or a value is not finite.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,6 +18,7 @@ from qs3.adaptation.density import density_ratio
 from qs3.adaptation.graph_labels import check_features, similarities
 from qs3.adaptation.priors import check_probabilities
 from qs3.errors import InputError
+from qs3.models.checks import check_range
 
 
 @dataclass(frozen=True)
@@ -42,9 +44,6 @@ def entropy(probabilities: Float[np.ndarray, "m k"]) -> float:
 
     It rewards a confident collapse to one class.
 
-    Raises:
-        InputError: where there is no cloud or rows are not probabilities.
-
     Example:
         >>> entropy(np.array([[1.0, 0.0], [0.0, 1.0]]))
         0.0
@@ -57,9 +56,6 @@ def information_maximisation(probabilities: Float[np.ndarray, "m k"]) -> float:
     """Return the information that predictions give on clouds, H(mean_i p_i) − mean_i H(p_i).
 
     From 0, also for a collapse to one class, to ln k. It expects classes of similar size.
-
-    Raises:
-        InputError: where there is no cloud or rows are not probabilities.
 
     Example:
         >>> round(information_maximisation(np.eye(4)), 4)
@@ -75,9 +71,6 @@ def bnm(probabilities: Float[np.ndarray, "m k"]) -> float:
 
     ‖P‖_* ≤ √min(m, k) ‖P‖_F ≤ √(min(m, k) m); it is divided by this bound, which predictions reach
     that are certain and spread evenly over the classes.
-
-    Raises:
-        InputError: where there is no cloud or rows are not probabilities.
 
     Example:
         >>> round(bnm(np.eye(3)), 12)
@@ -96,12 +89,7 @@ def snd(features: Float[np.ndarray, "m c"], temperature: float = 0.05) -> float:
     entropy of s_i. Memory is bounded: a block of rows is held at a time. A single cloud has no
     neighbour and scores 0.
 
-    Args:
-        features: Any description of the clouds; the authors take the softmax outputs.
-        temperature: T.
-
-    Raises:
-        InputError: where there is no cloud, a value is not finite or T is not positive.
+    Features are any description of the clouds; the authors take the softmax outputs.
 
     Example:
         >>> round(snd(np.ones((5, 3))), 6) == round(float(np.log(4)), 6)
@@ -155,9 +143,6 @@ def dev(
     NOTE: the domain classifier is logistic (`qs3.adaptation.density.density_ratio`), its penalty
     chosen on held-out clouds, where the authors train a network with one hidden layer. Where the
     domains hardly overlap in feature space no choice helps: the score varies much.
-
-    Raises:
-        InputError: where a set is empty, or a value is not finite.
     """
     _check(validation_probabilities)
     source = _checked(training_features, "training features")
@@ -183,9 +168,6 @@ def class_ami(
         k: Number of clusters: the number of classes.
         seed: Start of k-means.
 
-    Raises:
-        InputError: where there is no cloud, a value is not finite or k is not at least 1.
-
     Example:
         >>> points = np.array([[0.0], [0.1], [5.0], [5.1]])
         >>> round(class_ami(points, np.array([1, 1, 0, 0]), 2), 12)
@@ -195,8 +177,7 @@ def class_ami(
     from sklearn.metrics import adjusted_mutual_info_score
 
     rows = _checked(features, "features")
-    if k < 1:
-        raise InputError(f"k must be at least 1, not {k}")
+    check_range("k", k)
     if len(np.unique(predicted)) < 2:
         return 0.0
     rows = rows - rows.mean(axis=0)
@@ -208,9 +189,6 @@ def class_ami(
 
 def source_accuracy(probabilities: Float[np.ndarray, "v k"], labels: Int[np.ndarray, "v"]) -> float:
     """Return the accuracy on the held-out part of the source.
-
-    Raises:
-        InputError: where there is no cloud or rows are not probabilities.
 
     Example:
         >>> source_accuracy(np.eye(2), np.array([0, 0]))

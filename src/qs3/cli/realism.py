@@ -53,7 +53,7 @@ def realism(
         return _pair(out, pair, camera, files)
     from tqdm import tqdm
 
-    from qs3.report.realism_folder import test_camera
+    from qs3.report.realism import test_camera
 
     def say(result: dict[str, Any], before: bool) -> None:
         cost = "done before" if before else f"{result['seconds']:.1f} s"
@@ -135,8 +135,7 @@ def _number(value: float) -> str:
 
 def _summary(results: Sequence[Mapping[str, Any]], folder: Path) -> list[str]:
     """What came out, which plots there are, and where to look."""
-    from qs3.report.realism import REALISM_PLOTS
-    from qs3.report.realism_folder import RECORD
+    from qs3.report.realism import REALISM_PLOTS, RECORD
 
     verdicts = {result["id"]: _VERDICTS[result["passed"]] for result in results}
     drawn = [folder / plot for plot in REALISM_PLOTS.values() if (folder / plot).is_file()]

@@ -46,11 +46,7 @@ class CloudComparison:
 
 
 def compare_seeds(first: Mapping[int, float], second: Mapping[int, float]) -> SeedComparison | None:
-    """Compare two methods seed by seed; a seed that one of them lacks is left out.
-
-    Args:
-        first: Score by seed.
-        second: Score by seed.
+    """Compare two methods by their scores of each seed; one that either lacks is left out.
 
     Returns:
         First minus second; None where they share no seed.
@@ -75,10 +71,6 @@ def mcnemar(
 
     A sign test on the clouds on which they differ (McNemar, Psychometrika 1947); where there are
     none, p is 1.
-
-    Args:
-        first_right: Whether the first has each cloud right.
-        second_right: The same of the second, in the same order.
 
     Example:
         >>> mcnemar(np.array([True, False, False]), np.array([True, True, True]))

@@ -228,17 +228,13 @@ def read_record(path: Path) -> RunRecord:
     schema = value.get("schema") if isinstance(value, dict) else None
     if type(schema) is not int or not 1 <= schema <= SCHEMA_VERSION:
         raise InputError(f"{path}: record schema {schema}, this version reads 1 to 3")
-    value = _from_2(value) if schema < SCHEMA_VERSION else value
+    if schema < SCHEMA_VERSION:  # names of today; schema 1 lacked the choices, which may be absent
+        settings = value.get("settings")
+        named = {"settings": rename_settings(settings)} if isinstance(settings, dict) else {}
+        value |= named | {"method": rename_method(value.get("method"))}
     record = structure(value | {"schema": SCHEMA_VERSION}, RunRecord, path)
     _check_scores(path, record.scores)
     return record
-
-
-def _from_2(value: dict[str, Any]) -> dict[str, Any]:
-    """Give names of today; schema 1 lacked the choices as well, which may be absent."""
-    settings = value.get("settings")
-    named = {"settings": rename_settings(settings)} if isinstance(settings, dict) else {}
-    return value | named | {"method": rename_method(value.get("method"))}
 
 
 def rename_settings(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,10 +11,7 @@ from qs3.evaluation.records import RunRecord
 
 
 def choose_each(checkpoints: Sequence[Mapping[str, Any]]) -> dict[str, int]:
-    """Return which checkpoint each rule picks: the highest, the first of equals.
-
-    Args:
-        checkpoints: As in ``RunRecord.checkpoints``; one at least.
+    """Return which of ``RunRecord.checkpoints`` each rule picks: the highest, the first of equals.
 
     Returns:
         Row by rule: ``last``, each validator that says something, and ``oracle``, which looks at
@@ -31,9 +28,8 @@ def choose_each(checkpoints: Sequence[Mapping[str, Any]]) -> dict[str, int]:
 def validator_regret(records: Sequence[RunRecord]) -> pd.DataFrame:
     """Compare rules of selection over runs whose checkpoints were all scored.
 
-    Args:
-        records: Those without scored checkpoints (``evaluate`` with ``checkpoints``) and those with
-            a single one are left out.
+    Records without scored checkpoints (``evaluate`` with ``checkpoints``) and those with a single
+    one are left out.
 
     Returns:
         One line a test set and rule: number of ``runs``; ``regret`` in accuracy and

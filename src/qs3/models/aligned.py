@@ -40,9 +40,6 @@ class Aligned(PointClassifier):
     Convention:
         Points are [b n 3], z up.
 
-    Args:
-        model: The network.
-
     Example:
         >>> from qs3.models import create_model
         >>> Aligned(create_model("pointnet", 10)).eval()(torch.rand(2, 32, 3)).shape

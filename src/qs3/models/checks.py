@@ -18,11 +18,7 @@ def read_settings(
 ) -> dict[str, Any]:
     """Return settings as a class annotates them; lists, which JSON has, become tuples.
 
-    Args:
-        kind: The class.
-        settings: Arguments of it.
-        what: Its name, for messages.
-        fixed: Parameters that are not settings.
+    ``what`` is its name, for messages; ``fixed`` are parameters that are not settings.
 
     Raises:
         InputError: where a setting is unknown or of another type.

@@ -1,6 +1,8 @@
 """What every network of this package offers."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -59,15 +61,22 @@ class Widths(NamedTuple):
     """Of the earlier layers."""
 
 
-@torch.no_grad()
-def describe_point(model: PointClassifier) -> Features:
-    """Describe a cloud of one point, to see what a network gives; it stays as it was."""
+@contextmanager
+def evaluating(model: nn.Module) -> Iterator[None]:
+    """Put a network into evaluation mode for a while."""
     training = model.training
     model.eval()
     try:
-        return model.encode(torch.zeros(1, 1, 3).to(next(model.parameters())))
+        yield
     finally:
         model.train(training)
+
+
+@torch.no_grad()
+def describe_point(model: PointClassifier) -> Features:
+    """Describe a cloud of one point, to see what a network gives; it stays as it was."""
+    with evaluating(model):
+        return model.encode(torch.zeros(1, 1, 3).to(next(model.parameters())))
 
 
 def feature_widths(model: PointClassifier) -> Widths:
@@ -96,12 +105,7 @@ class ClassifierHead(nn.Module):
     """
 
     def __init__(
-        self,
-        channels: int,
-        hidden: tuple[int, ...],
-        num_classes: int,
-        dropout: float,
-        slope: float,
+        self, channels: int, hidden: tuple[int, ...], num_classes: int, dropout: float, slope: float
     ) -> None:
         super().__init__()
         check_range("num_classes", num_classes)
@@ -145,10 +149,7 @@ class LinearNorm(nn.Module):
 class PointwiseLayer(LinearNorm):
     """The same linear map at every point, batch normalisation over all points, leaky ReLU.
 
-    Args:
-        channels: Width of the input.
-        width: Width of the output.
-        slope: Slope of the leaky ReLU below zero; 0 is a plain ReLU.
+    ``slope`` is that of the leaky ReLU below zero; 0 is a plain ReLU.
     """
 
     def __init__(self, channels: int, width: int, slope: float) -> None:

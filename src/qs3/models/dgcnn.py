@@ -36,10 +36,6 @@ class EdgeConv(LinearNorm):
       needs, and clamped at 0, which repeated points need.
     - The scale γ/σ goes into the weights, and max_j is taken of the scaled W₁ x_j alone: the rest
       is the same for all j, and the leaky ReLU is monotone. The sign of γ needs no case.
-
-    Args:
-        channels: Width of the input.
-        width: Width of the output.
     """
 
     def __init__(self, channels: int, width: int) -> None:

@@ -26,7 +26,7 @@ from torch.autograd.function import once_differentiable
 from qs3.errors import InputError
 from qs3.models.normalisation import FoldedLayer, Moments, uses_batch
 from qs3.models.ops import flat_indices, gather_points, scatter_points
-from qs3.models.ops.gathering import is_exporting
+from qs3.models.ops.gathering import is_exporting, linear_max_gradients
 
 
 class GroupedMLP(nn.Module):
@@ -261,31 +261,7 @@ class _LinearMax(torch.autograd.Function):
     def backward(ctx, gradient: Tensor) -> tuple[Tensor, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
         edges, weight, winner = ctx.saved_tensors
         k, m, c = edges.shape
-        rows = edges.view(k * m, c)
         source = winner.long().mul_(m).add_(torch.arange(m, device=winner.device)[:, None])
-        # Of each channel Σ_s gradient_s · edge_s over the edges that it was won by.
-        of_weight = nn.functional.embedding_bag(
-            source.t().contiguous(), rows, mode="sum", per_sample_weights=gradient.t().contiguous()
-        )
-        return _of_edges(gradient, source, weight, k * m).view_as(edges), of_weight
-
-
-def _of_edges(
-    gradient: Float[Tensor, "m d"],
-    source: Int[Tensor, "m d"],
-    weight: Float[Tensor, "d c"],
-    edges: int,
-) -> Float[Tensor, "e c"]:
-    """Return for each edge Σ_o gradient_io · w_o over the channels o that it has won."""
-    d = gradient.shape[1]
-    flat = source.view(-1)
-    order = flat.argsort(stable=True)
-    ends = torch.bincount(flat, minlength=edges).cumsum(0)
-    offsets = torch.cat([ends.new_zeros(1), ends[:-1]])
-    return nn.functional.embedding_bag(
-        order % d,
-        weight,
-        offsets,
-        mode="sum",
-        per_sample_weights=gradient.reshape(-1).index_select(0, order),
-    )
+        rows = edges.view(k * m, c)
+        of_edges, of_weight = linear_max_gradients(gradient, source, rows, weight)
+        return of_edges.view_as(edges), of_weight

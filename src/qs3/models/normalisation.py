@@ -69,14 +69,9 @@ def fold_norm(
 ) -> tuple[Float[Tensor, "d c"], Float[Tensor, "d"]]:
     """Return weight and bias of a linear map that is this one, then its batch normalisation.
 
-    In training the running statistics move as those of `norm` would.
-
-    Args:
-        norm: Scale, shift and running statistics.
-        weight: The linear map.
-        moments: Those of its input; needed where `uses_batch`.
-        constant: Added to the linear map's output before the normalisation, which takes it away
-            again in training.
+    In training the running statistics move as those of ``norm`` would, by the moments of the map's
+    input. A ``constant`` is added to its output before the normalisation, which takes it away again
+    in training.
     """
     if not uses_batch(norm):
         assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101

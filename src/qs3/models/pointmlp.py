@@ -20,12 +20,7 @@ _FLOOR = 1e-5
 
 
 class ResidualBlock(nn.Module):
-    """ReLU(x + N W₂ ReLU(N W₁ x)), N a batch normalisation (§3.2, Eq. 3).
-
-    Args:
-        channels: Width of input and output.
-        hidden: Width between.
-    """
+    """ReLU(x + N W₂ ReLU(N W₁ x)), N a batch normalisation (§3.2, Eq. 3)."""
 
     def __init__(self, channels: int, hidden: int) -> None:
         super().__init__()
@@ -46,14 +41,8 @@ class Stage(nn.Module):
     With features f and a centre i, each neighbour j gives (α (f_j − f_i) / (σ + 1e-5), f_i), where
     σ is the standard deviation of all differences of the cloud; a layer to the new width, residual
     blocks, the maximum over j and more residual blocks follow. The affine module's β, as any bias
-    before a normalisation, has no effect and is left out.
-
-    Args:
-        channels: Width of the input.
-        width: Width of the output.
-        before: Residual blocks before the maximum over neighbours.
-        after: Residual blocks after it.
-        bottleneck: Share of the width inside a residual block.
+    before a normalisation, has no effect and is left out. ``before`` and ``after`` are numbers of
+    residual blocks about the maximum, whose inner width is a share, ``bottleneck``, of the outer.
     """
 
     def __init__(

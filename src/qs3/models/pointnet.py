@@ -12,7 +12,7 @@ from qs3.errors import InputError
 from qs3.models.checks import check_range
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
 from qs3.models.normalisation import FoldedLayer, fold_norm, row_moments, uses_batch
-from qs3.models.ops.gathering import blocks
+from qs3.models.ops.gathering import blocks, linear_max_gradients
 
 
 def linear_max(
@@ -75,25 +75,12 @@ class _LinearMax(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
         points, weight, winner = ctx.saved_tensors
-        b, n, c = points.shape
-        flat = winner + torch.arange(b, device=winner.device)[:, None] * n
-        bag = torch.nn.functional.embedding_bag
-        to_points = to_weight = None
-        if ctx.needs_input_grad[0]:
-            # Sorted by point, the outputs that each point won are a bag of rows of W.
-            point, order = flat.view(-1).sort(stable=True)
-            starts = torch.searchsorted(point, torch.arange(b * n, device=point.device))
-            share = gradient.reshape(-1)[order]
-            rows = order % len(weight)
-            to_points = bag(rows, weight, starts, mode="sum", per_sample_weights=share)
-            to_points = to_points.view(b, n, c)
-        if ctx.needs_input_grad[1]:
-            share = gradient.t().contiguous()
-            table = points.reshape(-1, c)
-            to_weight = bag(flat.t().contiguous(), table, mode="sum", per_sample_weights=share)
-        return to_points, to_weight
+        start = torch.arange(len(points), device=winner.device)[:, None] * points.shape[1]
+        rows = points.reshape(-1, points.shape[2])
+        of_points, of_weight = linear_max_gradients(gradient, winner + start, rows, weight)
+        return of_points.view_as(points), of_weight
 
 
 def _fold(
@@ -112,12 +99,7 @@ def _fold(
 
 
 class FirstLayer(FoldedLayer):
-    """`PointwiseLayer` with ReLU for few channels, whose moments are cheaper than those after it.
-
-    Args:
-        channels: Width of the input.
-        width: Width of the output.
-    """
+    """`PointwiseLayer` with ReLU for few channels; moments before it are cheaper than after."""
 
     def forward(self, points: Float[Tensor, "b n c"]) -> Float[Tensor, "b n d"]:
         """Return the new features of each point."""
@@ -133,10 +115,6 @@ class PointwiseMax(FoldedLayer):
     is w_oᵀ Σ w_o, with Σ the covariance of the input, so that the scale γ/σ is known before the
     product and goes into the weights; the shift and ReLU are monotone and follow the maximum.
     Neither the [b n d] product nor its gradient ever exists as a whole.
-
-    Args:
-        channels: Width of the input.
-        width: Width of the output.
     """
 
     def forward(self, points: Float[Tensor, "b n c"]) -> Float[Tensor, "b d"]:
@@ -162,10 +140,7 @@ def _shared(widths: tuple[int, ...]) -> nn.Sequential:
 class TransformNet(nn.Module):
     """T-Net: regress a [c c] matrix from the whole cloud, starting at the identity (§4.2).
 
-    Args:
-        channels: c.
-        widths: Widths of the shared layers; the official ones are 64, 128, 1024.
-        hidden: Widths of the layers after pooling; the official ones are 512, 256.
+    The official widths are 64, 128, 1024 of the shared layers and 512, 256 of those after pooling.
     """
 
     def __init__(self, channels: int, widths: tuple[int, ...], hidden: tuple[int, ...]) -> None:

@@ -78,12 +78,7 @@ class SANode(nn.Module):
         self.residual = PointwiseLayer(channels, width, 0.0)
 
     def forward(self, points: Float[Tensor, "b n 3"], local: Float[Tensor, "b n c"]) -> Nodes:
-        """Return the moved nodes.
-
-        Args:
-            points: The clouds.
-            local: Features of their points.
-        """
+        """Return the moved nodes of clouds whose points have these features."""
         chosen = farthest_point_sampling(points, min(self.nodes, points.shape[1]))
         # Positions and neighbours in single precision, as everywhere in this package.
         with torch.autocast(points.device.type, enabled=False):

@@ -141,12 +141,7 @@ s.save_file({k: v.clone() for k, v in d.get('model_state_dict', d).items()}, 'ou
 
     and hand over ``safetensors.torch.load_file("out.safetensors")``. Some checkpoints of PointNet++
     hold NumPy numbers, which ``weights_only=True`` refuses; without it, only a file that you trust
-    should be read.
-
-    Args:
-        name: The release, from the list above.
-        state_dict: Tensors by the release's names.
-        settings: Settings of the network that the weights do not tell.
+    should be read. ``settings`` are those of the network that the weights do not tell.
 
     Returns:
         The network on the CPU in single precision, in evaluation mode.

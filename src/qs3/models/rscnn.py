@@ -21,11 +21,7 @@ class RSConv(nn.Module):
     For a centre x_i and a point x_j around it, a small network maps the ten numbers
     h_ij = (|x_j − x_i|, x_i, x_j, x_j − x_i) to a weight for each channel of the point; weighted
     features are normalised, rectified and reduced by their maximum over j; a last layer raises the
-    number of channels.
-
-    Args:
-        channels: Width of the input features; 0 where there are none but the coordinates.
-        width: Width of the output.
+    number of channels. Where these are 0, there are no features but the coordinates.
     """
 
     def __init__(self, channels: int, width: int) -> None:
@@ -51,14 +47,9 @@ class RSConv(nn.Module):
         neighbours: Int[Tensor, "b m k"],
         relative: bool,
     ) -> Float[Tensor, "b m d"]:
-        """Return the new features of the centres.
+        """Return the new features of the centres, given by index as are the points around them.
 
-        Args:
-            points: The cloud of this level.
-            features: Its features; None before the first convolution.
-            samples: Indices of the centres.
-            neighbours: Indices of the points around each.
-            relative: Whether h_ij holds x_i and x_j as seen from x_i, as the release has it.
+        Relative, h_ij holds x_i and x_j as seen from x_i, as the release has it.
         """
         around = gather_points(points, neighbours)
         centre = gather_points(points, samples)[:, :, None].expand_as(around)

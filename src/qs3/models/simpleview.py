@@ -54,11 +54,6 @@ def depth_images(
     NOTE: the release takes rows from x and columns from y, so that its images are mirrored, and
     draws the origin at w/2. A network trained from scratch cannot tell.
 
-    Args:
-        points: Clouds in the unit ball.
-        resolution: h and w.
-        projection: Orthographic or perspective.
-
     Example:
         >>> image = depth_images(torch.tensor([[[0.0, 0.0, 1.0]]]), 3)[0]
         >>> image[0].nonzero().tolist(), round(float(image[4, 1, 1]), 4)  # at the top; from above
@@ -103,12 +98,8 @@ class BasicBlock(nn.Module):
     """Two 3×3 convolutions beside a shortcut (He et al., Fig. 5 left).
 
     The second normalisation's scale starts at 0, so that the block starts as its shortcut
-    (Goyal et al., 2017, §5.1), as in SimpleView's release.
-
-    Args:
-        channels: Width of the input.
-        width: Width of the output.
-        stride: Stride of the first convolution and, where there is one, of the 1×1 shortcut.
+    (Goyal et al., 2017, §5.1), as in SimpleView's release. The stride is that of the first
+    convolution and, where there is one, of the 1×1 shortcut.
     """
 
     def __init__(self, channels: int, width: int, stride: int) -> None:
@@ -140,9 +131,7 @@ class ResNet18(nn.Module):
     precision (errors of 3e-4 on 72 images of 128²), and a strided 1×1 convolution of 4 channels
     writes beyond its buffer.
 
-    Args:
-        channels: Channels of the images.
-        width: Width of the first stage, 64 in the original; the stages have 1, 2, 4 and 8 times it.
+    The stages have 1, 2, 4 and 8 times the width of the first, which is 64 in the original.
 
     Example:
         >>> ResNet18(1, 4)(torch.zeros(2, 1, 32, 32)).shape

@@ -49,11 +49,9 @@ def project(
 def shade(
     height: Float[np.ndarray, "n"], nearness: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n 4"]:
-    """Colour points by height, faded towards white with distance from the viewer.
+    """Colour points by world z, faded towards white with distance from the viewer.
 
-    Args:
-        height: World z; its range spans the colour map.
-        nearness: Coordinate towards the viewer; its range spans the fade.
+    The range of each spans the colour map and the fade.
     """
     colours = np.array(_MAP(0.8 * _unit(height)))  # the map's end is too light for white paper
     fade = 0.25 * (1.0 - _unit(nearness))[:, None]
@@ -70,13 +68,8 @@ def draw_cloud(
 ) -> None:
     """Scatter one cloud on ``axes``, far points first; rows that are not finite are left out.
 
-    Args:
-        axes: Where to draw.
-        points: World points.
-        azimuth: Viewer's azimuth in degrees.
-        elevation: Viewer's elevation in degrees.
-        limits: Lowest and highest corner of the box to frame, so that several clouds share a
-            scale; default: that of the points.
+    ``limits`` are the lowest and highest corner of the box to frame, so that several clouds share a
+    scale; by default those of the points.
     """
     points = points[np.isfinite(points).all(axis=1)]
     seen = project(points, azimuth, elevation)
@@ -127,10 +120,7 @@ def gallery(
 ) -> Figure:
     """Draw a grid of clouds: one row a class, up to ``columns`` clouds a row, each fitted.
 
-    Args:
-        samples: Clouds of each class, by class name; they may differ in their number of points.
-        title: Heading.
-        columns: Clouds a row; more are left out.
+    Clouds may differ in their number of points.
     """
     names, rows = [short(name) for name in samples], len(samples)
     # Inches.

@@ -48,9 +48,7 @@ class Holdings:
 def look(folder: Path, published: Mapping[str, Mapping[str, str]] | None = None) -> Holdings:
     """Find runs and records in a folder: of one run, of several, or of records alone.
 
-    Args:
-        folder: Where to look.
-        published: Published accuracies as text, by task and row of an experiment.
+    ``published`` are accuracies as text, by task and row of an experiment.
 
     Raises:
         InputError: where the folder is missing, is an unfinished run, or holds nothing that can be
@@ -113,10 +111,6 @@ def _require_sound(path: Path, record: RunRecord) -> None:
 
 def collect(holdings: Holdings, settings: ReportSettings) -> tuple[Report, tuple[str, ...]]:
     """Gather everything one page tells.
-
-    Args:
-        holdings: What lies in the folder.
-        settings: What is to be told.
 
     Returns:
         The report, and a line for each run or record that had to be left out.

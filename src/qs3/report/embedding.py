@@ -20,10 +20,6 @@ def embed(features: Float[np.ndarray, "b c"], seed: int = 0) -> Float[np.ndarray
     It starts from the principal components and runs on one thread: the same features give the same
     bits on the same machine. Neighbours stay neighbours; distances between clusters mean little.
 
-    Args:
-        features: One vector a cloud.
-        seed: Of what is random in it.
-
     Returns:
         Positions, scaled so that the farthest is 1 from their mean.
 
@@ -66,12 +62,7 @@ def feature_map(
 ) -> Figure:
     """Draw clouds in the plane: classes by colour, domains by marker.
 
-    Args:
-        positions: Where each cloud lies, for instance from `embed`.
-        labels: Classes, by index.
-        domains: Domain of each cloud; the first that occurs is drawn hollow and below.
-        class_names: Names of the classes.
-        title: Heading.
+    Of two domains or more the first that occurs is drawn hollow and below.
     """
     figure = Figure(figsize=(5.2, 6.2), layout="constrained")
     axes = figure.add_subplot()

@@ -1,10 +1,7 @@
 """What every picture shares: style, colours, and PNG bytes that depend on the input alone."""
 
-import functools
 import io
-from collections.abc import Callable
 from pathlib import Path
-from typing import ParamSpec, TypeVar
 
 import matplotlib
 import matplotlib.style
@@ -39,19 +36,8 @@ _STYLE = {
     "savefig.facecolor": "white",
 }
 
-_Given = ParamSpec("_Given")
-_Result = TypeVar("_Result")
-
-
-def house_style(draw: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
-    """Run a drawing function under the house style, whatever matplotlibrc the user has."""
-
-    @functools.wraps(draw)
-    def styled(*args: _Given.args, **kwargs: _Given.kwargs) -> _Result:
-        with matplotlib.style.context(["default", _STYLE]):
-            return draw(*args, **kwargs)
-
-    return styled
+house_style = matplotlib.style.context(["default", _STYLE])
+"""Decorator: runs a drawing function under this style, whatever matplotlibrc the user has."""
 
 
 @house_style

@@ -80,9 +80,6 @@ def score_lines(records: Sequence[NamedRecord]) -> tuple[tuple[ScoreLine, ...], 
     Runs of one method that differ in a setting or in their data stand on lines of their own, which
     say in what they differ. A record that is there twice counts once.
 
-    Args:
-        records: Records with their names.
-
     Returns:
         The lines, and a message for each record that had to be left out: another one of its line
         has the same seed and other scores.

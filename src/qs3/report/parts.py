@@ -42,10 +42,7 @@ def show_clouds(
 ) -> dict[str, list[Cloud]]:
     """Choose up to ``count`` clouds of each domain, evenly over the classes, first ones first.
 
-    Args:
-        domains: Labelled clouds by domain.
-        count: Clouds of a domain.
-        answers: Of a domain, what each network took its clouds for.
+    ``answers`` are, of a domain, what each network took its clouds for.
     """
     shown = {}
     for domain, clouds in domains.items():
@@ -70,12 +67,6 @@ def beside_source(
 
     Nearest is the smallest Euclidean distance between the network's features, among as many clouds
     of the source as a map of features shows.
-
-    Args:
-        loaded: The network.
-        said: What it says of the target.
-        target: Labelled clouds.
-        source: Labelled clouds that it learnt from, where they are at hand.
 
     Returns:
         `Report.mistakes` and `Report.nearest`.

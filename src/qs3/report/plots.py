@@ -52,9 +52,7 @@ class SelectionRound:
 def training_curves(curves: Sequence[Curve], marks: Sequence[float] = ()) -> Figure:
     """Draw curves over epochs, one panel below the other for each `Curve.panel`.
 
-    Args:
-        curves: What to draw.
-        marks: Epochs at which rounds begin: a thin vertical line stands there.
+    A thin vertical line stands at each of ``marks``, where rounds begin.
     """
     panels = list(dict.fromkeys(curve.panel for curve in curves))
     figure = Figure(figsize=(_WIDTH, 0.5 + 2.4 * len(panels)), layout="constrained")
@@ -120,10 +118,7 @@ def confusion_heatmap(
 ) -> Figure:
     """Draw counts by true class (rows) and predicted class, shaded by the share of the row.
 
-    Args:
-        matrix: Counts; one column more than classes counts predictions of none of them.
-        class_names: Names in the order of the rows.
-        title: Heading.
+    One column more than classes counts predictions of none of them.
     """
     k = len(class_names)
     total = matrix.sum(axis=1, keepdims=True)
@@ -161,12 +156,7 @@ def class_accuracy(
 ) -> Figure:
     """Draw the accuracy of each class before and after adaptation as pairs of bars.
 
-    Args:
-        before: Recall of each class in 0 … 1; NaN where the class has no cloud.
-        after: The same after adaptation.
-        class_names: Names of the classes.
-        counts: Clouds of each class, told beside its name.
-        names: What the two are called.
+    It is in 0 … 1, NaN where a class has no cloud; its number of clouds stands beside its name.
     """
     k = len(class_names)
     figure = Figure(figsize=(_WIDTH, 0.9 + 0.46 * k), layout="constrained")

@@ -212,9 +212,9 @@ def cushion(
     return loft(np.stack(rings) + (low + high) / 2)
 
 
-def pillow(x: Span, y: Span, z: Span, sides: int = 8) -> Solid:
+def pillow(x: Span, y: Span, z: Span) -> Solid:
     """Soft pillow: thick in the middle, thin at the rim."""
-    u = np.linspace(-1, 1, sides + 1)
+    u = np.linspace(-1, 1, 9)
     a, b = np.meshgrid(u, u, indexing="ij")
     bulge = 0.06 + 0.94 * np.sqrt(np.clip((1 - a**4) * (1 - b**4), 0, 1))
     pinch = 1 - 0.06 * (a * b) ** 2

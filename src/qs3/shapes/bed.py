@@ -1,11 +1,13 @@
 """Beds: framed, platform, boxspring, bunk, four-poster, sled, metal, cot."""
 
+from itertools import product
+
 import numpy as np
 
-from qs3.shapes._bedding import bed_size, bedding, headboard
 from qs3.shapes._dice import Dice
 from qs3.shapes._joinery import corners, legs
 from qs3.shapes._solids import (
+    Number,
     Solid,
     Span,
     around,
@@ -15,16 +17,77 @@ from qs3.shapes._solids import (
     centred,
     cushion,
     lathe,
+    pillow,
     posts,
     ribbon,
+    split,
     tube,
     within,
 )
 
 
+def _bed_size(dice: Dice) -> tuple[float, float]:
+    """Width and length: a single, a queen or a king."""
+    width = dice.pick(dice.between(0.8, 1.05), dice.between(1.2, 1.5), dice.between(1.5, 2.0))
+    return width, dice.between(1.9, 2.15)
+
+
+def _bedding(dice: Dice, x: Span, y: Span, z: Number, thick: Number) -> list[Solid]:
+    """Mattress on ``z`` with pillows at its head (+y) and perhaps a blanket."""
+    top = z + thick
+    parts = [cushion(dice, x, y, (z - 0.003, top), dice.between(0.02, 0.06), 0.01)]
+    width = x[1] - x[0]
+    count = 1 if width < 1.15 else 2
+    if dice.chance(0.9):
+        for row, i in product(range(dice.pick(1, 1, 2)), range(count)):
+            cx = x[0] + width * (i + 0.5) / count
+            half, deep = dice.between(0.3, 0.42) * width / count, dice.between(0.16, 0.24)
+            box = ((-half, half), (-deep, deep), (0, dice.between(0.08, 0.16)))
+            pad = cushion(dice, *box, 0.05, 0.01) if dice.chance(0.3) else pillow(*box)
+            pad = pad.turn("x", dice.between(0, 12) + (25 if row else 0))
+            low = pad.vertices[:, 2].min()
+            parts.append(pad.move(cx, y[1] - deep - 0.05 - 0.16 * row, top - low - 0.025))
+    if dice.chance(0.65):
+        over = dice.between(0.01, 0.03)
+        cover = (y[0] - over, y[0] + dice.between(0.3, 0.75) * (y[1] - y[0]))
+        heights = (top - dice.between(0.4, 1.1) * thick, top + dice.between(0.02, 0.05))
+        parts.append(cushion(dice, within(x, -over), cover, heights, 0.03))
+    return parts
+
+
+def _headboard(dice: Dice, x: Span, y: Number, z: Span, thick: Number) -> list[Solid]:
+    """Board at the head or foot of a bed, from ``y`` to the rear."""
+    style = dice.pick("board", "board", "padded", "slats", "posts", "arch")
+    low, high = z
+    if style == "board":
+        return [block(x, (y, y + thick), z)]
+    if style == "padded":
+        run = (y, y + 2 * thick)
+        return [cushion(dice, a, run, z, 0.03) for a in split(x, dice.pick(1, 2, 3, 5), -0.004)]
+    if style == "arch":
+        u = np.linspace(0, 1, 9)
+        path = np.stack([np.zeros(9), np.full(9, y + thick / 2), low + (high - low) * u], axis=1)
+        half = (x[1] - x[0]) / 2 * np.clip(1.04 - u**4, 0, 1) ** 0.5
+        return [ribbon(path, np.stack([half, 0 * u, 0 * u], axis=1), thick).move((x[0] + x[1]) / 2)]
+    post = max(thick, 0.05) * dice.between(1.0, 1.8)
+    parts = [
+        block(around(px, post / 2), (y, y + post), (low, high + dice.between(0.0, 0.08)))
+        for px in within(x, post / 2)
+    ]
+    mid = y + thick / 3 - 0.003
+    if style == "posts":
+        return [*parts, block(x, around(mid, thick / 3), (low, high - 0.03))]
+    rail = dice.between(0.06, 0.12)
+    for heights in ((high - rail, high), (low, low + rail)):
+        parts.append(block(x, around(mid, thick / 2), heights))
+    for px in np.linspace(x[0] + 0.12, x[1] - 0.12, dice.count(3, 9)):
+        parts.append(block(around(px, 0.015), (y - 0.002, mid + 0.01), (low, high - rail / 2)))
+    return parts
+
+
 def _rectangle(dice: Dice) -> tuple[Span, Span]:
     """Return x and y of a mattress."""
-    width, length = bed_size(dice)
+    width, length = _bed_size(dice)
     return centred(width), centred(length)
 
 
@@ -42,13 +105,13 @@ def framed(dice: Dice) -> list[Solid]:
     ]
     if dice.chance(0.92):
         top = base + thick + dice.between(0.08, 0.75)
-        parts += headboard(dice, outer, y[1], (rail[0], top), board)
+        parts += _headboard(dice, outer, y[1], (rail[0], top), board)
     if dice.chance(0.4):
         top = base + thick * dice.between(0.3, 1.4)
-        parts += headboard(dice, outer, y[0] - 1.1 * board, (rail[0], top), board)
+        parts += _headboard(dice, outer, y[0] - 1.1 * board, (rail[0], top), board)
     leg = dice.between(0.05, 0.09) * dice.bulk**0.7
     parts += legs(dice, corners(outer, around_y, leg / 2), rail[0] + 0.05, leg)
-    return parts + bedding(dice, within(x, 0.005), (y[0] + 0.005, y[1] - 0.01), base, thick)
+    return parts + _bedding(dice, within(x, 0.005), (y[0] + 0.005, y[1] - 0.01), base, thick)
 
 
 def platform(dice: Dice) -> list[Solid]:
@@ -61,8 +124,8 @@ def platform(dice: Dice) -> list[Solid]:
     parts.append(block(within(x, inset), (y[0] + inset, y[1] - inset * 0.5), (0, deck - 0.03)))
     if dice.chance(0.6):
         heights = (deck - 0.05, deck + thick + dice.between(0.1, 0.6))
-        parts += headboard(dice, outer, y[1] - 0.003, heights, 0.05)
-    return parts + bedding(dice, x, (y[0], y[1] - 0.01), deck, thick)
+        parts += _headboard(dice, outer, y[1] - 0.003, heights, 0.05)
+    return parts + _bedding(dice, x, (y[0], y[1] - 0.01), deck, thick)
 
 
 def boxspring(dice: Dice) -> list[Solid]:
@@ -77,11 +140,11 @@ def boxspring(dice: Dice) -> list[Solid]:
     over = dice.pick(0.0, 0.0, dice.between(0.05, 0.5))
     if dice.chance(0.9):
         heights = (dice.pick(0.0, foot), box + thick + dice.between(0.15, 0.8))
-        parts += headboard(dice, within(x, -over), y[1] - 0.003, heights, 0.05)
+        parts += _headboard(dice, within(x, -over), y[1] - 0.003, heights, 0.05)
     if over > 0.35:
         for table in ((x[0] - over, x[0] + 0.01), (x[1] - 0.01, x[1] + over)):
             parts.append(block(table, (y[1] - 0.4, y[1] + 0.002), (0.0, 0.45)))
-    return parts + bedding(dice, x, (y[0], y[1] - 0.01), box, thick)
+    return parts + _bedding(dice, x, (y[0], y[1] - 0.01), box, thick)
 
 
 def bunk(dice: Dice) -> list[Solid]:
@@ -94,7 +157,7 @@ def bunk(dice: Dice) -> list[Solid]:
     for deck in (upper,) if dice.chance(0.15) else (lower, upper):
         parts.append(block(x, y, (deck - 0.06, deck)))
         parts += [block(around(px, 0.015), y, (deck - 0.1, deck + 0.05)) for px in x]
-        parts += bedding(dice, within(x, 0.03), within(y, 0.03), deck, thick)
+        parts += _bedding(dice, within(x, 0.03), within(y, 0.03), deck, thick)
     for level in np.linspace(top - 0.05, upper + thick + 0.08, dice.count(1, 3)):
         parts += [block(around(px, 0.014), y, around(level, 0.03)) for px in x]
     for py in y:
@@ -112,7 +175,7 @@ def bunk(dice: Dice) -> list[Solid]:
 
 def four_poster(dice: Dice) -> list[Solid]:
     """Bed with a tall post at each corner and bars across the top."""
-    width, length = max(bed_size(dice)[0], 1.2), dice.between(1.95, 2.15)
+    width, length = max(_bed_size(dice)[0], 1.2), dice.between(1.95, 2.15)
     post, high = dice.between(0.05, 0.09), dice.between(1.7, 2.15)
     x, y = centred(width), centred(length)
     base, thick = dice.between(0.28, 0.4), dice.between(0.18, 0.28)
@@ -126,8 +189,8 @@ def four_poster(dice: Dice) -> list[Solid]:
             parts.append(block(outer[0], around(py, bar), heights))
         if dice.chance(0.25):
             parts.append(block(*outer, (high - 0.01, high + 0.02)))
-    parts += headboard(dice, x, y[1], (base - 0.1, base + thick + dice.between(0.3, 0.7)), 0.04)
-    return parts + bedding(dice, x, (y[0], y[1] - 0.01), base, thick)
+    parts += _headboard(dice, x, y[1], (base - 0.1, base + thick + dice.between(0.3, 0.7)), 0.04)
+    return parts + _bedding(dice, x, (y[0], y[1] - 0.01), base, thick)
 
 
 def sled(dice: Dice) -> list[Solid]:
@@ -147,7 +210,7 @@ def sled(dice: Dice) -> list[Solid]:
     for px in (x[0] - 0.035, x[1]):
         parts.append(block((px, px + 0.035), within(y, -0.03), (0.12, base + 0.05)))
     parts.append(block(within(x, -0.002), within(y, -0.03), (base - 0.05, base)))
-    return parts + bedding(dice, x, within(y, 0.02), base, thick)
+    return parts + _bedding(dice, x, within(y, 0.02), base, thick)
 
 
 def metal(dice: Dice) -> list[Solid]:
@@ -169,7 +232,7 @@ def metal(dice: Dice) -> list[Solid]:
             parts.append(knob.move(0, 0, -0.015))
     parts += [tube([(px, py, base) for py in y], bar, dice.sides) for px in x]
     parts.append(block(x, y, (base - 0.02, base + 0.01)))
-    return parts + bedding(dice, within(x, bar), within(y, 0.03), base + 0.01, thick)
+    return parts + _bedding(dice, within(x, bar), within(y, 0.03), base + 0.01, thick)
 
 
 def cot(dice: Dice) -> list[Solid]:
@@ -191,7 +254,7 @@ def cot(dice: Dice) -> list[Solid]:
             continue
         parts += [block(x, around(py, 0.013), z) for z in rails]
         parts += posts(np.linspace(*x, dice.count(5, 8))[1:-1], [py], 0.008, bars)
-    return parts + bedding(dice, within(x, 0.02), within(y, 0.02), base, dice.between(0.08, 0.13))
+    return parts + _bedding(dice, within(x, 0.02), within(y, 0.02), base, dice.between(0.08, 0.13))
 
 
 FAMILIES = (framed, platform, boxspring, bunk, four_poster, sled, metal, cot)

@@ -3,8 +3,8 @@
 import numpy as np
 
 from qs3.shapes._dice import Dice
-from qs3.shapes._easy_chairs import armchair, lounge, recliner, tub, wing
 from qs3.shapes._joinery import corners, legs
+from qs3.shapes._seats import armchair, bar_stool, bench, lounge, recliner, stool, tub, wing
 from qs3.shapes._solids import (
     Number,
     Solid,
@@ -22,7 +22,6 @@ from qs3.shapes._solids import (
     tube,
     within,
 )
-from qs3.shapes._stools import bar_stool, bench, stool
 
 
 def _backrest(dice: Dice, width: Number, y: Number, z: Span, thick: Number) -> list[Solid]:

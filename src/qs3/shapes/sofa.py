@@ -4,6 +4,7 @@ import numpy as np
 
 from qs3.shapes._dice import Dice
 from qs3.shapes._joinery import corners, legs
+from qs3.shapes._seats import upholstered
 from qs3.shapes._solids import (
     Number,
     Solid,
@@ -20,7 +21,6 @@ from qs3.shapes._solids import (
     tube,
     within,
 )
-from qs3.shapes._upholstery import upholstered
 
 
 def straight(dice: Dice) -> list[Solid]:

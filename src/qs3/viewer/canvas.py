@@ -24,12 +24,6 @@ class Canvas:
     """Draws one exhibit at a time on a viser server."""
 
     def __init__(self, server: Any, answers: Answers | None = None) -> None:
-        """Set the camera; nothing is drawn yet.
-
-        Args:
-            server: A `viser.ViserServer`.
-            answers: Of a network, where there is one.
-        """
         self._server, self._answers = server, answers
         self._lock = threading.RLock()
         self._shown: tuple[Exhibit, int] | None = None
@@ -40,11 +34,7 @@ class Canvas:
         self._text = server.gui.add_html("")
 
     def add_controls(self, mesh: bool = False) -> None:
-        """Add the controls of the look, below what the page has so far.
-
-        Args:
-            mesh: Whether there is a mesh to show.
-        """
+        """Add the controls of the look, and of a ``mesh`` if there is one, below those so far."""
         gui = self._server.gui
         with gui.add_folder("Look"):
             self._kind = gui.add_dropdown("Cloud", tuple(KINDS.values())[: 2 if mesh else 3])

@@ -83,11 +83,7 @@ def by_error(
 ) -> Colouring:
     """Colour points by their distance to the truth, from 0 to ``limit``; beyond it as at it.
 
-    Args:
-        distance: Of each point.
-        truth: What it was measured to.
-        limit: Value of the last colour; by default `round_limit`.
-        unit: Of the distance.
+    ``truth`` tells what it was measured to; the limit is by default that of `round_limit`.
     """
     limit = round_limit(distance) if limit is None else limit
     high = f"{limit:g}{unit} and more"

@@ -62,11 +62,9 @@ class ArrayExhibits:
         return cls(clouds.points, clouds.ids, tuple(labels))
 
     def __len__(self) -> int:
-        """Their number."""
         return len(self.points)
 
     def __getitem__(self, row: int) -> Exhibit:
-        """The object at a row."""
         return Exhibit(self.names[row], self.labels[row], {"points": self.points[row]})
 
 
@@ -110,7 +108,6 @@ class StoreExhibits:
         self._read = lru_cache(maxsize=1)(self._read_shard)
 
     def __len__(self) -> int:
-        """Their number."""
         return len(self._places)
 
     def __getitem__(self, row: int) -> Exhibit:
@@ -193,8 +190,8 @@ class Answers:
         given, true = self.class_names[self.best(row)], self.class_names[self.truth[row]]
         return f"right: {given}" if given == true else f"wrong: {given}, labelled {true}"
 
-    def facts(self, row: int, count: int = 3) -> tuple[tuple[str, str], ...]:
-        """The classes it holds likeliest for a row, with their probabilities."""
-        order = np.argsort(-self.probabilities[row], kind="stable")[:count]
+    def facts(self, row: int) -> tuple[tuple[str, str], ...]:
+        """The three classes it holds likeliest for a row, with their probabilities."""
+        order = np.argsort(-self.probabilities[row], kind="stable")[:3]
         shares = ", ".join(f"{self.class_names[i]} {self.probabilities[row, i]:.1%}" for i in order)
         return ((f"network, of the {KINDS[self.kind]} cloud", shares),)

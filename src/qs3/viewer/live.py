@@ -16,12 +16,8 @@ class Live:
     """Draws one frame at a time on a viser server."""
 
     def __init__(self, server: Any) -> None:
-        """Set the camera, above the one that sees the table; nothing is drawn yet.
-
-        Args:
-            server: A `viser.ViserServer`.
-        """
         self._server, self._drawn = server, []
+        # Above the camera that sees the table.
         server.initial_camera.position = (0.0, -0.6, 0.9)
         server.initial_camera.look_at = (0.0, 0.7, 0.0)
         server.scene.add_grid("/ground", width=4.0, height=4.0, cell_size=0.1, section_size=1.0)
@@ -30,9 +26,7 @@ class Live:
     def show(self, frame: SeenFrame, rate: str) -> None:
         """Draw the objects of a frame in place of those before, each in the colour of its class.
 
-        Args:
-            frame: What was seen.
-            rate: Told below it, such as how many frames a second.
+        The rate, such as how many frames a second, is told below it.
         """
         lines = []
         with self._server.atomic():

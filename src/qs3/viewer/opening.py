@@ -9,8 +9,12 @@ import trimesh
 
 from qs3 import shapes
 from qs3.errors import InputError, UnevenSizesError
+from qs3.io import load_clouds, load_unlabelled, read_cloud
 from qs3.io.clouds import CloudKind, PointClouds, UnlabelledClouds
 from qs3.io.load import is_store
+from qs3.io.point_files import POINT_FILES
+from qs3.meshes import load_mesh
+from qs3.meshes.loading import EXTENSIONS
 from qs3.training.shipped import find_run, shipped
 from qs3.viewer.exhibits import Answers, ArrayExhibits, Exhibits, StoreExhibits
 
@@ -25,10 +29,6 @@ def open_mesh(what: str, up: Literal["z", "y"] | None) -> trimesh.Trimesh | None
     Raises:
         InputError: where there is nothing of that name, or a mesh file is damaged.
     """
-    from qs3.io.point_files import POINT_FILES
-    from qs3.meshes import load_mesh
-    from qs3.meshes.loading import EXTENSIONS
-
     path = Path(what)
     if "://" not in what and not find_run(what).exists():
         raise InputError(
@@ -60,9 +60,6 @@ def open_exhibits(
     Raises:
         InputError: where they cannot be read, or ``data`` does not go with ``what``.
     """
-    from qs3.io import read_cloud
-    from qs3.io.point_files import POINT_FILES
-
     path = find_run(what)
     if path.suffix == ".safetensors" or any((path / name).is_file() for name in _RUN_FILES):
         return _open_run(path, data, split, cloud)
@@ -118,8 +115,6 @@ def _read(
     source: str, split: str | None, class_names: tuple[str, ...] | None = None, **how: Any
 ) -> PointClouds | UnlabelledClouds:
     """Read clouds with their labels, or without where they have none."""
-    from qs3.io import load_clouds, load_unlabelled
-
     try:
         return load_clouds(source, split=split, class_names=class_names, **how)
     except InputError as error:

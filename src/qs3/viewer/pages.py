@@ -2,8 +2,9 @@
 
 import contextlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from qs3.errors import InputError
 from qs3.sensor.presets import SENSORS, sensor_toml
@@ -16,38 +17,13 @@ from qs3.viewer.scan_controls import Control, make_controls, with_controls
 ALL = "all classes"
 
 
-@dataclass(frozen=True)
-class Choice:
-    """Which object of a collection is to be shown."""
-
-    class_name: str | None = None
-    """Of this class only; None is of any."""
-    wrong_only: bool = False
-    """Only those that the network gets wrong."""
-    place: int = 0
-    """Place among those; one beyond the ends is the nearest end's."""
-
-    def rows(self, exhibits: Exhibits, answers: Answers | None) -> list[int]:
-        """Rows of the objects to choose from."""
-        return [
-            row
-            for row, label in enumerate(exhibits.labels)
-            if self.class_name in (None, label)
-            and not (self.wrong_only and answers is not None and not answers.wrong[row])
-        ]
-
-
 @contextlib.contextmanager
 def gallery_page(
     server: Any, exhibits: Exhibits, answers: Answers | None = None, class_name: str | None = None
 ) -> Iterator[Canvas]:
-    """Put controls on a server to step through objects, until the block ends.
+    """Put controls on a `viser.ViserServer` to step through objects, until the block ends.
 
-    Args:
-        server: A `viser.ViserServer`.
-        exhibits: The objects.
-        answers: Of a network, row by row, where there is one.
-        class_name: Show this class first; None shows all.
+    Answers are those of a network, row by row; objects of ``class_name`` are shown first.
 
     Raises:
         InputError: where there is no object of that class.
@@ -59,37 +35,42 @@ def gallery_page(
             f"{', '.join(classes) or 'not known'}"
         )
 
-    def count(choice: Choice) -> int:
-        return max(len(choice.rows(exhibits, answers)), 1)
+    labels = np.array(exhibits.labels, dtype=object)
 
-    def pick(choice: Choice) -> tuple[Exhibit, int]:
-        rows = choice.rows(exhibits, answers)
-        if not rows:
+    def rows() -> np.ndarray:
+        """Rows of the objects to choose from."""
+        chosen = (labels == which.value) | (which.value == ALL)
+        if only.value and answers is not None:
+            chosen &= answers.wrong
+        return np.flatnonzero(chosen)
+
+    def pick(row: int | None) -> tuple[Exhibit, int]:
+        if row is None:
             raise InputError("no such object: none of this class is wrong")
-        row = rows[min(max(choice.place, 0), len(rows) - 1)]
         return exhibits[row], row
 
     gui, canvas = server.gui, Canvas(server, answers)
-    first = count(Choice(class_name))
     with gui.add_folder("Object"):
         which = gui.add_dropdown(
             "Class", (ALL, *classes), initial_value=class_name or ALL, visible=bool(classes)
         )
         labelled = answers is not None and answers.truth is not None
         only = gui.add_checkbox("Wrong ones only", False, visible=labelled)
+        first = max(len(rows()), 1)
         slider = gui.add_slider("Object", 1, first, 1, 1, disabled=first < 2)
         step = gui.add_button_group("Step", ("previous", "next"))
     canvas.add_controls()
     worker = Rescanner(pick, lambda picked: canvas.show(*picked), canvas.fail, delay=0.0)
 
-    def choice() -> Choice:
-        return Choice(None if which.value == ALL else which.value, only.value, slider.value - 1)
+    def ask(_: Any = None) -> None:
+        found = rows()
+        worker.ask(int(found[min(slider.value, len(found)) - 1]) if len(found) else None)
 
     def narrow(_: Any) -> None:
-        most = count(choice())
+        most = max(len(rows()), 1)
         slider.max, slider.disabled = most, most < 2
         slider.value = 1
-        worker.ask(choice())
+        ask()
 
     def move(_: Any) -> None:
         along = 1 if step.value == "next" else -1
@@ -98,8 +79,8 @@ def gallery_page(
     which.on_update(narrow)
     only.on_update(narrow)
     step.on_click(move)
-    slider.on_update(lambda _: worker.ask(choice()))
-    worker.ask(choice())
+    slider.on_update(ask)
+    ask()
     with contextlib.closing(worker):
         yield canvas
 

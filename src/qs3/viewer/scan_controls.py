@@ -106,7 +106,9 @@ def with_controls(settings: ScanSettings, values: Mapping[str, Any]) -> ScanSett
     sensor = settings.make_sensor()
     renderer: Any = settings.make_renderer()
     changes = {name: value for name, value in values.items() if name in _SCAN}
-    if "samples" in values:
+    if changes.get("scene") == str(settings.scene):
+        del changes["scene"]  # settings of a scene are more than their name
+    if "samples" in values and hasattr(renderer, "samples"):
         renderer = dataclasses.replace(renderer, samples=values["samples"])
     places: dict[str, Any] = {}
     for name, value in values.items():
@@ -114,7 +116,7 @@ def with_controls(settings: ScanSettings, values: Mapping[str, Any]) -> ScanSett
             places |= {place: value * attrgetter(place)(sensor) for place in _FACTORS[name]}
         elif name == "material":
             places |= {} if value == OWN_MATERIAL else {name: get_material(value)}
-        elif name not in changes and name != "samples":
+        elif name not in _SCAN and name != "samples":
             places[name] = value
     made = settings.with_sensor(_replaced(sensor, places), renderer)
     return dataclasses.replace(made, **changes)

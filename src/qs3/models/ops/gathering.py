@@ -61,17 +61,6 @@ def scatter_points(
     return _Scatter.apply(values, index, n)
 
 
-def _sum_into(values: Tensor, index: Tensor, n: int) -> Tensor:
-    b, c = len(values), values.shape[-1]
-    flat = flat_indices(index.reshape(b, -1, 1), n).view(-1)
-    rows = values.reshape(-1, c)
-    total = torch.zeros((b * n, c), dtype=values.dtype, device=values.device)
-    if values.is_cuda:
-        # On a GPU index_add_ adds in no fixed order; index_put_ sorts first.
-        return total.index_put_((flat,), rows, accumulate=True).view(b, n, c)
-    return total.index_add_(0, flat, rows).view(b, n, c)
-
-
 class _Gather(torch.autograd.Function):
     @staticmethod
     def forward(ctx, values: Tensor, index: Tensor) -> Tensor:
@@ -90,12 +79,46 @@ class _Scatter(torch.autograd.Function):
     @staticmethod
     def forward(ctx, values: Tensor, index: Tensor, n: int) -> Tensor:
         ctx.save_for_backward(index)
-        return _sum_into(values, index, n)
+        b, c = len(values), values.shape[-1]
+        flat = flat_indices(index.reshape(b, -1, 1), n).view(-1)
+        rows = values.reshape(-1, c)
+        total = torch.zeros((b * n, c), dtype=values.dtype, device=values.device)
+        if values.is_cuda:
+            # On a GPU index_add_ adds in no fixed order; index_put_ sorts first.
+            return total.index_put_((flat,), rows, accumulate=True).view(b, n, c)
+        return total.index_add_(0, flat, rows).view(b, n, c)
 
     @staticmethod
     def backward(ctx, gradient: Tensor) -> tuple[Tensor, None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         (index,) = ctx.saved_tensors
         return gather_points(gradient, index), None, None
+
+
+def linear_max_gradients(
+    gradient: Float[Tensor, "m d"],
+    winner: Int[Tensor, "m d"],
+    rows: Float[Tensor, "e c"],
+    weight: Float[Tensor, "d c"],
+) -> tuple[Float[Tensor, "e c"], Float[Tensor, "d c"]]:
+    """Return the gradients of rows and weight where output [m d] is the product of one row.
+
+    Example:
+        >>> winner, rows = torch.tensor([[0, 1]]), torch.tensor([[1.0], [2.0]])
+        >>> of = linear_max_gradients(torch.ones(1, 2), winner, rows, torch.tensor([[3.0], [4.0]]))
+        >>> [tensor.flatten().tolist() for tensor in of]
+        [[3.0, 4.0], [1.0, 2.0]]
+    """
+    bag = torch.nn.functional.embedding_bag
+    share = gradient.t().contiguous()
+    of_weight = bag(winner.t().contiguous(), rows, mode="sum", per_sample_weights=share)
+    # Sorted by row, the outputs that each row has won are a bag of rows of the weight.
+    flat = winner.view(-1)
+    order = flat.argsort(stable=True)
+    ends = torch.bincount(flat, minlength=len(rows)).cumsum(0)
+    starts = torch.cat([ends.new_zeros(1), ends[:-1]])
+    share = gradient.reshape(-1).index_select(0, order)
+    of_rows = bag(order % len(weight), weight, starts, mode="sum", per_sample_weights=share)
+    return of_rows, of_weight
 
 
 def flat_indices(neighbours: Int[Tensor, "b m k"], n: int | None = None) -> Int[Tensor, "b*m k"]:

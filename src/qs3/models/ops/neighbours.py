@@ -25,12 +25,8 @@ def knn(
     """Find the k nearest points of each centre, in no order.
 
     Exact up to the rounding of |x|² − 2x·y + |y|², which is taken about each cloud's mean. Memory
-    is bounded: distances are held for a block of rows at a time.
-
-    Args:
-        points: Clouds in any number of dimensions.
-        k: Number of neighbours, at most n.
-        centres: Where to look from; the points themselves where None.
+    is bounded: distances are held for a block of rows at a time. Points may have any number of
+    dimensions; they are their own centres where none are given.
 
     Raises:
         ValueError: where k is not in 1 to n.
@@ -116,11 +112,6 @@ def three_nn_interpolate(
     """Mean of the three nearest known features, weighted by 1/d² (Qi et al., NeurIPS 2017, Eq. 2).
 
     All known points count where there are fewer than three.
-
-    Args:
-        points: Where features are wanted.
-        known: Where they are known.
-        features: Those at the known points.
 
     Example:
         >>> known = torch.tensor([[[0.0, 0, 0], [2, 0, 0]]])
