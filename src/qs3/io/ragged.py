@@ -91,10 +91,7 @@ class RaggedClouds:
 
 
 def relabel(
-    clouds: PointClouds,
-    class_names: Sequence[str],
-    class_map: Mapping[str, str] | None,
-    where: str,
+    clouds: PointClouds, class_names: Sequence[str], class_map: Mapping[str, str] | None, where: str
 ) -> PointClouds:
     """Return labelled clouds under other names of their classes; see `RaggedClouds.labelled`."""
     given = RaggedClouds(

@@ -17,14 +17,7 @@ from qs3.meshes.sizes import check_guesses, class_ranges
 from qs3.store.executors import Failure, LocalExecutor
 from qs3.store.manifest import Manifest, package_versions
 from qs3.store.parts import Place
-from qs3.store.scan_item import (
-    GenerateSettings,
-    Item,
-    neighbour_of,
-    row_id,
-    scan_item,
-    size_class,
-)
+from qs3.store.scan_item import GenerateSettings, Item, neighbour_of, row_id, scan_item, size_class
 from qs3.store.shards import DType, shard_bytes, table_of
 
 

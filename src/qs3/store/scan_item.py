@@ -96,10 +96,7 @@ def size_class(item: Item) -> str:
 
 
 def settings_for(
-    settings: GenerateSettings,
-    items: Sequence[Item],
-    meshes: Sequence[str | Path],
-    per_class: int,
+    settings: GenerateSettings, items: Sequence[Item], meshes: Sequence[str | Path], per_class: int
 ) -> GenerateSettings:
     """Return settings that tell what is scanned: its classes, and where the meshes are from.
 

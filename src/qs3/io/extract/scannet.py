@@ -8,13 +8,7 @@ from typing import Literal
 import numpy as np
 
 from qs3.errors import InputError
-from qs3.io.extract.run import (
-    ExtractReport,
-    OutputSettings,
-    recorded,
-    run_extract,
-    wanted_classes,
-)
+from qs3.io.extract.run import ExtractReport, OutputSettings, recorded, run_extract, wanted_classes
 from qs3.sensor.checks import check_range
 
 
