@@ -44,13 +44,15 @@ def read_labels(
     for file in files:
         for key in _names(file.relative):
             named.setdefault(key, []).append(file)
-    real_root = Path(os.path.realpath(root))
+    real_root = os.path.realpath(root)
     labels: dict[str, tuple[str, str | None]] = {}
     lines: dict[str, int] = {}
     for line, (name, class_name, split) in _rows(path, (FILE_COLUMNS, CLASS_COLUMNS), ("split",)):
         where = f"{path}, line {line}"
         file = _find(name, named, root, where)
-        if file.linked and not _lies_below(root / file.relative, real_root):
+        if file.linked and not Path(os.path.realpath(root / file.relative)).is_relative_to(
+            real_root
+        ):
             raise InputError(
                 f"{where}: {name!r} is a link that leads outside {root}; put the file itself there"
             )
@@ -116,10 +118,6 @@ def _plain(name: str, root: Path, where: str) -> str:
     if path.is_absolute() or PureWindowsPath(name).drive or ".." in path.parts:
         raise InputError(f"{where}: {name!r} leads outside {root}; give a path below it")
     return str(path)
-
-
-def _lies_below(path: Path, real_root: Path) -> bool:
-    return Path(os.path.realpath(path)).is_relative_to(real_root)
 
 
 def _rows(
