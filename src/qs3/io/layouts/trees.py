@@ -23,9 +23,16 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.io.guards import naming
-from qs3.io.layouts.class_folders import CloudFile, choose_split, entries, list_folder, read_files
 from qs3.io.layouts.format import POINTS, SPLITS, Format, labels_as, named_folder
-from qs3.io.layouts.point_folders import write_files, write_folder
+from qs3.io.layouts.point_folders import (
+    CloudFile,
+    choose_split,
+    entries,
+    list_folder,
+    read_files,
+    write_files,
+    write_folder,
+)
 from qs3.io.ragged import RaggedClouds
 from qs3.meshes.classes import POINTDA10, map_labels
 
