@@ -16,10 +16,10 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.files import sha256
+from qs3.io.clouds import RaggedClouds
 from qs3.io.guards import utf8
 from qs3.io.layouts.format import SPLITS, Format
 from qs3.io.point_files import POINT_FILES, WRITTEN_FILES, cloud_bytes, read_cloud
-from qs3.io.ragged import RaggedClouds
 from qs3.store.progress import cloud_bar
 
 _LONGEST_NAME = 180

@@ -25,10 +25,10 @@ from pathlib import Path
 import numpy as np
 
 from qs3.errors import InputError
+from qs3.io.clouds import RaggedClouds
 from qs3.io.layouts.format import Format, labels_as
 from qs3.io.layouts.hdf5_sets import named, read_parts, write_parts
 from qs3.io.layouts.point_folders import CloudFile, choose_split
-from qs3.io.ragged import RaggedClouds
 
 CLASSES = (
     *("bag", "bin", "box", "cabinet", "chair", "desk", "display", "door"),

@@ -14,11 +14,10 @@ from jaxtyping import Bool
 from qs3.errors import InputError
 from qs3.files import parse_json
 from qs3.io import scratch
-from qs3.io.clouds import CloudChoice, CloudKind
+from qs3.io.clouds import CloudChoice, CloudKind, RaggedClouds
 from qs3.io.guards import utf8
 from qs3.io.layouts.format import SPLITS, Format
 from qs3.io.layouts.npz import frame_parts
-from qs3.io.ragged import RaggedClouds
 from qs3.io.scratch import Spool
 from qs3.processors import usable_processors
 from qs3.store.folder import Folder, open_folder

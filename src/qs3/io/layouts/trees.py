@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3.errors import InputError
+from qs3.io.clouds import RaggedClouds
 from qs3.io.guards import naming
 from qs3.io.layouts.format import POINTS, SPLITS, Format, labels_as, named_folder
 from qs3.io.layouts.point_folders import (
@@ -33,7 +34,6 @@ from qs3.io.layouts.point_folders import (
     write_files,
     write_folder,
 )
-from qs3.io.ragged import RaggedClouds
 from qs3.meshes.classes import POINTDA10, map_labels
 
 GRASPNET = (
