@@ -182,20 +182,12 @@ def pick(value: Any, kind: type[_Kind], where: str | Path) -> _Kind:
     return structure({key: value[key] for key in value if key in names}, kind, where)
 
 
-def as_array(numbers: Numbers, shape: tuple[int, ...], name: str) -> Float[np.ndarray, "..."]:
-    """Return numbers, nested or not, as an array.
-
-    Raises:
-        InputError: where there are not as many as the shape has; ``name`` is told.
-
-    Example:
-        >>> as_array((1.0, 2.0, 3.0, 4.0), (2, 2), "matrix").tolist()
-        [[1.0, 2.0], [3.0, 4.0]]
-    """
+def as_matrix(numbers: Numbers, name: str) -> Float[np.ndarray, "3 3"]:
+    """Return nine numbers, nested or not, as a matrix row by row; of others ``name`` is told."""
     flat = [n for row in numbers for n in (row if isinstance(row, tuple) else (row,))]
-    if len(flat) != math.prod(shape):
-        raise InputError(f"{name} must be {math.prod(shape)} numbers, not {len(flat)}")
-    return np.array(flat).reshape(shape)
+    if len(flat) != 9:
+        raise InputError(f"{name} must be 9 numbers, not {len(flat)}")
+    return np.array(flat).reshape(3, 3)
 
 
 def load_npy(
