@@ -154,11 +154,10 @@ def text_lines(content: bytes) -> Iterator[tuple[int, str]]:
 
 def read_numbers(path: Path, counts: tuple[int, ...]) -> Float[np.ndarray, "n"]:
     """Read a text file of numbers, as many as one of ``counts``, apart by white space."""
+    words = read_text(path).split()
     try:
-        numbers = np.array([float(word) for word in read_text(path).split()])
-    except ValueError as error:
-        if isinstance(error, InputError):
-            raise
+        numbers = np.array([float(word) for word in words])
+    except ValueError:
         raise InputError(f"{path}: not a text file of numbers") from None
     if len(numbers) not in counts:
         wanted = " or ".join(map(str, counts))
@@ -168,7 +167,6 @@ def read_numbers(path: Path, counts: tuple[int, ...]) -> Float[np.ndarray, "n"]:
 
 def read_small_json(path: Path, largest: int = 1 << 30) -> Any:
     """Read a JSON file of at most ``largest`` bytes; a longer one is refused."""
-    path = Path(path)
     if path.is_file() and path.stat().st_size > largest:
         raise InputError(f"{path}: {path.stat().st_size} bytes, more than the {largest} expected")
     return read_json(path)

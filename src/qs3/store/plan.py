@@ -110,7 +110,7 @@ class Plan:
 
 
 def make_plan(items: Sequence[Item], settings: GenerateSettings) -> Plan:
-    """Check a work list and resolve the renderer, once for all workers.
+    """Check a work list.
 
     Raises:
         InputError: where the list is empty or has equal ids, a class is unknown, or not all units

@@ -38,7 +38,7 @@ _Triple = tuple[float, float, float]
 
 def is_bop(source: Path) -> bool:
     """Whether a folder is a scene in BOP's layout, or holds some."""
-    return bool(_scenes(Path(source)))
+    return bool(_scenes(source))
 
 
 def extract_bop(
@@ -87,7 +87,7 @@ def list_bop_frames(
     source: Path, settings: DepthImageSettings, names: Mapping[str, str]
 ) -> tuple[list[Frame], Axes]:
     """List the images of a scene, or of all scenes of a folder; and the axes of their clouds."""
-    scenes = _scenes(Path(source))
+    scenes = _scenes(source)
     if not scenes:
         raise InputError(f"{source}: no scene of BOP's layout ({CAMERAS}) in it")
     images = [image for scene in scenes for image in _images(scene)]

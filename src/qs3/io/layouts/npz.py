@@ -48,7 +48,6 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
         InputError: where the file is missing, damaged, announces more than it can hold, or holds
             other arrays.
     """
-    path = Path(path)
     arrays = _read(path)
     with naming(path):
         clouds = _clouds(arrays)

@@ -59,7 +59,6 @@ def read_folder(
         InputError: where the folder is missing, has no cloud or no such split, has clouds both
             beside and in class folders, or a file is bad; the file is named.
     """
-    root = Path(root)
     files = list_folder(root, endings)
     names = sorted({file.class_name for file in files})
     return read_files(root, choose_split(root, files, split), () if names == [""] else names)
@@ -154,7 +153,9 @@ def entries(folder: Path, wanted: Callable[[os.DirEntry[str]], bool]) -> list[Pa
     return [folder / name for name in sorted(names)]
 
 
-def write_folder(root: Path, clouds: RaggedClouds, ending: str) -> None:
+def write_folder(
+    root: Path, clouds: RaggedClouds, ending: str, folders: Sequence[str] | None = None
+) -> None:
     """Write each cloud as one file; read back with `read_folder`, clouds and labels are equal.
 
     An id becomes the name of the file: without the class, the split and the ending that it may
@@ -164,15 +165,12 @@ def write_folder(root: Path, clouds: RaggedClouds, ending: str) -> None:
         root: Folder to make.
         clouds: What to write.
         ending: One of `point_files.WRITTEN_FILES`.
+        folders: Of each cloud, below the root; by default that of its class and split.
 
     Raises:
         InputError: where a class name cannot name a folder, or a split is neither train nor test.
     """
-    write_files(root, clouds, _cloud_folders(clouds), ending)
-
-
-def write_files(root: Path, clouds: RaggedClouds, folders: Sequence[str], ending: str) -> None:
-    """Write each cloud as one file into its own of ``folders`` below ``root`` (``class/train``)."""
+    folders = _cloud_folders(clouds) if folders is None else folders
     taken: set[str] = set()
     for folder in sorted(set(folders)):
         (root / folder).mkdir(parents=True, exist_ok=True)

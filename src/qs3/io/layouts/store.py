@@ -23,12 +23,12 @@ from qs3.processors import usable_processors
 from qs3.store.folder import Folder, open_folder
 from qs3.store.manifest import (
     Manifest,
+    Sums,
     finished_shards,
     open_dataset,
     package_versions,
     shard_name,
     write_manifest,
-    write_sums,
 )
 from qs3.store.progress import cloud_bar
 
@@ -176,7 +176,7 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
         versions=package_versions(),
     )
     write_manifest(folder, manifest)
-    sums = {}
+    sums = Sums(folder)
     with cloud_bar(None, "write", count) as bar:
         for index, start in enumerate(starts):
             rows = []
@@ -184,9 +184,9 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
                 points = np.asarray(clouds.clouds[i], dtype=np.float32)
                 name, class_name = utf8(clouds.ids[i]), names[labels[i]]
                 rows.append(CloudRow(name, name, 0, labels[i], class_name, splits[i], 0, points))
-            sums[shard_name(index)] = put_shard(folder, index, table_of(rows))
+            sums.note(shard_name(index), put_shard(folder, index, table_of(rows)))
             bar.update(len(rows))
-    write_sums(folder, sums)
+    sums.write()
 
 
 FORMAT = Format(

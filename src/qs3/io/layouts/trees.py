@@ -31,7 +31,6 @@ from qs3.io.layouts.point_folders import (
     entries,
     list_folder,
     read_files,
-    write_files,
     write_folder,
 )
 from qs3.meshes.classes import POINTDA10, map_labels
@@ -115,7 +114,7 @@ def _graspnet(kind: str, *cameras: str) -> Format:
         _check_points(clouds, _GRASPNET_POINTS)
         rows = zip(clouds.splits, labels, strict=True)
         folders = [f"{part}/{kind}/{cameras[0]}/{label}" for part, label in rows]
-        write_files(root, clouds, folders, ".xyz")
+        write_folder(root, clouds, ".xyz", folders)
 
     return Format(
         name="-".join(("graspnetpc10", kind.lower(), *(cameras if len(cameras) == 1 else ()))),
