@@ -71,11 +71,9 @@ def read_labels(
 def read_shapenet_splits(
     path: Path, wanted: Collection[tuple[str, str]]
 ) -> dict[tuple[str, str], str]:
-    """Read the splits of ShapeNetCore, ``all.csv``.
+    """Read the splits of ShapeNetCore, ``all.csv``: of ``wanted``, synset and model of meshes.
 
-    Args:
-        path: The CSV, with the columns ``synsetId``, ``modelId`` and ``split``.
-        wanted: Synset and model of the meshes that are there; other rows are passed over.
+    Its columns are ``synsetId``, ``modelId`` and ``split``; other rows are passed over.
 
     Raises:
         InputError: where a column is missing, or a model is in two splits.

@@ -37,10 +37,8 @@ def walk(
 ) -> list[MeshFile]:
     """Find the meshes at any depth; symbolic links are followed, circles of them left.
 
-    Args:
-        root: An existing folder.
-        skip: Folders right below the root that are left out.
-        others: Takes up how many other files there are of each ending.
+    Folders of ``skip`` right below the root are left out. ``others`` takes up how many other files
+    there are of each ending.
 
     Raises:
         InputError: where a folder cannot be read, or a link that is named like a mesh leads

@@ -177,13 +177,9 @@ class Estimate:
 def estimate(
     plan: Plan, part: tuple[int, int] = (0, 1), scans: int = 3, timeout: float | None = None
 ) -> Estimate:
-    """Scan a few objects, spread over the list, and multiply.
+    """Scan a few objects, spread over the list, one after another in one worker, and multiply.
 
-    Args:
-        plan: The work.
-        part: ``(i, n)``, as in `generate`.
-        timeout: Seconds that one scan may take; None waits for ever.
-        scans: Objects to scan, one after another in one worker, after one more to warm up.
+    The first is scanned once more before, to warm up; ``part`` and ``timeout`` as in `generate`.
 
     Raises:
         InputError: where none of them can be scanned.

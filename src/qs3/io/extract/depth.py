@@ -192,10 +192,7 @@ def cut_frame(
 ) -> Iterator[ExtractedCloud]:
     """Cut the objects from one depth image.
 
-    Args:
-        frame: The image, its camera and its objects.
-        settings: What is cut.
-        names: Class by the object: ``a``, or of an instance ``a/1`` or ``*/1``.
+    ``names`` gives the class by the object: ``a``, or of an instance ``a/1`` or ``*/1``.
 
     Raises:
         InputError: where a file is damaged, sizes differ, or the box is outside the image.

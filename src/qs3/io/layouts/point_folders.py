@@ -45,12 +45,7 @@ def read_folder(
 
     ``<root>/<class>/*``, ``<root>/<class>/<train|test>/*`` or ``<root>/<train|test>/<class>/*``;
     without labels ``<root>/*`` or ``<root>/<train|test>/*``. Files of other endings and hidden
-    ones are passed over.
-
-    Args:
-        root: The folder.
-        split: ``train`` or ``test``; None takes every file.
-        endings: Endings to take, of `point_files.POINT_FILES`.
+    ones are passed over; ``split`` None takes every other file.
 
     Returns:
         Clouds in the order of their classes and names. Classes are those of all splits, sorted.

@@ -148,11 +148,7 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
     """Write clouds as a data set that ``train`` and every other command read.
 
     The clouds become the noisy ones (``points``); there are no clean twins and no surfaces.
-
-    Args:
-        root: Folder to make.
-        clouds: What to write.
-        origin: Name of the layout that they come from, for ``dataset.json``.
+    ``origin`` is the name of the layout that they come from, for ``dataset.json``.
 
     Raises:
         InputError: where the clouds have no labels.
