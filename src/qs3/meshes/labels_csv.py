@@ -151,9 +151,8 @@ def _rows(
 
 def _lines(handle: TextIO, path: Path) -> Iterator[str]:
     """Yield the lines; one without end is refused before it fills the memory."""
-    number = 0
-    while line := handle.readline(_LONGEST_LINE):
-        number += 1
+    lines = iter(lambda: handle.readline(_LONGEST_LINE), "")
+    for number, line in enumerate(lines, start=1):
         if len(line) == _LONGEST_LINE:
             raise InputError(f"{path}, line {number}: too long for a CSV")
         yield line

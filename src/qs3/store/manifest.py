@@ -196,7 +196,6 @@ class Sums(dict[str, str]):
     """
 
     def __init__(self, folder: Folder) -> None:
-        """Read what is there."""
         super().__init__(read_sums(folder))
         self._folder, self._written, self._time = folder, dict(self), time.monotonic()
 
