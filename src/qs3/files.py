@@ -51,14 +51,12 @@ def atomic_path(path: Path) -> Iterator[Path]:
     ending = path.suffix if len(path.suffix) < 16 else ""  # some writers go by it
     temporary = path.with_name(f".{_stem(path)}.{secrets.token_hex(4)}.tmp{ending}")
     try:
-        yield temporary
-        sync_entry(temporary)
-        temporary.replace(path)
-        with contextlib.suppress(OSError):  # some file systems sync no folders
-            sync_entry(path.parent)
-    except OSError as error:
-        name_fault(error, path)
-        raise
+        with _faults_named(path):
+            yield temporary
+            sync_entry(temporary)
+            temporary.replace(path)
+            with contextlib.suppress(OSError):  # some file systems sync no folders
+                sync_entry(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -100,37 +98,38 @@ def new_folder(path: Path) -> Iterator[Path]:
     path = Path(path).resolve()
     if not path.name or (path.exists() and (not path.is_dir() or holds_something(path))):
         raise InputError(f"{path}: is there already; name a new or empty folder")
-    with temporary_folder(path, alone=True) as folder:
+    with temporary_folder(path, alone=True) as folder, _faults_named(path):
         whole = folder / path.name  # some layouts go by it
-        try:
-            yield whole
-            for inner, _, files in os.walk(whole):
-                for entry in (*files, ""):
-                    sync_entry(Path(inner) / entry)
-            if path.is_dir():
-                with folder_lock(path):
-                    remove_left_overs(path)
-                if any(path.iterdir()):
-                    raise InputError(
-                        f"{path}: was empty, but something has come meanwhile, which is left as it "
-                        "is; nothing was written, name a new or empty folder and run it again"
-                    )
-                path.rmdir()
-            whole.rename(path)
-        except OSError as error:
-            name_fault(error, path)
-            raise
+        yield whole
+        for inner, _, files in os.walk(whole):
+            for entry in (*files, ""):
+                sync_entry(Path(inner) / entry)
+        if path.is_dir():
+            with folder_lock(path):
+                remove_left_overs(path)
+            if any(path.iterdir()):
+                raise InputError(
+                    f"{path}: was empty, but something has come meanwhile, which is left as it "
+                    "is; nothing was written, name a new or empty folder and run it again"
+                )
+            path.rmdir()
+        whole.rename(path)
     sync_entry(path.parent)
 
 
-def name_fault(error: OSError, path: Path) -> None:
+@contextlib.contextmanager
+def _faults_named(path: Path) -> Iterator[None]:
     """Put the file's name into an error of writing; a full disk is told with what to do."""
-    if error.errno in _FULL:
-        raise StorageError(
-            f"{path}: cannot be written ({error.strerror}); make room there and run the same "
-            "command again"
-        ) from error
-    error.filename = error.filename or str(path)
+    try:
+        yield
+    except OSError as error:
+        if error.errno in _FULL:
+            raise StorageError(
+                f"{path}: cannot be written ({error.strerror}); make room there and run the same "
+                "command again"
+            ) from error
+        error.filename = error.filename or str(path)
+        raise
 
 
 def _stem(path: Path) -> str:
@@ -151,12 +150,9 @@ def folder_lock(path: Path) -> Iterator[None]:
     file = Path(path) / LOCK
     handle = _open_lock(file)
     try:
-        try:
+        with _faults_named(file):
             os.ftruncate(handle, 0)
             os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()}".encode(), 0)
-        except OSError as error:
-            name_fault(error, file)
-            raise
         yield
     finally:
         file.unlink(missing_ok=True)
@@ -301,7 +297,9 @@ def sha256(path: Path) -> str:
 
 def holds_something(path: Path) -> bool:
     """Whether ``path`` is a folder with content, left-overs of an interrupted write aside."""
-    return path.is_dir() and any(not _is_left_over(entry.name) for entry in path.iterdir())
+    return path.is_dir() and any(
+        entry.name != LOCK and not _LEFT_OVER.match(entry.name) for entry in path.iterdir()
+    )
 
 
 def remove_left_overs(path: Path) -> None:
@@ -309,10 +307,6 @@ def remove_left_overs(path: Path) -> None:
     for entry in Path(path).iterdir():
         if _LEFT_OVER.match(entry.name) and entry.is_file():
             entry.unlink()
-
-
-def _is_left_over(name: str) -> bool:
-    return name == LOCK or bool(_LEFT_OVER.match(name))
 
 
 def refuse_link(path: Path) -> None:

@@ -120,24 +120,17 @@ def first_difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any]
 @functools.cache
 def _converter() -> Converter:
     converter = Converter(forbid_extra_keys=True)
-    converter.register_structure_hook(int, _whole)
+    converter.register_structure_hook(int, _of(int, "a whole number"))
     converter.register_structure_hook(float, _number)
     converter.register_structure_hook(str, _of(str, "text"))
     converter.register_structure_hook(bool, _of(bool, "true or false"))
     converter.register_structure_hook(Path, _path)
     converter.register_structure_hook_func(lambda kind: get_origin(kind) is typing.Literal, _word)
-    converter.register_structure_hook_factory(
-        lambda kind: get_origin(kind) in _UNIONS,
-        lambda kind: functools.partial(_union, converter),
-    )
-    converter.register_structure_hook_factory(
-        lambda kind: get_origin(kind) in _SEQUENCES,
-        lambda kind: functools.partial(_sequence, converter),
-    )
-    converter.register_structure_hook_factory(
-        lambda kind: get_origin(kind) in _MAPPINGS,
-        lambda kind: functools.partial(_mapping, converter),
-    )
+    for origins, hook in ((_UNIONS, _union), (_SEQUENCES, _sequence), (_MAPPINGS, _mapping)):
+        converter.register_structure_hook_func(
+            lambda kind, origins=origins: get_origin(kind) in origins,
+            functools.partial(hook, converter),
+        )
     converter.register_structure_hook_factory(
         dataclasses.is_dataclass, lambda kind: _dataclass(converter, kind)
     )
@@ -153,12 +146,6 @@ def _dataclass(converter: Converter, kind: Any) -> Any:
         return make(value, kind)
 
     return hook
-
-
-def _whole(value: Any, _: Any) -> int:
-    if type(value) is not int:
-        raise TypeError(f"{_short(value)} is not a whole number")
-    return value
 
 
 def _number(value: Any, _: Any) -> float:
@@ -213,9 +200,8 @@ def _sequence(converter: Converter, value: Any, kind: Any) -> Any:
         kinds = inner
     else:
         kinds = (inner[0],) * len(value)
-    items = []
-    for index, (item, item_kind) in enumerate(zip(value, kinds, strict=True)):
-        items.append(_inside(converter, item, item_kind, f"[{index}]"))
+    rows = enumerate(zip(value, kinds, strict=True))
+    items = [_inside(converter, item, own, f"[{index}]") for index, (item, own) in rows]
     return items if get_origin(kind) is list else tuple(items)
 
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from qs3.io.ragged import RaggedClouds
+from qs3.io.clouds import RaggedClouds
 
 from ..meshes.test_announced import TRIANGLE, glb, tree
 from .layouts import build_generated, build_run, clouds

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from qs3.io.ragged import RaggedClouds
+from qs3.io.clouds import RaggedClouds
 from qs3.meshes.classes import POINTDA10
 
 CLASSES = POINTDA10

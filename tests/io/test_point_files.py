@@ -150,6 +150,7 @@ def bad_cases() -> dict[str, tuple[str, bytes, str]]:
         "pcd ragged": ("a.pcd", header + b"1 2 3\n" * 3, "8 numbers"),
         "pcd header": ("a.pcd", b"FIELDS x y z\nDATA ascii\n1 2 3\n", "header is incomplete"),
         "pcd fields": ("a.pcd", header.replace(b" x y ", b" u v "), "no fields x, y and z"),
+        "pcd too large": ("a.pcd", header + (b"1e200 " * 8 + b"\n") * 3, "not finite"),
         "pcd data": ("a.pcd", pcd_header("zip"), "DATA zip is unknown"),
         "pcd cut": ("a.pcd", pcd_binary()[:-1], "cut off"),
         "pcd compressed cut": ("a.pcd", pcd_compressed()[:-1], "cut off"),

@@ -1,6 +1,7 @@
 """STEP, IGES and 3MF: sizes of any unit, assemblies placed, hostile files refused."""
 
 import importlib.util
+import subprocess
 import sys
 from pathlib import Path
 
@@ -54,6 +55,18 @@ def test_an_assembly_is_merged_with_its_transforms(tmp_path: Path) -> None:
     second = mesh.vertices[mesh.vertices[:, 0] > 1]
     np.testing.assert_allclose(second.min(axis=0), [1.7, 0, 0], atol=1e-6)
     assert mesh.area == pytest.approx(2 * 1.43)
+
+
+@step_and_iges
+def test_less_time_than_ours_is_left_as_it_is(tmp_path: Path) -> None:
+    pytest.importorskip("resource")
+    path = tmp_path / "a.step"
+    path.write_text(step(scaled("mm")))
+    script = (
+        "import resource, sys; resource.setrlimit(resource.RLIMIT_CPU, (300, 300)); "
+        "from qs3.meshes import load_mesh; load_mesh(sys.argv[1])"
+    )
+    subprocess.run([sys.executable, "-c", script, str(path)], check=True)
 
 
 @threemf

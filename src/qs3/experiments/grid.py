@@ -210,7 +210,7 @@ def make_record(run: Run, setup: Setup, device: str = "") -> RunRecord:
     if device:
         _see_alone(device)
     from qs3.io import load_clouds, load_unlabelled
-    from qs3.io.ragged import relabel
+    from qs3.io.clouds import relabel
     from qs3.meshes.classes import POINTDA10, canonical
     from qs3.training import evaluate, fit, load_whole
 

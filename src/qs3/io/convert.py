@@ -9,13 +9,12 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.files import new_folder
-from qs3.io.clouds import CloudKind
+from qs3.io.clouds import CloudKind, RaggedClouds
 from qs3.io.guards import naming
 from qs3.io.layouts import FORMATS
 from qs3.io.layouts.store import write_store
 from qs3.io.load import format_named, read_clouds
 from qs3.io.preparation import MOST_POINTS, resample
-from qs3.io.ragged import RaggedClouds
 from qs3.meshes.classes import map_labels
 from qs3.store.progress import cloud_bar
 

@@ -154,11 +154,10 @@ def text_lines(content: bytes) -> Iterator[tuple[int, str]]:
 
 def read_numbers(path: Path, counts: tuple[int, ...]) -> Float[np.ndarray, "n"]:
     """Read a text file of numbers, as many as one of ``counts``, apart by white space."""
+    words = read_text(path).split()
     try:
-        numbers = np.array([float(word) for word in read_text(path).split()])
-    except ValueError as error:
-        if isinstance(error, InputError):
-            raise
+        numbers = np.array([float(word) for word in words])
+    except ValueError:
         raise InputError(f"{path}: not a text file of numbers") from None
     if len(numbers) not in counts:
         wanted = " or ".join(map(str, counts))
@@ -168,7 +167,6 @@ def read_numbers(path: Path, counts: tuple[int, ...]) -> Float[np.ndarray, "n"]:
 
 def read_small_json(path: Path, largest: int = 1 << 30) -> Any:
     """Read a JSON file of at most ``largest`` bytes; a longer one is refused."""
-    path = Path(path)
     if path.is_file() and path.stat().st_size > largest:
         raise InputError(f"{path}: {path.stat().st_size} bytes, more than the {largest} expected")
     return read_json(path)
@@ -182,20 +180,12 @@ def pick(value: Any, kind: type[_Kind], where: str | Path) -> _Kind:
     return structure({key: value[key] for key in value if key in names}, kind, where)
 
 
-def as_array(numbers: Numbers, shape: tuple[int, ...], name: str) -> Float[np.ndarray, "..."]:
-    """Return numbers, nested or not, as an array.
-
-    Raises:
-        InputError: where there are not as many as the shape has; ``name`` is told.
-
-    Example:
-        >>> as_array((1.0, 2.0, 3.0, 4.0), (2, 2), "matrix").tolist()
-        [[1.0, 2.0], [3.0, 4.0]]
-    """
+def as_matrix(numbers: Numbers, name: str) -> Float[np.ndarray, "3 3"]:
+    """Return nine numbers, nested or not, as a matrix row by row; of others ``name`` is told."""
     flat = [n for row in numbers for n in (row if isinstance(row, tuple) else (row,))]
-    if len(flat) != math.prod(shape):
-        raise InputError(f"{name} must be {math.prod(shape)} numbers, not {len(flat)}")
-    return np.array(flat).reshape(shape)
+    if len(flat) != 9:
+        raise InputError(f"{name} must be 9 numbers, not {len(flat)}")
+    return np.array(flat).reshape(3, 3)
 
 
 def load_npy(

@@ -9,10 +9,9 @@ from typing import Any
 
 from qs3.errors import InputError
 from qs3.files import holds_something
-from qs3.io.clouds import CloudChoice, Origin, PointClouds, UnlabelledClouds
+from qs3.io.clouds import CloudChoice, Origin, PointClouds, RaggedClouds, UnlabelledClouds
 from qs3.io.layouts import FORMATS, FORMER_NAMES, Format, point_folders
 from qs3.io.layouts.store import read_ragged
-from qs3.io.ragged import RaggedClouds
 from qs3.store.folder import open_folder
 from qs3.store.manifest import MANIFEST
 

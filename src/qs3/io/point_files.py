@@ -40,7 +40,8 @@ def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np
     content = read_small(path)
     if not content.strip():
         raise InputError(f"{path}: empty file")
-    with naming(path, f"cannot be read as {suffix[1:]}"):
+    # What overflows float32 is told below, as not finite.
+    with naming(path, f"cannot be read as {suffix[1:]}"), np.errstate(over="ignore"):
         if suffix == ".npy":
             points = load_npy(content, _accept)[:, :3]
         elif suffix == ".pcd":
@@ -50,10 +51,9 @@ def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np
         else:
             with memory_limit(path):
                 points = _trimesh(content, suffix[1:], mesh_points, seed)
+        points = np.array(points, dtype=np.float32, order="C")
     if not len(points):
         raise InputError(f"{path}: holds no point")
-    with np.errstate(over="ignore"):
-        points = np.array(points, dtype=np.float32, order="C")
     if not np.isfinite(points).all():
         raise InputError(f"{path}: a point is not finite; remove points with NaN or infinity")
     return points

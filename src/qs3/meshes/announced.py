@@ -149,11 +149,7 @@ def memory_limit(path: Path) -> Iterator[None]:
         return
     most = _READING + _READING_SHARE * path.stat().st_size
     with _limited:  # the limit is the whole process's
-        soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-        limits = [pages * resource.getpagesize() + most, soft, hard]
-        resource.setrlimit(
-            resource.RLIMIT_AS, (min(n for n in limits if n != resource.RLIM_INFINITY), hard)
-        )
+        before = lower_limit(resource.RLIMIT_AS, pages * resource.getpagesize() + most)
         try:
             yield
         except MemoryError as error:
@@ -161,4 +157,14 @@ def memory_limit(path: Path) -> Iterator[None]:
                 f"{path}: takes over {most / 2**30:.1f} GiB of memory to read; simplify the mesh"
             ) from error
         finally:
-            resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+            resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def lower_limit(kind: int, most: int) -> tuple[int, int]:
+    """Bring a limit of this process down to ``most``, and return what it was; a lower one stays."""
+    import resource
+
+    before = resource.getrlimit(kind)
+    least = min(limit for limit in (most, *before) if limit != resource.RLIM_INFINITY)
+    resource.setrlimit(kind, (least, before[1]))
+    return before

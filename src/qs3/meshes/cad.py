@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 
 from qs3.errors import InputError, MissingExtraError
-from qs3.meshes.announced import memory_limit
+from qs3.meshes.announced import lower_limit, memory_limit
 
 UNITS = {".step": "meters", ".stp": "meters", ".iges": "millimeters", ".igs": "millimeters"}
 """Endings, and the unit that cascadio's triangles are in, whichever the file is in: of STEP it
@@ -70,8 +70,7 @@ def _convert(path: Path, out: Path) -> None:
     try:
         import resource
 
-        most = resource.getrlimit(resource.RLIMIT_CPU)[1]
-        resource.setrlimit(resource.RLIMIT_CPU, (_SECONDS, most))
+        lower_limit(resource.RLIMIT_CPU, _SECONDS)
     except ImportError:  # Windows: the caller's time limit is left
         pass
     kind = "step" if UNITS[path.suffix.lower()] == "meters" else "iges"

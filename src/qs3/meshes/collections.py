@@ -89,14 +89,30 @@ def _draws(per_class: int, seed: int, classes: Sequence[str] | None) -> list[Mes
     return items
 
 
-def _files(root: Path, classes: Sequence[str] | None, labels: Path | None) -> list[MeshItem]:
+def _files(root: Path, classes: tuple[str, ...] | None, labels: Path | None) -> list[MeshItem]:
+    """Meshes of a folder, those of the classes that are chosen, by their new names.
+
+    Of ModelNet ``pointda10`` are exactly ten folders (night_stand becomes cabinet; dresser,
+    wardrobe, desk, bench, stool and tv_stand stay out), of ShapeNet ten synsets (display becomes
+    monitor, pot becomes plant), of anything else whatever ``canonical`` maps onto them. Any of
+    the ten may be missing. Other choices are names as they stand in the collection.
+    """
     items = read_tree(root, labels)
     if classes is None:
         return items
-    names = _rename(items, classes, str(root))
-    return [
-        _called(item, name) for name, item in zip(names, items, strict=True) if name is not None
-    ]
+    have = {(item.layout, item.class_name) for item in items}
+    names: dict[tuple[str | None, str], str | None]
+    if classes == (POINTDA10_CHOICE,):
+        names = {key: _of_pointda10(*key) for key in have}
+        if not any(names.values()):
+            raise InputError(f"{root}: none of PointDA-10's ten classes; {_listed(have)}")
+    else:
+        for name in classes:
+            if name not in {own for _, own in have}:
+                raise InputError(f"{root}: no class {name!r}; {_listed(have)}")
+        names = {key: key[1] if key[1] in classes else None for key in have}
+    chosen = [(item, names[item.layout, item.class_name]) for item in items]
+    return [_called(item, name) for item, name in chosen if name is not None]
 
 
 def rename_items(items: Sequence[MeshItem], wanted: Mapping[str, str]) -> list[MeshItem]:
@@ -125,27 +141,6 @@ def _chosen_names(classes: str | Sequence[str] | None) -> tuple[str, ...] | None
     if POINTDA10_CHOICE in names and len(names) > 1:
         raise InputError(f"classes {', '.join(names)}: {POINTDA10_CHOICE} stands for ten; alone")
     return names
-
-
-def _rename(items: Sequence[MeshItem], classes: Sequence[str], source: str) -> list[str | None]:
-    """New class name of each mesh; None where it is not chosen.
-
-    Of ModelNet ``pointda10`` are exactly ten folders (night_stand becomes cabinet; dresser,
-    wardrobe, desk, bench, stool and tv_stand stay out), of ShapeNet ten synsets (display becomes
-    monitor, pot becomes plant), of anything else whatever ``canonical`` maps onto them. Any of
-    the ten may be missing. Other choices are names as they stand in the collection.
-    """
-    have = {(item.layout, item.class_name) for item in items}
-    if tuple(classes) == (POINTDA10_CHOICE,):
-        names = {key: _of_pointda10(*key) for key in have}
-        if not any(names.values()):
-            raise InputError(f"{source}: none of PointDA-10's ten classes; {_listed(have)}")
-    else:
-        for name in classes:
-            if name not in {own for _, own in have}:
-                raise InputError(f"{source}: no class {name!r}; {_listed(have)}")
-        names = {key: key[1] if key[1] in classes else None for key in have}
-    return [names[item.layout, item.class_name] for item in items]
 
 
 def _of_pointda10(layout: str | None, name: str) -> str | None:

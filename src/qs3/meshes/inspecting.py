@@ -37,10 +37,7 @@ def inspect(
 ) -> Iterable[Inspection]:
     """Read meshes, and yield what each is like, in their order.
 
-    Args:
-        items: The meshes.
-        units: Unit of the files; see ``file_size``.
-        pictured: Of so many meshes of each class the surface is sampled.
+    Of ``pictured`` meshes of each class the surface is sampled; for ``units`` see ``file_size``.
     """
     shown: Counter[str] = Counter()
     for item in items:

@@ -44,13 +44,15 @@ def read_labels(
     for file in files:
         for key in _names(file.relative):
             named.setdefault(key, []).append(file)
-    real_root = Path(os.path.realpath(root))
+    real_root = os.path.realpath(root)
     labels: dict[str, tuple[str, str | None]] = {}
     lines: dict[str, int] = {}
     for line, (name, class_name, split) in _rows(path, (FILE_COLUMNS, CLASS_COLUMNS), ("split",)):
         where = f"{path}, line {line}"
         file = _find(name, named, root, where)
-        if file.linked and not _lies_below(root / file.relative, real_root):
+        if file.linked and not Path(os.path.realpath(root / file.relative)).is_relative_to(
+            real_root
+        ):
             raise InputError(
                 f"{where}: {name!r} is a link that leads outside {root}; put the file itself there"
             )
@@ -69,11 +71,9 @@ def read_labels(
 def read_shapenet_splits(
     path: Path, wanted: Collection[tuple[str, str]]
 ) -> dict[tuple[str, str], str]:
-    """Read the splits of ShapeNetCore, ``all.csv``.
+    """Read the splits of ShapeNetCore, ``all.csv``: of ``wanted``, synset and model of meshes.
 
-    Args:
-        path: The CSV, with the columns ``synsetId``, ``modelId`` and ``split``.
-        wanted: Synset and model of the meshes that are there; other rows are passed over.
+    Its columns are ``synsetId``, ``modelId`` and ``split``; other rows are passed over.
 
     Raises:
         InputError: where a column is missing, or a model is in two splits.
@@ -118,10 +118,6 @@ def _plain(name: str, root: Path, where: str) -> str:
     return str(path)
 
 
-def _lies_below(path: Path, real_root: Path) -> bool:
-    return Path(os.path.realpath(path)).is_relative_to(real_root)
-
-
 def _rows(
     path: Path, needed: Sequence[Sequence[str]], optional: Sequence[str] = ()
 ) -> Iterator[tuple[int, list[str]]]:
@@ -155,9 +151,8 @@ def _rows(
 
 def _lines(handle: TextIO, path: Path) -> Iterator[str]:
     """Yield the lines; one without end is refused before it fills the memory."""
-    number = 0
-    while line := handle.readline(_LONGEST_LINE):
-        number += 1
+    lines = iter(lambda: handle.readline(_LONGEST_LINE), "")
+    for number, line in enumerate(lines, start=1):
         if len(line) == _LONGEST_LINE:
             raise InputError(f"{path}, line {number}: too long for a CSV")
         yield line

@@ -72,10 +72,6 @@ def class_ranges(class_name: str) -> tuple[tuple[float, float], tuple[float, flo
 def size_name(class_name: str, own_class: str = "") -> str:
     """Return the class whose real size counts: its name, or its own where only that size is known.
 
-    Args:
-        class_name: Name of the class.
-        own_class: Name that it has in the collection, where it goes by another one.
-
     Example:
         >>> size_name("seat", "stool"), size_name("chair", "thing"), size_name("seat")
         ('stool', 'chair', 'seat')
@@ -85,15 +81,10 @@ def size_name(class_name: str, own_class: str = "") -> str:
 
 
 def class_size(mesh: "trimesh.Trimesh", class_name: str, rng: np.random.Generator) -> float:
-    """Draw a longest side in metres for a mesh of a class, uniform in the logarithm.
+    """Draw a longest side in metres for a mesh of a class, z up, uniform in the logarithm.
 
     Both longest side and height are within the class's ranges; where the mesh's proportions do not
-    allow that, the longest side is.
-
-    Args:
-        mesh: Any scale, z up.
-        class_name: One of the ten classes or an alias.
-        rng: One number is drawn.
+    allow that, the longest side is. The mesh is of any scale; one number is drawn.
 
     Raises:
         InputError: where no size of the class is known.

@@ -3,7 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -154,46 +154,40 @@ def _folders(root: Path, files: Sequence[MeshFile]) -> list[MeshItem]:
         len(parts) == 3 and parts[0] in MODELNET40 and parts[1] in ("train", "test")
         for parts in paths
     )
-    layout = "modelnet" if is_modelnet else "folders"
-    return [
-        MeshItem(name, *place, root / file.relative, None, _up(file.relative), layout)
-        for name, file, place in zip(ids(files), files, _places(paths), strict=True)
-    ]
+    return list(_items(root, files, "modelnet" if is_modelnet else "folders"))
 
 
 def _labelled(root: Path, labels: Path, others: Counter[str]) -> list[MeshItem]:
     files = walk(root, others=others)
     table = read_labels(labels, root, files) if files else {}
-    places = _places([file.relative.split("/") for file in files])
     items = []
-    # The ids are those of all meshes: a row more or less items them as they are.
-    for name, file, (_, folder_split) in zip(ids(files), files, places, strict=True):
+    # The ids are those of all meshes: a row more or less leaves them as they are.
+    for file, item in zip(files, _items(root, files, "labels"), strict=True):
         if file.relative in table:
             class_name, split = table[file.relative]
-            split = folder_split if split is None else split
-            up = _up(file.relative)
-            path = root / file.relative
-            items.append(MeshItem(name, class_name, split, path, None, up, "labels"))
+            split = item.split if split is None else split
+            items.append(replace(item, class_name=class_name, split=split))
     if len(items) < len(files):
         others["meshes without a row in the labels"] = len(files) - len(items)
     return items
 
 
-def _places(paths: Sequence[list[str]]) -> Iterator[tuple[str, str]]:
-    """Class and split of each path.
+def _items(root: Path, files: Sequence[MeshFile], layout: Layout) -> Iterator[MeshItem]:
+    """Meshes with the classes and splits that their folders tell.
 
     The first folder is the class, even one called train among cars and buses; only where all
     first folders are splits, the class comes below them.
     """
-    first = {parts[0] for parts in paths if len(parts) > 1}
-    split_first = first <= set(SPLITS)
-    for parts in paths:
-        folders = parts[:-1]
+    split_first = {f.relative.split("/")[0] for f in files if "/" in f.relative} <= set(SPLITS)
+    for name, file in zip(ids(files), files, strict=True):
+        above = file.relative.split("/")[:-1]
         if split_first:
-            yield (folders[1] if len(folders) > 1 else ""), (folders[0] if folders else "")
+            split, class_name = [*above, "", ""][:2]
         else:
-            split = next((name for name in folders[1:] if name in SPLITS), "")
-            yield (folders[0] if folders else ""), split
+            class_name = above[0] if above else ""
+            split = next((part for part in above[1:] if part in SPLITS), "")
+        path, up = root / file.relative, _up(file.relative)
+        yield MeshItem(name, class_name, split, path, None, up, layout)
 
 
 def _up(relative: str) -> Literal["y"] | None:

@@ -37,10 +37,8 @@ def walk(
 ) -> list[MeshFile]:
     """Find the meshes at any depth; symbolic links are followed, circles of them left.
 
-    Args:
-        root: An existing folder.
-        skip: Folders right below the root that are left out.
-        others: Takes up how many other files there are of each ending.
+    Folders of ``skip`` right below the root are left out. ``others`` takes up how many other files
+    there are of each ending.
 
     Raises:
         InputError: where a folder cannot be read, or a link that is named like a mesh leads
@@ -60,16 +58,13 @@ def walk(
                 real = os.path.realpath(entry.path) if is_link else f"{above[-1]}/{entry.name}"
                 if real not in above:
                     left.append((f"{prefix}{entry.name}/", linked or is_link, (*above, real)))
-            elif is_mesh(entry.name) and is_file(entry):
+                continue
+            ending = os.path.splitext(entry.name)[1].lower()  # noqa: PTH122
+            if ending in EXTENSIONS and is_file(entry):
                 meshes.append(MeshFile(prefix + entry.name, linked or is_link))
             elif others is not None:
-                others[os.path.splitext(entry.name)[1].lower() or entry.name] += 1  # noqa: PTH122
+                others[ending or entry.name] += 1
     return meshes
-
-
-def is_mesh(name: str) -> bool:
-    """Whether the ending is one that ``load_mesh`` reads."""
-    return name[name.rfind(".") :].lower() in EXTENSIONS
 
 
 def is_file(entry: os.DirEntry[str] | Path) -> bool:

@@ -40,7 +40,6 @@ class Folder:
     """Path on this machine, or an address such as ``s3://bucket/folder``."""
 
     def __str__(self) -> str:
-        """Return the path or address."""
         return self.address
 
     @property

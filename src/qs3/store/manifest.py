@@ -29,14 +29,8 @@ _LARGEST = 10**9  # rows and shards
 _SHARD = re.compile(r"shard-(\d{5,18})\.parquet", re.ASCII)
 _SUMS_EVERY = 5.0  # seconds; the whole file is written anew each time
 _PACKAGES = (
-    "qs3",
-    "mitsuba",
-    "numpy",
-    "opencv-python-headless",
-    "pyarrow",
-    "scipy",
-    "torch",
-    "trimesh",
+    *("qs3", "mitsuba", "numpy", "opencv-python-headless"),
+    *("pyarrow", "scipy", "torch", "trimesh"),
 )
 
 
@@ -177,12 +171,6 @@ def finished_shards(folder: Folder, count: int) -> list[int]:
     return sorted(n for n in numbers if n < count and shard_name(n) in names)
 
 
-def write_sums(folder: Folder, sums: Mapping[str, str]) -> None:
-    """Write ``SHA256SUMS`` anew, in the layout that ``sha256sum --check`` reads."""
-    lines = [f"{digest}  {name}\n" for name, digest in sorted(sums.items())]
-    folder.write(SUMS, "".join(lines).encode("ascii"))
-
-
 def read_sums(folder: Folder) -> dict[str, str]:
     """Return the checksum of each shard by its name; none where there is no ``SHA256SUMS``.
 
@@ -208,7 +196,6 @@ class Sums(dict[str, str]):
     """
 
     def __init__(self, folder: Folder) -> None:
-        """Read what is there."""
         super().__init__(read_sums(folder))
         self._folder, self._written, self._time = folder, dict(self), time.monotonic()
 
@@ -219,9 +206,10 @@ class Sums(dict[str, str]):
             self.write()
 
     def write(self) -> None:
-        """Write what has come since."""
+        """Write the file anew, as ``sha256sum --check`` reads it, if something has come since."""
         if self != self._written:
-            write_sums(self._folder, self)
+            lines = [f"{digest}  {name}\n" for name, digest in sorted(self.items())]
+            self._folder.write(SUMS, "".join(lines).encode("ascii"))
         self._written, self._time = dict(self), time.monotonic()
 
 

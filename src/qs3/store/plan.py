@@ -17,14 +17,7 @@ from qs3.meshes.sizes import check_guesses, class_ranges
 from qs3.store.executors import Failure, LocalExecutor
 from qs3.store.manifest import Manifest, package_versions
 from qs3.store.parts import Place
-from qs3.store.scan_item import (
-    GenerateSettings,
-    Item,
-    neighbour_of,
-    row_id,
-    scan_item,
-    size_class,
-)
+from qs3.store.scan_item import GenerateSettings, Item, neighbour_of, row_id, scan_item, size_class
 from qs3.store.shards import DType, shard_bytes, table_of
 
 
@@ -117,7 +110,7 @@ class Plan:
 
 
 def make_plan(items: Sequence[Item], settings: GenerateSettings) -> Plan:
-    """Check a work list and resolve the renderer, once for all workers.
+    """Check a work list.
 
     Raises:
         InputError: where the list is empty or has equal ids, a class is unknown, or not all units
@@ -184,13 +177,9 @@ class Estimate:
 def estimate(
     plan: Plan, part: tuple[int, int] = (0, 1), scans: int = 3, timeout: float | None = None
 ) -> Estimate:
-    """Scan a few objects, spread over the list, and multiply.
+    """Scan a few objects, spread over the list, one after another in one worker, and multiply.
 
-    Args:
-        plan: The work.
-        part: ``(i, n)``, as in `generate`.
-        timeout: Seconds that one scan may take; None waits for ever.
-        scans: Objects to scan, one after another in one worker, after one more to warm up.
+    The first is scanned once more before, to warm up; ``part`` and ``timeout`` as in `generate`.
 
     Raises:
         InputError: where none of them can be scanned.

@@ -96,18 +96,12 @@ def size_class(item: Item) -> str:
 
 
 def settings_for(
-    settings: GenerateSettings,
-    items: Sequence[Item],
-    meshes: Sequence[str | Path],
-    per_class: int,
+    settings: GenerateSettings, items: Sequence[Item], meshes: Sequence[str | Path], per_class: int
 ) -> GenerateSettings:
     """Return settings that tell what is scanned: its classes, and where the meshes are from.
 
-    Args:
-        settings: All others.
-        items: The work list.
-        meshes: ``shapes`` and folders that it was collected from.
-        per_class: Objects a class of the shapes.
+    ``meshes`` are ``shapes`` and the folders that the work list was collected from, ``per_class``
+    the shapes' objects a class.
     """
     return dataclasses.replace(
         settings,
@@ -150,13 +144,9 @@ def scan_seed(root: int, object_id: str, scan: int) -> int:
 
 
 def neighbour_of(items: Sequence[Item], position: int, scan: int, root: int) -> Item:
-    """Draw another item of a work list for a scan; order and worker count do not matter.
+    """Draw another item of a work list, of two at least, for a scan of the one at ``position``.
 
-    Args:
-        items: The work list, of two at least.
-        position: Of the object that is scanned, in the list.
-        scan: Index of its scan.
-        root: Root seed.
+    Order and worker count do not matter.
     """
     key = np.random.SeedSequence(scan_seed(root, items[position].id, scan), spawn_key=(0x4E42,))
     drawn = int(np.random.default_rng(key).integers(len(items) - 1))

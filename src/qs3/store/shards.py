@@ -67,14 +67,6 @@ _NAMES = _SCHEMAS["float32"].names
 _MOST_BYTES, _MOST_SHARE = 1 << 28, 8
 
 
-def _no_cloud() -> Float32[np.ndarray, "0 3"]:
-    return np.zeros((0, 3), np.float32)
-
-
-def _no_view() -> UInt8[np.ndarray, "0"]:
-    return np.zeros(0, np.uint8)
-
-
 @dataclass(frozen=True)
 class CloudRow:
     """One scan of one object, in the frame of the normalised mesh; or a cloud from elsewhere."""
@@ -95,13 +87,13 @@ class CloudRow:
     """Seed of the scan; 0 where nothing was drawn."""
     points: Float[np.ndarray, "n 3"]
     """The noisy cloud."""
-    view: UInt8[np.ndarray, "_"] = field(default_factory=_no_view)
+    view: UInt8[np.ndarray, "_"] = field(default_factory=lambda: np.zeros(0, np.uint8))
     """View that each noisy point comes from; empty where that is not known."""
-    clean: Float[np.ndarray, "m 3"] = field(default_factory=_no_cloud)
+    clean: Float[np.ndarray, "m 3"] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     """Its twin from the true z-buffer; empty where there is none."""
-    clean_view: UInt8[np.ndarray, "_"] = field(default_factory=_no_view)
+    clean_view: UInt8[np.ndarray, "_"] = field(default_factory=lambda: np.zeros(0, np.uint8))
     """View that each clean point comes from; empty where that is not known."""
-    surface: Float[np.ndarray, "s 3"] = field(default_factory=_no_cloud)
+    surface: Float[np.ndarray, "s 3"] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     """Samples of the mesh's whole surface; empty where there is no mesh."""
     yaw: float = 0.0
     """Rotation about z under which the mesh was scanned, radians; undone in the clouds."""
@@ -208,15 +200,20 @@ def parse_shard(source: bytes | Path, where: str, columns: Sequence[str] | None 
         ) from error
 
 
+def flat(column: pa.ChunkedArray) -> tuple[np.ndarray, np.ndarray]:
+    """All values of a column of lists, and where each list begins."""
+    rows = column.combine_chunks()
+    return rows.values.to_numpy(zero_copy_only=False), rows.offsets.to_numpy()
+
+
 def flat_clouds(table: pa.Table, column: str, path: Any) -> list[Float32[np.ndarray, "_ 3"]]:
     """Return the clouds of one column, a row each.
 
     Raises:
         InputError: where a cloud is empty, not made of triples, or not finite; ``path`` is named.
     """
-    rows = table[column].combine_chunks()
-    values = rows.values.to_numpy(zero_copy_only=False).astype(np.float32, copy=False)
-    offsets = rows.offsets.to_numpy(zero_copy_only=False)
+    values, offsets = flat(table[column])
+    values = values.astype(np.float32, copy=False)
     sizes = np.diff(offsets)
     bad = (sizes == 0) | (sizes % 3 != 0)
     if not bad.any() and not np.isfinite(values[offsets[0] : offsets[-1]]).all():

@@ -27,7 +27,7 @@ from qs3.store.manifest import (
 )
 from qs3.store.progress import progress_bar
 from qs3.store.scan_item import scan_seed
-from qs3.store.shards import digests, load_shard, parse_shard
+from qs3.store.shards import digests, flat, load_shard, parse_shard
 
 _PLAIN = ["id", "object", "scan", "label", "class_name", "seed"]
 _CLOUDS = {"points": "view", "clean": "clean_view", "surface": None}
@@ -126,7 +126,7 @@ def _shard(
     yield from _rows(name, table, manifest)
     for column, view in _CLOUDS.items():
         yield from _clouds(name, table, column, view, manifest)
-    values, offsets = _flat(table["points"])
+    values, offsets = flat(table["points"])
     pairs = itertools.pairwise(offsets)
     seen.clouds.append(digests(values[begin:end].tobytes() for begin, end in pairs))
 
@@ -149,10 +149,10 @@ def _rows(name: str, table: pa.Table, manifest: Manifest) -> Iterator[str]:
 def _clouds(
     name: str, table: pa.Table, column: str, view: str | None, manifest: Manifest
 ) -> Iterator[str]:
-    values, offsets = _flat(table[column])
+    values, offsets = flat(table[column])
     if column != "points" and not len(values):
         return  # a converted set, which has noisy clouds alone
-    views, view_offsets = (None, offsets) if view is None else _flat(table[view])
+    views, view_offsets = (None, offsets) if view is None else flat(table[view])
     limit = manifest.settings.get("views", 256)
     for row, identifier in enumerate(table["id"].to_pylist()):
         cloud = values[offsets[row] : offsets[row + 1]]
@@ -167,12 +167,6 @@ def _clouds(
                 yield f"{where} has {len(cloud) // 3} points and {len(own)} views"
             elif len(own) and own.max() >= limit:
                 yield f"{where} names view {own.max()} of {limit}"
-
-
-def _flat(column: pa.ChunkedArray) -> tuple[np.ndarray, np.ndarray]:
-    """All values of a column of lists, and where each list begins."""
-    rows = column.combine_chunks()
-    return rows.values.to_numpy(zero_copy_only=False), rows.offsets.to_numpy()
 
 
 def _repetitions(folder: Folder, seen: _Seen) -> Iterator[str]:

@@ -10,10 +10,9 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.io import load_clouds, load_unlabelled
-from qs3.io.clouds import PointClouds, UnlabelledClouds, numbered
+from qs3.io.clouds import PointClouds, RaggedClouds, UnlabelledClouds, numbered
 from qs3.io.load import is_store
 from qs3.io.preparation import LARGEST
-from qs3.io.ragged import RaggedClouds
 from qs3.meshes import collect
 from qs3.meshes.classes import canonical
 from qs3.meshes.sizes import CLASS_SIZES

@@ -16,8 +16,7 @@ from qs3.evaluation.records import RECORDS, RunRecord, Scores, score, write_reco
 from qs3.evaluation.regret import choose_each
 from qs3.files import sub_folder
 from qs3.io import load_clouds
-from qs3.io.clouds import CloudChoice, PointClouds
-from qs3.io.ragged import relabel
+from qs3.io.clouds import CloudChoice, PointClouds, relabel
 from qs3.meshes.classes import require_named
 from qs3.structure import unstructure
 from qs3.training.batches import load_whole

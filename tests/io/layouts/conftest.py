@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from qs3.io.ragged import RaggedClouds
+from qs3.io.clouds import RaggedClouds
 from qs3.meshes.classes import POINTDA10
 
 

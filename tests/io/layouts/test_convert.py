@@ -9,11 +9,11 @@ import pytest
 
 from qs3.errors import InputError, StorageError
 from qs3.files import temporary_folder
+from qs3.io.clouds import RaggedClouds
 from qs3.io.convert import convert
 from qs3.io.layouts.point_folders import write_folder
 from qs3.io.layouts.store import read_ragged
 from qs3.io.load import read_clouds
-from qs3.io.ragged import RaggedClouds
 from qs3.meshes.classes import POINTDA10
 from qs3.store.manifest import open_dataset
 

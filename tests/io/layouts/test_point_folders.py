@@ -9,11 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.errors import InputError
-from qs3.io.layouts.class_folders import read_folder
-from qs3.io.layouts.point_folders import file_stem, write_folder
+from qs3.io.clouds import RaggedClouds
+from qs3.io.layouts.point_folders import file_stem, read_folder, write_folder
 from qs3.io.load import load_unlabelled
 from qs3.io.point_files import WRITTEN_FILES, cloud_bytes, read_cloud
-from qs3.io.ragged import RaggedClouds
 
 from ..hostile import fuzz
 

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
+from qs3.io.clouds import RaggedClouds
 from qs3.io.layouts import pointda10
 from qs3.io.layouts.pointda10 import read_pointda10, write_h5, write_npy
 from qs3.io.load import detect, load_clouds
 from qs3.io.preparation import unit_ball
-from qs3.io.ragged import RaggedClouds
 from qs3.meshes.classes import POINTDA10
 
 from ..hostile import refused

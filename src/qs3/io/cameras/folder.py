@@ -133,10 +133,8 @@ def _read_times(path: Path) -> dict[str, float]:
     """Seconds by the name of each frame; none where there is no such file."""
     if not path.is_file():
         return {}
+    rows = csv.DictReader(io.StringIO(read_text(path, 1 << 26), newline=""))
     try:
-        rows = list(csv.DictReader(io.StringIO(read_text(path, 1 << 26), newline="")))
         return {row["frame"]: float(row["time"]) for row in rows}
     except (csv.Error, KeyError, TypeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{path}: not a CSV with the columns frame,time") from error

@@ -12,7 +12,7 @@ from qs3.errors import InputError, MissingExtraError, say_once
 from qs3.io.cameras.frames import Camera, DepthFrame
 from qs3.io.extract.depth_images import to_metres
 from qs3.io.extract.intrinsics import Intrinsics
-from qs3.io.guards import reason
+from qs3.io.guards import naming
 
 _PATIENCE = 5000  # milliseconds to the next frame
 
@@ -41,16 +41,11 @@ def realsense_camera(serial: str = "", file: Path | None = None, colour: bool = 
     if file is not None and not file.is_file():
         raise InputError(f"{file}: no such file")
     pipeline = rs.pipeline()
-    try:
+    with naming(where, "librealsense cannot open it"):
         profile = pipeline.start(_config(rs, pipeline, serial, file, colour))
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
-    except RuntimeError as error:
-        raise InputError(f"{where}: librealsense cannot open it ({reason(error)})") from error
     try:
-        yield from _frames(rs, pipeline, profile, where, colour)
-    except RuntimeError as error:
-        raise InputError(f"{where}: librealsense stopped ({reason(error)})") from error
+        with naming(where, "librealsense stopped"):
+            yield from _frames(rs, pipeline, profile, colour)
     finally:
         pipeline.stop()
 
@@ -76,14 +71,14 @@ def _config(rs: Any, pipeline: Any, serial: str, file: Path | None, colour: bool
     return config
 
 
-def _frames(rs: Any, pipeline: Any, profile: Any, where: str, colour: bool) -> Camera:
+def _frames(rs: Any, pipeline: Any, profile: Any, colour: bool) -> Camera:
     """Depth frames, each once, with the colour of the same moment.
 
     Where depth comes first, librealsense gives it twice: with the colour before, then with its own.
     """
     align, number, before = rs.align(rs.stream.depth), 0, -1
     held: DepthFrame | None = None
-    for frames in _framesets(rs, pipeline, profile.get_device(), where):
+    for frames in _framesets(rs, pipeline, profile.get_device()):
         depth = frames.get_depth_frame()
         fresh = bool(depth) and depth.get_frame_number() != before
         if held is not None and fresh:
@@ -105,7 +100,7 @@ def _frames(rs: Any, pipeline: Any, profile: Any, where: str, colour: bool) -> C
         yield held
 
 
-def _framesets(rs: Any, pipeline: Any, device: Any, where: str) -> Iterator[Any]:
+def _framesets(rs: Any, pipeline: Any, device: Any) -> Iterator[Any]:
     """What comes from a camera, or from a recording until it ends."""
     playback = device.as_playback() if device.is_playback() else None
     while True:
@@ -113,7 +108,7 @@ def _framesets(rs: Any, pipeline: Any, device: Any, where: str) -> Iterator[Any]
         if arrived:
             yield frames
         elif playback is None:
-            raise InputError(f"{where}: no frame in {_PATIENCE / 1000:g} s; check its cable")
+            raise InputError(f"no frame in {_PATIENCE / 1000:g} s; check its cable")
         elif playback.current_status() == rs.playback_status.stopped:
             return
 

@@ -82,9 +82,7 @@ class _Bag:
         self._read = self._types.deserialize_ros1 if old else self._types.deserialize_cdr
         self._reader = self.guarded(rosbag1.Reader if old else rosbag2.Reader, path)
         self.guarded(stack.enter_context, self._reader)
-        self.topics = {
-            connection.topic: connection.msgtype for connection in self._reader.connections
-        }
+        self.topics = {each.topic: each.msgtype for each in self._reader.connections}
         if old and any(topic.startswith("/device_0/") for topic in self.topics):
             raise InputError(f"{path}: recorded by a RealSense, not by ROS: read it as bag:{path}")
 
@@ -95,9 +93,7 @@ class _Bag:
 
     def messages(self, topic: str) -> Iterator[tuple[float, Any]]:
         """Yield the messages of a topic with the time at which they were recorded, seconds."""
-        wanted = [
-            connection for connection in self._reader.connections if connection.topic == topic
-        ]
+        wanted = [each for each in self._reader.connections if each.topic == topic]
         rows = iter(self._reader.messages(wanted))
         while (row := self.guarded(next, rows, None)) is not None:
             yield row[1] / 1e9, self.guarded(self._read, row[2], row[0].msgtype)

@@ -26,7 +26,7 @@ from qs3.io.extract.cut import check_rotation, upright
 from qs3.io.extract.depth import DepthImageSettings, Frame, FrameObject, cut_frame
 from qs3.io.extract.intrinsics import intrinsics_from_matrix
 from qs3.io.extract.run import ExtractReport, OutputSettings, recorded, run_extract
-from qs3.io.guards import Numbers, as_array, pick, read_small_json
+from qs3.io.guards import Numbers, as_matrix, naming, pick, read_small_json
 
 CAMERAS = "scene_camera.json"
 _TRUTH = "scene_gt.json"
@@ -38,7 +38,7 @@ _Triple = tuple[float, float, float]
 
 def is_bop(source: Path) -> bool:
     """Whether a folder is a scene in BOP's layout, or holds some."""
-    return bool(_scenes(Path(source)))
+    return bool(_scenes(source))
 
 
 def extract_bop(
@@ -87,7 +87,7 @@ def list_bop_frames(
     source: Path, settings: DepthImageSettings, names: Mapping[str, str]
 ) -> tuple[list[Frame], Axes]:
     """List the images of a scene, or of all scenes of a folder; and the axes of their clouds."""
-    scenes = _scenes(Path(source))
+    scenes = _scenes(source)
     if not scenes:
         raise InputError(f"{source}: no scene of BOP's layout ({CAMERAS}) in it")
     images = [image for scene in scenes for image in _images(scene)]
@@ -157,34 +157,31 @@ def _frame(
 ) -> Frame:
     scene, number, entry, listed = image
     identifier = f"{scene.resolve().name}/{number:06d}"
-    where = f"{scene / CAMERAS}, image {number}"
-    try:
+    with naming(f"{scene / CAMERAS}, image {number}"):
         camera = intrinsics_from_matrix(
-            as_array(entry.cam_K, (3, 3), "cam_K"),
+            as_matrix(entry.cam_K, "cam_K"),
             width=entry.width,
             height=entry.height,
             depth_scale=entry.depth_scale / 1000,
         )
         world = _out_of_camera(entry.cam_R_w2c, entry.cam_t_w2c, "w2c", axes == "world")
-        objects = []
-        for i, item in enumerate(listed):
-            where = f"{scene / _TRUTH}, image {number}, object {i}"
+    level = np.eye(4)
+    level[:3, :3] = upright(settings.gravity)
+    objects = []
+    for i, item in enumerate(listed):
+        with naming(f"{scene / _TRUTH}, image {number}, object {i}"):
             if not 0 <= item.obj_id < 1 << 31:
                 raise InputError(f"obj_id {item.obj_id} is no model")
             model = _out_of_camera(item.cam_R_m2c, item.cam_t_m2c, "m2c", axes == "model")
-            level = np.eye(4)
-            level[:3, :3] = upright(settings.gravity)
-            objects.append(
-                FrameObject(
-                    id=f"{identifier}/{i:06d}",
-                    mask=scene / _MASKS / f"{number:06d}_{i:06d}.png",
-                    to_axes={"world": world, "model": model}.get(axes, level),
-                    class_name=class_of(item.obj_id, settings, names),
-                    source={"obj_id": item.obj_id},
-                )
+        objects.append(
+            FrameObject(
+                id=f"{identifier}/{i:06d}",
+                mask=scene / _MASKS / f"{number:06d}_{i:06d}.png",
+                to_axes={"world": world, "model": model}.get(axes, level),
+                class_name=class_of(item.obj_id, settings, names),
+                source={"obj_id": item.obj_id},
             )
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        )
     path = scene / settings.depth_folder / f"{number:06d}.png"
     return Frame(identifier, path, camera, tuple(objects))
 
@@ -201,7 +198,7 @@ def _out_of_camera(
             "--frame camera"
         )
     pose = np.eye(4)
-    pose[:3, :3] = as_array(rotation, (3, 3), f"cam_R_{kind}")
+    pose[:3, :3] = as_matrix(rotation, f"cam_R_{kind}")
     pose[:3, 3] = np.array(shift) / 1000
     check_rotation(pose[:3, :3], f"cam_R_{kind}")
     return invert_rigid(pose)

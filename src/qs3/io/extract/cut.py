@@ -48,13 +48,7 @@ class CutSettings:
 def keep_pixels(
     depth: Float32[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"], settings: CutSettings
 ) -> Bool[np.ndarray, "h w"]:
-    """Tell which pixels of a mask give a point: gated, eroded and, if asked for, not flying.
-
-    Args:
-        depth: Metres along the optical axis, NaN where there is none.
-        mask: Pixels of the object.
-        settings: What is dropped.
-    """
+    """Tell which pixels of a mask give a point: gated, eroded and, if asked for, not flying."""
     # Imported here: what is cut from meshes needs no images.
     import cv2
 
@@ -83,18 +77,11 @@ def _supported(depth: Float[np.ndarray, "h w"], within: float) -> Bool[np.ndarra
 def lift(
     depth: Float32[np.ndarray, "h w"], keep: Bool[np.ndarray, "h w"], camera: Intrinsics
 ) -> Float[np.ndarray, "n 3"]:
-    """Lift pixels to points of the camera.
+    """Lift pixels that have a depth to points of the camera, in the pixels' row-major order.
 
     Convention:
-        OpenCV camera: x right, y down, z forward; pixel (0, 0) is the centre of the top-left one.
-
-    Args:
-        depth: Metres along the optical axis.
-        keep: Pixels to lift; each has a depth.
-        camera: The camera.
-
-    Returns:
-        Points in metres, in row-major order of the pixels.
+        OpenCV camera: x right, y down, z forward, metres; pixel (0, 0) is the centre of the
+        top-left one.
 
     Example:
         >>> camera = Intrinsics(2.0, 2.0, 0.0, 0.0)
@@ -178,12 +165,7 @@ class OrientedBox:
 def inside_box(
     points: Float[np.ndarray, "n 3"], box: OrientedBox, margin: float = 0.0
 ) -> Bool[np.ndarray, "n"]:
-    """Tell which points lie in a box, its faces included.
-
-    Args:
-        points: The points, in the frame of the box.
-        box: The box.
-        margin: Metres by which each face is moved outwards.
+    """Tell which points lie in a box, its faces included and moved outwards by ``margin`` metres.
 
     Raises:
         InputError: where the box has a number that is not finite, or its axes are no unit vectors

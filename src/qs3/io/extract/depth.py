@@ -21,13 +21,7 @@ from qs3.errors import InputError
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.io.extract.depth_images import DEPTH_FILES, list_images, read_depth, read_mask
 from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
-from qs3.io.extract.run import (
-    ExtractedCloud,
-    ExtractReport,
-    OutputSettings,
-    recorded,
-    run_extract,
-)
+from qs3.io.extract.run import ExtractedCloud, ExtractReport, OutputSettings, recorded, run_extract
 from qs3.io.guards import read_text, utf8
 
 _LARGEST_TABLE = 1 << 26
@@ -198,10 +192,7 @@ def cut_frame(
 ) -> Iterator[ExtractedCloud]:
     """Cut the objects from one depth image.
 
-    Args:
-        frame: The image, its camera and its objects.
-        settings: What is cut.
-        names: Class by the object: ``a``, or of an instance ``a/1`` or ``*/1``.
+    ``names`` gives the class by the object: ``a``, or of an instance ``a/1`` or ``*/1``.
 
     Raises:
         InputError: where a file is damaged, sizes differ, or the box is outside the image.

@@ -75,10 +75,7 @@ def read_raw(path: Path) -> np.ndarray:
 
 
 def read_infrared(path: Path) -> UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]:
-    """Read an infrared image; one of three channels, as viewers store it, becomes grey.
-
-    Args:
-        path: A PNG, TIFF or npy file of 8 or 16 bits.
+    """Read an infrared image of 8 or 16 bits; of three channels, as viewers store it, it is grey.
 
     Raises:
         InputError: where the file is missing, damaged or of another kind.
@@ -94,13 +91,9 @@ def read_infrared(path: Path) -> UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "
 
 
 def read_mask(path: Path, shape: tuple[int, ...] | None = None) -> Int32[np.ndarray, "h w"]:
-    """Read a mask: 0 is background, other numbers are objects.
+    """Read a mask: 0 is background, other numbers are objects; ``shape`` is what it must have.
 
     A coloured mask is 1 wherever it is not black.
-
-    Args:
-        path: A PNG, TIFF or npy file.
-        shape: Rows and columns it must have.
 
     Raises:
         InputError: where the file is missing, damaged or of another size.

@@ -52,13 +52,6 @@ def subsample(
     In each voxel the point of the lowest key stays; of too many voxels those stay whose hash is
     lowest. Parts first and their union then gives what everything at once gives.
 
-    Args:
-        points: The cloud.
-        keys: Random number of each point.
-        voxel: Edge of a voxel, in the units of the points.
-        max_points: Largest size of the result.
-        seed: Seed of the voxels' hashes.
-
     Raises:
         InputError: where a point lies a million voxels from the origin.
 
@@ -123,12 +116,9 @@ class ObjectFusion:
     def add(
         self, frame: int, points: Float32[np.ndarray, "n 3"], pixels: Int[np.ndarray, "n"]
     ) -> None:
-        """Offer the points of one frame.
+        """Offer the points of one frame, each frame once.
 
-        Args:
-            frame: Its number, below 2³²; each is offered once.
-            points: What it saw of the object.
-            pixels: Number of each point's pixel, below 2³².
+        The number of the frame and those of the points' pixels are below 2³².
         """
         self.offered += 1
         if not self.wants(frame):

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.errors import InputError
-from qs3.io.guards import Numbers, as_array, naming, pick, read_numbers, read_small_json
+from qs3.io.guards import Numbers, as_matrix, naming, pick, read_numbers, read_small_json
 
 CAMERA_FILES = ("intrinsics.json", "intrinsics.txt", "camera.json", "K.txt")
 """Names of the file that tells the camera of a folder of images."""
@@ -162,7 +162,7 @@ def _from_json(file: _CameraFile) -> Intrinsics:
         return Intrinsics(file.focal, file.focal, *file.principal_point, **more)
     for name in ("cam_K", "K", "intrinsic_matrix"):
         if (numbers := getattr(file, name)) is not None:
-            matrix = as_array(numbers, (3, 3), name)
+            matrix = as_matrix(numbers, name)
             return intrinsics_from_matrix(
                 matrix.T if name == "intrinsic_matrix" else matrix, **more
             )

@@ -43,7 +43,6 @@ def read_mat(path: Path, names: tuple[str, ...]) -> dict[str, Any]:
     # Imported here: other data sets have no MAT files.
     from scipy.io import loadmat
 
-    path = Path(path)
     content = read_small(path, _LARGEST_FILE, "a table of boxes; save only what is needed")
     if content[:10] == b"MATLAB 7.3" or content[512:520] == b"\x89HDF\r\n\x1a\n":
         raise InputError(f"{path}: of version 7.3; in MATLAB, save it anew with '-v7'")

@@ -165,12 +165,8 @@ def cut_frame(
 ) -> Iterator[ExtractedCloud]:
     """Cut the objects of one frame.
 
-    Args:
-        frame: The frame.
-        path: The file.
-        settings: What is cut.
-        kinds: The annotators' word and the class of each label that is wanted.
-        floors: Labels of floors.
+    ``kinds`` has the annotators' word and the class of each label that is wanted, ``floors`` the
+    labels of floors.
 
     Raises:
         InputError: where the file is damaged or of another layout.

@@ -15,7 +15,6 @@ from qs3.io.preparation import resample
 from qs3.meshes.classes import POINTDA10, map_labels
 from qs3.sensor.checks import check_range
 from qs3.store.executors import Failure, InlineExecutor, LocalExecutor, guarded, outcomes
-from qs3.store.executors.executor import failure_of
 from qs3.store.failures import read_failures, write_failures
 from qs3.store.folder import Folder, open_folder
 from qs3.store.info import info
@@ -224,11 +223,10 @@ def _put_unit(
     rows = guarded(lambda: [_row(c, class_names, num_points) for c in extract_one(unit)])
     if isinstance(rows, Failure):
         return rows
-    try:
-        return _put(folder, index, rows)
-    except Exception as error:
-        failure = failure_of(error)
-        return Failure(failure.kind, f"{folder}: cannot be written to ({failure.reason})", True)
+    done = guarded(_put, folder, index, rows)
+    if isinstance(done, Failure):
+        return Failure(done.kind, f"{folder}: cannot be written to ({done.reason})", fatal=True)
+    return done
 
 
 def _put(folder: Folder, index: int, rows: Sequence[CloudRow]) -> tuple[str, int]:

@@ -8,13 +8,7 @@ from typing import Literal
 import numpy as np
 
 from qs3.errors import InputError
-from qs3.io.extract.run import (
-    ExtractReport,
-    OutputSettings,
-    recorded,
-    run_extract,
-    wanted_classes,
-)
+from qs3.io.extract.run import ExtractReport, OutputSettings, recorded, run_extract, wanted_classes
 from qs3.sensor.checks import check_range
 
 
@@ -92,7 +86,8 @@ def extract_scannet(
     from qs3.io.extract.scannet_mesh import cut_mesh_scene
     from qs3.io.extract.scannet_scene import list_scenes, read_splits
 
-    splits = read_splits(settings.splits_train, settings.splits_test) or None
+    lists = settings.splits_train, settings.splits_test
+    splits = read_splits(*lists) if any(lists) else None
     scenes = list_scenes(source, settings.scenes or None, splits)
     cut = partial(cut_scene, settings=settings)
     if settings.from_mesh:

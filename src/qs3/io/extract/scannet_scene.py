@@ -195,9 +195,7 @@ def axis_alignment(scene: ScanNetScene) -> Float[np.ndarray, "4 4"]:
     return np.eye(4)
 
 
-def rest(
-    points: Float[np.ndarray, "n 3"],
-) -> tuple[Float[np.ndarray, "n 3"], list[float]]:
+def rest(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 3"], list[float]]:
     """Put a cloud's box over the origin, its lowest point on z = 0; also return where that was."""
     low, high = points.min(axis=0), points.max(axis=0)
     origin = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]], dtype=np.float64)

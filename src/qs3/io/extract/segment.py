@@ -98,9 +98,7 @@ class SegmentedObject:
 
 
 def segment_scene(
-    scene: Path,
-    out: Path,
-    settings: SceneSettings = SceneSettings(),
+    scene: Path, out: Path, settings: SceneSettings = SceneSettings()
 ) -> list[SegmentedObject]:
     """Cut a scene into a new folder: ``object_000.ply`` and so on, largest first, and a table.
 

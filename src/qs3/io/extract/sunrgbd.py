@@ -135,10 +135,7 @@ def extract_sunrgbd(
         frames,
         partial(cut_frame, settings=settings),
         output,
-        settings={
-            "extract": "extract_sunrgbd",
-            **recorded(settings, "boxes", "splits", "classes"),
-        },
+        settings={"extract": "extract_sunrgbd", **recorded(settings, "boxes", "splits", "classes")},
         class_names=classes or sorted({item.class_name for item in objects}),
         planned=len(objects),
         min_points=settings.cut.min_points,

@@ -23,7 +23,7 @@ from qs3.io.extract.cut import OrientedBox
 from qs3.io.extract.matlab import read_mat, struct_rows
 from qs3.io.extract.scannet_scene import class_of
 from qs3.io.extract.sunrgbd import DepthKind, SunFrame, SunObject
-from qs3.io.guards import Numbers, as_array, naming, pick, read_numbers, read_small_json
+from qs3.io.guards import Numbers, as_matrix, naming, pick, read_numbers, read_small_json
 
 META = "SUNRGBDMeta3DBB_v2.mat"
 DEPTH_FOLDERS: dict[DepthKind, str] = {"refined": "depth_bfx", "raw": "depth"}
@@ -49,7 +49,6 @@ def list_sunrgbd(
     the boxes; None looks for one at the root, above it and in the toolbox, then for the frames' own
     annotations. Frames in neither part of ``splits``, the toolbox's ``allsplit.mat``, are of none.
     """
-    root = Path(root)
     if not root.is_dir():
         raise InputError(f"{root}: no such folder")
     base = root / "SUNRGBD" if (root / "SUNRGBD").is_dir() else root
@@ -148,7 +147,7 @@ def _objects(rows: Iterable[Any], where: str, rename: Rename) -> tuple[SunObject
         name = rename(word)
         if name is not None:
             given = pick(row, _Box, place)
-            basis = as_array(given.basis, (3, 3), f"{place}: basis")
+            basis = as_matrix(given.basis, f"{place}: basis")
             box = OrientedBox(np.array(given.centroid), basis, np.array(given.coeffs))
             objects.append(SunObject(number, name, box))
     return tuple(objects)
@@ -172,8 +171,8 @@ def _from_mat(base: Path, path: Path, depth: DepthKind, rename: Rename) -> Itera
         yield SunFrame(
             str(folder),
             picture,
-            as_array(row.K, (3, 3), f"{where}.K"),
-            as_array(row.Rtilt, (3, 3), f"{where}.Rtilt"),
+            as_matrix(row.K, f"{where}.K"),
+            as_matrix(row.Rtilt, f"{where}.Rtilt"),
             _objects(
                 struct_rows(row.groundtruth3DBB, f"{where}.groundtruth3DBB"),
                 f"{where}.groundtruth3DBB",

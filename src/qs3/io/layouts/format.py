@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Int
 
 from qs3.errors import InputError
-from qs3.io.ragged import RaggedClouds
+from qs3.io.clouds import RaggedClouds
 from qs3.meshes.classes import map_labels
 
 SPLITS = ("train", "test")

@@ -28,12 +28,10 @@ _FILTERS = (1, 2, 3, 4, 32000)
 def read_file(
     path: Path, columns: Sequence[int], classes: int
 ) -> tuple[Float32[np.ndarray, "b n 3"], Int[np.ndarray, "b"]]:
-    """Read ``data`` and ``label`` of one file.
+    """Read ``data`` and ``label`` of one file; labels are from 0 to below ``classes``.
 
-    Args:
-        path: The file.
-        columns: Numbers of columns that ``data`` may have; those after the third are dropped.
-        classes: Number of classes; labels are 0 to one less.
+    ``columns`` are the numbers of columns that ``data`` may have; those after the third are
+    dropped.
 
     Raises:
         InputError: where the file is missing, damaged or cut short, lacks a dataset, has one of

@@ -15,12 +15,12 @@ from jaxtyping import Float32, Integer
 from qs3.errors import InputError
 from qs3.files import sha256, write_bytes, write_text
 from qs3.geometry import y_up_to_z_up, z_up_to_y_up
+from qs3.io.clouds import RaggedClouds
 from qs3.io.guards import read_text
-from qs3.io.layouts.class_folders import CloudFile, choose_split
 from qs3.io.layouts.format import POINTS, SPLITS
 from qs3.io.layouts.hdf5 import hdf5_bytes, read_file
+from qs3.io.layouts.point_folders import CloudFile, choose_split
 from qs3.io.preparation import stack
-from qs3.io.ragged import RaggedClouds
 
 CLOUDS_A_FILE = 2048
 

@@ -30,17 +30,11 @@ from jaxtyping import Float32
 
 from qs3.errors import InputError
 from qs3.files import write_text
+from qs3.io.clouds import RaggedClouds
 from qs3.io.guards import naming
-from qs3.io.layouts.class_folders import (
-    CloudFile,
-    choose_split,
-    entries,
-    list_folder,
-    read_files,
-)
 from qs3.io.layouts.format import POINTS, SPLITS, Format, labels_as
 from qs3.io.layouts.hdf5_sets import list_parts, named, read_parts, text_lines, write_parts
-from qs3.io.ragged import RaggedClouds
+from qs3.io.layouts.point_folders import CloudFile, choose_split, entries, list_folder, read_files
 from qs3.meshes.classes import MODELNET40
 
 CLASSES = tuple(sorted(MODELNET40))

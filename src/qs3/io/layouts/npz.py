@@ -7,9 +7,9 @@ from jaxtyping import Bool, Int
 
 from qs3.errors import InputError
 from qs3.files import sha256
+from qs3.io.clouds import RaggedClouds
 from qs3.io.guards import check_announced, load_npy, naming, open_zip, read_member
 from qs3.io.layouts.format import SPLITS, Format
-from qs3.io.ragged import RaggedClouds
 
 _PER_CLOUD = ("label", "is_train", "name", "strict", "frame")
 
@@ -48,7 +48,6 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
         InputError: where the file is missing, damaged, announces more than it can hold, or holds
             other arrays.
     """
-    path = Path(path)
     arrays = _read(path)
     with naming(path):
         clouds = _clouds(arrays)

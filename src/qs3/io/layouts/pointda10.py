@@ -32,12 +32,12 @@ from jaxtyping import Float, Float32
 
 from qs3.errors import InputError
 from qs3.geometry import y_up_to_z_up
+from qs3.io.clouds import RaggedClouds
 from qs3.io.layouts.format import SPLITS, Format, labels_as, named_folder
 from qs3.io.layouts.hdf5_sets import list_parts, named, read_parts, same_size, write_parts
 from qs3.io.layouts.point_folders import write_folder
 from qs3.io.layouts.trees import read_ten_classes
 from qs3.io.preparation import unit_ball
-from qs3.io.ragged import RaggedClouds
 from qs3.meshes.classes import POINTDA10
 
 Protocol = Literal["aligned", "original", "upright", "raw"]

@@ -25,10 +25,10 @@ from pathlib import Path
 import numpy as np
 
 from qs3.errors import InputError
-from qs3.io.layouts.class_folders import CloudFile, choose_split
+from qs3.io.clouds import RaggedClouds
 from qs3.io.layouts.format import Format, labels_as
 from qs3.io.layouts.hdf5_sets import named, read_parts, write_parts
-from qs3.io.ragged import RaggedClouds
+from qs3.io.layouts.point_folders import CloudFile, choose_split
 
 CLASSES = (
     *("bag", "bin", "box", "cabinet", "chair", "desk", "display", "door"),
@@ -43,7 +43,6 @@ _SPLITS = {"training": "train", "test": "test"}
 
 def read_scanobjectnn(path: Path, split: str | None = None) -> RaggedClouds:
     """Read one variant: a folder that holds its training file, test file or both; or one file."""
-    path = Path(path)
     files = _one_variant(path) if path.is_dir() else [path]
     parts = []
     for file in files:

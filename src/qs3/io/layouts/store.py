@@ -14,22 +14,21 @@ from jaxtyping import Bool
 from qs3.errors import InputError
 from qs3.files import parse_json
 from qs3.io import scratch
-from qs3.io.clouds import CloudChoice, CloudKind
+from qs3.io.clouds import CloudChoice, CloudKind, RaggedClouds
 from qs3.io.guards import utf8
 from qs3.io.layouts.format import SPLITS, Format
 from qs3.io.layouts.npz import frame_parts
-from qs3.io.ragged import RaggedClouds
 from qs3.io.scratch import Spool
 from qs3.processors import usable_processors
 from qs3.store.folder import Folder, open_folder
 from qs3.store.manifest import (
     Manifest,
+    Sums,
     finished_shards,
     open_dataset,
     package_versions,
     shard_name,
     write_manifest,
-    write_sums,
 )
 from qs3.store.progress import cloud_bar
 
@@ -149,11 +148,7 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
     """Write clouds as a data set that ``train`` and every other command read.
 
     The clouds become the noisy ones (``points``); there are no clean twins and no surfaces.
-
-    Args:
-        root: Folder to make.
-        clouds: What to write.
-        origin: Name of the layout that they come from, for ``dataset.json``.
+    ``origin`` is the name of the layout that they come from, for ``dataset.json``.
 
     Raises:
         InputError: where the clouds have no labels.
@@ -177,7 +172,7 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
         versions=package_versions(),
     )
     write_manifest(folder, manifest)
-    sums = {}
+    sums = Sums(folder)
     with cloud_bar(None, "write", count) as bar:
         for index, start in enumerate(starts):
             rows = []
@@ -185,9 +180,9 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
                 points = np.asarray(clouds.clouds[i], dtype=np.float32)
                 name, class_name = utf8(clouds.ids[i]), names[labels[i]]
                 rows.append(CloudRow(name, name, 0, labels[i], class_name, splits[i], 0, points))
-            sums[shard_name(index)] = put_shard(folder, index, table_of(rows))
+            sums.note(shard_name(index), put_shard(folder, index, table_of(rows)))
             bar.update(len(rows))
-    write_sums(folder, sums)
+    sums.write()
 
 
 FORMAT = Format(

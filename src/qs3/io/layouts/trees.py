@@ -22,17 +22,17 @@ from pathlib import Path
 import numpy as np
 
 from qs3.errors import InputError
+from qs3.io.clouds import RaggedClouds
 from qs3.io.guards import naming
-from qs3.io.layouts.class_folders import (
+from qs3.io.layouts.format import POINTS, SPLITS, Format, labels_as, named_folder
+from qs3.io.layouts.point_folders import (
     CloudFile,
     choose_split,
     entries,
     list_folder,
     read_files,
+    write_folder,
 )
-from qs3.io.layouts.format import POINTS, SPLITS, Format, labels_as, named_folder
-from qs3.io.layouts.point_folders import write_files, write_folder
-from qs3.io.ragged import RaggedClouds
 from qs3.meshes.classes import POINTDA10, map_labels
 
 GRASPNET = (
@@ -114,7 +114,7 @@ def _graspnet(kind: str, *cameras: str) -> Format:
         _check_points(clouds, _GRASPNET_POINTS)
         rows = zip(clouds.splits, labels, strict=True)
         folders = [f"{part}/{kind}/{cameras[0]}/{label}" for part, label in rows]
-        write_files(root, clouds, folders, ".xyz")
+        write_folder(root, clouds, ".xyz", folders)
 
     return Format(
         name="-".join(("graspnetpc10", kind.lower(), *(cameras if len(cameras) == 1 else ()))),

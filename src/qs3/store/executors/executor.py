@@ -156,9 +156,7 @@ class InlineExecutor:
         return []
 
     def __enter__(self) -> "InlineExecutor":
-        """Return itself."""
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Drop what waits."""
         self.drain()
