@@ -289,6 +289,12 @@ def test_a_shard_that_announces_more_than_it_can_hold_is_refused(fake, tmp_path,
     monkeypatch.setattr("qs3.store.shards._MOST_BYTES", 2**18)
     with pytest.raises(InputError, match=r"shard-00000\.parquet: announces far more"):
         load(tmp_path)
+    # A dictionary of one number: its pages are small before they are compressed, too.
+    path = tmp_path / shard_name(0)
+    pq.write_table(pq.read_table(path), path)
+    assert pq.ParquetFile(path).metadata.row_group(0).total_byte_size < 2**17
+    with pytest.raises(InputError, match=r"shard-00000\.parquet: announces far more"):
+        load(tmp_path)
 
 
 def test_a_folder_without_manifest_and_another_schema_are_refused(fake, tmp_path):

@@ -65,6 +65,7 @@ _SCHEMA_1 = pa.schema([column for column in _SCHEMAS["float32"] if column.name !
 _NAMES = _SCHEMAS["float32"].names
 # Noise shrinks by a tenth, a cloud of equal numbers a thousandfold: small files may, large may not.
 _MOST_BYTES, _MOST_SHARE = 1 << 28, 8
+_VALUE_BYTES = 4  # of a float32, the widest there are many of
 
 
 @dataclass(frozen=True)
@@ -184,7 +185,7 @@ def parse_shard(source: bytes | Path, where: str, columns: Sequence[str] | None 
             if not is_first and file.schema_arrow not in _SCHEMAS.values():
                 raise InputError(f"{where}: not a shard of a qs3 data set (other columns)")
             groups = [file.metadata.row_group(i) for i in range(file.num_row_groups)]
-            if sum(group.total_byte_size for group in groups) > _MOST_BYTES + _MOST_SHARE * size:
+            if sum(map(_announced, groups)) > _MOST_BYTES + _MOST_SHARE * size:
                 raise InputError(f"{where}: announces far more than its {size} bytes can hold")
             names = [name for name in wanted if not (is_first and name == "drawn")]
             table = file.read(columns=names, use_threads=False)
@@ -198,6 +199,12 @@ def parse_shard(source: bytes | Path, where: str, columns: Sequence[str] | None 
         raise InputError(
             f"{where}: damaged ({reason}); delete it and run the same command again"
         ) from error
+
+
+def _announced(group: pq.RowGroupMetaData) -> int:
+    """Bytes that a group of rows becomes: its pages, or its values if a dictionary hides them."""
+    values = sum(group.column(i).num_values for i in range(group.num_columns))
+    return max(group.total_byte_size, _VALUE_BYTES * values)
 
 
 def flat(column: pa.ChunkedArray) -> tuple[np.ndarray, np.ndarray]:
