@@ -88,8 +88,9 @@ def test_scans_of_any_kind_are_the_same_target(boxes, tmp_path):
 def test_what_cannot_be_is_told(boxes, tmp_path):
     with pytest.raises(InputError, match="no cloud found"):
         adapt(boxes, [], tmp_path)
-    with pytest.raises(InputError, match="model"):
-        adapt(boxes, boxes, tmp_path, train={"model": "dgcnn"})
+    with pytest.raises(InputError, match="model"):  # before a mesh is scanned
+        adapt("shapes", boxes, tmp_path, train={"model": "dgcnn"})
+    assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="not fitted"):
         qs3.training.Adapter().save(tmp_path)
 

@@ -70,6 +70,9 @@ def adapt(
     Raises:
         InputError: where something cannot be read, or settings do not go together.
     """
+    for name in ("model", "seed"):
+        if name in (train or {}):
+            raise InputError(f"{name} cannot be given in train here; use qs3.training.Adapter")
     source, target = _source(cad, Path(out) / "source", workers, seed), _target(scans)
     settings = unstructure(train_settings(Path("rooms")))
     batches = max(1, len(source) // settings["batch_size"])
@@ -81,9 +84,6 @@ def adapt(
             settings |= {"rule": "source-val", "validate_every": settings["epochs"]}
         else:
             _LOG.warning("no class has clouds enough to hold some out: the last round is kept")
-    for name in ("model", "seed"):
-        if name in (train or {}):
-            raise InputError(f"{name} cannot be given in train here; use qs3.training.Adapter")
     model = settings.pop("model")
     del settings["seed"]
     adapter = Adapter(
