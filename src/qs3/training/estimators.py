@@ -33,16 +33,7 @@ from qs3.training.fit import FitResult, fit
 from qs3.training.history import HISTORY
 from qs3.training.predict import Description, ask
 from qs3.training.prepared import note_clouds, require_finite
-from qs3.training.run import (
-    MODEL,
-    RUN,
-    SETTINGS,
-    Run,
-    is_run,
-    read_run,
-    read_settings,
-    write_run,
-)
+from qs3.training.run import MODEL, RUN, SETTINGS, Run, is_run, read_run, read_settings, write_run
 from qs3.training.shipped import find_run
 
 _Adapter = TypeVar("_Adapter", bound="Adapter")

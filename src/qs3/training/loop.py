@@ -15,13 +15,7 @@ from torch import Tensor, nn
 from qs3.adaptation import Method
 from qs3.errors import InputError, QS3Error
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.training.batches import (
-    DeviceClouds,
-    Share,
-    count_batches,
-    endless_batches,
-    make_batch,
-)
+from qs3.training.batches import DeviceClouds, Share, count_batches, endless_batches, make_batch
 from qs3.training.checkpoint import load_optimiser, optimiser_tensors, seed_sequence
 from qs3.training.config import TrainSettings
 from qs3.training.distributed import make_equal, make_fabric

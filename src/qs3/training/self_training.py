@@ -18,12 +18,7 @@ from qs3.evaluation.metrics import accuracy
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.training.batches import require_unlabelled
-from qs3.training.checkpoint import (
-    derived_seed,
-    new_model,
-    save_model,
-    weights_fingerprint,
-)
+from qs3.training.checkpoint import derived_seed, new_model, save_model, weights_fingerprint
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.distributed import make_fabric
 from qs3.training.history import EpochRecord

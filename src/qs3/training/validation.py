@@ -231,20 +231,6 @@ def choose(checkpoints: Sequence[Checkpoint], rule: str) -> Checkpoint:
     return checkpoints[values.index(best)]
 
 
-def tell_choice(run_dir: Path, stage: str, done: int, rule: str) -> dict[str, str | int]:
-    """Return stage and number of the checkpoint that a run's rule picks, for its record.
-
-    Args:
-        run_dir: Folder of the run.
-        stage: Its last stage.
-        done: Epochs or rounds of that.
-        rule: As in `choose`.
-    """
-    if rule != "last":  # which needs no checkpoint
-        done = choose(read_checkpoints(run_dir, stage), rule).number
-    return {"stage": stage, "number": done}
-
-
 def load_checkpoint(run_dir: Path, checkpoint: Checkpoint, model: PointClassifier) -> None:
     """Set a network's weights from a checkpoint."""
     path = Path(run_dir) / checkpoint.file
