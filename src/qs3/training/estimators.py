@@ -262,6 +262,8 @@ def _batches(given: Any) -> list[Float[np.ndarray, "_ _ 3"]]:
             if cloud is None:
                 raise InputError(f"cloud {place} is no array of numbers; {_EXPECTED}")
         batches = [cloud[None] for cloud in arrays if cloud is not None]
+    if not batches:
+        raise InputError(f"there is no cloud; {_EXPECTED}")
     start = 0
     for batch in batches:
         names = [str(start + row) for row in range(len(batch))]
