@@ -106,10 +106,7 @@ class Validation:
         self.fabric.barrier()
 
     def _values(
-        self,
-        target: Description | None,
-        holdout: Description | None,
-        source: Description | None,
+        self, target: Description | None, holdout: Description | None, source: Description | None
     ) -> dict[str, float | None]:
         """What each validator says; None where it lacks something or cannot tell."""
         values: dict[str, float | None] = dict.fromkeys(VALIDATORS)
