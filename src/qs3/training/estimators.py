@@ -130,9 +130,8 @@ class Adapter(ClassifierMixin, BaseEstimator):
             folder = Path(temporary) / "run" if self.run_dir is None else Path(self.run_dir)
             done = fit(method, source, target, settings, rounds, run_dir=folder)
             self._run, told = read_run(folder), read_settings(folder)
-        self.result_, self.model_ = done, done.model
-        self.classes_ = np.array(source.class_names)
-        names = source.class_names
+        self.result_, self.model_, names = done, done.model, source.class_names
+        self.classes_ = np.array(names)
         self._loaded = LoadedModel(done.model, names, told, settings.preparation, done.known)
         self._settings = settings
         return self

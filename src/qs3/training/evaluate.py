@@ -137,12 +137,7 @@ def _count_right(
 ) -> tuple[Mapping[str, Any], ...]:
     """Add to what rounds did how many of the pseudo labels that they kept were right.
 
-    Args:
-        run: Folder of the run.
-        rounds: What its rounds did.
-        test: Labelled clouds. Those of the target among them are known by the points that the
-            network gets.
-        answer_of: As in `_scores`.
+    Clouds of the target among the labelled ones are known by the points that the network gets.
     """
     selected = kept_clouds(run)
     if selected is None or len(selected[1]) != len(rounds):

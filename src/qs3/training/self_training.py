@@ -227,12 +227,7 @@ def _train_round(
 ) -> list[EpochRecord]:
     """Train the latest network on pseudo labels, and let the teacher follow.
 
-    Args:
-        state: Holds both.
-        task: What else there is.
-        number: Count of the round.
-        pseudo: Selected clouds with their pseudo labels.
-        apart: Those that are not trained on: they judge the ``best`` teacher.
+    The clouds that stand ``apart`` are not trained on: they judge the ``best`` teacher.
     """
     settings, rounds, teacher = task.settings, task.rounds, state.teacher
     if rounds.learning_rate is not None:
