@@ -100,3 +100,10 @@ def test_self_training_goes_on_from_a_network_without_its_source(qs3, scans, run
     assert not (tmp_path / "other").exists()
     code = qs3("train", "--method", "qbst", "--target", scans, "--out", out, code=2)
     assert "--source" in code.stderr
+
+
+def test_a_folder_with_the_networks_name_is_not_taken_for_it(qs3, scans, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rooms").mkdir()
+    assert "rooms: not a run of qs3" in qs3.refuses("demo", "--out", "demo", "--scans", scans)
+    assert not (tmp_path / "demo").exists()

@@ -73,8 +73,9 @@ def test_what_adapt_could_not_do_is_told(boxes, tmp_path, caplog):
     assert "all 1 rounds were skipped" in caplog.text
 
 
-def test_scans_of_any_kind_are_the_same_target(boxes, tmp_path):
-    folder = tmp_path / "scans"
+def test_scans_of_any_kind_are_the_same_target(boxes, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where a folder has the name of the network that comes with qs3
+    folder = tmp_path / "rooms"
     folder.mkdir()
     for name, cloud in zip(boxes.ids, boxes.points, strict=True):
         np.save(folder / f"{name.replace('/', '-')}.npy", cloud)
@@ -88,8 +89,9 @@ def test_scans_of_any_kind_are_the_same_target(boxes, tmp_path):
 def test_what_cannot_be_is_told(boxes, tmp_path):
     with pytest.raises(InputError, match="no cloud found"):
         adapt(boxes, [], tmp_path)
-    with pytest.raises(InputError, match="model"):
-        adapt(boxes, boxes, tmp_path, train={"model": "dgcnn"})
+    with pytest.raises(InputError, match="model"):  # before a mesh is scanned
+        adapt("shapes", boxes, tmp_path, train={"model": "dgcnn"})
+    assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="not fitted"):
         qs3.training.Adapter().save(tmp_path)
 

@@ -125,6 +125,11 @@ def test_unknown_words_are_refused_without_the_type_checks_of_the_tests():
         'TrainSettings(normalisation="own")': "normalisation = own is none of shared",
         'SelfTrainingSettings(rule="pst")': "rule = pst is none of qbst",
         'SelfTrainingSettings(prior="ml")': "prior = ml is none of em, bbse",
+        'SelfTrainingSettings(pool="shrinkng")': "pool = shrinkng is none of all, shrinking, split",
+        'SelfTrainingSettings(init="fresh")': "init = fresh is none of warm-up, scratch",
+        'SelfTrainingSettings(selection="all")': "selection = all is none of most-confident",
+        'SelfTrainingSettings(schedule="cosine")': "schedule = cosine is none of per-round",
+        'TrainSettings(precision="half")': "precision = half is none of 32-true, bf16-mixed",
     }
     script = "from qs3.training.config import *\n"
     for call in calls:

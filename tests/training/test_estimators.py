@@ -170,6 +170,7 @@ def test_what_is_no_cloud_is_refused(source, target):
         (np.zeros((0, 3)), r"cloud 0 has shape \[0, 3\]; "),
         ([good, good[:50], np.zeros((0, 3))], r"cloud 2 has shape \[0, 3\]; "),
         ([good, good[:50, :2]], r"cloud 1 has shape \[50, 2\]; "),
+        (iter([]), "there is no cloud; "),
         ([good, "chair"], "cloud 1 is no array of numbers; "),
         (np.zeros((1, 1, 9, 3)), r"no cloud in an array of shape \[1, 1, 9, 3\]; "),
     ):

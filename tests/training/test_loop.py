@@ -9,10 +9,9 @@ from qs3.adaptation import Method, SourceOnly
 from qs3.errors import InputError
 from qs3.training.batches import batches, count_batches
 from qs3.training.checkpoint import new_model
-from qs3.training.loop import train
+from qs3.training.loop import cosine, train
 from qs3.training.predict import predict_probabilities
 from qs3.training.prepared import prepare_clouds
-from qs3.training.schedules import cosine
 from qs3.training.state import CHECKPOINT
 
 from .common import Stop, same, stop_after

@@ -8,8 +8,7 @@ import torch
 
 from qs3.adaptation import SourceOnly
 from qs3.training.checkpoint import new_model
-from qs3.training.loop import train
-from qs3.training.schedules import plateau
+from qs3.training.loop import plateau, train
 
 
 def test_plateau_is_pytorchs():

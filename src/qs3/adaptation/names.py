@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from typing import Literal
 
+from qs3.errors import InputError
+
 MethodName = Literal[
     "source-only",
     "dann",
@@ -69,7 +71,7 @@ def split_method(method: str, rounds: str | None = None) -> tuple[str, str | Non
     ``rounds`` is a rule that is asked for beside it.
 
     Raises:
-        ValueError: where the method has a rule of its own and another one is asked for.
+        InputError: where the method has a rule of its own and another one is asked for.
 
     Example:
         >>> split_method("qbst"), split_method("gast", "qbst"), split_method("dann")
@@ -79,7 +81,7 @@ def split_method(method: str, rounds: str | None = None) -> tuple[str, str | Non
         return method, rounds
     warm_up, own = COMPOSED[method]
     if rounds is not None and rounds != own:
-        raise ValueError(
+        raise InputError(
             f"method {method} is {warm_up} with {own}; for another rule choose method {warm_up} "
             f"with self-training {rounds}"
         )

@@ -96,16 +96,14 @@ def _run(given: list[str]) -> int:
 
         show(f"qs3 {version('qs3')}")
         return 0
+    from qs3.errors import InputError
+
     if verb not in VERBS:
         from difflib import get_close_matches
-
-        from qs3.errors import InputError
 
         near = get_close_matches(verb, VERBS) or VERBS
         raise InputError(f"{verb}: no such verb; did you mean {' or '.join(near)}? See qs3 --help")
     if any(pair == ("--out", "") for pair in pairwise(rest)) or "--out=" in rest:
-        from qs3.errors import InputError
-
         raise InputError('--out "": is empty; name what to write')
     from qs3.cli.options import run_verb
 

@@ -53,13 +53,10 @@ class DemoSettings:
     """Processes that scan."""
 
 
-DEFAULTS = DemoSettings()
-
-
 def demo(
     out: Path = Path("demo"),
     scans: Path | None = None,
-    settings: Flat[DemoSettings] = DEFAULTS,
+    settings: Flat[DemoSettings] = DemoSettings(),
 ) -> int:
     """Adapt a network that comes with qs3 to a camera, without labels: scan, adapt, report.
 
@@ -71,16 +68,20 @@ def demo(
     """
     from qs3.cli.train import NO_ROUND
     from qs3.training.answers import list_clouds
-    from qs3.training.shipped import find_run
+    from qs3.training.run import is_run
+    from qs3.training.shipped import find_run, not_a_run
 
     start = time.perf_counter()
     if scans is not None and not scans.is_dir():
         raise InputError(f"{scans}: no such folder; name a folder of scans for --scans")
     files = [] if scans is None else list_clouds([scans])
+    network = find_run(settings.network)
+    if not is_run(network):  # a folder of this name, say, with something else in it
+        raise InputError(f"{network}: {not_a_run()}")
     folder = claim_folder(out, _MARKER)
     write_json(folder / _MARKER, dataclasses.asdict(settings))
     before = folder / "before"  # the records of its scores are written there
-    shutil.copytree(find_run(settings.network), before, dirs_exist_ok=True)
+    shutil.copytree(network, before, dirs_exist_ok=True)
     # The network has seen draws of 0.
     if settings.source_per_class:
         tell("[1/4] scan a small source: built-in shapes in rooms, cameras drawn")

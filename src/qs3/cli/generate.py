@@ -107,10 +107,12 @@ def generate(
         plan = make_plan(items, settings)
         show(*_expected(plan, part, timeout, processes if executor == "local" else None))
         return 0
-    place = _executor(executor, processes, timeout, address, gpus_per_scan)
-    report = generate_data(
-        items, out, settings, executor=place, shard=part, retry_failed=retry_failed
-    )
+    how: dict[str, Any] = {"workers": processes, "timeout": timeout}
+    if executor == "ray":
+        from qs3.store.executors.ray_cluster import RayExecutor
+
+        how = {"executor": RayExecutor(address, timeout, gpus_per_scan)}
+    report = generate_data(items, out, settings, shard=part, retry_failed=retry_failed, **how)
     show(out)
     following = f"qs3 train --source {out} --out RUN"
     if recipe is not None:
@@ -157,16 +159,6 @@ def _items(
             "unknown; put the meshes into one folder a class, or name a CSV of them: --labels"
         )
     return items
-
-
-def _executor(name: str, workers: int, timeout: float, address: str, gpus_per_scan: float) -> Any:
-    if name == "ray":
-        from qs3.store.executors.ray_cluster import RayExecutor
-
-        return RayExecutor(address, timeout, gpus_per_scan)
-    from qs3.store.executors import InlineExecutor, LocalExecutor
-
-    return InlineExecutor() if workers == 0 else LocalExecutor(workers, timeout)
 
 
 def _expected(

@@ -263,10 +263,7 @@ def train(options: Flat[TrainOptions]) -> int:
     from qs3.training.rounds import all_skipped, remarks
 
     seconds = None if options.max_time is None else parse_duration(options.max_time)
-    try:
-        base, rule = split_method(options.method, options.rounds_rule)
-    except ValueError as error:
-        raise InputError(str(error)) from error
+    base, rule = split_method(options.method, options.rounds_rule)
     if rule is None and options.self_training != SelfTrainingSettings():
         raise InputError(f"--method {options.method} has no rounds to set; add --self-training")
     if options.target is None and (rule is not None or base not in WITHOUT_TARGET):

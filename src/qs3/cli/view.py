@@ -44,13 +44,17 @@ def view(
         port: Port of 127.0.0.1 to listen on; 0 takes a free one.
         settings: With a mesh: how it is scanned to start with; the seed draws a built-in class.
     """
+    from qs3.viewer.opening import open_exhibits
+    from qs3.viewer.pages import gallery_page
     from qs3.viewer.serving import require_free, require_viser, serve, tunnel_of, url_of
 
     require_viser()
     require_free(port)
     # All is read before anything is served, so that a fault shows in time.
     page = _scan_page(what, data, up, class_name or "", settings)
-    page = page or _gallery(what, data, split, cloud, class_name)
+    if page is None:
+        exhibits, answers = open_exhibits(what, data, split, cloud)
+        page = partial(gallery_page, exhibits=exhibits, answers=answers, class_name=class_name)
     with serve(port, f"qs3 view · {Path(what).name}") as server, page(server):
         show(url_of(server))
         hint = f"From another machine, first: {tunnel_of(server)}"
@@ -61,16 +65,6 @@ def view(
                 pass
         tell("stopped")
     return 0
-
-
-def _gallery(
-    what: str, data: str | None, split: str | None, cloud: Any, class_name: str | None
-) -> "Callable[[Any], AbstractContextManager[Any]]":
-    from qs3.viewer.opening import open_exhibits
-    from qs3.viewer.pages import gallery_page
-
-    exhibits, answers = open_exhibits(what, data, split, cloud)
-    return partial(gallery_page, exhibits=exhibits, answers=answers, class_name=class_name)
 
 
 def _scan_page(

@@ -1,18 +1,54 @@
-"""What a grid of runs takes, from a few steps of each kind that are measured."""
+"""What a grid of runs takes, from a few scans and a few steps of each kind that are measured."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
 from qs3.adaptation import method_class
 from qs3.adaptation.names import split_method
+from qs3.experiments.domains import DATA, REAL_CLOUDS, DataSet, Part
 from qs3.experiments.runs import ORDINARY, Run
+from qs3.experiments.setup import Setup
 from qs3.io.clouds import PointClouds, numbered
+from qs3.store.manifest import MANIFEST
+from qs3.store.plan import Plan, estimate
 from qs3.training.batches import count_batches
 from qs3.training.config import TrainSettings
-from qs3.training.plan import Cost, measure
+from qs3.training.plan import Cost
+from qs3.training.plan import measure as measure_steps
 
 _CLASSES = 10
+
+
+def measure(
+    setup: Setup, left: Sequence[Run], plans: Mapping[str, Plan]
+) -> tuple[float, dict[str, float]]:
+    """Estimate what is left, from a few timed scans and a few timed steps of each kind.
+
+    Returns:
+        Processor seconds, of runs on a GPU those of the clock: of all scans, and of each run by its
+        name.
+    """
+    steps = {
+        network: step_costs(
+            [run for run in left if run.network == network],
+            setup.scale.train_with(setup.threads, network=network),
+            setup.scale.data_points,
+        )
+        for network in dict.fromkeys(run.network for run in left)
+    }
+    expected, trained = {}, set()
+    for run in left:
+        source, target, test = (_size(part, plans) for part in run.parts(setup.own))
+        # One training of the source alone serves several test sets.
+        again = run.folder in trained
+        trained.add(run.folder)
+        clouds = (source, target, test)
+        expected[run.name] = run_seconds(run, clouds, steps[run.network], only_scores=again)
+    absent = [
+        plan for name, plan in plans.items() if not (setup.out / DATA / name / MANIFEST).is_file()
+    ]
+    return sum((estimate(plan, scans=6).cpu_seconds for plan in absent), 0.0), expected
 
 
 def step_costs(runs: Iterable[Run], settings: TrainSettings, points: int) -> dict[str, Cost]:
@@ -24,14 +60,14 @@ def step_costs(runs: Iterable[Run], settings: TrainSettings, points: int) -> dic
     labels = np.arange(len(clouds)) % _CLASSES
     classes = tuple(map(str, range(_CLASSES)))
     source = PointClouds(clouds.astype(np.float32), labels, classes, numbered(len(clouds)))
-    return {name: measure(name, source, source.without_labels(), own) for name, own in each.items()}
+    return {
+        name: measure_steps(name, source, source.without_labels(), own)
+        for name, own in each.items()
+    }
 
 
 def run_seconds(
-    run: Run,
-    clouds: tuple[int, int, int],
-    costs: Mapping[str, Cost],
-    only_scores: bool = False,
+    run: Run, clouds: tuple[int, int, int], costs: Mapping[str, Cost], only_scores: bool = False
 ) -> float:
     """Estimate the seconds of a run; a round is taken to keep every cloud that it may.
 
@@ -64,3 +100,14 @@ def run_seconds(
         looks = 2 * rounds.rounds
     scored = 0 if run.row == ORDINARY else looks * test  # of each checkpoint
     return seconds + (looks * (source + target) + scored) * plain.look
+
+
+def _size(part: Part | None, plans: Mapping[str, Plan]) -> int:
+    """Clouds of a part of a data set; of the user's own the size is unknown: a thousand."""
+    if part is None:
+        return 0
+    if isinstance(part.data, DataSet):
+        plan = plans[part.data.name]
+        count = sum(item.split == part.split for item in plan.items) * plan.settings.scans_per_mesh
+        return count * (3 if part.cloud == "all" else 1)
+    return REAL_CLOUDS.get(part.data, {}).get(part.split, 1000)

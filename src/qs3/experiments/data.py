@@ -4,6 +4,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -79,27 +80,23 @@ def choose_meshes(scale: Scale, shared: Path | None) -> Sides:
             if counts[item.class_name] >= _LEAST:
                 assert item.path is not None  # noqa: S101
                 parts.setdefault((item.class_name, side_of(item.path.name)), []).append(item)
-    source, target, cad = [], [], 0
+    cad = 0
+    sides: dict[str, list[MeshItem]] = {"source": [], "target": []}
     for name in shapes.CLASSES:
         wanted = {
             "source": scale.source_per_class,
             "train": scale.target_count(name, scale.target_per_class),
             "test": scale.target_count(name, scale.test_per_class),
         }
-        drawn = {
-            "source": _draws(name, wanted["source"], _SEEDS["source"]),
-            "target": _draws(name, wanted["train"] + wanted["test"], _SEEDS["target"]),
-        }
-        for side, count in wanted.items():
-            made = parts.get((name, side), [])[:count]
+        most = {"source": wanted["source"], "target": wanted["train"] + wanted["test"]}
+        spare = {side: iter(_draws(name, count, _SEEDS[side])) for side, count in most.items()}
+        for part, count in wanted.items():
+            made = parts.get((name, part), [])[:count]
             cad += len(made)
-            spare = drawn["source" if side == "source" else "target"]
-            filled = made + [spare.pop(0) for _ in range(count - len(made))]
-            split = "train" if side == "source" else side
-            (source if side == "source" else target).extend(
-                replace(item, split=split) for item in filled
-            )
-    return Sides(source, target, cad)
+            side, split = ("source", "train") if part == "source" else ("target", part)
+            filled = [*made, *islice(spare[side], count - len(made))]
+            sides[side] += [replace(item, split=split) for item in filled]
+    return Sides(**sides, cad=cad)
 
 
 def _draws(class_name: str, count: int, seed: int) -> list[MeshItem]:
@@ -123,11 +120,7 @@ def make_plans(scale: Scale, sides: Sides, sets: Iterable[DataSet]) -> dict[str,
         sides: Of which meshes.
         sets: Which data sets.
     """
-    common = {
-        "meshes": sides.meshes,
-        "num_points": scale.data_points,
-        "rows_per_shard": 32,
-    }
+    common = {"meshes": sides.meshes, "num_points": scale.data_points, "rows_per_shard": 32}
     plans = {}
     for data in dict.fromkeys(sets):
         items, own = _plan(data, scale, sides)
@@ -165,12 +158,11 @@ def _plan(data: DataSet, scale: Scale, sides: Sides) -> tuple[list[MeshItem], Ma
 
 
 def _further_shapes(scale: Scale) -> list[MeshItem]:
-    parts = {"train": scale.source_per_class, "test": scale.test_per_class}
+    splits = ["train"] * scale.source_per_class + ["test"] * scale.test_per_class
     items = []
     for class_name in shapes.CLASSES:
-        drawn = _draws(class_name, sum(parts.values()), _SEEDS["second"])
-        for split, count in parts.items():
-            items += [replace(drawn.pop(0), split=split) for _ in range(count)]
+        drawn = _draws(class_name, len(splits), _SEEDS["second"])
+        items += [replace(item, split=split) for item, split in zip(drawn, splits, strict=True)]
     return items
 
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Int
 
 from qs3.experiments import GALLERIES
 from qs3.experiments.domains import DataSet, Domain, Kind, data_of
@@ -52,12 +51,10 @@ class Galleries:
                 cloud=data.train.cloud,
                 num_points=self.setup.scale.train.num_points,
             )
-            shown = clouds if data.own else clouds.select(_procedural(clouds.ids))
+            shown = clouds
+            if not data.own:  # an artist's mesh has the name of its file
+                procedural = [name.startswith("shapes/") for name in clouds.ids]
+                shown = clouds.select(np.flatnonzero(procedural))
             samples = samples_per_class(shown.points, shown.labels, shown.class_names, _PER_CLASS)
             write_png(folder / f"{kind}.png", gallery(samples, data.title))
         return folder
-
-
-def _procedural(ids: tuple[str, ...]) -> Int[np.ndarray, "s"]:
-    """Return the rows of procedural shapes; an artist's mesh has the name of its file."""
-    return np.flatnonzero([name.startswith("shapes/") for name in ids])

@@ -1,7 +1,7 @@
 """Makes tables anew: data, runs, records, then the tables from the records alone."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Union
@@ -9,15 +9,13 @@ from unittest import mock
 
 from qs3.errors import InputError
 from qs3.experiments import GALLERIES
-from qs3.experiments.domains import DATA, REAL_CLOUDS, DataSet, Part, data_of
+from qs3.experiments.domains import DATA, data_of
 from qs3.experiments.experiment import load_experiment
 from qs3.experiments.grid import Tell, data_sets, missing, run_grid
 from qs3.experiments.runs import Run
 from qs3.experiments.setup import Setup, claim
 from qs3.experiments.table import Table
 from qs3.store.executors import Executor, InlineExecutor, LocalExecutor
-from qs3.store.manifest import MANIFEST
-from qs3.store.plan import Plan
 
 if TYPE_CHECKING:
     from qs3.experiments.galleries import Galleries
@@ -132,11 +130,7 @@ def collect_runs(products: Sequence[Product]) -> list[Run]:
 
 
 def reproduce(
-    products: Sequence[Product],
-    setup: Setup,
-    workers: Workers,
-    tell: Tell,
-    dry_run: bool = False,
+    products: Sequence[Product], setup: Setup, workers: Workers, tell: Tell, dry_run: bool = False
 ) -> list[Path]:
     """Make data, runs and tables, whatever of them is missing.
 
@@ -154,6 +148,7 @@ def reproduce(
         InputError: where the folder is for other settings, a record is damaged or not of its run,
             or a run failed; what was made stays made.
     """
+    from qs3.experiments.cost import measure
     from qs3.experiments.data import choose_meshes, make_data, make_plans
 
     runs = collect_runs(products)
@@ -199,48 +194,3 @@ def reproduce(
     if failed:
         raise InputError(f"{'; '.join(failed)}; mend that and run the same command again")
     return paths
-
-
-def measure(
-    setup: Setup, left: Sequence[Run], plans: Mapping[str, Plan]
-) -> tuple[float, dict[str, float]]:
-    """Estimate what is left, from a few timed scans and a few timed steps of each kind.
-
-    Returns:
-        Processor seconds, of runs on a GPU those of the clock: of all scans, and of each run by its
-        name.
-    """
-    from qs3.experiments.cost import run_seconds, step_costs
-    from qs3.store.plan import estimate
-
-    steps = {
-        network: step_costs(
-            [run for run in left if run.network == network],
-            setup.scale.train_with(setup.threads, network=network),
-            setup.scale.data_points,
-        )
-        for network in dict.fromkeys(run.network for run in left)
-    }
-    expected, trained = {}, set()
-    for run in left:
-        source, target, test = (_size(part, plans) for part in run.parts(setup.own))
-        # One training of the source alone serves several test sets.
-        again = run.folder in trained
-        trained.add(run.folder)
-        clouds = (source, target, test)
-        expected[run.name] = run_seconds(run, clouds, steps[run.network], only_scores=again)
-    absent = [
-        plan for name, plan in plans.items() if not (setup.out / DATA / name / MANIFEST).is_file()
-    ]
-    return sum((estimate(plan, scans=6).cpu_seconds for plan in absent), 0.0), expected
-
-
-def _size(part: Part | None, plans: Mapping[str, Plan]) -> int:
-    """Clouds of a part of a data set; of the user's own the size is unknown: a thousand."""
-    if part is None:
-        return 0
-    if isinstance(part.data, DataSet):
-        plan = plans[part.data.name]
-        count = sum(item.split == part.split for item in plan.items) * plan.settings.scans_per_mesh
-        return count * (3 if part.cloud == "all" else 1)
-    return REAL_CLOUDS.get(part.data, {}).get(part.split, 1000)

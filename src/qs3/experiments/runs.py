@@ -108,11 +108,6 @@ class Run:
         }
 
     @property
-    def sees_target(self) -> bool:
-        """Whether its training is handed the target's clouds."""
-        return self.row not in (SUPERVISED, ORDINARY)
-
-    @property
     def folder(self) -> str:
         """Folder of the run below that of all runs."""
         place = str(self.source) if self.row == ORDINARY else self._task
@@ -144,7 +139,8 @@ class Run:
         learnt, target = data_of(self.source, own), data_of(self.target, own)
         if target.test is None:
             raise InputError(f"task {self._task}: {self.target} has no clouds to score on")
-        return learnt.train, target.train if self.sees_target else None, target.test
+        adapted_to = None if self.row in (SUPERVISED, ORDINARY) else target.train
+        return learnt.train, adapted_to, target.test
 
 
 def make_run(

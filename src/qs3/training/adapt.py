@@ -23,9 +23,12 @@ from qs3.training.config import GENTLE, SelfTrainingSettings, TrainSettings, cha
 from qs3.training.estimators import Adapter, Clouds
 from qs3.training.rounds import remarks
 from qs3.training.run import train_settings
+from qs3.training.shipped import WEIGHTS
 from qs3.training.validation import held_out
 
 _LOG = logging.getLogger(__name__)
+_LIKE = WEIGHTS / "rooms"
+"""Network whose settings are taken; by its name alone a folder of the user's could be meant."""
 _STEPS = 4000
 """Optimiser steps on the source: those of ``rooms``."""
 _PER_CLASS = 60
@@ -69,8 +72,11 @@ def adapt(
     Raises:
         InputError: where something cannot be read, or settings do not go together.
     """
+    for name in ("model", "seed"):
+        if name in (train or {}):
+            raise InputError(f"{name} cannot be given in train here; use qs3.training.Adapter")
     source, target = _source(cad, Path(out) / "source", workers, seed), _target(scans)
-    settings = unstructure(train_settings(Path("rooms")))
+    settings = unstructure(train_settings(_LIKE))
     batches = max(1, len(source) // settings["batch_size"])
     settings |= {"epochs": max(1, round(_STEPS / batches))} | dict(train or {})
     # By the source alone, as long as a class has enough clouds for a part to be held out.
@@ -80,9 +86,6 @@ def adapt(
             settings |= {"rule": "source-val", "validate_every": settings["epochs"]}
         else:
             _LOG.warning("no class has clouds enough to hold some out: the last round is kept")
-    for name in ("model", "seed"):
-        if name in (train or {}):
-            raise InputError(f"{name} cannot be given in train here; use qs3.training.Adapter")
     model = settings.pop("model")
     del settings["seed"]
     adapter = Adapter(
@@ -127,7 +130,7 @@ def _target(scans: Clouds) -> UnlabelledClouds:
     if isinstance(scans, PointClouds):
         return scans.without_labels()
     if isinstance(scans, str | Path):
-        settings = train_settings(Path("rooms"))
+        settings = train_settings(_LIKE)
         return load_whole(load_unlabelled, scans, settings.num_points, settings.preparation)
     clouds = [np.asarray(cloud, np.float32) for cloud in scans]
     if any(cloud.ndim != 2 or cloud.shape[1:] != (3,) for cloud in clouds):

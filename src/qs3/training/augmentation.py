@@ -57,10 +57,7 @@ def robust_box(points: Float[Tensor, "b n 3"]) -> Box:
 
 
 def lose_highest(
-    kept: Bool[Tensor, "b n"],
-    score: Float[Tensor, "b n"],
-    count: Int[Tensor, "b 1"],
-    least: float,
+    kept: Bool[Tensor, "b n"], score: Float[Tensor, "b n"], count: Int[Tensor, "b 1"], least: float
 ) -> Bool[Tensor, "b n"]:
     """Return which points are still kept after those of the highest score are lost.
 
@@ -78,9 +75,7 @@ def lose_highest(
 
 
 def in_sight(
-    points: Float[Tensor, "b n 3"],
-    azimuth: Float[Tensor, "b 1"],
-    elevation: Float[Tensor, "b 1"],
+    points: Float[Tensor, "b n 3"], azimuth: Float[Tensor, "b 1"], elevation: Float[Tensor, "b 1"]
 ) -> Bool[Tensor, "b n"]:
     """Return which points a camera far away sees: those not behind others, by a coarse depth image.
 

@@ -3,13 +3,14 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
 
 from qs3.adaptation.names import Normalisation, RoundRule, Rule, Selection, SingleClass
 from qs3.errors import InputError
 from qs3.io.preparation import PAPER, ROBUST, Preparation
+from qs3.sensor.checks import choices
 
 _Settings = TypeVar("_Settings", bound=Any)
 Schedule = Literal["cosine", "plateau"]
@@ -94,14 +95,8 @@ class Augmentation:
             0.3
         """
         usual: dict[str, Any] = {"sight": 0.3, "plane": 0.3, "cone": 0.3, "patches": 0.3}
-        usual |= {
-            "stretch": 1.0,
-            "tilt": 1.0,
-            "floor": 0.2,
-            "wall": 0.1,
-            "neighbour": 0.2,
-            "noise": 0.5,
-        }
+        usual |= {"stretch": 1.0, "tilt": 1.0, "noise": 0.5}
+        usual |= {"floor": 0.2, "wall": 0.1, "neighbour": 0.2}
         return cls(**usual | overrides)
 
 
@@ -189,9 +184,7 @@ class TrainSettings:
         least = 2 * self.devices
         fault = f"must be at least {least}" + (", 2 a device" if self.devices > 1 else "")
         _check(self, "batch_size", self.batch_size >= least, fault)
-        words = {"accelerator": Accelerator, "schedule": Schedule, "rule": Rule}
-        for name, kind in (words | {"normalisation": Normalisation}).items():
-            _check_word(self, name, kind)
+        _check_words(self)
         good = self.rule == "last" or self.validate_every > 0
         _check(self, "validate_every", good, f"leaves no checkpoint for rule = {self.rule!r}")
         good = self.threads in (None, "auto") or (type(self.threads) is int and self.threads > 0)
@@ -282,11 +275,9 @@ class SelfTrainingSettings:
         decay = self.weight_step * (self.rounds * self.epochs - 1)
         good = self.weight_step >= 0 and decay < min(1.0, self.source_weight)
         _check(self, "weight_step", good, "takes a factor of the losses to 0 within the rounds")
-        _check_word(self, "teacher", Teacher)
+        _check_words(self)
         good = self.teacher != "average" or self.init == "warm-up"
         _check(self, "teacher", good, "has no sense over weights that start anew; set init warm-up")
-        _check_word(self, "rule", RoundRule)
-        _check_word(self, "prior", Prior)
         defaults = {field.name: field.default for field in fields(self)}
         for (reader, words), names in _READ_BY.items():
             reads = getattr(self, reader) in words
@@ -335,9 +326,10 @@ def _check_ranges(settings: Any, ranges: Mapping[str, str]) -> None:
             _check(settings, name, value is None or _RANGES[fault](value), fault)
 
 
-def _check_word(settings: Any, name: str, kind: Any) -> None:
-    words = get_args(kind)
-    _check(settings, name, getattr(settings, name) in words, f"is none of {', '.join(words)}")
+def _check_words(settings: Any) -> None:
+    for name, words in choices(type(settings)).items():
+        fault = f"is none of {', '.join(map(str, words))}"
+        _check(settings, name, getattr(settings, name) in words, fault)
 
 
 def _check(settings: Any, name: str, good: bool, fault: str) -> None:

@@ -33,16 +33,7 @@ from qs3.training.fit import FitResult, fit
 from qs3.training.history import HISTORY
 from qs3.training.predict import Description, ask
 from qs3.training.prepared import note_clouds, require_finite
-from qs3.training.run import (
-    MODEL,
-    RUN,
-    SETTINGS,
-    Run,
-    is_run,
-    read_run,
-    read_settings,
-    write_run,
-)
+from qs3.training.run import MODEL, RUN, SETTINGS, Run, is_run, read_run, read_settings, write_run
 from qs3.training.shipped import find_run
 
 _Adapter = TypeVar("_Adapter", bound="Adapter")
@@ -139,9 +130,8 @@ class Adapter(ClassifierMixin, BaseEstimator):
             folder = Path(temporary) / "run" if self.run_dir is None else Path(self.run_dir)
             done = fit(method, source, target, settings, rounds, run_dir=folder)
             self._run, told = read_run(folder), read_settings(folder)
-        self.result_, self.model_ = done, done.model
-        self.classes_ = np.array(source.class_names)
-        names = source.class_names
+        self.result_, self.model_, names = done, done.model, source.class_names
+        self.classes_ = np.array(names)
         self._loaded = LoadedModel(done.model, names, told, settings.preparation, done.known)
         self._settings = settings
         return self
@@ -271,6 +261,8 @@ def _batches(given: Any) -> list[Float[np.ndarray, "_ _ 3"]]:
             if cloud is None:
                 raise InputError(f"cloud {place} is no array of numbers; {_EXPECTED}")
         batches = [cloud[None] for cloud in arrays if cloud is not None]
+    if not batches:
+        raise InputError(f"there is no cloud; {_EXPECTED}")
     start = 0
     for batch in batches:
         names = [str(start + row) for row in range(len(batch))]

@@ -67,7 +67,12 @@ def evaluate(
     train = loaded.settings["train"]
     called = {name: (class_map or {}).get(name, name) for name in loaded.class_names}
     names = tuple(dict.fromkeys(called.values()))
-    whole = _labelled(data, split, cloud, loaded, names, class_map)
+    if isinstance(data, PointClouds):
+        whole = relabel(data, names, class_map, "data")
+    else:
+        part: dict[str, Any] = {"split": split, "cloud": cloud}
+        part |= {"class_names": names, "class_map": class_map}
+        whole = load_whole(load_clouds, data, train["num_points"], loaded.preparation, **part)
     tested = data_record(whole)
     renamed = {name: other for name, other in called.items() if name != other}
     if class_map is not None:
@@ -96,7 +101,10 @@ def evaluate(
         rounds=_count_right(run, made.rounds, test, answer_of),
         chosen=made.chosen,
         checkpoints=tuple(scored),
-        choices={rule: _plain(scored[row]) for rule, row in picked.items()},
+        choices={
+            rule: {name: value for name, value in scored[row].items() if name != "validators"}
+            for rule, row in picked.items()
+        },
         marks=caveats(made, test),
         experiment=experiment,
     )
@@ -110,23 +118,6 @@ def record_path(run: Path, record: RunRecord) -> Path:
     text = json.dumps(unstructure(record), sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:10]
     return workplace(run) / RECORDS / f"{Path(record.test.name).stem}-{digest}.json"
-
-
-def _labelled(
-    data: str | Path | PointClouds,
-    split: str | None,
-    cloud: CloudChoice,
-    loaded: LoadedModel,
-    class_names: tuple[str, ...],
-    class_map: Mapping[str, str] | None,
-) -> PointClouds:
-    """Clouds with labels that index the classes of the scores."""
-    if not isinstance(data, PointClouds):
-        part = {"split": split, "cloud": cloud}
-        part |= {"class_names": class_names, "class_map": class_map}
-        points = loaded.settings["train"]["num_points"]
-        return load_whole(load_clouds, data, points, loaded.preparation, **part)
-    return relabel(data, class_names, class_map, "data")
 
 
 def _scores(
@@ -145,12 +136,7 @@ def _count_right(
 ) -> tuple[Mapping[str, Any], ...]:
     """Add to what rounds did how many of the pseudo labels that they kept were right.
 
-    Args:
-        run: Folder of the run.
-        rounds: What its rounds did.
-        test: Labelled clouds. Those of the target among them are known by the points that the
-            network gets.
-        answer_of: As in `_scores`.
+    Clouds of the target among the labelled ones are known by the points that the network gets.
     """
     selected = kept_clouds(run)
     if selected is None or len(selected[1]) != len(rounds):
@@ -186,7 +172,3 @@ def _scored(
         line |= {"stage": checkpoint.stage, "number": checkpoint.number}
         scored.append(line | {"validators": dict(checkpoint.validators)})
     return scored
-
-
-def _plain(scored: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in scored.items() if name != "validators"}

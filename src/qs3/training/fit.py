@@ -50,13 +50,7 @@ from qs3.training.run import (
 )
 from qs3.training.shipped import find_run
 from qs3.training.threads import choose_threads, threads, trial_step
-from qs3.training.validation import (
-    ROUND,
-    Checkpoint,
-    held_out,
-    read_checkpoints,
-    tell_choice,
-)
+from qs3.training.validation import ROUND, Checkpoint, choose, held_out, read_checkpoints
 
 _LOG = logging.getLogger(__name__)
 
@@ -210,10 +204,12 @@ def fit(
         data = data_fields(prepared, prepared_target, adapted)
         if before and not len(source):
             data["source"] = before.source
-        stage = (base, len(epochs)) if rounds_settings is None else (ROUND, len(rounds))
+        stage, number = (base, len(epochs)) if rounds_settings is None else (ROUND, len(rounds))
+        if settings.rule != "last":  # which needs no checkpoint
+            number = choose(read_checkpoints(run_dir, stage), settings.rule).number
+        chosen: dict[str, str | int] = {"stage": stage, "number": number}
         if rounds_settings is not None and method == base:
             method = f"{base}+{rounds_settings.rule}"
-        chosen = tell_choice(run_dir, *stage, settings.rule)
         run = Run(
             method=method,
             selection=settings.rule,

@@ -80,22 +80,17 @@ class History:
 
         def log(epochs: Sequence[EpochRecord]) -> None:
             nonlocal shown
-            self._write(self.lines + self._epochs(stage, epochs))
+            self._write(self.lines + self._of("epoch", epochs, stage=stage))
             if self.module is not None:
                 self._show(stage, epochs[shown:])
                 shown = len(epochs)
 
         return log
 
-    def source(self, stage: str, epochs: Sequence[EpochRecord]) -> None:
-        """Keep the epochs on the source."""
-        self.lines += self._epochs(stage, epochs)
-        self._write(self.lines)
-
-    def put(self, kind: str, records: Sequence[Any]) -> None:
-        """Keep the rounds or checkpoints so far, in place of the lines of that kind."""
+    def put(self, kind: str, records: Sequence[Any], **more: str) -> None:
+        """Keep the epochs, rounds or checkpoints so far, in place of the lines of that kind."""
         self.lines = [line for line in self.lines if line["kind"] != kind]
-        self.lines += [{"kind": kind, **asdict(record)} for record in records]
+        self.lines += self._of(kind, records, **more)
         self._write(self.lines)
 
     def close(self) -> None:
@@ -105,8 +100,8 @@ class History:
         self.board = None
 
     @staticmethod
-    def _epochs(stage: str, epochs: Sequence[EpochRecord]) -> list[dict[str, Any]]:
-        return [{"kind": "epoch", "stage": stage, **asdict(record)} for record in epochs]
+    def _of(kind: str, records: Sequence[Any], **more: str) -> list[dict[str, Any]]:
+        return [{"kind": kind, **more, **asdict(record)} for record in records]
 
     def _write(self, lines: list[dict[str, Any]]) -> None:
         write_text(self.folder / HISTORY, "".join(json.dumps(line) + "\n" for line in lines))

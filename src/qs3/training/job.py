@@ -68,12 +68,11 @@ def make_method(name: str, model: PointClassifier, settings: TrainSettings) -> M
 
 
 def fresh_model(method: str, settings: TrainSettings, count: int) -> PointClassifier:
-    """Return the network with the weights that a training begins with."""
-    return new_model_for(method, settings, count, derived_seed(settings.seed, 0))
+    """Return the network with the weights that a training begins with.
 
-
-def new_model_for(method: str, settings: TrainSettings, count: int, seed: int) -> PointClassifier:
-    """Make the network of the settings; it gives local features where a method needs them."""
+    It gives local features where the method needs them.
+    """
+    seed = derived_seed(settings.seed, 0)
     model = new_model(settings, count, seed)
     if method_class(method).needs_local and feature_widths(model).local is None:
         # Only a setting of what `encode` gives: the weights are the same.
@@ -84,9 +83,7 @@ def new_model_for(method: str, settings: TrainSettings, count: int, seed: int) -
 
 
 def run_job(
-    job: Job,
-    fabric: Fabric,
-    hooks: Hooks = NO_HOOKS,
+    job: Job, fabric: Fabric, hooks: Hooks = NO_HOOKS
 ) -> tuple[PointClassifier, list[EpochRecord], list[RoundRecord]]:
     """Train the method, then in rounds if asked; go on where an earlier call stopped.
 
@@ -130,7 +127,7 @@ def run_job(
         model = method.result()
         validation.adapt(model)
         if hooks.history is not None:
-            hooks.history.source(stage, epochs)
+            hooks.history.put("epoch", epochs, stage=stage)
         tell_checkpoints()
         if job.rounds is None:
             _follow_rule(model, stage, job)

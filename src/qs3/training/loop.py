@@ -15,20 +15,13 @@ from torch import Tensor, nn
 from qs3.adaptation import Method
 from qs3.errors import InputError, QS3Error
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.training.batches import (
-    DeviceClouds,
-    Share,
-    count_batches,
-    endless_batches,
-    make_batch,
-)
+from qs3.training.batches import DeviceClouds, Share, count_batches, endless_batches, make_batch
 from qs3.training.checkpoint import load_optimiser, optimiser_tensors, seed_sequence
 from qs3.training.config import TrainSettings
 from qs3.training.distributed import make_equal, make_fabric
 from qs3.training.history import EpochRecord, Log
 from qs3.training.prepared import Prepared, as_prepared, name_few
 from qs3.training.progress import Deadline, Progress, TimeUpError
-from qs3.training.schedules import cosine, plateau
 from qs3.training.state import TrainingState, averaged, make_average
 
 Labelled = PointClouds | Prepared[PointClouds]
@@ -161,7 +154,6 @@ def train(
                 for step in range(steps):
                     rows = [next(order) for order in orders]
                     batch = make_batch(labelled, rows, settings, augmentation, share)
-                    bar.watch(batch)
                     other = [next(order) for order in others]
                     points = None
                     if unlabelled is not None:
@@ -171,7 +163,7 @@ def train(
                         ).points
                     losses = wrapped(batch, points, (epoch * steps + step) / total, generator)
                     count = sum(map(len, rows))
-                    value = bar.measure(losses, count)
+                    value = bar.measure(losses, len(batch.labels), count)
                     where = f"epoch {epoch}, batch {step}"
                     drawn = list(zip([*labelled, unlabelled], [*rows, *other], strict=False))
                     _require_finite(value, f"{description}: the loss is {value} in {where}", drawn)
@@ -189,16 +181,7 @@ def train(
                     if average is not None:
                         average.update_parameters(method)
                     bar.step()
-            record = EpochRecord(
-                epoch=epoch,
-                losses=bar.losses(),
-                learning_rate=settings.learning_rate * factor,
-                seconds=bar.seconds(),
-                accuracy=bar.accuracy(),
-                samples_per_second=bar.rate(),
-                cpu_seconds=bar.cpu_seconds(),
-                steps=bar.steps,
-            )
+            record = bar.record(epoch, settings.learning_rate * factor)
             history.append(record)
             make_equal(method.state_dict().values(), fabric)
             if average is not None:
@@ -217,6 +200,40 @@ def train(
     if average is not None:
         method.load_state_dict(average.module.state_dict())
     return history, {k: v.clone() for k, v in optimiser_tensors(optimiser).items()}
+
+
+def cosine(epoch: int, period: int) -> float:
+    """Factor of the learning rate: from 1 in epoch 0 to 0 in epoch ``period``, and up again.
+
+    Example:
+        >>> [round(cosine(epoch, 2), 3) for epoch in range(5)]
+        [1.0, 0.5, 0.0, 0.5, 1.0]
+    """
+    return 0.5 * (1.0 + math.cos(math.pi * epoch / period))
+
+
+def plateau(losses: Sequence[float], rate: float) -> float:
+    """Factor of the learning rate after some epochs: halved each time that the loss stalls.
+
+    That is PyTorch's rule with the values of SimpleView's protocol (Goyal et al., ICML 2021), over
+    all that has been: nothing is to be kept over a stop. The loss is that of the training, so that
+    no test set is looked at.
+
+    Args:
+        losses: Mean loss of each epoch so far.
+        rate: Learning rate at the start.
+
+    Example:
+        >>> plateau([1.0] * 12, 1e-3), plateau([1.0] * 11, 1e-3)
+        (0.5, 1.0)
+    """
+    optimiser = torch.optim.SGD([torch.zeros(1)], lr=rate)
+    schedule = torch.optim.lr_scheduler.ReduceLROnPlateau(
+        optimiser, factor=0.5, patience=10, min_lr=1e-5, eps=0.0
+    )
+    for loss in losses:
+        schedule.step(loss)
+    return optimiser.param_groups[0]["lr"] / rate
 
 
 @contextmanager

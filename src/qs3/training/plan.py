@@ -9,6 +9,7 @@ from unittest import mock
 import numpy as np
 import torch
 
+from qs3.adaptation import method_class
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.structure import unstructure
 from qs3.training.batches import count_batches
@@ -54,7 +55,7 @@ def measure(
     clock, share = (time.perf_counter, 1) if cuda else (time.process_time, 1 / count)
     with threads(count), mock.patch.dict(os.environ, TQDM_DISABLE="1"):
         how = settings.num_points, settings.preparation
-        prepare_clouds(source.select(np.arange(2)), *how)  # compiles
+        prepare_clouds(source.select(np.arange(len(source))[:2]), *how)  # compiles
         began = clock()
         prepared = prepare_clouds(source, *how), prepare_clouds(target, *how)
         preparation = (clock() - began) / (len(source) + len(target))
@@ -96,6 +97,8 @@ def describe_plan(
         each = ", ".join(f"{name} {counts[i]}" for i, name in enumerate(source.class_names))
         lines.append(f"source    {len(source)} clouds, {held} of them held out: {each}")
         batches = count_batches(len(source) - held, settings.batch_size)
+        if target is not None and method_class(method).uses_target:  # the longer pass counts
+            batches = max(batches, count_batches(len(target), settings.batch_size))
         if not warm_up:
             steps = settings.epochs * batches
             size = settings.batch_size

@@ -268,12 +268,8 @@ def _order(
             chosen = farthest_point_samples(points, num_points)
             order = Order(chosen.astype(kind), np.full(b, num_points))
         if path is not None:
-            tensors = {"index": order.index, "counts": order.counts}
-            write_tensors(
-                path,
-                {name: torch.from_numpy(value) for name, value in tensors.items()},
-                {"sha256": _digest(order)},
-            )
+            index, counts = torch.from_numpy(order.index), torch.from_numpy(order.counts)
+            write_tensors(path, {"index": index, "counts": counts}, {"sha256": _digest(order)})
     return order
 
 

@@ -4,15 +4,15 @@ import os
 import re
 import sys
 import time
-from collections.abc import Sequence
 
 import torch
 from lightning_fabric import Fabric
 from torch import Tensor
 from tqdm import tqdm
 
-from qs3.adaptation import Batch, Method
+from qs3.adaptation import Method
 from qs3.errors import InputError, QS3Error
+from qs3.training.history import EpochRecord
 
 _FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
 
@@ -33,7 +33,7 @@ class Progress:
     def __init__(
         self, method: Method, fabric: Fabric, total: int, done: int, description: str
     ) -> None:
-        self.fabric, self.method, self.labels = fabric, method, None
+        self.fabric, self.method = fabric, method
         self.start, self.clouds = time.perf_counter(), 0
         self.bar = tqdm(
             total=total,
@@ -59,19 +59,14 @@ class Progress:
         self.steps = self.seen = 0
         self.hits: float | None = 0.0
 
-    def watch(self, batch: Batch) -> None:
-        """Note the labels that the network is to find."""
-        self.labels = batch.labels
-
-    def measure(self, losses: dict[str, Tensor], clouds: int) -> float:
+    def measure(self, losses: dict[str, Tensor], mine: int, clouds: int) -> float:
         """Sum up one step over all devices, and return its whole loss.
 
         Args:
             losses: This device's losses.
-            clouds: Labelled clouds of the step, over all devices.
+            mine: Labelled clouds of the step, on this device.
+            clouds: Those over all devices.
         """
-        assert self.labels is not None  # noqa: S101
-        mine = len(self.labels)
         values = [term.detach().float() * mine for term in losses.values()]
         right = self.method.right
         right = torch.full_like(values[0], torch.nan) if right is None else right
@@ -88,34 +83,34 @@ class Progress:
 
     def step(self) -> None:
         """Move the bar."""
-        self.bar.set_postfix_str(", ".join(self._parts()), refresh=False)
-        self.bar.update()
-
-    def _parts(self) -> Sequence[str]:
         parts = [f"loss {sum(self.sums.values()) / self.steps:.3f}"]
-        if self.accuracy() is not None:
-            parts.append(f"accuracy {self.accuracy():.1%}")
-        return [*parts, f"{self.clouds / (time.perf_counter() - self.start):.3g} samples/s"]
+        if (accuracy := self.accuracy()) is not None:
+            parts.append(f"accuracy {accuracy:.1%}")
+        parts.append(f"{self.clouds / (time.perf_counter() - self.start):.3g} samples/s")
+        self.bar.set_postfix_str(", ".join(parts), refresh=False)
+        self.bar.update()
 
     def accuracy(self) -> float | None:
         """Accuracy over this epoch's labelled clouds; None where it is not known."""
         return None if self.hits is None or not self.seen else self.hits / self.seen
 
-    def losses(self) -> dict[str, float]:
-        """Mean losses of this epoch."""
-        return {name: value / self.steps for name, value in self.sums.items()}
-
     def seconds(self) -> float:
         """Wall-clock seconds of this epoch."""
         return time.perf_counter() - self.began
 
-    def cpu_seconds(self) -> float:
-        """Processor seconds of this process in this epoch."""
-        return time.process_time() - self.cpu_began
-
-    def rate(self) -> float:
-        """Labelled clouds a second in this epoch."""
-        return self.seen / max(self.seconds(), 1e-9)
+    def record(self, epoch: int, learning_rate: float) -> EpochRecord:
+        """Return what this epoch did: losses are means over its steps."""
+        seconds = self.seconds()
+        return EpochRecord(
+            epoch=epoch,
+            losses={name: value / self.steps for name, value in self.sums.items()},
+            learning_rate=learning_rate,
+            seconds=seconds,
+            accuracy=self.accuracy(),
+            samples_per_second=self.seen / max(seconds, 1e-9),
+            cpu_seconds=time.process_time() - self.cpu_began,
+            steps=self.steps,
+        )
 
 
 class TimeUpError(QS3Error):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Bool, Float, Int
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
@@ -30,7 +30,6 @@ from qs3.training.loop import EpochCallback
 from qs3.training.overlap import checksums
 from qs3.training.prepared import Prepared
 from qs3.training.progress import Deadline
-from qs3.training.rules import Select
 
 STATE = "rounds.safetensors"
 
@@ -78,6 +77,8 @@ RoundCallback = Callable[[RoundRecord, PointClassifier], None]
 """Called after each round, when its state is written."""
 Look = Callable[[int, PointClassifier], None]
 """Called on every device after each round, before its state is written."""
+Select = Callable[[Float[np.ndarray, "m k"], float], Bool[np.ndarray, "m"]]
+"""A rule that selects among clouds by their probabilities and θ."""
 
 
 @dataclass(frozen=True)

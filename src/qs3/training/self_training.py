@@ -18,12 +18,7 @@ from qs3.evaluation.metrics import accuracy
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.training.batches import require_unlabelled
-from qs3.training.checkpoint import (
-    derived_seed,
-    new_model,
-    save_model,
-    weights_fingerprint,
-)
+from qs3.training.checkpoint import derived_seed, new_model, save_model, weights_fingerprint
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.distributed import make_fabric
 from qs3.training.history import EpochRecord
@@ -31,19 +26,19 @@ from qs3.training.loop import EpochCallback, train
 from qs3.training.overlap import data_fields
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared, as_prepared, label_clouds
+from qs3.training.pseudo_labels import ask_teacher, round_threshold, select_clouds
 from qs3.training.rounds import (
     Hooks,
     RoundCallback,
     RoundRecord,
     Rounds,
+    Select,
     Task,
     begin_rounds,
     write_rounds,
 )
-from qs3.training.rules import Select, make_rule, round_threshold
 from qs3.training.run import Run, RunSettings, claim_run, sum_cost, write_run
 from qs3.training.state import CHECKPOINT
-from qs3.training.teacher import ask_teacher
 from qs3.training.threads import choose_threads, threads
 from qs3.training.validation import ROUND
 
@@ -154,8 +149,11 @@ def run_rounds(model: PointClassifier, task: Task) -> tuple[PointClassifier, lis
         # Lines 4 to 17: select. θ rises from round to round (line 19).
         candidates = said.target[pool]
         theta = round_threshold(rounds, number, candidates)
-        rule = task.select or make_rule(rounds, number, source.labels, said.held)
-        chosen = pool[rule(candidates, theta)]
+        if task.select is not None:
+            chosen = pool[task.select(candidates, theta)]
+        else:
+            how = rounds, number, source.labels, said.held
+            chosen = pool[select_clouds(candidates, theta, *how)]
 
         # Line 18: train on what was selected.
         pseudo = label_clouds(target, chosen, labels[chosen], source.class_names)
@@ -229,12 +227,7 @@ def _train_round(
 ) -> list[EpochRecord]:
     """Train the latest network on pseudo labels, and let the teacher follow.
 
-    Args:
-        state: Holds both.
-        task: What else there is.
-        number: Count of the round.
-        pseudo: Selected clouds with their pseudo labels.
-        apart: Those that are not trained on: they judge the ``best`` teacher.
+    The clouds that stand ``apart`` are not trained on: they judge the ``best`` teacher.
     """
     settings, rounds, teacher = task.settings, task.rounds, state.teacher
     if rounds.learning_rate is not None:

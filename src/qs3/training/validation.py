@@ -106,10 +106,7 @@ class Validation:
         self.fabric.barrier()
 
     def _values(
-        self,
-        target: Description | None,
-        holdout: Description | None,
-        source: Description | None,
+        self, target: Description | None, holdout: Description | None, source: Description | None
     ) -> dict[str, float | None]:
         """What each validator says; None where it lacks something or cannot tell."""
         values: dict[str, float | None] = dict.fromkeys(VALIDATORS)
@@ -229,20 +226,6 @@ def choose(checkpoints: Sequence[Checkpoint], rule: str) -> Checkpoint:
             + (" and a held-out part of the source" if rule == "dev" else "")
         )
     return checkpoints[values.index(best)]
-
-
-def tell_choice(run_dir: Path, stage: str, done: int, rule: str) -> dict[str, str | int]:
-    """Return stage and number of the checkpoint that a run's rule picks, for its record.
-
-    Args:
-        run_dir: Folder of the run.
-        stage: Its last stage.
-        done: Epochs or rounds of that.
-        rule: As in `choose`.
-    """
-    if rule != "last":  # which needs no checkpoint
-        done = choose(read_checkpoints(run_dir, stage), rule).number
-    return {"stage": stage, "number": done}
 
 
 def load_checkpoint(run_dir: Path, checkpoint: Checkpoint, model: PointClassifier) -> None:

@@ -11,16 +11,9 @@ from qs3.experiments.runs import ORDINARY
 from qs3.experiments.scales import Scale
 
 
-def _rows(scale: Scale) -> Headings:
+def _headings(scale: Scale, what: str, domain: str) -> Headings:
     return tuple(
-        Heading(name, f"trained on {name}", {"source": Domain("A", sensor=name)})
-        for name in scale.sensors
-    )
-
-
-def _columns(scale: Scale) -> Headings:
-    return tuple(
-        Heading(name, f"scored on {name}", {"target": Domain("A", sensor=name)})
+        Heading(name, f"{what} on {name}", {domain: Domain("A", sensor=name)})
         for name in scale.sensors
     )
 
@@ -35,8 +28,8 @@ def _pairs(scale: Scale) -> list[Pair]:
 EXPERIMENT = Experiment(
     title="Transfer between sensors",
     source="not in the paper",
-    rows=_rows,
-    columns=_columns,
+    rows=lambda scale: _headings(scale, "trained", "source"),
+    columns=lambda scale: _headings(scale, "scored", "target"),
     fields={"row": ORDINARY},
     pairs=_pairs,
     corner="source",

@@ -1,0 +1,26 @@
+"""What a training would do is told before it is begun."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from qs3.errors import InputError
+from qs3.training import fit
+from qs3.training.plan import describe_plan
+
+
+def test_steps_are_those_of_the_training(source, target, settings, tmp_path):
+    """The longer of both domains is one pass, where the method uses the target."""
+    settings = replace(settings, epochs=1, validate_every=0)
+    for method in ("source-only", "dann"):
+        told = describe_plan(method, source, target.without_labels(), settings, None)
+        done = fit(method, source, target.without_labels(), settings, run_dir=tmp_path / method)
+        (epoch,) = done.history
+        steps = epoch.steps
+        assert told[1] == f"training  {method}, 1 epochs of {steps} steps of 8 clouds: {steps}"
+
+
+def test_a_single_cloud_is_refused(source, settings):
+    with pytest.raises(InputError, match="1 clouds are too few to train on"):
+        describe_plan("source-only", source.select(np.arange(1)), None, settings, None)
