@@ -18,6 +18,9 @@ from qs3.adaptation.pointdan import (
 )
 from qs3.models import Features, PointClassifier, create_model
 
+from ..models import common as networks
+from . import common
+
 SMALL = {
     "pointnet-sa": {
         "channels": (8, 8, 16, 16),
@@ -26,15 +29,9 @@ SMALL = {
         "neighbours": 8,
         "node_width": 8,
     },
-    "pointnet": {"channels": (8, 8, 16), "hidden": (8,), "transforms": False},
-    "dgcnn": {"channels": (8, 8), "embedding": 16, "hidden": (8,), "neighbours": 4},
-    "pointnet2": {
-        "centres": (12, 5),
-        "scales": (((0.9, 6, (8, 8, 16)),), ((1.4, 4, (16, 16)),)),
-        "embedding": (16, 24),
-        "hidden": (8,),
-        "per_point": True,
-    },
+    "pointnet": common.SMALL["pointnet"] | {"transforms": False},
+    "dgcnn": common.SMALL["dgcnn"],
+    "pointnet2": networks.SMALL["pointnet2"] | {"hidden": (8,)},
 }
 
 
