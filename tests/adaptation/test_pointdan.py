@@ -18,21 +18,9 @@ from qs3.adaptation.pointdan import (
 )
 from qs3.models import Features, PointClassifier, create_model
 
-from ..models import common as networks
-from . import common
+from ..models.common import SMALL
 
-SMALL = {
-    "pointnet-sa": {
-        "channels": (8, 8, 16, 16),
-        "transform_hidden": (8,),
-        "nodes": 12,
-        "neighbours": 8,
-        "node_width": 8,
-    },
-    "pointnet": common.SMALL["pointnet"] | {"transforms": False},
-    "dgcnn": common.SMALL["dgcnn"],
-    "pointnet2": networks.SMALL["pointnet2"] | {"hidden": (8,)},
-}
+NETWORKS = ["pointnet-sa", "pointnet", "dgcnn", "pointnet2"]
 
 
 def make(name, seed=0, dropout=0.0, **settings):
@@ -55,7 +43,7 @@ def run(method, progress=0.5, **sizes):
     return method(source, target, progress, torch.Generator())
 
 
-@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("name", NETWORKS)
 def test_terms_follow_the_formulae(name):
     method = make(name, source_weight=0.5, discrepancy_weight=2.0, node_weight=3.0)
     method.eval()
@@ -123,7 +111,7 @@ def test_each_domain_has_an_attention_of_its_own():
     )
 
 
-@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("name", NETWORKS)
 @pytest.mark.parametrize("norm", ["shared", "transnorm"])
 def test_the_second_head_is_the_first_anew(name, norm):
     method = make(name, normalisation=norm, dropout=0.3)
@@ -181,7 +169,7 @@ def test_the_head_of_any_network_is_found():
     assert all(p.grad is not None for p in method.parameters())
 
 
-@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("name", NETWORKS)
 def test_classifiers_learn_twice_as_fast(name):
     method = make(name)
     others, classifiers = method.parameter_groups(1e-4)
