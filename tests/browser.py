@@ -39,7 +39,6 @@ class Browser:
         client = pytest.importorskip("websockets.sync.client", reason="it comes with qs3[view]")
         flags = [*_FLAGS, f"--user-data-dir={profile}"]
         self.process = subprocess.Popen([path, *flags], stderr=subprocess.PIPE, text=True)
-        assert self.process.stderr is not None
         line = next(line for line in self.process.stderr if "DevTools listening" in line)
         port = line.split("ws://")[1].split("/")[0]
         # What is not read would block the browser.

@@ -49,15 +49,20 @@ def d435_pair(shared_data: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         cv2.imread(str(shared_data / "ir" / f"d435_{name}.png"), mode)
         for name, mode in (("left", 0), ("right", 0), ("depth_preview", 1))
     )
-    assert left is not None
-    assert right is not None
-    assert picture is not None
     blue, green, red = picture.astype(float).transpose(2, 0, 1)
     place = np.where(red == 0, green, np.where(green >= 254, 254 + (red + 254 - blue) / 2, 0))
     place = np.where((red >= 254) & (green < 254), 762 - green, place)
     place[picture.sum(axis=2) == 0] = np.nan
     camera = 427.12 * 50 / (198.9 + 1.275 * place)
     return left, right, camera.repeat(2, axis=0).repeat(2, axis=1)
+
+
+@pytest.fixture
+def typed(capfd):
+    """Runs ``qs3`` in this process."""
+    from .commands import Typed
+
+    return Typed(capfd)
 
 
 @pytest.fixture

@@ -175,7 +175,6 @@ def test_a_killed_process_lets_go(tmp_path: Path) -> None:
     script += "with folder_lock(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
     command = [sys.executable, "-c", script, str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == "held\n"
         with pytest.raises(InputError, match=f"process {process.pid} on"):
             folder_lock(tmp_path).__enter__()

@@ -5,10 +5,7 @@ import torch
 from qs3.adaptation import Batch
 from qs3.models import PointClassifier, create_model
 
-SMALL = {
-    "pointnet": {"channels": (8, 8, 16), "hidden": (8,)},
-    "dgcnn": {"neighbours": 4, "channels": (8, 8), "embedding": 16, "hidden": (8,)},
-}
+from ..models.common import SMALL
 
 
 def seeded(seed: int = 0) -> torch.Generator:

@@ -56,7 +56,6 @@ def test_an_empty_side_gives_zero_and_no_gradient(rng):
     value = chamfer(x, y, mask)
     assert value[1] == 0 and (value[[0, 2]] > 0).all()
     value.sum().backward()
-    assert x.grad is not None and y.grad is not None
     assert not x.grad[1].any() and not y.grad[1].any()
     y_mask = torch.ones(3, 55, dtype=torch.bool)
     y_mask[2] = False

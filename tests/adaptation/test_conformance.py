@@ -1,5 +1,6 @@
 """Every method on every kind of network: it trains, goes on after a stop, and sees no label."""
 
+import functools
 import itertools
 import json
 from dataclasses import replace
@@ -12,54 +13,30 @@ from qs3.adaptation import Batch, create_method, list_methods, method_class
 from qs3.adaptation.names import COMPOSED, WITHOUT_TARGET, MethodName
 from qs3.errors import InputError
 from qs3.io import load_clouds, load_unlabelled
-from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.io.clouds import UnlabelledClouds
 from qs3.models import create_model
 from qs3.training import SelfTrainingSettings, TrainSettings, fit, load_model
 from qs3.training.checkpoint import read_tensors
 from qs3.training.rounds import STATE
 from qs3.training.validation import choose, held_out_rows, read_checkpoints
 
+from ..models.common import SMALL
+from ..training.common import SWITCHES, Stop, history_of, make_clouds, plain, same, stop_at
+
 NETWORKS = {
-    "dgcnn": {"neighbours": 6, "channels": (8, 8, 16), "embedding": 32, "hidden": (16, 8)},
-    "pointnet": {"channels": (8, 8, 16), "hidden": (16, 8), "transforms": False},
-    "pointnet2": {
-        "centres": (12, 5),
-        "scales": (((0.9, 6, (8, 8, 16)),), ((1.4, 4, (16, 16)),)),
-        "embedding": (16, 24),
-        "hidden": (16, 8),
-    },
+    "dgcnn": SMALL["dgcnn"],
+    "pointnet": SMALL["pointnet"] | {"transforms": False},
+    "pointnet2": SMALL["pointnet2"] | {"per_point": False},
 }
 METHODS = list_methods()
 ROUNDS = SelfTrainingSettings(rounds=2, epochs=1, threshold=0.34)
-SWITCHED = SelfTrainingSettings(
-    rounds=2,
-    epochs=1,
-    teacher="average",
-    turns=2,
-    calibrate=True,
-    refine=True,
-    label_smoothing=0.0,
-    threshold_share=0.8,
-    floor=2,
-)
-"""Rounds with all that is off by default."""
+SWITCHED = replace(SWITCHES, epochs=1, threshold_share=0.8)
 pytestmark = pytest.mark.filterwarnings("ignore::qs3.adaptation.SingleClassWarning")
 SMALLER = {"pointdan": {"nodes": 8, "neighbours": 6}, "dann": {"hidden": (16,)}}
 """Settings that only save time; all else is a method's default."""
 
 
-class Stop(Exception):  # noqa: N818
-    """Ends a run from a callback, as a kill would."""
-
-
-def clouds(count, seed, classes=3, points=40):
-    rng = np.random.default_rng(seed)
-    labels = np.arange(count) % classes
-    shape = np.array([[1, 1, 1], [1, 1, 0.1], [0.1, 0.1, 1]])[labels]
-    xyz = (rng.normal(size=(count, points, 3)) * shape[:, None]).astype(np.float32)
-    return PointClouds(xyz, labels, ("ball", "disc", "rod"), tuple(map(str, range(count))))
-
-
+clouds = functools.partial(make_clouds, points=40)
 SOURCE, TARGET = clouds(14, 0), clouds(9, 1).without_labels()
 
 
@@ -81,21 +58,9 @@ def settings(method, network="pointnet", **changes):
 
 def fit_after_a_stop(*arguments, run_dir):
     """Fit, end it after the first epoch as a kill would, and take it up again."""
-
-    def stop(record, _):
-        raise Stop
-
     with pytest.raises(Stop):
-        fit(*arguments, run_dir=run_dir, on_epoch=stop)
+        fit(*arguments, run_dir=run_dir, on_epoch=stop_at(1))
     return fit(*arguments, run_dir=run_dir)
-
-
-def state(result):
-    return result.model.state_dict()
-
-
-def same(one, other):
-    return one.keys() == other.keys() and all(torch.equal(one[key], other[key]) for key in one)
 
 
 def batch(count=4, seed=0, points=24):
@@ -106,8 +71,7 @@ def batch(count=4, seed=0, points=24):
 
 def make(method, network, seed=0):
     torch.manual_seed(seed)
-    more = {"per_point": True} if network == "pointnet2" else {}
-    model = create_model(network, 3, **NETWORKS[network], **more)
+    model = create_model(network, 3, **NETWORKS[network] | {"per_point": network == "pointnet2"})
     return create_method(method, model, **SMALLER.get(method, {})).train()
 
 
@@ -160,11 +124,11 @@ def test_resumed_is_uninterrupted_and_seeds_count(method, network, tmp_path):
     assert all(np.isfinite(list(epoch.losses.values())).all() for epoch in whole.history)
     assert all(0 <= epoch.accuracy <= 1 for epoch in whole.history)
     resumed = fit_after_a_stop(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "cut")
-    assert same(state(whole), state(resumed))
+    assert same(whole.model, resumed.model)
     assert whole.checkpoints == resumed.checkpoints
-    assert same(state(resumed), load_model(tmp_path / "cut").model.state_dict())
+    assert same(resumed.model, load_model(tmp_path / "cut").model)
     other = fit(method, SOURCE, TARGET, replace(chosen, seed=1), run_dir=tmp_path / "other")
-    assert not same(state(whole), state(other))
+    assert not same(whole.model, other.model)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -239,14 +203,9 @@ def test_poisoned_labels_of_the_target_change_no_bit(method, rule, tmp_path):
             rounds = replace(ROUNDS, rule=COMPOSED[method][1])
         chosen = settings(method, epochs=2, rule=rule)
         result = fit_after_a_stop(method, SOURCE, target, chosen, rounds, run_dir=run)
-        history = [json.loads(line) for line in (run / "history.jsonl").read_text().splitlines()]
-        for line in history:
-            line.pop("seconds", None)
-            line.pop("cpu_seconds", None)
-            line.pop("samples_per_second", None)
-        runs.append((result, history, (run / "settings.json").read_text()))
+        runs.append((result, plain(history_of(run)), (run / "settings.json").read_text()))
     (right, history, kept), (wrong, history_of_wrong, kept_of_wrong) = runs
-    assert same(state(right), state(wrong))
+    assert same(right.model, wrong.model)
     assert right.checkpoints == wrong.checkpoints
     assert right.known == wrong.known
     assert right.known is not None
@@ -260,8 +219,8 @@ def test_poisoned_labels_of_the_target_change_no_bit(method, rule, tmp_path):
         stage = right.checkpoints[-1].stage if method not in COMPOSED else "round"
         run = tmp_path / "true" / "run"
         picked = choose(read_checkpoints(run, stage), "im")
-        kept = load_model(run / picked.file).model.state_dict()
-        assert same(kept, state(right))
+        kept = load_model(run / picked.file).model
+        assert same(kept, right.model)
 
 
 def test_the_poison_would_show(tmp_path):
@@ -272,7 +231,7 @@ def test_the_poison_would_show(tmp_path):
         fit("source-only", part, None, settings("source-only"), run_dir=tmp_path / name)
         for name, part in {"true": truth, "wrong": wrong}.items()
     )
-    assert not same(state(one), state(other))
+    assert not same(one.model, other.model)
 
 
 @pytest.mark.parametrize(
@@ -288,9 +247,9 @@ def test_the_poison_would_show(tmp_path):
 def test_every_normalisation(method, normalisation, tmp_path):
     chosen = settings(method, epochs=1, normalisation=normalisation)
     result = fit(method, SOURCE, TARGET, chosen, run_dir=tmp_path)
-    assert all(torch.isfinite(value).all() for value in state(result).values())
+    assert all(torch.isfinite(value).all() for value in result.model.state_dict().values())
     loaded = load_model(tmp_path).model
-    assert same(loaded.state_dict(), state(result))
+    assert same(loaded, result.model)
 
 
 @pytest.mark.parametrize("method", [n for n in METHODS if not method_class(n).uses_target])
@@ -299,7 +258,7 @@ def test_adaptive_statistics_alone_go_without_a_target_in_training(method, tmp_p
         fit(method, SOURCE, TARGET, settings(method, epochs=1, normalisation=name), run_dir=folder)
         for name, folder in (("adabn", tmp_path / "a"), ("shared", tmp_path / "b"))
     )
-    assert not same(state(adapted), state(shared))
+    assert not same(adapted.model, shared.model)
     with pytest.raises(InputError, match="needs a method that uses the target"):
         fit(method, SOURCE, TARGET, settings(method, normalisation="separate"), run_dir=tmp_path)
 
@@ -316,7 +275,7 @@ def test_any_warm_up_goes_with_any_self_training(method, rule, tmp_path):
         ("warm-up", 1),
     ]
     began_with = read_tensors(tmp_path / result.checkpoints[0].file)[0]
-    assert same(began_with, load_model(tmp_path / "warm-up").model.state_dict())
+    assert same(began_with, load_model(tmp_path / "warm-up").model)
 
 
 def test_a_rule_may_keep_the_network_that_the_rounds_began_with(monkeypatch, tmp_path):
@@ -327,7 +286,7 @@ def test_a_rule_may_keep_the_network_that_the_rounds_began_with(monkeypatch, tmp
     result = fit("source-only", SOURCE, TARGET, chosen, ROUNDS, run_dir=tmp_path)
     assert any(not record.skipped for record in result.rounds)
     assert json.loads((tmp_path / "run.json").read_text())["chosen"]["number"] == 0
-    assert same(state(result), load_model(tmp_path / "warm-up").model.state_dict())
+    assert same(result.model, load_model(tmp_path / "warm-up").model)
 
 
 @pytest.mark.parametrize(
@@ -432,7 +391,7 @@ def test_trains_on_two_devices_and_resumes(method, tmp_path):
     chosen = settings(method, "dgcnn", devices=2, epochs=2)
     whole = fit(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "whole")
     resumed = fit_after_a_stop(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "cut")
-    assert same(state(whole), state(resumed))
+    assert same(whole.model, resumed.model)
     assert whole.checkpoints == resumed.checkpoints
 
 
@@ -446,4 +405,4 @@ def test_trains_on_a_gpu_and_is_deterministic(method, network, tmp_path):
     one, other = (
         fit(method, SOURCE, TARGET, chosen, run_dir=tmp_path / name) for name in ("a", "b")
     )
-    assert same(state(one), state(other))
+    assert same(one.model, other.model)

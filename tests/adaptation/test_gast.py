@@ -7,13 +7,7 @@ import torch
 from qs3.adaptation import gast, pcm
 from qs3.adaptation.curvature import surface
 from qs3.adaptation.deformations import cell_centres, cells
-from qs3.adaptation.gast import (
-    GAST,
-    location_loss,
-    location_weights,
-    mix_rotations,
-    turn,
-)
+from qs3.adaptation.gast import GAST, location_loss, location_weights, mix_rotations, turn
 from qs3.adaptation.method import cross_entropy
 from qs3.adaptation.pcm import Mixed, mixed_cross_entropy
 

@@ -18,24 +18,9 @@ from qs3.adaptation.pointdan import (
 )
 from qs3.models import Features, PointClassifier, create_model
 
-SMALL = {
-    "pointnet-sa": {
-        "channels": (8, 8, 16, 16),
-        "transform_hidden": (8,),
-        "nodes": 12,
-        "neighbours": 8,
-        "node_width": 8,
-    },
-    "pointnet": {"channels": (8, 8, 16), "hidden": (8,), "transforms": False},
-    "dgcnn": {"channels": (8, 8), "embedding": 16, "hidden": (8,), "neighbours": 4},
-    "pointnet2": {
-        "centres": (12, 5),
-        "scales": (((0.9, 6, (8, 8, 16)),), ((1.4, 4, (16, 16)),)),
-        "embedding": (16, 24),
-        "hidden": (8,),
-        "per_point": True,
-    },
-}
+from ..models.common import SMALL
+
+NETWORKS = ["pointnet-sa", "pointnet", "dgcnn", "pointnet2"]
 
 
 def make(name, seed=0, dropout=0.0, **settings):
@@ -58,7 +43,7 @@ def run(method, progress=0.5, **sizes):
     return method(source, target, progress, torch.Generator())
 
 
-@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("name", NETWORKS)
 def test_terms_follow_the_formulae(name):
     method = make(name, source_weight=0.5, discrepancy_weight=2.0, node_weight=3.0)
     method.eval()
@@ -126,7 +111,7 @@ def test_each_domain_has_an_attention_of_its_own():
     )
 
 
-@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("name", NETWORKS)
 @pytest.mark.parametrize("norm", ["shared", "transnorm"])
 def test_the_second_head_is_the_first_anew(name, norm):
     method = make(name, normalisation=norm, dropout=0.3)
@@ -184,7 +169,7 @@ def test_the_head_of_any_network_is_found():
     assert all(p.grad is not None for p in method.parameters())
 
 
-@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("name", NETWORKS)
 def test_classifiers_learn_twice_as_fast(name):
     method = make(name)
     others, classifiers = method.parameter_groups(1e-4)

@@ -7,11 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.optimize import minimize
 
-from qs3.adaptation.priors import (
-    estimate_prior_bbse,
-    estimate_prior_em,
-    project_to_simplex,
-)
+from qs3.adaptation.priors import estimate_prior_bbse, estimate_prior_em, project_to_simplex
 from qs3.errors import InputError
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from qs3.cli import main
+from ..commands import refusal
 
 
 class Command:
@@ -52,41 +52,6 @@ class Command:
     def refuses(self, *arguments) -> str:
         """The one line with which the command refuses."""
         return refusal(self(*arguments, code=2))
-
-
-class Typed:
-    """Runs ``qs3`` in this process, which need not start; settings are checked by type here."""
-
-    def __init__(self, capfd) -> None:
-        self.capfd = capfd
-
-    def __call__(self, *arguments, code: int = 0):
-        self.capfd.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            main([str(argument) for argument in arguments])
-        done = subprocess.CompletedProcess(
-            arguments, int(ended.value.code or 0), *self.capfd.readouterr()
-        )
-        assert done.returncode == code, done.stderr
-        return done
-
-    def refuses(self, *arguments) -> str:
-        return refusal(self(*arguments, code=2))
-
-
-def refusal(done) -> str:
-    """The one line on standard error, bars of progress aside."""
-    assert done.stdout == ""
-    lines = [line for line in done.stderr.splitlines() if "it/s" not in line and line.strip()]
-    lines = [line for line in lines if "scan/s" not in line and "scene/s" not in line]
-    assert len(lines) == 1, done.stderr
-    assert lines[0].startswith("qs3: ")
-    return lines[0]
-
-
-@pytest.fixture
-def typed(capfd) -> Typed:
-    return Typed(capfd)
 
 
 @pytest.fixture(scope="session")

@@ -84,11 +84,8 @@ def test_self_training_goes_on_from_a_network_without_its_source(qs3, scans, run
              "--self-training.epochs", 1)  # fmt: skip
     out = tmp_path / "run"
     qs3(*words, "--out", out)
-    settings, made, before = (
-        json.loads((out / "settings.json").read_text()),
-        read_run(out),
-        read_run(run),
-    )
+    settings = json.loads((out / "settings.json").read_text())
+    made, before = read_run(out), read_run(run)
     assert settings["train"]["model"] == "pointnet"
     assert settings["train"]["num_points"] == 64
     assert settings["self_training"]["source_loss"] is False

@@ -1,5 +1,7 @@
 """``qs3 export`` as a user runs it."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -8,19 +10,20 @@ from qs3.io.preparation import ROBUST
 from qs3.models import create_model
 from qs3.training import TrainSettings, predict_probabilities, save_model
 
+SETTINGS = TrainSettings(
+    model="pointnet",
+    model_settings={"channels": (8, 8, 16), "hidden": (8,), "transforms": False},
+    num_points=32,
+)
+
 
 @pytest.fixture(scope="module")
 def network(tmp_path_factory):
     """A run of a small network that has learnt nothing."""
     folder = tmp_path_factory.mktemp("network")
-    settings = TrainSettings(
-        model="pointnet",
-        model_settings={"channels": (8, 8, 16), "hidden": (8,), "transforms": False},
-        num_points=32,
-    )
     torch.manual_seed(0)
-    model = create_model("pointnet", 3, **settings.model_settings).eval()
-    save_model(folder, model, ("bed", "lamp", "sofa"), settings)
+    model = create_model("pointnet", 3, **SETTINGS.model_settings).eval()
+    save_model(folder, model, ("bed", "lamp", "sofa"), SETTINGS)
     return folder, model
 
 
@@ -41,14 +44,8 @@ def test_export_writes_a_file_that_answers_as_the_run(qs3, network, tmp_path):
 
 
 def test_export_tells_what_has_to_go_before(qs3, network, tmp_path):
-    model = network[1]
-    settings = TrainSettings(
-        model="pointnet",
-        model_settings={"channels": (8, 8, 16), "hidden": (8,), "transforms": False},
-        num_points=32,
-        preparation=ROBUST,
-    )
-    save_model(tmp_path, model, ("bed", "lamp", "sofa"), settings)
+    settings = dataclasses.replace(SETTINGS, preparation=ROBUST)
+    save_model(tmp_path, network[1], ("bed", "lamp", "sofa"), settings)
     done = qs3("export", tmp_path, "--to", "torch-export")
     assert "distinct_inliers(cloud, True, 4096)" in done.stderr.splitlines()[-1]
 

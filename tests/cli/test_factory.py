@@ -3,6 +3,8 @@ import shutil
 
 import pytest
 
+from qs3 import shapes
+
 
 @pytest.fixture
 def few(quick):
@@ -14,8 +16,6 @@ def few(quick):
 @pytest.fixture
 def cad(tmp_path):
     """A folder of three meshes, of which one is broken."""
-    from qs3 import shapes
-
     for name in ("chair", "sofa"):
         (tmp_path / "cad" / name).mkdir(parents=True)
         shapes.make(name, 0).export(tmp_path / "cad" / name / "one.ply")
@@ -48,8 +48,6 @@ def test_parts_merge_into_a_sound_data_set(qs3, few, tmp_path):
 
 
 def test_a_mended_mesh_is_scanned_again_and_a_changed_one_refused(qs3, quick, cad, tmp_path):
-    from qs3 import shapes
-
     flags = ("--meshes", cad, "--out", tmp_path / "out", "--num-points", 64, *quick)
     done = qs3("generate", *flags, code=2)
     assert "1 scans failed; the first: sofa/two#0" in done.stderr
@@ -101,8 +99,6 @@ def test_shapes_and_meshes_go_into_one_data_set(qs3, quick, cad, tmp_path):
 
 
 def test_labels_in_a_csv_and_the_ten_classes(qs3, quick, tmp_path):
-    from qs3 import shapes
-
     flat = tmp_path / "flat"
     flat.mkdir()
     for index, name in enumerate(("chair", "table", "cabinet")):

@@ -26,10 +26,7 @@ def run(redirection="", **environment):
 
 @pytest.mark.parametrize(
     "environment",
-    [
-        {"PYTHONIOENCODING": "ascii"},
-        {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
-    ],
+    [{"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}],
 )
 def test_output_is_readable_where_it_is_not_utf8(environment):
     done = run(**environment)
@@ -65,7 +62,6 @@ def test_control_characters_reach_no_terminal(typed, capfd, tmp_path):
     line = typed.refuses("scan", tmp_path / f"{HOSTILE}.off", "--out", tmp_path / "out")
     assert r"a\x1b[2J\x9b31m\r\n\u202eb.off" in line
     show(HOSTILE)
-    assert logging.lastResort is not None
     logged = logging.lastResort.format(logging.makeLogRecord({"msg": HOSTILE}))
     warned = warnings.formatwarning(HOSTILE, UserWarning, "a.py", 1)
     rows = columns([(HOSTILE, "1"), ("b", "2")])

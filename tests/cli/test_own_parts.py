@@ -1,26 +1,23 @@
 """The page "Your own parts", command by command, on twelve parts and six objects on a table."""
 
-import importlib.util
 import shlex
 from pathlib import Path
 
 import pytest
 
+from ..scripts import load_script
+
 ROOT = Path(__file__).parents[2]
 
 
-def _story():
-    spec = importlib.util.spec_from_file_location("own", ROOT / "benchmarks" / "own_parts.py")
-    assert spec is not None
-    assert spec.loader is not None
-    story = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(story)
-    return story
+@pytest.fixture
+def story():
+    return load_script(ROOT / "benchmarks" / "own_parts.py")
 
 
-def test_the_page_tells_the_whole_way():
+def test_the_page_tells_the_whole_way(story):
     """Every verb of the way, in its order."""
-    lines = [line.strip() for block in _story().commands() for line in block.splitlines()]
+    lines = [line.strip() for block in story.commands() for line in block.splitlines()]
     verbs = [shlex.split(line)[1] for line in lines if line.startswith("qs3 ")]
     assert list(dict.fromkeys(verbs)) == [
         "meshes", "generate", "info", "train", "capture", "segment", "predict", "watch", "evaluate",
@@ -29,9 +26,8 @@ def test_the_page_tells_the_whole_way():
 
 
 @pytest.mark.slow
-def test_every_command_of_the_page_runs(tmp_path):
+def test_every_command_of_the_page_runs(story, tmp_path):
     """Twelve parts in four own classes, whose names stay; each part that was cut out is scored."""
-    story = _story()
     story.make(tmp_path)
     story.run(tmp_path)
     assert {p.name for p in (tmp_path / "sorted").iterdir()} <= {*story.CLASSES, "unknown"}

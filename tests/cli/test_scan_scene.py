@@ -10,6 +10,18 @@ import pytest
 import trimesh
 
 
+def written_alike(qs3, folder, *words):
+    """Rows of the shard that one worker and two write alike, their draws, and the settings."""
+    said = []
+    for name, workers in (("a", 1), ("b", 2)):
+        said.append(qs3(*words, "--out", folder / name, "--workers", workers).stderr)
+    one, two = (folder / name / "shard-00000.parquet" for name in "ab")
+    assert one.read_bytes() == two.read_bytes()
+    rows = pq.read_table(one).to_pylist()
+    settings = json.loads((folder / "a" / "dataset.json").read_text())["settings"]
+    return rows, [json.loads(row["drawn"]) for row in rows], settings, said
+
+
 def test_scan_writes_frames_of_a_scene_and_records_it(qs3, quick, tmp_path):
     out = tmp_path / "scan"
     done = qs3("scan", "chair", "--out", out, "--seed", 2, "--scene", "floor+beside", "--neighbour",
@@ -51,12 +63,7 @@ def test_generate_draws_neighbours_and_settings_and_records_them(qs3, quick, tmp
     common = ("generate", "--meshes", "shapes", "--classes", "chair", "lamp",
               "--per-class", 1, "--scene", "room+beside", "--randomise", "default",
               "--num-points", 64, "--crop", "box", "--box-margin", 0.05, *quick)  # fmt: skip
-    for name, workers in (("a", 1), ("b", 2)):
-        qs3(*common, "--out", tmp_path / name, "--workers", workers)
-    shards = [(tmp_path / name / "shard-00000.parquet").read_bytes() for name in "ab"]
-    assert shards[0] == shards[1]
-    rows = pq.read_table(tmp_path / "a" / "shard-00000.parquet").to_pylist()
-    drawn = [json.loads(row["drawn"]) for row in rows]
+    rows, drawn, settings, _ = written_alike(qs3, tmp_path, *common)
     ids = {row["object"] for row in rows}
     for row, values in zip(rows, drawn, strict=True):
         assert values["neighbour"] in ids - {row["object"]}
@@ -64,7 +71,6 @@ def test_generate_draws_neighbours_and_settings_and_records_them(qs3, quick, tmp
             "neighbour", "material", "light.ambient", "light.projector", "exposure.gain"
         }  # fmt: skip
     assert len({values["light.ambient"] for values in drawn}) == 2
-    settings = json.loads((tmp_path / "a" / "dataset.json").read_text())["settings"]
     assert settings["scene"]["layout"] == "room+beside"
     assert settings["box_margin"] == 0.05
     assert settings["randomise"]["light.projector"][2] == "log"
@@ -74,12 +80,7 @@ def test_generate_draws_rooms_alike_with_any_number_of_workers(qs3, quick, tmp_p
     common = ("generate", "--meshes", "shapes", "--classes", "chair", "plant", "--per-class", 1,
               "--scans-per-mesh", 2, "--sensor", "d435", "--randomise", "rooms", "material=diffuse",
               "room.distance=0.8:1.5", "--num-points", 64, "--crop", "mask", *quick)  # fmt: skip
-    for name, workers in (("a", 1), ("b", 2)):
-        qs3(*common, "--out", tmp_path / name, "--workers", workers)
-    shards = [(tmp_path / name / "shard-00000.parquet").read_bytes() for name in "ab"]
-    assert shards[0] == shards[1]
-    rows = pq.read_table(tmp_path / "a" / "shard-00000.parquet").to_pylist()
-    drawn = [json.loads(row["drawn"]) for row in rows]
+    rows, drawn, settings, _ = written_alike(qs3, tmp_path, *common)
     assert len({values["object_size"] for values in drawn}) == len(rows) == 4
     for row, values in zip(rows, drawn, strict=True):
         assert 0.8 <= values["room.distance"] <= 1.5
@@ -87,7 +88,6 @@ def test_generate_draws_rooms_alike_with_any_number_of_workers(qs3, quick, tmp_p
         beside = bool({"behind", "beside"} & {*values["room.layout"].split("+")})
         assert ("neighbour" in values) is beside
         assert np.ptp(np.reshape(row["surface"], (-1, 3)), axis=0).max() <= values["object_size"]
-    settings = json.loads((tmp_path / "a" / "dataset.json").read_text())["settings"]
     assert settings["randomise"]["room.distance"] == [0.8, 1.5]
 
 
@@ -174,13 +174,8 @@ def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(qs3, tmp_path
     how = ("generate", "--recipe", "rooms", "--classes", "chair", "plant", "--per-class", 1,
            "--scans-per-mesh", 3, "--sensor", "d435,kinect-v1", "--views", 2, "--num-points", 64,
            "--variant", "scalar_rgb", "--samples", 1)  # fmt: skip
-    for name, workers in (("a", 1), ("b", 2)):
-        done = qs3(*how, "--out", tmp_path / name, "--workers", workers)
-        assert "--source-cloud all" in done.stderr
-    shards = [(tmp_path / name / "shard-00000.parquet").read_bytes() for name in "ab"]
-    assert shards[0] == shards[1]
-    rows = pq.read_table(tmp_path / "a" / "shard-00000.parquet").to_pylist()
-    drawn = [json.loads(row["drawn"]) for row in rows]
+    rows, drawn, settings, said = written_alike(qs3, tmp_path, *how)
+    assert all("--source-cloud all" in line for line in said)
     assert {values["sensor"] for values in drawn} == {"d435", "kinect-v1"}
     for row, values in zip(rows, drawn, strict=True):
         assert max(row["clean_view"]) < values["views"] <= 2
@@ -188,7 +183,6 @@ def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(qs3, tmp_path
         for kind in ("clean", "surface"):  # in metres, as large as was drawn
             extent = np.ptp(np.reshape(row[kind], (-1, 3)), axis=0).max()
             assert extent <= values["object_size"] * (1 + 1e-6)
-    settings = json.loads((tmp_path / "a" / "dataset.json").read_text())["settings"]
     assert settings["recipe"] == "rooms"
     assert [one["name"] for one in settings["sensor"]] == ["d435", "kinect-v1"]
     assert "sensor: d435, kinect-v1" in qs3("info", tmp_path / "a").stdout

@@ -1,5 +1,6 @@
 """``qs3 view`` as a user calls it."""
 
+import functools
 import os
 import signal
 import socket
@@ -11,7 +12,6 @@ import numpy as np
 import pytest
 
 from qs3 import shapes
-from qs3.cli import main
 from qs3.cli.view import _scan_page
 from qs3.io import load_clouds
 from qs3.io.ply import write_ply
@@ -45,63 +45,53 @@ def run(tmp_path):
     return folder
 
 
-def refusal(capsys, *arguments):
-    with pytest.raises(SystemExit) as ended:
-        main(["view", *map(str, arguments), "--port", "0"])
-    printed = capsys.readouterr()
-    assert ended.value.code == 2
-    assert printed.out == ""  # no address: there is nothing to open
-    lines = printed.err.splitlines()
-    assert len(lines) == 1
-    assert lines[0].startswith("qs3: ")
-    return lines[0]
+@pytest.fixture
+def refused(typed):
+    """The one line of a refusal; no address is printed, as there is nothing to open."""
+    return functools.partial(typed.refuses, "view", "--port", 0)
 
 
-def test_faults_are_one_line(capsys, archive, run, tmp_path):
-    assert "absent.off: no such file" in refusal(capsys, tmp_path / "absent.off")
-    line = refusal(capsys, "toaster")
+def test_faults_are_one_line(refused, archive, run, tmp_path):
+    assert "absent.off: no such file" in refused(tmp_path / "absent.off")
+    line = refused("toaster")
     assert "toaster" in line
     assert "chair" in line
-    line = refusal(capsys, archive, "--class-name", "sofa")
+    line = refused(archive, "--class-name", "sofa")
     assert "sofa" in line
     assert "bed, chair" in line
-    assert "split 'test'" in refusal(capsys, archive, "--split", "test")
-    assert "--data" in refusal(capsys, run)
-    assert "gone.npz" in refusal(capsys, run, "--data", tmp_path / "gone.npz")
-    assert "--data goes with a run" in refusal(capsys, archive, "--data", archive)
-    assert "--data goes with a run" in refusal(capsys, "chair", "--data", archive)
-    assert "nosuch" in refusal(capsys, "chair", "--sensor", "nosuch")
-    assert "seed -1" in refusal(capsys, "chair", "--seed", -1)
+    assert "split 'test'" in refused(archive, "--split", "test")
+    assert "--data" in refused(run)
+    assert "gone.npz" in refused(run, "--data", tmp_path / "gone.npz")
+    assert "--data goes with a run" in refused(archive, "--data", archive)
+    assert "--data goes with a run" in refused("chair", "--data", archive)
+    assert "nosuch" in refused("chair", "--sensor", "nosuch")
+    assert "seed -1" in refused("chair", "--seed", -1)
     (tmp_path / "bad.obj").write_text("nonsense")
-    assert "bad.obj" in refusal(capsys, tmp_path / "bad.obj")
+    assert "bad.obj" in refused(tmp_path / "bad.obj")
     (tmp_path / "bad.ply").write_text("nonsense")
-    assert "bad.ply" in refusal(capsys, tmp_path / "bad.ply")
+    assert "bad.ply" in refused(tmp_path / "bad.ply")
     (tmp_path / "empty").mkdir()
-    assert "empty" in refusal(capsys, tmp_path / "empty")
+    assert "empty" in refused(tmp_path / "empty")
 
 
-def test_data_of_other_classes_than_the_run_is_refused(capsys, run, tmp_path):
+def test_data_of_other_classes_than_the_run_is_refused(refused, run, tmp_path):
     path = tmp_path / "other.npz"
     np.savez(path, points=np.ones((1, 8, 3)), label=[0], class_names=["spoon"])
-    line = refusal(capsys, run, "--data", path)
+    line = refused(run, "--data", path)
     assert "other.npz" in line
     assert "spoon" in line
 
 
-def test_a_port_in_use_is_named(capsys, archive):
+def test_a_port_in_use_is_named(typed, archive):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(SystemExit) as ended:
-            main(["view", str(archive), "--port", str(port)])
-    assert ended.value.code == 2
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert f"--port {port}: Address already in use" in printed.err
+        line = typed.refuses("view", archive, "--port", port)
+    assert f"--port {port}: Address already in use" in line
 
 
-def test_without_viser_the_extra_is_named(capsys, monkeypatch, archive):
+def test_without_viser_the_extra_is_named(refused, monkeypatch, archive):
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert "pip install 'qs3[view]'" in refusal(capsys, archive)
+    assert "pip install 'qs3[view]'" in refused(archive)
 
 
 def test_a_run_answers_for_each_cloud_and_labels_are_only_shown(run, archive, tmp_path):
@@ -157,7 +147,6 @@ def test_serves_until_ctrl_c(archive):
         env=dict(os.environ, PYTHONWARNINGS=""),
     ) as process:  # fmt: skip
         try:
-            assert process.stdout is not None
             address = process.stdout.readline().strip()
             port = int(address.rsplit(":", 1)[1].partition("/")[0])
             with urllib.request.urlopen(address, timeout=30) as page:  # noqa: S310

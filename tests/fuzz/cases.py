@@ -97,9 +97,7 @@ def _npy(folder: Path, given: RaggedClouds | None = None) -> Path:
     """A valid data set of the smallest layout."""
     from qs3.io.layouts import FORMATS
 
-    write = FORMATS["npy"].write
-    assert write is not None
-    write(folder / "src", given or clouds())
+    FORMATS["npy"].write(folder / "src", given or clouds())
     return folder / "src"
 
 

@@ -67,9 +67,7 @@ def written_as(name: str) -> Callable[[Path], None]:
     def build(folder: Path) -> None:
         from qs3.io.layouts import FORMATS
 
-        write = FORMATS[name].write
-        assert write is not None
-        write(folder, clouds(POINTS.get(name, 64), OWN_CLASSES.get(name, CLASSES)))
+        FORMATS[name].write(folder, clouds(POINTS.get(name, 64), OWN_CLASSES.get(name, CLASSES)))
 
     return build
 

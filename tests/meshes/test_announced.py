@@ -11,6 +11,8 @@ from qs3.errors import InputError
 from qs3.meshes import load_mesh
 from qs3.meshes.announced import memory_limit
 
+from ..io.hostile import refused
+
 TRIANGLE = struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0)
 
 
@@ -61,10 +63,8 @@ def test_what_announces_more_than_it_holds_is_refused(tmp_path: Path) -> None:
         (b'{"meshes": [{"primitives": [{"indices": 7}]}]}', TRIANGLE, "damaged"),
     ):
         path = glb(tmp_path / "a.glb", content, data)
-        with pytest.raises(InputError, match=message) as caught:
+        with refused(f"^{path}: .*{message}"):
             load_mesh(path)
-        assert str(caught.value).startswith(f"{path}: ")
-        assert "\n" not in str(caught.value)
 
 
 def test_reading_takes_so_much_memory_and_no_more(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from qs3.meshes import cad, collect, load_mesh
 from qs3.meshes.cad import check_extra
 from qs3.meshes.sizes import file_size
 
+from ..io.hostile import refused
 from .cad_files import box_3mf, iges, step, write_3mf
 
 SIZE = (0.4, 0.3, 0.85)
@@ -102,10 +103,8 @@ def test_a_hostile_3mf_is_refused_before_it_is_read(tmp_path: Path) -> None:
         ("<object", "", "damaged"),
     ):
         path = write_3mf(tmp_path / "a.3mf", objects, build)
-        with pytest.raises(InputError, match=message) as caught:
+        with refused(f"^{path}: .*{message}"):
             load_mesh(path)
-        assert str(caught.value).startswith(f"{path}: ")
-        assert "\n" not in str(caught.value)
     path.write_bytes(b"PK no archive")
     with pytest.raises(InputError, match="not a 3MF file"):
         load_mesh(path)
@@ -116,9 +115,8 @@ def test_a_hostile_3mf_is_refused_before_it_is_read(tmp_path: Path) -> None:
 def test_a_damaged_cad_file_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     path.write_bytes(b"ISO-10303-21; dear reader\n\x1b[2J")
-    with pytest.raises(InputError, match=f"cannot be read as {name[2:].upper()}") as caught:
+    with refused(f"cannot be read as {name[2:].upper()}"):
         load_mesh(path)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="signals end a process elsewhere otherwise")

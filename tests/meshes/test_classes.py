@@ -2,13 +2,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.meshes.classes import (
-    POINTDA10,
-    canonical,
-    label_order,
-    map_labels,
-    read_class_map,
-)
+from qs3.meshes.classes import POINTDA10, canonical, label_order, map_labels, read_class_map
 
 
 def test_canonical_folds_case_and_follows_aliases():

@@ -9,6 +9,8 @@ import pytest
 from qs3.errors import InputError
 from qs3.meshes import MeshItem, collect
 
+from ..io.hostile import refused
+
 
 def listed(items: list[MeshItem]) -> list[tuple[str, str, str]]:
     return [(item.id, item.class_name, item.split) for item in items]
@@ -81,10 +83,8 @@ def test_convention_shapenet_is_y_up_with_labels_too(tree, tmp_path: Path) -> No
     root = tree("03001627/a/models/model_normalized.obj", "mine/b.obj")
     rows = "file,class\n03001627/a/models/model_normalized,seat\nb,bed\n"
     items = collect(root, labels=put(tmp_path / "l.csv", rows))
-    assert [np.ptp(item.load().vertices, axis=0).tolist() for item in items] == [
-        [1, 0, 3],
-        [1, 3, 0],
-    ]
+    sides = [np.ptp(item.load().vertices, axis=0).tolist() for item in items]
+    assert sides == [[1, 0, 3], [1, 3, 0]]
 
 
 @pytest.mark.parametrize(
@@ -124,10 +124,9 @@ def test_faulty_tables_are_named_in_one_line(tree, tmp_path: Path, text: str, me
     (outside / "deep/out.off").write_text("")
     (root / "link.off").symlink_to(outside / "deep/out.off")
     (root / "linked").symlink_to(outside)
-    with pytest.raises(InputError, match=message) as caught:
-        collect(root, labels=put(tmp_path / "l.csv", text))
-    assert "\n" not in str(caught.value)
-    assert str(caught.value).startswith(str(tmp_path / "l.csv"))
+    labels = put(tmp_path / "l.csv", text)
+    with refused(f"^{labels}.*(?:{message})"):
+        collect(root, labels=labels)
 
 
 def test_a_link_within_the_root_is_no_way_out(tree, tmp_path: Path) -> None:

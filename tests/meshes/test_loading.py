@@ -11,6 +11,8 @@ from qs3 import shapes
 from qs3.errors import InputError
 from qs3.meshes import load_mesh
 
+from ..io.hostile import refused
+
 TETRA = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 
@@ -151,12 +153,8 @@ def test_bad_files_give_one_line_with_their_name(tmp_path: Path, name: str) -> N
     content, reason = BAD[name]
     path = tmp_path / name
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    with pytest.raises(InputError) as caught:
+    with refused(f"^{path}.*{reason}"):
         load_mesh(path)
-    message = str(caught.value)
-    assert message.startswith(str(path))
-    assert reason in message
-    assert "\n" not in message
 
 
 @pytest.mark.parametrize("ending", ["ply", "stl", "glb", "off", "obj"])

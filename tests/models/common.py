@@ -1,7 +1,6 @@
 """The textbook forms of `benchmarks/reference`, which are written apart from ours."""
 
 import copy
-import importlib.util
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -14,6 +13,8 @@ from torch import Tensor, nn
 from qs3.models import create_model
 from qs3.models.ops import farthest_point_sampling, knn
 from qs3.models.simpleview import depth_images
+
+from ..scripts import load_script
 
 REFERENCE = Path(__file__).parents[2] / "benchmarks" / "reference"
 SSG = (((0.5, 8, (8, 8, 16)),), ((0.9, 6, (16, 16, 24)),))
@@ -40,18 +41,42 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "simpleview in perspective": {"width": 4, "resolution": 24, "projection": "perspective"},
 }  # fmt: skip
 """Small networks that have a textbook form."""
+SMALL: dict[str, dict[str, Any]] = {
+    "dgcnn": {"neighbours": 6, "channels": (8, 8, 16), "embedding": 32, "hidden": (16, 8)},
+    "pointnet": {"channels": (8, 8, 16), "hidden": (16, 8)},
+    "pointnet of each point": {"channels": (8, 8, 16), "transforms": False, "per_point": True},
+    "pointnet-sa": {
+        "channels": (8, 8, 16, 16), "transform_hidden": (16, 8), "nodes": 12, "neighbours": 6,
+        "radius": 0.9, "node_width": 8,
+    },
+    "pointnet2": {
+        "centres": (12, 5), "scales": (((0.9, 6, (8, 8, 16)),), ((1.4, 4, (16, 16)),)),
+        "embedding": (16, 24), "hidden": (16, 8), "per_point": True,
+    },
+    "pointnet2-msg": {
+        "centres": (12, 5), "embedding": (16, 24), "hidden": (16, 8),
+        "scales": (
+            ((0.5, 4, (4, 8)), (0.9, 6, (8, 8, 8))), ((0.8, 3, (8, 16)), (1.4, 4, (8, 8, 8))),
+        ),
+    },
+    "pointmlp-elite": {
+        "embedding": 8, "expansions": (2, 1), "before": (1, 2), "after": (1, 1),
+        "neighbours": (6, 4), "reducers": (2, 2), "bottleneck": 0.5, "hidden": (16, 8),
+    },
+    "rscnn": {
+        "centres": (12, 5), "radii": (0.9, 1.4), "neighbours": (6, 4), "channels": (8, 16),
+        "embedding": 16, "hidden": (16, 8),
+    },
+    "simpleview": {"width": 2, "resolution": 24},
+}  # fmt: skip
+"""One of every network, and of some kinds of it."""
 
 
 def textbook(name: str) -> ModuleType:
     """Load the module of a network, or of the one that it is a variant of."""
     path = REFERENCE / f"{name.replace('-', '_')}.py"
     path = path if path.is_file() else path.with_stem(name.split("-")[0])
-    spec = importlib.util.spec_from_file_location(f"reference_{path.stem}", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script(path)
 
 
 def randomise(model: nn.Module, spread: float = 1.0, most: float = 2.0) -> None:
@@ -62,8 +87,6 @@ def randomise(model: nn.Module, spread: float = 1.0, most: float = 2.0) -> None:
     with torch.no_grad():
         for layer in model.modules():
             if isinstance(layer, nn.BatchNorm1d | nn.BatchNorm2d):
-                assert layer.running_mean is not None
-                assert layer.running_var is not None
                 layer.weight.normal_()
                 layer.bias.normal_()
                 layer.running_mean.normal_(std=spread)

@@ -8,12 +8,7 @@ from qs3.models import create_model
 from .common import textbook
 
 # Share of the textbook's bytes that ours may keep. PointNet spares its widest layer alone.
-SHARES = {
-    "dgcnn": 0.25,
-    "pointnet": 1.0,
-    "pointnet-sa": 0.5,
-    "pointnet2": 0.6,
-}
+SHARES = {"dgcnn": 0.25, "pointnet": 1.0, "pointnet-sa": 0.5, "pointnet2": 0.6}
 
 
 def kept(model, points):

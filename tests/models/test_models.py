@@ -14,54 +14,8 @@ from torch.optim.swa_utils import update_bn
 from qs3.errors import InputError
 from qs3.models import Features, create_model, list_models
 
-SMALL = {
-    "dgcnn": {"neighbours": 6, "channels": (8, 8, 16), "embedding": 32, "hidden": (16, 8)},
-    "pointnet": {"channels": (8, 8, 16), "hidden": (16, 8)},
-    "pointnet of each point": {"channels": (8, 8, 16), "transforms": False, "per_point": True},
-    "pointnet-sa": {
-        "channels": (8, 8, 16, 16),
-        "transform_hidden": (16, 8),
-        "nodes": 12,
-        "neighbours": 6,
-        "radius": 0.9,
-        "node_width": 8,
-    },
-    "pointnet2": {
-        "centres": (12, 5),
-        "scales": (((0.9, 6, (8, 8, 16)),), ((1.4, 4, (16, 16)),)),
-        "embedding": (16, 24),
-        "hidden": (16, 8),
-        "per_point": True,
-    },
-    "pointnet2-msg": {
-        "centres": (12, 5),
-        "scales": (
-            ((0.5, 4, (4, 8)), (0.9, 6, (8, 8, 8))),
-            ((0.8, 3, (8, 16)), (1.4, 4, (8, 8, 8))),
-        ),
-        "embedding": (16, 24),
-        "hidden": (16, 8),
-    },
-    "pointmlp-elite": {
-        "embedding": 8,
-        "expansions": (2, 1),
-        "before": (1, 2),
-        "after": (1, 1),
-        "neighbours": (6, 4),
-        "reducers": (2, 2),
-        "bottleneck": 0.5,
-        "hidden": (16, 8),
-    },
-    "rscnn": {
-        "centres": (12, 5),
-        "radii": (0.9, 1.4),
-        "neighbours": (6, 4),
-        "channels": (8, 16),
-        "embedding": 16,
-        "hidden": (16, 8),
-    },
-    "simpleview": {"width": 2, "resolution": 24},
-}
+from .common import SMALL
+
 NAMES = sorted(SMALL)
 
 

@@ -6,23 +6,13 @@ import torch
 
 from qs3.models.rscnn import RSCNN
 
-from .common import normed, randomise
-
-SMALL = {
-    "centres": (12, 5),
-    "radii": (0.9, 1.4),
-    "neighbours": (6, 4),
-    "channels": (8, 16),
-    "embedding": 16,
-    "hidden": (12, 8),
-    "dropout": 0.0,
-}
+from .common import SMALL, normed, randomise
 
 
 def make(**settings):
     """A small network whose normalisations have scales of both signs and some history."""
     torch.manual_seed(0)
-    model = RSCNN(5, **{**SMALL, **settings}).double()
+    model = RSCNN(5, **SMALL["rscnn"] | {"hidden": (12, 8), "dropout": 0.0} | settings).double()
     randomise(model, 0.3, 1.5)
     return model
 

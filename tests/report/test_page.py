@@ -141,9 +141,14 @@ def test_bad_news_is_told_as_it_is(report, kind):
     assert words[kind] in "".join(page.words)
 
 
-def test_table_of_rounds_holds_every_number(source):
+def cells_of(source):
+    """The texts of each row of each table."""
     rows = re.findall(r"<tr>(.*?)</tr>", source)
-    cells = [re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row) for row in rows]
+    return [re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row) for row in rows]
+
+
+def test_table_of_rounds_holds_every_number(source):
+    cells = cells_of(source)
     assert cells[:5] == [
         ["round", "1", "2"],
         ["θ", "0.800", "0.805"],
@@ -174,8 +179,7 @@ def test_parts_that_are_empty_are_left_out(report):
 
 
 def test_same_report_gives_the_same_bytes_and_its_verdict(report, tmp_path):
-    parts = {"before": report.before, "after": report.after, "scores": report.scores}
-    page = bare(report, **parts)
+    page = bare(report, before=report.before, after=report.after, scores=report.scores)
     for name in ("a", "b"):
         verdict = write_report(tmp_path / f"{name}.html", page)
     assert verdict == judge(report.before, report.after)
@@ -192,8 +196,7 @@ def test_one_network_makes_a_page_without_a_verdict(report, tmp_path):
 
 
 def test_table_of_records_has_published_values_marks_and_the_oracle_apart(source):
-    rows = re.findall(r"<tr>(.*?)</tr>", source)
-    cells = [re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row) for row in rows]
+    cells = cells_of(source)
     line = next(row for row in cells if row[0].startswith("line ") and len(row) == 9)
     assert line[2:5] == ["55.0 ± 5.0 (n=2)", "50.0 ± 10.0 (n=2)", "72.4 ± 0.8"]
     assert line[5].startswith("transductive, mark ")
@@ -205,7 +208,6 @@ def test_table_of_records_has_published_values_marks_and_the_oracle_apart(source
 
 def test_matrix_of_a_line_holds_its_counts_shaded_by_share(source):
     table = re.search(r'<table class="matrix">(.*?)</table>', source, re.DOTALL)
-    assert table is not None
     cells = [
         re.findall(r"<td(?: class=\"(\w+)\")?>(\d*)</td>", row)
         for row in re.findall(r"<tr>(.*?)</tr>", table[1])[1:]

@@ -24,12 +24,8 @@ POSE = Pose.looking_at(np.array([2.0, 1.0, 1.6]), np.zeros(3))
 CORNER = trimesh.util.concatenate(
     [
         trimesh.creation.box((1.0, 1.0, 0.1)),
-        trimesh.creation.box(
-            (0.1, 1.0, 0.8), trimesh.transformations.translation_matrix((-0.4, 0, 0.4))
-        ),
-        trimesh.creation.box(
-            (0.2, 0.2, 0.3), trimesh.transformations.translation_matrix((0.1, 0.1, 0.2))
-        ),
+        trimesh.creation.box((0.1, 1.0, 0.8)).apply_translation((-0.4, 0, 0.4)),
+        trimesh.creation.box((0.2, 0.2, 0.3)).apply_translation((0.1, 0.1, 0.2)),
     ]
 )
 needs_llvm = pytest.mark.skipif(
@@ -186,10 +182,7 @@ def test_a_region_is_cut_out_of_the_frame(variant):
 
 @pytest.mark.parametrize(
     ("variant", "name"),
-    [
-        pytest.param("llvm_ad_mono", "glossy-plastic", marks=needs_llvm),
-        ("scalar_rgb", "glass"),
-    ],
+    [pytest.param("llvm_ad_mono", "glossy-plastic", marks=needs_llvm), ("scalar_rgb", "glass")],
 )
 def test_shiny_surfaces_are_path_traced_whatever_the_setting(variant, name):
     scene = corner(MATERIALS[name])

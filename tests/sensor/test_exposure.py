@@ -19,13 +19,7 @@ RIG = StereoRig(width=201, height=161, focal=100.0)
 OBJECT = Region(40, 30, 110, 90)
 LINEAR = ExposureSettings(response="linear")
 EVERYTHING = ExposureSettings(
-    response="gamma",
-    auto=0.6,
-    psf=1.2,
-    vignetting=0.7,
-    speckle=200.0,
-    noise=2.0,
-    offset=-0.5,
+    response="gamma", auto=0.6, psf=1.2, vignetting=0.7, speckle=200.0, noise=2.0, offset=-0.5
 )
 
 

@@ -14,29 +14,15 @@ from qs3.errors import InputError
 from qs3.meshes import sample_surface
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.frames import depth_scale, encode_depth, remove_frames, write_frames
-from qs3.sensor.matching import MatchingSettings
-from qs3.sensor.presets import Sensor
-from qs3.sensor.render.mitsuba import MitsubaRenderer
-from qs3.sensor.rig import StereoRig
 from qs3.sensor.scan import scan
-from qs3.sensor.speckle import PatternSettings
-from qs3.sensor.views import Placement
 
-# A camera in metres before an object of 0.5 m.
-METRIC = Sensor(
-    name="metric",
-    rig=StereoRig(width=400, height=300, focal=420.0, baseline=0.09),
-    pattern=PatternSettings(columns=177, rows=138),
-    matching=MatchingSettings(num_disparities=64, block_size=11),
-    depth=DepthSettings(near=0.3, far=3.0, stride=1),
-    placement=Placement(radius=(1.0, 1.2)),
-    object_size=0.5,
-)
+from ..sensors import METRIC
+
 KINDS = ("ir_left", "ir_right", "depth", "depth_true", "normals", "mask", "mask_visib")
 
 
 @pytest.fixture(scope="module")
-def made():
+def made(renderer):
     return scan(
         shapes.make("chair", seed=1),
         sensor=METRIC,
@@ -45,7 +31,7 @@ def made():
         scene="room+behind",
         neighbour=shapes.make("table", seed=2),
         num_points=1024,
-        renderer=MitsubaRenderer(variant="scalar_rgb", samples=4),
+        renderer=renderer,
         full_frames=True,
     )
 

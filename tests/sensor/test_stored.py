@@ -1,5 +1,6 @@
 """A rig whose second image is the stored pattern."""
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -8,7 +9,6 @@ from qs3.sensor.depth import DepthSettings
 from qs3.sensor.exposure import ExposureSettings
 from qs3.sensor.matching import MatchingSettings
 from qs3.sensor.presets import Sensor
-from qs3.sensor.render.mitsuba import MitsubaRenderer
 from qs3.sensor.rig import StereoRig
 from qs3.sensor.scan import scan
 from qs3.sensor.speckle import PatternSettings, stored_pattern
@@ -28,8 +28,6 @@ ONE_CAMERA = Sensor(
 
 
 def test_convention_a_dot_is_where_its_direction_says(tmp_path):
-    import cv2
-
     # One lit cell of 9 × 6: third column, second row.
     picture = np.zeros((6, 9), np.uint8)
     picture[1, 2] = 255
@@ -57,9 +55,8 @@ def test_nothing_is_stored_outside_the_cone():
 
 
 @pytest.fixture(scope="module")
-def found():
+def found(renderer):
     plate = trimesh.creation.box(extents=[1, 1, 0.02])
-    renderer = MitsubaRenderer(variant="scalar_rgb", samples=4)
     return scan(plate, sensor=ONE_CAMERA, views=1, seed=0, renderer=renderer, keep_images=True)
 
 

@@ -33,9 +33,9 @@ class FakeItem:
         raise AssertionError("a fake has no mesh")
 
 
-def work(count: int, bad: tuple[int, ...] = ()) -> list[FakeItem]:
-    """A work list of chairs, some of them bad."""
-    return [FakeItem(f"bad{i}" if i in bad else f"m{i}") for i in range(count)]
+def work(count: int, bad: tuple[int, ...] = (), called: str = "bad") -> list[FakeItem]:
+    """A work list of chairs, some of them bad; their name tells how (see ``deadly_row``)."""
+    return [FakeItem(f"{called}{i}" if i in bad else f"m{i}") for i in range(count)]
 
 
 def run(items, out, settings=SETTINGS, *, row=None, **how) -> GenerateReport:

@@ -11,6 +11,8 @@ import pytest
 from qs3.errors import InputError
 from qs3.io.layouts.store import read_ragged
 from qs3.meshes.classes import POINTDA10
+from qs3.sensor.presets import get_sensor
+from qs3.sensor.scene import SceneSettings
 from qs3.store.failures import read_failures
 from qs3.store.generate import GenerateReport, GenerateSettings, scan_seed
 from qs3.store.info import info
@@ -108,8 +110,6 @@ def test_a_link_among_the_parts_is_not_followed(fake, tmp_path, link):
 
 
 def test_other_settings_or_another_work_list_are_refused(fake, tmp_path):
-    from qs3.sensor.scene import SceneSettings
-
     fake.run(items(fake), tmp_path, SETTINGS)
     before = fake.content(tmp_path)
     for changed, name in [
@@ -169,8 +169,6 @@ def test_settings_are_checked():
 
 
 def test_a_pattern_picture_is_recorded_by_name_and_content(tmp_path):
-    from qs3.sensor.presets import get_sensor
-
     picture = tmp_path / "dots.png"
     picture.write_bytes(b"dots")
     qs3 = get_sensor("paper")
@@ -203,8 +201,6 @@ def test_neighbours_are_other_objects_drawn_evenly_from_the_scans_own_seed(fake)
 
 
 def test_a_scene_with_a_neighbour_hands_one_to_every_scan(fake, tmp_path):
-    from qs3.sensor.scene import SceneSettings
-
     pairs = []
 
     def scan_one(item, scan, settings, neighbour):

@@ -35,7 +35,7 @@ from qs3.errors import QS3Error
 if __name__ == "__main__":
     # A job started in the background inherits that Ctrl-C is ignored; this one is to act on it.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    work = [fake.FakeItem("hangs" if i == 9 else f"m{i}") for i in range(24)]
+    work = fake.work(24, (9,), "hangs")
     try:
         report = fake.run(work, Path(sys.argv[2]), row=getattr(fake, sys.argv[3]), workers=2)
     except QS3Error as error:
@@ -82,8 +82,7 @@ def wait_for(condition, seconds: float = 60) -> None:
 
 
 def whole(fake, tmp_path) -> dict[str, bytes]:
-    items = [fake.FakeItem("hangs" if i == 9 else f"m{i}") for i in range(ROWS)]
-    fake.run(items, tmp_path / "whole")
+    fake.run(fake.work(ROWS, (9,), "hangs"), tmp_path / "whole")
     return fake.content(tmp_path / "whole")
 
 
@@ -122,7 +121,7 @@ def test_ctrl_c_keeps_what_is_under_way_and_shows_no_traceback(fake, start, tmp_
     assert process.returncode == 130, errors
     assert "Traceback" not in errors
     assert 0 < written_rows(out) < ROWS
-    fake.run([fake.FakeItem("hangs" if i == 9 else f"m{i}") for i in range(ROWS)], out)
+    fake.run(fake.work(ROWS, (9,), "hangs"), out)
     assert fake.content(out) == whole(fake, tmp_path)
 
 
@@ -167,8 +166,8 @@ def test_objects_that_hang_or_crash_fail_alone_and_what_was_written_counts(fake,
 
 
 def test_what_the_machine_kills_is_no_failure_and_is_made_on_the_next_run(fake, tmp_path):
-    items = [fake.FakeItem("killed" if i == 9 else f"m{i}") for i in range(ROWS)]
-    message = r"could not make 1, the first killed#0: .*SIGKILL.* run the same command again"
+    items = fake.work(ROWS, (9,), "killed")
+    message = r"could not make 1, the first killed9#0: .*SIGKILL.* run the same command again"
     with pytest.raises(InputError, match=message) as caught:
         fake.run(items, tmp_path / "out", row=fake.deadly_row, workers=2)
     assert "\n" not in str(caught.value)
@@ -181,7 +180,7 @@ def test_what_the_machine_kills_is_no_failure_and_is_made_on_the_next_run(fake, 
 
 
 def test_a_machine_that_kills_every_process_is_not_tried_on_and_on(fake, tmp_path):
-    items = [fake.FakeItem(f"killed{i}") for i in range(ROWS)]
+    items = fake.work(ROWS, tuple(range(ROWS)), "killed")
     with pytest.raises(InputError, match="could not make 5, the first killed0#0"):
         fake.run(items, tmp_path, row=fake.deadly_row, executor=Killer())
     assert read_failures(tmp_path) == []
@@ -368,8 +367,7 @@ def test_a_full_disk_stops_the_run_and_loses_nothing(fake, start, tmp_path, smal
     before = written_rows(out)
     if small_disk is not None:
         subprocess.run(["mount", "-o", "remount,size=4m", str(small_disk)], check=True)
-    items = [fake.FakeItem("hangs" if i == 9 else f"m{i}") for i in range(ROWS)]
-    report = fake.run(items, out)
+    report = fake.run(fake.work(ROWS, (9,), "hangs"), out)
     assert (report.done + report.skipped, report.failed) == (ROWS, 0)
     assert report.skipped >= before > 0
     assert fake.content(out) == whole(fake, tmp_path)

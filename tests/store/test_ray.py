@@ -48,8 +48,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 
 def whole(fake, folder: Path) -> dict[str, bytes]:
-    work = [fake.FakeItem("bad" if i == 7 else f"m{i}") for i in range(ROWS)]
-    fake.run(work, folder, row=fake.flaky_row)
+    fake.run(fake.work(ROWS, bad=(7,)), folder, row=fake.flaky_row)
     return fake.content(folder)
 
 
@@ -67,7 +66,7 @@ def test_a_node_killed_half_way_changes_no_byte(fake, tmp_path, cluster):
 
     killer = threading.Thread(target=kill_one)
     killer.start()
-    work = [fake.FakeItem("bad" if i == 7 else f"m{i}") for i in range(ROWS)]
+    work = fake.work(ROWS, bad=(7,))
     report = fake.run(work, out, row=fake.slow_flaky_row, executor=RayExecutor())
     killer.join()
     assert ROWS // 8 <= seen[0] < ROWS // 4 - 1, "the node was not killed half-way"
@@ -79,7 +78,7 @@ def test_a_node_killed_half_way_changes_no_byte(fake, tmp_path, cluster):
 @pytest.mark.slow
 def test_on_a_cluster_too_what_hangs_or_crashes_fails_alone(fake, tmp_path, cluster):
     for name, kind in (("hangs", "Timeout"), ("exits", "ProcessDied")):
-        work = [fake.FakeItem(name if i == 2 else f"m{i}") for i in range(6)]
+        work = fake.work(6, (2,), name)
         executor = RayExecutor(timeout=12.0 if kind == "Timeout" else None, retries=1)
         report = fake.run(work, tmp_path / name, row=fake.deadly_row, executor=executor)
         assert report == GenerateReport(done=5, skipped=0, failed=1)
@@ -98,12 +97,12 @@ def test_a_lost_raylet_is_no_failure_of_a_scan(fake, tmp_path, cluster):
 
     killer = threading.Thread(target=kill_head)
     killer.start()
-    work = [fake.FakeItem("bad" if i == 7 else f"m{i}") for i in range(ROWS)]
+    work = fake.work(ROWS, bad=(7,))
     with pytest.raises(InputError, match="run the same command again, nothing is lost") as caught:
         fake.run(work, out, row=fake.slow_flaky_row, executor=RayExecutor())
     killer.join()
     assert "\n" not in str(caught.value)
-    assert {record["object"] for record in read_failures(out)} <= {"bad"}
+    assert {record["object"] for record in read_failures(out)} <= {"bad7"}
     fake.run(work, out, row=fake.flaky_row)
     assert fake.content(out) == whole(fake, tmp_path / "whole")
 
@@ -152,10 +151,7 @@ class FakeRay:
 @pytest.mark.parametrize(
     ("fault", "message"),
     [
-        (
-            RayError("the raylet died\nand more"),
-            "lost a call 4 times or .*RayError: the raylet died",
-        ),
+        (RayError("the raylet died\nand more"), "lost a call 4 times or .*RayError: the raylet d"),
         (TaskError(), "on the cluster: No module named 'qs3'"),
     ],
 )

@@ -1,12 +1,13 @@
 """Data sets at addresses that are no folder of this machine."""
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from qs3.errors import InputError, StorageError
+from qs3.errors import InputError, MissingExtraError, StorageError
 from qs3.io.layouts.store import read_ragged
 from qs3.io.load import load_clouds
 from qs3.store.folder import _file_system, open_folder
@@ -16,8 +17,8 @@ from qs3.store.merge import merge
 from qs3.store.verify import verify
 
 
-def items(fake, count=10):
-    return [fake.FakeItem("bad" if i == 5 else f"m{i}") for i in range(count)]
+def items(fake):
+    return fake.work(10, bad=(5,))
 
 
 def whole(fake, folder: Path) -> dict[str, bytes]:
@@ -72,12 +73,9 @@ def test_a_run_into_memory_is_stopped_resumed_and_equal(fake, tmp_path, memory):
     assert content(memory) == whole(fake, tmp_path / "whole")
     assert verify(memory, progress=False) == []
     assert info(memory)["rows"] == 9
-    np.testing.assert_array_equal(
-        read_ragged(memory).clouds, read_ragged(tmp_path / "whole").clouds
-    )
-    np.testing.assert_array_equal(
-        load_clouds(memory, num_points=None).points, read_ragged(memory).clouds
-    )
+    there = read_ragged(memory).clouds
+    np.testing.assert_array_equal(there, read_ragged(tmp_path / "whole").clouds)
+    np.testing.assert_array_equal(load_clouds(memory, num_points=None).points, there)
 
 
 def test_a_folder_of_something_else_is_refused(fake, memory):
@@ -174,10 +172,6 @@ def test_a_store_that_cannot_be_reached_is_told_in_one_line(fake):
 
 
 def test_a_missing_package_is_named_with_its_extra(fake, monkeypatch):
-    import sys
-
-    from qs3.errors import MissingExtraError
-
     monkeypatch.setitem(sys.modules, "gcsfs", None)
     with pytest.raises(MissingExtraError, match=r"gcsfs is not installed.*\[gs\]"):
         fake.run(items(fake), "gs://a/b")

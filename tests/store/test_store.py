@@ -219,10 +219,9 @@ def test_other_settings_are_refused_by_name(fake, tmp_path):
     other = {"views": 5, "sensor": {"rig": {"focal": 900.0}}}
     with pytest.raises(InputError, match=r"sensor\.rig\.focal = 1500\.0, not 900\.0"):
         write_manifest(tmp_path, dataclasses.replace(there, settings=other))
+    fewer = {"sensor": there.settings["sensor"]}
     with pytest.raises(InputError, match=r"views = 5, not None"):
-        write_manifest(
-            tmp_path, dataclasses.replace(there, settings={"sensor": there.settings["sensor"]})
-        )
+        write_manifest(tmp_path, dataclasses.replace(there, settings=fewer))
     assert open_dataset(tmp_path) == there
 
 
@@ -322,11 +321,8 @@ def test_info_counts(fake, tmp_path):
     make(tmp_path, fake)
     counts = info(tmp_path)
     assert (counts["rows"], counts["objects"], counts["failed"]) == (6, 6, 0)
-    assert {name: n for name, n in counts["classes"].items() if n} == {
-        "bed": 2,
-        "chair": 2,
-        "sofa": 2,
-    }
+    classes = {name: count for name, count in counts["classes"].items() if count}
+    assert classes == {"bed": 2, "chair": 2, "sofa": 2}
     assert counts["splits"] == {"test": 3, "train": 3}
     assert counts["points"] == [16, 16]
 
@@ -355,7 +351,6 @@ def test_a_data_set_begun_before_a_setting_existed_goes_on(fake, tmp_path):
     fake.run(fake.work(4), tmp_path / "old")
     old, whole = (tmp_path / name / shard_name(0) for name in ("old", "whole"))
     assert old.read_bytes() == whole.read_bytes()
+    other = dataclasses.replace(fake.SETTINGS, scans_per_mesh=2)
     with pytest.raises(InputError, match="made with scans_per_mesh = 1, not 2"):
-        fake.run(
-            fake.work(4), tmp_path / "old", dataclasses.replace(fake.SETTINGS, scans_per_mesh=2)
-        )
+        fake.run(fake.work(4), tmp_path / "old", other)

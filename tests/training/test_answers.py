@@ -8,7 +8,6 @@ import pandas as pd
 import pytest
 import torch
 
-from qs3.cli import main
 from qs3.io import load_clouds
 from qs3.io.convert import convert
 from qs3.models import create_model
@@ -161,14 +160,9 @@ def test_calibrated_probabilities_keep_their_order(knowing, folder):
         assert list(other.probabilities.values()) == pytest.approx(powers / powers.sum())
 
 
-def test_a_network_without_held_out_source_says_so(model, folder, capsys):
-    for words in (["--unknown", "0.05"], ["--calibrated"]):
-        with pytest.raises(SystemExit) as ended:
-            main(["predict", str(model), str(folder), *words])
-        assert ended.value.code == 2
-        told = capsys.readouterr().err.splitlines()
-        assert "holdout above 0" in told[-1]
-        assert sum("Traceback" in line for line in told) == 0
+def test_a_network_without_held_out_source_says_so(model, folder, typed):
+    for words in (["--unknown", 0.05], ["--calibrated"]):
+        assert "holdout above 0" in typed.refuses("predict", model, folder, *words)
 
 
 def test_a_share_that_is_none_and_a_class_of_that_name_are_refused(knowing, folder, tmp_path):
@@ -200,19 +194,15 @@ def test_links_by_class_are_a_data_set(folder, tmp_path):
 
 
 def test_the_command_does_the_rest_names_every_fault_and_ends_with_2(
-    folder, model, tmp_path, capsys
+    folder, model, tmp_path, typed
 ):
     (folder / "more" / "empty.xyz").write_text("")
-    words = ["predict", model, folder, "--top", "2", "--csv", tmp_path / "t.csv", "--json",
-             tmp_path / "t.json", "--sort-into", tmp_path / "s"]  # fmt: skip
-    with pytest.raises(SystemExit) as ended:
-        main(list(map(str, words)))
-    told = capsys.readouterr()
-    assert ended.value.code == 2
-    lines = [line.split("\t") for line in told.out.splitlines()]
+    told = typed("predict", model, folder, "--top", 2, "--csv", tmp_path / "t.csv", "--json",
+                 tmp_path / "t.json", "--sort-into", tmp_path / "s", code=2)  # fmt: skip
+    lines = [line.split("\t") for line in told.stdout.splitlines()]
     assert [len(line) for line in lines] == [5, 5, 5]
-    assert "bad.ply" in told.err
-    assert "empty.xyz: empty file (2 of 5 files)" in told.err.splitlines()[-1]
+    assert "bad.ply" in told.stderr
+    assert "empty.xyz: empty file (2 of 5 files)" in told.stderr.splitlines()[-1]
     assert len(pd.read_csv(tmp_path / "t.csv")) == 5
     assert len(json.loads((tmp_path / "t.json").read_text())) == 5
     assert len(list((tmp_path / "s").rglob("*.npy"))) == 3

@@ -24,17 +24,8 @@ from qs3.training.augmentation import (
 )
 
 CHANCES = (
-    "sight",
-    "plane",
-    "cone",
-    "patches",
-    "stretch",
-    "tilt",
-    "floor",
-    "wall",
-    "neighbour",
-    "noise",
-)
+    "sight", "plane", "cone", "patches", "stretch", "tilt", "floor", "wall", "neighbour", "noise",
+)  # fmt: skip
 
 
 def generator(seed=0):
@@ -82,14 +73,8 @@ def test_off_changes_and_draws_nothing(clouds):
 @pytest.mark.parametrize("name", CHANCES)
 def test_each_has_its_chance_per_cloud(name):
     many = torch.rand(400, 120, 3, generator=generator())
-    some = replace(
-        Augmentation(),
-        **{name: 0.3},
-        plane_share=1.0,
-        cone_share=1.0,
-        clutter_share=1.0,
-        least=0.02,
-    )
+    harsh = {"plane_share": 1.0, "cone_share": 1.0, "clutter_share": 1.0, "least": 0.02}
+    some = Augmentation(**harsh, **{name: 0.3})
     points, kept = augment_clouds(many, some, generator(3))
     changed = ((points != many).any(dim=2) | ~kept).any(dim=1).float().mean()
     assert 0.2 < changed < 0.4

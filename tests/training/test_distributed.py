@@ -1,7 +1,6 @@
 """Two CPU processes that train together over the loopback interface."""
 
 import copy
-import dataclasses
 import json
 import multiprocessing
 import os
@@ -23,7 +22,7 @@ from qs3.training.distributed import all_devices, gather_rows, has_bf16_units, m
 from qs3.training.prepared import prepare_clouds
 from qs3.training.state import CHECKPOINT
 
-from .common import Stop, same
+from .common import Stop, plain, same, stop_at
 
 
 @pytest.fixture
@@ -98,23 +97,10 @@ def test_resumed_is_uninterrupted(source, target, two, tmp_path):
     whole = fit(*arguments, run_dir=tmp_path / "whole")
     assert not whole.rounds[0].skipped
     for limit in (3, 23):
-        seen = []
-
-        def stop(record, method, seen=seen, limit=limit):
-            seen.append(record.epoch)
-            if len(seen) == limit:
-                raise Stop
-
         with pytest.raises(Stop):
-            fit(*arguments, run_dir=tmp_path / "cut", on_epoch=stop)
+            fit(*arguments, run_dir=tmp_path / "cut", on_epoch=stop_at(limit))
     resumed = fit(*arguments, run_dir=tmp_path / "cut")
     assert same(whole.model, resumed.model)
-
-    def plain(records):
-        return [
-            {**dataclasses.asdict(record), "seconds": 0, "cpu_seconds": 0} for record in records
-        ]
-
     assert plain(whole.rounds) == plain(resumed.rounds)
 
 
@@ -130,14 +116,9 @@ def test_settings_that_cannot_be(settings, source, tmp_path):
     with pytest.raises(InputError, match="batch_size = 3 must be at least 4, 2 a device"):
         replace(settings, devices=2, batch_size=3)
     if not torch.cuda.is_available():
+        wrong = replace(settings, devices=2, accelerator="cuda")
         with pytest.raises(InputError, match="accelerator 'cuda' with devices = 2"):
-            fit(
-                "source-only",
-                source,
-                None,
-                replace(settings, devices=2, accelerator="cuda"),
-                run_dir=tmp_path / "run",
-            )
+            fit("source-only", source, None, wrong, run_dir=tmp_path / "run")
         assert not (tmp_path / "run").exists()
 
 

@@ -19,15 +19,8 @@ from qs3.training import (
 )
 from qs3.training.run import fingerprint, train_settings
 
-TRAIN = {
-    "model_settings": {"channels": (16, 16, 32), "hidden": (16,), "transforms": False},
-    "num_points": 64,
-    "epochs": 4,
-    "batch_size": 8,
-    "learning_rate": 1e-2,
-    "accelerator": "cpu",
-    "threads": 1,
-}
+from .common import TRAIN, same
+
 pytestmark = pytest.mark.filterwarnings("ignore::qs3.adaptation.SingleClassWarning")
 ROUNDS = {"rounds": 2, "epochs": 1, "threshold": 0.4}
 
@@ -58,16 +51,9 @@ def test_the_line_of_the_readme(source, target):
 def test_it_is_the_fit_of_the_function(source, target, tmp_path, made, method, rounds):
     made.fit(source, target.without_labels())
     settings = TrainSettings(**TRAIN, model="pointnet", preparation=ROBUST)
-    wanted = fit(
-        method,
-        source,
-        target.without_labels(),
-        settings,
-        None if rounds is None else SelfTrainingSettings(**ROUNDS | rounds),
-        run_dir=tmp_path / "run",
-    )
-    for name, value in wanted.model.state_dict().items():
-        assert torch.equal(value, made.model_.state_dict()[name])
+    rounds = None if rounds is None else SelfTrainingSettings(**ROUNDS | rounds)
+    arguments = (method, source, target.without_labels(), settings, rounds)
+    assert same(fit(*arguments, run_dir=tmp_path / "run").model, made.model_)
 
 
 @pytest.mark.parametrize("kind", [Adapter, QBST, SPST])
@@ -88,9 +74,7 @@ def test_clone_copies_parameters_and_nothing_else(kind, source):
 def test_run_folder_stays_and_is_taken_up(source, target, tmp_path):
     made = Adapter(model="pointnet", train=TRAIN, run_dir=tmp_path / "run").fit(source)
     assert (tmp_path / "run" / "model.safetensors").is_file()
-    again = clone(made).fit(source)
-    for name, value in made.model_.state_dict().items():
-        assert torch.equal(value, again.model_.state_dict()[name])
+    assert same(made.model_, clone(made).fit(source).model_)
 
 
 def test_unknown_is_an_answer_that_is_saved_with_the_network(source, target, tmp_path):

@@ -1,12 +1,10 @@
 """Exported networks, run by onnxruntime and by torch.export, against ours."""
 
-import importlib.util
 import json
 import subprocess
 import sys
 import zipfile
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,11 +21,7 @@ from qs3.training import TrainSettings, export, load_model, predict_probabilitie
 from qs3.training.export import compare, export_run, subsample_in_a_graph
 from qs3.training.prepared import normalise_in_a_graph
 
-_SUITE = Path(__file__).parents[1] / "models" / "test_models.py"
-_SPEC = importlib.util.spec_from_file_location("suite_of_models", _SUITE)
-_MODULE = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(_MODULE)
-SMALL = _MODULE.SMALL
+from ..models.common import SMALL
 
 OWN = replace(ROBUST, size_input=True, align=True)
 CLASSES = ("Stuhl", "テーブル", 'a "lamp"')
@@ -54,10 +48,7 @@ def make_run(folder, name=TINY, num_points=M, preparation=PAPER):
         model = Sized(model, preparation.radius_share)
         torch.nn.init.normal_(model.size[2].weight)
     settings = TrainSettings(
-        model=kind,
-        model_settings=SMALL[name],
-        num_points=num_points,
-        preparation=preparation,
+        model=kind, model_settings=SMALL[name], num_points=num_points, preparation=preparation
     )
     save_model(folder, model.eval(), CLASSES, settings)
     return model

@@ -119,7 +119,6 @@ def test_target_reaches_a_method_that_uses_it(source, target, settings):
         uses_target = True
 
         def losses(self, source, target, progress, generator):
-            assert target is not None
             assert target.shape[1:] == (64, 3)
             logits = self.model(source.points)
             return {"a": logits.square().mean(), "b": self.model(target).square().mean()}

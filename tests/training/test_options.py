@@ -29,7 +29,7 @@ from qs3.training import (
 from qs3.training.checkpoint import new_model
 from qs3.training.loop import train
 
-from .common import Stop, history_of, same, stop_after
+from .common import Stop, history_of, plain, same, stop_after
 
 
 @pytest.mark.parametrize("norm", [1e-3, 1e6])
@@ -190,12 +190,6 @@ def test_stopped_in_time_again_and_again_is_uninterrupted(source, target, settin
     assert plain(history_of(tmp_path / "whole")) == plain(history_of(tmp_path / "cut"))
 
 
-def plain(lines):
-    """Lines without what a clock tells."""
-    clock = {"seconds", "samples_per_second", "cpu_seconds"}
-    return [{key: value for key, value in line.items() if key not in clock} for line in lines]
-
-
 def test_history_is_there_after_each_epoch_and_repeats_nothing(source, settings, tmp_path):
     seen = []
 
@@ -257,8 +251,7 @@ def test_wandb_is_told_each_epoch_and_stays_offline(source, settings, tmp_path, 
 
 
 @pytest.mark.parametrize(
-    ("tracker", "module"),
-    [("tensorboard", "torch.utils.tensorboard.writer"), ("wandb", "wandb")],
+    ("tracker", "module"), [("tensorboard", "torch.utils.tensorboard.writer"), ("wandb", "wandb")]
 )
 def test_an_absent_tracker_names_the_extra(
     source, settings, tmp_path, monkeypatch, tracker, module

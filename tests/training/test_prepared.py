@@ -24,6 +24,8 @@ from qs3.training.config import preparation_of
 from qs3.training.prepared import Prepared, label_clouds, normalise_batch, prepare_clouds
 from qs3.training.run import SETTINGS, read_settings
 
+from .common import same
+
 OWN = replace(ROBUST, size_input=True)
 
 
@@ -178,12 +180,7 @@ def test_runs_of_before_have_the_papers(source, settings, tmp_path):
     assert structure(read_settings(tmp_path)["train"], TrainSettings, path).preparation == PAPER
     assert load_model(tmp_path).preparation == PAPER
     again = fit("source-only", source, None, settings, run_dir=tmp_path)  # the same run
-    assert all(
-        torch.equal(a, b)
-        for a, b in zip(
-            result.model.state_dict().values(), again.model.state_dict().values(), strict=True
-        )
-    )
+    assert same(result.model, again.model)
     other = replace(settings, preparation=ROBUST)
     with pytest.raises(InputError, match=r"train\.preparation\.\w+ = \S+, not"):
         fit("source-only", source, None, other, run_dir=tmp_path)

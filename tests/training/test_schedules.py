@@ -10,6 +10,8 @@ from qs3.adaptation import SourceOnly
 from qs3.training.checkpoint import new_model
 from qs3.training.loop import plateau, train
 
+from .common import Stop, same, stop_after
+
 
 def test_plateau_is_pytorchs():
     rng = np.random.default_rng(0)
@@ -39,19 +41,15 @@ def test_training_follows_it_and_resumes_bit_exactly(source, settings, tmp_path)
     def run(folder, on_epoch=None, seed=0):
         method = SourceOnly(new_model(falling, 3, seed))
         history, _ = train(method, source, None, falling, run_dir=folder, on_epoch=on_epoch)
-        return history, method.model.state_dict()
+        return history, method.model
 
-    def stop(record, method):
-        if record.epoch == 50:
-            raise KeyboardInterrupt
-
-    history, weights = run(tmp_path / "whole")
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "stopped", stop)
-    again, same = run(tmp_path / "stopped", seed=9)
+    history, whole = run(tmp_path / "whole")
+    with pytest.raises(Stop):
+        run(tmp_path / "stopped", stop_after(50))
+    again, resumed = run(tmp_path / "stopped", seed=9)
     losses = [sum(record.losses.values()) for record in history]
     expected = [plateau(losses[:epoch], 1.0) for epoch in range(60)]
     assert [record.learning_rate for record in history] == expected
     assert [record.learning_rate for record in again] == expected
     assert len(set(expected)) > 1
-    assert all(torch.equal(weights[name], same[name]) for name in weights)
+    assert same(whole, resumed)

@@ -1,6 +1,5 @@
 import contextlib
 import copy
-import dataclasses
 import logging
 from dataclasses import replace
 
@@ -31,7 +30,7 @@ from qs3.training.prepared import prepare_clouds
 from qs3.training.rounds import STATE, kept_clouds, remarks
 from qs3.training.self_training import self_train
 
-from .common import Stop, history_of, same
+from .common import SWITCHES, Stop, history_of, plain, same, stop_at
 
 WIDE = {
     "preparation": replace(ROBUST, size_input=True, align=True),
@@ -40,26 +39,6 @@ WIDE = {
 }
 """Outliers removed, points drawn anew, sizes told, clouds augmented."""
 ROUNDS = SelfTrainingSettings(rounds=3, epochs=2, threshold=0.4)
-
-
-SWITCHES = SelfTrainingSettings(
-    rounds=2,
-    epochs=2,
-    teacher="average",
-    teacher_decay=0.5,
-    turns=3,
-    calibrate=True,
-    refine=True,
-    label_smoothing=0.0,
-    threshold_share=0.5,
-    floor=2,
-)
-"""All that is off by default."""
-
-
-def plain(records):
-    """Records without what a clock tells."""
-    return [{**dataclasses.asdict(record), "seconds": 0, "cpu_seconds": 0} for record in records]
 
 
 @pytest.fixture(scope="module")
@@ -96,11 +75,6 @@ def test_improves_or_keeps_an_easy_target(given, target, warm, tmp_path):
         assert len(record.losses) == 2
     assert result.rounds[0].agreement is None
     assert 0 <= result.rounds[1].agreement <= 1
-
-
-def test_the_type_of_the_target_has_no_labels():
-    names = {f.name for f in dataclasses.fields(UnlabelledClouds)}
-    assert names == {"points", "ids", "checksum", "origin"}
 
 
 @pytest.mark.filterwarnings("ignore::qs3.adaptation.selection.SingleClassWarning")
@@ -147,13 +121,7 @@ def test_resumed_is_uninterrupted(source, target, settings, tmp_path, preset, wh
         rounds = self_training_preset(preset, rounds=3, epochs=8, threshold=0.34, **changes)
     arguments = (rounds.rule, source, target.without_labels(), settings, rounds)
     whole = fit(*arguments, run_dir=tmp_path / "whole")
-    seen = []
-
-    def on_epoch(record, method):
-        seen.append(record.epoch)
-        limit = {"warm-up": 5, "middle of round 2": 12 + 8 + 3}.get(where)
-        if len(seen) == limit:
-            raise Stop
+    stop = stop_at({"warm-up": 5, "middle of round 2": 12 + 8 + 3}.get(where))
 
     def on_round(record, model):
         if where == "between rounds" and record.round == 2:
@@ -161,18 +129,15 @@ def test_resumed_is_uninterrupted(source, target, settings, tmp_path, preset, wh
 
     assert not any(record.skipped for record in whole.rounds[:2])
     with pytest.raises(Stop):
-        fit(*arguments, run_dir=tmp_path / "cut", on_epoch=on_epoch, on_round=on_round)
+        fit(*arguments, run_dir=tmp_path / "cut", on_epoch=stop, on_round=on_round)
     with pytest.raises(InputError, match="not finished"):
         load_model(tmp_path / "cut")
-    done = len(seen)
-    redone = []
-    resumed = fit(
-        *arguments, run_dir=tmp_path / "cut", on_epoch=lambda r, m: redone.append(r.epoch)
-    )
+    going_on = stop_at(None)
+    resumed = fit(*arguments, run_dir=tmp_path / "cut", on_epoch=going_on)
     assert same(whole.model, resumed.model)
     assert plain(whole.rounds) == plain(resumed.rounds)
     trained = sum(not record.skipped for record in whole.rounds)
-    assert done + len(redone) == 12 + 8 * trained  # nothing is done twice
+    assert len(stop.seen + going_on.seen) == 12 + 8 * trained  # nothing is done twice
 
 
 def test_a_finished_run_is_not_done_again(given, source, warm, tmp_path):
@@ -195,20 +160,14 @@ def test_history_keeps_finished_rounds_over_stops(given, warm, tmp_path):
     run = tmp_path / "run"
     rounds = replace(ROUNDS, rounds=2, epochs=3, threshold=0.34)
     for calls in (4, 1):
-        seen = []
-
-        def stop(record, method, seen=seen, calls=calls):
-            seen.append(record)
-            if len(seen) == calls:
-                raise Stop
-
+        stop = stop_at(calls)
         with pytest.raises(Stop):
             fit(*given, rounds, run_dir=run, warm_up=warm, on_epoch=stop)
         lines = [line for line in history_of(run) if line["kind"] != "checkpoint"]
         kinds = [(line["kind"], line.get("stage", line.get("round"))) for line in lines]
         assert kinds == [("round", 1)] + [("epoch", "round-2")] * (2 if calls == 1 else 1)
         if calls == 4:
-            first = seen[:3]
+            first = stop.seen[:3]
     done = next(line for line in history_of(run) if line["kind"] == "round")
     assert done["accuracies"] == [epoch.accuracy for epoch in first]
     assert done["learning_rates"] == [epoch.learning_rate for epoch in first]
@@ -290,7 +249,6 @@ def test_the_limit_is_two_a_device_without_those_held_out(
     domains, settings, monkeypatch, count, teacher, devices, skipped
 ):
     """The settings' number of devices counts; here one device computes for all of them."""
-    source, target = domains
     rounds = replace(ROUNDS, rounds=1, teacher=teacher)
     trained = []
 
@@ -299,15 +257,11 @@ def test_the_limit_is_two_a_device_without_those_held_out(
         return [], {}
 
     monkeypatch.setattr("qs3.training.self_training.train", train)
+    many = replace(settings, devices=devices, batch_size=16)
     _, records = self_train(
-        new_model(settings, 3, 0),
-        source,
-        target,
-        replace(settings, devices=devices, batch_size=16),
-        rounds,
+        new_model(settings, 3, 0), *domains, many, rounds, fabric=make_fabric(settings),
         select=lambda p, theta: np.arange(len(p)) < count,
-        fabric=make_fabric(settings),
-    )
+    )  # fmt: skip
     assert records[0].skipped is skipped
     assert trained == ([] if skipped else [8])
 
@@ -460,16 +414,10 @@ def test_the_average_follows_the_network_epoch_by_epoch(domains, settings):
 
 def test_label_smoothing_of_the_rounds_is_their_own(domains, settings):
     smoothed = replace(settings, label_smoothing=0.3)
-    plain_, same_, own = (
-        one_round(domains, *how)[0] if len(how) == 1 else one_round(domains, how[0], **how[1])[0]
-        for how in (
-            (settings,),
-            (smoothed, {"label_smoothing": 0.0}),
-            (settings, {"label_smoothing": 0.3}),
-        )
-    )
-    assert same(plain_, same_)
-    assert not same(plain_, own)
+    without, none = one_round(domains, settings)[0], {"label_smoothing": 0.0}
+    own, _ = one_round(domains, settings, label_smoothing=0.3)
+    assert same(without, one_round(domains, smoothed, **none)[0])
+    assert not same(without, own)
     assert same(own, one_round(domains, smoothed)[0])
 
 

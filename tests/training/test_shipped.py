@@ -1,6 +1,5 @@
 """Networks that come with qs3: their files, their names, and how they are made from a run."""
 
-import importlib.util
 import json
 import logging
 import re
@@ -23,15 +22,15 @@ from qs3.training.export import export_run
 from qs3.training.prepared import note_size
 from qs3.training.shipped import WEIGHTS, find_run, shipped, workplace
 
+from ..scripts import load_script
+
 ROOT = Path(__file__).parents[2]
 CLOUDS = np.random.default_rng(0).uniform(size=(6, 300, 3)).astype(np.float32)
 
 
-def ship_module():
-    spec = importlib.util.spec_from_file_location("ship", ROOT / "benchmarks" / "ship.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+@pytest.fixture
+def ship():
+    return load_script(ROOT / "benchmarks" / "ship.py")
 
 
 @pytest.fixture(autouse=True)
@@ -156,8 +155,7 @@ def test_too_few_points_are_told_once(caplog, tmp_path):
     assert "fewer than 32 distinct points" in caplog.messages[1]
 
 
-def test_a_run_becomes_one(source, target, settings, tmp_path):
-    ship = ship_module()
+def test_a_run_becomes_one(ship, source, target, settings, tmp_path):
     settings = replace(settings, holdout=0.3)
     made = fit("source-only", source, None, settings, run_dir=tmp_path / "run")
     evaluate(tmp_path / "run", target)
@@ -196,10 +194,10 @@ def test_a_run_becomes_one(source, target, settings, tmp_path):
         ship.ship(tmp_path / "adapted", out, "balls", tmp_path)
 
 
-def test_a_weight_too_large_for_half_precision_is_refused(source, settings, tmp_path):
+def test_a_weight_too_large_for_half_precision_is_refused(ship, source, settings, tmp_path):
     fit("source-only", source, None, settings, run_dir=tmp_path / "run")
     loaded = load_model(tmp_path / "run")
     state = {name: value * 1e6 for name, value in loaded.model.state_dict().items()}
     load_tensors_into(loaded.model, state, tmp_path)
     with pytest.raises(SystemExit, match="too large"):
-        ship_module().rounding(loaded, settings)
+        ship.rounding(loaded, settings)

@@ -67,13 +67,11 @@ def test_training_returns_the_average_of_its_steps(source, settings):
                 expected[name] = tensor
     averaged = SourceOnly(new_model(settings, 3, 0))
     seen = []
-    train(
-        averaged,
-        source,
-        None,
-        settings,
-        on_epoch=lambda record, method: seen.append(copy.deepcopy(method.state_dict())),
-    )
+
+    def look(record, method):
+        seen.append(copy.deepcopy(method.state_dict()))
+
+    train(averaged, source, None, settings, on_epoch=look)
     for name, tensor in averaged.state_dict().items():
         torch.testing.assert_close(tensor, expected[name], rtol=1e-5, atol=1e-6)
         assert torch.equal(tensor, seen[-1][name])  # a callback sees the network that is kept

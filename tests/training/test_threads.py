@@ -7,11 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from qs3.errors import InputError
 from qs3.training import fit, read_run, threads
 from qs3.training.distributed import make_fabric
 from qs3.training.job import fresh_model, make_method
 from qs3.training.threads import choose_threads, describe_threads, fastest, trial_step
+
+from .common import Stop, same, stop_at
 
 
 @pytest.fixture
@@ -39,8 +40,6 @@ def test_the_rule_needs_no_clock(settings, four, monkeypatch):
         changed = replace(settings, threads=asked, devices=devices)
         assert choose_threads(changed, begun, lambda: lambda: None) == chosen
     assert choose_threads(replace(settings, threads="auto"), None, None) == 4
-    with pytest.raises(InputError, match="threads = 0 must be above 0, or auto"):
-        replace(settings, threads=0)
 
 
 def test_timing_takes_the_fastest_and_the_fewer_of_equals(monkeypatch):
@@ -79,8 +78,7 @@ def test_a_timed_run_is_that_of_its_number(source, target, settings, tmp_path, m
         results.append(fit("dann", source, target, changed, run_dir=tmp_path / name).model)
         assert torch.initial_seed() == 0
         assert torch.rand(1).item() == pytest.approx(0.4962566)
-    weights = [model.state_dict() for model in results]
-    assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
+    assert same(*results)
     assert len(steps) == 2
     for name in ("asked", "timed"):
         assert read_run(tmp_path / name).threads == 1
@@ -88,24 +86,19 @@ def test_a_timed_run_is_that_of_its_number(source, target, settings, tmp_path, m
 
 
 def test_a_resumed_run_keeps_its_number(source, settings, tmp_path, caplog):
-    def stop(record, method):
-        raise KeyboardInterrupt
-
     def go_on(count, **options):
-        fit(
-            "source-only",
-            source,
-            None,
-            replace(settings, threads=count),
-            run_dir=tmp_path,
-            **options,
-        )
+        changed = replace(settings, threads=count)
+        fit("source-only", source, None, changed, run_dir=tmp_path, **options)
 
-    with pytest.raises(KeyboardInterrupt):
-        go_on(2, on_epoch=stop)
+    def note(record, method):
+        counts.append(torch.get_num_threads())
+        raise Stop
+
     counts = []
-    with pytest.raises(KeyboardInterrupt):
-        go_on(None, on_epoch=lambda r, m: (counts.append(torch.get_num_threads()), stop(r, m)))
+    with pytest.raises(Stop):
+        go_on(2, on_epoch=stop_at(1))
+    with pytest.raises(Stop):
+        go_on(None, on_epoch=note)
     assert counts == [2]
     assert not caplog.records
     with caplog.at_level(logging.WARNING):

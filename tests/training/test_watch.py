@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qs3.cli import main
 from qs3.errors import InputError
 from qs3.io.cameras.folder import capture
 from qs3.io.cameras.frames import CaptureSettings, DepthFrame, open_camera
@@ -113,31 +112,21 @@ def test_places_move_against_the_camera(shots):
     np.testing.assert_allclose(np.diff(largest[:, 1:], axis=0), 0, atol=0.003)
 
 
-def run(capsys, *words):
-    with pytest.raises(SystemExit) as ended:
-        main([str(word) for word in words])
-    told = capsys.readouterr()
-    return ended.value.code, told.out, told.err
-
-
-def test_the_verbs_from_a_bag_to_answers(tmp_path, capsys):
+def test_the_verbs_from_a_bag_to_answers(tmp_path, typed):
     bag = write_ros1(tmp_path / "bag", list(frames(3)), "16UC1", "ros1-lz4")
-    code, out, err = run(capsys, "extract", "rosbag", bag, "--out", tmp_path / "a", "--frames", 2)
-    assert (code, out.strip()) == (0, str(tmp_path / "a"))
-    assert err.startswith("2 frames.")
+    done = typed("extract", "rosbag", bag, "--out", tmp_path / "a", "--frames", 2)
+    assert done.stdout.strip() == str(tmp_path / "a")
+    assert done.stderr.startswith("2 frames.")
     folder = f"folder:{tmp_path / 'a'}"
-    code, *_ = run(capsys, "capture", "--camera", folder, "--out", tmp_path / "b")
-    assert code == 0
-    assert (tmp_path / "b/depth/000001.png").read_bytes() == (
-        tmp_path / "a/depth/000001.png"
-    ).read_bytes()
-    code, out, err = run(capsys, "watch", "rooms", "--camera", f"folder:{tmp_path / 'b'}", "--json")
-    rows = [json.loads(line) for line in out.splitlines()]
+    typed("capture", "--camera", folder, "--out", tmp_path / "b")
+    first, second = (tmp_path / name / "depth" / "000001.png" for name in "ab")
+    assert first.read_bytes() == second.read_bytes()
+    done = typed("watch", "rooms", "--camera", f"folder:{tmp_path / 'b'}", "--json")
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
     assert [row["frame"] for row in rows] == ["000000", "000001"]
     assert len(rows[0]["objects"]) >= 3
     assert len(rows[0]["objects"][0]["probabilities"]) == 10
-    assert "a second; of each: read" in err
-    code, out, _ = run(capsys, "watch", "rooms", "--camera", folder, "--frames", 1)
-    assert out.startswith(f"000000\t{rows[0]['objects'][0]['class']} 0.")
-    code, _, err = run(capsys, "extract", "bag", tmp_path / "none.bag", "--out", tmp_path / "c")
-    assert (code, err.count("\n")) == (2, 1)
+    assert "a second; of each: read" in done.stderr
+    done = typed("watch", "rooms", "--camera", folder, "--frames", 1)
+    assert done.stdout.startswith(f"000000\t{rows[0]['objects'][0]['class']} 0.")
+    typed.refuses("extract", "bag", tmp_path / "none.bag", "--out", tmp_path / "c")

@@ -7,7 +7,8 @@ from qs3 import shapes
 from qs3.io.cameras.frames import DepthFrame
 from qs3.io.extract.intrinsics import Intrinsics
 
-from ..extract.depth_scene import box
+from ..extract.depth_scene import box, looking_down
+from ..extract.depth_scene import photograph as cast_image
 
 THINGS = (("chair", -0.35, 0.1), ("table", 0.0, -0.1), ("sofa", 0.35, 0.1), ("lamp", 0.05, 0.25))
 """Class, and place on the table in metres."""
@@ -32,18 +33,9 @@ def table() -> trimesh.Trimesh:
 
 def photograph(mesh: trimesh.Trimesh, camera: Intrinsics, down: float = 50.0, x: float = 0.0):
     """Depth in metres, 0 for none, of a camera before the table that looks down by degrees."""
-    s, c = np.sin(np.radians(down)), np.cos(np.radians(down))
-    rotation = np.array([[1, 0, 0], [0, -s, -c], [0, c, -s]])  # rows: right, down, ahead
-    eye = np.array([x, -0.55, 0.65])
-    v, u = np.mgrid[: camera.height, : camera.width].reshape(2, -1)
-    rays = np.stack(
-        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], axis=1
-    )
-    start = np.broadcast_to(eye, rays.shape)
-    hit, ray, _ = mesh.ray.intersects_location(start, rays @ rotation, multiple_hits=False)
-    depth = np.zeros(len(u))
-    depth[ray] = (hit - eye) @ rotation[2]
-    return depth.reshape(camera.height, camera.width)
+    pose = looking_down(down, (x, -0.55, 0.65))
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    return cast_image(mesh, pose, matrix, (camera.height, camera.width))[0]
 
 
 def frames(count: int, width: int = 320, height: int = 240, noise: float = 0.0):

@@ -36,17 +36,32 @@ def camera_to_world(yaw_degrees: float, down_degrees: float, distance: float = 1
     return pose
 
 
-def photograph(mesh: trimesh.Trimesh, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def looking_down(degrees: float, eye) -> np.ndarray:
+    """A camera that looks along +y and so many degrees down, with the image's horizon level."""
+    s, c = np.sin(np.radians(degrees)), np.cos(np.radians(degrees))
+    pose = np.eye(4)
+    pose[:3, :3] = [[1, 0, 0], [0, -s, c], [0, -c, -s]]
+    pose[:3, 3] = eye
+    return pose
+
+
+def cast(mesh: trimesh.Trimesh, rays, rotation, eye) -> tuple[np.ndarray, np.ndarray]:
+    """Depth (0: nothing) and triangle (−1: none) of rays [n 3] of depth 1 in the camera's axes."""
+    start = np.broadcast_to(eye, rays.shape)
+    hit, ray, face = mesh.ray.intersects_location(start, rays @ rotation.T, multiple_hits=False)
+    depth, faces = np.zeros(len(rays)), np.full(len(rays), -1)
+    depth[ray], faces[ray] = (hit - eye) @ rotation[:, 2], face
+    return depth, faces
+
+
+def photograph(
+    mesh: trimesh.Trimesh, pose: np.ndarray, matrix=MATRIX, shape=(HEIGHT, WIDTH)
+) -> tuple[np.ndarray, np.ndarray]:
     """Depth along the axis in metres (0: nothing) and the index of the triangle (−1: none)."""
-    v, u = np.mgrid[:HEIGHT, :WIDTH].reshape(2, -1)
-    rays = np.stack([u, v, np.ones(len(u))], axis=1) @ np.linalg.inv(MATRIX).T
-    start = np.broadcast_to(pose[:3, 3], rays.shape)
-    hit, ray, face = mesh.ray.intersects_location(start, rays @ pose[:3, :3].T, multiple_hits=False)
-    depth = np.zeros(len(u))
-    faces = np.full(len(u), -1)
-    depth[ray] = (hit - pose[:3, 3]) @ pose[:3, 2]
-    faces[ray] = face if len(face) else -1
-    return depth.reshape(HEIGHT, WIDTH), faces.reshape(HEIGHT, WIDTH)
+    v, u = np.indices(shape).reshape(2, -1)
+    rays = np.stack([u, v, np.ones(len(u))], axis=1) @ np.linalg.inv(matrix).T
+    depth, faces = cast(mesh, rays, pose[:3, :3], pose[:3, 3])
+    return depth.reshape(shape), faces.reshape(shape)
 
 
 def write_png(path, image) -> None:

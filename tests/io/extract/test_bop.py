@@ -14,25 +14,13 @@ from qs3.geometry import rotation_z
 from qs3.io.extract.bop import class_of, is_bop, list_bop_frames
 from qs3.io.extract.depth import DepthImageSettings, cut_frame
 from qs3.meshes import sample_surface
-from qs3.sensor.depth import DepthSettings
 from qs3.sensor.frames import write_frames
-from qs3.sensor.matching import MatchingSettings
-from qs3.sensor.presets import Sensor
 from qs3.sensor.render.mitsuba import MitsubaRenderer
-from qs3.sensor.rig import StereoRig
 from qs3.sensor.scan import scan
-from qs3.sensor.speckle import PatternSettings
-from qs3.sensor.views import Placement
 
+from ...sensors import METRIC
 from ..hostile import fuzz, refused
-from .depth_scene import (
-    MATRIX,
-    camera_to_world,
-    off_surface,
-    photograph,
-    thing,
-    write_png,
-)
+from .depth_scene import MATRIX, camera_to_world, off_surface, photograph, thing, write_png
 
 PLACE = np.eye(4)
 PLACE[:3, :3] = rotation_z(0.7)
@@ -121,17 +109,6 @@ def test_a_folder_of_scenes_is_all_its_scenes(scene, tmp_path):
     ]  # fmt: skip
 
 
-METRIC = Sensor(
-    name="metric",
-    rig=StereoRig(width=320, height=240, focal=336.0, baseline=0.09),
-    pattern=PatternSettings(columns=177, rows=138),
-    matching=MatchingSettings(num_disparities=64, block_size=11),
-    depth=DepthSettings(near=0.3, far=3.0, stride=1),
-    placement=Placement(radius=(1.0, 1.2)),
-    object_size=0.5,
-)
-
-
 @pytest.fixture(scope="module")
 def scanned(tmp_path_factory):
     made = scan(
@@ -163,7 +140,7 @@ def test_convention_our_own_frames_lie_on_the_mesh_again(scanned):
         dense = cKDTree(sample_surface(surface, 50_000, np.random.default_rng(0)))
         for cloud, statistics in zip(clouds(folder, frame=frame), made.views, strict=True):
             assert len(cloud.points) > 1000
-            sigma = 1.1**2 * statistics.disparity_sigma / (336 * 0.09)
+            sigma = 1.1**2 * statistics.disparity_sigma / (METRIC.rig.focal * METRIC.rig.baseline)
             assert np.median(dense.query(cloud.points)[0]) < 1.5 * sigma + 0.001
 
 

@@ -16,7 +16,7 @@ from qs3.io.extract.run import OutputSettings
 from qs3.io.guards import LIMIT
 
 from ..hostile import fuzz, refused
-from .depth_scene import box, off_surface, thing
+from .depth_scene import box, cast, off_surface, thing
 
 WORDS = ["wall", "floor", "sofa chair", "night stand", "light", "picture"]
 WALL, FLOOR, CHAIR, STAND, LIGHT, _ = range(1, 7)
@@ -46,16 +46,12 @@ def photograph(parts, rotation):
     ``parts`` are mesh, label and instance.
     """
     mesh = trimesh.util.concatenate([part[0] for part in parts])
-    owner = np.repeat(np.arange(len(parts)), [len(part[0].faces) for part in parts])
+    numbers = [part[1:] for part in parts for _ in part[0].faces]
     column, row = np.meshgrid(np.arange(1, 641), np.arange(1, 481))
     x3, y3 = (column - 325.58244941119034) / 518.8579, (row - 253.73616334) / 519.46961
     rays = np.stack([x3, y3, np.ones(x3.shape)], axis=-1).reshape(-1, 3)
-    start = np.broadcast_to(EYE, rays.shape)
-    hit, ray, face = mesh.ray.intersects_location(start, rays @ rotation.T, multiple_hits=False)
-    depth, labels, instances = np.zeros(len(rays)), np.zeros(len(rays)), np.zeros(len(rays))
-    depth[ray] = (hit - EYE) @ rotation[:, 2]
-    labels[ray] = np.array([part[1] for part in parts])[owner[face]]
-    instances[ray] = np.array([part[2] for part in parts])[owner[face]]
+    depth, face = cast(mesh, rays, rotation, EYE)
+    labels, instances = np.array([*numbers, (0, 0)])[face].T  # −1 is no face
     return [image.reshape(480, 640) for image in (depth, labels, instances)]
 
 

@@ -95,9 +95,8 @@ def test_far_points_raw_depth_margins_and_small_objects(root):
 
 def test_classes_are_renamed_or_left_out_and_splits_read(root):
     frames = list_sunrgbd(root, splits=root / "allsplit.mat", rename=rename_to(None))
-    assert [[item.class_name for item in f.objects] for f in frames] == [
-        ["sofa_chair", "toilet"]
-    ] * 2
+    named = [[item.class_name for item in frame.objects] for frame in frames]
+    assert named == [["sofa_chair", "toilet"]] * 2
     assert [frame.split for frame in frames] == ["train", "test"]
     assert {cloud.split for cloud in clouds(frames)} == {"train", "test"}
     with pytest.raises(InputError, match="no frame"):
@@ -238,14 +237,5 @@ def test_mutated_lists_of_boxes_are_read_or_refused(root, bare, tmp_path, rng):
         if rng.random() < 0.2:
             clouds(frames)
 
-    fuzz(
-        [
-            boxes,
-            frame / "annotation3Dfinal" / "index.json",
-            frame / "extrinsics" / "20150101.txt",
-            frame / "intrinsics.txt",
-        ],
-        read,
-        rng,
-        120,
-    )
+    own = ("annotation3Dfinal/index.json", "extrinsics/20150101.txt", "intrinsics.txt")
+    fuzz([boxes, *(frame / name for name in own)], read, rng, 120)

@@ -18,20 +18,21 @@ from qs3.meshes.classes import POINTDA10
 from qs3.store.manifest import open_dataset
 
 from ..hostile import refused
+from .common import content, make_clouds
 
 PLAIN = ("store", "ply", "specklenet10")
 
 
 @pytest.fixture
-def source(rng, tmp_path, formats):
+def source(rng, tmp_path):
     """A tree of text files with all ten classes and both splits, 2,048 points a cloud."""
-    clouds = formats.make_clouds(rng, num_points=2048)
+    clouds = make_clouds(rng, num_points=2048)
     write_folder(tmp_path / "source", clouds, ".npy")
     return tmp_path / "source"
 
 
 @pytest.mark.parametrize("to", PLAIN)
-def test_a_round_trip_keeps_points_labels_classes_and_splits(tmp_path, source, formats, to):
+def test_a_round_trip_keeps_points_labels_classes_and_splits(tmp_path, source, to):
     written = convert(source, tmp_path / "other", to)
     assert len(written.ids) == 20
     convert(tmp_path / "other", tmp_path / "back", "npy")
@@ -40,8 +41,8 @@ def test_a_round_trip_keeps_points_labels_classes_and_splits(tmp_path, source, f
     first, _ = read_clouds(source)
     assert origin == to
     assert other.class_names == back.class_names == POINTDA10
-    assert formats.content(other) == formats.content(first)
-    assert formats.content(back) == formats.content(first)
+    assert content(other) == content(first)
+    assert content(back) == content(first)
     # Names survive as well, whatever lies between.
     assert sorted(back.ids) == sorted(first.ids)
 
@@ -70,8 +71,8 @@ def test_clouds_without_labels_go_into_folders_only(rng, tmp_path):
     assert not (tmp_path / "c").exists()
 
 
-def test_classes_are_mapped_dropped_or_named(rng, tmp_path, formats):
-    clouds = formats.make_clouds(rng, ("desk", "night_stand", "toilet"), num_points=8)
+def test_classes_are_mapped_dropped_or_named(rng, tmp_path):
+    clouds = make_clouds(rng, ("desk", "night_stand", "toilet"), num_points=8)
     write_folder(tmp_path / "a", clouds, ".npy")
     with pytest.raises(InputError, match=r"class 'toilet' is none of.*--unmapped drop"):
         convert(tmp_path / "a", tmp_path / "b", "npy", classes=POINTDA10)

@@ -12,6 +12,7 @@ from qs3.io.layouts.hdf5 import hdf5_bytes, read_file
 from qs3.io.layouts.hdf5_sets import list_parts, read_parts
 
 from ..hostile import fuzz, refused
+from .common import hard_floats
 
 FILES = r"(train|test)_(\d+)\.h5"
 
@@ -66,12 +67,8 @@ def test_equal_arrays_give_equal_bytes_at_any_time(arrays):
     assert hdf5_bytes(arrays) == first
 
 
-def missing_data(file, arrays, folder):
-    del file["data"]
-
-
-def missing_label(file, arrays, folder):
-    del file["label"]
+def missing(name):
+    return lambda file, *_: file.pop(name)
 
 
 def replace(name, **options):
@@ -143,8 +140,8 @@ def point(value, kind="<f4"):
 
 
 HOSTILE = {
-    "missing data": (missing_data, "has no dataset 'data', only 'label'"),
-    "missing label": (missing_label, "has no dataset 'label', only 'data'"),
+    "missing data": (missing("data"), "has no dataset 'data', only 'label'"),
+    "missing label": (missing("label"), "has no dataset 'label', only 'data'"),
     "two axes": (replace("data", data=np.ones((6, 8))), r"shape \[b n 3 or 6\], not float64"),
     "four columns": (replace("data", data=np.ones((6, 8, 4))), r"of shape \[6, 8, 4\]"),
     "whole numbers": (replace("data", data=np.ones((6, 8, 3), int)), "must be floats"),
@@ -286,7 +283,7 @@ def test_convention_y_up_turns_to_z_up_and_back():
     np.testing.assert_array_equal(z_up_to_y_up(turned), np.eye(3))
 
 
-def test_turning_rounds_nothing(rng, formats):
-    cloud = formats.hard_floats(rng, 500)
+def test_turning_rounds_nothing(rng):
+    cloud = hard_floats(rng, 500)
     assert y_up_to_z_up(z_up_to_y_up(cloud)).tobytes() == cloud.tobytes()
     assert z_up_to_y_up(y_up_to_z_up(cloud)).tobytes() == cloud.tobytes()

@@ -9,6 +9,8 @@ from qs3.io.layouts import FORMATS, modelnet, scanobjectnn, trees
 from qs3.io.load import detect
 from qs3.meshes.classes import POINTDA10
 
+from .common import content, make_clouds
+
 WRITTEN = [layout for layout in FORMATS.values() if layout.write is not None]
 CLASSES = {
     "modelnet40-h5": modelnet.CLASSES,
@@ -25,20 +27,18 @@ def files(root):
 
 
 @pytest.fixture
-def clouds(rng, formats, layout):
+def clouds(rng, layout):
     classes = CLASSES.get(layout.name, POINTDA10)
-    return formats.make_clouds(rng, classes, num_points=POINTS.get(layout.name, 16))
+    return make_clouds(rng, classes, num_points=POINTS.get(layout.name, 16))
 
 
 @pytest.mark.parametrize("layout", WRITTEN, ids=lambda layout: layout.name)
-def test_what_is_written_reads_back_equal_and_again_gives_equal_bytes(
-    tmp_path, formats, layout, clouds
-):
+def test_what_is_written_reads_back_equal_and_again_gives_equal_bytes(tmp_path, layout, clouds):
     for run in ("a", "b"):
         layout.write(tmp_path / run, clouds)
     assert files(tmp_path / "a") == files(tmp_path / "b")
     back = layout.read(tmp_path / "a", None)
-    assert formats.content(back) == formats.content(clouds)
+    assert content(back) == content(clouds)
     assert set(back.class_names) == set(clouds.class_names)
     test = layout.read(tmp_path / "a", "test")
     assert set(test.splits) == {"test"}

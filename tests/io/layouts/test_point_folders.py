@@ -15,6 +15,7 @@ from qs3.io.load import load_unlabelled
 from qs3.io.point_files import WRITTEN_FILES, cloud_bytes, read_cloud
 
 from ..hostile import fuzz
+from .common import content, hard_floats, make_clouds
 
 
 def unlabelled(clouds, splits=()):
@@ -42,11 +43,11 @@ def independent(path):
 
 @pytest.mark.parametrize("ending", WRITTEN_FILES)
 @pytest.mark.parametrize("splits", [("train", "test"), ("",), ("", "test")])
-def test_what_is_written_reads_back_equal(rng, tmp_path, formats, ending, splits):
-    clouds = formats.make_clouds(rng, ("Night Stand", "Stühle 1", "bed"), 50, 3, splits)
+def test_what_is_written_reads_back_equal(rng, tmp_path, ending, splits):
+    clouds = make_clouds(rng, ("Night Stand", "Stühle 1", "bed"), 50, 3, splits)
     write_folder(tmp_path / "set", clouds, ending)
     back = read_folder(tmp_path / "set")
-    assert formats.content(back) == formats.content(clouds)
+    assert content(back) == content(clouds)
     assert back.class_names == ("Night Stand", "Stühle 1", "bed")
     if "test" in splits:
         test = read_folder(tmp_path / "set", "test")
@@ -55,8 +56,8 @@ def test_what_is_written_reads_back_equal(rng, tmp_path, formats, ending, splits
 
 
 @pytest.mark.parametrize("ending", WRITTEN_FILES)
-def test_a_file_reads_equal_by_other_readers(rng, tmp_path, formats, ending):
-    points = formats.hard_floats(rng, 500)
+def test_a_file_reads_equal_by_other_readers(rng, tmp_path, ending):
+    points = hard_floats(rng, 500)
     path = tmp_path / f"a{ending}"
     path.write_bytes(cloud_bytes(points, ending))
     # Bits, so that the sign of zero counts.

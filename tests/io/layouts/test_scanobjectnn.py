@@ -5,14 +5,11 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.io.layouts.scanobjectnn import (
-    CLASSES,
-    FORMAT,
-    read_scanobjectnn,
-    write_scanobjectnn,
-)
+from qs3.io.layouts.scanobjectnn import CLASSES, FORMAT, read_scanobjectnn, write_scanobjectnn
 from qs3.io.load import detect, load_clouds
 from qs3.meshes.classes import POINTDA10
+
+from .common import content, make_clouds
 
 
 def release(folder, rng, variant="", labels=range(15)):
@@ -90,8 +87,8 @@ def test_convention_the_files_are_y_up_and_are_turned_z_up(tmp_path):
         np.testing.assert_array_equal(file["data"][:], chair)
 
 
-def test_what_is_written_is_read_by_the_published_description(tmp_path, rng, formats):
-    given = formats.make_clouds(rng, (*CLASSES[1:], CLASSES[0]), num_points=16, per_part=2)
+def test_what_is_written_is_read_by_the_published_description(tmp_path, rng):
+    given = make_clouds(rng, (*CLASSES[1:], CLASSES[0]), num_points=16, per_part=2)
     write_scanobjectnn(tmp_path / "a", given)
     rows = []
     for part, name in (("train", "training"), ("test", "test")):
@@ -102,21 +99,21 @@ def test_what_is_written_is_read_by_the_published_description(tmp_path, rng, for
         assert label.shape == (30,)
         for cloud, row in zip(turned(data), label, strict=True):
             rows.append((CLASSES[row], part, np.ascontiguousarray(cloud).tobytes()))
-    assert sorted(rows) == formats.content(given)
+    assert sorted(rows) == content(given)
 
 
-def test_aliases_map_and_other_classes_are_named(tmp_path, rng, formats):
-    given = formats.make_clouds(rng, ("night_stand", "monitor", "bookshelf"), num_points=4)
+def test_aliases_map_and_other_classes_are_named(tmp_path, rng):
+    given = make_clouds(rng, ("night_stand", "monitor", "bookshelf"), num_points=4)
     write_scanobjectnn(tmp_path / "a", given)
     back = read_scanobjectnn(tmp_path / "a")
     assert sorted({CLASSES[i] for i in back.labels}) == ["cabinet", "display", "shelf"]
     with pytest.raises(InputError, match="class 'bathtub', 'lamp', 'plant' is none of: bag, bin"):
-        write_scanobjectnn(tmp_path / "b", formats.make_clouds(rng, POINTDA10, num_points=4))
+        write_scanobjectnn(tmp_path / "b", make_clouds(rng, POINTDA10, num_points=4))
     assert not (tmp_path / "b").exists()
 
 
-def test_one_split_gives_one_file_and_sizes_become_one(tmp_path, rng, formats):
-    given = formats.make_clouds(rng, ("bed", "sofa"), splits=("test",), num_points=4)
+def test_one_split_gives_one_file_and_sizes_become_one(tmp_path, rng):
+    given = make_clouds(rng, ("bed", "sofa"), splits=("test",), num_points=4)
     ragged = [rng.random((count, 3)).astype(np.float32) for count in (3, 2050)]
     write_scanobjectnn(tmp_path / "a", dataclasses.replace(given, clouds=ragged))
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["test_objectdataset.h5"]

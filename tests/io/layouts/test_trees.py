@@ -52,13 +52,6 @@ def test_convention_both_trees_are_z_up_on_disk_and_stay_so(tmp_path):
         assert points[:, 2].min() == 0
 
 
-def test_specklenet_has_2048_points(rng, tmp_path, formats):
-    few = formats.make_clouds(rng, num_points=8)
-    with pytest.raises(InputError, match="has 8 points, and this layout has 2048; add --num"):
-        SPECKLE.write(tmp_path / "set", few)
-    DEPTH.write(tmp_path / "set", few)
-
-
 def test_a_tree_of_another_kind_is_refused(tmp_path):
     root = released_tree(tmp_path / "a", classes=("chair", "toilet"))
     with pytest.raises(InputError, match=r"a: class 'toilet' is none of"):

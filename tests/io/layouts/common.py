@@ -1,7 +1,6 @@
 """Clouds to write and read back."""
 
 import numpy as np
-import pytest
 
 from qs3.io.clouds import RaggedClouds
 from qs3.meshes.classes import POINTDA10
@@ -42,11 +41,3 @@ def content(clouds):
     splits = clouds.splits or ("",) * len(names)
     points = [np.asarray(cloud, dtype="<f4").tobytes() for cloud in clouds.clouds]
     return sorted(zip(names, splits, points, strict=True))
-
-
-@pytest.fixture
-def formats():
-    """The helpers of this file."""
-    import types
-
-    return types.SimpleNamespace(make_clouds=make_clouds, hard_floats=hard_floats, content=content)
