@@ -1,6 +1,7 @@
 """Trees of ModelNet, of ShapeNet and of one's own; PointDA-10's ten classes in each."""
 
 import contextlib
+import itertools
 import os
 from pathlib import Path
 
@@ -247,6 +248,19 @@ def test_links_are_followed_and_circles_are_left(tree, tmp_path: Path) -> None:
     assert [item.id for item in collect(root)] == ["chair/a", "chair/c", "table/b"]
     (root / "table/lost.off").symlink_to(root / "nowhere.off")
     with pytest.raises(InputError, match=r"lost.off: a link that leads to no file"):
+        collect(root)
+
+
+def test_links_that_multiply_are_refused(tree, tmp_path: Path, monkeypatch) -> None:
+    root = tree("chair/a.off")
+    folders = [tmp_path / "far" / str(number) for number in range(24)]
+    for folder in folders:
+        folder.mkdir(parents=True)
+    for folder, further in itertools.pairwise([root / "chair", *folders]):
+        for name in "ab":
+            (folder / name).symlink_to(further)
+    monkeypatch.setattr("qs3.meshes.walking._MOST_LINKED", 1000)
+    with pytest.raises(InputError, match="links lead to more than 1000 folders"):
         collect(root)
 
 

@@ -10,6 +10,10 @@ from qs3.errors import InputError
 from qs3.meshes.loading import EXTENSIONS
 
 
+_MOST_LINKED = 100_000
+"""Folders that links may lead to: links that lead to one another multiply."""
+
+
 class MeshFile(NamedTuple):
     """A mesh found below a root."""
 
@@ -41,15 +45,22 @@ def walk(
     there are of each ending.
 
     Raises:
-        InputError: where a folder cannot be read, or a link that is named like a mesh leads
-            nowhere (a disk that is not there, say).
+        InputError: where a folder cannot be read, a link that is named like a mesh leads nowhere
+            (a disk that is not there, say), or links lead to one folder after another without end.
     """
     meshes: list[MeshFile] = []
+    linked_folders = 0
     # Of each folder still to be listed: its path below the root with a closing slash, whether a
     # link leads there, and the real paths from the root down to it, in which a circle shows.
     left: list[tuple[str, bool, tuple[str, ...]]] = [("", False, (os.path.realpath(root),))]
     while left:
         prefix, linked, above = left.pop()
+        linked_folders += linked
+        if linked_folders > _MOST_LINKED:
+            raise InputError(
+                f"{root}: links lead to more than {_MOST_LINKED} folders; name the folder of the "
+                "meshes itself"
+            )
         for entry in entries(root / prefix if prefix else root):
             if not prefix and entry.name in skip:
                 continue
