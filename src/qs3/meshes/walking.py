@@ -9,7 +9,6 @@ from typing import NamedTuple
 from qs3.errors import InputError
 from qs3.meshes.loading import EXTENSIONS
 
-
 _MOST_LINKED = 100_000
 """Folders that links may lead to: links that lead to one another multiply."""
 
