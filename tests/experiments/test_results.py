@@ -150,6 +150,29 @@ def test_what_docs_say_of_views_is_what_was_measured():
     assert text + f"{surfaces} as surfaces" in " ".join(page.split())
 
 
+def test_readme_says_of_views_and_rounds_what_was_measured():
+    def mean(folder: str, names: str) -> float:
+        paths = sorted((ROOT / "results" / folder).glob(names))
+        assert len(paths) == 3
+        return 100 * fmean(read_record(path).scores.accuracy for path in paths)
+
+    def rounds(row: str) -> float:
+        return mean("laptop/results", f"S-D_{row}_seed-*.json") - five
+
+    one = mean("laptop/results", "V1-D_ordinary_seed-*.json")
+    five = mean("laptop/results", "S-D_ordinary_seed-*.json")
+    real = [mean("views-on-real", f"{source}_seed-*.json") for source in ("V1", "S")]
+    gains = [rounds(row) for row in ("spst", "qbst-gentle", "qbst-paper")]
+    page = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+    for text in (
+        f"({one:.1f} against {five:.1f} % on simulated Kinect views, ",
+        f"{real[0]:.1f} against {real[1]:.1f} % on real ones)",
+        f"SPST adds {gains[0]:.1f} points, gentle rounds {gains[1]:.1f}, and QBST",
+        f"loses {-gains[2]:.1f}, as its pool",
+    ):
+        assert text in page, text
+
+
 def test_real_tables_and_their_page_are_what_the_records_say(monkeypatch):
     folder = ROOT / "results" / "real"
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
