@@ -144,10 +144,12 @@ def former_records(samples: int, seed: int) -> list[Record]:
     for name in ("d415", "d435", "d455", "kinect-v1"):
         bench = Bench(former(name), renderer, seed)
         tests = {test: run_test(test, bench) for test in LAWS if test != "T11"}
-        tests["T11"] = {"id": "T11", "rows": unbounded(bench), "seconds": 0.0}
+        start = time.perf_counter()
+        tests["T11"] = {"id": "T11", "rows": unbounded(bench)}
         if name != "kinect-v1":
             tests["T5"]["rows"] += spills(bench)
             tests["T6"]["rows"].append(dim(bench))
+        tests["T11"]["seconds"] = time.perf_counter() - start
         for test in tests.values():
             verdicts = [one["passed"] for one in test["rows"] if one["passed"] is not None]
             test["passed"] = all(verdicts) if verdicts else None

@@ -44,12 +44,12 @@ def make_clouds(
     return PointClouds(xyz.astype(np.float32), labels, tuple(names), ids)
 
 
-def stop_after(epoch):
-    """A callback that ends a training after an epoch."""
+def stop_after(epoch, error: type[BaseException] = Stop):
+    """A callback that ends a training after an epoch, as Ctrl-C would with `KeyboardInterrupt`."""
 
     def callback(record, method):
         if record.epoch == epoch:
-            raise Stop
+            raise error
 
     return callback
 

@@ -10,7 +10,7 @@ from qs3.adaptation import SourceOnly
 from qs3.training.checkpoint import new_model
 from qs3.training.loop import plateau, train
 
-from .common import Stop, same, stop_after
+from .common import same, stop_after
 
 
 def test_plateau_is_pytorchs():
@@ -44,8 +44,8 @@ def test_training_follows_it_and_resumes_bit_exactly(source, settings, tmp_path)
         return history, method.model
 
     history, whole = run(tmp_path / "whole")
-    with pytest.raises(Stop):
-        run(tmp_path / "stopped", stop_after(50))
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "stopped", stop_after(50, KeyboardInterrupt))
     again, resumed = run(tmp_path / "stopped", seed=9)
     losses = [sum(record.losses.values()) for record in history]
     expected = [plateau(losses[:epoch], 1.0) for epoch in range(60)]

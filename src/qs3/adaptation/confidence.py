@@ -53,7 +53,15 @@ def energy(logits: Float[np.ndarray, "b k"]) -> Float[np.ndarray, "b"]:
 
 
 def measure_known(logits: Float[np.ndarray, "v k"], labels: Int[np.ndarray, "v"]) -> Known:
-    """Return what held-out clouds of the source, which must not be none, tell of a network."""
+    """Return what held-out clouds of the source tell of a network.
+
+    Args:
+        logits: Its answers to clouds that it was not trained on.
+        labels: Their classes.
+
+    Raises:
+        InputError: where there is no cloud.
+    """
     temperature = fit_temperature(softmax(logits, axis=1), labels)
     quantiles = np.quantile(energy(logits), _LEVELS).round(5)
     return Known(round(temperature, 5), tuple(quantiles.tolist()), len(labels))

@@ -41,6 +41,10 @@ class _Reverse(torch.autograd.Function):
 def reversal_coefficient(progress: float, gamma: float = 10.0) -> float:
     """Return λ = 2 / (1 + exp(−γ p)) − 1, from 0 at the start to nearly 1 (JMLR 2016, §5.2.2).
 
+    Args:
+        progress: p, the share of the training that is done.
+        gamma: γ, how fast λ rises.
+
     Example:
         >>> [round(reversal_coefficient(p), 3) for p in (0.0, 0.1, 0.5, 1.0)]
         [0.0, 0.462, 0.987, 1.0]

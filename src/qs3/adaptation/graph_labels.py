@@ -76,6 +76,13 @@ def neighbour_graph(features: Float[np.ndarray, "m c"], k: int = 10) -> sparse.c
     their features; where it is not positive there is no link. Memory is bounded: similarities are
     held for a block of rows at a time.
 
+    Args:
+        features: One row a cloud.
+        k: Neighbours of each.
+
+    Raises:
+        InputError: where features are not finite or k is not at least 1.
+
     Example:
         >>> neighbour_graph(np.array([[1.0, 0.0], [2.0, 0.0], [0.0, 1.0]]), 1).toarray().tolist()
         [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]

@@ -29,6 +29,7 @@ def mmd(
     k(u, v) = Σ_σ exp(−|u − v|² / 2σ²), and MMD² = mean k(x, x') + mean k(y, y') − 2 mean k(x, y)
     (Gretton et al., JMLR 2012: eq. 5 biased, eq. 3 unbiased).
 
+    ``bandwidths`` are σ of each kernel, in the unit of the features.
     In the biased estimate a row's pair with itself counts, and the value is never negative; the
     expectation of the other is 0 for samples of one distribution.
 

@@ -3,9 +3,6 @@
 Convention:
     Probabilities are [m k]: m unlabelled clouds, k classes, rows summing to 1. The pseudo label of
     a cloud is its most probable class, the first one at ties; its confidence is that probability.
-    A rule takes probabilities, a threshold θ of 0 to 1 and whether a confidence equal to θ is
-    enough (``inclusive``). It raises InputError where rows are not probabilities or a setting is
-    unusable.
 """
 
 import warnings
@@ -30,6 +27,14 @@ def select_confident(
     """Select the clouds whose confidence exceeds a threshold (Algorithm 1, line 4).
 
     NOTE: the algorithm as printed compares the index of the class, a slip for its probability.
+
+    Args:
+        probabilities: Class probabilities.
+        threshold: θ, in 0 to 1.
+        inclusive: Whether a confidence equal to θ is enough.
+
+    Raises:
+        InputError: where rows are not probabilities or θ is not in 0 to 1.
 
     Example:
         >>> select_confident(np.array([[0.9, 0.1], [0.3, 0.7]]), 0.8).tolist()
@@ -62,6 +67,9 @@ def select_quasi_balanced(
         inclusive: Whether a confidence equal to θ is enough.
         single_class: Where all L clouds have one class, μ = 0 and the algorithm selects nothing;
             ``keep`` selects all of them and warns, ``drop`` follows the algorithm.
+
+    Raises:
+        InputError: where rows are not probabilities, or a setting is unusable.
 
     Warns:
         SingleClassWarning: where ``keep`` applies.
@@ -102,8 +110,16 @@ def select_uniform(
 
     Of each class at most q are kept, q the given quantile (rounded down to a count that occurs) of
     the numbers of confident clouds in the classes that have any. At quantile 0 it is the smallest,
-    and all these classes keep the same number; above, rarer classes keep all that they have, and
-    at 1 every confident cloud is kept.
+    and all these classes keep the same number; above, rarer classes keep all that they have.
+
+    Args:
+        probabilities: Class probabilities.
+        threshold: θ, in 0 to 1.
+        quantile: 0 to 1; 1 keeps every confident cloud.
+        inclusive: Whether a confidence equal to θ is enough.
+
+    Raises:
+        InputError: where rows are not probabilities, or a setting is not in 0 to 1.
 
     Example:
         >>> p = np.array([0.9, 0.95, 0.85, 0.1])
@@ -131,9 +147,18 @@ def select_prior(
     Of the classes with a positive prior π_k and L_k > 0 confident clouds, the ratios L_k / π_k
     bound the size of a selection that follows the prior; with T their given quantile,
     ⌈T π_k⌉ clouds of class k are kept, or all L_k where there are fewer. Classes of prior 0 keep
-    none. At quantile 0 the counts follow the prior, up to rounding; above, classes that the
-    threshold has left too rare keep all that they have and the others more. The prior is divided
-    by its sum.
+    none.
+
+    Args:
+        probabilities: Class probabilities.
+        threshold: θ, in 0 to 1.
+        prior: Share of each class; it is divided by its sum.
+        quantile: 0 to 1. At 0 the counts follow the prior, up to rounding; above, classes that the
+            threshold has left too rare keep all that they have and the others more.
+        inclusive: Whether a confidence equal to θ is enough.
+
+    Raises:
+        InputError: where rows are not probabilities, or a setting is unusable.
 
     Example:
         >>> p = np.array([0.9, 0.95, 0.85, 0.99, 0.1, 0.2])
@@ -165,11 +190,19 @@ def select_quantile(
 
     Of the N_k clouds with pseudo label k, confident or not, the ⌈share · N_k⌉ most confident are
     kept, so that each class has a threshold of its own; a threshold for all classes may come on
-    top, of which the authors have none (0). They begin with a share of 0.2 and add 0.05 a round,
-    to 0.5.
+    top, of which the authors have none (0).
 
     NOTE: the authors also divide the probabilities by the classes' thresholds before they label;
     here the labels stay as they are, since a rule only selects.
+
+    Args:
+        probabilities: Class probabilities.
+        threshold: θ, in 0 to 1.
+        share: Part of a class; the authors begin with 0.2 and add 0.05 a round, to 0.5.
+        inclusive: Whether a confidence equal to θ is enough.
+
+    Raises:
+        InputError: where rows are not probabilities, or a setting is not in 0 to 1.
 
     Example:
         >>> p = np.array([0.9, 0.6, 0.7, 0.45, 0.3])
@@ -191,6 +224,14 @@ def with_floor(
     Of a class with fewer than ``floor`` chosen clouds its most confident others come in, from
     below the threshold too, as far as there are clouds with that pseudo label. Nothing is taken
     away.
+
+    Args:
+        probabilities: Class probabilities.
+        chosen: What a rule selected of them.
+        floor: Least number of each class.
+
+    Raises:
+        InputError: where the floor is negative.
 
     Example:
         >>> p = np.array([0.9, 0.95, 0.6, 0.4, 0.3])

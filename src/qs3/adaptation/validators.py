@@ -2,8 +2,7 @@
 
 Convention:
     Higher is better, for every score. Probabilities are [m k], rows summing to 1; features are
-    [m c], as the network pools them. No function takes a label of the target. A score raises
-    InputError where there is no cloud, rows are not probabilities or a value is not finite.
+    [m c], as the network pools them. No function takes a label of the target.
 """
 
 from collections.abc import Callable, Mapping
@@ -44,6 +43,9 @@ def entropy(probabilities: Float[np.ndarray, "m k"]) -> float:
 
     It rewards a confident collapse to one class.
 
+    Raises:
+        InputError: where there is no cloud or rows are not probabilities.
+
     Example:
         >>> entropy(np.array([[1.0, 0.0], [0.0, 1.0]]))
         0.0
@@ -56,6 +58,9 @@ def information_maximisation(probabilities: Float[np.ndarray, "m k"]) -> float:
     """Return the information that predictions give on clouds, H(mean_i p_i) − mean_i H(p_i).
 
     From 0, also for a collapse to one class, to ln k. It expects classes of similar size.
+
+    Raises:
+        InputError: where there is no cloud or rows are not probabilities.
 
     Example:
         >>> round(information_maximisation(np.eye(4)), 4)
@@ -71,6 +76,9 @@ def bnm(probabilities: Float[np.ndarray, "m k"]) -> float:
 
     ‖P‖_* ≤ √min(m, k) ‖P‖_F ≤ √(min(m, k) m); it is divided by this bound, which predictions reach
     that are certain and spread evenly over the classes.
+
+    Raises:
+        InputError: where there is no cloud or rows are not probabilities.
 
     Example:
         >>> round(bnm(np.eye(3)), 12)
@@ -89,7 +97,12 @@ def snd(features: Float[np.ndarray, "m c"], temperature: float = 0.05) -> float:
     entropy of s_i. Memory is bounded: a block of rows is held at a time. A single cloud has no
     neighbour and scores 0.
 
-    Features are any description of the clouds; the authors take the softmax outputs.
+    Args:
+        features: Any description of the clouds; the authors take the softmax outputs.
+        temperature: T.
+
+    Raises:
+        InputError: where there is no cloud, a value is not finite or T is not positive.
 
     Example:
         >>> round(snd(np.ones((5, 3))), 6) == round(float(np.log(4)), 6)
@@ -143,6 +156,9 @@ def dev(
     NOTE: the domain classifier is logistic (`qs3.adaptation.density.density_ratio`), its penalty
     chosen on held-out clouds, where the authors train a network with one hidden layer. Where the
     domains hardly overlap in feature space no choice helps: the score varies much.
+
+    Raises:
+        InputError: where a set is empty, or a value is not finite.
     """
     _check(validation_probabilities)
     source = _checked(training_features, "training features")
@@ -168,6 +184,9 @@ def class_ami(
         k: Number of clusters: the number of classes.
         seed: Start of k-means.
 
+    Raises:
+        InputError: where there is no cloud, a value is not finite or k is not at least 1.
+
     Example:
         >>> points = np.array([[0.0], [0.1], [5.0], [5.1]])
         >>> round(class_ami(points, np.array([1, 1, 0, 0]), 2), 12)
@@ -189,6 +208,9 @@ def class_ami(
 
 def source_accuracy(probabilities: Float[np.ndarray, "v k"], labels: Int[np.ndarray, "v"]) -> float:
     """Return the accuracy on the held-out part of the source.
+
+    Raises:
+        InputError: where there is no cloud or rows are not probabilities.
 
     Example:
         >>> source_accuracy(np.eye(2), np.array([0, 0]))

@@ -68,6 +68,7 @@ def demo(
     """
     from qs3.cli.train import NO_ROUND
     from qs3.training.answers import list_clouds
+    from qs3.training.checkpoint import load_model
     from qs3.training.run import is_run
     from qs3.training.shipped import find_run, not_a_run
 
@@ -78,6 +79,7 @@ def demo(
     network = find_run(settings.network)
     if not is_run(network):  # a folder of this name, say, with something else in it
         raise InputError(f"{network}: {not_a_run()}")
+    load_model(network)  # what is wrong with it is told before anything is scanned
     folder = claim_folder(out, _MARKER)
     write_json(folder / _MARKER, dataclasses.asdict(settings))
     before = folder / "before"  # the records of its scores are written there

@@ -10,7 +10,7 @@ from qs3.errors import InputError
 from qs3.meshes.loading import EXTENSIONS
 
 _MOST_LINKED = 100_000
-"""Folders that links may lead to: links that lead to one another multiply."""
+"""Times that links may lead to a folder that was listed before: links between links multiply."""
 
 
 class MeshFile(NamedTuple):
@@ -48,17 +48,20 @@ def walk(
             (a disk that is not there, say), or links lead to one folder after another without end.
     """
     meshes: list[MeshFile] = []
-    linked_folders = 0
+    seen: set[str] = set()
+    again = 0
     # Of each folder still to be listed: its path below the root with a closing slash, whether a
     # link leads there, and the real paths from the root down to it, in which a circle shows.
     left: list[tuple[str, bool, tuple[str, ...]]] = [("", False, (os.path.realpath(root),))]
     while left:
         prefix, linked, above = left.pop()
-        linked_folders += linked
-        if linked_folders > _MOST_LINKED:
+        if linked:  # each folder of a large tree comes once; links between links bring it often
+            again += above[-1] in seen
+            seen.add(above[-1])
+        if again > _MOST_LINKED:
             raise InputError(
-                f"{root}: links lead to more than {_MOST_LINKED} folders; name the folder of the "
-                "meshes itself"
+                f"{root}: links lead to the same folders more than {_MOST_LINKED} times; name the "
+                "folder of the meshes itself"
             )
         for entry in entries(root / prefix if prefix else root):
             if not prefix and entry.name in skip:

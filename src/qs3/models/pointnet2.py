@@ -35,8 +35,12 @@ _MSG: tuple[tuple[Scale, ...], ...] = (
 class SetAbstraction(nn.Module):
     """Sample centres, group the points around each at one or more scales, describe the groups.
 
-    A cloud of fewer points than centres takes all of them. The descriptions of all scales are
-    concatenated. See `qs3.models.ops.ball_query` and `qs3.models.grouped.GroupedMLP`.
+    Args:
+        centres: Number of centres; a cloud of fewer points takes all of them.
+        channels: Width of the points' features; 0 where they have none.
+        scales: One or more, whose descriptions are concatenated.
+        ball_order: Which points a full ball keeps; see `qs3.models.ops.ball_query`.
+        features_first: See `qs3.models.grouped.GroupedMLP`.
     """
 
     def __init__(

@@ -68,7 +68,7 @@ def choices(kind: type) -> dict[str, tuple[Any, ...]]:
     found = {}
     for name, hint in get_type_hints(kind).items():
         union = get_origin(hint) in (Union, types.UnionType)
-        optional = union and type(None) in get_args(hint)
+        optional = union and set(get_args(hint)[1:]) == {type(None)}
         inner = get_args(hint)[0] if optional else hint
         if get_origin(inner) is Literal:
             found[name] = get_args(inner) + ((None,) if optional else ())

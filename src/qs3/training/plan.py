@@ -96,12 +96,12 @@ def describe_plan(
         counts = Counter(source.labels.tolist())
         each = ", ".join(f"{name} {counts[i]}" for i, name in enumerate(source.class_names))
         lines.append(f"source    {len(source)} clouds, {held} of them held out: {each}")
-        batches = count_batches(len(source) - held, settings.batch_size)
+        size, least = settings.batch_size, 2 * settings.devices
+        batches = count_batches(len(source) - held, size, least)
         if target is not None and method_class(method).uses_target:  # the longer pass counts
-            batches = max(batches, count_batches(len(target), settings.batch_size))
+            batches = max(batches, count_batches(max(len(target), least), size, least))
         if not warm_up:
             steps = settings.epochs * batches
-            size = settings.batch_size
             work = f"{settings.epochs} epochs of {batches} steps of {size} clouds: {steps}"
             lines.append(f"training  {method}, {work}")
     if target is not None:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from qs3.io.clouds import UnlabelledClouds, numbered
 from qs3.io.preparation import PAPER, Preparation
 from qs3.models import PointClassifier
+from qs3.models.classifier import evaluating
 from qs3.training.checkpoint import LoadedModel
 from qs3.training.prepared import Prepared, prepare_clouds, require_finite
 
@@ -104,12 +105,10 @@ def describe(
     """
     parameter = next(model.parameters())
     context = nullcontext if fabric is None else fabric.autocast
-    training = model.training
-    model.eval()
     rank, world = (0, 1) if fabric is None else (fabric.global_rank, fabric.world_size)
     mine = slice(rank * len(points) // world, (rank + 1) * len(points) // world)
     answers: list[np.ndarray] = []
-    try:
+    with evaluating(model):
         # A lone point tells the widths where this device has no cloud.
         example = torch.zeros(1, 1, 3).to(parameter)
         encoded = model.encode(example)
@@ -122,8 +121,6 @@ def describe(
             logits = logits.double()
             parts = (torch.softmax(logits, dim=1), encoded.pooled.double(), logits)
             answers.append(torch.cat(parts, dim=1).cpu().numpy())
-    finally:
-        model.train(training)
     rows = np.concatenate([np.zeros((0, 2 * classes + width)), *answers])
     if fabric is not None:
         from qs3.training.distributed import gather_rows  # slow to load, and for devices alone

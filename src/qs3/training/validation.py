@@ -17,6 +17,7 @@ from qs3.adaptation.validators import VALIDATORS, Observation, source_accuracy, 
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
+from qs3.models.classifier import evaluating
 from qs3.training.checkpoint import (
     load_tensors_into,
     read_facts,
@@ -156,22 +157,20 @@ def adapt_statistics(
         raise InputError("AdaBN needs clouds of the target")
     layers = [layer for layer in model.modules() if isinstance(layer, _BatchNorm)]
     momenta = [layer.momentum for layer in layers]
-    training = model.training
-    model.eval()
     parameter = next(model.parameters())
-    try:
-        for layer in layers:
-            layer.reset_running_stats()
-            layer.momentum = None  # a cumulative average
-            layer.train()
-        rows = np.arange(max(2, len(points))) % len(points)
-        count = max(1, len(rows) // max(2, batch_size))
-        for part in np.array_split(rows, count):
-            model(torch.from_numpy(points[part]).to(parameter.device, parameter.dtype))
-    finally:
-        for layer, momentum in zip(layers, momenta, strict=True):
-            layer.momentum = momentum
-        model.train(training)
+    with evaluating(model):
+        try:
+            for layer in layers:
+                layer.reset_running_stats()
+                layer.momentum = None  # a cumulative average
+                layer.train()
+            rows = np.arange(max(2, len(points))) % len(points)
+            count = max(1, len(rows) // max(2, batch_size))
+            for part in np.array_split(rows, count):
+                model(torch.from_numpy(points[part]).to(parameter.device, parameter.dtype))
+        finally:
+            for layer, momentum in zip(layers, momenta, strict=True):
+                layer.momentum = momentum
 
 
 def read_checkpoints(run_dir: Path, stage: str | None = None) -> list[Checkpoint]:

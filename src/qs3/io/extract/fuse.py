@@ -52,6 +52,13 @@ def subsample(
     In each voxel the point of the lowest key stays; of too many voxels those stay whose hash is
     lowest. Parts first and their union then gives what everything at once gives.
 
+    Args:
+        points: The cloud.
+        keys: Random number of each point.
+        voxel: Edge of a voxel, in the units of the points.
+        max_points: Largest size of the result.
+        seed: Seed of the voxels' hashes.
+
     Raises:
         InputError: where a point lies a million voxels from the origin.
 

@@ -49,6 +49,7 @@ def list_sunrgbd(
     the boxes; None looks for one at the root, above it and in the toolbox, then for the frames' own
     annotations. Frames in neither part of ``splits``, the toolbox's ``allsplit.mat``, are of none.
     """
+    root = Path(root)
     if not root.is_dir():
         raise InputError(f"{root}: no such folder")
     base = root / "SUNRGBD" if (root / "SUNRGBD").is_dir() else root

@@ -48,7 +48,7 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
         InputError: where the file is missing, damaged, announces more than it can hold, or holds
             other arrays.
     """
-    arrays = _read(path)
+    arrays = _read(path := Path(path))
     with naming(path):
         clouds = _clouds(arrays)
         count = len(clouds)

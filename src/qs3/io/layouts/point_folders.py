@@ -54,6 +54,7 @@ def read_folder(
         InputError: where the folder is missing, has no cloud or no such split, has clouds both
             beside and in class folders, or a file is bad; the file is named.
     """
+    root = Path(root)
     files = list_folder(root, endings)
     names = sorted({file.class_name for file in files})
     return read_files(root, choose_split(root, files, split), () if names == [""] else names)

@@ -43,6 +43,7 @@ _SPLITS = {"training": "train", "test": "test"}
 
 def read_scanobjectnn(path: Path, split: str | None = None) -> RaggedClouds:
     """Read one variant: a folder that holds its training file, test file or both; or one file."""
+    path = Path(path)
     files = _one_variant(path) if path.is_dir() else [path]
     parts = []
     for file in files:
