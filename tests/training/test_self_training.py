@@ -453,6 +453,11 @@ def test_remarks_on_what_went_wrong(domains, settings):
     ]
     fine = replace(one, single_class=False)
     assert remarks([fine], ROUNDS, "abc") == []
+    scratch, idle = replace(ROUNDS, init="scratch"), replace(records[1], kept=(0, 0, 0))
+    assert remarks([fine], scratch, "abc") == remarks([fine, idle], ROUNDS, "abc") == []
+    (line,) = remarks([replace(fine, steps=20), idle], scratch, "abc")
+    assert line.startswith("all rounds after round 1 were skipped: the network, which began with")
+    assert "in 20 steps from 9 of 30 clouds at most" in line
     (line,) = remarks([replace(fine, temperature=BOUNDS[0])], SWITCHES, "abc")
     assert "its bound, 0.25" in line
     assert "(--holdout)" in line

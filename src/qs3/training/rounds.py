@@ -242,9 +242,9 @@ def remarks(
 ) -> list[str]:
     """Say, a line each, what in the rounds was not as one would wish.
 
-    That is where none trained, with what to change; rounds whose confident clouds all had one
-    class; and a calibration that the held-out clouds do not bound. ``share`` is what the caller
-    calls ``threshold_share``.
+    That is where none trained, with what to change; where all were skipped after one that began
+    with fresh weights; rounds whose confident clouds all had one class; and a calibration that the
+    held-out clouds do not bound. ``share`` is what the caller calls ``threshold_share``.
     """
     lines = []
     if any(record.temperature == BOUNDS[0] for record in records):
@@ -271,6 +271,15 @@ def remarks(
             f"all {len(records)} rounds were skipped, as they kept {most} of {records[0].pool} "
             "clouds at most: the network is that of the warm-up; in another folder, "
             f"{setting} or begin with a better warm-up"
+        )
+    elif rounds.init == "scratch" and records and records[-1].skipped:
+        trained = [record for record in records if not record.skipped]
+        most, steps = max(sum(r.kept) for r in trained), sum(r.steps for r in trained)
+        lines.append(
+            f"all rounds after round {trained[-1].round} were skipped: the network, which began "
+            f"with fresh weights, has learnt in {steps} steps from {most} of {records[0].pool} "
+            "clouds at most; look at its scores, or keep the warm-up's weights "
+            "(--self-training.init warm-up)"
         )
     return lines
 
