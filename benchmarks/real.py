@@ -35,8 +35,9 @@ from qs3.training import evaluate, fit
 from qs3.training.config import (
     GENTLE,
     LIGHT,
+    PRESETS,
     Augmentation,
-    SelfTrainingSettings,
+    PresetName,
     TrainSettings,
     changed,
 )
@@ -53,6 +54,7 @@ class Cell:
 
     cloud: CloudChoice = "all"
     method: str = "source-only"
+    preset: PresetName = "default"
     network: str = "pointnet"
     steps: int = 4000
     preparation: Preparation = SIZED
@@ -64,6 +66,9 @@ class Cell:
 
 SEEN = replace(LIGHT, sight=1.0)
 ALL = Cell()
+SCANS = Cell(cloud="points")
+ROUNDS = replace(SCANS, method="qbst", warm_up="S again")
+CUT = replace(LIGHT, plane=0.75, plane_share=0.6)
 ROOMS = replace(ALL, preparation=replace(SIZED, align=True), augmentation=SEEN)
 GENTLY = replace(ROOMS, method="qbst", warm_up="rooms")
 DGCNN = replace(ALL, network="dgcnn", steps=2000)
@@ -71,7 +76,7 @@ CELLS: Mapping[str, Cell] = {
     # Sources, equal numbers of steps.
     "M": replace(ALL, cloud="surface"),
     "C": replace(ALL, cloud="clean"),
-    "S": replace(ALL, cloud="points"),
+    "S": SCANS,
     "S+C+M": ALL,
     # Adaptation, from the warm-up S+C+M of the same seed.
     "QBST": replace(ALL, method="qbst", warm_up="S+C+M"),
@@ -114,32 +119,45 @@ CELLS: Mapping[str, Cell] = {
     "rooms SPST": replace(ROOMS, method="spst", warm_up="rooms"),
     "rooms DGCNN": replace(ROOMS, network="dgcnn", steps=3000),
     # The recipe since the D435 and D455 stand in a lit room, and rooms of little depth are redrawn.
-    "S lit": replace(ALL, cloud="points"),
+    "S lit": SCANS,
     "S+C+M lit": ALL,
     "rooms lit": ROOMS,
-    # Switches of self-training, one at a time.
-    "QBST calibrated": replace(ALL, method="qbst", rounds={"calibrate": True}, warm_up="S+C+M"),
-    "QBST by share": replace(ALL, method="qbst", rounds={"threshold_share": 0.5}, warm_up="S+C+M"),
-    "QBST average": replace(ALL, method="qbst", rounds={"teacher": "average"}, warm_up="S+C+M"),
-    "QBST turns": replace(ALL, method="qbst", rounds={"turns": 8}, warm_up="S+C+M"),
-    "QBST floor": replace(ALL, method="qbst", rounds={"floor": 8}, warm_up="S+C+M"),
-    "QBST refined": replace(ALL, method="qbst", rounds={"refine": True}, warm_up="S+C+M"),
+    # Scans and trainings of S lit repeated on another machine: what follows is held against these.
+    "S again": SCANS,
+    # Presets of self-training from scans alone, then its switches, one at a time.
+    "S QBST paper": replace(ROUNDS, preset="paper"),
+    "S SPST": replace(ROUNDS, method="spst", preset="spst"),
+    "S QBST": ROUNDS,
+    "S QBST gentle": replace(ROUNDS, preset="gentle"),
+    "S QBST calibrated": replace(ROUNDS, rounds={"calibrate": True}),
+    "S QBST by share": replace(ROUNDS, rounds={"threshold_share": 0.5}),
+    "S QBST average": replace(ROUNDS, rounds={"teacher": "average"}),
+    "S QBST turns": replace(ROUNDS, rounds={"turns": 8}),
+    "S QBST floor": replace(ROUNDS, rounds={"floor": 8}),
+    "S QBST refined": replace(ROUNDS, rounds={"refine": True}),
     # The paper's network, one seed where three cost too much.
     "DGCNN M": replace(DGCNN, cloud="surface"),
     "DGCNN S": replace(DGCNN, cloud="points"),
     "DGCNN S+C+M": DGCNN,
     "DGCNN QBST": replace(DGCNN, method="qbst", warm_up="DGCNN S+C+M"),
-    # Ablations of the way into the network and of the augmentation, one at a time.
-    "no size": replace(ALL, preparation=ROBUST),
-    "strays kept": replace(ALL, preparation=replace(SIZED, remove_outliers=False)),
-    "unit ball": replace(ALL, preparation=replace(SIZED, radius_share=1.0)),
-    "same points": replace(ALL, preparation=replace(SIZED, redraw=False)),
-    "paper's way": replace(ALL, preparation=PAPER, augmentation=Augmentation()),
-    "aligned": replace(ALL, preparation=replace(SIZED, align=True)),
-    "sight": replace(ALL, augmentation=SEEN),
+    # Switches of the way into the network and of the augmentation, one at a time, on scans alone.
+    "no size": replace(SCANS, preparation=ROBUST),
+    "strays kept": replace(SCANS, preparation=replace(SIZED, remove_outliers=False)),
+    "unit ball": replace(SCANS, preparation=replace(SIZED, radius_share=1.0)),
+    "same points": replace(SCANS, preparation=replace(SIZED, redraw=False)),
+    "paper's way": replace(SCANS, preparation=PAPER, augmentation=Augmentation()),
+    "aligned": replace(SCANS, preparation=replace(SIZED, align=True)),
+    "sight": replace(SCANS, augmentation=SEEN),
+    "no augmentation": replace(SCANS, augmentation=Augmentation()),
+    "full augmentation": replace(SCANS, augmentation=Augmentation.scanned()),
+    "more cuts": replace(SCANS, augmentation=CUT),
+    "full QBST gentle": replace(
+        ROUNDS,
+        preset="gentle",
+        augmentation=Augmentation.scanned(),
+        warm_up="full augmentation",
+    ),
     "M sight": replace(ALL, cloud="surface", augmentation=SEEN),
-    "no augmentation": replace(ALL, augmentation=Augmentation()),
-    "full augmentation": replace(ALL, augmentation=Augmentation.scanned()),
 }
 
 
@@ -185,7 +203,7 @@ def make(options: argparse.Namespace, name: str, seed: int) -> None:
     needs = cell.method != "source-only"
     rounds = None
     if cell.rounds or cell.method in ("qbst", "spst"):
-        rounds = changed(SelfTrainingSettings(), {"rule": cell.method} | dict(cell.rounds))
+        rounds = changed(PRESETS[cell.preset], {"rule": cell.method} | dict(cell.rounds))
     run = options.out / f"{name}-{seed}"
     fit(
         cell.method,

@@ -43,14 +43,17 @@ PAIRS = (
     ("rooms QBST gentle, refined", "rooms"), ("rooms QBST gentle, more", "rooms"),
     ("rooms SPST", "rooms"), ("rooms QBST average", "rooms SPST"), ("rooms DGCNN", "rooms"),
     ("S lit", "S"), ("S lit", "M"), ("S+C+M lit", "S+C+M"), ("rooms lit", "rooms"),
-    ("rooms lit", "S lit"),
+    ("rooms lit", "S lit"), ("S again", "M"), ("S again", "S lit"),
+    ("S QBST paper", "S again"), ("S SPST", "S again"),
+    ("S QBST gentle", "S again"), ("S QBST paper", "S SPST"), ("S QBST gentle", "S SPST"),
+    ("full QBST gentle", "full augmentation"),
 )  # fmt: skip
 """First minus second."""
 SWITCHES = {
-    "QBST": ("QBST calibrated", "QBST by share", "QBST average", "QBST turns", "QBST floor",
-             "QBST refined"),
-    "S+C+M": ("no size", "strays kept", "unit ball", "same points", "paper's way",
-              "no augmentation", "full augmentation", "aligned", "sight"),
+    "S QBST": ("S QBST calibrated", "S QBST by share", "S QBST average", "S QBST turns",
+               "S QBST floor", "S QBST refined"),
+    "S again": ("no size", "strays kept", "unit ball", "same points", "paper's way",
+                "no augmentation", "full augmentation", "more cuts", "aligned", "sight"),
 }  # fmt: skip
 """Against what each switch is held."""
 TITLES = {
@@ -266,7 +269,9 @@ def filled(page: str, text: str) -> str:
     """Return a page of the documentation with its tables anew, out of what `tables` returned."""
     heads = {"short": SHORT, "scores": SCORES, "validators": VALIDATORS}
     starts = {name: f"{head}\n\n" for name, head in heads.items()}
-    for name, start in (starts | {"differences": "over both.\n\n"}).items():
+    for name, start in (
+        starts | {"differences": "over both.\n\n", "switches": "one at a time:\n\n"}
+    ).items():
         page = fill(page, name, text.partition(start)[2].partition("\n\n")[0])
     return page
 
