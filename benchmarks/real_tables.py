@@ -269,9 +269,8 @@ def filled(page: str, text: str) -> str:
     """Return a page of the documentation with its tables anew, out of what `tables` returned."""
     heads = {"short": SHORT, "scores": SCORES, "validators": VALIDATORS}
     starts = {name: f"{head}\n\n" for name, head in heads.items()}
-    for name, start in (
-        starts | {"differences": "over both.\n\n", "switches": "one at a time:\n\n"}
-    ).items():
+    starts |= {"differences": "over both.\n\n", "switches": "one at a time:\n\n"}
+    for name, start in starts.items():
         page = fill(page, name, text.partition(start)[2].partition("\n\n")[0])
     return page
 

@@ -53,19 +53,20 @@ def reason(error: Exception) -> str:
 
 
 @contextlib.contextmanager
-def naming(where: Any, fault: str = "") -> Iterator[None]:
+def naming(where: Any, fault: str = "", kind: type[Exception] = Exception) -> Iterator[None]:
     """Put a name before the `InputError` of a block, unless it stands there.
 
     Args:
         where: What is read.
-        fault: What any other exception is told as, with its reason: for libraries that raise
+        fault: What an exception of ``kind`` is told as, with its reason: for libraries that raise
             whatever they stumble over. Without it such an exception passes.
+        kind: What the library raises, where that is told apart from faults of our own.
     """
     try:
         yield
     except InputError as error:
         raise InputError(f"{where}: {str(error).removeprefix(f'{where}: ')}") from error
-    except Exception as error:
+    except kind as error:
         if not fault:
             raise
         raise InputError(f"{where}: {fault} ({reason(error)})") from error

@@ -45,7 +45,7 @@ def walk(
 
     Raises:
         InputError: where a folder cannot be read, a link that is named like a mesh leads nowhere
-            (a disk that is not there, say), or links lead to one folder after another without end.
+            (a disk that is not there, say), or links lead to the same folders again and again.
     """
     meshes: list[MeshFile] = []
     seen: set[str] = set()

@@ -19,10 +19,10 @@ def check_choices(settings: Any, room: str) -> None:
     Raises:
         InputError: where one has not.
     """
-    for name, known in choices(type(settings)).items():
+    for name, choices in choices_of(type(settings)).items():
         value = getattr(settings, name)
-        if value not in known:
-            offer = ", ".join(str(choice) for choice in known if choice is not None)
+        if value not in choices:
+            offer = ", ".join(str(choice) for choice in choices if choice is not None)
             raise InputError(f"{room}: no {name} {value!r}; choose one of {offer}")
 
 
@@ -63,13 +63,13 @@ def check_range(
 
 
 @functools.cache
-def choices(kind: type) -> dict[str, tuple[Any, ...]]:
+def choices_of(kind: type) -> dict[str, tuple[Any, ...]]:
     """Return the values that each choice of a dataclass of settings has."""
-    found = {}
+    choices = {}
     for name, hint in get_type_hints(kind).items():
         union = get_origin(hint) in (Union, types.UnionType)
         optional = union and set(get_args(hint)[1:]) == {type(None)}
         inner = get_args(hint)[0] if optional else hint
         if get_origin(inner) is Literal:
-            found[name] = get_args(inner) + ((None,) if optional else ())
-    return found
+            choices[name] = get_args(inner) + ((None,) if optional else ())
+    return choices

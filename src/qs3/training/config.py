@@ -10,7 +10,7 @@ import tyro
 from qs3.adaptation.names import Normalisation, RoundRule, Rule, Selection, SingleClass
 from qs3.errors import InputError
 from qs3.io.preparation import PAPER, ROBUST, Preparation
-from qs3.sensor.checks import choices
+from qs3.sensor.checks import choices_of
 
 _Settings = TypeVar("_Settings", bound=Any)
 Schedule = Literal["cosine", "plateau"]
@@ -327,7 +327,7 @@ def _check_ranges(settings: Any, ranges: Mapping[str, str]) -> None:
 
 
 def _check_words(settings: Any) -> None:
-    for name, words in choices(type(settings)).items():
+    for name, words in choices_of(type(settings)).items():
         fault = f"is none of {', '.join(map(str, words))}"
         _check(settings, name, getattr(settings, name) in words, fault)
 

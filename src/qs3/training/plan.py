@@ -91,12 +91,12 @@ def describe_plan(
         warm_up: Whether a network is given that takes the place of the training on the source.
     """
     lines, steps, classes = [], 0, 10
+    size, least = settings.batch_size, 2 * settings.devices
     if source is not None:
         held, classes = int(held_out(source, settings).sum()), len(source.class_names)
         counts = Counter(source.labels.tolist())
         each = ", ".join(f"{name} {counts[i]}" for i, name in enumerate(source.class_names))
         lines.append(f"source    {len(source)} clouds, {held} of them held out: {each}")
-        size, least = settings.batch_size, 2 * settings.devices
         batches = count_batches(len(source) - held, size, least)
         if target is not None and method_class(method).uses_target:  # the longer pass counts
             batches = max(batches, count_batches(max(len(target), least), size, least))
@@ -107,15 +107,15 @@ def describe_plan(
     if target is not None:
         lines.append(f"target    {len(target)} clouds")
     if rounds is not None and target is not None:
-        each = rounds.steps_per_epoch or count_batches(len(target), settings.batch_size)
+        each = rounds.steps_per_epoch or count_batches(len(target), size, least)
         most = rounds.rounds * rounds.epochs * each
         work = f"{rounds.rounds} rounds of {rounds.epochs} epochs of at most {each} steps: {most}"
         lines.append(f"rounds    {rounds.rule}, {work}")
         steps += most * (2 if rounds.source_loss else 1)  # as many clouds of the source
     model = fresh_model(method, settings, classes)
-    size = sum(value.numel() for value in model.parameters()) / 1e6
+    count = sum(value.numel() for value in model.parameters()) / 1e6
     lines.append(
-        f"network   {settings.model}, {size:.2f} million parameters, {settings.num_points} points"
+        f"network   {settings.model}, {count:.2f} million parameters, {settings.num_points} points"
     )
     plain, usual = unstructure(settings), unstructure(TrainSettings())
     others = [f"{name} {plain[name]}" for name in plain if plain[name] != usual[name]]

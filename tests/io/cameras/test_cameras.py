@@ -16,6 +16,7 @@ from qs3.io.extract.depth_images import read_depth
 from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
 from qs3.io.extract.run import OutputSettings
 from qs3.io.extract.segment import SceneSettings, segment_scene
+from qs3.io.guards import naming
 
 from ..hostile import fuzz, mutated, refused
 from .bags import RATE, write_realsense, write_ros1, write_ros2
@@ -291,3 +292,11 @@ def test_colour_of_another_size_and_bad_times_are_told(tmp_path):
     shutil.copy(out / "depth" / "000000.png", out / "depth" / "000001.png")
     with refused("no colour picture of the depth image's size", "000001.png"):
         read(f"folder:{out}")
+
+
+def test_faults_of_our_own_are_not_told_as_the_librarys():
+    with pytest.raises(InputError, match=r"^camera: it stopped \(no frame\)"):
+        with naming("camera", "it stopped", RuntimeError):
+            raise RuntimeError("no frame")
+    with pytest.raises(AttributeError), naming("camera", "it stopped", RuntimeError):
+        raise AttributeError("ours")

@@ -1,6 +1,5 @@
 """RealSense cameras and their recordings, by librealsense (extra ``realsense``)."""
 
-import contextlib
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +12,7 @@ from qs3.errors import InputError, MissingExtraError, say_once
 from qs3.io.cameras.frames import Camera, DepthFrame
 from qs3.io.extract.depth_images import to_metres
 from qs3.io.extract.intrinsics import Intrinsics
-from qs3.io.guards import naming, reason
+from qs3.io.guards import naming
 
 _PATIENCE = 5000  # milliseconds to the next frame
 
@@ -42,23 +41,13 @@ def realsense_camera(serial: str = "", file: Path | None = None, colour: bool = 
     if file is not None and not file.is_file():
         raise InputError(f"{file}: no such file")
     pipeline = rs.pipeline()
-    with _told(where, "librealsense cannot open it"):
+    with naming(where, "librealsense cannot open it", RuntimeError):
         profile = pipeline.start(_config(rs, pipeline, serial, file, colour))
     try:
-        with _told(where, "librealsense stopped"):
+        with naming(where, "librealsense stopped", RuntimeError):
             yield from _frames(rs, pipeline, profile, colour)
     finally:
         pipeline.stop()
-
-
-@contextlib.contextmanager
-def _told(where: str, fault: str) -> Iterator[None]:
-    """Tell what librealsense raises as its fault; an error of our own stays one."""
-    with naming(where):
-        try:
-            yield
-        except RuntimeError as error:
-            raise InputError(f"{fault} ({reason(error)})") from error
 
 
 def _config(rs: Any, pipeline: Any, serial: str, file: Path | None, colour: bool) -> Any:

@@ -109,15 +109,15 @@ def linear_max_gradients(
         [[3.0, 4.0], [1.0, 2.0]]
     """
     bag = torch.nn.functional.embedding_bag
-    share = gradient.t().contiguous()
-    of_weight = bag(winner.t().contiguous(), rows, mode="sum", per_sample_weights=share)
+    by_output = gradient.t().contiguous()
+    of_weight = bag(winner.t().contiguous(), rows, mode="sum", per_sample_weights=by_output)
     # Sorted by row, the outputs that each row has won are a bag of rows of the weight.
     flat = winner.view(-1)
     order = flat.argsort(stable=True)
     ends = torch.bincount(flat, minlength=len(rows)).cumsum(0)
     starts = torch.cat([ends.new_zeros(1), ends[:-1]])
-    share = gradient.reshape(-1).index_select(0, order)
-    of_rows = bag(order % len(weight), weight, starts, mode="sum", per_sample_weights=share)
+    by_row = gradient.reshape(-1).index_select(0, order)
+    of_rows = bag(order % len(weight), weight, starts, mode="sum", per_sample_weights=by_row)
     return of_rows, of_weight
 
 
