@@ -295,8 +295,8 @@ def test_colour_of_another_size_and_bad_times_are_told(tmp_path):
 
 
 def test_faults_of_our_own_are_not_told_as_the_librarys():
-    with pytest.raises(InputError, match=r"^camera: it stopped \(no frame\)"):
-        with naming("camera", "it stopped", RuntimeError):
-            raise RuntimeError("no frame")
+    said = r"^camera: it stopped \(no frame\)"
+    with pytest.raises(InputError, match=said), naming("camera", "it stopped", RuntimeError):
+        raise RuntimeError("no frame")
     with pytest.raises(AttributeError), naming("camera", "it stopped", RuntimeError):
         raise AttributeError("ours")
