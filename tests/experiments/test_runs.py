@@ -229,6 +229,17 @@ def test_laptop_judges():
         batches = count_batches(clouds - int(0.1 * clouds), train.batch_size)
         assert train.epochs * batches == pytest.approx(4000, rel=0.01)
     assert make_run(scale, S, D, SUPERVISED).train.epochs == train.epochs
+    # And whatever the method: one that uses the target goes once through the larger of both.
+    for row, kind in ROWS.items():
+        uses = method_class(split_method(kind.method)[0]).uses_target
+        for target, adapted_to in ((D, 1394), (Domain("F"), 1400), (R, 520), (Domain("U"), 32)):
+            if row == SUPERVISED:
+                continue
+            train = make_run(scale, S, target, row).train
+            counts = (540, adapted_to if uses else 0)
+            batches = max(count_batches(count, train.batch_size) for count in counts)
+            assert train.epochs * batches == pytest.approx(4000, rel=0.02), (row, target)
+            assert uses or train.epochs == make_run(scale, S, D, ORDINARY).train.epochs
     plans = make_plans(scale, sides, data_sets([make_run(scale, S, D, ORDINARY)]))
     sensors = {name: plan.settings.as_dict()["sensor"]["name"] for name, plan in plans.items()}
     assert sensors == {"source": "d435", "target": "kinect-v1"}

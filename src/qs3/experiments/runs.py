@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
-from qs3.adaptation.names import MethodName
+from qs3.adaptation.names import WITHOUT_TARGET, MethodName, split_method
 from qs3.errors import InputError
-from qs3.experiments.domains import Domain, Own, Part, data_of
+from qs3.experiments.domains import REAL_CLOUDS, DataSet, Domain, Own, Part, data_of
 from qs3.experiments.scales import Scale
 from qs3.training.config import GENTLE, PRESETS, SelfTrainingSettings, TrainSettings
 
@@ -179,7 +179,9 @@ def make_run(
         raise InputError(f"unknown row {row!r}; choose from {', '.join(ROWS)}")
     kind = ROWS[row]
     source = target if row == SUPERVISED else source
-    train = scale.train_with(threads, seed, network, source.kind)
+    alone = split_method(kind.method)[0] in WITHOUT_TARGET
+    adapted_to = 0 if alone else _count(scale, target)
+    train = scale.train_with(threads, seed, network, source.kind, adapted_to)
     if row == ORDINARY:
         # No target that checkpoints could be rated on; the last network is taken.
         train = replace(train, validate_every=0)
@@ -194,6 +196,14 @@ def make_run(
         changes = {name: value for name, value in changes.items() if getattr(usual, name) != value}
         rounds = replace(usual, **changes)
     return Run(source, target, row, seed, train, rounds, network, changes)
+
+
+def _count(scale: Scale, target: Domain) -> int:
+    """Return how many clouds there are to adapt to."""
+    part = data_of(target).train
+    if isinstance(part.data, DataSet):
+        return scale.count_clouds(target.kind)
+    return REAL_CLOUDS[part.data][part.split]
 
 
 def warm_up_of(scale: Scale, run: Run) -> Run | None:

@@ -44,7 +44,7 @@ class Scale:
     train: TrainSettings = field(default_factory=TrainSettings)
     """How networks are trained; the seed is a run's own."""
     optimiser_steps: int | None = None
-    """About how many steps each training on a source takes, in place of a number of epochs."""
+    """About how many steps each training takes, in place of a number of epochs."""
     rounds: Mapping[str, Any] = field(default_factory=dict)
     """Settings of self-training that differ from the preset of its rule."""
     tasks: tuple[str, ...] = ("M-D", "S-D", "M-R", "S-R")
@@ -85,7 +85,12 @@ class Scale:
         return small or any(self.networks.values())
 
     def train_with(
-        self, threads: int | None, seed: int = 0, network: str = "", source: str = "S"
+        self,
+        threads: int | None,
+        seed: int = 0,
+        network: str = "",
+        source: str = "S",
+        adapted_to: int = 0,
     ) -> TrainSettings:
         """Return the settings of a training with a seed and a number of threads.
 
@@ -93,15 +98,18 @@ class Scale:
             threads: CPU threads.
             seed: Root of all random steps.
             network: One of ``networks``, trained as the tables of networks do; "" is the bench's.
-            source: Kind of the domain that it learns from, whose size decides the epochs.
+            source: Kind of the domain that it learns from.
+            adapted_to: Clouds of the target that it trains on, too. The larger of both decides the
+                epochs, as an epoch is one pass over it.
 
         Raises:
             InputError: where the scale has no such network.
         """
         train = replace(self.train, seed=seed, threads=threads)
         if self.optimiser_steps is not None:
-            clouds = self._clouds(source)
-            batches = -(-(clouds - int(train.holdout * clouds)) // train.batch_size)
+            learnt = self.count_clouds(source)
+            longest = max(learnt - int(train.holdout * learnt), adapted_to)
+            batches = -(-longest // train.batch_size)
             train = replace(train, epochs=max(1, round(self.optimiser_steps / batches)))
         if not network:
             return train
@@ -110,11 +118,11 @@ class Scale:
         own = {"model": network, "model_settings": self.networks[network], **self.ordinary}
         return replace(train, **own)
 
-    def _clouds(self, source: str) -> int:
-        """How many clouds a domain has to learn from."""
-        if source in ("D", "F"):
+    def count_clouds(self, domain: str) -> int:
+        """Return how many clouds a kind of domain that is made here has to train on."""
+        if domain in ("D", "F"):
             return sum(self.target_count(name, self.target_per_class) for name in POINTDA10)
-        return self.source_per_class * len(POINTDA10) * (3 if source == "S+C+M" else 1)
+        return self.source_per_class * len(POINTDA10) * (3 if domain == "S+C+M" else 1)
 
     def describe_rounds(self) -> str:
         """Say where self-training is not the paper's; empty where it is.
