@@ -7,11 +7,13 @@ import shutil
 
 import numpy as np
 import pytest
+from matplotlib.container import ErrorbarContainer
 
 from qs3.cli.table import TableOptions, figure, table
 from qs3.errors import InputError
+from qs3.evaluation.compare import compare_seeds
 from qs3.evaluation.records import read_record
-from qs3.experiments.figures import picture
+from qs3.experiments.figures import draw, picture
 from qs3.experiments.scales import SCALES
 from qs3.experiments.setup import Setup, read_setup
 from qs3.experiments.table import Table
@@ -108,8 +110,9 @@ def test_one_training_of_a_source_serves_all_targets(whole):
     minutes = (rounds.cpu_seconds["total"] + rounds.cpu_seconds["warm-up"]) / 60
     steps = rounds.steps["total"] + rounds.steps["warm-up"]
     own = f"{100 * rounds.source_accuracy:.1f} %"
+    each = 60 * minutes / (100 * rounds.scores.accuracy)
     text = (whole / "adaptation-bench.md").read_text()
-    assert f"| qbst | {minutes:.1f} · {steps:,} · {own} |" in text
+    assert f"| qbst | {minutes:.1f} · {each:.1f} · {steps:,} · {own} |" in text
     assert not (whole / "runs/S-D/qbst/seed-0/warm-up").exists()
 
 
@@ -128,7 +131,9 @@ def test_cells_that_wait_show_the_command(finished, capsys):
     assert table(TableOptions("ordinary", finished, tasks=COLUMNS)) == 0
     said = capsys.readouterr().out
     assert "1 cells wait for runs" in said
-    assert "    qs3 reproduce ordinary --out copy --scale smoke --seeds 0 1\n" in said
+    # Of what was asked for alone: all lines and columns would be hours.
+    command = "qs3 reproduce ordinary --out copy --scale smoke --tasks M-D S-D S-F --seeds 0 1"
+    assert f"    {command}\n" in said
     assert next(line for line in said.splitlines() if line.startswith("| DGCNN")).count("…") == 1
 
 
@@ -199,6 +204,7 @@ def test_caveats_of_runs_stand_below_the_table(finished):
     change(path, "rounds", value=rounds)
     text = markdown(read(finished, "thresholds"))
     assert "- 1 of 2 rounds skipped, confident clouds too few: QBST, M → D on θ₀ = 0.2" in text
+    assert text.count("(n=1) (1 of 2 rounds trained)") == 2
     change(path, "rounds", value=[done | {"skipped": True} for done in rounds])
     for kind in ("md", "tex"):
         assert FORMATS[kind](read(finished, "thresholds")).count("(n=1) (no round trained)") >= 1
@@ -216,6 +222,20 @@ def test_figures_are_the_same_bytes_each_time(whole, tmp_path, capsys):
     for name in ("a.jpg", "a"):
         with pytest.raises(InputError, match=r"\.png or \.svg"):
             figure(TableOptions("ordinary", whole), tmp_path / name)
+
+
+def test_figures_have_the_width_of_a_column_and_95_percent_intervals(whole):
+    filled = read(whole, "ordinary", columns=COLUMNS)
+    for name, axes in (("ordinary", 1), ("thresholds", 2)):
+        figure = draw(read(whole, name))
+        assert figure.get_size_inches()[0] < 6 and len(figure.axes) == axes
+    figure = draw(filled)
+    assert "2 seeds, 95 % intervals" in figure.get_suptitle()
+    bars, *_ = [c for c in figure.axes[0].containers if isinstance(c, ErrorbarContainer)]
+    ((low, _), (high, _)) = bars.lines[2][0].get_segments()[1]  # M → D, the second row
+    scores = [record(whole, f"M-D_ordinary@dgcnn_seed-{seed}").scores.accuracy for seed in (0, 1)]
+    wanted = compare_seeds(dict(enumerate(scores)), {0: 0.0, 1: 0.0}).interval
+    assert [low, high] == pytest.approx([100 * end for end in wanted])
 
 
 def test_the_text_tells_how_the_table_s_own_networks_were_trained(tmp_path):

@@ -1,11 +1,12 @@
 """Is A better than B? Over the seeds that both ran, cloud by cloud for two runs, or over both."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Int
+
+from qs3.evaluation.metrics import mean_sem
 
 
 @dataclass(frozen=True)
@@ -51,17 +52,13 @@ def compare_seeds(first: Mapping[int, float], second: Mapping[int, float]) -> Se
     Returns:
         First minus second; None where they share no seed.
     """
-    from scipy.special import stdtrit  # the quantile of Student's t; scipy.stats loads slowly
-
     seeds = sorted(set(first) & set(second))
     if not seeds:
         return None
-    values = np.array([first[seed] - second[seed] for seed in seeds])
-    mean, n = float(values.mean()), len(values)
-    if n == 1:
-        return SeedComparison(mean, None, n)
-    half = float(stdtrit(n - 1, 0.975)) * float(values.std(ddof=1)) / math.sqrt(n)
-    return SeedComparison(mean, (mean - half, mean + half), n)
+    value = mean_sem([first[seed] - second[seed] for seed in seeds])
+    half = value.half
+    interval = None if half is None else (value.mean - half, value.mean + half)
+    return SeedComparison(value.mean, interval, value.n)
 
 
 def mcnemar(

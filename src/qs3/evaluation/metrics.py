@@ -24,6 +24,18 @@ class MeanSEM:
     n: int
     """Number of values."""
 
+    @property
+    def half(self) -> float | None:
+        """Half the width of Student's 95 % interval of the mean; None where there is one value.
+
+        Example:
+            >>> round(mean_sem([0.5, 0.6]).half, 3)
+            0.635
+        """
+        from scipy.special import stdtrit  # the quantile of Student's t; scipy.stats loads slowly
+
+        return None if self.sem is None else float(stdtrit(self.n - 1, 0.975)) * self.sem
+
     def format(self, scale: float = 100.0, digits: int = 1, count: bool = True) -> str:
         """Return the value as text, by default in per cent and with the number of values.
 

@@ -28,7 +28,8 @@ def markdown(filled: FilledTable) -> str:
     text += ["Class-mean accuracy:", "", to_markdown(_scores(filled, "class_mean_accuracy")), ""]
     if any(all(record.cpu_seconds for record in filled.records_of(at)) for at in filled.means):
         text += [
-            "CPU minutes of a run and its warm-up · steps of both · accuracy on its own source:"
+            "CPU minutes of a run and its warm-up · CPU seconds for each point of its accuracy · "
+            "steps of both · accuracy on its own source:"
         ]
         text += ["", to_markdown(_scores(filled, "cost")), ""]
     for column in table.headings()[1]:
@@ -115,21 +116,25 @@ def _value(filled: FilledTable, place: Place, score: str) -> str:
     if score == "cost":
         return _cost(filled.records_of(place))
     mean = filled.means[place]
-    never = " (no round trained)" if mean["rounds"] and not mean["trained"] else ""
-    return mean[score].format() + never
+    trained, rounds, text = mean["trained"], mean["rounds"], mean[score].format()
+    if trained == rounds:
+        return text
+    return f"{text} ({f'{trained} of {rounds} rounds' if trained else 'no round'} trained)"
 
 
 def _cost(records: Sequence[RunRecord]) -> str:
     """What a cell cost, mean over its seeds, and how well it fits its source."""
     if not all(record.cpu_seconds for record in records):
         return "–"
-    minutes, steps = (
+    seconds, steps = (
         sum(cost.get("total", 0) + cost.get("warm-up", 0) for cost in costs) / len(records)
         for costs in zip(*((r.cpu_seconds, r.steps) for r in records), strict=True)
     )
     fits = [r.source_accuracy for r in records if r.source_accuracy is not None]
     own = f"{100 * sum(fits) / len(fits):.1f} %" if fits else "–"
-    return f"{minutes / 60:.1f} · {steps:,.0f} · {own}"
+    points = 100 * sum(record.scores.accuracy for record in records) / len(records)
+    each = f"{seconds / points:.1f}" if points else "–"
+    return f"{seconds / 60:.1f} · {each} · {steps:,.0f} · {own}"
 
 
 def _published(filled: FilledTable, place: Place) -> str:
@@ -224,7 +229,8 @@ def _command(filled: FilledTable) -> str:
     """Return the command that makes what is missing."""
     setup = filled.table.setup
     words = [f"qs3 reproduce {filled.table.name} --out {setup.out.name} --scale {setup.scale.name}"]
-    words.append(f"--seeds {' '.join(map(str, setup.seeds))}")
+    chosen = {"methods": filled.table.rows, "tasks": filled.table.columns, "seeds": setup.seeds}
+    words += [f"--{name} {' '.join(map(str, keys))}" for name, keys in chosen.items() if keys]
     words += [f"--threads {setup.threads}"] if setup.threads not in (None, 1) else []
     for kind, own in setup.own.items():
         test = own.test.split if own.test else None
