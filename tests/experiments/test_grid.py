@@ -15,13 +15,17 @@ from qs3.cli.reproduce import reproduce as command
 from qs3.errors import InputError
 from qs3.evaluation.records import read_record
 from qs3.experiments import grid
-from qs3.experiments.domains import Domain, parse_own
+from qs3.experiments.cost import scans_left
+from qs3.experiments.data import choose_meshes, make_plans
+from qs3.experiments.domains import DataSet, Domain, parse_own
 from qs3.experiments.grid import make_record, run_grid
 from qs3.experiments.reproduce import Workers, products, reproduce
 from qs3.experiments.runs import ORDINARY, PAPER, make_run
 from qs3.experiments.setup import Setup, read_setup
 from qs3.experiments.table import Table
 from qs3.store.executors import Failure
+from qs3.store.manifest import shard_name
+from qs3.store.parts import Place
 
 from .conftest import TINY, make_tables
 
@@ -105,6 +109,18 @@ def test_a_dry_run_tells_counts_and_hours_and_writes_nothing(small_scales, finis
     assert re.search(r"30 scans of the source, 48 scans of the target; 12 runs, 12 of", said)
     assert re.search(r"about \d+\.\d\d hours", said)
     assert sorted(finished.rglob("*")) == before
+
+
+def test_a_data_set_that_is_begun_counts_by_the_scans_that_it_lacks(finished):
+    (plan,) = make_plans(TINY, choose_meshes(TINY, None), [DataSet("source")]).values()
+    folder = finished / "data" / "source"
+    assert scans_left(plan, folder) == 0
+    (folder / shard_name(0)).unlink()
+    assert scans_left(plan, folder) == plan.rows == scans_left(plan, finished / "absent")
+    part = folder / f"{Place(0, 3).stem}.parquet"
+    part.parent.mkdir(parents=True)
+    part.touch()
+    assert scans_left(plan, folder) == plan.rows - 1
 
 
 def test_galleries_show_procedural_shapes_alone(finished):

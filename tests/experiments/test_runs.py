@@ -205,14 +205,15 @@ def test_hours_follow_the_number_of_steps():
     judged = (40 + 16) * 0.75 + (40 + 64) * 0.5
     seconds = {
         row: run_seconds(make_run(scale, S, D, row), counts, costs)
-        for row in ("source-only", "dann", "qbst", "qbst-gentle")
+        for row in ("source-only", "dann", "qbst", PAPER, "qbst-gentle")
     }
     assert seconds["source-only"] == pytest.approx(30 + looks + judged)
     assert seconds["dann"] == pytest.approx(10 * 4 * 3 + looks + judged)
-    # Two rounds of an epoch, on both domains; what was kept is judged too.
+    # Two rounds of an epoch, on both domains, that keep half; what was kept is judged too.
     judged += 64 * 0.75
-    assert seconds["qbst"] == pytest.approx(2 * 4 * 2 + 4 * 120 * 0.25 + judged)
-    # Half of the target is kept.
+    assert seconds["qbst"] == pytest.approx(2 * 2 * 2 + 4 * 120 * 0.25 + judged)
+    # Of a pool that shrinks the second round keeps half of that half.
+    assert seconds[PAPER] == pytest.approx(2 + 1 + 4 * 120 * 0.25 + judged)
     assert seconds["qbst-gentle"] == pytest.approx(5 * 4 * 2 * 2 + 10 * 120 * 0.25 + judged)
     again = run_seconds(make_run(scale, S, D, "dann"), counts, costs, only_scores=True)
     assert again == pytest.approx(56 * 0.75)
