@@ -21,7 +21,7 @@ from qs3.experiments.domains import DataSet, Domain, parse_own
 from qs3.experiments.grid import make_record, run_grid
 from qs3.experiments.reproduce import Workers, products, reproduce
 from qs3.experiments.runs import ORDINARY, PAPER, make_run
-from qs3.experiments.setup import Setup, read_setup
+from qs3.experiments.setup import Setup, count_own, read_setup
 from qs3.experiments.table import Table
 from qs3.store.executors import Failure
 from qs3.store.manifest import shard_name
@@ -132,6 +132,7 @@ def test_galleries_show_procedural_shapes_alone(finished):
 def test_data_of_the_user_takes_a_domain_s_place(whole, tmp_path):
     data, out = whole / "data", tmp_path / "own"
     own = parse_own([f"D={data / 'target'}", f"M={data / 'source'}:train:"])
+    own = count_own(own, TINY)
     assert own["D"].stands_for == "" and own["M"].train.cloud == "surface"
     make_tables(out, ["ordinary"], ("dgcnn",), ("M-D",), (0,), own=own)
     text = (out / "ordinary.md").read_text()
@@ -145,6 +146,7 @@ def test_data_of_the_user_takes_a_domain_s_place(whole, tmp_path):
             make_tables(out, ["ordinary"], ("dgcnn",), ("M-D",), (0,), **changes)
     again = read_setup(out)
     assert again.own["D"].train.cloud == "points" and again.seeds == (0,)
+    assert [again.own[kind].train.count for kind in own] == [24, 30]
     filled = Table("ordinary", again, ("dgcnn",), ("M-D",)).read()
     assert filled.faults == () and filled.waiting == []
 

@@ -19,7 +19,7 @@ from qs3.experiments.grid import data_sets
 from qs3.experiments.reproduce import collect_runs, products
 from qs3.experiments.runs import ORDINARY, PAPER, ROWS, SUPERVISED, make_run, warm_up_of
 from qs3.experiments.scales import SCALES
-from qs3.experiments.setup import Setup
+from qs3.experiments.setup import Setup, count_own
 from qs3.experiments.table import Table
 from qs3.io import load_clouds, load_unlabelled
 from qs3.io.clouds import digests
@@ -245,6 +245,23 @@ def test_laptop_judges():
     sensors = {name: plan.settings.as_dict()["sensor"]["name"] for name, plan in plans.items()}
     assert sensors == {"source": "d435", "target": "kinect-v1"}
     assert {plan.settings.real_size for plan in plans.values()} == {"class"}
+
+
+def test_the_user_s_own_data_count_by_their_size(whole):
+    data, scale = whole / "data", SCALES["laptop"]
+    own = parse_own([f"S={data / 'source'}:train:train", f"D={data / 'target'}"])
+    own = count_own(own, TINY)
+    assert [own[kind].train.count for kind in "SD"] == [30, 24] and own["D"].test.count == 24
+    for row, batches in (("ordinary", 1), ("gast", 1), ("gast-spst", 1)):
+        run = make_run(scale, S, D, row, own=own)
+        assert run.train.epochs == 4000 / batches
+        before = warm_up_of(scale, run, own)
+        assert before is None or before.train.epochs == run.train.epochs
+    many = {
+        "D": dataclasses.replace(own["D"], train=dataclasses.replace(own["D"].train, count=640))
+    }
+    assert make_run(scale, S, D, "gast", own=many).train.epochs == 200
+    assert make_run(scale, S, D, "ordinary", own=many).train.epochs == 235
 
 
 def test_rounds_start_from_one_training_of_the_source():

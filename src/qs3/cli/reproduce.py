@@ -56,18 +56,19 @@ def reproduce(options: Flat[ReproduceOptions]) -> int:
     from qs3.experiments.reproduce import products
     from qs3.experiments.reproduce import reproduce as make
     from qs3.experiments.scales import SCALES
-    from qs3.experiments.setup import Setup
+    from qs3.experiments.setup import Setup, count_own
 
     if options.threads < 1:
         raise InputError(f"--threads {options.threads}: must be at least 1")
     shared = os.environ.get("QS3_SHARED_DATA")
+    scale = SCALES[options.scale]
     setup = Setup(
         out=options.out,
-        scale=SCALES[options.scale],
+        scale=scale,
         seeds=options.seeds,
         threads=options.threads,
         shared=Path(shared) if shared else None,
-        own=parse_own(options.data),
+        own=count_own(parse_own(options.data), scale),
     )
     names = options.names or (*TABLES, GALLERIES)
     parts = products(names, setup, options.methods, options.tasks)

@@ -120,11 +120,11 @@ def run_seconds(
 
 
 def _size(part: Part | None, plans: Mapping[str, Plan]) -> int:
-    """Clouds of a part of a data set; of the user's own the size is unknown: a thousand."""
+    """Clouds of a part of a data set; where nobody has counted them, a thousand."""
     if part is None:
         return 0
     if isinstance(part.data, DataSet):
         plan = plans[part.data.name]
         count = sum(item.split == part.split for item in plan.items) * plan.settings.scans_per_mesh
         return count * (3 if part.cloud == "all" else 1)
-    return REAL_CLOUDS.get(part.data, {}).get(part.split, 1000)
+    return 1000 if part.count is None else part.count

@@ -14,11 +14,8 @@ from qs3.errors import InputError
 from qs3.io.clouds import CloudChoice
 from qs3.store.manifest import MANIFEST
 
-REAL_CLOUDS: Mapping[Path, Mapping[str | None, int]] = {
-    Path("nyuv2_objects.npz"): {"strict-dev": 520, "strict-check": 300},
-    Path("sunrgbd_objects.npz"): {None: 32},
-}
-"""Files of real objects in the shared folder, and how many each part of them has."""
+REAL_CLOUDS = Path("nyuv2_objects.npz"), Path("sunrgbd_objects.npz")
+"""Files of real objects in the shared folder."""
 DATA = "data"
 """Folder of the data sets that are made here, in that of a reproduction."""
 Kind = Literal["M", "S", "S+C+M", "D", "F", "N", "C", "J", "R", "U", "V", "A"]
@@ -79,6 +76,8 @@ class Part:
     """Part of the data; None takes all."""
     cloud: CloudChoice
     """Which cloud of a generated data set."""
+    count: int | None = None
+    """How many clouds these are; None of what is made here, and of what nobody has counted."""
 
     def at_hand(self, shared: Path | None) -> bool:
         """Whether these are no real objects, or are there."""
@@ -153,11 +152,11 @@ _MADE: Mapping[str, DomainData] = {
     # Blocks of frames in the order of filming, so that no room is on both sides.
     "R": DomainData(
         "R: real NYU Depth v2 objects",
-        Part(_NYU, "strict-dev", "points"),
-        Part(_NYU, "strict-check", "points"),
+        Part(_NYU, "strict-dev", "points", 520),
+        Part(_NYU, "strict-check", "points", 300),
     ),
     "U": DomainData(
-        "U: real SUN RGB-D objects", Part(_SUN, None, "points"), Part(_SUN, None, "points")
+        "U: real SUN RGB-D objects", Part(_SUN, None, "points", 32), Part(_SUN, None, "points", 32)
     ),
 }
 
@@ -207,13 +206,17 @@ def parse_own(given: Sequence[str]) -> dict[str, DomainData]:
         whole = Path(path).resolve()
         # Samples of surfaces are one of the clouds of what `qs3 generate` makes.
         cloud = _MADE[kind].train.cloud if (whole / MANIFEST).is_file() else "points"
-        own[kind] = own_data(kind, whole, cloud, train or None, test or None)
+        own[kind] = own_data(kind, whole, cloud, (train or None, test or None))
     return own
 
 
 def own_data(
-    kind: str, path: Path, cloud: CloudChoice, train_split: str | None, test_split: str | None
+    kind: str,
+    path: Path,
+    cloud: CloudChoice,
+    splits: tuple[str | None, str | None],
+    counts: tuple[int | None, int | None] = (None, None),
 ) -> DomainData:
     """Return a domain whose clouds are the user's: one data set with two parts."""
-    train, test = (Part(path, split, cloud) for split in (train_split, test_split))
+    train, test = (Part(path, *part) for part in zip(splits, (cloud, cloud), counts, strict=True))
     return DomainData(f"{kind}: {path.name}", train, test, own=True)

@@ -13,6 +13,7 @@ from qs3.experiments import TABLES
 from qs3.experiments.domains import Domain, Kind
 from qs3.experiments.runs import SUPERVISED, Run, make_run
 from qs3.experiments.scales import NETWORKS, Scale
+from qs3.experiments.setup import Setup
 
 Place = tuple[str, str]
 """Key of the row and key of the column of a cell."""
@@ -96,9 +97,7 @@ class Experiment:
         value = rows.get(self.published_as.get(row, row))
         return None if value is None else (value[0], value[1] if len(value) > 1 else None)
 
-    def run(
-        self, scale: Scale, row: Heading, column: Heading, seed: int, threads: int | None
-    ) -> Run | None:
+    def run(self, setup: Setup, row: Heading, column: Heading, seed: int) -> Run | None:
         """Return the run of a cell; None where it has none.
 
         Real objects have no supervised row: there are none to spare for a training.
@@ -106,7 +105,8 @@ class Experiment:
         fields = {**self.fields, **row.fields, **column.fields}
         if fields["row"] == SUPERVISED and fields["target"].kind in ("R", "U"):
             return None
-        return make_run(scale, **fields, seed=seed, threads=threads)
+        own, threads = setup.own, setup.threads
+        return make_run(setup.scale, **fields, seed=seed, threads=threads, own=own)
 
 
 def load_experiment(name: str) -> Experiment:

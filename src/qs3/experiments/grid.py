@@ -156,7 +156,7 @@ def run_grid(
 
 def _folders(run: Run, setup: Setup) -> set[str]:
     """Return the folder of a run, and that of the run that it starts from."""
-    before = warm_up_of(setup.scale, run)
+    before = warm_up_of(setup.scale, run, setup.own)
     return {run.folder} if before is None else {run.folder, before.folder}
 
 
@@ -226,7 +226,7 @@ def make_record(run: Run, setup: Setup, device: str = "") -> RunRecord:
     kinds = {canonical(labelled.class_names[row]) for row in set(labelled.labels.tolist())}
     if labelled.class_names != POINTDA10 and kinds <= set(POINTDA10):  # of which the tables are
         labelled = relabel(labelled, POINTDA10, None, place(source))
-    before = warm_up_of(setup.scale, run)
+    before = warm_up_of(setup.scale, run, setup.own)
     fit(
         run.kind.method,
         labelled,

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from qs3.adaptation.names import WITHOUT_TARGET, MethodName, split_method
 from qs3.errors import InputError
-from qs3.experiments.domains import REAL_CLOUDS, DataSet, Domain, Own, Part, data_of
+from qs3.experiments.domains import Domain, Own, Part, data_of
 from qs3.experiments.scales import Scale
 from qs3.training.config import GENTLE, PRESETS, SelfTrainingSettings, TrainSettings
 
@@ -151,6 +151,7 @@ def make_run(
     seed: int = 0,
     threads: int | None = None,
     network: str = "",
+    own: Own | None = None,
     **changes: float,
 ) -> Run:
     """Return the run of a cell of a table.
@@ -163,6 +164,7 @@ def make_run(
         seed: Root of all random steps.
         threads: CPU threads.
         network: Network of the tables of networks; "" is that of the bench.
+        own: The user's data sets, whose sizes may decide the epochs.
         changes: Settings of the rounds that differ from the row's; those that do not are left out,
             so that a cell with the row's own value is one training with the table of methods.
 
@@ -180,8 +182,8 @@ def make_run(
     kind = ROWS[row]
     source = target if row == SUPERVISED else source
     alone = split_method(kind.method)[0] in WITHOUT_TARGET
-    adapted_to = 0 if alone else _count(scale, target)
-    train = scale.train_with(threads, seed, network, source.kind, adapted_to)
+    adapted_to = 0 if alone else _count(scale, target, own)
+    train = scale.train_with(threads, seed, network, _count(scale, source, own), adapted_to)
     if row == ORDINARY:
         # No target that checkpoints could be rated on; the last network is taken.
         train = replace(train, validate_every=0)
@@ -198,18 +200,16 @@ def make_run(
     return Run(source, target, row, seed, train, rounds, network, changes)
 
 
-def _count(scale: Scale, target: Domain) -> int:
-    """Return how many clouds there are to adapt to."""
-    part = data_of(target).train
-    if isinstance(part.data, DataSet):
-        return scale.count_clouds(target.kind)
-    return REAL_CLOUDS[part.data][part.split]
+def _count(scale: Scale, domain: Domain, own: Own | None) -> int:
+    """Return how many clouds a domain has to train on."""
+    count = data_of(domain, own).train.count
+    return scale.count_clouds(domain.kind) if count is None else count
 
 
-def warm_up_of(scale: Scale, run: Run) -> Run | None:
+def warm_up_of(scale: Scale, run: Run, own: Own | None = None) -> Run | None:
     """Return the run that self-training starts from; None without rounds."""
     row = run.kind.warm_up
     if not row:
         return None
     threads = run.train.threads if isinstance(run.train.threads, int) else None
-    return make_run(scale, run.source, run.target, row, run.seed, threads, run.network)
+    return make_run(scale, run.source, run.target, row, run.seed, threads, run.network, own)

@@ -89,7 +89,7 @@ class Scale:
         threads: int | None,
         seed: int = 0,
         network: str = "",
-        source: str = "S",
+        learnt: int = 0,
         adapted_to: int = 0,
     ) -> TrainSettings:
         """Return the settings of a training with a seed and a number of threads.
@@ -98,7 +98,7 @@ class Scale:
             threads: CPU threads.
             seed: Root of all random steps.
             network: One of ``networks``, trained as the tables of networks do; "" is the bench's.
-            source: Kind of the domain that it learns from.
+            learnt: Clouds of the source.
             adapted_to: Clouds of the target that it trains on, too. The larger of both decides the
                 epochs, as an epoch is one pass over it.
 
@@ -107,10 +107,9 @@ class Scale:
         """
         train = replace(self.train, seed=seed, threads=threads)
         if self.optimiser_steps is not None:
-            learnt = self.count_clouds(source)
             longest = max(learnt - int(train.holdout * learnt), adapted_to)
             batches = -(-longest // train.batch_size)
-            train = replace(train, epochs=max(1, round(self.optimiser_steps / batches)))
+            train = replace(train, epochs=max(1, round(self.optimiser_steps / max(1, batches))))
         if not network:
             return train
         if network not in self.networks:

@@ -2,14 +2,14 @@
 
 import contextlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from qs3.errors import InputError
-from qs3.experiments.domains import DomainData, Own, own_data
+from qs3.experiments.domains import DomainData, Own, Part, own_data
 from qs3.experiments.scales import Scale
 from qs3.files import claim_folder, read_json, write_json
-from qs3.io.clouds import CloudChoice
+from qs3.io.clouds import CloudChoice, PointClouds
 from qs3.structure import structure, unstructure
 
 MARKER = "bench.json"
@@ -51,6 +51,10 @@ class OwnRecord:
     """Checksum of the first."""
     test: str
     """Checksum of the second."""
+    train_clouds: int | None = None
+    """How many clouds the first has; None where nobody had counted them."""
+    test_clouds: int | None = None
+    """How many the second has."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +118,13 @@ def read_setup(folder: Path) -> Setup:
     """
     marker = read_marker(folder)
     own = {
-        kind: own_data(kind, Path(data.name), data.cloud, data.train_split, data.test_split)
+        kind: own_data(
+            kind,
+            Path(data.name),
+            data.cloud,
+            (data.train_split, data.test_split),
+            (data.train_clouds, data.test_clouds),
+        )
         for kind, data in marker.data.items()
     }
     seeds: set[int] = set()
@@ -125,15 +135,28 @@ def read_setup(folder: Path) -> Setup:
     return Setup(folder, marker.scale, tuple(sorted(seeds)) or (0, 1, 2), marker.threads, own=own)
 
 
-def _own_record(own: DomainData, scale: Scale) -> OwnRecord:
-    """Return what the user's data are known by; reading them tells early what is wrong."""
-    from qs3.io import load_clouds
+def count_own(own: Own, scale: Scale) -> Own:
+    """Count the clouds of the user's data; reading them tells early what is wrong."""
+    counted = {}
+    for kind, data in own.items():
+        assert data.test is not None  # noqa: S101
+        parts = [replace(p, count=len(_read(p, scale))) for p in (data.train, data.test)]
+        counted[kind] = replace(data, train=parts[0], test=parts[1])
+    return counted
 
+
+def _own_record(own: DomainData, scale: Scale) -> OwnRecord:
+    """Return what the user's data are known by."""
     train, test = own.train, own.test
     assert test is not None and isinstance(train.data, Path)  # noqa: S101
-    path, cloud, points = train.data, train.cloud, scale.train.num_points
-    sums = [
-        load_clouds(path, split=part.split, cloud=cloud, num_points=points).checksum
-        for part in (train, test)
-    ]
-    return OwnRecord(path.name, cloud, train.split, test.split, *sums)
+    sums = _read(train, scale).checksum, _read(test, scale).checksum
+    splits, counts = (train.split, test.split), (train.count, test.count)
+    return OwnRecord(train.data.name, train.cloud, *splits, *sums, *counts)
+
+
+def _read(part: Part, scale: Scale) -> PointClouds:
+    from qs3.io import load_clouds
+
+    assert isinstance(part.data, Path)  # noqa: S101
+    how = {"split": part.split, "cloud": part.cloud}
+    return load_clouds(part.data, **how, num_points=scale.train.num_points)

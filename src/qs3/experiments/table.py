@@ -63,13 +63,11 @@ class Table:
     def cells(self) -> dict[Place, list[Run]]:
         """Return the runs of each cell, in the order of the seeds."""
         rows, columns = self.headings()
-        scale, threads = self.setup.scale, self.setup.threads
         cells: dict[Place, list[Run]] = {}
         for row in rows:
             for column in columns:
                 runs = [
-                    self.experiment.run(scale, row, column, seed, threads)
-                    for seed in self.setup.seeds
+                    self.experiment.run(self.setup, row, column, seed) for seed in self.setup.seeds
                 ]
                 cells[row.key, column.key] = [run for run in runs if run is not None]
         return cells
@@ -87,7 +85,7 @@ class Table:
                 for part in run.parts(self.setup.own):
                     if part is not None:
                         part.locate(self.setup.out, self.setup.shared)
-                for needed in (warm_up_of(self.setup.scale, run), run):
+                for needed in (warm_up_of(self.setup.scale, run, self.setup.own), run):
                     if needed is not None:
                         wanted.setdefault(needed.name, needed)
         return list(wanted.values())
