@@ -123,6 +123,12 @@ def test_a_data_set_that_is_begun_counts_by_the_scans_that_it_lacks(finished):
     assert scans_left(plan, folder) == plan.rows - 1
 
 
+def test_a_shared_folder_that_is_not_there_is_told(small_scales, tmp_path, monkeypatch):
+    monkeypatch.setenv("QS3_SHARED_DATA", str(tmp_path / "typo"))
+    with pytest.raises(InputError, match=r"QS3_SHARED_DATA: .*typo is no folder"):
+        command(ReproduceOptions(("ordinary",), tmp_path / "out", "smoke", dry_run=True))
+
+
 def test_galleries_show_procedural_shapes_alone(finished):
     make_tables(finished, ["galleries"], seeds=(0,))
     names = sorted(path.name for path in (finished / "galleries").iterdir())

@@ -61,6 +61,8 @@ def reproduce(options: Flat[ReproduceOptions]) -> int:
     if options.threads < 1:
         raise InputError(f"--threads {options.threads}: must be at least 1")
     shared = os.environ.get("QS3_SHARED_DATA")
+    if shared and not Path(shared).is_dir():
+        raise InputError(f"QS3_SHARED_DATA: {shared} is no folder; correct it, or unset it")
     scale = SCALES[options.scale]
     setup = Setup(
         out=options.out,
