@@ -140,7 +140,9 @@ def test_data_of_the_user_takes_a_domain_s_place(whole, tmp_path):
     own = parse_own([f"D={data / 'target'}", f"M={data / 'source'}:train:"])
     own = count_own(own, TINY)
     assert own["D"].stands_for == "" and own["M"].train.cloud == "surface"
-    make_tables(out, ["ordinary"], ("dgcnn",), ("M-D",), (0,), own=own)
+    told: list[str] = []
+    make_tables(out, ["ordinary"], ("dgcnn",), ("M-D",), (0,), told.append, own=own)
+    assert "no scans; 1 runs" in told[0]
     text = (out / "ordinary.md").read_text()
     assert "D: target" in text and "Stand-ins" not in text
     for changed, said in (

@@ -163,7 +163,8 @@ def reproduce(
     plans = {name: plan for name, plan in plans.items() if name in needed}
     scanning, expected = measure(setup, left, plans)
     names = ", ".join(product.name for product in products)
-    scans = ", ".join(f"{plan.rows} scans of the {name}" for name, plan in plans.items())
+    sets = [f"{plan.rows} scans of the {name}" for name, plan in plans.items()]
+    scans = ", ".join(sets) or "no scans"
     seconds = scanning + sum(expected.values())
     tell(
         f"{names}, scale {setup.scale.name}: {scans}; {len(runs)} runs, {len(left)} of them "
