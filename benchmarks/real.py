@@ -81,10 +81,6 @@ CELLS: Mapping[str, Cell] = {
     # Adaptation, from the warm-up S+C+M of the same seed.
     "QBST": replace(ALL, method="qbst", warm_up="S+C+M"),
     "SPST": replace(ALL, method="spst", warm_up="S+C+M"),
-    "SD": replace(ALL, method="sd"),
-    "SD+QBST": replace(ALL, method="sd", rounds={"rule": "qbst"}, warm_up="SD"),
-    "GAST": replace(ALL, method="gast"),
-    "GAST+QBST": replace(ALL, method="gast", rounds={"rule": "qbst"}, warm_up="GAST"),
     # The network that comes with qs3, and self-training from it.
     "rooms": ROOMS,
     "rooms QBST": replace(ROOMS, method="qbst", warm_up="rooms"),
@@ -135,6 +131,11 @@ CELLS: Mapping[str, Cell] = {
     "S QBST turns": replace(ROUNDS, rounds={"turns": 8}),
     "S QBST floor": replace(ROUNDS, rounds={"floor": 8}),
     "S QBST refined": replace(ROUNDS, rounds={"refine": True}),
+    # Rivals that see the target from the first step, and the same rounds after them.
+    "S SD": replace(SCANS, method="sd"),
+    "S SD+QBST": replace(SCANS, method="sd", rounds={"rule": "qbst"}, warm_up="S SD"),
+    "S GAST": replace(SCANS, method="gast"),
+    "S GAST+QBST": replace(SCANS, method="gast", rounds={"rule": "qbst"}, warm_up="S GAST"),
     # The paper's network, one seed where three cost too much.
     "DGCNN M": replace(DGCNN, cloud="surface"),
     "DGCNN S": replace(DGCNN, cloud="points"),

@@ -34,8 +34,8 @@ PAGES = (ROOT / "docs" / "real.md", ROOT / "README.md")
 NAMES = {"dev": "NYU, first 70 %", "check": "NYU, last 30 %", "sunrgbd": "SUN RGB-D"}
 PAIRS = (
     ("S", "M"), ("S", "C"), ("C", "M"), ("S+C+M", "M"), ("S+C+M", "S"), ("QBST", "S+C+M"),
-    ("SPST", "S+C+M"), ("QBST", "SPST"), ("SD", "S+C+M"), ("SD+QBST", "SD"), ("GAST", "S+C+M"),
-    ("GAST+QBST", "GAST"), ("DGCNN S", "DGCNN M"), ("DGCNN S+C+M", "DGCNN M"),
+    ("SPST", "S+C+M"), ("QBST", "SPST"), ("DGCNN S", "DGCNN M"), ("DGCNN S+C+M", "DGCNN M"),
+    ("DGCNN S+C+M", "DGCNN S"),
     ("DGCNN QBST", "DGCNN S+C+M"),
     ("rooms", "S+C+M"), ("rooms", "M"), ("M sight", "M"),
     ("rooms QBST average", "rooms"), ("rooms QBST gentle", "rooms"),
@@ -45,7 +45,10 @@ PAIRS = (
     ("S lit", "S"), ("S lit", "M"), ("S+C+M lit", "S+C+M"), ("rooms lit", "rooms"),
     ("rooms lit", "S lit"), ("S again", "M"), ("S again", "S lit"),
     ("S QBST paper", "S again"), ("S SPST", "S again"),
-    ("S QBST gentle", "S again"), ("S QBST paper", "S SPST"), ("S QBST gentle", "S SPST"),
+    ("S QBST", "S again"), ("S QBST gentle", "S again"), ("S QBST paper", "S SPST"),
+    ("S QBST", "S SPST"), ("S QBST gentle", "S SPST"), ("S SD", "S again"),
+    ("S SD+QBST", "S SD"), ("S SD+QBST", "S again"), ("S GAST", "S again"),
+    ("S GAST+QBST", "S GAST"), ("S GAST+QBST", "S again"),
     ("full QBST gentle", "full augmentation"),
 )  # fmt: skip
 """First minus second."""
