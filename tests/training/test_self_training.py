@@ -447,6 +447,9 @@ def test_remarks_on_what_went_wrong(domains, settings):
     assert line.startswith("all 2 rounds were skipped, as they kept 2 of 30 clouds at most")
     assert "lower --self-training.threshold, give --self-training.threshold-share," in line
     assert "raise --self-training.threshold-share" in remarks(records, SWITCHES, "abc")[-1]
+    few = remarks([replace(records[0], pool=5)], SWITCHES, "abc")[-1]
+    assert few.endswith("give more clouds of the target: a round needs 6, 2 a class")
+    assert remarks([replace(records[0], pool=6)], SWITCHES, "abc")[-1].endswith("better warm-up")
     one = replace(records[0], single_class=True, confident=(0, 9, 0), kept=(0, 9, 0), skipped=False)
     assert remarks([one], ROUNDS, ("ball", "disc", "rod")) == [
         "round 1: all 9 confident clouds were of one class, disc; 9 were kept"

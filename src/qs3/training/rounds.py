@@ -261,16 +261,18 @@ def remarks(
                 f"{sum(record.kept)} were kept"
             )
     if all_skipped(records):
-        most = max(sum(record.kept) for record in records)
-        setting = f"lower --self-training.threshold, give {share},"
-        if rounds.rule == "quantile":
-            setting = "raise --self-training.portion"
+        most, pool = max(sum(record.kept) for record in records), records[0].pool
+        least = 2 * len(class_names)
+        remedy = f"lower --self-training.threshold, give {share}, or begin with a better warm-up"
+        if pool < least:
+            remedy = f"give more clouds of the target: a round needs {least}, 2 a class"
+        elif rounds.rule == "quantile":
+            remedy = "raise --self-training.portion or begin with a better warm-up"
         elif rounds.threshold_share is not None:
-            setting = f"raise {share}"
+            remedy = f"raise {share} or begin with a better warm-up"
         lines.append(
-            f"all {len(records)} rounds were skipped, as they kept {most} of {records[0].pool} "
-            "clouds at most: the network is that of the warm-up; in another folder, "
-            f"{setting} or begin with a better warm-up"
+            f"all {len(records)} rounds were skipped, as they kept {most} of {pool} clouds at "
+            f"most: the network is that of the warm-up; in another folder, {remedy}"
         )
     elif rounds.init == "scratch" and records and records[-1].skipped:
         trained = [record for record in records if not record.skipped]
