@@ -136,6 +136,9 @@ def test_one_confident_class_is_told_in_the_last_lines(qs3, source, store, tmp_p
     assert said == (
         f"qs3: round 1: all 10 confident clouds were of one class, {POINTDA10[3]}; 10 were kept"
     )
+    assert "all 10 confident clouds are of class 3: keeping all of them\n" in done.stderr
+    assert "selection.py" not in done.stderr + done.stdout
+    assert "SingleClassWarning" not in done.stderr
 
 
 def test_source_only_looks_at_a_target_without_learning_from_it(qs3, store, source, tmp_path):
