@@ -16,7 +16,7 @@ from qs3.io import load_clouds, load_unlabelled
 from qs3.meshes.classes import POINTDA10
 from qs3.models import create_model
 from qs3.structure import structure, unstructure
-from qs3.training import PRESETS, TrainSettings, fit, load_model, save_model
+from qs3.training import PRESETS, Augmentation, TrainSettings, fit, load_model, save_model
 from qs3.training.run import RunSettings
 
 QUICK = ("--model", "pointnet", "--model-set", "channels=[8, 8, 16]", "hidden=[8]", "--num-points",
@@ -206,6 +206,14 @@ def test_a_preset_follows_the_method(arguments, preset):
     chosen = defaults(arguments)["options"]
     assert chosen.preset == preset
     assert chosen.self_training == PRESETS[preset]
+
+
+@pytest.mark.parametrize("preset", ["paper", "released", "gentle"])
+def test_the_papers_presets_augment_nothing_whatever_the_warm_up_did(preset):
+    words = ["--method", "qbst", "--warm-up", "rooms", "--preset", preset]
+    train = defaults(words)["options"].train
+    assert (train.augmentation == Augmentation()) == (preset != "gentle")
+    assert train.preparation.size_input  # without which the network is another one
 
 
 def test_what_a_warm_up_tells_of_its_training_is_the_default(tmp_path):

@@ -72,7 +72,8 @@ def test_a_file_of_the_options_gives_the_options(line, tmp_path):
 def test_the_command_line_wins_and_a_preset_replaces_what_it_sets(tmp_path):
     file = tmp_path / "my.toml"
     file.write_text('source = "s"\ntarget = "t"\nmethod = "qbst"\n[train]\nepochs = 7\n'
-                    "[train.preparation]\nalign = true\n[self_training]\nrounds = 3\n")  # fmt: skip
+                    "[train.preparation]\nalign = true\n[train.augmentation]\nplane = 0.5\n"
+                    "[self_training]\nrounds = 3\n")  # fmt: skip
     common = ("--config", file, "--out", "o")
     got = parsed(*common)
     assert (got.source, got.train.epochs, got.self_training.rounds) == ("s", 7, 3)
@@ -85,8 +86,10 @@ def test_the_command_line_wins_and_a_preset_replaces_what_it_sets(tmp_path):
     got, plain = parsed(*common, "--preset", "paper"), parsed(*paper.split())
     assert got.self_training == plain.self_training
     assert got.train.preparation == plain.train.preparation
+    assert got.train.augmentation == plain.train.augmentation
     assert got.train.epochs == 7
     got = parsed(*common, "--method", "spst")
+    assert got.train.augmentation.plane == 0.5
     assert (got.preset, got.self_training.rule) == ("spst", "spst")
     assert got.self_training.weight_step == 0.005
 

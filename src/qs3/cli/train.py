@@ -21,6 +21,8 @@ from qs3.structure import structure, unstructure
 from qs3.toml_files import merged, read_toml, toml_lines
 from qs3.training.config import (
     PRESETS,
+    PUBLISHED,
+    Augmentation,
     PresetName,
     SelfTrainingSettings,
     TrainSettings,
@@ -154,6 +156,8 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
     how = TrainSettings(preparation=preparation_of(preset))
     if chosen.warm_up is not None:
         how = _as_trained(find_run(chosen.warm_up), how)
+    if preset in PUBLISHED:  # whatever the warm-up had
+        how = replace(how, augmentation=Augmentation())
     if alone := rule is not None and chosen.warm_up is not None and chosen.source is None:
         rounds = replace(rounds, source_loss=False)
     options = TrainOptions(out=Path(), preset=preset, train=how, self_training=rounds)
@@ -200,6 +204,8 @@ def _choices(words: Sequence[str]) -> tuple[Choices, dict[str, Any]]:
     if chosen.preset != filed.preset:
         if isinstance(train := given.get("train"), dict):
             train.pop("preparation", None)
+            if chosen.preset in PUBLISHED:
+                train.pop("augmentation", None)
     elif (chosen.method, chosen.rounds_rule) != (filed.method, filed.rounds_rule):
         chosen = replace(chosen, preset=None)
     else:

@@ -369,6 +369,10 @@ PRESETS: Mapping[str, SelfTrainingSettings] = {
 """The settings of each preset."""
 
 
+PUBLISHED = ("paper", "released")
+"""Presets of QS³'s own columns, which have its preparation and augment nothing else."""
+
+
 def preparation_of(preset: str | None) -> Preparation:
     """Return the preparation that goes with a preset of self-training, or with none.
 
@@ -376,7 +380,7 @@ def preparation_of(preset: str | None) -> Preparation:
         >>> preparation_of("released").redraw, preparation_of(None).redraw
         (False, True)
     """
-    return PAPER if preset in ("paper", "released") else ROBUST
+    return PAPER if preset in PUBLISHED else ROBUST
 
 
 def self_training_preset(name: str, **overrides: Any) -> SelfTrainingSettings:
