@@ -32,6 +32,7 @@ def test_a_dry_run_counts_writes_nothing_and_needs_no_folder(qs3, few, tmp_path)
     assert not (tmp_path / "out").exists()
     done = qs3("generate", *few, "--scans-per-mesh", 3, "--dry-run")
     assert "chair: 2 objects" in done.stdout
+    assert "scans to measure: 100%" in done.stderr
     assert "12 scans, of which 12 in this part, 6 shards" in done.stdout
     assert "disk: " in done.stdout
     assert "hours with" in done.stdout

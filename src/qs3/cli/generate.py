@@ -168,7 +168,7 @@ def _expected(
     from qs3.store.plan import estimate
 
     scans = 3 * len(plan.settings.each_sensor())
-    expected = estimate(plan, part, scans=scans, timeout=timeout)
+    expected = estimate(plan, part, scans=scans, timeout=timeout, text="scans to measure")
     machine = "one worker" if workers is None else f"{max(workers, 1)} workers of this machine"
     hours = expected.seconds / max(workers or 1, 1) / 3600
     return [

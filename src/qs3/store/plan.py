@@ -17,6 +17,7 @@ from qs3.meshes.sizes import check_guesses, class_ranges
 from qs3.store.executors import Failure, LocalExecutor
 from qs3.store.manifest import Manifest, package_versions
 from qs3.store.parts import Place
+from qs3.store.progress import progress_bar
 from qs3.store.scan_item import GenerateSettings, Item, neighbour_of, row_id, scan_item, size_class
 from qs3.store.shards import DType, shard_bytes, table_of
 
@@ -175,11 +176,16 @@ class Estimate:
 
 
 def estimate(
-    plan: Plan, part: tuple[int, int] = (0, 1), scans: int = 3, timeout: float | None = None
+    plan: Plan,
+    part: tuple[int, int] = (0, 1),
+    scans: int = 3,
+    timeout: float | None = None,
+    text: str | None = None,
 ) -> Estimate:
     """Scan a few objects, spread over the list, one after another in one worker, and multiply.
 
-    The first is scanned once more before, to warm up; ``part`` and ``timeout`` as in `generate`.
+    The first is scanned once more before, to warm up; ``part`` and ``timeout`` as in `generate`. A
+    progress bar says ``text``; None shows none.
 
     Raises:
         InputError: where none of them can be scanned.
@@ -191,8 +197,9 @@ def estimate(
     sizes: list[int] = []
     seconds: list[tuple[float, float]] = []
     failure: Failure | None = None
-    with LocalExecutor(1, timeout) as executor:
-        for index in [chosen[0], *chosen]:  # the first scan of a process compiles and loads
+    tried = [chosen[0], *chosen]  # the first scan of a process compiles and loads
+    with LocalExecutor(1, timeout) as executor, progress_bar(len(tried), text, "scan") as bar:
+        for index in tried:
             executor.submit(index, _timed, plan.arguments(index, 0), plan.settings.dtype)
             outcome = executor.next()[1]
             if isinstance(outcome, Failure):
@@ -200,6 +207,7 @@ def estimate(
             else:
                 seconds.append(outcome[0])
                 sizes.append(outcome[1])
+            bar.update()
     if not sizes:
         raise InputError(
             f"none of {len(chosen)} scans tried succeeded: {failure and failure.reason}"
