@@ -99,6 +99,15 @@ def test_self_training_goes_on_from_a_network_without_its_source(qs3, scans, run
     assert "--source" in code.stderr
 
 
+def test_what_the_demo_cannot_do_is_told_before_a_scan_is_made(qs3, scans, tmp_path):
+    out, bad = tmp_path / "demo", tmp_path / "bad"
+    assert "threshold_share" in qs3.refuses("demo", "--out", out, "--scans", scans, "--share", 0)
+    bad.mkdir()
+    np.save(bad / "broken.npy", np.full((40, 3), np.nan))
+    assert "broken.npy" in qs3.refuses("demo", "--out", out, "--scans", bad)
+    assert not out.exists()
+
+
 def test_a_folder_with_the_networks_name_is_not_taken_for_it(qs3, scans, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rooms").mkdir()

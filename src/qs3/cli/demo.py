@@ -18,7 +18,9 @@ from qs3.errors import InputError
 from qs3.files import claim_folder, write_json, write_text
 
 if TYPE_CHECKING:
+    from qs3.io.clouds import UnlabelledClouds
     from qs3.report.contents import Report
+    from qs3.training import SelfTrainingSettings
 
 _MARKER = "demo.json"
 _SHOWN = 200  # of the user's scans, on the page
@@ -79,7 +81,11 @@ def demo(
     network = find_run(settings.network)
     if not is_run(network):  # a folder of this name, say, with something else in it
         raise InputError(f"{network}: {not_a_run()}")
-    load_model(network)  # what is wrong with it is told before anything is scanned
+    # What is wrong with any of these is told before anything is scanned.
+    load_model(network)
+    _rounds(settings)
+    if scans is not None:
+        _read_target(scans, network)
     folder = claim_folder(out, _MARKER)
     write_json(folder / _MARKER, dataclasses.asdict(settings))
     before = folder / "before"  # the records of its scores are written there
@@ -135,26 +141,44 @@ def _renderer(settings: DemoSettings) -> Any:
 
 def _adapt(target: Path, before: Path, settings: DemoSettings, folder: Path) -> bool:
     """Adapt the network; tells whether any round trained it."""
-    from qs3.io import load_clouds, load_unlabelled
-    from qs3.training import fit, load_model, load_whole, self_training_preset
+    from qs3.io import load_clouds
+    from qs3.training import fit, load_model, load_whole
     from qs3.training.rounds import all_skipped, remarks
     from qs3.training.run import train_settings
 
     train = dataclasses.replace(train_settings(before), seed=settings.seed)
-    own = {"threshold_share": settings.share, "rounds": settings.rounds}
-    own |= {"epochs": settings.round_epochs, "source_loss": settings.source_per_class > 0}
-    rounds = self_training_preset("gentle", **own)
-    size, source = (train.num_points, train.preparation), None
+    rounds, source = _rounds(settings), None
     if settings.source_per_class:
         names = load_model(before).class_names
         part: dict[str, Any] = {"cloud": "all", "class_names": names}
+        size = train.num_points, train.preparation
         source = load_whole(load_clouds, folder / "source", *size, **part)
-    clouds = load_whole(load_unlabelled, target, *size)
+    clouds = _read_target(target, before)
     how = {"run_dir": folder / "qbst", "warm_up": before, "preset": "gentle"}
     done = fit("qbst", source, clouds, train, rounds, **how)
     lines = remarks(done.rounds, rounds, done.source.class_names, share="--share")
     tell(*(f"qs3: {line}" for line in lines))
     return not all_skipped(done.rounds)
+
+
+def _rounds(settings: DemoSettings) -> "SelfTrainingSettings":
+    from qs3.training import self_training_preset
+
+    own = {"threshold_share": settings.share, "rounds": settings.rounds}
+    own |= {"epochs": settings.round_epochs, "source_loss": settings.source_per_class > 0}
+    return self_training_preset("gentle", **own)
+
+
+def _read_target(target: Path, run: Path) -> "UnlabelledClouds":
+    from qs3.io import load_unlabelled
+    from qs3.training import load_whole
+    from qs3.training.prepared import require_finite
+    from qs3.training.run import train_settings
+
+    how = train_settings(run)
+    clouds = load_whole(load_unlabelled, target, how.num_points, how.preparation)
+    require_finite(clouds.points, clouds.ids, f"{target}: ")
+    return clouds
 
 
 def _score(folder: Path, settings: DemoSettings, path: Path) -> None:
