@@ -14,12 +14,13 @@ import torch
 import qs3
 from qs3.errors import TOLD, InputError
 from qs3.evaluation.records import find_records
-from qs3.io.preparation import ROBUST
+from qs3.io.clouds import PointClouds
+from qs3.io.preparation import ROBUST, Preparation, unit_ball
 from qs3.training import evaluate, fit, load_model, read_run
 from qs3.training.answers import predict_files
 from qs3.training.checkpoint import load_tensors_into
 from qs3.training.export import export_run
-from qs3.training.prepared import note_size
+from qs3.training.prepared import note_size, prepare_clouds
 from qs3.training.shipped import WEIGHTS, find_run, shipped, workplace
 
 from ..scripts import load_script
@@ -137,6 +138,20 @@ def test_a_stray_makes_no_millimetres_and_centimetres_are_told(caplog):
     (message,) = caplog.messages
     assert "smaller than 5 cm" in message
     assert "are to be in metres" in message
+
+
+def test_clouds_without_a_size_are_told_whatever_else_is_prepared(caplog):
+    sized = Preparation(size_input=True)
+    balls = PointClouds(unit_ball(CLOUDS), np.zeros(6, np.int64), ("box",), tuple("abcdef"))
+    TOLD.clear()
+    with caplog.at_level(logging.WARNING):
+        prepare_clouds(replace(balls, points=CLOUDS), 32, sized)
+        prepare_clouds(balls.select(np.arange(1)), 32, sized)  # one may be just so large
+        prepare_clouds(balls, 32)
+        assert not caplog.messages
+        prepare_clouds(balls.without_labels(), 32, sized)
+    (message,) = caplog.messages
+    assert "fills the unit ball" in message
 
 
 def test_too_few_points_are_told_once(caplog, tmp_path):

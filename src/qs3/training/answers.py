@@ -122,7 +122,7 @@ def predict_files(
         for name, points in clouds:
             try:
                 (answer,) = answer_clouds(loaded, points[None], unknown, calibrated)
-                note_clouds([points[None]], loaded.preparation)
+                note_clouds([points[None]])
             except InputError as error:
                 yield _fault(name, error)
             else:

@@ -18,7 +18,7 @@ from qs3.models.ops import gather_points
 from qs3.models.sized import ball_radius
 from qs3.training.augmentation import augment_clouds, turned
 from qs3.training.config import Augmentation, TrainSettings
-from qs3.training.prepared import Prepared, normalise_batch, note_size
+from qs3.training.prepared import Prepared, normalise_batch
 
 _SHARE_OF_MEMORY = 0.25
 """Part of a GPU's free memory that the clouds may take; the network needs the rest."""
@@ -59,9 +59,7 @@ def load_whole(
         part: ``split``, ``cloud`` and ``class_names``.
     """
     if preparation.counts_points:
-        clouds = load(data, num_points=None, most=max(LARGEST, num_points), **part)
-        note_size(clouds.points, preparation)
-        return clouds
+        return load(data, num_points=None, most=max(LARGEST, num_points), **part)
     try:
         return load(data, num_points=None, **part)
     except UnevenSizesError:

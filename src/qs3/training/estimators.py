@@ -173,7 +173,7 @@ class Adapter(ClassifierMixin, BaseEstimator):
             clouds = [points for path in listed for _, points in read_listed(path)]
         points = clouds.points if isinstance(clouds, PointClouds | UnlabelledClouds) else clouds
         batches = _batches(points)
-        note_clouds(batches, self._loaded.preparation)
+        note_clouds(batches)
         said = [ask(self._loaded, batch) for batch in batches]
         return Description(*map(np.concatenate, zip(*said, strict=True)))
 

@@ -31,6 +31,7 @@ from qs3.training.config import TrainSettings
 Kind = TypeVar("Kind", PointClouds, UnlabelledClouds)
 _HUGE = 20.0  # metres, more than any object of a room
 _TINY = 0.05  # metres, less than any
+_UNIT = 1e-3  # of a radius of 1 in half precision
 _FEW = 32  # points; fewer have no shape
 
 
@@ -143,7 +144,7 @@ def name_few(names: Sequence[str]) -> str:
 
 
 def note_size(points: Float[np.ndarray, "b n 3"], preparation: Preparation) -> None:
-    """Say once where clouds are not in metres, by the looks, and the network is told their size."""
+    """Say once where clouds have no size in metres, by the looks, and the network is told it."""
     if preparation.size_input and points.size:
         some = points[:: max(1, len(points) // BLOCK)]
         # Strays are not gone yet: a twentieth of the points does not count on either side.
@@ -159,17 +160,21 @@ def note_size(points: Float[np.ndarray, "b n 3"], preparation: Preparation) -> N
                 f"clouds are smaller than {100 * _TINY:.0f} cm, and the network is told their "
                 "size: points are to be in metres"
             )
+        balls = np.linalg.norm(some - some.mean(axis=1, keepdims=True), axis=2).max(axis=1)
+        if len(some) > 1 and np.abs(balls - 1).max() < _UNIT:
+            say_once(
+                "every cloud fills the unit ball, and the network is told their size: leave out "
+                "size_input, or give clouds of real sizes"
+            )
 
 
-def note_clouds(clouds: Sequence[Float[np.ndarray, "_ _ 3"]], preparation: Preparation) -> None:
-    """Say once where a network is asked about what can have no answer: `note_size`, and few points.
+def note_clouds(clouds: Sequence[Float[np.ndarray, "_ _ 3"]]) -> None:
+    """Say once where a network is asked about clouds of too few points.
 
     Args:
         clouds: Arrays of clouds.
-        preparation: What is done to them.
     """
     for points in clouds:
-        note_size(points, preparation)
         if any(map(_has_few, points)):
             say_once(
                 f"a cloud has fewer than {_FEW} distinct points, too few to tell its class: its "
@@ -204,6 +209,7 @@ def prepare_clouds(
         >>> prepare_clouds(clouds, 16).points.shape
         (2, 16, 3)
     """
+    note_size(clouds.points, preparation)
     order = _order(clouds.points, num_points, preparation, cache)
     return Prepared(clouds, np.arange(len(clouds)), num_points, preparation, order)
 
