@@ -1,6 +1,7 @@
 """CAD models and unlabelled scans in, a classifier out, in one call."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ import pytest
 import qs3
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds
+
+from .common import same
 
 SMALL = {
     "model_settings": {"channels": [8, 8, 16], "hidden": [8], "transforms": False},
@@ -45,6 +48,23 @@ def test_three_lines(boxes, tmp_path):
     assert made["train"]["preparation"]["size_input"]
     assert made["train"]["augmentation"]["stretch"] == 1.0
     assert model.result_.chosen["stage"] == "round"
+
+
+@pytest.mark.filterwarnings("ignore::qs3.adaptation.selection.SingleClassWarning")
+def test_poisoned_labels_of_the_scans_change_no_bit(boxes, tmp_path):
+    """As clouds that carry them, or in a file: true or wrong, the network is the same."""
+    names, networks = np.array(boxes.class_names), []
+    for labels in (boxes.labels, 1 - boxes.labels):
+        path = tmp_path / str(len(networks)) / "scans.npz"
+        path.parent.mkdir()
+        np.savez(path, points=boxes.points, label=labels, class_names=names)
+        for scans in (path, replace(boxes, labels=labels)):
+            made = adapt(boxes, scans, tmp_path / str(len(networks)), train=SMALL | {"rule": "im"})
+            networks.append(made.model_)
+            assert [record.skipped for record in made.result_.rounds] == [False]
+    (file, clouds), (wrong_file, wrong_clouds) = networks[:2], networks[2:]
+    assert same(file, wrong_file)
+    assert same(clouds, wrong_clouds)
 
 
 @pytest.mark.filterwarnings("ignore::qs3.adaptation.selection.SingleClassWarning")
@@ -91,6 +111,12 @@ def test_what_cannot_be_is_told(boxes, tmp_path):
         adapt(boxes, [], tmp_path)
     with pytest.raises(InputError, match="model"):  # before a mesh is scanned
         adapt("shapes", boxes, tmp_path, train={"model": "dgcnn"})
+    with pytest.raises(InputError, match="epochs = 0"):
+        adapt("shapes", boxes, tmp_path, train={"epochs": 0})
+    with pytest.raises(InputError, match="threshold_share = 0"):
+        adapt("shapes", boxes, tmp_path, self_training={"threshold_share": 0.0})
+    with pytest.raises(InputError, match="absent"):
+        adapt("shapes", tmp_path / "absent", tmp_path)
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="not fitted"):
         qs3.training.Adapter().save(tmp_path)

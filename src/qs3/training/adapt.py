@@ -75,7 +75,12 @@ def adapt(
     for name in ("model", "seed"):
         if name in (train or {}):
             raise InputError(f"{name} cannot be given in train here; use qs3.training.Adapter")
-    source, target = _source(cad, Path(out) / "source", workers, seed), _target(scans)
+    # What is wrong with settings or scans is told before a mesh is scanned.
+    own = {**GENTLE, **(self_training or {})} if method == "qbst" else self_training
+    changed(TrainSettings(), train or {}, " in train")
+    rounds = changed(SelfTrainingSettings(), own or {}, " in self_training")
+    target = _target(scans)
+    source = _source(cad, Path(out) / "source", workers, seed)
     settings = unstructure(train_settings(_LIKE))
     batches = max(1, len(source) // settings["batch_size"])
     settings |= {"epochs": max(1, round(_STEPS / batches))} | dict(train or {})
@@ -83,23 +88,22 @@ def adapt(
     held = held_out(source, TrainSettings(holdout=settings["holdout"]))
     if "rule" not in (train or {}):
         if held.any():
-            settings |= {"rule": "source-val", "validate_every": settings["epochs"]}
+            settings["rule"] = "source-val"
         else:
             _LOG.warning("no class has clouds enough to hold some out: the last round is kept")
+    if settings["rule"] != "last" and "validate_every" not in (train or {}):
+        settings["validate_every"] = settings["epochs"]
     model = settings.pop("model")
     del settings["seed"]
     adapter = Adapter(
         method,
         model,
-        self_training=dict(GENTLE) | dict(self_training or {})
-        if method == "qbst"
-        else self_training,
+        self_training=own,
         train=settings,
         run_dir=Path(out) / "run",
         random_state=seed,
     )
     adapter.fit(source, target)
-    rounds = changed(SelfTrainingSettings(), adapter.self_training or {}, " in self_training")
     for line in remarks(adapter.result_.rounds, rounds, source.class_names, "threshold_share"):
         _LOG.warning(line)
     return adapter
