@@ -125,6 +125,8 @@ CELLS: Mapping[str, Cell] = {
     "S SPST": replace(ROUNDS, method="spst", preset="spst"),
     "S QBST": ROUNDS,
     "S QBST gentle": replace(ROUNDS, preset="gentle"),
+    "S QBST gentle, alone": replace(ROUNDS, preset="gentle", rounds={"source_loss": False}),
+    "S QBST gentle, floor": replace(ROUNDS, preset="gentle", rounds={"floor": 8}),
     "S QBST calibrated": replace(ROUNDS, rounds={"calibrate": True}),
     "S QBST by share": replace(ROUNDS, rounds={"threshold_share": 0.5}),
     "S QBST average": replace(ROUNDS, rounds={"teacher": "average"}),

@@ -50,7 +50,7 @@ def test_a_method_its_settings_and_rounds_after_it(adapted):
     assert settings["train"]["model_settings"] == {"channels": [8, 8, 16], "hidden": [8]}
     assert settings["self_training"]["rule"] == "qbst"
     told = json.loads((adapted / "run.json").read_text())
-    assert (told["method"], told["selection"], told["preset"]) == ("dann+qbst", "im", "default")
+    assert (told["method"], told["selection"], told["preset"]) == ("dann+qbst", "im", "gentle")
     assert len(told["target_clouds"]) == 10
     names = sorted(path.name for path in (adapted / "checkpoints").iterdir())
     rounds, warm_up = (["round-0000", "round-0001", "round-0002"], ["warm-up-0001", "warm-up-0002"])
@@ -99,25 +99,25 @@ def test_rounds_with_all_switches_after_a_method(qs3, source, tmp_path, method):
         settings = structure(json.loads((run / "settings.json").read_text()), RunSettings, run)
         again = tmp_path / "again"
         fit(method, load_clouds(source, num_points=None), load_unlabelled(source, num_points=None),
-            settings.train, settings.self_training, run_dir=again, preset="default")  # fmt: skip
+            settings.train, settings.self_training, run_dir=again, preset="gentle")  # fmt: skip
         weights = [(folder / "model.safetensors").read_bytes() for folder in (run, again)]
         assert weights[0] == weights[1]
 
 
-def test_a_run_whose_rounds_were_all_skipped_says_what_to_change(qs3, store, source, tmp_path):
+def test_a_run_whose_rounds_were_all_skipped_says_what_to_change(qs3, source, tmp_path):
     run = tmp_path / "run"
-    command = ("train", "--source", source, "--target", store, "--out", run, "--method", "qbst",
-               "--self-training.rounds", 2, "--self-training.threshold", 0.98,
-               "--self-training.step", 0, *QUICK)  # fmt: skip
+    command = ("train", "--source", source, "--target", source, "--out", run, "--method", "qbst",
+               "--preset", "default", "--self-training.rounds", 2, "--self-training.step", 0,
+               "--self-training.threshold", 0.98, *QUICK)  # fmt: skip
     for _ in range(2):  # the same command again finds the same
         done = qs3(*command, code=4)
         assert done.stdout == f"{run}\n"
         last = done.stderr.rstrip().splitlines()[-1]
-        assert last.startswith("qs3: all 2 rounds were skipped, as they kept 0 of 10 clouds")
+        assert last.startswith("qs3: all 2 rounds were skipped, as they kept 0 of 40 clouds")
         assert "lower --self-training.threshold, give --self-training.threshold-share" in last
         assert "Next:" not in done.stderr
     assert all(told["skipped"] for told in json.loads((run / "run.json").read_text())["rounds"])
-    qs3("evaluate", run, "--data", store)
+    qs3("evaluate", run, "--data", source)
 
 
 def test_one_confident_class_is_told_in_the_last_lines(qs3, source, store, tmp_path):
@@ -192,11 +192,12 @@ def test_settings_are_json_or_words():
     ("arguments", "preset"),
     [
         ([], "default"),
-        (["--method", "qbst"], "default"),
+        (["--method", "qbst"], "gentle"),
         (["--method=spst"], "spst"),
         (["--method", "gast-spst"], "spst"),
         (["--method", "gast", "--self-training", "spst"], "spst"),
-        (["--method", "gast", "--self-training", "qbst"], "default"),
+        (["--method", "gast", "--self-training", "qbst"], "gentle"),
+        (["--method", "gast", "--self-training", "uniform"], "default"),
         (["--method", "qbst", "--preset", "paper"], "paper"),
         (["--method", "qbst", "--source", "a", "--warm-up", "rooms"], "gentle"),
         (["--method", "spst", "--source", "a", "--warm-up", "rooms"], "spst"),

@@ -19,7 +19,7 @@ def grid(qs3, store, run, tmp_path_factory):
     shutil.copytree(run, folder / "first")
     qs3("train", "--source", store, "--target", store, "--method", "qbst", "--warm-up", run,
         "--out", folder / "second", "--model", "pointnet", "--num-points", 64, "--epochs", 2,
-        "--batch-size", 5, "--threads", 1, "--self-training.threshold", 0.0,
+        "--batch-size", 5, "--threads", 1, "--preset", "default", "--self-training.threshold", 0.0,
         "--self-training.rounds", 2, "--self-training.epochs", 1,
         code=4)  # fmt: skip  # ten clouds are too few for a round
     for name in ("first", "second"):

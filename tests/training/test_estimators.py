@@ -17,12 +17,13 @@ from qs3.training import (
     fit,
     read_run,
 )
+from qs3.training.config import GENTLE
 from qs3.training.run import fingerprint, train_settings
 
 from .common import TRAIN, same
 
 pytestmark = pytest.mark.filterwarnings("ignore::qs3.adaptation.SingleClassWarning")
-ROUNDS = {"rounds": 2, "epochs": 1, "threshold": 0.4}
+ROUNDS = {"rounds": 2, "epochs": 1, "threshold_share": 0.6}
 
 
 def test_the_line_of_the_readme(source, target):
@@ -45,13 +46,13 @@ def test_the_line_of_the_readme(source, target):
             "coral",
             {"rule": "spst", "weight_step": 0.005},
         ),
-        (Adapter("qbst", "pointnet", train=TRAIN, self_training=ROUNDS), "qbst", {}),
+        (Adapter("qbst", "pointnet", train=TRAIN, self_training=ROUNDS), "qbst", GENTLE),
     ],
 )
 def test_it_is_the_fit_of_the_function(source, target, tmp_path, made, method, rounds):
     made.fit(source, target.without_labels())
     settings = TrainSettings(**TRAIN, model="pointnet", preparation=ROBUST)
-    rounds = None if rounds is None else SelfTrainingSettings(**ROUNDS | rounds)
+    rounds = None if rounds is None else SelfTrainingSettings(**dict(rounds) | ROUNDS)
     arguments = (method, source, target.without_labels(), settings, rounds)
     assert same(fit(*arguments, run_dir=tmp_path / "run").model, made.model_)
 

@@ -27,10 +27,11 @@ from qs3.training.config import (
     SelfTrainingSettings,
     TrainSettings,
     preparation_of,
+    usual_preset,
 )
 from qs3.training.history import Tracker
 from qs3.training.run import MODEL, is_run, train_settings
-from qs3.training.shipped import find_run, shipped
+from qs3.training.shipped import find_run
 
 TIME_UP = 3
 """Exit code where --max-time stopped a run that the same command takes up again."""
@@ -83,9 +84,9 @@ class Choices:
     """Rounds of self-training after the method, by this rule: --method gast --self-training
     qbst."""
     preset: PresetName | None = None
-    """Settings of the self-training: ours (default), what lost least on real scans (gentle, from a
-    network that comes with qs3), GAST's SPST (the default of that rule), QS³'s text (paper), or its
-    released code (released). A setting given beside it wins."""
+    """Settings of the self-training: what did best on real scans (gentle, in force for the rule
+    qbst), GAST's SPST (for the rule spst), those of `SelfTrainingSettings()` (default, for others),
+    QS³'s text (paper), or its released code (released). A setting given beside it wins."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,10 +149,7 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
     """
     chosen, given = _choices(words)
     rule = chosen.rounds_rule or COMPOSED.get(chosen.method, ("", None))[1]
-    usual: dict[str | None, PresetName] = {"spst": "spst"}
-    if str(chosen.warm_up) in shipped():
-        usual["qbst"] = "gentle"
-    preset = chosen.preset or usual.get(rule, "default")
+    preset = chosen.preset or usual_preset(rule)
     rounds = PRESETS[preset] if rule is None else replace(PRESETS[preset], rule=rule)
     how = TrainSettings(preparation=preparation_of(preset))
     if chosen.warm_up is not None:

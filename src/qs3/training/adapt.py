@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from qs3.adaptation.names import split_method
 from qs3.errors import InputError
 from qs3.io import load_clouds, load_unlabelled
 from qs3.io.clouds import PointClouds, RaggedClouds, UnlabelledClouds, numbered
@@ -19,8 +20,8 @@ from qs3.meshes.sizes import CLASS_SIZES
 from qs3.processors import usable_processors
 from qs3.structure import unstructure
 from qs3.training.batches import load_whole
-from qs3.training.config import GENTLE, SelfTrainingSettings, TrainSettings, changed
-from qs3.training.estimators import Adapter, Clouds
+from qs3.training.config import TrainSettings, changed
+from qs3.training.estimators import Adapter, Clouds, rounds_of
 from qs3.training.rounds import remarks
 from qs3.training.run import train_settings
 from qs3.training.shipped import WEIGHTS
@@ -76,9 +77,8 @@ def adapt(
         if name in (train or {}):
             raise InputError(f"{name} cannot be given in train here; use qs3.training.Adapter")
     # What is wrong with settings or scans is told before a mesh is scanned.
-    own = {**GENTLE, **(self_training or {})} if method == "qbst" else self_training
     changed(TrainSettings(), train or {}, " in train")
-    rounds = changed(SelfTrainingSettings(), own or {}, " in self_training")
+    rounds = rounds_of(self_training or {}, split_method(method)[1])
     target = _target(scans)
     source = _source(cad, Path(out) / "source", workers, seed)
     settings = unstructure(train_settings(_LIKE))
@@ -98,7 +98,7 @@ def adapt(
     adapter = Adapter(
         method,
         model,
-        self_training=own,
+        self_training=self_training,
         train=settings,
         run_dir=Path(out) / "run",
         random_state=seed,

@@ -345,7 +345,7 @@ GENTLE: Mapping[str, Any] = {
     "rounds": 5,
     "epochs": 4,
 }
-"""Rounds of `SelfTrainingSettings` that lost least on NYU's real objects (docs/real.md)."""
+"""Rounds of QBST that did best on NYU's real objects (docs/real.md)."""
 PRESETS: Mapping[str, SelfTrainingSettings] = {
     "default": SelfTrainingSettings(),
     "gentle": SelfTrainingSettings(**GENTLE),
@@ -371,6 +371,18 @@ PRESETS: Mapping[str, SelfTrainingSettings] = {
 
 PUBLISHED = ("paper", "released")
 """Presets of QS³'s own columns, which have its preparation and augment nothing else."""
+
+
+def usual_preset(rule: str | None) -> PresetName:
+    """Return the preset that rounds by a rule take where none is named.
+
+    Example:
+        >>> usual_preset("qbst"), usual_preset("spst"), usual_preset("uniform")
+        ('gentle', 'spst', 'default')
+    """
+    if rule == "qbst":
+        return "gentle"
+    return "spst" if rule == "spst" else "default"
 
 
 def preparation_of(preset: str | None) -> Preparation:

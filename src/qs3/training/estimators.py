@@ -28,6 +28,7 @@ from qs3.training.config import (
     TrainSettings,
     changed,
     preparation_of,
+    usual_preset,
 )
 from qs3.training.fit import FitResult, fit
 from qs3.training.history import HISTORY
@@ -163,8 +164,8 @@ class Adapter(ClassifierMixin, BaseEstimator):
 
     def _plan(self) -> tuple[str, SelfTrainingSettings | None]:
         """The method, and the settings of the rounds that follow it."""
-        given = self.self_training
-        return self.method, None if given is None else _rounds(given, split_method(self.method)[1])
+        given, rule = self.self_training, split_method(self.method)[1]
+        return self.method, None if given is None else rounds_of(given, rule)
 
     def _ask(self, clouds: Clouds) -> Description:
         self._require_fitted()
@@ -355,7 +356,7 @@ class QBST(Adapter):
         self.random_state = random_state
 
     def _plan(self) -> tuple[str, SelfTrainingSettings | None]:
-        rounds = _rounds(self.self_training or {}, self.rule)
+        rounds = rounds_of(self.self_training or {}, self.rule)
         if rounds.rule != self.rule:
             raise InputError(
                 f"{type(self).__name__} selects by {self.rule}; for rule {rounds.rule!r} use "
@@ -373,8 +374,8 @@ class SPST(QBST):
     rule: ClassVar[str] = "spst"
 
 
-def _rounds(given: Mapping[str, Any], rule: str | None) -> SelfTrainingSettings:
+def rounds_of(given: Mapping[str, Any], rule: str | None) -> SelfTrainingSettings:
     """Settings of rounds: those given, the others from the preset of the rule."""
     given = ({} if rule is None else {"rule": rule}) | dict(given)
-    preset = PRESETS["spst" if given.get("rule") == "spst" else "default"]
+    preset = PRESETS[usual_preset(given.get("rule"))]
     return changed(preset, given, " in self_training")

@@ -27,7 +27,7 @@ from qs3.training.checkpoint import (
     read_facts,
     weights_fingerprint,
 )
-from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings
+from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, usual_preset
 from qs3.training.distributed import all_devices, make_fabric
 from qs3.training.history import EpochRecord, History, Tracker
 from qs3.training.job import Job, fresh_model, make_method, run_job
@@ -272,7 +272,7 @@ def _plan(
     if rule is None:
         return base, self_training
     if self_training is None:
-        return base, PRESETS["spst" if rule == "spst" else "default"]
+        return base, PRESETS[usual_preset(rule)]
     if self_training.rule != rule:
         raise InputError(
             f"method {method} selects by {rule}, its self-training settings say "
