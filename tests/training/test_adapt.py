@@ -115,6 +115,8 @@ def test_what_cannot_be_is_told(boxes, tmp_path):
         adapt("shapes", boxes, tmp_path, train={"epochs": 0})
     with pytest.raises(InputError, match="threshold_share = 0"):
         adapt("shapes", boxes, tmp_path, self_training={"threshold_share": 0.0})
+    with pytest.raises(InputError, match="nope"):
+        adapt("shapes", boxes, tmp_path, method="nope")
     with pytest.raises(InputError, match="absent"):
         adapt("shapes", tmp_path / "absent", tmp_path)
     assert not (tmp_path / "out").exists()

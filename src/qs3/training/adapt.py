@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from qs3.adaptation import method_class
 from qs3.adaptation.names import split_method
 from qs3.errors import InputError
 from qs3.io import load_clouds, load_unlabelled
@@ -76,9 +77,11 @@ def adapt(
     for name in ("model", "seed"):
         if name in (train or {}):
             raise InputError(f"{name} cannot be given in train here; use qs3.training.Adapter")
-    # What is wrong with settings or scans is told before a mesh is scanned.
+    # What is wrong with these is told before a mesh is scanned.
+    base, rule = split_method(method)
+    method_class(base)
     changed(TrainSettings(), train or {}, " in train")
-    rounds = rounds_of(self_training or {}, split_method(method)[1])
+    rounds = rounds_of(self_training or {}, rule)
     target = _target(scans)
     source = _source(cad, Path(out) / "source", workers, seed)
     settings = unstructure(train_settings(_LIKE))
