@@ -35,7 +35,7 @@ NAMES = {"dev": "NYU, first 70 %", "check": "NYU, last 30 %", "sunrgbd": "SUN RG
 PAIRS = (
     ("S", "M"), ("S", "C"), ("C", "M"), ("S+C+M", "M"), ("S+C+M", "S"), ("QBST", "S+C+M"),
     ("SPST", "S+C+M"), ("QBST", "SPST"), ("DGCNN S", "DGCNN M"), ("DGCNN S+C+M", "DGCNN M"),
-    ("DGCNN S+C+M", "DGCNN S"),
+    ("DGCNN S+C+M", "DGCNN S"), ("DGCNN S", "S again"),
     ("DGCNN QBST", "DGCNN S+C+M"),
     ("rooms", "S+C+M"), ("rooms", "M"), ("M sight", "M"),
     ("rooms QBST average", "rooms"), ("rooms QBST gentle", "rooms"),
@@ -64,7 +64,8 @@ SWITCHES = {
 TITLES = {
     "M": "whole surfaces (M)", "C": "what a camera sees, without noise (C)", "S": "our scans (S)",
     "S lit": "the same, the D4xx in a lit room, as they are now",
-    "S+C+M": "all three", "QBST": "all three, then QBST", "SPST": "all three, then SPST",
+    "S+C+M": "all three", "QBST": "all three, then QBST (preset `default`)",
+    "SPST": "all three, then SPST",
     "rooms": "**`rooms`**", "rooms QBST gentle": "`rooms`, then gentle QBST",
     "rooms SPST gentle": "`rooms`, then gentle SPST", "rooms DGCNN": "`rooms` with a DGCNN",
 }  # fmt: skip
