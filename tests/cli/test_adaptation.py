@@ -197,7 +197,6 @@ def test_settings_are_json_or_words():
         (["--method", "gast-spst"], "spst"),
         (["--method", "gast", "--self-training", "spst"], "spst"),
         (["--method", "gast", "--self-training", "qbst"], "gentle"),
-        (["--method", "gast", "--self-training", "uniform"], "default"),
         (["--method", "qbst", "--preset", "paper"], "paper"),
         (["--method", "qbst", "--source", "a", "--warm-up", "rooms"], "gentle"),
         (["--method", "spst", "--source", "a", "--warm-up", "rooms"], "spst"),

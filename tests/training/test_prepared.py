@@ -192,6 +192,7 @@ def test_a_warm_up_of_another_preparation_is_refused(run, source, target, settin
             run_dir=tmp_path / "run", warm_up=run)  # fmt: skip
 
 
+@pytest.mark.filterwarnings("ignore::qs3.adaptation.SingleClassWarning")
 def test_one_place_tells_the_default(source, target, settings):
     assert TrainSettings().preparation == PAPER
     assert preparation_of("paper") == preparation_of("released") == PAPER
