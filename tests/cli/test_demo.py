@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.cli.demo import DemoSettings, _adapt
+from qs3.cli.demo import DemoSettings, _adapt, _read_target, _rounds
 from qs3.training import load_model, read_run
 
 SIZE = ("--share", 1.0, "--rounds", 1, "--round-epochs", 1, "--workers", 1)
@@ -70,7 +70,8 @@ def test_poisoned_labels_do_not_reach_the_demos_network(run, tmp_path):
         labels = (np.arange(40) + shift) % 10
         names = np.array(load_model(run).class_names)
         np.savez(folder / "target.npz", points=points, label=labels, class_names=names)
-        _adapt(folder / "target.npz", run, settings, folder)
+        clouds = _read_target(folder / "target.npz", run)
+        _adapt(clouds, _rounds(settings), run, settings, folder)
         states.append(load_model(folder / "qbst").model.state_dict())
     first, second = states
     assert all(torch.equal(first[name], second[name]) for name in first)

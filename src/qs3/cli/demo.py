@@ -83,9 +83,8 @@ def demo(
         raise InputError(f"{network}: {not_a_run()}")
     # What is wrong with any of these is told before anything is scanned.
     load_model(network)
-    _rounds(settings)
-    if scans is not None:
-        _read_target(scans, network)
+    rounds = _rounds(settings)
+    clouds = None if scans is None else _read_target(scans, network)
     folder = claim_folder(out, _MARKER)
     write_json(folder / _MARKER, dataclasses.asdict(settings))
     before = folder / "before"  # the records of its scores are written there
@@ -101,7 +100,9 @@ def demo(
     else:
         tell(f"[2/4] read {scans}")
     tell("[3/4] adapt to the target without labels")
-    has_trained = _adapt(scans or folder / "target", before, settings, folder)
+    if clouds is None:
+        clouds = _read_target(folder / "target", before)
+    has_trained = _adapt(clouds, rounds, before, settings, folder)
     tell("[4/4] report")
     path = folder / "report.html"
     _score(folder, settings, path) if scans is None else _tell_scans(folder, files, settings, path)
@@ -139,7 +140,13 @@ def _renderer(settings: DemoSettings) -> Any:
     return CameraSettings(samples=settings.samples, variant=settings.variant).make_renderer()
 
 
-def _adapt(target: Path, before: Path, settings: DemoSettings, folder: Path) -> bool:
+def _adapt(
+    clouds: "UnlabelledClouds",
+    rounds: "SelfTrainingSettings",
+    before: Path,
+    settings: DemoSettings,
+    folder: Path,
+) -> bool:
     """Adapt the network; tells whether any round trained it."""
     from qs3.io import load_clouds
     from qs3.training import fit, load_model, load_whole
@@ -147,13 +154,12 @@ def _adapt(target: Path, before: Path, settings: DemoSettings, folder: Path) -> 
     from qs3.training.run import train_settings
 
     train = dataclasses.replace(train_settings(before), seed=settings.seed)
-    rounds, source = _rounds(settings), None
+    source = None
     if settings.source_per_class:
         names = load_model(before).class_names
         part: dict[str, Any] = {"cloud": "all", "class_names": names}
         size = train.num_points, train.preparation
         source = load_whole(load_clouds, folder / "source", *size, **part)
-    clouds = _read_target(target, before)
     how = {"run_dir": folder / "qbst", "warm_up": before, "preset": "gentle"}
     done = fit("qbst", source, clouds, train, rounds, **how)
     lines = remarks(done.rounds, rounds, done.source.class_names, share="--share")

@@ -78,6 +78,8 @@ class Part:
     """Which cloud of a generated data set."""
     count: int | None = None
     """How many clouds these are; None of what is made here, and of what nobody has counted."""
+    checksum: str = ""
+    """That of the user's clouds as `qs3.experiments.setup.count_own` read them."""
 
     def at_hand(self, shared: Path | None) -> bool:
         """Whether these are no real objects, or are there."""

@@ -9,7 +9,7 @@ from qs3.errors import InputError
 from qs3.experiments.domains import DomainData, Own, Part, own_data
 from qs3.experiments.scales import Scale
 from qs3.files import claim_folder, read_json, write_json
-from qs3.io.clouds import CloudChoice, PointClouds
+from qs3.io.clouds import CloudChoice
 from qs3.structure import structure, unstructure
 
 MARKER = "bench.json"
@@ -143,23 +143,24 @@ def count_own(own: Own, scale: Scale) -> Own:
     counted = {}
     for kind, data in own.items():
         assert data.test is not None  # noqa: S101
-        parts = [replace(p, count=len(_read(p, scale))) for p in (data.train, data.test)]
-        counted[kind] = replace(data, train=parts[0], test=parts[1])
+        train, test = (_counted(part, scale) for part in (data.train, data.test))
+        counted[kind] = replace(data, train=train, test=test)
     return counted
 
 
 def _own_record(own: DomainData, scale: Scale) -> OwnRecord:
     """Return what the user's data are known by."""
-    train, test = own.train, own.test
-    assert test is not None and isinstance(train.data, Path)  # noqa: S101
-    sums = _read(train, scale).checksum, _read(test, scale).checksum
-    splits, counts = (train.split, test.split), (train.count, test.count)
-    return OwnRecord(train.data.name, train.cloud, *splits, *sums, *counts)
+    assert own.test is not None and isinstance(own.train.data, Path)  # noqa: S101
+    parts = (own.train, own.test)
+    train, test = (part if part.checksum else _counted(part, scale) for part in parts)
+    splits, sums = (train.split, test.split), (train.checksum, test.checksum)
+    return OwnRecord(own.train.data.name, train.cloud, *splits, *sums, train.count, test.count)
 
 
-def _read(part: Part, scale: Scale) -> PointClouds:
+def _counted(part: Part, scale: Scale) -> Part:
     from qs3.io import load_clouds
 
     assert isinstance(part.data, Path)  # noqa: S101
     how = {"split": part.split, "cloud": part.cloud}
-    return load_clouds(part.data, **how, num_points=scale.train.num_points)
+    clouds = load_clouds(part.data, **how, num_points=scale.train.num_points)
+    return replace(part, count=len(clouds), checksum=clouds.checksum)

@@ -160,8 +160,10 @@ def note_size(points: Float[np.ndarray, "b n 3"], preparation: Preparation) -> N
                 f"clouds are smaller than {100 * _TINY:.0f} cm, and the network is told their "
                 "size: points are to be in metres"
             )
+        if len(some) == 1:  # which may be just so large
+            return
         balls = np.linalg.norm(some - some.mean(axis=1, keepdims=True), axis=2).max(axis=1)
-        if len(some) > 1 and np.abs(balls - 1).max() < _UNIT:
+        if np.abs(balls - 1).max() < _UNIT:
             say_once(
                 "every cloud fills the unit ball, and the network is told their size: leave out "
                 "size_input, or give clouds of real sizes"
