@@ -234,6 +234,11 @@ def kept_clouds(run_dir: Path) -> tuple[list[str], list[Int[np.ndarray, "2 c"]]]
     return clouds, rounds
 
 
+def least_clouds(classes: int, devices: int = 1) -> int:
+    """Return how many clouds a round needs to train on: two a class, and two a device."""
+    return 2 * max(classes, devices)
+
+
 def remarks(
     records: Sequence[RoundRecord],
     rounds: SelfTrainingSettings,
@@ -262,7 +267,7 @@ def remarks(
             )
     if all_skipped(records):
         most, pool = max(sum(record.kept) for record in records), records[0].pool
-        least = 2 * len(class_names)
+        least = least_clouds(len(class_names))
         remedy = f"lower --self-training.threshold, give {share}, or begin with a better warm-up"
         if pool < least:
             remedy = f"give more clouds of the target: a round needs {least}, 2 a class"

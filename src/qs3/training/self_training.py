@@ -35,6 +35,7 @@ from qs3.training.rounds import (
     Select,
     Task,
     begin_rounds,
+    least_clouds,
     write_rounds,
 )
 from qs3.training.run import Run, RunSettings, claim_run, sum_cost, write_run
@@ -208,7 +209,7 @@ def _finish_round(state: Rounds, task: Task) -> None:
 
 
 def _too_few(number: int, count: int, classes: int, devices: int) -> bool:
-    least = 2 * max(classes, devices)
+    least = least_clouds(classes, devices)
     if count < least:
         _LOG.warning(
             "round %d: %d clouds to train on, fewer than %d (2 for each of %d classes and %d "
