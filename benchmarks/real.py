@@ -143,6 +143,7 @@ CELLS: Mapping[str, Cell] = {
     "DGCNN S": replace(DGCNN, cloud="points"),
     "DGCNN S+C+M": DGCNN,
     "DGCNN QBST": replace(DGCNN, method="qbst", warm_up="DGCNN S+C+M"),
+    "DGCNN QBST gentle": replace(DGCNN, method="qbst", preset="gentle", warm_up="DGCNN S+C+M"),
     # Switches of the way into the network and of the augmentation, one at a time, on scans alone.
     "no size": replace(SCANS, preparation=ROBUST),
     "strays kept": replace(SCANS, preparation=replace(SIZED, remove_outliers=False)),

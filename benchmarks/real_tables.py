@@ -36,7 +36,7 @@ PAIRS = (
     ("S", "M"), ("S", "C"), ("C", "M"), ("S+C+M", "M"), ("S+C+M", "S"), ("QBST", "S+C+M"),
     ("SPST", "S+C+M"), ("QBST", "SPST"), ("DGCNN S", "DGCNN M"), ("DGCNN S+C+M", "DGCNN M"),
     ("DGCNN S+C+M", "DGCNN S"), ("DGCNN S", "S again"),
-    ("DGCNN QBST", "DGCNN S+C+M"),
+    ("DGCNN QBST", "DGCNN S+C+M"), ("DGCNN QBST gentle", "DGCNN S+C+M"),
     ("rooms", "S+C+M"), ("rooms", "M"), ("M sight", "M"),
     ("rooms QBST average", "rooms"), ("rooms QBST gentle", "rooms"),
     ("rooms SPST gentle", "rooms"), ("rooms QBST gentle", "rooms SPST gentle"),
