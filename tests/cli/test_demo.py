@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from qs3.cli.demo import DemoSettings, _adapt, _read_target, _rounds
-from qs3.training import load_model, read_run
+from qs3.io.clouds import PointClouds
+from qs3.training import TrainSettings, fit, load_model, read_run
 
 SIZE = ("--share", 1.0, "--rounds", 1, "--round-epochs", 1, "--workers", 1)
 
@@ -115,6 +116,13 @@ def test_what_the_demo_cannot_do_is_told_before_a_scan_is_made(qs3, scans, tmp_p
     bad.mkdir()
     np.save(bad / "broken.npy", np.full((40, 3), np.nan))
     assert "broken.npy" in qs3.refuses("demo", "--out", out, "--scans", bad)
+    points = np.random.default_rng(2).normal(size=(8, 40, 3)).astype(np.float32)
+    ids = tuple(map(str, range(8)))
+    screws = PointClouds(points, np.arange(8) % 2, ("bolt", "nut"), ids)
+    small = TrainSettings(model="pointnet", num_points=32, epochs=1, batch_size=4, threads=1)
+    fit("source-only", screws, None, small, run_dir=tmp_path / "own")
+    told = qs3.refuses("demo", "--out", out, "--network", tmp_path / "own")
+    assert "does not know all classes of the shapes" in told
     assert not out.exists()
 
 

@@ -76,6 +76,7 @@ def demo(
         settings: Size of the demo.
     """
     from qs3.cli.train import NO_ROUND
+    from qs3.meshes.classes import POINTDA10, canonical
     from qs3.training.answers import list_clouds
     from qs3.training.checkpoint import load_model
     from qs3.training.run import is_run
@@ -89,16 +90,21 @@ def demo(
     if not is_run(network):  # a folder of this name, say, with something else in it
         raise InputError(f"{network}: {not_a_run()}")
     # What is wrong with any of these is told before anything is scanned.
-    load_model(network)
+    known = set(map(canonical, load_model(network).class_names))
+    if (scans is None or settings.source_per_class) and not known.issuperset(POINTDA10):
+        raise InputError(
+            f"{network}: does not know all classes of the shapes that the demo scans "
+            f"({', '.join(POINTDA10)}); name your scans for --scans, and --source-per-class 0"
+        )
     rounds = _rounds(settings)
     clouds = None if scans is None else _read_target(scans, network)
     folder = claim_folder(out, _MARKER)
     write_json(folder / _MARKER, dataclasses.asdict(settings))
     before = folder / "before"  # the records of its scores are written there
     shutil.copytree(network, before, dirs_exist_ok=True)
-    # The network has seen draws of 0.
     compares = scans is None and settings.surfaces_per_class > 0
     steps = 5 if compares else 4
+    # The network has seen draws of 0.
     if settings.source_per_class:
         tell(f"[1/{steps}] scan a small source: built-in shapes in rooms, cameras drawn")
         _scan(folder / "source", settings, settings.source_per_class, 2000 + settings.seed)
