@@ -138,6 +138,13 @@ CELLS: Mapping[str, Cell] = {
     "S SD+QBST": replace(SCANS, method="sd", rounds={"rule": "qbst"}, warm_up="S SD"),
     "S GAST": replace(SCANS, method="gast"),
     "S GAST+QBST": replace(SCANS, method="gast", rounds={"rule": "qbst"}, warm_up="S GAST"),
+    # The same by the preset that rounds of QBST have by default.
+    "S SD+QBST gentle": replace(
+        SCANS, method="sd", preset="gentle", rounds={"rule": "qbst"}, warm_up="S SD"
+    ),
+    "S GAST+QBST gentle": replace(
+        SCANS, method="gast", preset="gentle", rounds={"rule": "qbst"}, warm_up="S GAST"
+    ),
     # The paper's network, one seed where three cost too much.
     "DGCNN M": replace(DGCNN, cloud="surface"),
     "DGCNN S": replace(DGCNN, cloud="points"),

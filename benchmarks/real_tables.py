@@ -51,6 +51,8 @@ PAIRS = (
     ("S SD", "S again"),
     ("S SD+QBST", "S SD"), ("S SD+QBST", "S again"), ("S GAST", "S again"),
     ("S GAST+QBST", "S GAST"), ("S GAST+QBST", "S again"),
+    ("S SD+QBST gentle", "S SD"), ("S GAST+QBST gentle", "S GAST"),
+    ("S GAST+QBST gentle", "S again"),
     ("full QBST gentle", "full augmentation"),
 )  # fmt: skip
 """First minus second."""

@@ -93,9 +93,9 @@ def test_dann_makes_the_domains_harder_to_tell_apart():
     values = []
     for method in (SourceOnly(tiny()), DANN(tiny(), hidden=(64,))):
         optimiser = torch.optim.SGD(method.parameters(), lr=0.3)
-        values.append(separability(*train(method, 500, optimiser)))
+        values.append(separability(*train(method, 1000, optimiser)))
     assert values[0] < 0.3
-    assert values[1] > 0.55  # log 2 = 0.69 is chance
+    assert values[1] > 0.6  # log 2 = 0.69 is chance
 
 
 @pytest.mark.slow
