@@ -1,5 +1,7 @@
 """PointMLP-elite (Ma et al., ICLR 2022): residual layers around points, scaled by their spread."""
 
+from contextlib import nullcontext
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
@@ -14,6 +16,7 @@ from qs3.models.classifier import (
     normalised,
 )
 from qs3.models.ops import gather_points, knn, nested_samples
+from qs3.models.ops.gathering import is_exporting
 
 _FLOOR = 1e-5
 """Added to a cloud's standard deviation, as in the release."""
@@ -166,7 +169,10 @@ class PointMLPElite(PointClassifier):
 
     def encode(self, points: Float[Tensor, "b n 3"]) -> Features:
         """Describe each cloud by the maximum over its last centres."""
-        with torch.autocast(points.device.type, enabled=False):  # differences need all their bits
+        # Differences need all their bits. An exported graph has no number formats to switch, and
+        # PyTorch writes no such region around those of the operations inside.
+        whole = torch.autocast(points.device.type, enabled=False)
+        with nullcontext() if is_exporting() else whole:
             features = self.embed(points.to(self.embed.linear.weight.dtype))
             for stage, group in zip(self.stages, self.group(points), strict=True):
                 features = stage(features, *group)

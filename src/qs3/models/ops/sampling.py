@@ -61,7 +61,8 @@ def nested_samples(points: Float[Tensor, "b n 3"], counts: Sequence[int]) -> lis
         tensor([0, 1, 2, 3])
     """
     first = farthest_point_sampling(points, counts[0])
-    numbers = torch.arange(counts[0], device=points.device).expand(len(points), -1)
+    # Not len, which an exporter takes for a constant.
+    numbers = torch.arange(counts[0], device=points.device).expand(points.shape[0], -1)
     return [first, *(numbers[:, :count] for count in counts[1:])]
 
 
