@@ -281,7 +281,7 @@ def test_compiled_networks_give_the_same_scores_and_gradients(backend, names):
     assert done.returncode == 0, done.stderr[-2000:]
     worst = json.loads(done.stdout)
     assert len(worst) == 2 * len(names)
-    assert all(value < 1e-3 for value in worst.values()), worst
+    assert all(value < 1e-6 for value in worst.values()), worst
 
 
 @pytest.mark.gpu

@@ -280,15 +280,15 @@ import json, sys
 import numpy as np
 from pathlib import Path
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.io.preparation import Preparation
+from qs3.structure import structure
 from qs3.training import SelfTrainingSettings, TrainSettings, fit
 data, run = np.load(sys.argv[1]), Path(sys.argv[2])
 settings, rounds = json.loads(sys.argv[3])
-settings["preparation"] = Preparation(**settings["preparation"])
+train = structure(settings, TrainSettings, "settings")
 names = ("ball", "disc", "rod")
 source = PointClouds(data["points"], data["labels"], names, tuple(map(str, range(24))))
 target = UnlabelledClouds(data["target"], tuple(map(str, range(30))))
-fit("qbst", source, target, TrainSettings(**settings), SelfTrainingSettings(**rounds), run_dir=run)
+fit("qbst", source, target, train, SelfTrainingSettings(**rounds), run_dir=run)
 """
 
 
