@@ -37,7 +37,7 @@ PAIRS = (
     ("SPST", "S+C+M"), ("QBST", "SPST"), ("DGCNN S", "DGCNN M"), ("DGCNN S+C+M", "DGCNN M"),
     ("DGCNN S+C+M", "DGCNN S"), ("DGCNN S", "S again"),
     ("DGCNN QBST", "DGCNN S+C+M"), ("DGCNN QBST gentle", "DGCNN S+C+M"),
-    ("rooms", "S+C+M"), ("rooms", "M"), ("M sight", "M"),
+    ("rooms", "S+C+M"), ("rooms", "M"), ("M sight", "M"), ("S again", "M sight"),
     ("rooms QBST average", "rooms"), ("rooms QBST gentle", "rooms"),
     ("rooms SPST gentle", "rooms"), ("rooms QBST gentle", "rooms SPST gentle"),
     ("rooms QBST gentle, refined", "rooms"), ("rooms QBST gentle, more", "rooms"),
@@ -52,7 +52,7 @@ PAIRS = (
     ("S SD+QBST", "S SD"), ("S SD+QBST", "S again"), ("S GAST", "S again"),
     ("S GAST+QBST", "S GAST"), ("S GAST+QBST", "S again"),
     ("S SD+QBST gentle", "S SD"), ("S GAST+QBST gentle", "S GAST"),
-    ("S GAST+QBST gentle", "S again"),
+    ("S GAST+QBST gentle", "S again"), ("S QBST gentle", "S GAST"), ("S QBST gentle", "S SD"),
     ("full QBST gentle", "full augmentation"),
 )  # fmt: skip
 """First minus second."""
