@@ -202,8 +202,7 @@ def test_program_runs_without_qs3(exported):
     assert done.stdout.strip() == f"torch.Size([2, {len(CLASSES)}])", done.stderr
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("to", ["onnx", "torch-export"])
+@pytest.mark.parametrize("to", [pytest.param("onnx", marks=pytest.mark.slow), "torch-export"])
 @pytest.mark.parametrize("name", sorted(set(SMALL) - {TINY}))
 def test_every_network_can_be_exported(name, to, tmp_path):
     model = make_run(tmp_path, name)
