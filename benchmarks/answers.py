@@ -19,14 +19,14 @@ from real import parts
 
 from qs3.adaptation.priors import estimate_prior_em
 from qs3.evaluation.metrics import mean_sem
+from qs3.evaluation.records import score
 from qs3.evaluation.tables import to_markdown
 from qs3.files import write_text
-from qs3.geometry import rotation_z
 from qs3.io import load_clouds
 from qs3.io.preparation import normalise
 from qs3.training import load_model
 from qs3.training.checkpoint import LoadedModel
-from qs3.training.predict import describe
+from qs3.training.predict import describe, describe_turned
 from qs3.training.prepared import Prepared, prepare_clouds
 
 TIMES = 8
@@ -38,10 +38,7 @@ def answers(
 ) -> dict[str, np.ndarray]:
     """Class probabilities of clouds [b k], by way of asking."""
 
-    def ask(points: np.ndarray) -> np.ndarray:
-        return describe(loaded.model, np.ascontiguousarray(points, np.float32)).probabilities
-
-    rng, whole = np.random.default_rng(0), clouds.points
+    rng = np.random.default_rng(0)
     assert clouds.order is not None
     draws = []
     for _ in range(TIMES):
@@ -49,13 +46,13 @@ def answers(
         rows = np.stack([np.resize(pick, clouds.num_points) for pick in picks])
         index = np.take_along_axis(clouds.indices(slice(None)), rows, axis=1)
         chosen = np.take_along_axis(clouds.clouds.points, index[:, :, None], axis=1)
-        draws.append(ask(normalise(chosen, clouds.preparation)))
-    turned = [ask(whole @ rotation_z(2 * np.pi * k / TIMES).T) for k in range(TIMES)]
-    plain = turned[0]
+        points = normalise(chosen, clouds.preparation)
+        draws.append(describe(loaded.model, points).probabilities)
+    plain = describe(loaded.model, clouds).probabilities
     estimated = estimate_prior_em(plain, source_prior)
     return {
         "as they are": plain,
-        f"mean of {TIMES} turns": np.mean(turned, axis=0),
+        f"mean of {TIMES} turns": describe_turned(loaded.model, clouds, TIMES).probabilities,
         f"mean of {TIMES} draws of points": np.mean(draws, axis=0),
         "prior by expectation maximisation": plain * estimated / source_prior,
         "true prior (bound)": plain * true_prior / source_prior,
@@ -88,12 +85,9 @@ def main() -> int:
     ways["mean of the runs"] = [np.mean(said["as they are"], axis=0)]
     lines, told = [], []
     for way, given in ways.items():
-        scores = []
-        for probabilities in given:
-            right = probabilities.argmax(axis=1) == labels
-            by_class = [right[labels == k].mean() for k in np.unique(labels)]
-            scores.append((float(right.mean()), float(np.mean(by_class))))
         names = ("accuracy", "class_mean_accuracy")
+        made = [score(labels, rows.argmax(axis=1), data.class_names) for rows in given]
+        scores = [tuple(getattr(one, name) for name in names) for one in made]
         for run, pair in enumerate(scores):
             lines.append({"way": way, "run": run} | dict(zip(names, pair, strict=True)))
         means = [mean_sem(list(column)) for column in zip(*scores, strict=True)]

@@ -242,9 +242,14 @@ def _score(folder: Path, settings: DemoSettings, path: Path) -> None:
     from qs3.sensor.scan import scan
     from qs3.training import evaluate
 
-    compares = settings.surfaces_per_class > 0
-    names = {_SURFACES: "surfaces alone"} if compares else {}
-    names |= {"before": f"{settings.network} as it comes", "qbst": f"{settings.network} after QBST"}
+    names = {"before": f"{settings.network} as it comes", "qbst": f"{settings.network} after QBST"}
+    compared: tuple[str, ...] = ()
+    if settings.surfaces_per_class > 0:
+        names = {_SURFACES: "surfaces alone"} | names
+        compared = (
+            f"To compare with, a network like {settings.network} learnt here from surfaces alone, "
+            f"seen by no camera: {settings.surfaces_per_class} shapes a class, {_PASSES} epochs.",
+        )
     records = {what: evaluate(folder / name, folder / "target") for name, what in names.items()}
     page = _page(folder, settings)
     made = scan(
@@ -262,10 +267,6 @@ def _score(folder: Path, settings: DemoSettings, path: Path) -> None:
         low, high = record.scores.interval
         lines.append(f"accuracy on the target, {what + ':':21} {record.scores.accuracy:.1%}  "
                      f"(95 % interval {low:.0%} to {high:.0%})")  # fmt: skip
-    compared = (
-        f"To compare with, a network like {settings.network} learnt here from surfaces alone, seen "
-        f"by no camera: {settings.surfaces_per_class} shapes a class, {_PASSES} epochs.",
-    )
     page = dataclasses.replace(
         page,
         summary=f"{settings.network}, which comes with qs3, was adapted by quasi-balanced "
@@ -275,7 +276,7 @@ def _score(folder: Path, settings: DemoSettings, path: Path) -> None:
         montage_title=f"chair · sensor {settings.sensor}",
         notes=(
             *page.notes,
-            *(compared if compares else ()),
+            *compared,
             "The target is simulated, of the kind that the network was trained on, and small: this "
             "shows how adaptation goes, not what it brings on your camera. --scans does that.",
         ),

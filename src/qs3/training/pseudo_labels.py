@@ -20,11 +20,8 @@ from qs3.adaptation.selection import (
 )
 from qs3.errors import InputError
 from qs3.evaluation.metrics import confusion_matrix
-from qs3.geometry import rotation_z
-from qs3.models import PointClassifier
 from qs3.training.config import SelfTrainingSettings
-from qs3.training.predict import Description, describe
-from qs3.training.prepared import Prepared
+from qs3.training.predict import describe_turned
 from qs3.training.rounds import Rounds, Task
 from qs3.training.validation import adapt_statistics
 
@@ -54,11 +51,13 @@ def ask_teacher(state: Rounds, task: Task) -> Answers:
     if task.settings.normalisation == "adabn":
         teacher = copy.deepcopy(teacher)  # training goes on from the statistics of both domains
         adapt_statistics(teacher, target, task.settings.batch_size)
-    said = _describe_turned(teacher, target, task)
+    how = {"batch_size": task.settings.batch_size, "fabric": task.fabric}
+    ask = partial(describe_turned, teacher, turns=rounds.turns, **how)
+    said = ask(target)
     probabilities = said.probabilities
     held, temperature = None, None
     if holdout is not None and len(holdout) and (rounds.calibrate or rounds.prior == "bbse"):
-        held = holdout.labels, _describe_turned(teacher, holdout, task).probabilities
+        held = holdout.labels, ask(holdout).probabilities
     if rounds.calibrate:
         if held is None:
             raise InputError("calibrate needs a held-out part of the source; set holdout above 0")
@@ -68,16 +67,6 @@ def ask_teacher(state: Rounds, task: Task) -> Answers:
     if rounds.refine:
         probabilities = refine_probabilities(said.features, probabilities)
     return Answers(probabilities, held, temperature)
-
-
-def _describe_turned(model: PointClassifier, clouds: Prepared, task: Task) -> Description:
-    """Describe clouds; the mean over turns about z, of which the first is none."""
-    turns, answers = task.rounds.turns, []
-    ask = partial(describe, model, batch_size=task.settings.batch_size, fabric=task.fabric)
-    for turn in range(turns):
-        matrix = rotation_z(2 * np.pi * turn / turns).T.astype(np.float32)
-        answers.append(ask(clouds.points @ matrix) if turn else ask(clouds))
-    return Description(*(np.mean(parts, axis=0) for parts in zip(*answers, strict=True)))
 
 
 def round_threshold(
