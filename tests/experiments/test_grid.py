@@ -6,14 +6,16 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from qs3.cli.reproduce import ReproduceOptions
 from qs3.cli.reproduce import reproduce as command
 from qs3.errors import InputError
-from qs3.evaluation.records import read_record
+from qs3.evaluation.records import read_record, score, write_record
 from qs3.experiments import grid
 from qs3.experiments.cost import scans_left
 from qs3.experiments.data import choose_meshes, make_plans
@@ -71,6 +73,18 @@ def test_only_what_is_missing_is_made_again_and_with_the_same_numbers(finished, 
     for kind in ("md", "csv", "tex", "png"):
         name = f"adaptation-bench.{kind}"
         assert (finished / name).read_bytes() == (whole / name).read_bytes()
+
+
+def test_a_network_that_others_start_from_is_made_again_where_only_its_record_is_there(
+    finished, whole, monkeypatch
+):
+    lost = "S-D_qbst_seed-0"
+    (finished / "results" / f"{lost}.json").unlink()
+    shutil.rmtree(finished / "runs")
+    made = counting(monkeypatch)
+    make_tables(finished, ["adaptation-bench"], ("supervised", "qbst"), ("S-D",), (0,))
+    assert made == ["S-D_ordinary_seed-0", lost]
+    assert comparable(finished) == comparable(whole)
 
 
 def test_a_stop_between_training_and_record_loses_nothing(finished, whole, monkeypatch):
@@ -206,9 +220,9 @@ RUNS = [
 NAMES = [run.name for run in RUNS]
 
 
-def run_all(out, executor, **options):
+def run_all(out, executor, tell=lambda line: None, **options):
     setup = Setup(out, TINY)
-    return run_grid(RUNS, setup, lambda line: None, dict.fromkeys(NAMES, 1.0), executor, **options)
+    return run_grid(RUNS, setup, tell, dict.fromkeys(NAMES, 1.0), executor, **options)
 
 
 @pytest.fixture
@@ -224,6 +238,19 @@ def test_a_warm_up_is_waited_for_and_a_folder_has_one_run_at_a_time(ready_made, 
     assert executor.most == 2  # the source's training, and the other network's
     places = [executor.order.index(name) for name in NAMES[:3]]
     assert places == sorted(places)
+
+
+def test_a_record_that_is_there_stays_and_another_result_is_told(ready_made, whole, tmp_path):
+    made = read_record(whole / "results" / "S-D_ordinary_seed-0.json")
+    other = replace(made, scores=score(np.array([0, 1]), np.array([0, 0]), ("chair", "table")))
+    paths, told = [tmp_path / "results" / f"{name}.json" for name in NAMES], []
+    for path, record in zip(paths[:2], (other, made), strict=True):
+        write_record(path, record)
+    before = [path.read_bytes() for path in paths[:2]]
+    assert run_all(tmp_path, Inline(), told.append) == []
+    assert [path.read_bytes() for path in paths[:2]] == before
+    (line,) = [line for line in told if "stays" in line]
+    assert f"{paths[0]}: stays, with an accuracy of 50.0%" in line
 
 
 def test_a_failed_run_is_named_and_what_others_made_stays(ready_made, tmp_path):

@@ -3,7 +3,7 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from qs3.report.clouds import SIDES, draw_cloud, gallery, project, samples_per_class
+from qs3.report.clouds import SIDES, draw_cloud, gallery, project
 
 
 def test_convention_sides():
@@ -50,13 +50,6 @@ def test_points_that_are_not_finite_are_left_out():
     axes = Figure().add_subplot()
     draw_cloud(axes, np.array([[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]), *SIDES["front"])
     assert len(np.asarray(axes.collections[0].get_offsets())) == 1
-
-
-def test_samples_per_class_takes_the_first_of_each_class():
-    points = np.arange(5.0)[:, None, None] * np.ones((5, 2, 3))
-    samples = samples_per_class(points, np.array([1, 0, 1, 1, 0]), ["a", "b", "c"], count=2)
-    firsts = {name: [float(c[0, 0]) for c in clouds] for name, clouds in samples.items()}
-    assert firsts == {"a": [1.0, 4.0], "b": [0.0, 2.0], "c": []}
 
 
 def test_gallery_keeps_every_cloud_in_its_cell(rng):

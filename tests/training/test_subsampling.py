@@ -4,7 +4,6 @@ import pytest
 from qs3.errors import InputError
 from qs3.io.clouds import UnlabelledClouds, numbered
 from qs3.io.preparation import resample, unit_ball
-from qs3.sensor.sampling import farthest_point_sample, farthest_point_samples
 from qs3.training import prepared
 from qs3.training.prepared import prepare_clouds
 
@@ -28,11 +27,6 @@ def clouds(rng):
     return points
 
 
-def test_indices_are_those_of_one_cloud_after_another(clouds):
-    expected = np.stack([farthest_point_sample(cloud, 120) for cloud in clouds])
-    assert np.array_equal(farthest_point_samples(clouds, 120), expected)
-
-
 @pytest.mark.parametrize("count", [1, 64, 299, 300, 301, 650])
 def test_subsampled_and_normalised_is_what_evaluation_reads(clouds, count):
     """`load_clouds` subsamples cloud by cloud, then the network gets the unit ball."""
@@ -48,7 +42,7 @@ def test_choice_is_made_once(clouds, tmp_path, monkeypatch):
     def forbidden(points, num_points):
         raise AssertionError("made again")
 
-    monkeypatch.setattr(prepared, "farthest_point_samples", forbidden)
+    monkeypatch.setattr(prepared, "farthest_point_sample", forbidden)
     assert np.array_equal(subsample(clouds, 50, tmp_path), first)
     for other, count in ((clouds, 51), (clouds + 1, 50), (clouds[:4], 50)):
         with pytest.raises(AssertionError, match="made again"):

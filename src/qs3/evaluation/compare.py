@@ -20,17 +20,17 @@ class SeedComparison:
     n: int
     """Number of seeds."""
 
-    def format(self, scale: float = 100.0, digits: int = 1) -> str:
-        """Return the value as text, by default in points of a percentage.
+    def format(self) -> str:
+        """Return the value as text, in points of a percentage.
 
         Example:
             >>> compare_seeds({0: 0.6, 1: 0.7}, {0: 0.5, 1: 0.5}).format()
             '+15.0 points (95 % interval -48.5 to +78.5, n=2)'
         """
-        value = f"{scale * self.mean:+.{digits}f} points"
+        value = f"{100 * self.mean:+.1f} points"
         if self.interval is None:
             return f"{value} (one seed, no interval)"
-        low, high = (f"{scale * end:+.{digits}f}" for end in self.interval)
+        low, high = (f"{100 * end:+.1f}" for end in self.interval)
         return f"{value} (95 % interval {low} to {high}, n={self.n})"
 
 

@@ -36,15 +36,15 @@ class MeanSEM:
 
         return None if self.sem is None else float(stdtrit(self.n - 1, 0.975)) * self.sem
 
-    def format(self, scale: float = 100.0, digits: int = 1, count: bool = True) -> str:
-        """Return the value as text, by default in per cent and with the number of values.
+    def format(self, count: bool = True) -> str:
+        """Return the value in per cent as text, by default with the number of values.
 
         Example:
             >>> mean_sem([0.5, 0.6]).format()
             '55.0 ± 5.0 (n=2)'
         """
-        spread = "" if self.sem is None else f" ± {scale * self.sem:.{digits}f}"
-        return f"{scale * self.mean:.{digits}f}{spread}" + f" (n={self.n})" * count
+        spread = "" if self.sem is None else f" ± {100 * self.sem:.1f}"
+        return f"{100 * self.mean:.1f}{spread}" + f" (n={self.n})" * count
 
 
 def accuracy(labels: Int[np.ndarray, "b"], predictions: Int[np.ndarray, "b"]) -> float:

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.adaptation import method_class
 from qs3.adaptation.names import split_method
 from qs3.experiments.domains import DATA, DataSet, Part
 from qs3.experiments.runs import ORDINARY, Run
@@ -15,9 +14,8 @@ from qs3.store.folder import open_folder
 from qs3.store.manifest import finished_shards
 from qs3.store.parts import written_parts
 from qs3.store.plan import Plan, estimate
-from qs3.training.batches import count_batches
 from qs3.training.config import TrainSettings
-from qs3.training.plan import Cost
+from qs3.training.plan import Cost, epoch_steps, round_steps
 from qs3.training.plan import measure as measure_steps
 
 _CLASSES = 10
@@ -92,7 +90,7 @@ def run_seconds(
         only_scores: Whether its network is there, and nothing but its scores is missing.
     """
     settings, rounds, (source, target, test) = run.train, run.self_training, clouds
-    base, size, plain = split_method(run.kind.method)[0], settings.batch_size, costs["source-only"]
+    base, plain = split_method(run.kind.method)[0], costs["source-only"]
     judged = test + source + (0 if rounds is None else target)
     seconds = judged * (plain.preparation + plain.look)
     if only_scores:
@@ -100,20 +98,14 @@ def run_seconds(
     seconds += (source + target) * plain.preparation
     looks = 1
     if not run.kind.warm_up:
-        batches = count_batches(source - int(settings.holdout * source), size)
-        if method_class(base).uses_target:
-            batches = max(batches, count_batches(target, size))
-        seconds += settings.epochs * batches * costs[base].step
+        learnt = source - int(settings.holdout * source)
+        seconds += settings.epochs * epoch_steps(base, settings, learnt, target) * costs[base].step
         if settings.validate_every:
             looks = -(-settings.epochs // settings.validate_every)
     if rounds is not None:
-        pool, batches = target, 0
-        for _ in range(rounds.rounds):
-            kept = int(pool * (rounds.threshold_share or _KEPT))
-            batches += rounds.steps_per_epoch or count_batches(kept, size)
-            pool = kept if rounds.pool == "shrinking" else target
+        kept = rounds.threshold_share or _KEPT
         domains = 2 if rounds.source_loss else 1
-        seconds += rounds.epochs * batches * domains * plain.step
+        seconds += round_steps(rounds, settings, target, kept) * domains * plain.step
         looks = 2 * rounds.rounds
     scored = 0 if run.row == ORDINARY else looks * test  # of each checkpoint
     return seconds + (looks * (source + target) + scored) * plain.look

@@ -15,7 +15,7 @@ from qs3.experiments.domains import DataSet, Domain, Kind, data_of
 from qs3.experiments.runs import Run
 from qs3.experiments.setup import Setup
 from qs3.io import load_clouds
-from qs3.report.clouds import gallery, samples_per_class
+from qs3.report.clouds import gallery
 from qs3.report.figure import write_png
 
 _DOMAINS: tuple[Kind, ...] = ("M", "S", "D", "F")
@@ -55,6 +55,9 @@ class Galleries:
             if not data.own:  # an artist's mesh has the name of its file
                 procedural = [name.startswith("shapes/") for name in clouds.ids]
                 shown = clouds.select(np.flatnonzero(procedural))
-            samples = samples_per_class(shown.points, shown.labels, shown.class_names, _PER_CLASS)
+            samples = {
+                name: list(shown.points[shown.labels == label][:_PER_CLASS])
+                for label, name in enumerate(shown.class_names)
+            }
             write_png(folder / f"{kind}.png", gallery(samples, data.title))
         return folder

@@ -15,7 +15,7 @@ from qs3.experiments.setup import RESULTS, Setup
 from qs3.store.executors import Executor, Failure
 from qs3.store.executors.executor import stop_if_fatal
 from qs3.structure import unstructure
-from qs3.training.run import completed
+from qs3.training.run import MODEL, completed
 
 RUNS = "runs"
 """Folder of the runs, in that of a reproduction."""
@@ -44,7 +44,10 @@ def record_path(run: Run, setup: Setup) -> Path:
 
 
 def missing(runs: Sequence[Run], setup: Setup) -> list[Run]:
-    """Return the runs without a record; the records that are there are checked.
+    """Return the runs to be made; the records that are there are checked.
+
+    Those are the runs without a record, and those whose record is there and whose network is not,
+    though one without a record starts from it: records may come without their networks.
 
     Raises:
         InputError: where a record is damaged or not one of its run.
@@ -55,7 +58,13 @@ def missing(runs: Sequence[Run], setup: Setup) -> list[Run]:
             read_result(run, setup)
         else:
             left.append(run)
-    return left
+    begun = [before for run in left if (before := warm_up_of(setup.scale, run, setup.own))]
+    made = {run.folder for run in left}
+    needed = {run.folder: run for run in begun if run.folder not in made}
+    lost = [
+        run for place, run in needed.items() if not (setup.out / RUNS / place / MODEL).is_file()
+    ]
+    return lost + left
 
 
 def read_result(run: Run, setup: Setup) -> RunRecord:
@@ -113,7 +122,7 @@ def run_grid(
     """Train and score every run that is given, but for what starts from one that failed.
 
     Args:
-        runs: Runs without a record, a warm-up before what starts from it.
+        runs: Those of `missing`, a warm-up before what starts from it.
         setup: Where they go.
         tell: Is told of each run.
         expected: Seconds that each run was estimated to take, by its name.
@@ -149,7 +158,7 @@ def run_grid(
             if isinstance(outcome, Failure):
                 progress.fail(run, f"{outcome.kind}: {outcome.reason}")
             else:
-                write_record(record_path(run, setup), outcome)
+                _keep(run, outcome, setup, tell)
                 progress.done(run, outcome)
     return progress.faults
 
@@ -170,6 +179,18 @@ def _ready(queue: Sequence[Run], busy: Sequence[Run], setup: Setup) -> list[Run]
             ready.append(run)
         taken.add(run.folder)  # of several in one folder, the first goes first
     return ready
+
+
+def _keep(run: Run, record: RunRecord, setup: Setup, tell: Tell) -> None:
+    """Write a record; one that is there stays, as others were compared with it."""
+    path = record_path(run, setup)
+    if not path.is_file():
+        write_record(path, record)
+    elif (before := read_record(path)).scores != record.scores:
+        tell(
+            f"{path}: stays, with an accuracy of {before.scores.accuracy:.1%}; the network that "
+            "was made again, on another machine perhaps, is another one"
+        )
 
 
 class _Progress:

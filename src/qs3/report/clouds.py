@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 
 import matplotlib
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -91,25 +91,6 @@ def draw_cloud(
             axes.axhline(float(limits[0][2]), color=_GROUND, linewidth=0.8, zorder=0)
         bar = bar_length(float(high[0] - low[0]))
         _draw_bar(axes, float(low[0]), float(low[1]) - pad, bar, f"{bar:g}")
-
-
-def samples_per_class(
-    points: Float[np.ndarray, "b n 3"],
-    labels: Int[np.ndarray, "b"],
-    class_names: Sequence[str],
-    count: int = 4,
-) -> dict[str, list[np.ndarray]]:
-    """Return the first ``count`` clouds of each class, by class name.
-
-    Example:
-        >>> samples = samples_per_class(np.zeros((3, 5, 3)), np.array([1, 1, 0]), ["a", "b"], 1)
-        >>> {name: len(clouds) for name, clouds in samples.items()}
-        {'a': 1, 'b': 1}
-    """
-    return {
-        name: [points[i] for i in np.flatnonzero(labels == index)[:count]]
-        for index, name in enumerate(class_names)
-    }
 
 
 @house_style

@@ -43,21 +43,6 @@ def farthest_point_sample(
     return sample(np.ascontiguousarray(points[order].T), order, num_points, first, _BLOCK)
 
 
-def farthest_point_samples(
-    clouds: Float[np.ndarray, "b n 3"], num_points: int
-) -> Int[np.ndarray, "b m"]:
-    """Farthest point samples of clouds of one size, each from its point 0.
-
-    Raises:
-        InputError: as `farthest_point_sample`.
-
-    Example:
-        >>> farthest_point_samples(np.array([[[0.0, 0, 0], [1, 0, 0], [3, 0, 0]]]), 2).tolist()
-        [[0, 2]]
-    """
-    return np.array([farthest_point_sample(cloud, num_points) for cloud in clouds])
-
-
 def _along_curve(points: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, "n"]:
     """Indices in the order of a Morton curve through 1024³ cells."""
     size = float(np.ptp(points, axis=0).max())

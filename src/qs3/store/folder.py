@@ -53,11 +53,6 @@ class Folder:
         path = self.path
         return PurePosixPath(self.address).name if path is None else path.resolve().name
 
-    @property
-    def present(self) -> bool:
-        """Whether the folder is there; in an object store, whether anything is in it."""
-        return bool(self.names()) if self.path is None else self.path.is_dir()
-
     def exists(self, name: str) -> bool:
         """Whether there is a file of this name."""
         try:

@@ -71,8 +71,6 @@ class FitResult:
     """Stage and number of the network that it chose; round 0 is the one before the rounds."""
     checkpoints: tuple[Checkpoint, ...]
     """Networks along the way, with what each validator says of them."""
-    adapted: bool
-    """Whether the target had a part in the weights or in the choice of the network."""
     source: Prepared[PointClouds]
     """What was trained on: the source without its held-out part."""
     holdout: Prepared[PointClouds] | None
@@ -231,7 +229,6 @@ def fit(
         selection=settings.rule,
         chosen=chosen,
         checkpoints=tuple(read_checkpoints(run_dir)),
-        adapted=adapted,
         source=job.source,
         holdout=job.holdout,
         target=job.target,

@@ -69,6 +69,28 @@ def measure(
     return Cost(step * share, look * share, preparation * share)
 
 
+def epoch_steps(method: str, settings: TrainSettings, learnt: int, target: int) -> int:
+    """Count the steps of an epoch: one pass over the larger of the domains that it trains on."""
+    size, least = settings.batch_size, 2 * settings.devices
+    steps = count_batches(learnt, size, least)
+    if target and method_class(method).uses_target:
+        steps = max(steps, count_batches(max(target, least), size, least))
+    return steps
+
+
+def round_steps(
+    rounds: SelfTrainingSettings, settings: TrainSettings, target: int, kept: float = 1.0
+) -> int:
+    """Count the steps of all rounds that keep a share of the clouds they choose from."""
+    pool, steps = target, 0
+    for _ in range(rounds.rounds):
+        chosen = int(pool * kept)
+        each = count_batches(chosen, settings.batch_size, 2 * settings.devices)
+        steps += rounds.epochs * (rounds.steps_per_epoch or each)
+        pool = chosen if rounds.pool == "shrinking" else target
+    return steps
+
+
 def describe_plan(
     method: str,
     source: PointClouds | None,
@@ -91,24 +113,22 @@ def describe_plan(
         warm_up: Whether a network is given that takes the place of the training on the source.
     """
     lines, steps, classes = [], 0, 10
-    size, least = settings.batch_size, 2 * settings.devices
+    seen = 0 if target is None else len(target)
     if source is not None:
         held, classes = int(held_out(source, settings).sum()), len(source.class_names)
         counts = Counter(source.labels.tolist())
-        each = ", ".join(f"{name} {counts[i]}" for i, name in enumerate(source.class_names))
-        lines.append(f"source    {len(source)} clouds, {held} of them held out: {each}")
-        batches = count_batches(len(source) - held, size, least)
-        if target is not None and method_class(method).uses_target:  # the longer pass counts
-            batches = max(batches, count_batches(max(len(target), least), size, least))
+        named = ", ".join(f"{name} {counts[i]}" for i, name in enumerate(source.class_names))
+        lines.append(f"source    {len(source)} clouds, {held} of them held out: {named}")
         if not warm_up:
-            steps = settings.epochs * batches
-            work = f"{settings.epochs} epochs of {batches} steps of {size} clouds: {steps}"
-            lines.append(f"training  {method}, {work}")
+            each = epoch_steps(method, settings, len(source) - held, seen)
+            steps = settings.epochs * each
+            work = f"{settings.epochs} epochs of {each} steps of {settings.batch_size} clouds"
+            lines.append(f"training  {method}, {work}: {steps}")
     if target is not None:
         lines.append(f"target    {len(target)} clouds")
     if rounds is not None and target is not None:
-        each = rounds.steps_per_epoch or count_batches(len(target), size, least)
-        most = rounds.rounds * rounds.epochs * each
+        most = round_steps(rounds, settings, seen)
+        each = most // (rounds.rounds * rounds.epochs)
         work = f"{rounds.rounds} rounds of {rounds.epochs} epochs of at most {each} steps: {most}"
         lines.append(f"rounds    {rounds.rule}, {work}")
         steps += most * (2 if rounds.source_loss else 1)  # as many clouds of the source
@@ -126,8 +146,8 @@ def describe_plan(
         labels = np.arange(len(target)) % classes
         source = PointClouds(target.points, labels, names, target.ids)
     cost = measure(method, source, source.without_labels() if target is None else target, settings)
-    clouds = len(source) + (0 if target is None else len(target))
-    hours, minutes = divmod(round((steps * cost.step + clouds * cost.preparation) / 60), 60)
+    seconds = steps * cost.step + (len(source) + seen) * cost.preparation
+    hours, minutes = divmod(round(seconds / 60), 60)
     lines.append(
         f"time      about {hours} h {minutes:02} min of processor time here, or more where "
         f"validators look often: {cost.step:.2g} s a step"

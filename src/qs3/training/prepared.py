@@ -24,7 +24,7 @@ from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.preparation import BLOCK, LARGEST, PAPER, Preparation, distinct_inliers, normalise
 from qs3.io.scratch import scratch_array
 from qs3.models.sized import ball_radius
-from qs3.sensor.sampling import farthest_point_sample, farthest_point_samples
+from qs3.sensor.sampling import farthest_point_sample
 from qs3.training.checkpoint import read_tensors, write_tensors
 from qs3.training.config import TrainSettings
 
@@ -273,7 +273,7 @@ def _order(
         if counting:
             order = _ranked(points, num_points, preparation, width)
         else:
-            chosen = farthest_point_samples(points, num_points)
+            chosen = np.array([farthest_point_sample(cloud, num_points) for cloud in points])
             order = Order(chosen.astype(kind), np.full(b, num_points))
         if path is not None:
             index, counts = torch.from_numpy(order.index), torch.from_numpy(order.counts)

@@ -40,7 +40,6 @@ def read_ragged(
     where: str | Path | Folder,
     cloud: CloudChoice = "points",
     split: str | None = None,
-    partial: bool = False,
 ) -> RaggedClouds:
     """Read one kind of cloud of a data set, each in its own size.
 
@@ -51,7 +50,6 @@ def read_ragged(
         split: Rows of this split only; where every row tells its ``frame`` and whether it is
             ``strict``, as those of ``qs3 extract nyuv2``, also a part of
             `qs3.io.layouts.npz.frame_parts`.
-        partial: Accept a data set whose making has not finished.
 
     Raises:
         InputError: where the folder is not a data set, is unfinished or damaged, or has no such
@@ -60,7 +58,7 @@ def read_ragged(
     folder = open_folder(where)
     manifest = open_dataset(folder)
     shards = finished_shards(folder, manifest.shards)
-    if len(shards) < manifest.shards and not partial:
+    if len(shards) < manifest.shards:
         raise InputError(
             f"{folder}: unfinished, {len(shards)} of {manifest.shards} shards; run the same "
             "command again"
