@@ -87,6 +87,18 @@ def test_a_network_that_others_start_from_is_made_again_where_only_its_record_is
     assert comparable(finished) == comparable(whole)
 
 
+def test_data_made_anew_that_differ_are_told_before_a_training(finished, monkeypatch):
+    (finished / "results" / "S-D_qbst_seed-0.json").unlink()
+    path = finished / "results" / "S-D_supervised_seed-0.json"
+    record = read_json(path)
+    record["test"]["checksum"] = "0" * 64
+    write_json(path, record)
+    made = counting(monkeypatch)
+    with pytest.raises(InputError, match=f"{path}: read other data than .*data/target holds"):
+        make_tables(finished, ["adaptation-bench"], ("supervised", "qbst"), ("S-D",), (0,))
+    assert made == []
+
+
 def test_a_stop_between_training_and_record_loses_nothing(finished, whole, monkeypatch):
     shutil.rmtree(finished / "results")
 

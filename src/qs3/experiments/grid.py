@@ -12,6 +12,7 @@ from qs3.evaluation.records import DataRecord, RunRecord, read_record, write_rec
 from qs3.experiments.domains import DataSet, Own, Part
 from qs3.experiments.runs import ORDINARY, SUPERVISED, Run, warm_up_of
 from qs3.experiments.setup import RESULTS, Setup
+from qs3.io.clouds import CloudChoice
 from qs3.store.executors import Executor, Failure
 from qs3.store.executors.executor import stop_if_fatal
 from qs3.structure import unstructure
@@ -65,6 +66,46 @@ def missing(runs: Sequence[Run], setup: Setup) -> list[Run]:
         run for place, run in needed.items() if not (setup.out / RUNS / place / MODEL).is_file()
     ]
     return lost + left
+
+
+def require_same_data(runs: Sequence[Run], left: Sequence[Run], setup: Setup) -> None:
+    """Hold the data that runs will read to what the records of others read.
+
+    What another machine makes anew differs in rounding at least; tables refuse a mixture, which
+    would show after hours of training only.
+
+    Raises:
+        InputError: where a record read other data; the first such record is named.
+    """
+    from qs3.io.layouts.store import read_ragged
+
+    def made(run: Run) -> list[tuple[Path, CloudChoice] | None]:
+        return [
+            (part.locate(setup.out, setup.shared), part.cloud)
+            if part is not None and isinstance(part.data, DataSet)
+            else None
+            for part in run.parts(setup.own)
+        ]
+
+    needed = {data for run in left for data in made(run)}
+    sums: dict[tuple[Path, CloudChoice], str] = {}
+    for run in runs:
+        path = record_path(run, setup)
+        if not path.is_file():
+            continue
+        record = read_record(path)
+        parts = record.source, record.target, record.test
+        for data, read in zip(made(run), parts, strict=True):
+            if data is None or read is None or data not in needed:
+                continue
+            if data not in sums:
+                sums[data] = read_ragged(*data).checksum
+            if sums[data] != read.checksum:
+                raise InputError(
+                    f"{path}: read other data than {data[0]} holds, which another machine or "
+                    f"version may have made again; put the former back, or move the records of the "
+                    f"former out of {path.parent}, and run the same command again"
+                )
 
 
 def read_result(run: Run, setup: Setup) -> RunRecord:

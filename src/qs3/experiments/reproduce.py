@@ -11,7 +11,7 @@ from qs3.errors import InputError
 from qs3.experiments import GALLERIES
 from qs3.experiments.domains import DATA, data_of
 from qs3.experiments.experiment import load_experiment
-from qs3.experiments.grid import Tell, data_sets, missing, run_grid
+from qs3.experiments.grid import Tell, data_sets, missing, require_same_data, run_grid
 from qs3.experiments.runs import Run
 from qs3.experiments.setup import Setup, claim
 from qs3.experiments.table import Table
@@ -180,6 +180,7 @@ def reproduce(
             tell(f"{name}: {count} scans failed and are absent")
     failed: list[str] = []
     if left:
+        require_same_data(runs, left, setup)
         # A cluster gives a run its GPU itself.
         devices = () if workers.executor == "ray" else workers.devices
         at_once = max(len(workers.devices), workers.workers)
