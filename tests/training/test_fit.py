@@ -22,6 +22,16 @@ from .common import same
 ROUNDS = SelfTrainingSettings(rounds=1, epochs=1, threshold=0.4)
 
 
+def test_a_class_without_a_cloud_is_told(source, settings, tmp_path, caplog):
+    few = source.select(np.flatnonzero(source.labels != 1))
+    short = replace(settings, epochs=1, holdout=0.0)
+    fit("source-only", few, None, short, run_dir=tmp_path / "few")
+    assert "no cloud of disc to learn from" in caplog.text
+    caplog.clear()
+    fit("source-only", source, None, short, run_dir=tmp_path / "all")
+    assert "to learn from" not in caplog.text
+
+
 def test_source_only(source, settings, tmp_path):
     result = fit("source-only", source, None, settings, run_dir=tmp_path / "run")
     assert len(result.history) == settings.epochs

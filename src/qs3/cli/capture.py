@@ -1,6 +1,7 @@
 """``qs3 capture``: frames of a depth camera, live or recorded, as files."""
 
 import contextlib
+import shlex
 from pathlib import Path
 
 from qs3.cli.options import Flat
@@ -22,6 +23,7 @@ def capture(settings: Flat[CaptureSettings], out: Path) -> int:
         write_frames(open_camera(settings), out)
     count = len(list_images(out / DEPTH)) if (out / DEPTH).is_dir() else 0
     show(out)
-    tell(f"{count} frames. Next: qs3 segment {out / DEPTH}/FRAME --intrinsics {out} --out OBJECTS; "
-         f"qs3 watch RUN --camera folder:{out}")  # fmt: skip
+    depth, camera = (shlex.quote(str(path)) for path in (out / DEPTH, out))
+    tell(f"{count} frames. Next: qs3 segment {depth}/FRAME --intrinsics {camera} --out OBJECTS; "
+         f"qs3 watch RUN --camera {shlex.quote(f'folder:{out}')}")  # fmt: skip
     return 0

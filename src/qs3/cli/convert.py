@@ -1,5 +1,6 @@
 """``qs3 convert``: a data set of this field into the layout of another."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -65,6 +66,6 @@ def convert(
     kind, given = "without labels", "--method qbst --source DATA --target"
     if clouds.labels is not None:
         kind, given = f"of {len(set(clouds.labels.tolist()))} classes", "--source"
-    tell(f"{len(clouds.ids)} clouds {kind} written as {to}. Next: qs3 train {given} {target} "
-         "--out RUN")  # fmt: skip
+    tell(f"{len(clouds.ids)} clouds {kind} written as {to}. Next: qs3 train {given} "
+         f"{shlex.quote(str(target))} --out RUN")  # fmt: skip
     return 0

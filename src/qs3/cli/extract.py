@@ -1,5 +1,6 @@
 """``qs3 extract``: objects out of real scans, into a data set."""
 
+import shlex
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -88,13 +89,15 @@ def _tell(out: str, report: ExtractReport) -> int:
         tell(f"clouds in the axes of the {report.axes}")
     show(out)
     left = ""
-    if report.planned is not None and not report.failed:
-        fewer = report.planned - report.objects
-        left = f" of {report.planned}, {fewer} had fewer than {report.min_points} points"
+    if report.planned is not None:
+        fewer = f"had fewer than {report.min_points} points"
+        left = f" of {report.planned}, {report.planned - report.objects} {fewer}"
+        if report.failed:
+            left = f" of {report.planned}, the others failed or {fewer}"
     tell(
         f"{report.objects} objects{left}; {report.units} frames or scenes done, {report.skipped} "
         f"were there before, {report.failed} failed. Next: qs3 train --method qbst --source DATA "
-        f"--target {out} --out RUN"
+        f"--target {shlex.quote(str(out))} --out RUN"
     )
     refuse_failures(out, read_failures(out), "scenes or frames")
     return 0

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -114,7 +115,7 @@ def generate(
         how = {"executor": RayExecutor(address, timeout, gpus_per_scan)}
     report = generate_data(items, out, settings, shard=part, retry_failed=retry_failed, **how)
     show(out)
-    following = f"qs3 train --source {out} --out RUN"
+    following = f"qs3 train --source {shlex.quote(str(out))} --out RUN"
     if recipe is not None:
         following += " --source-cloud all"
     if part[1] > 1:

@@ -44,7 +44,7 @@ def scan(
     from qs3.meshes.collections import load_named
     from qs3.report.figure import write_png
     from qs3.report.montage import montage, montage_view
-    from qs3.sensor.frames import remove_frames, write_frames, write_parts
+    from qs3.sensor.frames import is_part, remove_frames, write_frames, write_parts
     from qs3.sensor.scan import scan as scan_mesh
 
     start = time.perf_counter()
@@ -75,7 +75,8 @@ def scan(
     folder = claim_folder(out, "scan.json")
     # The record first: it marks the folder as ours, should this be stopped in between.
     write_json(folder / "scan.json", record)
-    for stale in folder.glob("view-*-*.*"):  # of an earlier scan into this folder
+    replaced = (folder / "cloud.ply").is_file()
+    for stale in filter(is_part, list(folder.iterdir())):
         stale.unlink()
     remove_frames(folder / "frames")
     write_ply(folder / "cloud.ply", result.points, result.view)
@@ -87,6 +88,8 @@ def scan(
         write_frames(folder / "frames", result)
         written.append(folder / "frames")
     show(*written)
+    if replaced:
+        tell(f"{folder}: the scan that was there is replaced")
     tell(f"{_summary(result)}; {time.perf_counter() - start:.1f} s. "
          f"Look at {folder / 'montage.png'}")  # fmt: skip
     return 0

@@ -1,5 +1,6 @@
 """``qs3 segment``: the objects of a table or a floor, one cloud each."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -30,5 +31,6 @@ def segment(
         name, count = f"object_{number:03d}", str(len(item.points))
         rows.append([name, count, *numbers, f"{item.heading:.0f}°"])
     show(*columns(rows, 1))
-    tell(f"{len(objects)} objects in {out}, in metres; see {TABLE}. Next: qs3 predict RUN {out}")
+    following = f"qs3 predict RUN {shlex.quote(str(out))}"
+    tell(f"{len(objects)} objects in {out}, in metres; see {TABLE}. Next: {following}")
     return 0

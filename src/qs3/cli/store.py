@@ -76,6 +76,8 @@ def _lines(contents: dict[str, Any]) -> list[str]:
         f"{points} points a cloud",
         "classes: " + _counts(contents["classes"]),
     ]
+    if empty := [name for name, count in contents["classes"].items() if not count]:
+        lines.append("no cloud of: " + ", ".join(empty))
     if contents["renamed"]:
         names = (f"{own} → {other}" for own, other in contents["renamed"].items())
         lines.append("renamed: " + ", ".join(names))

@@ -1,6 +1,7 @@
 """``qs3 train``: a classifier from labelled clouds, adapted to unlabelled ones if asked."""
 
 import functools
+import shlex
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -316,5 +317,5 @@ def train(options: Flat[TrainOptions]) -> int:
         tell(f"qs3: {line}")
     if all_skipped(result.rounds):
         return NO_ROUND
-    tell(f"Next: qs3 evaluate {options.out} --data DATA")
+    tell(f"Next: qs3 evaluate {shlex.quote(str(options.out))} --data DATA")
     return 0

@@ -167,7 +167,8 @@ def check_guesses(items: Iterable[Any]) -> None:
         if len(guesses) > 1:
             raise InputError(
                 f"object_size file: {guesses['m']} would be taken for metres and {guesses['mm']} "
-                "for millimetres, by their lengths; name the unit of all of them: --units mm, say"
+                "for millimetres, by their lengths; where all have one unit, name it: --units mm, "
+                "say; otherwise save those of the other anew"
             )
 
 

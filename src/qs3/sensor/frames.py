@@ -19,6 +19,7 @@ Convention:
 
 import contextlib
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +94,19 @@ def remove_frames(folder: Path) -> None:
                 path.unlink()
         with contextlib.suppress(OSError):  # somebody else's files are in it
             Path(place).rmdir()
+
+
+_PART = re.compile(r"view-\d+-(left|right|depth|true-depth|camera)\.(png|json)")
+
+
+def is_part(path: Path) -> bool:
+    """Tell by its name whether `write_parts` wrote a file.
+
+    Example:
+        >>> is_part(Path("view-0-depth.png")), is_part(Path("view-0-mine.png"))
+        (True, False)
+    """
+    return _PART.fullmatch(path.name) is not None
 
 
 def write_parts(folder: Path, scan: Scan) -> list[Path]:

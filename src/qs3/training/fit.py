@@ -164,6 +164,7 @@ def fit(
         before = read_run(warm_up) if (warm_up / RUN).is_file() else None
         unseen = _is_new(source, held, settings, warm_up, loaded.settings, before)
     run_dir = Path(run_dir)
+    _note_absent(source)
     has_holdout = unseen and bool(held.any())
     _require_judges(settings, rounds_settings, target, has_holdout, held)
     # What cannot be made must not leave a folder behind that refuses the corrected call.
@@ -357,3 +358,15 @@ def _is_new(
         warm_up,
     )
     return False
+
+
+def _note_absent(source: PointClouds) -> None:
+    """Say which classes have no cloud: a network answers them all the same."""
+    there = set(source.labels.tolist())
+    absent = [name for label, name in enumerate(source.class_names) if label not in there]
+    if absent and there:  # without a source, rounds go on from a network that knows its classes
+        _LOG.warning(
+            "no cloud of %s to learn from, and the network may answer it none the less; leave the "
+            "class out, or see what failed (failures.jsonl of a data set)",
+            ", ".join(absent),
+        )

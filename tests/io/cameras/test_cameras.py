@@ -5,6 +5,7 @@ import json
 import shutil
 import time
 
+import cv2
 import numpy as np
 import pytest
 
@@ -123,6 +124,10 @@ def test_a_folder_of_images_with_a_camera_beside_them(tmp_path):
     (tmp_path / "K.txt").write_text("224 0 159.5 0 224 119.5 0 0 1")
     assert read_intrinsics(tmp_path).fx == 224
     assert len(read(f"folder:{tmp_path}")) == 2
+    # The camera's file tells no size; that of the first frame is that of all.
+    cv2.imwrite(str(tmp_path / "000002.png"), np.full((120, 160), 900, np.uint16))
+    with refused("is 160×120 pixels, the camera 320×240", tmp_path / "000002.png"):
+        read(f"folder:{tmp_path}")
 
 
 def test_a_recording_of_a_realsense_gives_every_frame(tmp_path):

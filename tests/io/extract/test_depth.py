@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.errors import InputError
+from qs3.errors import TOLD, InputError
 from qs3.io.extract.cut import CutSettings, keep_pixels, lift, upright
 from qs3.io.extract.depth import (
     DepthImageSettings,
@@ -219,6 +219,17 @@ def test_every_way_to_tell_a_camera(tmp_path):
     assert camera == Intrinsics(150.0, 150.0, 77.0, 61.0, 9, 8, 1e-4)
     with pytest.raises(InputError, match="160×120 pixels, the camera 9×8"):
         camera.check_size((120, 160), "a.png")
+
+
+def test_a_principal_point_outside_the_image_is_told(caplog):
+    TOLD.discard("principal point")
+    camera = read_intrinsics("448,448,319.5,100")
+    camera.check_size((240, 640), "whole.png")
+    assert not caplog.text
+    camera.check_size((240, 320), "crop.png")
+    assert not caplog.text  # the last column still
+    camera.check_size((240, 300), "crop.png")
+    assert "crop.png: is 300×240 pixels, and the camera's principal point" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,8 @@ def folder_camera(folder: Path, intrinsics: str = "", colour: bool = True) -> Ca
     for name, path in images.items():
         raw = read_raw(path)
         camera.check_size(raw.shape, str(path))
+        height, width = raw.shape  # of all, where the camera's file does not tell
+        camera = dataclasses.replace(camera, height=height, width=width)
         step = None if raw.dtype.kind == "f" else camera.depth_scale or MILLIMETRE
         depth = to_metres(raw, camera.depth_scale)
         picture = folder / COLOUR / f"{name}.png"

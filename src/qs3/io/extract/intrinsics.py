@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.io.guards import Numbers, as_matrix, naming, pick, read_numbers, read_small_json
 
 CAMERA_FILES = ("intrinsics.json", "intrinsics.txt", "camera.json", "K.txt")
@@ -53,12 +53,22 @@ class Intrinsics:
             raise InputError(f"camera: depth scale {self.depth_scale:g} must be positive")
 
     def check_size(self, shape: tuple[int, ...], where: str) -> None:
-        """Refuse an image of another size than the camera's; ``where`` names it."""
+        """Refuse an image of another size than the camera's; ``where`` names it.
+
+        A principal point outside the image, as of a crop from a corner, is told once.
+        """
         height, width = shape[:2]
         if (self.width or width, self.height or height) != (width, height):
             raise InputError(
                 f"{where}: is {width}×{height} pixels, the camera {self.width}×{self.height}; give "
                 "the intrinsics of this image"
+            )
+        if not (0 <= self.cx < width and 0 <= self.cy < height):
+            say_once(
+                f"{where}: is {width}×{height} pixels, and the camera's principal point "
+                f"{self.cx:g}, {self.cy:g} lies outside: these are another image's intrinsics, "
+                "unless it is a crop",
+                "principal point",
             )
 
 
