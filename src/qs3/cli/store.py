@@ -1,6 +1,7 @@
 """``qs3 info``, ``qs3 verify`` and ``qs3 merge``: look after finished data sets."""
 
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
@@ -126,6 +127,6 @@ def merge(parts: Annotated[tuple[str, ...], tyro.conf.Positional], out: str) -> 
     show(out)
     tell(
         f"{report.copied} shards copied, {report.skipped} were there before; {report.failed} scans "
-        f"had failed. Next: qs3 verify {out}"
+        f"had failed. Next: qs3 verify {shlex.quote(str(out))}"
     )
     return 0

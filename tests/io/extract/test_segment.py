@@ -212,8 +212,11 @@ def test_what_has_no_plane_or_nothing_on_it_is_one_line(tmp_path):
     with refused("no patch without gaps", "line.npy"):
         segment_scene(tmp_path / "line.npy", tmp_path / "o")
     np.save(tmp_path / "mm.npy", rng.random((100, 3)) * 1200)
-    with refused("in metres", "mm.npy"):
+    with refused("see --depth-scale", "mm.npy"):
         segment_scene(tmp_path / "mm.npy", tmp_path / "o")
+    np.save(tmp_path / "blind.npy", np.zeros((2, 3)))
+    with refused("2 points: no depth in it", "blind.npy"):
+        segment_scene(tmp_path / "blind.npy", tmp_path / "o")
     np.savez(tmp_path / "two.npz", points=rng.random((2, 9, 3)))
     with refused(r"shape \[n 3\]", "two.npz"):
         segment_scene(tmp_path / "two.npz", tmp_path / "o")

@@ -173,9 +173,12 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
     Raises:
         InputError: where no plane holds a tenth of the points, or nothing stands on it.
     """
-    if len(points) < 3 or np.ptp(points, axis=0).max() > _WIDEST:
+    if len(points) < 3:
+        raise InputError(f"{len(points)} points: no depth in it, or none that is near enough")
+    if (widest := np.ptp(points, axis=0).max()) > _WIDEST:
         raise InputError(
-            f"{len(points)} points, over {_WIDEST:g} m apart or too few; a scene is in metres"
+            f"its points lie {widest:,.0f} m apart, and a scene is in metres: see --depth-scale, "
+            "metres a step, for a depth image, and divide millimetres by 1000"
         )
     up = np.array([0.0, 0.0, 1.0])
     noise = 3 * settings.noise * (points**2).sum(axis=1)
