@@ -22,6 +22,7 @@ from qs3.files import (
     remove_left_overs,
     sub_folder,
     temporary_folder,
+    write_bytes,
     write_json,
 )
 
@@ -219,3 +220,11 @@ def test_a_folder_is_claimed_only_where_it_is_empty_or_ours(tmp_path: Path) -> N
         claim_folder(tmp_path, "mark")
     with pytest.raises(InputError, match="is a file"):
         claim_folder(tmp_path / "new" / "mark", "mark")
+
+
+def test_a_fault_of_writing_names_the_file_and_not_what_came_before_it(tmp_path: Path) -> None:
+    (tmp_path / "taken").mkdir()
+    with pytest.raises(OSError) as caught:
+        write_bytes(tmp_path / "taken", b"x")
+    assert caught.value.filename == str(tmp_path / "taken")
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]

@@ -51,7 +51,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     ending = path.suffix if len(path.suffix) < 16 else ""  # some writers go by it
     temporary = path.with_name(f".{_stem(path)}.{secrets.token_hex(4)}.tmp{ending}")
     try:
-        with _faults_named(path):
+        with _faults_named(path, temporary):
             yield temporary
             sync_entry(temporary)
             temporary.replace(path)
@@ -118,7 +118,7 @@ def new_folder(path: Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def _faults_named(path: Path) -> Iterator[None]:
+def _faults_named(path: Path, temporary: Path | None = None) -> Iterator[None]:
     """Put the file's name into an error of writing; a full disk is told with what to do."""
     try:
         yield
@@ -128,7 +128,8 @@ def _faults_named(path: Path) -> Iterator[None]:
                 f"{path}: cannot be written ({error.strerror}); make room there and run the same "
                 "command again"
             ) from error
-        error.filename = error.filename or str(path)
+        if error.filename is None or Path(error.filename) == temporary:
+            error.filename = str(path)
         raise
 
 
