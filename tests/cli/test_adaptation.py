@@ -18,6 +18,7 @@ from qs3.models import create_model
 from qs3.structure import structure, unstructure
 from qs3.training import PRESETS, Augmentation, TrainSettings, fit, load_model, save_model
 from qs3.training.run import RunSettings
+from qs3.training.validation import read_checkpoints
 
 QUICK = ("--model", "pointnet", "--model-set", "channels=[8, 8, 16]", "hidden=[8]", "--num-points",
          64, "--batch-size", 5, "--threads", 1, "--accelerator", "cpu", "--epochs", 2,
@@ -123,7 +124,9 @@ def test_a_run_whose_rounds_were_all_skipped_says_what_to_change(qs3, source, tm
 def test_one_confident_class_is_told_in_the_last_lines(qs3, source, store, tmp_path):
     """A network of one class: the round, the class and the count stand before what is next."""
     warm, run = tmp_path / "warm", tmp_path / "run"
-    qs3("train", "--source", source, "--out", warm, *QUICK)
+    told = qs3("train", "--source", source, "--out", warm, *QUICK).stderr
+    right = read_checkpoints(warm)[-1].validators["source-val"]
+    assert f"right of the source's held-out part: {right:.1%}\nNext: qs3 evaluate" in told
     loaded = load_model(warm)
     model, train = loaded.model, structure(loaded.settings["train"], TrainSettings, warm)
     with torch.no_grad():

@@ -313,6 +313,10 @@ def train(options: Flat[TrainOptions]) -> int:
         tell(f"qs3: {stop}")
         return TIME_UP
     show(options.out)
+    for made in result.checkpoints:
+        right = made.validators.get("source-val")
+        if right is not None and result.chosen == {"stage": made.stage, "number": made.number}:
+            tell(f"right of the source's held-out part: {right:.1%}")
     for line in remarks(result.rounds, options.self_training, result.source.class_names):
         tell(f"qs3: {line}")
     if all_skipped(result.rounds):
