@@ -93,7 +93,7 @@ def test_a_frame_without_objects_is_told_and_the_next_one_seen():
         if frame.objects:
             break
     assert [bool(frame.objects) for frame in seen] == [False, True]
-    assert "too few" in seen[0].fault
+    assert "no depth in it" in seen[0].fault
     del frame
     assert closed
     rate = Rate()
