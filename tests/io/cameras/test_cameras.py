@@ -114,7 +114,7 @@ def test_frames_and_every_choose(tmp_path):
             CaptureSettings("realsense", **wrong)
 
 
-def test_a_folder_of_images_with_a_camera_beside_them(tmp_path):
+def test_a_folder_of_images_with_a_camera_beside_them(tmp_path, caplog):
     capture(frames(2), tmp_path / "shots")
     for path in (tmp_path / "shots" / "depth").iterdir():
         path.rename(tmp_path / path.name)
@@ -126,8 +126,32 @@ def test_a_folder_of_images_with_a_camera_beside_them(tmp_path):
     assert len(read(f"folder:{tmp_path}")) == 2
     # The camera's file tells no size; that of the first frame is that of all.
     cv2.imwrite(str(tmp_path / "000002.png"), np.full((120, 160), 900, np.uint16))
-    with refused("is 160×120 pixels, the camera 320×240", tmp_path / "000002.png"):
+    with refused("1 of 3 frames were left out", tmp_path):
         read(f"folder:{tmp_path}")
+    assert f"{tmp_path / '000002.png'}: is 160×120 pixels, the camera 320×240" in caplog.text
+
+
+def test_a_damaged_frame_is_told_and_the_others_are_done(tmp_path, caplog):
+    shots, again = tmp_path / "shots", tmp_path / "again"
+    capture(frames(4), shots)
+    damaged = shots / "depth" / "000001.png"
+    damaged.write_bytes(damaged.read_bytes()[:200])
+    with refused("1 of 4 frames were left out, as told above; the others are done", shots):
+        capture(open_camera(CaptureSettings(f"folder:{shots}")), again)
+    assert str(damaged) in caplog.text
+    same = [("000000", "000000"), ("000001", "000002"), ("000002", "000003")]
+    assert [path.stem for path in sorted((again / "depth").iterdir())] == [new for new, _ in same]
+    times = read(f"folder:{shots}", frames=3)  # ends before what was left out is told as a fault
+    for (new, old), frame in zip(same, read(f"folder:{again}"), strict=True):
+        np.testing.assert_array_equal(
+            frame.depth, read_depth(shots / "depth" / f"{old}.png", 0.001), err_msg=new
+        )
+    assert [frame.timestamp for frame in read(f"folder:{again}")] == [
+        frame.timestamp for frame in times
+    ]
+    (shots / "depth" / "000000.png").write_bytes(b"")
+    with refused("not a PNG file", shots / "depth" / "000000.png"):
+        read(f"folder:{shots}")
 
 
 def test_a_recording_of_a_realsense_gives_every_frame(tmp_path):

@@ -7,20 +7,23 @@
 import csv
 import dataclasses
 import io
+import logging
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
 
-from qs3.errors import InputError
+from qs3.errors import InputError, StorageError
 from qs3.files import holds_something, write_bytes, write_json, write_text
 from qs3.io.cameras.frames import Camera, DepthFrame
 from qs3.io.extract.depth_images import MILLIMETRE, list_images, read_raw, to_metres
-from qs3.io.extract.intrinsics import CAMERA_FILES, read_intrinsics
+from qs3.io.extract.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
 from qs3.io.guards import naming, read_image, read_small, read_text
 
 DEPTH, COLOUR, TIMES = "depth", "color", "times.csv"
 _LARGEST = 1 << 28
+
+_log = logging.getLogger(__name__)
 
 
 def folder_camera(folder: Path, intrinsics: str = "", colour: bool = True) -> Camera:
@@ -31,8 +34,11 @@ def folder_camera(folder: Path, intrinsics: str = "", colour: bool = True) -> Ca
         intrinsics: Of the camera; empty takes the folder's own file, one of `CAMERA_FILES`.
         colour: Whether to read colour where there is some.
 
+    A damaged frame is told and left out, and ends it with an error once all others are given; where
+    the first one is, it ends there, for the others have likely the same fault.
+
     Raises:
-        InputError: where there is no depth image or no camera, or a file is damaged.
+        InputError: where there is no depth image or no camera, or a frame is damaged.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
@@ -41,17 +47,36 @@ def folder_camera(folder: Path, intrinsics: str = "", colour: bool = True) -> Ca
         raise InputError(f"{folder}: no depth image in it or in its folder {DEPTH}")
     camera = read_intrinsics(intrinsics or folder)
     times = _read_times(folder / TIMES)
+    good = 0
     for name, path in images.items():
-        raw = read_raw(path)
-        camera.check_size(raw.shape, str(path))
-        height, width = raw.shape  # of all, where the camera's file does not tell
-        camera = dataclasses.replace(camera, height=height, width=width)
-        step = None if raw.dtype.kind == "f" else camera.depth_scale or MILLIMETRE
-        depth = to_metres(raw, camera.depth_scale)
-        picture = folder / COLOUR / f"{name}.png"
-        seen = _read_colour(picture, depth.shape) if colour and picture.is_file() else None
-        own = dataclasses.replace(camera, depth_scale=step)
-        yield DepthFrame(depth, own, name, times.get(name), seen)
+        try:
+            frame = _read_frame(path, camera, folder / COLOUR / f"{name}.png" if colour else None)
+        except StorageError:
+            raise
+        except InputError as error:
+            if not good:
+                raise
+            _log.warning("left out: %s", error)
+            continue
+        good += 1
+        camera = dataclasses.replace(frame.camera, depth_scale=camera.depth_scale)
+        yield dataclasses.replace(frame, timestamp=times.get(name))
+    if good < len(images):
+        raise InputError(
+            f"{folder}: {len(images) - good} of {len(images)} frames were left out, as told above; "
+            "the others are done"
+        )
+
+
+def _read_frame(path: Path, camera: Intrinsics, picture: Path | None) -> DepthFrame:
+    raw = read_raw(path)
+    camera.check_size(raw.shape, str(path))
+    height, width = raw.shape  # of all, where the camera's file does not tell
+    step = None if raw.dtype.kind == "f" else camera.depth_scale or MILLIMETRE
+    depth = to_metres(raw, camera.depth_scale)
+    seen = _read_colour(picture, depth.shape) if picture is not None and picture.is_file() else None
+    own = dataclasses.replace(camera, height=height, width=width, depth_scale=step)
+    return DepthFrame(depth, own, path.stem, colour=seen)
 
 
 def capture(frames: Camera, out: Path) -> int:
