@@ -96,8 +96,7 @@ def new_folder(path: Path) -> Iterator[Path]:
         StorageError: where the disk is full; ``path`` is named.
     """
     path = Path(path).resolve()
-    if not path.name or (path.exists() and (not path.is_dir() or holds_something(path))):
-        raise InputError(f"{path}: is there already; name a new or empty folder")
+    refuse_taken(path)
     with temporary_folder(path, alone=True) as folder, _faults_named(path):
         whole = folder / path.name  # some layouts go by it
         yield whole
@@ -301,6 +300,16 @@ def holds_something(path: Path) -> bool:
     return path.is_dir() and any(
         entry.name != LOCK and not _LEFT_OVER.match(entry.name) for entry in path.iterdir()
     )
+
+
+def refuse_taken(path: Path) -> None:
+    """Refuse a folder to make where something is already.
+
+    Raises:
+        InputError: where ``path`` is a file, or a folder that is not empty.
+    """
+    if not path.name or (path.exists() and (not path.is_dir() or holds_something(path))):
+        raise InputError(f"{path}: is there already; name a new or empty folder")
 
 
 def remove_left_overs(path: Path) -> None:

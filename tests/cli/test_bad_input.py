@@ -102,6 +102,10 @@ def test_runs_and_their_data_are_checked(qs3, run, store, tmp_path):
     np.save(tmp_path / "pickle.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
     for name in ("nan.npy", "pickle.npy"):
         assert name in qs3.refuses("predict", run, tmp_path / name)
+    # What is in the way of the answers is told before a cloud is read.
+    for option in ("--sort-into", "--csv", "--json"):
+        line = qs3.refuses("predict", run, tmp_path / "nan.npy", option, store)
+        assert str(store) in line and "nan.npy" not in line
 
 
 def test_other_settings_do_not_overwrite_a_run_or_a_data_set(qs3, quick, run, store):

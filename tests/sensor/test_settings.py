@@ -100,7 +100,9 @@ FAULTS = {
         arc = 200.0""",
     Placement: "placement: radius = [0.0, 1.0]; radius = [nan, 1.0]; elevation = [50.0, 20.0]",
     DepthSettings: "depth: near = 1.0, far = 1.0; far = inf; stride = -4",
-    StereoRig: "rig: width = 100000 | a film of 100000 × 1080 pixels",
+    StereoRig: """rig:
+        width = 100000 | a film of 100000 × 1080 pixels
+        baseline = 50.0 | baseline 50 is in metres""",
     ScanSettings: """scan|camera:
         num_points = 0; samples = 0; seed = -1; views = 257; num_points = 'x' | 'x' must be a whole
         num_points = 10000000 | num_points 10000000 must be .* at most 1000000

@@ -38,7 +38,7 @@ def predict(
             objects that were held out of its training, with the share that is more familiar.
         calibrated: Tell the confidence that is calibrated on held-out source.
     """
-    from qs3.files import write_text
+    from qs3.files import refuse_taken, write_text
     from qs3.store.progress import progress_bar
     from qs3.training import answers as table
 
@@ -46,6 +46,12 @@ def predict(
         raise InputError("name one or more files or folders of points after the run")
     if top < 1:
         raise InputError(f"--top {top}: must be at least 1")
+    # Before all clouds are told: what is in the way of the answers would lose them.
+    if sort_into is not None:
+        refuse_taken(sort_into)
+    for file in (csv, json):
+        if file is not None and file.is_dir():
+            raise InputError(f"{file}: is a folder; name a file")
     paths = table.list_clouds(files)
     sets = any(map(table.is_data_set, paths))
     text = "predict" if sets or len(paths) > 1 else None

@@ -17,6 +17,7 @@ from qs3.geometry import invert_rigid, look_at, transform_points
 from qs3.sensor.checks import check_choices, check_range
 
 _MOST_PIXELS = 2**25  # three times the film of the largest depth cameras
+_LONGEST_BASELINE = 10.0  # an object is within a few metres; a larger one is in millimetres
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,11 @@ class StereoRig:
                 f"{_MOST_PIXELS:,} that can be rendered; take a smaller width or height"
             )
         check_range(self, "rig", "focal", "baseline", above=True)
+        if self.baseline > _LONGEST_BASELINE:
+            raise InputError(
+                f"rig: baseline {self.baseline:g} is in metres, or in the unit of a scene that has "
+                f"none, and at most {_LONGEST_BASELINE:g}; divide millimetres by 1000"
+            )
         check_range(self, "rig", "projector_offset", low=-10.0, high=10.0)
         if self.second == "pattern" and self.projector_offset != 1:
             raise InputError("rig: with the stored pattern as second image projector_offset is 1")

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from qs3.errors import InputError, StorageError
-from qs3.files import holds_something, write_bytes, write_json, write_text
+from qs3.files import refuse_taken, write_bytes, write_json, write_text
 from qs3.io.cameras.frames import Camera, DepthFrame
 from qs3.io.extract.depth_images import MILLIMETRE, list_images, read_raw, to_metres
 from qs3.io.extract.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
@@ -95,8 +95,7 @@ def capture(frames: Camera, out: Path) -> int:
     Raises:
         InputError: where the folder is taken, or the camera gives no frame.
     """
-    if out.exists() and (not out.is_dir() or holds_something(out)):
-        raise InputError(f"{out}: is there already; name a new or empty folder")
+    refuse_taken(out)
     times: dict[str, float] = {}
     count = 0
     try:
