@@ -8,8 +8,10 @@ import pytest
 import trimesh
 
 from qs3.errors import InputError
+from qs3.io.load import detect
 from qs3.io.pcd import lzf_decompress
 from qs3.io.point_files import read_cloud
+from qs3.training.answers import list_clouds
 
 from .hostile import refused
 
@@ -209,6 +211,24 @@ def test_other_files_are_refused(tmp_path):
     (tmp_path / "a.docx").write_bytes(b"x")
     with pytest.raises(InputError, match="not a point cloud file; known are"):
         read_cloud(tmp_path / "a.docx")
+
+
+def test_depth_images_in_the_place_of_clouds_get_the_way_to_clouds(tmp_path):
+    image = tmp_path / "shots" / "depth" / "000000.png"
+    image.parent.mkdir(parents=True)
+    image.write_bytes(b"x")
+    np.save(tmp_path / "000000.npy", np.ones((48, 65), np.float32))
+    for path, read in (
+        (image, read_cloud),
+        (tmp_path / "000000.npy", read_cloud),
+        (tmp_path / "shots", lambda path: list_clouds([path])),
+        (tmp_path / "shots", detect),
+    ):
+        with pytest.raises(InputError, match=r"qs3 segment IMAGE --intrinsics CAMERA") as error:
+            read(path)
+        assert str(path) in str(error.value)
+    np.save(tmp_path / "000000.npy", np.ones((48, 64), np.float32))  # points with features
+    assert read_cloud(tmp_path / "000000.npy").shape == (48, 3)
 
 
 def test_lzf_copies_overlap_and_long_lengths_take_a_byte_more():

@@ -12,6 +12,7 @@ from qs3.files import holds_something
 from qs3.io.clouds import CloudChoice, Origin, PointClouds, RaggedClouds, UnlabelledClouds
 from qs3.io.layouts import FORMATS, FORMER_NAMES, Format, point_folders
 from qs3.io.layouts.store import read_ragged
+from qs3.io.point_files import depth_hint
 from qs3.store.folder import open_folder
 from qs3.store.manifest import MANIFEST
 
@@ -141,7 +142,8 @@ def detect(path: Path) -> Format:
         return fits[0]
     if not fits:
         names = "; ".join(f"{layout.name}: {layout.layout}" for layout in FORMATS.values())
-        raise InputError(f"{path}: looks like no layout that is known; these are: {names}")
+        hint = depth_hint(path)
+        raise InputError(f"{path}: looks like no layout that is known; these are: {names}{hint}")
     several = "; ".join(f"--from {layout.name}: {layout.layout}" for layout in fits)
     raise InputError(f"{path}: could be several layouts; say which: {several}")
 

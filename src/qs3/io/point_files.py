@@ -9,12 +9,18 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from qs3.errors import InputError
+from qs3.io.extract.depth_images import DEPTH_FILES
 from qs3.io.guards import check_announced, load_npy, naming, read_small, text_lines
 from qs3.io.pcd import parse_pcd, pcd_bytes
 from qs3.io.ply import load_ply, ply_bytes
 from qs3.meshes.announced import memory_limit
 
 POINT_FILES = (".npy", ".xyz", ".txt", ".ply", ".pcd", ".off")
+_MOST_COLUMNS = 64  # of points with features; an image has more
+_SEGMENT = (
+    "; of a depth image the objects in it become clouds: qs3 segment IMAGE --intrinsics CAMERA "
+    "--out OBJECTS"
+)
 WRITTEN_FILES = (".npy", ".xyz", ".ply", ".pcd")
 
 
@@ -36,7 +42,9 @@ def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np
     path = Path(path)
     suffix = path.suffix.lower()
     if path.is_file() and suffix not in POINT_FILES:
-        raise InputError(f"{path}: not a point cloud file; known are {', '.join(POINT_FILES)}")
+        raise InputError(
+            f"{path}: not a point cloud file; known are {', '.join(POINT_FILES)}{depth_hint(path)}"
+        )
     content = read_small(path)
     if not content.strip():
         raise InputError(f"{path}: empty file")
@@ -87,7 +95,20 @@ def cloud_bytes(points: Float[np.ndarray, "n 3"], ending: str) -> bytes:
     raise InputError(f"{ending}: cannot be written; known are {', '.join(WRITTEN_FILES)}")
 
 
+def depth_hint(path: Path) -> str:
+    """What to do with a file or folder of depth images where clouds are asked for; else empty."""
+    places = [place for place in (path, path / "depth") if place.is_dir()]
+    files = [path] if path.is_file() else [file for place in places for file in place.iterdir()]
+    images = set(DEPTH_FILES) - set(POINT_FILES)
+    return _SEGMENT if any(file.suffix.lower() in images for file in files) else ""
+
+
 def _accept(shape: tuple[int, ...], kind: np.dtype) -> None:
+    if len(shape) == 2 and shape[1] > _MOST_COLUMNS:
+        raise InputError(
+            f"{shape[0]} × {shape[1]} numbers are an image, and points have x, y and z in the "
+            f"first three columns{_SEGMENT}"
+        )
     if len(shape) != 2 or shape[1] < 3 or kind.kind not in "fiu":
         raise InputError(
             f"needs numbers of shape [n, 3] or more columns, not {kind} of shape {list(shape)}"

@@ -18,7 +18,7 @@ from qs3.io.guards import utf8
 from qs3.io.layouts import FORMATS
 from qs3.io.layouts.point_folders import check_class
 from qs3.io.load import read_clouds
-from qs3.io.point_files import POINT_FILES, read_cloud
+from qs3.io.point_files import POINT_FILES, depth_hint, read_cloud
 from qs3.training.checkpoint import LoadedModel, load_model
 from qs3.training.predict import ask
 from qs3.training.prepared import note_clouds
@@ -71,7 +71,8 @@ def list_clouds(given: Sequence[Path]) -> list[Path]:
             matches = glob.glob(str(path), recursive=True)  # noqa: PTH207 (takes absolute ones too)
             paths = [Path(name) for name in sorted(matches)]
         if not paths:
-            raise InputError(f"{path}: no cloud found; known are {', '.join(POINT_FILES)}")
+            known = ", ".join(POINT_FILES)
+            raise InputError(f"{path}: no cloud found; known are {known}{depth_hint(path)}")
         files += paths
     return list(dict.fromkeys(files))
 
