@@ -1,11 +1,10 @@
 """``qs3 capture``: frames of a depth camera, live or recorded, as files."""
 
 import contextlib
-import shlex
 from pathlib import Path
 
 from qs3.cli.options import Flat
-from qs3.cli.text import show, tell
+from qs3.cli.text import quoted, show, tell
 from qs3.io.cameras.folder import DEPTH
 from qs3.io.cameras.folder import capture as write_frames
 from qs3.io.cameras.frames import CaptureSettings, open_camera
@@ -23,7 +22,7 @@ def capture(settings: Flat[CaptureSettings], out: Path) -> int:
         write_frames(open_camera(settings), out)
     count = len(list_images(out / DEPTH)) if (out / DEPTH).is_dir() else 0
     show(out)
-    depth, camera = (shlex.quote(str(path)) for path in (out / DEPTH, out))
+    depth, camera = (quoted(path) for path in (out / DEPTH, out))
     tell(f"{count} frames. Next: qs3 segment {depth}/FRAME --intrinsics {camera} --out OBJECTS; "
-         f"qs3 watch RUN --camera {shlex.quote(f'folder:{out}')}")  # fmt: skip
+         f"qs3 watch RUN --camera {quoted(f'folder:{out}')}")  # fmt: skip
     return 0

@@ -1,12 +1,11 @@
 """``qs3 convert``: a data set of this field into the layout of another."""
 
-import shlex
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-from qs3.cli.text import columns, show, tell
+from qs3.cli.text import columns, quoted, show, tell
 from qs3.errors import InputError
 
 
@@ -67,5 +66,5 @@ def convert(
     if clouds.labels is not None:
         kind, given = f"of {len(set(clouds.labels.tolist()))} classes", "--source"
     tell(f"{len(clouds.ids)} clouds {kind} written as {to}. Next: qs3 train {given} "
-         f"{shlex.quote(str(target))} --out RUN")  # fmt: skip
+         f"{quoted(target)} --out RUN")  # fmt: skip
     return 0

@@ -1,6 +1,5 @@
 """``qs3 extract``: objects out of real scans, into a data set."""
 
-import shlex
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +10,7 @@ import tyro
 from qs3.cli.capture import capture
 from qs3.cli.options import Flat
 from qs3.cli.store import refuse_failures
-from qs3.cli.text import show, tell
+from qs3.cli.text import quoted, show, tell
 from qs3.io.cameras.frames import CaptureSettings, FrameSettings
 from qs3.io.extract.depth import extract_depth
 from qs3.io.extract.nyuv2 import extract_nyuv2
@@ -97,7 +96,7 @@ def _tell(out: str, report: ExtractReport) -> int:
     tell(
         f"{report.objects} objects{left}; {report.units} frames or scenes done, {report.skipped} "
         f"were there before, {report.failed} failed. Next: qs3 train --method qbst --source DATA "
-        f"--target {shlex.quote(str(out))} --out RUN"
+        f"--target {quoted(out)} --out RUN"
     )
     refuse_failures(out, read_failures(out), "scenes or frames")
     return 0

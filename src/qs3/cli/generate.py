@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -11,7 +10,7 @@ import tyro
 
 from qs3.cli.options import Flat
 from qs3.cli.store import refuse_failures
-from qs3.cli.text import show, tell
+from qs3.cli.text import quoted, show, tell
 from qs3.errors import InputError
 from qs3.processors import usable_processors
 from qs3.store.scan_item import RECIPES, GenerateSettings, RecipeName, settings_for
@@ -115,7 +114,7 @@ def generate(
         how = {"executor": RayExecutor(address, timeout, gpus_per_scan)}
     report = generate_data(items, out, settings, shard=part, retry_failed=retry_failed, **how)
     show(out)
-    following = f"qs3 train --source {shlex.quote(str(out))} --out RUN"
+    following = f"qs3 train --source {quoted(out)} --out RUN"
     if recipe is not None:
         following += " --source-cloud all"
     if part[1] > 1:

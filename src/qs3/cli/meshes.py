@@ -1,14 +1,13 @@
 """``qs3 meshes``: what a folder of meshes holds, before anything is made of it."""
 
 import dataclasses
-import shlex
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from qs3.cli.text import columns, show, tell
+from qs3.cli.text import columns, quoted, show, tell
 from qs3.meshes.sizes import Unit
 
 if TYPE_CHECKING:
@@ -69,7 +68,7 @@ def meshes(
     wide = max(4, *map(len, pictures.values()))
     write_png(out, gallery(pictures, Path(folder).name, wide))
     show(out)
-    tell(f"Next: qs3 generate --meshes {shlex.quote(str(folder))} --out SET")
+    tell(f"Next: qs3 generate --meshes {quoted(folder)} --out SET")
     return 1 if faults else 0
 
 

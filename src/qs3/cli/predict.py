@@ -5,7 +5,7 @@ from typing import Annotated
 
 import tyro
 
-from qs3.cli.text import printable, show, tell
+from qs3.cli.text import printable, quoted, show, tell
 from qs3.errors import InputError
 
 
@@ -72,7 +72,7 @@ def predict(
     if sort_into is not None:
         table.sort_into(sort_into, answers)
         tell(f"links by class in {sort_into}: move what is wrong, then qs3 train --source "
-             f"{sort_into}")  # fmt: skip
+             f"{quoted(sort_into)}")  # fmt: skip
     faults = [answer.fault for answer in answers if answer.fault]
     for fault in faults[:-1]:
         tell(f"qs3: {printable(fault, keep='')}")

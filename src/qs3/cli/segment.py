@@ -1,13 +1,12 @@
 """``qs3 segment``: the objects of a table or a floor, one cloud each."""
 
-import shlex
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from qs3.cli.options import Flat
-from qs3.cli.text import columns, show, tell
+from qs3.cli.text import columns, quoted, show, tell
 from qs3.io.extract.segment import TABLE, SceneSettings, segment_scene
 
 
@@ -31,6 +30,6 @@ def segment(
         name, count = f"object_{number:03d}", str(len(item.points))
         rows.append([name, count, *numbers, f"{item.heading:.0f}°"])
     show(*columns(rows, 1))
-    following = f"qs3 predict RUN {shlex.quote(str(out))}"
+    following = f"qs3 predict RUN {quoted(out)}"
     tell(f"{len(objects)} objects in {out}, in metres; see {TABLE}. Next: {following}")
     return 0

@@ -1,13 +1,12 @@
 """``qs3 info``, ``qs3 verify`` and ``qs3 merge``: look after finished data sets."""
 
 import json
-import shlex
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import tyro
 
-from qs3.cli.text import show, tell
+from qs3.cli.text import quoted, show, tell
 from qs3.errors import InputError
 
 _Folder = Annotated[str, tyro.conf.Positional]
@@ -127,6 +126,6 @@ def merge(parts: Annotated[tuple[str, ...], tyro.conf.Positional], out: str) -> 
     show(out)
     tell(
         f"{report.copied} shards copied, {report.skipped} were there before; {report.failed} scans "
-        f"had failed. Next: qs3 verify {shlex.quote(str(out))}"
+        f"had failed. Next: qs3 verify {quoted(out)}"
     )
     return 0

@@ -6,6 +6,7 @@ would hide or turn the text around, is written as an escape.
 
 import logging
 import os
+import shlex
 import sys
 import warnings
 from collections.abc import Sequence
@@ -25,6 +26,11 @@ def show(*lines: object, end: str = "\n") -> None:
 def tell(*lines: object) -> None:
     """Print talk: what is under way, what comes next, faults."""
     _print(sys.stderr, lines, "\n")
+
+
+def quoted(path: object) -> str:
+    """A path as a shell takes it, for the command that comes next."""
+    return shlex.quote(str(path))
 
 
 def columns(rows: Sequence[Sequence[str]], right: int | None = None) -> list[str]:

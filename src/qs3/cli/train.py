@@ -1,7 +1,6 @@
 """``qs3 train``: a classifier from labelled clouds, adapted to unlabelled ones if asked."""
 
 import functools
-import shlex
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -13,7 +12,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from qs3.adaptation.names import COMPOSED, WITHOUT_TARGET, MethodName, RoundRule, split_method
 from qs3.cli.options import Flat
-from qs3.cli.text import show, tell
+from qs3.cli.text import quoted, show, tell
 from qs3.errors import InputError
 from qs3.evaluation.records import rename_method
 from qs3.files import parse_json
@@ -321,5 +320,5 @@ def train(options: Flat[TrainOptions]) -> int:
         tell(f"qs3: {line}")
     if all_skipped(result.rounds):
         return NO_ROUND
-    tell(f"Next: qs3 evaluate {shlex.quote(str(options.out))} --data DATA")
+    tell(f"Next: qs3 evaluate {quoted(options.out)} --data DATA")
     return 0
