@@ -208,6 +208,8 @@ def test_every_way_to_tell_a_camera(tmp_path):
         "scannet.txt": "\n".join(" ".join(map(str, row)) for row in wide),
     }
     cameras = [read_intrinsics("150,140,77,61")]
+    ways["librealsense.json"] = json.dumps({"fx": 150, "fy": 140, "ppx": 77, "ppy": 61})
+    ways["ros2.yaml"] = f"header: {{frame_id: a}}\nk: {rows}\nd: [0.0]\n---\nk: []\n"
     for name, text in ways.items():
         (tmp_path / name).write_text(text, encoding="utf-8")
         cameras.append(read_intrinsics(tmp_path / name))
@@ -219,6 +221,37 @@ def test_every_way_to_tell_a_camera(tmp_path):
     assert camera == Intrinsics(150.0, 150.0, 77.0, 61.0, 9, 8, 1e-4)
     with pytest.raises(InputError, match="160×120 pixels, the camera 9×8"):
         camera.check_size((120, 160), "a.png")
+
+
+def test_cameras_as_opencv_and_ros_write_them(tmp_path, caplog):
+    mine = cv2.FileStorage(str(tmp_path / "opencv.yaml"), cv2.FILE_STORAGE_WRITE)
+    mine.write("image_width", 160)
+    mine.write("image_height", 120)
+    mine.write("camera_matrix", MATRIX)
+    mine.write("distortion_coefficients", np.zeros((1, 5)))
+    mine.release()
+    head, _, rest = (tmp_path / "opencv.yaml").read_text().partition("\n")
+    assert head.startswith("%YAML")
+    (tmp_path / "opencv4.yaml").write_text(f"%YAML:1.0\n{rest}")
+    calibration = """image_width: 160
+image_height: 120
+camera_name: mine
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [150.0, 0.0, 77.0, 0.0, 140.0, 61.0, 0.0, 0.0, 1.0]
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0.0, 0.0, 0.0, 0.0, 0.0]}
+"""
+    (tmp_path / "camera_info.yaml").write_text(calibration)
+    expected = Intrinsics(150.0, 140.0, 77.0, 61.0, 160, 120)
+    assert read_intrinsics(tmp_path / "opencv.yaml") == expected
+    assert read_intrinsics(tmp_path / "opencv4.yaml") == expected
+    assert read_intrinsics(tmp_path) == expected  # camera_info.yaml is a name that is looked for
+    assert not caplog.text
+    (tmp_path / "bent.yml").write_text(calibration.replace("[0.0, 0.0", "[0.0, 0.1"))
+    assert read_intrinsics(tmp_path / "bent.yml") == expected
+    assert f"{tmp_path / 'bent.yml'}: tells lens distortion, which is not undone" in caplog.text
 
 
 def test_a_principal_point_outside_the_image_is_told(caplog):
@@ -263,6 +296,13 @@ def test_bad_cameras_on_the_command_line(text, message):
         ("a.json", '{"K": [[1, 0], [0, 1]]}', "K must be 9 numbers"),
         ("a.json", '{"focal": 3}', "principal_point"),
         ("a.json", "{}", "none of fx"),
+        ("a.yaml", "K: [1, 2", "not a YAML file"),
+        ("a.yaml", "[" * 10_000, "not a YAML file"),
+        ("a.yaml", "x" * 100_000, "too long"),
+        ("a.yaml", "", "not a table of names and values"),
+        ("a.yaml", "K: !!python/object/apply:os.system [ls]", "not a YAML file"),
+        ("a.yaml", "camera_matrix: {rows: 3, cols: 3}", "none of fx"),
+        ("a.yaml", "camera_matrix: {data: [a, b]}", "K.*not a number"),
         ("a.txt", "150 0 0 0 140 0 77 61 1", "row by row"),
         ("a.txt", "150 3 77 0 140 61 0 0 1", "skew"),
         ("a.txt", "150 0 77 0 -140 61 0 0 1", "must be positive"),

@@ -9,13 +9,26 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.errors import InputError, say_once
-from qs3.io.guards import Numbers, as_matrix, naming, pick, read_numbers, read_small_json
+from qs3.io.guards import Numbers, as_matrix, naming, pick, read_numbers, read_small_json, read_text
 
-CAMERA_FILES = ("intrinsics.json", "intrinsics.txt", "camera.json", "K.txt")
+CAMERA_FILES = ("intrinsics.json", "intrinsics.txt", "camera.json", "K.txt", "camera_info.yaml")
 """Names of the file that tells the camera of a folder of images."""
 
 _LARGEST = 1 << 20
-_FORMS = "give fx,fy,cx,cy, a JSON file, or a text file of 3×3 numbers"
+_LARGEST_YAML = 1 << 16  # its reader takes a second for so much
+_FORMS = "give fx,fy,cx,cy, a JSON or YAML file, or a text file of 3×3 numbers"
+_SAME = {
+    "camera_matrix": "K",
+    "k": "K",
+    "distortion_coefficients": "D",
+    "d": "D",
+    "coeffs": "D",
+    "image_width": "width",
+    "image_height": "height",
+    "ppx": "cx",
+    "ppy": "cy",
+}
+"""Other names in the files of OpenCV, ROS 1, ROS 2 and librealsense."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +116,11 @@ def read_intrinsics(given: str | Path) -> Intrinsics:
         given: ``fx,fy,cx,cy``; or a JSON file with ``fx``, ``fy``, ``cx``, ``cy`` (BOP's
             camera.json), with ``focal`` and ``principal_point`` (``qs3 scan --save-images``), with
             ``cam_K`` or ``K`` row by row, or with ``intrinsic_matrix`` column by column (Open3D);
-            or a text file of 4, 9 (3×3) or 16 (4×4) numbers row by row. A JSON file may also tell
-            ``width``, ``height`` and ``depth_scale`` (millimetres a step, as BOP) or
-            ``depth_unit`` (metres a step). Of a folder it is the first of `CAMERA_FILES` in it.
+            or a YAML file with any of these, with ``camera_matrix`` (OpenCV, ROS's calibration) or
+            as ROS prints a camera_info; or a text file of 4, 9 (3×3) or 16 (4×4) numbers row by
+            row. JSON and YAML may also tell ``width``, ``height`` and ``depth_scale`` (millimetres
+            a step, as BOP) or ``depth_unit`` (metres a step). Of a folder it is the first of
+            `CAMERA_FILES` in it. Lens distortion that a file tells is not undone, which is said.
 
     Raises:
         InputError: where it is none of these, or no camera.
@@ -131,8 +146,10 @@ def read_intrinsics(given: str | Path) -> Intrinsics:
     if numbers or not path.is_file():
         raise InputError(f"intrinsics {text!r}: {'' if numbers else 'no such file; '}{_FORMS}")
     with naming(path):
-        if path.suffix.lower() == ".json":
-            return _from_json(pick(read_small_json(path, _LARGEST), _CameraFile, "camera"))
+        if path.suffix.lower() in (".json", ".yaml", ".yml"):
+            json = path.suffix.lower() == ".json"
+            table = read_small_json(path, _LARGEST) if json else _read_yaml(path)
+            return _from_table(pick(_renamed(table), _CameraFile, "camera"), path)
         numbers = read_numbers(path, (4, 9, 16)).tolist()
         if len(numbers) == 4:
             return read_intrinsics(",".join(map(str, numbers)))
@@ -140,9 +157,39 @@ def read_intrinsics(given: str | Path) -> Intrinsics:
         return intrinsics_from_matrix(np.reshape(numbers, (side, side))[:3, :3])
 
 
+def _read_yaml(path: Path) -> Any:
+    # Imported here: few cameras come so.
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        """Plain values alone, and a matrix of OpenCV as the table that it is."""
+
+    Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", yaml.SafeLoader.construct_yaml_map)
+    text = read_text(path, _LARGEST_YAML)
+    if text.startswith("%YAML:"):  # OpenCV 4's first line, with a colon that YAML does not know
+        text = text.partition("\n")[2]
+    with naming(path, "not a YAML file"):  # whatever its reader stumbles over
+        table = next(yaml.load_all(text, Loader), None)  # of several messages of ROS the first
+    if not isinstance(table, dict):
+        raise InputError("not a table of names and values")
+    return table
+
+
+def _renamed(table: Any) -> Any:
+    """A table with our names in place of others', and a matrix as its numbers."""
+    if not isinstance(table, dict):
+        return table
+    ours: dict[Any, Any] = {}
+    for key, value in table.items():
+        name = _SAME.get(key, key)
+        numbers = value.get("data") if name in ("K", "D") and isinstance(value, dict) else value
+        ours.setdefault(name, numbers)
+    return ours
+
+
 @dataclass(frozen=True)
 class _CameraFile:
-    """What the JSON files of cameras hold, one of its groups in each; see `read_intrinsics`."""
+    """What JSON and YAML files of cameras hold, one of its groups each; see `read_intrinsics`."""
 
     fx: float | None = None
     fy: float | None = None
@@ -152,6 +199,7 @@ class _CameraFile:
     principal_point: tuple[float, float] | None = None
     cam_K: Numbers | None = None  # noqa: N815 (BOP's name)
     K: Numbers | None = None
+    D: Numbers | None = None
     intrinsic_matrix: Numbers | None = None
     width: int | None = None
     height: int | None = None
@@ -159,7 +207,9 @@ class _CameraFile:
     depth_unit: float | None = None
 
 
-def _from_json(file: _CameraFile) -> Intrinsics:
+def _from_table(file: _CameraFile, path: Path) -> Intrinsics:
+    if np.any(np.ravel(file.D or ())):
+        say_once(f"{path}: tells lens distortion, which is not undone; give undistorted images")
     scale = file.depth_unit if file.depth_scale is None else file.depth_scale / 1000
     more = {"width": file.width, "height": file.height, "depth_scale": scale}
     if file.fx is not None:
@@ -176,4 +226,4 @@ def _from_json(file: _CameraFile) -> Intrinsics:
             return intrinsics_from_matrix(
                 matrix.T if name == "intrinsic_matrix" else matrix, **more
             )
-    raise InputError("camera: the JSON file has none of fx, focal, cam_K, K, intrinsic_matrix")
+    raise InputError("camera: has none of fx, focal, cam_K, K, camera_matrix, intrinsic_matrix")
