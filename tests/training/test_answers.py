@@ -110,6 +110,7 @@ def test_tables_hold_what_was_answered(folder, tmp_path, model):
     assert rows["class"].tolist() == [(answer.best() or [("", 0)])[0][0] for answer in answers]
     assert set(rows.loc[0, ["class", "class_2", "class_3"]]) == set(NAMES)
     assert rows["fault"].tolist() == [answer.fault for answer in answers]
+    assert answers_csv(answers, top=9) == answers_csv(answers, top=3)  # there are three classes
     entries = json.loads(answers_json(answers))
     assert entries[0]["probabilities"] == answers[0].probabilities
     assert entries[2] == {"file": str(folder / "bad.ply"), "fault": answers[2].fault}

@@ -167,6 +167,7 @@ def answers_csv(answers: Iterable[Answer], top: int = 1) -> str:
     Where it was asked for, the familiarity too.
     """
     answers = list(answers)
+    top = max([1, *(len(answer.best(top)) for answer in answers)])  # no column stays empty
     more = [f"{word}_{i}" for i in range(2, top + 1) for word in ("class", "confidence")]
     more += ["familiarity"] if any(answer.familiarity is not None for answer in answers) else []
     buffer = io.StringIO()
