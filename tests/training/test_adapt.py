@@ -119,19 +119,41 @@ def test_what_cannot_be_is_told(boxes, tmp_path):
         adapt("shapes", boxes, tmp_path, method="nope")
     with pytest.raises(InputError, match="absent"):
         adapt("shapes", tmp_path / "absent", tmp_path)
+    with pytest.raises(InputError, match="units mm: goes with a folder of meshes alone"):
+        adapt(boxes, boxes, tmp_path, units="mm")
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="not fitted"):
         qs3.training.Adapter().save(tmp_path)
 
 
-@pytest.mark.slow
-def test_meshes_are_scanned_first(boxes, tmp_path):
+def cad(folder, scale=1.0):
     import trimesh
 
     for name, size in {"slab": (0.5, 0.5, 0.05), "post": (0.2, 0.2, 1.0)}.items():
-        place = tmp_path / "cad" / name
+        place = folder / name
         place.mkdir(parents=True)
-        trimesh.creation.box(size).export(place / "one.stl")
+        trimesh.creation.box(scale * np.array(size)).export(place / "one.stl")
+
+
+@pytest.mark.parametrize("units", [None, "mm"])
+def test_meshes_get_the_sizes_of_the_unit_that_is_told(boxes, tmp_path, monkeypatch, units):
+    class ReachedError(Exception):
+        pass
+
+    def stop(items, folder, recipe, **_):
+        raise ReachedError(recipe)
+
+    monkeypatch.setattr("qs3.store.generate.generate", stop)
+    cad(tmp_path / "cad", 1000.0)
+    with pytest.raises(ReachedError) as reached:
+        adapt(tmp_path / "cad", boxes, tmp_path, units=units)
+    (recipe,) = reached.value.args
+    assert (recipe.object_size, recipe.units) == ("file", units)
+
+
+@pytest.mark.slow
+def test_meshes_are_scanned_first(boxes, tmp_path):
+    cad(tmp_path / "cad")
     model = adapt(tmp_path / "cad", boxes, tmp_path, workers=1, method="source-only")
     assert list(model.classes_) == ["post", "slab"]
     assert (tmp_path / "out" / "source" / "dataset.json").is_file()

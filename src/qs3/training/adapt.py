@@ -17,7 +17,7 @@ from qs3.io.load import is_store
 from qs3.io.preparation import LARGEST
 from qs3.meshes import collect
 from qs3.meshes.classes import canonical
-from qs3.meshes.sizes import CLASS_SIZES
+from qs3.meshes.sizes import CLASS_SIZES, Unit
 from qs3.processors import usable_processors
 from qs3.structure import unstructure
 from qs3.training.batches import load_whole
@@ -42,6 +42,7 @@ def adapt(
     scans: Clouds,
     out: str | Path = "adapted",
     *,
+    units: Unit | None = None,
     method: str = "qbst",
     train: Mapping[str, Any] | None = None,
     self_training: Mapping[str, Any] | None = None,
@@ -64,6 +65,8 @@ def adapt(
             to be learnt from without a scan: a data set of qs3, or labelled clouds.
         scans: Clouds of the camera, one object each, z up, in metres. Labels are left behind.
         out: Folder for the data set (``source``) and the run (``run``).
+        units: Unit of the mesh files, m, cm, mm or in: the objects get the sizes in them, whatever
+            their class. None takes the above, and a file's unit for what it tells or looks to be.
         method: As in `Adapter`.
         train: Settings of `TrainSettings` that differ from those of ``rooms``; with ``rule`` "last"
             the last round is kept.
@@ -83,7 +86,7 @@ def adapt(
     changed(TrainSettings(), train or {}, " in train")
     rounds = rounds_of(self_training or {}, rule)
     target = _target(scans)
-    source = _source(cad, Path(out) / "source", workers, seed)
+    source = _source(cad, Path(out) / "source", units, workers, seed)
     settings = unstructure(train_settings(_LIKE))
     batches = max(1, len(source) // settings["batch_size"])
     settings |= {"epochs": max(1, round(_STEPS / batches))} | dict(train or {})
@@ -113,18 +116,25 @@ def adapt(
 
 
 def _source(
-    cad: str | Path | PointClouds, folder: Path, workers: int | None, seed: int
+    cad: str | Path | PointClouds,
+    folder: Path,
+    units: Unit | None,
+    workers: int | None,
+    seed: int,
 ) -> PointClouds:
     from qs3.store.generate import generate
     from qs3.store.scan_item import RECIPES, settings_for
 
+    scanned = not isinstance(cad, PointClouds) and not is_store(cad)
+    if units is not None and not scanned:
+        raise InputError(f"units {units}: goes with a folder of meshes alone")
     if isinstance(cad, PointClouds):
         return cad
-    if not is_store(cad):
+    if scanned:
         items = collect(cad, per_class=_PER_CLASS, seed=seed)
         have_sizes = {canonical(item.class_name) for item in items} <= {*CLASS_SIZES}
-        size = "class" if have_sizes else "file"
-        recipe = replace(RECIPES["rooms"], views=1, seed=seed, object_size=size)
+        size = "class" if have_sizes and units is None else "file"
+        recipe = replace(RECIPES["rooms"], views=1, seed=seed, object_size=size, units=units)
         recipe = settings_for(recipe, items, [cad], _PER_CLASS)
         generate(items, folder, recipe, workers=workers or usable_processors())
         cad = folder
