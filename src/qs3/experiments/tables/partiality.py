@@ -15,7 +15,12 @@ _COLUMNS = (
     Heading("J", "one side, noisy", {"source": Domain("J")}),
     Heading("S", "all around, noisy", {"source": Domain("S")}),
 )
-_PAIRS = (("missing surface", "C", "M"), ("noise, one side", "J", "C"), ("orbit", "S", "J"))
+_PAIRS = (
+    ("missing surface", "C", "M"),
+    ("noise, one side", "J", "C"),
+    ("both", "J", "M"),
+    ("orbit", "S", "J"),
+)
 
 EXPERIMENT = Experiment(
     title="Partiality control: scored on D",
