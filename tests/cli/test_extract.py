@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 
 from qs3.io import load_unlabelled
+from qs3.io.cameras.folder import capture
+from qs3.io.extract.segment import SceneSettings, segment_scene
 from qs3.io.layouts.store import read_ragged
 from qs3.store.manifest import open_dataset
+
+from ..io.cameras.table import frames
 
 
 def png(path, image):
@@ -176,3 +180,32 @@ def test_boxes_of_sun_rgbd(typed, tmp_path):
     low, high = data.clouds[0].min(axis=0), data.clouds[0].max(axis=0)
     np.testing.assert_allclose([low[0], high[0], high[2]], [-0.08, 0.88, 0.4], atol=0.041)
     assert (data.clouds[0][:, 1] == 2).all()
+
+
+def test_every_frame_of_a_capture_becomes_a_folder_of_objects(qs3, tmp_path):
+    """What cannot be cut is told, the others are done, and the same command goes on."""
+    shots, objects = tmp_path / "shots", tmp_path / "objects"
+    capture(frames(3), shots)
+    damaged = shots / "depth" / "000001.png"
+    whole = damaged.read_bytes()
+    damaged.write_bytes(whole[:100])
+    done = qs3("segment", shots, "--out", objects, code=2)
+    assert f"qs3: {damaged}: cut off or damaged" in done.stderr
+    assert f"qs3: {shots}: 1 of 3 scenes failed, as told above" in done.stderr
+    settings = SceneSettings(intrinsics=str(shots))
+    for name in ("000000", "000002"):
+        alone = segment_scene(shots / "depth" / f"{name}.png", tmp_path / name, settings)
+        files = sorted(path.name for path in (tmp_path / name).iterdir())
+        assert len(files) == len(alone) + 1
+        assert sorted(path.name for path in (objects / name).iterdir()) == files
+        for file in files:
+            assert (objects / name / file).read_bytes() == (tmp_path / name / file).read_bytes()
+    assert not (objects / "000001").exists()
+    damaged.write_bytes(whole)
+    done = qs3("segment", shots, "--out", objects)
+    assert done.stdout.startswith("000001\t")
+    assert "2 scenes were there before" in done.stderr
+    other = qs3.refuses("segment", shots, "--gap", 0.03, "--out", objects)
+    assert "other scenes or settings" in other
+    (tmp_path / "none").mkdir()
+    assert "no cloud" in qs3.refuses("segment", tmp_path / "none", "--out", tmp_path / "o")

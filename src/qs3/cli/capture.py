@@ -5,10 +5,9 @@ from pathlib import Path
 
 from qs3.cli.options import Flat
 from qs3.cli.text import quoted, show, tell
-from qs3.io.cameras.folder import DEPTH
 from qs3.io.cameras.folder import capture as write_frames
 from qs3.io.cameras.frames import CaptureSettings, open_camera
-from qs3.io.extract.depth_images import list_images
+from qs3.io.extract.depth_images import DEPTH, list_images
 
 
 def capture(settings: Flat[CaptureSettings], out: Path) -> int:
@@ -22,7 +21,6 @@ def capture(settings: Flat[CaptureSettings], out: Path) -> int:
         write_frames(open_camera(settings), out)
     count = len(list_images(out / DEPTH)) if (out / DEPTH).is_dir() else 0
     show(out)
-    depth, camera = (quoted(path) for path in (out / DEPTH, out))
-    tell(f"{count} frames. Next: qs3 segment {depth}/FRAME --intrinsics {camera} --out OBJECTS; "
+    tell(f"{count} frames. Next: qs3 segment {quoted(out)} --out OBJECTS; "
          f"qs3 watch RUN --camera {quoted(f'folder:{out}')}")  # fmt: skip
     return 0

@@ -6,8 +6,15 @@ from typing import Annotated
 import tyro
 
 from qs3.cli.options import Flat
-from qs3.cli.text import columns, quoted, show, tell
-from qs3.io.extract.segment import TABLE, SceneSettings, segment_scene
+from qs3.cli.text import columns, printable, quoted, show, tell
+from qs3.errors import InputError
+from qs3.io.extract.segment import (
+    TABLE,
+    SceneSettings,
+    list_scenes,
+    segment_scene,
+    segment_scenes,
+)
 
 
 def segment(
@@ -15,14 +22,20 @@ def segment(
     out: Path,
     settings: Flat[SceneSettings] = SceneSettings(),  # noqa: B008
 ) -> int:
-    """Cut a scan of a table or a floor into the objects that stand on it.
+    """Cut scans of a table or a floor into the objects that stand on it.
+
+    Of a folder each scene becomes a folder of its objects. A scene that cannot be read, or has no
+    object, is told at the end, and the exit code is 2; all others are done, and after a stop the
+    same command goes on.
 
     Args:
         scene: A cloud in metres (PLY, PCD, XYZ, NPY, NPZ); with --intrinsics a depth image (16-bit
-            PNG, TIFF, npy).
+            PNG, TIFF, npy); or a folder of them, as qs3 capture writes it.
         out: New folder for a PLY file an object, z up in metres, and objects.csv.
         settings: How it is cut.
     """
+    if scene.is_dir():
+        return _segment_folder(scene, out, settings)
     objects = segment_scene(scene, out, settings)
     rows = [["object", "points", "x", "y", "length", "width", "height", "heading"]]
     for number, item in enumerate(objects):
@@ -32,4 +45,27 @@ def segment(
     show(*columns(rows, 1))
     following = f"qs3 predict RUN {quoted(out)}"
     tell(f"{len(objects)} objects in {out}, in metres; see {TABLE}. Next: {following}")
+    return 0
+
+
+def _segment_folder(folder: Path, out: Path, settings: SceneSettings) -> int:
+    from qs3.store.progress import progress_bar
+
+    scenes, settings = list_scenes(folder, settings)
+    faults, objects, before = [], 0, 0
+    done = segment_scenes(scenes, out, settings)
+    for name, result in progress_bar(len(scenes), "segment", "scene", items=done):
+        if isinstance(result, InputError):
+            faults.append(str(result))
+        elif result is None:
+            before += 1
+        else:
+            objects += len(result)
+            show(f"{printable(name, keep='')}\t{len(result)} objects")
+    for fault in faults:
+        tell(f"qs3: {fault}")
+    tell(f"{objects} objects of {len(scenes) - before - len(faults)} scenes in {out}, in metres; "
+         f"{before} scenes were there before. Next: qs3 predict RUN {quoted(out)}")  # fmt: skip
+    if faults:
+        raise InputError(f"{folder}: {len(faults)} of {len(scenes)} scenes failed, as told above")
     return 0

@@ -16,11 +16,11 @@ from jaxtyping import UInt8
 from qs3.errors import InputError, StorageError
 from qs3.files import refuse_taken, write_bytes, write_json, write_text
 from qs3.io.cameras.frames import Camera, DepthFrame
-from qs3.io.extract.depth_images import MILLIMETRE, list_images, read_raw, to_metres
+from qs3.io.extract.depth_images import DEPTH, MILLIMETRE, list_images, read_raw, to_metres
 from qs3.io.extract.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
 from qs3.io.guards import naming, read_image, read_small, read_text
 
-DEPTH, COLOUR, TIMES = "depth", "color", "times.csv"
+COLOUR, TIMES = "color", "times.csv"
 _LARGEST = 1 << 28
 
 _log = logging.getLogger(__name__)
@@ -42,7 +42,7 @@ def folder_camera(folder: Path, intrinsics: str = "", colour: bool = True) -> Ca
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
-    images = list_images(folder / DEPTH if (folder / DEPTH).is_dir() else folder)
+    images = list_images(folder)
     if not images:
         raise InputError(f"{folder}: no depth image in it or in its folder {DEPTH}")
     camera = read_intrinsics(intrinsics or folder)

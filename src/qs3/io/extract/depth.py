@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 
 from qs3.errors import InputError
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
-from qs3.io.extract.depth_images import DEPTH_FILES, list_images, read_depth, read_mask
+from qs3.io.extract.depth_images import DEPTH_FILES, list_files, list_images, read_depth, read_mask
 from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
 from qs3.io.extract.run import ExtractedCloud, ExtractReport, OutputSettings, recorded, run_extract
 from qs3.io.guards import read_text, utf8
@@ -168,7 +168,7 @@ def list_frames(source: Path, camera: Intrinsics, settings: DepthImageSettings) 
     if mask is not None and not mask.exists():
         raise InputError(f"{mask}: no such file or folder")
     if mask is not None and mask.is_dir():
-        masks = list_images(mask)
+        masks = list_files(mask, DEPTH_FILES)
         for name, path in paths.items():
             if name not in masks:
                 raise InputError(f"{mask}: no mask {name}.png for {path}")

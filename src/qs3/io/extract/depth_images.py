@@ -12,6 +12,8 @@ from qs3.io.guards import check_pixels, load_npy, naming, read_image, read_small
 DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
 """Endings of depth images and of masks."""
 
+DEPTH = "depth"
+"""Folder of the depth images, beside that of colour."""
 MILLIMETRE = 0.001
 _LARGEST = 1 << 30
 _DEPTH_MODES = ("", "I;16", "I;16B", "I;16L", "I", "F")  # Pillow's; empty for npy
@@ -48,15 +50,24 @@ def to_metres(
 
 
 def list_images(folder: Path) -> dict[str, Path]:
-    """List the images of a folder by their names without ending; two of one name are refused."""
-    images: dict[str, Path] = {}
+    """List the images of a folder, or of its ``depth``, by their names without ending.
+
+    Raises:
+        InputError: where two have one name.
+    """
+    return list_files(folder / DEPTH if (folder / DEPTH).is_dir() else folder, DEPTH_FILES)
+
+
+def list_files(folder: Path, endings: tuple[str, ...]) -> dict[str, Path]:
+    """List the files of a folder with one of some endings, as `list_images` does."""
+    files: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
-        if path.name.startswith(".") or path.suffix.lower() not in DEPTH_FILES:
+        if path.name.startswith(".") or path.suffix.lower() not in endings:
             continue
-        if path.stem in images:
-            raise InputError(f"{path}: {images[path.stem].name} has the same name; rename one")
-        images[path.stem] = path
-    return images
+        if path.stem in files:
+            raise InputError(f"{path}: {files[path.stem].name} has the same name; rename one")
+        files[path.stem] = path
+    return files
 
 
 def read_raw(path: Path) -> np.ndarray:

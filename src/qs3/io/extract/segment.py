@@ -10,24 +10,25 @@ Source: Rusu, "Semantic 3D object maps for everyday manipulation in human living
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from qs3.errors import InputError
-from qs3.files import new_folder, write_bytes
+from qs3.errors import InputError, StorageError
+from qs3.files import claim_folder, new_folder, read_json, write_bytes, write_json
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
-from qs3.io.extract.depth_images import read_depth
-from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
+from qs3.io.extract.depth_images import list_files, list_images, read_depth
+from qs3.io.extract.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
 from qs3.io.extract.plane import Plane, fit_plane
 from qs3.io.guards import load_npy, naming, open_zip, read_member
-from qs3.io.point_files import cloud_bytes, read_cloud
+from qs3.io.point_files import POINT_FILES, cloud_bytes, read_cloud
 from qs3.io.preparation import thin
 from qs3.sensor.checks import check_range
 
-TABLE = "objects.csv"
+TABLE, SETTINGS = "objects.csv", "segment.json"
 _LEAST_SHARE = 0.1  # of the points, on the plane
 _WIDEST = 1000.0  # metres
 _FITTED = 2000  # points that the plane is fitted to
@@ -77,7 +78,8 @@ class SceneSettings(SegmentSettings):
 
     intrinsics: str = ""
     """Of a depth image: fx,fy,cx,cy; a JSON file of a camera; or a text file of 3×3
-    numbers; or the folder that has one. Without it the scene is a cloud in metres."""
+    numbers; or the folder that has one. Without it the scene is a cloud in metres, unless it is
+    a folder with its camera's file."""
     depth_scale: float | None = None
     """Metres a step of a depth image; None takes the camera's, else 0.001 for whole numbers and 1
     for others."""
@@ -127,6 +129,62 @@ def segment_scene(
         table = pd.DataFrame(rows, columns=columns).to_csv(index=False, float_format="%.4f")
         write_bytes(folder / TABLE, table.encode())
     return objects
+
+
+def list_scenes(folder: Path, settings: SceneSettings) -> tuple[dict[str, Path], SceneSettings]:
+    """List the scenes of a folder by their names, and say how they are read.
+
+    With intrinsics, or a camera's file in the folder, they are the depth images in ``folder/depth``
+    or in the folder itself, as ``qs3 capture`` writes them; else its clouds.
+
+    Raises:
+        InputError: where there is none, or two have one name.
+    """
+    if not settings.intrinsics and any((folder / name).is_file() for name in CAMERA_FILES):
+        settings = replace(settings, intrinsics=str(folder))
+    if settings.intrinsics:
+        scenes = list_images(folder)
+    else:
+        scenes = list_files(folder, (*POINT_FILES, ".npz"))
+    if not scenes:
+        what = "depth image" if settings.intrinsics else "cloud, and no camera's file"
+        raise InputError(f"{folder}: no {what} in it")
+    return scenes, settings
+
+
+def segment_scenes(
+    scenes: dict[str, Path], out: Path, settings: SceneSettings
+) -> Iterator[tuple[str, list[SegmentedObject] | InputError | None]]:
+    """Cut scenes one after another, each into the folder ``out/<name>`` as `segment_scene` does.
+
+    Args:
+        scenes: Files by the names of their folders.
+        out: A new or empty folder, or one of the same scenes and settings, which goes on.
+        settings: How they are cut.
+
+    Yields:
+        The name and the objects; the fault of a scene that cannot be read or has no object; None
+        where it was there before.
+
+    Raises:
+        InputError: where the folder is another's.
+    """
+    whole = {name: str(path.resolve()) for name, path in scenes.items()}
+    told = {"settings": repr(settings), "scenes": whole}
+    file = claim_folder(out, SETTINGS) / SETTINGS
+    if file.is_file() and read_json(file) != told:
+        raise InputError(f"{out}: holds objects of other scenes or settings; name another folder")
+    write_json(file, told)
+    for name, path in scenes.items():
+        if (out / name / TABLE).is_file():
+            yield name, None
+            continue
+        try:
+            yield name, segment_scene(path, out / name, settings)
+        except StorageError:
+            raise
+        except InputError as error:
+            yield name, error
 
 
 def read_scene(path: Path, settings: SceneSettings) -> Float[np.ndarray, "n 3"]:
