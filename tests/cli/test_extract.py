@@ -9,6 +9,7 @@ import pytest
 from qs3.io import load_unlabelled
 from qs3.io.cameras.folder import capture
 from qs3.io.extract.segment import SceneSettings, segment_scene
+from qs3.io.layouts.point_folders import read_folder
 from qs3.io.layouts.store import read_ragged
 from qs3.store.manifest import open_dataset
 
@@ -201,6 +202,10 @@ def test_every_frame_of_a_capture_becomes_a_folder_of_objects(qs3, tmp_path):
         for file in files:
             assert (objects / name / file).read_bytes() == (tmp_path / name / file).read_bytes()
     assert not (objects / "000001").exists()
+    clouds = read_folder(objects)
+    assert {name.partition("/")[0] for name in clouds.ids} == {"000000", "000002"}
+    assert clouds.labels is None  # a frame is no class
+    assert len(load_unlabelled(objects, num_points=64)) == len(clouds.ids)
     damaged.write_bytes(whole)
     done = qs3("segment", shots, "--out", objects)
     assert done.stdout.startswith("000001\t")

@@ -8,13 +8,8 @@ import tyro
 from qs3.cli.options import Flat
 from qs3.cli.text import columns, printable, quoted, show, tell
 from qs3.errors import InputError
-from qs3.io.extract.segment import (
-    TABLE,
-    SceneSettings,
-    list_scenes,
-    segment_scene,
-    segment_scenes,
-)
+from qs3.io.extract.segment import SceneSettings, list_scenes, segment_scene, segment_scenes
+from qs3.io.point_files import OBJECTS_TABLE
 
 
 def segment(
@@ -44,7 +39,7 @@ def segment(
         rows.append([name, count, *numbers, f"{item.heading:.0f}°"])
     show(*columns(rows, 1))
     following = f"qs3 predict RUN {quoted(out)}"
-    tell(f"{len(objects)} objects in {out}, in metres; see {TABLE}. Next: {following}")
+    tell(f"{len(objects)} objects in {out}, in metres; see {OBJECTS_TABLE}. Next: {following}")
     return 0
 
 

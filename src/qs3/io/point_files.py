@@ -16,6 +16,8 @@ from qs3.io.ply import load_ply, ply_bytes
 from qs3.meshes.announced import memory_limit
 
 POINT_FILES = (".npy", ".xyz", ".txt", ".ply", ".pcd", ".off")
+OBJECTS_TABLE = "objects.csv"
+"""Beside the objects that ``qs3 segment`` cuts out of a scene."""
 _MOST_COLUMNS = 64  # of points with features; an image has more
 _SEGMENT = (
     "; of a depth image the objects in it become clouds: qs3 segment IMAGE --intrinsics CAMERA "

@@ -24,11 +24,11 @@ from qs3.io.extract.depth_images import list_files, list_images, read_depth
 from qs3.io.extract.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
 from qs3.io.extract.plane import Plane, fit_plane
 from qs3.io.guards import load_npy, naming, open_zip, read_member
-from qs3.io.point_files import POINT_FILES, cloud_bytes, read_cloud
+from qs3.io.point_files import OBJECTS_TABLE, POINT_FILES, cloud_bytes, read_cloud
 from qs3.io.preparation import thin
 from qs3.sensor.checks import check_range
 
-TABLE, SETTINGS = "objects.csv", "segment.json"
+SETTINGS = "segment.json"
 _LEAST_SHARE = 0.1  # of the points, on the plane
 _WIDEST = 1000.0  # metres
 _FITTED = 2000  # points that the plane is fitted to
@@ -127,7 +127,7 @@ def segment_scene(
             rows.append([name, len(item.points), *item.centre, *item.size, item.heading])
         columns = ["file", "points", "x", "y", "z", "length", "width", "height", "heading"]
         table = pd.DataFrame(rows, columns=columns).to_csv(index=False, float_format="%.4f")
-        write_bytes(folder / TABLE, table.encode())
+        write_bytes(folder / OBJECTS_TABLE, table.encode())
     return objects
 
 
@@ -176,7 +176,7 @@ def segment_scenes(
         raise InputError(f"{out}: holds objects of other scenes or settings; name another folder")
     write_json(file, told)
     for name, path in scenes.items():
-        if (out / name / TABLE).is_file():
+        if (out / name / OBJECTS_TABLE).is_file():
             yield name, None
             continue
         try:

@@ -19,7 +19,13 @@ from qs3.files import sha256
 from qs3.io.clouds import RaggedClouds
 from qs3.io.guards import utf8
 from qs3.io.layouts.format import SPLITS, Format
-from qs3.io.point_files import POINT_FILES, WRITTEN_FILES, cloud_bytes, read_cloud
+from qs3.io.point_files import (
+    OBJECTS_TABLE,
+    POINT_FILES,
+    WRITTEN_FILES,
+    cloud_bytes,
+    read_cloud,
+)
 from qs3.store.progress import cloud_bar
 
 _LONGEST_NAME = 180
@@ -44,7 +50,8 @@ def read_folder(
     """Read the clouds of a folder in one of these layouts.
 
     ``<root>/<class>/*``, ``<root>/<class>/<train|test>/*`` or ``<root>/<train|test>/<class>/*``;
-    without labels ``<root>/*`` or ``<root>/<train|test>/*``. Files of other endings and hidden
+    without labels ``<root>/*``, ``<root>/<train|test>/*`` or ``<root>/<scene>/*`` with the table
+    that ``qs3 segment`` writes. Files of other endings and hidden
     ones are passed over; ``split`` None takes every other file.
 
     Returns:
@@ -76,8 +83,10 @@ def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudF
             places.append((folder, "", folder.name))
             places += [(path, path.name, folder.name) for path in inner[folder]]
         else:
-            places.append((folder, folder.name, ""))
-            places += [(folder / split, folder.name, split) for split in SPLITS]
+            # What qs3 segment made of a scene is named by it, which tells no class.
+            class_name = "" if (folder / OBJECTS_TABLE).is_file() else folder.name
+            places.append((folder, class_name, ""))
+            places += [(folder / split, class_name, split) for split in SPLITS]
     files = [
         CloudFile(path, utf8(name), split)
         for place, name, split in places
