@@ -164,13 +164,17 @@ def test_readme_says_of_views_and_rounds_what_was_measured():
     real = [mean("views-on-real", f"{source}_seed-*.json") for source in ("V1", "S")]
     paths = (ROOT / "results" / "laptop" / "results").glob("S-D_qbst-paper_seed-*.json")
     kept = fmean(sum(read_record(path).rounds[-1]["kept"]) for path in paths)
-    gains = [rounds(row) for row in ("spst", "qbst-gentle", "qbst-paper")]
+    gains = [rounds(row) for row in ("spst", "qbst-gentle", "qbst-paper", "defrec")]
+    surface, clean, noisy = (mean("laptop/results", f"{s}-D_ordinary_seed-*.json") for s in "MCJ")
     page = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
     for text in (
         f"({one:.1f} against {five:.1f} % on simulated Kinect views, ",
         f"{real[0]:.1f} against {real[1]:.1f} % on real ones)",
         f"SPST adds {gains[0]:.1f} points, gentle rounds {gains[1]:.1f}, and QBST",
         f"loses {-gains[2]:.1f}, as its pool shrinks to {kept:.0f} clouds",
+        f"DefRec changes nothing (−{-gains[3]:.1f})",
+        f"from one side are {noisy - surface:.1f} points above surfaces",
+        f"surface is worth {clean - surface:.1f} and noise {noisy - clean:.1f},",
     ):
         assert text in page, text
 
