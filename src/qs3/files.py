@@ -308,6 +308,7 @@ def refuse_taken(path: Path) -> None:
     Raises:
         InputError: where ``path`` is a file, or a folder that is not empty.
     """
+    path = Path(path).resolve()
     if not path.name or (path.exists() and (not path.is_dir() or holds_something(path))):
         raise InputError(f"{path}: is there already; name a new or empty folder")
 

@@ -1,6 +1,7 @@
 """``qs3 extract`` as a user runs it."""
 
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -8,10 +9,11 @@ import pytest
 
 from qs3.io import load_unlabelled
 from qs3.io.cameras.folder import capture
-from qs3.io.extract.segment import SceneSettings, segment_scene
+from qs3.io.extract.segment import SceneSettings, list_scenes, segment_scene, segment_scenes
 from qs3.io.layouts.point_folders import read_folder
 from qs3.io.layouts.store import read_ragged
 from qs3.store.manifest import open_dataset
+from qs3.training.answers import list_clouds
 
 from ..io.cameras.table import frames
 
@@ -198,7 +200,7 @@ def test_every_frame_of_a_capture_becomes_a_folder_of_objects(qs3, tmp_path):
         alone = segment_scene(shots / "depth" / f"{name}.png", tmp_path / name, settings)
         files = sorted(path.name for path in (tmp_path / name).iterdir())
         assert len(files) == len(alone) + 1
-        assert sorted(path.name for path in (objects / name).iterdir()) == files
+        assert {path.name for path in (objects / name).iterdir()} == {*files, "segment.json"}
         for file in files:
             assert (objects / name / file).read_bytes() == (tmp_path / name / file).read_bytes()
     assert not (objects / "000001").exists()
@@ -210,7 +212,49 @@ def test_every_frame_of_a_capture_becomes_a_folder_of_objects(qs3, tmp_path):
     done = qs3("segment", shots, "--out", objects)
     assert done.stdout.startswith("000001\t")
     assert "2 scenes were there before" in done.stderr
-    other = qs3.refuses("segment", shots, "--gap", 0.03, "--out", objects)
-    assert "other scenes or settings" in other
-    (tmp_path / "none").mkdir()
-    assert "no cloud" in qs3.refuses("segment", tmp_path / "none", "--out", tmp_path / "o")
+    (objects / ".000000.abcdef12.tmp" / "000000").mkdir(parents=True)  # of a killed process
+    shutil.copy(objects / "000000" / "object_000.ply", objects / ".000000.abcdef12.tmp" / "000000")
+    assert len(list_clouds([objects])) == sum(1 for _ in objects.glob("0*/*.ply"))
+    assert "3 scenes were there before" in qs3("segment", shots, "--out", objects).stderr
+    # Other settings, another camera and another image are other scenes.
+    camera = (shots / "intrinsics.json").read_text()
+    other = json.dumps(json.loads(camera) | {"fx": 300.0})
+    damaged.write_bytes((shots / "depth" / "000002.png").read_bytes())
+    for words, text, count in (((), camera, 1), (("--gap", 0.03), camera, 3), ((), other, 3)):
+        (shots / "intrinsics.json").write_text(text)
+        done = qs3("segment", shots, *words, "--out", objects, code=2)
+        assert f"{count} of 3 scenes failed" in done.stderr
+        assert "000001: is there already" in done.stderr
+
+
+def test_what_is_no_folder_of_scenes_or_objects_is_left_alone(qs3, tmp_path):
+    scenes, out = tmp_path / "scenes", tmp_path / "out"
+    scenes.mkdir()
+    (scenes / "readme.txt").write_text("clouds of Monday")
+    assert f"{scenes}: no cloud" in qs3.refuses("segment", scenes, "--out", out)
+    np.save(scenes / "a.npy", np.zeros((9, 3)))
+    line = qs3.refuses("segment", scenes, "--intrinsics", tmp_path / "no.json", "--out", out)
+    assert "no.json" in line
+    assert not out.exists()
+    out.mkdir()
+    (out / "a").symlink_to(tmp_path / "elsewhere")
+    done = qs3("segment", scenes, "--out", out, code=2)
+    assert "holds something else (a)" in done.stderr
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "segment.json").write_text("{}")
+    assert "is a link" in qs3("segment", scenes, "--out", out, code=2).stderr
+    assert [path.name for path in (tmp_path / "elsewhere").iterdir()] == ["segment.json"]
+
+
+def test_a_scene_of_one_class_stays_that_class(tmp_path):
+    """Only what was made of a folder of scenes has no classes, at whatever depth."""
+    (frame,) = frames(1)
+    capture((frame for frame in [frame]), tmp_path / "shots")
+    scenes, settings = list_scenes(tmp_path / "shots", SceneSettings())
+    for name in ("chair", "mug"):
+        segment_scene(scenes["000000"], tmp_path / "data" / name, settings)
+    assert read_folder(tmp_path / "data").class_names == ("chair", "mug")
+    list(segment_scenes(scenes | {"b": scenes["000000"]}, tmp_path / "split" / "train", settings))
+    clouds = read_folder(tmp_path / "split")
+    assert clouds.labels is None
+    assert set(clouds.splits) == {"train"}

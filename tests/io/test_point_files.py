@@ -10,7 +10,7 @@ import trimesh
 from qs3.errors import InputError
 from qs3.io.load import detect
 from qs3.io.pcd import lzf_decompress
-from qs3.io.point_files import read_cloud
+from qs3.io.point_files import depth_hint, read_cloud
 from qs3.training.answers import list_clouds
 
 from .hostile import refused
@@ -217,18 +217,27 @@ def test_depth_images_in_the_place_of_clouds_get_the_way_to_clouds(tmp_path):
     image = tmp_path / "shots" / "depth" / "000000.png"
     image.parent.mkdir(parents=True)
     image.write_bytes(b"x")
-    np.save(tmp_path / "000000.npy", np.ones((48, 65), np.float32))
+    np.save(tmp_path / "000000.npy", np.ones((48, 129), np.float32))
     for path, read in (
         (image, read_cloud),
         (tmp_path / "000000.npy", read_cloud),
         (tmp_path / "shots", lambda path: list_clouds([path])),
         (tmp_path / "shots", detect),
     ):
-        with pytest.raises(InputError, match=r"qs3 segment IMAGE --intrinsics CAMERA") as error:
+        with pytest.raises(
+            InputError, match="qs3 segment IMAGE_OR_FOLDER --intrinsics CAMERA"
+        ) as error:
             read(path)
         assert str(path) in str(error.value)
     np.save(tmp_path / "000000.npy", np.ones((48, 64), np.float32))  # points with features
     assert read_cloud(tmp_path / "000000.npy").shape == (48, 3)
+    np.save(tmp_path / "000000.npy", np.ones((3, 2048), np.float32))
+    with pytest.raises(InputError, match="transpose it"):
+        read_cloud(tmp_path / "000000.npy")
+    (tmp_path / "meshes").mkdir()
+    for name in ("texture.png", "chair.obj"):
+        (tmp_path / "meshes" / name).write_bytes(b"x")
+    assert not depth_hint(tmp_path / "meshes")
 
 
 def test_lzf_copies_overlap_and_long_lengths_take_a_byte_more():

@@ -52,6 +52,8 @@ def predict(
     for file in (csv, json):
         if file is not None and file.is_dir():
             raise InputError(f"{file}: is a folder; name a file")
+        if file is not None and file.parent.is_file():
+            raise InputError(f"{file}: {file.parent} is a file; name a file in a folder")
     paths = table.list_clouds(files)
     sets = any(map(table.is_data_set, paths))
     text = "predict" if sets or len(paths) > 1 else None

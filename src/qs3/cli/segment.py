@@ -8,8 +8,13 @@ import tyro
 from qs3.cli.options import Flat
 from qs3.cli.text import columns, printable, quoted, show, tell
 from qs3.errors import InputError
-from qs3.io.extract.segment import SceneSettings, list_scenes, segment_scene, segment_scenes
-from qs3.io.point_files import OBJECTS_TABLE
+from qs3.io.extract.segment import (
+    TABLE,
+    SceneSettings,
+    list_scenes,
+    segment_scene,
+    segment_scenes,
+)
 
 
 def segment(
@@ -39,7 +44,7 @@ def segment(
         rows.append([name, count, *numbers, f"{item.heading:.0f}°"])
     show(*columns(rows, 1))
     following = f"qs3 predict RUN {quoted(out)}"
-    tell(f"{len(objects)} objects in {out}, in metres; see {OBJECTS_TABLE}. Next: {following}")
+    tell(f"{len(objects)} objects in {out}, in metres; see {TABLE}. Next: {following}")
     return 0
 
 
@@ -58,9 +63,11 @@ def _segment_folder(folder: Path, out: Path, settings: SceneSettings) -> int:
             objects += len(result)
             show(f"{printable(name, keep='')}\t{len(result)} objects")
     for fault in faults:
-        tell(f"qs3: {fault}")
-    tell(f"{objects} objects of {len(scenes) - before - len(faults)} scenes in {out}, in metres; "
-         f"{before} scenes were there before. Next: qs3 predict RUN {quoted(out)}")  # fmt: skip
+        tell(f"qs3: {printable(fault, keep='')}")
+    cut = len(scenes) - before - len(faults)
+    if cut or before:
+        tell(f"{objects} objects of {cut} scenes in {out}, in metres; {before} scenes were there "
+             f"before. Next: qs3 predict RUN {quoted(out)}")  # fmt: skip
     if faults:
         raise InputError(f"{folder}: {len(faults)} of {len(scenes)} scenes failed, as told above")
     return 0

@@ -9,19 +9,19 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from qs3.errors import InputError
-from qs3.io.extract.depth_images import DEPTH_FILES
+from qs3.io.extract.depth_images import DEPTH_FILES, holds_images
 from qs3.io.guards import check_announced, load_npy, naming, read_small, text_lines
 from qs3.io.pcd import parse_pcd, pcd_bytes
 from qs3.io.ply import load_ply, ply_bytes
 from qs3.meshes.announced import memory_limit
 
 POINT_FILES = (".npy", ".xyz", ".txt", ".ply", ".pcd", ".off")
-OBJECTS_TABLE = "objects.csv"
-"""Beside the objects that ``qs3 segment`` cuts out of a scene."""
-_MOST_COLUMNS = 64  # of points with features; an image has more
+SCENE_RECORD = "segment.json"
+"""Beside the objects of each scene of a folder that ``qs3 segment`` cuts."""
+_MOST_COLUMNS = 128  # of points with features; an image has more
 _SEGMENT = (
-    "; of a depth image the objects in it become clouds: qs3 segment IMAGE --intrinsics CAMERA "
-    "--out OBJECTS"
+    "; of depth images the objects in them become clouds: qs3 segment IMAGE_OR_FOLDER "
+    "--intrinsics CAMERA --out OBJECTS"
 )
 WRITTEN_FILES = (".npy", ".xyz", ".ply", ".pcd")
 
@@ -99,14 +99,20 @@ def cloud_bytes(points: Float[np.ndarray, "n 3"], ending: str) -> bytes:
 
 def depth_hint(path: Path) -> str:
     """What to do with a file or folder of depth images where clouds are asked for; else empty."""
-    places = [place for place in (path, path / "depth") if place.is_dir()]
-    files = [path] if path.is_file() else [file for place in places for file in place.iterdir()]
-    images = set(DEPTH_FILES) - set(POINT_FILES)
-    return _SEGMENT if any(file.suffix.lower() in images for file in files) else ""
+    images = {*DEPTH_FILES} - {*POINT_FILES}
+    found = holds_images(path) if path.is_dir() else path.suffix.lower() in images
+    return _SEGMENT if found else ""
+
+
+def is_scene(path: Path) -> bool:
+    """Whether a folder holds the objects of one scene of many, which is no class."""
+    return (path / SCENE_RECORD).is_file()
 
 
 def _accept(shape: tuple[int, ...], kind: np.dtype) -> None:
     if len(shape) == 2 and shape[1] > _MOST_COLUMNS:
+        if shape[0] == 3:
+            raise InputError(f"is of shape [3, {shape[1]}]; transpose it, a row is a point")
         raise InputError(
             f"{shape[0]} × {shape[1]} numbers are an image, and points have x, y and z in the "
             f"first three columns{_SEGMENT}"

@@ -62,7 +62,8 @@ def list_clouds(given: Sequence[Path]) -> list[Path]:
     for path in given:
         if path.is_dir():
             paths = [p for p in sorted(path.rglob("*")) if p.suffix.lower() in POINT_FILES]
-            paths = [p for p in paths if p.is_file() and p.name[0] != "."]
+            hidden = [any(part[0] == "." for part in p.relative_to(path).parts) for p in paths]
+            paths = [p for p, h in zip(paths, hidden, strict=True) if p.is_file() and not h]
             if not paths and is_data_set(path):
                 paths = [path]
         elif path.exists() or not glob.has_magic(str(path)):

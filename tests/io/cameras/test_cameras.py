@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shutil
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -38,7 +39,7 @@ def same(one: DepthFrame, other: DepthFrame, colour: bool = True) -> None:
         np.testing.assert_array_equal(one.colour, other.colour)
 
 
-def test_what_is_captured_is_what_the_folder_gives_back(tmp_path):
+def test_what_is_captured_is_what_the_folder_gives_back(tmp_path, monkeypatch):
     shots = list(frames(3))
     assert capture((frame for frame in shots), tmp_path / "shots") == 3
     for one, two in zip(shots, read(f"folder:{tmp_path / 'shots'}"), strict=True):
@@ -46,6 +47,9 @@ def test_what_is_captured_is_what_the_folder_gives_back(tmp_path):
         assert one.name == two.name
     with refused("is there already"):
         capture(frames(1), tmp_path / "shots")
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    assert capture(frames(1), Path()) == 1
 
 
 def test_segment_and_extract_read_what_was_captured(tmp_path):

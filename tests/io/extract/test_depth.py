@@ -249,9 +249,15 @@ distortion_coefficients: {rows: 1, cols: 5, data: [0.0, 0.0, 0.0, 0.0, 0.0]}
     assert read_intrinsics(tmp_path / "opencv4.yaml") == expected
     assert read_intrinsics(tmp_path) == expected  # camera_info.yaml is a name that is looked for
     assert not caplog.text
-    (tmp_path / "bent.yml").write_text(calibration.replace("[0.0, 0.0", "[0.0, 0.1"))
-    assert read_intrinsics(tmp_path / "bent.yml") == expected
-    assert f"{tmp_path / 'bent.yml'}: tells lens distortion, which is not undone" in caplog.text
+    small = calibration.replace("[0.0, 0.0", "[0.0, 1e-05")
+    bent = {"bent.yml": small, "ragged.yml": calibration.replace("[0.0, 0.0", "[[0.1], [0.0, 0.1]")}
+    plain = {"fx": 150, "fy": 140, "cx": 77, "cy": 61, "width": 160, "height": 120}
+    bent["coeffs.json"] = json.dumps(plain | {"coeffs": {"k1": 0.1}, "k": 3, "d": None})
+    for name, text in bent.items():
+        (tmp_path / name).write_text(text)
+        assert read_intrinsics(tmp_path / name) == expected
+        told = f"{tmp_path / name}: tells lens distortion, which is not undone"
+        assert told in caplog.text, name
 
 
 def test_a_principal_point_outside_the_image_is_told(caplog):
@@ -297,6 +303,7 @@ def test_bad_cameras_on_the_command_line(text, message):
         ("a.json", '{"focal": 3}', "principal_point"),
         ("a.json", "{}", "none of fx"),
         ("a.yaml", "K: [1, 2", "not a YAML file"),
+        ("a.yaml", "a: &a {}\nb: {<<: [*a, *a]}\nfx: 1", "refers to parts of itself"),
         ("a.yaml", "[" * 10_000, "not a YAML file"),
         ("a.yaml", "x" * 100_000, "too long"),
         ("a.yaml", "", "not a table of names and values"),

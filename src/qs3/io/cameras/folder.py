@@ -53,7 +53,7 @@ def folder_camera(folder: Path, intrinsics: str = "", colour: bool = True) -> Ca
             frame = _read_frame(path, camera, folder / COLOUR / f"{name}.png" if colour else None)
         except StorageError:
             raise
-        except InputError as error:
+        except (InputError, OSError) as error:
             if not good:
                 raise
             _log.warning("left out: %s", error)

@@ -15,6 +15,7 @@ DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
 DEPTH = "depth"
 """Folder of the depth images, beside that of colour."""
 MILLIMETRE = 0.001
+_BESIDE = {".json", ".txt", ".csv", ".yaml", ".yml"}  # what tells cameras, times and names
 _LARGEST = 1 << 30
 _DEPTH_MODES = ("", "I;16", "I;16B", "I;16L", "I", "F")  # Pillow's; empty for npy
 
@@ -58,14 +59,24 @@ def list_images(folder: Path) -> dict[str, Path]:
     return list_files(folder / DEPTH if (folder / DEPTH).is_dir() else folder, DEPTH_FILES)
 
 
+def holds_images(folder: Path) -> bool:
+    """Whether a folder is one of depth images by its looks: no other data are in it."""
+    if (folder / DEPTH).is_dir():
+        return True
+    files = [path for path in folder.iterdir() if path.is_file() and path.name[0] != "."]
+    endings = {path.suffix.lower() for path in files} - _BESIDE
+    return bool(endings - {".npy"}) and endings <= {*DEPTH_FILES}
+
+
 def list_files(folder: Path, endings: tuple[str, ...]) -> dict[str, Path]:
     """List the files of a folder with one of some endings, as `list_images` does."""
     files: dict[str, Path] = {}
+    taken: dict[str, str] = {}  # some disks take A and a for one
     for path in sorted(folder.iterdir()):
-        if path.name.startswith(".") or path.suffix.lower() not in endings:
+        if path.name[0] == "." or path.suffix.lower() not in endings or not path.is_file():
             continue
-        if path.stem in files:
-            raise InputError(f"{path}: {files[path.stem].name} has the same name; rename one")
+        if (other := taken.setdefault(path.stem.casefold(), path.name)) != path.name:
+            raise InputError(f"{path}: {other} has the same name; rename one")
         files[path.stem] = path
     return files
 

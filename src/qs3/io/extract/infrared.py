@@ -23,7 +23,8 @@ class PairFiles:
     depth: Path | None = None
     """The camera's own depth in the left image's frame: 16-bit PNG, TIFF or npy."""
     intrinsics: str = ""
-    """Of the left image: fx,fy,cx,cy; a JSON file of a camera; or a text file of 3×3 numbers."""
+    """Of the left image: fx,fy,cx,cy; a JSON or YAML file of a camera; or a text file of 3×3
+    numbers."""
     baseline: float | None = None
     """Metres between the two infrared cameras."""
     depth_scale: float | None = None

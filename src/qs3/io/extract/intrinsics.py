@@ -1,6 +1,7 @@
 """The pinhole camera that took a depth image: its numbers, and the files they come in."""
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,20 +16,19 @@ CAMERA_FILES = ("intrinsics.json", "intrinsics.txt", "camera.json", "K.txt", "ca
 """Names of the file that tells the camera of a folder of images."""
 
 _LARGEST = 1 << 20
-_LARGEST_YAML = 1 << 16  # its reader takes a second for so much
+_LARGEST_YAML = 1 << 16  # its reader takes some seconds for so much
 _FORMS = "give fx,fy,cx,cy, a JSON or YAML file, or a text file of 3×3 numbers"
 _SAME = {
     "camera_matrix": "K",
     "k": "K",
-    "distortion_coefficients": "D",
-    "d": "D",
-    "coeffs": "D",
     "image_width": "width",
     "image_height": "height",
     "ppx": "cx",
     "ppy": "cy",
 }
 """Other names in the files of OpenCV, ROS 1, ROS 2 and librealsense."""
+_DISTORTION = ("D", "d", "distortion_coefficients", "coeffs")
+"""Where these files tell it."""
 
 
 @dataclass(frozen=True)
@@ -148,8 +148,11 @@ def read_intrinsics(given: str | Path) -> Intrinsics:
     with naming(path):
         if path.suffix.lower() in (".json", ".yaml", ".yml"):
             json = path.suffix.lower() == ".json"
-            table = read_small_json(path, _LARGEST) if json else _read_yaml(path)
-            return _from_table(pick(_renamed(table), _CameraFile, "camera"), path)
+            table = _renamed(read_small_json(path, _LARGEST) if json else _read_yaml(path))
+            camera = _from_table(pick(table, _CameraFile, "camera"))
+            if any(_is_bent(table.get(name)) for name in _DISTORTION):
+                say_once(f"{path}: tells lens distortion, which is not undone; give images without")
+            return camera
         numbers = read_numbers(path, (4, 9, 16)).tolist()
         if len(numbers) == 4:
             return read_intrinsics(",".join(map(str, numbers)))
@@ -164,7 +167,17 @@ def _read_yaml(path: Path) -> Any:
     class Loader(yaml.SafeLoader):
         """Plain values alone, and a matrix of OpenCV as the table that it is."""
 
-    Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", yaml.SafeLoader.construct_yaml_map)
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):  # a few lines of them become gigabytes
+                raise InputError("refers to parts of itself (*name), as no camera's file does")
+            return super().compose_node(parent, index)
+
+    tag = "tag:yaml.org,2002:"
+    Loader.add_constructor(f"{tag}opencv-matrix", yaml.SafeLoader.construct_yaml_map)
+    # YAML 1.1 takes 1e-05, without a point, for a word.
+    Loader.add_implicit_resolver(
+        f"{tag}float", re.compile(r"[-+]?\d+[eE][-+]?\d+$"), [*"-+0123456789"]
+    )
     text = read_text(path, _LARGEST_YAML)
     if text.startswith("%YAML:"):  # OpenCV 4's first line, with a colon that YAML does not know
         text = text.partition("\n")[2]
@@ -179,12 +192,25 @@ def _renamed(table: Any) -> Any:
     """A table with our names in place of others', and a matrix as its numbers."""
     if not isinstance(table, dict):
         return table
-    ours: dict[Any, Any] = {}
-    for key, value in table.items():
-        name = _SAME.get(key, key)
-        numbers = value.get("data") if name in ("K", "D") and isinstance(value, dict) else value
-        ours.setdefault(name, numbers)
+    ours = {key: value for key, value in table.items() if key not in _SAME}
+    for key, name in _SAME.items():
+        value = table.get(key)
+        if name == "K":
+            value = value.get("data") if isinstance(value, dict) else value
+            value = value if isinstance(value, list) else None  # another's k is something else
+        if value is not None:
+            ours.setdefault(name, value)
     return ours
+
+
+def _is_bent(distortion: Any) -> bool:
+    """Whether a number of a distortion, however it is told, is not 0."""
+    if isinstance(distortion, dict):
+        numbers = distortion.get("data", distortion)
+        return _is_bent([*numbers.values()] if isinstance(numbers, dict) else numbers)
+    if isinstance(distortion, list):
+        return any(map(_is_bent, distortion))
+    return isinstance(distortion, int | float) and distortion != 0
 
 
 @dataclass(frozen=True)
@@ -199,7 +225,6 @@ class _CameraFile:
     principal_point: tuple[float, float] | None = None
     cam_K: Numbers | None = None  # noqa: N815 (BOP's name)
     K: Numbers | None = None
-    D: Numbers | None = None
     intrinsic_matrix: Numbers | None = None
     width: int | None = None
     height: int | None = None
@@ -207,9 +232,7 @@ class _CameraFile:
     depth_unit: float | None = None
 
 
-def _from_table(file: _CameraFile, path: Path) -> Intrinsics:
-    if np.any(np.ravel(file.D or ())):
-        say_once(f"{path}: tells lens distortion, which is not undone; give undistorted images")
+def _from_table(file: _CameraFile) -> Intrinsics:
     scale = file.depth_unit if file.depth_scale is None else file.depth_scale / 1000
     more = {"width": file.width, "height": file.height, "depth_scale": scale}
     if file.fx is not None:

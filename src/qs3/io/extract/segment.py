@@ -10,25 +10,34 @@ Source: Rusu, "Semantic 3D object maps for everyday manipulation in human living
 """
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from qs3.errors import InputError, StorageError
-from qs3.files import claim_folder, new_folder, read_json, write_bytes, write_json
+from qs3.files import (
+    holds_something,
+    new_folder,
+    read_json,
+    refuse_link,
+    sha256,
+    write_bytes,
+    write_json,
+)
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
-from qs3.io.extract.depth_images import list_files, list_images, read_depth
+from qs3.io.extract.depth_images import holds_images, list_files, list_images, read_depth
 from qs3.io.extract.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
 from qs3.io.extract.plane import Plane, fit_plane
 from qs3.io.guards import load_npy, naming, open_zip, read_member
-from qs3.io.point_files import OBJECTS_TABLE, POINT_FILES, cloud_bytes, read_cloud
+from qs3.io.point_files import POINT_FILES, SCENE_RECORD, cloud_bytes, is_scene, read_cloud
 from qs3.io.preparation import thin
 from qs3.sensor.checks import check_range
 
-SETTINGS = "segment.json"
+TABLE = "objects.csv"
 _LEAST_SHARE = 0.1  # of the points, on the plane
 _WIDEST = 1000.0  # metres
 _FITTED = 2000  # points that the plane is fitted to
@@ -77,7 +86,7 @@ class SceneSettings(SegmentSettings):
     """How the scene of a file is read and cut into objects."""
 
     intrinsics: str = ""
-    """Of a depth image: fx,fy,cx,cy; a JSON file of a camera; or a text file of 3×3
+    """Of a depth image: fx,fy,cx,cy; a JSON or YAML file of a camera; a text file of 3×3
     numbers; or the folder that has one. Without it the scene is a cloud in metres, unless it is
     a folder with its camera's file."""
     depth_scale: float | None = None
@@ -100,7 +109,10 @@ class SegmentedObject:
 
 
 def segment_scene(
-    scene: Path, out: Path, settings: SceneSettings = SceneSettings()
+    scene: Path,
+    out: Path,
+    settings: SceneSettings = SceneSettings(),
+    record: Mapping[str, Any] | None = None,
 ) -> list[SegmentedObject]:
     """Cut a scene into a new folder: ``object_000.ply`` and so on, largest first, and a table.
 
@@ -109,6 +121,7 @@ def segment_scene(
             PNG, TIFF, npy).
         out: A new or empty folder.
         settings: How it is cut.
+        record: What is written beside the objects as `SCENE_RECORD`.
 
     Raises:
         InputError: where the scene cannot be read, has no plane or nothing on it, or the folder is
@@ -127,64 +140,77 @@ def segment_scene(
             rows.append([name, len(item.points), *item.centre, *item.size, item.heading])
         columns = ["file", "points", "x", "y", "z", "length", "width", "height", "heading"]
         table = pd.DataFrame(rows, columns=columns).to_csv(index=False, float_format="%.4f")
-        write_bytes(folder / OBJECTS_TABLE, table.encode())
+        write_bytes(folder / TABLE, table.encode())
+        if record is not None:
+            write_json(folder / SCENE_RECORD, record)
     return objects
 
 
 def list_scenes(folder: Path, settings: SceneSettings) -> tuple[dict[str, Path], SceneSettings]:
     """List the scenes of a folder by their names, and say how they are read.
 
-    With intrinsics, or a camera's file in the folder, they are the depth images in ``folder/depth``
+    With intrinsics, or a camera's file beside them, they are the depth images in ``folder/depth``
     or in the folder itself, as ``qs3 capture`` writes them; else its clouds.
 
     Raises:
         InputError: where there is none, or two have one name.
     """
-    if not settings.intrinsics and any((folder / name).is_file() for name in CAMERA_FILES):
+    told = any((folder / name).is_file() for name in CAMERA_FILES)
+    if not settings.intrinsics and told and holds_images(folder):
         settings = replace(settings, intrinsics=str(folder))
     if settings.intrinsics:
         scenes = list_images(folder)
-    else:
-        scenes = list_files(folder, (*POINT_FILES, ".npz"))
+    else:  # a text beside them is more often a note than a cloud
+        scenes = list_files(folder, tuple({*POINT_FILES, ".npz"} - {".txt"}))
     if not scenes:
-        what = "depth image" if settings.intrinsics else "cloud, and no camera's file"
+        what = "depth image" if settings.intrinsics else "cloud, and no depth image with a camera,"
         raise InputError(f"{folder}: no {what} in it")
     return scenes, settings
 
 
 def segment_scenes(
-    scenes: dict[str, Path], out: Path, settings: SceneSettings
+    scenes: Mapping[str, Path], out: Path, settings: SceneSettings
 ) -> Iterator[tuple[str, list[SegmentedObject] | InputError | None]]:
     """Cut scenes one after another, each into the folder ``out/<name>`` as `segment_scene` does.
 
+    A `SCENE_RECORD` in that folder tells the scene's checksum, its camera and the settings: what
+    was made of the same is left as it is, so that the same call goes on after a stop.
+
     Args:
         scenes: Files by the names of their folders.
-        out: A new or empty folder, or one of the same scenes and settings, which goes on.
+        out: A new or empty folder, or one with scenes that were cut.
         settings: How they are cut.
 
     Yields:
-        The name and the objects; the fault of a scene that cannot be read or has no object; None
-        where it was there before.
+        The name and the objects; the fault of a scene that cannot be read, has no object, or whose
+        folder is taken; None where it was there before.
 
     Raises:
-        InputError: where the folder is another's.
+        InputError: where the camera cannot be read, or the folder is another's.
     """
-    whole = {name: str(path.resolve()) for name, path in scenes.items()}
-    told = {"settings": repr(settings), "scenes": whole}
-    file = claim_folder(out, SETTINGS) / SETTINGS
-    if file.is_file() and read_json(file) != told:
-        raise InputError(f"{out}: holds objects of other scenes or settings; name another folder")
-    write_json(file, told)
+    how = {field.name: repr(getattr(settings, field.name)) for field in fields(settings)}
+    if settings.intrinsics:
+        how["intrinsics"] = repr(read_intrinsics(settings.intrinsics))
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file; name a folder")
+    strange = [e.name for e in out.iterdir() if not is_scene(e)] if holds_something(out) else []
+    if strange := [name for name in strange if name[0] != "."]:
+        raise InputError(f"{out}: holds something else ({strange[0]}); name a new or empty folder")
     for name, path in scenes.items():
-        if (out / name / OBJECTS_TABLE).is_file():
-            yield name, None
-            continue
+        place = out / name
         try:
-            yield name, segment_scene(path, out / name, settings)
+            record = {"sha256": sha256(path), "settings": how}
+            refuse_link(place)
+            if is_scene(place) and read_json(place / SCENE_RECORD) == record:
+                yield name, None
+            else:
+                yield name, segment_scene(path, place, settings, record)
         except StorageError:
             raise
         except InputError as error:
             yield name, error
+        except OSError as error:
+            yield name, InputError(f"{error.filename or path}: {error.strerror}")
 
 
 def read_scene(path: Path, settings: SceneSettings) -> Float[np.ndarray, "n 3"]:

@@ -20,10 +20,10 @@ from qs3.io.clouds import RaggedClouds
 from qs3.io.guards import utf8
 from qs3.io.layouts.format import SPLITS, Format
 from qs3.io.point_files import (
-    OBJECTS_TABLE,
     POINT_FILES,
     WRITTEN_FILES,
     cloud_bytes,
+    is_scene,
     read_cloud,
 )
 from qs3.store.progress import cloud_bar
@@ -50,8 +50,8 @@ def read_folder(
     """Read the clouds of a folder in one of these layouts.
 
     ``<root>/<class>/*``, ``<root>/<class>/<train|test>/*`` or ``<root>/<train|test>/<class>/*``;
-    without labels ``<root>/*``, ``<root>/<train|test>/*`` or ``<root>/<scene>/*`` with the table
-    that ``qs3 segment`` writes. Files of other endings and hidden
+    without labels ``<root>/*``, ``<root>/<train|test>/*`` or ``<root>/<scene>/*`` as
+    ``qs3 segment`` makes it of a folder. Files of other endings and hidden
     ones are passed over; ``split`` None takes every other file.
 
     Returns:
@@ -81,12 +81,10 @@ def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudF
     for folder in folders:
         if split_first:
             places.append((folder, "", folder.name))
-            places += [(path, path.name, folder.name) for path in inner[folder]]
+            places += [(path, _class_name(path), folder.name) for path in inner[folder]]
         else:
-            # What qs3 segment made of a scene is named by it, which tells no class.
-            class_name = "" if (folder / OBJECTS_TABLE).is_file() else folder.name
-            places.append((folder, class_name, ""))
-            places += [(folder / split, class_name, split) for split in SPLITS]
+            places.append((folder, _class_name(folder), ""))
+            places += [(folder / split, folder.name, split) for split in SPLITS]
     files = [
         CloudFile(path, utf8(name), split)
         for place, name, split in places
@@ -105,6 +103,11 @@ def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudF
             "<class>/<train|test>/"
         )
     return files
+
+
+def _class_name(folder: Path) -> str:
+    """A folder's name; empty for what qs3 segment made of a scene, whose name tells no class."""
+    return "" if is_scene(folder) else folder.name
 
 
 def choose_split(root: Path, files: Sequence[CloudFile], split: str | None) -> list[CloudFile]:
