@@ -102,6 +102,7 @@ def test_runs_and_their_data_are_checked(qs3, run, store, tmp_path):
     np.save(tmp_path / "pickle.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
     for name in ("nan.npy", "pickle.npy"):
         assert name in qs3.refuses("predict", run, tmp_path / name)
+    assert "qs3 convert" in qs3.refuses("predict", run, store, "--sort-into", tmp_path / "new")
     # What is in the way of the answers is told before a cloud is read.
     for option in ("--sort-into", "--csv", "--json"):
         line = qs3.refuses("predict", run, tmp_path / "nan.npy", option, store)

@@ -56,6 +56,11 @@ def predict(
             raise InputError(f"{file}: {file.parent} is a file; name a file in a folder")
     paths = table.list_clouds(files)
     sets = any(map(table.is_data_set, paths))
+    if sets and sort_into is not None:
+        raise InputError(
+            "--sort-into links to files, and the clouds of a data set are none; write files of it "
+            "first: qs3 convert DATA FOLDER --to ply"
+        )
     text = "predict" if sets or len(paths) > 1 else None
     said = table.predict_files(run, paths, unknown=unknown, calibrated=calibrated)
     bar = progress_bar(None if sets else len(paths), text, "cloud", items=said)
