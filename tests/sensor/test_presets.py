@@ -256,7 +256,8 @@ def test_a_picture_is_looked_for_beside_the_file(tmp_path, monkeypatch):
         ("[exposure]\nbits = 10", "opencv-bm takes 8 bits"),
         ("[depth]\nnear = 1.0\nfar = 1.5", "outside the depth gate.* 2 to 6.* 1 … 1.5"),
         ("base = 'd435'\n[depth]\nnear = 4.0", "outside the depth gate.* 0.4 to 2.8 m"),
-        ("base = 'd435'\n[rig]\nbaseline = 50.0", "f·b/z of 7679 px"),
+        ("base = 'd435'\n[rig]\nbaseline = 10.0", "f·b/z of 1536 px"),
+        ("base = 'd435'\n[rig]\nbaseline = 50.0", "divide millimetres by 1000"),
     ],
 )
 def test_faults_of_a_file_are_one_line_that_names_it(text, message, tmp_path):

@@ -21,7 +21,7 @@ VERBS = {
     "convert": "Convert a data set into the layout of another.",
     "capture": "Write the frames of a depth camera, live or recorded, as files.",
     "extract": "Cut objects out of real scans into a data set.",
-    "segment": "Cut a scan of a table or a floor into the objects that stand on it.",
+    "segment": "Cut scans of a table or a floor into the objects that stand on it.",
     "train": "Train a classifier, with a method of adaptation to an unlabelled target if asked.",
     "evaluate": "Score a run: accuracy, class-mean accuracy, confusion matrix.",
     "predict": "Tell the class of each file and how confident the network is.",

@@ -17,7 +17,7 @@ from qs3.geometry import invert_rigid, look_at, transform_points
 from qs3.sensor.checks import check_choices, check_range
 
 _MOST_PIXELS = 2**25  # three times the film of the largest depth cameras
-_LONGEST_BASELINE = 10.0  # an object is within a few metres; a larger one is in millimetres
+_LONGEST_BASELINE = 15.0  # objects are within a few metres; the shortest in millimetres is 18
 
 
 @dataclass(frozen=True)
