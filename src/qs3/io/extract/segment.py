@@ -20,7 +20,6 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from qs3.errors import InputError, StorageError
 from qs3.files import (
-    holds_something,
     new_folder,
     read_json,
     refuse_link,
@@ -109,10 +108,7 @@ class SegmentedObject:
 
 
 def segment_scene(
-    scene: Path,
-    out: Path,
-    settings: SceneSettings = SceneSettings(),
-    record: Mapping[str, Any] | None = None,
+    scene: Path, out: Path, settings: SceneSettings = SceneSettings()
 ) -> list[SegmentedObject]:
     """Cut a scene into a new folder: ``object_000.ply`` and so on, largest first, and a table.
 
@@ -121,18 +117,28 @@ def segment_scene(
             PNG, TIFF, npy).
         out: A new or empty folder.
         settings: How it is cut.
-        record: What is written beside the objects as `SCENE_RECORD`.
 
     Raises:
         InputError: where the scene cannot be read, has no plane or nothing on it, or the folder is
             taken.
     """
+    return _cut_into(out, scene, settings)
+
+
+def _cut_into(
+    out: Path,
+    scene: Path,
+    settings: SceneSettings,
+    camera: Intrinsics | None = None,
+    record: Mapping[str, Any] | None = None,
+) -> list[SegmentedObject]:
+    """Do as `segment_scene` does; ``record`` is written beside the objects as `SCENE_RECORD`."""
     # Imported here: it takes long, and the help of the verb needs none.
     import pandas as pd
 
     with new_folder(out) as folder:
         with naming(scene):
-            objects = segment(read_scene(scene, settings), settings)
+            objects = segment(read_scene(scene, settings, camera), settings)
         rows = []
         for number, item in enumerate(objects):
             name = f"object_{number:03d}.ply"
@@ -189,13 +195,15 @@ def segment_scenes(
         InputError: where the camera cannot be read, or the folder is another's.
     """
     how = {field.name: repr(getattr(settings, field.name)) for field in fields(settings)}
-    if settings.intrinsics:
-        how["intrinsics"] = repr(read_intrinsics(settings.intrinsics))
+    camera = read_intrinsics(settings.intrinsics) if settings.intrinsics else None
+    how["intrinsics"] = repr(camera)
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; name a folder")
-    strange = [e.name for e in out.iterdir() if not is_scene(e)] if holds_something(out) else []
-    if strange := [name for name in strange if name[0] != "."]:
-        raise InputError(f"{out}: holds something else ({strange[0]}); name a new or empty folder")
+    for entry in out.iterdir() if out.is_dir() else ():
+        if entry.name[0] != "." and not is_scene(entry):  # what begins so is of a stop
+            raise InputError(
+                f"{out}: holds something else ({entry.name}); name a new or empty folder"
+            )
     for name, path in scenes.items():
         place = out / name
         try:
@@ -204,7 +212,7 @@ def segment_scenes(
             if is_scene(place) and read_json(place / SCENE_RECORD) == record:
                 yield name, None
             else:
-                yield name, segment_scene(path, place, settings, record)
+                yield name, _cut_into(place, path, settings, camera, record)
         except StorageError:
             raise
         except InputError as error:
@@ -213,10 +221,18 @@ def segment_scenes(
             yield name, InputError(f"{error.filename or path}: {error.strerror}")
 
 
-def read_scene(path: Path, settings: SceneSettings) -> Float[np.ndarray, "n 3"]:
-    """Read a scene: metres, turned so that z is against gravity as far as that is known."""
+def read_scene(
+    path: Path, settings: SceneSettings, camera: Intrinsics | None = None
+) -> Float[np.ndarray, "n 3"]:
+    """Read a scene: metres, turned so that z is against gravity as far as that is known.
+
+    Args:
+        path: As `segment_scene` takes it.
+        settings: How it is read.
+        camera: What ``settings.intrinsics`` names, where it has been read.
+    """
     if settings.intrinsics:
-        camera = read_intrinsics(settings.intrinsics)
+        camera = camera or read_intrinsics(settings.intrinsics)
         scale = camera.depth_scale if settings.depth_scale is None else settings.depth_scale
         depth = read_depth(path, scale)
         camera.check_size(depth.shape, str(path))
