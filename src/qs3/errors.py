@@ -1,6 +1,8 @@
 """Errors that a user can act on: one line that names what is wrong and the fix."""
 
+import difflib
 import logging
+from collections.abc import Iterable
 
 _log = logging.getLogger(__name__)
 
@@ -33,6 +35,26 @@ class MissingExtraError(QS3Error, ImportError):
 
 class CannotCompileError(QS3Error, ImportError):
     """This machine cannot compile what is compiled when first used: no fault of one object."""
+
+
+def no_such(fault: str, name: str, names: Iterable[str], more: str = "") -> InputError:
+    """Return the error for a name that is none of some: the nearest of them, and all.
+
+    Args:
+        fault: The message's beginning.
+        name: What was given.
+        names: What there is.
+        more: The message's end.
+
+    Example:
+        >>> print(no_such("unknown model 'dgcn'", "dgcn", ("pointnet", "dgcnn")))
+        unknown model 'dgcn' (did you mean dgcnn?); choose one of pointnet, dgcnn
+    """
+    names = list(names)
+    lower = {other.lower(): other for other in names}
+    near = difflib.get_close_matches(name.lower(), lower, n=1)
+    aside = f" (did you mean {lower[near[0]]}?)" if near else ""
+    return InputError(f"{fault}{aside}; choose one of {', '.join(names)}{more}")
 
 
 TOLD: set[str] = set()

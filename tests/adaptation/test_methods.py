@@ -43,9 +43,9 @@ def test_default_parameter_group_holds_every_trainable_parameter():
 @pytest.mark.parametrize(
     ("name", "settings", "message"),
     [
-        ("dan", {}, "unknown method 'dan'; choose one of source-only, dann"),
+        ("dan", {}, "unknown method 'dan' .did you mean dann..; choose one of source-only"),
         ("source-only", {"wait": 1}, "unknown setting 'wait' of method source-only; it takes none"),
-        ("defrec", {"wait": 1}, "unknown setting 'wait' of method defrec; choose from deform"),
+        ("defrec", {"wait": 1}, "unknown setting 'wait' of method defrec .*choose one of deform"),
         (
             "mmd",
             {"biased": "yes"},

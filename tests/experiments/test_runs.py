@@ -116,8 +116,8 @@ def test_the_paper_s_cells_have_their_published_figures():
 @pytest.mark.parametrize(
     ("names", "rows", "columns", "seeds", "said"),
     [
-        (["ordinary"], ["typo"], [], (0,), "--methods typo: choose from dgcnn"),
-        (["ordinary"], [], ["typo"], (0,), "--tasks typo: choose from"),
+        (["ordinary"], ["typo"], [], (0,), "--methods typo; choose one of dgcnn"),
+        (["ordinary"], [], ["typo"], (0,), "--tasks typo; choose one of"),
         (["ordinary", "ordinary"], [], [], (0,), "name each once"),
         (["ordinary"], [], [], (0, 0), "name each once"),
         (["ordinary"], [], [], (), "at least one"),

@@ -150,7 +150,7 @@ def test_weights_of_release_0_1_give_the_scores_of_release_0_1(name, scores):
         ("pointnet2", {"scales": (((-0.2, 4, (8, 8)),),) * 2}, "radius in scales must be larger"),
         ("pointnet2", {"scales": (((0.2, 256, (8, 8)),),) * 2}, "neighbours in scales must be 1"),
         ("pointnet2", {"scales": (((0.2, 8, (8,)),),) * 2}, "widths must be two or more"),
-        ("pointnet2-msg", {"grouping": "ssg"}, "unknown setting 'grouping'.* from centres, scal"),
+        ("pointnet2-msg", {"grouping": "ssg"}, "unknown setting 'grouping'.* of centres, scal"),
         ("pointmlp-elite", {"reducers": (2, 2, 2, 0)}, "reducers must be 1 to 255"),
         ("pointmlp-elite", {"embedding": 1}, "leaves nothing"),
         ("rscnn", {"radii": (float("inf"), 1.0)}, "radii must be larger than 0"),

@@ -279,7 +279,7 @@ def test_unusable_places_and_runs_are_refused(tmp_path):
     (tmp_path / "folder.onnx").mkdir()
     faults = [
         ((tmp_path / "none", "onnx"), "no model.safetensors here"),
-        ((tmp_path, "tflite"), "choose onnx or torch-export"),
+        ((tmp_path, "tflite"), "choose one of onnx, torch-export"),
         ((tmp_path, "onnx", tmp_path / "a.pt2"), "ends in .onnx"),
         ((tmp_path, "onnx", tmp_path / "folder.onnx"), "is a folder"),
     ]

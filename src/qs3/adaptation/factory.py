@@ -4,7 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from qs3.adaptation.names import METHODS, Normalisation
-from qs3.errors import InputError
+from qs3.errors import no_such
 from qs3.models.checks import read_settings
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def method_class(name: str) -> "type[Method]":
         False
     """
     if name not in METHODS:
-        raise InputError(f"unknown method {name!r}; choose one of {', '.join(METHODS)}")
+        raise no_such(f"unknown method {name!r}", name, METHODS)
     module, kind = METHODS[name].split(".")
     return getattr(import_module(f"qs3.adaptation.{module}"), kind)
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from qs3.adaptation.names import Normalisation
-from qs3.errors import InputError
+from qs3.errors import no_such
 from qs3.models import PointClassifier
 
 _STATISTICS = ("running_mean", "running_var", "num_batches_tracked")
@@ -153,8 +153,6 @@ def make_norm(name: Normalisation, model: PointClassifier) -> DomainNorm:
         InputError: where the name is unknown.
     """
     if name not in get_args(Normalisation):
-        raise InputError(
-            f"unknown normalisation {name!r}; choose one of {', '.join(get_args(Normalisation))}"
-        )
+        raise no_such(f"unknown normalisation {name!r}", name, get_args(Normalisation))
     kinds = {"separate": SeparateNorm, "transnorm": TransNorm}
     return kinds.get(name, DomainNorm)(model)

@@ -96,13 +96,10 @@ def _run(given: list[str]) -> int:
 
         show(f"qs3 {version('qs3')}")
         return 0
-    from qs3.errors import InputError
+    from qs3.errors import InputError, no_such
 
     if verb not in VERBS:
-        from difflib import get_close_matches
-
-        near = get_close_matches(verb, VERBS) or VERBS
-        raise InputError(f"{verb}: no such verb; did you mean {' or '.join(near)}? See qs3 --help")
+        raise no_such(f"{verb}: no such verb", verb, VERBS, "; see qs3 --help")
     if any(pair == ("--out", "") for pair in pairwise(rest)) or "--out=" in rest:
         raise InputError('--out "": is empty; name what to write')
     from qs3.cli.options import run_verb

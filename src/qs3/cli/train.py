@@ -13,7 +13,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 from qs3.adaptation.names import COMPOSED, WITHOUT_TARGET, MethodName, RoundRule, split_method
 from qs3.cli.options import Flat
 from qs3.cli.text import quoted, show, tell
-from qs3.errors import InputError
+from qs3.errors import InputError, no_such
 from qs3.evaluation.records import rename_method
 from qs3.files import parse_json
 from qs3.io.clouds import CloudChoice
@@ -47,7 +47,7 @@ def _note_old_name(name: str) -> None:
 def _method(words: list[str]) -> str:
     name = rename_method(words[0])
     if name not in get_args(MethodName):
-        raise ValueError(f"{name!r} is none of {', '.join(get_args(MethodName))}")
+        raise no_such(f"no method {name!r}", name, get_args(MethodName))
     if name != words[0]:
         _note_old_name(words[0])
     return name

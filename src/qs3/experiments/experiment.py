@@ -8,7 +8,7 @@ from importlib import import_module
 from importlib.resources import files
 from typing import Any
 
-from qs3.errors import InputError
+from qs3.errors import no_such
 from qs3.experiments import TABLES
 from qs3.experiments.domains import Domain, Kind
 from qs3.experiments.runs import SUPERVISED, Run, make_run
@@ -116,7 +116,7 @@ def load_experiment(name: str) -> Experiment:
         InputError: where there is no such file.
     """
     if name not in TABLES:
-        raise InputError(f"unknown table {name!r}; choose from {', '.join(TABLES)}")
+        raise no_such(f"unknown table {name!r}", name, TABLES)
     return import_module(f"qs3.experiments.tables.{name.replace('-', '_')}").EXPERIMENT
 
 

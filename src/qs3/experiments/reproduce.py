@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Union
 from unittest import mock
 
-from qs3.errors import InputError
+from qs3.errors import InputError, no_such
 from qs3.experiments import GALLERIES
 from qs3.experiments.domains import DATA, data_of
 from qs3.experiments.experiment import load_experiment
@@ -101,7 +101,7 @@ def products(
     for option, keys in choices.items():
         for key in given[option]:
             if key not in keys:
-                raise InputError(f"--{option} {key}: choose from {', '.join(sorted(keys))}")
+                raise no_such(f"--{option} {key}", key, sorted(keys))
     return made
 
 

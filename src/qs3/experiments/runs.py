@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from qs3.adaptation.names import WITHOUT_TARGET, MethodName, split_method
-from qs3.errors import InputError
+from qs3.errors import InputError, no_such
 from qs3.experiments.domains import Domain, Own, Part, data_of
 from qs3.experiments.scales import Scale
 from qs3.training.config import GENTLE, PRESETS, SelfTrainingSettings, TrainSettings
@@ -178,7 +178,7 @@ def make_run(
         ('S-D_qbst-theta-0.3_seed-0', 'S-D/qbst-theta-0.3/seed-0', 'shrinking')
     """
     if row not in ROWS:
-        raise InputError(f"unknown row {row!r}; choose from {', '.join(ROWS)}")
+        raise no_such(f"unknown row {row!r}", row, ROWS)
     kind = ROWS[row]
     source = target if row == SUPERVISED else source
     alone = split_method(kind.method)[0] in WITHOUT_TARGET

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from qs3.errors import InputError
+from qs3.errors import no_such
 from qs3.experiments import ScaleName
 from qs3.io.preparation import ROBUST
 from qs3.meshes.classes import POINTDA10
@@ -113,7 +113,7 @@ class Scale:
         if not network:
             return train
         if network not in self.networks:
-            raise InputError(f"unknown network {network!r}; choose from {', '.join(self.networks)}")
+            raise no_such(f"unknown network {network!r}", network, self.networks)
         own = {"model": network, "model_settings": self.networks[network], **self.ordinary}
         return replace(train, **own)
 

@@ -1,13 +1,12 @@
 """One door to every kind of data set: ours, an archive, a folder, any layout that is known."""
 
-import difflib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from qs3.errors import InputError
+from qs3.errors import InputError, no_such
 from qs3.files import holds_something
 from qs3.io.clouds import CloudChoice, Origin, PointClouds, RaggedClouds, UnlabelledClouds
 from qs3.io.layouts import FORMATS, FORMER_NAMES, Format, point_folders
@@ -153,9 +152,7 @@ def format_named(name: str) -> Format:
     name = FORMER_NAMES.get(name, name)
     if name in FORMATS:
         return FORMATS[name]
-    near = difflib.get_close_matches(name, FORMATS, n=1)
-    meant = f"; did you mean {near[0]}?" if near else ""
-    raise InputError(f"{name!r} is no known layout ({', '.join(FORMATS)}){meant}")
+    raise no_such(f"{name!r} is no known layout", name, FORMATS)
 
 
 def require(path: Path, layout: Format | None = None) -> None:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, get_type_hints
 
-from qs3.errors import InputError
+from qs3.errors import InputError, no_such
 from qs3.structure import structure
 
 Number = int | float
@@ -27,8 +27,8 @@ def read_settings(
     choice = [field.name for field in dataclasses.fields(table)]
     for key in settings:
         if key not in choice:
-            words = f"choose from {', '.join(choice)}" if choice else "it takes none"
-            raise InputError(f"unknown setting {key!r} of {what}; {words}")
+            fault = f"unknown setting {key!r} of {what}"
+            raise no_such(fault, key, choice) if choice else InputError(f"{fault}; it takes none")
     values = structure(dict(settings), table, f"settings of {what}")
     return {key: getattr(values, key) for key in settings}
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from qs3.errors import InputError
+from qs3.errors import no_such
 from qs3.models.checks import read_settings
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def create_model(name: str, num_classes: int, **settings: Any) -> "PointClassifi
         'PointNet'
     """
     if name not in _MODELS:
-        raise InputError(f"unknown model {name!r}; choose one of {', '.join(_MODELS)}")
+        raise no_such(f"unknown model {name!r}", name, _MODELS)
     module, kind, fixed = _MODELS[name]
     make = getattr(import_module(f"qs3.models.{module}"), kind)
     values = read_settings(make, settings, name, ("num_classes", *fixed))

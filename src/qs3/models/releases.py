@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from qs3.errors import InputError
+from qs3.errors import InputError, no_such
 from qs3.models.classifier import PointClassifier
 from qs3.models.factory import create_model
 
@@ -156,7 +156,7 @@ s.save_file({k: v.clone() for k, v in d.get('model_state_dict', d).items()}, 'ou
         qs3.errors.InputError: weights for dgcnn: 70 missing, such as bn1.bias, bn1.num_batches_...
     """
     if name not in _RELEASES:
-        raise InputError(f"no release known for {name!r}; choose one of {', '.join(_RELEASES)}")
+        raise no_such(f"no release known for {name!r}", name, _RELEASES)
     release = _RELEASES[name]
     weights = _under_first_names(name, _plain(name, state_dict), release.tensors)
     implied = release.settings(weights)

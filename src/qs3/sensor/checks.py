@@ -6,7 +6,7 @@ import types
 from numbers import Integral, Real
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from qs3.errors import InputError
+from qs3.errors import InputError, no_such
 
 
 def check_choices(settings: Any, room: str) -> None:
@@ -22,8 +22,8 @@ def check_choices(settings: Any, room: str) -> None:
     for name, choices in choices_of(type(settings)).items():
         value = getattr(settings, name)
         if value not in choices:
-            offer = ", ".join(str(choice) for choice in choices if choice is not None)
-            raise InputError(f"{room}: no {name} {value!r}; choose one of {offer}")
+            offer = [str(choice) for choice in choices if choice is not None]
+            raise no_such(f"{room}: no {name} {value!r}", str(value), offer)
 
 
 def check_range(

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from qs3.errors import InputError
+from qs3.errors import no_such
 from qs3.sensor.checks import check_choices, check_range
 
 
@@ -58,5 +58,5 @@ def get_material(name: Material | str) -> Material:
     if isinstance(name, Material):
         return name
     if name not in MATERIALS:
-        raise InputError(f"material: no {name!r}; choose one of {', '.join(MATERIALS)}")
+        raise no_such(f"material: no {name!r}", name, MATERIALS)
     return MATERIALS[name]

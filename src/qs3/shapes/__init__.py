@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import trimesh
 
-from qs3.errors import InputError
+from qs3.errors import InputError, no_such
 from qs3.shapes import bathtub, bed, bookshelf, cabinet, chair, lamp, monitor, plant, sofa, table
 from qs3.shapes._dice import Dice
 from qs3.shapes._solids import Solid, assemble
@@ -35,7 +35,7 @@ def families(class_name: str) -> tuple[str, ...]:
         True
     """
     if class_name not in _FAMILIES:
-        raise InputError(f"class {class_name!r} is unknown; choose one of {', '.join(CLASSES)}")
+        raise no_such(f"class {class_name!r} is unknown", class_name, CLASSES)
     return tuple(family.__name__ for family in _FAMILIES[class_name])
 
 
@@ -62,9 +62,7 @@ def make(class_name: str, seed: int = 0, family: str | None = None) -> trimesh.T
     """
     names = families(class_name)
     if family is not None and family not in names:
-        raise InputError(
-            f"family {family!r} of {class_name} is unknown; choose one of {', '.join(names)}"
-        )
+        raise no_such(f"family {family!r} of {class_name} is unknown", family, names)
     if seed < 0:
         raise InputError(f"seed {seed}: choose a whole number from 0 up")
     rng = np.random.default_rng(np.random.SeedSequence([seed, CLASSES.index(class_name)]))

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import tyro
 
 from qs3.adaptation.names import Normalisation, RoundRule, Rule, Selection, SingleClass
-from qs3.errors import InputError
+from qs3.errors import InputError, no_such
 from qs3.io.preparation import PAPER, ROBUST, Preparation
 from qs3.sensor.checks import choices_of
 
@@ -410,7 +410,7 @@ def self_training_preset(name: str, **overrides: Any) -> SelfTrainingSettings:
         'best'
     """
     if name not in PRESETS:
-        raise InputError(f"unknown preset {name!r}; choose one of {', '.join(PRESETS)}")
+        raise no_such(f"unknown preset {name!r}", name, PRESETS)
     return changed(PRESETS[name], overrides)
 
 
@@ -424,7 +424,7 @@ def changed(settings: _Settings, given: Mapping[str, Any], where: str = "") -> _
     values = dict(given)
     for name, value in given.items():
         if name not in names:
-            raise InputError(f"unknown setting {name!r}{where}; choose from {', '.join(names)}")
+            raise no_such(f"unknown setting {name!r}{where}", name, names)
         if is_dataclass(inner := getattr(settings, name)) and isinstance(value, Mapping):
             values[name] = changed(inner, value, where)
     return replace(settings, **values)

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.errors import InputError, MissingExtraError, QS3Error
+from qs3.errors import InputError, MissingExtraError, QS3Error, no_such
 from qs3.files import write_bytes
 from qs3.io.preparation import LARGEST, PAPER, Preparation, distinct_inliers
 from qs3.models import PointClassifier
@@ -137,7 +137,7 @@ def export_run(run: Path, to: str, out: Path | None = None) -> Exported:
         QS3Error: where the network cannot be exported, or the file gives other answers.
     """
     if to not in SUFFIXES:
-        raise InputError(f"unknown format {to!r}; choose {' or '.join(SUFFIXES)}")
+        raise no_such(f"unknown format {to!r}", to, SUFFIXES)
     if to == "onnx":
         _require_onnx()
     loaded = load_model(run)

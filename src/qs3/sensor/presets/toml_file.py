@@ -6,11 +6,10 @@ Convention:
     file's folder. A whole number stands for a number with a point, not the other way round.
 """
 
-import difflib
 from pathlib import Path
 from typing import Any
 
-from qs3.errors import InputError, say_once
+from qs3.errors import InputError, no_such, say_once
 from qs3.sensor.presets.settings import Sensor, changed
 from qs3.structure import structure, unstructure
 from qs3.toml_files import merged, read_toml, toml_lines
@@ -43,12 +42,7 @@ def get_sensor(name: str) -> Sensor:
         return SENSORS[name]
     if name.lower().endswith(".toml"):
         return load_sensor(Path(name))
-    near = difflib.get_close_matches(name, SENSORS, n=1)
-    hint = f"did you mean {near[0]}? " if near else ""
-    raise InputError(
-        f"no sensor {name!r}; {hint}choose one of {', '.join(SENSORS)}, or name a file "
-        "that ends in .toml"
-    )
+    raise no_such(f"no sensor {name!r}", name, SENSORS, ", or name a file that ends in .toml")
 
 
 def sensor_name(name: str) -> str:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from qs3.errors import InputError
+from qs3.errors import InputError, no_such
 from qs3.processors import asked_threads
 from qs3.sensor.checks import check_choices, check_range
 from qs3.sensor.render.cache import Photographer
@@ -88,8 +88,7 @@ class MitsubaRenderer:
         if not self.variant:
             object.__setattr__(self, "variant", best_variant())
         elif self.variant not in VARIANTS:
-            offer = ", ".join(VARIANTS)
-            raise InputError(f"renderer: no variant {self.variant!r}; choose one of {offer}")
+            raise no_such(f"renderer: no variant {self.variant!r}", self.variant, VARIANTS)
         elif not usable(self.variant):
             raise InputError(f"renderer: {self.variant} does not work here; see: qs3 doctor")
         check_choices(self, "renderer")
