@@ -1,6 +1,10 @@
-"""How many processors this process may use, and how many threads its user asks for."""
+"""How many processors this process may use, how many threads its user asks for, and its script."""
 
+import contextlib
 import os
+import sys
+import types
+from collections.abc import Iterator
 
 
 def usable_processors() -> int:
@@ -18,3 +22,17 @@ def asked_threads() -> int | None:
     """Read ``OMP_NUM_THREADS``, for libraries that do not; None where it is no number above 0."""
     wanted = os.environ.get("OMP_NUM_THREADS", "")
     return int(wanted) or None if wanted.isdigit() else None
+
+
+@contextlib.contextmanager
+def script_hidden() -> Iterator[None]:
+    """Hide the caller's script from processes that are spawned meanwhile: each would run it anew.
+
+    So a script needs no ``if __name__ == "__main__"``; what it defines cannot be sent to them.
+    """
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = types.ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main

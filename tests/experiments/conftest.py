@@ -46,7 +46,7 @@ TINY = Scale(
 WORKERS = Workers(workers=1)
 
 
-def blob_row(item, scan, settings, neighbour=None):
+def blob_row(item, scan, settings, neighbours=()):
     """A cloud whose proportions tell its class; the target's are noisier."""
     seed = scan_seed(settings.seed, item.id, scan)
     rng = np.random.default_rng(seed)

@@ -10,6 +10,7 @@ import pytest
 
 from qs3.errors import InputError
 from qs3.io.layouts.store import read_ragged
+from qs3.meshes import MeshItem
 from qs3.meshes.classes import POINTDA10
 from qs3.sensor.presets import get_sensor
 from qs3.sensor.scene import SceneSettings
@@ -17,7 +18,7 @@ from qs3.store.failures import read_failures
 from qs3.store.generate import GenerateReport, GenerateSettings, scan_seed
 from qs3.store.info import info
 from qs3.store.manifest import MANIFEST, SUMS
-from qs3.store.scan_item import neighbour_of
+from qs3.store.scan_item import neighbours_of, scan_item
 
 SETTINGS = GenerateSettings(num_points=16, scans_per_mesh=3, rows_per_shard=4)
 
@@ -192,19 +193,19 @@ def test_seeds_depend_on_root_object_and_scan_alone_and_do_not_collide():
 
 def test_neighbours_are_other_objects_drawn_evenly_from_the_scans_own_seed(fake):
     work = items(fake)
-    drawn = [neighbour_of(work, 1, scan, 0).id for scan in range(400)]
+    drawn = [neighbours_of(work, 1, scan, 0)[0].id for scan in range(400)]
     counts = {name: drawn.count(name) for name in ("m0", "m2", "m3", "m4")}
     assert sum(counts.values()) == 400
     assert min(counts.values()) > 70
-    assert drawn == [neighbour_of(work, 1, scan, 0).id for scan in range(400)]
-    assert drawn != [neighbour_of(work, 1, scan, 1).id for scan in range(400)]
+    assert drawn == [neighbours_of(work, 1, scan, 0)[0].id for scan in range(400)]
+    assert drawn != [neighbours_of(work, 1, scan, 1)[0].id for scan in range(400)]
 
 
 def test_a_scene_with_a_neighbour_hands_one_to_every_scan(fake, tmp_path):
     pairs = []
 
-    def scan_one(item, scan, settings, neighbour):
-        pairs.append((item.id, scan, neighbour.id))
+    def scan_one(item, scan, settings, neighbours):
+        pairs.append((item.id, scan, neighbours[0].id))
         return fake.fake_row(item, scan, settings)
 
     settings = dataclasses.replace(SETTINGS, scene=SceneSettings("room+behind"))
@@ -213,7 +214,22 @@ def test_a_scene_with_a_neighbour_hands_one_to_every_scan(fake, tmp_path):
         fake.run(work[:1], tmp_path, settings, row=scan_one)
     fake.run(work, tmp_path, settings, row=scan_one)
     assert pairs == [
-        (item.id, scan, neighbour_of(work, i, scan, 0).id)
+        (item.id, scan, neighbours_of(work, i, scan, 0)[0].id)
         for i, item in enumerate(work)
         for scan in range(3)
     ]
+
+
+def test_a_neighbour_that_cannot_be_read_is_no_fault_of_the_object(tmp_path):
+    (tmp_path / "broken.stl").write_text("solid broken\nfacet normal 0 0")
+    shape = {"class_name": "chair", "split": "train", "path": None}
+    chair, other = (MeshItem(f"chair/{seed}", shape_seed=seed, **shape) for seed in (1, 2))
+    broken = MeshItem("broken", "chair", "train", tmp_path / "broken.stl", None)
+    settings = GenerateSettings(
+        num_points=16, sensor=get_sensor("d435"), scene=SceneSettings("room+behind"), views=1
+    )
+    rows = [scan_item(chair, 0, settings, beside) for beside in ([broken, other], [other])]
+    assert json.loads(rows[0].drawn)["neighbour"] == "chair/2"
+    np.testing.assert_array_equal(rows[0].points, rows[1].points)
+    with pytest.raises(InputError, match=r"broken\.stl"):
+        scan_item(chair, 0, settings, [broken])

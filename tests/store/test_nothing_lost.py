@@ -32,18 +32,18 @@ sys.path.insert(0, sys.argv[1])
 from pathlib import Path
 import qs3_fake_scan as fake
 from qs3.errors import QS3Error
-if __name__ == "__main__":
-    # A job started in the background inherits that Ctrl-C is ignored; this one is to act on it.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    work = fake.work(24, (9,), "hangs")
-    try:
-        report = fake.run(work, Path(sys.argv[2]), row=getattr(fake, sys.argv[3]), workers=2)
-    except QS3Error as error:
-        print(f"qs3: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
-    print(report.done, report.skipped, report.failed)
+# Without `if __name__ == "__main__"`: its workers do not run it.
+# A job started in the background inherits that Ctrl-C is ignored; this one is to act on it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+work = fake.work(24, (9,), "hangs")
+try:
+    report = fake.run(work, Path(sys.argv[2]), row=getattr(fake, sys.argv[3]), workers=2)
+except QS3Error as error:
+    print(f"qs3: {error}", file=sys.stderr)
+    sys.exit(2)
+except KeyboardInterrupt:
+    sys.exit(130)
+print(report.done, report.skipped, report.failed)
 """
 
 

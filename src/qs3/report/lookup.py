@@ -12,6 +12,7 @@ from qs3.errors import QS3Error
 from qs3.evaluation.records import DataRecord
 from qs3.io import load_clouds
 from qs3.io.clouds import CloudChoice, PointClouds
+from qs3.io.load import is_store
 from qs3.meshes import collect
 from qs3.sensor.presets import Sensor
 from qs3.sensor.settings import ScanSettings
@@ -61,7 +62,7 @@ def read_domain(
 
     if given is not None:
         if cloud is None:
-            generated = "://" in given or (Path(given) / MANIFEST).is_file()
+            generated = is_store(given)
             # Other data than generated ones have no twin to choose.
             cloud = recorded.cloud if generated and recorded is not None else "points"
         return load(given, split=split, cloud=cloud)

@@ -82,7 +82,8 @@ def generate(
         out: New or empty folder, or one that the same call began; any address that fsspec knows.
         settings: Settings of the data set.
         scan_one: Makes one row; a picklable function of a module. It is handed an item, the index
-            of its scan and the settings, and a second item where the scene has a neighbour.
+            of its scan and the settings, and other items, in the order in which they are drawn,
+            where the scene has a neighbour.
         workers: Processes of this machine; 0 does the work in this one, where a crash or a hang
             of one scan ends or hangs the run.
         timeout: Seconds that one scan may take in a process; None waits for ever.

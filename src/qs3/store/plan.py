@@ -18,7 +18,7 @@ from qs3.store.executors import Failure, LocalExecutor
 from qs3.store.manifest import Manifest, package_versions
 from qs3.store.parts import Place
 from qs3.store.progress import progress_bar
-from qs3.store.scan_item import GenerateSettings, Item, neighbour_of, row_id, scan_item, size_class
+from qs3.store.scan_item import GenerateSettings, Item, neighbours_of, row_id, scan_item, size_class
 from qs3.store.shards import DType, shard_bytes, table_of
 
 
@@ -56,12 +56,11 @@ class Plan:
         return divmod(index, self.settings.scans_per_mesh)
 
     def arguments(self, position: int, scan: int) -> tuple[Any, ...]:
-        """What `scan_item` is handed: object, scan, settings, and a neighbour where one stands."""
+        """What `scan_item` is handed: object, scan, settings; others where a neighbour stands."""
         item, settings = self.items[position], self.settings
         if not settings.needs_neighbour:
             return item, scan, settings
-        beside = neighbour_of(self.items, position, scan, settings.seed)
-        return item, scan, settings, beside
+        return item, scan, settings, neighbours_of(self.items, position, scan, settings.seed)
 
     def items_of(self, shards: Sequence[int]) -> Iterator[Item]:
         """Objects that have a row in one of the shards, in order; some come twice."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, runtime_che
 import numpy as np
 import tyro
 
+from qs3.errors import InputError, StorageError
 from qs3.meshes.classes import POINTDA10, label_order, map_labels
 from qs3.meshes.sizes import size_name
 from qs3.sensor.checks import check_range
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 
 RecipeName = Literal["rooms"]
+_NEIGHBOURS = 8
 
 
 @runtime_checkable
@@ -143,18 +145,33 @@ def scan_seed(root: int, object_id: str, scan: int) -> int:
     return int(state[0] >> np.uint64(1))
 
 
-def neighbour_of(items: Sequence[Item], position: int, scan: int, root: int) -> Item:
-    """Draw another item of a work list, of two at least, for a scan of the one at ``position``.
+def neighbours_of(
+    items: Sequence[Item], position: int, scan: int, root: int
+) -> tuple[Item, ...]:
+    """Draw other items of a work list, of two at least, for a scan of the one at ``position``.
 
     Order and worker count do not matter.
     """
     key = np.random.SeedSequence(scan_seed(root, items[position].id, scan), spawn_key=(0x4E42,))
-    drawn = int(np.random.default_rng(key).integers(len(items) - 1))
-    return items[drawn + (drawn >= position)]
+    rng = np.random.default_rng(key)
+    drawn = [int(rng.integers(len(items) - 1)) for _ in range(_NEIGHBOURS)]
+    return tuple(items[other + (other >= position)] for other in drawn)
+
+
+def _first_readable(items: Sequence[Item]) -> "tuple[Item, trimesh.Trimesh]":
+    """A damaged mesh is to cost its own scans, not those that it was drawn to stand beside."""
+    for item in items[:-1]:
+        try:
+            return item, item.load()
+        except StorageError:
+            raise
+        except InputError:
+            continue
+    return items[-1], items[-1].load()
 
 
 def scan_item(
-    item: Item, scan_index: int, settings: GenerateSettings, neighbour: Item | None = None
+    item: Item, scan_index: int, settings: GenerateSettings, neighbours: Sequence[Item] = ()
 ) -> CloudRow:
     """Scan one object once with the simulated sensor.
 
@@ -162,7 +179,8 @@ def scan_item(
         item: The object.
         scan_index: Which of its scans.
         settings: Settings of the data set.
-        neighbour: What stands before or beside it, where the scene has a neighbour.
+        neighbours: What may stand before or beside it, where the scene has a neighbour: the first
+            of them whose mesh can be read.
 
     Raises:
         InputError: where the mesh is unusable or the sensor sees nothing of it.
@@ -171,7 +189,7 @@ def scan_item(
     from qs3.sensor.scan import scan
 
     seed = scan_seed(settings.seed, item.id, scan_index)
-    beside = None if neighbour is None else neighbour.load()
+    neighbour, beside = _first_readable(neighbours) if neighbours else (None, None)
     classes = [size_class(member) for member in (item, neighbour) if member is not None]
     result = scan(item.load(), settings, seed=seed, neighbour=beside, class_names=classes)
     # The scan draws from children of `seed`; the key keeps this stream apart from them.

@@ -71,7 +71,7 @@ def adapt(
         train: Settings of `TrainSettings` that differ from those of ``rooms``; with ``rule`` "last"
             the last round is kept.
         self_training: Settings of the rounds that differ.
-        workers: Processes that scan; None takes one a core.
+        workers: Processes that scan; None takes one a core, 0 scans in this one.
         seed: Root of all random steps.
 
     Raises:
@@ -136,7 +136,7 @@ def _source(
         size = "class" if have_sizes and units is None else "file"
         recipe = replace(RECIPES["rooms"], views=1, seed=seed, object_size=size, units=units)
         recipe = settings_for(recipe, items, [cad], _PER_CLASS)
-        generate(items, folder, recipe, workers=workers or usable_processors())
+        generate(items, folder, recipe, workers=usable_processors() if workers is None else workers)
         cad = folder
     return load_clouds(cad, num_points=None, cloud="all")
 

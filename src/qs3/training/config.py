@@ -399,7 +399,7 @@ def self_training_preset(name: str, **overrides: Any) -> SelfTrainingSettings:
     """Return a preset with some settings changed.
 
     Args:
-        name: ``default``, ``spst``, ``paper`` or ``released``.
+        name: ``default``, ``gentle``, ``spst``, ``paper`` or ``released``.
         overrides: Settings that differ from the preset.
 
     Raises:

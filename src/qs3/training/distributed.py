@@ -14,7 +14,6 @@ import sys
 import tempfile
 import threading
 import time
-import types
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -35,6 +34,7 @@ from torch.multiprocessing.spawn import (
 )
 
 from qs3.errors import InputError, QS3Error, say_once
+from qs3.processors import script_hidden
 from qs3.store.executors.local import end_with_parent
 from qs3.training.config import TrainSettings
 from qs3.training.progress import TimeUpError
@@ -207,16 +207,12 @@ def all_devices(settings: TrainSettings, work: Work) -> Iterator[Fabric]:
 
 
 def _start(settings: TrainSettings, work: Work, folder: str) -> ProcessContext:
-    """Start the other processes; the caller's script, which each would run once more, is hidden."""
-    main = sys.modules["__main__"]
-    sys.modules["__main__"] = types.ModuleType("__main__")
-    try:
+    """Start the other processes."""
+    with script_hidden():
         count, arguments = settings.devices - 1, (folder, settings, work)
         context = start_processes(_do, arguments, count, join=False, daemon=True)
         assert context is not None  # noqa: S101
         return context
-    finally:
-        sys.modules["__main__"] = main
 
 
 def _fault(error: ProcessException) -> str:

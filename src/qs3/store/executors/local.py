@@ -13,10 +13,12 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 from qs3.errors import InputError
+from qs3.processors import script_hidden
 from qs3.store.executors.executor import Failure, guarded
 
 _BROKEN_IN_A_ROW = 3
@@ -25,10 +27,7 @@ _KILLED_FROM_OUTSIDE = (-9, -15)
 _LOCK_SECONDS = 5.0
 """A worker waits so long for the lock that all share, held for milliseconds at a time. One that was
 killed with it never gives it back: those that wait then end, and the pool is opened anew."""
-_NO_PROCESS = (
-    "workers: no process can be started; use workers=0, or put the call of a script under: "
-    "if __name__ == '__main__'"
-)
+_NO_PROCESS = "workers: no process can be started; use workers=0"
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM")
 ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in _LIBRARIES} | {"OPENCV_FOR_THREADS_NUM": "1"}
 """Environment in which the libraries use one thread: workers share the cores."""
@@ -40,6 +39,13 @@ class _Call:
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
     deaths: int = 0
+
+
+class _Process(SpawnProcess):
+    @staticmethod
+    def _Popen(process_obj: Any) -> Any:  # noqa: N802
+        with script_hidden():
+            return SpawnProcess._Popen(process_obj)  # type: ignore[attr-defined]
 
 
 class LocalExecutor:
@@ -89,6 +95,8 @@ class LocalExecutor:
             packed = bytes(ForkingPickler.dumps((call.function, *call.arguments)))
         except Exception as error:
             raise InputError(f"a call cannot be sent to another process ({error})") from error
+        if b"__main__" in packed:  # it is made of parts of the caller's script
+            self._context.Process = SpawnProcess
         for _ in range(_BROKEN_IN_A_ROW):
             try:
                 with _interrupt_blocked():
@@ -167,12 +175,13 @@ class LocalExecutor:
         # Here, since a process loads its libraries before any code of ours can tell it.
         self._environment = {name: os.environ.get(name) for name in ONE_THREAD}
         os.environ.update(ONE_THREAD)
-        context: Any = multiprocessing.get_context("spawn")
+        self._context: Any = SpawnContext()
+        self._context.Process = _Process
         self._pool = ProcessPool(
             self._workers,
             max_tasks=self._calls_per_process,
             initializer=_prepare_worker,
-            context=context,
+            context=self._context,
         )
 
     def _close(self, at_once: bool) -> None:
