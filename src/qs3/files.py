@@ -12,7 +12,7 @@ import secrets
 import shutil
 import socket
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -293,6 +293,16 @@ def sha256(path: Path) -> str:
     """Return the SHA-256 of a file's bytes as hexadecimal text."""
     with Path(path).open("rb") as handle:
         return hashlib.file_digest(handle, "sha256").hexdigest()
+
+
+def describe_others(others: Mapping[str, int]) -> str:
+    """Tell how many files of each ending were passed over; empty where none was.
+
+    Example:
+        >>> describe_others({".npz": 1, ".csv": 3})
+        '3 .csv, 1 .npz'
+    """
+    return ", ".join(f"{count} {ending}" for ending, count in sorted(others.items()))
 
 
 def holds_something(path: Path) -> bool:

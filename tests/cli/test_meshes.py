@@ -1,7 +1,25 @@
 """``qs3 meshes``: classes, sizes, hints, faults and a picture, from one folder."""
 
+import shlex
+
+import pytest
 import trimesh
 from PIL import Image
+
+
+@pytest.fixture
+def parts(tmp_path):
+    """Makes cubes of a length at places below a folder whose name a shell takes apart."""
+    root = tmp_path / "my parts"
+
+    def make(**lengths):
+        for name, length in lengths.items():
+            path = root / f"{name.replace('__', '/')}.stl"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            trimesh.creation.box((length, length, length / 2)).export(path)
+        return root
+
+    return make
 
 
 def test_a_folder_is_shown_with_its_sizes_hints_and_faults(tmp_path, typed, caplog):
@@ -23,3 +41,57 @@ def test_a_folder_is_shown_with_its_sizes_hints_and_faults(tmp_path, typed, capl
     assert lines[-1] == str(sheet)
     with Image.open(sheet) as picture:
         assert picture.width > picture.height
+
+
+def test_the_command_that_comes_next_keeps_the_options(parts, tmp_path, typed, monkeypatch):
+    monkeypatch.setattr("qs3.cli.generate._expected", lambda *_: [])  # no scan is measured
+    folder, labels, sheet = parts(a=90.0, b=40.0), tmp_path / "my labels.csv", tmp_path / "s.png"
+    labels.write_text("file,class\na.stl,cup\nb.stl,big lid\n")
+    given = ["--units", "mm", "--labels", labels, "--up", "y", "--classes", "big lid", "cup"]
+    done = typed("meshes", folder, "--out", sheet, *given)
+    words = shlex.split(done.stderr.splitlines()[-1])
+    assert words[:5] == ["Next:", "qs3", "generate", "--meshes", str(folder)]
+    typed(*words[2:-1], tmp_path / "set", "--dry-run")
+    assert {"--units", "--labels", "--up", "--classes"} < {*words}
+    plain = typed("meshes", parts(cup__a=1.0, lid__b=2.0), "--classes", "cup", "--out", sheet)
+    assert plain.stderr.splitlines()[-1].endswith("parts' --classes cup --out SET")
+
+
+def test_a_flat_folder_is_told_that_it_wants_classes(parts, tmp_path, typed):
+    done = typed("meshes", parts(a=1.0), "--out", tmp_path / "sheet.png")
+    assert "one folder a class" in done.stderr
+    assert "--labels CSV" in done.stderr
+    assert "qs3 generate" not in done.stderr
+
+
+def test_files_that_are_the_same_are_told_and_warned_of_in_two_classes(
+    parts, tmp_path, typed, caplog
+):
+    folder = parts(pin__p0=1.0, pin__p1=1.0, pin__p3=2.0, rod__q=3.0, rod__r=3.0, rod__s=3.0)
+    parts(cap__p4=2.0, cap__p5=4.0)
+    done = typed("meshes", folder, "--out", tmp_path / "sheet.png")
+    hints = [line for line in done.stdout.splitlines() if "same file" in line]
+    assert hints == [
+        "hint: pin/p0.stl and pin/p1.stl are the same file",
+        "hint: rod/q.stl and rod/r.stl are the same file (and 1 more)",
+    ]
+    (warning,) = [line for line in caplog.messages if "same file" in line]
+    assert warning.endswith("cap/p4.stl and pin/p3.stl are the same file in two classes")
+
+
+@pytest.mark.parametrize("name", ["sheet.jpg", "sheet"])
+def test_a_sheet_that_is_no_png_is_refused(parts, tmp_path, typed, name):
+    told = typed.refuses("meshes", parts(cup__a=1.0), "--out", tmp_path / name)
+    assert "ends in .png" in told
+    assert not (tmp_path / name).exists()
+
+
+def test_a_sheet_tells_the_name_of_each_mesh(parts, tmp_path, typed, monkeypatch):
+    from qs3.report import clouds
+
+    drawn = []
+    plain = clouds.gallery
+    monkeypatch.setattr(clouds, "gallery", lambda *given: drawn.append(given) or plain(*given))
+    names = {"cup__a": 1.0, "cup__b": 2.0, "lid__x__model": 3.0, "lid__y__model": 4.0}
+    typed("meshes", parts(**names), "--out", tmp_path / "sheet.png")
+    assert drawn[0][3] == {"cup": ["a", "b"], "lid": ["x", "y"]}

@@ -205,6 +205,22 @@ def test_what_takes_far_more_memory_than_its_size_is_refused(tmp_path, monkeypat
     assert str(caught.value).count(str(path)) == 1
 
 
+@pytest.mark.parametrize("head", ["x,y,z,r\n", "//X; Y; Z\n", "3\n", ""])
+@pytest.mark.parametrize("ending", ["csv", "asc", "pts", "txt"])
+def test_text_may_begin_with_names_or_a_count(tmp_path, head, ending):
+    path = tmp_path / f"a.{ending}"
+    path.write_text(head + "\n".join(",".join(map(str, row)) for row in POINTS.tolist()))
+    np.testing.assert_array_equal(read_cloud(path), POINTS)
+
+
+def test_decimal_commas_are_no_columns(tmp_path):
+    path = tmp_path / "a.xyz"
+    for apart in (" ", ";", "; "):
+        path.write_text(f"x{apart}y{apart}z\n" + apart.join(["0,10", "0,25", "-3"]))
+        with pytest.raises(InputError, match=r"line 2 has decimal commas: '0,10.*; write points"):
+            read_cloud(path)
+
+
 def test_other_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_cloud(tmp_path / "a.npy")

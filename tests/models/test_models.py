@@ -13,6 +13,7 @@ from torch.optim.swa_utils import update_bn
 
 from qs3.errors import InputError
 from qs3.models import Features, create_model, list_models
+from qs3.models.checks import check_positive, check_range
 
 from .common import SMALL
 
@@ -296,3 +297,9 @@ def test_a_gpu_gives_the_same_scores_and_gradients(name):
     on_gpu.square().sum().backward()
     for one, two in zip(twin.parameters(), model.parameters(), strict=True):
         torch.testing.assert_close(one.grad.cpu(), two.grad, rtol=1e-9, atol=1e-9)
+
+
+def test_a_yes_is_no_number():
+    for check in (check_range, check_positive):
+        with pytest.raises(InputError, match=r"share must be .*, not True"):
+            check("share", True)

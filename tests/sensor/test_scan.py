@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from qs3 import shapes
 from qs3.errors import TOLD, InputError
 from qs3.geometry import rotation_z
 from qs3.meshes import normalise, sample_surface
@@ -268,6 +269,8 @@ def test_views_that_are_matched_side_by_side_have_the_bits_of_one_after_another(
         ({"depth": DepthSettings(near=5.9)}, "saw no point"),
         # Smaller than a pixel.
         ({"object_size": 1e-3}, "saw no point.*0.001 large.* 3 to 5 away; set placement.radius"),
+        # So few points show no shape.
+        ({"object_size": 0.06}, r"saw \d+ points? of the object"),
         ({"object_size": 0.0}, "object_size"),
         ({"object_size": float("nan")}, "object_size"),
     ],
@@ -277,9 +280,20 @@ def test_what_cannot_be_seen_is_refused(change, message, renderer):
         scan(asymmetric(), sensor=dataclasses.replace(SMALL, **change), views=1, renderer=renderer)
 
 
+def test_a_mesh_may_be_a_file_or_a_built_in_class(tmp_path, renderer):
+    asymmetric().export(tmp_path / "part.stl")
+    settings = {"sensor": SMALL, "views": 1, "num_points": 64, "renderer": renderer}
+    clouds = [scan(mesh, **settings).points for mesh in (asymmetric(), tmp_path / "part.stl")]
+    np.testing.assert_allclose(*clouds, atol=1e-5)
+    chair = scan("chair", seed=2, **settings).mesh
+    assert chair.faces.shape == shapes.make("chair", seed=2).faces.shape
+    with pytest.raises(InputError, match="neither a mesh file nor a built-in class"):
+        scan("chairs", **settings)
+
+
 def test_few_points_are_told_with_size_distance_and_what_to_change(renderer, caplog):
     TOLD.clear()
-    for size, told in ((1.0, 0), (0.06, 1), (0.08, 1)):
+    for size, told in ((1.0, 0), (0.1, 1), (0.13, 1)):
         made = scan(
             asymmetric(), sensor=SMALL, object_size=size, views=1, num_points=512, renderer=renderer
         )
@@ -287,7 +301,7 @@ def test_few_points_are_told_with_size_distance_and_what_to_change(renderer, cap
         assert len(caplog.messages) == told
     (line,) = caplog.messages
     assert "num_points 512" in line
-    assert "about 0.06 large and is seen from 3 to 5 away; set placement.radius" in line
+    assert "about 0.1 large and is seen from 3 to 5 away; set placement.radius" in line
 
 
 def test_wrong_matches_within_the_gate_make_no_cloud_of_an_object_beyond_it(renderer):

@@ -35,7 +35,6 @@ def adapt(boxes, scans, tmp_path, **settings):
     return qs3.adapt(boxes, scans, tmp_path / "out", **settings)
 
 
-@pytest.mark.filterwarnings("ignore::qs3.adaptation.selection.SingleClassWarning")
 def test_three_lines(boxes, tmp_path):
     model = adapt(boxes, list(boxes.points), tmp_path)
     assert set(model.predict(boxes.points[:3])) <= {"post", "slab"}
@@ -50,7 +49,6 @@ def test_three_lines(boxes, tmp_path):
     assert model.result_.chosen["stage"] == "round"
 
 
-@pytest.mark.filterwarnings("ignore::qs3.adaptation.selection.SingleClassWarning")
 def test_poisoned_labels_of_the_scans_change_no_bit(boxes, tmp_path):
     """As clouds that carry them, or in a file: true or wrong, the network is the same."""
     names, networks = np.array(boxes.class_names), []
@@ -67,7 +65,6 @@ def test_poisoned_labels_of_the_scans_change_no_bit(boxes, tmp_path):
     assert same(clouds, wrong_clouds)
 
 
-@pytest.mark.filterwarnings("ignore::qs3.adaptation.selection.SingleClassWarning")
 def test_rounds_are_kept_where_they_lose_nothing_on_held_out_source(boxes, tmp_path):
     rounds = {"rounds": 2, "epochs": 1}
     result = adapt(boxes, boxes, tmp_path, self_training=rounds).result_
@@ -81,7 +78,6 @@ def test_rounds_are_kept_where_they_lose_nothing_on_held_out_source(boxes, tmp_p
     assert last.chosen == {"stage": "round", "number": 1}
 
 
-@pytest.mark.filterwarnings("ignore::qs3.adaptation.selection.SingleClassWarning")
 def test_what_adapt_could_not_do_is_told(boxes, tmp_path, caplog):
     few = boxes.select(np.arange(8))
     assert adapt(few, boxes, tmp_path / "few").result_.selection == "last"
@@ -121,6 +117,11 @@ def test_what_cannot_be_is_told(boxes, tmp_path):
         adapt("shapes", tmp_path / "absent", tmp_path)
     with pytest.raises(InputError, match="units mm: goes with a folder of meshes alone"):
         adapt(boxes, boxes, tmp_path, units="mm")
+    with pytest.raises(InputError, match="scan sensor: goes with a folder of meshes alone"):
+        adapt(boxes, boxes, tmp_path, scan={"sensor": "d415"})
+    cad(tmp_path / "cad")
+    with pytest.raises(InputError, match=r"unknown setting 'sensr' in scan .did you mean sensor"):
+        adapt(tmp_path / "cad", boxes, tmp_path, scan={"sensr": "d415"})
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="not fitted"):
         qs3.training.Adapter().save(tmp_path)
@@ -146,14 +147,19 @@ def test_meshes_get_the_sizes_of_the_unit_that_is_told(boxes, tmp_path, monkeypa
     monkeypatch.setattr("qs3.store.generate.generate", stop)
     cad(tmp_path / "cad", 1000.0)
     with pytest.raises(ReachedError) as reached:
-        adapt(tmp_path / "cad", boxes, tmp_path, units=units)
+        adapt(tmp_path / "cad", boxes, tmp_path, units=units, scan={"sensor": "d415"})
     (recipe,) = reached.value.args
     assert (recipe.object_size, recipe.units) == ("file", units)
+    assert (recipe.sensor, recipe.views) == ("d415", 1)
 
 
 @pytest.mark.slow
-def test_meshes_are_scanned_first(boxes, tmp_path):
+def test_meshes_are_scanned_first(boxes, tmp_path, caplog):
     cad(tmp_path / "cad")
-    model = adapt(tmp_path / "cad", boxes, tmp_path, workers=1, method="source-only")
+    (tmp_path / "cad" / "post" / "broken.stl").write_text("solid broken")
+    here = {"workers": 0, "train": SMALL | {"epochs": np.int64(1)}}
+    model = adapt(tmp_path / "cad", boxes, tmp_path, method="source-only", **here)
     assert list(model.classes_) == ["post", "slab"]
+    assert "1 of 3 scans failed, told in" in caplog.text
+    assert "post/broken#0" in caplog.text
     assert (tmp_path / "out" / "source" / "dataset.json").is_file()

@@ -71,6 +71,18 @@ def test_files_folders_and_patterns_are_listed_once(folder):
         list_clouds([folder / "*.pcd"])
 
 
+def test_what_a_folder_holds_beside_clouds_is_told_once(tmp_path, caplog):
+    np.save(tmp_path / "a.npy", np.eye(3))
+    (tmp_path / "below").mkdir()
+    passed = ("b.npz", "below/c.LAZ", "d.laz", "noend")
+    ours = (".h.npz", "segment.json", "objects.csv", "montage.png", "view-0-left.png", "README.md")
+    for name in passed + ours:
+        (tmp_path / name).write_text("")
+    for _ in range(2):
+        assert names(list_clouds([tmp_path]), tmp_path) == ["a.npy"]
+    assert caplog.messages == [f"{tmp_path}: not read: 2 .laz, 1 .npz, 1 noend"]
+
+
 def test_a_data_set_is_answered_cloud_by_cloud(folder, model, tmp_path):
     points = np.stack([np.load(folder / f"{name}.npy") for name in "ab"]).astype(np.float32)
     data = tmp_path / "data.npz"
@@ -142,7 +154,7 @@ def test_what_is_too_little_familiar_is_unknown(knowing, folder, tmp_path):
             assert row["class_2"] == plain_best(answer)[0][0]
             assert float(row["familiarity"]) == pytest.approx(answer.familiarity, abs=1e-6)
             assert entry["familiarity"] == answer.familiarity
-            assert (tmp_path / "sorted" / "unknown" / answer.file.name).exists()
+            assert answer.file in [p.resolve() for p in (tmp_path / "sorted" / "unknown").iterdir()]
 
 
 def plain_best(answer):
@@ -184,7 +196,7 @@ def test_links_by_class_are_a_data_set(folder, tmp_path):
     sort_into(tmp_path / "sorted", answers)
     links = {p.relative_to(tmp_path / "sorted").as_posix(): p.resolve()
              for p in (tmp_path / "sorted").rglob("*.npy")}  # fmt: skip
-    assert links == {"cup/a.npy": one, "jug/b.npy": two, "cup/a-2.npy": below}
+    assert links == {f"cup/{folder.name}_a.npy": one, "jug/b.npy": two, "cup/more_a.npy": below}
     clouds = load_clouds(tmp_path / "sorted", num_points=None)
     assert clouds.class_names == ("cup", "jug")
     with refused("is there already"):
@@ -192,6 +204,52 @@ def test_links_by_class_are_a_data_set(folder, tmp_path):
     with refused("cannot name a folder"):
         sort_into(tmp_path / "other", [Answer(one, {"../up": 1.0})])
     assert not (tmp_path / "other").exists()
+
+
+def test_links_to_files_of_one_name_tell_the_folder_and_lose_none(tmp_path):
+    long = "l" * 250
+    places = ["1/f/o.npy", "2/f/o.npy", "f/o.npy", "f_o.npy", f"f/{long}", f"2/f/{long}",
+              ".dot/o.npy", "f/o-2.npy"]  # fmt: skip
+    for place in places:
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / place).touch()
+    answers = [Answer(tmp_path / place, {"cup": 1.0}) for place in places]
+    sort_into(tmp_path / "sorted", answers)
+    links = {link.name: link.resolve() for link in (tmp_path / "sorted" / "cup").iterdir()}
+    assert sorted(links.values()) == sorted(tmp_path / place for place in places)
+    named = {"f_o.npy", "f_o-2.npy", "f_o-3.npy", "f_o-4.npy", "o-2.npy", "dot_o.npy"}
+    assert named < {*links}
+
+
+@pytest.mark.parametrize("option", ["--csv", "--json"])
+def test_no_cloud_is_overwritten_by_a_table(model, folder, tmp_path, typed, option):
+    for name in ("scan.xyz", "other.txt", "other.pts", "data.npz"):
+        (tmp_path / name).write_text("0 0 0\n1 1 1\n")
+    (tmp_path / "link.out").symlink_to(tmp_path / "scan.xyz")
+    (tmp_path / "hard.out").hardlink_to(tmp_path / "scan.xyz")
+    for out in ("scan.xyz", "link.out", "hard.out"):
+        told = typed.refuses("predict", model, tmp_path / "scan.xyz", option, tmp_path / out)
+        assert "one of the clouds" in told
+    assert "one of the clouds" in typed.refuses(
+        "predict", model, folder, option, folder / "more" / ".." / "b.npy"
+    )
+    for out in ("other.txt", "other.pts", "data.npz"):
+        told = typed.refuses("predict", model, tmp_path / "scan.xyz", option, tmp_path / out)
+        assert "may be a cloud" in told
+    assert all(p.read_text() == "0 0 0\n1 1 1\n" for p in tmp_path.iterdir())
+    table = tmp_path / f"table.{option[2:]}"
+    for _ in range(2):
+        typed("predict", model, folder / "a.npy", option, table)
+    typed("predict", model, folder / "a.npy", option, tmp_path / "new.txt")
+
+
+def test_what_is_unknown_is_told_to_become_a_class(knowing, folder, tmp_path, typed):
+    for share, told in ((1.0, True), (0.0, False)):
+        into = tmp_path / str(share)
+        done = typed("predict", knowing, folder / "*.npy", "--unknown", share, "--sort-into", into)
+        line = done.stderr.splitlines()[-1]
+        assert (into / "unknown").exists() == (f"{into / 'unknown'} (it would" in line) == told
+        assert line.endswith(f"then qs3 train --source {into}")
 
 
 def test_the_command_does_the_rest_names_every_fault_and_ends_with_2(

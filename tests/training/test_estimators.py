@@ -142,6 +142,17 @@ def test_clouds_may_be_what_numpy_takes_for_them(source, target):
     assert made.predict(np.round(100 * points).astype(int)).shape == (4,)
 
 
+def test_clouds_may_be_paths(source, target, tmp_path):
+    made = Adapter(model="pointnet", train=TRAIN).fit(source)
+    for place, points in enumerate(target.points[:3]):
+        np.save(tmp_path / f"{place}.npy", points)
+    wanted = made.predict(target.points[:3]).tolist()
+    assert made.predict(tmp_path).tolist() == wanted
+    assert made.predict([tmp_path / "2.npy", str(tmp_path / "0.npy")]).tolist() == wanted[2::-2]
+    with pytest.raises(InputError, match="is a file; name a folder"):
+        made.save(tmp_path / "0.npy")
+
+
 def test_what_is_no_cloud_is_refused(source, target):
     made = Adapter(model="pointnet", train=TRAIN).fit(source)
     good, expected = target.points[0], r"a cloud is \[n 3\] numbers, in metres, z up"

@@ -133,10 +133,12 @@ def test_a_stray_makes_no_millimetres_and_centimetres_are_told(caplog):
         note_size(strayed, sized)
         note_size(CLOUDS / 100, ROBUST)
         assert not caplog.messages
-        note_size(CLOUDS / 100, sized)
-        note_size(CLOUDS / 100, sized)
+        note_size(CLOUDS / 25, sized)  # a part of a few centimetres
+        assert not caplog.messages
+        note_size(CLOUDS / 1000, sized)
+        note_size(CLOUDS / 1000, sized)
     (message,) = caplog.messages
-    assert "smaller than 5 cm" in message
+    assert "smaller than 5 mm" in message
     assert "are to be in metres" in message
 
 
@@ -167,7 +169,7 @@ def test_too_few_points_are_told_once(caplog, tmp_path):
         TOLD.clear()
         list(predict_files(Path("rooms"), [tmp_path / "few.npy"]))
     assert len(caplog.messages) == 2
-    assert "fewer than 32 distinct points" in caplog.messages[1]
+    assert "few.npy has fewer than 32 distinct points" in caplog.messages[1]
 
 
 def test_a_run_becomes_one(ship, source, target, settings, tmp_path):

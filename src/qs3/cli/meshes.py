@@ -2,16 +2,22 @@
 
 import dataclasses
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from qs3.cli.text import columns, quoted, show, tell
+from qs3.errors import InputError, say_once
 from qs3.meshes.sizes import Unit
 
 if TYPE_CHECKING:
+    import numpy as np
+    from matplotlib.figure import Figure
+
     from qs3.meshes.inspecting import Inspection
+    from qs3.meshes.trees import MeshItem
 
 _PICTURED, _LISTED = 8, 20
 
@@ -29,7 +35,7 @@ def meshes(
     Args:
         folder: As `qs3 generate` takes it: one folder a class, ModelNet's or ShapeNet's tree, or
             shapes.
-        out: The contact sheet to write, PNG: the first eight of each class.
+        out: The contact sheet to write, PNG: the first eight of each class with their names.
         up: Up axis of the meshes; by default y for glTF and ShapeNet, z for all others.
         units: Unit of the files, but STEP and IGES; by default what they tell, else m up to a
             longest side of 5, mm above.
@@ -38,9 +44,10 @@ def meshes(
     """
     from tqdm import tqdm
 
+    if out.suffix.lower() != ".png":
+        raise InputError(f"--out {out}: the contact sheet is a PNG; name a file that ends in .png")
     from qs3.meshes.collections import collect
     from qs3.meshes.inspecting import inspect
-    from qs3.report.clouds import gallery
     from qs3.report.figure import write_png
 
     items = collect(folder, classes=classes or None, labels=labels)
@@ -58,18 +65,87 @@ def meshes(
     for hint, count in counts.most_common():
         show(f"hint: {count} of {len(inspections)}, such as {examples[hint]}: {hint}")
     faults = [look.fault for look in inspections if look.fault]
-    show(*(f"fault: {fault}" for fault in faults[:_LISTED]))
-    if len(faults) > _LISTED:
-        show(f"fault: and {len(faults) - _LISTED} more")
-    pictures = {
-        name: [look.surface for look in group if look.surface is not None]
-        for name, group in groups.items()
-    }
-    wide = max(4, *map(len, pictures.values()))
-    write_png(out, gallery(pictures, Path(folder).name, wide))
+    show(*_first(faults, "fault: "))
+    alike, apart = _same_files(Path(folder), [look.item for look in inspections if not look.fault])
+    show(*_first(alike, "hint: "))
+    for text in _first(apart, f"{folder}: "):
+        say_once(text)
+    write_png(out, _sheet(groups, Path(folder).name))
     show(out)
-    tell(f"Next: qs3 generate --meshes {quoted(folder)} --out SET")
+    given: dict[str, Sequence[object]] = {"classes": classes, "labels": (labels,), "up": (up,)}
+    if units is not None:  # generate takes them for sizes by the file and a camera in metres
+        given |= {"sensor": ("d435",), "object-size": ("file",), "units": (units,)}
+    tell(f"Next: {_following(folder, items, given)}")
     return 1 if faults else 0
+
+
+def _first(texts: Sequence[str], before: str) -> list[str]:
+    """The first of many lines, and how many more there are."""
+    more = [f"and {len(texts) - _LISTED} more"] if len(texts) > _LISTED else []
+    return [before + text for text in [*texts[:_LISTED], *more]]
+
+
+def _following(
+    folder: str, items: "Sequence[MeshItem]", given: Mapping[str, Sequence[object]]
+) -> str:
+    """The command that comes next, with those of the options that were given here."""
+    if not all(item.class_name for item in items):
+        return (
+            "a class for each mesh: put them into one folder a class, or name a CSV of them: "
+            "--labels CSV"
+        )
+    words = [f"qs3 generate --meshes {quoted(folder)}"]
+    for name, values in given.items():
+        if any(value is not None for value in values):
+            words.append(f"--{name} {' '.join(map(quoted, values))}")
+    return f"{' '.join(words)} --out SET"
+
+
+def _same_files(folder: Path, items: "Sequence[MeshItem]") -> tuple[list[str], list[str]]:
+    """Tell the files of one content in one class, and those in several; a pair of each.
+
+    Only files of equal size are read.
+    """
+    from qs3.store.manifest import mesh_sums
+
+    sizes = {item.id: item.path.stat().st_size for item in items if item.path is not None}
+    count = Counter(sizes.values())
+    sums = mesh_sums(item for item in items if item.id in sizes and count[sizes[item.id]] > 1)
+    equal: dict[str, list[MeshItem]] = {}
+    for item in items:
+        if item.id in sums:
+            equal.setdefault(sums[item.id], []).append(item)
+    alike, apart = [], []
+    for first, *others in equal.values():
+        strange = [item for item in others if item.class_name != first.class_name]
+        pair = [first, *(strange or others)][:2]
+        text = " and ".join(str(item.path.relative_to(folder)) for item in pair if item.path)
+        text += f" are the same file{' in two classes' * bool(strange)}"
+        text += f" (and {len(others) - 1} more)" * (len(others) > 1)
+        if others:
+            (apart if strange else alike).append(text)
+    return alike, apart
+
+
+def _sheet(groups: "Mapping[str, Sequence[Inspection]]", title: str) -> "Figure":
+    """Draw the first of each class, with their names."""
+    from qs3.report.clouds import gallery
+
+    pictures: dict[str, list[np.ndarray]] = {}
+    captions: dict[str, list[str]] = {}
+    for name, group in groups.items():
+        shown = [(look.item.id, look.surface) for look in group if look.surface is not None]
+        pictures[name] = [surface for _, surface in shown]
+        captions[name] = _captions([id for id, _ in shown])
+    return gallery(pictures, title, max(4, *map(len, pictures.values())), captions)
+
+
+def _captions(ids: Sequence[str]) -> list[str]:
+    """The last part of each name that tells one from another: of a/model and b/model a and b."""
+    parts = [id.split("/") for id in ids]
+    while len({part[-1] for part in parts}) == 1 < len(parts) and all(p[1:] for p in parts):
+        parts = [part[:-1] for part in parts]
+    return [part[-1] for part in parts]
 
 
 def _row(name: str, group: "list[Inspection]") -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """``qs3 predict``: answers of a run for files."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -7,6 +8,9 @@ import tyro
 
 from qs3.cli.text import printable, quoted, show, tell
 from qs3.errors import InputError
+
+_DATA_FILES = (".csv", ".asc", ".pts", ".npz", ".h5", ".hdf5", ".parquet")
+"""Endings of files that may hold clouds, beside those that are read in folders."""
 
 
 def predict(
@@ -28,7 +32,7 @@ def predict(
         files: Clouds (NPY, XYZ, PLY, PCD, or a mesh as OFF; z up), folders of them with all below,
             patterns in quotes such as 'scans/*.ply', or data sets of any layout.
         top: Classes told of each file, the likeliest first.
-        csv: File for the table as CSV.
+        csv: File for the table as CSV; one of the clouds is never overwritten.
         json: File for the table as JSON with the probability of every class; - prints it in place
             of text.
         sort_into: New folder that gets a folder a class with links to the files, to put right by
@@ -38,6 +42,7 @@ def predict(
             objects that were held out of its training, with the share that is more familiar.
         calibrated: Tell the confidence that is calibrated on held-out source.
     """
+    from qs3.adaptation.confidence import UNKNOWN
     from qs3.files import refuse_taken, write_text
     from qs3.store.progress import progress_bar
     from qs3.training import answers as table
@@ -55,6 +60,9 @@ def predict(
         if file is not None and file.parent.is_file():
             raise InputError(f"{file}: {file.parent} is a file; name a file in a folder")
     paths = table.list_clouds(files)
+    for option, file in (("csv", csv), ("json", json)):
+        if file is not None and (option, file) != ("json", Path("-")):
+            _refuse_cloud(option, file, paths)
     sets = any(map(table.is_data_set, paths))
     if sets and sort_into is not None:
         raise InputError(
@@ -78,8 +86,10 @@ def predict(
         write_text(json, table.answers_json(answers))
     if sort_into is not None:
         table.sort_into(sort_into, answers)
-        tell(f"links by class in {sort_into}: move what is wrong, then qs3 train --source "
-             f"{quoted(sort_into)}")  # fmt: skip
+        first = "move what is wrong"
+        if any(answer.refused for answer in answers):
+            first += f", move or remove what is in {sort_into / UNKNOWN} (it would become a class)"
+        tell(f"links by class in {sort_into}: {first}; then qs3 train --source {quoted(sort_into)}")
     faults = [answer.fault for answer in answers if answer.fault]
     for fault in faults[:-1]:
         tell(f"qs3: {printable(fault, keep='')}")
@@ -88,3 +98,23 @@ def predict(
         count = f" ({len(faults)} of {len(answers)} {kind})" if len(answers) > 1 else ""
         raise InputError(faults[-1] + count)
     return 0
+
+
+def _refuse_cloud(option: str, file: Path, clouds: Sequence[Path]) -> None:
+    """Refuse to write a table over a cloud: one that is read, or any that is there already."""
+    from qs3.io.point_files import POINT_FILES
+
+    there = file.exists()
+    for cloud in clouds:
+        same = there and cloud.exists() and file.samefile(cloud)
+        if same or file.absolute() == cloud.absolute():
+            raise InputError(
+                f"--{option} {file}: is one of the clouds to read, and would be overwritten; name "
+                "another file"
+            )
+    ending = file.suffix.lower()
+    if there and ending != f".{option}" and ending in {*POINT_FILES, *_DATA_FILES}:
+        raise InputError(
+            f"--{option} {file}: is there already and may be a cloud; name a new file, or one that "
+            f"ends in .{option}"
+        )

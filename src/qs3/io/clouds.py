@@ -158,7 +158,10 @@ class RaggedClouds:
                 is of no class, or sizes differ and no size is asked for.
         """
         if self.labels is None:
-            raise InputError(f"{where}: has no labels, and this needs them")
+            raise InputError(
+                f"{where}: has no labels, and this needs them: put each cloud into a folder named "
+                "by its class, below one folder"
+            )
         called = [(class_map or {}).get(name, name) for name in self.class_names]
         names = label_order(called) if class_names is None else tuple(class_names)
         with naming(where):

@@ -1,7 +1,8 @@
-"""Point clouds from single files: npy, xyz, txt, ply, pcd, off."""
+"""Point clouds from single files: npy, xyz, txt, csv, asc, pts, ply, pcd, off."""
 
 import array
 import io
+import re
 import warnings
 from pathlib import Path
 
@@ -15,9 +16,15 @@ from qs3.io.pcd import parse_pcd, pcd_bytes
 from qs3.io.ply import load_ply, ply_bytes
 from qs3.meshes.announced import memory_limit
 
+_TABLES = (".csv", ".asc", ".pts")
 POINT_FILES = (".npy", ".xyz", ".txt", ".ply", ".pcd", ".off")
+"""Endings of clouds in folders; those of `_TABLES`, which may hold anything, are read by name."""
 SCENE_RECORD = "segment.json"
 """Beside the objects of each scene of a folder that ``qs3 segment`` cuts."""
+_HEAD = re.compile(rb"\W*x\W+y\W+z\b.*|\d+", re.I)
+"""Names of columns, or a count of lines, in the first line of a text."""
+_DECIMAL_COMMAS = re.compile(r"(?=.*\d,\d)\s*([-+]?\d+(,\d+([eE][-+]?\d+)?)?(\s+|$)){3,}")
+"""Numbers apart by spaces or semicolons; a comma between two digits then marks no column."""
 _MOST_COLUMNS = 128  # of points with features; an image has more
 _SEGMENT = (
     "; of depth images the objects in them become clouds: qs3 segment IMAGE_OR_FOLDER "
@@ -34,7 +41,8 @@ def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np
     mark pixels that saw nothing; in any other file a NaN is a fault.
 
     Args:
-        path: The file; its ending tells the format, one of ``POINT_FILES``.
+        path: The file; its ending tells the format, one of ``POINT_FILES``, or .csv, .asc or .pts.
+            Text may begin with a line of names (x, y, z first) or the count of its lines.
         mesh_points: Samples of a mesh.
         seed: Seed of these samples.
 
@@ -43,10 +51,9 @@ def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if path.is_file() and suffix not in POINT_FILES:
-        raise InputError(
-            f"{path}: not a point cloud file; known are {', '.join(POINT_FILES)}{depth_hint(path)}"
-        )
+    if path.is_file() and suffix not in POINT_FILES + _TABLES:
+        known = ", ".join(POINT_FILES + _TABLES)
+        raise InputError(f"{path}: not a point cloud file; known are {known}{depth_hint(path)}")
     content = read_small(path)
     if not content.strip():
         raise InputError(f"{path}: empty file")
@@ -56,7 +63,7 @@ def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np
             points = load_npy(content, _accept)[:, :3]
         elif suffix == ".pcd":
             points = parse_pcd(content)
-        elif suffix in (".xyz", ".txt"):
+        elif suffix in (".xyz", ".txt", *_TABLES):
             points = _text(content)
         else:
             with memory_limit(path):
@@ -127,6 +134,9 @@ def _text(content: bytes) -> np.ndarray:
     """Rows of numbers apart by spaces or commas; ``#`` begins a comment."""
     size = 24 * (1 + max(content.count(b"\n"), content.count(b"\r")))
     check_announced("the table of its lines", size, size)
+    first, _, rest = content.partition(b"\n")
+    if _HEAD.fullmatch(first.strip()):
+        content = b"\n" + rest  # an empty line, as lines are told by their number
     try:
         # Ten times as fast; whatever it does not take is told line by line.
         with warnings.catch_warnings():
@@ -143,7 +153,12 @@ def _lines(content: bytes) -> np.ndarray:
     numbers = array.array("d")  # a list of lists takes ten times the room
     columns = 0
     for number, line in text_lines(content):
-        words = line.split("#")[0].replace(",", " ").replace(";", " ").split()
+        line = line.split("#")[0].replace(";", " ")
+        if _DECIMAL_COMMAS.fullmatch(line):
+            raise InputError(
+                f"line {number} has decimal commas: {line.strip()[:40]!r}; write points"
+            )
+        words = line.replace(",", " ").split()
         if not words:
             continue
         columns = columns or len(words)

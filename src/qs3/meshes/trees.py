@@ -11,6 +11,7 @@ import trimesh
 
 from qs3 import shapes
 from qs3.errors import InputError, MissingExtraError, say_once
+from qs3.files import describe_others
 from qs3.meshes.cad import NEEDS, check_extra
 from qs3.meshes.classes import MODELNET40, SHAPENET
 from qs3.meshes.labels_csv import read_labels, read_shapenet_splits
@@ -93,7 +94,7 @@ def read_tree(root: Path, labels: Path | None = None) -> list[MeshItem]:
         synsets = _synsets(root)
         items = _shapenet(root, synsets) if synsets else []
         items += _folders(root, walk(root, synsets, others))
-    unread = ", ".join(f"{count} {ending}" for ending, count in sorted(others.items()))
+    unread = describe_others(others)
     if not items:
         raise InputError(
             f"{root}: holds no mesh; expected <class>/*.ply, <class>/<train|test>/*.off, "

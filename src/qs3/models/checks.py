@@ -5,7 +5,9 @@ import functools
 import inspect
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, get_type_hints
+from typing import Any, TypeGuard, get_type_hints
+
+import numpy as np
 
 from qs3.errors import InputError, no_such
 from qs3.structure import structure
@@ -53,14 +55,18 @@ def check_range(
         Traceback (most recent call last):
         qs3.errors.InputError: neighbours must be 1 to 255, not 256
     """
-    numbers = value if isinstance(value, Sequence) else (value,)
-    if not numbers or not all(least <= number <= most for number in numbers):
+    numbers = value if isinstance(value, list | tuple) else (value,)
+    if not numbers or not all(_is_number(n) and least <= n <= most for n in numbers):
         span = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
         raise InputError(f"{name} must be {span}, not {value!r}")
 
 
 def check_positive(name: str, value: Number | Sequence[Number]) -> None:
     """Raise InputError unless a number, or each of one or more, is larger than 0 and finite."""
-    numbers = value if isinstance(value, Sequence) else (value,)
-    if not numbers or not all(0 < number < math.inf for number in numbers):
+    numbers = value if isinstance(value, list | tuple) else (value,)
+    if not numbers or not all(_is_number(n) and 0 < n < math.inf for n in numbers):
         raise InputError(f"{name} must be larger than 0, not {value!r}")
+
+
+def _is_number(value: Any) -> TypeGuard[Number]:
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool)

@@ -16,7 +16,9 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.font_manager import findfont, get_font
 
+from qs3.escapes import printable
 from qs3.report.figure import house_style, short, without_frame
 
 SIDES = {"front": (0.0, 0.0), "side": (90.0, 0.0), "top": (0.0, 90.0)}
@@ -26,6 +28,7 @@ _OBLIQUE = (30.0, 20.0)
 _MAP = matplotlib.colormaps["viridis"]
 _GROUND, _SHADOW = "#999999", "#dddddd"
 _FILLED, _RAISED = 0.84, 0.06  # of a cell: what a cloud takes, and how far above its middle
+_CAPTION, _LETTERS, _SIZE = 0.16, 17, 6.5  # cells a caption takes, its letters, their points
 
 
 def project(
@@ -98,21 +101,29 @@ def gallery(
     samples: Mapping[str, Sequence[Float[np.ndarray, "_ 3"]]],
     title: str = "",
     columns: int = 4,
+    captions: Mapping[str, Sequence[str]] | None = None,
 ) -> Figure:
     """Draw a grid of clouds: one row a class, up to ``columns`` clouds a row, each fitted.
 
-    Clouds may differ in their number of points.
+    Clouds may differ in their number of points. ``captions`` tell what is written below each.
     """
     names, rows = [short(name) for name in samples], len(samples)
     # Inches.
     cell, left, top = 1.05, 0.25 + 0.09 * max(map(len, names), default=0), 0.35 * bool(title)
-    width, height = left + cell * columns, top + cell * rows
+    pitch = 1.0 if captions is None else 1.0 + _CAPTION
+    width, height = left + cell * columns, top + cell * rows * pitch
     figure = Figure(figsize=(width, height))
     axes = figure.add_axes((left / width, 0.0, 1.0 - left / width, 1.0 - top / height))
     spots, shadows, colours = [], [], []
-    for row, clouds in enumerate(samples.values()):
+    for row, (name, clouds) in enumerate(samples.items()):
+        middle = -row * pitch
         if not clouds:
-            axes.text(0.0, -row, "none", ha="center", va="center", color="#666666")
+            axes.text(0.0, middle, "none", ha="center", va="center", color="#666666")
+        for column, text in enumerate((captions or {}).get(name, ())[:columns]):
+            axes.text(
+                column, middle - 0.5 - _CAPTION / 3, _caption(text), ha="center", va="center",
+                fontsize=_SIZE, color="#333333",
+            )  # fmt: skip
         for column, cloud in enumerate(clouds[:columns]):
             cloud = cloud[np.isfinite(cloud).all(axis=1)]
             if not len(cloud):
@@ -123,21 +134,21 @@ def gallery(
             both = np.concatenate([seen, shadow])[:, :2]
             low, high = both.min(axis=0), both.max(axis=0)
             scale = _FILLED / max(float((high - low).max()), 1e-12)
-            place = np.array([column, -row + _RAISED])
+            place = np.array([column, middle + _RAISED])
             order = np.argsort(seen[:, 2], kind="stable")
             spots.append(((seen[:, :2] - (low + high) / 2.0) * scale + place)[order])
             shadows.append((shadow[:, :2] - (low + high) / 2.0) * scale + place)
             colours.append(shade(cloud[:, 2], seen[:, 2])[order])
             bar = bar_length(0.9 / scale)
             if _FILLED / scale > 1e-9:
-                _draw_bar(axes, column - 0.45, -row - 0.43, bar * scale, f"{bar:g}")
+                _draw_bar(axes, column - 0.45, middle - 0.43, bar * scale, f"{bar:g}")
     if spots:
         spot, shadow = np.concatenate(spots), np.concatenate(shadows)
         axes.scatter(spot[:, 0], spot[:, 1], s=4.0, c=np.concatenate(colours), linewidths=0)
         axes.scatter(shadow[:, 0], shadow[:, 1], s=5.0, c=_SHADOW, linewidths=0, zorder=0.5)
-    axes.set(xlim=(-0.5, columns - 0.5), ylim=(0.5 - rows, 0.5), title=short(title, 40))
+    axes.set(xlim=(-0.5, columns - 0.5), ylim=(0.5 - rows * pitch, 0.5), title=short(title, 40))
     without_frame(axes)
-    axes.set_yticks(-np.arange(rows), names)
+    axes.set_yticks(-np.arange(rows) * pitch, names)
     axes.tick_params(axis="y", length=0)
     return figure
 
@@ -152,6 +163,16 @@ def bar_length(room: float) -> float:
     power = 10.0 ** np.floor(np.log10(max(0.4 * room, 1e-12)))
     step = max((s for s in (1, 2, 5) if s * power <= 0.4 * room), default=1)
     return float(f"{step * power:.3g}")
+
+
+def _caption(text: str) -> str:
+    """Cut a name within to what fits below a picture: files often differ at the end."""
+    font = get_font(findfont("DejaVu Sans"))
+    text = "".join(c if font.get_char_index(ord(c)) else "□" for c in printable(text, keep=""))
+    if len(text) <= _LETTERS:
+        return text
+    end = 2 * _LETTERS // 3
+    return f"{text[: _LETTERS - 1 - end]}…{text[-end:]}"
 
 
 def _draw_bar(axes: Axes, x: float, y: float, length: float, text: str) -> None:

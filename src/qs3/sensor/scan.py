@@ -6,6 +6,7 @@ Supplement, section on Mesh2Point; its settings are `qs3.sensor.settings.ScanSet
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from jaxtyping import Float32, UInt8
 
 from qs3.errors import InputError, say_once
 from qs3.geometry import rotation_z
+from qs3.meshes.collections import load_named
 from qs3.sensor.depth import fuse
 from qs3.sensor.lens import blur_reach
 from qs3.sensor.matching import matching_canvas
@@ -37,6 +39,9 @@ from qs3.sensor.view import (
     scene_of,
     take_views,
 )
+
+_LEAST_POINTS = 32
+"""Of a cloud; what repeats fewer of them shows no shape."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +78,7 @@ class Scan:
 
 
 def scan(
-    mesh: trimesh.Trimesh,
+    mesh: trimesh.Trimesh | str | Path,
     settings: ScanSettings | None = None,
     *,
     rig: StereoRig | None = None,
@@ -90,7 +95,8 @@ def scan(
     cropped and sampled down. The turn is undone in what is returned.
 
     Args:
-        mesh: The object, z up, in any unit.
+        mesh: The object, z up, in any unit; or its file, or the name of a built-in class, of which
+            the seed draws one.
         settings: How it is scanned; the defaults where there are none.
         rig: Replaces the sensor's rig.
         neighbour: Another mesh, for the layouts ``behind`` and ``beside``; it is normalised too.
@@ -116,6 +122,10 @@ def scan(
         (2048, 3)
     """
     how = dataclasses.replace(settings or ScanSettings(), **changes)
+    if isinstance(mesh, str | Path):
+        mesh, _ = load_named(str(mesh), how.seed)
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise InputError(f"scan: needs a trimesh, a file or a built-in class, not {type(mesh)}")
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence(how.seed).spawn(9)]
     how, chosen = choose(how, streams.pop())
     rng_place, rng_render, rng_noise, rng_sample, rng_scene, rng_settings, rng_size, rng_room = (
@@ -150,6 +160,7 @@ def scan(
         rooms = stand_in_rooms(how, sensor, body, neighbour, rng_room, rng_scene, redraw)
     else:
         rooms = [(sensor, stand(how, sensor, body, neighbour, rng_place, rng_scene), {})]
+    points = np.empty((0, 3))
     # A room of which the sensor got little is drawn again, as one that shows too little is.
     for sensor, around, room in rooms:
         parts = [object_region(bounds, sensor, pose) for pose in around.poses]
@@ -168,14 +179,14 @@ def scan(
             clean_points, clean_view = fuse(cleans)
         valid = np.mean([view.valid_fraction or 0.0 for view in statistics])
         enough = not how.room_layouts or valid >= how.least_valid
-        if enough and len(points) and len(clean_points):
+        if enough and len(points) >= _LEAST_POINTS and len(clean_points):
             drawn |= room
             break
     else:
         raise InputError(
-            "the sensor saw no point of the object: it is too thin, hidden, out of the depth gate, "
-            "or outside the image; check the mesh, the scene and the sensor's placement: "
-            + _standing(how, sensor, normalised)
+            f"the sensor saw {len(points) or 'no'} point{'s' * (len(points) > 1)} of the object: "
+            "it is too thin, hidden, out of the depth gate, or outside the image; check the mesh, "
+            f"its unit, the scene and the sensor's placement: {_standing(how, sensor, normalised)}"
         )
     if 4 * len(points) < how.num_points:
         say_once(
@@ -208,10 +219,11 @@ def _standing(how: ScanSettings, sensor: Sensor, mesh: trimesh.Trimesh) -> str:
     """How large the object is and how far away, and what changes that; in digits that repeat."""
     unit = " m" if sensor.metric else ""
     name = "room.distance" if how.room_layouts else "placement.radius"
+    where = "randomise" if how.room_layouts else "the sensor's TOML file"
     near, far, *_ = how.ranges.get(name, sensor.placement.radius)
     return (
         f"the object is about {mesh.extents.max():.1g}{unit} large and is seen "
-        f"from {near:.2g} to {far:.2g}{unit} away; set {name} to see it from nearer"
+        f"from {near:.2g} to {far:.2g}{unit} away; set {name} in {where} to see it from nearer"
     )
 
 

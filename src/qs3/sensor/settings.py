@@ -112,7 +112,7 @@ class CameraSettings:
         if isinstance(self.sensor, tuple):
             names = ", ".join(str(getattr(preset, "name", preset)) for preset in self.sensor)
             raise InputError(f"sensor: one is needed here, not several ({names}); name one")
-        sensor = get_sensor(self.sensor) if isinstance(self.sensor, str) else self.sensor
+        sensor = self.sensor if isinstance(self.sensor, Sensor) else get_sensor(str(self.sensor))
         for name, place in self._changes.items():
             sensor = changed(sensor, place, self.chosen(name))
         if self.pattern is not None:

@@ -145,9 +145,7 @@ def scan_seed(root: int, object_id: str, scan: int) -> int:
     return int(state[0] >> np.uint64(1))
 
 
-def neighbours_of(
-    items: Sequence[Item], position: int, scan: int, root: int
-) -> tuple[Item, ...]:
+def neighbours_of(items: Sequence[Item], position: int, scan: int, root: int) -> tuple[Item, ...]:
     """Draw other items of a work list, of two at least, for a scan of the one at ``position``.
 
     Order and worker count do not matter.

@@ -1,6 +1,8 @@
 """The whole way in one call: CAD models and unlabelled scans in, a classifier of the scans out."""
 
 import logging
+import operator
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +12,7 @@ import numpy as np
 
 from qs3.adaptation import method_class
 from qs3.adaptation.names import split_method
+from qs3.adaptation.selection import SingleClassWarning
 from qs3.errors import InputError
 from qs3.io import load_clouds, load_unlabelled
 from qs3.io.clouds import PointClouds, RaggedClouds, UnlabelledClouds, numbered
@@ -22,7 +25,7 @@ from qs3.processors import usable_processors
 from qs3.structure import unstructure
 from qs3.training.batches import load_whole
 from qs3.training.config import TrainSettings, changed
-from qs3.training.estimators import Adapter, Clouds, rounds_of
+from qs3.training.estimators import Adapter, Clouds, read_paths, rounds_of
 from qs3.training.rounds import remarks
 from qs3.training.run import train_settings
 from qs3.training.shipped import WEIGHTS
@@ -44,6 +47,7 @@ def adapt(
     *,
     units: Unit | None = None,
     method: str = "qbst",
+    scan: Mapping[str, Any] | None = None,
     train: Mapping[str, Any] | None = None,
     self_training: Mapping[str, Any] | None = None,
     workers: int | None = None,
@@ -68,6 +72,9 @@ def adapt(
         units: Unit of the mesh files, m, cm, mm or in: the objects get the sizes in them, whatever
             their class. None takes the above, and a file's unit for what it tells or looks to be.
         method: As in `Adapter`.
+        scan: Settings of `qs3.store.generate.GenerateSettings` that differ from those above, such
+            as ``{"sensor": "mine.toml"}`` for a camera of your own, or ``{"randomise": ["rooms",
+            "room.distance=0.3:1"]}`` for small parts seen from near.
         train: Settings of `TrainSettings` that differ from those of ``rooms``; with ``rule`` "last"
             the last round is kept.
         self_training: Settings of the rounds that differ.
@@ -85,8 +92,9 @@ def adapt(
     method_class(base)
     changed(TrainSettings(), train or {}, " in train")
     rounds = rounds_of(self_training or {}, rule)
+    seed = operator.index(seed)
     target = _target(scans)
-    source = _source(cad, Path(out) / "source", units, workers, seed)
+    source = _source(cad, Path(out) / "source", units, scan or {}, workers, seed)
     settings = unstructure(train_settings(_LIKE))
     batches = max(1, len(source) // settings["batch_size"])
     settings |= {"epochs": max(1, round(_STEPS / batches))} | dict(train or {})
@@ -109,7 +117,9 @@ def adapt(
         run_dir=Path(out) / "run",
         random_state=seed,
     )
-    adapter.fit(source, target)
+    with warnings.catch_warnings():  # told by name, below
+        warnings.simplefilter("ignore", SingleClassWarning)
+        adapter.fit(source, target)
     for line in remarks(adapter.result_.rounds, rounds, source.class_names, "threshold_share"):
         _LOG.warning(line)
     return adapter
@@ -119,15 +129,20 @@ def _source(
     cad: str | Path | PointClouds,
     folder: Path,
     units: Unit | None,
+    scan: Mapping[str, Any],
     workers: int | None,
     seed: int,
 ) -> PointClouds:
+    from qs3.store.failures import FAILURES, read_failures
     from qs3.store.generate import generate
     from qs3.store.scan_item import RECIPES, settings_for
 
     scanned = not isinstance(cad, PointClouds) and not is_store(cad)
-    if units is not None and not scanned:
-        raise InputError(f"units {units}: goes with a folder of meshes alone")
+    if (units is not None or scan) and not scanned:
+        what = f"units {units}" if units is not None else f"scan {', '.join(scan)}"
+        raise InputError(f"{what}: goes with a folder of meshes alone")
+    if "seed" in scan or "units" in scan:
+        raise InputError("scan: seed and units are given beside it")
     if isinstance(cad, PointClouds):
         return cad
     if scanned:
@@ -135,8 +150,13 @@ def _source(
         have_sizes = {canonical(item.class_name) for item in items} <= {*CLASS_SIZES}
         size = "class" if have_sizes and units is None else "file"
         recipe = replace(RECIPES["rooms"], views=1, seed=seed, object_size=size, units=units)
-        recipe = settings_for(recipe, items, [cad], _PER_CLASS)
+        recipe = settings_for(changed(recipe, scan, " in scan"), items, [cad], _PER_CLASS)
         generate(items, folder, recipe, workers=usable_processors() if workers is None else workers)
+        failed = read_failures(folder)
+        if failed:
+            many = f"{len(failed)} of {recipe.scans_per_mesh * len(items)} scans failed"
+            first = f"{failed[0]['id']}: {failed[0]['reason']}"
+            _LOG.warning(f"{many}, told in {folder / FAILURES}; the first, {first}")
         cad = folder
     return load_clouds(cad, num_points=None, cloud="all")
 
@@ -149,7 +169,8 @@ def _target(scans: Clouds) -> UnlabelledClouds:
     if isinstance(scans, str | Path):
         settings = train_settings(_LIKE)
         return load_whole(load_unlabelled, scans, settings.num_points, settings.preparation)
-    clouds = [np.asarray(cloud, np.float32) for cloud in scans]
+    given: Any = read_paths(scans)
+    clouds = [np.asarray(cloud, np.float32) for cloud in given]
     if any(cloud.ndim != 2 or cloud.shape[1:] != (3,) for cloud in clouds):
         raise InputError("scans: give clouds of shape [n 3], several of them")
     return RaggedClouds(clouds, numbered(len(clouds)), "").unlabelled(None, "scans", LARGEST)

@@ -4,6 +4,9 @@ import csv
 import glob
 import io
 import json
+import os
+import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,8 +15,8 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.adaptation.confidence import UNKNOWN, rescale
-from qs3.errors import InputError
-from qs3.files import json_bytes, new_folder
+from qs3.errors import InputError, say_once
+from qs3.files import describe_others, json_bytes, new_folder
 from qs3.io.guards import utf8
 from qs3.io.layouts import FORMATS
 from qs3.io.layouts.point_folders import check_class
@@ -22,6 +25,10 @@ from qs3.io.point_files import POINT_FILES, depth_hint, read_cloud
 from qs3.training.checkpoint import LoadedModel, load_model
 from qs3.training.predict import ask
 from qs3.training.prepared import note_clouds
+
+_BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|montage\.png|view-\d+-[a-z-]+\.png")
+"""What qs3 itself and others write beside clouds, and nobody takes for one."""
+_LONGEST_NAME = 240  # bytes; a number may follow
 
 
 @dataclass(frozen=True)
@@ -53,7 +60,7 @@ def list_clouds(given: Sequence[Path]) -> list[Path]:
     """List files of points: files as they are named, folders with all below them, patterns.
 
     A folder without such files that has a layout of `qs3.io.layouts` stays as it is, for
-    `read_listed`.
+    `read_listed`. What else lies in a folder of clouds is counted in the log, by ending.
 
     Raises:
         InputError: where a folder or a pattern has none.
@@ -61,11 +68,11 @@ def list_clouds(given: Sequence[Path]) -> list[Path]:
     files: list[Path] = []
     for path in given:
         if path.is_dir():
-            paths = [p for p in sorted(path.rglob("*")) if p.suffix.lower() in POINT_FILES]
-            hidden = [any(part[0] == "." for part in p.relative_to(path).parts) for p in paths]
-            paths = [p for p, h in zip(paths, hidden, strict=True) if p.is_file() and not h]
+            paths, unread = _list_folder(path)
             if not paths and is_data_set(path):
                 paths = [path]
+            elif paths and unread:
+                say_once(f"{path}: not read: {unread}")
         elif path.exists() or not glob.has_magic(str(path)):
             paths = [path]
         else:
@@ -76,6 +83,20 @@ def list_clouds(given: Sequence[Path]) -> list[Path]:
             raise InputError(f"{path}: no cloud found; known are {known}{depth_hint(path)}")
         files += paths
     return list(dict.fromkeys(files))
+
+
+def _list_folder(folder: Path) -> tuple[list[Path], str]:
+    """List files of points below a folder, and tell what else is there that may be clouds."""
+    paths: list[Path] = []
+    others: Counter[str] = Counter()
+    for path in sorted(folder.rglob("*")):
+        if any(part[0] == "." for part in path.relative_to(folder).parts) or not path.is_file():
+            continue
+        if path.suffix.lower() in POINT_FILES:
+            paths.append(path)
+        elif not _BESIDE.fullmatch(path.name.lower()):
+            others[path.suffix.lower() or path.name] += 1
+    return paths, describe_others(others)
 
 
 def is_data_set(path: Path) -> bool:
@@ -124,7 +145,7 @@ def predict_files(
         for name, points in clouds:
             try:
                 (answer,) = answer_clouds(loaded, points[None], unknown, calibrated)
-                note_clouds([points[None]])
+                note_clouds([points[None]], str(name))
             except InputError as error:
                 yield _fault(name, error)
             else:
@@ -207,7 +228,8 @@ def sort_into(folder: Path, answers: Iterable[Answer]) -> None:
     """Link files into a folder of each class, for a person to put right and to train on.
 
     Args:
-        folder: A new or empty folder; it becomes ``<class>/<file>``, links to the files.
+        folder: A new or empty folder; it becomes ``<class>/<file>``, links to the files. Of files
+            that share their name the link's is ``<parent>_<file>``.
         answers: What is sorted; files that could not be read are left out.
 
     Raises:
@@ -221,6 +243,7 @@ def sort_into(folder: Path, answers: Iterable[Answer]) -> None:
                 f"{answer.file}: is no file to link to but a cloud of a data set; write files of "
                 "it first: qs3 convert DATA FOLDER --to ply"
             )
+    count = Counter(answer.file.name for answer in answers if not answer.fault)
     with new_folder(folder) as whole:
         whole.mkdir()
         for answer in answers:
@@ -228,8 +251,17 @@ def sort_into(folder: Path, answers: Iterable[Answer]) -> None:
                 check_class(name)
                 own = whole / name
                 own.mkdir(exist_ok=True)
-                link, number = own / answer.file.name, 1
+                link = first = own / _link_name(answer.file, count[answer.file.name] > 1)
+                number = 1
                 while link.is_symlink():
                     number += 1
-                    link = own / f"{answer.file.stem}-{number}{answer.file.suffix}"
+                    link = first.with_name(f"{first.stem}-{number}{first.suffix}")
                 link.symlink_to(answer.file.resolve())
+
+
+def _link_name(file: Path, shared: bool) -> str:
+    """A file's name; of several in as many folders with that of its folder, such as a frame's."""
+    parent = file.parent.resolve().name.lstrip(".")  # what is hidden is not trained on
+    longer = f"{parent}_{file.name}"
+    fits = len(os.fsencode(longer)) <= _LONGEST_NAME
+    return longer if shared and parent and fits else file.name

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Annotated, Any, Literal, TypeVar
 
+import numpy as np
 import tyro
 
 from qs3.adaptation.names import Normalisation, RoundRule, Rule, Selection, SingleClass
@@ -323,6 +324,8 @@ def _check_ranges(settings: Any, ranges: Mapping[str, str]) -> None:
     for fault, names in ranges.items():
         for name in names.split():
             value = getattr(settings, name)
+            if isinstance(value, str):
+                raise InputError(f"setting {name} = {value!r} is no number")
             _check(settings, name, value is None or _RANGES[fault](value), fault)
 
 
@@ -427,6 +430,8 @@ def changed(settings: _Settings, given: Mapping[str, Any], where: str = "") -> _
             raise no_such(f"unknown setting {name!r}{where}", name, names)
         if is_dataclass(inner := getattr(settings, name)) and isinstance(value, Mapping):
             values[name] = changed(inner, value, where)
+        elif isinstance(value, np.generic):  # a record takes plain numbers
+            values[name] = value.item()
     return replace(settings, **values)
 
 

@@ -47,10 +47,11 @@ Clouds = (
     | Iterable[ArrayLike]
     | str
     | Path
+    | Sequence[str | Path]
 )
 """Clouds to tell the class of: many in one array or one, of different sizes in a list, or a file of
-points or a folder of them. What NumPy takes for such arrays will do: nested lists, tensors on the
-CPU."""
+points or a folder of them (in the order of `qs3.training.answers.list_clouds`), or a list of such.
+What NumPy takes for such arrays will do: nested lists, tensors on the CPU."""
 _EXPECTED = "a cloud is [n 3] numbers, in metres, z up"
 
 
@@ -148,6 +149,8 @@ class Adapter(ClassifierMixin, BaseEstimator):
         """
         self._require_fitted()
         folder, told = Path(folder), self._loaded.settings
+        if folder.is_file():
+            raise InputError(f"{folder}: is a file; name a folder")
         trained = (folder / HISTORY).is_file() or self._run is None
         if is_run(folder) and trained and read_settings(folder) != told:
             raise InputError(f"{folder}: holds another run; name another folder")
@@ -169,9 +172,7 @@ class Adapter(ClassifierMixin, BaseEstimator):
 
     def _ask(self, clouds: Clouds) -> Description:
         self._require_fitted()
-        if isinstance(clouds, str | Path):
-            listed = list_clouds([Path(clouds)])
-            clouds = [points for path in listed for _, points in read_listed(path)]
+        clouds = read_paths(clouds)
         points = clouds.points if isinstance(clouds, PointClouds | UnlabelledClouds) else clouds
         batches = _batches(points)
         note_clouds(batches)
@@ -240,6 +241,19 @@ class Adapter(ClassifierMixin, BaseEstimator):
         if said.shape != truth.shape:
             raise InputError(f"{len(said)} clouds have labels of shape {list(truth.shape)}")
         return float((said == truth).mean())
+
+
+def read_paths(clouds: Clouds) -> Clouds:
+    """Read clouds where paths are given, one or a list of them; anything else comes back as it is.
+
+    Raises:
+        InputError: where one cannot be read, or holds no cloud.
+    """
+    paths = clouds if isinstance(clouds, list | tuple) else [clouds]
+    if not paths or not all(isinstance(path, str | Path) for path in paths):
+        return clouds
+    listed = list_clouds([Path(str(path)) for path in paths])
+    return [points for path in listed for _, points in read_listed(path)]
 
 
 def _batches(given: Any) -> list[Float[np.ndarray, "_ _ 3"]]:

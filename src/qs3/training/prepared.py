@@ -30,7 +30,7 @@ from qs3.training.config import TrainSettings
 
 Kind = TypeVar("Kind", PointClouds, UnlabelledClouds)
 _HUGE = 20.0  # metres, more than any object of a room
-_TINY = 0.05  # metres, less than any
+_TINY = 0.005  # metres, less than what a depth camera sees of any
 _UNIT = 1e-3  # of a radius of 1 in half precision
 _FEW = 32  # points; fewer have no shape
 
@@ -157,7 +157,7 @@ def note_size(points: Float[np.ndarray, "b n 3"], preparation: Preparation) -> N
             )
         if size < _TINY:
             say_once(
-                f"clouds are smaller than {100 * _TINY:.0f} cm, and the network is told their "
+                f"clouds are smaller than {1000 * _TINY:.0f} mm, and the network is told their "
                 "size: points are to be in metres"
             )
         if len(some) == 1:  # which may be just so large
@@ -170,17 +170,19 @@ def note_size(points: Float[np.ndarray, "b n 3"], preparation: Preparation) -> N
             )
 
 
-def note_clouds(clouds: Sequence[Float[np.ndarray, "_ _ 3"]]) -> None:
+def note_clouds(clouds: Sequence[Float[np.ndarray, "_ _ 3"]], where: str = "a cloud") -> None:
     """Say once where a network is asked about clouds of too few points.
 
     Args:
         clouds: Arrays of clouds.
+        where: The first of them, for the message.
     """
     for points in clouds:
         if any(map(_has_few, points)):
             say_once(
-                f"a cloud has fewer than {_FEW} distinct points, too few to tell its class: its "
-                "answer means little"
+                f"{where} has fewer than {_FEW} distinct points, too few to tell its class: its "
+                "answer means little (told once)",
+                "few distinct points",
             )
 
 

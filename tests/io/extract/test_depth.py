@@ -253,6 +253,9 @@ distortion_coefficients: {rows: 1, cols: 5, data: [0.0, 0.0, 0.0, 0.0, 0.0]}
     bent = {"bent.yml": small, "ragged.yml": calibration.replace("[0.0, 0.0", "[[0.1], [0.0, 0.1]")}
     plain = {"fx": 150, "fy": 140, "cx": 77, "cy": 61, "width": 160, "height": 120}
     bent["coeffs.json"] = json.dumps(plain | {"coeffs": {"k1": 0.1}, "k": 3, "d": None})
+    for key in ("dist", "distCoeffs", "dist_coeff", "distortion"):
+        bent[f"{key}.json"] = json.dumps(plain | {key: [0.1, 0], "distance": 3})
+    bent["k1.json"] = json.dumps(plain | {"k1": -0.1})
     for name, text in bent.items():
         (tmp_path / name).write_text(text)
         assert read_intrinsics(tmp_path / name) == expected
@@ -299,6 +302,11 @@ def test_bad_cameras_on_the_command_line(text, message):
         ("a.json", '{"fx": 150, "fy": 140, "cx": 77, "cy": NaN}', "not a JSON file"),
         ("a.json", '{"fx": 150, "fy": 140, "cx": 77, "cy": 6, "width": 1.5}', "width"),
         ("a.json", '{"fx": 1, "fy": 1, "cx": 7, "cy": 6, "depth_scale": 0}', "must be positive"),
+        (
+            "a.json",
+            '{"fx": 1, "fy": 1, "cx": 7, "cy": 6, "depth_scale": 0.001}',
+            "1e-06 m a step of depth is finer .* depth_unit metres",
+        ),
         ("a.json", '{"K": [[1, 0], [0, 1]]}', "K must be 9 numbers"),
         ("a.json", '{"focal": 3}', "principal_point"),
         ("a.json", "{}", "none of fx"),

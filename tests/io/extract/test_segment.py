@@ -211,6 +211,9 @@ def test_what_has_no_plane_or_nothing_on_it_is_one_line(tmp_path):
     np.save(tmp_path / "line.npy", np.r_[line, rng.random((5000, 3)) * 9])
     with refused("no patch without gaps", "line.npy"):
         segment_scene(tmp_path / "line.npy", tmp_path / "o")
+    np.save(tmp_path / "tiny.npy", np.load(tmp_path / "bare.npy") * 1e-3)
+    with refused("all of it is within 5 cm: is its unit right", "tiny.npy"):
+        segment_scene(tmp_path / "tiny.npy", tmp_path / "o")
     np.save(tmp_path / "mm.npy", rng.random((100, 3)) * 1200)
     with refused("see --depth-scale", "mm.npy"):
         segment_scene(tmp_path / "mm.npy", tmp_path / "o")

@@ -27,8 +27,12 @@ _SAME = {
     "ppy": "cy",
 }
 """Other names in the files of OpenCV, ROS 1, ROS 2 and librealsense."""
-_DISTORTION = ("D", "d", "distortion_coefficients", "coeffs")
-"""Where these files tell it."""
+_DISTORTION = re.compile(
+    r"d|dist|dist(ortion)?_?coeff(icient)?s?|distortion|coeffs|[kp][1-6]", re.I
+)
+"""Names under which files tell it; `K` is the camera's matrix."""
+_FINEST = 5e-6
+"""Metres a step of depth; the finest camera we know of has 1e-5."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,11 @@ class Intrinsics:
             )
         if self.depth_scale is not None and not 0 < self.depth_scale < math.inf:
             raise InputError(f"camera: depth scale {self.depth_scale:g} must be positive")
+        if self.depth_scale is not None and self.depth_scale < _FINEST:
+            raise InputError(
+                f"camera: {self.depth_scale:g} m a step of depth is finer than any camera's; in a "
+                "file depth_scale is millimetres a step (BOP's), and depth_unit metres"
+            )
 
     def check_size(self, shape: tuple[int, ...], where: str) -> None:
         """Refuse an image of another size than the camera's; ``where`` names it.
@@ -150,7 +159,7 @@ def read_intrinsics(given: str | Path) -> Intrinsics:
             json = path.suffix.lower() == ".json"
             table = _renamed(read_small_json(path, _LARGEST) if json else _read_yaml(path))
             camera = _from_table(pick(table, _CameraFile, "camera"))
-            if any(_is_bent(table.get(name)) for name in _DISTORTION):
+            if any(_is_bent(v) for name, v in table.items() if _DISTORTION.fullmatch(str(name))):
                 say_once(f"{path}: tells lens distortion, which is not undone; give images without")
             return camera
         numbers = read_numbers(path, (4, 9, 16)).tolist()

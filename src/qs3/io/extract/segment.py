@@ -40,6 +40,7 @@ TABLE = "objects.csv"
 _LEAST_SHARE = 0.1  # of the points, on the plane
 _WIDEST = 1000.0  # metres
 _FITTED = 2000  # points that the plane is fitted to
+_SMALL_SCENE = 0.05  # metres; smaller than what any depth camera is held at
 _CORE = 5  # voxels around one that make it part of a cluster
 
 
@@ -342,6 +343,8 @@ def _over(
         sides = ConvexHull(patch[cluster_of == np.argmax(counts)]).equations
     except (QhullError, ValueError):  # no patch, or a line
         fault = f"its plane has no patch without gaps of {settings.gap:g} m; raise --gap"
+        if np.ptp(patch, axis=0).max() < _SMALL_SCENE:
+            fault = "all of it is within 5 cm: is its unit right? See --depth-scale, --units"
         raise InputError(fault) from None
     over = np.ones(len(points), dtype=bool)
     for x, y, offset in sides:
