@@ -203,11 +203,14 @@ def test_links_by_class_are_a_data_set(folder, tmp_path):
         sort_into(tmp_path / "sorted", answers)
     with refused("cannot name a folder"):
         sort_into(tmp_path / "other", [Answer(one, {"../up": 1.0})])
+    (tmp_path / "a.csv").touch()
+    with refused("is read by its name alone"):
+        sort_into(tmp_path / "other", [Answer(tmp_path / "a.csv", {"cup": 1.0})])
     assert not (tmp_path / "other").exists()
 
 
 def test_links_to_files_of_one_name_tell_the_folder_and_lose_none(tmp_path):
-    long = "l" * 250
+    long = "l" * 246 + ".npy"
     places = ["1/f/o.npy", "2/f/o.npy", "f/o.npy", "f_o.npy", f"f/{long}", f"2/f/{long}",
               ".dot/o.npy", "f/o-2.npy"]  # fmt: skip
     for place in places:

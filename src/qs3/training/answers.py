@@ -21,7 +21,7 @@ from qs3.io.guards import utf8
 from qs3.io.layouts import FORMATS
 from qs3.io.layouts.point_folders import check_class
 from qs3.io.load import read_clouds
-from qs3.io.point_files import POINT_FILES, depth_hint, read_cloud
+from qs3.io.point_files import POINT_FILES, WRITTEN_FILES, depth_hint, read_cloud
 from qs3.training.checkpoint import LoadedModel, load_model
 from qs3.training.predict import ask
 from qs3.training.prepared import note_clouds
@@ -234,7 +234,7 @@ def sort_into(folder: Path, answers: Iterable[Answer]) -> None:
 
     Raises:
         InputError: where the folder is taken, a class cannot name a folder, or a cloud is one of
-            a data set, without a file.
+            a data set, without a file, or in a file that is read by its name alone.
     """
     answers = list(answers)
     for answer in answers:
@@ -242,6 +242,11 @@ def sort_into(folder: Path, answers: Iterable[Answer]) -> None:
             raise InputError(
                 f"{answer.file}: is no file to link to but a cloud of a data set; write files of "
                 "it first: qs3 convert DATA FOLDER --to ply"
+            )
+        if not answer.fault and answer.file.suffix.lower() not in POINT_FILES:
+            raise InputError(
+                f"{answer.file}: is read by its name alone, and would be passed over in the folder "
+                f"of a class; write it as one of {', '.join(WRITTEN_FILES)} first"
             )
     count = Counter(answer.file.name for answer in answers if not answer.fault)
     with new_folder(folder) as whole:
