@@ -205,7 +205,7 @@ def test_what_takes_far_more_memory_than_its_size_is_refused(tmp_path, monkeypat
     assert str(caught.value).count(str(path)) == 1
 
 
-@pytest.mark.parametrize("head", ["x,y,z,r\n", "//X; Y; Z\n", "3\n", ""])
+@pytest.mark.parametrize("head", ["x,y,z,r\n", "//X; Y; Z\r\n", "3 \r", ""])
 @pytest.mark.parametrize("ending", ["csv", "asc", "pts", "txt"])
 def test_text_may_begin_with_names_or_a_count(tmp_path, head, ending):
     path = tmp_path / f"a.{ending}"

@@ -21,7 +21,7 @@ POINT_FILES = (".npy", ".xyz", ".txt", ".ply", ".pcd", ".off")
 """Endings of clouds in folders; those of `_TABLES`, which may hold anything, are read by name."""
 SCENE_RECORD = "segment.json"
 """Beside the objects of each scene of a folder that ``qs3 segment`` cuts."""
-_HEAD = re.compile(rb"\W*x\W+y\W+z\b.*|\d+", re.I)
+_HEAD = re.compile(rb"[^\w\r\n]*(x[^\w\r\n]+y[^\w\r\n]+z\b[^\r\n]*|\d+[ \t]*)(?=[\r\n])", re.I)
 """Names of columns, or a count of lines, in the first line of a text."""
 _DECIMAL_COMMAS = re.compile(r"(?=.*\d,\d)\s*([-+]?\d+(,\d+([eE][-+]?\d+)?)?(\s+|$)){3,}")
 """Numbers apart by spaces or semicolons; a comma between two digits then marks no column."""
@@ -134,9 +134,8 @@ def _text(content: bytes) -> np.ndarray:
     """Rows of numbers apart by spaces or commas; ``#`` begins a comment."""
     size = 24 * (1 + max(content.count(b"\n"), content.count(b"\r")))
     check_announced("the table of its lines", size, size)
-    first, _, rest = content.partition(b"\n")
-    if _HEAD.fullmatch(first.strip()):
-        content = b"\n" + rest  # an empty line, as lines are told by their number
+    if head := _HEAD.match(content):
+        content = content[head.end() :]  # an empty line is left, as lines are told by their number
     try:
         # Ten times as fast; whatever it does not take is told line by line.
         with warnings.catch_warnings():
