@@ -199,6 +199,20 @@ def test_a_depth_image_of_a_table_seen_from_above(tmp_path):
         np.testing.assert_allclose(other.centre, one.centre, atol=0.01)
 
 
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"gap": 0.0}, "gap 0: must be positive metres"),
+        ({"far": 1200.0}, "far 1200: is in metres, not millimetres"),
+        ({"height": 120.0}, "height 120: is in metres"),
+        ({"tolerance": 0.5}, "tolerance 0.5: must be below height 0.5"),
+    ],
+)
+def test_settings_are_in_metres_and_fit_together(settings, message):
+    with pytest.raises(InputError, match=message):
+        SegmentSettings(**settings)
+
+
 def test_what_has_no_plane_or_nothing_on_it_is_one_line(tmp_path):
     rng = np.random.default_rng(0)
     np.save(tmp_path / "fog.npy", rng.random((20_000, 3)))

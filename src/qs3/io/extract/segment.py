@@ -40,6 +40,7 @@ TABLE = "objects.csv"
 _LEAST_SHARE = 0.1  # of the points, on the plane
 _WIDEST = 1000.0  # metres
 _FITTED = 2000  # points that the plane is fitted to
+_FARTHEST = 50.0  # metres; no depth camera sees so far into a scene of objects
 _SMALL_SCENE = 0.05  # metres; smaller than what any depth camera is held at
 _CORE = 5  # voxels around one that make it part of a cluster
 
@@ -75,6 +76,13 @@ class SegmentSettings:
         for name in ("tolerance", "gap", "height", "far"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name} {getattr(self, name):g}: must be positive metres")
+            if _FARTHEST < getattr(self, name) < math.inf:
+                raise InputError(f"{name} {getattr(self, name):g}: is in metres, not millimetres")
+        if self.tolerance >= self.height:
+            raise InputError(
+                f"tolerance {self.tolerance:g}: must be below height {self.height:g}; what is up to "
+                "it is taken for the plane"
+            )
         check_range(self, "scene", "noise")
         check_range(self, "scene", "tilt", high=90)
         check_range(self, "scene", "min_points", "stride", low=1)
