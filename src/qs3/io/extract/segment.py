@@ -80,8 +80,8 @@ class SegmentSettings:
                 raise InputError(f"{name} {getattr(self, name):g}: is in metres, not millimetres")
         if self.tolerance >= self.height:
             raise InputError(
-                f"tolerance {self.tolerance:g}: must be below height {self.height:g}, as what is up "
-                "to it is taken for the plane"
+                f"tolerance {self.tolerance:g}: must be below height {self.height:g}, as what is "
+                "up to it is taken for the plane"
             )
         check_range(self, "scene", "noise")
         check_range(self, "scene", "tilt", high=90)
