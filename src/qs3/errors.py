@@ -1,8 +1,10 @@
 """Errors that a user can act on: one line that names what is wrong and the fix."""
 
+import contextlib
 import difflib
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextvars import ContextVar
 
 _log = logging.getLogger(__name__)
 
@@ -61,8 +63,21 @@ TOLD: set[str] = set()
 """What `say_once` has said in this process."""
 
 
+_UNSAID = ContextVar("unsaid", default=False)
+
+
+@contextlib.contextmanager
+def unsaid() -> Iterator[None]:
+    """Let `say_once` say nothing meanwhile, and forget it: it would be of data of our own."""
+    before = _UNSAID.set(True)
+    try:
+        yield
+    finally:
+        _UNSAID.reset(before)
+
+
 def say_once(text: str, kind: str = "") -> None:
     """Log a warning, once in the life of the process; of several of one ``kind``, the first."""
-    if (kind or text) not in TOLD:
+    if (kind or text) not in TOLD and not _UNSAID.get():
         TOLD.add(kind or text)
         _log.warning("%s", text)

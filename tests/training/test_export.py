@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.errors import InputError, MissingExtraError, QS3Error
+from qs3.errors import TOLD, InputError, MissingExtraError, QS3Error
 from qs3.io.preparation import PAPER, ROBUST, distinct_inliers, normalise, resample
 from qs3.models import create_model
 from qs3.models.aligned import Aligned
@@ -19,7 +19,7 @@ from qs3.models.ops.sampling import sample_in_a_loop
 from qs3.models.sized import Sized
 from qs3.training import TrainSettings, export, load_model, predict_probabilities, save_model
 from qs3.training.export import compare, export_run, subsample_in_a_graph
-from qs3.training.prepared import normalise_in_a_graph
+from qs3.training.prepared import normalise_in_a_graph, note_size
 
 from ..models.common import SMALL
 
@@ -229,6 +229,16 @@ def test_comparison_sees_a_wrong_answer():
     # Subsampled from another point, only clouds of more than M points give other answers.
     other = compare(model, M, lambda points: right(points[:, ::-1])) > export.ROUNDING
     assert export.STRAYS[0] < other.sum() <= 8
+
+
+def test_sizes_of_its_own_clouds_are_not_told(caplog):
+    TOLD.clear()
+    torch.manual_seed(0)
+    model = Sized(create_model("pointnet", 3, **SMALL[TINY]), OWN.radius_share).eval()
+    compare(model, M, lambda points: np.zeros((len(points), 3)), replace(OWN, align=False))
+    assert not caplog.messages
+    note_size(clouds(4, 50) * 1e4, OWN)
+    assert "larger than 20 m" in caplog.text
 
 
 def test_comparison_goes_the_whole_way_of_raw_clouds(monkeypatch):

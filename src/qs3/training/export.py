@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.errors import InputError, MissingExtraError, QS3Error, no_such
+from qs3.errors import InputError, MissingExtraError, QS3Error, no_such, unsaid
 from qs3.files import write_bytes
 from qs3.io.preparation import LARGEST, PAPER, Preparation, distinct_inliers
 from qs3.models import PointClassifier
@@ -211,7 +211,10 @@ def compare(
                 cloud = np.concatenate([cloud, cloud, cloud[:2] + 50 * np.ptp(cloud, axis=0)])
                 kept = distinct_inliers(cloud, how.remove_outliers, max(LARGEST, num_points))
                 points, given = cloud[None], cloud[kept][None]
-            wanted = predict_probabilities(model, points, num_points=num_points, preparation=how)
+            with unsaid():  # of sizes that are drawn here
+                wanted = predict_probabilities(
+                    model, points, num_points=num_points, preparation=how
+                )
             got = runner(given)
             if got.shape != wanted.shape or not np.isfinite(got).all():
                 differences += [float("inf")] * b
