@@ -170,7 +170,8 @@ def stand_in_rooms(
             body, drawn = Body(body.mesh, sensor.material), drawn | values
     raise InputError(
         f"randomise: {_MOST_DRAWS} rooms in a row would not do, the last one because: {fault}; "
-        "narrow the ranges (room.distance=0.8:2), or lower least_pixels or least_valid"
+        "narrow the ranges (room.distance=0.8:2, of small parts 0.3:1), or lower least_pixels or "
+        "least_valid"
     )
 
 
