@@ -93,7 +93,8 @@ def _clouds(arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
     if points is None:
         raise InputError("has no array called points")
     if points.dtype.kind != "f" or points.ndim != (3 if offset is None else 2):
-        one = "; one cloud is saved as points[None], or as .npy" if offset is None and points.ndim == 2 else ""
+        whole = offset is None and points.ndim == 2
+        one = "; one cloud is saved as points[None], or as .npy" if whole else ""
         raise InputError(
             f"points must be numbers of shape [b n 3], or [m 3] with offset, not {points.dtype} "
             f"of shape {list(points.shape)}{one}"
