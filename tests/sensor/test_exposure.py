@@ -6,6 +6,7 @@ import pytest
 import trimesh
 from scipy import linalg, stats
 
+from qs3.sensor.depth import DepthSettings
 from qs3.sensor.exposure import ExposureSettings, expose, expose_pair, radiance_of
 from qs3.sensor.lens import blur, blur_reach
 from qs3.sensor.matching import MatchingSettings
@@ -329,6 +330,7 @@ def test_a_scan_of_whole_frames_has_the_same_grey_levels(renderer):
         rig=StereoRig(240, 200, 267.0),
         exposure=EVERYTHING,
         matching=MatchingSettings(num_disparities=16, block_size=9),
+        depth=DepthSettings(stride=1),
     )
     plate = trimesh.creation.box(extents=[1, 0.3, 0.02])
     part, whole = (
