@@ -3,6 +3,7 @@
 import contextlib
 import difflib
 import logging
+import re
 from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
 
@@ -25,14 +26,41 @@ class UnevenSizesError(InputError):
     """Clouds of several sizes, where one array for all was asked for."""
 
 
-class MissingExtraError(QS3Error, ImportError):
-    """An optional package is needed; the message names the extra that brings it."""
+_DEBIAN = {"libusb-1.0.so": "libusb-1.0-0", "libgomp.so": "libgomp1", "libGL.so": "libgl1"}
+"""Debian's package of a system library that a wheel may lack."""
 
-    def __init__(self, package: str, extra: str) -> None:
-        super().__init__(
-            f"{package} is not installed; it comes with the extra {extra!r}: in a checkout of qs3, "
-            f"pip install -e '.[{extra}]'"
-        )
+
+class MissingExtraError(QS3Error, ImportError):
+    """An optional package is not installed, or cannot be loaded.
+
+    Args:
+        package: Name of the package.
+        extra: The extra that installs it.
+        cause: The error of its import, if it was imported.
+    """
+
+    def __init__(self, package: str, extra: str, cause: ImportError | None = None) -> None:
+        if cause is None or isinstance(cause, ModuleNotFoundError):
+            super().__init__(
+                f"{package} is not installed; it comes with the extra {extra!r}: in a checkout of "
+                f"qs3, pip install -e '.[{extra}]'"
+            )
+        else:
+            super().__init__(f"{package} cannot be loaded: {describe_import_error(cause)}")
+
+
+def describe_import_error(error: ImportError) -> str:
+    """Return the library that a package could not load, and how to install it.
+
+    Example:
+        >>> describe_import_error(ImportError("libusb-1.0.so.0: cannot open shared object file"))
+        'libusb-1.0.so.0; apt-get install libusb-1.0-0'
+    """
+    library = re.match(r"lib\S+\.so[.\d]*", str(error))
+    if library is None:
+        return str(error)
+    package = next((deb for name, deb in _DEBIAN.items() if library[0].startswith(name)), None)
+    return library[0] + (f"; apt-get install {package}" if package else " is missing")
 
 
 class CannotCompileError(QS3Error, ImportError):

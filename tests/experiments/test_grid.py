@@ -305,7 +305,7 @@ def test_a_device_that_is_not_there_is_told(tmp_path):
 @pytest.mark.parametrize("workers", [Workers(2), Workers(2, executor="ray", address="local")])
 def test_several_at_once_give_the_same_numbers(finished, whole, workers):
     if workers.executor == "ray":
-        pytest.importorskip("ray")
+        pytest.importorskip("ray", exc_type=ImportError)
     for name in ("runs", "results"):
         shutil.rmtree(finished / name)
     setup = Setup(finished, TINY, seeds=(0,), threads=1)

@@ -28,7 +28,7 @@ ROWS = 60
 @pytest.fixture
 def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """Three nodes of two cores on this machine; the first is the head."""
-    ray = pytest.importorskip("ray", reason="needs the extra ray")
+    ray = pytest.importorskip("ray", exc_type=ImportError, reason="needs the extra ray")
     from ray.cluster_utils import Cluster
 
     # Its workers import the fakes by name.
@@ -182,7 +182,7 @@ def test_gpus_that_are_not_there_are_refused(fake, tmp_path, cluster):
 
 
 def test_an_address_without_a_cluster_is_told(fake, tmp_path):
-    pytest.importorskip("ray")
+    pytest.importorskip("ray", exc_type=ImportError)
     with pytest.raises(InputError, match="no Ray cluster answers there"):
         fake.run([fake.FakeItem("m")], tmp_path / "out", executor=RayExecutor("auto"))
 

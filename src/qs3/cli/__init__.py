@@ -32,7 +32,7 @@ VERBS = {
     "figure": "Draw the figure of a table from records alone.",
     "report": "Write one self-contained HTML page.",
     "view": "Look at data, a run or a mesh in a browser on this machine.",
-    "doctor": "Tell what works on this machine and how to get what does not.",
+    "doctor": "Print what works on this machine and how to get what does not.",
     "completion": "Print what a shell needs to complete verbs and options.",
     "demo": "Adapt a network that comes with qs3 to a camera, without labels: scan, adapt, report.",
 }

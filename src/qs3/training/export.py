@@ -228,7 +228,7 @@ def _require_onnx() -> None:
         try:
             __import__(package)
         except ImportError as error:
-            raise MissingExtraError(package, "export") from error
+            raise MissingExtraError(package, "export", error) from error
 
 
 def _check_place(path: Path, to: str) -> None:

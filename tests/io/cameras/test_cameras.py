@@ -160,7 +160,7 @@ def test_a_damaged_frame_is_told_and_the_others_are_done(tmp_path, caplog):
 
 def test_a_recording_of_a_realsense_gives_every_frame(tmp_path):
     """Recorded by librealsense itself, of a camera made of software."""
-    pytest.importorskip("pyrealsense2")
+    pytest.importorskip("pyrealsense2", exc_type=ImportError)
     shots = list(frames(8))
     path = write_realsense(tmp_path / "shots", shots)
     got = []
@@ -180,7 +180,7 @@ def test_a_recording_of_a_realsense_gives_every_frame(tmp_path):
 
 
 def test_damaged_recordings_of_a_realsense_are_one_line(tmp_path):
-    pytest.importorskip("pyrealsense2")
+    pytest.importorskip("pyrealsense2", exc_type=ImportError)
     with refused("no such file", "none.bag"):
         read(f"bag:{tmp_path / 'none.bag'}")
     for ending in (".bag", ".db3"):

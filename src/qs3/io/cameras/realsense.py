@@ -30,12 +30,12 @@ def realsense_camera(serial: str = "", file: Path | None = None, colour: bool = 
 
     Raises:
         InputError: where there is no such camera or file, it is damaged, or it gives no depth.
-        MissingExtraError: where pyrealsense2 is not installed.
+        MissingExtraError: If pyrealsense2 is not installed or cannot be loaded.
     """
     try:
         import pyrealsense2
-    except ImportError:
-        raise MissingExtraError("pyrealsense2", "realsense") from None
+    except ImportError as error:
+        raise MissingExtraError("pyrealsense2", "realsense", error) from None
     rs: Any = pyrealsense2  # its names are made as it is loaded
     where = str(file or f"realsense {serial}".strip())
     if file is not None and not file.is_file():

@@ -67,8 +67,8 @@ class _Bag:
         try:
             from rosbags import rosbag1, rosbag2
             from rosbags.typesys import Stores, get_typestore
-        except ImportError:
-            raise MissingExtraError("rosbags", "ros") from None
+        except ImportError as error:
+            raise MissingExtraError("rosbags", "ros", error) from None
         if not path.exists():
             raise InputError(f"{path}: no such file or folder")
         metadata = path / "metadata.yaml"

@@ -15,6 +15,7 @@ from qs3.sensor.checks import check_choices, check_range
 from qs3.sensor.render.cache import Photographer
 from qs3.sensor.render.embree import EmbreePhotographer
 from qs3.sensor.render.jit import JitPhotographer
+from qs3.sensor.render.llvm import point_to_llvm
 from qs3.sensor.render.path import PathPhotographer
 from qs3.sensor.render.scene import MOST_SAMPLES, Scene, StereoPair, view_regions
 from qs3.sensor.rig import Pose, Region, StereoRig
@@ -38,10 +39,11 @@ mi.render(scene, spp=1)
 
 @functools.cache
 def usable(variant: str) -> bool:
-    """Whether a Mitsuba variant renders here, tried in a child process.
+    """Return whether a Mitsuba variant renders here, tried in a child process.
 
-    A system libLLVM that does not suit the processor aborts the whole process, hence the child.
+    A libLLVM that does not suit the processor aborts the whole process, hence the child.
     """
+    point_to_llvm()
     probe = [sys.executable, "-c", _PROBE, variant]
     try:
         return subprocess.run(probe, capture_output=True, timeout=300).returncode == 0
@@ -151,6 +153,7 @@ def _collected_later() -> Iterator[None]:
 
 def _mitsuba(variant: str) -> Any:
     """Import Mitsuba with ``variant`` set, whichever was set before."""
+    point_to_llvm()
     import mitsuba as mi
 
     if mi.variant() != variant:

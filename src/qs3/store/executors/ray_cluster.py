@@ -51,7 +51,7 @@ class RayExecutor:
         try:
             import ray
         except ImportError as error:
-            raise MissingExtraError("ray", "ray") from error
+            raise MissingExtraError("ray", "ray", error) from error
         self._ray: Any = ray
         self._address, self._timeout, self._gpus, self._retries = address, timeout, gpus, retries
         self._keys: dict[Any, Any] = {}

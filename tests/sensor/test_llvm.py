@@ -1,0 +1,85 @@
+"""The LLVM that Mitsuba's fast CPU variant loads: which library, and the same bits from each."""
+
+import importlib.metadata
+import os
+import subprocess
+import sys
+from ctypes.util import find_library
+from pathlib import PurePosixPath
+
+import pytest
+
+from qs3.sensor.render import llvm
+from qs3.sensor.render.mitsuba import usable
+
+
+@pytest.fixture(autouse=True)
+def forget(monkeypatch):
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "")  # put back after the test, whatever it sets
+    monkeypatch.delenv("DRJIT_LIBLLVM_PATH")
+    llvm.find_llvm.cache_clear()
+    yield
+    llvm.find_llvm.cache_clear()
+
+
+class _File(PurePosixPath):
+    def locate(self):
+        return self
+
+
+def _installed(monkeypatch, *files):
+    monkeypatch.setattr(importlib.metadata, "files", lambda name: [_File(file) for file in files])
+
+
+def test_the_variable_wins(monkeypatch):
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/opt/libLLVM.so")
+    assert llvm.find_llvm() == "/opt/libLLVM.so"
+
+
+def test_the_system_s_19_comes_before_the_wheel(monkeypatch, tmp_path):
+    (tmp_path / "libLLVM.so.19.1").touch()
+    _installed(monkeypatch, tmp_path / "libLLVM.so.19.1")
+    monkeypatch.setattr(llvm.ctypes.util, "find_library", lambda name: f"lib{name}.so")
+    assert llvm.find_llvm() is None
+
+
+def test_the_wheel_s_library_is_found_without_a_system_s(monkeypatch, tmp_path):
+    path = tmp_path / "libLLVM.so.19.1"
+    path.touch()
+    _installed(monkeypatch, tmp_path / "libLTO.so.19.1", path)
+    monkeypatch.setattr(llvm.ctypes.util, "find_library", lambda name: None)
+    assert llvm.find_llvm() == str(path)
+    llvm.point_to_llvm()
+    assert os.environ["DRJIT_LIBLLVM_PATH"] == str(path)  # for this process and its children
+
+
+def test_without_wheel_and_system_dr_jit_searches_itself(monkeypatch, tmp_path):
+    monkeypatch.setattr(llvm.ctypes.util, "find_library", lambda name: None)
+    _installed(monkeypatch, tmp_path / "libLLVM.so.19.1")  # listed, but deleted
+    assert llvm.find_llvm() is None
+
+    def none(name):
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "files", none)
+    assert llvm.find_llvm() is None
+
+
+def test_wheel_and_system_give_the_same_bits(tmp_path):
+    try:
+        files = importlib.metadata.files("karellen-llvm-core") or []
+    except importlib.metadata.PackageNotFoundError:
+        pytest.skip("the wheel karellen-llvm-core is not installed (extra llvm)")
+    wheel = next(str(file.locate()) for file in files if file.name.startswith("libLLVM.so"))
+    if not find_library("LLVM-19") or not usable("llvm_ad_mono"):
+        pytest.skip("the system has no libLLVM 19")
+    clouds = []
+    for name, path in (("wheel", wheel), ("system", "")):
+        environment = {k: v for k, v in os.environ.items() if k != "DRJIT_LIBLLVM_PATH"}
+        if path:
+            environment["DRJIT_LIBLLVM_PATH"] = path
+        scan = [sys.executable, "-m", "qs3", "scan", "chair", "--out", tmp_path / name]
+        scan += ["--variant", "llvm_ad_mono", "--views", "1"]
+        subprocess.run(scan, check=True, capture_output=True, env=environment)
+        clouds.append((tmp_path / name / "cloud.ply").read_bytes())
+    assert clouds[0] == clouds[1]
