@@ -20,7 +20,7 @@ from qs3.training import load_model, predict_probabilities
 from qs3.viewer.opening import open_exhibits, open_mesh
 from qs3.viewer.scan_controls import with_controls
 
-pytest.importorskip("viser", exc_type=ImportError, reason="viser is not installed: pip install 'qs3[view]'")
+pytest.importorskip("viser", reason="viser is not installed: pip install 'qs3[view]'")
 
 
 @pytest.fixture

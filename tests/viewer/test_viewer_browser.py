@@ -9,7 +9,7 @@ from qs3.viewer.serving import serve, url_of
 
 from ..browser import Browser, until
 
-pytest.importorskip("viser", exc_type=ImportError, reason="viser is not installed: pip install 'qs3[view]'")
+pytest.importorskip("viser", reason="viser is not installed: pip install 'qs3[view]'")
 
 
 @pytest.fixture

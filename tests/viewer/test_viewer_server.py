@@ -19,7 +19,7 @@ from qs3.viewer.serving import require_free, serve, tunnel_of, url_of
 
 from ..browser import until
 
-viser = pytest.importorskip("viser", exc_type=ImportError, reason="viser is not installed: pip install 'qs3[view]'")
+viser = pytest.importorskip("viser", reason="viser is not installed: pip install 'qs3[view]'")
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ import ctypes.util
 import functools
 import importlib.metadata
 import os
+from pathlib import Path
 
 _VARIABLE = "DRJIT_LIBLLVM_PATH"
 _WHEEL = "karellen-llvm-core"
@@ -26,8 +27,8 @@ def find_llvm() -> str | None:
     except importlib.metadata.PackageNotFoundError:
         return None
     library = next((file for file in files if file.name.startswith("libLLVM.so")), None)
-    path = None if library is None else os.path.realpath(str(library.locate()))
-    return path if path and os.path.exists(path) else None
+    path = None if library is None else Path(str(library.locate())).resolve()
+    return str(path) if path is not None and path.is_file() else None
 
 
 def point_to_llvm() -> None:
