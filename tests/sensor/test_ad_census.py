@@ -3,18 +3,14 @@
 import dataclasses
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
-import torch
 
-from qs3.errors import InputError, QS3Error
-from qs3.sensor.matching import MatchingSettings, match, matching_canvas, on_device
-from qs3.sensor.matching.settings import AdCensusSettings
+from qs3.errors import QS3Error
+from qs3.sensor.matching import MatchingSettings, match, matching_canvas
 from qs3.sensor.rig import Region, StereoRig
-from qs3.sensor.settings import ScanSettings
 
 SETTINGS = MatchingSettings(
     "ad-census", num_disparities=64, block_size=19, left_band="physical", quantum=1 / 32, median=3
@@ -143,50 +139,6 @@ def test_same_bytes_beside_other_threads_and_with_any_number_of_them():
         cv2.setNumThreads(threads)
     for disparity in several:
         assert disparity.tobytes() == wanted.tobytes()
-
-
-@pytest.mark.parametrize("bits", [8, 10])
-def test_torch_searches_to_the_same_bits(bits, monkeypatch):
-    left, right = pair((60, 150), 12.3, (70, 100, 27.6), noise=3.0)
-    if bits == 10:
-        left, right = (image.astype(np.uint16) * 4 + 1 for image in (left, right))
-    own = AdCensusSettings(census_width=13, census_height=5)  # 64 bits: the sign's too
-    real, count = on_device.search, 0
-
-    def on_cpu(*arguments):
-        nonlocal count
-        count += 1
-        return real(*arguments[:-1], "cpu")
-
-    monkeypatch.setattr(on_device, "search", on_cpu)
-    for settings in (SETTINGS, dataclasses.replace(SETTINGS, num_disparities=37, ad_census=own)):
-        disparity = match(left, right, settings, "another")
-        assert np.isfinite(disparity).mean() > 0.5
-        assert disparity.tobytes() == match(left, right, settings).tobytes()
-    assert count == 4  # from the left and from the right
-
-
-@pytest.mark.gpu
-def test_a_gpu_searches_to_the_same_bits():
-    if not torch.cuda.is_available():
-        pytest.skip("torch sees no CUDA device")
-    images = pair((130, 300), 12.3, (130, 200, 37.3))
-    assert match(*images, SETTINGS, "cuda").tobytes() == match(*images, SETTINGS).tobytes()
-
-
-def test_a_device_that_is_not_there_is_told(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(InputError, match="device: torch sees no CUDA device"):
-        match(*pair((40, 100), 5.0), SETTINGS, "cuda")
-
-
-@pytest.mark.parametrize(("device", "variant", "wanted"), [
-    ("auto", "cuda_ad_mono", "cuda"), ("auto", "scalar_rgb", "cpu"), ("cpu", "cuda_ad_mono", "cpu"),
-    ("cuda", "scalar_rgb", "cuda"),
-])  # fmt: skip
-def test_matching_follows_the_renderer_unless_it_is_told(device, variant, wanted):
-    renderer = SimpleNamespace(description={"name": "mitsuba", "variant": variant}, render=print)
-    assert ScanSettings(device=device).matching_device(renderer) == wanted
 
 
 def test_ten_bits_of_the_same_levels_give_the_same_depth():

@@ -45,7 +45,7 @@ def realism(
         unused = [
             f"--{field.name.replace('_', '-')}"
             for field in dataclasses.fields(camera)
-            if field.name not in ("sensor", "matching", "bias_correction", "device")
+            if field.name not in ("sensor", "matching", "bias_correction")
             and getattr(camera, field.name) != field.default
         ]
         if unused:
@@ -60,8 +60,7 @@ def realism(
         tqdm.write(f"{result['id']} {_VERDICTS[result['passed']]}, {cost}", file=sys.stderr)
 
     renderer = camera.make_renderer()
-    device = camera.matching_device(renderer)
-    results = test_camera(out, camera.make_sensor(), renderer, settings, say, device)
+    results = test_camera(out, camera.make_sensor(), renderer, settings, say)
     show(*table(results))
     tell(*_summary(results, out))
     missed = any(result["passed"] is False for result in results)
@@ -72,8 +71,7 @@ def _pair(out: Path, pair: InfraredPair, camera: CameraSettings, files: PairFile
     """Hold the matcher against a real camera's own depth."""
     from qs3.report.pair import PAIR_PLOT, PAIR_RECORD, compare_pair
 
-    device = camera.matching_device(None)
-    record = compare_pair(out, pair, camera.make_sensor(), files.checksums(), device)
+    record = compare_pair(out, pair, camera.make_sensor(), files.checksums())
     show(*pair_table(record))
     tell(*record["notes"], f"Look at {out / PAIR_PLOT} and {out / PAIR_RECORD}")
     return 0

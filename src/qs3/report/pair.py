@@ -20,7 +20,7 @@ _OFF = 2.0  # pixels of disparity at which the difference has its full colour
 
 
 def compare_pair(
-    out: Path, pair: InfraredPair, sensor: Sensor, images: Mapping[str, Any], device: str = "cpu"
+    out: Path, pair: InfraredPair, sensor: Sensor, images: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Compare, and write figures and picture.
 
@@ -29,7 +29,6 @@ def compare_pair(
         pair: The pair.
         sensor: Whose matcher it is.
         images: What the record tells of the files, as `PairFiles.checksums` returns it.
-        device: Where ``ad-census`` searches, ``cpu`` or ``cuda``.
 
     Returns:
         The record.
@@ -37,7 +36,7 @@ def compare_pair(
     Raises:
         InputError: where the folder holds something else, or as `compare` does.
     """
-    comparison = compare(pair, sensor.matching, device)
+    comparison = compare(pair, sensor.matching)
     record = comparison.figures | {
         "width": pair.left.shape[1],
         "height": pair.left.shape[0],

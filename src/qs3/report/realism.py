@@ -187,7 +187,6 @@ def test_camera(
     renderer: Renderer,
     settings: RealismSettings,
     on_result: Callable[[dict[str, Any], bool], None],
-    device: str = "cpu",
 ) -> list[dict[str, Any]]:
     """Test a camera; results that the folder holds already are taken from it.
 
@@ -197,7 +196,6 @@ def test_camera(
         renderer: What photographs; its settings are a dataclass.
         settings: Which tests, how thoroughly.
         on_result: Called with each result, and whether it was there before.
-        device: Where ``ad-census`` searches, ``cpu`` or ``cuda``, to the same bits.
 
     Returns:
         A result for each test of ``settings``, as `qs3.sensor.realism.realism` gives them.
@@ -232,7 +230,7 @@ def test_camera(
             write_png(folder / REALISM_PLOTS[result["id"]], figure)
 
     write_json(folder / RECORD, made_by | {"tests": list(before.values())})
-    return realism(sensor, renderer, settings, device=device, done=before, on_result=keep)
+    return realism(sensor, renderer, settings, done=before, on_result=keep)
 
 
 def _earlier(

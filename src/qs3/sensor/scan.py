@@ -252,5 +252,4 @@ def _photograph(
     with clock("true_depth"):
         casters = [DepthCaster(*(body.mesh for body in around.bodies))]
         casters += [DepthCaster(around.bodies[0].mesh)] if full_frames else []
-    device = how.matching_device(renderer)
-    return take_views(pairs, sensor, regions, parts, casters, rng_noise, clock, device)
+    return take_views(pairs, sensor, regions, parts, casters, rng_noise, clock)

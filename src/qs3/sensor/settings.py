@@ -77,9 +77,6 @@ class CameraSettings:
     view_transform: Literal["raw", "Standard", "Filmic", "AgX"] = "raw"
     """Of cycles: raw hands radiance to the sensor's exposure; the others take Blender's own grey
     levels in its place (the released images have Filmic)."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where ad-census searches, to the same bits: cuda is a GPU through torch, which auto takes
-    where Mitsuba renders on one too."""
 
     # Where in the sensor each setting that changes it belongs.
     _CHANGES: ClassVar[Mapping[str, str]] = {
@@ -133,13 +130,6 @@ class CameraSettings:
     def chosen(self, name: str) -> Any:
         """A setting by its name."""
         return getattr(self, name)
-
-    def matching_device(self, renderer: Renderer | None) -> str:
-        """Where to match, ``cpu`` or ``cuda``, beside what renders; None where nothing does."""
-        if self.device != "auto":
-            return self.device
-        variant = "" if renderer is None else renderer.description.get("variant", "")
-        return "cuda" if variant.startswith("cuda") else "cpu"
 
     def make_renderer(self) -> Renderer:
         """The renderer asked for.

@@ -123,13 +123,12 @@ def take_views(
     casters: Sequence[DepthCaster],
     rng: np.random.Generator,
     clock: "Clock",
-    device: str = "cpu",
 ) -> list[ViewImages]:
     """Expose and match a region of each view, with auto-exposure on its focus; cast its depth.
 
     The first of ``casters`` holds the scene; a second one, of the object alone, makes the views
     ones of whole frames, with silhouette and normals. Views are matched side by side, on as many
-    threads as there are processors or ``OMP_NUM_THREADS`` says; for a GPU on one.
+    threads as there are processors or ``OMP_NUM_THREADS`` says.
     """
     rig = sensor.rig
     canvases = [matching_canvas(region, rig, sensor.matching) for region in regions]
@@ -141,10 +140,9 @@ def take_views(
                 right = stored_pattern(rig, sensor.pattern, canvas, sensor.exposure.bits)
             lefts.append(left)
             rights.append(right)
-    threads = asked_threads() or usable_processors() if device == "cpu" else 1
+    threads = asked_threads() or usable_processors()
     with clock("matching"), ThreadPoolExecutor(threads) as pool:
-        how = repeat(sensor.matching), repeat(device)
-        disparities = list(pool.map(match, lefts, rights, *how))
+        disparities = list(pool.map(match, lefts, rights, repeat(sensor.matching)))
     views, whole = [], len(casters) > 1
     for pair, canvas, region, left, right, disparity in zip(
         pairs, canvases, regions, lefts, rights, disparities, strict=True

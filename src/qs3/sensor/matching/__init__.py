@@ -15,26 +15,21 @@ from qs3.sensor.matching.settings import matching_margin as matching_margin
 Image = UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]
 
 
-def match(
-    left: Image, right: Image, settings: MatchingSettings, device: str = "cpu"
-) -> Float32[np.ndarray, "h w"]:
+def match(left: Image, right: Image, settings: MatchingSettings) -> Float32[np.ndarray, "h w"]:
     """Match a rectified pair.
 
     Args:
         left: Grey levels of 8 bits, or of 10 bits in 16, which ``opencv-bm`` does not take.
         right: The same of the other camera.
         settings: The matcher.
-        device: Where ``ad-census`` searches, ``cpu`` or ``cuda``, to the same bits; the other
-            matchers know the CPU alone.
 
     Returns:
         Disparity in pixels, NaN where the matcher found none. ``opencv-bm`` gives steps of 1/16
         (less 1/32 with ``bias_correction``), ``quantum`` exact multiples of itself.
 
     Raises:
-        InputError: where the images are too small for the search range or have too many bits, or
-            there is no such device.
-        CannotCompileError: where ``ad-census`` is asked for on a machine that cannot compile.
+        InputError: If the images are too small for the search range or have too many bits.
+        CannotCompileError: If ``ad-census`` is asked for on a machine that cannot compile.
     """
     from qs3.sensor.matching.filters import quantise
     from qs3.sensor.matching.opencv_bm import match_opencv
@@ -65,5 +60,5 @@ def match(
         else:
             from qs3.sensor.matching.ad_census import match_ad_census  # it imports a compiler
 
-            disparity = match_ad_census(left, right, settings, device)
+            disparity = match_ad_census(left, right, settings)
     return quantise(disparity, settings.quantum)

@@ -36,7 +36,6 @@ def match_ad_census(
     left: UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"],
     right: UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"],
     settings: MatchingSettings,
-    device: str = "cpu",
 ) -> Float32[np.ndarray, "h w"]:
     """Match a rectified pair; ``quantum`` is not applied.
 
@@ -44,7 +43,6 @@ def match_ad_census(
         left: Grey levels of 8 bits, or of 10 bits in 16.
         right: The same of the other camera.
         settings: The matcher; the fields marked ``ad-census`` and those of ``ad_census``.
-        device: Where disparities are searched: ``cuda`` is a GPU through torch.
 
     Returns:
         Disparity in pixels, NaN where there is none. It needs 4 · h · w · ``num_disparities`` bytes
@@ -56,9 +54,8 @@ def match_ad_census(
     left_bits, right_bits = (_bits(image, own) for image in images)
     # NumPy asks for large pages, numba does not: taking these two by small pages, and anew in each
     # search, would be a third of the time.
-    shape = (2, *left.shape, settings.num_disparities)
-    volumes = np.empty(shape if device == "cpu" else 0, np.uint16)
-    how = settings, tone, device, volumes
+    volumes = np.empty((2, *left.shape, settings.num_disparities), np.uint16)
+    how = settings, tone, volumes
     minima = _search(images[0], images[1], left_bits, right_bits, *how)
     best, total, less, more, second = np.moveaxis(minima, 2, 0)
     columns = np.arange(left.shape[1])
@@ -100,8 +97,7 @@ def _search(
     right_bits: UInt64[np.ndarray, "h w"],
     settings: MatchingSettings,
     tone: float,
-    device: str,
-    volumes: UInt16[np.ndarray, "..."],
+    volumes: UInt16[np.ndarray, "2 h w d"],
 ) -> Int32[np.ndarray, "h w 5"]:
     """What `optimise` returns; ``volumes`` are room for its costs and totals."""
     own = settings.ad_census
@@ -117,13 +113,8 @@ def _search(
     small, large = UNIT * own.penalty_small, UNIT * own.penalty_large
     penalties = np.array([small, large, small / own.edge_divisor, large / own.edge_divisor])
     penalties, edge = penalties.astype(np.uint16), own.edge * tone
-    pictures = left, right, left_bits, right_bits, by_bits, by_levels, arms, shares
-    if device != "cpu":
-        from qs3.sensor.matching.on_device import search  # it imports torch
-
-        return search(*pictures, settings.num_disparities, penalties, edge, device)
     costs, totals = volumes
-    mean_costs(*pictures, costs)
+    mean_costs(left, right, left_bits, right_bits, by_bits, by_levels, arms, shares, costs)
     return optimise(costs, left, penalties, edge, totals)
 
 

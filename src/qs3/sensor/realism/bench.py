@@ -46,8 +46,6 @@ class Bench:
     """Seed of the first photograph of a test; the others count on from it."""
     quick: bool = False
     """Fewer targets and smaller parts of the frame."""
-    device: str = "cpu"
-    """Where ``ad-census`` searches: ``cpu`` or ``cuda``."""
 
     @property
     def rig(self) -> StereoRig:
@@ -81,7 +79,7 @@ class Bench:
         pairs = photograph(self.renderer, scene, sensor, [VIEW], [self.seed + index], [wide])
         rng = np.random.default_rng(self.seed + (index if noise is None else noise))
         caster = DepthCaster(*(body.mesh for body in bodies))
-        return take_views(pairs, sensor, [region], [focus], [caster], rng, Clock(), self.device)[0]
+        return take_views(pairs, sensor, [region], [focus], [caster], rng, Clock())[0]
 
     def refined(self, samples: int) -> "Bench":
         """The bench with more rays a pixel and longer paths, where the renderer has such settings.

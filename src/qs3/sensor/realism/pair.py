@@ -101,7 +101,7 @@ class Comparison:
     """Plain values, None where there is nothing to measure; `docs/realism.md` tells them."""
 
 
-def compare(pair: InfraredPair, settings: MatchingSettings, device: str = "cpu") -> Comparison:
+def compare(pair: InfraredPair, settings: MatchingSettings) -> Comparison:
     """Match a real pair and measure the result beside the camera's own depth.
 
     Raises:
@@ -110,7 +110,7 @@ def compare(pair: InfraredPair, settings: MatchingSettings, device: str = "cpu")
     """
     camera = pair.disparity
     settings = search_range(pair, settings)
-    ours = match(pair.left, pair.right, settings, device).astype(np.float64)
+    ours = match(pair.left, pair.right, settings).astype(np.float64)
     seen, theirs = np.isfinite(ours), np.isfinite(camera)
     both = in_sight(camera)
     common = both & seen & theirs

@@ -56,7 +56,6 @@ def realism(
     renderer: Renderer,
     settings: RealismSettings,
     *,
-    device: str = "cpu",
     done: Mapping[str, dict] | None = None,
     on_result: Callable[[dict], None] | None = None,
     progress: bool = True,
@@ -67,7 +66,6 @@ def realism(
         sensor: The sensor.
         renderer: What photographs.
         settings: Which tests.
-        device: Where ``ad-census`` searches: ``cpu`` or ``cuda``.
         done: Results that are there already, by id: they are returned as they are.
         on_result: Called with each result, as soon as it is there; also with those of ``done``.
         progress: Show a bar.
@@ -77,7 +75,7 @@ def realism(
         ``passed`` (None where it does not apply, with ``why``), ``rows`` (``what``, ``measured``,
         ``expected``, ``unit``, ``passed``), ``data`` (curves) and ``seconds``.
     """
-    bench, results = Bench(sensor, renderer, settings.seed, settings.quick, device), []
+    bench, results = Bench(sensor, renderer, settings.seed, settings.quick), []
     for name in tqdm(settings.tests, desc=f"realism of {sensor.name}", disable=not progress):
         result = (done or {}).get(name) or run_test(name, bench)
         results.append(result)
