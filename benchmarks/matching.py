@@ -31,7 +31,7 @@ import numpy as np
 
 from qs3.sensor.matching import MatchingSettings, match
 from qs3.sensor.matching.settings import Method
-from qs3.sensor.realism.pair import plane_noise
+from qs3.sensor.realism.pair import near_steps, plane_noise
 
 CANDIDATES: list[tuple[Method, int, bool]] = [
     ("opencv-bm", 15, False),
@@ -202,13 +202,6 @@ def spill(disparity: np.ndarray) -> list[str]:
     return [f"{middle:+.0f} [{low:.0f} {high:.0f}]" for middle, low, high in quantiles]
 
 
-def beside_steps(camera: np.ndarray) -> np.ndarray:
-    """Where the camera's disparity differs by 4 px or more within 8 px around."""
-    around, valid = np.ones((17, 17)), np.isfinite(camera)
-    high = cv2.dilate(np.where(valid, camera, 0), around)
-    return high - cv2.erode(np.where(valid, camera, 1e6), around) >= 4
-
-
 def bottle(disparity: np.ndarray) -> np.ndarray:
     """Median of the first and last column that is 4 px nearer than the floor beside it."""
     rows = disparity[44:130]
@@ -241,7 +234,7 @@ def table_of_pair(threads: int, picture: Path | None) -> None:
             rows[name] = pool.apply(measured, (name, threads))
     for name, (disparity, seconds, memory) in rows.items():
         off = np.abs(disparity - camera)
-        near = off[np.isfinite(off) & beside_steps(camera)]
+        near = off[np.isfinite(off) & near_steps(camera)]
         off = off[np.isfinite(off)]
         (up, right), (rms, along) = spill(disparity), plane_noise(disparity, PATCHES)
         ends = bottle(disparity) - bottle(camera)

@@ -2,15 +2,12 @@
 
     for sensor in d415 d435 d455 kinect-v1; do qs3 realism --sensor $sensor --out out/$sensor; done
     python benchmarks/realism_table.py out/d415 out/d435 out/d455 out/kinect-v1
-    python benchmarks/realism_table.py --former [--samples 4] [--seed 0]
     python benchmarks/realism_table.py --walls [--samples 4] [--seed 0]
 
 The first form puts one row a test and one column a record between the page's first markers. The
-second tests the presets as they were at commit 925f8c0 (`chairs.former`), by the laws of then and
-by those that came with AD-Census, and fills the markers ``former``. The third photographs one wall
-of albedo 0.6 with the d435 at four distances, each once, hands the same images to all matchers, and
-fills the last markers: once with Gaussian noise of 1.5 grey levels alone, and once with the
-preset's noise. Each form leaves the rest of the page as it is.
+second photographs one wall of albedo 0.6 with the d435 at four distances, each once, hands the same
+images to all matchers, and fills the last markers: once with Gaussian noise of 1.5 grey levels
+alone, and once with the preset's noise. Each form leaves the rest of the page as it is.
 """
 
 import argparse
@@ -22,28 +19,18 @@ from typing import Any
 
 import cv2
 import numpy as np
-from chairs import UNBOUNDED, former
 
-from qs3 import shapes
 from qs3.files import read_json, write_text
 from qs3.sensor.depth import depth_from_disparity
 from qs3.sensor.exposure import expose_pair
 from qs3.sensor.lens import blur_reach
 from qs3.sensor.matching import match, matching_canvas
 from qs3.sensor.matching.settings import Method
-from qs3.sensor.presets import changed, get_sensor
+from qs3.sensor.presets import get_sensor
 from qs3.sensor.realism import LAWS
-from qs3.sensor.realism.bench import VIEW, Bench, central, painted, wall, wall_region
-from qs3.sensor.realism.clouds import ratio_rows
-from qs3.sensor.realism.edges import spills
-from qs3.sensor.realism.metrics import plane_metrics
-from qs3.sensor.realism.rows import Row, row
-from qs3.sensor.realism.run import run_test
-from qs3.sensor.realism.surfaces import DIM, rate
+from qs3.sensor.realism.bench import VIEW, painted, wall, wall_region
+from qs3.sensor.realism.metrics import plane_noise
 from qs3.sensor.render.mitsuba import MitsubaRenderer
-from qs3.sensor.scan import scan
-from qs3.sensor.settings import renderer_dict
-from qs3.sensor.statistics import radius_ratio
 from qs3.sensor.view import photograph, scene_of
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "realism.md"
@@ -55,7 +42,7 @@ MATCHERS: tuple[tuple[Method, int], ...] = (
     ("zncc", 21),
     ("ad-census", 19),
 )
-TOLD = ("autocorrelation", "locking", "share kept", "fall over")
+UNBOUNDED = ("autocorrelation", "locking")
 Record = dict[str, Any]
 
 
@@ -88,10 +75,10 @@ def family(what: str) -> str:
 
 
 def shown(result: Record) -> dict[str, list[Record]]:
-    """A test's figures that have bounds, and some that are told beside them, by family."""
+    """A test's figures that have bounds, and some of those that have none, by family."""
     found: dict[str, list[Record]] = {}
     for one in result["rows"]:
-        if one["passed"] is not None or one["what"].startswith(TOLD):
+        if one["passed"] is not None or one["what"].startswith(UNBOUNDED):
             found.setdefault(family(one["what"]), []).append(one)
     return found
 
@@ -126,8 +113,6 @@ def realism_table(records: list[Record]) -> str:
         for result, one in zip(results, seen, strict=True):
             if result is None:
                 cells.append("not tested")
-            elif result["passed"] is None:
-                cells.append("does not apply")
             else:
                 cell = ["pass" if result["passed"] else "**MISS**"]
                 cell += [figures(one[n], len(shared[n]) > 1) if n in one else "–" for n in names]
@@ -136,54 +121,6 @@ def realism_table(records: list[Record]) -> str:
     seconds = (sum(t["seconds"] for t in record["tests"]) for record in records)
     lines.append("| seconds | " + " | ".join(f"{value:.0f}" for value in seconds) + " |")
     return "\n".join(lines)
-
-
-def former_records(samples: int, seed: int) -> list[Record]:
-    """What `qs3 realism` records of the former presets, and the figures of the newer laws."""
-    renderer, records = MitsubaRenderer(samples=samples), []
-    for name in ("d415", "d435", "d455", "kinect-v1"):
-        bench = Bench(former(name), renderer, seed)
-        tests = {test: run_test(test, bench) for test in LAWS if test != "T11"}
-        start = time.perf_counter()
-        tests["T11"] = {"id": "T11", "rows": unbounded(bench)}
-        if name != "kinect-v1":
-            tests["T5"]["rows"] += spills(bench)
-            tests["T6"]["rows"].append(dim(bench))
-        tests["T11"]["seconds"] = time.perf_counter() - start
-        for test in tests.values():
-            verdicts = [one["passed"] for one in test["rows"] if one["passed"] is not None]
-            test["passed"] = all(verdicts) if verdicts else None
-        record = {"sensor": dataclasses.asdict(bench.sensor), "renderer": renderer_dict(renderer)}
-        records.append(record | {"settings": {"quick": False}, "tests": list(tests.values())})
-        print(name, "done", flush=True)
-    return records
-
-
-def unbounded(bench: Bench) -> list[Row]:
-    """T11 of masks that bound no depth."""
-    made = [
-        scan(
-            shapes.make(shapes.CLASSES[index % 10], seed=index // 10),
-            sensor=bench.sensor,
-            renderer=bench.renderer,
-            views=1,
-            scene="room",
-            crop="mask",
-            depth_margin=UNBOUNDED,
-            seed=bench.seed + index,
-        )
-        for index in range(40)
-    ]
-    ratios = ([radius_ratio(cloud) for cloud in (one.points, one.clean)] for one in made)
-    return ratio_rows(*zip(*ratios, strict=True))[0]
-
-
-def dim(bench: Bench) -> Row:
-    """T6 of a wall of albedo 0.3 in an image of few grey levels."""
-    faint = changed(bench.sensor, "exposure.auto", DIM / 255)
-    region = central(bench.rig, 0.2, 0.35)
-    shown = dataclasses.replace(bench, sensor=faint).shoot([painted(wall(2.0), 0.3)], region)
-    return row(f"fill of albedo 0.3 at {DIM} grey levels", rate(shown.depth), 0.97)
 
 
 def walls_table(samples: int, seed: int) -> str:
@@ -230,14 +167,13 @@ def walls_table(samples: int, seed: int) -> str:
                 seconds.append(time.perf_counter() - start)
             error = disparity[np.isfinite(disparity)] - float(rig.disparity(z))
             good = error[np.abs(error) < 1]
-            plane = plane_metrics(
-                depth_from_disparity(disparity, rig, sensor.depth), rig, region, z
-            )
+            depth = depth_from_disparity(disparity, rig, sensor.depth)
             total = float(np.sqrt(np.mean(good**2)))
             fill = float(np.isfinite(disparity).mean())
             gross = 1 - len(good) / max(1, len(error))
             median = float(np.median(error))
-            seen[key].append((total, plane.sub_pixel, median, fill, gross, min(seconds)))
+            sub_pixel = plane_noise(depth, rig, region)[1]
+            seen[key].append((total, sub_pixel, median, fill, gross, min(seconds)))
     head = [
         "noise", "matcher", "block", *(f"total RMS at {z} m" for z in DISTANCES), "greatest",
         "sub-pixel RMS", "median bias", "least fill", "gross errors", "seconds a pair",
@@ -270,17 +206,14 @@ def walls_table(samples: int, seed: int) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folders", nargs="*", type=Path, help="of qs3 realism, one a column")
-    parser.add_argument("--former", action="store_true", help="test the former presets")
     parser.add_argument("--walls", action="store_true", help="measure the walls anew")
     parser.add_argument("--samples", type=int, default=MitsubaRenderer.samples)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    if not (options.folders or options.former or options.walls):
-        parser.error("name folders of qs3 realism, or --former, or --walls")
+    if not (options.folders or options.walls):
+        parser.error("name folders of qs3 realism, or --walls")
     if options.folders:
         put("tests", realism_table([read_json(f / "realism.json") for f in options.folders]))
-    if options.former:
-        put("former", realism_table(former_records(options.samples, options.seed)))
     if options.walls:
         put("walls", walls_table(options.samples, options.seed))
 

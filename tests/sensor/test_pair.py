@@ -1,4 +1,4 @@
-"""Laws of what is measured on a real pair, on maps whose spill, noise and planes are known."""
+"""Laws of what is measured on a real pair, on maps whose steps, noise and planes are known."""
 
 import dataclasses
 
@@ -10,62 +10,26 @@ from qs3.errors import InputError
 from qs3.sensor.matching import MatchingSettings
 from qs3.sensor.realism.pair import (
     InfraredPair,
-    find_edges,
     in_sight,
+    near_steps,
     planar_patches,
     plane_noise,
     search_range,
-    spill,
 )
 
 SHAPE = (160, 240)
 V, U = np.indices(SHAPE)
 
 
-def half(degrees, beyond=0.0):
-    """Where a near surface is whose edge, ``beyond`` px outwards, passes the middle so turned."""
-    angle = np.radians(degrees)
-    across = (U - 119.5) * np.cos(angle) + (V - 79.5) * np.sin(angle)
-    return across < beyond
-
-
-def picture(near, rng, contrast=60):
-    noisy = 80 + contrast * gaussian_filter(near.astype(float), 0.7) + 3 * rng.normal(size=SHAPE)
-    return noisy.round().astype(np.uint8)
-
-
-@pytest.mark.parametrize("degrees", [0, 25, 70, 90, 155, 180, 270, 300])
-@pytest.mark.parametrize("grown", [-2.0, 0.0, 3.0, 12.0])
-def test_spill_is_measured_along_the_normal_of_an_edge(degrees, grown, rng):
-    near = half(degrees)
-    camera = np.where(near, 20.0, 10.0)
-    camera[half(degrees, 10.0) & ~near & (np.cos(np.radians(degrees)) < -0.5)] = np.nan  # occluded
-    edges = find_edges(picture(near, rng), camera)
-    assert len(edges.level) >= 50
-    found = spill(np.where(half(degrees, grown), 20.0, 10.0), edges)
-    assert np.nanmedian(found) == pytest.approx(grown, abs=0.35)
-    assert np.nanmedian(spill(camera, edges)) == pytest.approx(0, abs=0.35)
-
-
-def test_the_image_tells_where_an_edge_is(rng):
-    """Also where the camera's own surface ends 4 px beyond it."""
-    camera = np.where(half(0, 4.0), 20.0, 10.0)
-    edges = find_edges(picture(half(0), rng), camera)
-    assert np.nanmedian(spill(camera, edges)) == pytest.approx(4, abs=0.35)
-    assert len(find_edges(picture(half(0), rng, contrast=0), camera).level) < 20
-    assert not len(find_edges(picture(half(0), rng), np.where(half(0), 20.0, 17.0)).level)
-    spots = 600 * gaussian_filter((rng.random(SHAPE) < 1 / 80).astype(float), 1.4)
-    assert len(find_edges((14 + spots).clip(0, 255).astype(np.uint8), camera).level) < 20
-
-
-def test_strays_and_holes_move_no_edge(rng):
-    near = half(0)
-    edges = find_edges(picture(near, rng), np.where(near, 20.0, 10.0))
-    speckled = np.where(near ^ (rng.random(SHAPE) < 0.1), 20.0, 10.0)
-    speckled[rng.random(SHAPE) < 0.2] = np.nan
-    found = spill(speckled, edges)
-    assert np.nanmedian(found) == pytest.approx(0, abs=0.6)
-    assert np.isnan(spill(np.full(SHAPE, np.nan), edges)).all()
+def test_steps_are_found_with_what_is_near_them():
+    disparity = np.full(SHAPE, 10.0)
+    disparity[:, 120:] = 14.5
+    disparity[::3] = np.nan
+    near = near_steps(disparity)
+    assert near[:, 112:128].all()
+    assert not near[:, :112].any()
+    assert not near[:, 128:].any()
+    assert not near_steps(np.where(disparity > 12, 13.5, disparity)).any()
 
 
 def test_noise_of_planes_is_that_which_was_put_on_them(rng):

@@ -1,4 +1,4 @@
-"""Ten tests of a simulated depth camera against what real ones are known to do."""
+"""Six laws of real depth cameras, measured on a simulated one; and its matcher on a real pair."""
 
 from qs3.sensor.realism.run import LAWS as LAWS
 from qs3.sensor.realism.run import RealismSettings as RealismSettings

@@ -5,10 +5,9 @@ Convention:
     Targets are placed by their distance along y.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -36,12 +35,10 @@ _REACH = 12.0  # half the side of a wall, in its distances: it fills every frame
 
 @dataclass(frozen=True)
 class Bench:
-    """A sensor under test and what photographs for it."""
+    """A sensor under test and its renderer."""
 
     sensor: Sensor
-    """The sensor."""
     renderer: Renderer
-    """What photographs."""
     seed: int = 0
     """Seed of the first photograph of a test; the others count on from it."""
     quick: bool = False
@@ -52,46 +49,19 @@ class Bench:
         """The sensor's rig."""
         return self.sensor.rig
 
-    def shoot(
-        self,
-        bodies: Sequence[Body],
-        region: Region,
-        index: int = 0,
-        noise: int | None = None,
-        focus: Region | None = None,
-    ) -> ViewImages:
-        """Photograph ``bodies`` and measure ``region`` of the left frame.
+    def shoot(self, bodies: Sequence[Body], region: Region, index: int = 0) -> ViewImages:
+        """Photograph ``bodies``, the object first, and measure ``region`` of the left frame.
 
-        Args:
-            bodies: What stands before the camera; the first is the object.
-            region: Part of the left frame that is wanted.
-            index: Number of the photograph, for its seed.
-            noise: The same for the image noise; ``index`` by default.
-            focus: What auto-exposure looks at; ``region`` by default.
+        ``index`` is the number of the photograph, for its seed.
         """
         sensor, rig = self.sensor, self.rig
-        focus = focus or region
-        both = np.array([matching_canvas(region, rig, sensor.matching).bounds, focus.bounds])
-        (x0, y0), (x1, y1) = both[:, :2].min(axis=0).tolist(), both[:, 2:].max(axis=0).tolist()
-        wide = Region(x0, y0, x1 - x0, y1 - y0)
-        wide = wide.grown(blur_reach(sensor.exposure.psf), rig.width, rig.height)
-        scene = scene_of(bodies, sensor)
-        pairs = photograph(self.renderer, scene, sensor, [VIEW], [self.seed + index], [wide])
-        rng = np.random.default_rng(self.seed + (index if noise is None else noise))
+        canvas = matching_canvas(region, rig, sensor.matching)
+        wide = canvas.grown(blur_reach(sensor.exposure.psf), rig.width, rig.height)
+        scene, seed = scene_of(bodies, sensor), self.seed + index
+        pairs = photograph(self.renderer, scene, sensor, [VIEW], [seed], [wide])
+        rng = np.random.default_rng(seed)
         caster = DepthCaster(*(body.mesh for body in bodies))
-        return take_views(pairs, sensor, [region], [focus], [caster], rng, Clock())[0]
-
-    def refined(self, samples: int) -> "Bench":
-        """The bench with more rays a pixel and longer paths, where the renderer has such settings.
-
-        Mirrors and glass are path traced: they need both.
-        """
-        renderer: Any = self.renderer
-        least = {"samples": samples, "max_depth": 8}
-        raised = {n: max(v, getattr(renderer, n)) for n, v in least.items() if hasattr(renderer, n)}
-        if not raised:
-            return self
-        return dataclasses.replace(self, renderer=dataclasses.replace(renderer, **raised))
+        return take_views(pairs, sensor, [region], [region], [caster], rng, Clock())[0]
 
 
 def painted(mesh: "trimesh.Trimesh", albedo: float = ALBEDO) -> Body:
@@ -148,10 +118,18 @@ def middle(sensor: Sensor) -> float:
     return float(np.sqrt(near * far))
 
 
+def shoot_wall(
+    bench: Bench, distance: float, share: float, index: int = 0, high: float | None = None
+) -> ViewImages:
+    """Photograph a facing wall; ``share`` and ``high`` are those of `wall_region`."""
+    region = wall_region(bench.sensor, distance, share, high)
+    return bench.shoot([painted(wall(distance))], region, index)
+
+
 def wall_region(
     sensor: Sensor, distance: float, share: float = 0.8, high: float | None = None
 ) -> Region:
-    """The middle of what can be measured of a wall: right of the left band f·b/z.
+    """The middle of a wall's measurable part, right of the left band f·b/z.
 
     It has ``share`` of the columns and ``high``, by default as much, of the rows.
     """
@@ -159,11 +137,3 @@ def wall_region(
     if sensor.matching.left_band == "opencv":
         left = sensor.matching.num_disparities + sensor.matching.block_size // 2
     return central(sensor.rig, share, share if high is None else high, left)
-
-
-def shoot_wall(
-    bench: Bench, distance: float, share: float, index: int = 0, high: float | None = None
-) -> ViewImages:
-    """Photograph a facing wall; ``share`` and ``high`` are those of `wall_region`."""
-    region = wall_region(bench.sensor, distance, share, high)
-    return bench.shoot([painted(wall(distance))], region, index)

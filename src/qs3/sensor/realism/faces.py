@@ -1,4 +1,4 @@
-"""How far the points of a scanned object lie off its faces, beside the law (T10).
+"""Distances of a scanned object's points from its faces, beside the law (T10).
 
 An error δ of disparity moves a point along its ray by z²·δ/(f·b) of depth. With r the ray of
 length 1 along the optical axis and n the face's unit normal, the point is then |r·n|·z²·δ/(f·b)
@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float
 
 from qs3.geometry import rotation_z
 from qs3.sensor.realism.bench import VIEW, Bench, painted
-from qs3.sensor.realism.rows import Judged, row
-from qs3.sensor.realism.walls import wall_metrics
+from qs3.sensor.realism.rows import Row, row
+from qs3.sensor.realism.walls import wall_noise
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import StereoRig
 from qs3.sensor.view import ViewImages
@@ -23,10 +23,9 @@ from qs3.sensor.view import ViewImages
 MOST_DEGREES = 60.0
 _TILT = 25.0  # degrees by which the object is looked down upon
 _GOLDEN = 0.381966  # of a full turn: any number of turns is spread evenly
-_BINS = np.arange(-5.0, 5.01, 0.25)
 
 
-def scanned(bench: Bench) -> Judged:
+def scanned(bench: Bench) -> list[Row]:
     """T10: a cabinet from many sides over the placement's distances, and walls there.
 
     Errors are alike within a block of the matcher, so that a view has but a few dozen independent
@@ -37,14 +36,13 @@ def scanned(bench: Bench) -> Judged:
     half = 0.9 * sensor.object_size
     walls = np.geomspace(max(near - half, 1.05 * sensor.depth.near), far + half, 3)
     # The middle of the frame, where the object is: the metric divides by the length of the ray.
-    sigma = [wall_metrics(bench, z, 0.3).sub_pixel for z in walls.tolist()]
+    sigma = [wall_noise(bench, z, 0.3)[1] for z in walls.tolist()]
     parts = []
     for index in range(count):
         distance = near + (far - near) * (index + 0.5) / count
         view = shoot_object(bench, distance, 360 * _GOLDEN * index, index)
         parts.append(off_faces(view, bench.rig, sensor.matching.block_size, walls, sigma))
-    ratio, cosine = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return scan_rows(ratio, cosine)
+    return scan_rows(np.concatenate(parts))
 
 
 def shoot_object(bench: Bench, distance: float, turn: float, index: int) -> ViewImages:
@@ -71,8 +69,10 @@ def off_faces(
     block: int,
     walls: Float[np.ndarray, "w"],
     sigma: list[float],
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+) -> Float[np.ndarray, "n"]:
     """Signed distances from the faces in units of the law, of points well inside a face.
+
+    Positive is away from the camera. Faces that are seen at more than 60° are left out.
 
     Args:
         view: A photograph, with normals.
@@ -80,22 +80,18 @@ def off_faces(
         block: The matcher's block: within half of it a pixel's neighbours must show its face.
         walls: Distances of facing walls.
         sigma: The sub-pixel RMS on each.
-
-    Returns:
-        Distance over expected deviation, positive away from the camera; cosine of the view angle.
     """
     cx, cy = rig.principal_point
     y, x = np.indices(view.depth.shape)
     x, y = (view.region.x + x - cx) / rig.focal, (view.region.y + y - cy) / rig.focal
     ray, normals = np.stack([x, y, np.ones(x.shape)], axis=-1), np.asarray(view.normals)
-    slope = np.abs(np.einsum("ijk,ijk->ij", ray, normals))
-    cosine = slope / np.linalg.norm(ray, axis=-1)
+    cosine = np.abs(np.einsum("ijk,ijk->ij", ray, normals)) / np.linalg.norm(ray, axis=-1)
     kept = inside_faces(view, ray, block // 2 + 2) & np.isfinite(view.depth)
     kept &= cosine > np.cos(np.radians(MOST_DEGREES))
     z = view.true_depth[kept]
     law = z**2 * np.interp(z, walls, sigma) / (rig.focal * rig.baseline)
-    # Both the distance and the law have the factor |r·n|.
-    return (view.depth[kept] - z) * slope[kept] / (law * slope[kept]), cosine[kept]
+    # Both the distance and the law have the factor |r·n|, which cancels.
+    return (view.depth[kept] - z) / law
 
 
 def inside_faces(
@@ -113,23 +109,14 @@ def inside_faces(
     return (np.abs(apart).max(axis=-1) < 1e-4) & view.mask
 
 
-def scan_rows(ratio: Float[np.ndarray, "n"], cosine: Float[np.ndarray, "n"]) -> Judged:
-    """Judge signed distances in units of the law; with the cosine of each point's view angle."""
+def scan_rows(ratio: Float[np.ndarray, "n"]) -> list[Row]:
+    """Judge signed distances in units of the law."""
     if len(ratio) < 100:
-        return [row("points", float(len(ratio)), 100.0)], {"distance": [], "share": []}
+        return [row("points", float(len(ratio)), 100.0)]
     median = float(np.median(ratio))
     mad = float(np.median(np.abs(ratio - median)))
-    counts, _ = np.histogram(ratio, _BINS)
-    angle = np.degrees(np.arccos(np.clip(cosine, 0, 1)))
-    rows = [
+    return [
         row("|median| over MAD", abs(median) / mad, None, 0.2, strict=True),
         row("1.4826 MAD over the law", 1.4826 * mad, 0.75, 1.25),
         row("points", float(len(ratio))),
     ]
-    for low in range(0, int(MOST_DEGREES), 15):
-        part = ratio[(angle >= low) & (angle < low + 15)]
-        if len(part) >= 100:
-            spread = 1.4826 * np.median(np.abs(part - np.median(part)))
-            rows.append(row(f"the same, seen at {low} … {low + 15}°", spread))
-    data = {"distance": (_BINS[:-1] + _BINS[1:]) / 2, "share": counts / len(ratio)}
-    return rows, data

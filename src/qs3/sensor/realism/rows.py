@@ -1,4 +1,4 @@
-"""What a test hands back: figures beside their bounds, as plain values for records and plots."""
+"""Measured figures beside their bounds, as plain values for records."""
 
 import math
 from typing import Any
@@ -6,24 +6,22 @@ from typing import Any
 import numpy as np
 
 Row = dict[str, Any]
-Judged = tuple[list[Row], dict[str, Any]]
-"""Figures, and curves by name."""
 
 
 def row(
     what: str,
-    measured: float | np.floating | None,
+    measured: float | np.floating,
     low: float | None = None,
     high: float | None = None,
     unit: str = "",
     *,
     strict: bool = False,
 ) -> Row:
-    """One figure beside its bounds; without bounds it is information and has no verdict.
+    """Return one figure beside its bounds; without bounds it has no verdict.
 
     Args:
-        what: What was measured.
-        measured: The figure; one that is not finite misses.
+        what: Name of the figure.
+        measured: Its value; one that is not finite misses.
         low: Least value that passes.
         high: Greatest value that passes.
         unit: Its unit.
@@ -33,22 +31,21 @@ def row(
         >>> row("slope", 2.0, 1.85, 2.15)["expected"], row("fill", 0.98, 0.99)["passed"]
         ('1.85 … 2.15', False)
     """
-    value, passed = plain(measured), None
+    value, passed, expected = plain(measured), None, ""
     if low is not None or high is not None:
         least, most = -math.inf if low is None else low, math.inf if high is None else high
         inside = value is not None and least <= value <= most
         passed = bool(inside and not (strict and value in (low, high)))
-    if low is not None and high is not None:
-        expected = f"{low:.4g}" if low == high else f"{low:.4g} … {high:.4g}"
-    elif low is not None:
+        expected = f"{least:.4g} … {most:.4g}"
+    if high is None and low is not None:
         expected = f"{'>' if strict else '≥'} {low:.4g}"
-    else:
-        expected = "" if high is None else f"{'<' if strict else '≤'} {high:.4g}"
+    elif low is None and high is not None:
+        expected = f"{'<' if strict else '≤'} {high:.4g}"
     return {"what": what, "measured": value, "expected": expected, "unit": unit, "passed": passed}
 
 
 def plain(value: Any) -> Any:
-    """Numbers as plain floats, arrays and sequences as lists; None for what JSON has no word for.
+    """Return numbers as floats, arrays and sequences as lists, and None for what is not finite.
 
     Example:
         >>> plain(np.float32(0.5)), plain([1, float("nan")])
