@@ -12,3 +12,4 @@ from qs3.io.preparation import Preparation as Preparation
 from qs3.meshes.classes import POINTDA10 as POINTDA10
 from qs3.meshes.classes import canonical as canonical
 from qs3.meshes.classes import map_labels as map_labels
+from qs3.reading import reading as reading
