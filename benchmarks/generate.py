@@ -86,9 +86,6 @@ class Warm:
     def next(self):
         return self.pool.next()
 
-    def drain(self):
-        return self.pool.drain()
-
     def __enter__(self) -> Executor:
         return self.pool
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.store.folder import open_folder
 from qs3.store.manifest import Manifest, write_manifest
 from qs3.store.shards import CloudRow, put_shard, table_of
 
@@ -30,5 +29,5 @@ def write_store(
     write_manifest(folder, Manifest(settings, tuple(names), len(made), shards, {"qs3": "0"}))
     each = -(-len(made) // shards)
     for shard in range(shards):
-        put_shard(open_folder(folder), shard, table_of(made[each * shard : each * (shard + 1)]))
+        put_shard(folder, shard, table_of(made[each * shard : each * (shard + 1)]))
     return folder

@@ -19,7 +19,7 @@ class InputError(QS3Error, ValueError):
 
 
 class StorageError(InputError):
-    """A disk is full, or a store behind an address does not answer: no fault of what is stored."""
+    """The disk is full; no fault of the data."""
 
 
 class UnevenSizesError(InputError):

@@ -30,7 +30,7 @@ def test_one_command_in_its_own_process_gives_a_sound_data_set(qs3, archive, tmp
     assert done.stderr.splitlines() == [
         f"4 clouds of 2 classes written as qs3. Next: qs3 train --source {tmp_path / 'a'} --out RUN"
     ]
-    qs3("verify", tmp_path / "a")
+    qs3("info", "--check", tmp_path / "a")
     assert load_clouds(tmp_path / "a", split="test", num_points=16).points.shape == (2, 16, 3)
 
 

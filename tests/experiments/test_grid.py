@@ -28,7 +28,6 @@ from qs3.experiments.table import Table
 from qs3.files import read_json, write_json
 from qs3.store.executors import Failure
 from qs3.store.manifest import shard_name
-from qs3.store.parts import Place
 
 from .conftest import TINY, make_tables
 
@@ -144,10 +143,6 @@ def test_a_data_set_that_is_begun_counts_by_the_scans_that_it_lacks(finished):
     assert scans_left(plan, folder) == 0
     (folder / shard_name(0)).unlink()
     assert scans_left(plan, folder) == plan.rows == scans_left(plan, finished / "absent")
-    part = folder / f"{Place(0, 3).stem}.parquet"
-    part.parent.mkdir(parents=True)
-    part.touch()
-    assert scans_left(plan, folder) == plan.rows - 1
 
 
 def test_a_shared_folder_that_is_not_there_is_told(small_scales, tmp_path, monkeypatch):

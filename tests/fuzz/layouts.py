@@ -94,10 +94,9 @@ def build_generated(folder: Path) -> None:
 
 def load_generated(path: Path) -> Any:
     from qs3.io.layouts.store import read_ragged
-    from qs3.store.info import info
-    from qs3.store.verify import verify
+    from qs3.store.info import check, info
 
-    verify(path, progress=False)
+    check(path, progress=False)
     info(path)
     return [read_ragged(path, cloud) for cloud in ("points", "clean", "surface")]
 

@@ -3,24 +3,18 @@
 import ctypes
 import os
 import signal
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from qs3.files import write_bytes
 from qs3.meshes.classes import POINTDA10
 from qs3.sensor.compiled import compiled
-from qs3.store.folder import Folder
 from qs3.store.generate import GenerateReport, GenerateSettings, Item, generate, scan_seed
 from qs3.store.shards import CloudRow
 
 SETTINGS = GenerateSettings(num_points=16, rows_per_shard=4)
-
-_sync = os.fsync
 
 
 @dataclass(frozen=True)
@@ -106,23 +100,14 @@ def slow_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
 
 
 def deadly_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
-    """Hang, crash or end the process, or hang once the row is written, by the object's name."""
+    """Hang, crash or end the process, by the object's name."""
     if item.id.startswith("hangs"):
         ctypes.PyDLL(None).sleep(600)  # the interpreter locked, as by a parser written in C
     if item.id.startswith("crashes"):
         os.kill(os.getpid(), signal.SIGSEGV)
-    if item.id.startswith("killed"):
-        os.kill(os.getpid(), signal.SIGKILL)
     if item.id.startswith("exits"):
         os._exit(9)
-    if item.id.startswith("late"):
-        Folder.write = _write_and_hang
     return fake_row(item, scan, settings)
-
-
-def _write_and_hang(folder: Folder, name: str, data: bytes) -> None:
-    write_bytes(folder.path / name, data)
-    time.sleep(600)
 
 
 def marked_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
@@ -130,34 +115,6 @@ def marked_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
     if item.id.startswith("bad") and Path(os.environ["QS3_FAKE_MARKER"]).exists():
         raise ValueError(f"{item.id} is broken")
     return fake_row(item, scan, settings)
-
-
-def crash_in_write_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
-    """Take the process along the first time that it has a shard written and not yet renamed."""
-    os.fsync = _sync_and_die
-    return slow_row(item, scan, settings)
-
-
-def _sync_and_die(handle: int) -> None:
-    _sync(handle)
-    name = Path(f"/proc/self/fd/{handle}").readlink().name
-    marker = Path(os.environ["QS3_FAKE_MARKER"])
-    if "shard-" in name and not marker.exists():
-        marker.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-
-
-def crash_with_lock_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
-    """Take the process along, the first time, with the lock that all workers share held."""
-    marker = Path(os.environ["QS3_FAKE_MARKER"])
-    if item.id.startswith("hangs") and not marker.exists():
-        frame: Any = sys._getframe()
-        while "channel" not in frame.f_locals:
-            frame = frame.f_back
-        frame.f_locals["channel"].mutex.acquire()
-        marker.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return slow_row(item, scan, settings)
 
 
 def slow_flaky_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:

@@ -2,20 +2,16 @@
 
 import logging
 import os
-import re
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from qs3.errors import InputError, MissingExtraError
-from qs3.store.executors import guarded
 from qs3.store.executors.ray_cluster import RayExecutor
 from qs3.store.failures import read_failures
 from qs3.store.generate import GenerateReport
@@ -79,7 +75,7 @@ def test_a_node_killed_half_way_changes_no_byte(fake, tmp_path, cluster):
 def test_on_a_cluster_too_what_hangs_or_crashes_fails_alone(fake, tmp_path, cluster):
     for name, kind in (("hangs", "Timeout"), ("exits", "ProcessDied")):
         work = fake.work(6, (2,), name)
-        executor = RayExecutor(timeout=12.0 if kind == "Timeout" else None, retries=1)
+        executor = RayExecutor(timeout=12.0 if kind == "Timeout" else None)
         report = fake.run(work, tmp_path / name, row=fake.deadly_row, executor=executor)
         assert report == GenerateReport(done=5, skipped=0, failed=1)
         assert [record["error"] for record in read_failures(tmp_path / name)] == [kind]
@@ -98,7 +94,7 @@ def test_a_lost_raylet_is_no_failure_of_a_scan(fake, tmp_path, cluster):
     killer = threading.Thread(target=kill_head)
     killer.start()
     work = fake.work(ROWS, bad=(7,))
-    with pytest.raises(InputError, match="run the same command again, nothing is lost") as caught:
+    with pytest.raises(InputError, match="run the same command again, ") as caught:
         fake.run(work, out, row=fake.slow_flaky_row, executor=RayExecutor())
     killer.join()
     assert "\n" not in str(caught.value)
@@ -107,77 +103,8 @@ def test_a_lost_raylet_is_no_failure_of_a_scan(fake, tmp_path, cluster):
     assert fake.content(out) == whole(fake, tmp_path / "whole")
 
 
-class RayError(Exception):
-    pass
-
-
-class TaskError(RayError):
-    cause = ModuleNotFoundError("No module named 'qs3'")
-
-
-class FakeRay:
-    """Does each task when it is waited for, and tells what it is told to of every third."""
-
-    exceptions = SimpleNamespace(RayError=RayError, RayTaskError=TaskError)
-
-    def __init__(self, fault: Exception) -> None:
-        self.fault, self.count = fault, 0
-
-    def is_initialized(self) -> bool:
-        return True
-
-    def cluster_resources(self) -> dict[str, int]:
-        return {"CPU": 1}
-
-    def remote(self, **_: Any) -> Callable[..., Any]:
-        def task(function: Callable[..., Any]) -> SimpleNamespace:
-            return SimpleNamespace(remote=lambda *given: partial(function, *given))
-
-        return task
-
-    def wait(self, calls: list[Any], num_returns: int) -> tuple[list[Any], list[Any]]:
-        return calls[:num_returns], calls[num_returns:]
-
-    def get(self, call: Callable[[], Any]) -> Any:
-        self.count += 1
-        if self.count % 3 == 0:
-            raise self.fault
-        return call()
-
-    def cancel(self, call: Any, force: bool) -> None:
-        raise self.fault
-
-
-@pytest.mark.parametrize(
-    ("fault", "message"),
-    [
-        (RayError("the raylet died\nand more"), "lost a call 4 times or .*RayError: the raylet d"),
-        (TaskError(), "on the cluster: No module named 'qs3'"),
-    ],
-)
-def test_what_the_cluster_loses_is_no_failure_and_is_made_on_the_next_run(
-    fake, tmp_path, monkeypatch, fault, message
-):
-    def in_this_process(timeout, folder, function, arguments):
-        return guarded(function, *arguments)
-
-    monkeypatch.setitem(sys.modules, "ray", FakeRay(fault))
-    monkeypatch.setattr("qs3.store.executors.ray_cluster._call", in_this_process)
-    work, out = fake.work(12, bad=(1,)), tmp_path / "out"
-    for _ in range(20):
-        try:
-            fake.run(work, out, row=fake.flaky_row, executor=RayExecutor())
-        except InputError as error:
-            assert re.search(message, str(error)) and "\n" not in str(error)
-            assert {record["object"] for record in read_failures(out)} <= {"bad1"}
-        else:
-            break
-    fake.run(work, tmp_path / "whole", row=fake.flaky_row)
-    assert fake.content(out) == fake.content(tmp_path / "whole")
-
-
 def test_gpus_that_are_not_there_are_refused(fake, tmp_path, cluster):
-    with pytest.raises(InputError, match="no GPU at this moment"):
+    with pytest.raises(InputError, match="the cluster has no GPU"):
         fake.run([fake.FakeItem("m")], tmp_path / "out", executor=RayExecutor(gpus=0.25))
 
 
@@ -187,7 +114,7 @@ def test_an_address_without_a_cluster_is_told(fake, tmp_path):
         fake.run([fake.FakeItem("m")], tmp_path / "out", executor=RayExecutor("auto"))
 
 
-@pytest.mark.parametrize("how", [{"timeout": 0.0}, {"gpus": -1.0}, {"retries": -1}])
+@pytest.mark.parametrize("how", [{"timeout": 0.0}, {"gpus": -1.0}])
 def test_numbers_out_of_range_are_refused(how):
     with pytest.raises(InputError):
         RayExecutor(**how)

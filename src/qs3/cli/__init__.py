@@ -17,7 +17,6 @@ VERBS = {
     "generate": "Scan many meshes into a data set; resumes, and logs what failed.",
     "merge": "Put the parts that `qs3 generate --shard i/n` made into one data set.",
     "info": "Print what a data set holds: counts, sizes, statistics of the sensor, failures.",
-    "verify": "Check a data set: checksums, finite points, labels, seeds, duplicates, counts.",
     "convert": "Convert a data set into the layout of another.",
     "capture": "Write the frames of a depth camera, live or recorded, as files.",
     "extract": "Cut objects out of real scans into a data set.",
@@ -41,7 +40,6 @@ VERBS = {
 ELSEWHERE = {
     "merge": "store.merge",
     "info": "store.info",
-    "verify": "store.verify",
     "evaluate": "evaluate.evaluate_run",
     "figure": "table.figure",
 }

@@ -17,7 +17,6 @@ from qs3.store.scan_item import RECIPES, GenerateSettings, RecipeName, settings_
 
 if TYPE_CHECKING:
     from qs3.meshes import MeshItem
-    from qs3.store.plan import Plan
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,8 +59,8 @@ def generate(
     Args:
         meshes: Folders of meshes (one folder a class, ModelNet's or ShapeNet's tree), and `shapes`
             for the built-in ones; several go into one data set. A neighbour is another of them.
-        out: Folder of the data set, or an address such as s3://bucket/folder; run the same command
-            again to go on after a stop. --dry-run needs none.
+        out: Folder of the data set; run the same command again to go on after a stop. --dry-run
+            needs none.
         recipe: rooms: settings for a source that is to meet scans of real rooms (cameras, sizes,
             layouts and views drawn); an option given beside it wins.
         up: Up axis of every mesh file; by default y for glTF and ShapeNet, z for all others.
@@ -75,14 +74,13 @@ def generate(
             depend on it.
         timeout: Seconds that one scan may take; then it is stopped and logged as failed.
         executor: local: processes of this machine; ray: a Ray cluster (extra `ray`), whose
-            machines must all reach the meshes and --out.
+            machines must all reach the meshes under the same path.
         address: Of the Ray cluster; local starts one here.
         gpus_per_scan: Share of a GPU that one scan takes, on a Ray cluster.
         shard: i/n makes part i of n (from 0), on one of n machines, each into a folder of its own;
             see qs3 merge.
         retry_failed: Scan again what failed before.
-        dry_run: Print counts, disk space and time, measured on three scans of each sensor; write
-            nothing.
+        dry_run: Print the numbers of objects, scans and shards; write nothing.
         settings: How they are scanned and written. Another seed draws other shapes and poses.
     """
     from qs3.meshes.classes import describe_renaming, read_class_map
@@ -102,11 +100,16 @@ def generate(
     tell(*describe_renaming(renamed, called))
     settings = settings_for(resolve_renderer(settings), items, meshes, per_class)
     settings.as_dict()  # a scene or a range that makes no sense stops here
-    processes = usable_processors() if workers is None else workers
     if dry_run:
         plan = make_plan(items, settings)
-        show(*_expected(plan, part, timeout, processes if executor == "local" else None))
+        show(*(f"{name}: {count} objects" for name, count in plan.objects().items()))
+        show(f"{plan.rows} scans in {plan.shards} shards")
+        if part[1] > 1:
+            shards = range(part[0], plan.shards, part[1])
+            scans = sum(len(plan.rows_of(shard)) for shard in shards)
+            show(f"part {shard}: {scans} scans in {len(shards)} shards")
         return 0
+    processes = usable_processors() if workers is None else workers
     how: dict[str, Any] = {"workers": processes, "timeout": timeout}
     if executor == "ray":
         from qs3.store.executors.ray_cluster import RayExecutor
@@ -159,21 +162,3 @@ def _items(
             "unknown; put the meshes into one folder a class, or name a CSV of them: --labels"
         )
     return items
-
-
-def _expected(
-    plan: "Plan", part: tuple[int, int], timeout: float, workers: int | None
-) -> list[str]:
-    """What the run would make and cost; without ``workers`` for one of any machine."""
-    from qs3.store.plan import estimate
-
-    scans = 3 * len(plan.settings.each_sensor())
-    expected = estimate(plan, part, scans=scans, timeout=timeout, text="scans to measure")
-    machine = "one worker" if workers is None else f"{max(workers, 1)} workers of this machine"
-    hours = expected.seconds / max(workers or 1, 1) / 3600
-    return [
-        *(f"{name}: {objects} objects" for name, objects in expected.objects.items()),
-        f"{expected.rows} scans, of which {expected.part_rows} in this part, {plan.shards} shards",
-        f"disk: {expected.bytes / 1e9:.3g} GB",
-        f"time: {hours:.3g} hours with {machine}, from {expected.measured} scans",
-    ]

@@ -1,4 +1,4 @@
-"""``qs3 info``, ``qs3 verify`` and ``qs3 merge``: look after finished data sets."""
+"""``qs3 info`` and ``qs3 merge``: look after finished data sets."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -25,18 +25,25 @@ def refuse_failures(out: str, failures: Sequence[Mapping[str, Any]], what: str) 
         )
 
 
-def info(folder: _Folder, as_json: bool = False) -> int:
+def info(folder: _Folder, as_json: bool = False, check: bool = False) -> int:
     """Print what a data set holds: counts, sizes, statistics of the sensor, failures.
 
     Args:
-        folder: Folder of a data set, or an address such as s3://bucket/folder; or clouds in any
-            layout that qs3 train reads, of which there is less to tell.
+        folder: Folder of a data set, or clouds in any layout that qs3 train reads.
         as_json: Print everything, settings and versions too, as one JSON object.
+        check: Read every shard and print its faults: damage, labels, repeated ids, clouds that are
+            empty or not finite, missing rows.
     """
     from qs3.io.load import describe_clouds, is_store
     from qs3.store.failures import read_failures
+    from qs3.store.info import check as find_faults
     from qs3.store.info import info as count
 
+    if check:
+        faults = find_faults(folder)
+        show(*faults)
+        if faults:
+            raise InputError(f"{folder}: {len(faults)} faults, printed above")
     if not is_store(folder):
         clouds = describe_clouds(folder)
         show(*([json.dumps(clouds, indent=2)] if as_json else _cloud_lines(clouds)))
@@ -97,28 +104,12 @@ def _counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{name or '(none)'} {count}" for name, count in counts.items() if count)
 
 
-def verify(folder: _Folder) -> int:
-    """Check a data set: checksums, finite points, labels, seeds, duplicates, counts.
-
-    Args:
-        folder: Folder of a data set, or an address such as s3://bucket/folder.
-    """
-    from qs3.store.verify import verify as look_through
-
-    faults = look_through(folder)
-    show(*faults)
-    if faults:
-        raise InputError(f"{folder}: {len(faults)} faults, printed above")
-    tell(f"{folder}: no fault")
-    return 0
-
-
 def merge(parts: Annotated[tuple[str, ...], tyro.conf.Positional], out: str) -> int:
     """Put the parts that `qs3 generate --shard i/n` made into one data set.
 
     Args:
-        parts: Folders or addresses of all parts.
-        out: Folder or address of the whole; run the same command again to go on after a stop.
+        parts: Folders of all parts.
+        out: Folder of the whole; run the same command again to go on after a stop.
     """
     from qs3.store.merge import merge as put_together
 
@@ -126,6 +117,6 @@ def merge(parts: Annotated[tuple[str, ...], tyro.conf.Positional], out: str) -> 
     show(out)
     tell(
         f"{report.copied} shards copied, {report.skipped} were there before; {report.failed} scans "
-        f"had failed. Next: qs3 verify {quoted(out)}"
+        f"had failed. Next: qs3 info --check {quoted(out)}"
     )
     return 0

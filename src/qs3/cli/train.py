@@ -71,9 +71,8 @@ class Choices:
     """TOML file of these options and the settings below. Each run writes its own, run.toml, which
     repeats it: --config runs/x/run.toml --out runs/y. What the command line has besides wins."""
     source: str | None = None
-    """Labelled clouds: what qs3 generate made (also at an address such as s3://bucket/set), or any
-    layout that qs3 convert --list tells. With --warm-up it may be left out: rounds of self-training
-    then learn from the target alone."""
+    """Labelled clouds: what qs3 generate made, or any layout that qs3 convert --list tells. With
+    --warm-up it may be left out: rounds of self-training then learn from the target alone."""
     warm_up: Path | None = None
     """Run whose network self-training starts from, in place of training first, or the name of a
     network that comes with qs3, such as rooms. How it was trained is the default of the settings

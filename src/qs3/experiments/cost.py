@@ -6,14 +6,12 @@ from pathlib import Path
 import numpy as np
 
 from qs3.adaptation.names import split_method
-from qs3.experiments.domains import DATA, DataSet, Part
+from qs3.experiments.domains import DataSet, Part
 from qs3.experiments.runs import ORDINARY, Run
 from qs3.experiments.setup import Setup
 from qs3.io.clouds import PointClouds, numbered
-from qs3.store.folder import open_folder
 from qs3.store.manifest import finished_shards
-from qs3.store.parts import written_parts
-from qs3.store.plan import Plan, estimate
+from qs3.store.plan import Plan
 from qs3.training.config import TrainSettings
 from qs3.training.plan import Cost, epoch_steps, round_steps
 from qs3.training.plan import measure as measure_steps
@@ -48,19 +46,12 @@ def measure(
         trained.add(run.folder)
         clouds = (source, target, test)
         expected[run.name] = run_seconds(run, clouds, steps[run.network], only_scores=again)
-    scanning = 0.0
-    for name, plan in plans.items():
-        if count := scans_left(plan, setup.out / DATA / name):
-            scanning += estimate(plan, scans=6).cpu_seconds * count / plan.rows
-    return scanning, expected
+    return 0.0, expected
 
 
 def scans_left(plan: Plan, path: Path) -> int:
     """Return how many scans of a work list are not there, in a data set that may be begun."""
-    folder = open_folder(path)
-    settled = set(finished_shards(folder, plan.shards))
-    parts = sum(place.shard not in settled for place in written_parts(folder))
-    return plan.rows - sum(map(plan.size, settled)) - parts
+    return plan.rows - sum(len(plan.rows_of(s)) for s in finished_shards(path, plan.shards))
 
 
 def step_costs(runs: Iterable[Run], settings: TrainSettings, points: int) -> dict[str, Cost]:

@@ -12,7 +12,6 @@ from qs3.io.clouds import CloudChoice, Origin, PointClouds, RaggedClouds, Unlabe
 from qs3.io.layouts import FORMATS, FORMER_NAMES, Format, point_folders
 from qs3.io.layouts.store import read_ragged
 from qs3.io.point_files import depth_hint
-from qs3.store.folder import open_folder
 from qs3.store.manifest import MANIFEST
 
 
@@ -45,7 +44,7 @@ def load_clouds(
             that is not in ``class_names``.
     """
     clouds = read_clouds(source, split, cloud)[0]
-    origin = Origin(open_folder(source).name, split, cloud)
+    origin = Origin(Path(source).resolve().name, split, cloud)
     return clouds.labelled(num_points, class_names, str(source), most, class_map, origin)
 
 
@@ -65,7 +64,7 @@ def load_unlabelled(
         InputError: where the source is no data set or is damaged.
     """
     clouds = read_clouds(source, split, cloud)[0].unlabelled(num_points, str(source), most)
-    return replace(clouds, origin=Origin(open_folder(source).name, split, cloud))
+    return replace(clouds, origin=Origin(Path(source).resolve().name, split, cloud))
 
 
 def read_clouds(
@@ -85,8 +84,6 @@ def read_clouds(
     Raises:
         InputError: where it cannot be read.
     """
-    if isinstance(source, str) and "://" in source:
-        return read_ragged(source, cloud, split), "store"
     path = Path(source)
     layout = detect(path) if origin is None else format_named(origin)
     require(path, layout)
@@ -98,8 +95,8 @@ def read_clouds(
 
 
 def is_store(source: str | Path) -> bool:
-    """Whether a source is a data set of ours: an address, or a folder with ``dataset.json``."""
-    return "://" in str(source) or (Path(source) / MANIFEST).is_file()
+    """Return whether a source is a data set of ours: a folder with ``dataset.json``."""
+    return (Path(source) / MANIFEST).is_file()
 
 
 def describe_clouds(source: str | Path) -> dict[str, Any]:

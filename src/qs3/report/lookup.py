@@ -16,7 +16,6 @@ from qs3.io.load import is_store
 from qs3.meshes import collect
 from qs3.sensor.presets import Sensor
 from qs3.sensor.settings import ScanSettings
-from qs3.store.folder import open_folder
 from qs3.store.manifest import MANIFEST, open_dataset
 from qs3.store.shards import load_shard
 from qs3.structure import structure
@@ -102,7 +101,7 @@ def find_mesh(run: Run) -> OwnMesh | None:
             object_size="file" if sized else None,
             units=made.get("units") if sized else None,
         )
-        objects = set(load_shard(open_folder(store), 0, ("object",))["object"].to_pylist())
+        objects = set(load_shard(store, 0, ("object",))["object"].to_pylist())
         for name in str(made.get("meshes", "")).split("+"):
             places = ["shapes"] if name == "shapes" else _near(store, name)
             for place in places:

@@ -1,39 +1,27 @@
 """Scan a list of meshes into a data set: resumable, in parallel, and the same every time.
 
-The work list (objects × scans, in fixed order) is cut into shards of a fixed number of rows. The
-process that makes a scan writes it down at once (`qs3.store.parts`); a shard is put together
-when all its scans are there. An object that fails is logged and absent.
+The work list (objects × scans, in fixed order) is cut into shards of a fixed number of rows. This
+process gathers the rows of a shard and writes them as one file; a shard that is there is skipped.
+A scan that fails is logged and absent.
 """
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+
+import pyarrow as pa
 
 from qs3.errors import InputError
+from qs3.files import write_json
 from qs3.store.executors import Executor, Failure, InlineExecutor, LocalExecutor, outcomes
 from qs3.store.failures import read_failures, write_failures
-from qs3.store.folder import PARTS, Folder, open_folder
 from qs3.store.manifest import (
-    MANIFEST,
-    Sums,
-    changed_meshes,
+    MESHES,
+    claimed,
     finished_shards,
     mesh_sums,
     read_mesh_sums,
-    shard_name,
     write_manifest,
-    write_mesh_sums,
-)
-from qs3.store.parts import (
-    Place,
-    finish_shard,
-    part_folder,
-    read_failure,
-    scan_to_part,
-    write_failure,
-    written_parts,
 )
 from qs3.store.plan import Plan, make_plan, resolve_renderer
 from qs3.store.progress import progress_bar
@@ -41,15 +29,12 @@ from qs3.store.scan_item import GenerateSettings as GenerateSettings
 from qs3.store.scan_item import Item as Item
 from qs3.store.scan_item import scan_item as scan_item
 from qs3.store.scan_item import scan_seed as scan_seed
-from qs3.store.shards import CloudRow, load_shard
-
-_STOPPED = ("ProcessDied", "Timeout")
-_TOO_MANY = 50
+from qs3.store.shards import CloudRow, load_shard, put_shard, table_of
 
 
 @dataclass(frozen=True)
 class GenerateReport:
-    """What one call of `generate` did, in scans."""
+    """Scans that one call of `generate` counted."""
 
     done: int
     """Scanned and written by this call."""
@@ -74,30 +59,29 @@ def generate(
 ) -> GenerateReport:
     """Scan every item into the data set at ``out``, going on where an earlier call stopped.
 
-    The bytes of the shards depend on the items and the settings alone. Ctrl-C lets the scans
-    that are under way end, keeps them, and raises ``KeyboardInterrupt``.
+    The bytes of the shards depend on the items and the settings alone. A stop, however abrupt,
+    costs the shards that are not complete.
 
     Args:
         items: Meshes, in the order of the rows.
-        out: New or empty folder, or one that the same call began; any address that fsspec knows.
+        out: New or empty folder, or one that the same call began.
         settings: Settings of the data set.
-        scan_one: Makes one row; a picklable function of a module. It is handed an item, the index
-            of its scan and the settings, and other items, in the order in which they are drawn,
-            where the scene has a neighbour.
+        scan_one: Makes one row; a picklable function of a module. Its arguments are an item, the
+            index of its scan and the settings; and, if the scene has a neighbour, other items in
+            the order in which they are drawn.
         workers: Processes of this machine; 0 does the work in this one, where a crash or a hang
             of one scan ends or hangs the run.
         timeout: Seconds that one scan may take in a process; None waits for ever.
-        executor: Where the work is done, in place of ``workers`` and ``timeout``.
+        executor: Replaces ``workers`` and ``timeout``.
         shard: ``(i, n)`` makes the shards i, i + n, i + 2n … alone, for one of n machines that
-            each write into a folder of their own; `qs3.store.merge` puts them together.
-        retry_failed: Scan again what failed before.
+            each write into their own folder; `qs3.store.merge` puts them together.
+        retry_failed: Scan again the rows that failed before.
         progress: Show a bar on the standard error stream.
 
     Raises:
-        InputError: where the list is empty or has equal ids, a class is unknown, the folder holds
-            something else or a data set of other settings, another process writes into it, or a
-            fault lies with the machine (a missing package, a full disk, processes that are killed)
-            and not with an object.
+        InputError: if the list is empty or has equal ids, a class is unknown, the folder holds
+            something else or a data set of other settings, another process writes into it, or the
+            machine is at fault (a missing package, a full disk) and not an object.
     """
     index, count = shard
     if not 0 <= index < count:
@@ -106,191 +90,94 @@ def generate(
         executor = InlineExecutor() if workers == 0 else LocalExecutor(workers, timeout)
     settings = settings if scan_one is not scan_item else resolve_renderer(settings)
     plan = make_plan(items, settings)
-    manifest = plan.manifest()
-    folder = open_folder(out)
-    with folder.claimed(MANIFEST):
-        write_manifest(folder, manifest)
-        run = _Run(plan, folder, scan_one)
-        mine = range(index, plan.shards, count)
-        run.check_meshes(mine)
-        run.list_work(mine, retry_failed)
-        return run.work(executor, f"{folder.name}: scans" if progress else None)
+    folder = Path(out)
+    with claimed(folder):
+        write_manifest(folder, plan.manifest())
+        run = _Run(plan, folder, range(index, plan.shards, count), retry_failed)
+        text = f"{folder.resolve().name}: scans" if progress else None
+        with progress_bar(run.total, text, "scan", run.total - run.left) as bar, executor:
+            calls = ((row, scan_one, *plan.arguments(row)) for row in run.rows())
+            for row, outcome in outcomes(executor, calls):
+                run.add(row, outcome)
+                bar.set_postfix(failed=run.failed, refresh=False)
+                bar.update()
+    return GenerateReport(run.left - run.failed, run.total - run.left, run.failed)
 
 
 class _Run:
-    """One call of `generate`: what is there, what is to do, what failed."""
+    """One call of `generate`: the rows to scan, and those of the shards that are not complete."""
 
-    def __init__(self, plan: Plan, folder: Folder, scan_one: Callable[..., CloudRow]) -> None:
-        """Look at what earlier calls left."""
-        self.plan, self.folder, self.scan_one = plan, folder, scan_one
-        self.parts = written_parts(folder)
-        """Rows that lie beside the shards, and the files' names."""
-        self.settled = set(finished_shards(folder, plan.shards))
-        """Shards that are put together, or all but."""
-        self.sums = Sums(folder)
-        self.failures = {Place(r["shard"], r["row"]): r for r in read_failures(folder)}
-        """What failed, now or before."""
-        self.log_is_behind = bool(self.parts)
-        """Whether ``failures.jsonl`` may lack something."""
-        for place, name in self.parts.items():
-            if name.endswith(".json"):
-                self.failures[place] = plan.failure_record(place, read_failure(folder, name))
-            else:
-                self.failures.pop(place, None)
-        self.todo: list[tuple[int, list[int]]] = []
-        """Rows to scan by shard; the next of both is the last."""
-        self.awaited: dict[int, int] = {}
-        """How many rows each shard waits for that is not complete."""
-        self.complete: list[int] = []
-        """Shards that wait for nothing more."""
-        self.total = self.left = self.done = self.failed = 0
-        self.failed_in_a_row: set[str] = set()
-        """Objects that failed since the last that did not."""
+    def __init__(self, plan: Plan, folder: Path, shards: Sequence[int], retry_failed: bool) -> None:
+        self.plan, self.folder = plan, folder
+        self.finished = {*finished_shards(folder, plan.shards)}
+        logged = read_failures(folder)
+        # A kill between log and shard leaves records of a shard that is not there.
+        self.failures = {r["id"]: r for r in logged if r["shard"] in self.finished}
+        if len(self.failures) < len(logged):
+            write_failures(folder, self.failures.values())
+        self._check_meshes(shards)
+        self.todo = {shard: self._missing(shard, retry_failed) for shard in shards}
+        self.total = sum(len(plan.rows_of(shard)) for shard in shards)
+        self.left = sum(map(len, self.todo.values()))
+        self.failed = 0
+        self._gathered: dict[int, dict[int, CloudRow | Failure]] = {}
 
-    def check_meshes(self, mine: Sequence[int]) -> None:
+    def _check_meshes(self, shards: Iterable[int]) -> None:
         """Refuse a mesh that is not the one that was scanned; one that failed may be mended."""
-        noted = read_mesh_sums(self.folder)
-        now = mesh_sums(self.plan.items_of(mine))
-        changed = set(changed_meshes(noted, now))
-        if changed:
-            scanned = {place for shard in self.settled for place in self.plan.places(shard)}
-            for place in sorted((scanned | set(self.parts)) - set(self.failures)):
-                name = self.plan.object_of(place)
-                if name in changed:
-                    raise InputError(
-                        f"{name}: the mesh has changed since it was scanned into {self.folder}; "
-                        "name another folder, or put the old file back"
-                    )
+        plan = self.plan
+        items = {(item := plan.item_of(r)).id: item for s in shards for r in plan.rows_of(s)}
+        noted, now = read_mesh_sums(self.folder), mesh_sums(items.values())
+        changed = {name for name, digest in now.items() if noted.get(name, digest) != digest}
+        for row in (row for shard in self.finished for row in plan.rows_of(shard) if changed):
+            if plan.item_of(row).id in changed and plan.row_id(row) not in self.failures:
+                raise InputError(
+                    f"{plan.item_of(row).id}: the mesh has changed since it was scanned into "
+                    f"{self.folder}; name another folder, or put the old file back"
+                )
         if not now.items() <= noted.items():
-            write_mesh_sums(self.folder, noted | now)
+            write_json(self.folder / MESHES, dict(sorted((noted | now).items())))
 
-    def list_work(self, mine: Sequence[int], retry_failed: bool) -> None:
-        """List the rows to scan and the shards to put together."""
-        with_parts = {place.shard for place in self.parts}
-        for shard in reversed(mine):
-            places = list(self.plan.places(shard))
-            self.total += len(places)
-            if shard not in self.settled:
-                again = self.failures if retry_failed else {}
-                lost = [p for p in places if p not in self.parts or p in again]
-            else:
-                # Parts beside a finished shard: an earlier call was stopped before it tidied up.
-                unsettled = shard_name(shard) not in self.sums or shard in with_parts
-                absent = self._absent_rows(shard, places) if retry_failed or unsettled else []
-                lost = absent if retry_failed else []
-                if not lost and not unsettled:
-                    continue
-            if not lost:
-                self.complete.append(shard)
-                continue
-            self.left += len(lost)
-            self.awaited[shard] = len(lost)
-            self.todo.append((shard, [place.row for place in reversed(lost)]))
+    def _missing(self, shard: int, retry_failed: bool) -> list[int]:
+        """Return the rows of a shard to scan."""
+        rows = self.plan.rows_of(shard)
+        if shard not in self.finished:
+            return list(rows)
+        if not retry_failed:
+            return []
+        present = {*load_shard(self.folder, shard, ["id"])["id"].to_pylist()}
+        return [row for row in rows if self.plan.row_id(row) not in present]
 
-    def _absent_rows(self, shard: int, places: Sequence[Place]) -> list[Place]:
-        """Rows that a finished shard lacks; failures of rows that it has are forgotten."""
-        present = set(load_shard(self.folder, shard, ["id"])["id"].to_pylist())
-        self.log_is_behind = True
-        absent = [place for place in places if self.plan.row_id(place) not in present]
-        for place in set(places) - set(absent):
-            self.failures.pop(place, None)
-        return [place for place in absent if not self.parts.get(place, "").endswith(".parquet")]
+    def rows(self) -> Iterable[int]:
+        """Return the rows to scan, in order."""
+        return (row for rows in self.todo.values() for row in rows)
 
-    def work(self, executor: Executor, text: str | None) -> GenerateReport:
-        """Do what is to do; ``text`` stands before the bar."""
-        skipped = self.total - self.left
-        bar = progress_bar(self.total, text, "scan", skipped)
-        with bar, executor:
-            try:
-                for key, outcome in outcomes(executor, self._next_call, self._name_of):
-                    if isinstance(key, Place):
-                        self._scanned(key, outcome)
-                        bar.set_postfix(failed=self.failed, refresh=False)
-                        bar.update()
-                    else:
-                        self._finished(key, outcome)
-            except KeyboardInterrupt:
-                bar.set_description("finishing what is under way (Ctrl-C again: not even that)")
-                executor.drain()
-                raise
-            finally:
-                self.sums.write()
-        if not written_parts(self.folder):
-            self.folder.remove(PARTS)
-        return GenerateReport(done=self.done, skipped=skipped, failed=self.failed)
+    def add(self, row: int, outcome: CloudRow | Failure) -> None:
+        """Take in a scan; write its shard if it was the last."""
+        shard = self.plan.shard_of(row)
+        gathered = self._gathered.setdefault(shard, {})
+        gathered[row] = outcome
+        self.failed += isinstance(outcome, Failure)
+        if len(gathered) == len(self.todo[shard]):
+            self._write(shard, self._gathered.pop(shard))
 
-    def _next_call(self) -> tuple[Any, ...] | None:
-        """Key, function and arguments of what is to be done next."""
-        if self.complete:
-            shard = self.complete.pop()
-            self._log_failures(shard)
-            return shard, finish_shard, *self._finish_arguments(shard)
-        if not self.todo:
-            return None
-        shard, rows = self.todo[-1]
-        place = Place(shard, rows.pop())
-        if not rows:
-            self.todo.pop()
-        arguments = self.plan.arguments(*self.plan.position(place))
-        call = functools.partial(self.scan_one, *arguments)
-        return place, scan_to_part, self.folder, place, self.plan.settings.dtype, call
-
-    def _name_of(self, key: Place | int) -> str:
-        return self.plan.row_id(key) if isinstance(key, Place) else shard_name(key)
-
-    def _scanned(self, place: Place, outcome: Failure | None) -> None:
-        self.awaited[place.shard] -= 1
-        if not self.awaited[place.shard]:
-            self.complete.append(place.shard)
-        if outcome is not None and outcome.kind in _STOPPED:
-            # It may have been stopped when its row was written and the answer was not yet here.
-            outcome = None if self.folder.exists(f"{place.stem}.parquet") else outcome
-        if outcome is None:
-            self.done += 1
-            self.failed_in_a_row.clear()
-            self.log_is_behind |= self.failures.pop(place, None) is not None
-            return
-        self.failed += 1
-        self.log_is_behind = True
-        self.failures[place] = self.plan.failure_record(place, outcome)
-        if outcome.kind in _STOPPED:  # it could not write this itself
-            write_failure(self.folder, place, outcome)
-        self.failed_in_a_row.add(self.plan.object_of(place))
-        if len(self.failed_in_a_row) >= _TOO_MANY:
-            raise InputError(
-                f"{_TOO_MANY} objects in a row failed, the last with: {outcome.reason}; if the "
-                "fault is the machine's, mend it and add --retry-failed; if it is theirs, run the "
-                "same command again to go on past them"
-            )
-
-    def _log_failures(self, shard: int) -> None:
-        """Log before the shard is there: afterwards nobody would ask why a row is missing."""
-        self.settled.add(shard)
-        if self.log_is_behind:
-            records = {
-                place: r for place, r in self.failures.items() if place.shard in self.settled
-            }
-            write_failures(self.folder, records.values())
-            self.log_is_behind = len(records) < len(self.failures)
-
-    def _finish_arguments(self, shard: int) -> tuple[Any, ...]:
-        places = list(self.plan.places(shard))
-        order = [self.plan.row_id(place) for place in places]
-        failed = [self.plan.row_id(place) for place in places if place in self.failures]
-        return self.folder, shard, self.plan.settings.dtype, order, failed
-
-    def _finished(self, shard: int, outcome: str | Failure) -> None:
-        if isinstance(outcome, Failure) and outcome.kind in _STOPPED:
-            outcome = finish_shard(*self._finish_arguments(shard))
-        name = shard_name(shard)
-        if isinstance(outcome, Failure):
-            where = str(self.folder)
-            reason = outcome.reason
-            raise InputError(reason if where in reason else f"{where}/{name}: {reason}")
-        if not self.folder.exists(name):
-            raise InputError(
-                f"{self.folder}/{name}: was written, but is not there; do all processes see one "
-                "and the same folder? Mend that and run the same command again"
-            )
-        self.sums.note(name, outcome)
-        self.folder.remove(part_folder(shard))
+    def _write(self, shard: int, gathered: dict[int, CloudRow | Failure]) -> None:
+        """Log the failures, write the shard, then forget earlier failures: none is ever lost."""
+        scans = [row for row in gathered.values() if isinstance(row, CloudRow)]
+        failures = {
+            self.plan.row_id(row): self.plan.failure_record(row, outcome)
+            for row, outcome in gathered.items()
+            if isinstance(outcome, Failure)
+        }
+        if failures:
+            self.failures |= failures
+            write_failures(self.folder, self.failures.values())
+        table = table_of(scans, self.plan.settings.dtype)
+        if shard in self.finished:
+            table = pa.concat_tables([load_shard(self.folder, shard), table])
+        position = {name: i for i, name in enumerate(table["id"].to_pylist())}
+        names = map(self.plan.row_id, self.plan.rows_of(shard))
+        order = pa.array([position[name] for name in names if name in position], pa.int64())
+        put_shard(self.folder, shard, table.take(order))
+        mended = [scan.id for scan in scans if self.failures.pop(scan.id, None)]
+        if mended:
+            write_failures(self.folder, self.failures.values())

@@ -1,64 +1,129 @@
-"""What a data set on disk, or behind an address, holds: counts, sizes, statistics."""
+"""Count and check the contents of a data set on disk."""
 
-import collections
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
-from qs3.store.failures import read_failures
-from qs3.store.folder import Folder, open_folder
-from qs3.store.manifest import finished_shards, open_dataset, shard_name
-from qs3.store.shards import STATISTICS, digests, load_shard
+from qs3.errors import InputError
+from qs3.store.failures import FAILURES, read_failures
+from qs3.store.manifest import Manifest, finished_shards, open_dataset, shard_name
+from qs3.store.progress import progress_bar
+from qs3.store.shards import STATISTICS, flat, load_shard
+
+_VIEWS = {"points": "view", "clean": "clean_view", "surface": None}
 
 
-def info(where: str | Path | Folder) -> dict[str, Any]:
-    """Count what a data set holds.
+def info(folder: str | Path) -> dict[str, Any]:
+    """Count the contents of a data set.
 
     Returns:
         ``rows``, ``objects``, ``rows_planned``, ``shards``, ``shards_planned``, ``failed``,
         ``bytes`` (of all shards), ``classes`` and ``splits`` (rows by name), ``renamed`` (classes
-        of the meshes that go by another name), ``points`` (smallest and largest noisy cloud),
+        of the meshes that have another name here), ``points`` (smallest and largest noisy cloud),
         ``statistics`` (median of each over the rows that have it), ``settings`` and ``versions``.
 
     Raises:
-        InputError: where the folder is not a data set or a shard is damaged.
+        InputError: if the folder is not a data set or a shard is damaged.
     """
-    folder = open_folder(where)
+    folder = Path(folder)
     manifest = open_dataset(folder)
-    classes = dict.fromkeys(manifest.class_names, 0)
-    splits: collections.Counter[str] = collections.Counter()
-    objects: list[np.ndarray] = []  # hashed, which takes a tenth of the room
-    sizes: list[np.ndarray] = []
-    figures: dict[str, list[np.ndarray]] = {name: [] for name in STATISTICS}
     shards = finished_shards(folder, manifest.shards)
-    total = 0
+    counts: dict[str, Counter[str]] = {"class_name": Counter(), "split": Counter()}
+    objects: set[str] = set()
+    sizes = [np.zeros(0, np.int32)]
+    figures = {name: [np.zeros(0)] for name in STATISTICS}
     for index in shards:
-        total += folder.size(shard_name(index))
-        wanted = ["object", "class_name", "split", "points", *STATISTICS]
-        table = load_shard(folder, index, wanted)
-        for name, count in collections.Counter(table["class_name"].to_pylist()).items():
-            classes[name] = classes.get(name, 0) + count
-        splits.update(table["split"].to_pylist())
-        objects.append(np.unique(digests(map(str.encode, table["object"].to_pylist()))))
-        sizes.append(np.diff(table["points"].combine_chunks().offsets.to_numpy()) // 3)
-        for name in STATISTICS:
-            figures[name].append(table[name].drop_null().to_numpy())
-    points = np.concatenate([*sizes, np.zeros(0, np.int32)])
-    medians = {name: np.concatenate([*parts, np.zeros(0)]) for name, parts in figures.items()}
+        table = load_shard(folder, index, [*counts, "object", "points", *STATISTICS])
+        for name, counter in counts.items():
+            counter.update(table[name].to_pylist())
+        objects.update(table["object"].to_pylist())
+        sizes.append(np.diff(flat(table["points"])[1]) // 3)
+        for name, values in figures.items():
+            values.append(table[name].drop_null().to_numpy())
+    points = np.concatenate(sizes)
+    statistics = {name: np.concatenate(values) for name, values in figures.items()}
     return {
         "rows": len(points),
         "rows_planned": manifest.rows,
-        "objects": len(np.unique(np.concatenate(objects))) if objects else 0,
+        "objects": len(objects),
         "failed": len(read_failures(folder)),
         "shards": len(shards),
         "shards_planned": manifest.shards,
-        "bytes": total,
-        "classes": classes,
+        "bytes": sum((folder / shard_name(index)).stat().st_size for index in shards),
+        "classes": dict.fromkeys(manifest.class_names, 0) | counts["class_name"],
         "renamed": dict(manifest.renamed),
-        "splits": dict(sorted(splits.items())),
+        "splits": dict(sorted(counts["split"].items())),
         "points": [int(points.min()), int(points.max())] if len(points) else [],
-        "statistics": {name: float(np.median(v)) for name, v in medians.items() if len(v)},
+        "statistics": {name: float(np.median(v)) for name, v in statistics.items() if len(v)},
         "settings": dict(manifest.settings),
         "versions": dict(manifest.versions),
     }
+
+
+def check(folder: str | Path, *, progress: bool = True) -> list[str]:
+    """Read a whole data set and return its faults, one line each.
+
+    Checks the columns and page checksums of every shard, labels against class names, repeated ids,
+    clouds that are empty or not finite, and the number of rows against plan and failures.
+
+    Args:
+        folder: Folder of the data set.
+        progress: Show a bar on the standard error stream.
+
+    Raises:
+        InputError: if it is no data set, or its description or log cannot be read.
+    """
+    folder = Path(folder)
+    manifest = open_dataset(folder)
+    present = finished_shards(folder, manifest.shards)
+    faults: list[str] = []
+    if len(present) < manifest.shards:
+        faults.append(
+            f"only {len(present)} of {manifest.shards} shards are there: unfinished, run the same "
+            "command again"
+        )
+    seen: dict[str, str] = {}
+    text = "check" if progress else None
+    for index in progress_bar(len(present), text, "shard", items=present):
+        name = shard_name(index)
+        try:
+            table = load_shard(folder, index)
+        except InputError as error:
+            faults.append(str(error))
+            continue
+        faults += (f"{name}: {fault}" for fault in _faults(table, manifest))
+        for identifier in table["id"].to_pylist():
+            if identifier in seen:
+                faults.append(f"{name}: {identifier} is there twice, also in {seen[identifier]}")
+            seen[identifier] = name
+    failed = {record["id"] for record in read_failures(folder)}
+    faults += (f"{FAILURES}: {name} failed, but is there" for name in sorted(failed & {*seen}))
+    if manifest.rows is not None and not faults and len(seen) + len(failed) != manifest.rows:
+        faults.append(
+            f"{manifest.rows} rows planned, but {len(seen)} are there and {len(failed)} failed"
+        )
+    return faults
+
+
+def _faults(table: pa.Table, manifest: Manifest) -> Iterator[str]:
+    names = manifest.class_names
+    ids = table["id"].to_pylist()
+    rows = zip(ids, table["label"].to_pylist(), table["class_name"].to_pylist(), strict=True)
+    for identifier, label, class_name in rows:
+        if not 0 <= label < len(names) or names[label] != class_name:
+            yield f"{identifier} has label {label} and class name {class_name!r}"
+    for column, view in _VIEWS.items():
+        values, starts = flat(table[column])
+        if column != "points" and not len(values):
+            continue  # real clouds have no twin and no surface
+        views = np.diff(starts) // 3 if view is None else np.diff(flat(table[view])[1])
+        for i, identifier in enumerate(ids):
+            cloud = values[starts[i] : starts[i + 1]]
+            if not len(cloud) or len(cloud) % 3 or not np.isfinite(cloud).all():
+                yield f"{column} of {identifier} is empty, not made of triples, or not finite"
+            elif views[i] not in (0, len(cloud) // 3):
+                yield f"{column} of {identifier} has {len(cloud) // 3} points and {views[i]} views"

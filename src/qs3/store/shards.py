@@ -4,11 +4,10 @@ Points lie flat in a list column, x0 y0 z0 x1 …: ``np.reshape(row, (-1, 3))``.
 opens a shard as it is. A shard holds no time, host or path, so equal scans give equal bytes.
 """
 
-import hashlib
 import io
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -16,10 +15,10 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Float, Float32, UInt8, UInt64
+from jaxtyping import Float, Float32, UInt8
 
 from qs3.errors import InputError
-from qs3.store.folder import Folder
+from qs3.files import write_bytes
 from qs3.store.manifest import shard_name
 
 STATISTICS = {
@@ -60,12 +59,7 @@ def _schema(dtype: DType) -> pa.Schema:
 
 
 _SCHEMAS: dict[DType, pa.Schema] = {"float32": _schema("float32"), "float16": _schema("float16")}
-# Shards of schema 1 have no `drawn`: nothing could be.
-_SCHEMA_1 = pa.schema([column for column in _SCHEMAS["float32"] if column.name != "drawn"])
 _NAMES = _SCHEMAS["float32"].names
-# Noise shrinks by a tenth, a cloud of equal numbers a thousandfold: small files may, large may not.
-_MOST_BYTES, _MOST_SHARE = 1 << 28, 8
-_VALUE_BYTES = 4  # of a float32, the widest there are many of
 
 
 @dataclass(frozen=True)
@@ -110,11 +104,9 @@ class CloudRow:
     """What was drawn for this scan (settings of the sensor, the neighbour), a JSON object."""
 
 
-def put_shard(folder: Folder, index: int, table: pa.Table) -> str:
-    """Write a table as shard ``index`` of a data set; return the SHA-256 of the file."""
-    content = shard_bytes(table)
-    folder.write(shard_name(index), content)
-    return hashlib.sha256(content).hexdigest()
+def put_shard(folder: Path, index: int, table: pa.Table) -> None:
+    """Write a table as shard ``index`` of a data set, whole or not at all."""
+    write_bytes(folder / shard_name(index), shard_bytes(table))
 
 
 def table_of(rows: Sequence[CloudRow], dtype: DType = "float32") -> pa.Table:
@@ -151,60 +143,27 @@ def shard_bytes(table: pa.Table) -> bytes:
     return buffer.getvalue()
 
 
-def load_shard(folder: Folder, index: int, columns: Sequence[str] | None = None) -> pa.Table:
-    """Read shard ``index`` of a data set, or some of its columns: from a disk these alone.
+def load_shard(folder: str | Path, index: int, columns: Sequence[str] | None = None) -> pa.Table:
+    """Read shard ``index`` of a data set, or some of its columns.
 
     Raises:
-        InputError: where the file is missing, cut off, not a shard, or announces columns far
-            larger than itself.
+        InputError: if the file is missing, cut off, or not a shard.
     """
-    name = shard_name(index)
-    where = f"{folder}/{name}"
-    if folder.path is None:
-        return parse_shard(folder.read(name), where, columns)
-    path = folder.path / name
+    path = Path(folder) / shard_name(index)
     if not path.is_file():
-        raise InputError(f"{where}: no such file")
-    return parse_shard(path, where, columns)
-
-
-def parse_shard(source: bytes | Path, where: str, columns: Sequence[str] | None = None) -> pa.Table:
-    """Read a shard from its bytes or file; one of schema 1 comes with nothing drawn.
-
-    ``where`` names it in messages.
-
-    Raises:
-        InputError: as `load_shard` does.
-    """
-    wanted = list(_NAMES if columns is None else columns)
-    size = len(source) if isinstance(source, bytes) else source.stat().st_size
-    opened = pa.BufferReader(source) if isinstance(source, bytes) else source
+        raise InputError(f"{path}: no such file")
     try:
-        with pq.ParquetFile(opened, page_checksum_verification=True, pre_buffer=False) as file:
-            is_first = file.schema_arrow.equals(_SCHEMA_1)
-            if not is_first and file.schema_arrow not in _SCHEMAS.values():
-                raise InputError(f"{where}: not a shard of a qs3 data set (other columns)")
-            groups = [file.metadata.row_group(i) for i in range(file.num_row_groups)]
-            if sum(map(_announced, groups)) > _MOST_BYTES + _MOST_SHARE * size:
-                raise InputError(f"{where}: announces far more than its {size} bytes can hold")
-            names = [name for name in wanted if not (is_first and name == "drawn")]
-            table = file.read(columns=names, use_threads=False)
+        with pq.ParquetFile(path, page_checksum_verification=True, pre_buffer=False) as file:
+            if file.schema_arrow not in _SCHEMAS.values():
+                raise InputError(f"{path}: not a shard of a qs3 data set (other columns)")
+            table = file.read(list(_NAMES if columns is None else columns), use_threads=False)
             table.validate(full=True)  # texts too: Arrow takes any bytes for UTF-8
-            if len(names) < len(wanted):
-                drawn = _SCHEMAS["float32"].field("drawn")
-                table = table.append_column(drawn, [["{}"] * len(table)])
-            return table.select(wanted)
+            return table
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(
-            f"{where}: damaged ({reason}); delete it and run the same command again"
+            f"{path}: damaged ({reason}); delete it and run the same command again"
         ) from error
-
-
-def _announced(group: pq.RowGroupMetaData) -> int:
-    """Bytes that a group of rows becomes: its pages, or its values if a dictionary hides them."""
-    values = sum(group.column(i).num_values for i in range(group.num_columns))
-    return max(group.total_byte_size, _VALUE_BYTES * values)
 
 
 def flat(column: pa.ChunkedArray) -> tuple[np.ndarray, np.ndarray]:
@@ -232,8 +191,3 @@ def flat_clouds(table: pa.Table, column: str, path: Any) -> list[Float32[np.ndar
             f"{path}: {column} of {name!r} is empty, not made of triples, or not finite"
         )
     return [values[begin:end].reshape(-1, 3) for begin, end in itertools.pairwise(offsets)]
-
-
-def digests(values: Iterable[bytes]) -> UInt64[np.ndarray, "_"]:
-    """Return 64 bits of the SHA-256 of each value, by which many are compared in little room."""
-    return np.frombuffer(b"".join(hashlib.sha256(v).digest()[:8] for v in values), np.uint64)

@@ -12,7 +12,6 @@ from jaxtyping import Float, Int, UInt8
 
 from qs3.errors import InputError
 from qs3.io.clouds import CloudKind, PointClouds, UnlabelledClouds
-from qs3.store.folder import open_folder
 from qs3.store.manifest import finished_shards, open_dataset, shard_name
 from qs3.store.shards import STATISTICS, flat_clouds, load_shard
 
@@ -80,7 +79,7 @@ class StoreExhibits:
         Raises:
             InputError: where the folder is no finished data set, is damaged, or has no such split.
         """
-        self._folder = open_folder(where)
+        self._folder = Path(where)
         manifest = open_dataset(self._folder)
         shards = finished_shards(self._folder, manifest.shards)
         if len(shards) < manifest.shards:

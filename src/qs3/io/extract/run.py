@@ -4,6 +4,7 @@ import functools
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -14,17 +15,14 @@ from qs3.io.guards import utf8
 from qs3.io.preparation import resample
 from qs3.meshes.classes import POINTDA10, map_labels
 from qs3.sensor.checks import check_range
-from qs3.store.executors import Failure, InlineExecutor, LocalExecutor, guarded, outcomes
+from qs3.store.executors import Failure, InlineExecutor, LocalExecutor, outcomes
 from qs3.store.failures import read_failures, write_failures
-from qs3.store.folder import Folder, open_folder
 from qs3.store.info import info
 from qs3.store.manifest import (
-    MANIFEST,
     Manifest,
-    Sums,
+    claimed,
     finished_shards,
     package_versions,
-    shard_name,
     write_manifest,
 )
 from qs3.store.progress import progress_bar
@@ -130,7 +128,7 @@ def run_extract(
     Args:
         units: Scenes or frames, in the order of the shards.
         extract_one: Yields the objects of one unit; a picklable function or partial.
-        output: A new or empty folder, or one that the same call began; any address fsspec knows.
+        output: A new or empty folder, or one that the same call began.
         settings: What the rows depend on, plain values; stored in ``dataset.json``.
         class_names: Classes in the order of the label; an object of any other class is a fault.
         planned: Objects that the source announces, for the report.
@@ -146,7 +144,7 @@ def run_extract(
         raise InputError(f"{out}: nothing to extract from")
     if len(set(names)) < len(names):
         raise InputError(f"{out}: two scenes or frames have one name; rename one")
-    folder = open_folder(out)
+    folder = Path(out)
     executor = InlineExecutor() if output.workers == 0 else LocalExecutor(output.workers)
     manifest = Manifest(
         settings={**settings, "num_points": num_points, "units": names},
@@ -155,52 +153,32 @@ def run_extract(
         shards=len(units),
         versions=package_versions(),
     )
-    with folder.claimed(MANIFEST):
+    with claimed(folder):
         write_manifest(folder, manifest)
         failures = {record["shard"]: record for record in read_failures(folder)}
-        sums = Sums(folder)
-        settled = {i for i in finished_shards(folder, len(units)) if shard_name(i) in sums}
+        settled = {*finished_shards(folder, len(units))}
         if output.retry_failed:
-            # Forgotten first: a shard that is written anew has another checksum.
-            for index in settled & set(failures):
-                settled.remove(index)
-                del sums[shard_name(index)]
-            sums.write()
-        make = functools.partial(_put_unit, folder, extract_one, tuple(class_names), num_points)
+            settled -= {*failures}
+        make = functools.partial(_rows, extract_one, tuple(class_names), num_points)
         todo = [index for index in range(len(units)) if index not in settled]
-        calls = ((index, make, index, units[index]) for index in todo)
-        bar = progress_bar(len(units), folder.name, "scene", len(settled))
+        calls = ((index, make, units[index]) for index in todo)
         objects = 0
-
-        def note(index: int, outcome: tuple[str, int] | Failure) -> None:
-            nonlocal objects
-            was_logged = failures.pop(index, None) is not None
-            if isinstance(outcome, Failure):
-                name = names[index]
-                place = {"id": name, "object": name, "scan": 0, "class_name": "", "shard": index}
-                fault = {"row": 0, "error": outcome.kind, "reason": outcome.reason}
-                failures[index] = place | fault
-                outcome = _put(folder, index, [])
-            if was_logged or index in failures:
-                write_failures(folder, failures.values())
-            sums.note(shard_name(index), outcome[0])
-            objects += outcome[1]
-            bar.set_postfix(objects=objects, failed=len(failures), refresh=False)
-            bar.update()
-
-        with bar, executor:
-            try:
-                for index, outcome in outcomes(
-                    executor, lambda: next(calls, None), names.__getitem__
-                ):
-                    note(index, outcome)
-            except KeyboardInterrupt:
-                bar.set_description("finishing what is under way")
-                for index, outcome in executor.drain():
-                    note(index, outcome)
-                raise
-            finally:
-                sums.write()
+        with progress_bar(len(units), folder.name, "scene", len(settled)) as bar, executor:
+            for index, rows in outcomes(executor, calls):
+                is_mended = failures.pop(index, None) is not None
+                if isinstance(rows, Failure):
+                    name = names[index]
+                    place = {"id": name, "object": name, "scan": 0, "class_name": "", "row": 0}
+                    fault = {"shard": index, "error": rows.kind, "reason": rows.reason}
+                    failures[index] = place | fault
+                    write_failures(folder, failures.values())
+                    rows = []
+                put_shard(folder, index, table_of(rows))
+                if is_mended:
+                    write_failures(folder, failures.values())
+                objects += len(rows)
+                bar.set_postfix(objects=objects, failed=len(failures), refresh=False)
+                bar.update()
     return ExtractReport(
         objects=info(folder)["rows"],
         units=len(todo),
@@ -211,26 +189,13 @@ def run_extract(
     )
 
 
-def _put_unit(
-    folder: Folder,
+def _rows(
     extract_one: Callable[[Any], Iterable[ExtractedCloud]],
     class_names: tuple[str, ...],
     num_points: int,
-    index: int,
     unit: Unit,
-) -> tuple[str, int] | Failure:
-    """Extract one unit and write its shard: the checksum and the number of objects."""
-    rows = guarded(lambda: [_row(c, class_names, num_points) for c in extract_one(unit)])
-    if isinstance(rows, Failure):
-        return rows
-    done = guarded(_put, folder, index, rows)
-    if isinstance(done, Failure):
-        return Failure(done.kind, f"{folder}: cannot be written to ({done.reason})", fatal=True)
-    return done
-
-
-def _put(folder: Folder, index: int, rows: Sequence[CloudRow]) -> tuple[str, int]:
-    return put_shard(folder, index, table_of(rows)), len(rows)
+) -> list[CloudRow]:
+    return [_row(cloud, class_names, num_points) for cloud in extract_one(unit)]
 
 
 def _row(cloud: ExtractedCloud, class_names: Sequence[str], num_points: int) -> CloudRow:

@@ -20,10 +20,8 @@ from qs3.io.layouts.format import SPLITS, Format
 from qs3.io.layouts.npz import frame_parts
 from qs3.io.scratch import Spool
 from qs3.processors import usable_processors
-from qs3.store.folder import Folder, open_folder
 from qs3.store.manifest import (
     Manifest,
-    Sums,
     finished_shards,
     open_dataset,
     package_versions,
@@ -37,14 +35,14 @@ _THREADS = min(usable_processors(), 8)
 
 
 def read_ragged(
-    where: str | Path | Folder,
+    where: str | Path,
     cloud: CloudChoice = "points",
     split: str | None = None,
 ) -> RaggedClouds:
     """Read one kind of cloud of a data set, each in its own size.
 
     Args:
-        where: Folder of the data set, or the address of one.
+        where: Folder of the data set.
         cloud: ``points`` (noisy), ``clean``, ``surface``, or ``all``: three clouds of each scan,
             named by its id, a stroke and their kind.
         split: Rows of this split only; where every row tells its ``frame`` and whether it is
@@ -55,7 +53,7 @@ def read_ragged(
         InputError: where the folder is not a data set, is unfinished or damaged, or has no such
             rows or clouds.
     """
-    folder = open_folder(where)
+    folder = Path(where)
     manifest = open_dataset(folder)
     shards = finished_shards(folder, manifest.shards)
     if len(shards) < manifest.shards:
@@ -101,7 +99,7 @@ def read_ragged(
     )
 
 
-def _frame_parts(folder: Folder, shards: Sequence[int]) -> dict[str, Bool[np.ndarray, "b"]]:
+def _frame_parts(folder: Path, shards: Sequence[int]) -> dict[str, Bool[np.ndarray, "b"]]:
     """Splits of all rows by frames; none where a row does not tell of its frame."""
     from qs3.store.shards import load_shard
 
@@ -119,7 +117,7 @@ def _frame_parts(folder: Folder, shards: Sequence[int]) -> dict[str, Bool[np.nda
 
 
 def _read_shard(
-    folder: Folder, index: int, kinds: Sequence[CloudKind], manifest: Manifest
+    folder: Path, index: int, kinds: Sequence[CloudKind], manifest: Manifest
 ) -> tuple[list[list[Any]], list[list[np.ndarray]], bytes]:
     """Ids, labels and splits of a shard, some kinds of its clouds, and the checksum of all that."""
     # Imported here: listing layouts does without Parquet, which weighs.
@@ -160,7 +158,6 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
     splits = clouds.splits or ("",) * count
     labels = clouds.labels.tolist()
     starts = range(0, count, ROWS_PER_SHARD)
-    folder = open_folder(root)
     root.mkdir(parents=True, exist_ok=True)
     manifest = Manifest(
         settings={"kind": "converted", "from": origin, "checksum": clouds.checksum},
@@ -169,8 +166,7 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
         shards=len(starts),
         versions=package_versions(),
     )
-    write_manifest(folder, manifest)
-    sums = Sums(folder)
+    write_manifest(root, manifest)
     with cloud_bar(None, "write", count) as bar:
         for index, start in enumerate(starts):
             rows = []
@@ -178,9 +174,8 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
                 points = np.asarray(clouds.clouds[i], dtype=np.float32)
                 name, class_name = utf8(clouds.ids[i]), names[labels[i]]
                 rows.append(CloudRow(name, name, 0, labels[i], class_name, splits[i], 0, points))
-            sums.note(shard_name(index), put_shard(folder, index, table_of(rows)))
+            put_shard(root, index, table_of(rows))
             bar.update(len(rows))
-    sums.write()
 
 
 FORMAT = Format(
