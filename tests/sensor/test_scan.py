@@ -355,3 +355,17 @@ def test_the_renderer_is_asked_for_no_more_than_is_matched(renderer):
     differ = whole.images[0].left[inner].astype(float) - part.images[0].left
     assert abs(differ.mean()) < 0.5
     assert whole.views[0].disparity_sigma == pytest.approx(part.views[0].disparity_sigma, rel=0.2)
+
+
+def test_a_resting_part_is_scanned_as_it_lies():
+    """Seed by seed, the cloud and the returned mesh agree, and upright scans draw nothing."""
+    rod = trimesh.creation.cylinder(0.1, 1.0)
+    heights = set()
+    for seed in range(4):
+        lying = scan(rod, sensor=SMALL, seed=seed, views=1, pose="resting", num_points=128)
+        assert np.asarray(lying.mesh.bounds).sum(axis=0) == pytest.approx(np.zeros(3), abs=1e-6)
+        assert lying.drawn["pose"] in (0, 1)
+        heights.add(round(float(lying.mesh.extents[2]), 1))
+        assert np.abs(trimesh.proximity.signed_distance(lying.mesh, lying.clean)).max() < 0.05
+    assert heights == {0.2}
+    assert "pose" not in scan(rod, sensor=SMALL, views=1, num_points=128).drawn

@@ -28,7 +28,7 @@ from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.sampling import resample
 from qs3.sensor.scene import ArrangedScene
 from qs3.sensor.settings import ScanSettings as ScanSettings
-from qs3.sensor.staging import choose, resized, sized, stand, stand_in_rooms
+from qs3.sensor.staging import choose, laid, resized, sized, stand, stand_in_rooms
 from qs3.sensor.statistics import ViewStatistics
 from qs3.sensor.view import (
     Clock,
@@ -57,7 +57,7 @@ class Scan:
     clean_view: UInt8[np.ndarray, "m"]
     """Index of the view of each clean point."""
     mesh: trimesh.Trimesh
-    """The normalised mesh in the sensor's object size, in metres for real cameras."""
+    """The normalised mesh in the sensor's object size, in metres for real cameras, as it lay."""
     yaw: float
     """Random rotation about z under which the object was photographed, in radians; undone."""
     poses: tuple[Pose, ...]
@@ -71,8 +71,8 @@ class Scan:
     sensor: Sensor
     """The sensor as it was used: with the rig, the object size and what was drawn."""
     drawn: dict[str, Any] = field(default_factory=dict)
-    """What ``randomise``, ``object_size``, several sensors and ``least_views`` drew, by name; of a
-    room also how often it was drawn again."""
+    """What ``randomise``, ``object_size``, ``pose``, several sensors and ``least_views`` drew, by
+    name; of a room also how often it was drawn again."""
     images: tuple[ViewImages, ...] = field(default=())
     """The pictures of each view, where ``keep_images`` or ``full_frames`` asked for them."""
 
@@ -126,7 +126,8 @@ def scan(
         mesh, _ = load_named(str(mesh), how.seed)
     if not isinstance(mesh, trimesh.Trimesh):
         raise InputError(f"scan: needs a trimesh, a file or a built-in class, not {type(mesh)}")
-    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(how.seed).spawn(9)]
+    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(how.seed).spawn(10)]
+    rng_pose = streams.pop()
     how, chosen = choose(how, streams.pop())
     rng_place, rng_render, rng_noise, rng_sample, rng_scene, rng_settings, rng_size, rng_room = (
         streams
@@ -140,7 +141,8 @@ def scan(
     given, (sensor, drawn) = sensor, draw(sensor, how.ranges, rng_settings)
     own_class, other_class = (*class_names, "", "")[:2]
     normalised, scale, size = sized(mesh, how, own_class, sensor.object_size, rng_size)
-    own = size | chosen
+    posed = laid(normalised, how.pose, rng_pose)
+    own = size | chosen | posed
     sensor, drawn = resized(sensor, scale), drawn | own
     yaw = float(rng_place.uniform(0, 2 * np.pi))
     turned = normalised.copy()
@@ -149,6 +151,7 @@ def scan(
     if neighbour is not None:
         neighbour, _, size = sized(neighbour, how, other_class or None, scale, rng_size)
         neighbour.vertices = neighbour.vertices * scene.neighbour_size
+        size |= laid(neighbour, how.pose, rng_pose)
         drawn |= {f"neighbour_{name}": value for name, value in size.items()}
     body = Body(turned, sensor.material)
     if how.room_layouts:

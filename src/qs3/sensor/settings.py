@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
 
 from qs3.errors import InputError
+from qs3.meshes.poses import PoseName
 from qs3.meshes.sizes import Unit
 from qs3.sensor.checks import check_choices, check_range
 from qs3.sensor.depth import PrincipalPoint
@@ -162,6 +163,9 @@ class ScanSettings(CameraSettings):
 
     preset: Literal["default", "paper", "released"] = "default"
     """Which column of the settings in which the paper's text and its code differ."""
+    pose: PoseName = "upright"
+    """How the object lies: upright, as its file has it; resting, in one of the stable poses of its
+    convex hull, drawn by its probability (parts on a table); any, turned at random."""
     views: int = 5
     """Views fused into one cloud."""
     least_views: int | None = None

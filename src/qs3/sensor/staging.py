@@ -9,6 +9,7 @@ import trimesh
 
 from qs3.errors import InputError
 from qs3.meshes import normalise
+from qs3.meshes.poses import PoseName, draw_pose
 from qs3.meshes.sizes import class_size, file_size
 from qs3.sensor.depth import gate
 from qs3.sensor.obstacles import check_views
@@ -78,6 +79,22 @@ def sized(
         scale = drawn["object_size"] / float(made.extents.max())
     made.vertices = made.vertices * scale
     return made, scale, drawn
+
+
+def laid(mesh: trimesh.Trimesh, pose: PoseName, rng: np.random.Generator) -> dict[str, Any]:
+    """Turn a normalised mesh into a drawn pose, about the centre of its box, which stays at 0.
+
+    Returns:
+        What was drawn, by name.
+
+    Raises:
+        InputError: If it has no resting pose and one is asked for.
+    """
+    rotation, drawn = draw_pose(mesh, pose, rng)
+    if pose != "upright":
+        mesh.vertices = mesh.vertices @ rotation.T
+        mesh.vertices = mesh.vertices - np.asarray(mesh.bounds).mean(axis=0)
+    return drawn
 
 
 def resized(sensor: Sensor, object_size: float) -> Sensor:
