@@ -34,7 +34,7 @@ ALL = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
 NAMES = [str(page.relative_to(ROOT)) for page in ALL]
 MADE = {"contributing.md", "changelog.md", "examples.md"}
 """Pages that exist in the built site alone."""
-SUBCOMMANDS = {"extract": ("scannet", "sunrgbd", "nyuv2", "depth", "bag", "rosbag")}
+SUBCOMMANDS = {"extract": ("scannet", "nyuv2", "depth", "bag", "rosbag")}
 METHODS = set(get_args(MethodName)) - {"gast-spst"}  # told on the pages of its parts
 
 
@@ -123,7 +123,7 @@ import json, site_hooks
 from qs3.cli import VERBS
 verbs = list(VERBS)
 asked = [verb for verb in verbs if verb != "extract"]
-asked += [f"extract {name}" for name in ("scannet", "sunrgbd", "nyuv2", "depth", "bag", "rosbag")]
+asked += [f"extract {name}" for name in ("scannet", "nyuv2", "depth", "bag", "rosbag")]
 told = {v: site_hooks.options_of(site_hooks.help_of(v.split())) for v in asked}
 try:
     refused = site_hooks.options_table(["no-such-verb"])

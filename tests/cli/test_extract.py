@@ -1,6 +1,7 @@
 """``qs3 extract`` as a user runs it."""
 
 import json
+import json
 import shutil
 
 import cv2
@@ -104,9 +105,7 @@ def test_a_bad_image_fails_alone_and_is_told(typed, pictures):
          "needs --mask"),
         (["depth", "D", "--intrinsics", "5,5,2,1", "--mask", "M", "--num-points", "0"],
          "num_points 0 must be at least 1"),
-        (["sunrgbd", "D"], "no frame"),
-        (["sunrgbd", "D", "--erode", "2"], "erode"),
-        (["sunrgbd", "D", "--classes", "chair", "chair"], "comes twice"),
+        (["nyuv2", "D", "--classes", "chair", "chair"], "comes twice"),
         (["nyuv2", "D"], "nyu_depth_v2_labeled.mat: no such file"),
         (["scannet", "D"], "scene0000_00"),
         (["scannet", "D", "--classes", "all"], "name the classes"),
@@ -162,27 +161,6 @@ def test_our_own_frames_go_in_again(qs3, quick, typed, tmp_path):
     noisy, true = read_ragged(tmp_path / "noisy"), read_ragged(tmp_path / "true")
     assert noisy.class_names == true.class_names == ("chair",)
     assert len(true.clouds[0]) == 2048
-
-
-def test_boxes_of_sun_rgbd(typed, tmp_path):
-    folder = tmp_path / "SUNRGBD" / "kv1" / "NYUdata" / "NYU0001"
-    depth = np.full((60, 80), 2000, np.uint16)
-    png(folder / "depth_bfx" / "d.png", (depth << 3) | (depth >> 13))
-    (folder / "intrinsics.txt").write_text("50 0 40 0 50 30 0 0 1")
-    (folder / "extrinsics").mkdir()
-    (folder / "extrinsics" / "a.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0")
-    box = {"basis": np.eye(3).tolist(), "coeffs": [0.5, 0.1, 0.4], "centroid": [0.4, 2.0, 0.0]}
-    boxes = [{"class": "endtable", **box}, {"class": "toilet", **box},
-             {"class": "sofa", **box, "coeffs": [0.05, 0.1, 0.05]}]  # fmt: skip
-    (tmp_path / "boxes.json").write_text(json.dumps({"kv1/NYUdata/NYU0001": boxes}))
-    done = typed("extract", "sunrgbd", tmp_path, "--out", tmp_path / "out", "--workers", "0")
-    assert "1 objects of 2, 1 had fewer than 100 points" in done.stderr
-    data = read_ragged(tmp_path / "out")
-    assert data.ids == ("kv1/NYUdata/NYU0001/000",)
-    assert data.class_names[data.labels[0]] == "table"
-    low, high = data.clouds[0].min(axis=0), data.clouds[0].max(axis=0)
-    np.testing.assert_allclose([low[0], high[0], high[2]], [-0.08, 0.88, 0.4], atol=0.041)
-    assert (data.clouds[0][:, 1] == 2).all()
 
 
 def test_every_frame_of_a_capture_becomes_a_folder_of_objects(qs3, tmp_path):

@@ -16,7 +16,6 @@ from qs3.io.extract.depth import extract_depth
 from qs3.io.extract.nyuv2 import extract_nyuv2
 from qs3.io.extract.run import ExtractReport, OutputSettings
 from qs3.io.extract.scannet import extract_scannet
-from qs3.io.extract.sunrgbd import extract_sunrgbd
 
 
 def _verb(function: Callable[..., ExtractReport]) -> Callable[..., int]:
@@ -71,7 +70,6 @@ def _rosbag(
 
 extract: dict[str, Callable[..., int]] = {
     "scannet": _verb(extract_scannet),
-    "sunrgbd": _verb(extract_sunrgbd),
     "nyuv2": _verb(extract_nyuv2),
     "depth": _verb(extract_depth),
     "bag": _bag,

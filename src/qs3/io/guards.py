@@ -2,7 +2,7 @@
 
 Every reader of files that others made comes through here: sizes first, then the library, and
 whatever that raises becomes one line. Nothing is ever unpickled. Guards that follow the structure
-of one format stand beside its reader: `layouts.hdf5`, `extract.matlab`, `ply`.
+of one format stand beside its reader: `layouts.hdf5`, `ply`.
 """
 
 import contextlib

@@ -1,10 +1,4 @@
-"""Which points of a depth image belong to an object: pixels, gravity, oriented boxes.
-
-Convention:
-    A box is its centre, three unit axes as the rows of ``basis``, and half its size along each.
-    Point p is inside where abs(basis_i · (p − centre)) ≤ half_i for all three i, as in SUN RGB-D's
-    toolbox (centroid, basis, coeffs).
-"""
+"""Pixels of a depth image that belong to an object, their points, and which way is up."""
 
 import math
 from dataclasses import dataclass
@@ -148,39 +142,3 @@ def check_rotation(matrix: Float[np.ndarray, "3 3"], name: str) -> None:
         and math.isclose(float(np.linalg.det(matrix)), 1.0, abs_tol=0.01)
     ):
         raise InputError(f"{name} is no rotation")
-
-
-@dataclass(frozen=True)
-class OrientedBox:
-    """A box in any orientation, in metres."""
-
-    centre: Float[np.ndarray, "3"]
-    """Its centre."""
-    basis: Float[np.ndarray, "3 3"]
-    """One unit axis a row."""
-    half: Float[np.ndarray, "3"]
-    """Half its size along each axis; the sign does not matter."""
-
-
-def inside_box(
-    points: Float[np.ndarray, "n 3"], box: OrientedBox, margin: float = 0.0
-) -> Bool[np.ndarray, "n"]:
-    """Tell which points lie in a box, its faces included and moved outwards by ``margin`` metres.
-
-    Raises:
-        InputError: where the box has a number that is not finite, or its axes are no unit vectors
-            about at right angles.
-
-    Example:
-        >>> box = OrientedBox(np.zeros(3), np.eye(3), np.array([1.0, 1.0, 0.5]))
-        >>> inside_box(np.array([[0.9, 0.0, 0.4], [0.9, 0.0, 0.6]]), box).tolist()
-        [True, False]
-    """
-    if not all(np.isfinite(part).all() for part in (box.centre, box.basis, box.half)):
-        raise InputError("a number of the box is not finite")
-    lengths = np.linalg.norm(box.basis, axis=1)
-    # Axes of drawn quadrangles are square to each other only about.
-    if abs(lengths - 1).max() > 0.01 or abs(np.linalg.det(box.basis)) < 0.5:
-        raise InputError("the axes of the box are not three unit vectors about at right angles")
-    local = np.einsum("nj,ij->ni", points - box.centre, box.basis)
-    return (np.abs(local) <= np.abs(box.half) + margin).all(axis=1)

@@ -17,7 +17,7 @@ Source: Silberman, Hoiem, Kohli and Fergus, "Indoor segmentation and support inf
 images", ECCV 2012 (https://cs.nyu.edu/~silberman/datasets/nyu_depth_v2.html).
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,6 @@ from jaxtyping import Bool, Float
 from qs3.errors import InputError
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.io.extract.intrinsics import Intrinsics
-from qs3.io.extract.matlab import read_mat
 from qs3.io.extract.plane import fit_plane, room_up
 from qs3.io.extract.run import (
     ExtractedCloud,
@@ -40,7 +39,8 @@ from qs3.io.extract.run import (
     run_extract,
     wanted_classes,
 )
-from qs3.io.extract.sunrgbd_lists import rename_to
+from qs3.io.extract.scannet_scene import class_of
+from qs3.io.guards import naming
 from qs3.io.layouts.hdf5 import matlab_texts, open_hdf5, plain_dataset
 from qs3.meshes.classes import canonical
 from qs3.meshes.sizes import CLASS_SIZES
@@ -51,6 +51,7 @@ CAMERA = Intrinsics(518.85790117450188, 519.46961112127485, 324.58244941119034, 
 """The colour camera, from the toolbox's ``camera_params.m``; here pixels count from 0."""
 WORDS: Mapping[str, str] = {
     "game table": "table",
+    "endtable": "end table",
     "light": "",  # mostly on a ceiling or a wall; what stands is called lamp
     "piano bench": "chair",
     "ping pong table": "table",
@@ -115,8 +116,7 @@ def extract_nyuv2(source: Path, output: OutputSettings, settings: Nyuv2Settings)
     path = source / FILE if source.is_dir() else source
     classes = wanted_classes(settings.classes)
     frames, words = list_nyuv2(path, settings.splits)
-    rename = rename_to(classes)
-    named = {i: rename(WORDS.get(word, word) if classes else word) for i, word in words.items()}
+    named = {i: _rename(word, classes) for i, word in words.items()}
     kinds = {i: (words[i], name) for i, name in named.items() if name}
     if not kinds:
         raise InputError(f"{path}: none of its {len(words)} classes is one of --classes")
@@ -131,6 +131,14 @@ def extract_nyuv2(source: Path, output: OutputSettings, settings: Nyuv2Settings)
     )
 
 
+def _rename(word: str, classes: Sequence[str] | None) -> str | None:
+    """Return the class of an annotator's word, None if it has none; without classes the word."""
+    if classes is None:
+        return word.strip()
+    plain = word.strip().lower().replace("_", " ")
+    return class_of(WORDS.get(plain, plain), classes)
+
+
 def list_nyuv2(path: Path, splits: Path | None = None) -> tuple[list[NyuFrame], dict[int, str]]:
     """List the frames of the file, and the word of each label; images are not read."""
     with open_hdf5(path) as file:
@@ -142,18 +150,30 @@ def list_nyuv2(path: Path, splits: Path | None = None) -> tuple[list[NyuFrame], 
     beside = path.with_name(SPLITS)
     splits = splits or (beside if beside.is_file() else None)
     parts = dict.fromkeys(range(1, count + 1), "")
-    for name in ("train", "test"):
-        if splits is None:
-            break
-        given = np.ravel(read_mat(splits, (f"{name}Ndxs",)).get(f"{name}Ndxs", ()))
-        for number in given.tolist():
-            if given.dtype.kind not in "iuf" or parts.get(number) != "":
-                raise InputError(f"{splits}: frame {number} is none of 1 to {count}, or in twice")
+    for name, numbers in _read_splits(splits).items() if splits else ():
+        for number in numbers:
+            if parts.get(number) != "":
+                raise InputError(
+                    f"{splits}: frame {number:g} is out of range 1–{count}, or in twice"
+                )
             parts[number] = name
     if splits and not all(parts.values()):
         raise InputError(f"{splits}: has no trainNdxs and testNdxs for all {count} frames")
     frames = [NyuFrame(f"nyu{i:04d}", i - 1, parts[i], scenes[i - 1]) for i in parts]
     return frames, words
+
+
+def _read_splits(path: Path) -> dict[str, list[int]]:
+    """Read the numbers of the training and test frames from ``splits.mat``."""
+    from scipy.io import loadmat
+
+    names = {"train": "trainNdxs", "test": "testNdxs"}
+    with naming(path, "cannot be read as a MAT file"):
+        table = loadmat(path, variable_names=list(names.values()))
+        return {
+            split: np.ravel(table.get(name, ())).astype(np.float64).tolist()
+            for split, name in names.items()
+        }
 
 
 def cut_frame(
