@@ -1,7 +1,6 @@
 """``qs3 extract`` as a user runs it."""
 
 import json
-import json
 import shutil
 
 import cv2

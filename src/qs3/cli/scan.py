@@ -17,7 +17,6 @@ def scan(
     mesh: Annotated[str, tyro.conf.Positional],
     out: Path,
     up: Literal["z", "y"] | None = None,
-    save_images: bool = False,
     frames: bool = False,
     neighbour: str = "",
     class_name: str = "",
@@ -30,8 +29,6 @@ def scan(
             (chair, …).
         out: Folder to write: cloud.ply, clean.ply, montage.png, scan.json.
         up: Up axis of the mesh file; by default y for glTF, z for all others.
-        save_images: Also write the grey pair, the 16-bit depth and the camera of each view,
-            object's part.
         frames: Also write whole frames in BOP's scene layout, into frames/: grey pair, depth, true
             depth, masks, normals, cameras and poses. Whole frames are matched then, so that the
             cloud differs by a few points from that of the object's part.
@@ -44,7 +41,7 @@ def scan(
     from qs3.meshes.collections import load_named
     from qs3.report.figure import write_png
     from qs3.report.montage import montage, montage_view
-    from qs3.sensor.frames import is_part, remove_frames, write_frames, write_parts
+    from qs3.sensor.frames import remove_frames, write_frames
     from qs3.sensor.scan import scan as scan_mesh
 
     start = time.perf_counter()
@@ -76,14 +73,11 @@ def scan(
     # The record first: it marks the folder as ours, should this be stopped in between.
     write_json(folder / "scan.json", record)
     replaced = (folder / "cloud.ply").is_file()
-    for stale in filter(is_part, list(folder.iterdir())):
-        stale.unlink()
     remove_frames(folder / "frames")
     write_ply(folder / "cloud.ply", result.points, result.view)
     write_ply(folder / "clean.ply", result.clean, result.clean_view)
     write_png(folder / "montage.png", figure)
     written = [folder / n for n in ("cloud.ply", "clean.ply", "montage.png", "scan.json")]
-    written += write_parts(folder, result) if save_images else []
     if frames:
         write_frames(folder / "frames", result)
         written.append(folder / "frames")

@@ -19,7 +19,6 @@ Convention:
 
 import contextlib
 import os
-import re
 from pathlib import Path
 from typing import Any
 
@@ -94,56 +93,6 @@ def remove_frames(folder: Path) -> None:
                 path.unlink()
         with contextlib.suppress(OSError):  # somebody else's files are in it
             Path(place).rmdir()
-
-
-_PART = re.compile(r"view-\d+-(left|right|depth|true-depth|camera)\.(png|json)")
-
-
-def is_part(path: Path) -> bool:
-    """Tell by its name whether `write_parts` wrote a file.
-
-    Example:
-        >>> is_part(Path("view-0-depth.png")), is_part(Path("view-0-mine.png"))
-        (True, False)
-    """
-    return _PART.fullmatch(path.name) is not None
-
-
-def write_parts(folder: Path, scan: Scan) -> list[Path]:
-    """Write the object's part of each view: grey pair, depth and camera, for a quick look.
-
-    Depth is in steps of 1/10,000 of the unit, 0 where there is none. Views that do not show the
-    object are left out. The files written are returned.
-    """
-    written: list[Path] = []
-    cx, cy = scan.sensor.rig.principal_point
-    for index, (images, pose) in enumerate(zip(scan.images, scan.poses, strict=True)):
-        if not images.left.size:  # the object is out of this view's sight
-            continue
-        pictures = {
-            "left": images.left,
-            "right": images.right,
-            "depth": encode_depth(images.depth, 0.1),
-            "true-depth": encode_depth(images.true_depth, 0.1),
-        }
-        for kind, picture in pictures.items():
-            written.append(folder / f"view-{index}-{kind}.png")
-            _write_picture(written[-1], picture)
-        camera = {
-            "width": images.region.width,
-            "height": images.region.height,
-            "focal": scan.sensor.rig.focal,
-            "principal_point": [cx - images.region.x, cy - images.region.y],
-            "region_of_frame": list(images.region.bounds),
-            "frame": [scan.sensor.rig.width, scan.sensor.rig.height],
-            "baseline": scan.sensor.rig.baseline,
-            "depth_unit": 1e-4,
-            "camera_to_world": pose.camera_to_world.tolist(),
-            "world": "the mesh in its object size, turned about z by yaw (scan.json)",
-        }
-        written.append(folder / f"view-{index}-camera.json")
-        write_json(written[-1], camera)
-    return written
 
 
 def _write_picture(path: Path, picture: np.ndarray) -> None:

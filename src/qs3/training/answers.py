@@ -26,7 +26,7 @@ from qs3.training.checkpoint import LoadedModel, load_model
 from qs3.training.predict import ask
 from qs3.training.prepared import note_clouds
 
-_BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|montage\.png|view-\d+-[a-z-]+\.png")
+_BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|montage\.png")
 """What qs3 itself and others write beside clouds, and nobody takes for one."""
 _LONGEST_NAME = 240  # bytes; a number may follow
 

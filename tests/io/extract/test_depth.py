@@ -194,28 +194,22 @@ def test_points_that_no_camera_sees_are_refused(taken, fx, scale):
         cut(folder / "depth" / "a.png", folder / "mask" / "a.png", camera)
 
 
-def test_every_way_to_tell_a_camera(tmp_path):
+def test_every_form_of_a_camera_gives_the_same(tmp_path):
     rows = MATRIX.ravel().tolist()
-    wide = np.eye(4)
-    wide[:3, :3] = MATRIX
-    ways = {
+    forms = {
         "bop.json": json.dumps({"fx": 150, "fy": 140.0, "cx": 77, "cy": 61, "depth_scale": 0.1}),
         "k.json": json.dumps({"K": MATRIX.tolist()}),
         "cam.json": json.dumps({"cam_K": rows, "width": 160, "height": 120}),
-        "open3d.json": json.dumps({"intrinsic_matrix": MATRIX.T.ravel().tolist()}),
         "k.txt": "150 0 77\n0 140 61\n0 0 1\n",
-        "four.txt": "150 140 77 61",
-        "scannet.txt": "\n".join(" ".join(map(str, row)) for row in wide),
+        "ros2.yaml": f"header: {{frame_id: a}}\nk: {rows}\nd: [0.0]\n---\nk: []\n",
     }
     cameras = [read_intrinsics("150,140,77,61")]
-    ways["librealsense.json"] = json.dumps({"fx": 150, "fy": 140, "ppx": 77, "ppy": 61})
-    ways["ros2.yaml"] = f"header: {{frame_id: a}}\nk: {rows}\nd: [0.0]\n---\nk: []\n"
-    for name, text in ways.items():
+    for name, text in forms.items():
         (tmp_path / name).write_text(text, encoding="utf-8")
         cameras.append(read_intrinsics(tmp_path / name))
     assert {(c.fx, c.fy, c.cx, c.cy) for c in cameras} == {(150.0, 140.0, 77.0, 61.0)}
     assert cameras[1].depth_scale == pytest.approx(0.0001)
-    own = {"focal": 150, "principal_point": [77, 61], "depth_unit": 1e-4, "width": 9, "height": 8}
+    own = {"fx": 150, "fy": 150, "cx": 77, "cy": 61, "depth_unit": 1e-4, "width": 9, "height": 8}
     (tmp_path / "own.json").write_text(json.dumps(own), encoding="utf-8")
     camera = read_intrinsics(tmp_path / "own.json")
     assert camera == Intrinsics(150.0, 150.0, 77.0, 61.0, 9, 8, 1e-4)
@@ -250,17 +244,12 @@ distortion_coefficients: {rows: 1, cols: 5, data: [0.0, 0.0, 0.0, 0.0, 0.0]}
     assert read_intrinsics(tmp_path) == expected  # camera_info.yaml is a name that is looked for
     assert not caplog.text
     small = calibration.replace("[0.0, 0.0", "[0.0, 1e-05")
-    bent = {"bent.yml": small, "ragged.yml": calibration.replace("[0.0, 0.0", "[[0.1], [0.0, 0.1]")}
     plain = {"fx": 150, "fy": 140, "cx": 77, "cy": 61, "width": 160, "height": 120}
-    bent["coeffs.json"] = json.dumps(plain | {"coeffs": {"k1": 0.1}, "k": 3, "d": None})
-    for key in ("dist", "distCoeffs", "dist_coeff", "distortion"):
-        bent[f"{key}.json"] = json.dumps(plain | {key: [0.1, 0], "distance": 3})
-    bent["k1.json"] = json.dumps(plain | {"k1": -0.1})
+    bent = {"bent.yml": small, "bent.json": json.dumps(plain | {"coeffs": [0.1, 0], "D": None})}
     for name, text in bent.items():
         (tmp_path / name).write_text(text)
         assert read_intrinsics(tmp_path / name) == expected
-        told = f"{tmp_path / name}: tells lens distortion, which is not undone"
-        assert told in caplog.text, name
+        assert f"{tmp_path / name}: has lens distortion, which is not corrected" in caplog.text
 
 
 def test_a_principal_point_outside_the_image_is_told(caplog):
@@ -293,13 +282,9 @@ def test_bad_cameras_on_the_command_line(text, message):
     ("name", "text", "message"),
     [
         ("a.json", "[1, 2", "not a JSON file"),
-        ("a.json", "[1, 2]", "not a JSON object"),
-        ("a.json", "[" * 100_000, "not a JSON file"),
-        ("a.json", '{"fx": ' + "1" * 5000 + "}", "not a JSON file"),
+        ("a.json", "[1, 2]", "not a table"),
         ("a.json", '{"fx": "150"}', "fx.*not a number"),
-        ("a.json", '{"fx": true, "fy": 1, "cx": 1, "cy": 1}', "fx.*not a number"),
         ("a.json", '{"fx": 150, "fy": 140, "cx": 77}', "one is missing"),
-        ("a.json", '{"fx": 150, "fy": 140, "cx": 77, "cy": NaN}', "not a JSON file"),
         ("a.json", '{"fx": 150, "fy": 140, "cx": 77, "cy": 6, "width": 1.5}', "width"),
         ("a.json", '{"fx": 1, "fy": 1, "cx": 7, "cy": 6, "depth_scale": 0}', "must be positive"),
         (
@@ -307,25 +292,20 @@ def test_bad_cameras_on_the_command_line(text, message):
             '{"fx": 1, "fy": 1, "cx": 7, "cy": 6, "depth_scale": 0.001}',
             "1e-06 m a step of depth is finer .* depth_unit metres",
         ),
-        ("a.json", '{"K": [[1, 0], [0, 1]]}', "K must be 9 numbers"),
-        ("a.json", '{"focal": 3}', "principal_point"),
-        ("a.json", "{}", "none of fx"),
-        ("a.yaml", "K: [1, 2", "not a YAML file"),
-        ("a.yaml", "a: &a {}\nb: {<<: [*a, *a]}\nfx: 1", "refers to parts of itself"),
-        ("a.yaml", "[" * 10_000, "not a YAML file"),
-        ("a.yaml", "x" * 100_000, "too long"),
-        ("a.yaml", "", "not a table of names and values"),
-        ("a.yaml", "K: !!python/object/apply:os.system [ls]", "not a YAML file"),
-        ("a.yaml", "camera_matrix: {rows: 3, cols: 3}", "none of fx"),
-        ("a.yaml", "camera_matrix: {data: [a, b]}", "K.*not a number"),
+        ("a.json", '{"K": [[1, 0], [0, 1]]}', "K must be 3×3 numbers"),
+        ("a.json", "{}", "neither fx nor"),
+        ("a.yaml", "K: [1, 2", "cannot be read as a camera"),
+        ("a.yaml", "", "not a table|empty"),
+        ("a.yaml", "K: !!python/object/apply:os.system [ls]", "cannot be read as a camera"),
+        ("a.yaml", "camera_matrix: {rows: 3, cols: 3}", "camera_matrix must be 3×3"),
+        ("a.yaml", "camera_matrix: {data: [a, b]}", "cannot be read as a camera"),
         ("a.txt", "150 0 0 0 140 0 77 61 1", "row by row"),
         ("a.txt", "150 3 77 0 140 61 0 0 1", "skew"),
         ("a.txt", "150 0 77 0 -140 61 0 0 1", "must be positive"),
         ("a.txt", "150 0 77 0 140 61 0 0 2", "0 0 1"),
         ("a.txt", "150 0 nan 0 140 61 0 0 1", "finite"),
-        ("a.txt", "1 2 3", "3 numbers instead"),
-        ("a.txt", "one two", "not a text file of numbers"),
-        ("a.txt", "\0\0", "not a text file of numbers"),
+        ("a.txt", "1 2 3", "must be 3×3 numbers, not 3"),
+        ("a.txt", "one two", "cannot be read as a camera"),
     ],
 )  # fmt: skip
 def test_bad_camera_files_are_refused_by_name(tmp_path, name, text, message):

@@ -10,27 +10,16 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.errors import InputError, say_once
-from qs3.io.guards import Numbers, as_matrix, naming, pick, read_numbers, read_small_json, read_text
+from qs3.files import read_json
+from qs3.io.guards import naming, pick
 
 CAMERA_FILES = ("intrinsics.json", "intrinsics.txt", "camera.json", "K.txt", "camera_info.yaml")
-"""Names of the file that tells the camera of a folder of images."""
+"""Names of the file that describes the camera of a folder of images."""
 
-_LARGEST = 1 << 20
-_LARGEST_YAML = 1 << 16  # its reader takes some seconds for so much
 _FORMS = "give fx,fy,cx,cy, a JSON or YAML file, or a text file of 3×3 numbers"
-_SAME = {
-    "camera_matrix": "K",
-    "k": "K",
-    "image_width": "width",
-    "image_height": "height",
-    "ppx": "cx",
-    "ppy": "cy",
-}
-"""Other names in the files of OpenCV, ROS 1, ROS 2 and librealsense."""
-_DISTORTION = re.compile(
-    r"d|dist|dist(ortion)?_?coeff(icient)?s?|distortion|coeffs|[kp][1-6]", re.I
-)
-"""Names under which files tell it; `K` is the camera's matrix."""
+_MATRIX_NAMES = ("K", "k", "cam_K", "camera_matrix")
+"""Names of the matrix in our, ROS 2's, BOP's and OpenCV's files."""
+_DISTORTION_NAMES = ("D", "d", "coeffs", "distortion_coefficients")
 _FINEST = 5e-6
 """Metres a step of depth; the finest camera we know of has 1e-5."""
 
@@ -53,11 +42,11 @@ class Intrinsics:
     cy: float
     """Row of the principal point."""
     width: int | None = None
-    """Columns of the images it belongs to, where the file tells."""
+    """Columns of its images; None if unknown."""
     height: int | None = None
-    """Rows of the images it belongs to, where the file tells."""
+    """Rows of its images; None if unknown."""
     depth_scale: float | None = None
-    """Metres a step of the depth images, where the file tells."""
+    """Metres a step of its depth images; None if unknown."""
 
     def __post_init__(self) -> None:
         if not all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy))):
@@ -77,7 +66,7 @@ class Intrinsics:
     def check_size(self, shape: tuple[int, ...], where: str) -> None:
         """Refuse an image of another size than the camera's; ``where`` names it.
 
-        A principal point outside the image, as of a crop from a corner, is told once.
+        Warns once if the principal point lies outside the image, as that of a crop from a corner.
         """
         height, width = shape[:2]
         if (self.width or width, self.height or height) != (width, height):
@@ -102,7 +91,7 @@ def intrinsics_from_matrix(matrix: Float[np.ndarray, "3 3"], **more: Any) -> Int
         more: ``width``, ``height`` or ``depth_scale``.
 
     Raises:
-        InputError: where it has another form, is transposed or has skew.
+        InputError: If it has another form, is transposed or has skew.
 
     Example:
         >>> intrinsics_from_matrix(np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])).cy
@@ -121,18 +110,17 @@ def intrinsics_from_matrix(matrix: Float[np.ndarray, "3 3"], **more: Any) -> Int
 def read_intrinsics(given: str | Path) -> Intrinsics:
     """Read a camera from four numbers or from a file.
 
+    Warns once if a file holds lens distortion, which is not corrected.
+
     Args:
-        given: ``fx,fy,cx,cy``; or a JSON file with ``fx``, ``fy``, ``cx``, ``cy`` (BOP's
-            camera.json), with ``focal`` and ``principal_point`` (``qs3 scan --save-images``), with
-            ``cam_K`` or ``K`` row by row, or with ``intrinsic_matrix`` column by column (Open3D);
-            or a YAML file with any of these, with ``camera_matrix`` (OpenCV, ROS's calibration) or
-            as ROS prints a camera_info; or a text file of 4, 9 (3×3) or 16 (4×4) numbers row by
-            row. JSON and YAML may also tell ``width``, ``height`` and ``depth_scale`` (millimetres
-            a step, as BOP) or ``depth_unit`` (metres a step). Of a folder it is the first of
-            `CAMERA_FILES` in it. Lens distortion that a file tells is not undone, which is said.
+        given: ``fx,fy,cx,cy``; a text file of 3×3 numbers, row by row; a JSON file; a YAML file of
+            OpenCV or ROS; or a folder with one of `CAMERA_FILES`. JSON and YAML hold ``fx``,
+            ``fy``, ``cx``, ``cy`` or the matrix row by row (``K``, ``cam_K``, ``camera_matrix``),
+            and may hold ``width``, ``height`` and ``depth_scale`` (millimetres a step, as BOP) or
+            ``depth_unit`` (metres a step).
 
     Raises:
-        InputError: where it is none of these, or no camera.
+        InputError: If it is none of these, or no camera.
 
     Example:
         >>> read_intrinsics("500,510,320,240").fy
@@ -149,24 +137,16 @@ def read_intrinsics(given: str | Path) -> Intrinsics:
     if not numbers and path.is_dir():
         files = [path / name for name in CAMERA_FILES if (path / name).is_file()]
         if not files:
-            names = ", ".join(CAMERA_FILES)
-            raise InputError(f"{path}: does not tell its camera ({names}); {_FORMS}")
+            raise InputError(f"{path}: has no camera file ({', '.join(CAMERA_FILES)}); {_FORMS}")
         path = files[0]
     if numbers or not path.is_file():
         raise InputError(f"intrinsics {text!r}: {'' if numbers else 'no such file; '}{_FORMS}")
-    with naming(path):
-        if path.suffix.lower() in (".json", ".yaml", ".yml"):
-            json = path.suffix.lower() == ".json"
-            table = _renamed(read_small_json(path, _LARGEST) if json else _read_yaml(path))
-            camera = _from_table(pick(table, _CameraFile, "camera"))
-            if any(_is_bent(v) for name, v in table.items() if _DISTORTION.fullmatch(str(name))):
-                say_once(f"{path}: tells lens distortion, which is not undone; give images without")
-            return camera
-        numbers = read_numbers(path, (4, 9, 16)).tolist()
-        if len(numbers) == 4:
-            return read_intrinsics(",".join(map(str, numbers)))
-        side = math.isqrt(len(numbers))
-        return intrinsics_from_matrix(np.reshape(numbers, (side, side))[:3, :3])
+    with naming(path, "cannot be read as a camera"):
+        if path.suffix.lower() == ".json":
+            return _from_table(read_json(path), path)
+        if path.suffix.lower() in (".yaml", ".yml"):
+            return _from_table(_read_yaml(path), path)
+        return _from_matrix(path.read_text(encoding="utf-8-sig").split(), "the matrix")
 
 
 def _read_yaml(path: Path) -> Any:
@@ -174,12 +154,7 @@ def _read_yaml(path: Path) -> Any:
     import yaml
 
     class Loader(yaml.SafeLoader):
-        """Plain values alone, and a matrix of OpenCV as the table that it is."""
-
-        def compose_node(self, parent: Any, index: Any) -> Any:
-            if self.check_event(yaml.AliasEvent):  # a few lines of them become gigabytes
-                raise InputError("refers to parts of itself (*name), as no camera's file does")
-            return super().compose_node(parent, index)
+        """Plain values, with OpenCV's matrices as tables."""
 
     tag = "tag:yaml.org,2002:"
     Loader.add_constructor(f"{tag}opencv-matrix", yaml.SafeLoader.construct_yaml_map)
@@ -187,75 +162,61 @@ def _read_yaml(path: Path) -> Any:
     Loader.add_implicit_resolver(
         f"{tag}float", re.compile(r"[-+]?\d+[eE][-+]?\d+$"), [*"-+0123456789"]
     )
-    text = read_text(path, _LARGEST_YAML)
+    text = path.read_text(encoding="utf-8-sig")
     if text.startswith("%YAML:"):  # OpenCV 4's first line, with a colon that YAML does not know
         text = text.partition("\n")[2]
-    with naming(path, "not a YAML file"):  # whatever its reader stumbles over
-        table = next(yaml.load_all(text, Loader), None)  # of several messages of ROS the first
-    if not isinstance(table, dict):
-        raise InputError("not a table of names and values")
-    return table
-
-
-def _renamed(table: Any) -> Any:
-    """A table with our names in place of others', and a matrix as its numbers."""
-    if not isinstance(table, dict):
-        return table
-    ours = {key: value for key, value in table.items() if key not in _SAME}
-    for key, name in _SAME.items():
-        value = table.get(key)
-        if name == "K":
-            value = value.get("data") if isinstance(value, dict) else value
-            value = value if isinstance(value, list) else None  # another's k is something else
-        if value is not None:
-            ours.setdefault(name, value)
-    return ours
-
-
-def _is_bent(distortion: Any) -> bool:
-    """Whether a number of a distortion, however it is told, is not 0."""
-    if isinstance(distortion, dict):
-        numbers = distortion.get("data", distortion)
-        return _is_bent([*numbers.values()] if isinstance(numbers, dict) else numbers)
-    if isinstance(distortion, list):
-        return any(map(_is_bent, distortion))
-    return isinstance(distortion, int | float) and distortion != 0
+    return next(yaml.load_all(text, Loader), None)  # ROS may print several messages
 
 
 @dataclass(frozen=True)
 class _CameraFile:
-    """What JSON and YAML files of cameras hold, one of its groups each; see `read_intrinsics`."""
+    """Values of a camera's JSON or YAML file; see `read_intrinsics`."""
 
     fx: float | None = None
     fy: float | None = None
     cx: float | None = None
     cy: float | None = None
-    focal: float | None = None
-    principal_point: tuple[float, float] | None = None
-    cam_K: Numbers | None = None  # noqa: N815 (BOP's name)
-    K: Numbers | None = None
-    intrinsic_matrix: Numbers | None = None
     width: int | None = None
     height: int | None = None
+    image_width: int | None = None
+    image_height: int | None = None
     depth_scale: float | None = None
     depth_unit: float | None = None
 
 
-def _from_table(file: _CameraFile) -> Intrinsics:
-    scale = file.depth_unit if file.depth_scale is None else file.depth_scale / 1000
-    more = {"width": file.width, "height": file.height, "depth_scale": scale}
+def _from_table(table: Any, path: Path) -> Intrinsics:
+    if not isinstance(table, dict):
+        raise InputError("not a table of names and values")
+    if any(_is_bent(table.get(name)) for name in _DISTORTION_NAMES):
+        say_once(f"{path}: has lens distortion, which is not corrected; give undistorted images")
+    file = pick(table, _CameraFile, path)
+    more = {
+        "width": file.width or file.image_width,
+        "height": file.height or file.image_height,
+        "depth_scale": file.depth_unit if file.depth_scale is None else file.depth_scale / 1000,
+    }
     if file.fx is not None:
         if file.fy is None or file.cx is None or file.cy is None:
-            raise InputError("camera: fx, fy, cx and cy belong together; one is missing")
+            raise InputError("fx, fy, cx and cy belong together; one is missing")
         return Intrinsics(file.fx, file.fy, file.cx, file.cy, **more)
-    if file.focal is not None:
-        if file.principal_point is None:
-            raise InputError("camera: focal needs principal_point, its column and row")
-        return Intrinsics(file.focal, file.focal, *file.principal_point, **more)
-    for name in ("cam_K", "K", "intrinsic_matrix"):
-        if (numbers := getattr(file, name)) is not None:
-            matrix = as_matrix(numbers, name)
-            return intrinsics_from_matrix(
-                matrix.T if name == "intrinsic_matrix" else matrix, **more
-            )
-    raise InputError("camera: has none of fx, focal, cam_K, K, camera_matrix, intrinsic_matrix")
+    for name in _MATRIX_NAMES:
+        if name in table:
+            return _from_matrix(_data(table[name]), name, **more)
+    raise InputError(f"has neither fx nor a matrix ({', '.join(_MATRIX_NAMES)})")
+
+
+def _from_matrix(numbers: Any, name: str, **more: Any) -> Intrinsics:
+    matrix = np.array(numbers, dtype=np.float64)
+    if matrix.size != 9:
+        raise InputError(f"{name} must be 3×3 numbers, not {matrix.size}")
+    return intrinsics_from_matrix(matrix.reshape(3, 3), **more)
+
+
+def _data(value: Any) -> Any:
+    """Return the numbers of OpenCV's and ROS's tables with ``rows``, ``cols`` and ``data``."""
+    return value.get("data") if isinstance(value, dict) else value
+
+
+def _is_bent(distortion: Any) -> bool:
+    numbers = _data(distortion)
+    return isinstance(numbers, list) and bool(np.any(np.array(numbers, dtype=np.float64)))
