@@ -56,6 +56,14 @@ def structure(value: Any, kind: type[_Kind], where: str | Path) -> _Kind:
         raise InputError(f"{where}: {_reason(error)}") from error
 
 
+def pick(value: Any, kind: type[_Kind], where: str | Path) -> _Kind:
+    """Make a dataclass of those plain values that it has fields for; other keys are ignored."""
+    if not isinstance(value, dict):
+        raise InputError(f"{where}: not a table of names and values")
+    names = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    return structure({key: value[key] for key in value if key in names}, kind, where)
+
+
 def unstructure(value: Any) -> Any:
     """Return a dataclass as plain values that JSON can hold: dicts, lists, text, numbers.
 

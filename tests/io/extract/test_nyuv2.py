@@ -13,9 +13,8 @@ from qs3.errors import InputError
 from qs3.io.extract.cut import CutSettings
 from qs3.io.extract.nyuv2 import FILE, Nyuv2Settings, extract_nyuv2, list_nyuv2
 from qs3.io.extract.run import OutputSettings
-from qs3.io.guards import LIMIT
 
-from ..hostile import fuzz, refused
+from ..hostile import refused
 from .depth_scene import box, cast, off_surface, thing
 
 WORDS = ["wall", "floor", "sofa chair", "night stand", "light", "picture"]
@@ -183,21 +182,15 @@ def test_classes_of_ones_own_and_all_of_them(folder, tmp_path):
         run(folder, tmp_path / "none", classes=("bathtub",))
 
 
-def test_one_frame_is_read_at_a_time(folder, tmp_path, monkeypatch):
-    """A file whose arrays would fill the memory is read: only one frame of each counts."""
-    monkeypatch.setenv(LIMIT, str(640 * 480 * 4 / 2**30))
-    assert run(folder, tmp_path / "out")[0].failed == 0
-
-
 def test_other_files_are_refused_in_one_line(folder, tmp_path):
-    with refused("no such file", FILE):
+    with refused("[nN]o such file", FILE):
         list_nyuv2(tmp_path / FILE)
     (tmp_path / FILE).write_bytes(b"no HDF5")
-    with refused("cannot be read as HDF5", FILE):
+    with refused("cannot be read as NYU Depth v2", FILE):
         list_nyuv2(tmp_path / FILE)
     with h5py.File(tmp_path / "other.mat", "w") as file:
         file["labels"] = np.zeros((2, 480, 640), np.uint8)
-    with refused(r"labels has shape \[2, 480, 640\]", "other.mat"):
+    with refused("names", "other.mat"):
         list_nyuv2(tmp_path / "other.mat")
     savemat(tmp_path / "splits.mat", {"trainNdxs": [[1], [2]], "testNdxs": [[2]]})
     with refused("frame 2", "splits.mat"):
@@ -205,9 +198,3 @@ def test_other_files_are_refused_in_one_line(folder, tmp_path):
     savemat(tmp_path / "splits.mat", {"trainNdxs": [[1], [2]]})
     with refused("for all 3 frames", "splits.mat"):
         list_nyuv2(folder / FILE, tmp_path / "splits.mat")
-
-
-def test_damaged_files_are_read_or_refused(folder, tmp_path):
-    path = tmp_path / FILE
-    path.write_bytes((folder / FILE).read_bytes())
-    fuzz([path], list_nyuv2, np.random.default_rng(0), 60)

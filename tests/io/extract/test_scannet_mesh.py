@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from qs3.io.extract.scannet import ScanNetSettings
-from qs3.io.extract.scannet_frames import cut_scene
 from qs3.io.extract.scannet_mesh import cut_mesh_scene, read_scene_mesh
 from qs3.io.extract.scannet_scene import ScanNetScene, read_objects
 
-from ..hostile import fuzz, refused
+from ..hostile import refused
 from .writers import CHAIR, TABLE, Room, write_aggregation, write_mesh, write_room, write_segments
 
 SETTINGS = ScanNetSettings(min_points=100)
@@ -88,24 +87,10 @@ def scene_with(tmp_path: Path, name: str, content: bytes) -> ScanNetScene:
     return scene_of(tmp_path)
 
 
-HEAD = (
-    b"ply\nformat binary_little_endian 1.0\nelement vertex %d\nproperty float x\nproperty float y\n"
-)
 BAD = {
-    "announced": (PLY, HEAD % 10**12 + b"property float z\nend_header\n" + bytes(36), "announces"),
-    "no z": (PLY, HEAD % 3 + b"end_header\n" + bytes(24), "x, y and z"),
-    "no ply": (PLY, b"solid", "read as ply"),
-    "empty": (PLY, b"", "read as ply"),
-    "none": (PLY, HEAD % 0 + b"property float z\nend_header\n", "no vertices"),
-    "NaN": (
-        PLY,
-        HEAD % 3 + b"property float z\nend_header\n" + np.full(9, np.nan, "<f4").tobytes(),
-        "not finite",
-    ),
+    "no ply": (PLY, b"solid", "read as PLY"),
     "too few": (SEGS, b'{"segIndices": [1, 1]}', "2 segIndices for 3 vertices"),
-    "text": (SEGS, b'{"segIndices": [1, 1, "1"]}', "whole numbers"),
-    "negative": (SEGS, b'{"segIndices": [1, 1, -1]}', "whole numbers"),
-    "nested": (SEGS, b'{"segIndices": ' + b"[" * 100_000, "not a JSON"),
+    "text": (SEGS, b'{"segIndices": [1, 1, "a"]}', "as a list of segments"),
     "other": (SEGS, b'{"segGroups": []}', "segIndices"),
 }
 
@@ -116,17 +101,3 @@ def test_bad_files_are_one_line(tmp_path: Path, fault: str) -> None:
     scene = scene_with(tmp_path, name, content)
     with refused(message, tmp_path / name):
         list(cut_mesh_scene(scene, SETTINGS))
-
-
-def test_mutated_files_raise_nothing_else(tmp_path: Path, rng: np.random.Generator) -> None:
-    room = write_room(tmp_path / "scans", frames=2, size=(32, 24))
-    settings = ScanNetSettings(every=1, min_pixels=5, min_points=5)
-    # The small mesh: parsing thousands of vertices again and again would test nothing more.
-    scene = scene_with(room.folder, "other", b"")
-
-    def read(_: Path) -> None:
-        for extract in (cut_scene, cut_mesh_scene):
-            list(extract(scene, settings))
-
-    paths = [path for path in room.folder.iterdir() if path.suffix not in ("", ".sens")]
-    fuzz(sorted(paths), read, rng, 100)

@@ -16,12 +16,18 @@ from jaxtyping import UInt8
 from qs3.errors import InputError, StorageError
 from qs3.files import refuse_taken, write_bytes, write_json, write_text
 from qs3.io.cameras.frames import Camera, DepthFrame
-from qs3.io.extract.depth_images import DEPTH, MILLIMETRE, list_images, read_raw, to_metres
+from qs3.io.extract.depth_images import (
+    DEPTH,
+    MILLIMETRE,
+    decode_image,
+    list_images,
+    read_raw,
+    to_metres,
+)
 from qs3.io.extract.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
-from qs3.io.guards import naming, read_image, read_small, read_text
+from qs3.reading import reading
 
 COLOUR, TIMES = "color", "times.csv"
-_LARGEST = 1 << 28
 
 _log = logging.getLogger(__name__)
 
@@ -32,13 +38,13 @@ def folder_camera(folder: Path, intrinsics: str = "", colour: bool = True) -> Ca
     Args:
         folder: As `capture` writes it, or with the depth images directly in it.
         intrinsics: Of the camera; empty takes the folder's own file, one of `CAMERA_FILES`.
-        colour: Whether to read colour where there is some.
+        colour: Whether to read colour if there is some.
 
-    A damaged frame is told and left out, and ends it with an error once all others are given; where
-    the first one is, it ends there, for the others have likely the same fault.
+    A damaged frame is reported and left out; after the other frames an error is raised. If the
+    first frame is damaged, the error is raised at once: the others have likely the same fault.
 
     Raises:
-        InputError: where there is no depth image or no camera, or a frame is damaged.
+        InputError: If there is no depth image or no camera, or a frame is damaged.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
@@ -80,10 +86,10 @@ def _read_frame(path: Path, camera: Intrinsics, picture: Path | None) -> DepthFr
 
 
 def capture(frames: Camera, out: Path) -> int:
-    """Write frames into a new folder, each file whole; what stops it leaves what is there.
+    """Write frames into a new folder, each file whole; a stop keeps the files written so far.
 
-    Depth becomes a PNG of 16 bits in the step in which it was measured, numbers with a point npy
-    in metres.
+    Depth becomes a 16-bit PNG in the step in which it was measured, floating-point depth npy in
+    metres.
 
     Args:
         frames: A camera; it is closed at the end.
@@ -93,7 +99,7 @@ def capture(frames: Camera, out: Path) -> int:
         How many were written.
 
     Raises:
-        InputError: where the folder is taken, or the camera gives no frame.
+        InputError: If the folder is taken, or the camera gives no frame.
     """
     refuse_taken(out)
     times: dict[str, float] = {}
@@ -148,19 +154,16 @@ def _png(image: np.ndarray) -> bytes:
 
 
 def _read_colour(path: Path, shape: tuple[int, ...]) -> UInt8[np.ndarray, "h w 3"]:
-    with naming(path):
-        image, mode = read_image(read_small(path, _LARGEST, "a picture"), "PNG")
-    if mode != "RGB" or image.shape != (*shape, 3) or image.dtype != np.uint8:
-        raise InputError(f"{path}: no colour picture of the depth image's size")
-    return image[..., ::-1]
+    with reading(path):
+        image = decode_image(path.read_bytes())
+        if image.shape != (*shape, 3) or image.dtype != np.uint8:
+            raise InputError("no colour picture of the depth image's size")
+        return image[..., ::-1]
 
 
 def _read_times(path: Path) -> dict[str, float]:
-    """Seconds by the name of each frame; none where there is no such file."""
+    """Return the seconds of each frame by its name; empty if there is no such file."""
     if not path.is_file():
         return {}
-    rows = csv.DictReader(io.StringIO(read_text(path, 1 << 26), newline=""))
-    try:
-        return {row["frame"]: float(row["time"]) for row in rows}
-    except (csv.Error, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: not a CSV with the columns frame,time") from error
+    with reading(path, "a CSV with the columns frame,time"), path.open(newline="") as handle:
+        return {row["frame"]: float(row["time"]) for row in csv.DictReader(handle)}

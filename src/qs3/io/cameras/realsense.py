@@ -12,7 +12,7 @@ from qs3.errors import InputError, MissingExtraError, say_once
 from qs3.io.cameras.frames import Camera, DepthFrame
 from qs3.io.extract.depth_images import to_metres
 from qs3.io.extract.intrinsics import Intrinsics
-from qs3.io.guards import naming
+from qs3.reading import naming
 
 _PATIENCE = 5000  # milliseconds to the next frame
 
@@ -41,13 +41,15 @@ def realsense_camera(serial: str = "", file: Path | None = None, colour: bool = 
     if file is not None and not file.is_file():
         raise InputError(f"{file}: no such file")
     pipeline = rs.pipeline()
-    with naming(where, "librealsense cannot open it", RuntimeError):
-        profile = pipeline.start(_config(rs, pipeline, serial, file, colour))
     try:
-        with naming(where, "librealsense stopped", RuntimeError):
-            yield from _frames(rs, pipeline, profile, colour)
-    finally:
-        pipeline.stop()
+        with naming(where):
+            profile = pipeline.start(_config(rs, pipeline, serial, file, colour))
+            try:
+                yield from _frames(rs, pipeline, profile, colour)
+            finally:
+                pipeline.stop()
+    except RuntimeError as error:
+        raise InputError(f"{where}: librealsense stopped ({error})") from error
 
 
 def _config(rs: Any, pipeline: Any, serial: str, file: Path | None, colour: bool) -> Any:

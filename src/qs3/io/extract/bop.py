@@ -11,33 +11,35 @@ Convention:
 """
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from qs3.errors import InputError
+from qs3.files import read_json
 from qs3.geometry import invert_rigid
-from qs3.io.extract.cut import check_rotation, upright
+from qs3.io.extract.cut import is_rotation, upright
 from qs3.io.extract.depth import DepthImageSettings, Frame, FrameObject, cut_frame
-from qs3.io.extract.intrinsics import intrinsics_from_matrix
+from qs3.io.extract.intrinsics import as_matrix, intrinsics_from_matrix
 from qs3.io.extract.run import ExtractReport, OutputSettings, recorded, run_extract
-from qs3.io.guards import Numbers, as_matrix, naming, pick, read_small_json
+from qs3.reading import naming, reading
+from qs3.structure import pick
 
 CAMERAS = "scene_camera.json"
 _TRUTH = "scene_gt.json"
 _MASKS = "mask_visib"
 
 Axes = Literal["auto", "world", "camera", "model"]
-_Triple = tuple[float, float, float]
+_Numbers = tuple[float, ...]
 
 
 def is_bop(source: Path) -> bool:
-    """Whether a folder is a scene in BOP's layout, or holds some."""
+    """Return whether a folder is a scene in BOP's layout, or holds some."""
     return bool(_scenes(source))
 
 
@@ -46,14 +48,14 @@ def extract_bop(
 ) -> ExtractReport:
     """Cut the objects of all images of a scene, or of a folder of scenes, into a data set.
 
-    The scene tells camera, masks and scale, so that settings of these are refused. ``names`` gives
-    the class by the model: ``obj_000001`` or ``1``. Raises as `depth.extract_depth` does.
+    The scene has camera, masks and scale, so that settings of these are refused. ``names`` gives
+    the class of a model, ``obj_000001`` or ``1``. Raises as `depth.extract_depth` does.
     """
     of_scene = ("intrinsics", "mask", "box", "depth_scale", "instances")
     for flag in of_scene:
         if getattr(settings, flag):
             word = flag.replace("_", "-")
-            raise InputError(f"--{word}: a scene in BOP's layout tells it; leave it out")
+            raise InputError(f"--{word}: a scene in BOP's layout has its own; leave it out")
     frames, axes = list_bop_frames(source, settings, names)
     objects = [item for frame in frames for item in frame.objects]
     if not objects:
@@ -87,20 +89,24 @@ def list_bop_frames(
     source: Path, settings: DepthImageSettings, names: Mapping[str, str]
 ) -> tuple[list[Frame], Axes]:
     """List the images of a scene, or of all scenes of a folder; and the axes of their clouds."""
-    scenes = _scenes(source)
-    if not scenes:
-        raise InputError(f"{source}: no scene of BOP's layout ({CAMERAS}) in it")
-    images = [image for scene in scenes for image in _images(scene)]
-    axes: Axes = "world" if all(camera.cam_R_w2c for _, _, camera, _ in images) else "camera"
-    axes = axes if settings.frame == "auto" else settings.frame
-    return [_frame(image, axes, settings, names) for image in images], axes
+    cameras = {scene: _read_cameras(scene) for scene in _scenes(source)}
+    in_world = all(camera.cam_R_w2c for scene in cameras.values() for camera in scene.values())
+    axes: Axes = "world" if in_world else "camera"
+    if settings.frame != "auto":
+        axes = settings.frame
+    frames = []
+    for scene, images in cameras.items():
+        truth = _read_truth(scene)
+        for number, camera in sorted(images.items()):
+            frames.append(
+                _frame(scene, number, camera, truth.get(number, []), axes, settings, names)
+            )
+    return frames, axes
 
 
 def _scenes(source: Path) -> list[Path]:
     if (source / CAMERAS).is_file():
         return [source]
-    if not source.is_dir():
-        return []
     return sorted(path.parent for path in source.glob(f"*/{CAMERAS}"))
 
 
@@ -109,11 +115,11 @@ class _Camera:
     """An entry of ``scene_camera.json``."""
 
     depth_scale: float
-    cam_K: Numbers  # noqa: N815 (BOP's name)
+    cam_K: _Numbers  # noqa: N815 (BOP's name)
     width: int | None = None
     height: int | None = None
-    cam_R_w2c: Numbers | None = None  # noqa: N815
-    cam_t_w2c: _Triple | None = None
+    cam_R_w2c: _Numbers | None = None  # noqa: N815
+    cam_t_w2c: _Numbers | None = None
 
 
 @dataclass(frozen=True)
@@ -121,41 +127,33 @@ class _Object:
     """An entry of the lists in ``scene_gt.json``."""
 
     obj_id: int
-    cam_R_m2c: Numbers | None = None  # noqa: N815
-    cam_t_m2c: _Triple | None = None
+    cam_R_m2c: _Numbers | None = None  # noqa: N815
+    cam_t_m2c: _Numbers | None = None
 
 
-_Image = tuple[Path, int, _Camera, list[_Object]]  # its scene, its number there, what was seen
+def _read_cameras(scene: Path) -> dict[int, _Camera]:
+    with reading(path := scene / CAMERAS, "a scene of BOP"):
+        images = read_json(path).items()
+        return {int(key): pick(entry, _Camera, f"image {key}") for key, entry in images}
 
 
-def _images(scene: Path) -> Iterator[_Image]:
-    cameras, truth = _by_image(scene / CAMERAS), _by_image(scene / _TRUTH)
-    for number in sorted(cameras):
-        camera = pick(cameras[number], _Camera, f"{scene / CAMERAS}, image {number}")
-        where = f"{scene / _TRUTH}, image {number}"
-        listed = truth.get(number, [])
-        if not isinstance(listed, list):
-            raise InputError(f"{where}: not a list of objects")
-        objects = [pick(item, _Object, f"{where}, object {i}") for i, item in enumerate(listed)]
-        yield scene, number, camera, objects
-
-
-def _by_image(path: Path) -> dict[int, Any]:
-    value = read_small_json(path)
-    if not isinstance(value, dict) or not all(
-        key.isascii() and key.isdecimal() and len(key) < 10 for key in value
-    ):
-        raise InputError(f"{path}: not a JSON object with one entry an image")
-    numbered = {int(key): entry for key, entry in value.items()}
-    if len(numbered) < len(value):
-        raise InputError(f"{path}: an image comes twice")
-    return numbered
+def _read_truth(scene: Path) -> dict[int, list[_Object]]:
+    with reading(path := scene / _TRUTH, "a scene of BOP"):
+        return {
+            int(key): [pick(e, _Object, f"image {key}, object {i}") for i, e in enumerate(entries)]
+            for key, entries in read_json(path).items()
+        }
 
 
 def _frame(
-    image: _Image, axes: Axes, settings: DepthImageSettings, names: Mapping[str, str]
+    scene: Path,
+    number: int,
+    entry: _Camera,
+    listed: list[_Object],
+    axes: Axes,
+    settings: DepthImageSettings,
+    names: Mapping[str, str],
 ) -> Frame:
-    scene, number, entry, listed = image
     identifier = f"{scene.resolve().name}/{number:06d}"
     with naming(f"{scene / CAMERAS}, image {number}"):
         camera = intrinsics_from_matrix(
@@ -164,20 +162,22 @@ def _frame(
             height=entry.height,
             depth_scale=entry.depth_scale / 1000,
         )
-        world = _out_of_camera(entry.cam_R_w2c, entry.cam_t_w2c, "w2c", axes == "world")
-    level = np.eye(4)
-    level[:3, :3] = upright(settings.gravity)
+    to_axes = np.eye(4)
+    to_axes[:3, :3] = upright(settings.gravity)
+    if axes == "world":
+        to_axes = _out_of_camera(
+            entry.cam_R_w2c, entry.cam_t_w2c, f"{scene / CAMERAS}, image {number}", "w2c"
+        )
     objects = []
     for i, item in enumerate(listed):
-        with naming(f"{scene / _TRUTH}, image {number}, object {i}"):
-            if not 0 <= item.obj_id < 1 << 31:
-                raise InputError(f"obj_id {item.obj_id} is no model")
-            model = _out_of_camera(item.cam_R_m2c, item.cam_t_m2c, "m2c", axes == "model")
+        if axes == "model":
+            where = f"{scene / _TRUTH}, image {number}, object {i}"
+            to_axes = _out_of_camera(item.cam_R_m2c, item.cam_t_m2c, where, "m2c")
         objects.append(
             FrameObject(
                 id=f"{identifier}/{i:06d}",
                 mask=scene / _MASKS / f"{number:06d}_{i:06d}.png",
-                to_axes={"world": world, "model": model}.get(axes, level),
+                to_axes=to_axes,
                 class_name=class_of(item.obj_id, settings, names),
                 source={"obj_id": item.obj_id},
             )
@@ -187,18 +187,14 @@ def _frame(
 
 
 def _out_of_camera(
-    rotation: Numbers | None, shift: _Triple | None, kind: str, needed: bool
+    rotation: _Numbers | None, shift: _Numbers | None, where: str, kind: str
 ) -> Float[np.ndarray, "4 4"]:
-    """The inverse of a pose in the camera, in metres; of none the identity, unless it is needed."""
-    if rotation is None and shift is None and not needed:
-        return np.eye(4)
+    """Return the inverse of a pose in the camera, in metres."""
     if rotation is None or shift is None:
-        raise InputError(
-            f"has no cam_R_{kind} and cam_t_{kind}, which belong together; give both, or choose "
-            "--frame camera"
-        )
+        raise InputError(f"{where}: has no cam_R_{kind} and cam_t_{kind}; choose --frame camera")
     pose = np.eye(4)
-    pose[:3, :3] = as_matrix(rotation, f"cam_R_{kind}")
+    pose[:3, :3] = as_matrix(rotation, f"{where}: cam_R_{kind}")
     pose[:3, 3] = np.array(shift) / 1000
-    check_rotation(pose[:3, :3], f"cam_R_{kind}")
+    if not is_rotation(pose[:3, :3]):
+        raise InputError(f"{where}: cam_R_{kind} is no rotation")
     return invert_rigid(pose)

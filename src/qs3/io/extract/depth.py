@@ -3,9 +3,7 @@
 A source in BOP's layout goes to `qs3.io.extract.bop`.
 """
 
-import csv
 import dataclasses
-import io
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -22,9 +20,9 @@ from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, u
 from qs3.io.extract.depth_images import DEPTH_FILES, list_files, list_images, read_depth, read_mask
 from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
 from qs3.io.extract.run import ExtractedCloud, ExtractReport, OutputSettings, recorded, run_extract
-from qs3.io.guards import read_text, utf8
+from qs3.io.guards import utf8
+from qs3.reading import reading
 
-_LARGEST_TABLE = 1 << 26
 _MOST_INSTANCES = 4096
 
 
@@ -247,21 +245,17 @@ def _masks(
 
 
 def read_names(path: Path) -> dict[str, str]:
-    """Read which image, instance or object is of which class from a CSV with name and class."""
-    names: dict[str, str] = {}
-    text = read_text(path, _LARGEST_TABLE)
-    try:
-        rows = csv.DictReader(io.StringIO(text, newline=""), strict=True)
-        if not {"name", "class"} <= set(rows.fieldnames or ()):
-            raise InputError(f"{path}: its first line must name the columns name,class")
-        for row in rows:
-            name, kind = (row["name"] or "").strip(), (row["class"] or "").strip()
-            if not name or not kind or not kind.isprintable() or name in names:
-                what = "comes twice" if name in names else "needs a name and a class"
-                raise InputError(f"{path}, line {rows.line_num}: {name!r} {what}")
-            names[name] = kind
-    except csv.Error as error:
-        raise InputError(f"{path}: not a CSV ({error})") from error
-    if not names:
-        raise InputError(f"{path}: no row after the columns' names")
-    return names
+    """Read the class of each image, instance or object from a CSV with columns name and class."""
+    # Imported here: most sources need no table.
+    import pandas as pd
+
+    with reading(path, "a CSV with the columns name,class"):
+        table = pd.read_csv(path, dtype=str, usecols=["name", "class"])
+        table = table.apply(lambda column: column.str.strip())
+        faults = table.isna().any(axis=1) | (table == "").any(axis=1) | table.duplicated(["name"])
+        if table.empty:
+            raise InputError("no row after the columns' names")
+        if faults.any():
+            line = int(np.flatnonzero(faults)[0]) + 2
+            raise InputError(f"line {line}: a name that is missing or comes twice, or no class")
+    return dict(zip(table["name"], table["class"], strict=True))

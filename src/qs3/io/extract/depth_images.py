@@ -1,5 +1,6 @@
 """Depth images, infrared images and masks from files: PNG, TIFF and npy."""
 
+import io
 import math
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, Shaped, UInt8, UInt16
 
 from qs3.errors import InputError
-from qs3.io.guards import check_pixels, load_npy, naming, read_image, read_small
+from qs3.reading import reading
 
 DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
 """Endings of depth images and of masks."""
@@ -15,25 +16,23 @@ DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
 DEPTH = "depth"
 """Folder of the depth images, beside that of colour."""
 MILLIMETRE = 0.001
-_BESIDE = {".json", ".txt", ".csv", ".yaml", ".yml"}  # what tells cameras, times and names
-_LARGEST = 1 << 30
-_DEPTH_MODES = ("", "I;16", "I;16B", "I;16L", "I", "F")  # Pillow's; empty for npy
+_BESIDE = {".json", ".txt", ".csv", ".yaml", ".yml"}  # cameras, times and names
 
 
 def read_depth(path: Path, depth_scale: float | None = None) -> Float32[np.ndarray, "h w"]:
     """Read a depth image.
 
     Convention:
-        Depth is along the optical axis in metres, NaN where there is none. Whole numbers count
-        millimetres and floating-point numbers metres unless ``depth_scale`` says otherwise. 0, a
-        negative number, NaN and infinity are no depth.
+        Depth is along the optical axis in metres, NaN where there is none. By default whole
+        numbers count millimetres and floating-point numbers metres. 0, a negative number, NaN and
+        infinity are no depth.
 
     Args:
         path: A 16-bit grey PNG, a TIFF of 16 or 32 bits, or a two-dimensional npy array.
-        depth_scale: Metres a step; None takes the above.
+        depth_scale: Metres a step; None takes the default.
 
     Raises:
-        InputError: where the file is missing, damaged, too large or no depth image.
+        InputError: If the file is missing, damaged, too large or no depth image.
     """
     return to_metres(read_raw(path), depth_scale)
 
@@ -41,7 +40,7 @@ def read_depth(path: Path, depth_scale: float | None = None) -> Float32[np.ndarr
 def to_metres(
     raw: Shaped[np.ndarray, "h w"], depth_scale: float | None = None
 ) -> Float32[np.ndarray, "h w"]:
-    """Turn the numbers of a depth image into metres, as `read_depth` says."""
+    """Turn the numbers of a depth image into metres, as `read_depth` does."""
     if depth_scale is not None and not 0 < depth_scale < math.inf:
         raise InputError(f"depth-scale {depth_scale:g}: must be positive metres a step")
     scale = depth_scale or (MILLIMETRE if raw.dtype.kind in "iu" else 1.0)
@@ -54,13 +53,13 @@ def list_images(folder: Path) -> dict[str, Path]:
     """List the images of a folder, or of its ``depth``, by their names without ending.
 
     Raises:
-        InputError: where two have one name.
+        InputError: If two have one name.
     """
     return list_files(folder / DEPTH if (folder / DEPTH).is_dir() else folder, DEPTH_FILES)
 
 
 def holds_images(folder: Path) -> bool:
-    """Whether a folder is one of depth images by its looks: no other data are in it."""
+    """Return whether a folder holds depth images and no other data."""
     if (folder / DEPTH).is_dir():
         return True
     files = [path for path in folder.iterdir() if path.is_file() and path.name[0] != "."]
@@ -83,28 +82,28 @@ def list_files(folder: Path, endings: tuple[str, ...]) -> dict[str, Path]:
 
 def read_raw(path: Path) -> np.ndarray:
     """Read the numbers [h w] of a depth image as they are stored; raises as `read_depth` does."""
-    image, mode = _read(path, "iuf")
-    if mode in ("1", "L"):
+    image = _read(path, "iuf")
+    if image.ndim != 2:
+        raise InputError(
+            f"{path}: a colour picture, not depth; depth is one grey channel of 16 bits"
+        )
+    if image.dtype == np.uint8 and path.suffix.lower() != ".npy":
         raise InputError(
             f"{path}: has 8 bits, which is a picture of depth and no measurement; save depth as "
             "16-bit PNG in millimetres, TIFF or npy"
-        )
-    if mode not in _DEPTH_MODES:
-        raise InputError(
-            f"{path}: a colour picture, not depth; depth is one grey channel of 16 bits"
         )
     return image
 
 
 def read_infrared(path: Path) -> UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]:
-    """Read an infrared image of 8 or 16 bits; of three channels, as viewers store it, it is grey.
+    """Read an infrared image of 8 or 16 bits; three channels, as viewers store it, become grey.
 
     Raises:
-        InputError: where the file is missing, damaged or of another kind.
+        InputError: If the file is missing, damaged or of another kind.
     """
     import cv2
 
-    image, _ = _read(path, "u")
+    image = _read(path, "u")
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{path}: holds {image.dtype}; an infrared image has 8 or 16 bits")
     if image.ndim == 3:
@@ -113,14 +112,14 @@ def read_infrared(path: Path) -> UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "
 
 
 def read_mask(path: Path, shape: tuple[int, ...] | None = None) -> Int32[np.ndarray, "h w"]:
-    """Read a mask: 0 is background, other numbers are objects; ``shape`` is what it must have.
+    """Read a mask of a given shape: 0 is background, other numbers are objects.
 
     A coloured mask is 1 wherever it is not black.
 
     Raises:
-        InputError: where the file is missing, damaged or of another size.
+        InputError: If the file is missing, damaged or of another size.
     """
-    mask, _ = _read(path, "iub")
+    mask = _read(path, "iub")
     if mask.ndim == 3:
         mask = np.asarray(mask[..., :3].any(axis=2))
     if mask.dtype.kind == "f":
@@ -136,23 +135,48 @@ def read_mask(path: Path, shape: tuple[int, ...] | None = None) -> Int32[np.ndar
     return np.asarray(mask, dtype=np.int32)
 
 
-def _read(path: Path, npy_kinds: str) -> tuple[np.ndarray, str]:
-    """The numbers of an image as stored, and Pillow's mode; empty for an npy file."""
+def _read(path: Path, npy_kinds: str) -> np.ndarray:
+    """Read the numbers of an image as they are stored."""
     ending = path.suffix.lower()
     if ending not in DEPTH_FILES:
         raise InputError(
             f"{path}: not an image of a depth camera; known are {', '.join(DEPTH_FILES)}"
         )
-    content = read_small(path, _LARGEST, "a depth image")
+    with reading(path):
+        if ending != ".npy":
+            return decode_image(path.read_bytes())
+        with path.open("rb") as handle:
+            array = np.lib.format.read_array(handle, allow_pickle=False)
+    if array.dtype.kind not in npy_kinds or array.ndim != 2 or not array.size:
+        raise InputError(
+            f"{path}: holds {array.dtype} of shape {list(array.shape)}; needed are numbers of "
+            "shape [h, w]"
+        )
+    return array
 
-    def accept(shape: tuple[int, ...], kind: np.dtype) -> None:
-        if kind.kind not in npy_kinds or len(shape) != 2:
-            raise InputError(
-                f"holds {kind} of shape {list(shape)}; needed are numbers of shape [h, w]"
-            )
-        check_pixels(shape[1], shape[0])
 
-    with naming(path):
-        if ending == ".npy":
-            return load_npy(content, accept), ""
-        return read_image(content, "PNG" if ending == ".png" else "TIFF")
+def decode_image(content: bytes) -> np.ndarray:
+    """Decode a PNG or TIFF; numbers, channels and their order are those of OpenCV.
+
+    Raises:
+        InputError: If it is damaged or of another kind.
+    """
+    # Imported here: npy files need no image library.
+    import cv2
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(io.BytesIO(content), formats=("PNG", "TIFF")) as image:
+            image.verify()  # OpenCV reads a PNG that is cut off without an error
+    except UnidentifiedImageError:
+        raise InputError("not a PNG or TIFF file, or damaged") from None
+    except Exception as error:  # Pillow raises many kinds
+        raise InputError(f"cut off or damaged ({error})") from error
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        decoded = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+    if decoded is None:
+        raise InputError("damaged, or of a kind that OpenCV cannot read")
+    return decoded

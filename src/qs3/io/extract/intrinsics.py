@@ -11,7 +11,8 @@ from jaxtyping import Float
 
 from qs3.errors import InputError, say_once
 from qs3.files import read_json
-from qs3.io.guards import naming, pick
+from qs3.reading import reading
+from qs3.structure import pick
 
 CAMERA_FILES = ("intrinsics.json", "intrinsics.txt", "camera.json", "K.txt", "camera_info.yaml")
 """Names of the file that describes the camera of a folder of images."""
@@ -141,12 +142,13 @@ def read_intrinsics(given: str | Path) -> Intrinsics:
         path = files[0]
     if numbers or not path.is_file():
         raise InputError(f"intrinsics {text!r}: {'' if numbers else 'no such file; '}{_FORMS}")
-    with naming(path, "cannot be read as a camera"):
+    with reading(path, "a camera"):
         if path.suffix.lower() == ".json":
             return _from_table(read_json(path), path)
         if path.suffix.lower() in (".yaml", ".yml"):
             return _from_table(_read_yaml(path), path)
-        return _from_matrix(path.read_text(encoding="utf-8-sig").split(), "the matrix")
+        numbers = path.read_text(encoding="utf-8-sig").split()
+        return intrinsics_from_matrix(as_matrix(numbers, "the matrix"))
 
 
 def _read_yaml(path: Path) -> Any:
@@ -201,15 +203,16 @@ def _from_table(table: Any, path: Path) -> Intrinsics:
         return Intrinsics(file.fx, file.fy, file.cx, file.cy, **more)
     for name in _MATRIX_NAMES:
         if name in table:
-            return _from_matrix(_data(table[name]), name, **more)
+            return intrinsics_from_matrix(as_matrix(_data(table[name]), name), **more)
     raise InputError(f"has neither fx nor a matrix ({', '.join(_MATRIX_NAMES)})")
 
 
-def _from_matrix(numbers: Any, name: str, **more: Any) -> Intrinsics:
+def as_matrix(numbers: Any, name: str) -> Float[np.ndarray, "3 3"]:
+    """Return nine numbers, nested or not, as a matrix row by row."""
     matrix = np.array(numbers, dtype=np.float64)
     if matrix.size != 9:
         raise InputError(f"{name} must be 3×3 numbers, not {matrix.size}")
-    return intrinsics_from_matrix(matrix.reshape(3, 3), **more)
+    return matrix.reshape(3, 3)
 
 
 def _data(value: Any) -> Any:

@@ -40,10 +40,9 @@ from qs3.io.extract.run import (
     wanted_classes,
 )
 from qs3.io.extract.scannet_scene import class_of
-from qs3.io.guards import naming
-from qs3.io.layouts.hdf5 import matlab_texts, open_hdf5, plain_dataset
 from qs3.meshes.classes import canonical
 from qs3.meshes.sizes import CLASS_SIZES
+from qs3.reading import reading
 
 FILE, SPLITS = "nyu_depth_v2_labeled.mat", "splits.mat"
 CAMERA = Intrinsics(518.85790117450188, 519.46961112127485, 324.58244941119034, 252.73736163340047,
@@ -110,7 +109,7 @@ def extract_nyuv2(source: Path, output: OutputSettings, settings: Nyuv2Settings)
         settings: What is cut.
 
     Raises:
-        InputError: where a file is missing or another, holds no object of these classes, or as
+        InputError: If a file is missing or another, holds no object of these classes, or as
             `run_extract` does.
     """
     path = source / FILE if source.is_dir() else source
@@ -141,12 +140,13 @@ def _rename(word: str, classes: Sequence[str] | None) -> str | None:
 
 def list_nyuv2(path: Path, splits: Path | None = None) -> tuple[list[NyuFrame], dict[int, str]]:
     """List the frames of the file, and the word of each label; images are not read."""
-    with open_hdf5(path) as file:
-        count = len(plain_dataset(file, "labels", path, (640, 480)))
-        words = dict(enumerate(matlab_texts(file, "names"), start=1))
-        scenes = matlab_texts(file, "scenes") if "scenes" in file else [""] * count
-    if len(scenes) != count:
-        raise InputError(f"{path}: {len(scenes)} scenes for {count} frames")
+    import h5py
+
+    with reading(path, "NYU Depth v2", streamed=True), h5py.File(path, "r") as opened:
+        file: Any = opened
+        count = len(file["labels"])
+        words = dict(enumerate(_texts(file, "names"), start=1))
+        scenes = _texts(file, "scenes")
     beside = path.with_name(SPLITS)
     splits = splits or (beside if beside.is_file() else None)
     parts = dict.fromkeys(range(1, count + 1), "")
@@ -163,15 +163,20 @@ def list_nyuv2(path: Path, splits: Path | None = None) -> tuple[list[NyuFrame], 
     return frames, words
 
 
+def _texts(file: Any, name: str) -> list[str]:
+    """Return a MATLAB cell of text: references to arrays of characters."""
+    return ["".join(map(chr, np.ravel(file[cell]))).strip("\0") for cell in np.ravel(file[name])]
+
+
 def _read_splits(path: Path) -> dict[str, list[int]]:
     """Read the numbers of the training and test frames from ``splits.mat``."""
     from scipy.io import loadmat
 
     names = {"train": "trainNdxs", "test": "testNdxs"}
-    with naming(path, "cannot be read as a MAT file"):
+    with reading(path, "a MAT file"):
         table = loadmat(path, variable_names=list(names.values()))
         return {
-            split: np.ravel(table.get(name, ())).astype(np.float64).tolist()
+            split: np.ravel(table.get(name, ())).astype(np.int64).tolist()
             for split, name in names.items()
         }
 
@@ -189,13 +194,15 @@ def cut_frame(
     labels of floors.
 
     Raises:
-        InputError: where the file is damaged or of another layout.
+        InputError: If the file is damaged or of another layout.
     """
+    import h5py
+
     name = {"raw": "rawDepths", "filled": "depths"}[settings.depth]
-    with open_hdf5(path) as file:
+    with reading(path, "NYU Depth v2", streamed=True), h5py.File(path, "r") as opened:
+        file: Any = opened
         depth, labels, instances = (
-            plain_dataset(file, array, path, (640, 480))[frame.index].T[_MEASURED]
-            for array in (name, "labels", "instances")
+            file[array][frame.index].T[_MEASURED] for array in (name, "labels", "instances")
         )
     depth = np.where((depth > 0) & np.isfinite(depth), depth, np.nan).astype(np.float32)
     camera = Intrinsics(CAMERA.fx, CAMERA.fy, CAMERA.cx - _MEASURED[1].start,

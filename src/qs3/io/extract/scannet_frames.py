@@ -22,6 +22,7 @@ ECCV 2022; Dai et al., "ScanNet", CVPR 2017.
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from typing import NamedTuple
 from zipfile import ZipFile
 
@@ -29,6 +30,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from qs3.errors import InputError
+from qs3.io.extract.depth_images import decode_image
 from qs3.io.extract.fuse import ObjectFusion
 from qs3.io.extract.run import ExtractedCloud
 from qs3.io.extract.scannet import ScanNetSettings
@@ -42,7 +44,7 @@ from qs3.io.extract.scannet_scene import (
     rest,
 )
 from qs3.io.extract.sens import SensHeader, read_depth_frames, read_sens_header
-from qs3.io.guards import open_zip, read_image, read_member
+from qs3.reading import naming, reading
 
 _MASKS = "_2d-instance-filt.zip"
 
@@ -151,7 +153,9 @@ def _owners(
 ) -> Owners:
     masks = scene.file(_MASKS)
     if settings.cut == "masks" or (settings.cut == "auto" and masks.is_file()):
-        return _by_masks(stack.enter_context(open_zip(masks)), header, settings.erode)
+        with reading(masks, streamed=True):
+            archive = stack.enter_context(ZipFile(masks))
+        return _by_masks(archive, header, settings.erode)
     if settings.cut == "auto" and not scene.file("_vh_clean_2.ply").is_file():
         raise InputError(
             f"{scene.folder}: has neither {masks.name} nor {scene.id}_vh_clean_2.ply with its "
@@ -196,28 +200,23 @@ def _by_masks(archive: ZipFile, header: SensHeader, radius: int) -> Owners:
 def read_mask(
     archive: ZipFile, frame: int, sizes: Sequence[tuple[int, int]]
 ) -> UInt8[np.ndarray, "h w"] | None:
-    """Return the mask of a frame, None where there is none; ``sizes`` (w, h) may it have.
+    """Return the mask of a frame, of one of some sizes (w, h); None if there is none.
 
     ``<scene>_2d-instance-filt.zip`` holds ``instance-filt/<frame>.png``, 8 bits, the ``objectId`` +
-    1 of each pixel, 0 where there is none: the annotated mesh as the colour camera sees it from the
-    frame's pose, filtered, at the colour image's size (1296×968). Members are read by their exact
-    names and nothing is written to disk, so that names which would lead elsewhere do no harm.
+    1 of each pixel, 0 if it has no object: the annotated mesh as the colour camera sees it from the
+    frame's pose, filtered, at the colour image's size (1296×968).
     """
     name = f"instance-filt/{frame}.png"
-    # An 8-bit image that nothing packs is a little larger than its pixels.
-    most = max(width * height for width, height in sizes) * 5 // 4 + 2**16
-    try:
-        content = read_member(archive, name, most)
-        if content is None:
-            return None
-        mask, mode = read_image(content, "PNG")
-        if mask.shape[1::-1] not in sizes:
+    if name not in archive.NameToInfo:
+        return None
+    with reading(Path(str(archive.filename)), "a mask", streamed=True), naming(name):
+        entry = archive.getinfo(name)
+        if entry.file_size > 2 * max(width * height for width, height in sizes) + 2**16:
+            raise InputError(f"would unpack to {entry.file_size} bytes")
+        mask = decode_image(archive.read(entry))
+        if mask.shape[::-1] not in sizes or mask.dtype != np.uint8:
             expected = " or ".join(f"{w}×{h}" for w, h in dict.fromkeys(sizes))
-            raise InputError(f"has {mask.shape[1]}×{mask.shape[0]} pixels; expected {expected}")
-        if mode != "L":
-            raise InputError("is no grey image of 8 bits")
-    except InputError as error:
-        raise InputError(f"{archive.filename}: {name}: {error}; copy the file again") from error
+            raise InputError(f"{mask.dtype} of shape {mask.shape}; expected 8 bits, {expected}")
     return mask
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.errors import InputError
+from qs3.files import read_json
 from qs3.geometry import transform_points
 from qs3.io.extract.run import ExtractedCloud
 from qs3.io.extract.scannet import ScanNetSettings
@@ -26,12 +27,10 @@ from qs3.io.extract.scannet_scene import (
     SceneObject,
     axis_alignment,
     object_seed,
-    read_list,
     read_objects,
     rest,
 )
-from qs3.io.guards import naming, read_small
-from qs3.io.ply import load_ply
+from qs3.reading import reading
 
 NO_OBJECT = -1
 _MESH, _SEGMENTS = "_vh_clean_2.ply", "_vh_clean_2.0.010000.segs.json"
@@ -42,25 +41,25 @@ def read_scene_mesh(
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
     """Read the decimated mesh of a scene and give its vertices to objects.
 
-    The vertices are in the scene's own frame, metres; with each comes `SceneObject.id`, −1 where it
-    is of none of the objects. A segment of two objects belongs to the first.
+    The vertices are in the scene's own frame, metres; with each comes the `SceneObject.id` of its
+    object, −1 if it has none. A segment of two objects belongs to the first.
     """
-    path = scene.file(_MESH)
-    content = read_small(path, what="a scene's decimated mesh")
-    with naming(path):
-        loaded = load_ply(content)
-    vertices = np.asarray(getattr(loaded, "vertices", np.zeros((0, 3))), dtype=np.float64)
-    if not len(vertices) or not (np.abs(vertices) < 1e4).all():
-        raise InputError(f"{path}: has no vertices, or some are not finite")
-    listed = read_list(scene.file(_SEGMENTS), "segIndices")
-    if not all(type(value) is int and 0 <= value < 2**31 for value in listed):
-        raise InputError(f"{scene.file(_SEGMENTS)}: segIndices are not all whole numbers from 0 up")
-    if len(listed) != len(vertices):
-        raise InputError(
-            f"{scene.file(_SEGMENTS)}: has {len(listed)} segIndices for {len(vertices)} vertices "
-            f"of {path.name}; they are of different releases"
-        )
-    segments = np.array(listed, dtype=np.int64)
+    # Imported here: scenes cut by masks need no mesh library.
+    import trimesh
+
+    path, segments_path = scene.file(_MESH), scene.file(_SEGMENTS)
+    with reading(path):
+        mesh = trimesh.load(path, file_type="ply", process=False)
+        vertices = np.asarray(getattr(mesh, "vertices", None), dtype=np.float64).reshape(-1, 3)
+        if not np.isfinite(vertices).all():
+            raise InputError("a vertex is not finite")
+    with reading(segments_path, "a list of segments"):
+        segments = np.array(read_json(segments_path)["segIndices"], dtype=np.int64)
+        if len(segments) != len(vertices):
+            raise InputError(
+                f"has {len(segments)} segIndices for {len(vertices)} vertices of {path.name}; "
+                "they are of different releases"
+            )
     owner = np.full(len(vertices), NO_OBJECT, dtype=np.int64)
     for item in reversed(objects):
         owner[np.isin(segments, np.array(item.segments, dtype=np.int64))] = item.id

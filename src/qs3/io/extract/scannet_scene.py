@@ -16,15 +16,16 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from qs3.errors import InputError
+from qs3.files import read_json
 from qs3.io.extract.sens import is_rigid
-from qs3.io.guards import pick, read_small_json, read_text
 from qs3.meshes.classes import POINTDA10, map_labels
+from qs3.reading import reading
+from qs3.structure import pick
 
 LABELS: Mapping[str, str] = {
     "bathroom cabinet": "cabinet",
@@ -86,20 +87,20 @@ def list_scenes(
 ) -> list[ScanNetScene]:
     """List scenes in the order of their names.
 
-    ``root`` is a copy of the release, its ``scans`` folder, or one scene's folder. Only what
-    ``scenes`` and ``splits`` (as `read_splits` gives it) name is listed; something has to be.
+    Args:
+        root: A copy of the release, its ``scans`` folder, or one scene's folder.
+        scenes: Names of the scenes; None lists all.
+        splits: Split of each scene as `read_splits` returns them; scenes without one are left out.
+
+    Raises:
+        InputError: If a scene is missing, or none is left.
     """
-    if not root.is_dir():
-        raise InputError(f"{root}: no such folder; name the one that holds ScanNet's scans")
     if _SCENE.fullmatch(root.resolve().name):
         folders = {root.resolve().name: root}
     else:
         below = root / "scans" if (root / "scans").is_dir() else root
-        folders = {
-            entry.name: entry
-            for entry in below.iterdir()
-            if _SCENE.fullmatch(entry.name) and entry.is_dir()
-        }
+        entries = below.iterdir() if below.is_dir() else ()
+        folders = {path.name: path for path in entries if _SCENE.fullmatch(path.name)}
     for name in scenes or ():
         if name not in folders:
             raise InputError(f"{root}: has no scene {name!r}; its folder is missing")
@@ -107,12 +108,12 @@ def list_scenes(
     chosen = [name for name in sorted(folders) if all(name in names for names in wanted)]
     if not chosen:
         form = "no folder of the form scene0000_00"
-        raise InputError(f"{root}: holds {'none of the scenes asked for' if folders else form}")
+        raise InputError(f"{root}: has {'none of the scenes asked for' if folders else form}")
     return [ScanNetScene(name, folders[name], (splits or {}).get(name, "")) for name in chosen]
 
 
 def read_splits(train: Path | None = None, test: Path | None = None) -> dict[str, str]:
-    """Read the official lists, one scene a line, into the split of each scene.
+    """Read the split of each scene from the official lists, one scene a line.
 
     ScanNet hides the labels of its own test scenes; its validation list, ``scannetv2_val.txt``, is
     the ``test`` of PointDA-10 and of the clouds made here (1,201 and 312 scenes).
@@ -121,17 +122,18 @@ def read_splits(train: Path | None = None, test: Path | None = None) -> dict[str
     for split, path in (("train", train), ("test", test)):
         if path is None:
             continue
-        for number, line in enumerate(read_text(path).splitlines(), start=1):
-            name = line.strip()
-            if name and not _SCENE.fullmatch(name):
-                raise InputError(f"{path}: line {number} is no scene's name: {name[:40]!r}")
-            if name and splits.setdefault(name, split) != split:
+        with reading(path, "a list of scenes"):
+            names = path.read_text(encoding="utf-8").split()
+        for name in names:
+            if not _SCENE.fullmatch(name):
+                raise InputError(f"{path}: {name[:40]!r} is not the name of a scene")
+            if splits.setdefault(name, split) != split:
                 raise InputError(f"{path}: {name} is in the list of the other split too")
     return splits
 
 
 def class_of(label: str, class_names: Sequence[str] = POINTDA10) -> str | None:
-    """Class of an annotator's label, None where it is in none.
+    """Return the class of an annotator's label, None if it has none.
 
     Example:
         >>> class_of("office chair"), class_of("kitchen cabinets"), class_of("toilet")
@@ -146,19 +148,17 @@ def class_of(label: str, class_names: Sequence[str] = POINTDA10) -> str | None:
 
 
 def read_objects(scene: ScanNetScene, class_names: Sequence[str] = POINTDA10) -> list[SceneObject]:
-    """Read the annotated objects of a scene that are in a class asked for."""
+    """Read the annotated objects of a scene that are in some classes."""
     path = scene.file(".aggregation.json")
     objects: dict[int, SceneObject] = {}
-    for place, value in enumerate(read_list(path, "segGroups")):
-        where = f"{path}: entry {place} of segGroups"
-        group = pick(value, _Group, where)
-        if not all(0 <= number < 2**31 for number in (group.objectId, *group.segments)):
-            raise InputError(f"{where}: a number is below 0 or beyond 31 bits")
-        name = class_of(group.label, class_names)
-        if name is not None:
-            # scene0217_00 lists its objects twice: the first stays.
-            item = SceneObject(group.objectId, group.label, name, group.segments)
-            objects.setdefault(item.id, item)
+    with reading(path, "an annotation of ScanNet"):
+        for place, value in enumerate(read_json(path)["segGroups"]):
+            group = pick(value, _Group, f"entry {place} of segGroups")
+            name = class_of(group.label, class_names)
+            if name is not None:
+                # scene0217_00 lists its objects twice: the first stays.
+                item = SceneObject(group.objectId, group.label, name, group.segments)
+                objects.setdefault(item.id, item)
     return [objects[number] for number in sorted(objects)]
 
 
@@ -172,7 +172,7 @@ class _Group:
 
 
 def axis_alignment(scene: ScanNetScene) -> Float[np.ndarray, "4 4"]:
-    """World to aligned axes, metres; identity where the scene's ``.txt`` has none.
+    """Return the transform from world to aligned axes, metres; identity if the scene has none.
 
     Convention:
         After it z is up and the room's walls lie along x and y. The scene's own frame has z up but
@@ -181,17 +181,14 @@ def axis_alignment(scene: ScanNetScene) -> Float[np.ndarray, "4 4"]:
     path = scene.file(".txt")
     if not path.is_file():
         return np.eye(4)
-    for line in read_text(path).splitlines():
-        key, _, value = line.partition("=")
-        if key.strip() != "axisAlignment":
-            continue
-        try:
-            matrix = np.array([float(word) for word in value.split()]).reshape(4, 4)
-        except ValueError as error:
-            raise InputError(f"{path}: axisAlignment is not 16 numbers") from error
-        if not is_rigid(matrix):
-            raise InputError(f"{path}: axisAlignment is no rotation and shift")
-        return matrix
+    with reading(path, "axisAlignment"):
+        for line in path.read_text(encoding="utf-8").splitlines():
+            key, _, value = line.partition("=")
+            if key.strip() == "axisAlignment":
+                matrix = np.array(value.split(), dtype=np.float64).reshape(4, 4)
+                if not is_rigid(matrix):
+                    raise InputError("axisAlignment is no rotation and shift")
+                return matrix
     return np.eye(4)
 
 
@@ -203,14 +200,6 @@ def rest(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 3"], li
 
 
 def object_seed(seed: int, scene: ScanNetScene, number: int) -> int:
-    """Seed of one object's choices, the same in whatever order scenes are done."""
+    """Return the seed of one object's choices; the order of scenes does not matter."""
     words = [seed, *scene.id.encode("utf-8"), number]
     return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0])
-
-
-def read_list(path: Path, key: str) -> list[Any]:
-    """The list under ``key`` of a JSON file of annotations, its entries unchecked."""
-    content = read_small_json(path)
-    if not isinstance(content, dict) or not isinstance(content.get(key), list):
-        raise InputError(f"{path}: has no list {key!r}; it is no annotation of ScanNet")
-    return content[key]

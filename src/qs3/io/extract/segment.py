@@ -31,9 +31,9 @@ from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, u
 from qs3.io.extract.depth_images import holds_images, list_files, list_images, read_depth
 from qs3.io.extract.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
 from qs3.io.extract.plane import Plane, fit_plane
-from qs3.io.guards import load_npy, naming, open_zip, read_member
 from qs3.io.point_files import POINT_FILES, SCENE_RECORD, cloud_bytes, is_scene, read_cloud
 from qs3.io.preparation import thin
+from qs3.reading import naming, reading
 from qs3.sensor.checks import check_range
 
 TABLE = "objects.csv"
@@ -247,9 +247,8 @@ def read_scene(
         camera.check_size(depth.shape, str(path))
         return lift_scene(depth, camera, settings, str(path))
     if path.suffix.lower() == ".npz":
-        with open_zip(path) as archive:
-            content = read_member(archive, "points.npy")
-        array: np.ndarray = np.zeros(0) if content is None else load_npy(content)
+        with reading(path, "a cloud named points"), np.load(path, allow_pickle=False) as archive:
+            array = archive["points"]
         if array.dtype.kind != "f" or array.ndim != 2 or array.shape[1] < 3:
             raise InputError(f"{path}: needs points, an array of numbers of shape [n 3]: one cloud")
         points = array[:, :3].astype(np.float64)
