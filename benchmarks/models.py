@@ -53,9 +53,8 @@ SEARCHES = {
 
 
 def reference_file(name: str) -> Path:
-    """The textbook form of a network; "pointnet2-msg" is made by that of "pointnet2"."""
-    own = HERE / "reference" / f"{name.replace('-', '_')}.py"
-    return own if own.is_file() else own.with_stem(name.split("-")[0])
+    """The textbook form of a network."""
+    return HERE / "reference" / f"{name.replace('-', '_')}.py"
 
 
 def make(name: str, form: str, device: str) -> nn.Module:

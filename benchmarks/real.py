@@ -133,15 +133,10 @@ CELLS: Mapping[str, Cell] = {
     "S QBST turns": replace(ROUNDS, rounds={"turns": 8}),
     "S QBST floor": replace(ROUNDS, rounds={"floor": 8}),
     "S QBST refined": replace(ROUNDS, rounds={"refine": True}),
-    # Rivals that see the target from the first step, and the same rounds after them.
-    "S SD": replace(SCANS, method="sd"),
-    "S SD+QBST": replace(SCANS, method="sd", rounds={"rule": "qbst"}, warm_up="S SD"),
+    # A rival that sees the target from the first step, and the same rounds after it.
     "S GAST": replace(SCANS, method="gast"),
     "S GAST+QBST": replace(SCANS, method="gast", rounds={"rule": "qbst"}, warm_up="S GAST"),
     # The same by the preset that rounds of QBST have by default.
-    "S SD+QBST gentle": replace(
-        SCANS, method="sd", preset="gentle", rounds={"rule": "qbst"}, warm_up="S SD"
-    ),
     "S GAST+QBST gentle": replace(
         SCANS, method="gast", preset="gentle", rounds={"rule": "qbst"}, warm_up="S GAST"
     ),
@@ -160,14 +155,7 @@ CELLS: Mapping[str, Cell] = {
     "aligned": replace(SCANS, preparation=replace(SIZED, align=True)),
     "sight": replace(SCANS, augmentation=SEEN),
     "no augmentation": replace(SCANS, augmentation=Augmentation()),
-    "full augmentation": replace(SCANS, augmentation=Augmentation.scanned()),
     "more cuts": replace(SCANS, augmentation=CUT),
-    "full QBST gentle": replace(
-        ROUNDS,
-        preset="gentle",
-        augmentation=Augmentation.scanned(),
-        warm_up="full augmentation",
-    ),
     "M sight": replace(ALL, cloud="surface", augmentation=SEEN),
 }
 
@@ -281,7 +269,7 @@ def main() -> int:
         words += [f"--{name}", str(getattr(options, name))]
     words += ["--check"] if options.check else []
     worst = 0
-    # What starts from a warm-up comes after all warm-ups; SD and GAST serve as such too.
+    # What starts from a warm-up comes after all warm-ups; GAST serves as such too.
     first = [item for item in left if not CELLS[item[0]].warm_up]
     with concurrent.futures.ThreadPoolExecutor(options.workers) as pool:
         for batch in (first, [item for item in left if item not in first]):

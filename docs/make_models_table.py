@@ -27,7 +27,6 @@ PUBLISHED = {
     "pointnet2": ("1.48", "1,684", "RS-CNN, complexity"),
     "rscnn": ("1.41", "295", "RS-CNN, complexity"),
     "simpleview": ("0.8", "–", "SimpleView, §4"),
-    "pointmlp-elite": ("0.68", "–", "PointMLP, Table 1"),
 }
 
 
@@ -43,7 +42,6 @@ def reference(name: str) -> ModuleType | None:
     """The textbook form of a network, by the name `create_model` takes; None where ours is it."""
     stem = name.replace("-", "_")
     path = _ROOT / "benchmarks" / "reference" / f"{stem}.py"
-    path = path if path.is_file() else path.with_stem(name.split("-")[0])
     if not path.is_file():
         return None
     spec = importlib.util.spec_from_file_location(f"reference_{stem}", path)

@@ -49,7 +49,7 @@ rounds = SelfTrainingSettings(rounds=3, epochs=3, threshold=0.6)
 
 print(" ".join(f"{name:>11}" for name in ("", *VALIDATORS, "accuracy")))
 with tempfile.TemporaryDirectory() as folder:
-    for method in ("source-only", "coral", "qbst"):
+    for method in ("source-only", "dann", "qbst"):
         result = fit(
             method,
             source,

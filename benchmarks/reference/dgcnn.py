@@ -53,7 +53,6 @@ class DGCNN(nn.Module):
         embedding: int = 1024,
         hidden: tuple[int, ...] = (512, 256),
         dropout: float = 0.5,
-        per_point: bool = False,
     ) -> None:
         super().__init__()
         self.neighbours = neighbours

@@ -50,7 +50,6 @@ class PointNet(nn.Module):
         hidden: tuple[int, ...] = (512, 256),
         dropout: float = 0.3,
         transforms: bool = True,
-        per_point: bool = False,
     ) -> None:
         super().__init__()
         stack = [shared(c, d) for c, d in itertools.pairwise((3, *channels))]

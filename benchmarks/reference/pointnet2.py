@@ -8,11 +8,7 @@ import itertools
 import torch
 from torch import Tensor, nn
 
-SSG = (((0.2, 32, (64, 64, 128)),), ((0.4, 64, (128, 128, 256)),))
-MSG = (
-    ((0.1, 16, (32, 32, 64)), (0.2, 32, (64, 64, 128)), (0.4, 128, (64, 96, 128))),
-    ((0.2, 32, (64, 64, 128)), (0.4, 64, (128, 128, 256)), (0.8, 128, (128, 128, 256))),
-)
+SCALES = ((0.2, 32, (64, 64, 128)), (0.4, 64, (128, 128, 256)))
 
 
 def pick(values: Tensor, index: Tensor) -> Tensor:
@@ -33,16 +29,11 @@ def sample(points: Tensor, m: int) -> Tensor:
     return torch.stack(chosen, dim=1)
 
 
-def ball(points: Tensor, centres: Tensor, radius: float, k: int, order: str) -> Tensor:
+def ball(points: Tensor, centres: Tensor, radius: float, k: int) -> Tensor:
     distance = torch.cdist(centres, points)
-    if order == "nearest":
-        found = distance.topk(k, dim=2, largest=False).indices
-        inside = distance.gather(2, found) <= radius
-        return torch.where(inside, found, found[:, :, :1])
-    n = points.shape[1]
-    number = torch.arange(n, device=points.device).expand_as(distance)
-    found = torch.where(distance <= radius, number, n).sort(dim=2).values[:, :, :k]
-    return torch.where(found < n, found, found[:, :, :1])
+    found = distance.topk(k, dim=2, largest=False).indices
+    inside = distance.gather(2, found) <= radius
+    return torch.where(inside, found, found[:, :, :1])
 
 
 def shared(channels: int, widths: tuple[int, ...]) -> nn.Sequential:
@@ -55,66 +46,54 @@ def shared(channels: int, widths: tuple[int, ...]) -> nn.Sequential:
 class PointNet2(nn.Module):
     """Takes the arguments of `qs3.models.PointNet2`.
 
-    ``groups``, where set, holds for each level the indices of the centres and of each scale's
-    groups, in place of the network's own sampling and ball query.
+    ``groups``, if set, holds for each level the indices of the centres and of their groups, in
+    place of the network's own sampling and ball query.
     """
 
     def __init__(
         self,
         num_classes: int,
-        grouping: str = "ssg",
-        centres: tuple[int, int] = (512, 128),
-        scales: tuple | None = None,
+        centres: tuple[int, ...] = (512, 128),
+        scales: tuple = SCALES,
         embedding: tuple[int, ...] = (256, 512, 1024),
         hidden: tuple[int, ...] = (512, 256),
         dropout: float = 0.4,
-        ball_order: str = "nearest",
-        per_point: bool = False,
     ) -> None:
         super().__init__()
-        self.grouping, self.centres, self.ball_order = grouping, centres, ball_order
-        self.scales = scales or (SSG if grouping == "ssg" else MSG)
+        self.centres, self.scales = centres, scales
         channels = 0
         self.levels = nn.ModuleList()
-        for level in self.scales:
-            self.levels.append(nn.ModuleList(shared(3 + channels, scale[2]) for scale in level))
-            channels = sum(scale[2][-1] for scale in level)
+        for _, _, widths in scales:
+            self.levels.append(shared(3 + channels, widths))
+            channels = widths[-1]
         self.embed = shared(3 + channels, embedding)
         layers: list[nn.Module] = []
         for depth, (c, d) in enumerate(itertools.pairwise((embedding[-1], *hidden))):
             layers += [nn.Linear(c, d, bias=depth > 0), nn.BatchNorm1d(d), nn.ReLU()]
             layers += [nn.Dropout(dropout)]
         self.classify = nn.Sequential(*layers, nn.Linear((embedding[-1], *hidden)[-1], num_classes))
-        self.groups: list[tuple[Tensor, list[Tensor]]] | None = None
+        self.groups: list[tuple[Tensor, Tensor]] | None = None
 
     def forward(self, points: Tensor) -> Tensor:
         features = None
         for depth, level in enumerate(self.levels):
-            chosen, balls = self.grouped(points, depth)
+            chosen, index = self.grouped(points, depth)
             centres = pick(points, chosen)
-            described = []
-            for network, index in zip(level, balls, strict=True):
-                edges = pick(points, index) - centres[:, :, None]
-                if features is not None:
-                    around = pick(features, index)
-                    both = (around, edges) if self.grouping == "msg" else (edges, around)
-                    edges = torch.cat(both, dim=3)
-                described.append(network(edges.permute(0, 3, 1, 2)).amax(dim=3).transpose(1, 2))
-            points, features = centres, torch.cat(described, dim=2)
+            edges = pick(points, index) - centres[:, :, None]
+            if features is not None:
+                edges = torch.cat([edges, pick(features, index)], dim=3)
+            points, features = centres, level(edges.permute(0, 3, 1, 2)).amax(dim=3).transpose(1, 2)
         both = torch.cat([points, features], dim=2).transpose(1, 2)[..., None]
         return self.classify(self.embed(both).amax(dim=(2, 3)))
 
-    def grouped(self, points: Tensor, depth: int) -> tuple[Tensor, list[Tensor]]:
+    def grouped(self, points: Tensor, depth: int) -> tuple[Tensor, Tensor]:
         if self.groups is not None:
             return self.groups[depth]
         with torch.no_grad():
             n = points.shape[1]
             chosen = sample(points, min(self.centres[depth], n))
-            centres = pick(points, chosen)
-            return chosen, [
-                ball(points, centres, radius, min(k, n), self.ball_order)
-                for radius, k, _ in self.scales[depth]
-            ]
+            radius, k, _ = self.scales[depth]
+            return chosen, ball(points, pick(points, chosen), radius, min(k, n))
 
 
 def from_ours(model: nn.Module) -> PointNet2:
@@ -122,19 +101,18 @@ def from_ours(model: nn.Module) -> PointNet2:
     layers = list(model.classify.layers)
     textbook = PointNet2(
         layers[-1].out_features,
-        model.grouping,
         tuple(level.centres for level in model.levels),
         tuple(
-            tuple(
-                (radius, k, tuple(layer.linear.out_features for layer in scale.layers))
-                for (radius, k), scale in zip(level.balls, level.scales, strict=True)
+            (
+                level.radius,
+                level.neighbours,
+                tuple(layer.linear.out_features for layer in level.network.layers),
             )
             for level in model.levels
         ),
         tuple(layer.linear.out_features for layer in model.embed),
         tuple(layer.out_features for layer in layers[:-1] if isinstance(layer, nn.Linear)),
         next((layer.p for layer in layers if isinstance(layer, nn.Dropout)), 0.0),
-        model.levels[0].ball_order,
     )
     ours = list(model.state_dict().values())
     textbook.to(ours[0])

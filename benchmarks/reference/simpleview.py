@@ -23,26 +23,19 @@ VIEWS = torch.tensor(
 """World to camera for the cameras on +x, +y, −x, −y, +z, −z."""
 
 
-def depth_images(points: Tensor, resolution: int, projection: str) -> Tensor:
-    """Each view alone, by a rotation, a projection and a scatter in floating point."""
+def depth_images(points: Tensor, resolution: int) -> Tensor:
+    """Each view alone, by a rotation and a scatter in floating point."""
     b = len(points)
     images = []
     for view in VIEWS.to(points):
         x, y, z = (points @ view.t() + points.new_tensor([0.0, 0.0, 1.4])).unbind(dim=2)
-        if projection == "perspective":
-            x, y = x / z, y / z
         u = ((x + 1) * ((resolution - 1) / 2)).round().long()
         v = ((y + 1) * ((resolution - 1) / 2)).round().long()
         inside = (u >= 0) & (u < resolution) & (v >= 0) & (v < resolution) & (z >= 0.01)
         cloud = torch.arange(b, device=points.device)[:, None].expand_as(u)[inside]
         pixel = (cloud * resolution + v[inside]) * resolution + u[inside]
         image = points.new_zeros(b * resolution * resolution)
-        if projection == "perspective":
-            weight = image.scatter_add(0, pixel, 1 / z[inside])
-            count = image.scatter_add(0, pixel, torch.ones_like(z[inside]))
-            image = torch.where(count > 0, count / weight, 0.0)
-        else:
-            image = image.scatter_reduce(0, pixel, z[inside], "amin", include_self=False)
+        image = image.scatter_reduce(0, pixel, z[inside], "amin", include_self=False)
         images.append(image.view(b, resolution, resolution))
     return torch.stack(images, dim=1)
 
@@ -72,11 +65,10 @@ class SimpleView(nn.Module):
         num_classes: int,
         width: int = 16,
         resolution: int = 128,
-        projection: str = "orthographic",
         dropout: float = 0.5,
     ) -> None:
         super().__init__()
-        self.resolution, self.projection = resolution, projection
+        self.resolution = resolution
         stages = [(1, 1, 1), (1, 1, 1), (1, 2, 2), (2, 2, 1), (2, 4, 2), (4, 4, 1), (4, 8, 2)]
         self.backbone = nn.Sequential(
             nn.Conv2d(1, width, 3, 1, 1, bias=False),
@@ -99,7 +91,7 @@ class SimpleView(nn.Module):
 
     def forward(self, points: Tensor, images: Tensor | None = None) -> Tensor:
         if images is None:
-            images = depth_images(points, self.resolution, self.projection)
+            images = depth_images(points, self.resolution)
         views = self.dropout(self.norm(self.backbone(images.flatten(0, 1).unsqueeze(1))))
         return self.classify(views.view(len(images), -1))
 
@@ -123,7 +115,6 @@ def from_ours(model: Any) -> SimpleView:
         linear.out_features,
         model.backbone.stem.out_channels,
         model.resolution,
-        model.projection,
         model.dropout.p,
     ).to(linear.weight)
     for fast, slow in pairs(model, textbook):

@@ -26,7 +26,7 @@ from ..training.common import SWITCHES, Stop, history_of, make_clouds, plain, sa
 NETWORKS = {
     "dgcnn": SMALL["dgcnn"],
     "pointnet": SMALL["pointnet"] | {"transforms": False},
-    "pointnet2": SMALL["pointnet2"] | {"per_point": False},
+    "pointnet2": SMALL["pointnet2"] | {"local": False},
 }
 METHODS = list_methods()
 ROUNDS = SelfTrainingSettings(rounds=2, epochs=1, threshold=0.34)
@@ -71,7 +71,8 @@ def batch(count=4, seed=0, points=24):
 
 def make(method, network, seed=0):
     torch.manual_seed(seed)
-    model = create_model(network, 3, **NETWORKS[network] | {"per_point": network == "pointnet2"})
+    local = {"local": True} if network == "pointnet2" else {}
+    model = create_model(network, 3, **NETWORKS[network] | local)
     return create_method(method, model, **SMALLER.get(method, {})).train()
 
 
@@ -166,7 +167,7 @@ def test_targets_of_any_size(method, target, tmp_path):
 
 @pytest.mark.parametrize(("count", "seen_whole"), [(31, "target"), (4, "source")])
 def test_no_domain_is_truncated(count, seen_whole, tmp_path, monkeypatch):
-    kind, seen = method_class("mmd"), {"source": 0, "target": 0}
+    kind, seen = method_class("dann"), {"source": 0, "target": 0}
     losses = kind.losses
 
     def watched(self, source, target, progress, generator):
@@ -175,8 +176,8 @@ def test_no_domain_is_truncated(count, seen_whole, tmp_path, monkeypatch):
         return losses(self, source, target, progress, generator)
 
     monkeypatch.setattr(kind, "losses", watched)
-    chosen = settings("mmd", epochs=1, holdout=0.0)
-    fit("mmd", SOURCE, clouds(count, 5).without_labels(), chosen, run_dir=tmp_path)
+    chosen = settings("dann", epochs=1, holdout=0.0)
+    fit("dann", SOURCE, clouds(count, 5).without_labels(), chosen, run_dir=tmp_path)
     whole = {"source": len(SOURCE), "target": count - 1}  # a last batch of one cloud is left out
     assert seen[seen_whole] >= whole[seen_whole]
 
@@ -232,35 +233,6 @@ def test_the_poison_would_show(tmp_path):
         for name, part in {"true": truth, "wrong": wrong}.items()
     )
     assert not same(one.model, other.model)
-
-
-@pytest.mark.parametrize(
-    ("method", "normalisation"),
-    [
-        *zip(
-            [name for name in METHODS if method_class(name).uses_target],
-            itertools.cycle(["separate", "transnorm"]),
-            strict=False,
-        )
-    ],
-)
-def test_every_normalisation(method, normalisation, tmp_path):
-    chosen = settings(method, epochs=1, normalisation=normalisation)
-    result = fit(method, SOURCE, TARGET, chosen, run_dir=tmp_path)
-    assert all(torch.isfinite(value).all() for value in result.model.state_dict().values())
-    loaded = load_model(tmp_path).model
-    assert same(loaded, result.model)
-
-
-@pytest.mark.parametrize("method", [n for n in METHODS if not method_class(n).uses_target])
-def test_adaptive_statistics_alone_go_without_a_target_in_training(method, tmp_path):
-    adapted, shared = (
-        fit(method, SOURCE, TARGET, settings(method, epochs=1, normalisation=name), run_dir=folder)
-        for name, folder in (("adabn", tmp_path / "a"), ("shared", tmp_path / "b"))
-    )
-    assert not same(adapted.model, shared.model)
-    with pytest.raises(InputError, match="needs a method that uses the target"):
-        fit(method, SOURCE, TARGET, settings(method, normalisation="separate"), run_dir=tmp_path)
 
 
 @pytest.mark.parametrize(

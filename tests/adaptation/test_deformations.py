@@ -8,11 +8,8 @@ from qs3.adaptation.deformations import (
     DEFORMATIONS,
     cell_centres,
     cells,
-    deform_features,
     deform_radius,
-    deform_split,
     deform_voxels,
-    drop_points,
     pick_cells,
 )
 
@@ -21,12 +18,7 @@ from .common import ball, seeded
 SIGMA = 0.001**0.5
 
 
-def by_own_features(points, generator):
-    return deform_features(points, points.flip(2) * 2, generator)
-
-
-ALL = {**DEFORMATIONS, "features": by_own_features}
-every = pytest.mark.parametrize("deform", ALL.values(), ids=ALL)
+every = pytest.mark.parametrize("deform", DEFORMATIONS.values(), ids=DEFORMATIONS)
 
 
 def shell(b, n=1000):
@@ -139,99 +131,8 @@ def test_radius_takes_a_seed_with_enough_neighbours():
     assert torch.equal(moved, (torch.arange(300) >= 270).expand(20, -1))
 
 
-def test_features_collapse_the_points_most_alike():
-    points = ball(3, 200)
-    features = torch.randn(3, 200, 8, generator=seeded(3))
-    deformed, moved = deform_features(points, features, seeded(), share=0.1)
-    assert moved.sum(dim=1).tolist() == [20, 20, 20]
-    for cloud, out, mask, vector in zip(points, deformed, moved, features, strict=True):
-        order = torch.cdist(vector, vector).argsort(dim=1)[:, :20].sort(dim=1).values
-        seeds = (order == mask.nonzero()[:, 0]).all(dim=1).nonzero()[:, 0]
-        assert len(seeds) >= 1
-        assert float((out[mask].mean(dim=0) - cloud[seeds]).norm(dim=1).min()) < 5 * SIGMA / 20**0.5
-
-
-def test_drop_points_keeps_points_as_probable_as_asked():
-    points = ball(1, 4).expand(20000, -1, -1)
-    keep = torch.tensor([1.0, 0.9, 0.5, 0.2])
-    moved = drop_points(points, keep.expand(20000, -1), seeded()).moved
-    # One point is always dropped; where there are two or more, nothing had to be added.
-    free = moved.sum(dim=1) >= 2
-    assert not moved[free, 0].any()
-    pairs = {mask: float(keep_both(mask, keep)) for mask in ("0011", "0101", "0110", "0111")}
-    total = sum(pairs.values())
-    for mask, probability in pairs.items():
-        wanted = torch.tensor([c == "1" for c in mask])
-        share = float((moved[free] == wanted).all(dim=1).float().mean())
-        assert share == pytest.approx(probability / total, abs=0.02)
-
-
-def keep_both(mask, keep):
-    return np.prod([1 - p if c == "1" else p for c, p in zip(mask, keep.tolist(), strict=True)])
-
-
-def test_dropped_points_land_beside_survivors():
-    points = ball(3, 200)
-    deformed, moved = drop_points(points, torch.full((3, 200), 0.5), seeded())
-    for cloud, out, mask in zip(points, deformed, moved, strict=True):
-        near, at = torch.cdist(out[mask], cloud[~mask]).min(dim=1)
-        assert float(near.max()) < 5 * SIGMA
-        assert len(set(at.tolist())) > 30
-
-
-def test_drop_points_never_drops_all_nor_none():
-    points = ball(50, 6)
-    assert (drop_points(points, torch.zeros(50, 6), seeded()).moved.sum(dim=1) == 5).all()
-    assert (drop_points(points, torch.ones(50, 6), seeded()).moved.sum(dim=1) == 1).all()
-
-
-def test_split_thins_one_side_of_a_plane():
-    points = ball(8, 1000)
-    moved = deform_split(points, seeded()).moved
-    share = moved.float().mean(dim=1)
-    assert float((share - 0.375).abs().max()) < 0.08
-    for cloud, mask in zip(points - points.mean(dim=1, keepdim=True), moved, strict=True):
-        direction = cloud[mask].mean(dim=0)
-        sides = (cloud @ torch.nn.functional.normalize(direction, dim=0)) > 0
-        assert float(mask[sides].float().mean()) > 0.6
-        assert float(mask[~sides].float().mean()) < 0.15
-
-
-def test_gradient_thins_along_the_longest_axis():
-    points = ball(16, 2000) * torch.tensor([0.3, 1.0, 0.5])
-    moved = DEFORMATIONS["gradient"](points, seeded()).moved.double().numpy()
-    ends = set()
-    for cloud, mask in zip(points.double().numpy(), moved, strict=True):
-        slopes = np.linalg.lstsq(np.c_[cloud, np.ones(2000)], mask, rcond=None)[0][:3]
-        length = np.ptp(cloud[:, 1])
-        assert abs(abs(slopes[1]) * length - 0.95) < 0.25
-        assert np.abs(slopes[[0, 2]] * np.ptp(cloud[:, [0, 2]], axis=0)).max() < 0.25
-        ends.add(np.sign(slopes[1]))
-    assert ends == {-1.0, 1.0}
-
-
-def test_lambertian_keeps_what_faces_the_light():
-    """On a sphere the survivors' share is the mean of max(cos, 0.05), and they face one way."""
-    points = shell(6, 2000)
-    moved = DEFORMATIONS["lambertian"](points, seeded()).moved
-    cosine = np.linspace(-1, 1, 10001)
-    expected = np.maximum(cosine, 0.05).mean()
-    assert float((~moved).float().mean()) == pytest.approx(expected, abs=0.02)
-    for cloud, mask in zip(points, moved, strict=True):
-        light = torch.nn.functional.normalize(cloud[~mask].mean(dim=0), dim=0)
-        facing = cloud @ light
-        assert float((~mask)[facing > 0.9].float().mean()) > 0.85
-        assert float((~mask)[facing < 0].float().mean()) < 0.1
-
-
 def test_radius_falls_back_on_the_fullest_ball():
     lonely = torch.arange(1, 298)[:, None] * torch.tensor([10.0, 0, 0])
     points = torch.cat([lonely, torch.zeros(3, 3)])[None].expand(10, -1, -1)
     moved = deform_radius(points, seeded()).moved
     assert torch.equal(moved, (torch.arange(300) >= 297).expand(10, -1))
-
-
-def test_features_share_of_one_moves_all_and_of_none_one():
-    points = ball(2, 50)
-    assert deform_features(points, points, seeded(), share=1.0).moved.all()
-    assert deform_features(points, points, seeded(), share=0.0).moved.sum(dim=1).tolist() == [1, 1]

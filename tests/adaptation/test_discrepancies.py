@@ -7,12 +7,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.distance import pdist
 
-from qs3.adaptation.coral import coral
-from qs3.adaptation.dann import reverse_gradient
-from qs3.adaptation.mmd import FACTORS, median_bandwidths, mmd, squared_distances
+from qs3.adaptation.mmd import mmd, squared_distances
 from qs3.adaptation.pointdan import classifier_discrepancy
+from qs3.adaptation.reversal import reverse_gradient
 from qs3.errors import InputError
 
 SIGMAS = (0.3, 1.0, 4.0)
@@ -27,30 +25,24 @@ def kernel(u, v, sigmas):
     return sum(np.exp(-np.sum((u - v) ** 2) / (2 * s**2)) for s in sigmas)
 
 
-def mmd_by_loops(x, y, sigmas, biased):
+def mmd_by_loops(x, y, sigmas):
     def within(z):
-        pairs = [
-            kernel(z[i], z[j], sigmas)
-            for i, j in itertools.product(range(len(z)), repeat=2)
-            if biased or i != j
-        ]
-        return np.mean(pairs)
+        return np.mean([kernel(u, v, sigmas) for u, v in itertools.product(z, repeat=2)])
 
     across = np.mean([kernel(u, v, sigmas) for u in x for v in y])
     return within(x) + within(y) - 2 * across
 
 
-@pytest.mark.parametrize("biased", [True, False])
 @pytest.mark.parametrize("far", [0.0, 1000.0])
-def test_mmd_is_the_double_loop(biased, far):
+def test_mmd_is_the_double_loop(far):
     x, y = (sample + far for sample in samples())
-    value = mmd(torch.from_numpy(x), torch.from_numpy(y), SIGMAS, biased)
-    assert float(value) == pytest.approx(mmd_by_loops(x, y, SIGMAS, biased), abs=1e-9)
+    value = mmd(torch.from_numpy(x), torch.from_numpy(y), SIGMAS)
+    assert float(value) == pytest.approx(mmd_by_loops(x, y, SIGMAS), abs=1e-9)
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(1, 6), st.integers(1, 6), st.integers(0, 2**31), st.floats(0.01, 100.0))
-def test_biased_mmd_is_never_negative_and_symmetric(b, m, seed, sigma):
+def test_mmd_is_never_negative_and_symmetric(b, m, seed, sigma):
     generator = torch.Generator().manual_seed(seed)
     x = torch.randn(b, 4, generator=generator, dtype=torch.float64)
     y = torch.randn(m, 4, generator=generator, dtype=torch.float64)
@@ -62,19 +54,9 @@ def test_biased_mmd_is_never_negative_and_symmetric(b, m, seed, sigma):
     assert abs(mmd(x, x[torch.randperm(b, generator=generator)], [sigma])) < rounding
 
 
-def test_unbiased_mmd_is_zero_in_the_mean_and_biased_is_not():
-    generator = torch.Generator().manual_seed(0)
-    draws = [torch.randn(2, 6, 2, generator=generator).double().unbind() for _ in range(500)]
-    free = np.array([float(mmd(x, y, [1.0], biased=False)) for x, y in draws])
-    biased = np.array([float(mmd(x, y, [1.0])) for x, y in draws])
-    assert abs(free.mean()) < 4 * free.std() / np.sqrt(len(free))
-    assert biased.mean() > 10 * biased.std() / np.sqrt(len(free))
-
-
 def test_mmd_has_the_gradient_of_its_values():
     x, y = (torch.from_numpy(s).requires_grad_() for s in samples(4, 3, 2))
     assert torch.autograd.gradcheck(lambda u, v: mmd(u, v, SIGMAS), (x, y))
-    assert torch.autograd.gradcheck(lambda u, v: mmd(u, v, SIGMAS, biased=False), (x, y))
 
 
 def test_squared_distances_of_single_precision_far_from_the_origin():
@@ -82,41 +64,6 @@ def test_squared_distances_of_single_precision_far_from_the_origin():
     both = torch.cat([x, y]).double()
     expected = (both[:, None] - both).square().sum(dim=2)
     torch.testing.assert_close(squared_distances(x, y), expected, rtol=0, atol=1e-9)
-
-
-def test_bandwidths_follow_the_median_and_pass_no_gradient():
-    x, y = samples()
-    squared = np.sort(pdist(np.concatenate([x, y]), "sqeuclidean"))
-    median = squared[(len(squared) - 1) // 2]  # of an even number the lower one
-    sample = torch.from_numpy(x).requires_grad_()
-    sigmas = median_bandwidths(sample, torch.from_numpy(y))
-    assert not sigmas.requires_grad
-    expected = np.sqrt(median * np.array(FACTORS) / 2)
-    np.testing.assert_allclose(sigmas.numpy(), expected, rtol=1e-9)
-    assert (len(FACTORS), FACTORS[0], FACTORS[16], FACTORS[-1]) == (33, 2**-8, 1.0, 2**8)
-
-
-def test_bandwidths_of_equal_rows_leave_mmd_zero():
-    x = torch.ones(3, 4, requires_grad=True)
-    value = mmd(x, torch.ones(2, 4), median_bandwidths(x, torch.ones(2, 4)))
-    value.backward()
-    assert value.item() == pytest.approx(0.0, abs=1e-6)
-    assert not x.grad.any()
-
-
-def test_coral_is_the_distance_of_numpys_covariances():
-    x, y = samples()
-    difference = np.cov(x, rowvar=False) - np.cov(y, rowvar=False)
-    expected = np.linalg.norm(difference, "fro") ** 2 / (4 * 3**2)
-    assert float(coral(torch.from_numpy(x), torch.from_numpy(y))) == pytest.approx(expected)
-
-
-def test_coral_does_not_see_the_mean_and_is_zero_for_equal_samples():
-    x, _ = (torch.from_numpy(s) for s in samples())
-    assert float(coral(x, x + 3.0)) == pytest.approx(0.0, abs=1e-12)
-    assert float(coral(x, 2 * x)) > 0.01
-    u, v = (torch.from_numpy(s).requires_grad_() for s in samples(4, 3, 2))
-    assert torch.autograd.gradcheck(coral, (u, v))
 
 
 def test_classifier_discrepancy_is_the_mean_difference():
@@ -129,24 +76,19 @@ def test_classifier_discrepancy_is_the_mean_difference():
     assert float(classifier_discrepancy(certain, certain.roll(1, 0))) == pytest.approx(2 / 4)
 
 
-@pytest.mark.parametrize("function", [lambda x, y: mmd(x, y, [1.0]), coral])
-def test_half_precision_and_autocast_do_not_reach_the_sums(function):
+def test_half_precision_and_autocast_do_not_reach_the_sums():
     x, y = (torch.from_numpy(s).to(torch.bfloat16) for s in samples())
-    expected = function(x.double(), y.double())
+    expected = mmd(x.double(), y.double(), [1.0])
     with torch.autocast("cpu", torch.bfloat16):
-        value = function(x, y)
+        value = mmd(x, y, [1.0])
     assert value.dtype == torch.float32
     assert float(value) == pytest.approx(float(expected), rel=1e-5)
 
 
 def test_samples_that_are_too_small_are_refused():
     x = torch.zeros(1, 2)
-    with pytest.raises(InputError, match="samples of 2 or more, not 1 and 3"):
-        mmd(x, torch.zeros(3, 2), [1.0], biased=False)
     with pytest.raises(InputError, match="samples of 1 or more, not 0 and 1"):
         mmd(x[:0], x, [1.0])
-    with pytest.raises(InputError, match="coral needs samples of 2 or more, not 3 and 1"):
-        coral(torch.zeros(3, 2), x)
 
 
 @pytest.mark.parametrize("coefficient", [0.0, 0.3, 1.0])

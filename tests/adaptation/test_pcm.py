@@ -115,7 +115,7 @@ def test_the_larger_part_decides_what_counts_as_right(monkeypatch, share):
     assert right > 0
     # A network that names the smaller part where the two differ.
     logits = torch.nn.functional.one_hot(smaller, 3).float()
-    monkeypatch.setattr(method, "logits", lambda *_: logits)
+    monkeypatch.setattr(method.model, "forward", lambda *_: logits)
     method(Batch(clouds(4), labels), None, 0.0, seeded())
     assert method.right is not None
     assert int(method.right) == 4 - int(right)

@@ -5,10 +5,9 @@ import json
 import numpy as np
 import pytest
 import torch
-import tyro
 
 from qs3.adaptation.confidence import BOUNDS
-from qs3.cli.train import TrainOptions, _note_old_name, defaults, parse_settings
+from qs3.cli.train import defaults, parse_settings
 from qs3.errors import InputError
 from qs3.evaluation import read_record
 from qs3.files import write_json
@@ -72,7 +71,7 @@ def test_every_validators_choice_is_scored_and_the_oracle_stands_apart(qs3, adap
 
 
 @pytest.mark.filterwarnings("ignore::qs3.adaptation.SingleClassWarning")
-@pytest.mark.parametrize("method", ["sd", "gast"])
+@pytest.mark.parametrize("method", ["dann", "gast"])
 def test_rounds_with_all_switches_after_a_method(qs3, source, tmp_path, method):
     """From the command line to the record; Python makes the same bits."""
     run = tmp_path / "run"
@@ -96,7 +95,7 @@ def test_rounds_with_all_switches_after_a_method(qs3, source, tmp_path, method):
         assert told["known"] == told["kept"]
         assert sum(told["right"]) <= sum(told["known"])
         assert BOUNDS[0] <= told["temperature"] <= BOUNDS[1]
-    if method == "sd":
+    if method == "dann":
         settings = structure(json.loads((run / "settings.json").read_text()), RunSettings, run)
         again = tmp_path / "again"
         fit(method, load_clouds(source, num_points=None), load_unlabelled(source, num_points=None),
@@ -240,11 +239,3 @@ def test_what_a_warm_up_tells_of_its_training_is_the_default(tmp_path):
         train = defaults(words)["options"].train
         assert (train.model, train.num_points, train.learning_rate) == ("pointnet", 32, rate)
         assert train.model_settings == {"channels": [4, 4, 8]}
-
-
-def test_a_method_of_an_earlier_release_is_taken_with_a_note(capsys):
-    _note_old_name.cache_clear()
-    words = ["--source", "a", "--out", "b", "--method", "qs3"]
-    options = tyro.cli(TrainOptions, args=words, default=defaults(words)["options"])
-    assert options.method == "qbst"
-    assert capsys.readouterr().err.count("--method qs3 is qbst now") == 1

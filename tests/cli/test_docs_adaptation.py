@@ -15,8 +15,7 @@ import tyro
 
 from qs3.adaptation import create_method, method_class
 from qs3.adaptation.method import Batch
-from qs3.adaptation.mmd import FACTORS
-from qs3.adaptation.names import COMPOSED, MethodName, Normalisation, RoundRule, Rule, split_method
+from qs3.adaptation.names import COMPOSED, MethodName, RoundRule, Rule, split_method
 from qs3.adaptation.validators import VALIDATORS
 from qs3.cli.evaluate import evaluate_run
 from qs3.cli.train import TrainOptions, parse_settings
@@ -29,8 +28,6 @@ PAGE = (ROOT / "docs" / "adaptation.md").read_text(encoding="utf-8")
 SETTINGS = (ROOT / "docs" / "settings.md").read_text(encoding="utf-8")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 METHODS = get_args(MethodName)
-TOLD_IN_WORDS = {("mmd", "factors"): f"{len(FACTORS)} numbers, 2⁻⁸ to 2⁸ in steps of √2"}
-"""Defaults too long for a table."""
 ON = {"on": True, "off": False}
 
 
@@ -91,7 +88,7 @@ def test_settings_of_a_method_are_those_of_its_class(name):
         assert all(f"`{part}`" in text for part in COMPOSED[name])
         assert "| setting |" not in text
         return
-    fixed = {"self", "model", "label_smoothing", "normalisation"}
+    fixed = {"self", "model", "label_smoothing"}
     kind = method_class(name)
     own = {
         key: parameter.default
@@ -104,9 +101,6 @@ def test_settings_of_a_method_are_those_of_its_class(name):
     table = rows(text, "setting", "default", "meaning")
     assert list(table) == list(own)
     for key, default in own.items():
-        if (name, key) in TOLD_IN_WORDS:
-            assert table[key][0] == TOLD_IN_WORDS[name, key]
-            continue
         # As --method-set reads it.
         read = parse_settings("--method-set", [f"{key}={table[key][0]}"])[key]
         assert read == json.loads(json.dumps(default)), key
@@ -180,7 +174,6 @@ def test_every_flag_that_is_named_exists(page, typed):
 
 def test_tables_of_rules_name_all_of_them():
     assert list(rows(PAGE, "rule", "kept of class k", "where from")) == list(get_args(RoundRule))
-    assert list(rows(PAGE, "value", "statistics")) == list(get_args(Normalisation))
     scores = rows(PAGE, "rule", "score", "needs", "blind to")
     assert list(scores) == list(get_args(Rule)) == ["last", *VALIDATORS]
     assert list(rows(PAGE, "preset", "what differs from `default`")) == [
@@ -260,7 +253,7 @@ def test_columns_where_text_and_code_differ():
 def test_settings_of_training():
     table = rows(sections(SETTINGS, 2)["Training"], "setting", "default", "what it does")
     fields = {field.name for field in dataclasses.fields(TrainSettings)}
-    new = {"normalisation", "holdout", "validate_every", "rule", "model_set", "method_set"}
+    new = {"holdout", "validate_every", "rule", "model_set", "method_set"}
     names = {row.removeprefix("--").replace("-", "_"): cells for row, cells in table.items()}
     assert new <= set(names)
     for name in fields & set(names):

@@ -149,4 +149,4 @@ def test_a_dry_run_tells_what_would_be_trained_and_writes_nothing(
     assert "10 clouds, 0 of them held out" in qs3(*words[:-1], "--dry_run").stdout
     assert set(store.rglob("*")) == before
     assert not list(tmp_path.iterdir())
-    assert "--target" in qs3.refuses(*words, "--method", "mmd")
+    assert "--target" in qs3.refuses(*words, "--method", "dann")

@@ -17,51 +17,34 @@ from qs3.models.simpleview import depth_images
 from ..scripts import load_script
 
 REFERENCE = Path(__file__).parents[2] / "benchmarks" / "reference"
-SSG = (((0.5, 8, (8, 8, 16)),), ((0.9, 6, (16, 16, 24)),))
-MSG = (
-    ((0.3, 4, (4, 8)), (0.6, 9, (8, 6, 10))),
-    ((0.6, 5, (8, 12)), (1.2, 7, (8, 8, 8))),
-)
 _DGCNN = {"neighbours": 7, "channels": (16, 16, 24), "embedding": 32, "hidden": (16, 8)}
 _POINTNET = {"channels": (8, 8, 8, 12, 32), "hidden": (16, 8)}
-_POINTNET2 = {"centres": (24, 8), "embedding": (16, 32), "hidden": (16, 8)}
 NETWORKS: dict[str, dict[str, Any]] = {
     "dgcnn": _DGCNN,
-    "dgcnn of each point": _DGCNN | {"per_point": True},
     "pointnet": _POINTNET,
-    "pointnet of each point": _POINTNET | {"per_point": True},
     "pointnet without transforms": _POINTNET | {"transforms": False},
     "pointnet-sa": {
         "channels": (8, 12, 16, 24), "transform_hidden": (16, 8), "hidden": (8,), "nodes": 10,
         "neighbours": 7, "radius": 0.5, "node_width": 6,
     },
-    "pointnet2": _POINTNET2 | {"scales": SSG},
-    "pointnet2-msg": _POINTNET2 | {"scales": MSG},
+    "pointnet2": {
+        "centres": (24, 8), "scales": ((0.5, 8, (8, 8, 16)), (0.9, 6, (16, 16, 24))),
+        "embedding": (16, 32), "hidden": (16, 8),
+    },
     "simpleview": {"width": 4, "resolution": 24},
-    "simpleview in perspective": {"width": 4, "resolution": 24, "projection": "perspective"},
 }  # fmt: skip
 """Small networks that have a textbook form."""
 SMALL: dict[str, dict[str, Any]] = {
     "dgcnn": {"neighbours": 6, "channels": (8, 8, 16), "embedding": 32, "hidden": (16, 8)},
     "pointnet": {"channels": (8, 8, 16), "hidden": (16, 8)},
-    "pointnet of each point": {"channels": (8, 8, 16), "transforms": False, "per_point": True},
+    "pointnet without transforms": {"channels": (8, 8, 16), "transforms": False},
     "pointnet-sa": {
         "channels": (8, 8, 16, 16), "transform_hidden": (16, 8), "nodes": 12, "neighbours": 6,
         "radius": 0.9, "node_width": 8,
     },
     "pointnet2": {
-        "centres": (12, 5), "scales": (((0.9, 6, (8, 8, 16)),), ((1.4, 4, (16, 16)),)),
-        "embedding": (16, 24), "hidden": (16, 8), "per_point": True,
-    },
-    "pointnet2-msg": {
-        "centres": (12, 5), "embedding": (16, 24), "hidden": (16, 8),
-        "scales": (
-            ((0.5, 4, (4, 8)), (0.9, 6, (8, 8, 8))), ((0.8, 3, (8, 16)), (1.4, 4, (8, 8, 8))),
-        ),
-    },
-    "pointmlp-elite": {
-        "embedding": 8, "expansions": (2, 1), "before": (1, 2), "after": (1, 1),
-        "neighbours": (6, 4), "reducers": (2, 2), "bottleneck": 0.5, "hidden": (16, 8),
+        "centres": (12, 5), "scales": ((0.9, 6, (8, 8, 16)), (1.4, 4, (16, 16))),
+        "embedding": (16, 24), "hidden": (16, 8), "local": True,
     },
     "rscnn": {
         "centres": (12, 5), "radii": (0.9, 1.4), "neighbours": (6, 4), "channels": (8, 16),
@@ -73,10 +56,8 @@ SMALL: dict[str, dict[str, Any]] = {
 
 
 def textbook(name: str) -> ModuleType:
-    """Load the module of a network, or of the one that it is a variant of."""
-    path = REFERENCE / f"{name.replace('-', '_')}.py"
-    path = path if path.is_file() else path.with_stem(name.split("-")[0])
-    return load_script(path)
+    """Load the module of a network."""
+    return load_script(REFERENCE / f"{name.replace('-', '_')}.py")
 
 
 def randomise(model: nn.Module, spread: float = 1.0, most: float = 2.0) -> None:
@@ -115,13 +96,13 @@ def clouds(kind: str = "plain", b: int = 8, n: int = 60) -> Tensor:
     return points[:, : few.get(kind, n)].contiguous() + 30 * (kind == "far")
 
 
-def groups(model: Any, points: Tensor) -> list[tuple[Tensor, list[Tensor]]]:
+def groups(model: Any, points: Tensor) -> list[tuple[Tensor, Tensor]]:
     """Centres of each level of PointNet++ and the points around them."""
     result = []
     for level in model.levels:
         chosen = farthest_point_sampling(points, min(level.centres, points.shape[1]))
-        centres, balls = level.group(points)
-        result.append((chosen, balls))
+        centres, ball = level.group(points)
+        result.append((chosen, ball))
         points = centres
     return result
 
@@ -142,7 +123,7 @@ def textbook_of(name: str, model: Any, points: Tensor) -> tuple[Any, Callable[[T
                 features = convolution(features, graphs[-1])
         return slow, lambda given: slow(given, graphs)
     if name.startswith("simpleview"):
-        images = depth_images(points, model.resolution, model.projection).double()
+        images = depth_images(points, model.resolution).double()
         return slow, lambda given: slow(given, images)
     return slow, slow
 

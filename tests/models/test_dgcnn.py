@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from qs3.models import pooling
+from qs3.models import dgcnn, pooling
 from qs3.models.dgcnn import EdgeConv
 from qs3.models.ops import knn
 
@@ -20,43 +20,47 @@ def test_blocks_of_the_last_layer_do_not_matter(train, monkeypatch):
     compare("dgcnn", make("dgcnn").train(train), clouds())
 
 
-def test_pooled_features_are_those_of_the_points():
-    model = make("dgcnn of each point").eval()
-    features = model.encode(clouds())
-    both = torch.cat([features.per_point.amax(dim=1), features.per_point.mean(dim=1)], dim=1)
-    model.per_point = False
-    lean = model.encode(clouds())
-    assert lean.per_point is None
-    for result in (features.pooled, lean.pooled):
-        torch.testing.assert_close(result, both, rtol=0, atol=1e-12)
+def plainly_pooled(layer, points):
+    """What `pooled_layer` does, by the layer and two reductions."""
+    each = layer(points)
+    return each.amax(dim=1), each.mean(dim=1)
+
+
+def test_pooled_features_are_those_of_the_points(monkeypatch):
+    model = make("dgcnn").eval()
+    pooled = model.encode(clouds()).pooled
     with torch.no_grad():
-        torch.testing.assert_close(model.encode(clouds()).pooled, both, rtol=0, atol=1e-12)
+        torch.testing.assert_close(model.encode(clouds()).pooled, pooled, rtol=0, atol=1e-12)
+    monkeypatch.setattr(dgcnn, "pooled_layer", plainly_pooled)
+    torch.testing.assert_close(model.encode(clouds()).pooled, pooled, rtol=0, atol=1e-12)
 
 
 @pytest.mark.slow
-def test_half_precision_costs_no_more_than_in_plain_layers():
+def test_half_precision_costs_no_more_than_in_plain_layers(monkeypatch):
     """Errors of the last layer's gradient, as means: rounding moves the maximum by chance."""
 
-    def gradient(seed, dtype, half, per_point):
+    def gradient(seed, dtype, half, pool):
+        monkeypatch.setattr(dgcnn, "pooled_layer", pool)
         generator = torch.Generator().manual_seed(seed)
         points = torch.randn(4, 40, 3, generator=generator).to(dtype)
-        model = make("dgcnn", per_point=per_point).to(dtype).train()
+        model = make("dgcnn").to(dtype).train()
         with torch.autocast("cpu", torch.bfloat16, enabled=half):
             pooled = model.encode(points).pooled
         weights = torch.randn(pooled.shape, generator=generator).to(pooled.dtype)
         (pooled * weights).sum().backward()
         return model.embed.linear.weight.grad.double()
 
-    def error(half, per_point):
+    def error(half, pool):
         total = 0.0
         for seed in range(6):
-            exact = gradient(seed, torch.float64, False, True)
-            result = gradient(seed, torch.float32, half, per_point)
+            exact = gradient(seed, torch.float64, False, plainly_pooled)
+            result = gradient(seed, torch.float32, half, pool)
             total += float((result - exact).norm() / exact.norm()) / 6
         return total
 
-    assert error(False, False) < 1e-5
-    assert 1e-3 < error(True, False) < 1.5 * error(True, True)
+    ours = pooling.pooled_layer
+    assert error(False, ours) < 1e-5
+    assert 1e-3 < error(True, ours) < 1.5 * error(True, plainly_pooled)
 
 
 def test_textbook_form_finds_the_same_graphs():

@@ -58,8 +58,7 @@ def test_knn_holds_each_neighbour_once_among_repeated_points():
     "find",
     [
         lambda p: knn(p, 8).sort(dim=2).values,
-        lambda p: ball_query(p, p[:, :90], 0.4, 8, "nearest"),
-        lambda p: ball_query(p, p[:, :90], 0.4, 8, "first"),
+        lambda p: ball_query(p, p[:, :90], 0.4, 8),
     ],
 )
 def test_blocks_do_not_matter(find, monkeypatch):
@@ -151,28 +150,21 @@ def test_neighbours_of_other_centres_are_those_of_a_kd_tree():
 
 
 @pytest.mark.parametrize("offset", [0.0, 30.0])
-@pytest.mark.parametrize("order", ["nearest", "first"])
 @pytest.mark.parametrize(("n", "k"), [(300, 5), (512, 32), (20, 20)])
-def test_balls_are_those_of_a_kd_tree(n, k, order, offset):
+def test_balls_are_those_of_a_kd_tree(n, k, offset):
     points, centres = random_clouds(2, n) + offset, random_clouds(2, 30, seed=1) + offset
-    result = ball_query(torch.from_numpy(points), torch.from_numpy(centres), 0.5, k, order).numpy()
+    result = ball_query(torch.from_numpy(points), torch.from_numpy(centres), 0.5, k).numpy()
     for cloud in range(2):
         tree = cKDTree(points[cloud])
         nearest = tree.query(centres[cloud], 1)[1]
         inside = tree.query_ball_point(centres[cloud], 0.5)
         for row, members in enumerate(inside):
-            if order == "nearest":
-                distance = np.linalg.norm(points[cloud][members] - centres[cloud][row], axis=1)
-                members = [members[i] for i in np.argsort(distance)[:k]]
-            else:
-                members = sorted(members)[:k]
-            members = members or [nearest[row]]
+            distance = np.linalg.norm(points[cloud][members] - centres[cloud][row], axis=1)
+            members = [members[i] for i in np.argsort(distance)[:k]] or [nearest[row]]
             got = result[cloud, row]
             assert set(got) == set(members)
             assert got[0] == members[0]
             assert (got == got[0]).sum() == k - len(members) + 1
-            if order == "first":
-                assert list(got[: len(members)]) == members
 
 
 @pytest.mark.parametrize("start", [None, 4])

@@ -7,7 +7,7 @@ from qs3.models import PointNet, create_model
 from qs3.models import pointnet as module
 from qs3.models.pointnet import linear_max
 
-from .common import close, clouds, make
+from .common import clouds
 
 
 def test_linear_max_by_finite_differences():
@@ -64,13 +64,6 @@ def test_the_widest_layer_is_never_whole():
     with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
         model(points.repeat(1, 16, 1))
     assert largest == few
-
-
-def test_features_of_each_point_only_where_asked():
-    assert make("pointnet").encode(clouds(b=4, n=30)).per_point is None
-    features = make("pointnet of each point").eval().encode(clouds(b=4, n=30))
-    assert features.per_point.shape == (4, 30, 32)
-    close(features.pooled, make("pointnet").eval().encode(clouds(b=4, n=30)).pooled, 1e-9)
 
 
 def test_default_is_the_published_network():

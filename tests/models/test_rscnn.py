@@ -22,7 +22,7 @@ def clouds(b=4, n=40):
     return points * 0.6
 
 
-def edge_by_edge(layer, points, features, samples, neighbours, relative):
+def edge_by_edge(layer, points, features, samples, neighbours):
     """Liu et al., §3.1 and Fig. 3, in NumPy: h_ij, its map, the weighted features, the maximum."""
     relations, values = [], []
     b, m, k = neighbours.shape
@@ -31,8 +31,7 @@ def edge_by_edge(layer, points, features, samples, neighbours, relative):
             for j in neighbours[cloud, centre].tolist():
                 x_i, x_j = (points[cloud, i].numpy() for i in (samples[cloud, centre], j))
                 away = x_j - x_i
-                seen = (0 * x_i, away) if relative else (x_i, x_j)
-                relations.append(np.concatenate([[np.linalg.norm(away)], *seen, away]))
+                relations.append(np.concatenate([[np.linalg.norm(away)], x_i, x_j, away]))
                 own = [] if features is None else [features[cloud, j].detach().numpy()]
                 values.append(np.concatenate([away, *own]))
 
@@ -53,21 +52,19 @@ def edge_by_edge(layer, points, features, samples, neighbours, relative):
 
 
 @pytest.mark.parametrize("train", [True, False])
-@pytest.mark.parametrize("coordinates", ["absolute", "relative"])
-def test_convolutions_are_the_papers_edge_by_edge(coordinates, train):
-    model = make(coordinates=coordinates).train(train)
+def test_convolutions_are_the_papers_edge_by_edge(train):
+    model = make().train(train)
     points, features = clouds(), None
     for layer, (samples, neighbours) in zip(model.convolutions, model.group(points), strict=True):
-        arguments = (points, features, samples, neighbours, coordinates == "relative")
+        arguments = (points, features, samples, neighbours)
         expected = edge_by_edge(layer, *arguments)
         features = layer(*arguments)
         np.testing.assert_allclose(features.detach().numpy(), expected, atol=1e-9)
         points = points.gather(1, samples[:, :, None].expand(-1, -1, 3))
 
 
-@pytest.mark.parametrize("order", ["nearest", "first"])
-def test_a_group_is_the_centre_and_the_first_or_nearest_others_in_its_ball(order):
-    model = make(ball_order=order, radii=(0.7, 1.0), neighbours=(12, 6))
+def test_a_group_is_the_centre_and_the_nearest_others_in_its_ball():
+    model = make(radii=(0.7, 1.0), neighbours=(12, 6))
     points = clouds(n=64)
     for (samples, around), radius, k in zip(
         model.group(points), model.radii, model.neighbours, strict=True
@@ -76,8 +73,7 @@ def test_a_group_is_the_centre_and_the_first_or_nearest_others_in_its_ball(order
             for centre, ball in zip(own.tolist(), balls.tolist(), strict=True):
                 distance = (cloud - cloud[centre]).norm(dim=1)
                 others = [i for i in range(len(cloud)) if i != centre and distance[i] <= radius]
-                if order == "nearest":
-                    others.sort(key=lambda i: float(distance[i]))
+                others.sort(key=lambda i: float(distance[i]))
                 assert set(ball) == {centre, *others[:k]}
         points = points.gather(1, samples[:, :, None].expand(-1, -1, 3))
 
@@ -86,16 +82,3 @@ def test_number_of_parameters_is_the_releases_less_what_has_no_effect():
     biases = 64 + 16 + 128 + 128 + 512 + 1024  # before a normalisation
     release = 1_289_473
     assert sum(p.numel() for p in RSCNN(40).parameters()) == release + 256 - biases
-
-
-def test_relative_relation_does_not_see_where_a_ball_is():
-    """As in the release; the paper's relation does."""
-    for coordinates in ("relative", "absolute"):
-        convolution = make(coordinates=coordinates).eval().convolutions[0]
-        points = clouds()
-        group = make().group(points)[0]
-        near, far = (
-            convolution(points + shift, None, *group, coordinates == "relative")
-            for shift in (0.0, 0.5)
-        )
-        assert torch.allclose(near, far, rtol=0, atol=1e-9) == (coordinates == "relative")

@@ -13,7 +13,6 @@ from .common import textbook as load_textbook
 
 textbook = load_textbook("simpleview")
 
-BOTH = ("orthographic", "perspective")
 SIDES = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1.0]])
 UPS = np.array([[0, 0, 1]] * 4 + [[0, 1, 0], [0, -1, 0.0]])
 
@@ -25,7 +24,7 @@ def ball(b=2, n=300, seed=0, dtype=torch.float64):
     return (nn.functional.normalize(points, dim=2) * radius).to(dtype)
 
 
-def drawn_by_hand(cloud, size, projection):
+def drawn_by_hand(cloud, size):
     """Point by point, with cameras that look at the origin from 1.4 away."""
     images = np.zeros((6, size, size))
     for image, side, up in zip(images, SIDES, UPS, strict=True):
@@ -36,26 +35,19 @@ def drawn_by_hand(cloud, size, projection):
         for point in cloud:
             depth = (point - 1.4 * side) @ forward
             x, y = point @ right, point @ down
-            if projection == "perspective":
-                x, y = x / depth, y / depth
             pixel = tuple(int(np.rint((c + 1) / 2 * (size - 1))) for c in (y, x))
             if all(0 <= c < size for c in pixel):
                 hits.setdefault(pixel, []).append(depth)
         for pixel, depths in hits.items():
-            if projection == "perspective":
-                weights = [1 / depth for depth in depths]
-                image[pixel] = np.average(depths, weights=weights)
-            else:
-                image[pixel] = min(depths)
+            image[pixel] = min(depths)
     return images
 
 
-@pytest.mark.parametrize("projection", BOTH)
 @pytest.mark.parametrize("size", [16, 33])
-def test_images_are_those_drawn_by_hand(size, projection):
+def test_images_are_those_drawn_by_hand(size):
     points = ball()
-    images = depth_images(points, size, projection)
-    expected = np.stack([drawn_by_hand(c, size, projection) for c in points.numpy()])
+    images = depth_images(points, size)
+    expected = np.stack([drawn_by_hand(c, size) for c in points.numpy()])
     assert (expected > 0).mean() > 0.05
     np.testing.assert_allclose(images.numpy(), expected, rtol=0, atol=1e-10)
 
@@ -63,23 +55,20 @@ def test_images_are_those_drawn_by_hand(size, projection):
 LETTER = ("#####", "#....", "###..", "#....", "#....")
 
 
-@pytest.mark.parametrize("projection", BOTH)
 @pytest.mark.parametrize("view", range(6))
-def test_convention_views_are_upright_and_not_mirrored(view, projection):
+def test_convention_views_are_upright_and_not_mirrored(view):
     """An F, written where somebody who stands at the camera reads it, is read in the image."""
     # Right and up of the reader at +x, +y, −x, −y, +z (a map) and −z, written out by hand.
     rights = ((0, 1, 0), (-1, 0, 0), (0, -1, 0), (1, 0, 0), (1, 0, 0), (1, 0, 0))
     ups = ((0, 0, 1), (0, 0, 1), (0, 0, 1), (0, 0, 1), (0, 1, 0), (0, -1, 0))
     right, up = np.array(rights[view]), np.array(ups[view])
-    # The plane through the origin faces the camera; a perspective image is wider by 1.4.
-    size = 1.0 if projection == "orthographic" else 1.4
     cloud = [
-        size * ((column - 2) / 2 * right + (2 - row) / 2 * up)
+        (column - 2) / 2 * right + (2 - row) / 2 * up
         for row, line in enumerate(LETTER)
         for column, mark in enumerate(line)
         if mark == "#"
     ]
-    image = depth_images(torch.tensor(np.array(cloud))[None], 5, projection)[0, view]
+    image = depth_images(torch.tensor(np.array(cloud))[None], 5)[0, view]
     read = ["".join("#" if depth > 0 else "." for depth in row) for row in image.tolist()]
     assert tuple(read) == LETTER
     torch.testing.assert_close(image[image > 0], torch.full((11,), 1.4, dtype=torch.float64))
@@ -99,31 +88,28 @@ def test_the_nearest_point_hides_those_behind_it():
     assert float(images[2].max()) == pytest.approx(0.8)
 
 
-@pytest.mark.parametrize("projection", BOTH)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_order_of_the_points_does_not_change_a_bit(projection, dtype):
+def test_order_of_the_points_does_not_change_a_bit(dtype):
     points = ball(n=500, dtype=dtype)
     order = torch.randperm(500, generator=torch.Generator().manual_seed(1))
-    images = depth_images(points, 8, projection)  # many points a pixel
-    assert torch.equal(depth_images(points[:, order], 8, projection), images)
+    images = depth_images(points, 8)  # many points a pixel
+    assert torch.equal(depth_images(points[:, order], 8), images)
 
 
-@pytest.mark.parametrize("projection", BOTH)
-def test_points_beyond_the_image_are_not_seen(projection):
+def test_points_beyond_the_image_are_not_seen():
     inside = ball(n=50)
     outside = torch.tensor([[[0.0, 30, 0], [-30, 3, 3], [0, 0, -1e20], [torch.nan, 0, 0]]])
     both = torch.cat([inside, outside.double().expand(2, -1, -1)], dim=1)
     away = [2]  # the camera on −x: what lies there lies beyond its image or behind it
-    images = depth_images(both, 16, projection)
+    images = depth_images(both, 16)
     assert images.isfinite().all()
-    assert torch.equal(images[:, away], depth_images(inside, 16, projection)[:, away])
-    assert not depth_images(inside + 30, 16, "orthographic").any()
+    assert torch.equal(images[:, away], depth_images(inside, 16)[:, away])
+    assert not depth_images(inside + 30, 16).any()
 
 
-@pytest.mark.parametrize("projection", BOTH)
-def test_the_textbook_draws_the_same_images(projection):
-    images = depth_images(ball(), 16, projection)
-    torch.testing.assert_close(textbook.depth_images(ball(), 16, projection), images)
+def test_the_textbook_draws_the_same_images():
+    images = depth_images(ball(), 16)
+    torch.testing.assert_close(textbook.depth_images(ball(), 16), images)
 
 
 def test_pooled_holds_each_view_in_its_place():

@@ -83,12 +83,11 @@ def test_it_begins_as_the_network_is_and_learns_the_size(clouds):
 
 
 def test_it_hands_on_what_the_network_gives(clouds):
-    inside = make(per_point=True).eval()
+    inside = make().eval()
     network = Sized(inside, 1.0).eval()
     own = inside.encode(clouds / ball_radius(clouds, 1.0)[:, None, None])
     given = network.encode(clouds)
     assert torch.equal(own.local, given.local)
-    assert torch.equal(own.per_point, given.per_point)
     assert unit_of(inside, clouds) == 1.0
     assert torch.equal(unit_of(network, clouds)[:, 0, 0], ball_radius(clouds, 1.0))
     assert network.encode(torch.zeros(2, 5, 3)).pooled.isfinite().all()
@@ -96,7 +95,7 @@ def test_it_hands_on_what_the_network_gives(clouds):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_takes_it_or_says_no(clouds, method):
-    network = create_model("pointnet-sa", 4) if method == "pointdan" else make(per_point=True)
+    network = create_model("pointnet-sa", 4) if method == "pointdan" else make()
     network = Sized(network, 0.95)
     if method in ("defrec", "pcm", "defrec-pcm"):
         with pytest.raises(InputError, match="size_input"):
@@ -108,17 +107,16 @@ def test_every_method_takes_it_or_says_no(clouds, method):
     assert all(term.isfinite() for term in terms.values())
 
 
-@pytest.mark.parametrize("method", ["sd", "gast"])
-def test_what_distorts_in_the_unit_ball_does_so_in_the_clouds_own(clouds, method, monkeypatch):
+def test_gast_distorts_clouds_in_their_own_ball(clouds, monkeypatch):
     """Of a cloud three times as large, the network inside sees the same."""
     seen = []
 
     for scale in (1.0, 3.0):
-        inside = make(per_point=True)
+        inside = make()
         encode = inside.encode
         passed = []
         monkeypatch.setattr(inside, "encode", lambda p, e=encode, s=passed: (s.append(p), e(p))[1])
-        made = create_method(method, Sized(inside, 0.95)).eval()
+        made = create_method("gast", Sized(inside, 0.95)).eval()
         passed.clear()
         generator = torch.Generator().manual_seed(0)
         batch = Batch(scale * clouds, torch.arange(6) % 4)

@@ -122,7 +122,6 @@ def test_unknown_words_are_refused_without_the_type_checks_of_the_tests():
         'TrainSettings(rule="oracle")': "rule = oracle is none of last",
         'TrainSettings(accelerator="mps")': "accelerator = mps is none of auto, cpu, cuda",
         'TrainSettings(schedule="steps")': "schedule = steps is none of cosine, plateau",
-        'TrainSettings(normalisation="own")': "normalisation = own is none of shared",
         'SelfTrainingSettings(rule="pst")': "rule = pst is none of qbst",
         'SelfTrainingSettings(prior="ml")': "prior = ml is none of em, bbse",
         'SelfTrainingSettings(pool="shrinkng")': "pool = shrinkng is none of all, shrinking, split",

@@ -42,8 +42,8 @@ def test_the_line_of_the_readme(source, target):
     [
         (Adapter("dann", "pointnet", train=TRAIN), "dann", None),
         (
-            SPST("pointnet", train=TRAIN, self_training=ROUNDS, warm_up="coral"),
-            "coral",
+            SPST("pointnet", train=TRAIN, self_training=ROUNDS, warm_up="dann"),
+            "dann",
             {"rule": "spst", "weight_step": 0.005},
         ),
         (Adapter("qbst", "pointnet", train=TRAIN, self_training=ROUNDS), "qbst", GENTLE),

@@ -89,12 +89,6 @@ def test_arguments_that_do_not_go_together(source, target, settings, tmp_path):
         fit("source-only", source, None, settings, ROUNDS, run_dir=run)
     with pytest.raises(InputError, match="selects by spst, its self-training settings say qbst"):
         fit("spst", source, unlabelled, settings, ROUNDS, run_dir=run)
-    adapted = replace(settings, normalisation="adabn")
-    with pytest.raises(InputError, match="normalisation adabn needs a target"):
-        fit("source-only", source, None, adapted, run_dir=run)
-    separate = replace(settings, normalisation="separate")
-    with pytest.raises(InputError, match="separate needs a method that uses the target"):
-        fit("source-only", source, unlabelled, separate, run_dir=run)
     with pytest.raises(InputError, match="unknown method 'gasp'"):
         fit("gasp", source, unlabelled, settings, run_dir=run)
     strange = replace(settings, method_settings={"weight": 1})

@@ -56,7 +56,7 @@ def test_accuracy_is_that_of_the_labelled_batches(source, settings):
 
     class Watch(SourceOnly):
         def losses(self, source, target, progress, generator):
-            logits = self.logits(source.points)
+            logits = self.model(source.points)
             hits.append((logits.argmax(dim=1) == source.labels).float().mean().item())
             return {"source": self.classification(logits, source)}
 

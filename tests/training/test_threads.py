@@ -108,7 +108,7 @@ def test_a_resumed_run_keeps_its_number(source, settings, tmp_path, caplog):
 
 
 def test_a_step_to_be_timed_needs_no_clouds(settings):
-    method = make_method("coral", fresh_model("coral", settings, 3), settings)
+    method = make_method("dann", fresh_model("dann", settings, 3), settings)
     step = trial_step(method, 3, settings, make_fabric(settings))
     before = torch.get_rng_state()
     step()

@@ -4,38 +4,13 @@ import itertools
 import math
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
 from qs3.adaptation.method import Batch, Method, Target, Terms
+from qs3.adaptation.reversal import reverse_gradient
 from qs3.models import feature_widths
 from qs3.models.checks import check_positive, check_range
-
-
-def reverse_gradient(x: Float[Tensor, "*shape"], coefficient: float) -> Float[Tensor, "*shape"]:
-    """Return ``x``; its gradient is multiplied by −coefficient (Ganin & Lempitsky, ICML 2015).
-
-    What comes after minimises a loss while what comes before maximises it, in one backward pass.
-
-    Example:
-        >>> x = torch.tensor([3.0], requires_grad=True)
-        >>> reverse_gradient(x, 0.5).square().backward()
-        >>> x.grad
-        tensor([-3.])
-    """
-    return _Reverse.apply(x, coefficient)
-
-
-class _Reverse(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, x: Tensor, coefficient: float) -> Tensor:
-        ctx.coefficient = coefficient
-        return x.view_as(x)
-
-    @staticmethod
-    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return gradient * -ctx.coefficient, None
 
 
 def reversal_coefficient(progress: float, gamma: float = 10.0) -> float:
@@ -58,6 +33,7 @@ def domain_loss(source: Float[Tensor, "b"], target: Float[Tensor, "b_t"]) -> Flo
     It should make its scores of the source negative and those of the target positive.
 
     Example:
+        >>> import torch
         >>> round(float(domain_loss(torch.zeros(3), torch.zeros(2))), 4)  # 2 log 2
         1.3863
     """
@@ -106,6 +82,6 @@ class DANN(Method):
             for features in (of_source, of_target)
         ]
         return {
-            "source": self.classification(self.head(of_source, "source"), source),
+            "source": self.classification(self.model.head(of_source), source),
             "domain": self.domain_weight * domain_loss(*scores),
         }

@@ -7,11 +7,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor, nn
 
-from qs3.adaptation.deformations import DEFORMATIONS, Deformation, Deformed, deform_features
-from qs3.adaptation.method import Batch, Domain, Method, Target, Terms
+from qs3.adaptation.deformations import DEFORMATIONS, Deformation
+from qs3.adaptation.method import Batch, Method, Target, Terms
 from qs3.models import Features, feature_widths
 from qs3.models.checks import check_range
-from qs3.models.classifier import evaluating
 from qs3.models.ops import gather_points
 from qs3.models.ops.gathering import blocks
 
@@ -157,15 +156,10 @@ class DefRec(Method):
 
     L = (1 − w) · CE(source) + w · 20 · Chamfer(rebuilt part, original part).
 
-    NOTE: only the volume-based deformations follow released code. There the cell is the first in a
-    random order *of the batch* with 40 points, and a cloud without one has no finite loss; here
-    each cloud has an order of its own, and the fullest cell stands in for a missing one.
-    NOTE: the paper gives no full account of the others. *features*: the 15 % of points most alike
-    a random one collapse to it; likeness is the distance of the network's own local features of the
-    whole cloud, found in evaluation mode without a gradient. *split*, *gradient* and *lambertian*
-    (after Hermosilla et al., TOG 2018): points that the uneven sampling drops land beside ones that
-    survive, so that clouds keep their size, and the dropped ones are rebuilt. The shares and
-    probabilities of `qs3.adaptation.deformations` are ours.
+    NOTE: the deformations are the volume-based ones, the only ones that the authors released.
+    There the cell is the first in a random order *of the batch* with 40 points, and a cloud without
+    one has no finite loss; here each cloud has an order of its own, and the fullest cell stands in
+    for a missing one.
     NOTE: the head is evaluated at the moved points alone, whose batch statistics it then uses; the
     released one is evaluated at all points, and masked.
     NOTE: the weight is that of the released scripts; the default of their parser is 0.5.
@@ -194,7 +188,7 @@ class DefRec(Method):
 
     def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of the source and the distance of rebuilt parts."""
-        cross_entropy = self.classification(self.logits(source.points, "source"), source)
+        cross_entropy = self.classification(self.model(source.points), source)
         rebuilt = self.rebuilding(source.points, target, generator)
         return {"source": (1 - self.weight) * cross_entropy, **rebuilt}
 
@@ -203,23 +197,11 @@ class DefRec(Method):
     ) -> Terms:
         """Deform clouds, rebuild what moved, and return the weighted loss of each domain."""
         assert target is not None  # noqa: S101
-        domains: list[tuple[Domain, Tensor]] = [("source", source), ("target", target)]
+        domains = [("source", source), ("target", target)]
         terms = {}
         for domain, points in domains if self.on_source else domains[1:]:
-            deformed = self.deform(points, domain, generator)
-            predicted = self.rebuild["head"](self.features(deformed.points, domain), deformed.moved)
+            deformed = DEFORMATIONS[self.deformation](points, generator)
+            predicted = self.rebuild["head"](self.model.encode(deformed.points), deformed.moved)
             loss = reconstruction_loss(predicted, points, deformed.moved)
             terms[f"defrec_{domain}"] = self.weight * loss
         return terms
-
-    def deform(
-        self, points: Float[Tensor, "b n 3"], domain: Domain, generator: Generator
-    ) -> Deformed:
-        """Return deformed clouds of a domain."""
-        if self.deformation != "features":
-            return DEFORMATIONS[self.deformation](points, generator)
-        # In evaluation mode, so that this look leaves no trace in the running statistics.
-        with evaluating(self.model), torch.no_grad():
-            local = self.features(points, domain).local
-        assert local is not None  # noqa: S101
-        return deform_features(points, local, generator)

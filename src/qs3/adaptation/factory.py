@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from qs3.adaptation.names import METHODS, Normalisation
+from qs3.adaptation.names import METHODS
 from qs3.errors import no_such
 from qs3.models.checks import read_settings
 
@@ -43,7 +43,6 @@ def create_method(
     model: "PointClassifier",
     *,
     label_smoothing: float = 0.0,
-    normalisation: Normalisation = "shared",
     **settings: Any,
 ) -> "Method":
     """Make a method around a network; what else it trains is drawn from PyTorch's random state.
@@ -52,7 +51,6 @@ def create_method(
         name: One of `list_methods`.
         model: The network to train.
         label_smoothing: ε of the source's cross entropy.
-        normalisation: How the network normalises the two domains.
         settings: Further fields of the method; those left out keep the paper's values.
 
     Raises:
@@ -60,6 +58,5 @@ def create_method(
             does not give what the method needs.
     """
     kind = method_class(name)
-    shared = {"label_smoothing": label_smoothing, "normalisation": normalisation}
-    own = read_settings(kind, settings, f"method {name}", ("model", *shared))
-    return kind(model, **shared, **own)
+    own = read_settings(kind, settings, f"method {name}", ("model", "label_smoothing"))
+    return kind(model, label_smoothing=label_smoothing, **own)

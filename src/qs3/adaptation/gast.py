@@ -9,7 +9,7 @@ from torch import Generator, Tensor, nn
 
 from qs3.adaptation.curvature import surface
 from qs3.adaptation.deformations import CELLS, deform_cells, pick_cells
-from qs3.adaptation.method import Batch, Domain, Method, Target, Terms
+from qs3.adaptation.method import Batch, Method, Target, Terms
 from qs3.adaptation.pcm import Mixed, draw_share, mix_halves, mixed_cross_entropy
 from qs3.errors import InputError
 from qs3.models import feature_widths
@@ -146,13 +146,13 @@ class GAST(Method):
     def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of the source and the loss of each task in each domain."""
         assert target is not None  # noqa: S101
-        supervised = self.classification(self.logits(source.points, "source"), source)
+        supervised = self.classification(self.model(source.points), source)
         terms = {"source": self.classification_weight * supervised}
         if self.on_source:
             terms |= self._tasks(source.points, "source", generator)
         return terms | self._tasks(target, "target", generator)
 
-    def _tasks(self, points: Tensor, domain: Domain, generator: Generator) -> Terms:
+    def _tasks(self, points: Tensor, domain: str, generator: Generator) -> Terms:
         terms = {}
         unit = unit_of(self.model, points)
         points = points / unit
@@ -162,12 +162,12 @@ class GAST(Method):
             weights = None
             if self.curvature:
                 weights = location_weights(surface(points).curvature, distorted.moved)
-            logits = self.locate(self.features(distorted.points * unit, domain).pooled)
+            logits = self.locate(self.model.encode(distorted.points * unit).pooled)
             loss = location_loss(logits, located, weights)
             terms[f"location_{domain}"] = self.location_weight * loss
         if self.turned_x is not None and self.turned_y is not None:
             mixed = mix_rotations(points, generator, self.concentration)
-            pooled = self.features(mixed.points * unit, domain).pooled
+            pooled = self.model.encode(mixed.points * unit).pooled
             loss = mixed_cross_entropy(self.turned_x(pooled), self.turned_y(pooled), mixed)
             terms[f"rotation_{domain}"] = self.rotation_weight * loss
         return terms

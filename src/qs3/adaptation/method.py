@@ -3,20 +3,15 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Generator, Tensor, nn
 
-from qs3.adaptation.names import Normalisation
-from qs3.adaptation.normalisation import make_norm
 from qs3.errors import InputError
 from qs3.models import Features, PointClassifier, feature_widths
 from qs3.models.sized import Sized
-
-Domain = Literal["source", "target"]
-"""Where clouds come from; it decides which batch statistics the network uses."""
 
 Target = Float[Tensor, "b_t n_t 3"] | None
 """Clouds of the target; None where a method does without."""
@@ -79,8 +74,6 @@ class Method(nn.Module, ABC):
     """The network to train."""
     label_smoothing: float = 0.0
     """ε of `cross_entropy` on the source."""
-    normalisation: Normalisation = "shared"
-    """How the network normalises the two domains."""
 
     def __new__(cls, *args: object, **settings: object):
         """Prepare the module before its fields are set, as PyTorch asks."""
@@ -99,7 +92,6 @@ class Method(nn.Module, ABC):
                 f"{type(self).__name__} changes clouds in the unit ball, where they have no size; "
                 "leave size_input out, or choose another method"
             )
-        self.norm = make_norm(self.normalisation, self.model)
         self.right: Tensor | None = None
 
     @abstractmethod
@@ -120,26 +112,13 @@ class Method(nn.Module, ABC):
         self.right = None
         return self.losses(source, target, progress, generator)
 
-    def features(self, points: Float[Tensor, "b n 3"], domain: Domain = "source") -> Features:
-        """Describe clouds of a domain; every pass of the network goes through here or `logits`."""
-        with self.norm.of(domain):
-            return self.model.encode(points)
-
-    def head(self, features: Features, domain: Domain = "source") -> Float[Tensor, "b k"]:
-        """Return the logits of described clouds."""
-        with self.norm.of(domain):
-            return self.model.head(features)
-
     def both(self, source: Batch, target: Target) -> tuple[Features, Features]:
-        """Describe a batch of each domain, the source first."""
-        assert target is not None  # noqa: S101
-        return self.features(source.points, "source"), self.features(target, "target")
+        """Describe a batch of each domain, the source first.
 
-    def logits(
-        self, points: Float[Tensor, "b n 3"], domain: Domain = "source"
-    ) -> Float[Tensor, "b k"]:
-        """Return the logits of clouds of a domain."""
-        return self.head(self.features(points, domain), domain)
+        The domains pass through the network apart, so that each has its own batch statistics.
+        """
+        assert target is not None  # noqa: S101
+        return self.model.encode(source.points), self.model.encode(target)
 
     def classification(self, logits: Float[Tensor, "b k"], batch: Batch) -> Float[Tensor, ""]:
         """Return the cross entropy on labelled clouds, and note how many the network had right."""
@@ -153,7 +132,3 @@ class Method(nn.Module, ABC):
     def after_step(self) -> None:
         """Run after each optimiser step; by default nothing."""
         return
-
-    def result(self) -> PointClassifier:
-        """Return the trained network: by default the one that was handed in."""
-        return self.model

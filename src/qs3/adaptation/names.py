@@ -8,14 +8,11 @@ from qs3.errors import InputError
 MethodName = Literal[
     "source-only",
     "dann",
-    "mmd",
-    "coral",
     "pointdan",
     "defrec",
     "pcm",
     "defrec-pcm",
     "gast",
-    "sd",
     "spst",
     "qbst",
     "gast-spst",
@@ -31,26 +28,17 @@ Selection = Literal["most-confident", "least-confident"]
 SingleClass = Literal["keep", "drop"]
 """What becomes of the confident clouds where all of them have one class (μ = 0)."""
 
-Normalisation = Literal["shared", "separate", "adabn", "transnorm"]
-"""Batch statistics across domains. shared: running statistics follow both domains as they pass.
-separate: each domain has its own; the trained network keeps the target's. adabn: as shared, then
-computed anew over the target (Li et al., 2018). transnorm: as separate, and channels that differ
-less between the domains weigh more (Wang et al., NeurIPS 2019)."""
-
 Rule = Literal["last", "source-val", "entropy", "im", "bnm", "snd", "dev", "class-ami"]
 """How the network is chosen among a run's checkpoints; no rule looks at a label of the target."""
 
 METHODS: Mapping[str, str] = {
     "source-only": "source_only.SourceOnly",
     "dann": "dann.DANN",
-    "mmd": "mmd.MMD",
-    "coral": "coral.CORAL",
     "pointdan": "pointdan.PointDAN",
     "defrec": "defrec.DefRec",
     "pcm": "pcm.PCM",
     "defrec-pcm": "pcm.DefRecPCM",
     "gast": "gast.GAST",
-    "sd": "self_distillation.SelfDistillation",
 }
 """Module and class of each method that trains by itself."""
 

@@ -136,7 +136,7 @@ class PCM(Method):
         A mixed cloud counts as right where it is given the class of its larger part.
         """
         mixed = mix_clouds(batch.points, batch.labels, generator, self.concentration)
-        logits = self.logits(mixed.points)
+        logits = self.model(mixed.points)
         larger = mixed.first if mixed.share >= 0.5 else mixed.second
         self.classification(logits.detach(), Batch(mixed.points, larger))
         return mixed_cross_entropy(logits, logits, mixed, self.label_smoothing)

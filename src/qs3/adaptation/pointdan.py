@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
-from qs3.adaptation.dann import reverse_gradient
 from qs3.adaptation.method import Batch, Method, Target, Terms, cross_entropy
 from qs3.adaptation.mmd import mmd
+from qs3.adaptation.reversal import reverse_gradient
 from qs3.models import Features, PointClassifier, describe_point
 from qs3.models.checks import check_positive, check_range
 from qs3.models.classifier import evaluating
@@ -175,13 +175,13 @@ class PointDAN(Method):
         """Return the cross entropy of both classifiers, their negated discrepancy, the MMD."""
         of_source, of_target = self.both(source, target)
         assert target is not None  # noqa: S101
-        first = self.classification(self.head(of_source, "source"), source)
+        first = self.classification(self.model.head(of_source), source)
         second = cross_entropy(self.second.head(of_source), source.labels, self.label_smoothing)
         pooled = reverse_gradient(of_target.pooled, reversal_coefficient(progress))
         turned = replace(of_target, pooled=pooled)
         probabilities = [
             logits.float().softmax(dim=1)
-            for logits in (self.head(turned, "target"), self.second.head(turned))
+            for logits in (self.model.head(turned), self.second.head(turned))
         ]
         nodes = [
             self.attention["source"](self.nodes_of(source.points, of_source)),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor
 
-from qs3.adaptation.method import Batch, Domain, Method, Target, Terms, cross_entropy
+from qs3.adaptation.method import Batch, Method, Target, Terms, cross_entropy
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
@@ -30,15 +30,15 @@ class PseudoLabelled(Method):
         fallen = self.weight_step * self.epochs[done]
         terms: dict[str, Tensor] = {}
         right = torch.zeros((), dtype=torch.int64, device=source.labels.device)
-        passes: tuple[tuple[str, Domain, slice, float], ...] = (
-            ("source", "source", slice(count, None), self.source_weight - fallen),
-            ("pseudo", "target", slice(0, count), 1.0 - fallen),
+        passes: tuple[tuple[str, slice, float], ...] = (
+            ("source", slice(count, None), self.source_weight - fallen),
+            ("pseudo", slice(0, count), 1.0 - fallen),
         )
-        for name, domain, rows, weight in passes:
+        for name, rows, weight in passes:
             labels = source.labels[rows]
             if not len(labels):
                 continue
-            logits = self.logits(source.points[rows], domain)
+            logits = self.model(source.points[rows])
             right += (logits.detach().argmax(dim=1) == labels).sum()
             terms[name] = weight * cross_entropy(logits, labels, self.label_smoothing)
         self.right = right

@@ -13,4 +13,4 @@ class SourceOnly(Method):
 
     def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of the source batch."""
-        return {"source": self.classification(self.logits(source.points), source)}
+        return {"source": self.classification(self.model(source.points), source)}

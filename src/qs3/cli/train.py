@@ -5,16 +5,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import tyro
-from tyro.constructors import PrimitiveConstructorSpec
 
 from qs3.adaptation.names import COMPOSED, WITHOUT_TARGET, MethodName, RoundRule, split_method
 from qs3.cli.options import Flat
 from qs3.cli.text import quoted, show, tell
-from qs3.errors import InputError, no_such
-from qs3.evaluation.records import rename_method
+from qs3.errors import InputError
 from qs3.files import parse_json
 from qs3.io.clouds import CloudChoice
 from qs3.structure import structure, unstructure
@@ -39,30 +37,6 @@ NO_ROUND = 4
 """Exit code where no round of self-training had enough clouds to train on."""
 
 
-@functools.cache
-def _note_old_name(name: str) -> None:
-    tell(f"--method {name} is {rename_method(name)} now, on whatever source")
-
-
-def _method(words: list[str]) -> str:
-    name = rename_method(words[0])
-    if name not in get_args(MethodName):
-        raise no_such(f"no method {name!r}", name, get_args(MethodName))
-    if name != words[0]:
-        _note_old_name(words[0])
-    return name
-
-
-_METHOD = PrimitiveConstructorSpec(
-    nargs=1,
-    metavar="{" + ",".join(get_args(MethodName)) + "}",
-    instance_from_str=_method,
-    is_instance=lambda value: value in get_args(MethodName),
-    str_from_instance=lambda name: [name],
-)
-"""How a method is named; names of earlier releases are taken too."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Choices:
     """What settings of self-training are in force before any of them is given by itself."""
@@ -77,7 +51,7 @@ class Choices:
     """Run whose network self-training starts from, in place of training first, or the name of a
     network that comes with qs3, such as rooms. How it was trained is the default of the settings
     below."""
-    method: Annotated[MethodName, _METHOD] = "source-only"
+    method: MethodName = "source-only"
     """How the target takes part; spst, qbst and gast-spst end in rounds of self-training."""
     rounds_rule: Annotated[RoundRule | None, tyro.conf.arg(name="self-training")] = None
     """Rounds of self-training after the method, by this rule: --method gast --self-training
@@ -96,7 +70,7 @@ class TrainOptions(Choices):
     """Folder of the run; run the same command again to go on after a stop."""
     target: str | None = None
     """Clouds of the target; labels that lie there are dropped unused. source-only takes them for
-    validators and AdaBN alone."""
+    validators alone."""
     source_split: str | None = None
     """Part of the source, such as train; all of it by default."""
     target_split: str | None = None
@@ -241,8 +215,8 @@ def parse_settings(option: str, given: Sequence[str]) -> dict[str, Any]:
         InputError: where a pair has no equals sign, or a name comes twice.
 
     Example:
-        >>> parse_settings("--model-set", ["k=10", "grouping=msg", "hidden=[64, 32]"])
-        {'k': 10, 'grouping': 'msg', 'hidden': [64, 32]}
+        >>> parse_settings("--model-set", ["k=10", "order=first", "hidden=[64, 32]"])
+        {'k': 10, 'order': 'first', 'hidden': [64, 32]}
     """
     settings: dict[str, Any] = {}
     for pair in given:

@@ -46,9 +46,6 @@ ROWS: Mapping[str, Row] = {
     "gast-spst": Row("gast-spst", "spst", "gast"),
     "qbst": _QBST,
     "dann": Row("dann"),
-    "mmd": Row("mmd"),
-    "coral": Row("coral"),
-    "sd": Row("sd"),
     "spst": Row("spst", "spst", ORDINARY),
     # What lost least on real objects.
     "qbst-gentle": replace(_QBST, changes=GENTLE),

@@ -145,7 +145,7 @@ class Scale:
 _NARROW: Mapping[str, Mapping[str, Any]] = {
     "pointnet2": {
         "centres": (96, 32),
-        "scales": (((0.25, 16, (32, 32, 64)),), ((0.5, 16, (64, 64, 128)),)),
+        "scales": ((0.25, 16, (32, 32, 64)), (0.5, 16, (64, 64, 128))),
         "embedding": (128, 256),
     },
     "dgcnn": {"neighbours": 10, "channels": (32, 32, 64, 64), "embedding": 256},

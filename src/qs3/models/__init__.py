@@ -12,11 +12,9 @@ if TYPE_CHECKING:
     from qs3.models.dgcnn import DGCNN as DGCNN
     from qs3.models.factory import create_model as create_model
     from qs3.models.factory import list_models as list_models
-    from qs3.models.pointmlp import PointMLPElite as PointMLPElite
     from qs3.models.pointnet import PointNet as PointNet
     from qs3.models.pointnet2 import PointNet2 as PointNet2
     from qs3.models.pointnet_sa import PointNetSA as PointNetSA
-    from qs3.models.releases import load_reference as load_reference
     from qs3.models.rscnn import RSCNN as RSCNN
     from qs3.models.simpleview import SimpleView as SimpleView
 

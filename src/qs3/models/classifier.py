@@ -19,8 +19,6 @@ class Features:
 
     pooled: Float[Tensor, "b c"]
     """One vector a cloud, the input of the head."""
-    per_point: Float[Tensor, "b n d"] | None = None
-    """One vector a point from the last layer before pooling; None where a network has none."""
     local: Float[Tensor, "b n e"] | None = None
     """One vector a point from the earlier layers; None where a network has none."""
     nodes: Float[Tensor, "b m f"] | None = None
@@ -55,8 +53,6 @@ class Widths(NamedTuple):
 
     pooled: int
     """Of the vector a cloud."""
-    per_point: int | None
-    """Of the last layer before pooling."""
     local: int | None
     """Of the earlier layers."""
 
@@ -85,11 +81,11 @@ def feature_widths(model: PointClassifier) -> Widths:
     Example:
         >>> from qs3.models import create_model
         >>> feature_widths(create_model("dgcnn", 10))
-        Widths(pooled=2048, per_point=None, local=512)
+        Widths(pooled=2048, local=512)
     """
     features = describe_point(model)
-    parts = (features.pooled, features.per_point, features.local)
-    return Widths(*(None if part is None else part.shape[-1] for part in parts))  # pyright: ignore[reportArgumentType]
+    local = features.local
+    return Widths(features.pooled.shape[-1], None if local is None else local.shape[-1])
 
 
 class ClassifierHead(nn.Module):

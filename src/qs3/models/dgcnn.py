@@ -114,8 +114,7 @@ class DGCNN(PointClassifier):
     """DGCNN as in the official classification network.
 
     Four EdgeConvs on graphs rebuilt in feature space, one layer over their concatenation, maximum
-    and mean over the points, three fully connected layers. ``local`` is the concatenation,
-    ``per_point`` that one layer's output, which is not made unless it is asked for.
+    and mean over the points, three fully connected layers. ``local`` is the concatenation.
 
     Args:
         num_classes: k.
@@ -125,7 +124,6 @@ class DGCNN(PointClassifier):
         embedding: Width of the layer before pooling.
         hidden: Widths of the head's hidden layers.
         dropout: Probability of dropping a hidden unit of the head.
-        per_point: Whether `encode` gives ``per_point``.
 
     Example:
         >>> network = DGCNN(10, neighbours=4, channels=(8, 8), embedding=16, hidden=(8,)).eval()
@@ -141,14 +139,12 @@ class DGCNN(PointClassifier):
         embedding: int = 1024,
         hidden: tuple[int, ...] = (512, 256),
         dropout: float = 0.5,
-        per_point: bool = False,
     ) -> None:
         super().__init__()
         check_range("neighbours", neighbours, 1, 255)
         check_range("channels", channels)
         check_range("embedding", embedding)
         self.neighbours = neighbours
-        self.per_point = per_point
         widths = (3, *channels)
         self.convolutions = nn.ModuleList(EdgeConv(c, d) for c, d in itertools.pairwise(widths))
         self.embed = PointwiseLayer(sum(channels), embedding, _SLOPE)
@@ -161,9 +157,5 @@ class DGCNN(PointClassifier):
         for convolution in self.convolutions:
             levels.append(convolution(levels[-1], knn(levels[-1], k)))
         local = torch.cat(levels[1:], dim=2)
-        per_point = self.embed(local) if self.per_point else None
-        if per_point is None:
-            parts = pooled_layer(self.embed, local)
-        else:
-            parts = (per_point.amax(dim=1), per_point.mean(dim=1))
-        return Features(pooled=torch.cat(parts, dim=1), per_point=per_point, local=local)
+        pooled = torch.cat(pooled_layer(self.embed, local), dim=1)
+        return Features(pooled=pooled, local=local)

@@ -10,17 +10,15 @@ from qs3.models.checks import read_settings
 if TYPE_CHECKING:
     from qs3.models.classifier import PointClassifier
 
-_MODELS: Mapping[str, tuple[str, str, dict[str, Any]]] = {
-    "dgcnn": ("dgcnn", "DGCNN", {}),
-    "pointmlp-elite": ("pointmlp", "PointMLPElite", {}),
-    "pointnet": ("pointnet", "PointNet", {}),
-    "pointnet-sa": ("pointnet_sa", "PointNetSA", {}),
-    "pointnet2": ("pointnet2", "PointNet2", {}),
-    "pointnet2-msg": ("pointnet2", "PointNet2", {"grouping": "msg"}),
-    "rscnn": ("rscnn", "RSCNN", {}),
-    "simpleview": ("simpleview", "SimpleView", {}),
+_MODELS: Mapping[str, str] = {
+    "dgcnn": "dgcnn.DGCNN",
+    "pointnet": "pointnet.PointNet",
+    "pointnet-sa": "pointnet_sa.PointNetSA",
+    "pointnet2": "pointnet2.PointNet2",
+    "rscnn": "rscnn.RSCNN",
+    "simpleview": "simpleview.SimpleView",
 }
-"""Module, class and fixed settings of each network."""
+"""Module and class of each network."""
 
 
 def list_models() -> tuple[str, ...]:
@@ -50,7 +48,6 @@ def create_model(name: str, num_classes: int, **settings: Any) -> "PointClassifi
     """
     if name not in _MODELS:
         raise no_such(f"unknown model {name!r}", name, _MODELS)
-    module, kind, fixed = _MODELS[name]
+    module, kind = _MODELS[name].split(".")
     make = getattr(import_module(f"qs3.models.{module}"), kind)
-    values = read_settings(make, settings, name, ("num_classes", *fixed))
-    return make(num_classes, **fixed, **values)
+    return make(num_classes, **read_settings(make, settings, name, ("num_classes",)))

@@ -35,18 +35,14 @@ class GroupedMLP(nn.Module):
     Args:
         channels: Width of the points' features; 0 where they have none.
         widths: Widths of the layers, at least two.
-        features_first: Whether the first layer's weight holds the features before the position.
     """
 
-    def __init__(
-        self, channels: int, widths: tuple[int, ...], features_first: bool = False
-    ) -> None:
+    def __init__(self, channels: int, widths: tuple[int, ...]) -> None:
         super().__init__()
         if len(widths) < 2:
             raise InputError(f"widths must be two or more, not {widths}")
         ends = (3 + channels, *widths)
         self.layers = nn.ModuleList(FoldedLayer(c, d) for c, d in itertools.pairwise(ends))
-        self.features_first = features_first
 
     def forward(
         self,
@@ -64,7 +60,7 @@ class GroupedMLP(nn.Module):
             mean = points.mean(dim=1, keepdim=True)
             points, centres = (points - mean).to(dtype), (centres - mean).to(dtype)
             features = None if features is None else features.to(dtype)
-            first = _FirstInput(points, features, centres, index, self.features_first)
+            first = _FirstInput(points, features, centres, index)
             batch = any(uses_batch(self._layer(i).norm) for i in range(len(self.layers)))
             if batch or torch.is_grad_enabled():
                 best = self._all_edges(first)
@@ -123,18 +119,12 @@ class _FirstInput:
         features: Float[Tensor, "b n c"] | None,
         centres: Float[Tensor, "b m 3"],
         index: Int[Tensor, "b m k"],
-        features_first: bool,
     ) -> None:
         self.points, self.features, self.centres = points, features, centres
         self.index = index
-        self.features_first = features_first
         self.differences = gather_points(points, index) - centres[:, :, None]
         self._products: Tensor | None = None
         self._of_centres: Tensor | None = None
-
-    def _joined(self, position: Tensor, feature: Tensor, dim: int) -> Tensor:
-        parts = (feature, position) if self.features_first else (position, feature)
-        return torch.cat(parts, dim=dim)
 
     def moments(self) -> Moments:
         """Return mean and covariance of the input over all edges."""
@@ -155,12 +145,8 @@ class _FirstInput:
         # Σ_e d_e f_jᵀ, summed over the edges that end in a point first.
         around = scatter_points(centred.view(*self.index.shape, 3), self.index, n).flatten(0, 1)
         cross = around.t() @ features / count
-        if self.features_first:
-            blocks = ((own, cross.t()), (cross, covariance))
-        else:
-            blocks = ((covariance, cross), (cross.t(), own))
-        rows = [torch.cat(row, dim=1) for row in blocks]
-        return Moments(self._joined(mean, feature_mean, 0), torch.cat(rows), count)
+        rows = [torch.cat([covariance, cross], dim=1), torch.cat([cross.t(), own], dim=1)]
+        return Moments(torch.cat([mean, feature_mean]), torch.cat(rows), count)
 
     def apply(
         self, weight: Float[Tensor, "d c"], shift: Float[Tensor, "d"], neighbour: int | None = None
@@ -171,12 +157,11 @@ class _FirstInput:
         if self.features is None:
             edges = self.differences[:, :, pick].permute(2, 0, 1, 3).reshape(-1, b * m, 3)
             return _rectified(edges, weight, shift)
-        n, c = self.features.shape[1:]
+        n = self.features.shape[1]
         if self._products is None:
-            position = weight[:, c:] if self.features_first else weight[:, :3]
-            inputs = self._joined(self.points, self.features, 2)
+            inputs = torch.cat([self.points, self.features], dim=2)
             self._products = nn.functional.linear(inputs, weight, shift).flatten(0, 1)
-            self._of_centres = nn.functional.linear(self.centres, position).flatten(0, 1)
+            self._of_centres = nn.functional.linear(self.centres, weight[:, :3]).flatten(0, 1)
         flat = flat_indices(self.index, n)[:, pick].t()
         return _RectifiedEdges.apply(self._products, self._of_centres, flat)
 

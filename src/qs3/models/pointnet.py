@@ -123,11 +123,6 @@ class PointwiseMax(FoldedLayer):
             points, weight, shift = _fold(self.linear, self.norm, points)
         return nn.functional.relu(linear_max(points, weight) + shift)
 
-    def each(self, points: Float[Tensor, "b n c"]) -> Float[Tensor, "b n d"]:
-        """Return what `forward` takes the maximum of; costs the time and memory it saves."""
-        normed = self.norm(self.linear(points).flatten(0, 1))
-        return nn.functional.relu(normed, inplace=True).view(*points.shape[:2], -1)
-
 
 def _shared(widths: tuple[int, ...]) -> nn.Sequential:
     """Layers from one width to the next; the first is of the cheaper kind for coordinates."""
@@ -176,9 +171,6 @@ class PointNet(PointClassifier):
         hidden: Widths of the head's hidden layers, and of the T-Nets'.
         dropout: Probability of dropping a hidden unit of the head.
         transforms: Whether to use the two T-Nets; without, it is the paper's "vanilla" network.
-        per_point: Whether `encode` gives ``per_point``: the layer before pooling at each point,
-            for methods that need it. It is the largest tensor of the network by far, and not made
-            otherwise.
 
     Example:
         >>> PointNet(10, channels=(8, 8, 16), hidden=(8,)).eval()(torch.zeros(2, 32, 3)).shape
@@ -192,7 +184,6 @@ class PointNet(PointClassifier):
         hidden: tuple[int, ...] = (512, 256),
         dropout: float = 0.3,
         transforms: bool = True,
-        per_point: bool = False,
     ) -> None:
         super().__init__()
         if len(channels) < 3:
@@ -206,7 +197,6 @@ class PointNet(PointClassifier):
             TransformNet(channels[1], channels[-3:], hidden) if transforms else None
         )
         self.classify = ClassifierHead(channels[-1], hidden, num_classes, dropout, 0.0)
-        self.per_point = per_point
 
     def encode(self, points: Float[Tensor, "b n 3"]) -> Features:
         """Describe each cloud by the maximum over its points."""
@@ -215,8 +205,4 @@ class PointNet(PointClassifier):
         local = self.early(points)
         if self.feature_transform is not None:
             local = local @ self.feature_transform(local)
-        late = self.late(local)
-        if not self.per_point:
-            return Features(pooled=self.pool(late), local=local)
-        per_point = self.pool.each(late)
-        return Features(pooled=per_point.amax(dim=1), per_point=per_point, local=local)
+        return Features(pooled=self.pool(self.late(local)), local=local)

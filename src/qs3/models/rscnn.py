@@ -1,7 +1,5 @@
 """RS-CNN (Liu et al., CVPR 2019): weights of points around a centre, learnt from their relation."""
 
-from typing import Literal
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
@@ -9,7 +7,7 @@ from torch import Tensor, nn
 from qs3.errors import InputError
 from qs3.models.checks import check_positive, check_range
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, normalised
-from qs3.models.ops import BallOrder, ball_query, gather_points, nested_samples
+from qs3.models.ops import ball_query, gather_points, nested_samples
 
 _RAISED = 16
 """Channels to which the first convolution raises the coordinates."""
@@ -45,17 +43,11 @@ class RSConv(nn.Module):
         features: Float[Tensor, "b n c"] | None,
         samples: Int[Tensor, "b m"],
         neighbours: Int[Tensor, "b m k"],
-        relative: bool,
     ) -> Float[Tensor, "b m d"]:
-        """Return the new features of the centres, given by index as are the points around them.
-
-        Relative, h_ij holds x_i and x_j as seen from x_i, as the release has it.
-        """
+        """Return the new features of the centres, given by index as are the points around them."""
         around = gather_points(points, neighbours)
         centre = gather_points(points, samples)[:, :, None].expand_as(around)
         difference = around - centre
-        if relative:
-            centre, around = torch.zeros_like(centre), difference
         distance = difference.norm(dim=3, keepdim=True)
         relation = torch.cat([distance, centre, around, difference], dim=3)
         related = normalised(self.relate_norm, self.relate(relation)).relu_()
@@ -81,11 +73,10 @@ class RSCNN(PointClassifier):
     complexity tells 1.41 million.
 
     NOTE: the release takes x_i off the coordinates in place, so that its relation is in effect
-    (|x_j − x_i|, 0, x_j − x_i, x_j − x_i); ``coordinates="relative"`` does the same. In a ball of
-    too many points it keeps those that come first in the cloud (``ball_order="first"``), which
-    makes the result depend on the order of the points; by default the nearest stay. It draws
-    weights from Kaiming's normal distribution and sets biases to zero; ours begin as PyTorch's
-    layers do.
+    (|x_j − x_i|, 0, x_j − x_i, x_j − x_i). In a ball of too many points it keeps those that come
+    first in the cloud, which makes the result depend on the order of the points; here the nearest
+    stay. It draws weights from Kaiming's normal distribution and sets biases to zero; ours begin as
+    PyTorch's layers do.
 
     Args:
         num_classes: k.
@@ -96,8 +87,6 @@ class RSCNN(PointClassifier):
         embedding: Width of the layer before the maximum over the centres.
         hidden: Widths of the head's hidden layers.
         dropout: Probability of dropping a hidden unit of the head.
-        ball_order: Which points a ball keeps that has too many: the "nearest", or the "first".
-        coordinates: What the relation holds of x_i and x_j: "absolute" (paper) or "relative".
 
     Example:
         >>> network = RSCNN(10, centres=(8, 4), channels=(8, 8), embedding=16, hidden=(8,)).eval()
@@ -115,8 +104,6 @@ class RSCNN(PointClassifier):
         embedding: int = 1024,
         hidden: tuple[int, ...] = (512, 256),
         dropout: float = 0.5,
-        ball_order: BallOrder = "nearest",
-        coordinates: Literal["absolute", "relative"] = "absolute",
     ) -> None:
         super().__init__()
         levels = {"centres": centres, "neighbours": neighbours, "channels": channels}
@@ -129,8 +116,6 @@ class RSCNN(PointClassifier):
             raise InputError(f"centres must not grow, not {centres}")
         check_range("embedding", embedding)
         self.centres, self.radii, self.neighbours = centres, radii, neighbours
-        self.ball_order: BallOrder = ball_order
-        self.relative = coordinates == "relative"
         widths = (0, *channels[:-1])
         self.convolutions = nn.ModuleList(map(RSConv, widths, channels))
         self.embed = nn.Linear(channels[-1] + 3, embedding, bias=False)
@@ -145,10 +130,7 @@ class RSCNN(PointClassifier):
         levels = zip(nested_samples(points, counts), self.radii, self.neighbours, strict=True)
         for samples, radius, neighbours in levels:
             centres, k = gather_points(points, samples), min(neighbours + 1, points.shape[1])
-            around = ball_query(points, centres, radius, k, self.ball_order)
-            if self.ball_order == "first":
-                around = _with_centre(around, samples)
-            groups.append((samples, around))
+            groups.append((samples, ball_query(points, centres, radius, k)))
             points = centres
         return groups
 
@@ -159,18 +141,8 @@ class RSCNN(PointClassifier):
         groups = self.group(points)
         with torch.autocast(points.device.type, enabled=False):  # relations need all their bits
             for convolution, group in zip(self.convolutions, groups, strict=True):
-                features = convolution(points, features, *group, self.relative)
+                features = convolution(points, features, *group)
                 points = gather_points(points, group[0])
         assert features is not None  # noqa: S101
         embedded = self.embed(torch.cat([points, features], dim=2))
         return Features(pooled=normalised(self.embed_norm, embedded).amax(dim=1).relu())
-
-
-def _with_centre(around: Int[Tensor, "b m k"], samples: Int[Tensor, "b m"]) -> Int[Tensor, "b m k"]:
-    """Put the centre into balls that do not hold it, for the last point; fill up with it."""
-    centre = samples[:, :, None]
-    filler = around == around[:, :, :1]
-    filler[:, :, 0] = False
-    around = torch.where(filler, centre, around)
-    held = (around == centre).any(dim=2, keepdim=True)
-    return torch.where(held, around, torch.cat([centre, around[:, :, :-1]], dim=2))

@@ -1,7 +1,5 @@
 """SimpleView (Goyal et al., ICML 2021): ResNet-18 (He et al., CVPR 2016) on six depth images."""
 
-from typing import Literal
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -10,15 +8,10 @@ from qs3.models.checks import check_range
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier
 from qs3.models.ops.gathering import in_single_precision
 
-Projection = Literal["orthographic", "perspective"]
-"""How points reach a pixel; see `depth_images`."""
-
 _DISTANCE = 1.4
 """From each camera to the origin, as in the release."""
 _NEAR = 0.01
 """Points with less depth than this are not seen."""
-_FIXED = 2.0**40
-"""Inverse depths are summed as integers of this unit, whose sum has no order."""
 _VIEWS = (
     ((1, 1), (2, -1), (0, -1)),
     ((0, -1), (2, -1), (1, -1)),
@@ -31,9 +24,7 @@ _VIEWS = (
 
 
 @torch.no_grad()
-def depth_images(
-    points: Float[Tensor, "b n 3"], resolution: int = 128, projection: Projection = "orthographic"
-) -> Float[Tensor, "b 6 h w"]:
+def depth_images(points: Float[Tensor, "b n 3"], resolution: int = 128) -> Float[Tensor, "b 6 h w"]:
     """Draw each cloud as seen from six sides; the order of the points does not matter.
 
     Convention:
@@ -44,15 +35,12 @@ def depth_images(
         (w − 1)/2. Depth is along the optical axis, in 0.4 to 2.4 for the unit ball; 0 is empty.
 
     A point falls on the one pixel nearest to it, as in the release; points beyond the image, or
-    behind the camera, are not seen. No gradient flows to the points.
+    behind the camera, are not seen. x = ±1 falls on the centres of the first and the last column;
+    of several points in a pixel the nearest is taken. No gradient flows to the points.
 
-    - orthographic: x = ±1 falls on the centres of the first and the last column; of several points
-      in a pixel the nearest is taken.
-    - perspective, as the release: 90° of view; several points in a pixel give their mean depth
-      weighted by 1/depth (the harmonic mean).
-
-    NOTE: the release takes rows from x and columns from y, so that its images are mirrored, and
-    draws the origin at w/2. A network trained from scratch cannot tell.
+    NOTE: the release draws in perspective (90° of view), several points in a pixel by their mean
+    depth weighted by 1/depth. It takes rows from x and columns from y, so that its images are
+    mirrored, and draws the origin at w/2; a network trained from scratch cannot tell.
 
     Example:
         >>> image = depth_images(torch.tensor([[[0.0, 0.0, 1.0]]]), 3)[0]
@@ -64,8 +52,6 @@ def depth_images(
     axes, signs = torch.tensor(_VIEWS, device=points.device).unbind(dim=2)
     right, down, forward = (points[:, :, axes] * signs).unbind(dim=3)
     depth = forward + _DISTANCE
-    if projection == "perspective":
-        right, down = right / depth, down / depth
     column, row = ((c + 1.0) * ((resolution - 1) / 2) for c in (right, down))
     column, row = column.round(), row.round()
     seen = (column >= 0) & (column < resolution) & (row >= 0) & (row < resolution)
@@ -75,16 +61,9 @@ def depth_images(
     pixel = (image * resolution + row.long()) * resolution + column.long()
     # What is not seen goes to one more pixel, which is then dropped.
     pixel = torch.where(seen, pixel, pixels).reshape(-1)
-    if projection == "perspective":
-        inverse = (_FIXED / depth.clamp_min(_NEAR)).round().long().reshape(-1)
-        total = torch.zeros(pixels + 1, dtype=torch.int64, device=points.device)
-        count = total.clone().scatter_add_(0, pixel, torch.ones_like(pixel))
-        total.scatter_add_(0, pixel, inverse)
-        drawn = count.to(depth.dtype) * _FIXED / total.clamp_min(1).to(depth.dtype)
-    else:
-        drawn = torch.full((pixels + 1,), torch.inf, dtype=depth.dtype, device=points.device)
-        drawn.scatter_reduce_(0, pixel, depth.reshape(-1), "amin")
-        drawn = torch.where(drawn.isinf(), 0.0, drawn)
+    drawn = torch.full((pixels + 1,), torch.inf, dtype=depth.dtype, device=points.device)
+    drawn.scatter_reduce_(0, pixel, depth.reshape(-1), "amin")
+    drawn = torch.where(drawn.isinf(), 0.0, drawn)
     return drawn[:-1].view(b, 6, resolution, resolution)
 
 
@@ -171,7 +150,6 @@ class SimpleView(PointClassifier):
         num_classes: k.
         width: Width of the ResNet's first stage.
         resolution: Height and width of the images.
-        projection: orthographic or perspective; see `depth_images`.
         dropout: Probability of dropping a feature of a view, and a hidden unit of the head.
 
     Example:
@@ -184,14 +162,12 @@ class SimpleView(PointClassifier):
         num_classes: int,
         width: int = 16,
         resolution: int = 128,
-        projection: Projection = "orthographic",
         dropout: float = 0.5,
     ) -> None:
         super().__init__()
         check_range("width", width)
         check_range("resolution", resolution, 8, 1024)
         self.resolution = resolution
-        self.projection: Projection = projection
         self.backbone = ResNet18(1, width)
         channels = 8 * width
         self.norm = nn.BatchNorm1d(channels)
@@ -200,7 +176,7 @@ class SimpleView(PointClassifier):
 
     def encode(self, points: Float[Tensor, "b n 3"]) -> Features:
         """Describe each cloud by the features of its six views, side by side."""
-        images = depth_images(points, self.resolution, self.projection)
+        images = depth_images(points, self.resolution)
         return Features(pooled=self.describe(images.to(self.norm.weight.dtype)))
 
     def describe(self, images: Float[Tensor, "b 6 h w"]) -> Float[Tensor, "b c"]:

@@ -90,7 +90,7 @@ class Sized(PointClassifier):
             torch.where(flat, 0.0, points / torch.where(flat, 1.0, radius))
         )
         pooled = features.pooled + self.size(log_extents(points)).to(features.pooled.dtype)
-        return Features(pooled, features.per_point, features.local, features.nodes)
+        return Features(pooled, features.local, features.nodes)
 
     def head(self, features: Features) -> Float[Tensor, "b k"]:
         """Return the logits of the network inside."""

@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from qs3.training.run import read_run as read_run
     from qs3.training.self_training import self_train as self_train
     from qs3.training.validation import Checkpoint as Checkpoint
-    from qs3.training.validation import adapt_statistics as adapt_statistics
     from qs3.training.validation import read_checkpoints as read_checkpoints
 
 _MODULES = handed_on(__file__)

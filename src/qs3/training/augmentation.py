@@ -18,11 +18,9 @@ from qs3.training.config import Augmentation
 _OUTSIDE = 0.01
 """Share of the points beyond each side of the robust box."""
 _MARGIN = 0.4
-"""What a crop leaves beside the object, in radii: slabs reach at most so far beyond its box."""
-_GAP = 0.2
-"""Largest distance of a wall or neighbour from the box, in radii."""
+"""What a crop leaves beside the object, in radii: floor reaches at most so far beyond its box."""
 _THICKNESS = 0.02
-"""Thickness of a slab, in radii."""
+"""Thickness of the floor, in radii."""
 _HIGHEST = 0.7
 """Largest elevation of a camera that looks at a cloud, in radians."""
 _CELLS = 0.62
@@ -106,13 +104,6 @@ def beyond_plane(
     return (points * normal).sum(dim=2)
 
 
-def outside_cone(
-    points: Float[Tensor, "b n 3"], camera: Float[Tensor, "b 1 3"], aim: Float[Tensor, "b 1 3"]
-) -> Float[Tensor, "b n"]:
-    """Score points by the angle between their ray from the camera and its axis, as −cosine."""
-    return -torch.cosine_similarity(points - camera, aim - camera, dim=2)
-
-
 def near_patch(
     points: Float[Tensor, "b n 3"], centres: Float[Tensor, "b k 3"]
 ) -> Float[Tensor, "b n"]:
@@ -150,74 +141,29 @@ def tilted(
     Convention:
         Right-handed about (cos h, sin h, 0), by Rodrigues' formula; radians.
     """
-    axis = _horizontal(heading).expand_as(points)
+    axis = torch.stack([heading.cos(), heading.sin(), torch.zeros_like(heading)], dim=2)
+    axis = axis.expand_as(points)
     across = torch.linalg.cross(axis, points - centre)
     along = torch.linalg.cross(axis, across)
     return points + angle.sin()[:, None] * across + (1 - angle.cos())[:, None] * along
 
 
-def slab(
-    box: Box,
-    axis: Int[Tensor, "b 1"],
-    upper: Bool[Tensor, "b 1"],
-    gap: Float[Tensor, "b 1"],
-    edges: Float[Tensor, "b 2 3"],
-    uniform: Float[Tensor, "b n 3"],
+def floor_beneath(
+    box: Box, edges: Float[Tensor, "b 2 3"], uniform: Float[Tensor, "b n 3"]
 ) -> Float[Tensor, "b n 3"]:
-    """Return points of a slab along a face of the box, reaching a margin beyond its edges.
+    """Return points of a slab of floor under the box, reaching a margin beyond its edges.
 
     Args:
         box: The clouds' boxes.
-        axis: Which coordinate the slab bounds: 0 and 1 for a wall, 2 for floor.
-        upper: Whether it lies on the upper side.
-        gap: Its distance from the face, in radii.
         edges: In 0 to 1, how much of the lower and upper half of the box it leaves free.
         uniform: In 0 to 1, where the points lie on what it covers.
     """
-    margin = _MARGIN * box.radius * torch.ones_like(box.low)
+    margin = _MARGIN * box.radius
     low, high = box.low - margin, box.high + margin
-    low[..., 2] = box.low[..., 2]  # nothing lies beneath the floor
     start, stop = edges[:, :1] / 2, 1 - edges[:, 1:] / 2
-    inside = low + (high - low) * (start + (stop - start) * uniform)
-    depth = box.radius * (gap[:, None] + _THICKNESS * uniform)
-    outside = torch.where(upper[:, None], box.high + depth, box.low - depth)
-    bounded = torch.arange(3, device=axis.device) == axis
-    return torch.where(bounded[:, None], outside, inside)
-
-
-def piece_beside(
-    box: Box,
-    others: Float[Tensor, "b n 3"],
-    size: Float[Tensor, "b 1"],
-    turn: Float[Tensor, "b 1"],
-    heading: Float[Tensor, "b 1"],
-    aside: Float[Tensor, "b 1"],
-    gap: Float[Tensor, "b 1"],
-) -> Float[Tensor, "b n 3"]:
-    """Stand other clouds beside these, on the same floor; the nearest of their points come first.
-
-    Args:
-        box: Boxes of these clouds.
-        others: The other clouds.
-        size: Their radius then, in these clouds' radii.
-        turn: Angle by which they are turned about the vertical.
-        heading: Direction in which they stand, seen from above.
-        aside: Shift across that direction, in radii.
-        gap: Distance to the box along that direction, in radii.
-    """
-    theirs = robust_box(others)
-    scale = size[:, None] * box.radius / theirs.radius.clamp_min(torch.finfo(others.dtype).tiny)
-    piece = turned(scale * (others - theirs.centre), turn)
-    ahead, across = _horizontal(heading), _horizontal(heading + torch.pi / 2)
-    progress = (piece * ahead).sum(dim=2)
-    order = progress.argsort(dim=1, stable=True)
-    near = progress.gather(1, order)[:, int(_OUTSIDE * piece.shape[1]), None, None]
-    reach = ((box.high - box.low) / 2 * ahead.abs()).sum(dim=2, keepdim=True)
-    distance = reach + gap[:, None] * box.radius - near
-    place = box.centre + distance * ahead + aside[:, None] * box.radius * across
-    foot = box.low + scale * (theirs.high - theirs.low) / 2
-    place = torch.cat([place[..., :2], foot[..., 2:]], dim=2)
-    return gather_points(piece, order) + place
+    across = low + (high - low) * (start + (stop - start) * uniform)
+    depth = box.low - box.radius * (_THICKNESS * uniform)
+    return torch.cat([across[..., :2], depth[..., 2:]], dim=2)
 
 
 def replaced(
@@ -243,10 +189,6 @@ def replaced(
     return points.scatter(
         1, places, torch.where(new[..., None], substitutes, points.gather(1, places))
     )
-
-
-def _horizontal(heading: Float[Tensor, "b 1"]) -> Float[Tensor, "b 1 3"]:
-    return torch.stack([heading.cos(), heading.sin(), torch.zeros_like(heading)], dim=2)
 
 
 @dataclass(frozen=True)
@@ -281,9 +223,6 @@ def augment_clouds(
 ) -> tuple[Float[Tensor, "b n 3"], Bool[Tensor, "b n"]]:
     """Imitate on a whole batch what a scan does to its clouds.
 
-    Several devices that share a batch each do it to all of it, with generators alike, and take
-    their part of the result: a neighbour is another cloud of the batch.
-
     Args:
         points: Clouds, on any device, in any unit, z up, before they are turned and normalised.
         settings: What is done, how often and how strongly.
@@ -302,7 +241,11 @@ def augment_clouds(
         points = stretched(points, centre, factor)
         box = Box(*(stretched(corner, centre, factor) for corner in box))
     kept = _cut(points, kept, box, settings, draw)
-    points = _clutter(points, kept, box, settings, draw)
+    if settings.floor > 0:
+        n = points.shape[1]
+        floor = floor_beneath(box, draw.uniform(2, 3), draw.uniform(n, 3))
+        share = draw.strength(settings.floor, settings.floor_share)
+        points = replaced(points, kept, floor, share, draw.uniform(n))
     if settings.tilt > 0:
         angle = draw.strength(settings.tilt, settings.tilt_degrees).deg2rad()
         points = tilted(points, box.centre, draw.angle(), angle)
@@ -328,52 +271,12 @@ def _cut(
         score = beyond_plane(points, draw.normal(1, 3))
         count = (draw.strength(settings.plane, settings.plane_share) * n).long()
         kept = lose_highest(kept, score, count, settings.least)
-    if settings.cone > 0:
-        level = draw.uniform(1, 1, high=math.pi / 3)
-        sight = level.cos() * _horizontal(draw.angle()) + level.sin() * points.new_tensor([0, 0, 1])
-        camera = box.centre + draw.uniform(1, 1, low=1.5, high=4.0) * box.radius * sight
-        score = outside_cone(points, camera, _take(points, draw.uniform(1)))
-        count = (draw.strength(settings.cone, settings.cone_share) * n).long()
-        kept = lose_highest(kept, score, count, settings.least)
     if settings.patches > 0:
         score = near_patch(points, _take(points, draw.uniform(settings.patch_count)))
         size = draw.strength(settings.patches, settings.patch_radius) * box.radius[:, 0]
         count = (kept & (-score < size)).sum(dim=1, keepdim=True)
         kept = lose_highest(kept, score, count, settings.least)
     return kept
-
-
-def _clutter(
-    points: Float[Tensor, "b n 3"],
-    kept: Bool[Tensor, "b n"],
-    box: Box,
-    settings: Augmentation,
-    draw: _Draws,
-) -> Float[Tensor, "b n 3"]:
-    b, n, _ = points.shape
-    never = torch.zeros_like(kept[:, :1])
-
-    def put(probability: float, new: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
-        share = draw.strength(probability, settings.clutter_share)
-        return replaced(points, kept, new, share, draw.uniform(n))
-
-    if settings.neighbour > 0:
-        step = 1 + (draw.uniform() * (b - 1)).long()
-        others = points[(torch.arange(b, device=points.device) + step) % b]
-        size, aside = draw.uniform(1, low=0.7, high=1.4), draw.uniform(1, low=-0.5, high=0.5)
-        gap = draw.uniform(1, high=_GAP)
-        piece = piece_beside(box, others, size, draw.angle(), draw.angle(), aside, gap)
-        points = put(settings.neighbour, piece)
-    if settings.wall > 0:
-        axis, upper = draw.uniform(1) < 0.5, draw.uniform(1) < 0.5
-        gap, edges = draw.uniform(1, high=_GAP), draw.uniform(2, 3)
-        wall = slab(box, axis.long(), upper, gap, edges, draw.uniform(n, 3))
-        points = put(settings.wall, wall)
-    if settings.floor > 0:
-        edges, gap = draw.uniform(2, 3), 0 * box.radius[:, 0]
-        floor = slab(box, never.long() + 2, never, gap, edges, draw.uniform(n, 3))
-        points = put(settings.floor, floor)
-    return points
 
 
 def _take(points: Float[Tensor, "b n 3"], uniform: Float[Tensor, "b k"]) -> Float[Tensor, "b k 3"]:

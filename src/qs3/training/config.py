@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import numpy as np
 import tyro
 
-from qs3.adaptation.names import Normalisation, RoundRule, Rule, Selection, SingleClass
+from qs3.adaptation.names import RoundRule, Rule, Selection, SingleClass
 from qs3.errors import InputError, no_such
 from qs3.io.preparation import PAPER, ROBUST, Preparation
 from qs3.sensor.checks import choices_of
@@ -43,10 +43,6 @@ class Augmentation:
     """Probability that a random plane cuts a cloud."""
     plane_share: float = 0.4
     """Largest share of the points behind that plane, which are lost."""
-    cone: float = 0.0
-    """Probability that a random view cone, a camera's image, cuts a cloud."""
-    cone_share: float = 0.4
-    """Largest share of the points outside that cone, which are lost."""
     patches: float = 0.0
     """Probability that patches of a cloud are lost."""
     patch_count: int = 4
@@ -54,8 +50,8 @@ class Augmentation:
     patch_radius: float = 0.25
     """Largest radius of a cloud's patches."""
     least: float = 0.25
-    """Share of the points that planes, cones and patches together always leave; a camera that would
-    see less looks from nowhere."""
+    """Share of the points that planes and patches together always leave; `sight` is skipped if it
+    would leave fewer."""
     stretch: float = 0.0
     """Probability that a cloud is stretched, each axis by a factor of its own."""
     stretch_factor: float = 1.2
@@ -66,20 +62,16 @@ class Augmentation:
     """Largest angle of that tilt."""
     floor: float = 0.0
     """Probability that a slab of floor beneath replaces points."""
-    wall: float = 0.0
-    """Probability that a slab of wall beside the box, along one of its faces, replaces points."""
-    neighbour: float = 0.0
-    """Probability that the near piece of another cloud of the batch, beside it, replaces points."""
-    clutter_share: float = 0.2
-    """Largest share of the points that each of floor, wall and neighbour replaces."""
+    floor_share: float = 0.2
+    """Largest share of the points that floor replaces."""
     noise: float = 0.0
     """Probability that Gaussian noise is added to a cloud."""
     noise_sigma: float = 0.02
     """Largest standard deviation of a cloud's noise."""
 
     def __post_init__(self) -> None:
-        chances = "sight plane cone patches stretch tilt floor wall neighbour noise"
-        ranges = {"must be in 0 to 1": f"{chances} plane_share cone_share clutter_share"}
+        chances = "sight plane patches stretch tilt floor noise"
+        ranges = {"must be in 0 to 1": f"{chances} plane_share floor_share"}
         ranges |= {"must not be negative": "patch_radius noise_sigma tilt_degrees"}
         ranges |= {"must be above 0, to 1": "least", "must be above 0": "patch_count"}
         _check_ranges(self, ranges | {"must be at least 1": "stretch_factor"})
@@ -92,12 +84,11 @@ class Augmentation:
             overrides: Settings that differ.
 
         Example:
-            >>> Augmentation.scanned(wall=0.0).plane
+            >>> Augmentation.scanned(floor=0.0).plane
             0.3
         """
-        usual: dict[str, Any] = {"sight": 0.3, "plane": 0.3, "cone": 0.3, "patches": 0.3}
-        usual |= {"stretch": 1.0, "tilt": 1.0, "noise": 0.5}
-        usual |= {"floor": 0.2, "wall": 0.1, "neighbour": 0.2}
+        usual: dict[str, Any] = {"sight": 0.3, "plane": 0.3, "patches": 0.3}
+        usual |= {"stretch": 1.0, "tilt": 1.0, "floor": 0.2, "noise": 0.5}
         return cls(**usual | overrides)
 
 
@@ -135,10 +126,6 @@ class TrainSettings:
     t steps at most (1 + t)/(10 + t)."""
     label_smoothing: float = 0.0
     """Probability mass spread evenly over the classes."""
-    normalisation: Normalisation = "shared"
-    """Whose running statistics batch normalisation keeps: of both domains as they pass; of each
-    apart, or weighed by TransNorm (both need a method that uses the target); or AdaBN, computed
-    anew over the target in the end."""
     method_settings: Annotated[Mapping[str, Any], tyro.conf.Suppress] = field(default_factory=dict)
     """Arguments of the method that differ from its defaults."""
     holdout: float = 0.1

@@ -76,7 +76,7 @@ class Adapter(ClassifierMixin, BaseEstimator):
         result_: The whole `FitResult`: epochs, rounds, checkpoints with their validators.
 
     Example:
-        >>> Adapter("dann", train={"epochs": 50}).get_params()["train"]
+        >>> Adapter("gast", train={"epochs": 50}).get_params()["train"]
         {'epochs': 50}
     """
 

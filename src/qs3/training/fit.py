@@ -108,8 +108,7 @@ def fit(
             in self-training.
         source: Labelled clouds, as read. A share of ``settings.holdout`` is kept for validators.
             None where the rounds go on from a warm-up by the target alone (``source_loss`` off).
-        target: Clouds without labels, as read. ``source-only`` takes them for validators and AdaBN
-            alone.
+        target: Clouds without labels, as read. ``source-only`` takes them for validators alone.
         settings: How to train.
         self_training: Settings of the rounds, which follow any method where they are given; a
             method that ends in self-training takes its own preset where they are absent.
@@ -136,15 +135,8 @@ def fit(
     """
     base, rounds_settings = _plan(method, self_training)
     needs = rounds_settings is not None or method_class(base).uses_target
-    separate = settings.normalisation in ("separate", "transnorm")
-    if target is None and (needs or settings.normalisation != "shared"):
-        what = f"method {method}" if needs else f"normalisation {settings.normalisation}"
-        raise InputError(f"{what} needs a target: give unlabelled clouds")
-    if separate and not method_class(base).uses_target and warm_up is None:
-        raise InputError(
-            f"normalisation {settings.normalisation} needs a method that uses the target in its "
-            f"training, which {base} does not; choose adabn"
-        )
+    if target is None and needs:
+        raise InputError(f"method {method} needs a target: give unlabelled clouds")
     if warm_up is not None and rounds_settings is None:
         raise InputError(f"method {method} takes no warm-up; leave it out or add self-training")
     if target is not None:
@@ -198,8 +190,7 @@ def fit(
         ):
             hooks = Hooks(history, deadline, on_epoch, on_round)
             model, epochs, rounds = run_job(job, fabric, hooks)
-        adapted = needs or settings.normalisation != "shared"
-        adapted = adapted or settings.rule not in ("last", "source-val")
+        adapted = needs or settings.rule not in ("last", "source-val")
         data = data_fields(prepared, prepared_target, adapted)
         if before and not len(source):
             data["source"] = before.source

@@ -62,7 +62,6 @@ def make_method(name: str, model: PointClassifier, settings: TrainSettings) -> M
             name,
             model,
             label_smoothing=settings.label_smoothing,
-            normalisation=settings.normalisation,
             **settings.method_settings,
         )
 
@@ -76,7 +75,7 @@ def fresh_model(method: str, settings: TrainSettings, count: int) -> PointClassi
     model = new_model(settings, count, seed)
     if method_class(method).needs_local and feature_widths(model).local is None:
         # Only a setting of what `encode` gives: the weights are the same.
-        wider = dict(settings.model_settings) | {"per_point": True}
+        wider = dict(settings.model_settings) | {"local": True}
         with contextlib.suppress(InputError):
             return new_model(replace(settings, model_settings=wider), count, seed)
     return model
@@ -123,9 +122,7 @@ def run_job(
             deadline=hooks.deadline,
             description=stage,
         )
-        method.norm.settle()
-        model = method.result()
-        validation.adapt(model)
+        model = method.model
         if hooks.history is not None:
             hooks.history.put("epoch", epochs, stage=stage)
         tell_checkpoints()
@@ -149,7 +146,6 @@ def run_job(
             hooks=hooks,
         )
         model, records = run_rounds(model, task)
-        validation.adapt(model)
         _follow_rule(model, ROUND, job)
         _save(job.run_dir, model, job, fabric)
     return model, epochs, records

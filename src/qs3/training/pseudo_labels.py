@@ -1,6 +1,5 @@
 """Lines 3 to 17 of Algorithm 1: what the teacher says of the target, and what is selected of it."""
 
-import copy
 from functools import partial
 from typing import NamedTuple
 
@@ -23,7 +22,6 @@ from qs3.evaluation.metrics import confusion_matrix
 from qs3.training.config import SelfTrainingSettings
 from qs3.training.predict import describe_turned
 from qs3.training.rounds import Rounds, Task
-from qs3.training.validation import adapt_statistics
 
 
 class Answers(NamedTuple):
@@ -48,9 +46,6 @@ def ask_teacher(state: Rounds, task: Task) -> Answers:
     """
     rounds, holdout, target = task.rounds, task.holdout, task.target
     teacher = state.latest if rounds.teacher == "latest" else state.teacher.model
-    if task.settings.normalisation == "adabn":
-        teacher = copy.deepcopy(teacher)  # training goes on from the statistics of both domains
-        adapt_statistics(teacher, target, task.settings.batch_size)
     how = {"batch_size": task.settings.batch_size, "fabric": task.fabric}
     ask = partial(describe_turned, teacher, turns=rounds.turns, **how)
     said = ask(target)

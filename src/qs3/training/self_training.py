@@ -12,7 +12,6 @@ from lightning_fabric import Fabric
 
 from qs3.adaptation import Method, PseudoLabelled
 from qs3.adaptation.selection import select_confident
-from qs3.adaptation.self_distillation import follow
 from qs3.errors import InputError
 from qs3.evaluation.metrics import accuracy
 from qs3.io.clouds import PointClouds, UnlabelledClouds
@@ -39,7 +38,7 @@ from qs3.training.rounds import (
     write_rounds,
 )
 from qs3.training.run import Run, RunSettings, claim_run, sum_cost, write_run
-from qs3.training.state import CHECKPOINT
+from qs3.training.state import CHECKPOINT, follow
 from qs3.training.threads import choose_threads, threads
 from qs3.training.validation import ROUND
 
@@ -240,8 +239,6 @@ def _train_round(
         state.latest.load_state_dict(fresh.state_dict())
     continuous = rounds.schedule == "continuous"
     first = before * rounds.epochs
-    # TransNorm's weights are in the network's scales already; a second time they would double.
-    plain = settings.normalisation in ("shared", "adabn")
     smoothing = rounds.label_smoothing
     method = PseudoLabelled(
         state.latest,
@@ -249,21 +246,19 @@ def _train_round(
         weight_step=rounds.weight_step,
         epochs=range(first, first + rounds.epochs),
         label_smoothing=settings.label_smoothing if smoothing is None else smoothing,
-        normalisation="shared" if plain else "separate",
     )
     kept, judges = pseudo.select(~apart), pseudo.select(apart)
 
     def teach(method: Method, epoch: int) -> None:
-        with method.norm.of("target"):
-            if rounds.teacher == "average":
-                follow(teacher.model, method.model, rounds.teacher_decay)
-            elif rounds.teacher == "best" and len(judges):
-                size, fabric = settings.batch_size, task.fabric
-                said = describe(method.model, judges, batch_size=size, fabric=fabric)
-                score = accuracy(judges.labels, said.probabilities.argmax(axis=1))
-                if score > teacher.score:
-                    teacher.score.fill_(score)
-                    teacher.model.load_state_dict(method.model.state_dict())
+        if rounds.teacher == "average":
+            follow(teacher.model, method.model, rounds.teacher_decay)
+        elif rounds.teacher == "best" and len(judges):
+            size, fabric = settings.batch_size, task.fabric
+            said = describe(method.model, judges, batch_size=size, fabric=fabric)
+            score = accuracy(judges.labels, said.probabilities.argmax(axis=1))
+            if score > teacher.score:
+                teacher.score.fill_(score)
+                teacher.model.load_state_dict(method.model.state_dict())
 
     epochs, optimiser = train(
         method,
@@ -283,6 +278,5 @@ def _train_round(
         deadline=task.hooks.deadline,
         description=f"round {number}/{rounds.rounds}",
     )
-    method.norm.settle()
     state.optimiser = optimiser if continuous else {}
     return epochs

@@ -57,6 +57,24 @@ def make_average(module: nn.Module, decay: float) -> AveragedModel:
     return average
 
 
+@torch.no_grad()
+def follow(average: nn.Module, student: nn.Module, decay: float) -> None:
+    """Move an average by 1 − decay towards a network; integers are copied.
+
+    Example:
+        >>> average, student = torch.nn.Linear(1, 1), torch.nn.Linear(1, 1)
+        >>> follow(average, student, 0.0)
+        >>> torch.equal(average.weight, student.weight)
+        True
+    """
+    present = student.state_dict()
+    for name, tensor in average.state_dict().items():
+        if tensor.is_floating_point():
+            tensor.lerp_(present[name], 1.0 - decay)
+        else:
+            tensor.copy_(present[name])
+
+
 @contextmanager
 def averaged(module: nn.Module, average: AveragedModel | None) -> Iterator[None]:
     """Let a module hold its average, if there is one, for a while."""

@@ -7,17 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Int
 from lightning_fabric import Fabric
-from torch.nn.modules.batchnorm import _BatchNorm
 
 from qs3.adaptation import Method
 from qs3.adaptation.validators import VALIDATORS, Observation, source_accuracy, validate
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
-from qs3.models.classifier import evaluating
 from qs3.training.checkpoint import (
     load_tensors_into,
     read_facts,
@@ -59,7 +56,7 @@ class Validation:
         source: The part of the source that is trained on.
         holdout: The part that is not; None where there is none.
         target: Clouds without labels; None where there are none.
-        settings: How often to look, and whose normalisation counts.
+        settings: How often to look.
         fabric: The devices; all must call.
     """
 
@@ -82,17 +79,14 @@ class Validation:
         """Make a checkpoint where one is due."""
         done, every = epoch + 1, self.settings.validate_every
         if every and (done == self.settings.epochs or done % every == 0):
-            copied = copy.deepcopy(method)  # the training goes on from its own statistics
-            copied.norm.settle()
-            self.look(stage, done, copied.result())
+            self.look(stage, done, method.model)
 
     def look(self, stage: str, number: int, model: PointClassifier) -> None:
-        """Measure a network, adapted as it would be at the end, and keep those weights."""
+        """Measure a network and keep its weights."""
         if not self.settings.validate_every:
             return
         model = copy.deepcopy(model)  # what follows goes on from its own statistics
         self.fabric.to_device(model)
-        self.adapt(model)
         target, holdout, source = (
             None
             if clouds is None or not len(clouds)
@@ -128,49 +122,6 @@ class Validation:
         except InputError as error:  # NaN, say: a number for the record must not end the run
             _LOG.warning("the validators cannot judge this checkpoint: %s", error)
         return values
-
-    def adapt(self, model: PointClassifier) -> None:
-        """Compute batch statistics anew over the target where the settings ask for AdaBN."""
-        if self.settings.normalisation == "adabn" and self.target is not None:
-            adapt_statistics(model, self.target, self.settings.batch_size)
-
-
-@torch.no_grad()
-def adapt_statistics(
-    model: PointClassifier, points: np.ndarray | Prepared, batch_size: int = 32
-) -> None:
-    """Compute the running statistics of batch normalisation anew over clouds (AdaBN).
-
-    Each layer's mean and variance become the averages over the batches, all of the same weight
-    (Li et al., Adaptive batch normalisation, 2018). Weights stay as they are. Of a single cloud
-    the network must be able to take a batch statistic: it goes in twice.
-
-    Args:
-        model: The network; its mode is put back.
-        points: Clouds [b n 3], prepared, without labels.
-        batch_size: Clouds in a batch; a last one of a single cloud is joined to the one before.
-
-    Raises:
-        InputError: where there is no cloud.
-    """
-    if not len(points):
-        raise InputError("AdaBN needs clouds of the target")
-    layers = [layer for layer in model.modules() if isinstance(layer, _BatchNorm)]
-    momenta = [layer.momentum for layer in layers]
-    parameter = next(model.parameters())
-    with evaluating(model):
-        try:
-            for layer in layers:
-                layer.reset_running_stats()
-                layer.momentum = None  # a cumulative average
-                layer.train()
-            rows = np.arange(max(2, len(points))) % len(points)
-            count = max(1, len(rows) // max(2, batch_size))
-            for part in np.array_split(rows, count):
-                model(torch.from_numpy(points[part]).to(parameter.device, parameter.dtype))
-        finally:
-            for layer, momentum in zip(layers, momenta, strict=True):
-                layer.momentum = momentum
 
 
 def read_checkpoints(run_dir: Path, stage: str | None = None) -> list[Checkpoint]:

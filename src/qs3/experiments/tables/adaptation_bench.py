@@ -19,9 +19,6 @@ _ROWS = (
     "qbst-gentle",
     # The paper's table lacks these.
     "dann",
-    "mmd",
-    "coral",
-    "sd",
     "spst",
 )
 _PAIRS = (

@@ -11,7 +11,6 @@ from qs3.models.ops.gathering import gather_points as gather_points
 from qs3.models.ops.gathering import neighbour_max as neighbour_max
 from qs3.models.ops.gathering import neighbour_sum as neighbour_sum
 from qs3.models.ops.gathering import scatter_points as scatter_points
-from qs3.models.ops.neighbours import BallOrder as BallOrder
 from qs3.models.ops.neighbours import ball_query as ball_query
 from qs3.models.ops.neighbours import knn as knn
 from qs3.models.ops.neighbours import three_nn_interpolate as three_nn_interpolate

@@ -1,15 +1,10 @@
 """Neighbours of points: the k nearest, those within a ball, and features between the nearest."""
 
-from typing import Literal
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from qs3.models.ops.gathering import blocks, gather_points, in_single_precision
-
-BallOrder = Literal["nearest", "first"]
-"""Which points a ball keeps that has too many: its nearest, or those first in the cloud."""
 
 _GROUP = 8
 """Candidates are thinned in groups of this many points before the exact selection."""
@@ -64,43 +59,37 @@ def ball_query(
     centres: Float[Tensor, "b m 3"],
     radius: float,
     k: int,
-    order: BallOrder = "nearest",
 ) -> Int[Tensor, "b m k"]:
     """Find at most k points within a radius of each centre (Qi et al., NeurIPS 2017, §3.2).
 
-    A ball with fewer points is filled up with its first entry. An empty ball holds the point
-    nearest to its centre, k times.
+    A ball of more than k points keeps its nearest, whatever the order of the points: the very
+    nearest first, the others in no order. A ball with fewer points is filled up with its first
+    entry. An empty ball holds the point nearest to its centre, k times.
 
     Args:
         points: The clouds.
         centres: Centres of the balls.
         radius: In the unit of the points; a point at exactly this distance is inside.
         k: Number of points to return, at most n.
-        order: Which points a ball of more than k keeps. "nearest": the nearest, the very nearest
-            first and the others in no order, whatever the order of the points. "first": those that
-            come first in the cloud, in that order, as the released code has it.
 
     Raises:
-        ValueError: where k is not in 1 to n, or the order has another name.
+        ValueError: if k is not in 1 to n.
 
     Example:
         >>> line = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [5, 0, 0]]])
-        >>> ball_query(line, line[:, 1:], 2.0, 2, order="first").tolist()
-        [[[0, 1], [2, 2]]]
+        >>> ball_query(line, line[:, 1:], 2.0, 2).tolist()
+        [[[1, 0], [2, 2]]]
     """
     b, n, _ = points.shape
     m = centres.shape[1]
     _check(n, k)
-    if order not in ("nearest", "first"):
-        raise ValueError(f"order must be nearest or first, not {order}")
     with torch.autocast(points.device.type, enabled=False):
         points = in_single_precision(points)
         centres = centres.to(points.dtype)
         indices = torch.zeros((b, m, k), dtype=torch.int64, device=points.device)
         for cloud, row in blocks(b, m, n, _budget(points)):
             squared = _squared_distances(points[cloud], centres[cloud, row])
-            pick = _nearest_in_ball if order == "nearest" else _first_in_ball
-            indices[cloud, row] = pick(squared, radius * radius, k)
+            indices[cloud, row] = _nearest_in_ball(squared, radius * radius, k)
     return indices
 
 
@@ -162,17 +151,6 @@ def _nearest_in_ball(squared: Float[Tensor, "b r n"], limit: float, k: int) -> I
     inside.scatter_(2, column, inside[:, :, :1].clone())
     inside[:, :, :1] = nearest
     return inside
-
-
-def _first_in_ball(squared: Float[Tensor, "b r n"], limit: float, k: int) -> Int[Tensor, "b r k"]:
-    """Return the k smallest indices inside; the first one fills up the rest."""
-    n = squared.shape[2]
-    number = torch.arange(n, dtype=torch.int32, device=squared.device)
-    inside = torch.where(squared <= limit, number, n)
-    chosen = inside.topk(k, dim=2, largest=False, sorted=True).values.long()
-    first = chosen[:, :, :1]
-    first = torch.where(first < n, first, squared.argmin(dim=2, keepdim=True))
-    return torch.where(chosen < n, chosen, first)
 
 
 def _smallest(values: Float[Tensor, "b r n"], k: int) -> Int[Tensor, "b r k"]:
