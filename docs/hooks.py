@@ -43,7 +43,6 @@ PACKAGES = (
     "qs3.adaptation",
     "qs3.training",
     "qs3.report",
-    "qs3.viewer",
     "qs3.experiments",
 )
 _ROOT_MODULES = (
