@@ -29,7 +29,7 @@ VERBS = {
     "reproduce": "Make tables and figures anew, with their data and trainings.",
     "table": "Print a table, ours beside the published figures, from records alone.",
     "figure": "Draw the figure of a table from records alone.",
-    "report": "Write one self-contained HTML page.",
+    "report": "Write one self-contained HTML page about a run.",
     "view": "Step through a data set, a run's answers or one cloud in a browser, until Ctrl-C.",
     "doctor": "Print what works on this machine and how to get what does not.",
     "demo": "Adapt a network that comes with qs3 to a camera, without labels: scan, adapt, report.",
