@@ -156,7 +156,7 @@ class Page:
     def show(self, row: int) -> None:
         """Show an object; after the last comes the first."""
         row %= len(self._items)
-        clouds = {
+        clouds: dict[CloudKind, Any] = {
             kind: of[row][np.isfinite(of[row]).all(axis=1)]
             for kind, of in self._items.clouds.items()
         }
