@@ -19,3 +19,13 @@ def printable(text: str, keep: str = "\n\t") -> str:
         else letter.encode("unicode_escape").decode()
         for letter in text
     )
+
+
+def utf8(name: str) -> str:
+    r"""Return the name of a file, with bytes that are not UTF-8 as escapes.
+
+    Example:
+        >>> print(utf8("st\udcffhl"), utf8("Stühle"))
+        st\udcffhl Stühle
+    """
+    return name.encode("utf-8", errors="backslashreplace").decode("utf-8")

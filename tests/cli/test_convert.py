@@ -24,11 +24,12 @@ def archive(tmp_path, rng):
 
 
 def test_one_command_in_its_own_process_gives_a_sound_data_set(qs3, archive, tmp_path):
-    done = qs3("convert", archive, tmp_path / "a", "--to", "qs3", "--classes", "pointda10",
+    done = qs3("convert", archive, tmp_path / "a", "--to", "store", "--classes", "pointda10",
                "--unmapped", "drop", "--num-points", 16)  # fmt: skip
     assert done.stdout == f"{tmp_path / 'a'}\n"
     assert done.stderr.splitlines() == [
-        f"4 clouds of 2 classes written as qs3. Next: qs3 train --source {tmp_path / 'a'} --out RUN"
+        "4 clouds of 2 classes written as store. Next: qs3 train --source "
+        f"{tmp_path / 'a'} --out RUN"
     ]
     qs3("info", "--check", tmp_path / "a")
     assert load_clouds(tmp_path / "a", split="test", num_points=16).points.shape == (2, 16, 3)
@@ -39,24 +40,24 @@ def test_the_list_tells_every_layout(typed):
     assert rows[0] == ["name", "read", "write", "layout"]
     assert [row[0] for row in rows[1:]] == list(FORMATS)
     able = {row[0]: (row[1], row[2]) for row in rows[1:]}
-    assert able["npz"] == ("yes", "no")
+    assert able["pointda10"] == ("yes", "no")
     assert able["ply"] == ("yes", "yes")
 
 
 def test_from_split_and_cloud(typed, archive, tmp_path):
-    typed("convert", archive, tmp_path / "a", "--to", "npy", "--split", "test")
+    typed("convert", archive, tmp_path / "a", "--to", "ply", "--split", "test")
     files = sorted(p.relative_to(tmp_path / "a").as_posix() for p in (tmp_path / "a").rglob("*.*"))
-    assert files == [f"{name}/test/thing_{i}.npy"
+    assert files == [f"{name}/test/thing_{i}.ply"
                      for name, i in (("desk", 3), ("night_stand", 4), ("toilet", 5))]  # fmt: skip
-    done = typed("convert", tmp_path / "a", tmp_path / "b", "--to", "ply", "--from", "npy")
+    done = typed("convert", tmp_path / "a", tmp_path / "b", "--to", "ply", "--from", "folder")
     assert done.stderr.startswith("3 clouds of 3 classes written as ply. Next: qs3 train --source ")
 
 
 def test_clouds_without_labels_are_told_so(typed, tmp_path):
     (tmp_path / "flat").mkdir()
     (tmp_path / "flat" / "a.xyz").write_text("1 2 3\n")
-    done = typed("convert", tmp_path / "flat", tmp_path / "b", "--to", "pcd")
-    assert "1 clouds without labels written as pcd. Next: qs3 train --method qbst" in done.stderr
+    done = typed("convert", tmp_path / "flat", tmp_path / "b", "--to", "ply")
+    assert "1 clouds without labels written as ply. Next: qs3 train --method qbst" in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -64,17 +65,16 @@ def test_clouds_without_labels_are_told_so(typed, tmp_path):
     [
         ((), ("name what to read", "--list")),
         (("ARCHIVE", "OUT"), ("name what to read", "--list")),
-        (("ARCHIVE", "OUT", "--to", "obj"), ("'obj'", "depthscannet10")),
-        (("ARCHIVE", "OUT", "--to", "ply", "--from", "zip"), ("'zip'", "depthscannet10")),
-        (("ARCHIVE", "OUT", "--to", "npz"), ("npz", "only read")),
+        (("ARCHIVE", "OUT", "--to", "obj"), ("'obj'", "modelnet-off")),
+        (("ARCHIVE", "OUT", "--to", "ply", "--from", "zip"), ("'zip'", "modelnet-off")),
+        (("ARCHIVE", "OUT", "--to", "npz"), ("npz", "ends in .npz")),
         (("ARCHIVE", "OUT", "--to", "ply", "--classes", "pointda10"), ("toilet", "--unmapped")),
         (("ARCHIVE", "OUT", "--to", "ply", "--cloud", "clean"), ("clouds.npz", "'clean'")),
         (("ARCHIVE", "OUT", "--to", "ply", "--num-points", "-1"), ("--num-points -1",)),
-        (("ARCHIVE", "OUT", "--to", "specklenet10"), ("toilet",)),
         (("ARCHIVE", "ARCHIVE", "--to", "ply"), ("clouds.npz", "there already")),
         (("missing", "OUT", "--to", "ply"), ("missing", "no such file or folder")),
-        (("missing", "OUT", "--to", "ply", "--from", "depthscannet10"),
-         ("https://github.com/Gorilla-Lab-SCUT/QS3", "Scannet_single_obj_1012_new")),
+        (("missing", "OUT", "--to", "ply", "--from", "modelnet-off"),
+         ("http://modelnet.cs.princeton.edu", "*.off")),
     ],
 )  # fmt: skip
 def test_each_fault_is_one_line_and_leaves_nothing(typed, archive, tmp_path, arguments, words):

@@ -1,17 +1,10 @@
-import struct
-import tracemalloc
-import zipfile
-
-import h5py
 import numpy as np
 import pytest
 
+from qs3 import reading
 from qs3.errors import InputError
-from qs3.io import guards
 from qs3.io.clouds import PointClouds, UnlabelledClouds, digests
-from qs3.io.layouts.hdf5 import read_file
 from qs3.io.load import describe_clouds, load_clouds, load_unlabelled
-from qs3.io.point_files import cloud_bytes, read_cloud
 from qs3.meshes.classes import POINTDA10
 from qs3.store.generate import GenerateSettings, generate
 
@@ -162,7 +155,7 @@ def test_an_archive_of_clouds_of_different_sizes(rng, tmp_path):
         ({"label": np.array([0, 1])}, "label has shape"),
         ({"label": np.array([0, 1, 2])}, "not one of 0 to 1"),
         ({"class_names": None}, "needs class_names"),
-        ({"class_names": np.array(["bed", None], dtype=object)}, "plain arrays"),
+        ({"class_names": np.array(["bed", None], dtype=object)}, "allow_pickle=False"),
     ],
 )
 def test_a_bad_archive_is_named(rng, tmp_path, changes, message):
@@ -174,7 +167,7 @@ def test_a_bad_archive_is_named(rng, tmp_path, changes, message):
 def test_an_archive_that_is_none(rng, tmp_path):
     path = tmp_path / "a.npz"
     path.write_bytes(b"no archive")
-    with pytest.raises(InputError, match="not a NumPy archive"):
+    with pytest.raises(InputError, match="cannot be read as NPZ"):
         load_clouds(path)
     with path.open("wb") as handle:
         np.save(handle, rng.random((2, 8, 3)))
@@ -182,38 +175,18 @@ def test_an_archive_that_is_none(rng, tmp_path):
         load_clouds(path)
     whole = write_npz(tmp_path / "b.npz", rng).read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match="not a NumPy archive"):
+    with pytest.raises(InputError, match="cannot be read as NPZ"):
         load_clouds(path)
     with pytest.raises(InputError, match="no split 'dev'"):
         load_clouds(tmp_path / "b.npz", split="dev")
 
 
-def test_an_archive_that_would_fill_the_memory_is_refused(tmp_path, monkeypatch):
-    header = {"descr": "<f4", "fortran_order": False, "shape": (500_000, 1000, 3)}
-    path = tmp_path / "a.npz"
-    for megabytes, packing in ((65, zipfile.ZIP_DEFLATED), (1, zipfile.ZIP_STORED)):
-        with (
-            zipfile.ZipFile(path, "w", packing) as archive,
-            archive.open("points.npy", "w") as member,
-        ):
-            np.lib.format.write_array_header_1_0(member, header)  # of 6 GB
-            for _ in range(megabytes):
-                member.write(bytes(2**20))
-        tracemalloc.start()
-        with pytest.raises(InputError, match=r"a\.npz: .* announces \d+ bytes"):
-            load_clouds(path)
-        assert tracemalloc.get_traced_memory()[1] < 2**24
-        tracemalloc.stop()
-    monkeypatch.setenv(guards.LIMIT, str(1000 / 2**30))
-    with pytest.raises(InputError, match="read are 1000 at most"):
-        load_clouds(write_npz(path, np.random.default_rng(0)))
-
-
-def test_an_archive_of_a_hundred_thousand_members_is_refused(tmp_path):
-    end = struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 60_000, 60_000, 0, 0, 0)
-    (tmp_path / "a.npz").write_bytes(end)
-    with pytest.raises(InputError, match=r"a\.npz: .*60000 members"):
-        load_clouds(tmp_path / "a.npz")
+def test_an_archive_that_would_unpack_beyond_the_ceiling_is_refused(tmp_path, rng, monkeypatch):
+    path = write_npz(tmp_path / "a.npz", rng)
+    monkeypatch.setattr(reading, "MOST_BYTES", 2 * path.stat().st_size)
+    np.savez_compressed(path, points=np.zeros((4, 5000, 3), np.float32))
+    with refused(r"a\.npz: its content has \d+ bytes, more than the limit"):
+        load_clouds(path)
 
 
 def test_a_generated_data_set(fake, tmp_path):
@@ -248,40 +221,9 @@ def test_modelnet10_keeps_its_own_classes(shared_data):
     assert len(load_unlabelled(path, split="train")) == 3991
 
 
-@pytest.mark.parametrize("name", ["a.npz", "a.npy", "a.h5", "a.ply"])
-def test_the_largest_file_is_named_by_the_environment(tmp_path, rng, monkeypatch, name):
-    points = rng.random((4, 50, 3)).astype(np.float32)
-    path = tmp_path / name
-    if name == "a.npz":
-        np.savez(path, points=points)
-    elif name == "a.h5":
-        with h5py.File(path, "w") as file:
-            file["data"], file["label"] = points, np.zeros(4, np.uint8)
-    else:
-        path.write_bytes(cloud_bytes(points[0], path.suffix))
-
-    def read():
-        if name == "a.h5":
-            return read_file(path, columns=(3,), classes=1)
-        return read_cloud(path) if name != "a.npz" else load_unlabelled(path, num_points=None)
-
-    read()
-    monkeypatch.setenv(guards.LIMIT, str(500 / 2**30))
-    message = r"read are 500 at most: split the file, or.* QS3_LARGEST_FILE_GIB to a larger number"
-    with pytest.raises(InputError, match=message) as caught:
-        read()
-    assert str(caught.value).startswith(f"{path}: ")
-    monkeypatch.setenv(guards.LIMIT, str(5000 / 2**30))
-    read()
-    for word in ("much", "-1", "nan", "inf", "0"):
-        monkeypatch.setenv(guards.LIMIT, word)
-        with pytest.raises(InputError, match=f"QS3_LARGEST_FILE_GIB={word}: a number of GiB"):
-            read()
-
-
 def test_a_data_set_of_any_layout_is_described(folder, rng, tmp_path):
     contents = describe_clouds(folder)
-    assert (contents["layout"], contents["rows"], contents["points"]) == ("npy", 4, [20, 64])
+    assert (contents["layout"], contents["rows"], contents["points"]) == ("folder", 4, [20, 64])
     assert contents["classes"] == {"Night Stand": 2, "desk": 2}
     assert contents["splits"] == {"test": 2, "train": 2}
     bare = describe_clouds(write_npz(tmp_path / "a.npz", rng, label=None, class_names=None))

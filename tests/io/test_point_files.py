@@ -1,6 +1,5 @@
 import io
 import struct
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,6 @@ import trimesh
 
 from qs3.errors import InputError
 from qs3.io.load import detect
-from qs3.io.pcd import lzf_decompress
 from qs3.io.point_files import depth_hint, read_cloud
 from qs3.training.answers import list_clouds
 
@@ -23,6 +21,11 @@ def npy(array: np.ndarray) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, array)
     return buffer.getvalue()
+
+
+def npy_header(shape: str) -> bytes:
+    text = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode()
 
 
 def text(separator: str) -> bytes:
@@ -54,21 +57,6 @@ def pcd_binary() -> bytes:
     return pcd_header("binary") + b"".join(rows)
 
 
-def lzf_literals(raw: bytes) -> bytes:
-    """A valid stream without one back-reference."""
-    chunks = [raw[i : i + 32] for i in range(0, len(raw), 32)]
-    return b"".join(bytes([len(chunk) - 1]) + chunk for chunk in chunks)
-
-
-def pcd_compressed() -> bytes:
-    raw = POINTS[:, 2].astype("<f8").tobytes() + np.full(3, 255, "<u4").tobytes()
-    raw += POINTS[:, 0].tobytes() + POINTS[:, 1].tobytes()
-    raw += np.tile(np.arange(4, dtype="<i2"), 3).tobytes()
-    packed = lzf_literals(raw)
-    sizes = struct.pack("<II", len(packed), len(raw))
-    return pcd_header("binary_compressed") + sizes + packed
-
-
 @pytest.mark.parametrize(
     ("name", "content"),
     [
@@ -79,10 +67,8 @@ def pcd_compressed() -> bytes:
         ("a.txt", text("\t").replace(b"\n", b"\r\n")),
         ("a.ply", ply("ascii")),
         ("a.ply", ply("binary_little_endian")),
-        ("a.ply", ply("binary_little_endian") + b"\n"),
         ("ascii.pcd", pcd_ascii()),
         ("binary.pcd", pcd_binary()),
-        ("compressed.pcd", pcd_compressed()),
         ("a.off", b"OFF\n3 0 0\n" + b"\n".join(f"{x} {y} {z}".encode() for x, y, z in POINTS)),
     ],
 )
@@ -111,72 +97,52 @@ def test_a_pcd_pixel_that_saw_nothing_is_left_out(tmp_path):
     np.testing.assert_array_equal(read_cloud(tmp_path / "a.pcd"), POINTS)
 
 
-def byte_header(data: str, count: int) -> bytes:
-    text = f"FIELDS x y z\nSIZE 1 1 1\nTYPE U U U\nPOINTS {count}\nDATA {data}\n"
-    return text.encode()
-
-
-def pcd_of_zeros(count: int) -> bytes:
-    """One byte for each number, packed as well as LZF packs."""
-    packed = bytes([0, 0]) + bytes([0b111_00000, 255, 0]) * (3 * count // 264)
-    sizes = struct.pack("<II", len(packed), 3 * count)
-    return byte_header("binary_compressed", count) + sizes + packed
-
-
 def bad_cases() -> dict[str, tuple[str, bytes, str]]:
     nan = POINTS.copy()
     nan[1, 1] = np.nan
     header = pcd_header("ascii")
     return {
-        "empty": ("a.xyz", b"", "empty file"),
-        "blank": ("a.ply", b"\n \n", "empty file"),
-        "comments alone": ("a.xyz", b"# nothing\n", "holds no point"),
-        "garbage text": ("a.xyz", b"hello dear world\n", "line 1 is not three numbers"),
-        "ragged": ("a.xyz", b"1 2 3\n1 2\n", "line 2 has 2 columns"),
-        "two columns": ("a.txt", b"1 2\n3 4\n", "line 1 has 2 columns"),
+        "empty": ("a.xyz", b"", "the file is empty"),
+        "blank": ("a.ply", b"\n \n", "cannot be read as PLY"),
+        "comments alone": ("a.xyz", b"# nothing\n", "no data"),
+        "garbage text": ("a.xyz", b"hello dear world\n", "could not convert string 'hello'"),
+        "ragged": ("a.xyz", b"1 2 3\n1 2\n", "columns changed from 3 to 2 at row 2"),
+        "two columns": ("a.txt", b"1 2\n3 4\n", r"needs numbers of shape \[n, 3\]"),
         "NaN": ("a.xyz", b"1 2 nan\n", "not finite"),
-        "binary as text": ("a.txt", bytes(range(128, 256)), "cannot be read as txt"),
+        "binary as text": ("a.txt", bytes(range(128, 256)), "cannot be read as TXT"),
         "too large for float32": ("a.xyz", b"1 2 1e200\n", "not finite"),
         "npy NaN": ("a.npy", npy(nan), "not finite"),
         "npy columns": ("a.npy", npy(POINTS[:, :2]), r"\[n, 3\]"),
         "npy cube": ("a.npy", npy(np.zeros((2, 3, 3))), r"\[n, 3\]"),
         "npy empty": ("a.npy", npy(np.zeros((0, 3))), "holds no point"),
         "npy text": ("a.npy", npy(np.array([["a", "b", "c"]])), "needs numbers"),
-        "npy garbage": ("a.npy", b"not numpy", "cannot be read as npy"),
-        "npy cut": ("a.npy", npy(POINTS)[:-9], "cut off"),
-        "ply garbage": ("a.ply", b"just some words\n", "cannot be read as ply"),
-        "off garbage": ("a.off", b"just some words\n", "cannot be read as off"),
-        "off empty": ("a.off", b"OFF\n0 0 0\n", "a.off"),
+        "npy garbage": ("a.npy", b"not numpy", "cannot be read as NPY"),
+        "npy cut": ("a.npy", npy(POINTS)[:-9], "cannot be read as NPY"),
+        "npy of terabytes": ("a.npy", npy_header("(900000000000, 3)"), "GiB of memory"),
+        "ply garbage": ("a.ply", b"just some words\n", "cannot be read as PLY"),
+        "ply text cut": ("a.ply", ply("ascii").rpartition(b"\n0")[0], "declares 3 rows of vertex"),
+        "ply cut": ("a.ply", ply("binary_little_endian")[:-1], "unexpected length"),
+        "off garbage": ("a.off", b"just some words\n", "cannot be read as OFF"),
+        "off cut": ("a.off", b"OFF\n900000000 0 0\n1 2 3\n", "the file is cut short"),
+        "off empty": ("a.off", b"OFF\n0 0 0\n", "holds no point"),
         "pcd garbage": ("a.pcd", b"just some words\n", "no DATA line"),
-        "pcd short": ("a.pcd", header + b"1 2 3 4 1 2 3 4\n", "1 of 3 points"),
-        "pcd ragged": ("a.pcd", header + b"1 2 3\n" * 3, "8 numbers"),
+        "pcd short": ("a.pcd", header + b"1 2 3 4 1 2 3 4\n", "declares 3 points, but has 1"),
+        "pcd ragged": ("a.pcd", header + b"1 2 3\n" * 3, "its header declares 8"),
         "pcd header": ("a.pcd", b"FIELDS x y z\nDATA ascii\n1 2 3\n", "header is incomplete"),
         "pcd fields": ("a.pcd", header.replace(b" x y ", b" u v "), "no fields x, y and z"),
         "pcd too large": ("a.pcd", header + (b"1e200 " * 8 + b"\n") * 3, "not finite"),
         "pcd data": ("a.pcd", pcd_header("zip"), "DATA zip is unknown"),
-        "pcd cut": ("a.pcd", pcd_binary()[:-1], "cut off"),
-        "pcd compressed cut": ("a.pcd", pcd_compressed()[:-1], "cut off"),
-        "pcd bytes": ("a.pcd", pcd_of_zeros(6_000_000), "made to fill the memory"),
-        "long line": ("a.xyz", b"1," * 600_000, "line 1 has 1200000 characters"),
-        "pcd long line": ("a.pcd", header + b" " * 1_100_000 + b"1", "1100001 characters"),
+        "pcd cut": ("a.pcd", pcd_binary()[:-1], "declares 3 points, but has 2"),
+        "pcd compressed": (
+            "a.pcd",
+            pcd_header("binary_compressed"),
+            "pcl_convert_pcd_ascii_binary",
+        ),
     }
 
 
-@pytest.mark.parametrize("data", ["ascii", "binary", "text"])
-def test_small_numbers_count_as_the_floats_that_they_become(tmp_path, monkeypatch, data):
-    monkeypatch.setenv("QS3_LARGEST_FILE_GIB", "1e-6")
-    path = tmp_path / ("a.xyz" if data == "text" else "a.pcd")
-    for count in (10, 60):
-        content = bytes(3 * count) if data == "binary" else b"1 2 3\n" * count
-        path.write_bytes((b"" if data == "text" else byte_header(data, count)) + content)
-        if count == 10:
-            assert read_cloud(path).shape == (10, 3)
-    with refused("announces 1[0-9]{3} bytes; read are 1073 at most", path):
-        read_cloud(path)
-
-
 @pytest.mark.parametrize("case", bad_cases())
-def test_a_bad_file_is_one_clear_line_that_names_it(tmp_path, case):
+def test_bad_file_is_refused_in_one_line_with_its_name(tmp_path, case):
     name, content, message = bad_cases()[case]
     (tmp_path / name).write_bytes(content)
     with refused(message, tmp_path / name):
@@ -189,20 +155,9 @@ def test_pickled_content_is_never_loaded(tmp_path):
             return (Path.touch, (tmp_path / "sprung",))
 
     np.save(tmp_path / "a.npy", np.array([Trap()], dtype=object), allow_pickle=True)
-    with pytest.raises(InputError, match="cannot be read as npy"):
+    with pytest.raises(InputError, match="cannot be read as NPY"):
         read_cloud(tmp_path / "a.npy")
     assert not (tmp_path / "sprung").exists()
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="Linux alone tells what a process has")
-@pytest.mark.parametrize("suffix", [".ply", ".off"])
-def test_what_takes_far_more_memory_than_its_size_is_refused(tmp_path, monkeypatch, suffix):
-    path = tmp_path / f"a{suffix}"
-    trimesh.creation.box().export(path)
-    monkeypatch.setattr(trimesh, "load", lambda *_, **__: bytearray(3 << 30))
-    with pytest.raises(InputError, match=r"takes over 2\.0 GiB of memory to read") as caught:
-        read_cloud(path)
-    assert str(caught.value).count(str(path)) == 1
 
 
 @pytest.mark.parametrize("head", ["x,y,z,r\n", "//X; Y; Z\r\n", "3 \r", ""])
@@ -217,7 +172,7 @@ def test_decimal_commas_are_no_columns(tmp_path):
     path = tmp_path / "a.xyz"
     for apart in (" ", ";", "; "):
         path.write_text(f"x{apart}y{apart}z\n" + apart.join(["0,10", "0,25", "-3"]))
-        with pytest.raises(InputError, match=r"line 2 has decimal commas: '0,10.*; write points"):
+        with pytest.raises(InputError, match=r"has decimal commas: '0,10.*; write points"):
             read_cloud(path)
 
 
@@ -256,17 +211,18 @@ def test_depth_images_in_the_place_of_clouds_get_the_way_to_clouds(tmp_path):
     assert not depth_hint(tmp_path / "meshes")
 
 
-def test_lzf_copies_overlap_and_long_lengths_take_a_byte_more():
-    # "abc", then 3 from 2 back ("bcb"), then 7 + 20 + 2 from 0 back: a run of the last byte.
-    stream = bytes([2]) + b"abc" + bytes([0b001_00000, 1]) + bytes([0b111_00000, 20, 0])
-    assert lzf_decompress(stream, 6 + 29) == b"abcbcb" + b"b" * 29
-    # A distance above 256 uses the low bits of the control byte.
-    plain = bytes(range(256)) * 2
-    stream = lzf_literals(plain) + bytes([0b010_00001, 255])
-    assert lzf_decompress(stream, 516) == plain + plain[:4]
-
-
-@pytest.mark.parametrize("stream", [b"\x20", b"\x20\x05", b"\x00a\x20\x01", b"\x00ab\x00"])
-def test_lzf_damage_is_found(stream):
-    with pytest.raises(ValueError, match="damaged"):
-        lzf_decompress(stream, 100)
+@pytest.mark.parametrize("form", ["ascii", "binary_big_endian", "binary_little_endian"])
+def test_ply_with_other_columns_and_elements_around_its_vertices(tmp_path, form):
+    lines = (
+        "comment made by hand\nelement camera 1\nproperty double focal\n"
+        "element vertex 2\nproperty uchar red\nproperty double z\nproperty float x\n"
+        "property short y\nelement face 0\nproperty list uchar int vertex_indices"
+    )
+    order = ">" if "big" in form else "<"
+    body = struct.pack(f"{order}dBdfhBdfh", 1.5, 9, 3, 1, 2, 8, 6, 4, 5)
+    if form == "ascii":
+        body = b"1.5\n9 3 1 2\n8 6 4 5\n"
+    (tmp_path / "a.ply").write_bytes(
+        f"ply\nformat {form} 1.0\n{lines}\nend_header\n".encode() + body
+    )
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.ply"), [[1, 2, 3], [4, 5, 6]])

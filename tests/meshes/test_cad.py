@@ -1,7 +1,6 @@
 """STEP, IGES and 3MF: sizes of any unit, assemblies placed, hostile files refused."""
 
 import importlib.util
-import subprocess
 import sys
 from pathlib import Path
 
@@ -58,18 +57,6 @@ def test_an_assembly_is_merged_with_its_transforms(tmp_path: Path) -> None:
     assert mesh.area == pytest.approx(2 * 1.43)
 
 
-@step_and_iges
-def test_less_time_than_ours_is_left_as_it_is(tmp_path: Path) -> None:
-    pytest.importorskip("resource")
-    path = tmp_path / "a.step"
-    path.write_text(step(scaled("mm")))
-    script = (
-        "import resource, sys; resource.setrlimit(resource.RLIMIT_CPU, (300, 300)); "
-        "from qs3.meshes import load_mesh; load_mesh(sys.argv[1])"
-    )
-    subprocess.run([sys.executable, "-c", script, str(path)], check=True)
-
-
 @threemf
 @pytest.mark.parametrize("unit", ["millimeter", "inch", "meter"])
 def test_3mf_places_its_parts_and_tells_its_unit(tmp_path: Path, unit: str) -> None:
@@ -87,26 +74,12 @@ def test_3mf_places_its_parts_and_tells_its_unit(tmp_path: Path, unit: str) -> N
 
 
 @threemf
-def test_a_hostile_3mf_is_refused_before_it_is_read(tmp_path: Path) -> None:
-    tens = "".join(
-        f'<object id="{n}"><components>'
-        + f'<component objectid="{n - 1}"/>' * 10
-        + "</components></object>"
-        for n in range(2, 12)
-    )
-    circle = '<object id="2"><components><component objectid="2"/></components></object>'
-    box, item = box_3mf(SIZE), '<item objectid="{}"/>'
-    for objects, build, message in (
-        (box + tens, item.format(11), "places 11111111111 parts"),
-        (box + circle, item.format(2), "in a circle"),
-        (box + " " * 100_000_000, item.format(1), "would unpack to 1000"),
-        ("<object", "", "damaged"),
-    ):
-        path = write_3mf(tmp_path / "a.3mf", objects, build)
-        with refused(f"^{path}: .*{message}"):
-            load_mesh(path)
+def test_damaged_3mf_is_refused_in_one_line(tmp_path: Path) -> None:
+    path = write_3mf(tmp_path / "a.3mf", "<object", "")
+    with refused("cannot be read as 3MF", path):
+        load_mesh(path)
     path.write_bytes(b"PK no archive")
-    with pytest.raises(InputError, match="not a 3MF file"):
+    with refused("cannot be read as 3MF", path):
         load_mesh(path)
 
 

@@ -1,6 +1,7 @@
 """Every format read back, and one clear line for every bad file."""
 
 import json
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -117,20 +118,21 @@ POINTS_PLY = (
 )
 OFF3 = "OFF\n3 1 0\n{}\n{}\n{}\n3 0 1 {}\n"
 BAD = {
-    "garbage.off": ("hello, this is a letter\n", "not an OFF file"),
-    "counts.off": ("OFF\nmany vertices\n", "not an OFF file"),
-    "binary.off": (b"\xff\xfe\x00\x01" * 9, "not an OFF file"),
+    "garbage.off": ("hello, this is a letter\n", "cannot be read as OFF"),
+    "counts.off": ("OFF\nmany vertices\n", "cannot be read as OFF"),
+    "binary.off": (b"\xff\xfe\x00\x01" * 9, "cannot be read as OFF"),
     "empty.off": ("", "empty"),
-    "blank.off": ("\n\n", "not an OFF file"),
+    "blank.off": ("\n\n", "cannot be read as OFF"),
     "novertex.off": ("OFF\n0 0 0\n", "empty"),
     "noface.off": ("OFF\n2 0 0\n0 0 0\n1 1 1\n", "no faces"),
     "short.off": ("OFF\n4 4 0\n0 0 0\n1 0 0\n", "cut short"),
-    "line.off": ("OFF\n3 1 0\n0 0 0\n1 0 x\n0 1 0\n3 0 1 2\n", "damaged line"),
-    "row.off": ("OFF\n3 1 0\n0 0 0\n1 0\n0 1 0\n3 0 1 2\n", "damaged line"),
-    "face.off": ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1\n", "damaged line"),
-    "range.off": (OFF3.format("0 0 0", "1 0 0", "0 1 0", 7), "names vertex 7"),
-    "minus.off": (OFF3.format("0 0 0", "1 0 0", "0 1 0", -1), "names vertex -1"),
-    "huge.off": (OFF3.format("0 0 0", "1 0 0", "0 1 0", "9" * 20), "damaged line"),
+    "cut.off": ("OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "declares 3 vertices and 2 faces"),
+    "line.off": ("OFF\n3 1 0\n0 0 0\n1 0 x\n0 1 0\n3 0 1 2\n", "cannot be read as OFF"),
+    "row.off": ("OFF\n3 1 0\n0 0 0\n1 0\n0 1 0\n3 0 1 2\n", "cannot be read as OFF"),
+    "face.off": ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1\n", "fewer corners"),
+    "range.off": (OFF3.format("0 0 0", "1 0 0", "0 1 0", 7), "outside the range"),
+    "minus.off": (OFF3.format("0 0 0", "1 0 0", "0 1 0", -1), "outside the range"),
+    "huge.off": (OFF3.format("0 0 0", "1 0 0", "0 1 0", "9" * 20), "cannot be read as OFF"),
     "nan.off": (OFF3.format("nan 0 0", "1 0 0", "0 1 0", 2), "NaN or infinite"),
     "inf.off": (OFF3.format("inf 0 0", "1 0 0", "0 1 0", 2), "NaN or infinite"),
     "zero.off": (OFF3.format("1 1 1", "1 1 1", "1 1 1", 2), "zero size"),
@@ -174,18 +176,67 @@ def test_missing_file_and_folder(tmp_path: Path) -> None:
         load_mesh(tmp_path)
 
 
-@pytest.mark.parametrize("uri", ["../outside.bin", "https://example.org/a.bin", "/etc/hostname"])
-def test_nothing_outside_the_folder_is_read(tmp_path: Path, uri: str) -> None:
-    inner = tmp_path / "inner"
-    inner.mkdir()
-    files = trimesh.exchange.gltf.export_gltf(trimesh.Scene(tetra()))
-    tree = json.loads(files["model.gltf"])
-    for i, buffer in enumerate(tree["buffers"]):
-        (tmp_path / "outside.bin").write_bytes(files[buffer["uri"]]) if i == 0 else None
-        buffer["uri"] = uri
-    (inner / "a.gltf").write_text(json.dumps(tree))
-    with pytest.raises(InputError, match="no file beside it"):
-        load_mesh(inner / "a.gltf")
+def glb(path: Path, tree: dict, data: bytes) -> Path:
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    body = struct.pack("<II", len(text), 0x4E4F534A) + text
+    body += struct.pack("<II", len(data), 0x004E4942) + data
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
+    return path
+
+
+@pytest.mark.parametrize(("count", "faces"), [(3, 3), (20_000_000_000, 0)])
+def test_gltf_is_read_or_refused_at_the_limit_of_memory(
+    tmp_path: Path, count: int, faces: int
+) -> None:
+    """By the standard an accessor without a buffer is zeros, of any number."""
+    places = {"componentType": 5126, "type": "VEC3", "count": count}
+    tree = {
+        "asset": {"version": "2.0"},
+        "buffers": [{"byteLength": 36}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "accessors": [places | ({"bufferView": 0} if faces else {})],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "nodes": [{"mesh": 0}] * 3,
+        "scenes": [{"nodes": [0, 1, 2]}],
+        "scene": 0,
+    }
+    path = glb(tmp_path / "a.glb", tree, struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0))
+    if faces:
+        assert len(load_mesh(path).faces) == faces
+    else:
+        with refused(rf"^{path}: "):
+            load_mesh(path)
+
+
+CUT_PLY = (
+    "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+    "property float z\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [("", "declares 2 rows of face"), ("3 0 1\n", "fewer than 3 corners"), ("3 0 1 x\n", "PLY")],
+)
+def test_text_ply_that_holds_less_than_it_declares_is_refused(
+    tmp_path: Path, row: str, message: str
+) -> None:
+    (tmp_path / "a.ply").write_text(CUT_PLY + row)
+    with refused(message, tmp_path / "a.ply"):
+        load_mesh(tmp_path / "a.ply")
+
+
+def test_binary_ply_of_mixed_polygons_is_refused(tmp_path: Path) -> None:
+    head = CUT_PLY.partition("0 0 0")[0].replace("ascii", "binary_little_endian")
+    head = head.replace("face 2", "face 3")
+    body = TETRA[:3].astype("<f4").tobytes()
+    for corners in ([0, 1, 2], [0, 1, 2, 0], [0, 1]):
+        body += struct.pack(f"<B{len(corners)}i", len(corners), *corners)
+    (tmp_path / "a.ply").write_bytes(head.encode() + body)
+    with refused("mixes lists of several lengths", tmp_path / "a.ply"):
+        load_mesh(tmp_path / "a.ply")
 
 
 @pytest.mark.data

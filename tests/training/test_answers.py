@@ -264,7 +264,7 @@ def test_the_command_does_the_rest_names_every_fault_and_ends_with_2(
     lines = [line.split("\t") for line in told.stdout.splitlines()]
     assert [len(line) for line in lines] == [5, 5, 5]
     assert "bad.ply" in told.stderr
-    assert "empty.xyz: empty file (2 of 5 files)" in told.stderr.splitlines()[-1]
+    assert "empty.xyz: the file is empty (2 of 5 files)" in told.stderr.splitlines()[-1]
     assert len(pd.read_csv(tmp_path / "t.csv")) == 5
     assert len(json.loads((tmp_path / "t.json").read_text())) == 5
     assert len(list((tmp_path / "s").rglob("*.npy"))) == 3

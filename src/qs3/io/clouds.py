@@ -9,10 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.errors import InputError
-from qs3.io.guards import naming
 from qs3.io.preparation import stack
-from qs3.io.scratch import scratch_array
 from qs3.meshes.classes import label_order, map_labels, require_named
+from qs3.reading import naming
 
 CloudKind = Literal["points", "clean", "surface"]
 """A scanned object's noisy cloud, its twin from the true z-buffer, samples of its whole surface."""
@@ -190,8 +189,7 @@ class RaggedClouds:
         """
         points = stack(self.clouds, num_points, where, most)
         order = np.argsort(digests(points), kind="stable")
-        ordered = np.take(points, order, axis=0, out=scratch_array(points.shape))
-        return UnlabelledClouds(ordered, numbered(len(points)), self.checksum)
+        return UnlabelledClouds(points[order], numbered(len(points)), self.checksum)
 
 
 def relabel(

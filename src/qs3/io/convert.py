@@ -10,12 +10,12 @@ import numpy as np
 from qs3.errors import InputError
 from qs3.files import new_folder
 from qs3.io.clouds import CloudKind, RaggedClouds
-from qs3.io.guards import naming
 from qs3.io.layouts import FORMATS
 from qs3.io.layouts.store import write_store
 from qs3.io.load import format_named, read_clouds
 from qs3.io.preparation import MOST_POINTS, resample
 from qs3.meshes.classes import map_labels
+from qs3.reading import naming
 from qs3.store.progress import cloud_bar
 
 
@@ -54,8 +54,7 @@ def convert(
     layout = format_named(to)
     if layout.write is None:
         written = [other.name for other in FORMATS.values() if other.write is not None]
-        kin = [name for name in written if name.startswith(to)] or written
-        raise InputError(f"{to}: is only read; written are {', '.join(kin)}")
+        raise InputError(f"{to}: is only read; written are {', '.join(written)}")
     with new_folder(target) as whole:
         clouds, name = read_clouds(source, split, cloud, origin)
         if classes is not None:

@@ -9,7 +9,7 @@ from typing import Any
 from qs3.errors import InputError, no_such
 from qs3.files import holds_something
 from qs3.io.clouds import CloudChoice, Origin, PointClouds, RaggedClouds, UnlabelledClouds
-from qs3.io.layouts import FORMATS, FORMER_NAMES, Format, point_folders
+from qs3.io.layouts import FORMATS, Format
 from qs3.io.layouts.store import read_ragged
 from qs3.io.point_files import depth_hint
 from qs3.store.manifest import MANIFEST
@@ -133,7 +133,7 @@ def detect(path: Path) -> Format:
     """
     require(path)
     fits = [layout for layout in FORMATS.values() if layout.detect(path)]
-    fits = [layout for layout in fits if layout not in point_folders.FORMATS] or fits
+    fits = [layout for layout in fits if layout.name != "folder"] or fits
     if len(fits) == 1:
         return fits[0]
     if not fits:
@@ -145,8 +145,7 @@ def detect(path: Path) -> Format:
 
 
 def format_named(name: str) -> Format:
-    """Return a layout by its name; of an unknown one the nearest name and all names are told."""
-    name = FORMER_NAMES.get(name, name)
+    """Return a layout by its name."""
     if name in FORMATS:
         return FORMATS[name]
     raise no_such(f"{name!r} is no known layout", name, FORMATS)

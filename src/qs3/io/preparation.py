@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.errors import InputError, UnevenSizesError
-from qs3.io.scratch import Spool, scratch_array
 
 MOST_POINTS = 1_000_000
 """Most points that one cloud is brought to, as a scan has."""
@@ -227,11 +226,9 @@ def stack(
             )
         if 0 in sizes:
             raise InputError(f"{where}: holds an empty cloud")
-        points = scratch_array((len(clouds), min(most, max(sizes)), 3))
+        points = np.empty((len(clouds), min(most, max(sizes)), 3), dtype=np.float32)
         for row, cloud in enumerate(clouds):
             kept = thin(len(cloud), most)
             points[row] = cloud[kept[np.arange(points.shape[1]) % len(kept)]]
         return points
-    if isinstance(clouds, Spool):
-        return clouds.points.reshape(len(clouds), -1, 3)
     return np.stack(clouds).astype(np.float32, copy=False)

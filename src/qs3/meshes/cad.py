@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 
 from qs3.errors import InputError, MissingExtraError
-from qs3.meshes.announced import lower_limit, memory_limit
+from qs3.reading import reading
 
 UNITS = {".step": "meters", ".stp": "meters", ".iges": "millimeters", ".igs": "millimeters"}
 """Endings, and the unit that cascadio's triangles are in, whichever the file is in: of STEP it
@@ -67,14 +67,8 @@ def _convert(path: Path, out: Path) -> None:
     sys.modules.setdefault("trimesh", None)  # pyright: ignore[reportArgumentType]
     import cascadio
 
-    try:
-        import resource
-
-        lower_limit(resource.RLIMIT_CPU, _SECONDS)
-    except ImportError:  # Windows: the caller's time limit is left
-        pass
     kind = "step" if UNITS[path.suffix.lower()] == "meters" else "iges"
-    with memory_limit(path):
+    with reading(path):
         data = cascadio.load(
             path.read_bytes(),
             kind,

@@ -1,4 +1,4 @@
-"""Wrapper that adds the size of a cloud to the features of a network."""
+"""A network that is told how large a cloud is."""
 
 import torch
 from jaxtyping import Float

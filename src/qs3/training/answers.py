@@ -16,12 +16,12 @@ from jaxtyping import Float
 
 from qs3.adaptation.confidence import UNKNOWN, rescale
 from qs3.errors import InputError, say_once
+from qs3.escapes import utf8
 from qs3.files import describe_others, json_bytes, new_folder
-from qs3.io.guards import utf8
 from qs3.io.layouts import FORMATS
-from qs3.io.layouts.point_folders import check_class
+from qs3.io.layouts.folders import check_class
 from qs3.io.load import read_clouds
-from qs3.io.point_files import POINT_FILES, WRITTEN_FILES, depth_hint, read_cloud
+from qs3.io.point_files import POINT_FILES, depth_hint, read_cloud
 from qs3.training.checkpoint import LoadedModel, load_model
 from qs3.training.predict import ask
 from qs3.training.prepared import note_clouds
@@ -246,7 +246,7 @@ def sort_into(folder: Path, answers: Iterable[Answer]) -> None:
         if not answer.fault and answer.file.suffix.lower() not in POINT_FILES:
             raise InputError(
                 f"{answer.file}: is read by its name alone, and would be passed over in the folder "
-                f"of a class; write it as one of {', '.join(WRITTEN_FILES)} first"
+                f"of a class; write it as one of {', '.join(POINT_FILES)} first"
             )
     count = Counter(answer.file.name for answer in answers if not answer.fault)
     with new_folder(folder) as whole:

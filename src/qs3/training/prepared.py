@@ -22,7 +22,6 @@ from tqdm import tqdm
 from qs3.errors import InputError, say_once
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.preparation import BLOCK, LARGEST, PAPER, Preparation, distinct_inliers, normalise
-from qs3.io.scratch import scratch_array
 from qs3.models.sized import ball_radius
 from qs3.sensor.sampling import farthest_point_sample
 from qs3.training.checkpoint import read_tensors, write_tensors
@@ -287,7 +286,7 @@ def _ranked(
     points: Float[np.ndarray, "b n 3"], num_points: int, preparation: Preparation, width: int
 ) -> Order:
     """Which points count, cloud by cloud, in PyTorch's number of threads."""
-    index = scratch_array((len(points), width), np.min_scalar_type(points.shape[1] - 1))
+    index = np.empty((len(points), width), np.min_scalar_type(points.shape[1] - 1))
     counts = np.empty(len(points), np.int64)
 
     def rank(row: int) -> None:

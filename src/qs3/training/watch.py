@@ -1,5 +1,6 @@
-"""Cut the frames of a depth camera into objects and classify each."""
+"""Frames of a depth camera cut into objects, and what a network says of each."""
 
+import time
 from collections.abc import Generator, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -12,17 +13,32 @@ from qs3.io.preparation import LARGEST, stack
 from qs3.training.answers import Answer, answer_clouds
 from qs3.training.checkpoint import LoadedModel, load_model
 
-_DENSER = 4  # points kept of an object, as a multiple of the network's: stray removal is slow
+_DENSER = 4
+"""Of an object so many times the points of the network count; strays take longer in more."""
+
+STAGES = ("read", "segment", "predict")
+
+
+class SeenObject(NamedTuple):
+    """An object on the table and what the network says of it."""
+
+    item: SegmentedObject
+    """Its points and its box."""
+    answer: Answer
+    """What the network says of it."""
 
 
 class SeenFrame(NamedTuple):
-    """The objects of a frame and their answers."""
+    """What was seen in a frame."""
 
     name: str
+    """The frame's."""
     timestamp: float | None
     """Seconds, by the camera's clock."""
-    objects: tuple[tuple[SegmentedObject, Answer], ...]
+    objects: tuple[SeenObject, ...]
     """The largest first."""
+    seconds: tuple[float, float, float]
+    """That reading, segmenting and predicting took."""
     fault: str = ""
     """Why there is no object."""
 
@@ -30,53 +46,92 @@ class SeenFrame(NamedTuple):
 def watch(
     run: str | Path, camera: Camera, settings: SegmentSettings, unknown: float | None = None
 ) -> Generator[SeenFrame, None, None]:
-    """Yield the objects before a camera, frame by frame; closing it closes the camera.
+    """Yield what stands before a camera, frame by frame; closing it closes the camera.
 
-    The arguments are those of `predict_objects`; ``run`` is a folder, its model.safetensors, or the
-    name of a network that comes with qs3.
+    Args:
+        run: Folder of a run, its model.safetensors, or the name of a network that comes with qs3.
+        camera: Gives the frames.
+        settings: How a frame is cut into objects.
+        unknown: As in `predict_objects`.
 
     Raises:
-        InputError: if the run or the camera cannot be read, or the run cannot tell unknown objects.
+        InputError: where the run or the camera cannot be read, or the run does not hold what is
+            known to it.
     """
     loaded = load_model(Path(run))
     if unknown is not None:
         loaded.require_known(run, unknown)
     with closing(camera):
-        for frame in camera:
-            items, fault = [], ""
+        while True:
+            begin = time.perf_counter()
+            frame = next(camera, None)
+            if frame is None:
+                return
+            read, fault = time.perf_counter(), ""
             try:
-                scene = lift_scene(frame.depth, frame.camera, settings, frame.name)
-                items = segment(scene, settings)
+                items = segment(
+                    lift_scene(frame.depth, frame.camera, settings, frame.name), settings
+                )
             except InputError as error:  # an empty table, a hand before the lens
-                fault = str(error)
+                items, fault = [], str(error)
+            cut = time.perf_counter()
             objects = predict_objects(loaded, items, unknown)
-            yield SeenFrame(frame.name, frame.timestamp, objects, fault)
+            end = time.perf_counter()
+            yield SeenFrame(
+                frame.name, frame.timestamp, objects, (read - begin, cut - read, end - cut), fault
+            )
 
 
 def predict_objects(
     loaded: LoadedModel, items: Sequence[SegmentedObject], unknown: float | None = None
-) -> tuple[tuple[SegmentedObject, Answer], ...]:
-    """Classify the objects of a frame in one pass.
+) -> tuple[SeenObject, ...]:
+    """Tell the class of each object of a frame, all in one pass.
 
-    ``unknown`` is the share of objects of the known classes that may be rejected; None rejects
-    none.
+    Args:
+        loaded: The network.
+        items: The objects.
+        unknown: Share of objects of the known classes that may be refused; None always answers.
     """
     if not items:
         return ()
     most = min(LARGEST, _DENSER * (loaded.num_points or LARGEST))
     clouds = stack([item.points for item in items], None, "frame", most)
-    return tuple(zip(items, answer_clouds(loaded, clouds, unknown), strict=True))
+    return tuple(map(SeenObject, items, answer_clouds(loaded, clouds, unknown)))
 
 
-def rows(frame: SeenFrame) -> list[dict[str, Any]]:
-    """Return a plain mapping for each object, or one with the fault; lengths in metres."""
-    head = {"frame": frame.name, "time": frame.timestamp}
-    if frame.fault:
-        return [head | {"fault": frame.fault}]
-    lines = []
+def plain(frame: SeenFrame) -> dict[str, Any]:
+    """A frame as plain values, for JSON; lengths in metres."""
+    objects = []
     for item, answer in frame.objects:
-        ((label, share),) = answer.best()
+        ((name, share),) = answer.best()
         box = {"centre": item.centre, "size": item.size, "heading": item.heading}
-        told = {"class": label, "confidence": share, "points": len(item.points)}
-        lines.append(head | told | box | {"probabilities": answer.probabilities})
-    return lines
+        fields = {"class": name, "confidence": share, "points": len(item.points), **box}
+        objects.append(fields | {"probabilities": answer.probabilities})
+    seconds = dict(zip(STAGES, frame.seconds, strict=True))
+    line = {"frame": frame.name, "time": frame.timestamp, "objects": objects, "seconds": seconds}
+    return line | ({"fault": frame.fault} if frame.fault else {})
+
+
+class Rate:
+    """How many frames a second, and the mean time of each stage."""
+
+    def __init__(self) -> None:
+        self._frames, self._timed, self._sums = 0, 0, [0.0, 0.0, 0.0]
+
+    def add(self, frame: SeenFrame) -> None:
+        """Count a frame."""
+        self._frames += 1
+        if self._frames == 2:  # what the first one loads, the others find there
+            self._timed, self._sums = 0, [0.0, 0.0, 0.0]
+        self._timed += 1
+        self._sums = [total + part for total, part in zip(self._sums, frame.seconds, strict=True)]
+
+    def __str__(self) -> str:
+        """A line; nothing before the first frame."""
+        if not self._frames:
+            return ""
+        means = [part / self._timed for part in self._sums]
+        parts = ", ".join(
+            f"{name} {1000 * mean:.0f} ms" for name, mean in zip(STAGES, means, strict=True)
+        )
+        return f"{self._frames} frames, {1 / sum(means):.1f} a second; of each: {parts}"

@@ -148,14 +148,16 @@ def test_small_high_and_near_things():
 
 @pytest.mark.parametrize("ending", [".ply", ".npz", ".xyz"])
 def test_a_scene_becomes_a_folder_and_a_table(tmp_path, ending):
-    from qs3.io.point_files import cloud_bytes
+    from qs3.io.ply import ply_bytes
 
     scene = table_scene(np.random.default_rng(0))
     path = tmp_path / f"scene{ending}"
     if ending == ".npz":
         np.savez(path, points=scene)
+    elif ending == ".xyz":
+        np.savetxt(path, scene, "%.9g")
     else:
-        path.write_bytes(cloud_bytes(scene, ending))
+        path.write_bytes(ply_bytes(scene))
     objects = segment_scene(path, tmp_path / "objects")
     check(objects)
     rows = pd.read_csv(tmp_path / "objects" / "objects.csv")

@@ -1,19 +1,15 @@
-import dataclasses
-
 import h5py
 import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.io.clouds import RaggedClouds
 from qs3.io.layouts import pointda10
-from qs3.io.layouts.pointda10 import read_pointda10, write_h5, write_npy
+from qs3.io.layouts.pointda10 import read_pointda10
 from qs3.io.load import detect, load_clouds
 from qs3.io.preparation import unit_ball
 from qs3.meshes.classes import POINTDA10
 
 from ..hostile import refused
-from .common import content, make_clouds
 
 BY_NAME = {layout.name: layout for layout in pointda10.FORMATS}
 
@@ -115,30 +111,20 @@ def test_the_aligned_protocol_is_the_published_rule_with_its_plant_exception(tmp
 
 def test_the_original_protocol_takes_the_first_points_and_turns_nothing(tmp_path, rng):
     lamp = release(tmp_path, rng)
-    short = tmp_path / "shapenet" / "chair" / "train" / "chair_0001.npy"
+    short = tmp_path / "shapenet" / "plant" / "train" / "plant_0001.npy"
     np.save(short, np.load(short)[:1000])
-    for domain in ("modelnet", "shapenet", "scannet"):
-        clouds = read_pointda10(tmp_path / domain, protocol="original")
-        raw = read_pointda10(tmp_path / domain, protocol="raw")
-        for cloud, stored, label in zip(clouds.clouds, raw.clouds, raw.labels, strict=True):
-            first = stored[:1024].astype(np.float64)
-            expected = published_alignment(first, turn=False)
-            assert cloud.shape == (1024, 3)
-            np.testing.assert_allclose(cloud[: len(first)], expected, atol=1e-6)
-            assert not cloud[len(first) :].any()
-            plain = domain == "modelnet" or (domain == "shapenet" and POINTDA10[label] == "plant")
-            if plain:
-                np.testing.assert_allclose(stored, lamp[: len(stored)].astype(np.float32))
-    assert any(len(c) == 1000 for c in read_pointda10(tmp_path / "shapenet", None, "raw").clouds)
-
-
-def test_raw_is_what_is_stored_and_protocols_have_their_own_checksums(tmp_path, rng):
-    release(tmp_path, rng)
-    raw = read_pointda10(tmp_path / "scannet", "test", "raw")
+    for domain, count in (("modelnet", 1024), ("shapenet", 1000)):
+        clouds = read_pointda10(tmp_path / domain, "train", "original")
+        cloud = clouds.clouds[clouds.labels.tolist().index(POINTDA10.index("plant"))]
+        assert cloud.shape == (1024, 3)
+        expected = published_alignment(lamp[:count], turn=False)
+        np.testing.assert_allclose(cloud[:count], expected, atol=1e-6)
+        assert not cloud[count:].any()
     with h5py.File(tmp_path / "scannet" / "test_0.h5") as file:
-        np.testing.assert_array_equal(raw.clouds, file["data"][..., :3].astype(np.float32))
-    sums = [read_pointda10(tmp_path / "scannet", "test", p).checksum for p in ("raw", "aligned")]
-    assert len({*sums, raw.checksum}) == 2
+        stored = file["data"][0, :1024, :3]
+    clouds = read_pointda10(tmp_path / "scannet", "test", "original")
+    np.testing.assert_allclose(clouds.clouds[0], published_alignment(stored, False), atol=1e-6)
+    assert clouds.checksum != read_pointda10(tmp_path / "scannet", "test").checksum
 
 
 def test_the_root_asks_for_one_domain(tmp_path, rng):
@@ -153,7 +139,7 @@ def test_the_root_asks_for_one_domain(tmp_path, rng):
         assert len(load_clouds(root / domain, split="test").ids) == 2
     # Under another name an npy tree does not tell its up axis.
     (root / "shapenet").rename(root / "other")
-    assert detect(root / "other").name == "npy"
+    assert detect(root / "other").name == "folder"
     with pytest.raises(InputError, match=r"no domain of PointDA-10; name a folder called modelnet"):
         read_pointda10(root / "other")
     named = read_pointda10(root / "other", domain="shapenet")
@@ -164,124 +150,13 @@ def test_the_root_asks_for_one_domain(tmp_path, rng):
         read_pointda10(root / "nowhere")
 
 
-def load_npy_as_published(root, part):
-    """Folders sorted give the label; a cloud a file. Nothing of ours is used."""
-    classes = sorted(path.name for path in root.iterdir())
-    clouds, labels = [], []
-    for label, name in enumerate(classes):
-        for path in sorted((root / name / part).glob("*.npy")):
-            clouds.append(np.load(path)[:, :3])
-            labels.append(label)
-    return clouds, labels
-
-
-def load_h5_as_published(root, part):
-    """Files by their list, ``data`` and ``label`` one after another, as the first loader does."""
-    names = (root / f"{part}_files.txt").read_text().splitlines()
-    data, label = [], []
-    for name in names:
-        with h5py.File(root / name.rstrip().split("/")[-1], "r") as file:
-            data.append(file["data"][:])
-            label.append(file["label"][:])
-    return np.concatenate(data), np.concatenate(label)
-
-
-@pytest.fixture
-def given(rng):
-    """Clouds of all classes and both splits, with their own order of classes."""
-    classes = (*reversed(POINTDA10[1:]), "tub")
-    return make_clouds(rng, classes, num_points=16, per_part=2)
-
-
-def names_and_points(clouds, labels):
-    """Clouds with their classes in PointDA-10's words, in an order of their own."""
-    points = [np.asarray(cloud, dtype="<f4").tobytes() for cloud in clouds]
-    return sorted(zip([POINTDA10[label] for label in labels], points, strict=True))
-
-
-def test_a_loader_from_the_published_description_reads_what_is_written(tmp_path, given):
-    write_npy(tmp_path / "a", given)
-    write_h5(tmp_path / "b", given)
-    names = ["bathtub" if name == "tub" else name for name in given.class_names]
-    labels = [POINTDA10.index(names[label]) for label in given.labels]
-    for part in ("train", "test"):
-        own = [row for row, split in enumerate(given.splits) if split == part]
-        expected = names_and_points([given.clouds[i] for i in own], [labels[i] for i in own])
-        clouds, read_labels = load_npy_as_published(tmp_path / "a" / "modelnet", part)
-        assert names_and_points(clouds, read_labels) == expected
-        data, read_labels = load_h5_as_published(tmp_path / "b" / "scannet", part)
-        assert data.dtype == np.float32
-        assert data.shape == (len(own), 16, 6)
-        assert not data[..., 3:].any()
-        # y up in the file: x y z there is x, z, −y here.
-        back = np.stack([data[..., 0], -data[..., 2], data[..., 1]], axis=-1)
-        assert names_and_points(back, read_labels) == expected
-        # What the field's loader would train on.
-        for i, cloud in zip(own, data, strict=True):
-            if abs(given.clouds[i]).max() < 1e30:
-                expected_cloud = published_alignment(given.clouds[i].astype(float), turn=False)
-                turned = published_alignment(cloud[:, :3].astype(float), turn=True)
-                np.testing.assert_allclose(turned, expected_cloud, atol=1e-6)
-    assert (tmp_path / "b" / "scannet" / "train_files.txt").read_text() == "./train_0.h5\n"
-
-
-@pytest.mark.parametrize("name", ["pointda10-npy", "pointda10-h5"])
-def test_a_round_trip_is_equal_and_aligned_gives_unit_balls(tmp_path, given, name):
-    layout = BY_NAME[name]
-    layout.write(tmp_path / "a", given)
-    back = layout.read(tmp_path / "a", None)
-    tub = dataclasses.replace(
-        given, class_names=tuple(n.replace("tub", "bathtub") for n in given.class_names)
-    )
-    assert content(back) == content(tub)
-    assert len(set(back.ids)) == 40
-    aligned = BY_NAME["pointda10"].read(tmp_path / "a", None)
-    balls = dataclasses.replace(tub, clouds=[unit_ball(c[None])[0] for c in given.clouds])
-    assert content(aligned) == content(balls)
-
-
-def test_other_sizes_become_2048(tmp_path, rng):
-    clouds = [rng.random((count, 3)).astype(np.float32) for count in (5, 2048, 2100)]
-    given = RaggedClouds(
-        clouds, ("a", "b", "c"), "", np.zeros(3, int), ("bed",), ("train", "train", "train")
-    )
-    for name in ("pointda10-npy", "pointda10-h5"):
-        BY_NAME[name].write(tmp_path / name, given)
-        back = BY_NAME[name].read(tmp_path / name, None)
-        assert [len(cloud) for cloud in back.clouds] == [2048] * 3
-        np.testing.assert_array_equal(back.clouds[1], clouds[1])
-        np.testing.assert_array_equal(back.clouds[0], np.tile(clouds[0], (410, 1))[:2048])
-
-
-def test_a_file_holds_2048_clouds(tmp_path, rng):
-    count = 4097
-    given = RaggedClouds(
-        list(rng.random((count, 2, 3)).astype(np.float32)),
-        tuple(str(i) for i in range(count)),
-        "",
-        np.arange(count) % 10,
-        POINTDA10,
-        ("train",) * count,
-    )
-    write_h5(tmp_path / "a", given)
-    counts = {}
-    for path in sorted((tmp_path / "a" / "scannet").iterdir()):
-        if path.suffix == ".h5":
-            with h5py.File(path) as file:
-                counts[path.name] = len(file["label"])
-    assert counts == {"train_0.h5": 2048, "train_1.h5": 2048, "train_2.h5": 1}
-    back = BY_NAME["pointda10-h5"].read(tmp_path / "a", None)
-    np.testing.assert_array_equal(back.clouds, given.clouds)
-    np.testing.assert_array_equal(back.labels, given.labels)
-
-
 @pytest.mark.parametrize(
     ("name", "array", "message"),
     [
-        ("label", [10, 0], r"train_0\.h5: label 10 is none of 0 to 9"),
-        ("data", np.ones((2, 2048, 5)), r"train_0\.h5: data must be floats of .* \[b n 3 or 6\]"),
+        ("label", [10, 0], r"train_0\.h5: label 10 is out of range 0–9"),
+        ("data", np.ones((2, 2048, 2)), r"train_0\.h5: data must be floats of shape"),
     ],
-    ids=["an eleventh label", "five columns"],
+    ids=["an eleventh label", "two columns"],
 )
 def test_hostile_trees_are_refused_in_one_line(tmp_path, rng, name, array, message):
     release(tmp_path, rng)

@@ -16,11 +16,11 @@ import tyro
 from jaxtyping import Bool, Float
 
 from qs3.errors import InputError
+from qs3.escapes import utf8
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.io.extract.depth_images import DEPTH_FILES, list_files, list_images, read_depth, read_mask
 from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
 from qs3.io.extract.run import ExtractedCloud, ExtractReport, OutputSettings, recorded, run_extract
-from qs3.io.guards import utf8
 from qs3.reading import reading
 
 _MOST_INSTANCES = 4096

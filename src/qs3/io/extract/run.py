@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from qs3.errors import InputError
-from qs3.io.guards import utf8
+from qs3.escapes import utf8
 from qs3.io.preparation import resample
 from qs3.meshes.classes import POINTDA10, map_labels
 from qs3.sensor.checks import check_range

@@ -22,6 +22,7 @@ from qs3.errors import InputError, StorageError
 from qs3.files import (
     new_folder,
     read_json,
+    refuse_link,
     sha256,
     write_bytes,
     write_json,
@@ -30,7 +31,8 @@ from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, u
 from qs3.io.extract.depth_images import holds_images, list_files, list_images, read_depth
 from qs3.io.extract.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
 from qs3.io.extract.plane import Plane, fit_plane
-from qs3.io.point_files import POINT_FILES, SCENE_RECORD, cloud_bytes, is_scene, read_cloud
+from qs3.io.ply import ply_bytes
+from qs3.io.point_files import POINT_FILES, SCENE_RECORD, is_scene, read_cloud
 from qs3.io.preparation import thin
 from qs3.reading import naming, reading
 from qs3.sensor.checks import check_range
@@ -150,7 +152,7 @@ def _cut_into(
         rows = []
         for number, item in enumerate(objects):
             name = f"object_{number:03d}.ply"
-            write_bytes(folder / name, cloud_bytes(item.points, ".ply"))
+            write_bytes(folder / name, ply_bytes(item.points))
             rows.append([name, len(item.points), *item.centre, *item.size, item.heading])
         columns = ["file", "points", "x", "y", "z", "length", "width", "height", "heading"]
         table = pd.DataFrame(rows, columns=columns).to_csv(index=False, float_format="%.4f")
@@ -216,6 +218,7 @@ def segment_scenes(
         place = out / name
         try:
             record = {"sha256": sha256(path), "settings": how}
+            refuse_link(place)
             if is_scene(place) and read_json(place / SCENE_RECORD) == record:
                 yield name, None
             else:

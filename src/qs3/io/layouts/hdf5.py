@@ -1,162 +1,222 @@
-"""HDF5 files of clouds, ``data`` [b n c] and ``label`` [b], opened with every check in one place.
+"""HDF5 files of clouds: ModelNet40, ScanObjectNN and the ScanNet part of PointDA-10.
 
-A file may announce far more than it holds, or send its reader to other files. So only plain
-numbers are read that lie in the file itself, and only after their announced size has been held
-against the file's own.
+Each file has ``data`` [b n c], of which the first three columns are x, y and z, and ``label`` [b].
+The name of a file tells the data set and the split:
+
+- ModelNet40: ``ply_data_<train|test><i>.h5``
+- ScanObjectNN: ``training_objectdataset*.h5`` and ``test_objectdataset*.h5``; points of the
+  background are kept, as the benchmark's classifiers see them.
+- PointDA-10's ScanNet: ``<train|test>_<i>.h5``
+
+If ``shape_names.txt`` lies beside the files, it names a class a line in the order of the label.
+
+Convention:
+    y is up in the files of all three. Clouds are turned z up by (x, y, z) → (x, −z, y), and back
+    if they are written.
+
+    NOTE: only the up axis is documented. A ModelNet cloud may be turned about z against its mesh.
+
+Source: Qi et al., "PointNet", CVPR 2017 (https://github.com/charlesq34/pointnet); Uy et al.,
+"Revisiting Point Cloud Classification", ICCV 2019 (https://github.com/hkust-vgd/scanobjectnn).
 """
 
-import contextlib
+import dataclasses
+import hashlib
 import io
-import itertools
-import math
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Int
 
 from qs3.errors import InputError
-from qs3.io.guards import DENSEST, check_announced, naming
+from qs3.files import sha256, write_bytes, write_text
+from qs3.geometry import y_up_to_z_up, z_up_to_y_up
+from qs3.io.clouds import RaggedClouds
+from qs3.io.layouts.folders import CloudFile, choose_split
+from qs3.io.layouts.format import POINTS, SPLITS, Format
+from qs3.io.preparation import stack
+from qs3.meshes.classes import MODELNET40, POINTDA10, map_labels
+from qs3.reading import check_size, reading
 
-_BLOCK = 2**24
-_MOST_TEXTS, _LONGEST_TEXT = 100_000, 1000
-# gzip, shuffle, Fletcher's checksum, szip, LZF: what HDF5 and h5py bring; no plugin is loaded.
-_FILTERS = (1, 2, 3, 4, 32000)
+MODELNET40_CLASSES = tuple(sorted(MODELNET40))
+SCANOBJECTNN_CLASSES = (
+    *("bag", "bin", "box", "cabinet", "chair", "desk", "display", "door"),
+    *("shelf", "table", "bed", "pillow", "sink", "sofa", "toilet"),
+)
+CLOUDS_A_FILE = 2048
+
+_NAMES = "shape_names.txt"
+_MOST_CLASSES = 256
+_MODELNET40 = r"ply_data_(train|test)_?(\d+)()\.h5"
+_SCANOBJECTNN = r"(training|test)()_objectdataset(.*)\.h5"
+POINTDA10_SCANNET = r"(train|test)_(\d+)()\.h5"
+"""Names of files; the groups are split, number and variant."""
+_CLASSES = {
+    _MODELNET40: MODELNET40_CLASSES,
+    _SCANOBJECTNN: SCANOBJECTNN_CLASSES,
+    POINTDA10_SCANNET: POINTDA10,
+}
 
 
-def read_file(
-    path: Path, columns: Sequence[int], classes: int
-) -> tuple[Float32[np.ndarray, "b n 3"], Int[np.ndarray, "b"]]:
-    """Read ``data`` and ``label`` of one file; labels are from 0 to below ``classes``.
-
-    ``columns`` are the numbers of columns that ``data`` may have; those after the third are
-    dropped.
+def read_hdf5(path: Path, split: str | None = None) -> RaggedClouds:
+    """Read a folder of HDF5 files of one data set, or one of them, and turn the clouds z up.
 
     Raises:
-        InputError: where the file is missing, damaged or cut short, lacks a dataset, has one of
-            another kind, shape or announced size, sends the reader to another file, or holds a
-            label out of range or a point that is not finite.
+        InputError: if there is no such file or split, the folder holds several data sets or
+            variants, or a file is damaged or has a label out of range.
     """
-    with open_hdf5(path) as file:
-        data, label = (plain_dataset(file, name, path) for name in ("data", "label"))
-        shape = data.shape
-        if data.dtype.kind != "f" or len(shape) != 3 or shape[2] not in columns:
-            several = " or ".join(map(str, columns))
-            raise InputError(
-                f"data must be floats of shape [b n {several}], not {data.dtype} of shape "
-                f"{list(shape)}"
-            )
-        if label.dtype.kind not in "iu" or label.shape not in ((shape[0],), (shape[0], 1)):
-            raise InputError(
-                f"label must be whole numbers of shape [{shape[0]}], not {label.dtype} of "
-                f"shape {list(label.shape)}"
-            )
-        if 0 in shape:
-            raise InputError("holds no point")
-        numbers = label[()].reshape(-1)
-        low, high = int(numbers.min()), int(numbers.max())
-        if low < 0 or high >= classes:
-            raise InputError(f"label {min(low, 0) or high} is none of 0 to {classes - 1}")
-        return _points(data), numbers.astype(np.int64)
+    files, classes = list_files(path)
+    listed = (path if path.is_dir() else path.parent) / _NAMES
+    if listed.is_file():
+        with reading(listed):
+            names = [name for name in listed.read_text("utf-8").splitlines() if name.strip()]
+        classes = tuple(name.strip() for name in names)
+        if not classes or len(set(classes)) < len(classes):
+            raise InputError(f"{listed}: needs one class name a line, none twice")
+    clouds = read_files(choose_split(path, files, split), classes)
+    return dataclasses.replace(clouds, clouds=[y_up_to_z_up(cloud) for cloud in clouds.clouds])
 
 
-@contextlib.contextmanager
-def open_hdf5(path: Path) -> Iterator[Any]:
-    """Open a file; whatever goes wrong while it is read becomes one line that names it."""
-    # Imported here: layouts of other kinds do without.
+def list_files(path: Path) -> tuple[list[CloudFile], tuple[str, ...]]:
+    """List the files of one data set in the order of split and number, and its classes."""
+    found = [(pattern, match) for pattern in _CLASSES for match in find(path, pattern)]
+    kinds = {(pattern, match[3]) for pattern, match in found}
+    if not kinds:
+        raise InputError(f"{path}: no HDF5 file of a known name; expected {FORMAT.layout}")
+    if len(kinds) > 1:
+        names = ", ".join(match[0] for _, match in found)
+        raise InputError(
+            f"{path}: holds several data sets or variants ({names}); name one file, or put the "
+            "files of one into a folder of their own"
+        )
+    folder = path if path.is_dir() else path.parent
+    files = [
+        (part, int(match[2] or 0), CloudFile(folder / match[0], "", split))
+        for _, match in found
+        for part, split in enumerate(SPLITS)
+        if match[1].startswith(split)
+    ]
+    return [file for *_, file in sorted(files, key=lambda row: row[:2])], _CLASSES[found[0][0]]
+
+
+def find(path: Path, *patterns: str) -> list[re.Match[str]]:
+    """Return how the names of a file, or of the files in a folder, match; reads no content."""
+    try:
+        paths = [*path.iterdir()] if path.is_dir() else [path] if path.is_file() else []
+    except OSError:  # a folder that cannot be listed
+        paths = []
+    matches = [re.fullmatch(pattern, file.name) for file in paths for pattern in patterns]
+    return [match for match in matches if match]
+
+
+def read_files(files: Sequence[CloudFile], class_names: Sequence[str]) -> RaggedClouds:
+    """Read files of different names as they are stored; the id of a cloud is ``<file>/<row>``."""
+    digest = hashlib.sha256()
+    clouds: list[np.ndarray] = []
+    ids: list[str] = []
+    labels: list[np.ndarray] = []
+    splits: list[str] = []
+    for file in files:
+        points, numbers = _read_file(file.path, len(class_names))
+        digest.update(f"{file.path.name} {sha256(file.path)}\n".encode(errors="surrogateescape"))
+        clouds += list(points)
+        ids += [f"{file.path.stem}/{row:05d}" for row in range(len(points))]
+        labels.append(numbers)
+        splits += [file.split] * len(points)
+    return RaggedClouds(
+        clouds=clouds,
+        ids=tuple(ids),
+        checksum=digest.hexdigest(),
+        labels=np.concatenate(labels),
+        class_names=tuple(class_names),
+        splits=tuple(splits),
+    )
+
+
+def _read_file(
+    path: Path, classes: int
+) -> tuple[Float32[np.ndarray, "b n 3"], Int[np.ndarray, "b"]]:
+    # Imported here: other layouts do without.
     import h5py
 
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    with naming(path, "cannot be read as HDF5"), h5py.File(path, "r") as file:
-        yield file
-
-
-def plain_dataset(file: Any, name: str, path: Path, frame: tuple[int, ...] | None = None) -> Any:
-    """Return a dataset of plain numbers that lie in this file, no more than it can hold.
-
-    With ``frame``, sizes after the first, it is to be read one frame at a time: only one is held
-    against what the file can hold.
-    """
-    dataset = _own(file, name, name)
-    if dataset.shape is None or dataset.dtype.kind not in "fiu" or dataset.dtype.itemsize > 8:
-        raise InputError(f"{name} holds {dataset.dtype}, no plain numbers")
-    if frame is not None and dataset.shape[1:] != frame:
-        raise InputError(f"{name} has shape {list(dataset.shape)}, not [n, {str(list(frame))[1:]}")
-    plist = dataset.id.get_create_plist()
-    if any(plist.get_filter(i)[0] not in _FILTERS for i in range(plist.get_nfilters())):
-        raise InputError(f"{name} is compressed by a plugin; write it again with gzip or none")
-    # A chunk may be larger than the dataset; only chunks can be compressed.
-    cells = max(math.prod(frame or dataset.shape), math.prod(dataset.chunks or (0,)))
-    size, stored = cells * dataset.dtype.itemsize, dataset.id.get_storage_size()
-    densest = DENSEST if dataset.chunks else 1
-    check_announced(name, size, min(stored, path.stat().st_size), densest)
-    return dataset
-
-
-def matlab_texts(file: Any, name: str) -> list[str]:
-    """Return a MATLAB cell of text: a dataset of references to datasets of characters."""
-    import h5py
-
-    cell = _own(file, name, name)
-    if h5py.check_ref_dtype(cell.dtype) is not h5py.Reference or cell.size > _MOST_TEXTS:
-        raise InputError(f"{name} is no cell of text, or too long a one")
-    words = []
-    for reference in cell[()].ravel():
-        letters = _own(file, reference, name)
-        if letters.dtype.kind != "u" or letters.size > _LONGEST_TEXT:
-            raise InputError(f"{name} holds something that is no text, or too long a one")
-        words.append("".join(map(chr, letters[()].ravel())).strip("\0"))  # an empty one is zeros
-    return words
-
-
-def _own(file: Any, key: Any, name: str) -> Any:
-    """The dataset at a name or a reference, if it lies in this very file."""
-    import h5py
-
-    if isinstance(key, str):
-        link = file.get(key, getlink=True)
-        if link is None:
-            others = ", ".join(ascii(other) for other in itertools.islice(file, 5))
-            raise InputError(f"has no dataset {name!r}, only {others[:200] or 'none'}")
-        if not isinstance(link, h5py.HardLink):
+    with reading(path, "HDF5"), h5py.File(path, "r") as file, np.errstate(over="ignore"):
+        data, label = file["data"], file["label"]
+        if not isinstance(data, h5py.Dataset) or not isinstance(label, h5py.Dataset):
+            raise InputError("data and label must be datasets")
+        check_size("data", data.nbytes)
+        check_size("label", label.nbytes)
+        if data.dtype.kind != "f" or data.ndim != 3 or data.shape[2] < 3 or 0 in data.shape:
             raise InputError(
-                f"{name} is a link, which may lead to another file; links are not read"
+                f"data must be floats of shape [b n 3] or more columns, not {data.dtype} of shape "
+                f"{list(data.shape)}"
             )
-    dataset = file[key]
-    if not isinstance(dataset, h5py.Dataset):
-        raise InputError(f"{name} is no dataset")
-    if dataset.is_virtual or dataset.external:
-        raise InputError(f"{name} lies in another file, which is not read")
-    return dataset
+        if label.dtype.kind not in "iu" or label.shape not in ((len(data),), (len(data), 1)):
+            raise InputError(
+                f"label must be whole numbers of shape [{len(data)}], not {label.dtype} of shape "
+                f"{list(label.shape)}"
+            )
+        points = data[()][..., :3].astype(np.float32)
+        labels = label[()].reshape(-1)
+        for wrong in labels[(labels < 0) | (labels >= classes)].tolist():
+            raise InputError(f"label {wrong} is out of range 0–{classes - 1}")
+        finite = np.isfinite(points).all(axis=(1, 2))
+        if not finite.all():
+            raise InputError(f"cloud {int(np.argmin(finite))} has a point that is not finite")
+    return points, labels.astype(np.int64)
 
 
-def _points(data: Any) -> Float32[np.ndarray, "b n 3"]:
-    """Read block by block, so that colours and float64 never lie in memory as a whole."""
-    count, number, columns = data.shape
-    step = max(1, _BLOCK // (number * columns * data.dtype.itemsize))
-    if data.chunks is not None:  # no chunk is decompressed for two blocks
-        step = -(-step // data.chunks[0]) * data.chunks[0]
-    points = np.zeros((count, number, 3), dtype=np.float32)
-    for start in range(0, count, step):
-        with np.errstate(over="ignore"):
-            points[start : start + step] = data[start : start + step][..., :3]
-    finite = np.isfinite(points).all(axis=(1, 2))
-    if not finite.all():
-        raise InputError(f"cloud {int(np.argmin(finite))} has a point that is not finite")
-    return points
+def write_hdf5(path: Path, clouds: RaggedClouds) -> None:
+    """Write a folder of files as ModelNet40 has them, y up, with ``shape_names.txt``.
 
+    Read back, clouds, class names and splits are equal. If all classes are of ModelNet40, labels
+    are those of the forty. Clouds of several sizes are brought to 2,048 points. The order within a
+    split is kept, the ids are not.
 
-def hdf5_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Return an HDF5 file of plain datasets; equal arrays give equal bytes.
-
-    Made in memory, so that a full disk shows where the bytes are written and never half-way.
+    Raises:
+        InputError: if there are no labels, a cloud is in neither train nor test, or there are more
+            than 256 classes.
     """
+    if clouds.labels is None:
+        raise InputError("this layout needs labels, and the clouds have none")
+    if not clouds.splits or not set(clouds.splits) <= set(SPLITS):
+        raise InputError(
+            "this layout needs train or test for every cloud, and some have neither; write one "
+            "that needs none, such as --to ply"
+        )
+    names = MODELNET40_CLASSES if MODELNET40.issuperset(clouds.class_names) else clouds.class_names
+    if len(names) > _MOST_CLASSES or any(name != name.strip() or "\n" in name for name in names):
+        raise InputError(f"this layout holds {_MOST_CLASSES} classes, each one line of {_NAMES}")
+    labels = map_labels(clouds.class_names, clouds.labels, names)[0].astype(np.uint8)[:, None]
+    sizes = {len(cloud) for cloud in clouds.clouds}
+    points = stack(clouds.clouds, None if len(sizes) == 1 else POINTS, "this layout")
+    data = z_up_to_y_up(points).astype(np.float32)
+    path.mkdir(parents=True, exist_ok=True)
+    write_text(path / _NAMES, "".join(f"{name}\n" for name in names))
+    for split in SPLITS:
+        rows = np.flatnonzero(np.array(clouds.splits) == split)
+        for number, start in enumerate(range(0, len(rows), CLOUDS_A_FILE)):
+            own = rows[start : start + CLOUDS_A_FILE]
+            write_bytes(path / f"ply_data_{split}{number}.h5", _bytes(data[own], labels[own]))
+
+
+def _bytes(data: np.ndarray, label: np.ndarray) -> bytes:
+    """Return an HDF5 file; equal arrays give equal bytes."""
     import h5py
 
     buffer = io.BytesIO()
     with h5py.File(buffer, "w") as file:
-        for name, array in arrays.items():
-            file.create_dataset(name, data=array, track_times=False)
+        file.create_dataset("data", data=data, track_times=False)
+        file.create_dataset("label", data=label, track_times=False)
     return buffer.getvalue()
+
+
+FORMAT = Format(
+    name="h5",
+    layout="HDF5 with data and label: ply_data_<train|test>*.h5 (ModelNet40), "
+    "<training|test>_objectdataset*.h5 (ScanObjectNN) or <train|test>_*.h5 (PointDA-10's ScanNet)",
+    detect=lambda path: bool(find(path, _MODELNET40, _SCANOBJECTNN)),
+    read=read_hdf5,
+    write=write_hdf5,
+)

@@ -1,15 +1,18 @@
 """NumPy archives of clouds, of equal sizes (``points`` [b n 3]) or not (with ``offset``)."""
 
+import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int
 
 from qs3.errors import InputError
-from qs3.files import sha256
+from qs3.escapes import utf8
+from qs3.files import sha256, write_bytes
 from qs3.io.clouds import RaggedClouds
-from qs3.io.guards import check_announced, load_npy, naming, open_zip, read_member
 from qs3.io.layouts.format import SPLITS, Format
+from qs3.reading import check_size, naming, reading
 
 _PER_CLOUD = ("label", "is_train", "name", "strict", "frame")
 
@@ -45,8 +48,7 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
         split: ``train`` or ``test`` by ``is_train``; a part of `frame_parts`; None takes all.
 
     Raises:
-        InputError: where the file is missing, damaged, announces more than it can hold, or holds
-            other arrays.
+        InputError: if the file cannot be read (see `qs3.reading.reading`) or holds other arrays.
     """
     arrays = _read(path := Path(path))
     with naming(path):
@@ -69,23 +71,41 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
     )
 
 
+def write_npz(path: Path, clouds: RaggedClouds) -> None:
+    """Write an archive that `read_npz` reads back equal; splits other than train and test are lost.
+
+    Raises:
+        InputError: if the name does not end in .npz.
+    """
+    if path.suffix.lower() != ".npz":
+        raise InputError(f"{path.name}: name a file that ends in .npz")
+    sizes = [len(cloud) for cloud in clouds.clouds]
+    points = np.concatenate([np.asarray(cloud, np.float32) for cloud in clouds.clouds])
+    arrays: dict[str, Any] = {"points": points, "name": np.array([utf8(n) for n in clouds.ids])}
+    if len(set(sizes)) == 1:
+        arrays["points"] = points.reshape(len(sizes), -1, 3)
+    else:
+        arrays["offset"] = np.cumsum([0, *sizes])
+    if clouds.labels is not None:
+        arrays["label"] = clouds.labels
+        arrays["class_names"] = np.array([utf8(name) for name in clouds.class_names])
+    if clouds.splits and set(clouds.splits) <= set(SPLITS):
+        arrays["is_train"] = np.array(clouds.splits) == "train"
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    write_bytes(path, buffer.getvalue())
+
+
 def _read(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an archive, of those that are known."""
-    arrays, whole = {}, 0
-    try:
-        with open_zip(path) as archive:
-            for name in ("points", "offset", "class_names", *_PER_CLOUD):
-                content = read_member(archive, f"{name}.npy")
-                if content is not None:
-                    whole += len(content)
-                    check_announced("all of it together", whole, whole)
-                    arrays[name] = load_npy(content)
-    except InputError as error:
-        if not path.is_file():
-            raise
-        plain = str(error).removeprefix(f"{path}: ")
-        raise InputError(f"{path}: not a NumPy archive of plain arrays ({plain})") from error
-    return arrays
+    """Return the arrays that have a known name."""
+    with reading(path, "NPZ"), path.open("rb") as handle:
+        archive = np.load(handle, allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise InputError("not a NumPy archive of plain arrays")
+        with archive:
+            check_size("its content", sum(entry.file_size for entry in archive.zip.infolist()))
+            names = {"points", "offset", "class_names", *_PER_CLOUD} & set(archive.files)
+            return {name: archive[name] for name in names}
 
 
 def _clouds(arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
@@ -149,4 +169,5 @@ FORMAT = Format(
     layout="one NumPy archive with points [b n 3], label, class_names, is_train and name",
     detect=lambda path: path.suffix.lower() == ".npz" and path.is_file(),
     read=read_npz,
+    write=write_npz,
 )

@@ -23,7 +23,6 @@ protocol: Achituve et al., "Self-Supervised Learning for Domain Adaptation on Po
 
 import dataclasses
 import hashlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -33,20 +32,19 @@ from jaxtyping import Float, Float32
 from qs3.errors import InputError
 from qs3.geometry import y_up_to_z_up
 from qs3.io.clouds import RaggedClouds
-from qs3.io.layouts.format import SPLITS, Format, labels_as, named_folder
-from qs3.io.layouts.hdf5_sets import list_parts, named, read_parts, same_size, write_parts
-from qs3.io.layouts.point_folders import write_folder
-from qs3.io.layouts.trees import read_ten_classes
+from qs3.io.layouts import hdf5
+from qs3.io.layouts.folders import choose_split, list_folder, read_files
+from qs3.io.layouts.format import SPLITS, Format
 from qs3.io.preparation import unit_ball
-from qs3.meshes.classes import POINTDA10
+from qs3.meshes.classes import POINTDA10, map_labels
+from qs3.reading import naming
 
-Protocol = Literal["aligned", "original", "upright", "raw"]
-"""What is done to the clouds as they are stored; see `read_pointda10`."""
+Protocol = Literal["aligned", "original"]
+"""How stored clouds are prepared; see `read_pointda10`."""
 Domain = Literal["modelnet", "shapenet", "scannet"]
 
 DOMAINS: tuple[Domain, ...] = ("modelnet", "shapenet", "scannet")
 ORIGINAL_POINTS = 1024
-_FILES = r"(train|test)_(\d+)\.h5"
 _PLANT = POINTDA10.index("plant")
 
 
@@ -65,8 +63,6 @@ def read_pointda10(
     - ``original`` (PointDAN 2019): the first 1,024 points, centred and scaled to the unit ball, in
       ShapeNet filled up with zeros where there are fewer; nothing is turned. Its training turns
       clouds at random about x, which is nobody's up axis there.
-    - ``upright``: turned z up, in the size and place of the file.
-    - ``raw``: as stored.
 
     Args:
         path: ``<root>/modelnet``, ``<root>/shapenet`` or ``<root>/scannet``; the root itself where
@@ -80,13 +76,13 @@ def read_pointda10(
             the ten, a file is bad, or a protocol is unknown.
     """
     if protocol not in get_args(Protocol):
-        raise InputError(f"protocol {protocol!r}: choose aligned, original, upright or raw")
+        raise InputError(f"protocol {protocol!r}: choose aligned or original")
     root, domain = _domain(Path(path), domain)
     if domain == "scannet":
-        parts = list_parts(root, _FILES, "train_<i>.h5 or test_<i>.h5", split)
-        clouds = read_parts(parts, POINTDA10, (3, 6), turn=False)
+        files, _ = hdf5.list_files(root)
+        clouds = hdf5.read_files(choose_split(root, files, split), POINTDA10)
     else:
-        clouds = read_ten_classes(root, split, ".npy")
+        clouds = _read_classes(root, split)
     labels = [] if clouds.labels is None else clouds.labels.tolist()
     prepared = [
         _prepare(cloud, protocol, domain, label)
@@ -96,18 +92,29 @@ def read_pointda10(
     return dataclasses.replace(clouds, clouds=prepared, checksum=checksum)
 
 
+def _read_classes(root: Path, split: str | None) -> RaggedClouds:
+    """Read ``<class>/<train|test>/*.npy``, folders named after PointDA-10's ten classes."""
+    files = list_folder(root, (".npy",))
+    for file in files:
+        if file.split not in SPLITS or not file.class_name:
+            raise InputError(f"{file.path}: lies outside <class>/<train|test>/ of this layout")
+    names = sorted({file.class_name for file in files})
+    with naming(root):
+        positions, _ = map_labels(names, np.arange(len(names)))
+    clouds = read_files(root, choose_split(root, files, split), names)
+    return dataclasses.replace(clouds, labels=positions[clouds.labels], class_names=POINTDA10)
+
+
 def _prepare(
     cloud: Float[np.ndarray, "n 3"], protocol: Protocol, domain: Domain, label: int
 ) -> Float32[np.ndarray, "m 3"]:
-    if protocol == "raw":
-        return cloud
     if protocol == "original":
         cloud = unit_ball(cloud[None, :ORIGINAL_POINTS])[0]
         short = ORIGINAL_POINTS - len(cloud)
         return np.pad(cloud, ((0, short), (0, 0))) if domain == "shapenet" else cloud
     if domain == "scannet" or (domain == "shapenet" and label != _PLANT):
         cloud = y_up_to_z_up(cloud)
-    return cloud if protocol == "upright" else unit_ball(cloud[None])[0]
+    return unit_ball(cloud[None])[0]
 
 
 def _domain(path: Path, domain: Domain | None) -> tuple[Path, Domain]:
@@ -122,7 +129,7 @@ def _domain(path: Path, domain: Domain | None) -> tuple[Path, Domain]:
         raise InputError(f"{path}: holds several domains of PointDA-10; name one: {several}")
     if inside:
         return path / inside[0], inside[0]
-    if named(path, _FILES):
+    if hdf5.find(path, hdf5.POINTDA10_SCANNET):
         return path, "scannet"
     for name in DOMAINS:
         if _is_called(path, name):
@@ -139,7 +146,7 @@ def _is_called(path: Path, name: str) -> bool:
 
 def _is_domain(path: Path, domain: Domain) -> bool:
     if domain == "scannet":
-        return named(path, _FILES)
+        return path.is_dir() and bool(hdf5.find(path, hdf5.POINTDA10_SCANNET))
     return any((path / name / part).is_dir() for name in POINTDA10 for part in SPLITS)
 
 
@@ -150,71 +157,19 @@ def _detect(path: Path) -> bool:
     )
 
 
-def write_npy(path: Path, clouds: RaggedClouds) -> None:
-    """Write the tree of the domain modelnet, z up, into ``modelnet`` below ``path``.
-
-    Read back as ``upright`` or ``raw``, clouds, labels and splits are equal; as ``aligned`` they
-    are the unit balls of the clouds. Where the clouds have one size it is kept; otherwise all are
-    brought to 2,048 points. All ten classes get a folder, since some loaders count folders.
-    """
-    labels = labels_as(clouds, POINTDA10)
-    points = same_size(clouds)
-    root = named_folder(path, "modelnet")
-    for name in POINTDA10:
-        for part in SPLITS:
-            (root / name / part).mkdir(parents=True, exist_ok=True)
-    ten = dataclasses.replace(clouds, clouds=list(points), labels=labels, class_names=POINTDA10)
-    write_folder(root, ten, ".npy")
-
-
-def write_h5(path: Path, clouds: RaggedClouds) -> None:
-    """Write the files of the domain scannet, y up, into ``scannet`` below ``path``.
-
-    ``data`` is float32 with black for colour; 2,048 clouds a file. Each cloud is stored as
-    (x, z, −y), which is turned back without rounding: read as ``upright``, clouds, labels and
-    splits are equal; as ``aligned`` they are `preparation.unit_ball` of the clouds, to the bit.
-    Sizes as in `write_npy`; the order within a split is kept, the ids are not.
-    """
-    labels = labels_as(clouds, POINTDA10).astype(np.int32)
-    files = ("train_{}.h5", "test_{}.h5")
-    write_parts(named_folder(path, "scannet"), clouds, labels, files, columns=6, listed="./")
-
-
-_LAYOUT = "modelnet/ or shapenet/ with <class>/<train|test>/*.npy, or scannet/<train|test>_*.h5"
-
-
-_WRITTEN: dict[str, Callable[[Path, RaggedClouds], None]] = {
-    "pointda10-npy": write_npy,
-    "pointda10-h5": write_h5,
-}
-
-
-def _format(name: str, protocol: Protocol, layout: str) -> Format:
+def _format(name: str, protocol: Protocol, how: str) -> Format:
     return Format(
         name=name,
-        layout=layout,
-        # One layout is found out; its files read in other ways, and the writers' own readers, are
-        # chosen by --from alone.
-        detect=_detect if name == "pointda10" else lambda path: False,
+        layout=f"a domain of PointDA-10, {how}: modelnet/ or shapenet/ with "
+        "<class>/<train|test>/*.npy, or scannet/<train|test>_*.h5",
+        # The same files: the other protocol is chosen by --from alone.
+        detect=_detect if protocol == "aligned" else lambda path: False,
         read=lambda path, split: read_pointda10(path, split, protocol),
-        write=_WRITTEN.get(name),
         page="https://drive.google.com/file/d/1-LfJWL5geF9h0Z2QpdTL0n4lShy8wy2J (PointDA_data.zip)",
     )
 
 
-_UPRIGHT = "the same, turned z up but not scaled; written as"
 FORMATS = (
-    _format(
-        "pointda10",
-        "aligned",
-        f"a domain of PointDA-10, turned z up, in the unit ball: {_LAYOUT}",
-    ),
-    _format(
-        "pointda10-original",
-        "original",
-        f"the same as PointDAN read it, not turned, the first 1,024 points: {_LAYOUT}",
-    ),
-    _format("pointda10-raw", "raw", f"the same as stored: {_LAYOUT}"),
-    _format("pointda10-npy", "upright", f"{_UPRIGHT} modelnet/<class>/<train|test>/*.npy"),
-    _format("pointda10-h5", "upright", f"{_UPRIGHT} scannet/<train|test>_*.h5"),
+    _format("pointda10", "aligned", "turned z up, in the unit ball"),
+    _format("pointda10-original", "original", "as PointDAN read it, the first 1,024 points"),
 )

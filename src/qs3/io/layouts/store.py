@@ -12,13 +12,11 @@ import numpy as np
 from jaxtyping import Bool
 
 from qs3.errors import InputError
+from qs3.escapes import utf8
 from qs3.files import parse_json
-from qs3.io import scratch
 from qs3.io.clouds import CloudChoice, CloudKind, RaggedClouds
-from qs3.io.guards import utf8
 from qs3.io.layouts.format import SPLITS, Format
 from qs3.io.layouts.npz import frame_parts
-from qs3.io.scratch import Spool
 from qs3.processors import usable_processors
 from qs3.store.manifest import (
     Manifest,
@@ -63,7 +61,7 @@ def read_ragged(
         )
     kinds = get_args(CloudKind) if cloud == "all" else (cloud,)
     rows: list[tuple[str, int, str]] = []
-    clouds: list[np.ndarray] | Spool | None = None
+    clouds: list[np.ndarray] = []
     parts = {} if split in (None, *SPLITS) else _frame_parts(folder, shards)
     splits, done = {*parts}, 0
     digest = hashlib.sha256()
@@ -73,9 +71,6 @@ def read_ragged(
         for columns, scanned, checksum in read:
             digest.update(checksum)
             splits.update(columns[2])
-            if clouds is None:
-                size = sum(cloud.nbytes for own in scanned for cloud in own) * len(shards)
-                clouds = Spool() if size >= scratch.LARGE else []
             chosen = [i for i, part in enumerate(columns[2]) if split in (None, part)]
             if split in parts:
                 chosen = np.flatnonzero(parts[split][done : done + len(columns[0])]).tolist()

@@ -1,0 +1,277 @@
+"""Folders of point files: one folder a class, or all in one without labels.
+
+``<root>/<class>/<train|test>/<name>.<ending>``; the level of the split is left out if it is
+unknown, that of the class if there are no labels.
+"""
+
+import hashlib
+import os
+import re
+import urllib.parse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from qs3.errors import InputError
+from qs3.escapes import utf8
+from qs3.files import sha256
+from qs3.io.clouds import RaggedClouds
+from qs3.io.layouts.format import SPLITS, Format
+from qs3.io.ply import ply_bytes
+from qs3.io.point_files import POINT_FILES, is_scene, read_cloud
+from qs3.store.progress import cloud_bar
+
+_LONGEST_NAME = 180
+_DEPTH = 3
+
+
+@dataclass(frozen=True)
+class CloudFile:
+    """One file of a data set, not yet read."""
+
+    path: Path
+    """The file."""
+    class_name: str
+    """Name of the class of all in it; empty where no folder tells one."""
+    split: str
+    """``train``, ``test`` or empty."""
+
+
+def read_folder(
+    root: Path, split: str | None = None, endings: Sequence[str] = POINT_FILES
+) -> RaggedClouds:
+    """Read the clouds of a folder in one of these layouts.
+
+    ``<root>/<class>/*``, ``<root>/<class>/<train|test>/*`` or ``<root>/<train|test>/<class>/*``;
+    without labels ``<root>/*``, ``<root>/<train|test>/*`` or ``<root>/<scene>/*`` as
+    ``qs3 segment`` makes it of a folder. Files of other endings and hidden
+    ones are passed over; ``split`` None takes every other file.
+
+    Returns:
+        Clouds in the order of their classes and names. Classes are those of all splits, sorted.
+
+    Raises:
+        InputError: where the folder is missing, has no cloud or no such split, has clouds both
+            beside and in class folders, or a file is bad; the file is named.
+    """
+    root = Path(root)
+    files = list_folder(root, endings)
+    names = sorted({file.class_name for file in files})
+    return read_files(root, choose_split(root, files, split), () if names == [""] else names)
+
+
+def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudFile]:
+    """List the cloud files of a folder without reading them; all as `read_folder` does."""
+    if not root.is_dir():
+        raise InputError(f"{root}: no such folder")
+    folders = entries(root, os.DirEntry.is_dir)
+    inner = {folder: entries(folder, os.DirEntry.is_dir) for folder in folders}
+    # A class may be named train.
+    split_first = all(f.name in SPLITS for f in folders) and not any(
+        path.name in SPLITS for paths in inner.values() for path in paths
+    )
+    places = [(root, "", "")]
+    for folder in folders:
+        if split_first:
+            places.append((folder, "", folder.name))
+            places += [(path, _class_name(path), folder.name) for path in inner[folder]]
+        else:
+            places.append((folder, _class_name(folder), ""))
+            places += [(folder / split, folder.name, split) for split in SPLITS]
+    files = [
+        CloudFile(path, utf8(name), split)
+        for place, name, split in places
+        for path in entries(place, lambda e: Path(e.name).suffix.lower() in endings and e.is_file())
+    ]
+    loose = [file.path for file in files if not file.class_name]
+    beside = [path for path in loose if path.parent == root]
+    if 0 < len(loose) < len(files) or 0 < len(beside) < len(files):
+        raise InputError(
+            f"{loose[0].parent}: has clouds both in class folders and beside them "
+            f"({loose[0].name}); move either away"
+        )
+    if not files:
+        raise InputError(
+            f"{root}: no cloud found; known are {', '.join(endings)} in it, in <class>/ or in "
+            "<class>/<train|test>/"
+        )
+    return files
+
+
+def _class_name(folder: Path) -> str:
+    """A folder's name; empty for what qs3 segment made of a scene, whose name tells no class."""
+    return "" if is_scene(folder) else folder.name
+
+
+def choose_split(root: Path, files: Sequence[CloudFile], split: str | None) -> list[CloudFile]:
+    """Keep the files of one split, of which there must be some; None keeps all."""
+    if split is None:
+        return list(files)
+    parts = sorted({file.split for file in files if file.split})
+    if split not in parts:
+        raise InputError(
+            f"{root}: has no split {split!r}, only {', '.join(parts) or 'clouds without one'}"
+        )
+    return [file for file in files if file.split == split]
+
+
+def read_files(
+    root: Path,
+    files: Sequence[CloudFile],
+    class_names: Sequence[str],
+    read: Callable[[Path], np.ndarray] = read_cloud,
+    kind: str = "",
+) -> RaggedClouds:
+    """Read cloud files in their order; their names below ``root`` become the ids.
+
+    Labels index ``class_names``; without any there are no labels. ``kind`` tells what ``read``
+    makes of a file, where that is not its points, for the checksum.
+    """
+    names = tuple(class_names)
+    digest = hashlib.sha256(kind.encode())
+    clouds, ids = [], []
+    for file in cloud_bar(files, "read", len(files)):
+        ids.append(utf8(file.path.relative_to(root).as_posix()))
+        digest.update(f"{ids[-1]} {sha256(file.path)}\n".encode())
+        clouds.append(read(file.path))
+    splits = tuple(file.split for file in files)
+    return RaggedClouds(
+        clouds=clouds,
+        ids=tuple(ids),
+        checksum=digest.hexdigest(),
+        labels=np.array([names.index(f.class_name) for f in files], np.int64) if names else None,
+        class_names=names,
+        splits=splits if any(splits) else (),
+    )
+
+
+def entries(folder: Path, wanted: Callable[[os.DirEntry[str]], bool]) -> list[Path]:
+    """What a folder holds of a kind, hidden entries aside, in order; nothing where it is none."""
+    if not folder.is_dir():
+        return []
+    with os.scandir(folder) as listed:
+        names = [entry.name for entry in listed if entry.name[0] != "." and wanted(entry)]
+    return [folder / name for name in sorted(names)]
+
+
+def write_folder(root: Path, clouds: RaggedClouds) -> None:
+    """Write each cloud as one PLY; read back with `read_folder`, clouds and labels are equal.
+
+    An id becomes the name of the file: without the class, the split and the ending that it may
+    begin and end with, its parts joined by ``_``, and anything unusual in it as ``%XX``.
+
+    Args:
+        root: Folder to make.
+        clouds: What to write.
+
+    Raises:
+        InputError: where a class name cannot name a folder, or a split is neither train nor test.
+    """
+    folders = _cloud_folders(clouds)
+    taken: set[str] = set()
+    for folder in sorted(set(folders)):
+        (root / folder).mkdir(parents=True, exist_ok=True)
+    rows = zip(clouds.clouds, clouds.ids, folders, strict=True)
+    for cloud, identifier, folder in cloud_bar(rows, "write", len(clouds.clouds)):
+        stem = name = f"{folder}/{file_stem(identifier, folder)}".lstrip("/")
+        number = 1
+        while name.casefold() in taken:
+            number += 1
+            name = f"{stem}-{number}"
+        taken.add(name.casefold())
+        (root / f"{name}.ply").write_bytes(ply_bytes(cloud))
+
+
+def _cloud_folders(clouds: RaggedClouds) -> list[str]:
+    """The folder of each cloud below the root: class, class/split, split or nothing."""
+    splits = clouds.splits or ("",) * len(clouds.ids)
+    if other := sorted({split for split in splits if split not in ("", *SPLITS)}):
+        raise InputError(
+            f"split {other[0]!r} has no folder in this layout, which knows train and test; choose "
+            "one with --split and write it alone"
+        )
+    if clouds.labels is None:
+        if len(set(splits)) > 1 and "" in splits:
+            raise InputError("some clouds have a split and others none; choose one with --split")
+        return list(splits)
+    names = [clouds.class_names[label] for label in sorted(set(clouds.labels.tolist()))]
+    for name in names:
+        check_class(name)
+    folded = [name.casefold() for name in names]
+    if len(set(folded)) < len(folded):
+        raise InputError(
+            f"classes {', '.join(names)}: two differ in capitals only and would share a folder on "
+            "some systems; rename one"
+        )
+    labels = clouds.labels.tolist()
+    return [
+        f"{clouds.class_names[label]}/{split}".rstrip("/")
+        for label, split in zip(labels, splits, strict=True)
+    ]
+
+
+def check_class(name: str) -> None:
+    """Refuse a class that cannot name a folder."""
+    plain = name.isprintable() and not set(name) & set('/\\:*?"<>|')
+    if not plain or not name or name != name.strip(" ") or name[0] == "." or name[-1] == ".":
+        raise InputError(f"class {name!r} cannot name a folder; rename it")
+    if name in SPLITS or len(name.encode()) > _LONGEST_NAME:
+        raise InputError(
+            f"class {name[:40]!r} cannot name a folder (too long, or the name of a split)"
+        )
+
+
+def file_stem(identifier: str, folder: str = "") -> str:
+    """Return a file name without ending for an id; it holds no separator and never leads outside.
+
+    Args:
+        identifier: Any text.
+        folder: Folder it goes to, such as ``chair/train``; left out where the id begins with it.
+
+    Example:
+        >>> file_stem("chair/train/chair_0001.off", "chair/train"), file_stem("../../a#0")
+        ('chair_0001', '%2E._.._a_0')
+    """
+    name = identifier.removeprefix(f"{folder}/") if folder else identifier
+    for ending in POINT_FILES:
+        if name.lower().endswith(ending) and len(name) > len(ending):
+            name = name[: -len(ending)]
+            break
+    name = re.sub(r"[/\\#\s]+", "_", name)
+    name = urllib.parse.quote(name, safe="", errors="backslashreplace") or "_"
+    if name[0] == ".":
+        name = "%2E" + name[1:]
+    if len(name) > _LONGEST_NAME:
+        digest = hashlib.sha256(identifier.encode(errors="backslashreplace")).hexdigest()
+        name = f"{name[: _LONGEST_NAME - 17]}-{digest[:16]}"
+    return name
+
+
+def _detect(root: Path) -> bool:
+    """Return whether a point file lies in the folder or up to two levels below."""
+    endings: set[str] = set()
+    for folder, inner, files in os.walk(root, followlinks=True):
+        depth = len(Path(folder).relative_to(root).parts)
+        inner[:] = [name for name in inner if not name.startswith(".") and depth < _DEPTH - 1]
+        endings.update(Path(name).suffix.lower() for name in files if not name.startswith("."))
+    return not endings.isdisjoint(POINT_FILES)
+
+
+FORMATS = (
+    Format(
+        name="folder",
+        layout=f"a folder of point files ({', '.join(POINT_FILES)}), <class>/<train|test>/* or "
+        "fewer levels",
+        detect=_detect,
+        read=read_folder,
+    ),
+    Format(
+        name="ply",
+        layout="the same, PLY files alone: <class>/<train|test>/*.ply or fewer levels",
+        detect=lambda root: False,  # such a folder is found as `folder`
+        read=lambda root, split: read_folder(root, split, (".ply",)),
+        write=write_folder,
+    ),
+)
