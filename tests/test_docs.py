@@ -19,10 +19,8 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 sys.path.insert(0, str(DOCS))
 try:
-    import make_method_pages
-    import make_sensor_sheet
-    import site_api
-    import site_hooks
+    import hooks
+    import make
 finally:
     sys.path.remove(str(DOCS))
 
@@ -96,7 +94,7 @@ def test_links_to_descriptions_of_code_lead_to_what_there_is():
             there = (page.parent / path).resolve()
             package = re.search(r"<!-- package: ([\w.]+) -->", text(there))
             assert package is not None, path
-            modules = re.findall(r"^::: (\S+)$", site_api.body(package[1]), re.MULTILINE)
+            modules = re.findall(r"^::: (\S+)$", hooks.body(package[1]), re.MULTILINE)
             module, _, own = name.rpartition(".")
             assert module in modules, name
             tree = ast.parse(text((ROOT / "src" / module.replace(".", "/")).with_suffix(".py")))
@@ -109,27 +107,27 @@ def test_every_public_package_has_its_page():
     marked = re.findall(
         r"<!-- package: ([\w.]+) -->", "".join(text(page) for page in (DOCS / "api").glob("*.md"))
     )
-    assert sorted(marked) == sorted(site_api.PACKAGES)
+    assert sorted(marked) == sorted(hooks.PACKAGES)
     folders = {p.parent.name for p in (ROOT / "src" / "qs3").glob("[!_]*/__init__.py")} - {"cli"}
-    assert {f"qs3.{name}" for name in folders} | {"qs3"} == set(site_api.PACKAGES)
-    body = site_api.body("qs3.training")
+    assert {f"qs3.{name}" for name in folders} | {"qs3"} == set(hooks.PACKAGES)
+    body = hooks.body("qs3.training")
     assert "[`fit`](#qs3.training.fit.fit)" in body
     assert "\n::: qs3.training.fit\n" in body
-    assert "[`scan`](sensor.md#qs3.sensor.scan.scan)" in site_api.body("qs3")
+    assert "[`scan`](sensor.md#qs3.sensor.scan.scan)" in hooks.body("qs3")
 
 
 ASK = """
-import json, site_hooks
+import json, hooks
 from qs3.cli import VERBS
 verbs = list(VERBS)
 asked = [verb for verb in verbs if verb != "extract"]
 asked += [f"extract {name}" for name in ("scannet", "nyuv2", "depth", "bag", "rosbag")]
-told = {v: site_hooks.options_of(site_hooks.help_of(v.split())) for v in asked}
+told = {v: hooks.options_of(hooks.help_of(v.split())) for v in asked}
 try:
-    refused = site_hooks.options_table(["no-such-verb"])
+    refused = hooks.options_table(["no-such-verb"])
 except ValueError as error:
     refused = str(error)
-table = site_hooks.options_table(["info"])
+table = hooks.options_table(["info"])
 print(json.dumps({"verbs": verbs, "options": told, "table": table, "refused": refused}))
 """
 
@@ -235,9 +233,9 @@ def test_python_on_the_pages_compiles(page):
 
 
 def test_the_picture_of_the_sensors_is_of_the_presets_as_they_are():
-    """Else `python docs/make_sensor_sheet.py` draws it anew."""
-    with Image.open(make_sensor_sheet.PICTURE) as picture:
-        assert picture.info["presets"] == make_sensor_sheet.presets()
+    """Else `python docs/make.py sensor` draws it anew."""
+    with Image.open(make.SENSOR_PICTURE) as picture:
+        assert picture.info["presets"] == make.presets()
 
 
 def test_every_method_has_a_page_in_step_with_the_others():
@@ -246,8 +244,8 @@ def test_every_method_has_a_page_in_step_with_the_others():
     for page in (DOCS / "methods").glob("*.md"):
         page_text = text(page)
         # What stands between markers is that of docs/adaptation.md and docs/settings.md:
-        # `python docs/make_method_pages.py` brings it there.
-        assert make_method_pages.filled(page_text) == page_text, page.name
+        # `python docs/make.py methods` brings it there.
+        assert make.filled(page_text) == page_text, page.name
         if page.stem != "index":
             if page.stem not in ("source-only", "qs3"):
                 assert f"--method {page.stem}" in page_text, page.name
@@ -279,7 +277,7 @@ def test_published_figures_of_the_methods_are_those_of_the_table():
 
 
 def test_examples_are_shown_whole():
-    page = site_hooks.examples()
+    page = hooks.examples()
     for path in (ROOT / "examples").glob("*.py"):
         assert path.read_text(encoding="utf-8") in page
 
@@ -287,4 +285,4 @@ def test_examples_are_shown_whole():
 def test_what_a_page_would_load_from_the_network_is_found():
     html = """<script src="https://a/x.js"></script><link rel=stylesheet href=//b/x.css>
     <img alt="" src='http://c/x.png'><a href="https://d">d</a><img src="images/x.png">"""
-    assert site_hooks.fetched(html) == ["https://a/x.js", "//b/x.css", "http://c/x.png"]
+    assert hooks.fetched(html) == ["https://a/x.js", "//b/x.css", "http://c/x.png"]

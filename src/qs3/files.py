@@ -1,17 +1,13 @@
-"""Files written whole or not at all, fresh temporary folders, locks, strict JSON, checksums."""
+"""Files and folders written whole or not at all, one lock, strict JSON, checksums."""
 
 import contextlib
 import errno
-import glob
 import hashlib
 import json
-import math
 import os
 import re
 import secrets
 import shutil
-import socket
-import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,13 +15,10 @@ from typing import Any
 from qs3.errors import InputError, StorageError
 
 LOCK = ".lock"
-"""Name of the file that tells who writes into a folder; it is there only meanwhile."""
+"""Name of the lock file in a folder; it may stay there, unlocked."""
 
-_LEFT_OVER = re.compile(r"\..+\.(\d+|[0-9a-f]{8})\.tmp(\.\w+)?$")
-_SUSPECT = re.compile(r"\\u[dD][89a-fA-F]")
-"""What halves of surrogate pairs look like in JSON."""
+_LEFT_OVER = re.compile(r"\.[0-9a-f]{16}\.tmp(\.\w+)?")
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_LONGEST_STEM = 100  # bytes of a name that go into a temporary one; the longest name may have 143
 
 
 @contextlib.contextmanager
@@ -36,89 +29,34 @@ def atomic_path(path: Path) -> Iterator[Path]:
     the old one or the whole new one. On an exception the temporary file is removed.
 
     Raises:
-        StorageError: where the disk is full; ``path`` is named.
+        StorageError: if the disk is full; ``path`` is named.
 
     Example:
-        >>> with temporary_folder(Path(tempfile.gettempdir()) / "example") as folder:
-        ...     with atomic_path(folder / "a.txt") as temporary:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with atomic_path(Path(folder) / "a.txt") as temporary:
         ...         _ = temporary.write_text("whole")
-        ...     (folder / "a.txt").read_text()
+        ...     (Path(folder) / "a.txt").read_text()
         'whole'
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    # A random name: nobody can have put a link there to lead the write elsewhere.
     ending = path.suffix if len(path.suffix) < 16 else ""  # some writers go by it
-    temporary = path.with_name(f".{_stem(path)}.{secrets.token_hex(4)}.tmp{ending}")
+    temporary = path.with_name(f".{secrets.token_hex(8)}.tmp{ending}")
     try:
-        with _faults_named(path, temporary):
+        with _disk_faults(path, temporary):
             yield temporary
-            sync_entry(temporary)
+            _sync(temporary)
             temporary.replace(path)
             with contextlib.suppress(OSError):  # some file systems sync no folders
-                sync_entry(path.parent)
+                _sync(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
-def temporary_folder(path: Path, alone: bool = False) -> Iterator[Path]:
-    """Yield a fresh folder beside ``path``, removed with all that is in it at the end.
-
-    Its name is random: no folder that is there already is taken for it, and no link followed. It
-    holds nothing but its lock. What a killed process left behind for the same ``path`` is removed.
-
-    Raises:
-        InputError: where another process has such a folder at this moment, and ``alone`` is asked.
-    """
-    path = Path(path).absolute()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    for entry in path.parent.glob(f".{glob.escape(_stem(path))}.????????.tmp"):
-        if (entry / LOCK).is_file() and not entry.is_symlink():
-            others = contextlib.nullcontext() if alone else contextlib.suppress(InputError)
-            with others, folder_lock(entry):  # nobody's any more
-                shutil.rmtree(entry, ignore_errors=True)
-    folder = Path(tempfile.mkdtemp(prefix=f".{_stem(path)}.", suffix=".tmp", dir=path.parent))
-    try:
-        with folder_lock(folder):
-            yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-@contextlib.contextmanager
-def new_folder(path: Path) -> Iterator[Path]:
-    """Yield the path of a folder to make, which becomes ``path`` when the block ends well.
-
-    Raises:
-        InputError: where ``path`` is there already and no empty folder, at the beginning or at the
-            end: what has come meanwhile stays, and what was made goes.
-        StorageError: where the disk is full; ``path`` is named.
-    """
-    path = Path(path).resolve()
-    refuse_taken(path)
-    with temporary_folder(path, alone=True) as folder, _faults_named(path):
-        whole = folder / path.name  # some layouts go by it
-        yield whole
-        for inner, _, files in os.walk(whole):
-            for entry in (*files, ""):
-                sync_entry(Path(inner) / entry)
-        if path.is_dir():
-            with folder_lock(path):
-                remove_left_overs(path)
-            if any(path.iterdir()):
-                raise InputError(
-                    f"{path}: was empty, but something has come meanwhile, which is left as it "
-                    "is; nothing was written, name a new or empty folder and run it again"
-                )
-            path.rmdir()
-        whole.rename(path)
-    sync_entry(path.parent)
-
-
-@contextlib.contextmanager
-def _faults_named(path: Path, temporary: Path | None = None) -> Iterator[None]:
-    """Put the file's name into an error of writing; a full disk is told with what to do."""
+def _disk_faults(path: Path, temporary: Path | None = None) -> Iterator[None]:
+    """Name ``path`` in an error of writing, and say what to do about a full disk."""
     try:
         yield
     except OSError as error:
@@ -132,83 +70,60 @@ def _faults_named(path: Path, temporary: Path | None = None) -> Iterator[None]:
         raise
 
 
-def _stem(path: Path) -> str:
-    """The name of a path, as much of it as leaves room for a mark within the longest name."""
-    return os.fsencode(path.name)[:_LONGEST_STEM].decode(errors="ignore")
+@contextlib.contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """Yield the path of a folder to make, which becomes ``path`` when the block ends well.
+
+    Raises:
+        InputError: if ``path`` is a file or a folder with content, at the beginning or at the end,
+            or another process makes it at this moment.
+        StorageError: if the disk is full; ``path`` is named.
+    """
+    path = Path(path).resolve()
+    refuse_taken(path)
+    temporary = path.with_name(f".{path.name}.tmp")
+    temporary.mkdir(parents=True, exist_ok=True)
+    with folder_lock(temporary), _disk_faults(path):
+        try:
+            whole = temporary / path.name  # some layouts go by it
+            if whole.exists():  # left by a killed process
+                shutil.rmtree(whole)
+            yield whole
+            for inner, _, files in os.walk(whole):
+                for entry in (*files, ""):
+                    _sync(Path(inner) / entry)
+            refuse_taken(path)
+            if path.is_dir():
+                shutil.rmtree(path)
+            whole.rename(path)
+            _sync(path.parent)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
 
 
 @contextlib.contextmanager
 def folder_lock(path: Path) -> Iterator[None]:
-    """Keep a second process from writing into a folder; a killed one lets go.
-
-    The system's own lock on the file ``.lock``, which names process and machine. Where a file
-    system has none, that name decides: a process of this machine that has ended lets go.
+    """Keep a second process from writing into a folder; a killed one releases it.
 
     Raises:
-        InputError: where another process holds it; process and machine are named.
+        InputError: if another process holds it.
     """
-    file = Path(path) / LOCK
-    handle = _open_lock(file)
+    import filelock
+
+    lock = filelock.FileLock(Path(path) / LOCK)
     try:
-        with _faults_named(file):
-            os.ftruncate(handle, 0)
-            os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()}".encode(), 0)
+        lock.acquire(blocking=False)
+    except filelock.Timeout:
+        raise InputError(
+            f"{path}: another qs3 is writing into this folder; wait for it, or name another one"
+        ) from None
+    try:
         yield
     finally:
-        file.unlink(missing_ok=True)
-        os.close(handle)
+        lock.release()
 
 
-def _open_lock(file: Path) -> int:
-    """Open and lock a file that nobody else holds."""
-    while True:
-        refuse_link(file)
-        handle = os.open(file, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
-        try:
-            _lock(handle, file)
-            with contextlib.suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(handle), file.stat()):
-                    return handle
-        except BaseException:
-            os.close(handle)
-            raise
-        os.close(handle)  # it was let go, and its file removed, since we opened it
-
-
-def _lock(handle: int, file: Path) -> None:
-    holder = os.read(handle, 200).decode(errors="replace")
-    try:
-        import fcntl
-
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return
-    except ImportError:  # Windows
-        return
-    except BlockingIOError:
-        advice = "wait for it, or name another one"
-    except OSError:  # a file system without locks
-        if _has_ended(holder):
-            return
-        advice = f"wait for it or, if it has ended, remove {file}"
-    by = f" ({holder})" if holder else ""
-    raise InputError(f"{file.parent}: another qs3 is writing into this folder{by}; {advice}")
-
-
-def _has_ended(holder: str) -> bool:
-    """Whether the process that a lock names is gone for certain."""
-    process, _, machine = holder.removeprefix("process ").partition(" on ")
-    if machine != socket.gethostname() or not process.isdigit():
-        return not holder
-    try:
-        os.kill(int(process), 0)
-    except (ProcessLookupError, OverflowError):
-        return True
-    except PermissionError:
-        return False
-    return int(process) == os.getpid()  # ours since it was started: that one has ended
-
-
-def sync_entry(path: Path) -> None:
+def _sync(path: Path) -> None:
     """Bring a file, or the names in a folder, to disk."""
     if os.name == "nt" and path.is_dir():  # Windows opens no folder
         return
@@ -245,7 +160,7 @@ def read_json(path: Path) -> Any:
     """Read a JSON file.
 
     Raises:
-        InputError: where the file is missing or is not JSON.
+        InputError: if the file is missing or is not JSON.
     """
     path = Path(path)
     if not path.is_file():
@@ -254,39 +169,23 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(data: bytes | str, where: str | Path) -> Any:
-    """Read JSON text, strictly: what comes back can be written again as JSON in UTF-8.
-
-    So no NaN, no infinity (1e999), no half of a surrogate pair, no whole number of thousands of
-    digits; nor is a file read that is nested deeper than Python goes.
+    """Read JSON text; NaN and infinity are refused.
 
     Raises:
-        InputError: where it is not such JSON; ``where`` heads the message.
+        InputError: if it is not JSON; ``where`` heads the message.
 
     Example:
         >>> parse_json(b'{"a": [1, 2]}', "a.json")
         {'a': [1, 2]}
     """
     try:
-        text = data.decode() if isinstance(data, bytes) else data.encode().decode()
-        value = json.loads(text, parse_constant=_refuse, parse_float=_finite)
-        if _SUSPECT.search(text):
-            json.dumps(value, ensure_ascii=False).encode()
-        return value
-    except RecursionError:
-        raise InputError(f"{where}: not a JSON file (nested too deep)") from None
-    except ValueError as error:  # UnicodeDecodeError and JSONDecodeError among them
+        return json.loads(data, parse_constant=_refuse)
+    except (ValueError, RecursionError) as error:  # UnicodeDecodeError and JSONDecodeError too
         raise InputError(f"{where}: not a JSON file ({str(error)[:200]})") from error
 
 
 def _refuse(constant: str) -> Any:
     raise ValueError(f"{constant} is no number of JSON")
-
-
-def _finite(word: str) -> float:
-    number = float(word)
-    if math.isinf(number):
-        raise ValueError(f"{word[:40]} is too large a number")
-    return number
 
 
 def sha256(path: Path) -> str:
@@ -296,7 +195,7 @@ def sha256(path: Path) -> str:
 
 
 def describe_others(others: Mapping[str, int]) -> str:
-    """Tell how many files of each ending were passed over; empty where none was.
+    """Count the skipped files of each ending in one line; empty if there are none.
 
     Example:
         >>> describe_others({".npz": 1, ".csv": 3})
@@ -306,17 +205,17 @@ def describe_others(others: Mapping[str, int]) -> str:
 
 
 def holds_something(path: Path) -> bool:
-    """Whether ``path`` is a folder with content, left-overs of an interrupted write aside."""
+    """Return whether ``path`` is a folder with content, other than a lock or an unfinished file."""
     return path.is_dir() and any(
-        entry.name != LOCK and not _LEFT_OVER.match(entry.name) for entry in path.iterdir()
+        entry.name != LOCK and not _LEFT_OVER.fullmatch(entry.name) for entry in path.iterdir()
     )
 
 
 def refuse_taken(path: Path) -> None:
-    """Refuse a folder to make where something is already.
+    """Refuse the path of a new folder if something is there.
 
     Raises:
-        InputError: where ``path`` is a file, or a folder that is not empty.
+        InputError: if ``path`` is a file, or a folder that is not empty.
     """
     path = Path(path).resolve()
     if not path.name or (path.exists() and (not path.is_dir() or holds_something(path))):
@@ -324,42 +223,21 @@ def refuse_taken(path: Path) -> None:
 
 
 def remove_left_overs(path: Path) -> None:
-    """Remove what interrupted writes left in a folder; nobody else may be writing there."""
+    """Remove the unfinished files of killed processes; nobody else may be writing there."""
     for entry in Path(path).iterdir():
-        if _LEFT_OVER.match(entry.name) and entry.is_file():
+        if _LEFT_OVER.fullmatch(entry.name):
             entry.unlink()
-
-
-def refuse_link(path: Path) -> None:
-    """Refuse a link where a file or folder of ours belongs: it leads to somebody else's.
-
-    Raises:
-        InputError: where it is one.
-    """
-    if path.is_symlink():
-        raise InputError(f"{path}: is a link, which qs3 does not follow; remove it")
-
-
-def sub_folder(path: Path) -> Path:
-    """Return a folder of ours within another, made if absent.
-
-    Raises:
-        InputError: where it is a link: what is written there would land elsewhere.
-    """
-    refuse_link(path)
-    path.mkdir(parents=True, exist_ok=True)
-    return path
 
 
 def claim_folder(path: Path, marker: str) -> Path:
     """Return ``path`` as an output folder: made if absent, accepted if empty or ours.
 
     Args:
-        path: The folder the user named.
+        path: The folder that the user named.
         marker: Name of the file that shows that an earlier run of the same command made it.
 
     Raises:
-        InputError: where it is a file, or a folder that holds something else.
+        InputError: if it is a file, or a folder that holds something else.
     """
     path = Path(path)
     if path.exists() and not path.is_dir():

@@ -1,16 +1,20 @@
 """``qs3 demo`` and training that goes on from a network without its source."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from qs3.cli.demo import DemoSettings, _adapt, _read_target, _rounds
-from qs3.io.clouds import PointClouds
-from qs3.training import TrainSettings, fit, load_model, read_run
+import qs3 as package
+from qs3.cli import demo as module
+from qs3.meshes import POINTDA10
+from qs3.training import load_model, read_run
 
-SIZE = ("--share", 1.0, "--rounds", 1, "--round-epochs", 1, "--workers", 1)
+from ..stores import write_store
+
+ROUNDS = {"threshold_share": 1.0, "rounds": 1, "epochs": 1}
 
 
 @pytest.fixture(scope="module")
@@ -25,67 +29,66 @@ def scans(tmp_path_factory):
     return folder
 
 
+@pytest.fixture
+def small(monkeypatch):
+    """The smallest demo."""
+    for name, value in {"SAMPLES": 1, "TARGET": 2, "SOURCE": 1, "SURFACES": 1, "EPOCHS": 1}.items():
+        monkeypatch.setattr(module, f"_{name}", value)
+    monkeypatch.setattr(module, "_ROUNDS", ROUNDS | {"source_loss": True})
+
+
+def write_source(folder, *_, **__):
+    if not folder.exists():
+        write_store(folder, POINTDA10, [(row % 10, "train", 64) for row in range(40)])
+
+
 @pytest.mark.slow
-def test_a_demo_of_the_smallest_size(qs3, run, tmp_path):
-    # Ten clouds are too few for a round, which the exit code says; the page is made all the same.
-    size = ("--network", run, "--per-class", 1, "--samples", 1, "--sensor", "kinect-v1",
-            "--variant", "scalar_rgb", "--source-per-class", 1, "--surfaces-per-class", 1,
-            *SIZE)  # fmt: skip
+@pytest.mark.usefixtures("small")
+def test_a_demo_of_the_smallest_size(typed, tmp_path):
     out = tmp_path / "demo"
-    done = qs3("demo", "--out", out, *size, code=4)
-    assert str(out / "report.html") in done.stdout
-    told = [line.partition("target, ")[2] for line in done.stdout.splitlines()]
-    told = [line.partition(":")[0] for line in told if line]
-    assert told == ["surfaces alone", f"{run} as it comes", f"{run} after QBST"]
-    assert done.stdout.count("95 % interval") == 3
-    assert "10 clouds, whose labels served this score alone" in done.stdout
+    first = typed("demo", "--out", out, "--workers", 1)
+    lines = [line for line in first.stdout.splitlines() if line.startswith("accuracy")]
+    assert [line.split(", ")[1].partition(":")[0] for line in lines] == [
+        "surfaces only", "rooms", "QBST",
+    ]  # fmt: skip
+    assert all("95 % interval" in line for line in lines)
+    assert f"report: {out / 'report.html'}" in first.stdout
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "http://" not in page.replace("http://www.w3.org", "")
-    assert "qbst" in page
-    assert "learnt here from surfaces alone, seen by no camera: 1 shapes a class" in page
-    again = qs3("demo", "--out", out, *size, code=4)
-    assert again.stdout == done.stdout
-    (out / "report.html").unlink()
-    alone = qs3("demo", "--out", out, *size, "--surfaces-per-class", 0, code=4)
-    assert "surfaces alone" not in alone.stdout
-    assert "accuracy on the target" in alone.stdout
+    assert typed("demo", "--out", out, "--workers", 1).stdout == first.stdout
 
 
-def test_a_demo_on_ones_own_scans_tells_answers_and_no_score(qs3, scans, tmp_path):
+@pytest.mark.usefixtures("small")
+def test_own_scans_get_answers_and_no_score(typed, scans, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "_scan", write_source)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rooms").mkdir()  # a folder with the network's name is not taken for it
     out = tmp_path / "demo"
-    done = qs3("demo", "--out", out, "--scans", scans, "--source-per-class", 0, *SIZE)
+    done = typed("demo", "--out", out, "--scans", scans)
     rows = [line.split() for line in done.stdout.splitlines()[1:11]]
     assert [sum(int(row[place]) for row in rows) for place in (1, 2)] == [40, 40]
     assert "accuracy" not in done.stdout
-    table = (out / "predictions.csv").read_text("utf-8").splitlines()
-    assert len(table) == 41
-    page = (out / "report.html").read_text(encoding="utf-8")
-    assert "scans, by predicted class" in page
-    assert "Labels of the target" not in page
+    assert len((out / "predictions.csv").read_text("utf-8").splitlines()) == 41
+    assert (out / "report.html").is_file()
     assert not list((out / "before").glob("records/*"))
-    size = ("--source-per-class", 0, *SIZE, "--share", 0.01)
-    none = qs3("demo", "--out", tmp_path / "none", "--scans", scans, *size, code=4)
-    assert "raise --share" in none.stderr
-    assert "report.html" in none.stdout
 
 
 @pytest.mark.filterwarnings("ignore::qs3.adaptation.selection.SingleClassWarning")
-def test_poisoned_labels_do_not_reach_the_demos_network(run, tmp_path):
+def test_poisoned_labels_do_not_reach_the_adapted_network(tmp_path):
+    write_source(tmp_path / "source")
     rng = np.random.default_rng(1)
     points = rng.normal(size=(40, 64, 3)) * rng.uniform(0.2, 2, size=(40, 1, 3))
-    states, settings = [], DemoSettings(share=1.0, rounds=2, source_per_class=0)
+    states = []
     for case, shift in {"true": 0, "wrong": 1}.items():
-        folder = tmp_path / case
-        folder.mkdir()
+        path = tmp_path / f"{case}.npz"
         labels = (np.arange(40) + shift) % 10
-        names = np.array(load_model(run).class_names)
-        np.savez(folder / "target.npz", points=points, label=labels, class_names=names)
-        clouds = _read_target(folder / "target.npz", run)
-        _adapt(clouds, _rounds(settings), run, settings, folder)
-        states.append(load_model(folder / "qbst").model.state_dict())
+        np.savez(path, points=points, label=labels, class_names=np.array(POINTDA10))
+        package.adapt(tmp_path / "source", path, tmp_path / case, warm_up="rooms",
+                      self_training=ROUNDS)  # fmt: skip
+        states.append(load_model(tmp_path / case / "run").model.state_dict())
     first, second = states
     assert all(torch.equal(first[name], second[name]) for name in first)
-    before = load_model(run).model.state_dict()
+    before = load_model(Path("rooms")).model.state_dict()
     assert not all(torch.equal(first[name], before[name]) for name in first)
 
 
@@ -110,24 +113,10 @@ def test_self_training_goes_on_from_a_network_without_its_source(qs3, scans, run
     assert "--source" in code.stderr
 
 
-def test_what_the_demo_cannot_do_is_told_before_a_scan_is_made(qs3, scans, tmp_path):
+def test_unreadable_scans_are_refused_before_a_scan_is_made(qs3, tmp_path):
     out, bad = tmp_path / "demo", tmp_path / "bad"
-    assert "threshold_share" in qs3.refuses("demo", "--out", out, "--scans", scans, "--share", 0)
     bad.mkdir()
     np.save(bad / "broken.npy", np.full((40, 3), np.nan))
     assert "broken.npy" in qs3.refuses("demo", "--out", out, "--scans", bad)
-    points = np.random.default_rng(2).normal(size=(8, 40, 3)).astype(np.float32)
-    ids = tuple(map(str, range(8)))
-    screws = PointClouds(points, np.arange(8) % 2, ("bolt", "nut"), ids)
-    small = TrainSettings(model="pointnet", num_points=32, epochs=1, batch_size=4, threads=1)
-    fit("source-only", screws, None, small, run_dir=tmp_path / "own")
-    told = qs3.refuses("demo", "--out", out, "--network", tmp_path / "own")
-    assert "does not know all classes of the shapes" in told
+    assert "no such folder" in qs3.refuses("demo", "--out", out, "--scans", tmp_path / "none")
     assert not out.exists()
-
-
-def test_a_folder_with_the_networks_name_is_not_taken_for_it(qs3, scans, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "rooms").mkdir()
-    assert "rooms: not a run of qs3" in qs3.refuses("demo", "--out", "demo", "--scans", scans)
-    assert not (tmp_path / "demo").exists()

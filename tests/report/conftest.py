@@ -6,24 +6,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qs3.evaluation.metrics import mean_sem
-from qs3.evaluation.records import DataRecord, score
-from qs3.report.contents import Cloud, FeatureMap, Report, Scored
-from qs3.report.lines import ScoreLine
+from qs3.evaluation.records import Scores, score
 from qs3.report.montage import MontageView
-from qs3.report.page import write_report
-from qs3.report.plots import Curve, SelectionRound
+from qs3.report.page import Cloud, Report, write_report
+from qs3.report.plots import Curve
+from qs3.training.rounds import RoundRecord
 
 from ..stores import write_store
 
 HOSTILE = '</script><script>alert(\'x\')</script><img src="http://example.org/a.png" onerror="b()">'
 
 
-def scored(name: str, matrix: np.ndarray, class_names, paired: bool = False) -> Scored:
-    """A network with this confusion matrix; a column more than classes is none of them."""
+def scored(matrix: np.ndarray, class_names) -> Scores:
+    """Scores with this confusion matrix; a column more than classes is an answer outside them."""
     true, answers = (np.repeat(index.ravel(), matrix.ravel()) for index in np.indices(matrix.shape))
-    answers = np.where(answers < len(class_names), answers, -1)
-    return Scored(name, score(true, answers, class_names), true == answers if paired else None)
+    return score(true, np.where(answers < len(class_names), answers, -1), class_names)
+
+
+def a_round(index: int, kept: list[int], above: list[int], **more) -> RoundRecord:
+    facts = {"agreement": None, "skipped": False, "single_class": False, "held_out": None}
+    facts |= {"theta": 0.8 + 0.01 * index, "pool": 9, "losses": (), "seconds": 0.0} | more
+    return RoundRecord(round=index, confident=tuple(above), kept=tuple(kept), **facts)
 
 
 @pytest.fixture(scope="session")
@@ -36,59 +39,30 @@ def report() -> Report:
     cloud = rng.normal(size=(60, 3)).astype(np.float32)
     names = ("bed", f"chair {HOSTILE}", "table")
     clouds = [
-        Cloud(rng.normal(size=(50, 3)).astype(np.float32), name, f"Taken for {HOSTILE}")
+        Cloud(rng.normal(size=(50, 3)).astype(np.float32), name, f"qbst: {HOSTILE}")
         for name in names
     ]
-    matrix = np.array([[6, 4, 0], [5, 5, 0], [0, 5, 5]])
+    matrix = np.array([[6, 4, 0, 0], [5, 5, 0, 0], [0, 5, 4, 1]])
     epochs = np.arange(1, 5)
     return Report(
         title=f"Title {HOSTILE}",
         summary=f"Summary {HOSTILE}",
         class_names=names,
-        before=scored(f"before {HOSTILE}", matrix, names),
-        after=scored(f"after {HOSTILE}", np.array([[10, 0, 0], [0, 10, 0], [0, 1, 9]]), names),
-        command=f"qs3 demo {HOSTILE}",
-        settings={"seed": 0, "sensor": {"views": 5, "name": HOSTILE}},
-        versions={"qs3": f"0.1.0 {HOSTILE}"},
+        scores={
+            f"before {HOSTILE}": scored(matrix, names),
+            f"after {HOSTILE}": scored(np.array([[10, 0, 0], [0, 10, 0], [0, 1, 9]]), names),
+        },
+        notes=(f"Note {HOSTILE}",),
         montage=MontageView(image, image, 30 / depth, depth, true, cloud, cloud, np.eye(16)),
         montage_title=f"mesh {HOSTILE}",
-        data={"source": DataRecord(f"data {HOSTILE}", "0a" * 32, 30)},
         clouds={"source": [*clouds, *clouds], f"target {HOSTILE}": clouds},
-        mistakes={f"scan {HOSTILE}": clouds[1:], "source": clouds[:2]},
-        nearest={"lone": clouds[:1]},
-        maps=(
-            FeatureMap(
-                f"map {HOSTILE}",
-                rng.normal(size=(9, 2)),
-                np.arange(9) % 3,
-                ("source",) * 5 + (f"target {HOSTILE}",) * 4,
-            ),
-        ),
-        scores=(
-            ScoreLine(
-                name=f"line {HOSTILE}",
-                network="dgcnn",
-                data=f"a → b {HOSTILE}",
-                selection="last",
-                accuracy=mean_sem([0.5, 0.6]),
-                class_mean_accuracy=mean_sem([0.4, 0.6]),
-                class_names=names,
-                confusion=np.pad(matrix, ((0, 0), (0, 1))),
-                seeds=(0, 1),
-                differs=f"theta {HOSTILE}",
-                published="72.4 ± 0.8",
-                choices={"last": mean_sem([0.5, 0.6]), "oracle": mean_sem([0.7, 0.8])},
-                marks=("transductive", f"mark {HOSTILE}"),
-            ),
-        ),
-        published_source=f"paper {HOSTILE}",
         curves=(Curve(f"loss {HOSTILE}", epochs, 1.0 / epochs),),
         marks=(2.0,),
         rounds=(
-            SelectionRound(1, 0.8, np.array([5, 0, 3]), np.array([2, 0, 2]), 0.5),
-            SelectionRound(2, 0.805, np.array([1, 0, 0]), np.zeros(3, int), None, HOSTILE),
+            a_round(1, [2, 0, 2], [5, 0, 3], agreement=0.5),
+            a_round(2, [0, 0, 0], [1, 0, 0], skipped=True),
         ),
-        notes=(f"Note {HOSTILE}",),
+        settings={"seed": 0, "sensor": {"views": 5, "name": HOSTILE}},
     )
 
 

@@ -7,21 +7,12 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from qs3.errors import InputError
-from qs3.report.figure import AFTER, BEFORE, PALETTE, class_colour, png_bytes
-from qs3.report.plots import (
-    Curve,
-    SelectionRound,
-    class_accuracy,
-    confusion_heatmap,
-    selection_counts,
-    training_curves,
-)
+from qs3.report.figure import PALETTE, class_colour, png_bytes
+from qs3.report.plots import Curve, confusion_heatmap, selection_counts, training_curves
+
+from .conftest import a_round
 
 NAMES = ("bed", "chair", "table")
-
-
-def a_round(index: int, kept: list[int], above: list[int], note: str = "") -> SelectionRound:
-    return SelectionRound(index, 0.8 + 0.01 * index, np.array(above), np.array(kept), note=note)
 
 
 def test_curves_of_one_panel_share_axes():
@@ -44,7 +35,7 @@ def test_curves_of_one_panel_share_axes():
 
 
 def test_bars_stack_to_what_was_selected():
-    rounds = [a_round(1, [3, 0, 2], [5, 0, 2]), a_round(2, [0, 0, 0], [1, 0, 1], "skipped")]
+    rounds = [a_round(1, [3, 0, 2], [5, 0, 2]), a_round(2, [0, 0, 0], [1, 0, 1], skipped=True)]
     figure = selection_counts(rounds, NAMES)
     theta, bars = figure.axes
     np.testing.assert_allclose(theta.lines[0].get_ydata(), [0.81, 0.82])
@@ -56,7 +47,7 @@ def test_bars_stack_to_what_was_selected():
 
 def test_confusion_shades_by_row_and_writes_counts():
     matrix = np.array([[8, 2, 0, 0], [0, 1, 0, 3], [0, 0, 0, 0]])
-    axes = confusion_heatmap(matrix, NAMES, "before").axes[0]
+    axes = confusion_heatmap(matrix.tolist(), NAMES, "before").axes[0]
     shown = np.asarray(axes.images[0].get_array())
     np.testing.assert_allclose(shown, [[0.8, 0.2, 0, 0], [0, 0.25, 0, 0.75], [0, 0, 0, 0]])
     written = {tuple(map(int, t.get_position()))[::-1]: t.get_text() for t in axes.texts}
@@ -65,25 +56,13 @@ def test_confusion_shades_by_row_and_writes_counts():
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("predicted", "true")
 
 
-def test_class_bars_and_classes_without_a_cloud():
-    before, after = np.array([0.5, 0.0, np.nan]), np.array([1.0, 0.25, np.nan])
-    axes = class_accuracy(before, after, NAMES, np.array([2, 4, 0]), ("old", "new")).axes[0]
-    assert [[bar.get_width() for bar in group] for group in axes.containers] == [
-        [50, 0, 0],
-        [100, 25, 0],
-    ]
-    assert [t.get_text() for t in axes.get_yticklabels()] == ["bed (2)", "chair (4)", "table (0)"]
-    assert [t.get_text() for t in axes.texts].count("no cloud") == 1
-    assert axes.get_ylim()[0] > axes.get_ylim()[1]  # the first class is on top
-
-
 def test_rounds_of_other_classes_are_refused():
     with pytest.raises(InputError, match="not of 3 classes"):
         selection_counts([a_round(1, [1, 2], [1, 2])], NAMES)
 
 
 def test_names_are_text_not_formulas():
-    figure = confusion_heatmap(np.eye(2, dtype=int), ("a$b$", r"$\frac{"))
+    figure = confusion_heatmap(((1, 0), (0, 1)), ("a$b$", r"$\frac{"))
     assert len(png_bytes(figure, dpi=50)) > 1000
 
 
@@ -97,12 +76,11 @@ def test_colours_differ_for_the_colour_blind():
         gap = np.abs(seen[:, None] - seen[None]).max(axis=-1) + np.eye(len(seen))
         assert gap.min() > 0.1
     assert class_colour(3) != class_colour(4)
-    assert abs(np.mean(to_rgb(BEFORE)) - np.mean(to_rgb(AFTER))) > 0.3
 
 
 def test_no_global_state_of_pyplot():
     before = dict(matplotlib.rcParams)
-    png_bytes(confusion_heatmap(np.eye(2, dtype=int), ("a", "b")), dpi=30)
+    png_bytes(confusion_heatmap(((1, 0), (0, 1)), ("a", "b")), dpi=30)
     assert dict(matplotlib.rcParams) == before
     code = "import sys, qs3.report.page; "
     code += "sys.exit('matplotlib.pyplot' in sys.modules or 'torch' in sys.modules)"

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from qs3.files import LOCK
 from qs3.meshes.classes import POINTDA10
 from qs3.sensor.compiled import compiled
 from qs3.store.generate import GenerateReport, GenerateSettings, Item, generate, scan_seed
@@ -39,9 +40,8 @@ def run(items, out, settings=SETTINGS, *, row=None, **how) -> GenerateReport:
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    """Every file of a folder, whatever its depth."""
-    files = (path for path in folder.rglob("*") if path.is_file())
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+    """Every file of a data set but its lock."""
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name != LOCK}
 
 
 def fake_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:

@@ -42,7 +42,7 @@ def surface(points: Float[Tensor, "b n 3"], neighbours: int = 32) -> Surface:
             all of them.
 
     Raises:
-        InputError: where there are fewer than 3 neighbours.
+        InputError: if there are fewer than 3 neighbours.
 
     Example:
         >>> plane = torch.cartesian_prod(torch.arange(4.0), torch.arange(4.0), torch.zeros(1))

@@ -102,7 +102,7 @@ def deform_voxels(points: Float[Tensor, "b n 3"], generator: torch.Generator) ->
 def deform_radius(points: Float[Tensor, "b n 3"], generator: torch.Generator) -> Deformed:
     """Collapse a ball around a random point to that point: volume-based, as released ("radius").
 
-    The ball, of radius 0.5, should have 20 points, the seed among them; where none has so many, the
+    The ball, of radius 0.5, should have 20 points, the seed among them; if none has so many, the
     seed is the first of those with most points, in a random order.
     """
     b, n, _ = points.shape

@@ -36,7 +36,7 @@ def chamfer(
     there is no mask all points count.
 
     Returns:
-        One distance a pair; 0 where one of the two has no point that counts.
+        One distance a pair; 0 if one of the two has no point that counts.
 
     Example:
         >>> x, y = torch.zeros(1, 2, 3), torch.ones(1, 1, 3)

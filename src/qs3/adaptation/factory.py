@@ -26,7 +26,7 @@ def method_class(name: str) -> "type[Method]":
     """Return the class of a method.
 
     Raises:
-        InputError: where the name is unknown.
+        InputError: if the name is unknown.
 
     Example:
         >>> method_class("source-only").uses_target
@@ -54,7 +54,7 @@ def create_method(
         settings: Further fields of the method; those left out keep the paper's values.
 
     Raises:
-        InputError: where the name or a setting is unknown, a value is unusable, or the network
+        InputError: if the name or a setting is unknown, a value is unusable, or the network
             does not give what the method needs.
     """
     kind = method_class(name)

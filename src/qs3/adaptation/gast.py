@@ -63,7 +63,7 @@ def location_weights(
 ) -> Float[Tensor, "b"]:
     """Share of each cloud's curvature that was distorted, scaled to a mean of 1 over the batch.
 
-    A cloud without curvature counts as evenly curved. All weigh the same where nothing curved was
+    A cloud without curvature counts as evenly curved. All weigh the same if nothing curved was
     distorted in any cloud.
 
     Example:
@@ -83,7 +83,7 @@ def location_loss(
     located: Int[Tensor, "b"],
     weights: Float[Tensor, "b"] | None = None,
 ) -> Float[Tensor, ""]:
-    """Cross entropy with the distorted cell, each cloud weighted; evenly where there are none."""
+    """Cross entropy with the distorted cell, each cloud weighted; evenly without weights."""
     each = nn.functional.cross_entropy(logits.float(), located, reduction="none")
     return each.mean() if weights is None else (weights * each).mean()
 
@@ -106,7 +106,7 @@ class GAST(Method):
     cell itself is drawn without regard to curvature, as there. The curvature is the surface
     variation over 32 neighbours of the cloud as the step sees it, jitter included.
     NOTE: the cell is the first with 20 points in a random order of each cloud's own, and the
-    fullest one where none has so many; the released order is the batch's.
+    fullest one if none has so many; the released order is the batch's.
     NOTE: labels mix as round(λ n) / n. The location layer is linear on every network; the released
     PointNet has a hidden layer there. In the released code the rotation task is off by default.
 

@@ -1,4 +1,4 @@
-"""What a method of adaptation offers to the training loop."""
+"""Base class of the methods of adaptation."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
@@ -14,7 +14,7 @@ from qs3.models import Features, PointClassifier, feature_widths
 from qs3.models.sized import Sized
 
 Target = Float[Tensor, "b_t n_t 3"] | None
-"""Clouds of the target; None where a method does without."""
+"""Clouds of the target; None if a method does without."""
 
 Terms = dict[str, Tensor]
 """Scalar losses by name."""
@@ -28,7 +28,7 @@ class Batch(NamedTuple):
     labels: Int[Tensor, "b"]
     """Their classes, or pseudo labels."""
     parts: tuple[int, ...] = ()
-    """Numbers of clouds from each of several sets, in order; empty where there is one set."""
+    """Numbers of clouds from each of several sets, in order; empty if there is one set."""
 
 
 def cross_entropy(
@@ -59,7 +59,7 @@ class Method(nn.Module, ABC):
     unusable ones and makes what else is trained.
 
     Raises:
-        InputError: where a setting is unusable, or the method needs local features and the network
+        InputError: if a setting is unusable, or the method needs local features and the network
             has none.
     """
 
@@ -68,7 +68,7 @@ class Method(nn.Module, ABC):
     needs_local: ClassVar[bool] = False
     """Whether the method needs ``Features.local`` of the network."""
     in_unit_ball: ClassVar[bool] = False
-    """Whether it takes clouds of radius 1 alone, not those of a network that is told their size."""
+    """Whether it takes clouds of radius 1 alone, not those of a `Sized` network."""
 
     model: PointClassifier = field(kw_only=False)
     """The network to train."""
@@ -100,7 +100,7 @@ class Method(nn.Module, ABC):
 
         Args:
             source: Labelled clouds.
-            target: Clouds of the target; None where `uses_target` is false.
+            target: Clouds of the target; None if `uses_target` is false.
             progress: Share of the training that is done, 0 to 1.
             generator: Source of every random draw of the method (on the CPU).
         """

@@ -26,7 +26,7 @@ Selection = Literal["most-confident", "least-confident"]
 """End of a class's ranking by confidence that is kept."""
 
 SingleClass = Literal["keep", "drop"]
-"""What becomes of the confident clouds where all of them have one class (μ = 0)."""
+"""What becomes of the confident clouds if all of them have one class (μ = 0)."""
 
 Rule = Literal["last", "source-val", "entropy", "im", "bnm", "snd", "dev", "class-ami"]
 """How the network is chosen among a run's checkpoints; no rule looks at a label of the target."""
@@ -59,7 +59,7 @@ def split_method(method: str, rounds: str | None = None) -> tuple[str, str | Non
     ``rounds`` is a rule that is asked for beside it.
 
     Raises:
-        InputError: where the method has a rule of its own and another one is asked for.
+        InputError: if the method has a rule of its own and another one is asked for.
 
     Example:
         >>> split_method("qbst"), split_method("gast", "qbst"), split_method("dann")

@@ -42,7 +42,7 @@ def draw_share(concentration: float, generator: Generator) -> float:
 def sample_spread(
     points: Float[Tensor, "b n 3"], m: int, generator: Generator
 ) -> Float[Tensor, "b m 3"]:
-    """Sample m farthest points of each cloud from a random start; none where m is 0."""
+    """Sample m farthest points of each cloud from a random start; none if m is 0."""
     start = torch.randint(points.shape[1], (len(points),), generator=generator).to(points.device)
     if m == 0:
         return points[:, :0]
@@ -133,7 +133,7 @@ class PCM(Method):
     def mixed(self, batch: Batch, generator: Generator) -> Float[Tensor, ""]:
         """Return the loss on the source, and note how many clouds the network had right.
 
-        A mixed cloud counts as right where it is given the class of its larger part.
+        A mixed cloud counts as right if it is given the class of its larger part.
         """
         mixed = mix_clouds(batch.points, batch.labels, generator, self.concentration)
         logits = self.model(mixed.points)

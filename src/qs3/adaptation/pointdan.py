@@ -117,10 +117,10 @@ class PointDAN(Method):
       and minimised at once, with a constant ``node_weight``.
     - The reversal's coefficient grows with every step there is, not with every epoch.
     - The trained network decides by its own head, the first classifier, not by the mean of the two,
-      so that it is a plain network; the second classifier is this head anew.
+      so that it is a plain network; the second classifier has fresh weights.
     - On networks other than ``pointnet-sa`` the nodes are not interpolated back into the network,
       and their offsets learn from the MMD instead (``steered`` of the module of nodes).
-    - The source weight is 1; the authors take 0.5 where the target is ScanNet, and on ScanNet to
+    - The source weight is 1; the authors take 0.5 if the target is ScanNet, and on ScanNet to
       ShapeNet.
 
     """

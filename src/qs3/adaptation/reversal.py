@@ -8,7 +8,7 @@ from torch import Tensor
 def reverse_gradient(x: Float[Tensor, "*shape"], coefficient: float) -> Float[Tensor, "*shape"]:
     """Return ``x``; its gradient is multiplied by −coefficient (Ganin & Lempitsky, ICML 2015).
 
-    What comes after minimises a loss while what comes before maximises it, in one backward pass.
+    Layers after it minimise a loss while layers before it maximise it, in one backward pass.
 
     Example:
         >>> x = torch.tensor([3.0], requires_grad=True)

@@ -24,15 +24,14 @@ VERBS = {
     "train": "Train a classifier, with a method of adaptation to an unlabelled target if asked.",
     "evaluate": "Score a run: accuracy, class-mean accuracy, confusion matrix.",
     "predict": "Tell the class of each file and how confident the network is.",
-    "watch": "Tell what stands before a depth camera, frame by frame.",
+    "watch": "Print the objects before a depth camera, frame by frame.",
     "export": "Export a network as ONNX or for PyTorch.",
     "reproduce": "Make tables and figures anew, with their data and trainings.",
     "table": "Print a table, ours beside the published figures, from records alone.",
     "figure": "Draw the figure of a table from records alone.",
-    "report": "Write one self-contained HTML page.",
-    "view": "Look at data, a run or a mesh in a browser on this machine.",
+    "report": "Write one self-contained HTML page about a run.",
+    "view": "Step through a data set, a run's answers or one cloud in a browser, until Ctrl-C.",
     "doctor": "Print what works on this machine and how to get what does not.",
-    "completion": "Print what a shell needs to complete verbs and options.",
     "demo": "Adapt a network that comes with qs3 to a camera, without labels: scan, adapt, report.",
 }
 """A line of help for each verb; it is a function of its own module but for those in `ELSEWHERE`."""
@@ -94,6 +93,10 @@ def _run(given: list[str]) -> int:
 
         show(f"qs3 {version('qs3')}")
         return 0
+    if verb in ("--tyro-print-completion", "--tyro-write-completion"):
+        from qs3.cli.options import complete
+
+        return complete(given)
     from qs3.errors import InputError, no_such
 
     if verb not in VERBS:
@@ -117,5 +120,6 @@ def _help() -> str:
             *lines,
             "",
             "The options of a verb: qs3 VERB --help",
+            "The tab key, in ~/.bashrc: source <(qs3 --tyro-print-completion bash)",
         ]
     )

@@ -13,6 +13,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
+from qs3.cli import ELSEWHERE, VERBS
 from qs3.cli.text import printable, tell
 from qs3.errors import QS3Error
 
@@ -38,10 +39,25 @@ def run_verb(verb: str, place: str, text: str, words: list[str]) -> int:
             verbs = {name: _later(each) for name, each in function.items()}
             call = tyro.extras.subcommand_cli_from_dict(verbs, description=text, **how)
         else:
-            asked = [] if "--tyro-print-completion" in words else words
-            given = module.defaults(asked) if hasattr(module, "defaults") else {}
+            given = module.defaults(words) if hasattr(module, "defaults") else {}
             call = tyro.cli(functools.partial(_later(function), **given), **how)
     return call()
+
+
+def complete(words: list[str]) -> int:
+    """Print or write tyro's completion script for all verbs."""
+    app = tyro.extras.SubcommandApp()
+    for verb in VERBS:
+        name, _, function_name = ELSEWHERE.get(verb, f"{verb}.{verb}").partition(".")
+        function: Any = getattr(importlib.import_module(f"qs3.cli.{name}"), function_name)
+        if isinstance(function, dict):
+            inner = tyro.extras.SubcommandApp()
+            for own, each in function.items():
+                inner.command(each, name=own)
+            app.command(inner, name=verb)
+        else:
+            app.command(function, name=verb)
+    return app.cli(prog="qs3", args=words, registry=_registry)
 
 
 def _later(function: Callable[..., int]) -> Callable[..., Callable[[], int]]:

@@ -23,7 +23,7 @@ def read_settings(
     ``what`` is its name, for messages; ``fixed`` are parameters that are not settings.
 
     Raises:
-        InputError: where a setting is unknown or of another type.
+        InputError: if a setting is unknown or of another type.
     """
     table = _table(kind, fixed)
     choice = [field.name for field in dataclasses.fields(table)]

@@ -1,4 +1,4 @@
-"""What every network of this package offers."""
+"""Base class and common layers of the networks."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -15,14 +15,14 @@ from qs3.models.checks import check_range
 
 @dataclass(frozen=True)
 class Features:
-    """What a network knows of a cloud before it decides on a class."""
+    """Features of a batch of clouds, from which the head computes the logits."""
 
     pooled: Float[Tensor, "b c"]
     """One vector a cloud, the input of the head."""
     local: Float[Tensor, "b n e"] | None = None
-    """One vector a point from the earlier layers; None where a network has none."""
+    """One vector a point from the earlier layers; None if the network has none."""
     nodes: Float[Tensor, "b m f"] | None = None
-    """One vector for each of a fixed number of regions; None where a network has none."""
+    """One vector for each of a fixed number of regions; None if the network has none."""
 
 
 class PointClassifier(nn.Module, ABC):

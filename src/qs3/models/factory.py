@@ -40,7 +40,7 @@ def create_model(name: str, num_classes: int, **settings: Any) -> "PointClassifi
         settings: Arguments of that network; those left out keep their defaults.
 
     Raises:
-        InputError: where the name or a setting is unknown, or a value is unusable.
+        InputError: if the name or a setting is unknown, or a value is unusable.
 
     Example:
         >>> type(create_model("pointnet", 10, dropout=0.1)).__name__

@@ -2,7 +2,7 @@
 
 The function is the textbook's: a linear map, batch normalisation and ReLU at every (centre,
 neighbour) edge, several times, then the maximum over the neighbours (Qi et al., NeurIPS 2017).
-What is done otherwise, for speed and memory:
+The differences, for speed and memory:
 
 - Batch normalisation never runs over the edges. A linear layer's output has mean W μ and variances
   w_oᵀ Σ w_o, where μ and Σ are mean and covariance of its input; scale and shift then go into the
@@ -33,7 +33,7 @@ class GroupedMLP(nn.Module):
     """Shared layers over the points of each group, and the maximum over each group.
 
     Args:
-        channels: Width of the points' features; 0 where they have none.
+        channels: Width of the points' features; 0 if they have none.
         widths: Widths of the layers, at least two.
     """
 
@@ -169,7 +169,7 @@ class _FirstInput:
 def _rectified(
     edges: Float[Tensor, "k r c"], weight: Float[Tensor, "d c"], shift: Float[Tensor, "d"]
 ) -> Float[Tensor, "k r d"]:
-    """Return ReLU(W x + s); in place, which costs a copy where it is not done on a whole tensor."""
+    """Return ReLU(W x + s); in place, which costs a copy unless it is done on a whole tensor."""
     rows = torch.addmm(shift, edges.reshape(-1, edges.shape[2]), weight.t()).relu_()
     return rows.view(*edges.shape[:2], -1)
 

@@ -45,7 +45,7 @@ def uses_batch(norm: nn.Module) -> bool:
     normalisations are in training adapts them to what it sees.
 
     Raises:
-        InputError: where the layer is of a kind that takes statistics beyond its own batch.
+        InputError: if the layer is of a kind that takes statistics beyond its own batch.
 
     Example:
         >>> uses_batch(nn.BatchNorm1d(3)), uses_batch(nn.BatchNorm1d(3).eval())
@@ -90,7 +90,7 @@ def fold_norm(
 def update_running(
     norm: nn.BatchNorm1d, mean: Float[Tensor, "c"], variance: Float[Tensor, "c"], count: int
 ) -> None:
-    """Move the running statistics, where there are any, as batch normalisation does.
+    """Move the running statistics, if there are any, as batch normalisation does.
 
     Without a momentum they are the plain mean over all batches so far. ``count`` is the number of
     values that the mean and the biased variance are taken over.

@@ -36,8 +36,8 @@ class SANode(nn.Module):
     learnt layer's output over the points nearest to its new place. A cloud of fewer points than
     nodes has as many nodes as points.
 
-    NOTE: a ball of more points keeps its nearest, where the release keeps its first, and sampling
-    starts at the point farthest from the mean, where the release draws one: so the order of the
+    NOTE: a ball of more points keeps its nearest; the release keeps its first. Sampling
+    starts at the point farthest from the mean; the release draws one. So the order of the
     points does not matter. A ball of fewer is filled with the node's own point, which does
     not pull.
 
@@ -49,7 +49,7 @@ class SANode(nn.Module):
         radius: Of the balls, in the unit of the points.
         steered: Whether a node's feature passes a gradient to its offset: the slope, at the moved
             node, of the features interpolated between the points; the value stays the maximum. As
-            published there is none, since indices have no gradient: offsets learn only where the
+            published there is none, since indices have no gradient: offsets learn only if the
             nodes are interpolated back to the points.
 
     Example:
@@ -125,7 +125,7 @@ class PointNetSA(PointClassifier):
     Both T-Nets, two shared layers, nodes, three nearest nodes interpolated to each point and
     concatenated, two shared layers, maximum over the points, batch normalisation, one linear layer.
     Widths are those of the authors' release. ``local`` is the concatenation, ``nodes`` the nodes'
-    features; where a cloud has fewer points than nodes, they are repeated.
+    features; they are repeated if a cloud has fewer points than nodes.
 
     NOTE: layers before a batch normalisation have no bias; the T-Nets are those of
     `qs3.models.PointNet`, which start at the identity and use ReLU where the release has a leaky

@@ -70,7 +70,7 @@ class RSCNN(PointClassifier):
     itself and at most ``neighbours`` others within ``radii``.
 
     Parameters for 40 classes: 1.29 million, as the release's network has; the paper's table of
-    complexity tells 1.41 million.
+    complexity gives 1.41 million.
 
     NOTE: the release takes x_i off the coordinates in place, so that its relation is in effect
     (|x_j − x_i|, 0, x_j − x_i, x_j − x_i). In a ball of too many points it keeps those that come

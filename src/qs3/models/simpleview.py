@@ -40,7 +40,7 @@ def depth_images(points: Float[Tensor, "b n 3"], resolution: int = 128) -> Float
 
     NOTE: the release draws in perspective (90° of view), several points in a pixel by their mean
     depth weighted by 1/depth. It takes rows from x and columns from y, so that its images are
-    mirrored, and draws the origin at w/2; a network trained from scratch cannot tell.
+    mirrored, and draws the origin at w/2; a network trained from scratch learns the same.
 
     Example:
         >>> image = depth_images(torch.tensor([[[0.0, 0.0, 1.0]]]), 3)[0]
@@ -59,7 +59,7 @@ def depth_images(points: Float[Tensor, "b n 3"], resolution: int = 128) -> Float
     image = torch.arange(b * 6, device=points.device).view(b, 1, 6)
     pixels = b * 6 * resolution * resolution
     pixel = (image * resolution + row.long()) * resolution + column.long()
-    # What is not seen goes to one more pixel, which is then dropped.
+    # Unseen points go to one more pixel, which is then dropped.
     pixel = torch.where(seen, pixel, pixels).reshape(-1)
     drawn = torch.full((pixels + 1,), torch.inf, dtype=depth.dtype, device=points.device)
     drawn.scatter_reduce_(0, pixel, depth.reshape(-1), "amin")
@@ -78,7 +78,7 @@ class BasicBlock(nn.Module):
 
     The second normalisation's scale starts at 0, so that the block starts as its shortcut
     (Goyal et al., 2017, §5.1), as in SimpleView's release. The stride is that of the first
-    convolution and, where there is one, of the 1×1 shortcut.
+    convolution and, if there is one, of the 1×1 shortcut.
     """
 
     def __init__(self, channels: int, width: int, stride: int) -> None:
@@ -143,8 +143,8 @@ class SimpleView(PointClassifier):
     The features of the six views are normalised together, dropped independently, put side by side
     and classified by two fully connected layers.
 
-    NOTE: the default draws orthographic images; the release's are perspective. It has a bias before
-    the head's batch normalisation, which changes nothing, and there is none here.
+    NOTE: the release has a bias before the head's batch normalisation, which changes nothing; there
+    is none here. For the images see `depth_images`.
 
     Args:
         num_classes: k.

@@ -1,4 +1,4 @@
-"""A network that is told how large a cloud is."""
+"""Wrapper that adds the size of a cloud to the features of a network."""
 
 import torch
 from jaxtyping import Float

@@ -15,9 +15,6 @@ PALETTE = tuple(_MUTED.split())
 """Paul Tol's `muted` scheme, distinct for colour-blind readers (https://personal.sron.nl/~pault);
 its pale grey is a shade darker here, to be seen on white."""
 
-BEFORE, AFTER = "#bbbbbb", "#117733"
-"""Colours of a score before and after adaptation: also told apart by lightness alone."""
-
 NO_VALUE = "#c9c9c9"
 """Grey of pixels without a value; it is in none of the colour maps used."""
 

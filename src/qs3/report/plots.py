@@ -2,14 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Int, Num
+from jaxtyping import Num
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from qs3.errors import InputError
-from qs3.report.figure import AFTER, BEFORE, PALETTE, class_colour, house_style, short
+from qs3.report.figure import PALETTE, class_colour, house_style, short
+
+if TYPE_CHECKING:
+    from qs3.training.rounds import RoundRecord
 
 _WIDTH = 5.2  # inches: at a phone's 360 px the 10-point text is still about 10 px high
 _COLOURS = (PALETTE[0], PALETTE[6], PALETTE[3], PALETTE[7], PALETTE[2], "#000000")
@@ -28,24 +32,6 @@ class Curve:
     """Values; a NaN leaves a gap."""
     panel: str = "loss"
     """Label of the vertical axis; curves of the same panel share one."""
-
-
-@dataclass(frozen=True)
-class SelectionRound:
-    """What one round of self-training selected."""
-
-    index: int
-    """Number of the round, from 1."""
-    theta: float
-    """Threshold θ."""
-    confident: Int[np.ndarray, "k"]
-    """Clouds above the threshold, by predicted class."""
-    kept: Int[np.ndarray, "k"]
-    """Clouds selected for training, by predicted class."""
-    agreement: float | None = None
-    """Share of agreement in 0 … 1, where the run measured one."""
-    note: str = ""
-    """Remark such as "skipped: too few"."""
 
 
 @house_style
@@ -77,7 +63,7 @@ def training_curves(curves: Sequence[Curve], marks: Sequence[float] = ()) -> Fig
 
 
 @house_style
-def selection_counts(rounds: Sequence[SelectionRound], class_names: Sequence[str]) -> Figure:
+def selection_counts(rounds: "Sequence[RoundRecord]", class_names: Sequence[str]) -> Figure:
     """Draw the selected clouds of each round stacked by class, and the threshold θ above them.
 
     A dotted outline shows how many clouds were above the threshold.
@@ -87,7 +73,7 @@ def selection_counts(rounds: Sequence[SelectionRound], class_names: Sequence[str
     """
     if any(len(r.kept) != len(class_names) for r in rounds):
         raise InputError(f"selection_counts: counts are not of {len(class_names)} classes")
-    places = np.array([r.index for r in rounds])
+    places = np.array([r.round for r in rounds])
     figure = Figure(figsize=(_WIDTH, 5.6), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(1, 3.4))
     upper.plot(places, [r.theta for r in rounds], "o-", color="black", markersize=4)
@@ -99,7 +85,7 @@ def selection_counts(rounds: Sequence[SelectionRound], class_names: Sequence[str
         style = {"color": class_colour(index), "edgecolor": "white"}
         lower.bar(places, height, 0.75, floor, label=short(name), **style)
         floor += height
-    above = np.array([int(r.confident.sum()) for r in rounds])
+    above = np.array([sum(r.confident) for r in rounds])
     outline = {"color": "none", "edgecolor": "#555555", "linestyle": ":", "linewidth": 1.2}
     lower.bar(places, above, 0.83, label="above θ", zorder=0, **outline)
     lower.set(xlabel="round, and selected / above θ", ylabel="selected clouds")
@@ -114,13 +100,13 @@ def selection_counts(rounds: Sequence[SelectionRound], class_names: Sequence[str
 
 @house_style
 def confusion_heatmap(
-    matrix: Int[np.ndarray, "k columns"], class_names: Sequence[str], title: str = ""
+    counts: Sequence[Sequence[int]], class_names: Sequence[str], title: str = ""
 ) -> Figure:
     """Draw counts by true class (rows) and predicted class, shaded by the share of the row.
 
     One column more than classes counts predictions of none of them.
     """
-    k = len(class_names)
+    matrix, k = np.array(counts), len(class_names)
     total = matrix.sum(axis=1, keepdims=True)
     share = np.divide(matrix, total, out=np.zeros(matrix.shape), where=total > 0)
     names = [short(name) for name in class_names]
@@ -143,38 +129,4 @@ def confusion_heatmap(
     axes.tick_params(which="both", length=0)
     axes.spines[:].set(visible=True, color="#bbbbbb")
     axes.set(xlabel="predicted", ylabel="true", title=short(title, 40))
-    return figure
-
-
-@house_style
-def class_accuracy(
-    before: Float[np.ndarray, "k"],
-    after: Float[np.ndarray, "k"],
-    class_names: Sequence[str],
-    counts: Int[np.ndarray, "k"],
-    names: tuple[str, str] = ("before", "after"),
-) -> Figure:
-    """Draw the accuracy of each class before and after adaptation as pairs of bars.
-
-    It is in 0 … 1, NaN where a class has no cloud; its number of clouds stands beside its name.
-    """
-    k = len(class_names)
-    figure = Figure(figsize=(_WIDTH, 0.9 + 0.46 * k), layout="constrained")
-    axes = figure.add_subplot()
-    rows = np.arange(k)
-    for offset, values, name, colour in (
-        (-0.2, before, names[0], BEFORE),
-        (0.2, after, names[1], AFTER),
-    ):
-        lengths = np.nan_to_num(values, nan=0.0)
-        axes.barh(rows + offset, 100.0 * lengths, 0.38, color=colour, label=short(name, 24))
-        for row, value in zip(rows, values, strict=True):
-            text = "no cloud" if np.isnan(value) else f"{100.0 * value:.0f}"
-            if not (np.isnan(value) and offset > 0):
-                axes.text(100.0 * lengths[row] + 1, row + offset, text, va="center", fontsize=8.5)
-    axes.set_yticks(rows, [f"{short(n)} ({c})" for n, c in zip(class_names, counts, strict=True)])
-    axes.invert_yaxis()
-    axes.set(xlim=(0, 108), xticks=range(0, 101, 20), xlabel="accuracy of the class [%]")
-    axes.tick_params(axis="y", length=0)
-    figure.legend(loc="outside upper center", ncols=2)
     return figure

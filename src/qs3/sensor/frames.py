@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt16
 
 from qs3.errors import InputError
-from qs3.files import atomic_path, refuse_link, write_bytes, write_json
+from qs3.files import atomic_path, write_bytes, write_json
 from qs3.geometry import invert_rigid, rotation_z
 from qs3.sensor.presets import Sensor
 from qs3.sensor.scan import Scan
@@ -82,9 +82,10 @@ def remove_frames(folder: Path) -> None:
     A link within is never followed: it is removed.
 
     Raises:
-        InputError: where the folder itself is a link.
+        InputError: if the folder itself is a link.
     """
-    refuse_link(folder)
+    if folder.is_symlink():
+        raise InputError(f"{folder}: is a link, which qs3 does not follow; remove it")
     for place, folders, files in os.walk(folder, topdown=False):
         links = [path for name in folders if (path := Path(place) / name).is_symlink()]
         written = (Path(place) / name for name in files)

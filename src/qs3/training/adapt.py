@@ -15,7 +15,7 @@ from qs3.adaptation.names import split_method
 from qs3.adaptation.selection import SingleClassWarning
 from qs3.errors import InputError
 from qs3.io import load_clouds, load_unlabelled
-from qs3.io.clouds import PointClouds, RaggedClouds, UnlabelledClouds, numbered
+from qs3.io.clouds import PointClouds, RaggedClouds, UnlabelledClouds, numbered, relabel
 from qs3.io.load import is_store
 from qs3.io.preparation import LARGEST
 from qs3.meshes import collect
@@ -24,11 +24,13 @@ from qs3.meshes.sizes import CLASS_SIZES, Unit
 from qs3.processors import usable_processors
 from qs3.structure import unstructure
 from qs3.training.batches import load_whole
+from qs3.training.checkpoint import load_model
 from qs3.training.config import TrainSettings, changed
-from qs3.training.estimators import Adapter, Clouds, read_paths, rounds_of
+from qs3.training.estimators import Adapter, Clouds, load, read_paths, rounds_of
+from qs3.training.fit import fit
 from qs3.training.rounds import remarks
 from qs3.training.run import train_settings
-from qs3.training.shipped import WEIGHTS
+from qs3.training.shipped import WEIGHTS, find_run
 from qs3.training.validation import held_out
 
 _LOG = logging.getLogger(__name__)
@@ -50,6 +52,7 @@ def adapt(
     scan: Mapping[str, Any] | None = None,
     train: Mapping[str, Any] | None = None,
     self_training: Mapping[str, Any] | None = None,
+    warm_up: str | Path | None = None,
     workers: int | None = None,
     seed: int = 0,
 ) -> Adapter:
@@ -78,6 +81,8 @@ def adapt(
         train: Settings of `TrainSettings` that differ from those of ``rooms``; with ``rule`` "last"
             the last round is kept.
         self_training: Settings of the rounds that differ.
+        warm_up: Run to adapt, or the name of a network that comes with qs3; None trains one.
+            ``train`` then changes the settings of that run, and its rule chooses among the rounds.
         workers: Processes that scan; None takes one a core, 0 scans in this one.
         seed: Root of all random steps.
 
@@ -93,8 +98,19 @@ def adapt(
     changed(TrainSettings(), train or {}, " in train")
     rounds = rounds_of(self_training or {}, rule)
     seed = operator.index(seed)
+    begun = None if warm_up is None else load_model(Path(warm_up))
     target = _target(scans)
     source = _source(cad, Path(out) / "source", units, scan or {}, workers, seed)
+    if warm_up is not None and begun is not None:
+        source = relabel(source, begun.class_names, None, "source")
+        own = changed(replace(train_settings(Path(warm_up)), seed=seed), train or {}, " in train")
+        with warnings.catch_warnings():  # `remarks` names them
+            warnings.simplefilter("ignore", SingleClassWarning)
+            done = fit(method, source, target, own, rounds, run_dir=Path(out) / "run",
+                       warm_up=find_run(warm_up))  # fmt: skip
+        for line in remarks(done.rounds, rounds, source.class_names, "threshold_share"):
+            _LOG.warning(line)
+        return load(Path(out) / "run")
     settings = unstructure(train_settings(_LIKE))
     batches = max(1, len(source) // settings["batch_size"])
     settings |= {"epochs": max(1, round(_STEPS / batches))} | dict(train or {})

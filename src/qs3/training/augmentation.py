@@ -1,4 +1,4 @@
-"""What a scan loses and gains, imitated on whole batches of clouds.
+"""Augmentation of whole batches of clouds: the losses and gains of a scan, imitated.
 
 The pure functions take what is drawn; `augment_clouds` draws it. Nothing depends on a cloud's unit:
 lengths are relative to its robust box. The vertical is z.
@@ -18,7 +18,7 @@ from qs3.training.config import Augmentation
 _OUTSIDE = 0.01
 """Share of the points beyond each side of the robust box."""
 _MARGIN = 0.4
-"""What a crop leaves beside the object, in radii: floor reaches at most so far beyond its box."""
+"""Margin of a crop beside the object, in radii: floor reaches at most so far beyond its box."""
 _THICKNESS = 0.02
 """Thickness of the floor, in radii."""
 _HIGHEST = 0.7
@@ -61,9 +61,9 @@ def lose_highest(
 
     Args:
         kept: Points that are there.
-        score: What orders them.
+        score: Order of loss, the highest first.
         count: How many of each cloud go.
-        least: Share of all points that stays; fewer go where it would be touched.
+        least: Share of all points that stays; fewer go if it would be touched.
     """
     left = kept.sum(dim=1, keepdim=True) - math.ceil(least * kept.shape[1])
     order = score.masked_fill(~kept, -torch.inf).argsort(dim=1, descending=True, stable=True)
@@ -156,7 +156,7 @@ def floor_beneath(
     Args:
         box: The clouds' boxes.
         edges: In 0 to 1, how much of the lower and upper half of the box it leaves free.
-        uniform: In 0 to 1, where the points lie on what it covers.
+        uniform: In 0 to 1, place of the points on the covered area.
     """
     margin = _MARGIN * box.radius
     low, high = box.low - margin, box.high + margin
@@ -178,9 +178,9 @@ def replaced(
     Args:
         points: Clouds.
         kept: Points that may be replaced.
-        substitutes: What takes their place, in this order.
+        substitutes: Points that take their place, in this order.
         share: Share of each cloud's kept points, rounded down.
-        uniform: In 0 to 1; the points where it is highest go.
+        uniform: In 0 to 1; the points of the highest go.
     """
     count = (share * kept.sum(dim=1, keepdim=True)).long()
     order = uniform.masked_fill(~kept, -1).argsort(dim=1, descending=True, stable=True)
@@ -225,8 +225,8 @@ def augment_clouds(
 
     Args:
         points: Clouds, on any device, in any unit, z up, before they are turned and normalised.
-        settings: What is done, how often and how strongly.
-        generator: Source of all draws, on the device of the points. What is off draws nothing.
+        settings: Kinds, probabilities and strengths.
+        generator: Source of all draws, on the device of the points. Kinds that are off draw none.
 
     Returns:
         The points, and which of them the scan would have kept.

@@ -14,7 +14,6 @@ from qs3.errors import InputError
 from qs3.evaluation.environment import git_commit, hardware, versions
 from qs3.evaluation.records import RECORDS, RunRecord, Scores, score, write_record
 from qs3.evaluation.regret import choose_each
-from qs3.files import sub_folder
 from qs3.io import load_clouds
 from qs3.io.clouds import CloudChoice, PointClouds, relabel
 from qs3.meshes.classes import require_named
@@ -109,7 +108,7 @@ def evaluate(
         experiment=experiment,
     )
     path = record_path(run, record)
-    write_record(sub_folder(path.parent) / path.name, record)
+    write_record(path, record)
     return record
 
 

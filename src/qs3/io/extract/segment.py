@@ -22,7 +22,6 @@ from qs3.errors import InputError, StorageError
 from qs3.files import (
     new_folder,
     read_json,
-    refuse_link,
     sha256,
     write_bytes,
     write_json,
@@ -218,7 +217,6 @@ def segment_scenes(
         place = out / name
         try:
             record = {"sha256": sha256(path), "settings": how}
-            refuse_link(place)
             if is_scene(place) and read_json(place / SCENE_RECORD) == record:
                 yield name, None
             else:

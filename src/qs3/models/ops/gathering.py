@@ -100,7 +100,7 @@ def linear_max_gradients(
     rows: Float[Tensor, "e c"],
     weight: Float[Tensor, "d c"],
 ) -> tuple[Float[Tensor, "e c"], Float[Tensor, "d c"]]:
-    """Return the gradients of rows and weight where output [m d] is the product of one row.
+    """Return the gradients of rows and weight if output [m d] is the product of one row.
 
     Example:
         >>> winner, rows = torch.tensor([[0, 1]]), torch.tensor([[1.0], [2.0]])
@@ -126,7 +126,7 @@ def flat_indices(neighbours: Int[Tensor, "b m k"], n: int | None = None) -> Int[
 
     Args:
         neighbours: Indices within the own cloud.
-        n: Points a cloud; m where None.
+        n: Points a cloud; m if None.
 
     Example:
         >>> flat_indices(torch.tensor([[[0]], [[0]]])).tolist()
@@ -160,7 +160,7 @@ def neighbour_max(
     The [b m k c] tensor of neighbour values never exists. At ties the gradient goes to the first.
 
     Raises:
-        ValueError: where k is over 255.
+        ValueError: if k is over 255.
 
     Example:
         >>> neighbour_max(torch.tensor([[[1.0], [2.0]]]), torch.tensor([[[0, 1], [0, 0]]])).tolist()

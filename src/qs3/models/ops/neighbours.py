@@ -21,10 +21,10 @@ def knn(
 
     Exact up to the rounding of |x|² − 2x·y + |y|², which is taken about each cloud's mean. Memory
     is bounded: distances are held for a block of rows at a time. Points may have any number of
-    dimensions; they are their own centres where none are given.
+    dimensions; they are their own centres if none are given.
 
     Raises:
-        ValueError: where k is not in 1 to n.
+        ValueError: if k is not in 1 to n.
 
     Example:
         >>> line = torch.tensor([[[0.0], [1.0], [5.0]]])
@@ -100,7 +100,7 @@ def three_nn_interpolate(
 ) -> Float[Tensor, "b n c"]:
     """Mean of the three nearest known features, weighted by 1/d² (Qi et al., NeurIPS 2017, Eq. 2).
 
-    All known points count where there are fewer than three.
+    All known points count if there are fewer than three.
 
     Example:
         >>> known = torch.tensor([[[0.0, 0, 0], [2, 0, 0]]])

@@ -26,11 +26,11 @@ def farthest_point_sampling(
     Args:
         points: The clouds.
         m: Number of points to choose, at most n.
-        start: First point of each cloud; the point farthest from the cloud's mean where None, so
+        start: First point of each cloud; the point farthest from the cloud's mean if None, so
             that the order of the points does not matter.
 
     Raises:
-        ValueError: where m is not in 1 to n.
+        ValueError: if m is not in 1 to n.
 
     Example:
         >>> line = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [9, 0, 0]]])

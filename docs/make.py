@@ -1,0 +1,499 @@
+"""Make the parts of the documentation that code or records fill in: ``python docs/make.py PART``.
+
+- ``methods``: formulas and settings in docs/methods, from other pages.
+- ``models``: the table of sizes in docs/models.md.
+- ``shapes``, ``sensor``, ``pipeline``, ``quasi-balanced``, ``edges``: the picture of that name.
+- ``results OUT NAME``: records and tables in results/NAME from those of a reproduction in OUT; with
+  ``results/NAME NAME`` the tables again.
+"""
+
+import argparse
+import dataclasses
+import hashlib
+import importlib.util
+import json
+import re
+import shutil
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+import qs3
+from qs3.errors import InputError
+from qs3.geometry import look_at
+from qs3.meshes import normalise
+from qs3.report.clouds import draw_cloud
+from qs3.report.figure import house_style, write_png
+from qs3.sensor.materials import MATERIALS
+from qs3.sensor.presets import SENSORS, Sensor, get_sensor, settings_dict
+from qs3.sensor.view import ViewImages
+
+if TYPE_CHECKING:
+    import trimesh
+    from torch import nn
+
+DOCS = Path(__file__).parent
+ROOT = DOCS.parent
+IMAGES = DOCS / "images"
+Picture = UInt8[np.ndarray, "h w 3"]
+
+# The pages of the methods
+
+_BLOCK = re.compile(r"(<!-- (\w+) of ([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+_OTHER_RULES = {
+    "qbst": {"rule", "prior", "quantile", "portion", "portion_step"},
+    "spst": {"rule", "prior", "quantile", "portion", "portion_step", "selection", "single_class"},
+}
+"""Settings of self-training that a rule does not read."""
+
+
+def section(name: str) -> str:
+    """Return the text on a method in docs/adaptation.md."""
+    page = (DOCS / "adaptation.md").read_text(encoding="utf-8")
+    for part in re.split(r"^#{2,3} ", page, flags=re.MULTILINE):
+        title, _, text = part.partition("\n")
+        if f"`{name}`" in title:
+            return text.strip().replace("](", "](../")
+    raise ValueError(f"docs/adaptation.md has no section on {name}")
+
+
+def formula(name: str) -> str:
+    """Return the paragraphs before commands, settings and differences."""
+    kept = []
+    for paragraph in section(name).split("\n\n"):
+        if paragraph.startswith(("```", "|", "Differs")):
+            break
+        kept.append(paragraph)
+    return "\n\n".join(kept)
+
+
+def method_settings(name: str) -> str:
+    """Return the table of settings."""
+    return "\n".join(line for line in section(name).splitlines() if line.startswith("|"))
+
+
+def differs(name: str) -> str:
+    """Return the differences from the publication."""
+    text = section(name)
+    return text[re.search(r"^Differs", text, re.MULTILINE).start() :]  # type: ignore[union-attr]
+
+
+def rounds(rule: str) -> str:
+    """Return the settings of self-training that a rule reads, with its defaults."""
+    page = (DOCS / "settings.md").read_text(encoding="utf-8")
+    table = page.split("### Self-training")[1].split("\n### ")[0]
+    rows = [line for line in table.splitlines() if line.startswith("| `")]
+    lines = ["| setting | default | what it does |", "|---|---|---|"]
+    for row in rows:
+        name, default, spst, meaning = (cell.strip() for cell in row.strip("|").split("|"))
+        if name.strip("`") not in _OTHER_RULES[rule]:
+            lines.append(f"| {name} | {spst if rule == 'spst' else default} | {meaning} |")
+    return "\n".join(lines)
+
+
+_PARTS = {"formula": formula, "settings": method_settings, "differs": differs, "rounds": rounds}
+
+
+def filled(page: str) -> str:
+    """Return a page with everything between its markers made again."""
+    return _BLOCK.sub(lambda m: f"{m[1]}{_PARTS[m[2]](m[3])}\n{m[4]}", page)
+
+
+def methods() -> None:
+    """Bring the pages of the methods up to date with docs/adaptation.md and docs/settings.md."""
+    for path in sorted((DOCS / "methods").glob("*.md")):
+        path.write_text(filled(path.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+# The table of networks
+
+_START, _END = "<!-- sizes: docs/make.py models -->", "<!-- end of sizes -->"
+PUBLISHED = {
+    "pointnet": ("3.5", "440", "PointNet, Table 6"),
+    "pointnet2": ("1.48", "1,684", "RS-CNN, complexity"),
+    "rscnn": ("1.41", "295", "RS-CNN, complexity"),
+    "simpleview": ("0.8", "–", "SimpleView, §4"),
+}
+"""Parameters in millions, multiply-adds in millions, and their source."""
+
+
+def multiply_adds(model: "nn.Module") -> float:
+    """Count the multiply-adds of one forward pass in evaluation, in millions.
+
+    Those of matrix products and convolutions, at one cloud of 1,024 points.
+    """
+    import torch
+    from torch.utils.flop_counter import FlopCounterMode
+
+    points = torch.randn(1, 1024, 3, generator=torch.Generator().manual_seed(0)) * 0.4
+    with FlopCounterMode(display=False) as counter, torch.no_grad():
+        model.eval()(points)
+    return counter.get_total_flops() / 2e6
+
+
+def reference(name: str) -> ModuleType | None:
+    """Return the textbook form of a network in benchmarks/reference; None if ours is it."""
+    stem = name.replace("-", "_")
+    path = ROOT / "benchmarks" / "reference" / f"{stem}.py"
+    if not path.is_file():
+        return None
+    spec = importlib.util.spec_from_file_location(f"reference_{stem}", path)
+    assert spec is not None and spec.loader is not None  # noqa: S101
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def models() -> None:
+    """Write parameters and multiply-adds of every network, ours and published."""
+    import torch
+
+    from qs3.models import create_model, list_models
+
+    lines = [
+        "| network | parameters, M | published | multiply-adds, M: ours | textbook | published "
+        "| source |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name in list_models():
+        torch.manual_seed(0)
+        model = create_model(name, 40)
+        size = sum(p.numel() for p in model.parameters()) / 1e6
+        ours, book = multiply_adds(model), reference(name)
+        textbook = f"{multiply_adds(book.from_ours(model)):,.0f}" if book else "–"
+        size_there, adds_there, source = PUBLISHED.get(name, ("–", "–", ""))
+        lines.append(
+            f"| `{name}` | {size:.2f} | {size_there} | {ours:,.0f} | {textbook} "
+            f"| {adds_there} | {source} |"
+        )
+    page = DOCS / "models.md"
+    before, rest = page.read_text(encoding="utf-8").split(_START)
+    table, after = "\n".join(lines), rest.split(_END)[1]
+    page.write_text(f"{before}{_START}\n{table}\n{_END}{after}", encoding="utf-8")
+
+
+# The contact sheet of the shapes
+
+_SUN = np.array([0.35, -0.55, 0.8]) / np.linalg.norm([0.35, -0.55, 0.8])
+_TINT = (0.93, 0.9, 0.86)
+
+
+def shapes(draws: int = 12) -> None:
+    """Draw the built-in shapes: one row a class, one column a draw."""
+    rows = [
+        np.hstack([photograph(qs3.shapes.make(name, seed)) for seed in range(draws)])
+        for name in qs3.shapes.CLASSES
+    ]
+    picture = np.vstack(rows)[..., ::-1]
+    cv2.imwrite(str(IMAGES / "shapes.png"), picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+
+
+def photograph(mesh: "trimesh.Trimesh", pixels: int = 96) -> Picture:
+    """Draw a mesh, z up, lit by a sun with a shadow and by the sky; seen from its front's left."""
+    from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+    mesh = normalise(mesh, "ball")
+    fine = 2 * pixels
+    a, e = np.radians((-55.0, 24.0))
+    toward = np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
+    pose = look_at(4.0 * toward, np.zeros(3))
+    grid = (np.arange(fine) - (fine - 1) / 2) / (fine / 2) * 0.27
+    u, v = np.meshgrid(grid, grid)
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ pose[:3, :3].T
+    origins = np.broadcast_to(pose[:3, 3], rays.shape)
+    caster = RayMeshIntersector(mesh)
+    face = caster.intersects_first(origins, rays)
+    hit = np.flatnonzero(face >= 0)
+    image = np.full((fine * fine, 3), 1.0)
+    if len(hit):
+        image[hit] = _shade(mesh, caster, face[hit], origins[hit], rays[hit])[:, None] * _TINT
+    small = cv2.resize(image.reshape(fine, fine, 3), (pixels, pixels), interpolation=cv2.INTER_AREA)
+    return (255 * np.clip(small, 0, 1) ** (1 / 1.4)).astype(np.uint8)
+
+
+def _shade(
+    mesh: "trimesh.Trimesh", caster: Any, face: np.ndarray, origins: np.ndarray, rays: np.ndarray
+) -> Float[np.ndarray, "n"]:
+    normal = mesh.face_normals[face]
+    normal = normal * -np.sign((normal * rays).sum(axis=1, keepdims=True))
+    corner = mesh.triangles[face][:, 0]
+    distance = ((corner - origins) * normal).sum(axis=1) / (rays * normal).sum(axis=1)
+    point = origins + distance[:, None] * rays + 2e-3 * normal
+    lit = ~caster.intersects_any(point, np.broadcast_to(_SUN, point.shape))
+    sun = np.clip(normal @ _SUN, 0, 1) * lit
+    sky = 0.5 + 0.5 * normal[:, 2]
+    side = 0.5 + 0.5 * normal @ np.array([-0.8, -0.5, 0.33])
+    return 0.08 + 0.5 * sun + 0.2 * sky + 0.17 * side
+
+
+# The contact sheet of the sensor
+
+_SCENES = ("alone", "floor", "wall", "room", "behind", "beside")
+_CELL, _LINE = 190, 22
+SENSOR_PICTURE = IMAGES / "sensor.png"
+
+
+def presets() -> str:
+    """Return a fingerprint of all presets; the picture holds that of its own."""
+    plain = {name: settings_dict(sensor) for name, sensor in SENSORS.items()}
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+
+
+def sensor() -> None:
+    """Draw materials in a room and scenes as a D435 sees them, and all presets."""
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    d435 = get_sensor("d435")
+    rows = [
+        # In a room: of a mirror or a pane that stands alone there is nothing to be seen.
+        [
+            cell(name, dataclasses.replace(d435, material=material), "room")
+            for name, material in MATERIALS.items()
+        ],
+        [cell(name, d435, name) for name in _SCENES],
+        [cell(name, preset) for name, preset in SENSORS.items()],
+    ]
+    width = max(len(row) for row in rows)
+    blank = np.full_like(rows[0][0], 255)
+    picture = np.vstack([np.hstack(row + [blank] * (width - len(row))) for row in rows])
+    about = PngInfo()
+    about.add_text("presets", presets())
+    Image.fromarray(picture[..., ::-1]).save(SENSOR_PICTURE, pnginfo=about, optimize=True)
+
+
+def cell(title: str, sensor: Sensor, scene: str = "alone") -> Picture:
+    """Draw one scan of a chair: left image, depth and true depth, with its figures above."""
+    from qs3.sensor.render.mitsuba import MitsubaRenderer
+
+    neighbour = qs3.shapes.make("cabinet", seed=2) if scene in ("behind", "beside") else None
+    # Shiny surfaces are path traced and need many rays; the others do not.
+    renderer = MitsubaRenderer(samples=4 if sensor.material.rough else 64)
+    try:
+        made = qs3.scan(
+            qs3.shapes.make("chair", seed=3),
+            sensor=sensor,
+            views=1,
+            seed=4,
+            scene=scene,
+            neighbour=neighbour,
+            crop="none",
+            renderer=renderer,
+            keep_images=True,
+        )
+    except InputError as error:
+        if "saw no point" not in str(error):
+            raise
+        return _labelled(title, "no point seen", [np.full((_CELL, _CELL, 3), 40, np.uint8)] * 3)
+    view, images = made.views[0], made.images[0]
+    left = images.left if images.left.dtype == np.uint8 else (images.left >> 2).astype(np.uint8)
+    known = images.true_depth[np.isfinite(images.true_depth)]
+    limits = (float(known.min()), float(known.max()))
+    pictures = [
+        np.repeat(left[..., None], 3, axis=2),
+        _coloured(images.depth, limits),
+        _coloured(images.true_depth, limits),
+    ]
+    figures = f"fill {view.valid_fraction or 0:.0%}"
+    if view.disparity_sigma is not None:
+        figures += f", sigma {view.disparity_sigma:.3f} px"
+    return _labelled(title, figures, pictures)
+
+
+def _coloured(depth: Float[np.ndarray, "h w"], limits: tuple[float, float]) -> Picture:
+    low, high = limits
+    share = np.clip((depth - low) / max(high - low, 1e-9), 0, 1)
+    levels = np.nan_to_num(255 * (1 - share)).astype(np.uint8)
+    picture = cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)
+    picture[~np.isfinite(depth)] = 40
+    return picture
+
+
+def _labelled(title: str, figures: str, pictures: list[np.ndarray]) -> Picture:
+    head = np.full((2 * _LINE, _CELL, 3), 255, np.uint8)
+    for line, text in enumerate((title, figures)):
+        place = (4, _LINE * (line + 1) - 6)
+        cv2.putText(head, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
+    return np.vstack([head, *(_fitted(picture) for picture in pictures)])
+
+
+def _fitted(picture: Picture) -> Picture:
+    """Fit a picture into a square cell; its shape stays."""
+    height, width = picture.shape[:2]
+    scale = _CELL / max(height, width)
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    square = np.full((_CELL, _CELL, 3), 255, np.uint8)
+    top, left = (_CELL - small.shape[0]) // 2, (_CELL - small.shape[1]) // 2
+    square[top : top + small.shape[0], left : left + small.shape[1]] = small
+    return square
+
+
+# Pictures of the first page, of QBST and of the matchers
+
+_MARGIN = 12
+"""Pixels of the depth image that are shown around the object."""
+_GREY: dict[str, Any] = {"cmap": "gray"}
+
+
+def _depths(view: ViewImages) -> dict[str, Any]:
+    """Colours from the nearest to the farthest true depth."""
+    near, far = np.nanmin(view.true_depth), np.nanmax(view.true_depth)
+    return {"cmap": "viridis_r", "vmin": near, "vmax": far}
+
+
+def _draw(
+    axes: Iterable[Axes],
+    panels: Sequence[tuple[str, np.ndarray, dict[str, Any]]],
+    seen: Bool[np.ndarray, "h w"],
+    aside: int = _MARGIN,
+) -> None:
+    """Draw titled pictures, each in its colours, around the seen pixels."""
+    rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+    for axis, (title, picture, colours) in zip(axes, panels, strict=True):
+        share = picture.shape[0] / seen.shape[0]
+        top, bottom = int((rows[0] - _MARGIN) * share), int((rows[-1] + _MARGIN) * share)
+        first, last = int((columns[0] - aside) * share), int((columns[-1] + aside) * share)
+        axis.imshow(picture[max(top, 0) : bottom, max(first, 0) : last], **colours)
+        axis.set_title(title)
+        axis.set_axis_off()
+
+
+@house_style
+def pipeline() -> Figure:
+    """One scan of a built-in chair: both images, disparity, depth, true depth, and the cloud."""
+    made = qs3.scan(qs3.shapes.make("chair", seed=3), views=3, seed=4, keep_images=True)
+    view = made.images[0]
+    seen = np.isfinite(view.true_depth)
+    depth = _depths(view)
+    low, high = np.nanquantile(view.disparity[seen], (0.02, 0.98))
+    nearness = {"cmap": "viridis", "vmin": low, "vmax": high}
+    figure = Figure(figsize=(10, 6.9), layout="constrained", facecolor="white")
+    axes = figure.subplots(2, 3)
+    panels = [
+        ("left camera", view.left, _GREY),
+        ("right camera", view.right, _GREY),
+        ("disparity", view.disparity, nearness),
+        ("depth, as measured", view.depth, depth),
+        ("depth, true", view.true_depth, depth),
+    ]
+    _draw(axes.flat[:5], panels, seen)
+    axis = axes.flat[5]
+    draw_cloud(axis, made.points, azimuth=-55.0, elevation=20.0)
+    axis.set_title("cloud of three views")
+    return figure
+
+
+@house_style
+def quasi_balanced() -> Figure:
+    """The count that Algorithm 1 keeps of a class, among a thousand confident clouds."""
+    from qs3.adaptation.selection import balanced_count
+
+    total = 1000
+    confident = np.arange(0, total + 1)
+    kept = [balanced_count(int(n), total) if n else 0 for n in confident]
+    figure = Figure(figsize=(6, 3.4), layout="constrained", facecolor="white")
+    axis: Axes = figure.subplots()
+    axis.plot(confident, confident, color="0.6", linestyle="--", label="SPST: all of them")
+    axis.plot(confident, kept, color="C0", label="QBST: ⌈L_k (1 − L_k/L)⌉")
+    axis.set_xlabel("clouds of the class over θ, L_k, of L = 1,000")
+    axis.set_ylabel("kept")
+    axis.set_xlim(0, total)
+    axis.set_ylim(0, total)
+    axis.legend(frameon=False)
+    return figure
+
+
+@house_style
+def edges() -> Figure:
+    """A chair as the D435 sees it at 1.6 and 3 m: image, true depth, both matchers' depth."""
+    camera, chair = get_sensor("d435"), qs3.shapes.make("chair", seed=3)
+    figure = Figure(figsize=(10, 6.1), layout="constrained", facecolor="white")
+    for row, distance in zip(figure.subplots(2, 4), (1.6, 3.0), strict=True):
+        placement = dataclasses.replace(camera.placement, radius=(distance, distance))
+        placed = dataclasses.replace(camera, placement=placement)
+        how = {"sensor": placed, "scene": "room", "object_size": 0.9, "views": 1, "seed": 4}
+        block, census = (
+            qs3.scan(chair, **how, matching=matcher, crop="none", keep_images=True).images[0]
+            for matcher in ("zncc", "ad-census")
+        )
+        depth = _depths(census)
+        panels = [
+            (f"left camera, {distance} m", census.left, _GREY),
+            ("depth, true", census.true_depth, depth),
+            ("block matching (zncc)", block.depth, depth),
+            ("ad-census", census.depth, depth),
+        ]
+        _draw(row, panels, census.mask, aside=3 * _MARGIN)
+    return figure
+
+
+# Results
+
+
+def results(out: Path, name: str) -> None:
+    """Copy records and tables of a reproduction into results/NAME, without its data and runs.
+
+    Tables are written from the records, for the rows and columns that have any.
+    """
+    from qs3.experiments import GALLERIES, TABLES
+    from qs3.experiments.setup import MARKER, RESULTS, read_setup
+    from qs3.experiments.table import Table
+    from qs3.files import write_bytes
+
+    folder = ROOT / "results" / name
+    for path in [out / MARKER, *sorted((out / RESULTS).glob("*.json"))]:
+        write_bytes(folder / path.relative_to(out), path.read_bytes())
+    pictures = out / GALLERIES
+    if pictures.is_dir() and pictures.resolve() != (folder / GALLERIES).resolve():
+        shutil.copytree(pictures, folder / GALLERIES, dirs_exist_ok=True)
+    for table in TABLES:
+        made = Table(table, read_setup(folder)).read()
+        if made.faults or not made.records:
+            print(f"{table}: left out", *made.faults)
+        else:
+            places = [place for place in made.runs if made.records_of(place)]
+            rows, columns = (tuple(dict.fromkeys(place[i] for place in places)) for i in (0, 1))
+            print(dataclasses.replace(made.table, rows=rows, columns=columns).write())
+
+
+FIGURES: dict[str, Callable[[], Figure]] = {
+    "pipeline": pipeline,
+    "quasi-balanced": quasi_balanced,
+    "edges": edges,
+}
+OTHERS: dict[str, Callable[[], None]] = {
+    "methods": methods,
+    "models": models,
+    "shapes": shapes,
+    "sensor": sensor,
+}
+
+
+def main() -> None:
+    """Make the part that the command line asks for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("part", choices=[*OTHERS, *FIGURES, "results"])
+    parser.add_argument("results", nargs="*", metavar="OUT NAME", help="of results alone")
+    given = parser.parse_args()
+    if len(given.results) != (2 if given.part == "results" else 0):
+        parser.error("results takes OUT and NAME, other parts take nothing")
+    if given.part == "results":
+        results(Path(given.results[0]), given.results[1])
+    elif given.part in FIGURES:
+        write_png(IMAGES / f"{given.part}.png", FIGURES[given.part](), dpi=110)
+    else:
+        OTHERS[given.part]()
+
+
+if __name__ == "__main__":
+    main()

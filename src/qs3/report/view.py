@@ -1,0 +1,201 @@
+"""Step through clouds in a browser on this machine, by viser (extra ``view``)."""
+
+import contextlib
+import html
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from qs3.errors import InputError, MissingExtraError
+from qs3.io import read_cloud
+from qs3.io.clouds import CloudKind
+from qs3.io.load import read_clouds
+from qs3.io.point_files import POINT_FILES
+from qs3.training.answers import answer_clouds
+from qs3.training.checkpoint import load_model
+from qs3.training.run import MODEL, is_run
+from qs3.training.shipped import find_run, shipped
+
+HOST = "127.0.0.1"
+KINDS: dict[CloudKind, str] = {"points": "scan", "clean": "clean twin", "surface": "surface"}
+_GAP = 1.3  # from one cloud to the next, in lengths of the object
+_POINT = 0.012
+_Answer = Callable[[Float[np.ndarray, "n 3"]], Mapping[str, float]]
+_MAP = matplotlib.colormaps["viridis"]
+
+
+@dataclass(frozen=True)
+class Items:
+    """Objects to step through."""
+
+    names: tuple[str, ...]
+    clouds: Mapping[CloudKind, Sequence[Float[np.ndarray, "_ 3"]]]
+    """The clouds of all objects, by kind; there are always scans."""
+    labels: tuple[str, ...] = ()
+    """Classes by name; empty if the data has no labels."""
+    answer: _Answer | None = None
+    """Return the probabilities that a network gives to a cloud, the largest first."""
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def text(self, row: int) -> str:
+        """Return number, name, label and answer of an object as HTML; names are escaped."""
+        lines = [f"{row + 1} of {len(self)}: {self.names[row]}"]
+        if self.labels:
+            lines.append(f"label: {self.labels[row]}")
+        if self.answer is not None:
+            lines.append(f"answer: {_answer_text(self.answer, self.clouds['points'][row])}")
+        body = "<br>".join(map(html.escape, lines))
+        return f'<div style="padding:0.4em 0.9em;overflow-wrap:anywhere">{body}</div>'
+
+
+def _answer_text(answer: _Answer, points: Float[np.ndarray, "n 3"]) -> str:
+    try:
+        shares = list(answer(points).items())[:3]
+    except InputError as error:  # a point that is not finite: the page shows the reason
+        return str(error)
+    return ", ".join(f"{name} {share:.1%}" for name, share in shares)
+
+
+def open_items(what: str, data: str | None = None, split: str | None = None) -> Items:
+    """Read a data set, one cloud, or the data that a run shall answer for.
+
+    Args:
+        what: Data set of any layout, file of points, or run (folder, file or name).
+        data: With a run: the clouds to predict.
+        split: Part of the data.
+
+    Raises:
+        InputError: if it cannot be read, or ``data`` is missing for a run or given without one.
+    """
+    path = find_run(what)
+    if not path.exists():
+        raise InputError(
+            f"{what}: no such file or folder, nor a network that comes with qs3 "
+            f"({', '.join(shipped())})"
+        )
+    if path.suffix == ".safetensors" or is_run(path) or (path / MODEL).is_file():
+        if data is None:
+            raise InputError(f"{what}: is a run; name the clouds to predict with --data")
+        loaded, items = load_model(path), open_items(data, split=split)
+        return Items(
+            items.names,
+            items.clouds,
+            items.labels,
+            lambda points: answer_clouds(loaded, points[None])[0].probabilities,
+        )
+    if data is not None:
+        raise InputError(f"--data goes with a run of qs3 train, and {what} is none")
+    if path.is_file() and path.suffix.lower() in POINT_FILES:
+        return Items((path.name,), {"points": [read_cloud(path)]})
+    read, layout = read_clouds(path, split)
+    clouds: dict[CloudKind, Any] = {"points": read.clouds}
+    for kind in ("clean", "surface") if layout == "store" else ():
+        try:
+            clouds[kind] = read_clouds(path, split, kind)[0].clouds
+        except InputError as error:
+            if f"has no {kind!r} clouds" not in str(error):
+                raise
+    named = () if read.labels is None else tuple(read.class_names[row] for row in read.labels)
+    return Items(read.ids, clouds, named)
+
+
+def place(
+    clouds: Sequence[Float[np.ndarray, "_ 3"]],
+) -> list[Float32[np.ndarray, "_ 3"]]:
+    """Put clouds of one object beside each other, the longest side of all of them being 1.
+
+    Example:
+        >>> line = np.array([[0.0, 0, 0], [0, 0, 4]])
+        >>> [cloud[:, 0].tolist() for cloud in place([line, line])]
+        [[0.0, 0.0], [1.2999999523162842, 1.2999999523162842]]
+    """
+    low, high = (np.stack([of(cloud, axis=0) for cloud in clouds]) for of in (np.min, np.max))
+    low, high = low.min(axis=0), high.max(axis=0)
+    side = max(float((high - low).max()), 1e-9)
+    middle = (low + high) / 2
+    shifts = [np.array([_GAP * column, 0, 0]) for column in range(len(clouds))]
+    return [
+        ((cloud - middle) / side + shift).astype(np.float32)
+        for cloud, shift in zip(clouds, shifts, strict=True)
+    ]
+
+
+def height_colours(points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
+    """Colour points by z, from the lowest (violet) to the highest (yellow)."""
+    height = points[:, 2] - points[:, 2].min()
+    return np.asarray(_MAP(height / max(float(height.max()), 1e-9), bytes=True))[:, :3]
+
+
+class Page:
+    """The page: an object's clouds side by side, its label and answer, and two buttons."""
+
+    def __init__(self, server: Any, items: Items) -> None:
+        self._server, self._items, self.row = server, items, 0
+        columns = len(items.clouds)
+        server.initial_camera.position = (_GAP * (columns - 1) / 2, -1.2 - 0.9 * columns, 0.8)
+        server.initial_camera.look_at = (_GAP * (columns - 1) / 2, 0.0, 0.0)
+        self.text = server.gui.add_html("")
+        self.previous, self.next = (server.gui.add_button(name) for name in ("Previous", "Next"))
+        self._lock = threading.Lock()  # viser runs each click in a thread of its own
+        self.previous.on_click(lambda _: self._step(-1))
+        self.next.on_click(lambda _: self._step(1))
+        self.show(0)
+
+    def _step(self, by: int) -> None:
+        with self._lock:
+            self.show(self.row + by)
+
+    def show(self, row: int) -> None:
+        """Show an object; after the last comes the first."""
+        row %= len(self._items)
+        clouds: dict[CloudKind, Any] = {
+            kind: of[row][np.isfinite(of[row]).all(axis=1)]
+            for kind, of in self._items.clouds.items()
+        }
+        placed = place(list(clouds.values()))
+        text = self._items.text(row)
+        with self._server.atomic():
+            for column, (kind, points) in enumerate(zip(clouds, placed, strict=True)):
+                colours = height_colours(points)
+                self._server.scene.add_point_cloud(
+                    f"/{kind}", points, colours, point_size=_POINT, point_shading="flat"
+                )
+                title = f"{KINDS[kind]} ({len(points)} points)"
+                self._server.scene.add_label(
+                    f"/{kind}-title", title, position=(_GAP * column, 0.0, 0.65)
+                )
+            self.text.content = text
+        self.row = row
+
+
+@contextlib.contextmanager
+def serve(items: Items, port: int) -> Iterator[tuple[str, Page]]:
+    """Serve the page on 127.0.0.1 until the block ends; yield its address and the page.
+
+    Args:
+        items: Objects, one at least.
+        port: The next free one is taken if it is in use; 0 takes any.
+
+    Raises:
+        MissingExtraError: if viser is not installed.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise MissingExtraError("viser", "view") from error
+    with contextlib.redirect_stdout(sys.stderr):  # viser prints where it listens, and that it ends
+        server = viser.ViserServer(HOST, port, label="qs3 view", verbose=False)
+    try:
+        server.gui.configure_theme(show_logo=False, show_share_button=False)
+        yield f"http://{HOST}:{server.get_port()}", Page(server, items)
+    finally:
+        with contextlib.redirect_stdout(sys.stderr):
+            server.stop()
