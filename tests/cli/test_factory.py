@@ -75,7 +75,7 @@ def test_info_counts_and_its_check_finds_damage(qs3, store, tmp_path):
     data[len(data) // 2] ^= 1
     shard.write_bytes(bytes(data))
     done = qs3("info", "--check", tmp_path / "copy", code=2)
-    assert "shard-00000.parquet: damaged" in done.stdout
+    assert "shard-00000.parquet: cannot be read as Parquet" in done.stdout
     assert "1 faults, printed above" in done.stderr
     assert "not a qs3 data set" in qs3.refuses("info", "--check", tmp_path)
     (tmp_path / "none").mkdir()

@@ -164,7 +164,9 @@ def test_a_damaged_shard_is_named(fake, tmp_path, damage):
             "bits": content[:begin] + bytes(400) + content[begin + 400 :],
         }[damage]
     )
-    with pytest.raises(InputError, match=r"shard-00001\.parquet: damaged") as caught:
+    with pytest.raises(
+        InputError, match=r"shard-00001\.parquet: (cannot be read as Parquet|the file is empty)"
+    ) as caught:
         read_ragged(tmp_path)
     assert "\n" not in str(caught.value)
 
@@ -244,6 +246,6 @@ def test_check_lists_the_faults_of_a_data_set(fake, tmp_path):
     assert check(tmp_path, progress=False) == ["6 rows planned, but 5 are there and 0 failed"]
     (tmp_path / shard_name(1)).write_bytes(b"PAR1")
     (damaged,) = check(tmp_path, progress=False)
-    assert "shard-00001.parquet: damaged" in damaged
+    assert "shard-00001.parquet: cannot be read as Parquet" in damaged
     (tmp_path / shard_name(1)).unlink()
     assert "only 1 of 2 shards are there" in check(tmp_path, progress=False)[0]

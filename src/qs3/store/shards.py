@@ -19,6 +19,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from qs3.errors import InputError
 from qs3.files import write_bytes
+from qs3.reading import reading
 from qs3.store.manifest import shard_name
 
 STATISTICS = {
@@ -150,20 +151,15 @@ def load_shard(folder: str | Path, index: int, columns: Sequence[str] | None = N
         InputError: if the file is missing, cut off, or not a shard.
     """
     path = Path(folder) / shard_name(index)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    try:
-        with pq.ParquetFile(path, page_checksum_verification=True, pre_buffer=False) as file:
-            if file.schema_arrow not in _SCHEMAS.values():
-                raise InputError(f"{path}: not a shard of a qs3 data set (other columns)")
-            table = file.read(list(_NAMES if columns is None else columns), use_threads=False)
-            table.validate(full=True)  # texts too: Arrow takes any bytes for UTF-8
-            return table
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(
-            f"{path}: damaged ({reason}); delete it and run the same command again"
-        ) from error
+    with (
+        reading(path, "Parquet"),
+        pq.ParquetFile(path, page_checksum_verification=True, pre_buffer=False) as file,
+    ):
+        if file.schema_arrow not in _SCHEMAS.values():
+            raise InputError(f"{path}: not a shard of a qs3 data set (other columns)")
+        table = file.read(list(_NAMES if columns is None else columns), use_threads=False)
+        table.validate(full=True)  # texts too: Arrow takes any bytes for UTF-8
+        return table
 
 
 def flat(column: pa.ChunkedArray) -> tuple[np.ndarray, np.ndarray]:
