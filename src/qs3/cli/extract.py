@@ -60,8 +60,8 @@ def _rosbag(
     Args:
         source: A .bag of ROS 1; of ROS 2 the folder with metadata.yaml, a .db3 or a .mcap.
         out: New folder for depth/, intrinsics.json and times.csv.
-        topic: Which topic of depth images, where there are several.
-        intrinsics: Where the bag has no CameraInfo: fx,fy,cx,cy or a file.
+        topic: Topic of the depth images, if there are several.
+        intrinsics: If the bag has no CameraInfo: fx,fy,cx,cy or a file.
         settings: Which of its frames.
     """
     camera = CaptureSettings(f"rosbag:{source}", intrinsics, topic, **asdict(settings))

@@ -24,9 +24,8 @@ def segment(
 ) -> int:
     """Cut scans of a table or a floor into the objects that stand on it.
 
-    Of a folder each scene becomes a folder of its objects. A scene that cannot be read, or has no
-    object, is told at the end, and the exit code is 2; all others are done, and after a stop the
-    same command goes on.
+    Of a folder each scene becomes a folder of its objects. Scenes that cannot be read or have no
+    object are reported at the end, and the exit code is 2. After a stop the same command goes on.
 
     Args:
         scene: A cloud in metres (PLY, PCD, XYZ, NPY, NPZ); with --intrinsics a depth image (16-bit
@@ -69,5 +68,5 @@ def _segment_folder(folder: Path, out: Path, settings: SceneSettings) -> int:
         tell(f"{objects} objects of {cut} scenes in {out}, in metres; {before} scenes were there "
              f"before. Next: qs3 predict RUN {quoted(out)}")  # fmt: skip
     if faults:
-        raise InputError(f"{folder}: {len(faults)} of {len(scenes)} scenes failed, as told above")
+        raise InputError(f"{folder}: {len(faults)} of {len(scenes)} scenes failed, see above")
     return 0

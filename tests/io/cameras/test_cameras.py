@@ -139,7 +139,7 @@ def test_a_damaged_frame_is_told_and_the_others_are_done(tmp_path, caplog):
     capture(frames(4), shots)
     damaged = shots / "depth" / "000001.png"
     damaged.write_bytes(damaged.read_bytes()[:200])
-    with refused("1 of 4 frames were left out, as told above; the others are done", shots):
+    with refused("1 of 4 frames were left out, see above; the others are done", shots):
         capture(open_camera(CaptureSettings(f"folder:{shots}")), again)
     assert str(damaged) in caplog.text
     same = [("000000", "000000"), ("000001", "000002"), ("000002", "000003")]

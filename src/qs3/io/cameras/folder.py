@@ -1,6 +1,6 @@
 """Frames as files: the layout that `capture` writes and ``folder:DIR`` reads.
 
-``depth/000000.png`` and so on, ``color/000000.png`` where there is colour, ``intrinsics.json``, and
+``depth/000000.png`` and so on, ``color/000000.png`` if there is colour, ``intrinsics.json``, and
 ``times.csv`` with the columns frame and time.
 """
 
@@ -69,7 +69,7 @@ def folder_camera(folder: Path, intrinsics: str = "", colour: bool = True) -> Ca
         yield dataclasses.replace(frame, timestamp=times.get(name))
     if good < len(images):
         raise InputError(
-            f"{folder}: {len(images) - good} of {len(images)} frames were left out, as told above; "
+            f"{folder}: {len(images) - good} of {len(images)} frames were left out, see above; "
             "the others are done"
         )
 
@@ -77,7 +77,7 @@ def folder_camera(folder: Path, intrinsics: str = "", colour: bool = True) -> Ca
 def _read_frame(path: Path, camera: Intrinsics, picture: Path | None) -> DepthFrame:
     raw = read_raw(path)
     camera.check_size(raw.shape, str(path))
-    height, width = raw.shape  # of all, where the camera's file does not tell
+    height, width = raw.shape  # the camera's file may not have it
     step = None if raw.dtype.kind == "f" else camera.depth_scale or MILLIMETRE
     depth = to_metres(raw, camera.depth_scale)
     seen = _read_colour(picture, depth.shape) if picture is not None and picture.is_file() else None

@@ -1,4 +1,4 @@
-"""What a depth camera gives, whichever it is, and the cameras by name.
+"""Frames of depth cameras, and the cameras by name.
 
 A camera is a generator of `DepthFrame`; closing it lets go of the device or file. So a camera of
 your own is a function with ``yield``.
@@ -22,16 +22,16 @@ class DepthFrame:
     """One picture of a depth camera."""
 
     depth: Float32[np.ndarray, "h w"]
-    """Metres along the optical axis, NaN where there is none."""
+    """Metres along the optical axis, NaN if there is none."""
     camera: Intrinsics
-    """Of the depth, with metres a step of the whole numbers it was measured in; None for numbers
-    with a point."""
+    """Of the depth, with the unit of its stored depth in metres; None if depth is floating
+    point."""
     name: str
     """Its file, or its number from 000000."""
     timestamp: float | None = None
-    """Seconds, by the camera's clock; None where nothing tells."""
+    """Seconds, by the camera's clock; None if unknown."""
     colour: UInt8[np.ndarray, "h w 3"] | None = None
-    """Red, green and blue of the same pixels; None where there is none."""
+    """Red, green and blue of the same pixels; None if there is none."""
 
 
 Camera = Generator[DepthFrame, None, None]
@@ -60,27 +60,27 @@ class CaptureSettings(FrameSettings):
     """realsense, or realsense:SERIAL; bag:FILE, a recording of one; rosbag:PATH, a recording of
     ROS; folder:DIR, depth images as qs3 capture writes them."""
     intrinsics: str = ""
-    """Of a folder or a ROS bag that does not tell its own: fx,fy,cx,cy or a file."""
+    """Of a folder or a ROS bag without its own: fx,fy,cx,cy or a file."""
     topic: str = ""
     """Of a ROS bag with several topics of depth images: which."""
 
 
 def open_camera(settings: CaptureSettings, colour: bool = True) -> Camera:
-    """Yield frames of a camera, as many and as often as the settings say.
+    """Yield frames of a camera, as many and as often as the settings ask.
 
     Args:
         settings: Which camera, and which of its frames.
-        colour: Whether colour is asked for, where the camera has it.
+        colour: Whether to read colour if the camera has it.
 
     Raises:
-        InputError: where there is no such camera or file, or it is damaged.
-        MissingExtraError: where its package is not installed.
+        InputError: If there is no such camera or file, or it is damaged.
+        MissingExtraError: If its package is not installed.
     """
     last, count = -np.inf, 0
     with closing(_camera(settings, colour)) as camera:
         for frame in camera:
             if frame.timestamp is not None:
-                # A step backwards begins anew: clocks are set, and recordings put together.
+                # A step backwards starts again: clocks are set, and recordings put together.
                 if last <= frame.timestamp < last + settings.every * (1 - 1e-6):
                     continue
                 last = frame.timestamp

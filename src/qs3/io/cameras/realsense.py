@@ -26,10 +26,10 @@ def realsense_camera(serial: str = "", file: Path | None = None, colour: bool = 
     Args:
         serial: Number of the camera; empty takes the first.
         file: A recording (.bag, or .db3 of librealsense 2.58 and later) in place of a camera.
-        colour: Whether to give colour where there is some.
+        colour: Whether to give colour if there is some.
 
     Raises:
-        InputError: where there is no such camera or file, it is damaged, or it gives no depth.
+        InputError: If there is no such camera or file, it is damaged, or it gives no depth.
         MissingExtraError: If pyrealsense2 is not installed or cannot be loaded.
     """
     try:
@@ -103,7 +103,7 @@ def _frames(rs: Any, pipeline: Any, profile: Any, colour: bool) -> Camera:
 
 
 def _framesets(rs: Any, pipeline: Any, device: Any) -> Iterator[Any]:
-    """What comes from a camera, or from a recording until it ends."""
+    """Yield framesets of a camera, or of a recording until it ends."""
     playback = device.as_playback() if device.is_playback() else None
     while True:
         arrived, frames = pipeline.try_wait_for_frames(_PATIENCE if playback is None else 200)
@@ -128,7 +128,7 @@ def _depth_frame(depth: Any, name: str) -> DepthFrame:
 
 
 def _together(depth: Any, colour: Any) -> bool:
-    """Whether both are of one moment, as far as one clock tells."""
+    """Return whether both are of one moment; true if their clocks differ."""
     if depth.get_frame_timestamp_domain() != colour.get_frame_timestamp_domain():
         return True
     slower = min(depth.profile.fps(), colour.profile.fps())

@@ -15,15 +15,11 @@ from qs3.io.extract.intrinsics import Intrinsics, intrinsics_from_matrix, read_i
 from qs3.reading import reading
 
 _KINDS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
-_PACKED = re.compile(r"16UC1;\s*compressedDepth(\s+png)?")
-_HEADER = 12  # bytes before the PNG of compressedDepth
+_DEPTH = re.compile(r"16UC1|mono16|32FC1|16UC1;\s*compressedDepth(\s+png)?")
 
 
 def ros_camera(path: Path, topic: str = "", intrinsics: str = "") -> Camera:
-    """Yield the depth images of a ROS bag.
-
-    Convention:
-        Whole numbers are millimetres, floating-point numbers metres (REP 118).
+    """Yield the depth images of a ROS bag; whole numbers are millimetres, others metres (REP 118).
 
     Args:
         path: A .bag of ROS 1; of ROS 2 the folder with metadata.yaml, a .db3 or a .mcap.
@@ -31,16 +27,13 @@ def ros_camera(path: Path, topic: str = "", intrinsics: str = "") -> Camera:
         intrinsics: Of the camera; if empty, the CameraInfo beside the images.
 
     Raises:
-        InputError: If the bag is missing or damaged, or topic or camera cannot be told.
+        InputError: If the bag is missing or damaged, or topic or camera is ambiguous.
         MissingExtraError: If rosbags is not installed.
     """
-    largest = path
-    if path.is_dir():
-        files = (file for file in path.iterdir() if file.is_file())
-        largest = max(files, key=lambda file: file.stat().st_size, default=path / "metadata.yaml")
+    file = path / "metadata.yaml" if path.is_dir() else path
     frames = _frames(path, topic, read_intrinsics(intrinsics) if intrinsics else None)
     while True:
-        with reading(largest, "a ROS bag", streamed=True):
+        with reading(file, "a ROS bag", streamed=True):
             frame = next(frames, None)
         if frame is None:
             return
@@ -53,7 +46,6 @@ def _frames(path: Path, topic: str, camera: Intrinsics | None) -> Camera:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise MissingExtraError("rosbags", "ros", error) from None
-
     old = path.suffix == ".bag"
     # The standard types: rosbags would execute code made of the definitions in a bag.
     types = get_typestore(Stores.ROS1_NOETIC if old else Stores.ROS2_HUMBLE)
@@ -69,10 +61,12 @@ def _frames(path: Path, topic: str, camera: Intrinsics | None) -> Camera:
                 yield time / 1e9, read(data, connection.msgtype)
 
         images = [name for name, kind in kinds.items() if kind in ("Image", "CompressedImage")]
-        topics = [name for name in images if _is_depth(next(messages(name), (0, None))[1])]
+        topics = [n for n in images if _DEPTH.fullmatch(_encoding(next(messages(n), (0, None))[1]))]
         chosen = [name for name in topics if topic in ("", name)]
         if len(chosen) != 1:
-            raise InputError(f"--topic must name one topic of depth images: {', '.join(topics)}")
+            raise InputError(
+                f"--topic must name one topic of depth images: {', '.join(topics) or 'none'}"
+            )
         topic = chosen[0]
         if camera is None:
             infos = [name for name, kind in kinds.items() if kind == "CameraInfo"]
@@ -100,17 +94,13 @@ def _intrinsics(info: Any, topic: str) -> Intrinsics:
     return intrinsics_from_matrix(matrix.astype(np.float64))
 
 
-def _is_packed(message: Any) -> bool:
-    return _PACKED.fullmatch(getattr(message, "format", "")) is not None
-
-
-def _is_depth(message: Any) -> bool:
-    return _is_packed(message) or getattr(message, "encoding", "") in _KINDS
+def _encoding(message: Any) -> str:
+    return getattr(message, "format", "") or getattr(message, "encoding", "")
 
 
 def _pixels(message: Any) -> Shaped[np.ndarray, "h w"]:
-    if _is_packed(message):
-        image = decode_image(bytes(message.data[_HEADER:]))
+    if hasattr(message, "format"):
+        image = decode_image(bytes(message.data[12:]))  # after its header
         if image.dtype != np.uint16 or image.ndim != 2:
             raise InputError(f"compressedDepth holds {image.dtype} {image.shape}, not 16 bits")
         return image

@@ -7,7 +7,7 @@ Convention:
     BOP counts millimetres, the points are in metres. A depth picture times ``depth_scale`` is
     millimetres along the optical axis. Matrices are row by row; a world point is at R·p + t in the
     OpenCV camera. Clouds are in the axes of the world, of the object's own model, or of the camera
-    turned as `cut.upright` says.
+    turned by `cut.upright`.
 """
 
 import dataclasses

@@ -28,7 +28,7 @@ _MOST_INSTANCES = 4096
 
 @dataclass(frozen=True)
 class DepthImageSettings:
-    """What is cut from depth images of any camera, or from scenes in BOP's layout."""
+    """Settings for objects from depth images of any camera, or from scenes in BOP's layout."""
 
     intrinsics: str = ""
     """fx,fy,cx,cy; a JSON or YAML file of a camera; or a text file of 3×3 numbers."""
@@ -47,7 +47,7 @@ class DepthImageSettings:
     """CSV with the columns name and class: of an image (a), an instance (a/1, or */1 in any image)
     or a model of BOP (1 or obj_000001)."""
     frame: Literal["auto", "world", "camera", "model"] = "auto"
-    """Axes of the clouds, in BOP's layout: auto is the world where the scene tells it."""
+    """Axes of the clouds, in BOP's layout: auto is the world if the scene has it."""
     depth_folder: str = "depth"
     """Folder of the depth pictures in a scene of BOP's layout; depth_true, of qs3 scan --frames,
     gives clean twins."""
@@ -80,14 +80,14 @@ def extract_depth(
         source: A depth image (16-bit PNG, TIFF, npy), a folder of them, or a scene in BOP's layout
             or a folder of such scenes, such as the frames/ of qs3 scan --frames.
         output: Where the clouds go.
-        settings: What is cut.
+        settings: Which objects are cut, and how.
 
     Raises:
-        InputError: where there is nothing to cut from, camera or object is not told, a setting
+        InputError: If there is nothing to cut from, camera or object is not given, a setting
             does not suit the source, or as `run_extract` does.
 
     Convention:
-        Metres; the camera is the origin, axes as `cut.upright` says. For BOP see `bop`.
+        Metres; the camera is the origin, axes as in `cut.upright`. For BOP see `bop`.
     """
     from qs3.io.extract import bop
 
@@ -124,16 +124,16 @@ def extract_depth(
 
 @dataclass(frozen=True)
 class FrameObject:
-    """An object of a depth image, or all of its mask's objects where instances are asked for."""
+    """An object of a depth image, or all instances of its mask."""
 
     id: str
     """Name of its cloud, and of what the instances' numbers are put behind."""
     mask: Path | None
-    """The mask, or None where a box tells the object."""
+    """The mask; None if a box gives the object."""
     to_axes: Float[np.ndarray, "k k"]
-    """What takes camera points to the axes of the cloud: a rotation, or a pose in metres."""
+    """Camera to the axes of the cloud: a rotation, or a pose in metres."""
     class_name: str = ""
-    """Its class, where that is known without the table of names."""
+    """Its class; empty if the table of names decides."""
     source: Mapping[str, object] = field(default_factory=dict)
     """Where it came from, for the data set."""
 
@@ -147,9 +147,9 @@ class Frame:
     path: Path
     """The file."""
     camera: Intrinsics
-    """The camera that took it, with the depth scale in metres a step where that is known."""
+    """The camera that took it, with metres a step of depth if known."""
     objects: tuple[FrameObject, ...]
-    """What is cut out."""
+    """Objects to cut out."""
 
 
 def list_frames(source: Path, camera: Intrinsics, settings: DepthImageSettings) -> list[Frame]:
@@ -193,7 +193,7 @@ def cut_frame(
     ``names`` gives the class by the object: ``a``, or of an instance ``a/1`` or ``*/1``.
 
     Raises:
-        InputError: where a file is damaged, sizes differ, or the box is outside the image.
+        InputError: If a file is damaged, sizes differ, or the box is outside the image.
     """
     depth = read_depth(frame.path, frame.camera.depth_scale)
     frame.camera.check_size(depth.shape, str(frame.path))

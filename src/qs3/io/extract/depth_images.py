@@ -23,7 +23,7 @@ def read_depth(path: Path, depth_scale: float | None = None) -> Float32[np.ndarr
     """Read a depth image.
 
     Convention:
-        Depth is along the optical axis in metres, NaN where there is none. By default whole
+        Depth is along the optical axis in metres, NaN if there is none. By default whole
         numbers count millimetres and floating-point numbers metres. 0, a negative number, NaN and
         infinity are no depth.
 

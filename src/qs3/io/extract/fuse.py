@@ -2,8 +2,8 @@
 
 A volume or a mean per voxel would average the sensor's noise away, which is what clouds of raw
 depth are for. Here every point that comes out is one that the sensor measured. Where there are too
-many, chance decides: each point and each voxel has a number hashed from the seed and from where it
-is (frame and pixel, or voxel), and the lowest numbers stay. The result is a uniform choice that
+many, chance decides: each point and each voxel has a number hashed from the seed and its place
+(frame and pixel, or voxel), and the lowest numbers stay. The result is a uniform choice that
 depends neither on the order of the frames nor on how the work was cut up.
 """
 
@@ -60,7 +60,7 @@ def subsample(
         seed: Seed of the voxels' hashes.
 
     Raises:
-        InputError: where a point lies a million voxels from the origin.
+        InputError: If a point lies a million voxels from the origin.
 
     Example:
         >>> cloud = np.array([[0.001, 0, 0], [0.002, 0, 0], [0.5, 0, 0]])
@@ -97,7 +97,7 @@ class ObjectFusion:
         self._voxel, self._max_points = voxel, max_points
         self._max_frames, self._seed = max_frames, seed
         self._held: dict[int, tuple[int, int, _Part]] = {}  # rank, points and part of each frame
-        self._fused: list[_Part] = []  # of all frames, where none is left out
+        self._fused: list[_Part] = []  # of all frames, if none is left out
         self._used = self._measured = 0
         self.offered = 0
         """Frames offered so far."""

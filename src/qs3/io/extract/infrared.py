@@ -42,19 +42,19 @@ class PairFiles:
             )
 
     def checksums(self) -> dict[str, dict[str, str]]:
-        """Name (not the path) and SHA-256 of each image, for records; none where none is named."""
+        """Name (not the path) and SHA-256 of each image, for records; empty without images."""
         left, right = self.pair or (None, None)
         paths = {"left": left, "right": right, "depth": self.depth}
         return {n: {"name": p.name, "sha256": sha256(p)} for n, p in paths.items() if p is not None}
 
     def read(self) -> InfraredPair | None:
-        """Read the pair; None where none is named.
+        """Read the pair; None if no files are given.
 
         Images of 16 bits are brought to the 10 bits that such cameras have, both by one power of
         two.
 
         Raises:
-            InputError: where a file is missing, damaged or of another kind, or they do not belong
+            InputError: If a file is missing, damaged or of another kind, or they do not belong
                 together.
         """
         if self.pair is None or self.depth is None or self.baseline is None:

@@ -59,16 +59,16 @@ WORDS: Mapping[str, str] = {
 """Words of its annotators that the common table of class names does not hold, or not so."""
 
 _MEASURED = (slice(44, 471), slice(40, 601))
-_FLOOR = 500  # pixels of floor that tell a plane
+_FLOOR = 500  # pixels of floor that fix a plane
 _UP = np.array([0.0, -1.0, 0.0])
 
 
 @dataclass(frozen=True)
 class Nyuv2Settings:
-    """What is cut from the labelled frames of NYU Depth v2."""
+    """Settings for objects from the labelled frames of NYU Depth v2."""
 
     splits: Path | None = None
-    """The official splits.mat, which tells train from test; by default the one beside the file, if
+    """The official splits.mat with train and test frames; by default the one beside the file, if
     there is one."""
     classes: tuple[str, ...] = ("pointda10",)
     """Classes to map the objects onto; pointda10 for its ten, all for the annotators' own."""
@@ -97,7 +97,7 @@ class NyuFrame:
     split: str
     """``train``, ``test`` or empty."""
     scene: str
-    """Where it was filmed, such as ``kitchen_0004``; empty where the file does not tell."""
+    """Where it was filmed, such as ``kitchen_0004``."""
 
 
 def extract_nyuv2(source: Path, output: OutputSettings, settings: Nyuv2Settings) -> ExtractReport:
@@ -106,7 +106,7 @@ def extract_nyuv2(source: Path, output: OutputSettings, settings: Nyuv2Settings)
     Args:
         source: nyu_depth_v2_labeled.mat or its folder.
         output: Where the clouds go.
-        settings: What is cut.
+        settings: Which objects are cut, and how.
 
     Raises:
         InputError: If a file is missing or another, holds no object of these classes, or as
@@ -239,10 +239,10 @@ def cut_frame(
 def level(
     depth: Float[np.ndarray, "h w"], floor: Bool[np.ndarray, "h w"], camera: Intrinsics
 ) -> tuple[Float[np.ndarray, "3 3"], float, bool]:
-    """Rotation of camera points to z up, what is added to z, and whether a floor was found.
+    """Return the rotation of camera points to z up, the shift of z, and whether a floor was found.
 
     The floor is the plane of the pixels that are labelled so, within 45° of level; without one the
-    room's own surfaces tell (`plane.room_up`).
+    room's own surfaces decide (`plane.room_up`).
     """
     if floor.sum() >= _FLOOR:
         points = lift(depth, floor, camera)

@@ -1,4 +1,4 @@
-"""Planes in clouds, and which way is up where no plane tells: floors, table tops, rooms."""
+"""Planes in clouds, and the upward direction of rooms: floors, table tops."""
 
 import math
 from typing import NamedTuple
@@ -50,7 +50,7 @@ def fit_plane(
         seed: Seed of the draws.
 
     Returns:
-        The plane; None where three points never gave one that is level enough.
+        The plane; None if no three points gave one that is level enough.
 
     Example:
         >>> grid = np.stack([*np.mgrid[:9, :9].reshape(2, -1), np.full(81, 0.5)], axis=1)
@@ -97,7 +97,7 @@ def room_up(
     from RGB-D images", CVPR 2013, section 2.1.
 
     Args:
-        points: Point of each pixel, NaN where there is none.
+        points: Point of each pixel, NaN if there is none.
         up: Where to begin: about the image's upward direction, of unit length.
     """
     across, down = np.gradient(points, axis=1), np.gradient(points, axis=0)

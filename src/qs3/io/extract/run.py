@@ -66,7 +66,7 @@ class ExtractedCloud:
 
 @runtime_checkable
 class Unit(Protocol):
-    """What is extracted at a time, and lost at a time if the machine stops: a scene, a frame."""
+    """The unit of work and of resume: a scene, a frame."""
 
     @property
     def id(self) -> str:
@@ -76,7 +76,7 @@ class Unit(Protocol):
 
 @dataclass(frozen=True)
 class ExtractReport:
-    """What one call of `run_extract` did, and what the data set holds after it."""
+    """Counts of one call of `run_extract` and of its data set."""
 
     objects: int
     """Objects in the data set."""
@@ -87,15 +87,15 @@ class ExtractReport:
     failed: int
     """Scenes or frames that failed, now or before; each is in ``failures.jsonl``."""
     planned: int | None = None
-    """Objects that the source announces; None where only cutting tells."""
+    """Objects that the source announces; None if unknown before cutting."""
     min_points: int = 0
     """Objects of fewer points were left out."""
     axes: str = ""
-    """Axes of the clouds, where the source let choose."""
+    """Axes of the clouds, if the source has several."""
 
 
 def wanted_classes(given: Sequence[str]) -> tuple[str, ...] | None:
-    """The classes to map onto: ``pointda10`` for its ten; None for ``all``, the source's own."""
+    """Return the classes to map onto: ten for ``pointda10``; None for ``all``, the source's own."""
     if tuple(given) in (("all",), ()):
         return None
     if tuple(given) == ("pointda10",):
@@ -106,7 +106,7 @@ def wanted_classes(given: Sequence[str]) -> tuple[str, ...] | None:
 
 
 def recorded(settings: Any, *leave_out: str) -> dict[str, Any]:
-    """Settings as ``dataset.json`` has them: plain values, null for infinity, which JSON lacks."""
+    """Return settings as plain values for ``dataset.json``, with null for infinity."""
     plain = json.loads(json.dumps(unstructure(settings)), parse_constant=lambda _: None)
     return {name: value for name, value in plain.items() if name not in leave_out}
 
@@ -129,13 +129,13 @@ def run_extract(
         units: Scenes or frames, in the order of the shards.
         extract_one: Yields the objects of one unit; a picklable function or partial.
         output: A new or empty folder, or one that the same call began.
-        settings: What the rows depend on, plain values; stored in ``dataset.json``.
+        settings: Plain values that the rows depend on; stored in ``dataset.json``.
         class_names: Classes in the order of the label; an object of any other class is a fault.
         planned: Objects that the source announces, for the report.
         min_points: Size below which ``extract_one`` leaves objects out, for the report.
 
     Raises:
-        InputError: where there is no unit or two have one name, the folder holds something else,
+        InputError: If there is no unit or two have one name, the folder holds something else,
             or a fault lies with the machine and not with a unit.
     """
     out, num_points = output.out, output.num_points

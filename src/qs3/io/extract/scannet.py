@@ -34,7 +34,7 @@ class ScanNetSettings:
     """Largest depth kept, metres: beyond it the sensor's noise passes 3 cm."""
     cut: Literal["auto", "masks", "mesh"] = "auto"
     """By the instance masks of the frames, or by nearness to the annotated mesh; auto takes the
-    masks where the scene has them."""
+    masks if the scene has them."""
     erode: int = 2
     """Pixels of the depth image by which masks shrink: as far as they miss the depth's edges."""
     distance: float = 0.05
@@ -76,10 +76,10 @@ def extract_scannet(
     Args:
         source: A copy of the release, its folder scans, or one scene's folder.
         output: Where the clouds go.
-        settings: What is cut.
+        settings: Which objects are cut, and how.
 
     Raises:
-        InputError: where a scene asked for is not there, nothing is left, or as `run_extract`
+        InputError: If a scene asked for is not there, nothing is left, or as `run_extract`
             does.
     """
     from qs3.io.extract.scannet_frames import cut_scene

@@ -1,7 +1,7 @@
 """DepthScanNet-like clouds: objects of ScanNet fused from raw depth frames.
 
 QS3 tests on objects "taken directly from" ScanNet's depth frames, which keep the sensor's noise;
-how many frames it fused and how it cut objects out is unpublished. What is done here:
+how many frames it fused and how it cut objects out is unpublished. Steps:
 
 1. Every ``every``-th frame with a pose is read; depth beyond ``near`` and ``far`` is left out.
 2. A point belongs to the object whose instance mask (shrunk by ``erode``) it falls on, through the
@@ -13,7 +13,7 @@ how many frames it fused and how it cut objects out is unpublished. What is done
 4. Each voxel keeps one measured point at random: even density, unaveraged noise (`ObjectFusion`).
 
 Convention:
-    Metres, z up: the scene's axisAlignment where it has one, else the scene's own frame. The box's
+    Metres, z up: the scene's axisAlignment if it has one, else the scene's own frame. The box's
     middle is at x = y = 0 and its lowest point at z = 0; ``source["origin"]`` leads back.
 
 Source: Chen et al., "Quasi-Balanced Self-Training on Noise-Aware Synthesis of Object Point Clouds",
@@ -50,7 +50,7 @@ _MASKS = "_2d-instance-filt.zip"
 
 
 class Seen(NamedTuple):
-    """What the depth camera measured in one frame."""
+    """Points that the depth camera measured in one frame."""
 
     frame: int
     """Its number."""

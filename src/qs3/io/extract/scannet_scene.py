@@ -1,6 +1,6 @@
 """Scenes of ScanNet on disk: which there are, their objects, their axes.
 
-A scene's folder (``scans/scene0000_00`` of the release) holds, of what is read here::
+A scene's folder (``scans/scene0000_00`` of the release) holds these files, among others::
 
     scene0000_00.sens                         depth frames, poses, calibration
     scene0000_00.txt                          axisAlignment

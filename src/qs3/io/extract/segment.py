@@ -52,7 +52,7 @@ class SegmentSettings:
     far: float = math.inf
     """Depths of a depth image at or above are dropped, metres."""
     stride: int = 1
-    """Of a depth image, every so many-th row and column is taken: 2 is four times as fast."""
+    """Of a depth image, use every n-th row and column: 2 is four times as fast."""
     gravity: tuple[float, float, float] | None = None
     """Downward direction, roughly, in the axes of the file; None takes 0 0 -1 of a cloud (z up) and
     0 1 0 of a depth image (the camera's y)."""
@@ -128,7 +128,7 @@ def segment_scene(
         settings: How it is cut.
 
     Raises:
-        InputError: where the scene cannot be read, has no plane or nothing on it, or the folder is
+        InputError: If the scene cannot be read, has no plane or nothing on it, or the folder is
             taken.
     """
     return _cut_into(out, scene, settings)
@@ -162,13 +162,13 @@ def _cut_into(
 
 
 def list_scenes(folder: Path, settings: SceneSettings) -> tuple[dict[str, Path], SceneSettings]:
-    """List the scenes of a folder by their names, and say how they are read.
+    """List the scenes of a folder by their names, and return the settings to read them with.
 
     With intrinsics, or a camera's file beside them, they are the depth images in ``folder/depth``
     or in the folder itself, as ``qs3 capture`` writes them; else its clouds.
 
     Raises:
-        InputError: where there is none, or two have one name.
+        InputError: If there is none, or two have one name.
     """
     told = any((folder / name).is_file() for name in CAMERA_FILES)
     if not settings.intrinsics and told and holds_images(folder):
@@ -188,8 +188,8 @@ def segment_scenes(
 ) -> Iterator[tuple[str, list[SegmentedObject] | InputError | None]]:
     """Cut scenes one after another, each into the folder ``out/<name>`` as `segment_scene` does.
 
-    A `SCENE_RECORD` in that folder tells the scene's checksum, its camera and the settings: what
-    was made of the same is left as it is, so that the same call goes on after a stop.
+    A `SCENE_RECORD` in that folder has the scene's checksum, its camera and the settings: scenes
+    cut with the same settings are skipped, so that the same call goes on after a stop.
 
     Args:
         scenes: Files by the names of their folders.
@@ -198,10 +198,10 @@ def segment_scenes(
 
     Yields:
         The name and the objects; the fault of a scene that cannot be read, has no object, or whose
-        folder is taken; None where it was there before.
+        folder is taken; None if it was cut before.
 
     Raises:
-        InputError: where the camera cannot be read, or the folder is another's.
+        InputError: If the camera cannot be read, or the folder is another's.
     """
     how = {field.name: repr(getattr(settings, field.name)) for field in fields(settings)}
     camera = read_intrinsics(settings.intrinsics) if settings.intrinsics else None
@@ -237,7 +237,7 @@ def read_scene(
     Args:
         path: As `segment_scene` takes it.
         settings: How it is read.
-        camera: What ``settings.intrinsics`` names, where it has been read.
+        camera: The camera of ``settings.intrinsics``, if it was read already.
     """
     if settings.intrinsics:
         camera = camera or read_intrinsics(settings.intrinsics)
@@ -273,12 +273,12 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
     """Cut a scene into the objects that stand on its largest level plane, by points.
 
     Args:
-        points: The scene in metres, z up to ``tilt`` degrees; where ``noise`` is set, the camera at
+        points: The scene in metres, z up to ``tilt`` degrees; if ``noise`` is set, the camera at
             the origin.
         settings: How it is cut.
 
     Raises:
-        InputError: where no plane holds a tenth of the points, or nothing stands on it.
+        InputError: If no plane holds a tenth of the points, or nothing stands on it.
     """
     if len(points) < 3:
         raise InputError(f"{len(points)} points: no depth in it, or none that is near enough")
@@ -297,7 +297,7 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
     if plane is None or held < _LEAST_SHARE:
         raise InputError(
             f"no plane within {settings.tilt:g}° of level holds a tenth of the points to "
-            f"{middle:g} m; tell --gravity, or raise --tolerance"
+            f"{middle:g} m; give --gravity, or raise --tolerance"
         )
     points = turn(_level(plane), points) - np.array([0.0, 0.0, plane.offset])
     near = (points[:, 2] <= settings.height) & (points[:, 2] >= -tolerance)
