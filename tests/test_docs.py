@@ -32,7 +32,7 @@ ALL = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
 NAMES = [str(page.relative_to(ROOT)) for page in ALL]
 MADE = {"contributing.md", "changelog.md", "examples.md"}
 """Pages that exist in the built site alone."""
-SUBCOMMANDS = {"extract": ("scannet", "nyuv2", "depth", "bag", "rosbag")}
+SUBCOMMANDS = {"extract": ("scannet", "nyuv2", "depth")}
 METHODS = set(get_args(MethodName)) - {"gast-spst"}  # told on the pages of its parts
 
 
@@ -121,7 +121,7 @@ import json, hooks
 from qs3.cli import VERBS
 verbs = list(VERBS)
 asked = [verb for verb in verbs if verb != "extract"]
-asked += [f"extract {name}" for name in ("scannet", "nyuv2", "depth", "bag", "rosbag")]
+asked += [f"extract {name}" for name in ("scannet", "nyuv2", "depth")]
 told = {v: hooks.options_of(hooks.help_of(v.split())) for v in asked}
 try:
     refused = hooks.options_table(["no-such-verb"])

@@ -110,7 +110,7 @@ def test_places_move_against_the_camera(shots):
 
 def test_the_verbs_from_a_bag_to_answers(tmp_path, typed):
     bag = write_ros1(tmp_path / "bag", list(frames(3)), "16UC1", "ros1-lz4")
-    done = typed("extract", "rosbag", bag, "--out", tmp_path / "a", "--frames", 2)
+    done = typed("capture", "--camera", f"rosbag:{bag}", "--out", tmp_path / "a", "--frames", 2)
     assert done.stdout.strip() == str(tmp_path / "a")
     assert done.stderr.startswith("2 frames.")
     folder = f"folder:{tmp_path / 'a'}"
@@ -124,4 +124,4 @@ def test_the_verbs_from_a_bag_to_answers(tmp_path, typed):
     assert len(seen[0]["probabilities"]) == 10
     done = typed("watch", "rooms", "--camera", folder, "--frames", 1)
     assert done.stdout.startswith(f"000000\t{seen[0]['class']} 0.")
-    typed.refuses("extract", "bag", tmp_path / "none.bag", "--out", tmp_path / "c")
+    typed.refuses("capture", "--camera", f"bag:{tmp_path}/none.bag", "--out", tmp_path / "c")

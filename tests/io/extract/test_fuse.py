@@ -94,8 +94,7 @@ def test_the_choice_of_voxels_and_frames_is_uniform() -> None:
 def test_what_is_held_is_bounded() -> None:
     fusion = ObjectFusion(0.001, 50, 4, 0)
     for index, points, pixels in stream(0, 60):
-        if fusion.wants(index):
-            fusion.add(index, points, pixels)
+        fusion.add(index, points, pixels)
         assert fusion.frames <= 4
         assert len(fusion.points()) <= 50
 

@@ -361,7 +361,7 @@ def test_objects_listed_twice_come_once(tmp_path: Path) -> None:
     groups = [(1, "chair", [1]), (0, "desk", [2]), (1, "couch", [3]), (4, "wall", [4])]
     write_aggregation(tmp_path / "scene0217_00.aggregation.json", groups)
     objects = read_objects(scene)
-    assert [(item.id, item.class_name, item.segments) for item in objects] == [
+    assert [(item.objectId, name, item.segments) for item, name in objects] == [
         (0, "table", (2,)),
         (1, "chair", (1,)),
     ]

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qs3.io.extract.scannet import ScanNetSettings
-from qs3.io.extract.scannet_mesh import cut_mesh_scene, read_scene_mesh
-from qs3.io.extract.scannet_scene import ScanNetScene, read_objects
+from qs3.io.extract.scannet import ScanNetSettings, cut_mesh_scene
+from qs3.io.extract.scannet_scene import ScanNetScene, read_objects, read_scene_mesh
 
 from ..hostile import refused
 from .writers import CHAIR, TABLE, Room, write_aggregation, write_mesh, write_room, write_segments

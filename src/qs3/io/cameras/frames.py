@@ -37,10 +37,17 @@ class DepthFrame:
 Camera = Generator[DepthFrame, None, None]
 
 
-@dataclass(frozen=True, kw_only=True)
-class FrameSettings:
-    """Which frames of a camera."""
+@dataclass(frozen=True)
+class CaptureSettings:
+    """Which camera, and which of its frames."""
 
+    camera: str
+    """realsense, or realsense:SERIAL; bag:FILE, a recording of one; rosbag:PATH, a recording of
+    ROS; folder:DIR, depth images as qs3 capture writes them."""
+    intrinsics: str = ""
+    """Of a folder or a ROS bag without its own: fx,fy,cx,cy or a file."""
+    topic: str = ""
+    """Topic of the depth images, if a ROS bag has several."""
     frames: int | None = None
     """Frames to take at most; all by default, of a live camera until Ctrl-C."""
     every: float = 0.0
@@ -50,19 +57,6 @@ class FrameSettings:
         if self.frames is not None and self.frames < 1:
             raise InputError(f"--frames {self.frames}: must be at least 1")
         check_range(self, "frames", "every")
-
-
-@dataclass(frozen=True)
-class CaptureSettings(FrameSettings):
-    """Which camera, and which of its frames."""
-
-    camera: str
-    """realsense, or realsense:SERIAL; bag:FILE, a recording of one; rosbag:PATH, a recording of
-    ROS; folder:DIR, depth images as qs3 capture writes them."""
-    intrinsics: str = ""
-    """Of a folder or a ROS bag without its own: fx,fy,cx,cy or a file."""
-    topic: str = ""
-    """Of a ROS bag with several topics of depth images: which."""
 
 
 def open_camera(settings: CaptureSettings, colour: bool = True) -> Camera:

@@ -88,37 +88,26 @@ class ObjectFusion:
     """Gathers the raw points of one object from a stream of frames.
 
     Of the frames that are offered, at most ``max_frames`` stay, chosen uniformly by the hash of
-    their number; each is subsampled by itself, so that what is held never passes
-    ``max_frames`` × ``max_points`` points however many frames there are. With ``max_frames`` 0 all
-    frames are fused, and ``max_points`` points are held.
+    their number. Each is subsampled by itself, so that at most ``max_frames`` × ``max_points``
+    points are held. With ``max_frames`` 0 all frames stay.
     """
 
     def __init__(self, voxel: float, max_points: int, max_frames: int, seed: int) -> None:
         self._voxel, self._max_points = voxel, max_points
         self._max_frames, self._seed = max_frames, seed
         self._held: dict[int, tuple[int, int, _Part]] = {}  # rank, points and part of each frame
-        self._fused: list[_Part] = []  # of all frames, if none is left out
-        self._used = self._measured = 0
         self.offered = 0
         """Frames offered so far."""
 
     @property
     def frames(self) -> int:
         """Frames fused."""
-        return self._used + len(self._held)
+        return len(self._held)
 
     @property
     def measured(self) -> int:
-        """Points in the frames that are held or were fused, before sampling."""
-        return self._measured + sum(count for _, count, _ in self._held.values())
-
-    def wants(self, frame: int) -> bool:
-        """Whether `add` would keep a frame of this number now."""
-        return (
-            self._max_frames == 0
-            or len(self._held) < self._max_frames
-            or self._rank(frame) < max(rank for rank, _, _ in self._held.values())
-        )
+        """Points in the fused frames, before sampling."""
+        return sum(count for _, count, _ in self._held.values())
 
     def add(
         self, frame: int, points: Float32[np.ndarray, "n 3"], pixels: Int[np.ndarray, "n"]
@@ -128,31 +117,24 @@ class ObjectFusion:
         The number of the frame and those of the points' pixels are below 2³².
         """
         self.offered += 1
-        if not self.wants(frame):
-            return
+        rank = int(mix(np.array([frame], dtype=np.uint64), self._seed + 1)[0])
+        if self._max_frames and len(self._held) == self._max_frames:
+            last = max(self._held, key=lambda number: self._held[number][0])
+            if rank >= self._held[last][0]:
+                return
+            del self._held[last]
         place = np.uint64(frame << 32) | pixels.astype(np.uint64)
         part = self._kept(points, mix(place, self._seed))
-        if self._max_frames == 0:
-            self._used += 1
-            self._measured += len(points)
-            self._fused = [self._union([*self._fused, part])]
-            return
-        if len(self._held) == self._max_frames:
-            del self._held[max(self._held, key=lambda number: self._held[number][0])]
-        self._held[frame] = (self._rank(frame), len(points), part)
+        self._held[frame] = (rank, len(points), part)
 
     def points(self) -> Float32[np.ndarray, "n 3"]:
         """Return the cloud: at most ``max_points`` measured points, frame after frame."""
-        parts = self._fused + [self._held[frame][2] for frame in sorted(self._held)]
-        return self._union(parts)[0] if parts else np.zeros((0, 3), dtype=np.float32)
-
-    def _rank(self, frame: int) -> int:
-        return int(mix(np.array([frame], dtype=np.uint64), self._seed + 1)[0])
+        parts = [self._held[frame][2] for frame in sorted(self._held)]
+        if not parts:
+            return np.zeros((0, 3), dtype=np.float32)
+        points, keys = map(np.concatenate, zip(*parts, strict=True))
+        return self._kept(points, keys)[0]
 
     def _kept(self, points: Float32[np.ndarray, "n 3"], keys: UInt64[np.ndarray, "n"]) -> _Part:
         kept = subsample(points, keys, self._voxel, self._max_points, self._seed)
         return points[kept], keys[kept]
-
-    def _union(self, parts: list[_Part]) -> _Part:
-        points = np.concatenate([points for points, _ in parts])
-        return self._kept(points, np.concatenate([keys for _, keys in parts]))

@@ -34,13 +34,14 @@ from qs3.io.extract.depth_images import decode_image
 from qs3.io.extract.fuse import ObjectFusion
 from qs3.io.extract.run import ExtractedCloud
 from qs3.io.extract.scannet import ScanNetSettings
-from qs3.io.extract.scannet_mesh import NO_OBJECT, read_scene_mesh
 from qs3.io.extract.scannet_scene import (
+    NO_OBJECT,
     ScanNetScene,
     SceneObject,
     axis_alignment,
     object_seed,
     read_objects,
+    read_scene_mesh,
     rest,
 )
 from qs3.io.extract.sens import SensHeader, read_depth_frames, read_sens_header
@@ -78,13 +79,13 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
     sens = scene.file(".sens")
     header = read_sens_header(sens)
     fusions = {
-        item.id: ObjectFusion(
+        item.objectId: ObjectFusion(
             settings.voxel,
             settings.max_points,
             settings.max_frames,
-            object_seed(settings.seed, scene, item.id),
+            object_seed(settings.seed, scene, item.objectId),
         )
-        for item in objects
+        for item, _ in objects
     }
     if not objects:
         return
@@ -112,8 +113,8 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
                     fusion.add(frame.index, placed, pixels[own])
     if unmasked and not masked:
         raise InputError(f"{scene.file(_MASKS)}: has no mask of any frame read; it is incomplete")
-    for item in objects:
-        fusion = fusions.pop(item.id)
+    for item, class_name in objects:
+        fusion = fusions.pop(item.objectId)
         cloud = fusion.points()
         if len(cloud) < settings.min_points:
             continue
@@ -125,7 +126,8 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
             "measured": fusion.measured,
             "origin": origin,
         }
-        yield ExtractedCloud(f"{scene.id}/{item.id}", item.class_name, points, scene.split, source)
+        identifier = f"{scene.id}/{item.objectId}"
+        yield ExtractedCloud(identifier, class_name, points, scene.split, source)
 
 
 def _rays(header: SensHeader) -> Float[np.ndarray, "n 3"]:
@@ -148,7 +150,7 @@ def _owners(
     scene: ScanNetScene,
     settings: ScanNetSettings,
     header: SensHeader,
-    objects: Sequence[SceneObject],
+    objects: Sequence[tuple[SceneObject, str]],
     stack: ExitStack,
 ) -> Owners:
     masks = scene.file(_MASKS)
@@ -256,7 +258,9 @@ def _hidden(
     return depth > 1.05 * front[down, across]
 
 
-def _by_mesh(scene: ScanNetScene, objects: Sequence[SceneObject], distance: float) -> Owners:
+def _by_mesh(
+    scene: ScanNetScene, objects: Sequence[tuple[SceneObject, str]], distance: float
+) -> Owners:
     """Objects by the nearest vertex of the annotated mesh, other objects' and the floor's too."""
     # Imported here: scenes cut by masks need no k-d tree.
     from scipy.spatial import KDTree

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from qs3.errors import InputError
 from qs3.files import read_json
@@ -49,6 +49,8 @@ LABELS: Mapping[str, str] = {
 }
 """Free labels of ScanNet's annotators that the common table of class names does not hold."""
 
+NO_OBJECT = -1
+_MESH, _SEGMENTS = "_vh_clean_2.ply", "_vh_clean_2.0.010000.segs.json"
 _SCENE = re.compile(r"scene\d{4}_\d{2}")
 
 
@@ -70,14 +72,12 @@ class ScanNetScene:
 
 @dataclass(frozen=True)
 class SceneObject:
-    """One annotated object of a scene that is in a class asked for."""
+    """One annotated object of a scene, an entry of ``segGroups``."""
 
-    id: int
-    """ScanNet's ``objectId``; a mask shows it as ``id`` + 1."""
+    objectId: int  # noqa: N815 (ScanNet's name)
+    """A mask shows it as this number + 1."""
     label: str
     """The annotator's word."""
-    class_name: str
-    """The class it maps to."""
     segments: tuple[int, ...]
     """Its segments of the mesh."""
 
@@ -147,28 +147,50 @@ def class_of(label: str, class_names: Sequence[str] = POINTDA10) -> str | None:
     return None
 
 
-def read_objects(scene: ScanNetScene, class_names: Sequence[str] = POINTDA10) -> list[SceneObject]:
-    """Read the annotated objects of a scene that are in some classes."""
+def read_objects(
+    scene: ScanNetScene, class_names: Sequence[str] = POINTDA10
+) -> list[tuple[SceneObject, str]]:
+    """Read the annotated objects of a scene that are in some classes, each with its class."""
     path = scene.file(".aggregation.json")
-    objects: dict[int, SceneObject] = {}
+    objects: dict[int, tuple[SceneObject, str]] = {}
     with reading(path, "an annotation of ScanNet"):
         for place, value in enumerate(read_json(path)["segGroups"]):
-            group = pick(value, _Group, f"entry {place} of segGroups")
-            name = class_of(group.label, class_names)
+            item = pick(value, SceneObject, f"entry {place} of segGroups")
+            name = class_of(item.label, class_names)
             if name is not None:
                 # scene0217_00 lists its objects twice: the first stays.
-                item = SceneObject(group.objectId, group.label, name, group.segments)
-                objects.setdefault(item.id, item)
+                objects.setdefault(item.objectId, (item, name))
     return [objects[number] for number in sorted(objects)]
 
 
-@dataclass(frozen=True)
-class _Group:
-    """An entry of ``segGroups``."""
+def read_scene_mesh(
+    scene: ScanNetScene, objects: Sequence[tuple[SceneObject, str]]
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
+    """Read the decimated mesh of a scene and give its vertices to objects.
 
-    objectId: int  # noqa: N815 (ScanNet's name)
-    label: str
-    segments: tuple[int, ...]
+    The vertices are in the scene's own frame, metres; with each comes the ``objectId`` of its
+    object, −1 if it has none. A segment of two objects belongs to the first.
+    """
+    # Imported here: scenes cut by masks need no mesh library.
+    import trimesh
+
+    path, segments_path = scene.file(_MESH), scene.file(_SEGMENTS)
+    with reading(path):
+        mesh = trimesh.load(path, file_type="ply", process=False)
+        vertices = np.asarray(getattr(mesh, "vertices", None), dtype=np.float64).reshape(-1, 3)
+        if not np.isfinite(vertices).all():
+            raise InputError("a vertex is not finite")
+    with reading(segments_path, "a list of segments"):
+        segments = np.array(read_json(segments_path)["segIndices"], dtype=np.int64)
+        if len(segments) != len(vertices):
+            raise InputError(
+                f"has {len(segments)} segIndices for {len(vertices)} vertices of {path.name}; "
+                "they are of different releases"
+            )
+    owner = np.full(len(vertices), NO_OBJECT, dtype=np.int64)
+    for item, _ in reversed(objects):
+        owner[np.isin(segments, np.array(item.segments, dtype=np.int64))] = item.objectId
+    return vertices, owner
 
 
 def axis_alignment(scene: ScanNetScene) -> Float[np.ndarray, "4 4"]:
