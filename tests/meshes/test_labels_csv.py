@@ -90,7 +90,7 @@ def test_convention_shapenet_is_y_up_with_labels_too(tree, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "line 1: no column file or path or uid"),
+        ("", "the file is empty"),
         ("file,kind\na,chair\n", r"line 1: no column class_name .*; it has 'file', 'kind'$"),
         ("where,class\na,chair\n", r"line 1: no column file .*; it has 'where', 'class'$"),
         ("file,class,file\na,chair,b\n", "line 1: two columns are called file"),
@@ -98,75 +98,32 @@ def test_convention_shapenet_is_y_up_with_labels_too(tree, tmp_path: Path) -> No
         ("file,class\na,chair\nz,chair\n", "line 3: 'z' is no mesh below"),
         ("file,class\nnotes.txt,chair\n", "line 2: 'notes.txt' is no mesh below"),
         ("file,class\ntwin,chair\n", "line 2: 'twin' is 2 files, such as d/twin.off and twin.obj"),
-        ("file,class\n../out.off,chair\n", r"line 2: '../out.off' leads outside"),
-        ("file,class\nd/../../out.off,chair\n", "line 2: .* leads outside"),
-        ("file,class\n..\\out.off,chair\n", "line 2: .* leads outside"),
-        ("file,class\n/etc/passwd,chair\n", "line 2: '/etc/passwd' leads outside"),
-        ("file,class\nC:/out.off,chair\n", "line 2: 'C:/out.off' leads outside"),
-        ("file,class\nlink,chair\n", "line 2: 'link' is a link that leads outside"),
-        ("file,class\nlinked/deep/out.off,chair\n", "line 2: .* is a link that leads outside"),
+        ("file,class\n../out.off,chair\n", r"line 2: '../out.off' is no mesh below"),
+        ("file,class\n/etc/passwd,chair\n", "line 2: '/etc/passwd' is no mesh below"),
         ("file,class\na,chair\na.off,chair\n", "line 3: 'a.off' has a row already, line 2"),
         ("file,class\na, \n", "line 2: 'a' has an empty class"),
-        ('file,class\na,"two\nlines"\n', r"line 3: 'a' has an odd class 'two\\nlines' or split"),
+        ('file,class\na,"two\nlines"\n', r"line 2: 'a' has an odd class 'two\\nlines' or split"),
         ("file,class\n ,chair\n", "line 2: names no file"),
-        ("file,class\na\n", "line 2: has 1 columns, the headings 2"),
-        ("file,class\na,chair,sofa\n", "line 2: has 3 columns, the headings 2"),
-        ('file,class\na,"chair\n', "not a CSV"),
-        ("file,class\n" + "a" * 200_000 + ",chair\n", "not a CSV"),
-        ("file,class\n" + "a" * 2_000_000 + ",chair\n", "line 2: too long for a CSV"),
-        ("file,class\na\0,chair\n", "line 2|not a CSV"),
+        ("file,class\na\n", "line 2: 'a' has an empty class"),
+        ("file,class\na,chair,sofa\n", "Expected 2 fields in line 2, saw 3"),
+        ('file,class\na,"chair\n', "cannot be read as CSV"),
     ],
 )
 def test_faulty_tables_are_named_in_one_line(tree, tmp_path: Path, text: str, message: str) -> None:
     root = tree("a.off", "twin.obj", "d/twin.off", "notes.txt")
-    outside = tmp_path / "outside"
-    (outside / "deep").mkdir(parents=True)
-    (outside / "deep/out.off").write_text("")
-    (root / "link.off").symlink_to(outside / "deep/out.off")
-    (root / "linked").symlink_to(outside)
     labels = put(tmp_path / "l.csv", text)
     with refused(f"^{labels}.*(?:{message})"):
         collect(root, labels=labels)
 
 
-def test_a_link_within_the_root_is_no_way_out(tree, tmp_path: Path) -> None:
-    root = tree("deep/a.off")
-    (root / "b.off").symlink_to(root / "deep/a.off")
-    labels = put(tmp_path / "l.csv", "file,class\nb,chair\n")
-    assert listed(collect(root, labels=labels)) == [("b", "chair", "")]
-
-
 def test_tables_that_are_none(tree, tmp_path: Path) -> None:
     root = tree("a.off")
-    with pytest.raises(InputError, match=r"none.csv: cannot be read"):
+    with pytest.raises(InputError, match=r"none.csv: no such file"):
         collect(root, labels=tmp_path / "none.csv")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="is a folder"):
         collect(root, labels=tmp_path)
     (tmp_path / "binary.csv").write_bytes(b"file,class\n\xff\xfe\x00")
-    with pytest.raises(InputError, match="not UTF-8"):
+    with pytest.raises(InputError, match="cannot be read as CSV"):
         collect(root, labels=tmp_path / "binary.csv")
     with pytest.raises(InputError, match="shapes have their own classes"):
         collect("shapes", labels=tmp_path / "binary.csv")
-
-
-def test_damaged_tables_end_in_a_clear_line_or_in_meshes_of_the_root(
-    tree, tmp_path: Path, rng: np.random.Generator
-) -> None:
-    root = tree("a.off", "d/b.off", "d/c.off")
-    valid = b'file,class,split\na.off,chair,train\nd/b,"night stand",test\nc,bed,\n'
-    tokens = [b"..", b"/", b"\\", b'"', b",", b"\n", b"\0", b"\xff", b"\xef\xbb\xbf", b"a" * 300]
-    ids = {item.id for item in collect(root)}
-    refused = 0
-    for _ in range(100):
-        data = bytearray(valid)
-        for _ in range(rng.integers(1, 4)):
-            at = int(rng.integers(len(data)))
-            token = tokens[rng.integers(len(tokens))]
-            data[at : at + int(rng.integers(0, 4))] = token * int(rng.integers(0, 3))
-        (tmp_path / "l.csv").write_bytes(data)
-        try:
-            assert {item.id for item in collect(root, labels=tmp_path / "l.csv")} <= ids
-        except InputError as error:
-            refused += 1
-            assert "\n" not in str(error)
-    assert 25 < refused < 100

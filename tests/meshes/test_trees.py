@@ -1,7 +1,6 @@
 """Trees of ModelNet, of ShapeNet and of one's own; PointDA-10's ten classes in each."""
 
 import contextlib
-import itertools
 import os
 from pathlib import Path
 
@@ -249,30 +248,6 @@ def test_links_are_followed_and_circles_are_left(tree, tmp_path: Path) -> None:
     (root / "table/lost.off").symlink_to(root / "nowhere.off")
     with pytest.raises(InputError, match=r"lost.off: a link that leads to no file"):
         collect(root)
-
-
-def test_links_that_multiply_are_refused(tree, tmp_path: Path, monkeypatch) -> None:
-    root = tree("chair/a.off")
-    folders = [tmp_path / "far" / str(number) for number in range(24)]
-    for folder in folders:
-        folder.mkdir(parents=True)
-    for folder, further in itertools.pairwise([root / "chair", *folders]):
-        for name in "ab":
-            (folder / name).symlink_to(further)
-    monkeypatch.setattr("qs3.meshes.walking._MOST_LINKED", 1000)
-    with pytest.raises(InputError, match="links lead to the same folders more than 1000 times"):
-        collect(root)
-
-
-def test_one_link_to_many_folders_is_followed(tree, tmp_path: Path, monkeypatch) -> None:
-    root = tree("chair/a.off")
-    for number in range(8):
-        folder = tmp_path / "disk" / str(number)
-        folder.mkdir(parents=True)
-        (folder / "b.off").write_text("")
-    (root / "table").symlink_to(tmp_path / "disk")
-    monkeypatch.setattr("qs3.meshes.walking._MOST_LINKED", 2)
-    assert len(collect(root)) == 9
 
 
 def test_a_name_that_no_table_can_hold_is_refused(tree) -> None:

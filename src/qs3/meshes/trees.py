@@ -16,7 +16,7 @@ from qs3.meshes.cad import NEEDS, check_extra
 from qs3.meshes.classes import MODELNET40, SHAPENET
 from qs3.meshes.labels_csv import read_labels, read_shapenet_splits
 from qs3.meshes.loading import EXTENSIONS, load_mesh
-from qs3.meshes.walking import MeshFile, entries, ids, is_file, walk
+from qs3.meshes.walking import entries, ids, is_file, walk
 
 SPLITS: tuple[str, ...] = ("train", "test", "val")
 """Names of folders that are splits, not classes."""
@@ -148,8 +148,8 @@ def _model(folder: Path) -> str | None:
     return next((name for name in _SHAPENET_FILES if is_file(folder / name)), None)
 
 
-def _folders(root: Path, files: Sequence[MeshFile]) -> list[MeshItem]:
-    paths = [file.relative.split("/") for file in files]
+def _folders(root: Path, files: Sequence[str]) -> list[MeshItem]:
+    paths = [file.split("/") for file in files]
     _refuse_wrong_level(root, paths)
     is_modelnet = all(
         len(parts) == 3 and parts[0] in MODELNET40 and parts[1] in ("train", "test")
@@ -164,8 +164,8 @@ def _labelled(root: Path, labels: Path, others: Counter[str]) -> list[MeshItem]:
     items = []
     # The ids are those of all meshes: a row more or less leaves them as they are.
     for file, item in zip(files, _items(root, files, "labels"), strict=True):
-        if file.relative in table:
-            class_name, split = table[file.relative]
+        if file in table:
+            class_name, split = table[file]
             split = item.split if split is None else split
             items.append(replace(item, class_name=class_name, split=split))
     if len(items) < len(files):
@@ -173,21 +173,21 @@ def _labelled(root: Path, labels: Path, others: Counter[str]) -> list[MeshItem]:
     return items
 
 
-def _items(root: Path, files: Sequence[MeshFile], layout: Layout) -> Iterator[MeshItem]:
+def _items(root: Path, files: Sequence[str], layout: Layout) -> Iterator[MeshItem]:
     """Meshes with the classes and splits that their folders tell.
 
     The first folder is the class, even one called train among cars and buses; only where all
     first folders are splits, the class comes below them.
     """
-    split_first = {f.relative.split("/")[0] for f in files if "/" in f.relative} <= set(SPLITS)
+    split_first = {f.split("/")[0] for f in files if "/" in f} <= set(SPLITS)
     for name, file in zip(ids(files), files, strict=True):
-        above = file.relative.split("/")[:-1]
+        above = file.split("/")[:-1]
         if split_first:
             split, class_name = [*above, "", ""][:2]
         else:
             class_name = above[0] if above else ""
             split = next((part for part in above[1:] if part in SPLITS), "")
-        path, up = root / file.relative, _up(file.relative)
+        path, up = root / file, _up(file)
         yield MeshItem(name, class_name, split, path, None, up, layout)
 
 

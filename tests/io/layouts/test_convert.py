@@ -206,7 +206,7 @@ def test_a_killed_run_leaves_no_half_data_set_and_the_next_one_clears_up(tmp_pat
     target = tmp_path / "out"
 
     def half():
-        return list(tmp_path.glob(".out.*.tmp/out/**/*.ply"))
+        return list(tmp_path.glob(".out.tmp/out/**/*.ply"))
 
     process = subprocess.Popen([sys.executable, "-c", SLOW_CONVERT, str(source), str(target)])
     deadline = time.monotonic() + 60
