@@ -7,7 +7,6 @@ a user can mend is one line on standard error and exit code 2; Ctrl-C ends with 
 import errno
 import sys
 from collections.abc import Sequence
-from itertools import pairwise
 
 VERBS = {
     "scan": "Photograph one mesh: noisy cloud, clean twin, a picture of every stage.",
@@ -97,12 +96,10 @@ def _run(given: list[str]) -> int:
         from qs3.cli.options import complete
 
         return complete(given)
-    from qs3.errors import InputError, no_such
+    from qs3.errors import no_such
 
     if verb not in VERBS:
         raise no_such(f"{verb}: no such verb", verb, VERBS, "; see qs3 --help")
-    if any(pair == ("--out", "") for pair in pairwise(rest)) or "--out=" in rest:
-        raise InputError('--out "": is empty; name what to write')
     from qs3.cli.options import run_verb
 
     return run_verb(verb, ELSEWHERE.get(verb, f"{verb}.{verb}"), VERBS[verb], rest)

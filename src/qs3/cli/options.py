@@ -1,12 +1,10 @@
 """From words of a command line to the library's own settings, by tyro."""
 
-import contextlib
 import dataclasses
 import functools
 import importlib
-import io
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
@@ -14,7 +12,6 @@ import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from qs3.cli import ELSEWHERE, VERBS
-from qs3.cli.text import printable, tell
 from qs3.errors import QS3Error
 
 _Settings = TypeVar("_Settings")
@@ -34,13 +31,12 @@ def run_verb(verb: str, place: str, text: str, words: list[str]) -> int:
     module = importlib.import_module(f"qs3.cli.{name}")
     function: Any = getattr(module, function_name)
     how: dict[str, Any] = {"prog": f"qs3 {verb}", "args": words, "registry": _registry}
-    with _own_words(words):
-        if isinstance(function, dict):
-            verbs = {name: _later(each) for name, each in function.items()}
-            call = tyro.extras.subcommand_cli_from_dict(verbs, description=text, **how)
-        else:
-            given = module.defaults(words) if hasattr(module, "defaults") else {}
-            call = tyro.cli(functools.partial(_later(function), **given), **how)
+    if isinstance(function, dict):
+        verbs = {name: _later(each) for name, each in function.items()}
+        call = tyro.extras.subcommand_cli_from_dict(verbs, description=text, **how)
+    else:
+        given = module.defaults(words) if hasattr(module, "defaults") else {}
+        call = tyro.cli(functools.partial(_later(function), **given), **how)
     return call()
 
 
@@ -68,21 +64,6 @@ def _later(function: Callable[..., int]) -> Callable[..., Callable[[], int]]:
         return functools.partial(function, *given, **named)
 
     return call
-
-
-@contextlib.contextmanager
-def _own_words(words: list[str]) -> Iterator[None]:
-    """Where a word would move a terminal, escape what is told of it, and the colours with it."""
-    if all(printable(word) == word for word in words):
-        yield
-        return
-    with io.StringIO() as heard:
-        try:
-            with contextlib.redirect_stderr(heard):
-                yield
-        finally:
-            if heard.getvalue():
-                tell(heard.getvalue().rstrip("\n"))
 
 
 @_registry.primitive_rule
