@@ -80,27 +80,6 @@ def unstructure(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def fill(old: Any, wanted: Any, defaults: Any) -> Any:
-    """Give settings that were written before some of them existed the defaults of those.
-
-    Args:
-        old: Plain values, as they were written.
-        wanted: Plain values to be compared with them: only what these have is filled in.
-        defaults: Plain values of a setting that nobody named.
-
-    Example:
-        >>> fill({"a": 1}, {"a": 1, "b": 2}, {"a": 0, "b": 3})
-        {'a': 1, 'b': 3}
-    """
-    if not all(isinstance(value, Mapping) for value in (old, wanted, defaults)):
-        return old
-    filled = {
-        name: fill(value, wanted.get(name), defaults.get(name)) for name, value in old.items()
-    }
-    missing = [name for name in wanted if name in defaults and name not in old]
-    return filled | {name: defaults[name] for name in missing}
-
-
 def first_difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any] | None:
     """Return name and both values of the first setting that differs, None where none does.
 
