@@ -98,20 +98,8 @@ CELLS: Mapping[str, Cell] = {
         ROOMS, method="spst", rounds={**GENTLE, "rule": "spst"}, warm_up="rooms"
     ),
     # Further such rounds, chosen after the ones before had been scored.
-    "rooms QBST gentle, refined": replace(GENTLY, rounds={**GENTLE, "refine": True}),
     "rooms QBST gentle, more": replace(GENTLY, rounds={**GENTLE, "threshold_share": 0.8}),
     "rooms QBST gentle, faster": replace(GENTLY, rounds={**GENTLE, "learning_rate": 3e-4}),
-    # Every round is a checkpoint: which validator picks the best?
-    "rooms QBST checked": replace(
-        ROOMS,
-        method="qbst",
-        rounds={"teacher": "average"},
-        train={"validate_every": 1},
-        warm_up="rooms",
-    ),
-    "rooms QBST gentle, checked": replace(
-        GENTLY, rounds={**GENTLE, "rounds": 10}, train={"validate_every": 1}
-    ),
     "rooms SPST": replace(ROOMS, method="spst", warm_up="rooms"),
     "rooms DGCNN": replace(ROOMS, network="dgcnn", steps=3000),
     # The recipe since the D435 and D455 stand in a lit room, and rooms of little depth are redrawn.
@@ -126,13 +114,8 @@ CELLS: Mapping[str, Cell] = {
     "S QBST": ROUNDS,
     "S QBST gentle": replace(ROUNDS, preset="gentle"),
     "S QBST gentle, alone": replace(ROUNDS, preset="gentle", rounds={"source_loss": False}),
-    "S QBST gentle, floor": replace(ROUNDS, preset="gentle", rounds={"floor": 8}),
-    "S QBST calibrated": replace(ROUNDS, rounds={"calibrate": True}),
     "S QBST by share": replace(ROUNDS, rounds={"threshold_share": 0.5}),
     "S QBST average": replace(ROUNDS, rounds={"teacher": "average"}),
-    "S QBST turns": replace(ROUNDS, rounds={"turns": 8}),
-    "S QBST floor": replace(ROUNDS, rounds={"floor": 8}),
-    "S QBST refined": replace(ROUNDS, rounds={"refine": True}),
     # A rival that sees the target from the first step, and the same rounds after it.
     "S GAST": replace(SCANS, method="gast"),
     "S GAST+QBST": replace(SCANS, method="gast", rounds={"rule": "qbst"}, warm_up="S GAST"),
@@ -218,8 +201,7 @@ def make(options: argparse.Namespace, name: str, seed: int) -> None:
     clouds["source"] = source.select(np.sort(rows))
     for part in ("source", *scored(options)):
         fields = {"cell": name, "part": part}
-        checkpoints = train.validate_every > 0 and part != "source"
-        record = evaluate(run, clouds[part], checkpoints=checkpoints, experiment=fields)
+        record = evaluate(run, clouds[part], experiment=fields)
         write_record(record_path(options, name, seed, part), record)
 
 

@@ -18,7 +18,6 @@ from real import parts
 
 from qs3.evaluation.compare import bootstrap_difference
 from qs3.evaluation.records import RunRecord, read_record
-from qs3.evaluation.regret import validator_regret
 from qs3.evaluation.tables import average, frame, to_markdown
 from qs3.io.layouts.npz import frame_parts
 from qs3.training import load_model
@@ -40,14 +39,14 @@ PAIRS = (
     ("rooms", "S+C+M"), ("rooms", "M"), ("M sight", "M"), ("S again", "M sight"),
     ("rooms QBST average", "rooms"), ("rooms QBST gentle", "rooms"),
     ("rooms SPST gentle", "rooms"), ("rooms QBST gentle", "rooms SPST gentle"),
-    ("rooms QBST gentle, refined", "rooms"), ("rooms QBST gentle, more", "rooms"),
+    ("rooms QBST gentle, more", "rooms"),
     ("rooms SPST", "rooms"), ("rooms QBST average", "rooms SPST"), ("rooms DGCNN", "rooms"),
     ("S lit", "S"), ("S lit", "M"), ("S+C+M lit", "S+C+M"), ("rooms lit", "rooms"),
     ("rooms lit", "S lit"), ("S again", "M"), ("S again", "S lit"),
     ("S QBST paper", "S again"), ("S SPST", "S again"),
     ("S QBST", "S again"), ("S QBST gentle", "S again"), ("S QBST paper", "S SPST"),
     ("S QBST", "S SPST"), ("S QBST gentle", "S SPST"), ("S QBST gentle, alone", "S again"),
-    ("S QBST gentle", "S QBST gentle, alone"), ("S QBST gentle, floor", "S QBST gentle"),
+    ("S QBST gentle", "S QBST gentle, alone"),
     ("S SD", "S again"),
     ("S SD+QBST", "S SD"), ("S SD+QBST", "S again"), ("S GAST", "S again"),
     ("S GAST+QBST", "S GAST"), ("S GAST+QBST", "S again"),
@@ -57,8 +56,7 @@ PAIRS = (
 )  # fmt: skip
 """First minus second."""
 SWITCHES = {
-    "S QBST": ("S QBST calibrated", "S QBST by share", "S QBST average", "S QBST turns",
-               "S QBST floor", "S QBST refined"),
+    "S QBST": ("S QBST by share", "S QBST average"),
     "S again": ("no size", "strays kept", "unit ball", "same points", "paper's way",
                 "no augmentation", "full augmentation", "more cuts", "aligned", "sight"),
 }  # fmt: skip
@@ -73,7 +71,6 @@ TITLES = {
 }  # fmt: skip
 """Lines of README's table, which has no room for all."""
 SHORT, SCORES = "## In short, accuracy / class mean", "## Scores"
-VALIDATORS = "## Rounds that rules choose, NYU, first 70 %"
 
 
 def read_records(folder: Path) -> list[RunRecord]:
@@ -156,9 +153,6 @@ def tables(folder: Path) -> str:
     rounds = round_table(records)
     if len(rounds):
         text += ["## Rounds of self-training, seed 0", "", to_markdown(rounds), ""]
-    judged = validator_table(records)
-    if len(judged):
-        text += [VALIDATORS, "", to_markdown(judged), ""]
     for part in looked:
         for cell in ("M", "S+C+M", "QBST", "rooms", "rooms QBST average"):
             text += confusion(records, cell, part) if part != "sunrgbd" else []
@@ -240,17 +234,6 @@ def round_table(records: list[RunRecord]) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def validator_table(records: list[RunRecord]) -> pd.DataFrame:
-    """Lines of rules: what the round of their choice loses on NYU's first 70 %, without labels."""
-    table = validator_regret([record for record in records if place(record)[1] == "dev"])
-    if table.empty:
-        return table
-    table["correlation"] = [
-        f"{c.mean:+.2f}" if c is not None else "–" for c in table["correlation"]
-    ]
-    return table.drop(columns="test")
-
-
 def confusion(records: list[RunRecord], cell: str, part: str) -> list[str]:
     """Lines of the confusion matrix of a cell, summed over its seeds."""
     mine = [record.scores for record in records if place(record) == (cell, part)]
@@ -275,7 +258,7 @@ def fill(page: str, name: str, table: str) -> str:
 
 def filled(page: str, text: str) -> str:
     """Return a page of the documentation with its tables anew, out of what `tables` returned."""
-    heads = {"short": SHORT, "scores": SCORES, "validators": VALIDATORS}
+    heads = {"short": SHORT, "scores": SCORES}
     starts = {name: f"{head}\n\n" for name, head in heads.items()}
     starts |= {"differences": "over both.\n\n", "switches": "one at a time:\n\n"}
     for name, start in starts.items():

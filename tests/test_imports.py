@@ -21,7 +21,6 @@ ROOT = Path(__file__).parents[1]
         "qs3.io.layouts.store",
         "qs3.evaluation",
         "qs3.adaptation.factory",
-        "qs3.adaptation.validators",
         "qs3.models.factory",
         "qs3.cli.scan",
         "qs3.cli.generate",

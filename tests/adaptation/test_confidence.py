@@ -13,9 +13,12 @@ from qs3.adaptation.confidence import (
     fit_temperature,
     measure_known,
     rescale,
+)
+from qs3.adaptation.selection import (
+    select_confident,
+    select_quasi_balanced,
     threshold_of_share,
 )
-from qs3.adaptation.selection import select_confident, select_quasi_balanced
 from qs3.errors import InputError
 
 SHARES = st.sampled_from([0.01, 0.07, 0.2, 0.5, 0.9, 1.0])

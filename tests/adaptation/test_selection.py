@@ -1,8 +1,7 @@
-"""Laws of the selection: QS³'s Algorithm 1, and the rules beyond the paper."""
+"""Laws of the selection: QS³'s Algorithm 1."""
 
 import warnings
 from fractions import Fraction
-from functools import partial
 from math import ceil
 
 import numpy as np
@@ -15,16 +14,11 @@ from qs3.adaptation.selection import (
     SingleClassWarning,
     balanced_count,
     select_confident,
-    select_prior,
-    select_quantile,
     select_quasi_balanced,
-    select_uniform,
-    with_floor,
 )
 from qs3.errors import InputError
 
 thresholds = st.sampled_from([0.0, 0.3, 0.5, 0.8, 0.805])
-shares = st.sampled_from([0.0, 0.07, 0.2, 0.5, 0.9, 1.0])
 
 
 @st.composite
@@ -112,37 +106,11 @@ def test_the_threshold_itself_is_out_unless_inclusive():
     assert select_quasi_balanced(rows, 0.75, inclusive=True).all()
 
 
-@given(probabilities(), thresholds, st.integers(0, 6), st.sampled_from(["keep", "drop"]))
-def test_floor_beside_a_reference_cloud_by_cloud(rows, threshold, floor, single_class):
-    """Clouds come in one by one, the surest of the class first, until it has enough or no more."""
-    chosen = select(rows, threshold, single_class=single_class)
-    expected = chosen.copy()
-    labels, confidence = rows.argmax(axis=1), rows.max(axis=1)
-    for label in range(rows.shape[1]):
-        while (expected & (labels == label)).sum() < floor:
-            left = np.flatnonzero(~expected & (labels == label))
-            if not len(left):
-                break
-            expected[left[confidence[left].argmax()]] = True
-    floored = with_floor(rows, chosen, floor)
-    assert np.array_equal(floored, expected)
-    assert floored[chosen].all()
-    for label in labels:
-        members = labels == label
-        count = max((chosen & members).sum(), min(floor, members.sum()))
-        assert (floored & members).sum() == count
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda p: with_floor(p, np.ones(len(p), dtype=bool), -1), "floor must be at least 0"),
         (lambda p: select_confident(p, 1.2), "threshold must be 0 to 1"),
-        (lambda p: select_uniform(p, 0.5, quantile=1.1), "quantile must be 0 to 1"),
-        (lambda p: select_quantile(p, 0.5, -0.1), "share must be 0 to 1"),
-        (lambda p: select_prior(p, 0.5, np.zeros(2)), "not all zero"),
-        (lambda p: select_prior(p, 0.5, np.array([np.nan, 1.0])), "finite"),
-        (lambda p: select_uniform(2 * p, 0.5), "sum to 1"),
+        (lambda p: select_confident(2 * p, 0.5), "sum to 1"),
     ],
 )
 def test_settings_are_checked(call, message):
@@ -165,35 +133,9 @@ def test_rows_must_be_probabilities(rows, message):
         select_quasi_balanced(np.array(rows, dtype=np.float64), 0.8)
 
 
-@st.composite
-def rules(draw):
-    """A rule with drawn settings: a function of rows, threshold and prior."""
-    inclusive = draw(st.booleans())
-    name = draw(st.sampled_from(["balanced", "uniform", "prior", "quantile"]))
-    share = draw(shares)
-    if name == "balanced":
-        return lambda rows, theta, _: select(rows, theta, inclusive=inclusive)
-    if name == "uniform":
-        return lambda rows, theta, _: select_uniform(
-            rows, theta, quantile=share, inclusive=inclusive
-        )
-    if name == "quantile":
-        return lambda rows, theta, _: select_quantile(rows, theta, share, inclusive=inclusive)
-    return lambda rows, theta, prior: select_prior(
-        rows, theta, prior, quantile=share, inclusive=inclusive
-    )
-
-
-PRIOR = np.array([0.4, 0.1, 0.2, 0.25, 0.05])
-
-
-def prior_of(rows):
-    return PRIOR[: rows.shape[1]]
-
-
-@given(probabilities(), thresholds, rules())
-def test_selected_are_the_most_confident_of_their_class(rows, threshold, rule):
-    chosen = rule(rows, threshold, prior_of(rows))
+@given(probabilities(), thresholds, st.booleans())
+def test_selected_are_the_most_confident_of_their_class(rows, threshold, inclusive):
+    chosen = select(rows, threshold, inclusive=inclusive)
     confident = select_confident(rows, threshold, inclusive=True)
     assert not (chosen & ~confident).any()
     labels, confidence = rows.argmax(axis=1), rows.max(axis=1)
@@ -208,99 +150,16 @@ def test_selected_are_the_most_confident_of_their_class(rows, threshold, rule):
                 assert i < left[confidence[left] == confidence[left].max()].min()
 
 
-@given(probabilities(distinct=True), thresholds, rules(), st.randoms(use_true_random=False))
-def test_order_of_the_clouds_does_not_matter(rows, threshold, rule, random):
+@given(probabilities(distinct=True), thresholds, st.randoms(use_true_random=False))
+def test_order_of_the_clouds_does_not_matter(rows, threshold, random):
     order = np.array(random.sample(range(len(rows)), len(rows)), dtype=np.int64)
-    chosen = rule(rows, threshold, prior_of(rows))
-    assert np.array_equal(rule(rows[order], threshold, prior_of(rows)), chosen[order])
+    assert np.array_equal(select(rows[order], threshold), select(rows, threshold)[order])
 
 
-@given(probabilities(distinct=True), thresholds, rules(), st.randoms(use_true_random=False))
-def test_names_of_the_classes_do_not_matter(rows, threshold, rule, random):
+@given(probabilities(distinct=True), thresholds, st.randoms(use_true_random=False))
+def test_names_of_the_classes_do_not_matter(rows, threshold, random):
     columns = np.array(random.sample(range(rows.shape[1]), rows.shape[1]), dtype=np.int64)
-    prior = prior_of(rows)
-    expected = rule(rows, threshold, prior)
-    assert np.array_equal(rule(rows[:, columns], threshold, prior[columns]), expected)
-
-
-def counts_of(rows, mask):
-    return np.bincount(rows[mask].argmax(axis=1), minlength=rows.shape[1])
-
-
-@given(probabilities(), thresholds)
-def test_uniform_keeps_equally_many(rows, threshold):
-    confident = counts_of(rows, select_confident(rows, threshold))
-    kept = counts_of(rows, select_uniform(rows, threshold))
-    least = min(confident[confident > 0], default=0)
-    assert kept.tolist() == [least if count else 0 for count in confident]
-
-
-@given(probabilities(), thresholds)
-def test_uniform_at_the_largest_quantile_keeps_all(rows, threshold):
-    chosen = select_uniform(rows, threshold, quantile=1.0)
-    assert np.array_equal(chosen, select_confident(rows, threshold))
-
-
-@given(probabilities(), thresholds, shares, shares)
-def test_higher_quantiles_keep_more(rows, threshold, first, second):
-    low, high = min(first, second), max(first, second)
-    for rule in (select_uniform, partial(select_prior, prior=prior_of(rows))):
-        small = rule(rows, threshold, quantile=low)
-        assert not (small & ~rule(rows, threshold, quantile=high)).any()
-    assert not (
-        select_quantile(rows, threshold, low) & ~select_quantile(rows, threshold, high)
-    ).any()
-
-
-@given(probabilities(), thresholds, shares)
-def test_a_flat_prior_is_the_uniform_rule(rows, threshold, quantile):
-    flat = np.full(rows.shape[1], 1 / rows.shape[1])
-    chosen = select_prior(rows, threshold, flat, quantile=quantile)
-    assert np.array_equal(chosen, select_uniform(rows, threshold, quantile=quantile))
-
-
-@given(probabilities(), thresholds)
-def test_kept_counts_follow_the_prior(rows, threshold):
-    prior = prior_of(rows)
-    confident = counts_of(rows, select_confident(rows, threshold))
-    kept = counts_of(rows, select_prior(rows, threshold, prior))
-    present = confident > 0
-    if not present.any():
-        assert kept.sum() == 0
-        return
-    total = (confident[present] / prior[present]).min()
-    assert (kept[present] >= total * prior[present] - 1e-6).all()
-    assert (kept[present] < total * prior[present] + 1).all()
-    # Nothing larger fits: some class is kept whole.
-    assert (kept == confident)[present].any()
-
-
-def test_a_class_of_prior_0_keeps_none():
-    rows = np.array([[0.9, 0.1], [0.1, 0.9], [0.2, 0.8]])
-    assert select_prior(rows, 0.5, np.array([0.0, 2.0])).tolist() == [False, True, True]
-    assert not select_prior(rows[:1], 0.5, np.array([0.0, 1.0])).any()
-
-
-@given(probabilities(), shares)
-def test_quantile_counts_are_shares_of_the_class(rows, share):
-    everyone = counts_of(rows, np.ones(len(rows), dtype=bool))
-    kept = counts_of(rows, select_quantile(rows, 0.0, share))
-    hundredths = round(100 * share)
-    assert kept.tolist() == [-(-int(n) * hundredths // 100) for n in everyone]
-
-
-@given(probabilities(), thresholds, shares)
-def test_quantile_meets_the_threshold_on_top(rows, threshold, share):
-    chosen = select_quantile(rows, threshold, share)
-    expected = select_quantile(rows, 0.0, share) & select_confident(rows, threshold)
-    assert np.array_equal(chosen, expected)
-
-
-def test_shares_are_meant_as_written():
-    confidence = np.linspace(0.6, 0.9, 100)
-    rows = np.stack([confidence, 1 - confidence], axis=1)
-    assert ceil(0.07 * 100) == 8
-    assert select_quantile(rows, 0.0, 0.07).sum() == 7
+    assert np.array_equal(select(rows[:, columns], threshold), select(rows, threshold))
 
 
 def test_ends_differ():
@@ -311,14 +170,3 @@ def test_ends_differ():
     least = select_quasi_balanced(rows, 0.8, selection="least-confident")
     assert np.flatnonzero(most).tolist() == [1, 3, 6, 7]
     assert np.flatnonzero(least).tolist() == [4, 5, 6, 7]
-
-
-@given(probabilities(), st.sampled_from([0.55, 0.75]), st.booleans())
-def test_the_threshold_itself(rows, threshold, inclusive):
-    for rule in (
-        partial(select_uniform, quantile=1.0),
-        partial(select_quantile, share=1.0),
-        partial(select_prior, prior=prior_of(rows), quantile=1.0),
-    ):
-        chosen = rule(rows, threshold, inclusive=inclusive)
-        assert not (chosen & ~select_confident(rows, threshold, inclusive=inclusive)).any()

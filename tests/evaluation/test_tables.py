@@ -55,13 +55,6 @@ def test_fields_of_an_experiment_make_lines_too(with_accuracy):
     assert table["row"].tolist() == ["a", "b"] and table["seeds"].tolist() == [(0,), (1,)]
 
 
-def test_each_rule_of_selection_has_a_line(with_accuracy):
-    choice = {"accuracy": 0.25, "class_mean_accuracy": 0.125, "number": 3}
-    table = frame([with_accuracy(0, 0.5, choices={"oracle": choice})], rules=True)
-    assert table["rule"].tolist() == ["chosen (last)", "oracle"]
-    assert table["accuracy"].tolist() == [0.5, 0.25]
-
-
 def test_text_shows_mean_error_and_number_of_seeds(with_accuracy):
     lines = frame([with_accuracy(0, 1 / 3), with_accuracy(1, 0.6)])
     head, rule, row = to_markdown(average(lines)[["method", "accuracy"]]).splitlines()

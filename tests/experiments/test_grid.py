@@ -40,7 +40,6 @@ def comparable(folder):
     return {
         name: (
             run.scores,
-            run.choices,
             [{**done, "seconds": 0, "cpu_seconds": 0} for done in run.rounds],
         )
         for name, run in records.items()

@@ -60,22 +60,9 @@ def test_numbers_are_those_of_the_records(whole):
     assert (whole / "ordinary.tex").read_text().count(r"\\") == 3
 
 
-def test_the_bench_tells_every_rule_and_what_rounds_kept(whole):
-    rows = list(csv.DictReader((whole / "adaptation-bench.csv").read_text().splitlines()))
+def test_the_bench_shows_what_rounds_kept(whole):
     text = (whole / "adaptation-bench.md").read_text()
-    for row in ("source-only", "qbst"):
-        run = record(whole, f"S-D_{row}_seed-0")
-        by_rule = {line["rule"]: float(line["accuracy"]) for line in rows if line["row"] == row}
-        chosen = {rule: choice["accuracy"] for rule, choice in run.choices.items()}
-        assert by_rule == chosen | {"chosen (last)": run.scores.accuracy}
-        cells = [
-            f"{100 * chosen[rule]:.1f}" for rule in (*sorted(chosen.keys() - {"oracle"}), "oracle")
-        ]
-        line = next(
-            x for x in text.split("checkpoint")[1].splitlines() if x.startswith(f"| {row} ")
-        )
-        shown = line.strip("| ").split(" | ")[1:]
-        assert sorted(shown[:-1]) == sorted(cells[:-1]) and shown[-1] == cells[-1]
+    run = record(whole, "S-D_qbst_seed-0")
     kept = run.rounds[-1]
     # All that was kept is of the target's clouds, whose labels were looked at afterwards.
     assert kept["known"] == kept["kept"] and sum(kept["right"]) <= sum(kept["kept"])
@@ -83,7 +70,6 @@ def test_the_bench_tells_every_rule_and_what_rounds_kept(whole):
     cells = [f"{count:.1f} / {right:.1f}" for count, right in pairs]
     cells.append(f"{sum(kept['kept']):.1f} of {sum(kept['confident']):.1f}")
     assert f"| qbst | {' | '.join(cells)} | " in text
-    assert "oracle \\*" in text and "an upper bound, not a rule" in text
 
 
 def test_differences_are_paired_over_seeds(whole):

@@ -57,7 +57,7 @@ def test_poisoned_labels_of_the_scans_change_no_bit(boxes, tmp_path):
         path.parent.mkdir()
         np.savez(path, points=boxes.points, label=labels, class_names=names)
         for scans in (path, replace(boxes, labels=labels)):
-            made = adapt(boxes, scans, tmp_path / str(len(networks)), train=SMALL | {"rule": "im"})
+            made = adapt(boxes, scans, tmp_path / str(len(networks)), train=SMALL)
             networks.append(made.model_)
             assert [record.skipped for record in made.result_.rounds] == [False]
     (file, clouds), (wrong_file, wrong_clouds) = networks[:2], networks[2:]
@@ -69,9 +69,7 @@ def test_rounds_are_kept_where_they_lose_nothing_on_held_out_source(boxes, tmp_p
     rounds = {"rounds": 2, "epochs": 1}
     result = adapt(boxes, boxes, tmp_path, self_training=rounds).result_
     assert result.selection == "source-val"
-    shares = {
-        c.number: c.validators["source-val"] for c in result.checkpoints if c.stage == "round"
-    }
+    shares = {c.number: c.source_accuracy for c in result.checkpoints if c.stage == "round"}
     assert list(shares) == [0, 1, 2]
     assert result.chosen["number"] == max(shares, key=shares.get)
     last = adapt(boxes, boxes, tmp_path / "last", train=SMALL | {"rule": "last"}).result_

@@ -52,14 +52,11 @@ def test_a_fitted_run_is_scored_on_any_clouds(source, target, settings, tmp_path
     assert len(result.source) == 24
     assert result.target.points.shape == (30, 64, 3)
 
-    record = evaluate(tmp_path / "run", target, checkpoints=True, experiment={"row": "dann"})
+    record = evaluate(tmp_path / "run", target, experiment={"row": "dann"})
     assert read_record(record_path(tmp_path / "run", record)) == record
     assert record.marks == ("transductive", "supervised")
     assert record.experiment == {"row": "dann"}
     assert (record.cpu_seconds, record.steps) == (run.cpu_seconds, run.steps)
-    assert record.scores.accuracy == record.choices["last"]["accuracy"]
-    best = max(choice["accuracy"] for choice in record.choices.values())
-    assert record.choices["oracle"]["accuracy"] == best
 
     order = np.array([2, 0, 1])  # other numbers for the same names
     names = tuple(np.array(target.class_names)[np.argsort(order)])

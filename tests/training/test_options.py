@@ -296,7 +296,7 @@ fit("qbst", source, target, train, SelfTrainingSettings(**rounds), run_dir=run)
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_killed_in_the_middle_of_an_epoch_is_uninterrupted(source, target, settings, tmp_path, how):
     settings = replace(settings, epochs=12, ema_decay=0.8, clip_norm=1.0, num_points=32)
-    rounds = SelfTrainingSettings(rounds=2, epochs=8, steps_per_epoch=12, threshold=0.34)
+    rounds = SelfTrainingSettings(rounds=2, epochs=40, threshold=0.34)
     arguments = ("qbst", source, target.without_labels(), settings, rounds)
     whole = fit(*arguments, run_dir=tmp_path / "whole")
     np.savez(

@@ -7,11 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.adaptation.confidence import BOUNDS, fit_temperature, rescale
-from qs3.adaptation.graph_labels import refine_probabilities
-from qs3.adaptation.selection import SingleClassWarning, select_quasi_balanced, with_floor
+from qs3.adaptation.selection import SingleClassWarning, select_quasi_balanced
 from qs3.errors import InputError
-from qs3.geometry import rotation_z
 from qs3.io.clouds import UnlabelledClouds
 from qs3.io.preparation import ROBUST
 from qs3.training import (
@@ -25,7 +22,7 @@ from qs3.training import (
 )
 from qs3.training.checkpoint import derived_seed, new_model
 from qs3.training.distributed import make_fabric
-from qs3.training.predict import describe, predict_probabilities
+from qs3.training.predict import predict_probabilities
 from qs3.training.prepared import prepare_clouds
 from qs3.training.rounds import STATE, kept_clouds, remarks
 from qs3.training.self_training import self_train
@@ -116,7 +113,7 @@ def test_resumed_is_uninterrupted(source, target, settings, tmp_path, preset, wh
     # From scratch, a shrinking pool is too small here to go on; `released` covers that start.
     changes = {"init": "warm-up"} if preset == "paper" else {}
     if preset == "switches":
-        settings, rounds = replace(settings, holdout=0.25), replace(SWITCHES, rounds=3, epochs=8)
+        rounds = replace(SWITCHES, rounds=3, epochs=8)
     else:
         rounds = self_training_preset(preset, rounds=3, epochs=8, threshold=0.34, **changes)
     arguments = (rounds.rule, source, target.without_labels(), settings, rounds)
@@ -319,9 +316,9 @@ def test_single_class_is_warned_of_and_recorded(domains, settings):
 
 @pytest.fixture(scope="module")
 def adapted(source, target, settings, tmp_path_factory):
-    """A run with all switches on, what it gave, and its settings."""
+    """A run with all switches on, its result, and its settings."""
     run = tmp_path_factory.mktemp("switched") / "run"
-    chosen = replace(settings, epochs=25, holdout=0.25, label_smoothing=0.2)
+    chosen = replace(settings, epochs=25, label_smoothing=0.2)
     return run, fit("qbst", source, target.without_labels(), chosen, SWITCHES, run_dir=run), chosen
 
 
@@ -329,50 +326,34 @@ def test_python_rounds_are_those_of_fit(adapted, tmp_path):
     run, result, chosen = adapted
     model = load_model(run / "warm-up").model
     given = (model, result.source, result.target, chosen, SWITCHES)
-    loop, records = self_train(*given, holdout=result.holdout, run_dir=tmp_path / "run")
+    loop, records = self_train(*given, run_dir=tmp_path / "run")
     assert same(loop, result.model)
     assert plain(records) == plain(result.rounds)
     assert read_run(run).chosen == read_run(tmp_path / "run").chosen == {
         "stage": "round",
         "number": 2,
     }  # fmt: skip
-    with pytest.raises(InputError, match="calibrate needs a held-out part"):
-        self_train(*given)
 
 
-def answers(model, clouds, turns=1):
-    """Mean probabilities over turns, by PyTorch alone."""
-    angles = 2 * np.pi * np.arange(turns) / turns
-    told = []
-    for angle in angles:
-        matrix = torch.from_numpy(rotation_z(angle)).float()
-        with torch.no_grad():
-            logits = model.eval()(torch.from_numpy(clouds.points) @ matrix.T)
-        told.append(torch.softmax(logits.double(), dim=1).numpy())
-    return np.mean(told, axis=0)
+def answers(model, clouds):
+    """Probabilities, by PyTorch alone."""
+    with torch.no_grad():
+        logits = model.eval()(torch.from_numpy(clouds.points[:]))
+    return torch.softmax(logits.double(), dim=1).numpy()
 
 
 def test_the_first_round_by_hand(adapted):
-    """Turns, temperature, graph, quantile, QBST's counts and the floor, from the warm-up."""
+    """Quantile and QBST's counts, from the warm-up."""
     run, result, _ = adapted
-    model = load_model(run / "warm-up").model
-    held = answers(model, result.holdout, 3)
-    temperature = fit_temperature(held, result.holdout.labels)
+    probabilities = answers(load_model(run / "warm-up").model, result.target)
     record = result.rounds[0]
-    assert record.temperature == pytest.approx(temperature, rel=1e-4)
-    spread = rescale(answers(model, result.target, 3), temperature)
-    features = [
-        describe(model, (result.target.points @ rotation_z(angle).T).astype(np.float32)).features
-        for angle in (0.0, 2 * np.pi / 3, 4 * np.pi / 3)
-    ]
-    refined = refine_probabilities(np.mean(features, axis=0), spread)
-    theta = np.sort(refined.max(axis=1))[14]
+    theta = np.sort(probabilities.max(axis=1))[14]
     assert record.theta == pytest.approx(theta, abs=1e-4)
     assert sum(record.confident) == 15
-    chosen = with_floor(refined, select_quasi_balanced(refined, record.theta), 2)
+    chosen = select_quasi_balanced(probabilities, record.theta)
     rows, labels = kept_clouds(run)[1][0]
     assert np.array_equal(rows, np.flatnonzero(chosen))
-    assert np.array_equal(labels, refined[chosen].argmax(axis=1))
+    assert np.array_equal(labels, probabilities[chosen].argmax(axis=1))
     assert record.kept == tuple(np.bincount(labels, minlength=3))
 
 
@@ -410,15 +391,6 @@ def test_the_average_follows_the_network_epoch_by_epoch(domains, settings):
     for number, weights in enumerate((model.state_dict(), averages[1], averages[3])):
         teacher.load_state_dict(weights)
         assert np.allclose(seen[number], answers(teacher, target), atol=1e-5), number
-
-
-def test_label_smoothing_of_the_rounds_is_their_own(domains, settings):
-    smoothed = replace(settings, label_smoothing=0.3)
-    without, none = one_round(domains, settings)[0], {"label_smoothing": 0.0}
-    own, _ = one_round(domains, settings, label_smoothing=0.3)
-    assert same(without, one_round(domains, smoothed, **none)[0])
-    assert not same(without, own)
-    assert same(own, one_round(domains, smoothed)[0])
 
 
 def test_evaluate_tells_how_many_pseudo_labels_were_right(adapted, target, settings):
@@ -461,9 +433,6 @@ def test_remarks_on_what_went_wrong(domains, settings):
     (line,) = remarks([replace(fine, steps=20), idle], scratch, "abc")
     assert line.startswith("all rounds after round 1 were skipped: the network, which began with")
     assert "in 20 steps from 9 of 30 clouds at most" in line
-    (line,) = remarks([replace(fine, temperature=BOUNDS[0])], SWITCHES, "abc")
-    assert "its bound, 0.25" in line
-    assert "(--holdout)" in line
 
 
 def test_empty_target(domains, settings):

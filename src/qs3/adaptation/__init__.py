@@ -1,6 +1,6 @@
 """Methods of adaptation, their losses, and the rules that select pseudo labels.
 
-Names, rules and validators need no PyTorch; it loads when a method is first asked for.
+Names and rules need no PyTorch; it loads when a method is first requested.
 """
 
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""How sure a network is: a temperature, a threshold for a share of the clouds, what is unknown.
+"""Confidence of a network: calibration by a temperature, and recognition of unknown objects.
 
 Convention:
     Probabilities are [m k], rows summing to 1; the confidence of a cloud is its largest one.
@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import log_softmax, softmax
 
-from qs3.adaptation.priors import check_probabilities, count_of_share
+from qs3.adaptation.selection import check_probabilities
 from qs3.errors import InputError
-from qs3.models.checks import check_positive, check_range
+from qs3.models.checks import check_positive
 
 BOUNDS = (0.25, 4.0)
 """Least and largest temperature: a network that is right on every held-out cloud asks for 0."""
@@ -113,28 +113,3 @@ def rescale(probabilities: Float[np.ndarray, "m k"], temperature: float) -> np.n
     if temperature == 1:
         return probabilities
     return softmax(np.log(np.maximum(probabilities, _TINY)) / temperature, axis=1)
-
-
-def threshold_of_share(
-    probabilities: Float[np.ndarray, "m k"], share: float, *, inclusive: bool = False
-) -> float:
-    """Return the θ that keeps a share of the clouds: the ⌈share · m⌉ most confident.
-
-    Clouds as confident as the last of these are kept too. Where a confidence equal to θ is not
-    enough (``inclusive``), θ is the next lower confidence, or 0.
-
-    Raises:
-        InputError: where rows are not probabilities, or the share is not above 0 and at most 1.
-
-    Example:
-        >>> rows = np.array([[0.9, 0.1], [0.3, 0.7], [0.4, 0.6]])
-        >>> threshold_of_share(rows, 0.5), threshold_of_share(rows, 0.5, inclusive=True)
-        (0.6, 0.7)
-    """
-    check_probabilities(probabilities)
-    check_positive("share", share)
-    check_range("share", share, 0, 1)
-    confidence = probabilities.max(axis=1)
-    last = np.sort(confidence)[len(confidence) - count_of_share(share, len(confidence))]
-    theta = last if inclusive else confidence[confidence < last].max(initial=0.0)
-    return min(1.0, float(theta))

@@ -19,7 +19,7 @@ MethodName = Literal[
 ]
 """Methods of adaptation; the last three end in rounds of self-training (`COMPOSED`)."""
 
-RoundRule = Literal["qbst", "spst", "uniform", "prior", "quantile"]
+RoundRule = Literal["qbst", "spst"]
 """Which clouds a round of self-training selects."""
 
 Selection = Literal["most-confident", "least-confident"]
@@ -28,8 +28,9 @@ Selection = Literal["most-confident", "least-confident"]
 SingleClass = Literal["keep", "drop"]
 """What becomes of the confident clouds if all of them have one class (μ = 0)."""
 
-Rule = Literal["last", "source-val", "entropy", "im", "bnm", "snd", "dev", "class-ami"]
-"""How the network is chosen among a run's checkpoints; no rule looks at a label of the target."""
+Rule = Literal["last", "source-val"]
+"""How a run's network is chosen: the last checkpoint, or the one with the highest accuracy on the
+held-out part of the source. No rule reads a label of the target."""
 
 METHODS: Mapping[str, str] = {
     "source-only": "source_only.SourceOnly",

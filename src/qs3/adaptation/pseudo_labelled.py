@@ -16,10 +16,8 @@ class PseudoLabelled(Method):
     Each part passes through the network by itself, the source first.
     """
 
-    source_weight: float = 1.0
-    """Factor of the source's loss in epoch 0; the target's is 1."""
     weight_step: float = 0.0
-    """Taken off both factors after each epoch (SPST: 0.005)."""
+    """Taken off the factors of both losses after each epoch; they begin at 1 (SPST: 0.005)."""
     epochs: range = range(1)
     """Numbers of the epochs of this training, for ``weight_step``."""
 
@@ -27,14 +25,14 @@ class PseudoLabelled(Method):
         """Return the weighted cross entropies, ``pseudo`` and ``source``."""
         count = source.parts[0] if source.parts else len(source.labels)
         done = min(int(progress * len(self.epochs) + 1e-9), len(self.epochs) - 1)
-        fallen = self.weight_step * self.epochs[done]
+        weight = 1.0 - self.weight_step * self.epochs[done]
         terms: dict[str, Tensor] = {}
         right = torch.zeros((), dtype=torch.int64, device=source.labels.device)
-        passes: tuple[tuple[str, slice, float], ...] = (
-            ("source", slice(count, None), self.source_weight - fallen),
-            ("pseudo", slice(0, count), 1.0 - fallen),
+        passes: tuple[tuple[str, slice], ...] = (
+            ("source", slice(count, None)),
+            ("pseudo", slice(0, count)),
         )
-        for name, rows, weight in passes:
+        for name, rows in passes:
             labels = source.labels[rows]
             if not len(labels):
                 continue

@@ -1,20 +1,23 @@
-"""Which pseudo labels to believe: pure rules on class probabilities (NumPy only).
+"""Rules that select pseudo labels: pure functions of class probabilities (NumPy only).
 
 Convention:
     Probabilities are [m k]: m unlabelled clouds, k classes, rows summing to 1. The pseudo label of
     a cloud is its most probable class, the first one at ties; its confidence is that probability.
 """
 
+import math
 import warnings
 from collections.abc import Sequence
+from fractions import Fraction
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from qs3.adaptation.names import Selection, SingleClass
-from qs3.adaptation.priors import check_prior, check_probabilities, count_of_share
 from qs3.errors import InputError
-from qs3.models.checks import check_range
+from qs3.models.checks import check_positive, check_range
+
+_TOLERANCE = 1e-3
 
 
 class SingleClassWarning(UserWarning):
@@ -34,7 +37,7 @@ def select_confident(
         inclusive: Whether a confidence equal to θ is enough.
 
     Raises:
-        InputError: where rows are not probabilities or θ is not in 0 to 1.
+        InputError: if rows are not probabilities or θ is not in 0 to 1.
 
     Example:
         >>> select_confident(np.array([[0.9, 0.1], [0.3, 0.7]]), 0.8).tolist()
@@ -44,6 +47,31 @@ def select_confident(
     check_range("threshold", threshold, 0, 1)
     confidence = probabilities.max(axis=1)
     return confidence >= threshold if inclusive else confidence > threshold
+
+
+def threshold_of_share(
+    probabilities: Float[np.ndarray, "m k"], share: float, *, inclusive: bool = False
+) -> float:
+    """Return the θ that keeps a share of the clouds: the ⌈share · m⌉ most confident.
+
+    Clouds as confident as the last of these are kept too. Unless a confidence equal to θ is enough
+    (``inclusive``), θ is the next lower confidence, or 0.
+
+    Raises:
+        InputError: if rows are not probabilities, or the share is not above 0 and at most 1.
+
+    Example:
+        >>> rows = np.array([[0.9, 0.1], [0.3, 0.7], [0.4, 0.6]])
+        >>> threshold_of_share(rows, 0.5), threshold_of_share(rows, 0.5, inclusive=True)
+        (0.6, 0.7)
+    """
+    check_probabilities(probabilities)
+    check_positive("share", share)
+    check_range("share", share, 0, 1)
+    confidence = probabilities.max(axis=1)
+    last = np.sort(confidence)[len(confidence) - count_of_share(share, len(confidence))]
+    theta = last if inclusive else confidence[confidence < last].max(initial=0.0)
+    return min(1.0, float(theta))
 
 
 def select_quasi_balanced(
@@ -65,14 +93,14 @@ def select_quasi_balanced(
         threshold: θ, in 0 to 1.
         selection: Which of a class to keep; ``least-confident`` is what the released code does.
         inclusive: Whether a confidence equal to θ is enough.
-        single_class: Where all L clouds have one class, μ = 0 and the algorithm selects nothing;
+        single_class: If all L clouds have one class, μ = 0 and the algorithm selects nothing;
             ``keep`` selects all of them and warns, ``drop`` follows the algorithm.
 
     Raises:
-        InputError: where rows are not probabilities, or a setting is unusable.
+        InputError: if rows are not probabilities, or a setting is unusable.
 
     Warns:
-        SingleClassWarning: where ``keep`` applies.
+        SingleClassWarning: if ``keep`` applies.
 
     Example:
         Three confident clouds of class 0 and one of class 1: ⌈3 · 1/4⌉ = 1 and ⌈1 · 3/4⌉ = 1.
@@ -97,151 +125,6 @@ def select_quasi_balanced(
         return confident
     most = [balanced_count(count, total) if count else 0 for count in counts.tolist()]
     return keep_of_classes(probabilities, confident, most, selection)
-
-
-def select_uniform(
-    probabilities: Float[np.ndarray, "m k"],
-    threshold: float,
-    *,
-    quantile: float = 0.0,
-    inclusive: bool = False,
-) -> Bool[np.ndarray, "m"]:
-    """Select equally many confident clouds of each class.
-
-    Of each class at most q are kept, q the given quantile (rounded down to a count that occurs) of
-    the numbers of confident clouds in the classes that have any. At quantile 0 it is the smallest,
-    and all these classes keep the same number; above, rarer classes keep all that they have.
-
-    Args:
-        probabilities: Class probabilities.
-        threshold: θ, in 0 to 1.
-        quantile: 0 to 1; 1 keeps every confident cloud.
-        inclusive: Whether a confidence equal to θ is enough.
-
-    Raises:
-        InputError: where rows are not probabilities, or a setting is not in 0 to 1.
-
-    Example:
-        >>> p = np.array([0.9, 0.95, 0.85, 0.1])
-        >>> select_uniform(np.stack([p, 1 - p], axis=1), 0.8).tolist()
-        [False, True, False, True]
-    """
-    check_range("quantile", quantile, 0, 1)
-    confident = select_confident(probabilities, threshold, inclusive=inclusive)
-    counts = count_labels(probabilities, confident)
-    present = counts[counts > 0]
-    most = int(np.quantile(present, quantile, method="lower")) if len(present) else 0
-    return keep_of_classes(probabilities, confident, [most] * len(counts))
-
-
-def select_prior(
-    probabilities: Float[np.ndarray, "m k"],
-    threshold: float,
-    prior: Float[np.ndarray, "k"],
-    *,
-    quantile: float = 0.0,
-    inclusive: bool = False,
-) -> Bool[np.ndarray, "m"]:
-    """Select confident clouds so that their classes are as frequent as a prior says.
-
-    Of the classes with a positive prior π_k and L_k > 0 confident clouds, the ratios L_k / π_k
-    bound the size of a selection that follows the prior; with T their given quantile,
-    ⌈T π_k⌉ clouds of class k are kept, or all L_k where there are fewer. Classes of prior 0 keep
-    none.
-
-    Args:
-        probabilities: Class probabilities.
-        threshold: θ, in 0 to 1.
-        prior: Share of each class; it is divided by its sum.
-        quantile: 0 to 1. At 0 the counts follow the prior, up to rounding; above, classes that the
-            threshold has left too rare keep all that they have and the others more.
-        inclusive: Whether a confidence equal to θ is enough.
-
-    Raises:
-        InputError: where rows are not probabilities, or a setting is unusable.
-
-    Example:
-        >>> p = np.array([0.9, 0.95, 0.85, 0.99, 0.1, 0.2])
-        >>> rows = np.stack([p, 1 - p], axis=1)
-        >>> select_prior(rows, 0.7, np.array([0.5, 0.5])).tolist()
-        [False, True, False, True, True, True]
-    """
-    check_range("quantile", quantile, 0, 1)
-    share = check_prior("prior", prior, probabilities.shape[1])
-    confident = select_confident(probabilities, threshold, inclusive=inclusive)
-    counts = count_labels(probabilities, confident)
-    use = (counts > 0) & (share > 0)
-    if not use.any():
-        return np.zeros(len(probabilities), dtype=bool)
-    total = float(np.quantile(counts[use] / share[use], quantile, method="lower"))
-    # A product that is an integer but for rounding must not gain one.
-    most = np.ceil(total * share - 1e-9).astype(np.int64)
-    return keep_of_classes(probabilities, confident, most.tolist())
-
-
-def select_quantile(
-    probabilities: Float[np.ndarray, "m k"],
-    threshold: float,
-    share: float = 0.2,
-    *,
-    inclusive: bool = False,
-) -> Bool[np.ndarray, "m"]:
-    """Select the same share of every class: class-balanced self-training (Zou et al., ECCV 2018).
-
-    Of the N_k clouds with pseudo label k, confident or not, the ⌈share · N_k⌉ most confident are
-    kept, so that each class has a threshold of its own; a threshold for all classes may come on
-    top, of which the authors have none (0).
-
-    NOTE: the authors also divide the probabilities by the classes' thresholds before they label;
-    here the labels stay as they are, since a rule only selects.
-
-    Args:
-        probabilities: Class probabilities.
-        threshold: θ, in 0 to 1.
-        share: Part of a class; the authors begin with 0.2 and add 0.05 a round, to 0.5.
-        inclusive: Whether a confidence equal to θ is enough.
-
-    Raises:
-        InputError: where rows are not probabilities, or a setting is not in 0 to 1.
-
-    Example:
-        >>> p = np.array([0.9, 0.6, 0.7, 0.45, 0.3])
-        >>> select_quantile(np.stack([p, 1 - p], axis=1), 0.0, 0.5).tolist()
-        [True, False, True, False, True]
-    """
-    check_range("share", share, 0, 1)
-    confident = select_confident(probabilities, threshold, inclusive=inclusive)
-    counts = count_labels(probabilities, np.ones(len(probabilities), dtype=bool))
-    most = [count_of_share(share, count) for count in counts.tolist()]
-    return keep_of_classes(probabilities, confident, most)
-
-
-def with_floor(
-    probabilities: Float[np.ndarray, "m k"], chosen: Bool[np.ndarray, "m"], floor: int
-) -> Bool[np.ndarray, "m"]:
-    """Add to a selection until it has a least number of each class, so that none is lost.
-
-    Of a class with fewer than ``floor`` chosen clouds its most confident others come in, from
-    below the threshold too, as far as there are clouds with that pseudo label. Nothing is taken
-    away.
-
-    Args:
-        probabilities: Class probabilities.
-        chosen: What a rule selected of them.
-        floor: Least number of each class.
-
-    Raises:
-        InputError: where the floor is negative.
-
-    Example:
-        >>> p = np.array([0.9, 0.95, 0.6, 0.4, 0.3])
-        >>> rows = np.stack([p, 1 - p], axis=1)
-        >>> with_floor(rows, select_confident(rows, 0.8), 1).tolist()
-        [True, True, False, False, True]
-    """
-    check_range("floor", floor, 0)
-    missing = np.maximum(floor - count_labels(probabilities, chosen), 0)
-    return chosen | keep_of_classes(probabilities, ~chosen, missing.tolist())
 
 
 def count_labels(
@@ -278,3 +161,30 @@ def balanced_count(members: int, total: int) -> int:
         6
     """
     return -(-members * (total - members) // total)
+
+
+def count_of_share(share: float, total: int) -> int:
+    """Return ⌈share · total⌉ for a share as it is written: 0.07 of 100 is 7, not 8.
+
+    Example:
+        >>> count_of_share(0.07, 100)
+        7
+    """
+    return math.ceil(Fraction(str(float(share))) * total)
+
+
+def check_probabilities(probabilities: Float[np.ndarray, "m k"]) -> None:
+    """Check that rows are probabilities.
+
+    Raises:
+        InputError: if there is no class, a value is not finite or is negative, or the sum of a row
+            is not 1 within 0.001.
+    """
+    if probabilities.shape[1] == 0:
+        raise InputError("probabilities have no class")
+    if not np.isfinite(probabilities).all():
+        raise InputError("probabilities hold NaN or infinity; the network has diverged")
+    if (probabilities < -_TOLERANCE).any():
+        raise InputError("probabilities are negative; hand in softmax outputs, not logits")
+    if (np.abs(probabilities.sum(axis=1, dtype=np.float64) - 1.0) > _TOLERANCE).any():
+        raise InputError("probabilities do not sum to 1; hand in softmax outputs, not logits")

@@ -18,7 +18,6 @@ def evaluate_run(
     data: str,
     split: str | None = None,
     cloud: CloudKind = "points",
-    checkpoints: bool = False,
     class_map: Annotated[Path | None, tyro.conf.arg(name="map")] = None,
     json: bool = False,
 ) -> int:
@@ -32,8 +31,6 @@ def evaluate_run(
             file.
         split: Part of the data, such as test; all of it by default.
         cloud: Of generated data: noisy scans, their clean twins, or samples of the whole surface.
-        checkpoints: Score every checkpoint too, and tell which one each validator would have
-            chosen; apart from them the oracle, an upper bound that looks at the labels of the data.
         class_map: TOML file of what classes of the data and of the run are called in the scores:
             stool = "chair"; others keep their names.
         json: Print the whole record as JSON in place of text.
@@ -42,9 +39,7 @@ def evaluate_run(
     from qs3.training import evaluate, record_path
 
     called = None if class_map is None else read_class_map(class_map)
-    record = evaluate(
-        run, data, split=split, cloud=cloud, checkpoints=checkpoints, class_map=called
-    )
+    record = evaluate(run, data, split=split, cloud=cloud, class_map=called)
     tell(*describe_renaming(record.test.renamed, called))
     if json:
         show(dumps(unstructure(record), indent=2))
@@ -54,8 +49,6 @@ def evaluate_run(
             show(f"checkpoint          {stage} {number}, by rule {record.selection}")
         show(*scores_text(record.scores, record.marks))
         show(*rounds_text(record.rounds))
-        if record.choices:
-            show(*choices_text(record.choices))
     tell(f"record: {record_path(run, record)}")
     return 0
 
@@ -71,16 +64,6 @@ def rounds_text(rounds: Sequence[Mapping[str, Any]]) -> list[str]:
         numbers = (done["round"], sum(done["kept"]), labelled, right)
         rows.append((*map(str, numbers), share))
     return ["", *columns(rows, 0)]
-
-
-def choices_text(choices: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """What each rule would have chosen, as lines."""
-    rows: list[tuple[str, ...]] = [("chosen by", "checkpoint", "accuracy", "class mean")]
-    for rule, choice in choices.items():
-        scores = (f"{choice[name]:.1%}" for name in ("accuracy", "class_mean_accuracy"))
-        name = "oracle *" if rule == "oracle" else rule
-        rows.append((name, f"{choice['stage']} {choice['number']}", *scores))
-    return ["", *columns(rows, 2), "* looks at the labels of this data: an upper bound"]
 
 
 def scores_text(scores: Scores, marks: Sequence[str] = ()) -> list[str]:

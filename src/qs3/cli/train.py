@@ -69,8 +69,7 @@ class TrainOptions(Choices):
     out: Path
     """Folder of the run; run the same command again to go on after a stop."""
     target: str | None = None
-    """Clouds of the target; labels that lie there are dropped unused. source-only takes them for
-    validators alone."""
+    """Clouds of the target; labels that lie there are dropped unused. source-only needs none."""
     source_split: str | None = None
     """Part of the source, such as train; all of it by default."""
     target_split: str | None = None
@@ -286,7 +285,7 @@ def train(options: Flat[TrainOptions]) -> int:
         return TIME_UP
     show(options.out)
     for made in result.checkpoints:
-        right = made.validators.get("source-val")
+        right = made.source_accuracy
         if right is not None and result.chosen == {"stage": made.stage, "number": made.number}:
             tell(f"right of the source's held-out part: {right:.1%}")
     for line in remarks(result.rounds, options.self_training, result.source.class_names):

@@ -107,7 +107,7 @@ class RunRecord:
     seed: int
     """Root of all random steps."""
     selection: str
-    """Rule that chose the model; ``oracle`` alone looks at labels of the test set."""
+    """Rule that chose the model; no rule reads a label of the target."""
     scores: Scores
     """Scores of the chosen model."""
     seconds: Mapping[str, float]
@@ -124,12 +124,6 @@ class RunRecord:
     how many were ``right``."""
     chosen: Mapping[str, str | int] | None = None
     """Checkpoint of the scores: its ``stage`` and ``number``; None in earlier releases."""
-    checkpoints: tuple[Mapping[str, Any], ...] = ()
-    """Where every checkpoint of the last stage was scored: stage, number, accuracies, and what the
-    validators said of it without labels."""
-    choices: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Where every checkpoint was scored: of each rule its checkpoint, accuracy and class-mean
-    accuracy. ``oracle`` among them chose by the labels of the test set: an upper bound."""
     marks: tuple[str, ...] = ()
     """Caveats printed with the number: ``transductive``, ``supervised`` …"""
     experiment: Mapping[str, str | int | float] | None = None

@@ -24,12 +24,8 @@ _LATEX: Mapping[int, str] = str.maketrans(
 )  # fmt: skip
 
 
-def frame(
-    records: Sequence[RunRecord],
-    fields: Sequence[Mapping[str, Any]] = (),
-    rules: bool = False,
-) -> pd.DataFrame:
-    """Return one line a record, or one a record and rule of selection.
+def frame(records: Sequence[RunRecord], fields: Sequence[Mapping[str, Any]] = ()) -> pd.DataFrame:
+    """Return one line a record.
 
     Columns: ``fields``, those of `LINE`, ``seed``, ``accuracy``, ``class_mean_accuracy``,
     ``rounds`` of self-training and how many of them ``trained``, and ``alike``, which is equal for
@@ -39,18 +35,9 @@ def frame(
     Args:
         records: Runs.
         fields: Columns of each record that come first.
-        rules: Whether each rule that would have chosen a checkpoint has a line too, told by a
-            column ``rule``; the run's own choice is ``chosen (NAME)``.
     """
-    lines = []
-    for record, first in zip(records, fields or [{}] * len(records), strict=True):
-        line = dict(first) | _line(record)
-        if rules:
-            lines.append(line | {"rule": f"chosen ({record.selection})"})
-            for rule, choice in record.choices.items():
-                lines.append(line | {"rule": rule} | {name: choice[name] for name in SCORES})
-        else:
-            lines.append(line)
+    firsts = fields or [{}] * len(records)
+    lines = [dict(first) | _line(one) for one, first in zip(records, firsts, strict=True)]
     return pd.DataFrame(lines)
 
 

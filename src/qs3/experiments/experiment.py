@@ -78,8 +78,6 @@ class Experiment:
     """Domains that no data of the user can take the place of, since others are made beside them."""
     usual: Callable[[Scale], Sequence[str]] = lambda scale: ()
     """Keys of the columns that are made where none is asked for; empty makes all."""
-    rules: bool = False
-    """Whether it tells, further, the score by every rule of selection, and what rounds kept."""
 
     @property
     def paper(self) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 from qs3.errors import InputError
 from qs3.evaluation.records import DataRecord, RunRecord, read_record, write_record
 from qs3.experiments.domains import DataSet, Own, Part
-from qs3.experiments.runs import ORDINARY, SUPERVISED, Run, warm_up_of
+from qs3.experiments.runs import SUPERVISED, Run, warm_up_of
 from qs3.experiments.setup import RESULTS, Setup
 from qs3.io.clouds import CloudChoice
 from qs3.store.executors import Executor, Failure
@@ -305,7 +305,7 @@ def make_record(run: Run, setup: Setup, device: str = "") -> RunRecord:
     def score(part: Part, **options: Any) -> RunRecord:
         return evaluate(folder, place(part), split=part.split, cloud=part.cloud, **options)
 
-    record = score(test, checkpoints=run.row != ORDINARY, experiment=run.fields)
+    record = score(test, experiment=run.fields)
     if target is not None and record.rounds:
         # Right by the labels of what they chose from, which a record alone is told.
         record = replace(record, rounds=score(target).rounds)

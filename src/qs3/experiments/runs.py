@@ -182,7 +182,7 @@ def make_run(
     adapted_to = 0 if alone else _count(scale, target, own)
     train = scale.train_with(threads, seed, network, _count(scale, source, own), adapted_to)
     if row == ORDINARY:
-        # No target that checkpoints could be rated on; the last network is taken.
+        # The last network is taken; it needs no checkpoints.
         train = replace(train, validate_every=0)
     if not kind.sized:
         train = replace(train, preparation=replace(train.preparation, size_input=False))

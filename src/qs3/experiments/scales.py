@@ -22,7 +22,7 @@ class Scale:
     name: str
     """Told in the title of the table."""
     source_per_class: int
-    """Objects a class of the source, of which a tenth is held out for the validators."""
+    """Objects a class of the source, of which a tenth is held out."""
     target_per_class: int
     """Objects a class to adapt to."""
     test_per_class: int

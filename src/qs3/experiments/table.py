@@ -165,13 +165,13 @@ class FilledTable:
         names = [run.name for run in self.runs[place]]
         return [self.records[name] for name in names if name in self.records]
 
-    def frame(self, rules: bool = False) -> pd.DataFrame:
+    def frame(self) -> pd.DataFrame:
         """Return one line a run; see `qs3.evaluation.tables.frame`."""
         records = {place: self.records_of(place) for place in self.runs}
         fields = [
             {"row": row, "column": column} for row, column in records for _ in records[row, column]
         ]
-        return frame([record for cell in records.values() for record in cell], fields, rules)
+        return frame([record for cell in records.values() for record in cell], fields)
 
     @cached_property
     def means(self) -> dict[Place, Mapping[str, Any]]:

@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping, Sequence
 
 import pandas as pd
 
-from qs3.evaluation.metrics import mean_sem
 from qs3.evaluation.records import RunRecord, count_rounds
 from qs3.evaluation.tables import SCORES, to_csv, to_latex, to_markdown
 from qs3.experiments import TableFormat
@@ -13,8 +12,6 @@ from qs3.experiments.experiment import Heading, Place
 from qs3.experiments.runs import SUPERVISED
 from qs3.experiments.setup import MARKER, read_marker
 from qs3.experiments.table import FilledTable
-
-_ORACLE = "oracle"
 
 
 def markdown(filled: FilledTable) -> str:
@@ -52,10 +49,9 @@ def markdown(filled: FilledTable) -> str:
 
 
 def csv(filled: FilledTable) -> str:
-    """Return one line a run, or one a run and rule of selection."""
-    rules = filled.table.experiment.rules
-    lines = filled.frame(rules)
-    columns = ["row", "column", "seed", *(["rule"] * rules), *SCORES, "paper_mean", "paper_sem"]
+    """Return one line a run."""
+    lines = filled.frame()
+    columns = ["row", "column", "seed", *SCORES, "paper_mean", "paper_sem"]
     if lines.empty:
         return to_csv(pd.DataFrame(columns=[*columns, "marks"]))
     places = list(zip(lines["row"], lines["column"], strict=True))
@@ -158,44 +154,14 @@ def _caveats(filled: FilledTable) -> list[str]:
 
 
 def _further(filled: FilledTable, column: Heading) -> list[str]:
-    """Tell of a column what rounds kept and, where asked for, the score by every rule."""
+    """Return what the rounds of a column kept."""
     rows = filled.table.headings()[0]
     cells = {row.title: filled.records_of((row.key, column.key)) for row in rows}
-    cells = {title: records for title, records in cells.items() if records}
-    text = _by_rule(filled, column, cells) if filled.table.experiment.rules else []
-    kept = _kept(cells)
-    if not kept.empty:
-        text += [f"{column.title}, clouds kept in the last round / right of them, by pseudo label:"]
-        text += ["", to_markdown(kept), ""]
-    return text
-
-
-def _by_rule(
-    filled: FilledTable, column: Heading, cells: Mapping[str, Sequence[RunRecord]]
-) -> list[str]:
-    """Tell of a column the score by every rule, the oracle apart."""
-    rules = dict.fromkeys(rule for cell in cells.values() for run in cell for rule in run.choices)
-    order = sorted(rules, key=lambda rule: rule == _ORACLE)
-    if not order:
+    kept = _kept({title: records for title, records in cells.items() if records})
+    if kept.empty:
         return []
-    body = [[title, *(_choice(cell, rule) for rule in order)] for title, cell in cells.items()]
-    head = [rule.replace(_ORACLE, f"{_ORACLE} \\*") for rule in order]
-    return [
-        f"{column.title}, accuracy % at the checkpoint that each rule chooses:",
-        "",
-        to_markdown(pd.DataFrame(body, columns=[filled.table.experiment.corner, *head])),
-        "",
-        "\\* looks at the labels of the scored clouds: an upper bound, not a rule.",
-        "",
-    ]
-
-
-def _choice(records: Sequence[RunRecord], rule: str) -> str:
-    """Mean accuracy by a rule; nothing where it said nothing in one of the runs."""
-    if any(rule not in record.choices for record in records):
-        return "–"
-    values = [float(record.choices[rule]["accuracy"]) for record in records]
-    return mean_sem(values).format(count=False)
+    head = f"{column.title}, clouds kept in the last round / right of them, by pseudo label:"
+    return [head, "", to_markdown(kept), ""]
 
 
 def _kept(cells: Mapping[str, Sequence[RunRecord]]) -> pd.DataFrame:

@@ -24,8 +24,6 @@ PresetName = Literal["default", "gentle", "spst", "paper", "released"]
 """Whole columns of settings: our defaults, SPST's, QS³'s text, QS³'s released code."""
 Teacher = Literal["latest", "best", "average"]
 """Networks that can give the pseudo labels."""
-Prior = Literal["em", "bbse"]
-"""Estimates of the target's class shares."""
 MOST_POINTS = 16_384
 """Most points a cloud: the distances among those of one alone take 1 GiB."""
 
@@ -129,12 +127,13 @@ class TrainSettings:
     method_settings: Annotated[Mapping[str, Any], tyro.conf.Suppress] = field(default_factory=dict)
     """Arguments of the method that differ from its defaults."""
     holdout: float = 0.1
-    """Share of the source that is not trained on, but kept for the validators."""
+    """Share of the source that is held out of the training: for ``source-val`` and calibration."""
     validate_every: int = 10
-    """Epochs from one checkpoint of the network, with all validators, to the next; the last epoch
-    and every round of self-training always make one. 0 makes none."""
+    """Epochs between two checkpoints of the network; the last epoch and every round of
+    self-training always write one. 0 writes none."""
     rule: Rule = "last"
-    """How the network is chosen: the last, or the checkpoint that a validator rates highest."""
+    """How the network is chosen: the last checkpoint, or the one with the highest accuracy on the
+    held-out part of the source."""
     rotate_z: bool = True
     """Whether each cloud is turned about the vertical at random, anew in each epoch."""
     jitter_sigma: float = 0.01
@@ -185,12 +184,7 @@ class SelfTrainingSettings:
 
     rule: Annotated[RoundRule, tyro.conf.Suppress] = "qbst"
     """Which clouds are selected: ``qbst`` keeps fewer of dominant classes (QS³); ``spst`` all over
-    the threshold (GAST); ``uniform`` as many of each class; ``prior`` follows an estimate of the
-    target's class shares; ``quantile`` the same share of each class's clouds (CBST)."""
-    refine: bool = False
-    """Whether pseudo labels are first smoothed over a graph of similar clouds."""
-    prior: Prior = "em"
-    """Estimate of the class shares, for ``prior``; ``bbse`` needs a held-out part of the source."""
+    the threshold (GAST)."""
     threshold: float = 0.8
     """θ₀, the confidence that a pseudo label must exceed in round 1."""
     step: float = 0.005
@@ -198,15 +192,10 @@ class SelfTrainingSettings:
     threshold_share: float | None = None
     """Share of the clouds to select from that is to be confident: θ of each round is then their
     quantile, in place of ``threshold`` and ``step``."""
-    floor: int = 0
-    """Least number kept of each class, as far as clouds have its pseudo label: the most confident,
-    also from below θ. 0 leaves the rule's own counts."""
     rounds: int = 10
     """Number of rounds."""
     epochs: int = 10
     """Passes over the selected clouds in each round."""
-    steps_per_epoch: int | None = None
-    """Optimiser steps an epoch; None makes one pass over the selected clouds."""
     selection: Selection = "most-confident"
     """End of a class's ranking by confidence that is kept."""
     inclusive: bool = False
@@ -222,28 +211,13 @@ class SelfTrainingSettings:
     of the network over the epochs of all rounds, which begins at the warm-up."""
     teacher_decay: float = 0.9
     """What the ``average`` keeps of itself after an epoch; the rest is the network's."""
-    turns: int = 1
-    """The teacher's answers are means over so many turns of a cloud about z, evenly spread."""
-    calibrate: bool = False
-    """Whether the teacher's confidence is calibrated before the threshold: by a temperature that is
-    fitted, in each round anew, on the held-out part of the source with its hard labels."""
-    label_smoothing: float | None = None
-    """Label smoothing in the rounds; None takes that of the training before them."""
     learning_rate: float | None = None
     """Adam's learning rate at the start of a round; None takes that of the training before."""
     source_loss: bool = True
     """Whether each step takes as many labelled clouds of the source too."""
-    source_weight: float = 1.0
-    """Factor of the source's loss at the start."""
     weight_step: float = 0.0
-    """Taken off both factors, of the target's and the source's loss, after each epoch."""
-    quantile: float = 0.5
-    """Which of the classes' counts bounds all: ``uniform`` and ``prior`` keep what this quantile of
-    the classes allows, and all of a class with less; at 0 the rarest class decides."""
-    portion: float = 0.2
-    """Share of each class's clouds that ``quantile`` keeps in round 1."""
-    portion_step: float = 0.05
-    """Added to it after each round, up to all."""
+    """Taken off both factors, of the target's and the source's loss, after each epoch; both begin
+    at 1."""
     schedule: Literal["per-round", "continuous"] = "per-round"
     """A fresh optimiser and cosine in each round; or one optimiser and one cosine whose half
     period is a round, so that the rate rises again in every second round."""
@@ -251,17 +225,15 @@ class SelfTrainingSettings:
     """What becomes of the confident clouds where all have one class: kept, or none selected."""
 
     def __post_init__(self) -> None:
-        ranges = {"must be in 0 to 1": "threshold quantile", "must be at least 1": "turns"}
-        ranges |= {"must be above 0": "rounds epochs source_weight steps_per_epoch learning_rate"}
-        ranges |= {"must be above 0, to 1": "portion threshold_share"}
-        ranges |= {"must be in 0 to below 1": "label_smoothing teacher_decay"}
-        _check_ranges(self, ranges | {"must not be negative": "portion_step floor"})
+        ranges = {"must be in 0 to 1": "threshold", "must be above 0, to 1": "threshold_share"}
+        ranges |= {"must be above 0": "rounds epochs learning_rate"}
+        _check_ranges(self, ranges | {"must be in 0 to below 1": "teacher_decay"})
         last = self.threshold + self.step * (self.rounds - 1)
         _check(
             self, "step", self.step >= 0 and last <= 1, "takes θ out of 0 to 1 within the rounds"
         )
         decay = self.weight_step * (self.rounds * self.epochs - 1)
-        good = self.weight_step >= 0 and decay < min(1.0, self.source_weight)
+        good = self.weight_step >= 0 and decay < 1
         _check(self, "weight_step", good, "takes a factor of the losses to 0 within the rounds")
         _check_words(self)
         good = self.teacher != "average" or self.init == "warm-up"
@@ -280,19 +252,10 @@ class SelfTrainingSettings:
 
 _READ_BY: Mapping[tuple[str, tuple[Any, ...]], tuple[str, ...]] = {
     ("rule", ("qbst",)): ("selection", "single_class"),
-    ("rule", ("prior",)): ("prior",),
-    ("rule", ("uniform", "prior")): ("quantile",),
-    ("rule", ("quantile",)): ("portion", "portion_step"),
-    ("rule", ("qbst", "spst", "uniform", "prior")): (
-        "threshold",
-        "step",
-        "inclusive",
-        "threshold_share",
-    ),
     ("threshold_share", (None,)): ("threshold", "step"),
     ("teacher", ("average",)): ("teacher_decay",),
 }
-"""Settings that are looked at only where another one has some value."""
+"""Settings that apply only for certain values of another setting."""
 
 
 _RANGES: Mapping[str, Callable[[float], bool]] = {
@@ -364,10 +327,10 @@ PUBLISHED = ("paper", "released")
 
 
 def usual_preset(rule: str | None) -> PresetName:
-    """Return the preset that rounds by a rule take where none is named.
+    """Return the preset of rounds by a rule if none is named.
 
     Example:
-        >>> usual_preset("qbst"), usual_preset("spst"), usual_preset("uniform")
+        >>> usual_preset("qbst"), usual_preset("spst"), usual_preset(None)
         ('gentle', 'spst', 'default')
     """
     if rule == "qbst":

@@ -73,7 +73,7 @@ class Adapter(ClassifierMixin, BaseEstimator):
     Attributes:
         model_: The trained network.
         classes_: Names of the classes, in the order of the probabilities.
-        result_: The whole `FitResult`: epochs, rounds, checkpoints with their validators.
+        result_: The whole `FitResult`: epochs, rounds and checkpoints.
 
     Example:
         >>> Adapter("gast", train={"epochs": 50}).get_params()["train"]

@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from qs3.errors import InputError
 from qs3.evaluation.environment import git_commit, hardware, versions
 from qs3.evaluation.records import RECORDS, RunRecord, Scores, score, write_record
-from qs3.evaluation.regret import choose_each
 from qs3.io import load_clouds
 from qs3.io.clouds import CloudChoice, PointClouds, relabel
 from qs3.meshes.classes import require_named
@@ -26,7 +24,6 @@ from qs3.training.prepared import Prepared, prepare_clouds, require_finite
 from qs3.training.rounds import kept_clouds
 from qs3.training.run import data_record, read_run
 from qs3.training.shipped import workplace
-from qs3.training.validation import ROUND, load_checkpoint, read_checkpoints
 
 
 def evaluate(
@@ -35,7 +32,6 @@ def evaluate(
     *,
     split: str | None = None,
     cloud: CloudChoice = "points",
-    checkpoints: bool = False,
     experiment: Mapping[str, str | int | float] | None = None,
     class_map: Mapping[str, str] | None = None,
 ) -> RunRecord:
@@ -51,8 +47,6 @@ def evaluate(
         data: Labelled clouds, or where they lie: whatever `qs3.io.load_clouds` reads.
         split: Part of the data, where they are read here.
         cloud: Which cloud of generated data, likewise.
-        checkpoints: Whether to score every checkpoint of the run's last stage too, and tell which
-            one each validator would have chosen; ``oracle``, among them, looks at the labels.
         experiment: Place of the run in a grid of runs, for the record.
         class_map: What classes are called in the scores, of the data and of the network: a run
             that knows a stool is scored on data of chairs by ``{"stool": "chair"}``.
@@ -79,8 +73,6 @@ def evaluate(
     answer_of = np.array([names.index(other) for other in called.values()])
     require_finite(whole.points, whole.ids)
     test = prepare_clouds(whole, train["num_points"], loaded.preparation)
-    scored = _scored(run, test, answer_of) if checkpoints else []
-    picked = choose_each(scored) if scored else {}
     record = RunRecord(
         method=made.method,
         model=train["model"],
@@ -99,11 +91,6 @@ def evaluate(
         commit=git_commit(),
         rounds=_count_right(run, made.rounds, test, answer_of),
         chosen=made.chosen,
-        checkpoints=tuple(scored),
-        choices={
-            rule: {name: value for name, value in scored[row].items() if name != "validators"}
-            for rule, row in picked.items()
-        },
         marks=caveats(made, test),
         experiment=experiment,
     )
@@ -154,20 +141,3 @@ def _count_right(
         counts = {name: np.bincount(of, minlength=size).tolist() for name, of in counted.items()}
         counted_rounds.append({**record, **counts})
     return tuple(counted_rounds)
-
-
-def _scored(
-    run: Path, test: Prepared[PointClouds], answer_of: Int[np.ndarray, "k"]
-) -> list[dict[str, Any]]:
-    """Score the checkpoints of the run's last stage."""
-    checkpoints = read_checkpoints(run, ROUND) or read_checkpoints(run)
-    if not checkpoints:
-        raise InputError(f"{run}: has no checkpoints; train with --validate-every above 0")
-    loaded, scored = load_model(run), []
-    for checkpoint in checkpoints:
-        load_checkpoint(run, checkpoint, loaded.model)
-        scores = _scores(loaded, test, answer_of)
-        line = {"accuracy": scores.accuracy, "class_mean_accuracy": scores.class_mean_accuracy}
-        line |= {"stage": checkpoint.stage, "number": checkpoint.number}
-        scored.append(line | {"validators": dict(checkpoint.validators)})
-    return scored

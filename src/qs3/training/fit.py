@@ -70,7 +70,7 @@ class FitResult:
     chosen: Mapping[str, str | int]
     """Stage and number of the network that it chose; round 0 is the one before the rounds."""
     checkpoints: tuple[Checkpoint, ...]
-    """Networks along the way, with what each validator says of them."""
+    """Checkpoints of the network, with their accuracy on the held-out part of the source."""
     source: Prepared[PointClouds]
     """What was trained on: the source without its held-out part."""
     holdout: Prepared[PointClouds] | None
@@ -106,9 +106,9 @@ def fit(
     Args:
         method: One of `qs3.adaptation.names.MethodName`; ``spst``, ``qbst`` and ``gast-spst`` end
             in self-training.
-        source: Labelled clouds, as read. A share of ``settings.holdout`` is kept for validators.
+        source: Labelled clouds, as read. A share of ``settings.holdout`` is held out.
             None where the rounds go on from a warm-up by the target alone (``source_loss`` off).
-        target: Clouds without labels, as read. ``source-only`` takes them for validators alone.
+        target: Clouds without labels, as read. ``source-only`` does not use them.
         settings: How to train.
         self_training: Settings of the rounds, which follow any method where they are given; a
             method that ends in self-training takes its own preset where they are absent.
@@ -158,7 +158,7 @@ def fit(
     run_dir = Path(run_dir)
     _note_absent(source)
     has_holdout = unseen and bool(held.any())
-    _require_judges(settings, rounds_settings, target, has_holdout, held)
+    _require_holdout(settings, has_holdout, held)
     # What cannot be made must not leave a folder behind that refuses the corrected call.
     model = fresh_model(base, settings, len(source.class_names))
     trial, device = make_method(base, model, settings), make_fabric(settings)
@@ -190,8 +190,7 @@ def fit(
         ):
             hooks = Hooks(history, deadline, on_epoch, on_round)
             model, epochs, rounds = run_job(job, fabric, hooks)
-        adapted = needs or settings.rule not in ("last", "source-val")
-        data = data_fields(prepared, prepared_target, adapted)
+        data = data_fields(prepared, prepared_target, needs)
         if before and not len(source):
             data["source"] = before.source
         stage, number = (base, len(epochs)) if rounds_settings is None else (ROUND, len(rounds))
@@ -245,9 +244,10 @@ def _no_clouds(warm_up: Path | None, rounds: SelfTrainingSettings | None) -> Poi
     """An empty source of the warm-up's classes."""
     if warm_up is None or rounds is None:
         raise InputError("without a source there is nothing to train on; give labelled clouds")
-    if rounds.source_loss or rounds.rule == "prior":
-        name = "source_loss" if rounds.source_loss else "rule prior"
-        raise InputError(f"{name} needs labelled clouds of the source; give some, or leave it out")
+    if rounds.source_loss:
+        raise InputError(
+            "source_loss needs labelled clouds of the source; give some, or leave it out"
+        )
     names = load_model(warm_up).class_names
     return PointClouds(np.zeros((0, 1, 3), np.float32), np.zeros(0, np.int64), names, ())
 
@@ -270,29 +270,20 @@ def _plan(
     return base, self_training
 
 
-def _require_judges(
-    settings: TrainSettings,
-    rounds: SelfTrainingSettings | None,
-    target: UnlabelledClouds | None,
-    has_holdout: bool,
-    held: Bool[np.ndarray, "b"],
+def _require_holdout(
+    settings: TrainSettings, has_holdout: bool, held: Bool[np.ndarray, "b"]
 ) -> None:
-    """Refuse, before anything is trained, what would lack something in the end."""
-    by_source = settings.rule in ("source-val", "dev")
-    bbse = rounds is not None and rounds.prior == "bbse"
-    if not has_holdout and (by_source or bbse or (rounds is not None and rounds.calibrate)):
-        what = "prior 'bbse'" if bbse else "calibrate"
-        what = f"rule {settings.rule!r}" if by_source else what
-        remedy = f"raise holdout above {settings.holdout:g}, or give more clouds a class"
-        if not len(held):
-            remedy = "give a source"
-        elif held.any():
-            remedy = "give a source that it has not, or a warm-up of this source, seed and holdout"
-        raise InputError(
-            f"{what} needs a held-out part of the source that no warm-up has seen; {remedy}"
-        )
-    if target is None and settings.rule not in ("last", "source-val"):
-        raise InputError(f"rule {settings.rule!r} needs a target: give unlabelled clouds")
+    """Raise InputError, before anything is trained, if ``source-val`` would lack its clouds."""
+    if settings.rule != "source-val" or has_holdout:
+        return
+    remedy = f"raise holdout above {settings.holdout:g}, or give more clouds a class"
+    if not len(held):
+        remedy = "give a source"
+    elif held.any():
+        remedy = "give a source that it has not, or a warm-up of this source, seed and holdout"
+    raise InputError(
+        f"rule 'source-val' needs a held-out part of the source that no warm-up has seen; {remedy}"
+    )
 
 
 def _check_warm_up(

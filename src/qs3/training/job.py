@@ -41,7 +41,7 @@ class Job:
     source: Prepared[PointClouds]
     """Labelled clouds to train on."""
     holdout: Prepared[PointClouds] | None
-    """Labelled clouds of the source for the validators."""
+    """Held-out part of the source; None if there is none."""
     target: Prepared[UnlabelledClouds] | None
     """Clouds of the target; None where there are none."""
     settings: TrainSettings
@@ -91,7 +91,8 @@ def run_job(
     """
     epochs: list[EpochRecord] = []
     records: list[RoundRecord] = []
-    validation = Validation(job.run_dir, job.source, job.holdout, job.target, job.settings, fabric)
+    classes = job.source.class_names
+    validation = Validation(job.run_dir, classes, job.holdout, job.settings, fabric)
 
     def tell_checkpoints() -> None:
         if hooks.history is not None:
@@ -140,7 +141,6 @@ def run_job(
             settings=job.settings,
             rounds=job.rounds,
             fabric=fabric,
-            holdout=job.holdout,
             run_dir=job.run_dir,
             look=look,
             hooks=hooks,

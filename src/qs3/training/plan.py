@@ -86,7 +86,7 @@ def round_steps(
     for _ in range(rounds.rounds):
         chosen = int(pool * kept)
         each = count_batches(chosen, settings.batch_size, 2 * settings.devices)
-        steps += rounds.epochs * (rounds.steps_per_epoch or each)
+        steps += rounds.epochs * each
         pool = chosen if rounds.pool == "shrinking" else target
     return steps
 
@@ -149,7 +149,7 @@ def describe_plan(
     seconds = steps * cost.step + (len(source) + seen) * cost.preparation
     hours, minutes = divmod(round(seconds / 60), 60)
     lines.append(
-        f"time      about {hours} h {minutes:02} min of processor time here, or more where "
-        f"validators look often: {cost.step:.2g} s a step"
+        f"time      about {hours} h {minutes:02} min of processor time here: "
+        f"{cost.step:.2g} s a step"
     )
     return lines

@@ -1,13 +1,12 @@
 """Class probabilities of clouds."""
 
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from qs3.geometry import rotation_z
 from qs3.io.clouds import UnlabelledClouds, numbered
 from qs3.io.preparation import PAPER, Preparation
 from qs3.models import PointClassifier
@@ -128,21 +127,3 @@ def describe(
 
         rows = gather_rows(rows, mine, len(points), fabric)
     return Description(*np.split(rows, [classes, classes + width], axis=1))
-
-
-def describe_turned(
-    model: PointClassifier, clouds: Prepared, turns: int, **how: Any
-) -> Description:
-    """Describe clouds; the mean over turns about z, evenly spread, of which the first is none.
-
-    Args:
-        model: The network.
-        clouds: Clouds.
-        turns: How many.
-        how: As in `describe`.
-    """
-    answers = []
-    for turn in range(turns):
-        matrix = rotation_z(2 * np.pi * turn / turns).T.astype(np.float32)
-        answers.append(describe(model, clouds.points @ matrix if turn else clouds, **how))
-    return Description(*(np.mean(parts, axis=0) for parts in zip(*answers, strict=True)))

@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float, Int
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from qs3.adaptation.confidence import BOUNDS
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
@@ -41,7 +40,7 @@ class RoundRecord:
     round: int
     """Count from 1."""
     theta: float
-    """Threshold of this round; 0 for rule ``quantile``."""
+    """Threshold of this round."""
     pool: int
     """Clouds to select from."""
     confident: tuple[int, ...]
@@ -65,8 +64,6 @@ class RoundRecord:
     """Of each epoch, as in `EpochRecord`: on the pseudo labels and the source together."""
     learning_rates: tuple[float, ...] = ()
     """Adam's learning rate in each epoch."""
-    temperature: float | None = None
-    """What calibrated the teacher; None where that is not asked for."""
     cpu_seconds: float = 0.0
     """As ``seconds``, of the first device's processor."""
     steps: int = 0
@@ -117,8 +114,6 @@ class Task:
     """How it labels and selects."""
     fabric: Fabric
     """Devices and number format; all devices do the rounds."""
-    holdout: Prepared[PointClouds] | None = None
-    """Part of the source that is not trained on."""
     select: Select | None = None
     """Selection rule, in place of the one of the settings."""
     run_dir: Path | None = None
@@ -245,19 +240,13 @@ def remarks(
     class_names: Sequence[str],
     share: str = "--self-training.threshold-share",
 ) -> list[str]:
-    """Say, a line each, what in the rounds was not as one would wish.
+    """Return warnings about the self-training rounds, a line each.
 
-    That is where none trained, with what to change; where all were skipped after one that began
-    with fresh weights; rounds whose confident clouds all had one class; and a calibration that the
-    held-out clouds do not bound. ``share`` is what the caller calls ``threshold_share``.
+    A warning names: no round that trained, with a remedy; rounds that were all skipped after one
+    that began with fresh weights; rounds whose confident clouds all had one class. ``share`` is the
+    caller's name of ``threshold_share``.
     """
     lines = []
-    if any(record.temperature == BOUNDS[0] for record in records):
-        lines.append(
-            f"the temperature ended at its bound, {BOUNDS[0]}, as the network is right on (nearly) "
-            "all held-out clouds of the source: its confidence is raised and not calibrated; hold "
-            "out more (--holdout)"
-        )
     for record in records:
         if record.single_class and any(record.kept):
             count, name = sum(record.confident), class_names[int(np.argmax(record.confident))]
@@ -271,8 +260,6 @@ def remarks(
         remedy = f"lower --self-training.threshold, give {share}, or begin with a better warm-up"
         if pool < least:
             remedy = f"give more clouds of the target: a round needs {least}, 2 a class"
-        elif rounds.rule == "quantile":
-            remedy = "raise --self-training.portion or begin with a better warm-up"
         elif rounds.threshold_share is not None:
             remedy = f"raise {share} or begin with a better warm-up"
         lines.append(

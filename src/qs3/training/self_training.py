@@ -54,7 +54,6 @@ def self_train(
     settings: TrainSettings,
     self_training: SelfTrainingSettings,
     *,
-    holdout: PointClouds | Prepared[PointClouds] | None = None,
     select: Select | None = None,
     fabric: Fabric | None = None,
     run_dir: Path | None = None,
@@ -73,8 +72,6 @@ def self_train(
         target: Clouds without labels, likewise.
         settings: Network, batch size, rate, augmentation, seed. Its epochs are not used.
         self_training: Settings of the rounds.
-        holdout: Part of the source that is not trained on, prepared: for the calibration, and for
-            an estimate of the class shares.
         select: Selection rule, in place of the one of the settings.
         fabric: Device and number format; made from the settings where it is not given.
         run_dir: Folder of a run, from which a call that was killed goes on after its last epoch,
@@ -86,13 +83,11 @@ def self_train(
         The network of the last round, and a record of each round.
 
     Raises:
-        InputError: where the target is empty, its points are not finite, a setting needs a
-            held-out part and there is none, or the folder holds another run.
+        InputError: if the target is empty, its points are not finite, or the folder holds another
+            run.
     """
     source, target = as_prepared(source, settings), as_prepared(target, settings)
     require_unlabelled(target.clouds)
-    if holdout is not None:
-        holdout = as_prepared(holdout, settings)
     fabric = fabric or make_fabric(settings)
     run_dir = None if run_dir is None else Path(run_dir)
     task = Task(
@@ -101,7 +96,6 @@ def self_train(
         settings=settings,
         rounds=self_training,
         fabric=fabric,
-        holdout=holdout,
         select=select,
         run_dir=run_dir,
         hooks=Hooks(on_epoch=on_epoch, on_round=on_round),
@@ -143,17 +137,16 @@ def run_rounds(model: PointClassifier, task: Task) -> tuple[PointClassifier, lis
     for number in range(len(state.records) + 1, rounds.rounds + 1):
         start, cpu_start, pool = time.perf_counter(), time.process_time(), state.pool
         # Line 3: label the target.
-        said = ask_teacher(state, task)
-        labels = said.target.argmax(axis=1)
+        probabilities = ask_teacher(state, task)
+        labels = probabilities.argmax(axis=1)
 
         # Lines 4 to 17: select. θ rises from round to round (line 19).
-        candidates = said.target[pool]
+        candidates = probabilities[pool]
         theta = round_threshold(rounds, number, candidates)
         if task.select is not None:
             chosen = pool[task.select(candidates, theta)]
         else:
-            how = rounds, number, source.labels, said.held
-            chosen = pool[select_clouds(candidates, theta, *how)]
+            chosen = pool[select_clouds(candidates, theta, rounds)]
 
         # Line 18: train on what was selected.
         pseudo = label_clouds(target, chosen, labels[chosen], source.class_names)
@@ -181,7 +174,6 @@ def run_rounds(model: PointClassifier, task: Task) -> tuple[PointClassifier, lis
             seconds=time.perf_counter() - start,
             accuracies=tuple(epoch.accuracy for epoch in epochs),
             learning_rates=tuple(epoch.learning_rate for epoch in epochs),
-            temperature=said.temperature,
             cpu_seconds=time.process_time() - cpu_start,
             steps=sum(epoch.steps for epoch in epochs),
         )
@@ -239,13 +231,11 @@ def _train_round(
         state.latest.load_state_dict(fresh.state_dict())
     continuous = rounds.schedule == "continuous"
     first = before * rounds.epochs
-    smoothing = rounds.label_smoothing
     method = PseudoLabelled(
         state.latest,
-        source_weight=rounds.source_weight,
         weight_step=rounds.weight_step,
         epochs=range(first, first + rounds.epochs),
-        label_smoothing=settings.label_smoothing if smoothing is None else smoothing,
+        label_smoothing=settings.label_smoothing,
     )
     kept, judges = pseudo.select(~apart), pseudo.select(apart)
 
@@ -268,7 +258,6 @@ def _train_round(
         fabric=task.fabric,
         run_dir=task.run_dir,
         stream=(STREAM, number),
-        steps_per_epoch=rounds.steps_per_epoch,
         first_epoch=first if continuous else 0,
         optimiser_state=state.optimiser if continuous else None,
         observer=teach,

@@ -1,8 +1,7 @@
-"""Checkpoints of the network along a run, each with every validator, and the choice among them."""
+"""Checkpoints of the network during a run, and the choice among them."""
 
 import copy
-import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,9 +10,10 @@ from jaxtyping import Bool, Int
 from lightning_fabric import Fabric
 
 from qs3.adaptation import Method
-from qs3.adaptation.validators import VALIDATORS, Observation, source_accuracy, validate
+from qs3.adaptation.names import Rule
 from qs3.errors import InputError
-from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.evaluation.metrics import accuracy
+from qs3.io.clouds import PointClouds
 from qs3.models import PointClassifier
 from qs3.training.checkpoint import (
     load_tensors_into,
@@ -23,15 +23,12 @@ from qs3.training.checkpoint import (
     seed_sequence,
 )
 from qs3.training.config import TrainSettings
-from qs3.training.predict import Description, describe
+from qs3.training.predict import describe
 from qs3.training.prepared import Prepared
 
-_LOG = logging.getLogger(__name__)
 CHECKPOINTS = "checkpoints"
 ROUND = "round"
 """Stage of the checkpoints that self-training makes."""
-_SOURCE_CLOUDS = 1000
-"""Of the source, at most so many tell DEV where the source lies."""
 
 
 @dataclass(frozen=True)
@@ -42,86 +39,59 @@ class Checkpoint:
     """``round`` for self-training, else the stage of the epochs."""
     number: int
     """Epochs, or rounds, that were done; of rounds 0 is what they began with."""
-    validators: Mapping[str, float | None]
-    """What each validator says, higher is better; None where it lacks something."""
+    source_accuracy: float | None
+    """Accuracy on the held-out part of the source; None if there is none."""
     file: str
     """Weights, relative to the run's folder."""
 
 
 class Validation:
-    """Looks at the network in the course of a run; no label of the target is at hand.
+    """Writes checkpoints during a run and scores them on the held-out part of the source.
 
     Args:
         run_dir: Folder of the run; weights go to ``checkpoints/`` there.
-        source: The part of the source that is trained on.
-        holdout: The part that is not; None where there is none.
-        target: Clouds without labels; None where there are none.
-        settings: How often to look.
+        class_names: Classes of the network.
+        holdout: Held-out part of the source; None if there is none.
+        settings: How often to write a checkpoint.
         fabric: The devices; all must call.
     """
 
     def __init__(
         self,
         run_dir: Path,
-        source: Prepared[PointClouds],
+        class_names: Sequence[str],
         holdout: Prepared[PointClouds] | None,
-        target: Prepared[UnlabelledClouds] | None,
         settings: TrainSettings,
         fabric: Fabric,
     ) -> None:
         self.run_dir, self.settings, self.fabric = Path(run_dir), settings, fabric
-        rows = np.random.default_rng(seed_sequence(settings.seed, 2)).permutation(len(source))
-        self.source = source.select(np.sort(rows[:_SOURCE_CLOUDS]))
-        self.holdout, self.target = holdout, target
-        self.class_names = source.class_names
+        self.class_names, self.holdout = tuple(class_names), holdout
 
     def after_epoch(self, stage: str, method: Method, epoch: int) -> None:
-        """Make a checkpoint where one is due."""
+        """Write a checkpoint if one is due."""
         done, every = epoch + 1, self.settings.validate_every
         if every and (done == self.settings.epochs or done % every == 0):
             self.look(stage, done, method.model)
 
     def look(self, stage: str, number: int, model: PointClassifier) -> None:
-        """Measure a network and keep its weights."""
+        """Score a network and write its weights."""
         if not self.settings.validate_every:
             return
         model = copy.deepcopy(model)  # what follows goes on from its own statistics
         self.fabric.to_device(model)
-        target, holdout, source = (
-            None
-            if clouds is None or not len(clouds)
-            else describe(model, clouds, batch_size=self.settings.batch_size, fabric=self.fabric)
-            for clouds in (self.target, self.holdout, self.source)
-        )
+        right = self._source_accuracy(model)
         if self.fabric.is_global_zero:
-            values = self._values(target, holdout, source)
-            facts = {"stage": stage, "number": number, "validators": values}
+            facts = {"stage": stage, "number": number, "source_accuracy": right}
             name = f"{CHECKPOINTS}/{stage}-{number:04d}.safetensors"
             save_model(self.run_dir, model, self.class_names, self.settings, name=name, facts=facts)
         self.fabric.barrier()
 
-    def _values(
-        self, target: Description | None, holdout: Description | None, source: Description | None
-    ) -> dict[str, float | None]:
-        """What each validator says; None where it lacks something or cannot tell."""
-        values: dict[str, float | None] = dict.fromkeys(VALIDATORS)
-        labels = None if self.holdout is None else self.holdout.labels
-        try:
-            if target is not None:
-                seen = Observation(
-                    target_probabilities=target.probabilities,
-                    target_features=target.features,
-                    validation_probabilities=None if holdout is None else holdout.probabilities,
-                    validation_features=None if holdout is None else holdout.features,
-                    validation_labels=labels,
-                    training_features=None if source is None else source.features,
-                )
-                return values | validate(seen)
-            if holdout is not None and labels is not None:
-                values["source-val"] = source_accuracy(holdout.probabilities, labels)
-        except InputError as error:  # NaN, say: a number for the record must not end the run
-            _LOG.warning("the validators cannot judge this checkpoint: %s", error)
-        return values
+    def _source_accuracy(self, model: PointClassifier) -> float | None:
+        if self.holdout is None or not len(self.holdout):
+            return None
+        size = self.settings.batch_size
+        answers = describe(model, self.holdout, batch_size=size, fabric=self.fabric)
+        return accuracy(self.holdout.labels, answers.probabilities.argmax(axis=1))
 
 
 def read_checkpoints(run_dir: Path, stage: str | None = None) -> list[Checkpoint]:
@@ -141,7 +111,7 @@ def read_checkpoints(run_dir: Path, stage: str | None = None) -> list[Checkpoint
             checkpoint = Checkpoint(
                 stage=str(facts["stage"]),
                 number=int(facts["number"]),
-                validators=dict(facts["validators"]),
+                source_accuracy=facts["source_accuracy"],
                 file=f"{CHECKPOINTS}/{path.name}",
             )
         except (KeyError, TypeError, ValueError) as error:
@@ -151,30 +121,25 @@ def read_checkpoints(run_dir: Path, stage: str | None = None) -> list[Checkpoint
     return sorted(checkpoints, key=lambda made: (made.stage, made.number))
 
 
-def choose(checkpoints: Sequence[Checkpoint], rule: str) -> Checkpoint:
-    """Return the checkpoint that a rule picks: the highest, the first of equals.
+def choose(checkpoints: Sequence[Checkpoint], rule: Rule) -> Checkpoint:
+    """Return the checkpoint that a rule picks; ``source-val`` takes the first of equals.
 
     Raises:
-        InputError: where there is none, or the validator has said nothing.
+        InputError: if there is no checkpoint, or none has a score on a held-out part.
 
     Example:
-        >>> scores = [{"im": 0.2}, {"im": 0.4}, {"im": 0.4}]
-        >>> made = [Checkpoint("round", i, values, "") for i, values in enumerate(scores)]
-        >>> choose(made, "im").number, choose(made, "last").number
+        >>> made = [Checkpoint("round", i, value, "") for i, value in enumerate((0.2, 0.4, 0.4))]
+        >>> choose(made, "source-val").number, choose(made, "last").number
         (1, 2)
     """
     if not checkpoints:
         raise InputError("the run has no checkpoints; train with validate_every above 0")
     if rule == "last":
         return checkpoints[-1]
-    values = [checkpoint.validators.get(rule) for checkpoint in checkpoints]
+    values = [checkpoint.source_accuracy for checkpoint in checkpoints]
     best = max((value for value in values if value is not None), default=None)
     if best is None:
-        raise InputError(
-            f"rule {rule!r} has nothing to go by: it needs "
-            + ("a held-out part of the source" if rule == "source-val" else "a target")
-            + (" and a held-out part of the source" if rule == "dev" else "")
-        )
+        raise InputError(f"rule {rule!r} needs a held-out part of the source")
     return checkpoints[values.index(best)]
 
 
@@ -185,13 +150,13 @@ def load_checkpoint(run_dir: Path, checkpoint: Checkpoint, model: PointClassifie
 
 
 def held_out(source: PointClouds, settings: TrainSettings) -> Bool[np.ndarray, "b"]:
-    """Tell which clouds of the source are kept for the validators; a scan's stay together."""
+    """Return which clouds of the source are held out; clouds of one scan stay together."""
     scans, rows = np.unique(source.scan_rows(), return_inverse=True)
     return held_out_rows(source.labels[scans], settings)[rows]
 
 
 def held_out_rows(labels: Int[np.ndarray, "b"], settings: TrainSettings) -> Bool[np.ndarray, "b"]:
-    """Tell which clouds of the source are kept for the validators, by the seed alone.
+    """Return which clouds of the source are held out; the seed alone decides.
 
     The share is taken of each class, rounded; a class never loses its last cloud.
 

@@ -21,6 +21,5 @@ EXPERIMENT = Experiment(
     pairs=lambda scale: [(f"{row} over qbst", row, "qbst") for row in _ROWS[1:]],
     corner="method",
     made=("M", "S", "D", "R"),
-    rules=True,
 )
 """A row of the bench and its variants."""

@@ -1,4 +1,4 @@
-"""The bench of adaptation: every method on scans and on surfaces, by every rule of selection.
+"""The bench of adaptation: every method on scans and on surfaces.
 
 Paper: main table of adaptation methods of QS³ (ECCV 2022), whose figures stand beside ours.
 """
@@ -39,6 +39,5 @@ EXPERIMENT = Experiment(
     corner="method",
     made=("M", "S", "D", "R"),
     usual=lambda scale: scale.tasks,
-    rules=True,
 )
 """Every method that there is."""
