@@ -10,7 +10,6 @@ test label plays a part in the training or in the choice of the network (the las
 """
 
 import argparse
-import json
 import statistics
 import subprocess
 import sys
@@ -19,6 +18,7 @@ from pathlib import Path
 
 import torch
 
+from qs3.evaluation.records import RECORDS, RunRecord, read_records
 from qs3.io import load_clouds
 from qs3.models import create_model, list_models
 
@@ -47,10 +47,10 @@ def command(*words: str) -> list[str]:
     return [sys.executable, "-m", "qs3", *words]
 
 
-def run(options: argparse.Namespace, network: str, seed: int) -> dict:
+def run(options: argparse.Namespace, network: str, seed: int) -> RunRecord:
     folder = options.out / f"{network}-{options.points}-{options.epochs}-{seed}"
-    records = folder / "records"
-    if not list(records.glob("*.json")):
+    records = folder / RECORDS
+    if not records.is_file():
         given = ["--source", str(options.data), "--source-split", "train", "--out", str(folder)]
         given += ["--model", network, "--num-points", str(options.points), "--seed", str(seed)]
         given += ["--epochs", str(options.epochs), "--threads", str(options.threads), *RECIPE]
@@ -58,7 +58,7 @@ def run(options: argparse.Namespace, network: str, seed: int) -> dict:
         subprocess.run(command("train", *given), check=True)
         scored = command("evaluate", str(folder), "--data", str(options.data), "--split", "test")
         subprocess.run(scored, check=True)
-    return json.loads(sorted(records.glob("*.json"))[-1].read_text())
+    return read_records(records)[0][-1][1]
 
 
 def main() -> None:
@@ -92,9 +92,9 @@ def main() -> None:
     ]
     for network in options.networks:
         records = [run(options, network, seed) for seed in options.seeds]
-        scores = [100 * record["scores"]["accuracy"] for record in records]
-        means = [100 * record["scores"]["class_mean_accuracy"] for record in records]
-        minutes = [record["seconds"]["total"] / 60 for record in records]
+        scores = [100 * record.scores.accuracy for record in records]
+        means = [100 * record.scores.class_mean_accuracy for record in records]
+        minutes = [record.seconds["total"] / 60 for record in records]
         lines.append(
             f"| {network} | {statistics.mean(scores):.1f} | {statistics.mean(means):.1f} "
             f"| {', '.join(f'{score:.1f}' for score in scores)} "

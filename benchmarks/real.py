@@ -13,9 +13,7 @@ into --records: those of the last 30 % tell by their number how often it was loo
 
 import argparse
 import concurrent.futures
-import json
 import os
-import re
 import subprocess
 import sys
 import time
@@ -26,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from qs3.evaluation.records import write_record
+from qs3.evaluation.records import RECORDS, RunRecord, append_record, read_records
 from qs3.io import load_clouds
 from qs3.io.clouds import CloudChoice, PointClouds, UnlabelledClouds
 from qs3.io.preparation import PAPER, ROBUST, Preparation
@@ -202,19 +200,25 @@ def make(options: argparse.Namespace, name: str, seed: int) -> None:
     for part in ("source", *scored(options)):
         fields = {"cell": name, "part": part}
         record = evaluate(run, clouds[part], experiment=fields)
-        write_record(record_path(options, name, seed, part), record)
+        append_record(options.records / RECORDS, record)
 
 
 def scored(options: argparse.Namespace) -> tuple[str, ...]:
     return ("dev", "sunrgbd", "check") if options.check else ("dev", "sunrgbd")
 
 
-def record_path(options: argparse.Namespace, name: str, seed: int, part: str) -> Path:
-    return options.records / f"{re.sub('[^-+A-Za-z0-9]+', '_', name)}-{seed}-{part}.json"
-
-
-def done(options: argparse.Namespace, name: str, seed: int) -> bool:
-    return all(record_path(options, name, seed, part).is_file() for part in scored(options))
+def recorded(folder: Path) -> dict[tuple[str, int, str], RunRecord]:
+    """Records by cell, seed and part."""
+    if not (folder / RECORDS).is_file():
+        return {}
+    records, faults = read_records(folder / RECORDS)
+    if faults:
+        raise SystemExit("\n".join(faults))
+    return {
+        (str(one.experiment["cell"]), one.seed, str(one.experiment["part"])): one
+        for _, one in records
+        if one.experiment is not None
+    }
 
 
 def call(words: list[str], name: str, seed: int) -> tuple[str, int, float, int]:
@@ -242,7 +246,13 @@ def main() -> int:
     if options.one:
         make(options, options.one, options.seeds[0])
         return 0
-    left = [(n, s) for s in options.seeds for n in options.cells if not done(options, n, s)]
+    there = recorded(options.records)
+    left = [
+        (name, seed)
+        for seed in options.seeds
+        for name in options.cells
+        if not all((name, seed, part) in there for part in scored(options))
+    ]
     print(f"{len(left)} runs are missing: {', '.join(f'{n}-{s}' for n, s in left)}", flush=True)
     if options.dry_run:
         return 0
@@ -262,9 +272,8 @@ def main() -> int:
                 worst = max(worst, code)
                 score = ""
                 if code == 0:
-                    value = json.loads(record_path(options, name, seed, "dev").read_text())
-                    scores = value["scores"]
-                    both = (scores["accuracy"], scores["class_mean_accuracy"])
+                    scores = recorded(options.records)[name, seed, "dev"].scores
+                    both = (scores.accuracy, scores.class_mean_accuracy)
                     score = " / ".join(f"{100 * x:.1f}" for x in both)
                 print(f"{name}-{seed}: {seconds / 60:.1f} min, code {code}; {score}", flush=True)
     return worst

@@ -14,16 +14,15 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from real import parts
+from real import parts, recorded
 
 from qs3.evaluation.compare import bootstrap_difference
-from qs3.evaluation.records import RunRecord, read_record
+from qs3.evaluation.records import RunRecord
 from qs3.evaluation.tables import average, frame, to_markdown
 from qs3.io.layouts.npz import frame_parts
 from qs3.training import load_model
 from qs3.training.predict import describe
 from qs3.training.prepared import prepare_clouds
-from qs3.training.run import completed
 
 RIGHT = "right.csv"
 TABLES = "tables.md"
@@ -74,7 +73,7 @@ SHORT, SCORES = "## In short, accuracy / class mean", "## Scores"
 
 
 def read_records(folder: Path) -> list[RunRecord]:
-    return [completed(read_record(path), path) for path in sorted(folder.glob("*.json"))]
+    return list(recorded(folder).values())
 
 
 def place(record: RunRecord) -> tuple[str, str]:

@@ -13,14 +13,13 @@ else this is kept as RUN has it.
 import argparse
 import copy
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
 import torch
 
 from qs3.adaptation.confidence import measure_known
-from qs3.evaluation.records import RunRecord, find_records
+from qs3.evaluation.records import RECORDS, RunRecord, read_records
 from qs3.files import write_json, write_text
 from qs3.io import load_clouds
 from qs3.io.clouds import CloudChoice, PointClouds
@@ -73,7 +72,7 @@ def ship(
     save_model(out, half, loaded.class_names, settings, known=known, facts=facts)
     write_json(out / SETTINGS, loaded.settings)
     named = dataclasses.replace(run.source, name=source)
-    write_run(dataclasses.replace(run, folder=out, source=named, source_shapes=()))
+    write_run(dataclasses.replace(run, folder=out, source=named))
     parts = {"facts": facts_of(run, loaded, facts["rounding"]), "scores": scores_of(run, records)}
     card = (out / "README.md").read_text("utf-8")
     for name, lines in parts.items():
@@ -136,22 +135,22 @@ def told(value: object) -> str:
 def scores_of(run: Run, folder: Path) -> list[str]:
     """Lines of the scores of this run, by record; they are those before the rounding."""
     lines = []
-    for path, record in found(run, folder):
+    for record in found(run, folder):
         scores = record.scores
         low, high = scores.interval
         part = str((record.experiment or {}).get("part", ""))
         lines.append(
             f"| {record.test.label} {f'({part})' if part else ''} | {scores.clouds} "
             f"| {scores.accuracy:.1%} ({low:.0%} to {high:.0%}) "
-            f"| {scores.class_mean_accuracy:.1%} | `{path.name}` |"
+            f"| {scores.class_mean_accuracy:.1%} |"
         )
     if not lines:
         return [f"No record of this run is in `{folder.name}` yet."]
-    head = "| data | clouds | accuracy (95 % interval) | class mean | record |"
-    return [head, "|---|---|---|---|---|", *lines]
+    head = "| data | clouds | accuracy (95 % interval) | class mean |"
+    return [head, "|---|---|---|---|", *lines]
 
 
-def found(run: Run, folder: Path) -> Sequence[tuple[Path, RunRecord]]:
+def found(run: Run, folder: Path) -> list[RunRecord]:
     """Records of the same training (method, source and all settings) on data new to it."""
 
     def same(record: RunRecord) -> bool:
@@ -159,8 +158,9 @@ def found(run: Run, folder: Path) -> Sequence[tuple[Path, RunRecord]]:
         seen = record.method != run.method or "training clouds" in record.marks
         return not seen and record.source.checksum == run.source.checksum and one == other
 
-    pairs = find_records(folder, every_json=True)[0] if folder.is_dir() else []
-    return [(path, record) for path, record in pairs if same(record)]
+    path = folder / RECORDS
+    pairs = read_records(path)[0] if path.is_file() else []
+    return [record for _, record in pairs if same(record)]
 
 
 if __name__ == "__main__":

@@ -443,14 +443,16 @@ def results(out: Path, name: str) -> None:
 
     Tables are written from the records, for the rows and columns that have any.
     """
+    from qs3.evaluation.records import RECORDS
     from qs3.experiments import GALLERIES, TABLES
-    from qs3.experiments.setup import MARKER, RESULTS, read_setup
+    from qs3.experiments.setup import MARKER, read_setup
     from qs3.experiments.table import Table
-    from qs3.files import write_bytes
+    from qs3.experiments.text import markdown
+    from qs3.files import write_bytes, write_text
 
     folder = ROOT / "results" / name
-    for path in [out / MARKER, *sorted((out / RESULTS).glob("*.json"))]:
-        write_bytes(folder / path.relative_to(out), path.read_bytes())
+    for file in (MARKER, RECORDS):
+        write_bytes(folder / file, (out / file).read_bytes())
     pictures = out / GALLERIES
     if pictures.is_dir() and pictures.resolve() != (folder / GALLERIES).resolve():
         shutil.copytree(pictures, folder / GALLERIES, dirs_exist_ok=True)
@@ -459,9 +461,7 @@ def results(out: Path, name: str) -> None:
         if made.faults or not made.records:
             print(f"{table}: left out", *made.faults)
         else:
-            places = [place for place in made.runs if made.records_of(place)]
-            rows, columns = (tuple(dict.fromkeys(place[i] for place in places)) for i in (0, 1))
-            print(dataclasses.replace(made.table, rows=rows, columns=columns).write())
+            write_text(folder / f"{table}.md", markdown(made.made_part()))
 
 
 FIGURES: dict[str, Callable[[], Figure]] = {

@@ -8,7 +8,7 @@ import torch
 
 from qs3.cli.train import defaults, parse_settings
 from qs3.errors import InputError
-from qs3.evaluation import read_record
+from qs3.evaluation.records import RECORDS, read_records
 from qs3.files import write_json
 from qs3.io import load_clouds, load_unlabelled
 from qs3.meshes.classes import POINTDA10
@@ -73,7 +73,7 @@ def test_rounds_with_all_switches_after_a_method(qs3, source, tmp_path, method):
     done = qs3("evaluate", run, "--data", source)
     assert "checkpoint          round 2, by rule last" in done.stdout
     assert "known here" in done.stdout
-    record = read_record(next((run / "records").glob("*.json")))
+    record = read_records(run / RECORDS)[0][0][1]
     assert record.method == f"{method}+qbst"
     assert record.chosen == {"stage": "round", "number": 2}
     for told in record.rounds:

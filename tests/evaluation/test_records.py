@@ -1,3 +1,4 @@
+import concurrent.futures
 import dataclasses
 import json
 
@@ -5,33 +6,42 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.evaluation.records import find_records, read_record, score, write_record
+from qs3.evaluation.records import RECORDS, append_record, read_records, score
 
 
-def test_a_record_comes_back_as_it_was(record, tmp_path):
-    path = write_record(tmp_path / "run", record)
-    assert path.name == "record.json"
-    assert read_record(path) == read_record(tmp_path / "run") == record
-    assert write_record(tmp_path / "run", record) == path
-
-
-def test_without_a_target(record, tmp_path):
+def test_records_come_back_as_they_were_and_once(record, tmp_path):
+    path = tmp_path / "run" / RECORDS
     plain = dataclasses.replace(record, target=None, method="source-only", rounds=(), marks=())
-    assert read_record(write_record(tmp_path / "a.json", plain)) == plain
+    for one in (record, plain, record):
+        append_record(path, one)
+    assert read_records(path) == ([(f"{path}:1", record), (f"{path}:2", plain)], [])
 
 
-def test_a_finished_record_is_not_overwritten(record, tmp_path):
-    path = write_record(tmp_path, record)
-    before = path.read_bytes()
-    with pytest.raises(InputError, match="another run"):
-        write_record(tmp_path, dataclasses.replace(record, seed=1))
-    assert path.read_bytes() == before
+def test_a_line_that_a_kill_cut_short_counts_as_not_written(record, tmp_path, caplog):
+    path = tmp_path / RECORDS
+    append_record(path, record)
+    whole = path.read_bytes()
+    path.write_bytes(whole + whole[:100])
+    assert read_records(path) == ([(f"{path}:1", record)], [])
+    assert f"{path}:2: the line is cut short" in caplog.text
+    other = dataclasses.replace(record, seed=1)
+    append_record(path, other)
+    assert [made for _, made in read_records(path)[0]] == [record, other]
+
+
+def test_several_processes_may_append(record, tmp_path):
+    path = tmp_path / RECORDS
+    records = [dataclasses.replace(record, seed=seed) for seed in range(40)]
+    with concurrent.futures.ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda one: append_record(path, one), records))
+    found, faults = read_records(path)
+    assert faults == [] and sorted(one.seed for _, one in found) == list(range(40))
 
 
 def test_what_is_not_json_is_refused_and_nothing_is_written(record, tmp_path):
     for value in (float("nan"), {1, 2}, np.float32(1)):
         with pytest.raises(InputError, match="not plain JSON"):
-            write_record(tmp_path, dataclasses.replace(record, settings={"a": value}))
+            append_record(tmp_path / RECORDS, dataclasses.replace(record, settings={"a": value}))
     assert not list(tmp_path.iterdir())
 
 
@@ -56,52 +66,28 @@ def edit(value, path, new):
         ("seed", True, "'seed'"),
         ("scores.accuracy", 0.9, "'scores.accuracy'"),
         ("scores.clouds", 9, "'scores.clouds'"),
-        ("schema", 99, "schema 99"),
+        ("schema", 3, "schema 3, this version reads 4"),
         ("schema", True, "schema True"),
     ],
 )
 def test_a_field_that_cannot_be_is_named(record, tmp_path, field, new, message):
-    path = write_record(tmp_path, record)
+    path = tmp_path / RECORDS
+    append_record(path, record)
     value = json.loads(path.read_text())
     edit(value, field, new)
-    path.write_text(json.dumps(value))
-    with pytest.raises(InputError, match=rf"record\.json.*{message}"):
-        read_record(path)
-
-
-def test_records_of_older_schemas_are_brought_up_to_date(record, tmp_path):
-    """Schema 1 had no choices; up to 2 a teacher was a labeller, and qbst was qs3 on scans."""
-    now = dataclasses.replace(record, settings={"method": "qbst", "self_training": {"teacher": 1}})
-    value = json.loads(write_record(tmp_path / "now.json", now).read_text())
-    del value["experiment"]
-    value |= {"method": "qs3", "schema": 2}
-    value["settings"] = {"method": "qs3", "self_training": {"labeller": 1}}
-    for schema in (2, 1):
-        path = tmp_path / f"{schema}.json"
-        path.write_text(json.dumps(value | {"schema": schema}))
-        assert read_record(path) == now
-        value.pop("choices", None)
+    path.write_text(json.dumps(value) + "\n")
+    records, (fault,) = read_records(path)
+    assert not records and fault.startswith(f"{path}:1: ") and message in fault
 
 
 @pytest.mark.parametrize("text", ["", "[]", "3", "{"])
-def test_a_damaged_record_is_named(tmp_path, text):
-    (tmp_path / "record.json").write_text(text)
-    with pytest.raises(InputError, match=r"record\.json"):
-        read_record(tmp_path)
-
-
-def test_records_are_found_below_a_folder_in_order(record, tmp_path):
-    for seed in (2, 0, 1):
-        changed = dataclasses.replace(record, seed=seed)
-        write_record(tmp_path / "deep" / f"seed-{seed}", changed)
-    (tmp_path / "deep" / "seed-2" / "records").mkdir()
-    (tmp_path / "deep" / "seed-2" / "records" / "a.json").write_text("{}")
-    (tmp_path / "deep" / "other.json").write_text("{}")
-    records, faults = find_records(tmp_path)
-    assert [made.seed for _, made in records] == [0, 1, 2]
-    assert len(faults) == 1
-    with pytest.raises(InputError, match="no such folder"):
-        find_records(tmp_path / "nowhere")
+def test_a_damaged_line_is_named_and_the_rest_is_read(record, tmp_path, text):
+    path = tmp_path / RECORDS
+    append_record(path, record)
+    path.write_bytes(path.read_bytes() + f"{text}\n".encode() + path.read_bytes())
+    records, (fault,) = read_records(path)
+    assert [where for where, _ in records] == [f"{path}:1", f"{path}:3"]
+    assert f"{path}:2: " in fault
 
 
 def test_score_holds_together():

@@ -1,5 +1,6 @@
 """A grid so small that it takes seconds: blobs in place of scans, narrow networks."""
 
+import json
 import os
 import shutil
 import warnings
@@ -7,6 +8,7 @@ import warnings
 import numpy as np
 import pytest
 
+from qs3.evaluation.records import RECORDS, read_records
 from qs3.experiments.data import choose_meshes, make_plans
 from qs3.experiments.grid import data_sets
 from qs3.experiments.reproduce import Workers, collect_runs, products, reproduce
@@ -14,6 +16,7 @@ from qs3.experiments.scales import SCALES, Scale
 from qs3.experiments.setup import Setup, claim
 from qs3.store.generate import generate, scan_seed
 from qs3.store.shards import CloudRow
+from qs3.structure import unstructure
 from qs3.training.config import TrainSettings
 
 TINY = Scale(
@@ -89,6 +92,42 @@ def make_tables(out, names, rows=(), columns=(), seeds=(0, 1), tell=lambda line:
     with warnings.catch_warnings():  # so small a network may be sure of one class alone, or of none
         warnings.simplefilter("ignore")
         return reproduce(parts, setup, WORKERS, tell)
+
+
+def name_of(record):
+    """Name of the run of a record, from its fields."""
+    known = {"source", "source_views", "target", "row", "network", "seed"}
+    place, network = record.experiment, record.experiment.get("network")
+    source = (
+        "S" if place["row"] == "supervised" else f"{place['source']}{place.get('source_views', '')}"
+    )
+    words = {"threshold": "theta"}
+    changed = [f"-{words.get(n, n)}-{place[n]:g}" for n in place if n not in known]
+    label = "".join([record.method, *changed]) if changed else place["row"]
+    label += f"@{network}" if network else ""
+    return f"{source}-{place['target']}_{label}_seed-{place['seed']}"
+
+
+def records_of(folder):
+    """Records by the name of their run, in the order of the lines."""
+    path = folder / RECORDS
+    found, faults = read_records(path) if path.is_file() else ([], [])
+    assert faults == []
+    return {name_of(record): record for _, record in found}
+
+
+def rewrite(folder, change):
+    """Write the records again: each as ``change`` returns its JSON value, or without it (None)."""
+    lines = []
+    for name, record in records_of(folder).items():
+        value = change(name, unstructure(record))
+        lines += [] if value is None else [json.dumps(value) + "\n"]
+    (folder / RECORDS).write_text("".join(lines))
+
+
+def drop(folder, *names):
+    """Delete records by the names of their runs."""
+    rewrite(folder, lambda name, value: None if name in names else value)
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,7 @@ import pytest
 from qs3.cli.reproduce import ReproduceOptions
 from qs3.cli.reproduce import reproduce as command
 from qs3.errors import InputError
-from qs3.evaluation.records import read_record, score, write_record
+from qs3.evaluation.records import RECORDS, append_record, score
 from qs3.experiments import grid
 from qs3.experiments.cost import scans_left
 from qs3.experiments.data import choose_meshes, make_plans
@@ -29,20 +29,19 @@ from qs3.files import read_json, write_json
 from qs3.store.executors import Failure
 from qs3.store.manifest import shard_name
 
-from .conftest import TINY, make_tables
+from .conftest import TINY, drop, make_tables, records_of, rewrite
 
 S, D, F = Domain("S"), Domain("D"), Domain("F")
 COLUMNS = ("M-D", "S-D", "S-F")
 
 
 def comparable(folder):
-    records = {path.name: read_record(path) for path in sorted((folder / "results").iterdir())}
     return {
         name: (
             run.scores,
             [{**done, "seconds": 0, "cpu_seconds": 0} for done in run.rounds],
         )
-        for name, run in records.items()
+        for name, run in records_of(folder).items()
     }
 
 
@@ -60,7 +59,7 @@ def counting(monkeypatch):
 
 def test_only_what_is_missing_is_made_again_and_with_the_same_numbers(finished, whole, monkeypatch):
     lost = "S-D_qbst_seed-0"
-    (finished / "results" / f"{lost}.json").unlink()
+    drop(finished, lost)
     shutil.rmtree(finished / "runs/S-D/qbst/seed-0")
     made, told = counting(monkeypatch), []
     rows = ("supervised", "source-only", "qbst")
@@ -77,7 +76,7 @@ def test_a_network_that_others_start_from_is_made_again_where_only_its_record_is
     finished, whole, monkeypatch
 ):
     lost = "S-D_qbst_seed-0"
-    (finished / "results" / f"{lost}.json").unlink()
+    drop(finished, lost)
     shutil.rmtree(finished / "runs")
     made = counting(monkeypatch)
     make_tables(finished, ["adaptation-bench"], ("supervised", "qbst"), ("S-D",), (0,))
@@ -86,19 +85,22 @@ def test_a_network_that_others_start_from_is_made_again_where_only_its_record_is
 
 
 def test_data_made_anew_that_differ_are_told_before_a_training(finished, monkeypatch):
-    (finished / "results" / "S-D_qbst_seed-0.json").unlink()
-    path = finished / "results" / "S-D_supervised_seed-0.json"
-    record = read_json(path)
-    record["test"]["checksum"] = "0" * 64
-    write_json(path, record)
+    def change(name, value):
+        if name == "S-D_supervised_seed-0":
+            value["test"]["checksum"] = "0" * 64
+        return None if name == "S-D_qbst_seed-0" else value
+
+    rewrite(finished, change)
     made = counting(monkeypatch)
-    with pytest.raises(InputError, match=f"{path}: read other data than .*data/target holds"):
+    with pytest.raises(
+        InputError, match=r"records\.jsonl:\d+: read other data than .*data/target holds"
+    ):
         make_tables(finished, ["adaptation-bench"], ("supervised", "qbst"), ("S-D",), (0,))
     assert made == []
 
 
 def test_a_stop_between_training_and_record_loses_nothing(finished, whole, monkeypatch):
-    shutil.rmtree(finished / "results")
+    (finished / RECORDS).unlink()
 
     def stop(run, setup, device=""):
         if run.target == F:
@@ -108,7 +110,7 @@ def test_a_stop_between_training_and_record_loses_nothing(finished, whole, monke
     monkeypatch.setattr(grid, "make_record", stop)
     with pytest.raises(KeyboardInterrupt):
         make_tables(finished, ["ordinary"], columns=COLUMNS)
-    assert len(list((finished / "results").iterdir())) == 2
+    assert len(records_of(finished)) == 2
     monkeypatch.setattr(grid, "make_record", make_record)
     make_tables(finished, ["ordinary"], columns=COLUMNS)
     found, wanted = comparable(finished), comparable(whole)
@@ -123,7 +125,7 @@ def test_a_folder_of_other_settings_is_refused(finished):
 
 def test_a_dry_run_tells_counts_and_hours_and_writes_nothing(small_scales, finished, capsys):
     shutil.rmtree(finished / "runs")
-    shutil.rmtree(finished / "results")
+    (finished / RECORDS).unlink()
     before = sorted(finished.rglob("*"))
     options = ReproduceOptions(
         ("adaptation-bench",), finished, "smoke", dry_run=True, methods=("qbst",)
@@ -233,8 +235,12 @@ def run_all(out, executor, tell=lambda line: None, **options):
 
 @pytest.fixture
 def ready_made(whole, monkeypatch):
-    record = read_record(whole / "results" / "S-D_ordinary_seed-0.json")
-    monkeypatch.setattr(grid, "make_record", lambda run, setup, device: record)
+    record = records_of(whole)["S-D_ordinary_seed-0"]
+
+    def make(run, setup, device):
+        return replace(record, experiment=run.fields)
+
+    monkeypatch.setattr(grid, "make_record", make)
 
 
 def test_a_warm_up_is_waited_for_and_a_folder_has_one_run_at_a_time(ready_made, tmp_path):
@@ -247,16 +253,16 @@ def test_a_warm_up_is_waited_for_and_a_folder_has_one_run_at_a_time(ready_made, 
 
 
 def test_a_record_that_is_there_stays_and_another_result_is_told(ready_made, whole, tmp_path):
-    made = read_record(whole / "results" / "S-D_ordinary_seed-0.json")
+    made = records_of(whole)["S-D_ordinary_seed-0"]
     other = replace(made, scores=score(np.array([0, 1]), np.array([0, 0]), ("chair", "table")))
-    paths, told = [tmp_path / "results" / f"{name}.json" for name in NAMES], []
-    for path, record in zip(paths[:2], (other, made), strict=True):
-        write_record(path, record)
-    before = [path.read_bytes() for path in paths[:2]]
+    path, told = tmp_path / RECORDS, []
+    for run, record in zip(RUNS[:2], (other, made), strict=True):
+        append_record(path, replace(record, experiment=run.fields))
+    before = path.read_bytes()
     assert run_all(tmp_path, Inline(), told.append) == []
-    assert [path.read_bytes() for path in paths[:2]] == before
+    assert path.read_bytes().startswith(before) and len(records_of(tmp_path)) == len(RUNS)
     (line,) = [line for line in told if "stays" in line]
-    assert f"{paths[0]}: stays, with an accuracy of 50.0%" in line
+    assert f"{path}:1: {NAMES[0]} stays, with an accuracy of 50.0%" in line
 
 
 def test_a_failed_run_is_named_and_what_others_made_stays(ready_made, tmp_path):
@@ -266,11 +272,11 @@ def test_a_failed_run_is_named_and_what_others_made_stays(ready_made, tmp_path):
     assert [line.partition(":")[0] for line in failed[1:]] == [
         "S/ordinary/seed-0", "S-D/qbst-paper/seed-0"
     ]  # fmt: skip
-    assert [path.stem for path in (tmp_path / "results").iterdir()] == [NAMES[3]]
+    assert list(records_of(tmp_path)) == [NAMES[3]]
 
 
 def test_each_device_has_one_run_at_a_time(whole, tmp_path, monkeypatch):
-    record = read_record(whole / "results" / "S-D_ordinary_seed-0.json")
+    record = records_of(whole)["S-D_ordinary_seed-0"]
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
     executor, seen = Inline(), []
 
@@ -278,7 +284,7 @@ def test_each_device_has_one_run_at_a_time(whole, tmp_path, monkeypatch):
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "7,8,3")  # a new process has the scheduler's
         grid._see_alone(device)
         seen.append(os.environ["CUDA_VISIBLE_DEVICES"])
-        return record
+        return replace(record, experiment=run.fields)
 
     monkeypatch.setattr(grid, "make_record", make)
     assert run_all(tmp_path, executor, devices=("2", "0")) == []
@@ -300,8 +306,8 @@ def test_a_device_that_is_not_there_is_told(tmp_path):
 def test_several_at_once_give_the_same_numbers(finished, whole, workers):
     if workers.executor == "ray":
         pytest.importorskip("ray", exc_type=ImportError)
-    for name in ("runs", "results"):
-        shutil.rmtree(finished / name)
+    shutil.rmtree(finished / "runs")
+    (finished / RECORDS).unlink()
     setup = Setup(finished, TINY, seeds=(0,), threads=1)
     reproduce(products(["thresholds"], setup), setup, workers, print)
     found, wanted = comparable(finished), comparable(whole)
@@ -318,17 +324,17 @@ conftest["make_tables"](Path(sys.argv[1]), ["thresholds"], seeds=(0,))
 
 @pytest.mark.slow
 def test_killed_at_any_time_it_goes_on_with_the_same_numbers(finished, whole):
-    for name in ("runs", "results"):
-        shutil.rmtree(finished / name)
+    shutil.rmtree(finished / "runs")
+    (finished / RECORDS).unlink()
     script = _KILLED.format(conftest=str(Path(__file__).parent / "conftest.py"))
     kept: set[str] = set()
     for count in (1, 4, 8):
         with subprocess.Popen([sys.executable, "-c", script, str(finished)]) as running:
-            while running.poll() is None and len(list(finished.glob("results/*.json"))) < count:
+            while running.poll() is None and len(records_of(finished)) < count:
                 time.sleep(0.01)
             if count < 8:
                 running.kill()
-        found = {path.name for path in finished.glob("results/*.json")}
+        found = set(records_of(finished))
         assert kept <= found
         kept = found
     assert running.returncode == 0

@@ -1,6 +1,5 @@
 """The tables in results/ are what their records say: nothing in them is written by hand."""
 
-import csv
 import dataclasses
 import importlib
 import json
@@ -13,44 +12,32 @@ from typing import Any
 import pytest
 
 from qs3 import structure
-from qs3.evaluation.records import read_record
+from qs3.evaluation.records import RECORDS, RunRecord, read_records
 from qs3.experiments import TABLES, runs, scales, setup
 from qs3.experiments.experiment import load_experiment
 from qs3.experiments.figures import draw
 from qs3.experiments.setup import read_setup
-from qs3.experiments.table import FilledTable, Table
-from qs3.experiments.text import FORMATS
+from qs3.experiments.table import Table
+from qs3.experiments.text import markdown
 from qs3.training import config, run
 
 ROOT = Path(__file__).parents[2]
-FOLDERS = sorted(path.parent for path in (ROOT / "results").glob("*/bench.json"))
-RECORDS = [path for folder in FOLDERS for path in sorted((folder / "results").glob("*.json"))]
-FILES = [path for folder in FOLDERS for path in sorted(folder.glob("*.csv"))]
+RESULTS = ROOT / "results"
+FOLDERS = sorted(path.parent for path in RESULTS.glob("*/bench.json"))
+FILES = [path for folder in FOLDERS for path in sorted(folder.glob("*.md"))]
 
 
-def filled_like(path: Path) -> FilledTable:
-    """The table with the rows and columns that the file has."""
-    with path.open(encoding="utf-8") as handle:
-        lines = list(csv.DictReader(handle))
-    rows, columns = (tuple({line[name] for line in lines}) for name in ("row", "column"))
-    name = next(name for name in sorted(TABLES, key=len) if path.stem.startswith(name))
-    return Table(name, read_setup(path.parent), rows, columns).read()
-
-
-def rows_of(text: str) -> list[list[str]]:
-    return [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| ")]
+def records_in(folder: str) -> list[RunRecord]:
+    records, faults = read_records(RESULTS / folder / RECORDS)
+    assert faults == []
+    return [record for _, record in records]
 
 
 @pytest.mark.parametrize("path", FILES, ids=[f"{p.parent.name}-{p.stem}" for p in FILES])
 def test_a_table_is_what_its_records_say(path):
-    filled = filled_like(path)
+    filled = Table(path.stem, read_setup(path.parent)).read().made_part()
     assert filled.faults == ()
-    committed = path.read_text(encoding="utf-8").splitlines()
-    assert list(csv.DictReader(FORMATS["csv"](filled).splitlines())) == list(
-        csv.DictReader(committed)
-    )
-    text = path.with_suffix(".md").read_text(encoding="utf-8")
-    assert rows_of(FORMATS["md"](filled)) == rows_of(text)
+    assert markdown(filled) == path.read_text(encoding="utf-8")
     assert draw(filled).axes
 
 
@@ -61,7 +48,7 @@ def test_every_record_is_of_a_run_of_a_table():
             filled = Table(name, read_setup(folder)).read()
             assert filled.faults == ()
             names |= set(filled.records)
-        assert names == {path.stem for path in (folder / "results").glob("*.json")}
+        assert len(names) == len(records_in(folder.name))
 
 
 def wider(kind: type, modules: Sequence[Any], patch: pytest.MonkeyPatch, **types: type) -> type:
@@ -97,29 +84,25 @@ def test_a_setting_that_is_added_leaves_all_records_readable(monkeypatch):
             for record in filled.records.values():
                 assert record.settings["train"]["novelty"] == 0.5
                 count += 1
-    assert count >= len(RECORDS) > 20  # some stand in several tables
-    for path in sorted((ROOT / "results" / "real").glob("*.json")):
-        read_record(path)
+    made = sum(len(records_in(folder.name)) for folder in FOLDERS)
+    assert count >= made > 20  # some stand in several tables
 
 
 def test_the_networks_page_shows_what_the_records_of_modelnet10_say():
     text = (ROOT / "docs" / "models.md").read_text(encoding="utf-8")
     part = text.partition("## ModelNet10")[2].partition("\n## ")[0]
-    records = sorted((ROOT / "results" / "modelnet10").glob("*.json"))
-    assert {path.stem for path in records} == set(re.findall(r"^\| `([\w-]+)` \|", part, re.M))
-    for path in records:
-        record = read_record(path)
+    records = records_in("modelnet10")
+    assert {one.model for one in records} == set(re.findall(r"^\| `([\w-]+)` \|", part, re.M))
+    for record in records:
         scores = (record.scores.accuracy, record.scores.class_mean_accuracy)
         shown = " | ".join(f"{100 * value:.1f}" for value in scores)
-        assert record.model == path.stem and record.test.clouds == 908
-        assert f"| `{path.stem}` | {shown} | 1 |" in part
+        assert record.test.clouds == 908
+        assert f"| `{record.model}` | {shown} | 1 |" in part
 
 
 def test_records_hold_no_path_of_a_machine():
-    for path in sorted((ROOT / "results").rglob("*.json")):
-        text = path.read_text(encoding="utf-8")
-        assert not re.search(r'"/[a-z]+/', text), path
-        json.loads(text)
+    for path in sorted(RESULTS.rglob("*.json*")):
+        assert not re.search(r'"/[a-z]+/', path.read_text(encoding="utf-8")), path
 
 
 def test_what_docs_say_of_unknown_objects_is_what_was_measured():
@@ -136,12 +119,25 @@ def test_what_docs_say_of_unknown_objects_is_what_was_measured():
             assert f"{aurocs}{refused.replace('%', ' %')} {before} → {after} |" in page
 
 
+def matching(folder: str, **fields: str | int) -> list[RunRecord]:
+    """The three records, one a seed, whose run has these fields."""
+    changed = {"threshold", "step", "network"} - set(fields)
+    found = [
+        record
+        for record in records_in(folder)
+        if record.experiment is not None
+        and fields.items() <= record.experiment.items()
+        and not changed & record.experiment.keys()
+    ]
+    assert len({record.seed for record in found}) == len(found) == 3
+    return found
+
+
 def test_what_docs_say_of_views_is_what_was_measured():
     page = (ROOT / "docs" / "real.md").read_text(encoding="utf-8")
-    folder = ROOT / "results" / "views-on-real"
     means = []
-    for source in ("V1", "S", "M"):
-        records = [read_record(path) for path in sorted(folder.glob(f"{source}_seed-*.json"))]
+    for source in ("V", "S", "M"):
+        records = matching("views-on-real", source=source)
         assert {record.test.split for record in records} == {"strict-dev"} and len(records) == 3
         values = [100 * record.scores.accuracy for record in records]
         means.append(f"{fmean(values):.1f} ± {stdev(values) / 3**0.5:.1f}")
@@ -151,21 +147,18 @@ def test_what_docs_say_of_views_is_what_was_measured():
 
 
 def test_readme_says_of_views_and_rounds_what_was_measured():
-    def mean(folder: str, names: str) -> float:
-        paths = sorted((ROOT / "results" / folder).glob(names))
-        assert len(paths) == 3
-        return 100 * fmean(read_record(path).scores.accuracy for path in paths)
+    def mean(folder: str, **fields: str | int) -> float:
+        return 100 * fmean(one.scores.accuracy for one in matching(folder, **fields))
 
-    def rounds(row: str) -> float:
-        return mean("laptop/results", f"S-D_{row}_seed-*.json") - five
+    def on_d(source: str, row: str = "ordinary") -> float:
+        return mean("laptop", source=source, target="D", row=row)
 
-    one = mean("laptop/results", "V1-D_ordinary_seed-*.json")
-    five = mean("laptop/results", "S-D_ordinary_seed-*.json")
-    real = [mean("views-on-real", f"{source}_seed-*.json") for source in ("V1", "S")]
-    paths = (ROOT / "results" / "laptop" / "results").glob("S-D_qbst-paper_seed-*.json")
-    kept = fmean(sum(read_record(path).rounds[-1]["kept"]) for path in paths)
-    gains = [rounds(row) for row in ("spst", "qbst-gentle", "qbst-paper", "defrec")]
-    surface, clean, noisy = (mean("laptop/results", f"{s}-D_ordinary_seed-*.json") for s in "MCJ")
+    one, five = on_d("V"), on_d("S")
+    real = [mean("views-on-real", source=source) for source in ("V", "S")]
+    paper = matching("laptop", source="S", target="D", row="qbst-paper")
+    kept = fmean(sum(record.rounds[-1]["kept"]) for record in paper)
+    gains = [on_d("S", row) - five for row in ("spst", "qbst-gentle", "qbst-paper", "defrec")]
+    surface, clean, noisy = (on_d(source) for source in "MCJ")
     page = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
     for text in (
         f"({one:.1f} against {five:.1f} % on simulated Kinect views, ",

@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -12,24 +11,30 @@ from matplotlib.container import ErrorbarContainer
 from qs3.cli.table import TableOptions, figure, table
 from qs3.errors import InputError
 from qs3.evaluation.compare import compare_seeds
-from qs3.evaluation.records import read_record
+from qs3.evaluation.records import RECORDS, append_record
 from qs3.experiments.figures import draw, picture
 from qs3.experiments.scales import SCALES
 from qs3.experiments.setup import Setup, read_setup
 from qs3.experiments.table import Table
 from qs3.experiments.text import FORMATS, markdown
 
+from .conftest import drop, records_of, rewrite
+
 COLUMNS = ("M-D", "S-D", "S-F")
 
 
-def change(path, *fields, value):
+def change(folder, name, *fields, value):
     """Change a field of a record."""
-    whole = json.loads(path.read_text())
-    inner = whole
-    for name in fields[:-1]:
-        inner = inner[name]
-    inner[fields[-1]] = value
-    path.write_text(json.dumps(whole))
+
+    def changed(of, whole):
+        inner = whole
+        for field in fields[:-1] if of == name else ():
+            inner = inner[field]
+        if of == name:
+            inner[fields[-1]] = value
+        return whole
+
+    rewrite(folder, changed)
 
 
 def read(folder, name, **changes):
@@ -37,7 +42,7 @@ def read(folder, name, **changes):
 
 
 def record(folder, name):
-    return read_record(folder / "results" / f"{name}.json")
+    return records_of(folder)[name]
 
 
 def test_numbers_are_those_of_the_records(whole):
@@ -112,8 +117,7 @@ def test_records_of_thresholds_have_their_fields_and_settings(whole):
 
 
 def test_cells_that_wait_show_the_command(finished, capsys):
-    for path in (finished / "results").glob("S-F_ordinary@dgcnn_*"):
-        path.unlink()
+    drop(finished, *(f"S-F_ordinary@dgcnn_seed-{seed}" for seed in (0, 1)))
     assert table(TableOptions("ordinary", finished, tasks=COLUMNS)) == 0
     said = capsys.readouterr().out
     assert "1 cells wait for runs" in said
@@ -124,18 +128,19 @@ def test_cells_that_wait_show_the_command(finished, capsys):
 
 
 def test_damaged_and_foreign_records_are_refused_and_the_rest_shown(finished, capsys):
-    results = finished / "results"
-    (results / "S-D_ordinary@dgcnn_seed-0.json").write_text("{")
-    shutil.copy(
-        results / "S-D_ordinary@dgcnn_seed-1.json", results / "M-D_ordinary@dgcnn_seed-1.json"
-    )
-    change(results / "S-F_ordinary@dgcnn_seed-1.json", "test", "checksum", value="0")
+    place = record(finished, "M-D_ordinary@dgcnn_seed-1").experiment
+    drop(finished, "S-D_ordinary@dgcnn_seed-0", "M-D_ordinary@dgcnn_seed-1")
+    change(finished, "S-F_ordinary@dgcnn_seed-1", "test", "checksum", value="0")
+    foreign = dataclasses.replace(record(finished, "S-D_ordinary@dgcnn_seed-1"), experiment=place)
+    append_record(finished / RECORDS, foreign)
+    with (finished / RECORDS).open("a") as file:
+        file.write("{\n")
     assert table(TableOptions("ordinary", finished, tasks=COLUMNS)) == 1
     out, err = capsys.readouterr()
     refused = [line for line in err.splitlines() if "refused" in line]
     assert len(refused) == 3
     for name, why in (
-        ("S-D_ordinary@dgcnn_seed-0", "not a JSON file"),
+        ("records.jsonl:", "JSON"),
         ("M-D_ordinary@dgcnn_seed-1", "source differs"),
         ("S-F_ordinary@dgcnn_seed-1", "other data (test F)"),
     ):
@@ -155,43 +160,37 @@ def test_damaged_and_foreign_records_are_refused_and_the_rest_shown(finished, ca
         (["marks"], ["supervised"], "supervised differs"),
         (["test", "split"], "train", "test differs"),
         (["source", "cloud"], "clean", "source differs"),
-        (["experiment", "row"], "spst", "experiment differs"),
         (["extra"], 1, "'extra' is unknown"),
     ],
 )
 def test_a_record_of_another_run_is_told_with_what_differs(finished, fields, value, said):
-    path = finished / "results" / "S-D_qbst_seed-0.json"
-    change(path, *fields, value=value)
+    change(finished, "S-D_qbst_seed-0", *fields, value=value)
     filled = read(finished, "adaptation-bench", rows=("qbst",), columns=("S-D",))
     (fault,) = filled.faults
-    assert str(path) in fault and said in fault and not filled.records
+    assert str(finished / RECORDS) in fault and said in fault and not filled.records
 
 
 def test_a_mean_over_runs_of_other_networks_is_refused(finished):
-    change(
-        finished / "results" / "S-D_ordinary@dgcnn_seed-1.json",
-        "settings", "class_names", value=["chair"],
-    )  # fmt: skip
+    name = "S-D_ordinary@dgcnn_seed-1"
+    change(finished, name, "settings", "class_names", value=["chair"])
     with pytest.raises(InputError, match="not in the seed alone"):
         markdown(read(finished, "ordinary", columns=COLUMNS))
 
 
 def test_caveats_of_runs_stand_below_the_table(finished):
-    results = finished / "results"
-    change(results / "S-D_ordinary@dgcnn_seed-0.json", "marks", value=["training clouds"])
+    change(finished, "S-D_ordinary@dgcnn_seed-0", "marks", value=["training clouds"])
     filled = read(finished, "ordinary", columns=COLUMNS)
     assert "- training clouds: DGCNN on S → D" in FORMATS["md"](filled)
     assert "% training clouds: DGCNN on S → D" in FORMATS["tex"](filled)
     assert FORMATS["csv"](filled).count("training clouds") == 2
-    path = results / "M-D_qbst-theta-0.2_seed-0.json"
-    rounds = [
-        done | {"skipped": n == 1} for n, done in enumerate(json.loads(path.read_text())["rounds"])
-    ]
-    change(path, "rounds", value=rounds)
+    name = "M-D_qbst-theta-0.2_seed-0"
+    made = record(finished, name).rounds
+    rounds = [{**done, "skipped": n == 1} for n, done in enumerate(made)]
+    change(finished, name, "rounds", value=rounds)
     text = markdown(read(finished, "thresholds"))
     assert "- 1 of 2 rounds skipped, confident clouds too few: QBST, M → D on θ₀ = 0.2" in text
     assert text.count("(n=1) (1 of 2 rounds trained)") == 2
-    change(path, "rounds", value=[done | {"skipped": True} for done in rounds])
+    change(finished, name, "rounds", value=[done | {"skipped": True} for done in rounds])
     for kind in ("md", "tex"):
         assert FORMATS[kind](read(finished, "thresholds")).count("(n=1) (no round trained)") >= 1
     assert "Self-training here: threshold 0.0, rounds 2, epochs 1 (paper: 0.8, 10, 10)." in text

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from qs3.evaluation.records import read_record
+from qs3.errors import InputError
+from qs3.evaluation.records import RECORDS, read_records
 from qs3.sensor.presets.toml_file import load_sensor
 from qs3.store.info import info
 from qs3.store.manifest import MANIFEST
@@ -40,8 +41,11 @@ def _manifest(folder: Path, text: str) -> Any:
 
 
 def _record(folder: Path, text: str) -> Any:
-    (folder / "record.json").write_text(f'{{"schema": {text}}}')
-    return read_record(folder / "record.json")
+    (folder / RECORDS).write_text(f'{{"schema": {text}}}\n')
+    records, faults = read_records(folder / RECORDS)
+    if faults:
+        raise InputError(faults[0])
+    return records
 
 
 def _weights(folder: Path, text: str) -> Any:

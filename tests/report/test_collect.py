@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.evaluation.records import find_records
+from qs3.evaluation.records import RECORDS, read_records
 from qs3.files import read_json
 from qs3.report.collect import collect
 from qs3.report.page import render
@@ -18,7 +18,7 @@ def test_run_has_scores_curves_rounds_and_clouds(grid):
     data = str(grid / "shapes")
     report = collect(grid / "second", data=data, source=data, before=grid / "first")
     assert list(report.scores) == ["first (before)", "qbst"]
-    ((_, recorded),), _ = find_records(grid / "second")
+    ((_, recorded),), _ = read_records(grid / "second" / RECORDS)
     assert report.scores["qbst"] == recorded.scores
     assert {domain: len(clouds) for domain, clouds in report.clouds.items()} == {
         "source": 12,
@@ -48,7 +48,7 @@ def test_part_of_the_data_is_scored(grid):
 
 def test_run_without_a_record_has_no_scores(grid, tmp_path):
     shutil.copytree(grid / "first", tmp_path / "run")
-    shutil.rmtree(tmp_path / "run" / "records")
+    (tmp_path / "run" / RECORDS).unlink()
     report = collect(tmp_path / "run")
     assert report.scores == {}
     assert report.curves
@@ -74,8 +74,8 @@ def test_damaged_files_of_a_run_are_named(grid, tmp_path, damage):
     folder = tmp_path / "run"
     shutil.copytree(grid / "second", folder)
     if damage == "record":
-        bad = next((folder / "records").iterdir())
-        bad.write_text("{")
+        bad = folder / RECORDS
+        bad.write_text("{\n")
     elif damage == "round":
         bad = folder / "run.json"
         values = read_json(bad)

@@ -1,4 +1,4 @@
-"""Runs and their scores: made in Python by any way, and by an earlier release."""
+"""Runs and their scores, made in Python."""
 
 import dataclasses
 import json
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.evaluation import read_record
+from qs3.evaluation import read_records
 from qs3.files import folder_lock
 from qs3.training import (
     QBST,
@@ -18,7 +18,7 @@ from qs3.training import (
     fit,
     is_run,
     read_run,
-    record_path,
+    records_path,
     save_model,
     self_train,
 )
@@ -53,7 +53,7 @@ def test_a_fitted_run_is_scored_on_any_clouds(source, target, settings, tmp_path
     assert result.target.points.shape == (30, 64, 3)
 
     record = evaluate(tmp_path / "run", target, experiment={"row": "dann"})
-    assert read_record(record_path(tmp_path / "run", record)) == record
+    assert read_records(records_path(tmp_path / "run"))[0][-1][1] == record
     assert record.marks == ("transductive", "supervised")
     assert record.experiment == {"row": "dann"}
     assert (record.cpu_seconds, record.steps) == (run.cpu_seconds, run.steps)
@@ -87,7 +87,7 @@ def test_a_run_of_own_classes_is_scored_by_a_map_on_data_that_merge_them(
     together = np.array([[1, 0], [1, 0], [0, 1]])
     expected = together.T @ counts @ together
     assert np.array_equal(np.array(record.scores.confusion)[:, :2], expected)
-    assert read_record(record_path(tmp_path / "run", record)).test.renamed == record.test.renamed
+    assert read_records(records_path(tmp_path / "run"))[0][-1][1] == record
     with pytest.raises(InputError, match="the map of classes names mug, and none of chair"):
         evaluate(tmp_path / "run", replace(target, class_names=names), class_map={"mug": "cup"})
 
@@ -131,38 +131,15 @@ def test_an_unfinished_run_is_told_from_none(source, settings, tmp_path):
         read_run(tmp_path)
 
 
-def test_a_run_of_an_earlier_release_is_read(source, target, settings, tmp_path):
-    """As 0.1.0 wrote it: ``run.json`` without a schema, method qs3, a labeller."""
-    claim(tmp_path, "qbst", source, target.without_labels(), settings, ROUNDS)
-    save_model(tmp_path, new_model(settings, 3, 0), source.class_names, settings)
-    value = json.loads((tmp_path / "settings.json").read_text())
-    value["self_training"]["labeller"] = value["self_training"].pop("teacher")
-    value["method"] = "qs3"
-    (tmp_path / "settings.json").write_text(json.dumps(value))
-    data = {"name": "store", "checksum": "ab", "clouds": 24, "split": "train", "cloud": "points"}
-    old = {
-        "method": "qs3",
-        "preset": "default",
-        "selection": "last",
-        "data": {"source": data, "target": data | {"split": None}},
-        "supervised": False,
-        "source_clouds": ["0f"],
-        "target_clouds": [],
-        "unknown_warm_up": False,
-        "rounds": [{"round": 1, "theta": 0.34, "skipped": False, "kept": [1, 2, 3]}],
-        "seconds": {"source": 1.5, "rounds": 0.5, "total": 2.0},
-    }
-    (tmp_path / "run.json").write_text(json.dumps(old))
-    run = read_run(tmp_path)
-    assert (run.method, run.source.split, run.target.split) == ("qbst", "train", None)
-    assert run.settings["self_training"]["teacher"] == "latest"
-    record = evaluate(tmp_path, target)
-    assert (record.method, record.source.clouds, record.marks) == ("qbst", 24, ())
-    # and the same call goes on with it
-    claim(tmp_path, "qbst", source, target.without_labels(), settings, ROUNDS)
-    (tmp_path / "run.json").write_text(json.dumps(old | {"colour": "red"}))
-    with pytest.raises(InputError, match=r"run\.json.*'colour' is unknown"):
-        read_run(tmp_path)
+def test_a_run_of_another_schema_and_an_unknown_field_are_refused(source, settings, tmp_path):
+    fit("source-only", source, None, replace(settings, epochs=1), run_dir=tmp_path / "run")
+    path = tmp_path / "run" / "run.json"
+    made = json.loads(path.read_text())
+    for change, said in (({"schema": 2}, "schema 2 of a run, this version reads 3"),
+                         ({"colour": "red"}, "'colour' is unknown")):  # fmt: skip
+        path.write_text(json.dumps(made | change))
+        with pytest.raises(InputError, match=rf"run\.json.*{said}"):
+            read_run(tmp_path / "run")
 
 
 def test_other_data_are_told_by_their_option_and_not_by_a_checksum(

@@ -13,7 +13,7 @@ import torch
 
 import qs3
 from qs3.errors import TOLD, InputError
-from qs3.evaluation.records import find_records
+from qs3.evaluation.records import RECORDS, read_records
 from qs3.io.clouds import PointClouds
 from qs3.io.preparation import ROBUST, Preparation, unit_ball
 from qs3.training import evaluate, fit, load_model, read_run
@@ -104,7 +104,7 @@ def test_what_is_made_from_it_goes_into_the_working_directory(tmp_path):
     record = evaluate(Path("rooms"), "labelled.npz")
     assert record.method == "source-only"
     assert record.marks == ()
-    assert [one for _, one in find_records(tmp_path / "records")[0]] == [record]
+    assert [one for _, one in read_records(tmp_path / RECORDS)[0]] == [record]
     done = export_run(Path("rooms"), "torch-export")
     assert done.path == Path("model.pt2")
     assert {path: path.stat().st_mtime_ns for path in WEIGHTS.rglob("*")} == before
@@ -184,7 +184,7 @@ def test_a_run_becomes_one(ship, source, target, settings, tmp_path):
         for part in ("facts", "scores")
     )
     (out / "README.md").write_text(f"# mine\n{parts}The end.\n")
-    ship.ship(tmp_path / "run", out, "balls", tmp_path / "run" / "records")
+    ship.ship(tmp_path / "run", out, "balls", tmp_path / "run")
     first = {path.name: path.read_bytes() for path in out.iterdir()}
     card = first["README.md"].decode()
     assert card.startswith("# mine\n<!-- facts")
@@ -197,10 +197,10 @@ def test_a_run_becomes_one(ship, source, target, settings, tmp_path):
         torch.testing.assert_close(answers[1][name], value, rtol=1e-3, atol=1e-4)
     assert load_model(out).known == made.known
     # From itself: the same bytes, the figure of the rounding too.
-    ship.ship(out, out, "balls", tmp_path / "run" / "records")
+    ship.ship(out, out, "balls", tmp_path / "run")
     assert {path.name: path.read_bytes() for path in out.iterdir()} == first
     # Measured anew on the rounded network, which is hardly another.
-    ship.ship(tmp_path / "run", out, "balls", tmp_path / "run" / "records", source)
+    ship.ship(tmp_path / "run", out, "balls", tmp_path / "run", source)
     known = load_model(out).known
     assert known.clouds == made.known.clouds
     assert known.energies == pytest.approx(made.known.energies, rel=1e-2, abs=1e-2)

@@ -23,7 +23,7 @@ def evaluate_run(
 ) -> int:
     """Score a run: accuracy, class-mean accuracy, confusion matrix.
 
-    It leaves a record in the run, or in ./records; no other verb reads labels of a target.
+    It appends to records.jsonl in the run, or here; no other verb reads labels of a target.
 
     Args:
         run: Folder of a run, or a network that comes with qs3: rooms.
@@ -36,7 +36,7 @@ def evaluate_run(
         json: Print the whole record as JSON in place of text.
     """
     from qs3.meshes.classes import describe_renaming, read_class_map
-    from qs3.training import evaluate, record_path
+    from qs3.training import evaluate, records_path
 
     called = None if class_map is None else read_class_map(class_map)
     record = evaluate(run, data, split=split, cloud=cloud, class_map=called)
@@ -49,7 +49,7 @@ def evaluate_run(
             show(f"checkpoint          {stage} {number}, by rule {record.selection}")
         show(*scores_text(record.scores, record.marks))
         show(*rounds_text(record.rounds))
-    tell(f"record: {record_path(run, record)}")
+    tell(f"record: {records_path(run)}")
     return 0
 
 

@@ -28,7 +28,7 @@ class TableOptions:
     name: Annotated[TableName, tyro.conf.Positional]
     """Which one."""
     results: Annotated[Path, tyro.conf.Positional]
-    """Folder that qs3 reproduce made, or such a one as lies in results/ of the source."""
+    """Folder that qs3 reproduce made, or one like results/laptop of the source."""
     methods: tuple[str, ...] = ()
     """Lines; all by default."""
     tasks: tuple[str, ...] = ()

@@ -17,7 +17,6 @@ from qs3.evaluation.metrics import wilson_interval as wilson_interval
 from qs3.evaluation.records import DataRecord as DataRecord
 from qs3.evaluation.records import RunRecord as RunRecord
 from qs3.evaluation.records import Scores as Scores
-from qs3.evaluation.records import find_records as find_records
-from qs3.evaluation.records import read_record as read_record
+from qs3.evaluation.records import append_record as append_record
+from qs3.evaluation.records import read_records as read_records
 from qs3.evaluation.records import score as score
-from qs3.evaluation.records import write_record as write_record

@@ -1,6 +1,7 @@
-"""One JSON record a run: everything that a table or a reader needs to trust a number."""
+"""Records of scored runs, one JSON line each: all that a table needs."""
 
 import json
+import logging
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -19,16 +20,14 @@ from qs3.evaluation.metrics import (
     per_class_accuracy,
     wilson_interval,
 )
-from qs3.files import read_json, write_json
+from qs3.files import parse_json, write_bytes
 from qs3.io.clouds import CloudChoice, Origin
 from qs3.structure import structure, unstructure
 
-RECORD = "record.json"
-RECORDS = "records"
-"""Folder of a run's own records."""
-SCHEMA_VERSION = 3
-_FOLDERS = (RECORDS, "results")
-"""Folders whose JSON files are records: a run's own, and those of a grid of runs."""
+_LOG = logging.getLogger(__name__)
+RECORDS = "records.jsonl"
+"""File of records, in the folder of a run or of a grid of runs."""
+SCHEMA_VERSION = 4
 
 
 @dataclass(frozen=True)
@@ -45,9 +44,8 @@ class DataRecord:
     """Part of the data; None is all of it."""
     cloud: CloudChoice = "points"
     """Which cloud of a generated data set."""
-    renamed: Mapping[str, str] = field(default_factory=dict, compare=False)
-    """Classes that are called otherwise than in the data: name there → name in the run. Earlier
-    releases did not say, so two records are compared without it."""
+    renamed: Mapping[str, str] = field(default_factory=dict)
+    """Classes that have another name in the run: name in the data → name in the run."""
 
     @classmethod
     def of(cls, origin: Origin | None, checksum: str, clouds: int) -> "DataRecord":
@@ -123,14 +121,13 @@ class RunRecord:
     or somebody scored the target too, also, by pseudo label, how many of them are ``known`` so and
     how many were ``right``."""
     chosen: Mapping[str, str | int] | None = None
-    """Checkpoint of the scores: its ``stage`` and ``number``; None in earlier releases."""
+    """Checkpoint of the scores: its ``stage`` and ``number``; None if it is not known."""
     marks: tuple[str, ...] = ()
     """Caveats printed with the number: ``transductive``, ``supervised`` …"""
     experiment: Mapping[str, str | int | float] | None = None
     """Place of the run in a grid of runs, by fields; None outside of one."""
     cpu_seconds: Mapping[str, float] = field(default_factory=dict)
-    """Processor seconds by part, and beside the ``total`` those of a ``warm-up`` that was given;
-    empty in earlier releases."""
+    """Processor seconds by part, and beside the ``total`` those of a ``warm-up`` that was given."""
     steps: Mapping[str, int] = field(default_factory=dict)
     """Optimiser steps, as the processor seconds."""
     source_accuracy: float | None = None
@@ -182,87 +179,79 @@ def score(
     )
 
 
-def write_record(path: Path, record: RunRecord) -> Path:
-    """Write a record, once.
+def append_record(path: Path, record: RunRecord) -> None:
+    """Append a record to a file of JSON lines; a record that is there already is not repeated.
 
-    Args:
-        path: A JSON file, or the folder of a run, where it becomes ``record.json``.
-        record: The record.
-
-    Returns:
-        The file.
+    A last line that is cut short, as a kill leaves it, is dropped first.
 
     Raises:
-        InputError: where another record is there already, or a value is not plain JSON.
+        InputError: if a value is not plain JSON.
     """
     path = Path(path)
-    path = path if path.suffix == ".json" else path / RECORD
     try:
-        value = json.loads(json.dumps(unstructure(record), allow_nan=False))
+        line = json.dumps(unstructure(record), allow_nan=False).encode() + b"\n"
     except (TypeError, ValueError) as error:
         raise InputError(f"{path}: the record is not plain JSON ({error})") from error
-    if path.exists():
-        if read_json(path) == value:
-            return path
-        raise InputError(f"{path}: holds the record of another run; name another folder")
-    write_json(path, value)
-    return path
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = path.read_bytes().splitlines(keepends=True) if path.is_file() else []
+    if line in lines:
+        return
+    if lines and not lines[-1].endswith(b"\n"):
+        write_bytes(path, b"".join(lines[:-1]))
+    with path.open("ab", buffering=0) as file:  # one call a line: several processes may append
+        if file.write(line) < len(line):
+            raise InputError(f"{path}: the disk is full; free some space and run the command again")
+        os.fsync(file.fileno())
 
 
-def read_record(path: Path) -> RunRecord:
-    """Read a record, from its file or the folder of its run; an older schema is brought up to date.
+def read_records(path: Path) -> tuple[list[tuple[str, RunRecord]], list[str]]:
+    """Read a file of records, one JSON line each.
+
+    Returns:
+        Place (``records.jsonl:3``) and record of each line, and a message for each line that is not
+        a record: not JSON, of another schema, with an unknown, missing or wrongly typed field, or
+        with scores that are not those of its confusion matrix. A last line that is cut short, as a
+        kill leaves it, counts as not written; a warning names it.
 
     Raises:
-        InputError: where it is missing, not JSON, of an unknown schema, has an unknown, missing or
-            wrongly typed field, or scores that are not those of its confusion matrix.
+        InputError: if there is no such file.
     """
     path = Path(path)
-    path = path / RECORD if path.is_dir() else path
-    value = read_json(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    records, faults = [], []
+    for number, line in enumerate(path.read_bytes().splitlines(keepends=True), 1):
+        where = f"{path}:{number}"
+        if not line.endswith(b"\n"):
+            _LOG.warning("%s: the line is cut short and counts as not written", where)
+            continue
+        try:
+            records.append((where, _structured(parse_json(line, where), where)))
+        except QS3Error as error:
+            faults.append(str(error))
+    return records, faults
+
+
+def _structured(value: Any, where: str) -> RunRecord:
     schema = value.get("schema") if isinstance(value, dict) else None
-    if type(schema) is not int or not 1 <= schema <= SCHEMA_VERSION:
-        raise InputError(f"{path}: record schema {schema}, this version reads 1 to 3")
-    if schema < SCHEMA_VERSION:  # names of today; schema 1 lacked the choices, which may be absent
-        settings = value.get("settings")
-        named = {"settings": rename_settings(settings)} if isinstance(settings, dict) else {}
-        value |= named | {"method": rename_method(value.get("method"))}
-    record = structure(value | {"schema": SCHEMA_VERSION}, RunRecord, path)
-    _check_scores(path, record.scores)
+    if schema != SCHEMA_VERSION or isinstance(schema, bool):
+        raise InputError(f"{where}: record schema {schema}, this version reads {SCHEMA_VERSION}")
+    record = structure(value, RunRecord, where)
+    _check_scores(where, record.scores)
     return record
 
 
-def rename_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Give a run's settings the names that they have today.
-
-    Example:
-        >>> rename_settings({"method": "qs3", "self_training": {"labeller": "best"}})
-        {'method': 'qbst', 'self_training': {'teacher': 'best'}}
-    """
-    renamed = dict(settings)
-    rounds = renamed.get("self_training")
-    if isinstance(rounds, dict):
-        renamed["self_training"] = {
-            "teacher" if name == "labeller" else name: value for name, value in rounds.items()
-        }
-    return renamed | ({"method": rename_method(settings["method"])} if "method" in settings else {})
-
-
-def rename_method(name: Any) -> Any:
-    """Return a method's name of today: qbst was qs3 where the source was scanned."""
-    return "qbst" if name == "qs3" else name
-
-
-def _check_scores(path: Path, scores: Scores) -> None:
-    """Refuse scores that are not those of the confusion matrix."""
+def _check_scores(where: str, scores: Scores) -> None:
+    """Raise InputError if scores are not those of the confusion matrix."""
     k = len(scores.class_names)
     try:
         matrix = np.array(scores.confusion, dtype=np.int64).reshape(k, k + 1)
     except (ValueError, OverflowError):
-        raise InputError(f"{path}: field 'scores.confusion' is no table of counts") from None
+        raise InputError(f"{where}: field 'scores.confusion' is no table of counts") from None
     counts, right = matrix.sum(axis=1), matrix.diagonal()
     total = int(counts.sum())
     if (matrix < 0).any() or total != scores.clouds or not total:
-        raise InputError(f"{path}: field 'scores.clouds' is not the sum of 'scores.confusion'")
+        raise InputError(f"{where}: field 'scores.clouds' is not the sum of 'scores.confusion'")
     present = counts > 0
     wanted = {
         "accuracy": int(right.sum()) / total,
@@ -270,39 +259,7 @@ def _check_scores(path: Path, scores: Scores) -> None:
     }
     for name, value in wanted.items():
         if not abs(getattr(scores, name) - value) < 1e-9:  # also where it is NaN
-            raise InputError(f"{path}: field 'scores.{name}' is not that of 'scores.confusion'")
-
-
-def find_records(
-    folder: Path, every_json: bool = False
-) -> tuple[list[tuple[Path, RunRecord]], list[str]]:
-    """Find the records below a folder: ``record.json``, ``records/*.json``, ``results/*.json``.
-
-    Args:
-        folder: Where to look; data sets and hidden folders in it are passed over.
-        every_json: Whether every JSON file is taken for a record.
-
-    Returns:
-        Paths and records in the order of the paths, and a line for each that cannot be read.
-
-    Raises:
-        InputError: where there is no such folder.
-    """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder")
-    records, faults = [], []
-    for place, files in walk(folder):
-        for name in files:
-            if name != RECORD and not (
-                name.endswith(".json") and (every_json or place.name in _FOLDERS)
-            ):
-                continue
-            try:
-                records.append((place / name, read_record(place / name)))
-            except QS3Error as error:
-                faults.append(str(error))
-    return records, faults
+            raise InputError(f"{where}: field 'scores.{name}' is not that of 'scores.confusion'")
 
 
 def walk(folder: Path) -> Iterator[tuple[Path, list[str]]]:

@@ -1,4 +1,4 @@
-"""Runs a grid: only what is missing, one folder a run, one record a run among the results."""
+"""Makes the missing runs of a grid: a folder and a line of ``records.jsonl`` for each."""
 
 import os
 import time
@@ -8,10 +8,16 @@ from pathlib import Path
 from typing import Any
 
 from qs3.errors import InputError
-from qs3.evaluation.records import DataRecord, RunRecord, read_record, write_record
+from qs3.evaluation.records import (
+    RECORDS,
+    DataRecord,
+    RunRecord,
+    append_record,
+    read_records,
+)
 from qs3.experiments.domains import DataSet, Own, Part
 from qs3.experiments.runs import SUPERVISED, Run, warm_up_of
-from qs3.experiments.setup import RESULTS, Setup
+from qs3.experiments.setup import Setup
 from qs3.io.clouds import CloudChoice
 from qs3.store.executors import Executor, Failure
 from qs3.store.executors.executor import stop_if_fatal
@@ -39,9 +45,26 @@ def data_sets(runs: Sequence[Run], own: Own | None = None) -> list[DataSet]:
     return list(dict.fromkeys(p.data for p in parts if isinstance(p.data, DataSet)))
 
 
-def record_path(run: Run, setup: Setup) -> Path:
-    """Return where the record of a run lies among the results."""
-    return setup.out / RESULTS / f"{run.name}.json"
+Results = Mapping[tuple[tuple[str, Any], ...], tuple[str, RunRecord]]
+"""Place and record of each run, by the fields of the run."""
+
+
+def read_results(setup: Setup) -> tuple[Results, list[str]]:
+    """Return the records of a folder, and a message for each line that is none."""
+    path = setup.out / RECORDS
+    if not path.is_file():
+        return {}, []
+    results: dict[tuple[tuple[str, Any], ...], tuple[str, RunRecord]] = {}
+    records, faults = read_records(path)
+    for where, record in records:
+        first, _ = results.setdefault(_key(record.experiment or {}), (where, record))
+        if first != where:
+            faults.append(f"{where}: is a second record of the run of {first}; delete one line")
+    return results, faults
+
+
+def _key(fields: Mapping[str, Any]) -> tuple[tuple[str, Any], ...]:
+    return tuple(sorted(fields.items()))
 
 
 def missing(runs: Sequence[Run], setup: Setup) -> list[Run]:
@@ -51,14 +74,12 @@ def missing(runs: Sequence[Run], setup: Setup) -> list[Run]:
     though one without a record starts from it: records may come without their networks.
 
     Raises:
-        InputError: where a record is damaged or not one of its run.
+        InputError: if a record is damaged or not one of its run.
     """
-    left = []
-    for run in runs:
-        if record_path(run, setup).is_file():
-            read_result(run, setup)
-        else:
-            left.append(run)
+    results, faults = read_results(setup)
+    if faults:
+        raise InputError("; ".join(faults))
+    left = [run for run in runs if find_result(run, setup, results) is None]
     begun = [before for run in left if (before := warm_up_of(setup.scale, run, setup.own))]
     made = {run.folder for run in left}
     needed = {run.folder: run for run in begun if run.folder not in made}
@@ -89,11 +110,11 @@ def require_same_data(runs: Sequence[Run], left: Sequence[Run], setup: Setup) ->
 
     needed = {data for run in left for data in made(run)}
     sums: dict[tuple[Path, CloudChoice], str] = {}
+    results, _ = read_results(setup)
     for run in runs:
-        path = record_path(run, setup)
-        if not path.is_file():
+        if _key(run.fields) not in results:
             continue
-        record = read_record(path)
+        where, record = results[_key(run.fields)]
         parts = record.source, record.target, record.test
         for data, read in zip(made(run), parts, strict=True):
             if data is None or read is None or data not in needed:
@@ -102,24 +123,22 @@ def require_same_data(runs: Sequence[Run], left: Sequence[Run], setup: Setup) ->
                 sums[data] = read_ragged(*data).checksum
             if sums[data] != read.checksum:
                 raise InputError(
-                    f"{path}: read other data than {data[0]} holds, which another machine or "
-                    f"version may have made again; put the former back, or move the records of the "
-                    f"former out of {path.parent}, and run the same command again"
+                    f"{where}: read other data than {data[0]} holds, which another machine or "
+                    "version may have made again; put the former back, or delete the records of "
+                    "the former, and run the same command again"
                 )
 
 
-def read_result(run: Run, setup: Setup) -> RunRecord:
-    """Read the record of a run.
-
-    Returns:
-        The record with all its settings, those that it does not name among them: they have their
-        defaults. So has an older one the fields of its experiment, which its name alone told.
+def find_result(run: Run, setup: Setup, results: Results) -> RunRecord | None:
+    """Return the record of a run, if there is one; settings that it lacks have their defaults.
 
     Raises:
-        InputError: where it is damaged, or that of another run; the file is named.
+        InputError: if its settings or its data are not those of the run.
     """
-    path = record_path(run, setup)
-    record = completed(read_record(path), path)
+    if _key(run.fields) not in results:
+        return None
+    where, record = results[_key(run.fields)]
+    record = completed(record, where)
     settings = record.settings
     source, target, test = run.parts(setup.own)
     differing = {
@@ -133,15 +152,14 @@ def read_result(run: Run, setup: Setup) -> RunRecord:
         "source": _part(record.source) != _part(source),
         "target": _part(record.target) != _part(target),
         "test": _part(record.test) != _part(test),
-        "experiment": record.experiment not in (None, run.fields),
     }
     for name, differs in differing.items():
         if differs:
             raise InputError(
-                f"{path}: is not the record of {run.folder} ({name} differs); delete it and run "
-                "the same command again"
+                f"{where}: is not the record of {run.name} ({name} differs); delete the line and "
+                "run the same command again"
             )
-    return replace(record, experiment=run.fields)
+    return record
 
 
 def _part(data: DataRecord | Part | None) -> tuple[str, str | None, str] | None:
@@ -223,14 +241,15 @@ def _ready(queue: Sequence[Run], busy: Sequence[Run], setup: Setup) -> list[Run]
 
 
 def _keep(run: Run, record: RunRecord, setup: Setup, tell: Tell) -> None:
-    """Write a record; one that is there stays, as others were compared with it."""
-    path = record_path(run, setup)
-    if not path.is_file():
-        write_record(path, record)
-    elif (before := read_record(path)).scores != record.scores:
+    """Append a record; one that is there stays, as others were compared with it."""
+    results, _ = read_results(setup)
+    where, before = results.get(_key(run.fields), ("", None))
+    if before is None:
+        append_record(setup.out / RECORDS, record)
+    elif before.scores != record.scores:
         tell(
-            f"{path}: stays, with an accuracy of {before.scores.accuracy:.1%}; the network that "
-            "was made again, on another machine perhaps, is another one"
+            f"{where}: {run.name} stays, with an accuracy of {before.scores.accuracy:.1%}; the "
+            "network that was made again, on another machine perhaps, is another one"
         )
 
 

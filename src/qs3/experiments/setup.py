@@ -1,11 +1,11 @@
 """What a folder of a reproduction is for, and the file in it that says so."""
 
-import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from qs3.errors import InputError
+from qs3.evaluation.records import RECORDS, read_records
 from qs3.experiments.domains import DomainData, Own, Part, own_data
 from qs3.experiments.scales import Scale
 from qs3.files import claim_folder, read_json, write_json
@@ -13,8 +13,6 @@ from qs3.io.clouds import CloudChoice
 from qs3.structure import structure, unstructure
 
 MARKER = "bench.json"
-RESULTS = "results"
-"""Folder of the records, in that of a reproduction."""
 
 
 @dataclass(frozen=True)
@@ -130,12 +128,11 @@ def read_setup(folder: Path) -> Setup:
         )
         for kind, data in marker.data.items()
     }
-    seeds: set[int] = set()
-    for path in (folder / RESULTS).glob("*.json"):
-        # A damaged record is told by the table that needs it.
-        with contextlib.suppress(InputError, KeyError, TypeError):
-            seeds.add(int(read_json(path)["seed"]))
-    return Setup(folder, marker.scale, tuple(sorted(seeds)) or (0, 1, 2), marker.threads, own=own)
+    path = folder / RECORDS
+    # The table names records that are damaged.
+    records = read_records(path)[0] if path.is_file() else []
+    seeds = tuple(sorted({record.seed for _, record in records})) or (0, 1, 2)
+    return Setup(folder, marker.scale, seeds, marker.threads, own=own)
 
 
 def count_own(own: Own, scale: Scale) -> Own:

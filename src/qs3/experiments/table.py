@@ -1,7 +1,7 @@
 """A table of a folder: its runs, and what their records say."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from qs3.evaluation.records import RunRecord
 from qs3.evaluation.tables import average, frame
 from qs3.experiments.domains import DataSet
 from qs3.experiments.experiment import Experiment, Headings, Place, load_experiment
-from qs3.experiments.grid import read_result, record_path
+from qs3.experiments.grid import find_result, read_results
 from qs3.experiments.runs import Run, warm_up_of
 from qs3.experiments.setup import Setup
 from qs3.files import write_bytes, write_text
@@ -95,18 +95,20 @@ class Table:
         return []
 
     def read(self) -> "FilledTable":
-        """Fill the table from the records that are there; the others are told with the reason."""
+        """Fill the table from its records; ``faults`` names each record that is refused."""
         cells = self.cells()
         records: dict[str, RunRecord] = {}
-        faults: dict[str, None] = {}
+        results, faults = read_results(self.setup)
         runs = {run.name: run for runs in cells.values() for run in runs}
         for name, run in runs.items():
-            if record_path(run, self.setup).is_file():
-                try:
-                    records[name] = read_result(run, self.setup)
-                except InputError as error:
-                    faults[str(error)] = None
-        faults |= dict.fromkeys(_take_out_mixed(records, runs))
+            try:
+                record = find_result(run, self.setup, results)
+            except InputError as error:
+                faults.append(str(error))
+                continue
+            if record is not None:
+                records[name] = record
+        faults += _take_out_mixed(records, runs)
         return FilledTable(self, cells, records, tuple(faults))
 
     def write(self) -> Path:
@@ -142,7 +144,7 @@ def _take_out_mixed(records: dict[str, RunRecord], runs: Mapping[str, Run]) -> l
         for part, read in data.items():
             checksum, where = firsts.setdefault(part, (read.checksum, name))
             if checksum != read.checksum:
-                faults.append(f"{name}.json: read other data ({part}) than {where}; delete it")
+                faults.append(f"{name}: read other data ({part}) than {where}; delete its record")
                 records.pop(name, None)
     return faults
 
@@ -159,6 +161,14 @@ class FilledTable:
     """Records that are there, by the name of the run."""
     faults: tuple[str, ...] = ()
     """What is wrong with each record that was refused."""
+
+    def made_part(self) -> "FilledTable":
+        """Return the table with the rows and columns alone that have records."""
+        places = [place for place in self.runs if self.records_of(place)]
+        if not places:
+            return self
+        rows, columns = (tuple(dict.fromkeys(place[i] for place in places)) for i in (0, 1))
+        return replace(self.table, rows=rows, columns=columns).read()
 
     def records_of(self, place: Place) -> list[RunRecord]:
         """Return the records of a cell, in the order of the seeds."""

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Int
 
 from qs3.errors import InputError
-from qs3.evaluation.records import DataRecord, RunRecord, find_records, score
+from qs3.evaluation.records import RECORDS, DataRecord, RunRecord, read_records, score
 from qs3.files import parse_json
 from qs3.io import load_clouds
 from qs3.io.clouds import CloudKind, PointClouds
@@ -123,12 +123,13 @@ def _read(data: str, loaded: LoadedModel, **part: Any) -> PointClouds:
 
 def _last_record(folder: Path, test: DataRecord | None = None) -> RunRecord | None:
     """Return the newest record in a run's folder, of the test data if they are named."""
-    found, faults = find_records(folder)
+    if not (folder / RECORDS).is_file():
+        return None
+    found, faults = read_records(folder / RECORDS)
     if faults:
         raise InputError(faults[0])
-    found = [(path, record) for path, record in found if test in (None, record.test)]
-    newest = max(found, key=lambda pair: pair[0].stat().st_mtime, default=None)
-    return None if newest is None else newest[1]
+    fitting = [record for _, record in found if test in (None, record.test)]
+    return fitting[-1] if fitting else None
 
 
 def _summary(run: Run, test: DataRecord | None) -> str:

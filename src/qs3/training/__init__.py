@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from qs3.training.estimators import SPST as SPST
     from qs3.training.estimators import Adapter as Adapter
     from qs3.training.evaluate import evaluate as evaluate
-    from qs3.training.evaluate import record_path as record_path
+    from qs3.training.evaluate import records_path as records_path
     from qs3.training.fit import FitResult as FitResult
     from qs3.training.fit import fit as fit
     from qs3.training.history import EpochRecord as EpochRecord

@@ -1,7 +1,5 @@
 """Scores of a finished run on labelled clouds, as a record."""
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +9,10 @@ import numpy as np
 from jaxtyping import Int
 
 from qs3.evaluation.environment import git_commit, hardware, versions
-from qs3.evaluation.records import RECORDS, RunRecord, Scores, score, write_record
+from qs3.evaluation.records import RECORDS, RunRecord, Scores, append_record, score
 from qs3.io import load_clouds
 from qs3.io.clouds import CloudChoice, PointClouds, relabel
 from qs3.meshes.classes import require_named
-from qs3.structure import unstructure
 from qs3.training.batches import load_whole
 from qs3.training.checkpoint import LoadedModel, load_model
 from qs3.training.overlap import both_checksums, caveats
@@ -35,9 +32,9 @@ def evaluate(
     experiment: Mapping[str, str | int | float] | None = None,
     class_map: Mapping[str, str] | None = None,
 ) -> RunRecord:
-    """Score a run on labelled clouds, and write the record into its folder ``records``.
+    """Score a run on labelled clouds, and append the record to ``records.jsonl`` in its folder.
 
-    That of a network that comes with qs3 goes into ``records`` of the working directory.
+    The record of a network that comes with qs3 goes into the working directory.
 
     Labels of the data are put onto the network's classes by name or alias, and the record says
     which (``test.renamed``); an answer that the data has no cloud of stays an answer, and is wrong.
@@ -52,8 +49,8 @@ def evaluate(
             that knows a stool is scored on data of chairs by ``{"stool": "chair"}``.
 
     Raises:
-        InputError: where the run is not finished, the data cannot be read, classes of the data
-            are none of the network's, the map is of none of either, or ``records`` is a link.
+        InputError: if the run is not finished, the data cannot be read, or a class of the data or
+            of the map is unknown to the network.
     """
     made, loaded = read_run(run), load_model(run)
     run = made.folder
@@ -94,16 +91,13 @@ def evaluate(
         marks=caveats(made, test),
         experiment=experiment,
     )
-    path = record_path(run, record)
-    write_record(path, record)
+    append_record(records_path(run), record)
     return record
 
 
-def record_path(run: Path, record: RunRecord) -> Path:
-    """Return where `evaluate` writes a record: name of the data, checksum of the record."""
-    text = json.dumps(unstructure(record), sort_keys=True)
-    digest = hashlib.sha256(text.encode()).hexdigest()[:10]
-    return workplace(run) / RECORDS / f"{Path(record.test.name).stem}-{digest}.json"
+def records_path(run: Path) -> Path:
+    """Return the file to which `evaluate` appends the records of a run."""
+    return workplace(run) / RECORDS
 
 
 def _scores(

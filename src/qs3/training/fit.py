@@ -229,7 +229,7 @@ def fit(
 
 def _with_warm_up(run: Run, before: Run) -> Run:
     """Add what the network has seen in its warm-up, for the marks of its scores, and its cost."""
-    names = ("source_clouds", "source_shapes", "target_clouds", "target_shapes")
+    names = ("source_clouds", "target_clouds")
     both: dict[str, Any] = {
         name: tuple(sorted({*getattr(run, name), *getattr(before, name)})) for name in names
     }

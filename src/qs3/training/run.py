@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from qs3.errors import InputError
-from qs3.evaluation.records import DataRecord, RunRecord, rename_method, rename_settings, walk
+from qs3.evaluation.records import DataRecord, RunRecord, walk
 from qs3.files import claim_folder, folder_lock, read_json, write_json
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.structure import first_difference, structure, unstructure
@@ -21,7 +21,7 @@ RUN = "run.json"
 SETTINGS = "settings.json"
 CONFIG = "run.toml"
 MODEL = "model.safetensors"
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 
 
 @dataclass(frozen=True)
@@ -51,10 +51,6 @@ class Run:
     ``warm-up``, where they are known. Empty in earlier releases."""
     steps: Mapping[str, int] = field(default_factory=dict)
     """Optimiser steps, likewise."""
-    source_shapes: tuple[str, ...] = ()
-    """What the labelled clouds look like, so that one written anew is known too."""
-    target_shapes: tuple[str, ...] = ()
-    """The same of the clouds of the target."""
     threads: int | None = None
     """CPU threads of each process, in the call that ended the run; None where it is not known."""
     chosen: Mapping[str, str | int] | None = None
@@ -118,7 +114,7 @@ def write_run(run: Run) -> None:
 
 
 def read_run(folder: Path) -> Run:
-    """Read a finished run; one of an older version is brought up to date.
+    """Read a finished run.
 
     Args:
         folder: Its folder, or the name of a network that comes with qs3.
@@ -140,20 +136,15 @@ def read_run(folder: Path) -> Run:
             f"{folder}: the run is not finished; run its qs3 train command again to go on"
         )
     value = read_json(path)
-    schema = value.get("schema", 1) if isinstance(value, dict) else None
-    if schema not in (1, SCHEMA_VERSION):
-        raise InputError(f"{path}: schema {schema} of a run, this version reads 1 and 2")
-    value = dict(value)
-    if schema == 1:
-        data = value.pop("data", None)
-        value |= data if isinstance(data, dict) else {}
-        value |= {"method": rename_method(value.get("method")), "schema": SCHEMA_VERSION}
+    schema = value.get("schema") if isinstance(value, dict) else None
+    if schema != SCHEMA_VERSION:
+        raise InputError(f"{path}: schema {schema} of a run, this version reads {SCHEMA_VERSION}")
     settings = read_settings(folder)
-    return structure(value | {"folder": folder, "settings": settings}, Run, path)
+    return structure({**value, "folder": folder, "settings": settings}, Run, path)
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
-    """Read ``settings.json``, the `RunSettings` of a run as plain values, by their names of today.
+    """Read ``settings.json``, the `RunSettings` of a run as plain values.
 
     Raises:
         InputError: where the file is missing, or holds what cannot be a setting.
@@ -174,10 +165,7 @@ def train_settings(run: Path) -> TrainSettings:
 
 
 def _settings(path: Path) -> RunSettings:
-    value = read_json(path)
-    return structure(
-        rename_settings(value) if isinstance(value, dict) else value, RunSettings, path
-    )
+    return structure(read_json(path), RunSettings, path)
 
 
 def completed(record: RunRecord, where: str | Path) -> RunRecord:
