@@ -126,11 +126,11 @@ class RaggedClouds:
     checksum: str
     """SHA-256 over what was read."""
     labels: Int[np.ndarray, "b"] | None = None
-    """Index into ``class_names``, where the files tell."""
+    """Index into ``class_names``; None without labels."""
     class_names: tuple[str, ...] = ()
     """Names as the files have them."""
     splits: tuple[str, ...] = ()
-    """Split of each cloud (``train``, ``test`` or empty), where the files tell."""
+    """Split of each cloud: ``train``, ``test`` or empty; no entries without splits."""
 
     def labelled(
         self,
@@ -147,13 +147,13 @@ class RaggedClouds:
             num_points: Points a cloud; None keeps what is there.
             class_names: Classes of the result, found by name or alias; None takes the files' own,
                 see `label_order`.
-            where: What was read, for messages.
+            where: Name of the source, for messages.
             most: As in `qs3.io.preparation.stack`.
-            class_map: What the files' classes shall be called before that; None keeps their names.
+            class_map: New names of the files' classes, applied first; None keeps their names.
             origin: Where the clouds are from; what is called otherwise is added.
 
         Raises:
-            InputError: where there are no labels, a class is not in ``class_names``, ``class_map``
+            InputError: if there are no labels, a class is not in ``class_names``, ``class_map``
                 is of no class, or sizes differ and no size is asked for.
         """
         if self.labels is None:
@@ -185,7 +185,7 @@ class RaggedClouds:
         points' checksums.
 
         Raises:
-            InputError: where there is no cloud, or sizes differ and no size is asked for.
+            InputError: if there is no cloud, or sizes differ and no size is asked for.
         """
         points = stack(self.clouds, num_points, where, most)
         order = np.argsort(digests(points), kind="stable")

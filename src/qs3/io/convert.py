@@ -34,7 +34,7 @@ def convert(
     """Read a data set and write it in another layout, whole or not at all.
 
     Args:
-        source: What to read.
+        source: Data set to read.
         target: A new path, or an empty folder.
         to: Name of the layout to write.
         origin: Name of the layout of ``source``; None finds it out.
@@ -42,13 +42,13 @@ def convert(
         cloud: Which cloud of a data set of ours.
         num_points: Points a cloud, by `preparation.resample`; None keeps what is there.
         classes: Classes to map the labels onto, by the table of aliases; None keeps them.
-        unmapped: What to do with clouds of a class that is not in ``classes``.
+        unmapped: Refuse or drop clouds of a class that is not in ``classes``.
 
     Returns:
-        What was written.
+        The clouds that were written.
 
     Raises:
-        InputError: where the source cannot be read, the target is taken, a layout is unknown, is
+        InputError: if the source cannot be read, the target is taken, a layout is unknown, is
             not written or cannot hold these clouds, or a class does not map.
     """
     layout = format_named(to)
@@ -93,7 +93,7 @@ def _map_classes(
 
 
 def _plain(clouds: RaggedClouds, num_points: int | None, where: str) -> RaggedClouds:
-    """Clouds of float32, finite, and of one size where one is asked for."""
+    """Return clouds of float32, finite, and of one size if ``num_points`` is given."""
     if num_points is not None and not 1 <= num_points <= MOST_POINTS:
         raise InputError(f"--num-points {num_points}: must be in 1 to {MOST_POINTS}")
     if not clouds.clouds:

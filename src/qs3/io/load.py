@@ -1,4 +1,4 @@
-"""One door to every kind of data set: ours, an archive, a folder, any layout that is known."""
+"""Load a dataset in any supported layout."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ def load_clouds(
     most: int | None = None,
     class_map: Mapping[str, str] | None = None,
 ) -> PointClouds:
-    """Read labelled clouds from whatever ``source`` is.
+    """Read labelled clouds in any supported layout.
 
     Args:
         source: Folder written by ``generate``, folder of class folders, npz archive, or any
@@ -40,8 +40,8 @@ def load_clouds(
         most: As in `qs3.io.preparation.stack`, where ``num_points`` is None.
 
     Raises:
-        InputError: where the source is none of these, is damaged, has no labels, or has a class
-            that is not in ``class_names``.
+        InputError: if the source cannot be read, has no labels, or has a class that is not in
+            ``class_names``.
     """
     clouds = read_clouds(source, split, cloud)[0]
     origin = Origin(Path(source).resolve().name, split, cloud)
@@ -56,12 +56,12 @@ def load_unlabelled(
     cloud: CloudChoice = "points",
     most: int | None = None,
 ) -> UnlabelledClouds:
-    """Read clouds and leave any labels behind; a flat folder of point files will do too.
+    """Read clouds without their labels, from a flat folder of point files too.
 
     The arguments are those of `load_clouds`.
 
     Raises:
-        InputError: where the source is no data set or is damaged.
+        InputError: if the source cannot be read.
     """
     clouds = read_clouds(source, split, cloud)[0].unlabelled(num_points, str(source), most)
     return replace(clouds, origin=Origin(Path(source).resolve().name, split, cloud))
@@ -73,16 +73,16 @@ def read_clouds(
     cloud: CloudChoice = "points",
     origin: str | None = None,
 ) -> tuple[RaggedClouds, str]:
-    """Read a data set as its files have it; also return the name of its layout.
+    """Read a data set as it is stored; return it with the name of its layout.
 
     Args:
         source: What to read; see `load_clouds`.
         split: Part to read; None takes all.
         cloud: Which cloud of a generated data set.
-        origin: Name of the layout; None finds it out.
+        origin: Name of the layout; by default the names of the files tell it.
 
     Raises:
-        InputError: where it cannot be read.
+        InputError: if it cannot be read.
     """
     path = Path(source)
     layout = detect(path) if origin is None else format_named(origin)
@@ -104,10 +104,10 @@ def describe_clouds(source: str | Path) -> dict[str, Any]:
 
     Returns:
         ``layout``, ``rows``, ``points`` (smallest and largest cloud), ``classes`` and ``splits``
-        (clouds by name; empty where the files tell none).
+        (clouds by name; empty if there are none).
 
     Raises:
-        InputError: where it cannot be read.
+        InputError: if it cannot be read.
     """
     clouds, layout = read_clouds(source)
     sizes = [len(cloud) for cloud in clouds.clouds]
@@ -124,11 +124,10 @@ def describe_clouds(source: str | Path) -> dict[str, Any]:
 def detect(path: Path) -> Format:
     """Return the one layout that a path looks like, judged by names.
 
-    Plain folders of point files fit much that has a name of its own; they count where nothing
-    else does.
+    A folder of point files also fits most other layouts; it counts only if nothing else does.
 
     Raises:
-        InputError: where the path is missing or empty, or fits no layout or several; they are
+        InputError: if the path is missing or empty, or fits no layout or several; they are
             listed.
     """
     require(path)
@@ -152,7 +151,7 @@ def format_named(name: str) -> Format:
 
 
 def require(path: Path, layout: Format | None = None) -> None:
-    """Refuse a path that is missing or empty; tell where the data set is got, if it is known."""
+    """Refuse a path that is missing or empty; the message has the page of a known data set."""
     if path.is_file() or holds_something(path):
         return
     what = "an empty folder" if path.is_dir() else "no such file or folder"

@@ -1,4 +1,4 @@
-"""The one way of clouds into a network: no strays, one number of points, a ball of radius 1.
+"""Preprocessing shared by training and inference: outliers, number of points, unit ball.
 
 Every function returns new float32 arrays and leaves its input as it was.
 """
@@ -172,7 +172,7 @@ def resample(
         rng: Draws the first point of the sample; without it, it is point 0.
 
     Raises:
-        InputError: where the cloud is empty or ``num_points`` is not in 1 to ``MOST_POINTS``.
+        InputError: if the cloud is empty or ``num_points`` is not in 1 to ``MOST_POINTS``.
 
     Example:
         >>> resample(np.array([[0.0, 0, 0], [1, 0, 0]]), 3)[:, 0].tolist()
@@ -211,7 +211,7 @@ def stack(
             (`thin`). None refuses them.
 
     Raises:
-        InputError: where there is no cloud or an empty one, or sizes differ and no size is asked
+        InputError: if there is no cloud or an empty one, or sizes differ and no size is asked
             for.
     """
     if not clouds:

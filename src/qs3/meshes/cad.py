@@ -26,7 +26,7 @@ _SECONDS = 600
 
 
 def check_extra(ending: str) -> None:
-    """Refuse an ending that needs the extra ``cad`` where that is not installed.
+    """Refuse an ending that needs the extra ``cad`` if that is not installed.
 
     Raises:
         MissingExtraError: naming the extra.
@@ -42,7 +42,7 @@ def to_glb(path: Path) -> bytes:
     One thread does it, so that the same file always gives the same triangles.
 
     Raises:
-        InputError: where the file is damaged, holds no surface, or takes over 600 seconds or far
+        InputError: if the file is damaged, holds no surface, or takes over 600 seconds or far
             more memory than its size.
     """
     with tempfile.TemporaryDirectory() as folder:
@@ -62,7 +62,7 @@ def to_glb(path: Path) -> bytes:
 
 
 def _convert(path: Path, out: Path) -> None:
-    """Do the work; whatever OpenCASCADE prints belongs to nobody."""
+    """Do the work; what OpenCASCADE prints is dropped."""
     # cascadio can do without, in half the time.
     sys.modules.setdefault("trimesh", None)  # pyright: ignore[reportArgumentType]
     import cascadio

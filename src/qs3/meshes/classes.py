@@ -65,7 +65,7 @@ def read_class_map(path: Path) -> dict[str, str]:
     """Read what classes shall be called: a TOML file of lines such as ``stool = "chair"``.
 
     Raises:
-        InputError: where the file is missing, is no TOML, or holds anything but such lines.
+        InputError: if the file is missing, is no TOML, or holds anything but such lines.
     """
     hint = 'give each class one line, such as stool = "chair"'
     given = read_toml(path, hint)
@@ -168,7 +168,7 @@ def map_labels(
         The new labels of the clouds that are kept, and which clouds are kept.
 
     Raises:
-        InputError: where a class of some cloud is not in ``to`` and ``unmapped`` is ``error``.
+        InputError: if a class of some cloud is not in ``to`` and ``unmapped`` is ``error``.
 
     Example:
         >>> labels, kept = map_labels(["desk", "dresser"], np.array([1, 0]))

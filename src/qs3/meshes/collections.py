@@ -52,7 +52,7 @@ def collect(
             ``read_labels``; meshes without a row are left out.
 
     Raises:
-        InputError: where the folder is missing or holds no mesh, a class is not in it, the CSV is
+        InputError: if the folder is missing or holds no mesh, a class is not in it, the CSV is
             at fault, or a number is out of range.
 
     Example:
@@ -119,7 +119,7 @@ def rename_items(items: Sequence[MeshItem], wanted: Mapping[str, str]) -> list[M
     """Give classes of meshes the names of a map, others keep theirs; see ``MeshItem.own_class``.
 
     Raises:
-        InputError: where the map is of none of the classes.
+        InputError: if the map is of none of the classes.
     """
     require_named(sorted({item.class_name for item in items}), wanted)
     return [_called(item, wanted.get(item.class_name, item.class_name)) for item in items]
@@ -170,7 +170,7 @@ def load_named(
         up: Up axis of a file; by default y for glTF, z for all others.
 
     Raises:
-        InputError: where it is neither, or the file holds no mesh.
+        InputError: if it is neither, or the file holds no mesh.
     """
     if name in shapes.CLASSES and not Path(name).exists():
         return shapes.make(name, seed=seed), {"name": name, "source": "shapes", "sha256": ""}

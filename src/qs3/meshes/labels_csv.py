@@ -26,7 +26,7 @@ def read_labels(path: Path, root: Path, files: Sequence[str]) -> dict[str, tuple
         files: The meshes below it.
 
     Returns:
-        Path below the root → class and split; the split is None where the CSV gives none.
+        Path below the root → class and split; the split is None if the CSV gives none.
 
     Raises:
         InputError: with the line, if a column is missing, a row names no mesh, several, or one
@@ -61,7 +61,7 @@ def read_shapenet_splits(
     Its columns are ``synsetId``, ``modelId`` and ``split``; other rows are passed over.
 
     Raises:
-        InputError: where a column is missing, or a model is in two splits.
+        InputError: if a column is missing, or a model is in two splits.
     """
     splits: dict[tuple[str, str], str] = {}
     for line, (synset, model, split) in _rows(path, (("synsetid",), ("modelid",), ("split",))):
@@ -75,7 +75,7 @@ def read_shapenet_splits(
 
 
 def _names(relative: str) -> set[str]:
-    """What a row may call a mesh."""
+    """Return the names by which a row may call a mesh."""
     bare = relative.rpartition("/")[2]
     return {relative, relative.rpartition(".")[0], bare, bare.rpartition(".")[0]}
 

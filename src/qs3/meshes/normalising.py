@@ -22,7 +22,7 @@ def normalise(mesh: trimesh.Trimesh, size: Literal["box", "ball"] = "box") -> tr
         A new mesh with the same faces; nothing is rotated.
 
     Raises:
-        InputError: where the mesh has no extent, or ``size`` is neither of the two.
+        InputError: if the mesh has no extent, or ``size`` is neither of the two.
 
     Example:
         >>> brick = trimesh.creation.box((4.0, 2.0, 1.0))
@@ -52,7 +52,7 @@ def sample_surface(
     a + √r₁(1 − r₂)(b − a) + √r₁r₂(c − a) with r₁, r₂ uniform, which is uniform over the triangle.
 
     Raises:
-        InputError: where the surface has no area.
+        InputError: if the surface has no area.
 
     Example:
         >>> ball = trimesh.creation.icosphere(subdivisions=3)

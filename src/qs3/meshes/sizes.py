@@ -51,7 +51,7 @@ def class_ranges(class_name: str) -> tuple[tuple[float, float], tuple[float, flo
     """Ranges of longest side and height of a class or an alias of one, in metres.
 
     Raises:
-        InputError: where no size of the class is known.
+        InputError: if no size of the class is known.
     """
     if not class_name:
         raise InputError(
@@ -87,7 +87,7 @@ def class_size(mesh: "trimesh.Trimesh", class_name: str, rng: np.random.Generato
     allow that, the longest side is. The mesh is of any scale; one number is drawn.
 
     Raises:
-        InputError: where no size of the class is known.
+        InputError: if no size of the class is known.
 
     Example:
         >>> import trimesh
@@ -111,7 +111,7 @@ def file_size(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float,
     says once, of the first such mesh, where two differ or a unit is guessed.
 
     Raises:
-        InputError: where the mesh's unit is unknown, or it is smaller than 1 mm or larger than
+        InputError: if the mesh's unit is unknown, or it is smaller than 1 mm or larger than
             10 m.
 
     Example:

@@ -36,7 +36,7 @@ class MeshItem:
     class_name: str
     """Class by folder, synset, CSV or shape; empty in a flat folder."""
     split: str
-    """``"train"``, ``"test"`` or another, or empty where the collection has no split."""
+    """``"train"``, ``"test"`` or another, or empty if the collection has no split."""
     path: Path | None
     """The file, or None for a procedural shape."""
     shape_seed: int | None
@@ -44,15 +44,15 @@ class MeshItem:
     up: Literal["z", "y"] | None = None
     """Up axis of the file, or None to go by its format; see ``load_mesh``."""
     layout: Layout | None = None
-    """What the file was recognised as, or None for a procedural shape."""
+    """Layout in which the file was found, or None for a procedural shape."""
     own_class: str = ""
-    """Name of the class in the collection, where it goes by another one; else empty."""
+    """Name of the class in the collection, if it was renamed; else empty."""
 
     def load(self) -> trimesh.Trimesh:
         """Read or make the mesh.
 
         Raises:
-            InputError: where the file cannot be used.
+            InputError: if the file cannot be used.
         """
         if self.path is not None:
             return load_mesh(self.path, up=self.up)
@@ -69,7 +69,7 @@ def read_tree(root: Path, labels: Path | None = None) -> list[MeshItem]:
     - with ``labels``: classes from the CSV, see ``read_labels``; splits too, else from folders;
     - ShapeNetCore, told by a synset's number among the folders:
       ``<synset>/<id>/models/model_normalized.obj`` (v2) or ``<synset>/<id>/model.obj`` (v1), with
-      splits from ``all.csv`` where that lies in the root;
+      splits from ``all.csv`` if that lies in the root;
     - ModelNet, told by all meshes being ``<class>/<train|test>/<file>`` of ModelNet40's classes;
     - any other: the first folder is the class, a folder named train, test or val anywhere is the
       split; meshes right in the root have no class.
@@ -81,7 +81,7 @@ def read_tree(root: Path, labels: Path | None = None) -> list[MeshItem]:
     which one file a model is asked for.
 
     Raises:
-        InputError: where there is no mesh, a folder cannot be read, the CSV is at fault, the
+        InputError: if there is no mesh, a folder cannot be read, the CSV is at fault, the
             tree lies a level higher or lower than it should, or a file needs the extra ``cad``.
     """
     if not root.is_dir():

@@ -13,7 +13,7 @@ def entries(folder: str | Path) -> list[os.DirEntry[str]]:
     """List a folder without what is hidden (a leading dot).
 
     Raises:
-        InputError: where it cannot be read.
+        InputError: if it cannot be read.
     """
     try:
         with os.scandir(folder) as listing:
@@ -72,7 +72,7 @@ def is_file(entry: os.DirEntry[str] | Path) -> bool:
 
 
 def ids(files: Sequence[str]) -> list[str]:
-    """Names of meshes: paths without ending; where two would be one, both keep their endings.
+    """Return names of meshes: paths without ending, unless two would be equal.
 
     Example:
         >>> ids(["chair/a.off", "b.obj", "b.ply"])

@@ -34,7 +34,7 @@ class CloudFile:
     path: Path
     """The file."""
     class_name: str
-    """Name of the class of all in it; empty where no folder tells one."""
+    """Name of the class of its clouds; empty if no folder names one."""
     split: str
     """``train``, ``test`` or empty."""
 
@@ -53,7 +53,7 @@ def read_folder(
         Clouds in the order of their classes and names. Classes are those of all splits, sorted.
 
     Raises:
-        InputError: where the folder is missing, has no cloud or no such split, has clouds both
+        InputError: if the folder is missing, has no cloud or no such split, has clouds both
             beside and in class folders, or a file is bad; the file is named.
     """
     root = Path(root)
@@ -148,7 +148,7 @@ def read_files(
 
 
 def entries(folder: Path, wanted: Callable[[os.DirEntry[str]], bool]) -> list[Path]:
-    """What a folder holds of a kind, hidden entries aside, in order; nothing where it is none."""
+    """Return sorted entries of a folder, hidden ones left out; none if it is missing."""
     if not folder.is_dir():
         return []
     with os.scandir(folder) as listed:
@@ -164,10 +164,10 @@ def write_folder(root: Path, clouds: RaggedClouds) -> None:
 
     Args:
         root: Folder to make.
-        clouds: What to write.
+        clouds: Clouds to write.
 
     Raises:
-        InputError: where a class name cannot name a folder, or a split is neither train nor test.
+        InputError: if a class name cannot name a folder, or a split is neither train nor test.
     """
     folders = _cloud_folders(clouds)
     taken: set[str] = set()
@@ -228,7 +228,7 @@ def file_stem(identifier: str, folder: str = "") -> str:
 
     Args:
         identifier: Any text.
-        folder: Folder it goes to, such as ``chair/train``; left out where the id begins with it.
+        folder: Folder it goes to, such as ``chair/train``; left out if the id begins with it.
 
     Example:
         >>> file_stem("chair/train/chair_0001.off", "chair/train"), file_stem("../../a#0")

@@ -1,6 +1,7 @@
 """NumPy archives of clouds, of equal sizes (``points`` [b n 3]) or not (with ``offset``)."""
 
 import io
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +41,8 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
 
     Arrays: ``points`` of shape [b n 3], or [m 3] with ``offset`` [b + 1] such that cloud i is
     ``points[offset[i]:offset[i + 1]]``; optional ``label`` [b] with ``class_names`` [k];
-    ``is_train`` [b], or ``strict`` and ``frame`` [b], where a split is asked for; ``name`` [b]
-    where there are names. Nothing pickled is loaded.
+    ``is_train`` [b], or ``strict`` and ``frame`` [b], for splits; ``name``
+    [b]. Nothing pickled is loaded.
 
     Args:
         path: The file.
@@ -98,14 +99,11 @@ def write_npz(path: Path, clouds: RaggedClouds) -> None:
 
 def _read(path: Path) -> dict[str, np.ndarray]:
     """Return the arrays that have a known name."""
-    with reading(path, "NPZ"), path.open("rb") as handle:
+    with reading(path, "NPZ"), path.open("rb") as handle, zipfile.ZipFile(handle) as members:
+        check_size("its content", sum(entry.file_size for entry in members.infolist()))
         archive = np.load(handle, allow_pickle=False)
-        if not isinstance(archive, np.lib.npyio.NpzFile):
-            raise InputError("not a NumPy archive of plain arrays")
-        with archive:
-            check_size("its content", sum(entry.file_size for entry in archive.zip.infolist()))
-            names = {"points", "offset", "class_names", *_PER_CLOUD} & set(archive.files)
-            return {name: archive[name] for name in names}
+        names = {"points", "offset", "class_names", *_PER_CLOUD} & set(archive.files)
+        return {name: archive[name] for name in names}
 
 
 def _clouds(arrays: dict[str, np.ndarray]) -> list[np.ndarray]:

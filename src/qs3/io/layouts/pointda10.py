@@ -61,18 +61,18 @@ def read_pointda10(
     - ``aligned`` (DefRec 2020 and all since): turned z up, then centred on the mean and scaled to
       the unit ball. Loaders then take 1,024 points by farthest point sampling: ``num_points``.
     - ``original`` (PointDAN 2019): the first 1,024 points, centred and scaled to the unit ball, in
-      ShapeNet filled up with zeros where there are fewer; nothing is turned. Its training turns
+      ShapeNet filled up with zeros if there are fewer; nothing is turned. Its training turns
       clouds at random about x, which is nobody's up axis there.
 
     Args:
         path: ``<root>/modelnet``, ``<root>/shapenet`` or ``<root>/scannet``; the root itself where
             it holds one of them only.
         split: ``train`` or ``test``; None takes both.
-        protocol: What is done to the clouds.
+        protocol: How to prepare the clouds.
         domain: Which domain it is; None goes by the folder's name, or by its .h5 files.
 
     Raises:
-        InputError: where the domain cannot be told, the path holds several, a class is none of
+        InputError: if the domain cannot be told, the path holds several, a class is none of
             the ten, a file is bad, or a protocol is unknown.
     """
     if protocol not in get_args(Protocol):

@@ -43,12 +43,12 @@ def read_ragged(
         where: Folder of the data set.
         cloud: ``points`` (noisy), ``clean``, ``surface``, or ``all``: three clouds of each scan,
             named by its id, a stroke and their kind.
-        split: Rows of this split only; where every row tells its ``frame`` and whether it is
+        split: Rows of this split only; if every row tells its ``frame`` and whether it is
             ``strict``, as those of ``qs3 extract nyuv2``, also a part of
             `qs3.io.layouts.npz.frame_parts`.
 
     Raises:
-        InputError: where the folder is not a data set, is unfinished or damaged, or has no such
+        InputError: if the folder is not a data set, is unfinished or damaged, or has no such
             rows or clouds.
     """
     folder = Path(where)
@@ -95,7 +95,7 @@ def read_ragged(
 
 
 def _frame_parts(folder: Path, shards: Sequence[int]) -> dict[str, Bool[np.ndarray, "b"]]:
-    """Splits of all rows by frames; none where a row does not tell of its frame."""
+    """Return splits of all rows by frames; none if a row has no frame."""
     from qs3.store.shards import load_shard
 
     facts = []
@@ -142,7 +142,7 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
     ``origin`` is the name of the layout that they come from, for ``dataset.json``.
 
     Raises:
-        InputError: where the clouds have no labels.
+        InputError: if the clouds have no labels.
     """
     from qs3.store.shards import CloudRow, put_shard, table_of
 
