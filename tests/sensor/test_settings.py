@@ -66,11 +66,6 @@ def test_changes_go_where_they_belong_in_the_sensor():
     assert (sensor.object_size, sensor.material) == (0.5, get_material("dark"))
 
 
-def test_a_scene_by_name_takes_surfaces_by_name():
-    settings = ScanSettings(scene="room", floor_material="dark")
-    assert settings.make_scene() == SceneSettings("room", floor=get_material("dark"))
-
-
 # Of each class how its messages begin, and faults as TOML; behind a bar what the message says
 # where it is not the first field's name alone.
 FAULTS = {
@@ -87,8 +82,8 @@ FAULTS = {
         uniqueness = -0.1; correlation = 1.0; correlation = nan; texture = -2.0; median = 4
         min_region = -1""",
     ExposureSettings: """exposure:
-        gamma = 0.0; gain = inf; auto = 1.0; auto = -0.1; max_gain = -1.0; psf = -0.5; psf = nan
-        vignetting = 1.5; speckle = -1.0; noise = nan; offset = 300.0
+        gain = 0.0; gain = inf; auto = 1.0; auto = -0.1; max_gain = -1.0; psf = -0.5; psf = nan
+        speckle = -1.0; noise = nan; offset = 300.0
         response = 'log' | response 'log'; choose; bits = 12 | bits 12; choose""",
     PatternSettings: """pattern:
         columns = 31 | multiples of 3; rows = 0 | multiples of 3; spot_size = 0.0; spot_size = 2.5

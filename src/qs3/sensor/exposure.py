@@ -1,6 +1,6 @@
 """From radiance to the grey image of 8 or 10 bits that the matcher sees.
 
-In this order: vignetting, point-spread function, speckle of the projector's own light, gain or
+In this order: point-spread function, speckle of the projector's own light, gain or
 auto-exposure, response, Gamma speckle, Gaussian noise, saturation, rounding. Speckle multiplies
 grey levels, as in SAPIEN (after Landau et al.: shape 398.12; noise −0.231 ± 0.83 of 255);
 saturation comes last, as a full well's does.
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Shaped, UInt8, UInt16
 
 from qs3.sensor.checks import check_choices, check_range
-from qs3.sensor.lens import blur, blur_reach, vignette
+from qs3.sensor.lens import blur, blur_reach
 from qs3.sensor.render.scene import StereoPair
 from qs3.sensor.rig import Region, StereoRig
 
@@ -29,11 +29,8 @@ _MIDDLE, _EXPONENT = 0.18, 0.756
 class ExposureSettings:
     """How the imager turns light into grey levels."""
 
-    response: Literal["film", "linear", "gamma"] = "film"
-    """``film`` compresses highlights as a film curve does; ``linear`` clips at white; ``gamma``
-    is linear to the power of 1/``gamma``."""
-    gamma: float = 2.2
-    """Exponent of the ``gamma`` response."""
+    response: Literal["film", "linear"] = "film"
+    """``film`` compresses highlights as a film curve does; ``linear`` clips at white."""
     gain: float = 1.0
     """Factor on the radiance before the response, also on what auto-exposure chose."""
     auto: float = 0.0
@@ -44,8 +41,6 @@ class ExposureSettings:
     0 is no bound. Without it a dark surface gets as bright an image as a white one."""
     psf: float = 0.0
     """Standard deviation in pixels of the lens's Gaussian point-spread function; 0 is none."""
-    vignetting: float = 0.0
-    """Share of the cos⁴ law by which the image darkens away from the optical axis, 0 to 1."""
     speckle: float = 0.0
     """Shape of the Gamma distribution of mean 1 that multiplies each pixel (coherent speckle and
     photon noise); larger is less, 398.12 as Landau et al. measured; 0 is none."""
@@ -61,11 +56,10 @@ class ExposureSettings:
 
     def __post_init__(self) -> None:
         check_choices(self, "exposure")
-        check_range(self, "exposure", "gamma", "gain", above=True)
+        check_range(self, "exposure", "gain", above=True)
         check_range(self, "exposure", "max_gain", "speckle", "coherent", "noise")
         check_range(self, "exposure", "auto", high=1.0, below=True)
         check_range(self, "exposure", "psf", high=20.0)
-        check_range(self, "exposure", "vignetting", high=1.0)
         check_range(self, "exposure", "offset", low=-255.0, high=255.0)
 
 
@@ -127,7 +121,7 @@ def expose(
     automatic: float = 1.0,
     display: bool = False,
 ) -> Grey:
-    """Expose one image behind its lens: all that `expose_pair` does but blur and vignetting.
+    """Expose one image behind its lens: all that `expose_pair` does but the blur.
 
     NOTE: the released scanner saves Blender's Filmic view transform. ``film`` stands for it with
     the closed form y = x^a/(x^a + c^a), c = 0.18 (middle grey to one half) and a = 0.756, which
@@ -194,7 +188,7 @@ def radiance_of(share: float, settings: ExposureSettings) -> float:
     """
     if settings.response == "film":
         return _MIDDLE * (share / (1 - share)) ** (1 / _EXPONENT)
-    return share**settings.gamma if settings.response == "gamma" else share
+    return share
 
 
 def _respond(light: Shaped[np.ndarray, "h w"], settings: ExposureSettings) -> np.ndarray:
@@ -202,7 +196,7 @@ def _respond(light: Shaped[np.ndarray, "h w"], settings: ExposureSettings) -> np
     if settings.response == "film":
         powered = light**_EXPONENT
         return powered / (powered + _MIDDLE**_EXPONENT)
-    return light ** (1 / settings.gamma) if settings.response == "gamma" else light
+    return light
 
 
 def _quantised(levels: Float[np.ndarray, "h w"], settings: ExposureSettings) -> Grey:
@@ -218,8 +212,4 @@ def _through_lens(
     """One image's light of ``part`` behind the lens."""
     reach = blur_reach(settings.psf)
     wide = part.grown(reach, rig.width, rig.height) if reach and not part.empty else part
-    light = pair.canvas(wide)[side]
-    if settings.vignetting:
-        light = light * vignette(rig, wide, settings.vignetting)
-    light = blur(light, settings.psf)
-    return light[part.within(wide)]
+    return blur(pair.canvas(wide)[side], settings.psf)[part.within(wide)]

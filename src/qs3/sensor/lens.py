@@ -1,26 +1,9 @@
-"""What the lens does to the light before the imager counts it: darker corners and a blur."""
+"""The blur of the lens, before the imager counts the light."""
 
 import math
 
 import numpy as np
 from jaxtyping import Float, Float32
-
-from qs3.sensor.rig import Region, StereoRig
-
-
-def vignette(rig: StereoRig, part: Region, share: float) -> Float32[np.ndarray, "h w"]:
-    """How much of the light arrives: 1 − share + share·cos⁴ of the angle from the optical axis.
-
-    Example:
-        >>> rig = StereoRig(width=3, height=1, focal=1.0)  # the rim is seen at 45°
-        >>> vignette(rig, rig.full_frame, 1.0).tolist()
-        [[0.25, 1.0, 0.25]]
-    """
-    cx, cy = rig.principal_point
-    x = (part.x + np.arange(part.width) - cx) / rig.focal
-    y = (part.y + np.arange(part.height) - cy) / rig.focal
-    cosine_squared = 1 / (1 + x[None, :] ** 2 + y[:, None] ** 2)
-    return (1 - share + share * cosine_squared**2).astype(np.float32)
 
 
 def blur_reach(psf: float) -> int:

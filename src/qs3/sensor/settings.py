@@ -13,7 +13,7 @@ from qs3.meshes.sizes import Unit
 from qs3.sensor.checks import check_choices, check_range
 from qs3.sensor.depth import PrincipalPoint
 from qs3.sensor.matching.settings import Method
-from qs3.sensor.materials import Material, get_material
+from qs3.sensor.materials import Material
 from qs3.sensor.presets import Sensor, changed, get_sensor
 from qs3.sensor.randomise import resolve_ranges
 from qs3.sensor.render import Renderer
@@ -207,10 +207,6 @@ class ScanSettings(CameraSettings):
     scene: SceneSettings | str = "alone"
     """alone (the paper), floor, wall, room (both), behind a neighbour or beside one, on a table;
     joined by + as in room+beside."""
-    floor_material: Material | str | None = None
-    """Surface of the floor by name, such as dark; default: diffuse, albedo 0.5."""
-    wall_material: Material | str | None = None
-    """Surface of the wall by name; default: diffuse, albedo 0.6."""
     randomise: Mapping[str, Sequence[Any]] | Sequence[str] | None = None
     """Draw settings of the sensor anew for each scan: light.ambient=0:0.1,
     exposure.gain=0.5:2:log, material=diffuse,metal,dark, or default alone (materials, ambient
@@ -313,15 +309,12 @@ class ScanSettings(CameraSettings):
 
     def make_scene(self) -> SceneSettings:
         """What stands around the object."""
-        scene = SceneSettings(self.scene) if isinstance(self.scene, str) else self.scene
-        surfaces = {"floor": self.floor_material, "wall": self.wall_material}
-        named = {part: get_material(m) for part, m in surfaces.items() if m is not None}
-        return dataclasses.replace(scene, **named)
+        return SceneSettings(self.scene) if isinstance(self.scene, str) else self.scene
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for records; what the sensor and the renderer say of themselves is apart."""
         apart = {*(f.name for f in dataclasses.fields(CameraSettings)), *self._CHANGES, "preset"}
-        apart |= {"crop", "floor_material", "wall_material", "seed"}
+        apart |= {"crop", "seed"}
         names = [f.name for f in dataclasses.fields(ScanSettings) if f.name not in apart]
         ranges = [dict(settings.ranges) for settings in self.each_sensor()]
         crop = self.chosen("crop")
