@@ -55,7 +55,7 @@ LINES = [
     ("--source", "a", "--method", "dann", "--target", "t", "--self-training", "qbst", "--preset",
      "released", "--source-split", "train", "--classes", "pointda10", "--map", "m.toml"),
     ("--method", "qbst", "--warm-up", "rooms", "--target", "t", "--clip-norm", "None",
-     "--augmentation.sight", 0.5, "--threads", "auto", "--log", "tensorboard"),
+     "--augmentation.sight", 0.5, "--threads", "auto"),
     ("--method", "qbst", "--preset", "paper", "--source", "s", "--target", "t", "--no-rotate-z"),
 ]  # fmt: skip
 

@@ -8,14 +8,13 @@ import subprocess
 import sys
 import time
 from dataclasses import asdict, replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 from qs3.adaptation import SourceOnly
-from qs3.errors import InputError, MissingExtraError, QS3Error, UnevenSizesError
+from qs3.errors import InputError, QS3Error, UnevenSizesError
 from qs3.io.preparation import stack
 from qs3.training import (
     Deadline,
@@ -29,7 +28,7 @@ from qs3.training import (
 from qs3.training.checkpoint import new_model
 from qs3.training.loop import train
 
-from .common import Stop, history_of, plain, same, stop_after
+from .common import Stop, history_of, plain, same
 
 
 @pytest.mark.parametrize("norm", [1e-3, 1e6])
@@ -203,63 +202,6 @@ def test_history_is_there_after_each_epoch_and_repeats_nothing(source, settings,
     fit("source-only", source, None, settings, run_dir=tmp_path, on_epoch=look)
     assert seen == [[0], [0, 1], [0, 1, 2], [0, 1, 2, 3]]
     assert not list(tmp_path.glob("*.csv"))
-
-
-def test_tensorboard_shows_each_epoch_once(source, target, settings, tmp_path):
-    reader = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    rounds = SelfTrainingSettings(rounds=1, epochs=2, threshold=0.34)
-    arguments = ("qbst", source, target.without_labels(), replace(settings, epochs=12), rounds)
-
-    with pytest.raises(Stop):
-        fit(*arguments, run_dir=tmp_path, tracker="tensorboard", on_epoch=stop_after(2))
-    result = fit(*arguments, run_dir=tmp_path, tracker="tensorboard")
-    shown = reader.EventAccumulator(str(tmp_path / "tensorboard" / "warm-up")).Reload()
-    assert set(shown.Tags()["scalars"]) == {
-        "loss/source", "accuracy", "learning_rate", "samples_per_second",
-    }  # fmt: skip
-    events = shown.Scalars("loss/source")
-    assert [event.step for event in events] == list(range(12))
-    expected = [record.losses["source"] for record in result.history]
-    assert [event.value for event in events] == pytest.approx(expected, rel=1e-6)
-    shown = reader.EventAccumulator(str(tmp_path / "tensorboard" / "round-1")).Reload()
-    assert len(shown.Scalars("accuracy")) == 2
-
-
-def test_wandb_is_told_each_epoch_and_stays_offline(source, settings, tmp_path, monkeypatch):
-    told = []
-
-    def init(**how):
-        told.append((how, [], []))
-        _, steps, ended = told[-1]
-        return SimpleNamespace(
-            log=lambda values, step: steps.append((step, values)), finish=lambda: ended.append(True)
-        )
-
-    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init))
-    monkeypatch.delenv("WANDB_MODE", raising=False)
-    result = fit("source-only", source, None, settings, run_dir=tmp_path / "a", tracker="wandb")
-    monkeypatch.setenv("WANDB_MODE", "online")
-    fit("source-only", source, None, settings, run_dir=tmp_path / "b", tracker="wandb")
-    (how, steps, ended), (other, _, _) = told
-    assert (how["mode"], other["mode"]) == ("offline", "online")
-    assert (how["name"], how["dir"]) == ("a/source-only", str(tmp_path / "a"))
-    assert [step for step, _ in steps] == list(range(settings.epochs))
-    assert [values["loss/source"] for _, values in steps] == [
-        record.losses["source"] for record in result.history
-    ]
-    assert ended == [True]
-
-
-@pytest.mark.parametrize(
-    ("tracker", "module"), [("tensorboard", "torch.utils.tensorboard.writer"), ("wandb", "wandb")]
-)
-def test_an_absent_tracker_names_the_extra(
-    source, settings, tmp_path, monkeypatch, tracker, module
-):
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(MissingExtraError, match="track"):
-        fit("source-only", source, None, settings, run_dir=tmp_path / "run", tracker=tracker)
-    assert not (tmp_path / "run").exists()
 
 
 def test_statistics_stay_in_full_precision_under_bf16(source, settings):

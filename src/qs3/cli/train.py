@@ -27,7 +27,6 @@ from qs3.training.config import (
     preparation_of,
     usual_preset,
 )
-from qs3.training.history import Tracker
 from qs3.training.run import MODEL, is_run, train_settings
 from qs3.training.shipped import find_run
 
@@ -94,9 +93,6 @@ class TrainOptions(Choices):
     max_time: str | None = None
     """Time for this call, as hours, minutes and seconds: 00:30:00. It stops before an epoch that
     would end later, with exit code 3; the same command goes on."""
-    log: Tracker = "jsonl"
-    """history.jsonl is always written; tensorboard adds event files in OUT/tensorboard, wandb runs
-    of Weights & Biases in OUT/wandb, offline unless WANDB_MODE says otherwise."""
     dry_run: bool = False
     """Print what would be trained, and about how long it takes, by a step that is timed here; write
     nothing. --out may be left out."""
@@ -277,7 +273,6 @@ def train(options: Flat[TrainOptions]) -> int:
             preset=options.preset,
             supervised=options.supervised,
             deadline=Deadline(seconds, start),
-            tracker=options.log,
             config=run_toml(replace(options, train=settings)),
         )
     except TimeUpError as stop:

@@ -1,6 +1,5 @@
 """Train and adapt in one call, into a folder from which the call can be taken up again."""
 
-import contextlib
 import logging
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -29,7 +28,7 @@ from qs3.training.checkpoint import (
 )
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, usual_preset
 from qs3.training.distributed import all_devices, make_fabric
-from qs3.training.history import EpochRecord, History, Tracker
+from qs3.training.history import EpochRecord, History
 from qs3.training.job import Job, fresh_model, make_method, run_job
 from qs3.training.loop import EpochCallback
 from qs3.training.overlap import caveats, data_fields
@@ -93,7 +92,6 @@ def fit(
     preset: str | None = None,
     supervised: bool = False,
     deadline: Deadline | None = None,
-    tracker: Tracker = "jsonl",
     config: str | None = None,
     on_epoch: EpochCallback | None = None,
     on_round: RoundCallback | None = None,
@@ -121,7 +119,6 @@ def fit(
         supervised: Whether the source is the labelled training part of the target, for the record.
         deadline: Time for this call; it stops before an epoch that would end later, but never
             before its first.
-        tracker: What is told of the epochs beside ``history.jsonl``.
         config: Text of ``run.toml``, from which the command line repeats the run.
         on_epoch: Called after each epoch.
         on_round: Called after each round.
@@ -130,7 +127,6 @@ def fit(
         InputError: where arguments do not go together, points are not finite, or the folder holds
             another run.
         TimeUpError: where the time is up; the same call goes on.
-        MissingExtraError: where the tracker is absent.
         QS3Error: where a loss or a gradient is not finite, or the process of another device ended.
     """
     base, rounds_settings = _plan(method, self_training)
@@ -162,7 +158,7 @@ def fit(
     # What cannot be made must not leave a folder behind that refuses the corrected call.
     model = fresh_model(base, settings, len(source.class_names))
     trial, device = make_method(base, model, settings), make_fabric(settings)
-    history = History(run_dir, tracker)
+    history = History(run_dir)
     wanted = RunSettings.of(method, source, target, settings, rounds_settings, weights)
     step = partial(trial_step, trial, len(source.class_names), settings, device)
     with claim_run(run_dir, wanted, partial(choose_threads, settings, step=step)) as claimed:
@@ -185,7 +181,6 @@ def fit(
         )
         with (
             threads(count),
-            contextlib.closing(history),
             all_devices(settings, partial(run_job, job)) as fabric,
         ):
             hooks = Hooks(history, deadline, on_epoch, on_round)
