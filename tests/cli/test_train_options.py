@@ -55,7 +55,7 @@ LINES = [
     ("--source", "a", "--method", "dann", "--target", "t", "--self-training", "qbst", "--preset",
      "released", "--source-split", "train", "--classes", "pointda10", "--map", "m.toml"),
     ("--method", "qbst", "--warm-up", "rooms", "--target", "t", "--clip-norm", "None",
-     "--augmentation.sight", 0.5, "--threads", "auto"),
+     "--augmentation.sight", 0.5, "--threads", 2),
     ("--method", "qbst", "--preset", "paper", "--source", "s", "--target", "t", "--no-rotate-z"),
 ]  # fmt: skip
 
@@ -140,7 +140,7 @@ def test_a_dry_run_tells_what_would_be_trained_and_writes_nothing(
     words = ("train", "--source", store, *QUICK, "--epochs", 3, "--holdout", 0, "--dry-run")
     told = qs3(*words).stdout
     for part in ("10 clouds, 0 of them held out", "chair 1", "3 epochs of 2 steps of 5 clouds: 6",
-                 "pointnet, 3.4", "64 points", "holdout 0.0", "processor time here"):  # fmt: skip
+                 "pointnet, 3.4", "64 points", "holdout 0.0"):  # fmt: skip
         assert part in told, told
     rounds = ("--target", store, "--method", "qbst", "--self-training.rounds", 2,
               "--self-training.epochs", 4)  # fmt: skip

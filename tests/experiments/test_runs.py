@@ -11,7 +11,6 @@ from qs3.adaptation import method_class
 from qs3.adaptation.names import split_method
 from qs3.errors import InputError
 from qs3.experiments import TABLES
-from qs3.experiments.cost import run_seconds
 from qs3.experiments.data import choose_meshes, make_plans, side_of
 from qs3.experiments.domains import Domain, data_of, parse_own
 from qs3.experiments.experiment import load_experiment, published
@@ -24,7 +23,6 @@ from qs3.experiments.table import Table
 from qs3.io import load_clouds, load_unlabelled
 from qs3.io.clouds import digests
 from qs3.training.batches import count_batches
-from qs3.training.plan import Cost
 
 from .conftest import TINY
 
@@ -195,28 +193,6 @@ def test_a_path_through_a_link_and_a_name_of_ours_are_the_user_s(tmp_path):
     with pytest.raises(InputError, match="no clouds to score on"):
         make_run(TINY, S, Domain("J"), ORDINARY).parts()
     assert data_of(S, own).stands_for == "" and data_of(D, own).stands_for
-
-
-def test_hours_follow_the_number_of_steps():
-    costs = {name: Cost(step, 0.25, 0.5) for name, step in (("source-only", 1.0), ("dann", 3.0))}
-    scale = dataclasses.replace(TINY, train=dataclasses.replace(TINY.train, epochs=10))
-    counts = (40, 64, 16)  # 36 trained on: 3 batches; 4 of the target
-    looks = 10 * (40 + 64 + 16) * 0.25
-    judged = (40 + 16) * 0.75 + (40 + 64) * 0.5
-    seconds = {
-        row: run_seconds(make_run(scale, S, D, row), counts, costs)
-        for row in ("source-only", "dann", "qbst", PAPER, "qbst-gentle")
-    }
-    assert seconds["source-only"] == pytest.approx(30 + looks + judged)
-    assert seconds["dann"] == pytest.approx(10 * 4 * 3 + looks + judged)
-    # Two rounds of an epoch, on both domains, that keep half; what was kept is judged too.
-    judged += 64 * 0.75
-    assert seconds["qbst"] == pytest.approx(2 * 2 * 2 + 4 * 120 * 0.25 + judged)
-    # Of a pool that shrinks the second round keeps half of that half.
-    assert seconds[PAPER] == pytest.approx(2 + 1 + 4 * 120 * 0.25 + judged)
-    assert seconds["qbst-gentle"] == pytest.approx(5 * 4 * 2 * 2 + 10 * 120 * 0.25 + judged)
-    again = run_seconds(make_run(scale, S, D, "dann"), counts, costs, only_scores=True)
-    assert again == pytest.approx(56 * 0.75)
 
 
 def test_laptop_judges():

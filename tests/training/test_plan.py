@@ -2,10 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
-import pytest
-
-from qs3.errors import InputError
 from qs3.training import fit
 from qs3.training.plan import describe_plan
 
@@ -19,8 +15,3 @@ def test_steps_are_those_of_the_training(source, target, settings, tmp_path):
         (epoch,) = done.history
         steps = epoch.steps
         assert told[1] == f"training  {method}, 1 epochs of {steps} steps of 8 clouds: {steps}"
-
-
-def test_a_single_cloud_is_refused(source, settings):
-    with pytest.raises(InputError, match="1 clouds are too few to train on"):
-        describe_plan("source-only", source.select(np.arange(1)), None, settings, None)

@@ -43,7 +43,7 @@ class ReproduceOptions:
     """Data sets of yours in place of what is made here, as NAME=PATH or NAME=PATH:TRAIN:TEST with
     two parts of it: D=scans/depth."""
     dry_run: bool = False
-    """Print counts and hours, by a few scans and steps in processor time; write nothing."""
+    """Print the numbers of scans and runs; write nothing."""
     threads: int = 1
     """CPU threads of a training; numbers are the same for the same count."""
     workers: Flat[Workers] = field(default_factory=Workers)

@@ -94,8 +94,7 @@ class TrainOptions(Choices):
     """Time for this call, as hours, minutes and seconds: 00:30:00. It stops before an epoch that
     would end later, with exit code 3; the same command goes on."""
     dry_run: bool = False
-    """Print what would be trained, and about how long it takes, by a step that is timed here; write
-    nothing. --out may be left out."""
+    """Print the numbers of clouds and steps; write nothing. --out may be left out."""
     train: Flat[TrainSettings] = field(default_factory=TrainSettings)
     """How the network is trained."""
     self_training: SelfTrainingSettings = field(default_factory=SelfTrainingSettings)

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -173,7 +173,6 @@ def run_grid(
     runs: Sequence[Run],
     setup: Setup,
     tell: Tell,
-    expected: Mapping[str, float],
     executor: Executor,
     devices: Sequence[str] = (),
     at_once: int = 1,
@@ -184,7 +183,6 @@ def run_grid(
         runs: Those of `missing`, a warm-up before what starts from it.
         setup: Where they go.
         tell: Is told of each run.
-        expected: Seconds that each run was estimated to take, by its name.
         executor: Where runs are made.
         devices: GPUs that share the work, one run each at a time.
         at_once: Runs at a time where no device is named.
@@ -195,7 +193,7 @@ def run_grid(
     Raises:
         InputError: where something failed that no other run will be spared, such as a full disk.
     """
-    queue, busy, progress = list(runs), dict[str, tuple[Run, str]](), _Progress(expected, tell)
+    queue, busy, progress = list(runs), dict[str, tuple[Run, str]](), _Progress(len(runs), tell)
     with executor:
         free = list(devices) or [""] * at_once
         while queue or busy:
@@ -254,13 +252,13 @@ def _keep(run: Run, record: RunRecord, setup: Setup, tell: Tell) -> None:
 
 
 class _Progress:
-    """Tells of each run, what failed, and how long the rest will take."""
+    """Prints a line a run: its scores, or its fault."""
 
-    def __init__(self, expected: Mapping[str, float], tell: Tell) -> None:
-        self.left, self.tell = dict(expected), tell
+    def __init__(self, count: int, tell: Tell) -> None:
+        self.count, self.made, self.tell = count, 0, tell
         self.failed: set[str] = set()
         self.faults: list[str] = []
-        self.count, self.spent, self.start = len(expected), 0.0, time.monotonic()
+        self.start = time.monotonic()
 
     def fail(self, run: Run, why: str) -> None:
         self.failed.add(run.folder)
@@ -268,10 +266,11 @@ class _Progress:
         self.tell(f"failed: {self.faults[-1]}")
 
     def done(self, run: Run, record: RunRecord) -> None:
-        self.spent += self.left.pop(run.name)
-        rest = sum(self.left.values()) * (time.monotonic() - self.start) / max(self.spent, 1e-9)
+        self.made += 1
+        left = self.count - self.made - len(self.faults)
+        rest = left * (time.monotonic() - self.start) / self.made
         self.tell(
-            f"[{self.count - len(self.left)}/{self.count}] {run.folder} on {run.target}: accuracy "
+            f"[{self.made}/{self.count}] {run.folder} on {run.target}: accuracy "
             f"{record.scores.accuracy:.1%}, class mean {record.scores.class_mean_accuracy:.1%}; "
             f"{rest / 60:.0f} min left"
         )

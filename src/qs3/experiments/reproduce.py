@@ -41,11 +41,6 @@ class Workers:
             if not device.isdecimal():
                 raise InputError(f"--devices {device}: name GPUs by index, such as 0 1")
 
-    @property
-    def at_once(self) -> int:
-        """Runs at a time."""
-        return len(self.devices) or self.workers
-
     def start(self) -> Executor:
         """Return what makes the runs.
 
@@ -139,7 +134,7 @@ def reproduce(
         setup: Where and how large.
         workers: Who makes it.
         tell: Is told how it goes.
-        dry_run: Only tell what is to do and how long it takes; nothing is written.
+        dry_run: Only tell how many scans and runs are missing; nothing is written.
 
     Returns:
         The main file of each product that was made.
@@ -148,7 +143,6 @@ def reproduce(
         InputError: where the folder is for other settings, a record is damaged or not of its run,
             or a run failed; what was made stays made.
     """
-    from qs3.experiments.cost import measure
     from qs3.experiments.data import choose_meshes, make_data, make_plans
 
     runs = collect_runs(products)
@@ -161,15 +155,11 @@ def reproduce(
     executor = workers.start()  # a missing extra is told before anything is made
     needed = {data.name for data in [*data_sets(left, setup.own), *drawn]}
     plans = {name: plan for name, plan in plans.items() if name in needed}
-    scanning, expected = measure(setup, left, plans)
     names = ", ".join(product.name for product in products)
     sets = [f"{plan.rows} scans of the {name}" for name, plan in plans.items()]
     scans = ", ".join(sets) or "no scans"
-    seconds = scanning + sum(expected.values())
     tell(
-        f"{names}, scale {setup.scale.name}: {scans}; {len(runs)} runs, {len(left)} of them "
-        f"missing; about {seconds / workers.at_once / 3600:.2f} hours here, "
-        f"{scanning / workers.at_once / 3600:.2f} of them for scans ({workers.at_once} at a time)"
+        f"{names}, scale {setup.scale.name}: {scans}; {len(runs)} runs, {len(left)} of them missing"
     )
     if dry_run:
         return []
@@ -186,7 +176,7 @@ def reproduce(
         at_once = max(len(workers.devices), workers.workers)
         # Processes start without progress bars: several would write over one another.
         with mock.patch.dict(os.environ, TQDM_DISABLE="1"):
-            failed = run_grid(left, setup, tell, expected, executor, devices, at_once)
+            failed = run_grid(left, setup, tell, executor, devices, at_once)
     paths = []
     for product in products:
         try:

@@ -152,14 +152,12 @@ class TrainSettings:
     devices: int = 1
     """GPUs, or CPU processes, of this machine that share each batch. Each normalises its own share
     (batch normalisation), so that results differ a little between numbers of devices."""
-    threads: int | Literal["auto"] | None = None
-    """CPU threads of each process. None takes the cores (OMP_NUM_THREADS where it is set), or one
-    for each of several processes; auto times a few steps, as one thread may be faster on a busy
-    machine. A run keeps its number. Results are bit-identical for equal numbers, and after a stop
-    on at most two devices (DDP sums the first step's gradients of three in another order)."""
+    threads: int | None = None
+    """CPU threads. None takes OMP_NUM_THREADS, or all cores. A run keeps its number; results are
+    bit-identical for equal numbers."""
 
     def __post_init__(self) -> None:
-        ranges = {"must be above 0": "num_points epochs learning_rate devices clip_norm"}
+        ranges = {"must be above 0": "num_points epochs learning_rate devices clip_norm threads"}
         ranges |= {"must be in 0 to below 1": "label_smoothing holdout"}
         ranges |= {"must be between 0 and 1": "ema_decay"}
         least = "weight_decay jitter_sigma jitter_clip seed validate_every"
@@ -174,8 +172,6 @@ class TrainSettings:
         _check_words(self)
         good = self.rule == "last" or self.validate_every > 0
         _check(self, "validate_every", good, f"leaves no checkpoint for rule = {self.rule!r}")
-        good = self.threads in (None, "auto") or (type(self.threads) is int and self.threads > 0)
-        _check(self, "threads", good, "must be above 0, or auto")
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ from qs3.training.run import (
     write_run,
 )
 from qs3.training.shipped import find_run
-from qs3.training.threads import choose_threads, threads, trial_step
+from qs3.training.threads import choose_threads, threads
 from qs3.training.validation import ROUND, Checkpoint, choose, held_out, read_checkpoints
 
 _LOG = logging.getLogger(__name__)
@@ -157,11 +157,11 @@ def fit(
     _require_holdout(settings, has_holdout, held)
     # What cannot be made must not leave a folder behind that refuses the corrected call.
     model = fresh_model(base, settings, len(source.class_names))
-    trial, device = make_method(base, model, settings), make_fabric(settings)
+    make_method(base, model, settings)
+    make_fabric(settings)
     history = History(run_dir)
     wanted = RunSettings.of(method, source, target, settings, rounds_settings, weights)
-    step = partial(trial_step, trial, len(source.class_names), settings, device)
-    with claim_run(run_dir, wanted, partial(choose_threads, settings, step=step)) as claimed:
+    with claim_run(run_dir, wanted, partial(choose_threads, settings)) as claimed:
         if config is not None:
             write_text(run_dir / CONFIG, config)
         count = claimed.threads or 1

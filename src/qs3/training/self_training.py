@@ -100,7 +100,7 @@ def self_train(
         run_dir=run_dir,
         hooks=Hooks(on_epoch=on_epoch, on_round=on_round),
     )
-    choose = partial(choose_threads, settings, step=None)
+    choose = partial(choose_threads, settings)
     if run_dir is None:
         with threads(choose(None)):
             return run_rounds(model, task)
