@@ -31,11 +31,6 @@ def test_imports_without_torch(module):
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
-def test_answers_load_nothing_for_several_devices():
-    code = "import sys, qs3.training.answers; sys.exit('lightning_fabric' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
-
-
 def test_settings_of_a_camera_import_nothing_heavy():
     heavy = {"cv2", "scipy", "trimesh", "embreex", "mitsuba", "drjit", "matplotlib", "torch"}
     modules = "qs3.sensor.realism, qs3.sensor.settings"

@@ -327,16 +327,6 @@ def test_networks_without_local_features_are_refused_by_name(method):
         create_method(method, create_model("rscnn", 3))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS)
-def test_trains_on_two_devices_and_resumes(method, tmp_path):
-    chosen = settings(method, "dgcnn", devices=2, epochs=2)
-    whole = fit(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "whole")
-    resumed = fit_after_a_stop(method, SOURCE, TARGET, chosen, run_dir=tmp_path / "cut")
-    assert same(whole.model, resumed.model)
-    assert whole.checkpoints == resumed.checkpoints
-
-
 @pytest.mark.gpu
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("method", METHODS)

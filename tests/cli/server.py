@@ -30,7 +30,6 @@ def serve() -> list[str] | None:
 
 
 if __name__ == "__main__":
-    import lightning_fabric  # noqa: F401
     import torch  # noqa: F401
     import tyro  # noqa: F401
 

@@ -1,6 +1,5 @@
 """Options of ``qs3 train`` that end a run, share it out or write more of it."""
 
-import json
 import tomllib
 from dataclasses import fields
 from pathlib import Path
@@ -26,22 +25,6 @@ def test_max_time_stops_with_its_own_code_and_goes_on(qs3, store, tmp_path):
     assert "run the same again to go on" in stopped.stderr
     done = len((tmp_path / "run" / "history.jsonl").read_text().splitlines())
     assert 1 <= done < 400
-
-
-@pytest.mark.slow
-def test_two_devices_write_and_say_everything_once(qs3, store, tmp_path):
-    done = qs3("train", "--source", store, "--out", tmp_path / "run", "--epochs", 3, *QUICK,
-               "--devices", 2)  # fmt: skip
-    assert done.stdout == f"{tmp_path / 'run'}\n"
-    assert done.stderr.count("Next:") == 1
-    text = (tmp_path / "run" / "history.jsonl").read_text().splitlines()
-    lines = [json.loads(line) for line in text]
-    assert [line["epoch"] for line in lines if line["kind"] == "epoch"] == [0, 1, 2]
-    assert len(set(text)) == len(text)
-    names = {path.name.split("-")[0] for path in (tmp_path / "run").iterdir()}
-    assert names == {"checkpoint.safetensors", "checkpoints", "history.jsonl", "model.safetensors",
-                     "run.json", "run.toml", "settings.json", "subsample"}  # fmt: skip
-    qs3("evaluate", tmp_path / "run", "--data", store)
 
 
 def parsed(*words) -> TrainOptions:

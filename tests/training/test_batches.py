@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from qs3.io.preparation import PAPER, Preparation, unit_ball
-from qs3.training.batches import DeviceClouds, Share, augment, batches, first_places, make_batch
+from qs3.training.batches import DeviceClouds, augment, batches, first_places
 from qs3.training.prepared import prepare_clouds
 
 CPU = torch.device("cpu")
@@ -44,32 +44,9 @@ def test_jitter_is_clipped_gaussian(settings):
     assert torch.equal(augment(torch.ones(2, 3, 3), off, generator()), torch.ones(2, 3, 3))
 
 
-@pytest.mark.parametrize("redraw", [False, True])
-@pytest.mark.parametrize("world", [2, 3])
-def test_shares_are_the_whole_batch_once(source, target, settings, world, redraw):
-    """With points drawn anew too: the draws of a cloud are those of one device."""
-    how = {"num_points": 40, "preparation": Preparation(redraw=redraw)}
-    sets = [ready(source, **how), ready(target, **how)]
-    rows = [np.array([5, 0, 7, 3, 9, 11, 2]), np.arange(6)]
-    whole = make_batch(sets, rows, settings, generator())
-    parts = [
-        make_batch(sets, rows, settings, generator(), Share(rank, world)) for rank in range(world)
-    ]
-    order = [
-        place
-        for rank in range(world)
-        for start, count in ((0, 7), (7, 6))
-        for place in range(start + rank, start + count, world)
-    ]
-    assert sorted(order) == list(range(13))
-    assert torch.equal(torch.cat([part.points for part in parts]), whole.points[order])
-    assert torch.equal(torch.cat([part.labels for part in parts]), whole.labels[order])
-    assert torch.equal(whole.labels[:7], torch.from_numpy(source.labels[rows[0]]))
-
-
-def test_last_batch_too_small_for_all_devices_is_dropped():
-    assert [len(rows) for rows in batches(11, 4, np.random.default_rng(0), 4)] == [4, 4]
-    assert [len(rows) for rows in batches(12, 8, np.random.default_rng(0), 4)] == [8, 4]
+def test_a_last_batch_of_one_cloud_is_dropped():
+    assert [len(rows) for rows in batches(9, 4, np.random.default_rng(0))] == [4, 4]
+    assert [len(rows) for rows in batches(10, 8, np.random.default_rng(0))] == [8, 2]
 
 
 def test_clouds_without_labels_are_taken(target):

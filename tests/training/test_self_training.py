@@ -21,7 +21,6 @@ from qs3.training import (
     self_training_preset,
 )
 from qs3.training.checkpoint import derived_seed, new_model
-from qs3.training.distributed import make_fabric
 from qs3.training.predict import predict_probabilities
 from qs3.training.prepared import prepare_clouds
 from qs3.training.rounds import STATE, kept_clouds, remarks
@@ -233,20 +232,11 @@ def test_pool_split_leaves_a_fifth_aside(domains, settings):
 
 
 @pytest.mark.parametrize(
-    ("count", "teacher", "devices", "skipped"),
-    [
-        (8, "best", 1, False),
-        (7, "latest", 4, True),
-        (8, "latest", 4, False),
-        (9, "best", 5, True),
-        (9, "best", 4, False),  # 8 of them to train on
-    ],
+    ("count", "teacher", "trained_on"), [(5, "latest", []), (6, "latest", [6]), (9, "best", [8])]
 )
-def test_the_limit_is_two_a_device_without_those_held_out(
-    domains, settings, monkeypatch, count, teacher, devices, skipped
+def test_a_round_needs_two_clouds_a_class_and_trains_without_those_held_out(
+    domains, settings, monkeypatch, count, teacher, trained_on
 ):
-    """The settings' number of devices counts; here one device computes for all of them."""
-    rounds = replace(ROUNDS, rounds=1, teacher=teacher)
     trained = []
 
     def train(method, clouds, *arguments, **options):
@@ -254,13 +244,13 @@ def test_the_limit_is_two_a_device_without_those_held_out(
         return [], {}
 
     monkeypatch.setattr("qs3.training.self_training.train", train)
-    many = replace(settings, devices=devices, batch_size=16)
+    rounds = replace(ROUNDS, rounds=1, teacher=teacher)
     _, records = self_train(
-        new_model(settings, 3, 0), *domains, many, rounds, fabric=make_fabric(settings),
+        new_model(settings, 3, 0), *domains, settings, rounds,
         select=lambda p, theta: np.arange(len(p)) < count,
     )  # fmt: skip
-    assert records[0].skipped is skipped
-    assert trained == ([] if skipped else [8])
+    assert trained == trained_on
+    assert records[0].skipped is (not trained_on)
 
 
 def test_pool_shrinks_to_what_was_kept(domains, settings):

@@ -108,7 +108,7 @@ class Method(nn.Module, ABC):
     def forward(
         self, source: Batch, target: Target, progress: float, generator: Generator
     ) -> Terms:
-        """Return `losses`; a distributed wrapper needs the call to pass through here."""
+        """Return `losses` of a step."""
         self.right = None
         return self.losses(source, target, progress, generator)
 

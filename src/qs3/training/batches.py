@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -69,19 +69,6 @@ def load_whole(
 _NONE = Augmentation()
 
 
-class Share(NamedTuple):
-    """The part of every batch that falls to one of several devices."""
-
-    rank: int = 0
-    """Number of the device, from 0."""
-    world: int = 1
-    """Number of devices."""
-
-
-WHOLE = Share()
-"""All of every batch."""
-
-
 class DeviceClouds:
     """Clouds of which batches are made on the device; a GPU holds them where they fit.
 
@@ -113,10 +100,9 @@ class DeviceClouds:
         self,
         rows: np.ndarray,
         generator: torch.Generator | None = None,
-        share: Share = WHOLE,
         augmentation: Augmentation = _NONE,
     ) -> Batch:
-        """Return this device's share of the clouds at ``rows``, normalised, on the device.
+        """Return the clouds at ``rows``, normalised, on the device.
 
         More points are drawn where clouds are augmented; what is left of them is cut to the number,
         then normalised.
@@ -124,25 +110,23 @@ class DeviceClouds:
         Args:
             rows: Clouds of a batch.
             generator: Source of all draws, on the device; without one the fixed choice of points is
-                taken as it is. Several devices draw alike, each for the whole batch.
-            share: This device's part.
+                taken as it is.
             augmentation: What is done to the clouds.
         """
         preparation, num_points = self.clouds.preparation, self.clouds.num_points
-        mine = slice(share.rank, None, share.world)
-        labels = self.labels[torch.from_numpy(rows[mine])].to(self.device)
+        labels = self.labels[torch.from_numpy(rows)].to(self.device)
         if generator is None or (augmentation == _NONE and not preparation.redraw):
-            points = self._points(rows[mine], self._first(rows[mine]))
+            points = self._points(rows, self._first(rows))
             return Batch(normalise_batch(points, preparation), labels)
         spare = 1 if augmentation == _NONE else 2 * _SPARE if augmentation.sight else _SPARE
         chosen, distinct = self._chosen(rows, spare * num_points, generator)
         if augmentation == _NONE:
-            points = self._points(rows[mine], chosen[mine])
+            points = self._points(rows, chosen)
         else:
             points, kept = augment_clouds(self._points(rows, chosen), augmentation, generator)
             kept = kept & distinct
             kept = torch.where(kept.any(dim=1, keepdim=True), kept, distinct)
-            points = gather_points(points, first_places(kept, num_points))[mine]
+            points = gather_points(points, first_places(kept, num_points))
         return Batch(normalise_batch(points, preparation), labels)
 
     def _first(self, rows: np.ndarray) -> Int[Tensor, "r m"]:
@@ -212,8 +196,6 @@ def augment(
     points: Float[Tensor, "b n 3"],
     settings: TrainSettings,
     generator: torch.Generator,
-    rows: Sequence[int] | None = None,
-    total: int | None = None,
 ) -> Float[Tensor, "b n 3"]:
     """Turn clouds about z and jitter them, as the settings say, on their device.
 
@@ -224,18 +206,13 @@ def augment(
         points: Clouds.
         settings: Which augmentation, and how strong.
         generator: Source of the draws, on the device of the points.
-        rows: Places of these clouds in a batch that several devices share: the draws are those of
-            the whole batch.
-        total: Clouds in that batch.
     """
-    place = torch.arange(len(points)) if rows is None else torch.as_tensor(rows)
-    place, count = place.to(points.device), len(points) if total is None else total
     drawn = {"generator": generator, "device": points.device, "dtype": points.dtype}
     if settings.rotate_z:
-        points = turned(points, 2 * torch.pi * torch.rand(count, 1, **drawn)[place])
+        points = turned(points, 2 * torch.pi * torch.rand(len(points), 1, **drawn))
     if settings.jitter_sigma > 0 and settings.jitter_clip > 0:
-        noise = settings.jitter_sigma * torch.randn(count, *points.shape[1:], **drawn)
-        noise = noise.clamp_(-settings.jitter_clip, settings.jitter_clip)[place]
+        noise = settings.jitter_sigma * torch.randn(points.shape, **drawn)
+        noise = noise.clamp_(-settings.jitter_clip, settings.jitter_clip)
         if settings.preparation.size_input:  # the cloud is in metres
             share = settings.preparation.radius_share
             noise = noise * ball_radius(points, share)[:, None, None]
@@ -243,35 +220,31 @@ def augment(
     return points
 
 
-def batches(
-    count: int, size: int, rng: np.random.Generator, least: int = 2
-) -> Iterator[np.ndarray]:
-    """Cut a random order into batches; a last one of fewer than ``least`` clouds is dropped.
+def batches(count: int, size: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
+    """Cut a random order into batches; a last one of a single cloud is dropped.
 
-    Batch normalisation needs two clouds on each device.
+    Batch normalisation needs two clouds.
     """
     order = rng.permutation(count)
     for start in range(0, count, size):
-        if count - start >= least:
+        if count - start >= 2:
             yield order[start : start + size]
 
 
-def endless_batches(
-    count: int, size: int, rng: np.random.Generator, least: int = 2
-) -> Iterator[np.ndarray]:
+def endless_batches(count: int, size: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
     """Yield the batches of one random order after another, without end."""
-    orders = (batches(count, size, rng, least) for _ in itertools.count())
+    orders = (batches(count, size, rng) for _ in itertools.count())
     return itertools.chain.from_iterable(orders)
 
 
-def count_batches(count: int, size: int, least: int = 2) -> int:
+def count_batches(count: int, size: int) -> int:
     """Return how many batches `batches` cuts.
 
     Example:
         >>> count_batches(9, 4), count_batches(10, 4)
         (2, 3)
     """
-    return count // size + (count % size >= least)
+    return count // size + (count % size >= 2)
 
 
 def make_batch(
@@ -279,21 +252,13 @@ def make_batch(
     rows: Sequence[np.ndarray],
     settings: TrainSettings,
     generator: torch.Generator,
-    share: Share = WHOLE,
 ) -> Batch:
-    """Put this device's share of the chosen rows of every set, augmented, into one batch.
-
-    The augmentation of a cloud does not depend on the number of devices.
-    """
+    """Put the chosen rows of every set, augmented, into one batch."""
     parts = [
-        clouds.take(index, generator, share, settings.augmentation)
+        clouds.take(index, generator, settings.augmentation)
         for clouds, index in zip(sets, rows, strict=True)
     ]
-    places, total = [], 0
-    for index in rows:
-        places += range(total + share.rank, total + len(index), share.world)
-        total += len(index)
     points = torch.cat([part.points for part in parts])
-    points = augment(points, settings, generator, places, total)
+    points = augment(points, settings, generator)
     labels = torch.cat([part.labels for part in parts])
     return Batch(points, labels, tuple(len(part.labels) for part in parts))

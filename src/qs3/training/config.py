@@ -16,8 +16,8 @@ from qs3.sensor.checks import choices_of
 _Settings = TypeVar("_Settings", bound=Any)
 Schedule = Literal["cosine", "plateau"]
 """A cosine to 0 over the training; or halved where the loss falls no more."""
-Precision = Literal["32-true", "bf16-mixed", "16-mixed", "64-true"]
-"""Number formats that Lightning Fabric offers here."""
+Precision = Literal["32-true", "bf16-mixed", "16-mixed"]
+"""Number formats."""
 Accelerator = Literal["auto", "cpu", "cuda"]
 """Where a training can compute."""
 PresetName = Literal["default", "gentle", "spst", "paper", "released"]
@@ -109,7 +109,7 @@ class TrainSettings:
     epochs: int = 200
     """Passes over the source."""
     batch_size: int = 32
-    """Clouds of each labelled set in an optimiser step, over all devices together."""
+    """Clouds of each labelled set in an optimiser step."""
     learning_rate: float = 1e-3
     """Adam's learning rate at the start."""
     schedule: Schedule = "cosine"
@@ -147,17 +147,14 @@ class TrainSettings:
     the heads; edge, group and relation layers and batch statistics run in full precision in all
     networks. A CPU without bf16 units computes bf16-mixed slowly."""
     accelerator: Accelerator = "auto"
-    """Where to compute; auto takes GPUs of CUDA where there are any. Apple's GPUs are left out, as
+    """Where to compute; auto uses a CUDA GPU if there is one. Apple's GPUs are left out, as
     networks need float64, which they lack."""
-    devices: int = 1
-    """GPUs, or CPU processes, of this machine that share each batch. Each normalises its own share
-    (batch normalisation), so that results differ a little between numbers of devices."""
     threads: int | None = None
     """CPU threads. None takes OMP_NUM_THREADS, or all cores. A run keeps its number; results are
     bit-identical for equal numbers."""
 
     def __post_init__(self) -> None:
-        ranges = {"must be above 0": "num_points epochs learning_rate devices clip_norm threads"}
+        ranges = {"must be above 0": "num_points epochs learning_rate clip_norm threads"}
         ranges |= {"must be in 0 to below 1": "label_smoothing holdout"}
         ranges |= {"must be between 0 and 1": "ema_decay"}
         least = "weight_decay jitter_sigma jitter_clip seed validate_every"
@@ -166,9 +163,7 @@ class TrainSettings:
         fault = f"must be at most {MOST_POINTS}; the distances among the points of one cloud alone "
         fault += f"would take {points**2 / 2**28:.3g} GiB"
         _check(self, "num_points", points <= MOST_POINTS, fault)
-        least = 2 * self.devices
-        fault = f"must be at least {least}" + (", 2 a device" if self.devices > 1 else "")
-        _check(self, "batch_size", self.batch_size >= least, fault)
+        _check(self, "batch_size", self.batch_size >= 2, "must be at least 2")
         _check_words(self)
         good = self.rule == "last" or self.validate_every > 0
         _check(self, "validate_every", good, f"leaves no checkpoint for rule = {self.rule!r}")

@@ -27,7 +27,7 @@ from qs3.training.checkpoint import (
     weights_fingerprint,
 )
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, usual_preset
-from qs3.training.distributed import all_devices, make_fabric
+from qs3.training.device import choose_device
 from qs3.training.history import EpochRecord, History
 from qs3.training.job import Job, fresh_model, make_method, run_job
 from qs3.training.loop import EpochCallback
@@ -99,7 +99,7 @@ def fit(
     """Train a network with a method of adaptation, then in rounds of self-training if asked.
 
     Called again with the same arguments it goes on after the last finished epoch, and ends with
-    the same bits as if it had never stopped (same devices, at most two, and number of threads).
+    the same bits as if it had never stopped (on the same device, with as many threads).
 
     Args:
         method: One of `qs3.adaptation.names.MethodName`; ``spst``, ``qbst`` and ``gast-spst`` end
@@ -127,7 +127,7 @@ def fit(
         InputError: where arguments do not go together, points are not finite, or the folder holds
             another run.
         TimeUpError: where the time is up; the same call goes on.
-        QS3Error: where a loss or a gradient is not finite, or the process of another device ended.
+        QS3Error: where a loss or a gradient is not finite.
     """
     base, rounds_settings = _plan(method, self_training)
     needs = rounds_settings is not None or method_class(base).uses_target
@@ -158,7 +158,7 @@ def fit(
     # What cannot be made must not leave a folder behind that refuses the corrected call.
     model = fresh_model(base, settings, len(source.class_names))
     make_method(base, model, settings)
-    make_fabric(settings)
+    choose_device(settings)
     history = History(run_dir)
     wanted = RunSettings.of(method, source, target, settings, rounds_settings, weights)
     with claim_run(run_dir, wanted, partial(choose_threads, settings)) as claimed:
@@ -179,12 +179,9 @@ def fit(
             run_dir,
             warm_up,
         )
-        with (
-            threads(count),
-            all_devices(settings, partial(run_job, job)) as fabric,
-        ):
+        with threads(count):
             hooks = Hooks(history, deadline, on_epoch, on_round)
-            model, epochs, rounds = run_job(job, fabric, hooks)
+            model, epochs, rounds = run_job(job, hooks)
         data = data_fields(prepared, prepared_target, needs)
         if before and not len(source):
             data["source"] = before.source

@@ -27,9 +27,9 @@ class EpochRecord:
     """Share of the labelled clouds, augmented, that the network in training had right; None where
     a method does not call the network on them."""
     samples_per_second: float = 0.0
-    """Labelled clouds a second, over all devices."""
+    """Labelled clouds a second."""
     cpu_seconds: float = 0.0
-    """Processor seconds of the first device's process, all threads together."""
+    """Processor seconds, all threads together."""
     steps: int = 0
     """Optimiser steps."""
 

@@ -1,4 +1,4 @@
-"""The work of a run, the same on each of its devices."""
+"""The work of a run."""
 
 import contextlib
 from dataclasses import dataclass, replace
@@ -6,7 +6,6 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from lightning_fabric import Fabric
 
 from qs3.adaptation import Method, create_method, method_class
 from qs3.adaptation.confidence import measure_known
@@ -82,7 +81,7 @@ def fresh_model(method: str, settings: TrainSettings, count: int) -> PointClassi
 
 
 def run_job(
-    job: Job, fabric: Fabric, hooks: Hooks = NO_HOOKS
+    job: Job, hooks: Hooks = NO_HOOKS
 ) -> tuple[PointClassifier, list[EpochRecord], list[RoundRecord]]:
     """Train the method, then in rounds if asked; go on where an earlier call stopped.
 
@@ -92,7 +91,7 @@ def run_job(
     epochs: list[EpochRecord] = []
     records: list[RoundRecord] = []
     classes = job.source.class_names
-    validation = Validation(job.run_dir, classes, job.holdout, job.settings, fabric)
+    validation = Validation(job.run_dir, classes, job.holdout, job.settings)
 
     def tell_checkpoints() -> None:
         if hooks.history is not None:
@@ -114,7 +113,6 @@ def run_job(
             job.source,
             job.target,
             job.settings,
-            fabric=fabric,
             run_dir=folder,
             stream=(0,),
             observer=partial(validation.after_epoch, stage),
@@ -129,7 +127,7 @@ def run_job(
         tell_checkpoints()
         if job.rounds is None:
             _follow_rule(model, stage, job)
-        _save(folder, model, job, fabric)
+        _save(folder, model, job)
     if job.rounds is not None and job.target is not None:
         if not read_checkpoints(job.run_dir, ROUND):
             look(0, model)  # a rule may find that no round is better
@@ -140,14 +138,13 @@ def run_job(
             target=job.target,
             settings=job.settings,
             rounds=job.rounds,
-            fabric=fabric,
             run_dir=job.run_dir,
             look=look,
             hooks=hooks,
         )
         model, records = run_rounds(model, task)
         _follow_rule(model, ROUND, job)
-        _save(job.run_dir, model, job, fabric)
+        _save(job.run_dir, model, job)
     return model, epochs, records
 
 
@@ -158,16 +155,14 @@ def _follow_rule(model: PointClassifier, stage: str, job: Job) -> None:
         load_checkpoint(job.run_dir, picked, model)
 
 
-def _save(folder: Path, model: PointClassifier, job: Job, fabric: Fabric) -> None:
+def _save(folder: Path, model: PointClassifier, job: Job) -> None:
     known = None
     if job.holdout is not None:
-        size = job.settings.batch_size
-        said = describe(model, job.holdout, batch_size=size, fabric=fabric)
+        how = {"batch_size": job.settings.batch_size, "precision": job.settings.precision}
+        said = describe(model, job.holdout, **how)
         known = measure_known(said.logits, job.holdout.labels)
     elif job.warm_up is not None:
         before = load_model(job.warm_up)
         if weights_fingerprint(before.model) == weights_fingerprint(model):  # no round trained it
             known = before.known
-    if fabric.is_global_zero:
-        save_model(folder, model, job.source.class_names, job.settings, known=known)
-    fabric.barrier()
+    save_model(folder, model, job.source.class_names, job.settings, known=known)

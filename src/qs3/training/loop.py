@@ -5,20 +5,18 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from lightning_fabric import Fabric
 from torch import Tensor, nn
 
 from qs3.adaptation import Method
 from qs3.errors import InputError, QS3Error
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.training.batches import DeviceClouds, Share, count_batches, endless_batches, make_batch
+from qs3.training.batches import DeviceClouds, count_batches, endless_batches, make_batch
 from qs3.training.checkpoint import load_optimiser, optimiser_tensors, seed_sequence
 from qs3.training.config import TrainSettings
-from qs3.training.distributed import make_equal, make_fabric
+from qs3.training.device import autocast, choose_device
 from qs3.training.history import EpochRecord, Log
 from qs3.training.prepared import Prepared, as_prepared, name_few
 from qs3.training.progress import Deadline, Progress, TimeUpError
@@ -32,7 +30,7 @@ EpochCallback = Callable[[EpochRecord, Method], None]
 
 
 Observer = Callable[[Method, int], None]
-"""Looks at the network after each epoch, on every device, before the checkpoint is written."""
+"""Looks at the network after each epoch, before the checkpoint is written."""
 
 
 def train(
@@ -41,7 +39,6 @@ def train(
     target: UnlabelledClouds | Prepared[UnlabelledClouds] | None,
     settings: TrainSettings,
     *,
-    fabric: Fabric | None = None,
     run_dir: Path | None = None,
     stream: tuple[int, ...] = (),
     steps_per_epoch: int | None = None,
@@ -58,7 +55,7 @@ def train(
 
     Order of the clouds, augmentation and dropout are drawn from (seed, stream, epoch), so that a
     training that stops at any moment and is started again ends bit-identically, on the same
-    devices, at most two, with the same number of threads.
+    device with the same number of threads.
 
     Args:
         method: The method with its network; trained in place and left in training mode. With
@@ -68,7 +65,6 @@ def train(
         target: Clouds of the target, likewise; they are not looked at where the method does not
             use them. An epoch is one pass over the source or the target, whichever is longer.
         settings: How to train.
-        fabric: Devices and number format; made from the settings where it is not given.
         run_dir: Folder for the checkpoint; without one there is none. A checkpoint of another
             ``stream`` there is left aside and overwritten.
         stream: Numbers that set the random draws of this training apart from others of this seed.
@@ -77,8 +73,8 @@ def train(
         optimiser_state: Adam's state at the start, in place of zeros.
         observer: Looks at the network after each epoch.
         beside: A module that the observer keeps up to date; it goes into the checkpoint too.
-        on_epoch: Called after each epoch on the first device, when its checkpoint is written.
-        log: Is handed the epochs so far, on the first device.
+        on_epoch: Called after each epoch, when its checkpoint is written.
+        log: Called with the epochs so far.
         deadline: Ends the training before an epoch that would end too late.
         description: Shown beside the progress bar.
 
@@ -86,52 +82,51 @@ def train(
         A record of each epoch, and Adam's state at the end.
 
     Raises:
-        InputError: where there are not two clouds of each set a device, points are not finite, or
-            the target is missing.
+        InputError: if a set has fewer than two clouds, points are not finite, or the target is
+            missing.
         TimeUpError: where the deadline has come.
         QS3Error: where a loss or a gradient is not finite; the last checkpoint stays good.
     """
-    fabric = fabric or make_fabric(settings)
-    share = Share(fabric.global_rank, fabric.world_size)
-    least = 2 * share.world
+    device = choose_device(settings)
     ready = partial(as_prepared, settings=settings)
     sets = [
         ready(clouds)
         for clouds in ([source] if isinstance(source, PointClouds | Prepared) else source)
     ]
     for clouds in sets:
-        if len(clouds) < least:
-            raise InputError(f"{len(clouds)} clouds are too few to train on; give at least {least}")
+        if len(clouds) < 2:
+            raise InputError(f"{len(clouds)} clouds are too few to train on; give at least 2")
     if method.uses_target and (target is None or not len(target)):
         raise InputError(f"{type(method).__name__} needs a target; give unlabelled clouds")
     if not method.uses_target:
         target = None
+    method.to(device)
     optimiser = torch.optim.Adam(
         method.parameter_groups(settings.learning_rate),
         lr=settings.learning_rate,
         weight_decay=settings.weight_decay,
     )
     base_rates = [group["lr"] for group in optimiser.param_groups]
-    wrapped, wrapped_optimiser = fabric.setup(method, optimiser)
+    scaler = torch.GradScaler(device.type, enabled=settings.precision == "16-mixed")
     if optimiser_state:
         load_optimiser(optimiser, optimiser_state)
     average = None if settings.ema_decay is None else make_average(method, settings.ema_decay)
-    state = TrainingState(method, optimiser, average, beside, stream, fabric)
+    state = TrainingState(method, optimiser, average, beside, stream, scaler)
     history = state.resume(run_dir)
     if log is not None:
         log(history)
-    labelled = [DeviceClouds(clouds, fabric.device) for clouds in sets]
-    unlabelled = None if target is None else DeviceClouds(ready(target), fabric.device)
+    labelled = [DeviceClouds(clouds, device) for clouds in sets]
+    unlabelled = None if target is None else DeviceClouds(ready(target), device)
 
     # A target of a single cloud goes in twice, each time with another augmentation.
-    drawn_from = 0 if target is None else max(len(target), least)
+    drawn_from = 0 if target is None else max(len(target), 2)
     steps = steps_per_epoch or max(
-        count_batches(count, settings.batch_size, least) for count in (len(sets[0]), drawn_from)
+        count_batches(count, settings.batch_size) for count in (len(sets[0]), drawn_from)
     )
     total = settings.epochs * steps
-    with Progress(method, fabric, total, len(history) * steps, description) as bar:
+    with Progress(method, total, len(history) * steps, description) as bar:
         for epoch in range(len(history), settings.epochs):
-            _stop_in_time(deadline, fabric, f"{description}, epoch {epoch}")
+            _stop_in_time(deadline, f"{description}, epoch {epoch}")
             bar.begin_epoch()
             if settings.schedule == "plateau":
                 so_far = [sum(record.losses.values()) for record in history]
@@ -142,50 +137,43 @@ def train(
                 group["lr"] = rate * factor
             rng = np.random.default_rng(seed_sequence(settings.seed, *stream, epoch))
             seeds = [int(seed) for seed in rng.integers(2**62, size=3)]
-            # Augmentation is drawn alike on every device, each for the whole batch.
-            augmentation = torch.Generator(fabric.device).manual_seed(seeds[0])
-            generator = torch.Generator().manual_seed(seeds[1] + share.rank)
+            augmentation = torch.Generator(device).manual_seed(seeds[0])
+            generator = torch.Generator().manual_seed(seeds[1])
             orders, others = (
-                [endless_batches(count, settings.batch_size, rng, least) for count in counts]
+                [endless_batches(count, settings.batch_size, rng) for count in counts]
                 for counts in (map(len, sets), [drawn_from] if drawn_from else [])
             )
             method.train()
-            with _seeded(fabric.device, seeds[2] + share.rank):
+            with _seeded(device, seeds[2]):
                 for step in range(steps):
                     rows = [next(order) for order in orders]
-                    batch = make_batch(labelled, rows, settings, augmentation, share)
+                    batch = make_batch(labelled, rows, settings, augmentation)
                     other = [next(order) for order in others]
                     points = None
                     if unlabelled is not None:
                         other = [index % len(unlabelled) for index in other]
-                        points = make_batch(
-                            [unlabelled], other, settings, augmentation, share
-                        ).points
-                    losses = wrapped(batch, points, (epoch * steps + step) / total, generator)
-                    count = sum(map(len, rows))
-                    value = bar.measure(losses, len(batch.labels), count)
+                        points = make_batch([unlabelled], other, settings, augmentation).points
+                    with autocast(device, settings.precision):
+                        losses = method(batch, points, (epoch * steps + step) / total, generator)
+                    value = bar.measure(losses, len(batch.labels))
                     where = f"epoch {epoch}, batch {step}"
                     drawn = list(zip([*labelled, unlabelled], [*rows, *other], strict=False))
                     _require_finite(value, f"{description}: the loss is {value} in {where}", drawn)
-                    # The devices' gradients are averaged: a larger share must weigh more.
-                    weight = len(batch.labels) * share.world / count
-                    loss = torch.stack([term.float() for term in losses.values()]).sum() * weight
-                    wrapped_optimiser.zero_grad()
-                    fabric.backward(loss)
-                    norm = _clip(fabric, wrapped, wrapped_optimiser, settings.clip_norm)
+                    loss = torch.stack([term.float() for term in losses.values()]).sum()
+                    optimiser.zero_grad()
+                    scaler.scale(loss).backward()
+                    norm = _clip(optimiser, scaler, settings.clip_norm)
                     _require_finite(
                         norm, f"{description}: the gradient is {norm} in {where}", drawn
                     )
-                    wrapped_optimiser.step()
+                    scaler.step(optimiser)
+                    scaler.update()
                     method.after_step()
                     if average is not None:
                         average.update_parameters(method)
                     bar.step()
             record = bar.record(epoch, settings.learning_rate * factor)
             history.append(record)
-            make_equal(method.state_dict().values(), fabric)
-            if average is not None:
-                make_equal(average.state_dict().values(), fabric)
             if observer is not None:
                 with averaged(method, average):
                     observer(method, epoch)
@@ -244,30 +232,25 @@ def _seeded(device: torch.device, seed: int) -> Iterator[None]:
         yield
 
 
-def _clip(fabric: Fabric, module: Any, optimiser: Any, norm: float | None) -> float:
-    """Scale the gradient down where asked, and return its length before; the same on all devices.
+def _clip(optimiser: torch.optim.Optimizer, scaler: torch.GradScaler, norm: float | None) -> float:
+    """Scale the gradient down if asked, and return its length before.
 
     A 16-bit scaler skips steps that are not finite by itself: of those 0 is returned.
     """
-    scaled = getattr(fabric.strategy.precision, "scaler", None) is not None
-    if scaled and norm is None:
+    if scaler.is_enabled() and norm is None:
         return 0.0
-    length = fabric.clip_gradients(
-        module, optimiser, max_norm=math.inf if norm is None else norm, error_if_nonfinite=False
-    )
-    assert length is not None  # noqa: S101
-    return 0.0 if scaled else float(length)
+    scaler.unscale_(optimiser)
+    parameters = [value for group in optimiser.param_groups for value in group["params"]]
+    length = nn.utils.clip_grad_norm_(parameters, math.inf if norm is None else norm)
+    return 0.0 if scaler.is_enabled() else float(length)
 
 
-def _stop_in_time(deadline: Deadline | None, fabric: Fabric, where: str) -> None:
-    """Stop all devices where the first one's deadline has come."""
-    passed = torch.tensor(float(deadline is not None and deadline.passed()), device=fabric.device)
-    make_equal([passed], fabric)
-    if passed:
-        minutes = 0.0 if deadline is None else deadline.elapsed() / 60
+def _stop_in_time(deadline: Deadline | None, where: str) -> None:
+    """Stop if the deadline has come."""
+    if deadline is not None and deadline.passed():
         raise TimeUpError(
-            f"stopped after {minutes:.1f} minutes, before {where}, as the next epoch would not end "
-            "in time; run the same again to go on"
+            f"stopped after {deadline.elapsed() / 60:.1f} minutes, before {where}, as the next "
+            "epoch would not end in time; run the same again to go on"
         )
 
 

@@ -1,7 +1,6 @@
 """Class probabilities of clouds."""
 
-from contextlib import nullcontext
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,10 +11,9 @@ from qs3.io.preparation import PAPER, Preparation
 from qs3.models import PointClassifier
 from qs3.models.classifier import evaluating
 from qs3.training.checkpoint import LoadedModel
+from qs3.training.config import Precision
+from qs3.training.device import autocast
 from qs3.training.prepared import Prepared, prepare_clouds, require_finite
-
-if TYPE_CHECKING:
-    from lightning_fabric import Fabric
 
 
 class Description(NamedTuple):
@@ -36,7 +34,6 @@ def predict_probabilities(
     num_points: int | None = None,
     preparation: Preparation | None = None,
     batch_size: int = 32,
-    fabric: "Fabric | None" = None,
 ) -> Float[np.ndarray, "b k"]:
     """Predict the class probabilities of clouds, without augmentation.
 
@@ -48,8 +45,6 @@ def predict_probabilities(
             all.
         preparation: What is done to the clouds; None takes the loaded network's, or the unit ball.
         batch_size: Clouds in a forward pass. It does not change the result but for rounding.
-        fabric: Number format, and devices that share the clouds: all must call, all get the same.
-            Single precision on one device where it is not given.
 
     Returns:
         Softmax in float64; rows sum to 1 to rounding.
@@ -67,7 +62,7 @@ def predict_probabilities(
         num_points, preparation = num_points or model.num_points, preparation or model.preparation
         model = model.model
     prepared = _prepared(points, num_points, preparation)
-    return describe(model, prepared, batch_size=batch_size, fabric=fabric).probabilities
+    return describe(model, prepared, batch_size=batch_size).probabilities
 
 
 def ask(loaded: LoadedModel, points: Float[np.ndarray, "b n 3"]) -> Description:
@@ -93,7 +88,7 @@ def describe(
     points: Float[np.ndarray, "b n 3"] | Prepared,
     *,
     batch_size: int = 32,
-    fabric: "Fabric | None" = None,
+    precision: Precision = "32-true",
 ) -> Description:
     """Return class probabilities, pooled features and logits of clouds, without augmentation.
 
@@ -101,29 +96,22 @@ def describe(
         model: The network; its mode is put back afterwards, its device stays.
         points: Clouds, prepared.
         batch_size: Clouds in a forward pass.
-        fabric: As in `predict_probabilities`.
+        precision: Number format.
     """
     parameter = next(model.parameters())
-    context = nullcontext if fabric is None else fabric.autocast
-    rank, world = (0, 1) if fabric is None else (fabric.global_rank, fabric.world_size)
-    mine = slice(rank * len(points) // world, (rank + 1) * len(points) // world)
     answers: list[np.ndarray] = []
     with evaluating(model):
-        # A lone point tells the widths where this device has no cloud.
+        # A single point gives the widths, if there is no cloud.
         example = torch.zeros(1, 1, 3).to(parameter)
         encoded = model.encode(example)
         classes, width = model.head(encoded).shape[1], encoded.pooled.shape[1]
-        for start in range(mine.start, mine.stop, batch_size):
-            batch = torch.from_numpy(points[start : min(start + batch_size, mine.stop)])
-            with context():
+        for start in range(0, len(points), batch_size):
+            batch = torch.from_numpy(points[start : start + batch_size])
+            with autocast(parameter.device, precision):
                 encoded = model.encode(batch.to(parameter.device, parameter.dtype))
                 logits = model.head(encoded)
             logits = logits.double()
             parts = (torch.softmax(logits, dim=1), encoded.pooled.double(), logits)
             answers.append(torch.cat(parts, dim=1).cpu().numpy())
     rows = np.concatenate([np.zeros((0, 2 * classes + width)), *answers])
-    if fabric is not None:
-        from qs3.training.distributed import gather_rows  # slow to load, and for devices alone
-
-        rows = gather_rows(rows, mine, len(points), fabric)
     return Description(*np.split(rows, [classes, classes + width], axis=1))

@@ -6,7 +6,6 @@ import sys
 import time
 
 import torch
-from lightning_fabric import Fabric
 from torch import Tensor
 from tqdm import tqdm
 
@@ -20,20 +19,15 @@ _FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{rem
 class Progress:
     """Shows loss, accuracy, samples/s and time left, and sums them up over an epoch.
 
-    Losses and accuracy are those of the whole batch, over all devices.
-
     Args:
         method: Tells how many labelled clouds it had right (`Method.classification`).
-        fabric: The devices; only the first one shows a bar.
         total: Steps in all.
         done: Steps of earlier calls.
         description: Shown at the left.
     """
 
-    def __init__(
-        self, method: Method, fabric: Fabric, total: int, done: int, description: str
-    ) -> None:
-        self.fabric, self.method = fabric, method
+    def __init__(self, method: Method, total: int, done: int, description: str) -> None:
+        self.method = method
         self.start, self.clouds = time.perf_counter(), 0
         self.bar = tqdm(
             total=total,
@@ -41,7 +35,7 @@ class Progress:
             desc=description,
             bar_format=_FORMAT,
             # TQDM_DISABLE is set where several runs share a terminal.
-            disable=not fabric.is_global_zero or "TQDM_DISABLE" in os.environ,
+            disable="TQDM_DISABLE" in os.environ,
             mininterval=0.5 if sys.stderr.isatty() else 30.0,
         )
         self.begin_epoch()
@@ -59,27 +53,24 @@ class Progress:
         self.steps = self.seen = 0
         self.hits: float | None = 0.0
 
-    def measure(self, losses: dict[str, Tensor], mine: int, clouds: int) -> float:
-        """Sum up one step over all devices, and return its whole loss.
+    def measure(self, losses: dict[str, Tensor], clouds: int) -> float:
+        """Sum up one step, and return its whole loss.
 
         Args:
-            losses: This device's losses.
-            mine: Labelled clouds of the step, on this device.
-            clouds: Those over all devices.
+            losses: Losses of the step.
+            clouds: Number of its labelled clouds.
         """
-        values = [term.detach().float() * mine for term in losses.values()]
+        values = [term.detach().float() for term in losses.values()]
         right = self.method.right
-        right = torch.full_like(values[0], torch.nan) if right is None else right
-        sums = self.fabric.all_reduce(torch.stack([*values, right.to(values[0])]), reduce_op="sum")
-        assert isinstance(sums, Tensor)  # noqa: S101
-        *terms, hits = sums.tolist()
+        values.append(torch.full_like(values[0], torch.nan) if right is None else right.float())
+        *terms, hits = torch.stack(values).tolist()
         for name, value in zip(losses, terms, strict=True):
-            self.sums[name] = self.sums.get(name, 0.0) + value / clouds
+            self.sums[name] = self.sums.get(name, 0.0) + value
         self.steps += 1
         self.seen += clouds
         self.clouds += clouds
         self.hits = None if self.hits is None or hits != hits else self.hits + hits
-        return sum(terms) / clouds
+        return sum(terms)
 
     def step(self) -> None:
         """Move the bar."""

@@ -10,10 +10,10 @@ from qs3.training.rounds import Rounds, Task
 
 
 def ask_teacher(state: Rounds, task: Task) -> Float[np.ndarray, "m k"]:
-    """Return the teacher's class probabilities of the target; all devices must call."""
+    """Return the teacher's class probabilities of the target."""
     teacher = state.latest if task.rounds.teacher == "latest" else state.teacher.model
-    size = task.settings.batch_size
-    return describe(teacher, task.target, batch_size=size, fabric=task.fabric).probabilities
+    how = {"batch_size": task.settings.batch_size, "precision": task.settings.precision}
+    return describe(teacher, task.target, **how).probabilities
 
 
 def round_threshold(

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from lightning_fabric import Fabric
 from torch import Tensor, nn
 
 from qs3.errors import InputError
@@ -24,6 +23,7 @@ from qs3.training.checkpoint import (
     write_tensors,
 )
 from qs3.training.config import SelfTrainingSettings, TrainSettings
+from qs3.training.device import choose_device
 from qs3.training.history import History, Log
 from qs3.training.loop import EpochCallback
 from qs3.training.overlap import checksums
@@ -50,8 +50,8 @@ class RoundRecord:
     agreement: float | None
     """Share of the target whose pseudo label is that of the round before; None in round 1."""
     skipped: bool
-    """Whether too few clouds were kept to train on (fewer than 2 a class or 2 a device, without
-    those held out), so that the network stayed as it was."""
+    """Whether too few clouds were kept to train on (fewer than 2 a class, without those held out),
+    so that the network stayed as it was."""
     single_class: bool
     """Whether all confident clouds had one class."""
     held_out: float | None
@@ -65,7 +65,7 @@ class RoundRecord:
     learning_rates: tuple[float, ...] = ()
     """Adam's learning rate in each epoch."""
     cpu_seconds: float = 0.0
-    """As ``seconds``, of the first device's processor."""
+    """As ``seconds``, of the processor."""
     steps: int = 0
     """Optimiser steps."""
 
@@ -73,14 +73,14 @@ class RoundRecord:
 RoundCallback = Callable[[RoundRecord, PointClassifier], None]
 """Called after each round, when its state is written."""
 Look = Callable[[int, PointClassifier], None]
-"""Called on every device after each round, before its state is written."""
+"""Called after each round, before its state is written."""
 Select = Callable[[Float[np.ndarray, "m k"], float], Bool[np.ndarray, "m"]]
 """A rule that selects among clouds by their probabilities and θ."""
 
 
 @dataclass(frozen=True)
 class Hooks:
-    """Who is told of a run, and when it has to end; on the first device alone."""
+    """Who is told of a run, and when it has to end."""
 
     history: History | None = None
     """Is told of epochs, checkpoints and rounds."""
@@ -97,7 +97,6 @@ class Hooks:
 
 
 NO_HOOKS = Hooks()
-"""Of the other devices."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,8 +111,6 @@ class Task:
     """How a round trains."""
     rounds: SelfTrainingSettings
     """How it labels and selects."""
-    fabric: Fabric
-    """Devices and number format; all devices do the rounds."""
     select: Select | None = None
     """Selection rule, in place of the one of the settings."""
     run_dir: Path | None = None
@@ -163,16 +160,15 @@ class Rounds:
 
 def begin_rounds(model: PointClassifier, task: Task) -> Rounds:
     """Return the state before the first round, or after the last one that was written."""
-    latest = copy.deepcopy(model)
+    device, latest = choose_device(task.settings), copy.deepcopy(model)
     teacher = Teacher(latest)
     for network in (latest, teacher):
-        task.fabric.to_device(network)
+        network.to(device)
     index = np.arange(len(task.target))
     pool = index[index % 10 < 8] if task.rounds.pool == "split" else index
     state = Rounds(latest, teacher, pool)
     if task.run_dir is not None and (task.run_dir / STATE).is_file():
         _read(task.run_dir / STATE, state)
-    task.fabric.barrier()  # the first device must not write before all have read
     return state
 
 
@@ -229,9 +225,9 @@ def kept_clouds(run_dir: Path) -> tuple[list[str], list[Int[np.ndarray, "2 c"]]]
     return clouds, rounds
 
 
-def least_clouds(classes: int, devices: int = 1) -> int:
-    """Return how many clouds a round needs to train on: two a class, and two a device."""
-    return 2 * max(classes, devices)
+def least_clouds(classes: int) -> int:
+    """Return how many clouds a round needs to train on: two a class."""
+    return 2 * classes
 
 
 def remarks(

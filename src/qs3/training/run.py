@@ -47,12 +47,11 @@ class Run:
     seconds: Mapping[str, float]
     """Wall-clock seconds: ``source``, ``rounds``, ``total``."""
     cpu_seconds: Mapping[str, float] = field(default_factory=dict)
-    """Processor seconds of the first device's process, likewise; beside them those of a given
-    ``warm-up``, where they are known. Empty in earlier releases."""
+    """Processor seconds, likewise; beside them those of a given ``warm-up``, if they are known."""
     steps: Mapping[str, int] = field(default_factory=dict)
     """Optimiser steps, likewise."""
     threads: int | None = None
-    """CPU threads of each process, in the call that ended the run; None where it is not known."""
+    """CPU threads in the call that ended the run; None if unknown."""
     chosen: Mapping[str, str | int] | None = None
     """Checkpoint that the rule chose: its ``stage`` and ``number``; None in earlier releases."""
     preset: str | None = None
@@ -88,7 +87,7 @@ class RunSettings:
     warm_up: str | None = None
     """That of the weights that the run starts from."""
     threads: int | None = None
-    """CPU threads of each process; None in runs of earlier releases."""
+    """CPU threads."""
 
     @classmethod
     def of(
@@ -153,12 +152,12 @@ def read_settings(folder: Path) -> dict[str, Any]:
 
 
 def train_settings(run: Path) -> TrainSettings:
-    """Read how a run was trained, without what fits its machine alone: threads, devices, format.
+    """Read how a run was trained, without what fits its machine alone: threads, device, format.
 
     Raises:
         InputError: where its ``settings.json`` is missing, or is none.
     """
-    machine = ("threads", "devices", "accelerator", "precision")
+    machine = ("threads", "accelerator", "precision")
     default = TrainSettings()
     train = _settings(find_run(run) / SETTINGS).train
     return replace(train, **{name: getattr(default, name) for name in machine})

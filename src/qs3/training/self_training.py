@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool
-from lightning_fabric import Fabric
 
 from qs3.adaptation import Method, PseudoLabelled
 from qs3.adaptation.selection import select_confident
@@ -19,7 +18,6 @@ from qs3.models import PointClassifier
 from qs3.training.batches import require_unlabelled
 from qs3.training.checkpoint import derived_seed, new_model, save_model, weights_fingerprint
 from qs3.training.config import SelfTrainingSettings, TrainSettings
-from qs3.training.distributed import make_fabric
 from qs3.training.history import EpochRecord
 from qs3.training.loop import EpochCallback, train
 from qs3.training.overlap import data_fields
@@ -55,7 +53,6 @@ def self_train(
     self_training: SelfTrainingSettings,
     *,
     select: Select | None = None,
-    fabric: Fabric | None = None,
     run_dir: Path | None = None,
     on_round: RoundCallback | None = None,
     on_epoch: EpochCallback | None = None,
@@ -73,7 +70,6 @@ def self_train(
         settings: Network, batch size, rate, augmentation, seed. Its epochs are not used.
         self_training: Settings of the rounds.
         select: Selection rule, in place of the one of the settings.
-        fabric: Device and number format; made from the settings where it is not given.
         run_dir: Folder of a run, from which a call that was killed goes on after its last epoch,
             and which `qs3.training.evaluate` takes.
         on_round: Called after each round.
@@ -88,14 +84,12 @@ def self_train(
     """
     source, target = as_prepared(source, settings), as_prepared(target, settings)
     require_unlabelled(target.clouds)
-    fabric = fabric or make_fabric(settings)
     run_dir = None if run_dir is None else Path(run_dir)
     task = Task(
         source=source,
         target=target,
         settings=settings,
         rounds=self_training,
-        fabric=fabric,
         select=select,
         run_dir=run_dir,
         hooks=Hooks(on_epoch=on_epoch, on_round=on_round),
@@ -126,7 +120,7 @@ def self_train(
 
 
 def run_rounds(model: PointClassifier, task: Task) -> tuple[PointClassifier, list[RoundRecord]]:
-    """Do the rounds of `self_train` on each device; go on after the last one that is finished."""
+    """Do the rounds of `self_train`; go on after the last one that is finished."""
     source, target, rounds = task.source, task.target, task.rounds
     if not len(target):
         raise InputError("the target has no cloud; give unlabelled clouds")
@@ -152,7 +146,7 @@ def run_rounds(model: PointClassifier, task: Task) -> tuple[PointClassifier, lis
         pseudo = label_clouds(target, chosen, labels[chosen], source.class_names)
         apart = (np.arange(len(chosen)) % 10 >= 8) & (rounds.teacher == "best")
         count = len(chosen) - int(apart.sum())
-        skipped = _too_few(number, count, classes, task.settings.devices)
+        skipped = _too_few(number, count, classes)
         epochs = []
         if not skipped:
             epochs = _train_round(state, task, number, pseudo, apart)
@@ -189,23 +183,22 @@ def _finish_round(state: Rounds, task: Task) -> None:
     record = state.records[-1]
     if task.look is not None:
         task.look(record.round, state.latest)
-    if task.run_dir is not None and task.fabric.is_global_zero:
+    if task.run_dir is not None:
         write_rounds(task, state)
         (task.run_dir / CHECKPOINT).unlink(missing_ok=True)
-    task.fabric.barrier()
     if task.hooks.history is not None:
         task.hooks.history.put("round", state.records)
     if task.hooks.on_round is not None:
         task.hooks.on_round(record, state.latest)
 
 
-def _too_few(number: int, count: int, classes: int, devices: int) -> bool:
-    least = least_clouds(classes, devices)
+def _too_few(number: int, count: int, classes: int) -> bool:
+    least = least_clouds(classes)
     if count < least:
         _LOG.warning(
-            "round %d: %d clouds to train on, fewer than %d (2 for each of %d classes and %d "
-            "devices); the network stays as it was",
-            *(number, count, least, classes, devices),
+            "round %d: %d clouds to train on, fewer than %d (2 for each of %d classes); the "
+            "network stays as it was",
+            *(number, count, least, classes),
         )
     return count < least
 
@@ -243,8 +236,8 @@ def _train_round(
         if rounds.teacher == "average":
             follow(teacher.model, method.model, rounds.teacher_decay)
         elif rounds.teacher == "best" and len(judges):
-            size, fabric = settings.batch_size, task.fabric
-            said = describe(method.model, judges, batch_size=size, fabric=fabric)
+            how = {"batch_size": settings.batch_size, "precision": settings.precision}
+            said = describe(method.model, judges, **how)
             score = accuracy(judges.labels, said.probabilities.argmax(axis=1))
             if score > teacher.score:
                 teacher.score.fill_(score)
@@ -255,7 +248,6 @@ def _train_round(
         [kept, task.source] if rounds.source_loss else kept,
         None,
         replace(settings, epochs=rounds.epochs, schedule="cosine"),
-        fabric=task.fabric,
         run_dir=task.run_dir,
         stream=(STREAM, number),
         first_epoch=first if continuous else 0,

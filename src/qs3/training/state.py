@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning_fabric import Fabric
 from torch import nn
 from torch.optim.swa_utils import AveragedModel
 
@@ -103,12 +102,12 @@ class TrainingState:
     """A network that is kept beside the method's."""
     stream: tuple[int, ...]
     """Numbers of this training's random draws; a checkpoint of another stream is not for it."""
-    fabric: Fabric
-    """The devices: the first one writes, all read."""
+    scaler: torch.GradScaler
+    """Scale of the loss in 16-mixed; not enabled in other number formats."""
 
     def write(self, folder: Path | None, history: list[EpochRecord]) -> None:
         """Write the checkpoint into a run's folder, after an epoch; without one do nothing."""
-        if folder is None or not self.fabric.is_global_zero:
+        if folder is None:
             return
         tensors = prefixed("method", self.method.state_dict())
         tensors |= prefixed("optimiser", optimiser_tensors(self.optimiser))
@@ -117,7 +116,7 @@ class TrainingState:
         facts = {
             "stream": list(self.stream),
             "history": [asdict(record) for record in history],
-            "scale": self.fabric.strategy.precision.state_dict(),
+            "scale": self.scaler.state_dict(),
         }
         write_tensors(Path(folder) / CHECKPOINT, tensors, facts)
 
@@ -128,9 +127,7 @@ class TrainingState:
             InputError: where the file is damaged or belongs to another network.
         """
         path = None if folder is None else Path(folder) / CHECKPOINT
-        history = [] if path is None or not path.is_file() else self._read(path)
-        self.fabric.barrier()  # the first device must not write before all have read
-        return history
+        return [] if path is None or not path.is_file() else self._read(path)
 
     def _read(self, path: Path) -> list[EpochRecord]:
         tensors, facts = read_tensors(path)
@@ -142,7 +139,7 @@ class TrainingState:
             load_optimiser(self.optimiser, without_prefix("optimiser", tensors))
             for name, module in self._further().items():
                 load_tensors_into(module, without_prefix(name, tensors), path)
-            self.fabric.strategy.precision.load_state_dict(facts["scale"])
+            self.scaler.load_state_dict(facts["scale"])
         except (KeyError, TypeError) as error:
             raise InputError(f"{path}: not a checkpoint of this version; delete it") from error
         return history

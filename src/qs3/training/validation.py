@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Int
-from lightning_fabric import Fabric
 
 from qs3.adaptation import Method
 from qs3.adaptation.names import Rule
@@ -23,6 +22,7 @@ from qs3.training.checkpoint import (
     seed_sequence,
 )
 from qs3.training.config import TrainSettings
+from qs3.training.device import choose_device
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared
 
@@ -53,7 +53,6 @@ class Validation:
         class_names: Classes of the network.
         holdout: Held-out part of the source; None if there is none.
         settings: How often to write a checkpoint.
-        fabric: The devices; all must call.
     """
 
     def __init__(
@@ -62,9 +61,8 @@ class Validation:
         class_names: Sequence[str],
         holdout: Prepared[PointClouds] | None,
         settings: TrainSettings,
-        fabric: Fabric,
     ) -> None:
-        self.run_dir, self.settings, self.fabric = Path(run_dir), settings, fabric
+        self.run_dir, self.settings = Path(run_dir), settings
         self.class_names, self.holdout = tuple(class_names), holdout
 
     def after_epoch(self, stage: str, method: Method, epoch: int) -> None:
@@ -78,19 +76,17 @@ class Validation:
         if not self.settings.validate_every:
             return
         model = copy.deepcopy(model)  # what follows goes on from its own statistics
-        self.fabric.to_device(model)
+        model.to(choose_device(self.settings))
         right = self._source_accuracy(model)
-        if self.fabric.is_global_zero:
-            facts = {"stage": stage, "number": number, "source_accuracy": right}
-            name = f"{CHECKPOINTS}/{stage}-{number:04d}.safetensors"
-            save_model(self.run_dir, model, self.class_names, self.settings, name=name, facts=facts)
-        self.fabric.barrier()
+        facts = {"stage": stage, "number": number, "source_accuracy": right}
+        name = f"{CHECKPOINTS}/{stage}-{number:04d}.safetensors"
+        save_model(self.run_dir, model, self.class_names, self.settings, name=name, facts=facts)
 
     def _source_accuracy(self, model: PointClassifier) -> float | None:
         if self.holdout is None or not len(self.holdout):
             return None
-        size = self.settings.batch_size
-        answers = describe(model, self.holdout, batch_size=size, fabric=self.fabric)
+        how = {"batch_size": self.settings.batch_size, "precision": self.settings.precision}
+        answers = describe(model, self.holdout, **how)
         return accuracy(self.holdout.labels, answers.probabilities.argmax(axis=1))
 
 
