@@ -23,7 +23,8 @@ def network(tmp_path_factory):
     folder = tmp_path_factory.mktemp("network")
     torch.manual_seed(0)
     model = create_model("pointnet", 3, **SETTINGS.model_settings).eval()
-    save_model(folder, model, ("bed", "lamp", "sofa"), SETTINGS)
+    settings = dataclasses.replace(SETTINGS, preparation=ROBUST)
+    save_model(folder, model, ("bed", "lamp", "sofa"), settings)
     return folder, model
 
 
@@ -32,31 +33,26 @@ def test_export_writes_a_file_that_answers_as_the_run(qs3, network, tmp_path):
 
     folder, model = network
     out = tmp_path / "new" / "shapes.onnx"
-    done = qs3("export", folder, "--to", "onnx", "--out", out)
+    done = qs3("export", folder, "--out", out)
     assert done.stdout.splitlines() == [str(out)]
-    assert len(done.stderr.splitlines()) == 1
-    assert "on 28 random clouds" in done.stderr
-    points = np.random.default_rng(0).normal(size=(2, 77, 3)).astype(np.float32)
+    first, second = done.stderr.splitlines()
+    assert "on 16 random clouds" in first
+    assert "resample(cloud[distinct_inliers(cloud, True, 4096)], 32)" in second
+    points = np.random.default_rng(0).normal(size=(2, 32, 3)).astype(np.float32)
     session = onnxruntime.InferenceSession(out, providers=["CPUExecutionProvider"])
     (found,) = session.run(None, {"points": points})
-    wanted = predict_probabilities(model, points, num_points=32)
+    how = dataclasses.replace(ROBUST, remove_outliers=False, redraw=False)
+    wanted = predict_probabilities(model, points, preparation=how)
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-5)
 
 
-def test_export_tells_what_has_to_go_before(qs3, network, tmp_path):
-    settings = dataclasses.replace(SETTINGS, preparation=ROBUST)
-    save_model(tmp_path, network[1], ("bed", "lamp", "sofa"), settings)
-    done = qs3("export", tmp_path, "--to", "torch-export")
-    assert "distinct_inliers(cloud, True, 4096)" in done.stderr.splitlines()[-1]
-
-
 def test_export_keeps_what_it_did_not_write(qs3, network, tmp_path):
-    other = tmp_path / "other.pt2"
+    other = tmp_path / "other.onnx"
     other.write_text("precious")
-    line = qs3.refuses("export", network[0], "--to", "torch-export", "--out", other)
-    assert "other.pt2: holds something else" in line
+    line = qs3.refuses("export", network[0], "--out", other)
+    assert "other.onnx: is not an export of qs3" in line
     assert other.read_text() == "precious"
 
 
 def test_export_names_what_is_no_run(qs3, tmp_path):
-    assert "no model.safetensors here" in qs3.refuses("export", tmp_path, "--to", "onnx")
+    assert "no model.safetensors here" in qs3.refuses("export", tmp_path)

@@ -24,7 +24,7 @@ VERBS = {
     "evaluate": "Score a run: accuracy, class-mean accuracy, confusion matrix.",
     "predict": "Tell the class of each file and how confident the network is.",
     "watch": "Print the objects before a depth camera, frame by frame.",
-    "export": "Export a network as ONNX or for PyTorch.",
+    "export": "Export a network as ONNX.",
     "reproduce": "Make tables and figures anew, with their data and trainings.",
     "table": "Print a table, ours beside the published figures, from records alone.",
     "figure": "Draw the figure of a table from records alone.",

@@ -1,41 +1,36 @@
-"""``qs3 export``: a trained network for use without qs3."""
+"""``qs3 export``: a trained network as ONNX."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
 from qs3.cli.text import show, tell
 
 
-def export(
-    run: Annotated[Path, tyro.conf.Positional],
-    to: Literal["onnx", "torch-export"],
-    out: Path | None = None,
-) -> int:
-    """Export a network as ONNX or for PyTorch.
+def export(run: Annotated[Path, tyro.conf.Positional], out: Path | None = None) -> int:
+    """Export a network as ONNX.
 
-    It takes points of any number, with the run's pre-processing inside, and gives probabilities;
-    the file is compared with the run first. It tells what is to be done to a cloud before.
+    The file takes clouds of a fixed number of points and returns probabilities. It is compared with
+    PyTorch before it is written.
 
     Args:
         run: Folder of a run, its model.safetensors, or a network that comes with qs3: rooms.
-        to: onnx, which many programs run; or torch-export, which PyTorch runs without qs3.
-        out: The file; model.onnx or model.pt2 in the run by default.
+        out: The file; model.onnx in the run by default.
     """
-    from qs3.training.export import ROUNDING, export_run
+    from qs3.training.export import CLOUDS, export_run
 
-    done = export_run(run, to, out)
+    done = export_run(run, out)
     show(done.path)
     tell(
-        f"{done.path.stat().st_size / 1e6:.1f} MB in {done.seconds:.0f} s; on {done.clouds} random "
-        f"clouds its probabilities differ from the run's by at most {done.difference:.1e}, "
-        f"on {done.strays} by more than {ROUNDING:.0e}"
+        f"{done.path.stat().st_size / 1e6:.1f} MB in {done.seconds:.0f} s; on {CLOUDS} random "
+        f"clouds its probabilities differ from PyTorch's by at most {done.difference:.1e}"
     )
-    if done.expects["distinct"]:
-        outliers, most = done.expects["outliers_removed"], done.expects["most"]
-        tell(
-            "before the file gets a cloud: cloud = cloud[qs3.io.preparation.distinct_inliers("
-            f"cloud, {outliers}, {most})]; without it answers differ from qs3 predict"
-        )
+    cloud, expects = "cloud", done.expects
+    if expects["distinct"]:
+        cloud += f"[distinct_inliers(cloud, {expects['outliers_removed']}, {expects['most']})]"
+    tell(
+        "prepare each cloud by the functions of qs3.io.preparation first: "
+        f"resample({cloud}, {expects['points']})"
+    )
     return 0
