@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from qs3.sensor.scan import Scan as Scan
     from qs3.sensor.scan import scan as scan
     from qs3.training.adapt import adapt as adapt
-    from qs3.training.estimators import load as load
+    from qs3.training.classifier import Classifier as Classifier
+    from qs3.training.classifier import load as load
 
 # OpenMP's threads, which PyTorch loads with, spin while they wait for one another. Beside another
 # busy program the wait is long, and training keeps a quarter of its rate or less; brief spinning
@@ -32,7 +33,8 @@ _LAZY = {
     "StereoRig": "qs3.sensor.rig",
     "Scan": "qs3.sensor.scan",
     "scan": "qs3.sensor.scan",
-    "load": "qs3.training.estimators",
+    "Classifier": "qs3.training.classifier",
+    "load": "qs3.training.classifier",
 }
 
 

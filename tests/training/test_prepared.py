@@ -12,7 +12,6 @@ from qs3.io.clouds import PointClouds
 from qs3.io.preparation import PAPER, ROBUST, Preparation, distinct_inliers, normalise, resample
 from qs3.structure import structure
 from qs3.training import (
-    QBST,
     TrainSettings,
     evaluate,
     fit,
@@ -192,23 +191,10 @@ def test_a_warm_up_of_another_preparation_is_refused(run, source, target, settin
             run_dir=tmp_path / "run", warm_up=run)  # fmt: skip
 
 
-@pytest.mark.filterwarnings("ignore::qs3.adaptation.SingleClassWarning")
-def test_one_place_tells_the_default(source, target, settings):
+def test_a_preset_sets_the_preparation():
     assert TrainSettings().preparation == PAPER
     assert preparation_of("paper") == preparation_of("released") == PAPER
     assert preparation_of(None) == preparation_of("default") == preparation_of("spst") == ROBUST
-    train = {"model_settings": settings.model_settings, "num_points": 40, "epochs": 1,
-             "batch_size": 8, "accelerator": "cpu", "threads": 1}  # fmt: skip
-    rounds = {"rounds": 1, "epochs": 1}
-    made = QBST("pointnet", train=train, self_training=rounds).fit(source, target.without_labels())
-    assert made.result_.source.preparation == ROBUST
-    train |= {"preparation": {"redraw": False, "size_input": True}}
-    made = QBST("pointnet", train=train, self_training=rounds).fit(source, target.without_labels())
-    assert made.result_.source.preparation == Preparation(True, 0.95, False, True)
-    wanted = predict_probabilities(
-        made.model_, target.points, num_points=40, preparation=made.result_.source.preparation
-    )
-    assert np.array_equal(made.predict_proba(target), wanted)
 
 
 def test_weights_tell_their_preparation(run, tmp_path):

@@ -86,7 +86,7 @@ def test_load_takes_clouds_of_every_form(tmp_path):
     network = qs3.load("rooms")
     names = network.predict(CLOUDS)
     assert names.shape == (6,)
-    assert set(names) <= set(network.classes_)
+    assert set(names) <= set(network.class_names)
     assert network.predict(CLOUDS[0]).tolist() == [names[0]]
     shares = network.predict_proba([CLOUDS[0], CLOUDS[1, :100]])
     assert shares.shape == (2, 10)

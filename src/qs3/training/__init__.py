@@ -15,14 +15,12 @@ if TYPE_CHECKING:
     from qs3.training.checkpoint import LoadedModel as LoadedModel
     from qs3.training.checkpoint import load_model as load_model
     from qs3.training.checkpoint import save_model as save_model
+    from qs3.training.classifier import Classifier as Classifier
     from qs3.training.config import PRESETS as PRESETS
     from qs3.training.config import Augmentation as Augmentation
     from qs3.training.config import SelfTrainingSettings as SelfTrainingSettings
     from qs3.training.config import TrainSettings as TrainSettings
     from qs3.training.config import self_training_preset as self_training_preset
-    from qs3.training.estimators import QBST as QBST
-    from qs3.training.estimators import SPST as SPST
-    from qs3.training.estimators import Adapter as Adapter
     from qs3.training.evaluate import evaluate as evaluate
     from qs3.training.evaluate import records_path as records_path
     from qs3.training.fit import FitResult as FitResult

@@ -22,11 +22,16 @@ from qs3.meshes import collect
 from qs3.meshes.classes import canonical
 from qs3.meshes.sizes import CLASS_SIZES, Unit
 from qs3.processors import usable_processors
-from qs3.structure import unstructure
 from qs3.training.batches import load_whole
 from qs3.training.checkpoint import load_model
-from qs3.training.config import TrainSettings, changed
-from qs3.training.estimators import Adapter, Clouds, load, read_paths, rounds_of
+from qs3.training.classifier import Classifier, Clouds, read_paths
+from qs3.training.config import (
+    PRESETS,
+    SelfTrainingSettings,
+    TrainSettings,
+    changed,
+    usual_preset,
+)
 from qs3.training.fit import fit
 from qs3.training.rounds import remarks
 from qs3.training.run import train_settings
@@ -55,7 +60,7 @@ def adapt(
     warm_up: str | Path | None = None,
     workers: int | None = None,
     seed: int = 0,
-) -> Adapter:
+) -> Classifier:
     """Make a classifier for a depth camera from CAD models and scans without labels.
 
     The models are scanned as ``qs3 generate --recipe rooms --views 1`` does, in sizes of their
@@ -74,13 +79,14 @@ def adapt(
         out: Folder for the data set (``source``) and the run (``run``).
         units: Unit of the mesh files, m, cm, mm or in: the objects get the sizes in them, whatever
             their class. None takes the above, and a file's unit for what it tells or looks to be.
-        method: As in `Adapter`.
+        method: One of `qs3.adaptation.names.MethodName`.
         scan: Settings of `qs3.store.generate.GenerateSettings` that differ from those above, such
             as ``{"sensor": "mine.toml"}`` for a camera of your own, or ``{"randomise": ["rooms",
             "room.distance=0.3:1"]}`` for small parts seen from near.
         train: Settings of `TrainSettings` that differ from those of ``rooms``; with ``rule`` "last"
             the last round is kept.
-        self_training: Settings of the rounds that differ.
+        self_training: Settings of the rounds that differ; ``{}`` adds rounds to a method that has
+            none.
         warm_up: Run to adapt, or the name of a network that comes with qs3; None trains one.
             ``train`` then changes the settings of that run, and its rule chooses among the rounds.
         workers: Processes that scan; None takes one a core, 0 scans in this one.
@@ -89,56 +95,59 @@ def adapt(
     Raises:
         InputError: where something cannot be read, or settings do not go together.
     """
+    given = dict(train or {})
     for name in ("model", "seed"):
-        if name in (train or {}):
-            raise InputError(f"{name} cannot be given in train here; use qs3.training.Adapter")
-    # What is wrong with these is told before a mesh is scanned.
+        if name in given:
+            raise InputError(f"{name} cannot be given in train here; use qs3.training.fit")
+    # Faults of the settings are raised before a mesh is scanned.
     base, rule = split_method(method)
     method_class(base)
-    changed(TrainSettings(), train or {}, " in train")
-    rounds = rounds_of(self_training or {}, rule)
+    changed(TrainSettings(), given, " in train")
+    rounds = None
+    if rule is not None or self_training is not None:
+        rounds = _rounds(self_training or {}, rule)
     seed = operator.index(seed)
     begun = None if warm_up is None else load_model(Path(warm_up))
     target = _target(scans)
     source = _source(cad, Path(out) / "source", units, scan or {}, workers, seed)
-    if warm_up is not None and begun is not None:
+    if begun is None or warm_up is None:
+        settings = _settings_like_rooms(source, given, seed)
+    else:
         source = relabel(source, begun.class_names, None, "source")
-        own = changed(replace(train_settings(Path(warm_up)), seed=seed), train or {}, " in train")
-        with warnings.catch_warnings():  # `remarks` names them
-            warnings.simplefilter("ignore", SingleClassWarning)
-            done = fit(method, source, target, own, rounds, run_dir=Path(out) / "run",
-                       warm_up=find_run(warm_up))  # fmt: skip
+        own = replace(train_settings(Path(warm_up)), seed=seed)
+        settings = changed(own, given, " in train")
+    with warnings.catch_warnings():  # `remarks` names them
+        warnings.simplefilter("ignore", SingleClassWarning)
+        before = None if warm_up is None else find_run(warm_up)
+        done = fit(
+            method, source, target, settings, rounds, run_dir=Path(out) / "run", warm_up=before
+        )
+    if rounds is not None:
         for line in remarks(done.rounds, rounds, source.class_names, "threshold_share"):
             _LOG.warning(line)
-        return load(Path(out) / "run")
-    settings = unstructure(train_settings(_LIKE))
-    batches = max(1, len(source) // settings["batch_size"])
-    settings |= {"epochs": max(1, round(_STEPS / batches))} | dict(train or {})
-    # By the source alone, as long as a class has enough clouds for a part to be held out.
-    held = held_out(source, TrainSettings(holdout=settings["holdout"]))
-    if "rule" not in (train or {}):
-        if held.any():
-            settings["rule"] = "source-val"
+    return Classifier.load(Path(out) / "run")
+
+
+def _settings_like_rooms(source: PointClouds, given: Mapping[str, Any], seed: int) -> TrainSettings:
+    """Return the settings of ``rooms``, with as many steps, and those given."""
+    like = replace(train_settings(_LIKE), seed=seed)
+    batches = max(1, len(source) // int(given.get("batch_size", like.batch_size)))
+    chosen = {"epochs": max(1, round(_STEPS / batches))} | dict(given)
+    if "rule" not in given:
+        # By the source alone, if a class has enough clouds for a part to be held out.
+        if held_out(source, TrainSettings(holdout=given.get("holdout", like.holdout))).any():
+            chosen["rule"] = "source-val"
         else:
             _LOG.warning("no class has clouds enough to hold some out: the last round is kept")
-    if settings["rule"] != "last" and "validate_every" not in (train or {}):
-        settings["validate_every"] = settings["epochs"]
-    model = settings.pop("model")
-    del settings["seed"]
-    adapter = Adapter(
-        method,
-        model,
-        self_training=self_training,
-        train=settings,
-        run_dir=Path(out) / "run",
-        random_state=seed,
-    )
-    with warnings.catch_warnings():  # told by name, below
-        warnings.simplefilter("ignore", SingleClassWarning)
-        adapter.fit(source, target)
-    for line in remarks(adapter.result_.rounds, rounds, source.class_names, "threshold_share"):
-        _LOG.warning(line)
-    return adapter
+    if chosen.get("rule", like.rule) != "last":
+        chosen.setdefault("validate_every", chosen["epochs"])
+    return changed(like, chosen, " in train")
+
+
+def _rounds(given: Mapping[str, Any], rule: str | None) -> SelfTrainingSettings:
+    """Return the settings of the rounds: those given, the others from the preset of the rule."""
+    given = ({} if rule is None else {"rule": rule}) | dict(given)
+    return changed(PRESETS[usual_preset(given.get("rule"))], given, " in self_training")
 
 
 def _source(
@@ -185,8 +194,7 @@ def _target(scans: Clouds) -> UnlabelledClouds:
     if isinstance(scans, str | Path):
         settings = train_settings(_LIKE)
         return load_whole(load_unlabelled, scans, settings.num_points, settings.preparation)
-    given: Any = read_paths(scans)
-    clouds = [np.asarray(cloud, np.float32) for cloud in given]
+    clouds = [np.asarray(cloud, np.float32) for cloud in read_paths(scans)]
     if any(cloud.ndim != 2 or cloud.shape[1:] != (3,) for cloud in clouds):
         raise InputError("scans: give clouds of shape [n 3], several of them")
     return RaggedClouds(clouds, numbered(len(clouds)), "").unlabelled(None, "scans", LARGEST)

@@ -1,0 +1,178 @@
+"""A trained network as an object: ``Classifier.load(run).predict(clouds)``."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from qs3.adaptation.confidence import UNKNOWN, rescale
+from qs3.errors import InputError
+from qs3.files import write_json
+from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.models import PointClassifier
+from qs3.structure import structure
+from qs3.training.answers import list_clouds, read_listed
+from qs3.training.checkpoint import LoadedModel, load_model, save_model
+from qs3.training.config import TrainSettings
+from qs3.training.predict import Description, ask
+from qs3.training.prepared import note_clouds, require_finite
+from qs3.training.run import RUN, SETTINGS, Run, is_run, read_run, read_settings, write_run
+from qs3.training.shipped import find_run
+
+Clouds = PointClouds | UnlabelledClouds | ArrayLike | str | Path | Sequence[str | Path]
+"""Clouds: one array [n 3] or [b n 3], a list of arrays of different sizes, clouds as read, or paths
+of files and folders (in the order of `qs3.training.answers.list_clouds`)."""
+_EXPECTED = "a cloud is [n 3] numbers, in metres, z up"
+
+
+class Classifier:
+    """A trained network with the names of its classes; `load` makes one.
+
+    Args:
+        loaded: Network, classes and settings.
+        run: The record of its training, for `save`; None for weights alone.
+    """
+
+    def __init__(self, loaded: LoadedModel, run: Run | None = None) -> None:
+        self._loaded, self._run = loaded, run
+
+    @classmethod
+    def load(cls, run: str | Path) -> "Classifier":
+        """Return the classifier of a run.
+
+        Args:
+            run: Folder of a run, its ``model.safetensors``, or the name of a network that comes
+                with qs3, such as ``rooms``.
+
+        Raises:
+            InputError: if the path is not a run, or a file of it is damaged.
+
+        Example:
+            >>> points = np.random.default_rng(0).uniform(size=(500, 3))  # a box of a metre, z up
+            >>> Classifier.load("rooms").predict(points).shape
+            (1,)
+        """
+        place = find_run(run)
+        folder = place.parent if place.is_file() else place
+        return cls(load_model(place), read_run(folder) if (folder / RUN).is_file() else None)
+
+    @property
+    def model(self) -> PointClassifier:
+        """The network."""
+        return self._loaded.model
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Names of the classes, in the order of the probabilities."""
+        return self._loaded.class_names
+
+    def predict(self, clouds: Clouds, *, unknown: float | None = None) -> np.ndarray:
+        """Return the name of the most probable class of each cloud.
+
+        Args:
+            clouds: Clouds, or paths of them.
+            unknown: Share of known objects, measured on held-out source, that may be rejected as
+                ``"unknown"``. None always answers a class.
+
+        Raises:
+            InputError: as `predict_proba`; or if no part of the source was held out.
+        """
+        said = self._ask(clouds)
+        names = np.array(self.class_names)[said.probabilities.argmax(axis=1)]
+        if unknown is None:
+            return names
+        known = self._loaded.require_known("this network", unknown)
+        return np.where(known.familiarity(said.logits) < unknown, UNKNOWN, names)
+
+    def predict_proba(
+        self, clouds: Clouds, *, calibrated: bool = False
+    ) -> Float[np.ndarray, "b k"]:
+        """Return class probabilities, in the order of ``class_names``; a row for each cloud.
+
+        Args:
+            clouds: Clouds, or paths of them.
+            calibrated: Whether to calibrate the probabilities on the held-out source.
+
+        Raises:
+            InputError: if a file cannot be read, a cloud is empty or not [n 3], or a point is not
+                finite; or if no part of the source was held out to calibrate on.
+        """
+        shares = self._ask(clouds).probabilities
+        if not calibrated:
+            return shares
+        return rescale(shares, self._loaded.require_known("this network").temperature)
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the network into a folder, for `load` and every command.
+
+        Writes ``model.safetensors``, and ``settings.json`` and ``run.json`` if it was loaded with
+        them. Returns the file of the weights.
+
+        Raises:
+            InputError: if the folder is a file, or holds another run.
+        """
+        folder, settings = Path(folder), self._loaded.settings
+        if folder.is_file():
+            raise InputError(f"{folder}: is a file; name a folder")
+        if is_run(folder) and (self._run is None or read_settings(folder) != settings):
+            raise InputError(f"{folder}: holds another run; name another folder")
+        train = structure(settings["train"], TrainSettings, folder)
+        path = save_model(folder, self.model, self.class_names, train, known=self._loaded.known)
+        if self._run is not None:
+            write_json(folder / SETTINGS, settings)
+            write_run(replace(self._run, folder=folder))
+        return path
+
+    def _ask(self, clouds: Clouds) -> Description:
+        batches = _batches(read_paths(clouds))
+        note_clouds(batches)
+        said = [ask(self._loaded, batch) for batch in batches]
+        return Description(*map(np.concatenate, zip(*said, strict=True)))
+
+
+load = Classifier.load
+
+
+def read_paths(clouds: Clouds) -> Any:
+    """Read clouds from one path or a list of paths; return anything else as it is.
+
+    Raises:
+        InputError: if a file cannot be read, or a folder holds no cloud.
+    """
+    paths = clouds if isinstance(clouds, list | tuple) else [clouds]
+    if not paths or not all(isinstance(path, str | Path) for path in paths):
+        return clouds
+    listed = list_clouds([Path(str(path)) for path in paths])
+    return [points for path in listed for _, points in read_listed(path)]
+
+
+def _batches(given: Any) -> list[Float[np.ndarray, "_ _ 3"]]:
+    """Return clouds as arrays of clouds of one size, in their order.
+
+    Raises:
+        InputError: if there is no cloud, or with the number of the first that is not finite points.
+    """
+    if isinstance(given, PointClouds | UnlabelledClouds):
+        given = given.points
+    if isinstance(given, list | tuple):
+        arrays = [np.asarray(part) for part in given]
+        flat = all(array.ndim == 1 for array in arrays)  # the points of one cloud
+        batches = [np.asarray(arrays)[None]] if flat else [array[None] for array in arrays]
+    else:
+        whole = np.asarray(given)
+        batches = [whole[None] if whole.ndim == 2 else whole]
+    start, checked = 0, []
+    for batch in batches:
+        if batch.ndim != 3 or batch.shape[2] != 3 or not batch.shape[1]:
+            raise InputError(f"cloud {start} has shape {list(batch.shape[1:])}; {_EXPECTED}")
+        if batch.dtype.kind not in "fiu":
+            raise InputError(f"cloud {start} holds {batch.dtype}; {_EXPECTED}")
+        numbers = batch if batch.dtype.kind == "f" else batch.astype(np.float64)
+        require_finite(numbers, [str(start + row) for row in range(len(numbers))])
+        start += len(numbers)
+        checked.append(numbers)
+    return checked
