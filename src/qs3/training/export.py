@@ -122,12 +122,23 @@ def export_run(run: Path, out: Path | None = None) -> Exported:
     return Exported(path, worst, seconds, expects)
 
 
+def random_clouds(num_points: int) -> Float[np.ndarray, "m n 3"]:
+    """Return the clouds of the check: off the origin, and as large as 0.001 to 1000.
+
+    Example:
+        >>> random_clouds(32).shape
+        (16, 32, 3)
+    """
+    rng, each = np.random.default_rng(0), (CLOUDS, 1, 3)
+    points = rng.normal(size=(CLOUDS, num_points, 3)) * rng.uniform(0.1, 1, size=each)
+    points = (points + rng.normal(size=each)) * 10.0 ** rng.uniform(-3, 3, size=(CLOUDS, 1, 1))
+    return points.astype(np.float32)
+
+
 def compare(
     model: PointClassifier, num_points: int, preparation: Preparation, data: bytes
 ) -> Float[np.ndarray, "m"]:
     """Return the largest difference of a probability from PyTorch's, for each of random clouds.
-
-    The clouds lie off the origin, and are as large as 0.001 to 1000.
 
     Args:
         model: The network.
@@ -137,16 +148,13 @@ def compare(
     """
     import onnxruntime
 
-    rng = np.random.default_rng(0)
-    points = rng.normal(size=(CLOUDS, num_points, 3)) * rng.uniform(0.1, 1, size=(CLOUDS, 1, 3))
-    points = (points + rng.normal(size=(CLOUDS, 1, 3))) * 10.0 ** rng.uniform(-3, 3, (CLOUDS, 1, 1))
-    points = points.astype(np.float32)
+    points = random_clouds(num_points)
     how = replace(preparation, remove_outliers=False, redraw=False)
     with unsaid():  # the sizes are drawn here
         wanted = predict_probabilities(model, points, preparation=how)
     session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
-    parts = [session.run(None, {"points": part})[0] for part in (points[:1], points[1:])]
-    return np.abs(np.concatenate(parts) - wanted).max(axis=1)
+    answers = (session.run(None, {"points": part})[0] for part in (points[:1], points[1:]))
+    return np.abs(np.concatenate([np.asarray(part) for part in answers]) - wanted).max(axis=1)
 
 
 def _require_onnx() -> None:
