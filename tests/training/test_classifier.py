@@ -8,7 +8,7 @@ import torch
 
 import qs3
 from qs3.errors import InputError
-from qs3.report.collect import look
+from qs3.report.collect import collect
 from qs3.training import Classifier, SelfTrainingSettings, evaluate, fit, read_run
 from qs3.training.run import fingerprint, train_settings
 
@@ -60,7 +60,7 @@ def test_a_saved_network_is_a_run(network, folder, source, target, tmp_path):
         assert (run.method, run.source) == ("source-only", read_run(folder).source)
         assert run.settings["source"] == fingerprint(source)
         assert evaluate(place, target).scores == evaluate(folder, target).scores
-        assert look(place).runs == (run,)
+        assert collect(place).class_names == network.class_names
     settings = train_settings(tmp_path / "saved")
     rounds = SelfTrainingSettings(rounds=2, epochs=1, threshold_share=0.6)
     arguments = ("qbst", source, target.without_labels(), settings, rounds)
@@ -80,7 +80,7 @@ def test_weights_alone_are_saved_alone(network, folder, target, tmp_path):
     with pytest.raises(InputError, match="holds another run"):
         bare.save(folder)
     bare.save(tmp_path / "alone")
-    for ask in (look, lambda folder: evaluate(folder, target)):
+    for ask in (collect, lambda folder: evaluate(folder, target)):
         with pytest.raises(InputError, match=r"weights alone; settings.json and run.json are miss"):
             ask(tmp_path / "alone")
 
