@@ -250,12 +250,12 @@ def read_names(path: Path) -> dict[str, str]:
     import pandas as pd
 
     with reading(path, "a CSV with the columns name,class"):
-        table = pd.read_csv(path, dtype=str, usecols=["name", "class"])
-        table = table.apply(lambda column: column.str.strip())
-        faults = table.isna().any(axis=1) | (table == "").any(axis=1) | table.duplicated(["name"])
+        table = pd.read_csv(path, dtype=str, usecols=["name", "class"], keep_default_na=False)
+        names, kinds = (table[column].str.strip() for column in ("name", "class"))
+        faults = (names == "") | (kinds == "") | names.duplicated()
         if table.empty:
             raise InputError("no row after the columns' names")
         if faults.any():
             line = int(np.flatnonzero(faults)[0]) + 2
             raise InputError(f"line {line}: a name that is missing or comes twice, or no class")
-    return dict(zip(table["name"], table["class"], strict=True))
+    return dict(zip(names, kinds, strict=True))
