@@ -66,6 +66,8 @@ class LocalExecutor:
             InputError: if an idle worker died and took the pool with it.
         """
         packed = pickle.dumps((function, *arguments))
+        if b"__main__" in packed:  # parts of the caller's script, which the workers then load
+            self._context.Process = SpawnProcess
         try:
             self._keys[self._pool.schedule(_call, args=(packed,), timeout=self._timeout)] = key
         except RuntimeError as error:
@@ -129,8 +131,13 @@ def _cause(code: int) -> str:
 
 
 def _call(packed: bytes) -> Any:
-    """Unpack and call; pebble would unpack, and import, under the lock that all workers share."""
-    return guarded(*pickle.loads(packed))  # noqa: S301
+    """Do a call; pebble would unpack it, and import, under the lock that all workers share."""
+    return guarded(_unpack_and_call, packed)
+
+
+def _unpack_and_call(packed: bytes) -> Any:
+    function, *arguments = pickle.loads(packed)  # noqa: S301
+    return function(*arguments)
 
 
 def _prepare_worker() -> None:
