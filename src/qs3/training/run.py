@@ -178,28 +178,10 @@ def completed(record: RunRecord, where: str | Path) -> RunRecord:
         InputError: where a setting is unknown, or its value is none.
     """
     settings = dict(record.settings)
-    former: dict[str, Any] = {}
-    if settings.get("train") is not None:
-        settings["train"], former = _split_former(settings["train"])
     for name, kind in (("train", TrainSettings), ("self_training", SelfTrainingSettings)):
         if settings.get(name) is not None:
             settings[name] = unstructure(structure(settings[name], kind, where))
-    if former:
-        settings["train"]["augmentation"] |= former
     return replace(record, settings=settings)
-
-
-_FORMER = {"cone": 0.0, "cone_share": 0.4, "wall": 0.0, "neighbour": 0.0, "clutter_share": 0.2}
-"""Augmentations that no longer exist, with their defaults."""
-
-
-def _split_former(train: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the settings of a training that exist, and augmentations in use that no longer do."""
-    kept = {name: value for name, value in train.items() if name != "normalisation"}
-    augmentation = dict(kept.get("augmentation", {}))
-    former = {name: augmentation.pop(name) for name in _FORMER if name in augmentation}
-    used = {name: value for name, value in former.items() if value != _FORMER[name]}
-    return kept | {"augmentation": augmentation}, used
 
 
 def is_run(folder: Path) -> bool:
