@@ -47,15 +47,25 @@ def write_source(folder, *_, **__):
 def test_a_demo_of_the_smallest_size(typed, tmp_path):
     out = tmp_path / "demo"
     first = typed("demo", "--out", out, "--workers", 1)
-    lines = [line for line in first.stdout.splitlines() if line.startswith("accuracy")]
-    assert [line.split(", ")[1].partition(":")[0] for line in lines] == [
-        "surfaces only", "rooms", "QBST",
-    ]  # fmt: skip
-    assert all("95 % interval" in line for line in lines)
+    assert first.stdout.count("accuracy on the target") == 3
     assert f"report: {out / 'report.html'}" in first.stdout
-    page = (out / "report.html").read_text(encoding="utf-8")
-    assert "http://" not in page.replace("http://www.w3.org", "")
+    assert "From mesh to cloud" in (out / "report.html").read_text(encoding="utf-8")
     assert typed("demo", "--out", out, "--workers", 1).stdout == first.stdout
+
+
+@pytest.mark.usefixtures("small")
+def test_three_networks_are_scored_and_a_second_run_prints_the_same(typed, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "_scan", write_source)
+    monkeypatch.setattr("qs3.cli.report.with_scan", lambda page, *_: page)
+    first = typed("demo", "--out", tmp_path / "demo")
+    lines = [line for line in first.stdout.splitlines() if line.startswith("accuracy")]
+    names = [line.split(", ")[1].partition(":")[0] for line in lines]
+    assert names == ["surfaces only", "rooms", "QBST"]
+    assert all("95 % interval" in line for line in lines)
+    page = (tmp_path / "demo" / "report.html").read_text(encoding="utf-8")
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    assert "Rounds of self-training" in page
+    assert typed("demo", "--out", tmp_path / "demo").stdout == first.stdout
 
 
 @pytest.mark.usefixtures("small")

@@ -6,9 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from qs3.cli.text import columns, show, tell
 from qs3.errors import InputError
 from qs3.files import claim_folder, write_json, write_text
+from qs3.io.clouds import PointClouds
+from qs3.meshes import POINTDA10, collect, sample_surface
+from qs3.meshes.sizes import class_size
 
 _NETWORK, _SENSOR = "rooms", "d435"
 _SAMPLES = 4  # rays a pixel
@@ -32,7 +37,7 @@ def demo(
     import qs3
     from qs3.cli.report import with_scan
     from qs3.cli.train import NO_ROUND
-    from qs3.report.collect import collect
+    from qs3.report import collect as report
     from qs3.report.page import write_report
     from qs3.training import evaluate, read_run
     from qs3.training.answers import answers_csv, list_clouds, predict_files, read_listed
@@ -65,23 +70,21 @@ def demo(
             low, high = scores.interval
             show(f"accuracy on the target, {name + ':':14} {scores.accuracy:.1%}  "
                  f"(95 % interval {low:.0%} to {high:.0%})")  # fmt: skip
-        page = collect(run, data=str(target), source=str(folder / "source"), before=before)
+        page = report.collect(run, data=str(target), source=str(folder / "source"), before=before)
         page = with_scan(page, "chair", _SENSOR)
     else:
-        page = collect(run)
+        page = report.collect(run)
         first, last = (list(predict_files(place, files)) for place in (before, run))
         write_text(folder / "predictions.csv", answers_csv(last, top=3))
         old, new = (Counter(said.best()[0][0] for said in answers) for answers in (first, last))
         rows = [(name, str(old[name]), str(new[name])) for name in page.class_names]
         show(*columns([("class", "before", "after"), *rows], 1), folder / "predictions.csv")
-    title = "qs3 demo: a classifier adapted to a depth camera without labels"
-    write_report(folder / "report.html", replace(page, title=title))
+    write_report(folder / "report.html", page)
     show(f"report: {folder / 'report.html'}")
     return NO_ROUND if all(done["skipped"] for done in read_run(run).rounds) else 0
 
 
 def _scan(folder: Path, per_class: int, seed: int, workers: int, **how: Any) -> None:
-    from qs3.meshes import collect
     from qs3.sensor.settings import CameraSettings
     from qs3.store.failures import read_failures
     from qs3.store.generate import generate
@@ -98,11 +101,6 @@ def _scan(folder: Path, per_class: int, seed: int, workers: int, **how: Any) -> 
 
 def _learn_surfaces(folder: Path, like: Path, seed: int) -> None:
     """Train a network with the settings of another one on whole surfaces, seen by no camera."""
-    import numpy as np
-
-    from qs3.io.clouds import PointClouds
-    from qs3.meshes import POINTDA10, collect, sample_surface
-    from qs3.meshes.sizes import class_size
     from qs3.training import fit
     from qs3.training.config import LIGHT
     from qs3.training.run import train_settings
