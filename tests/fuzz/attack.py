@@ -21,8 +21,6 @@ _WORDS = [b"nan", b"-1", b"1e999", b"x", b"null", b"[" * 10_000, b"9" * 5000, b"
 
 
 class End(NamedTuple):
-    """The end of one sample."""
-
     kind: str
     number: int
     end: str
@@ -30,7 +28,7 @@ class End(NamedTuple):
 
 
 class _HangError(BaseException):
-    """Raised after too long; no handler of Exception catches it."""
+    """Not an Exception, so that no handler catches it."""
 
 
 def attack(kinds: Sequence[str], folder: Path, count: int, seed: int = 0) -> Iterator[End]:

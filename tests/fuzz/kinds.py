@@ -28,15 +28,12 @@ from ..stores import write_store
 
 @dataclass(frozen=True)
 class Kind:
-    """A builder to a new path, a loader, and the name of the path."""
-
     build: Callable[[Path], None]
     load: Callable[[Path], Any]
     name: str = "data"
 
 
 def clouds() -> RaggedClouds:
-    """Six clouds of three classes."""
     points = np.random.default_rng(0).normal(size=(6, 64, 3)).astype(np.float32)
     ids = tuple(f"cloud {i}" for i in range(6))
     return RaggedClouds(
@@ -54,7 +51,6 @@ def _layout(layout: str, name: str = "data") -> Kind:
 
 
 def build_generated(path: Path) -> None:
-    """Write a data set as ``generate`` makes it, with every kind of cloud."""
     write_store(path, POINTDA10, [(i % 3, "train", 64) for i in range(6)], shards=2)
 
 
@@ -87,7 +83,6 @@ def _build_sensor(path: Path) -> None:
 
 
 def build_run(path: Path) -> None:
-    """Train a small run, as ``train`` leaves it."""
     network = {"channels": [4, 4, 8], "hidden": [4], "transforms": False}
     settings = TrainSettings(
         model="pointnet", model_settings=network, num_points=16, epochs=1, batch_size=3, threads=1
