@@ -13,6 +13,8 @@ from qs3.errors import InputError, MissingExtraError, QS3Error
 from qs3.io.preparation import PAPER, ROBUST, distinct_inliers, normalise, resample
 from qs3.models import create_model
 from qs3.models.aligned import Aligned
+from qs3.models.ops import farthest_point_sampling
+from qs3.models.ops.sampling import _sample_in_a_loop
 from qs3.models.sized import Sized
 from qs3.training import TrainSettings, export, load_model, predict_probabilities, save_model
 from qs3.training.export import export_run
@@ -129,6 +131,15 @@ def test_normalise_in_a_graph_is_that_of_training(preparation, n):
     np.testing.assert_allclose(got, wanted, rtol=2e-7, atol=1e-7)
     same = torch.full((1, 7, 3), 0.1, dtype=torch.float64)
     assert torch.equal(normalise_in_a_graph(same), torch.zeros(1, 7, 3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("m", [1, 9, 40])
+def test_the_loop_of_a_graph_samples_as_networks_do(m):
+    points = torch.randn(3, 40, 3, generator=torch.Generator().manual_seed(0))
+    points[:, 20:] = points[:, :20]
+    start = torch.tensor([0, 7, 39])
+    got = _sample_in_a_loop(points.permute(2, 0, 1).contiguous(), m, start)
+    assert torch.equal(got, farthest_point_sampling(points, m, start))
 
 
 @pytest.mark.parametrize(

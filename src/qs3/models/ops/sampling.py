@@ -45,8 +45,7 @@ def farthest_point_sampling(
         start = (points - points.mean(dim=1, keepdim=True)).square().sum(dim=2).argmax(dim=1)
     planes = points.permute(2, 0, 1).contiguous()
     if is_exporting():
-        chosen = start[:, None].expand(-1, m).clone()
-        return sample_in_a_loop(planes, chosen, torch.full_like(start[0], m))
+        return _sample_in_a_loop(planes, m, start)
     return _sample(planes, m, start)  # pyright: ignore[reportCallIssue]
 
 
@@ -117,45 +116,28 @@ def _sample_in_numpy(
     return np.ascontiguousarray(chosen.T)
 
 
-def sample_in_a_loop(
-    planes: Float[Tensor, "3 b n"],
-    chosen: Int[Tensor, "b m"],
-    end: Int[Tensor, ""],
-    repeat: bool = False,
+def _sample_in_a_loop(
+    planes: Float[Tensor, "3 b n"], m: int, start: Int[Tensor, "b"]
 ) -> Int[Tensor, "b m"]:
-    """Sample farthest points by one loop in the graph, whose last steps may be left out.
-
-    Args:
-        planes: x, y and z of the clouds.
-        chosen: Indices to begin with; the first of each cloud is where sampling starts.
-        end: Where sampling ends; ``chosen`` stays as it is from there on.
-        repeat: Whether a point may be chosen again, once all others lie on chosen ones too.
-
-    Example:
-        >>> planes = torch.tensor([[[0.0, 1.0, 9.0]], [[0.0, 0, 0]], [[0.0, 0, 0]]])
-        >>> sample_in_a_loop(planes, torch.zeros(1, 3, dtype=torch.int64), torch.tensor(2)).tolist()
-        [[0, 2, 0]]
-    """
+    """Choose by one loop in the graph."""
     # The public wrapper would first compile both functions, which a debugger's or a checker's
     # wrapping of them breaks; the operation itself takes them as they are, with all they read.
     from torch._higher_order_ops.while_loop import while_loop_op
 
-    def goes_on(step, chosen, nearest, planes, end):
-        return step < end
+    def goes_on(step, chosen, nearest, planes):
+        return step < m
 
-    def choose(step, chosen, nearest, planes, end):
+    def choose(step, chosen, nearest, planes):
         newest = chosen.index_select(1, (step - 1).view(1))
         position = planes.gather(2, newest.expand(3, -1, 1))
         # One addition after the other, as elsewhere, for the same bits.
         x, y, z = (planes - position).square().unbind()
-        nearest = torch.minimum(nearest, x + y + z)
-        if not repeat:
-            nearest = nearest.scatter(1, newest, -1.0)
+        nearest = torch.minimum(nearest, x + y + z).scatter(1, newest, -1.0)
         farthest = nearest.argmax(dim=1, keepdim=True)
-        column = torch.arange(chosen.shape[1], device=chosen.device)
+        column = torch.arange(m, device=chosen.device)
         return step + 1, torch.where(column == step, farthest, chosen), nearest
 
-    start = torch.ones((), dtype=torch.int64, device=chosen.device)
-    nearest = torch.full_like(planes[0], torch.inf)
-    carried: tuple = (start, chosen, nearest)
-    return while_loop_op(goes_on, choose, carried, (planes, end))[1]
+    first = torch.ones((), dtype=torch.int64, device=start.device)
+    chosen = start[:, None].expand(-1, m).clone()
+    carried: tuple = (first, chosen, torch.full_like(planes[0], torch.inf))
+    return while_loop_op(goes_on, choose, carried, (planes,))[1]
