@@ -57,14 +57,15 @@ def generate(
     """Scan many meshes into a data set; resumes, and logs what failed.
 
     Args:
-        meshes: Folders of meshes (one folder a class, ModelNet's or ShapeNet's tree), and `shapes`
-            for the built-in ones; several go into one data set. A neighbour is another of them.
+        meshes: Folders of meshes (one folder a class, ModelNet's or ShapeNet's tree), `shapes` for
+            built-in furniture, `parts` for built-in machine parts; several go into one data set. A
+            neighbour is another of them.
         out: Folder of the data set; run the same command again to go on after a stop. --dry-run
             needs none.
         recipe: rooms: settings for a source that is to meet scans of real rooms (cameras, sizes,
             layouts and views drawn); an option given beside it wins.
         up: Up axis of every mesh file; by default y for glTF and ShapeNet, z for all others.
-        per_class: Objects a class, of the built-in shapes.
+        per_class: Objects a class, of the built-in shapes and parts.
         classes: Classes to scan, by the names of their folders, or pointda10 for its ten, renamed;
             all by default.
         class_map: TOML file of what classes shall be called: stool = "chair"; others keep theirs.
@@ -141,15 +142,15 @@ def _items(
     labels: Path | None,
 ) -> "list[MeshItem]":
     """The list of meshes."""
-    from qs3.meshes.collections import collect, rename_items
+    from qs3.meshes.collections import BUILT_IN, collect, rename_items
 
     if not meshes:
-        raise InputError("--meshes: name a folder of meshes, or shapes for the built-in ones")
-    if labels is not None and len([source for source in meshes if source != "shapes"]) != 1:
+        raise InputError("--meshes: name a folder of meshes, or shapes or parts for built-in ones")
+    if labels is not None and len([source for source in meshes if source not in BUILT_IN]) != 1:
         raise InputError(f"--labels {labels}: goes with one folder of --meshes")
     items: list[MeshItem] = []
     for source in meshes:
-        named = None if source == "shapes" else labels
+        named = None if source in BUILT_IN else labels
         kinds = classes or None
         items += collect(source, per_class=per_class, seed=seed, classes=kinds, labels=named)
     if up is not None:

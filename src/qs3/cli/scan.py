@@ -26,7 +26,7 @@ def scan(
 
     Args:
         mesh: A mesh file (OFF, OBJ, PLY, STL, GLB, GLTF, STEP, IGES, 3MF) or a built-in class
-            (chair, …).
+            (chair, …) or part (flange, …).
         out: Folder to write: cloud.ply, clean.ply, montage.png, scan.json.
         up: Up axis of the mesh file; by default y for glTF, z for all others.
         frames: Also write whole frames in BOP's scene layout, into frames/: grey pair, depth, true

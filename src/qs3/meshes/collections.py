@@ -1,4 +1,4 @@
-"""Lists of meshes to scan: from a folder, or drawn from the procedural shapes."""
+"""Lists of meshes to scan: from a folder, or drawn from the built-in shapes and parts."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from qs3 import shapes
-from qs3.errors import InputError
+from qs3.errors import InputError, no_such
 from qs3.files import sha256
 from qs3.meshes.classes import (
     POINTDA10,
@@ -23,6 +23,9 @@ from qs3.meshes.trees import MeshItem, read_tree
 
 POINTDA10_CHOICE = "pointda10"
 """The choice that takes PointDA-10's ten classes and gives them its names."""
+
+BUILT_IN: dict[str, tuple[str, ...]] = {"shapes": shapes.CLASSES, "parts": shapes.PARTS}
+"""Collections that need no file, and their classes."""
 
 _MOST_NAMES = 60
 
@@ -39,12 +42,12 @@ def collect(
     """List the meshes of a collection, always in the same order.
 
     Args:
-        source: ``"shapes"`` for procedural draws; else a folder: ModelNet's, ShapeNet's, one
-            folder a class, or meshes lying flat in it (then without a class); see ``read_tree``.
-            Any format of ``load_mesh`` will do. A folder that is itself named shapes is meant by
-            ``./shapes``.
-        per_class: Number of draws of each class; for shapes only.
-        seed: Another seed gives other draws; for shapes only.
+        source: ``"shapes"`` for built-in furniture, ``"parts"`` for built-in machine parts; else a
+            folder: ModelNet's, ShapeNet's, one folder a class, or meshes lying flat in it (then
+            without a class); see ``read_tree``. Any format of ``load_mesh`` will do. Write
+            ``./shapes`` for a folder of that name.
+        per_class: Number of draws of each built-in class.
+        seed: Another seed gives other draws of built-in classes.
         classes: Keep these classes only; ``"pointda10"`` keeps and renames the ten classes of
             PointDA-10, by ModelNet's and ShapeNet's own lists or else by aliases; None keeps all.
         split: Keep this split only; None keeps all. Shapes have no split.
@@ -60,10 +63,15 @@ def collect(
         ['shapes/chair/000000', 'shapes/chair/000001']
     """
     names = _chosen_names(classes)
-    if str(source) == "shapes":
+    if str(source) in BUILT_IN:
         if labels is not None:
-            raise InputError(f"labels {labels}: shapes have their own classes; leave it out")
-        items = _draws(per_class, seed, shapes.CLASSES if names == (POINTDA10_CHOICE,) else names)
+            raise InputError(f"labels {labels}: {source} have their own classes; leave it out")
+        if source == "parts" and Path(source).is_dir():
+            raise InputError(
+                "parts: means the built-in parts, and there is a folder of that name; write "
+                "./parts for the folder, or run the command elsewhere"
+            )
+        items = _draws(str(source), per_class, seed, names)
     else:
         items = _files(Path(source), names, None if labels is None else Path(labels))
     if split is not None:
@@ -73,19 +81,25 @@ def collect(
     return items
 
 
-def _draws(per_class: int, seed: int, classes: Sequence[str] | None) -> list[MeshItem]:
+def _draws(
+    source: str, per_class: int, seed: int, classes: tuple[str, ...] | None
+) -> list[MeshItem]:
     if per_class < 1:
-        raise InputError(f"per-class {per_class}: ask for at least 1 shape of each class")
+        raise InputError(f"per-class {per_class}: ask for at least 1 object of each class")
     if seed < 0:
         raise InputError(f"seed {seed}: choose a whole number from 0 up")
+    own = BUILT_IN[source]
+    if classes == (POINTDA10_CHOICE,) and source == "shapes":
+        classes = None
     items = []
-    for name in shapes.CLASSES if classes is None else classes:
-        shapes.families(name)
+    for name in own if classes is None else classes:
+        if name not in own:
+            raise no_such(f"class {name!r} is unknown", name, own)
         for index in range(per_class):
-            entropy = [seed, shapes.CLASSES.index(name), index]
+            entropy = [seed, own.index(name), index]
             drawn = int(np.random.SeedSequence(entropy).generate_state(1, np.uint64)[0])
             # 63 bits: the seed has to fit the signed integers of a table.
-            items.append(MeshItem(f"shapes/{name}/{index:06d}", name, "", None, drawn >> 1))
+            items.append(MeshItem(f"{source}/{name}/{index:06d}", name, "", None, drawn >> 1))
     return items
 
 
@@ -165,18 +179,19 @@ def load_named(
     """Return the mesh of a file or a built-in class, and where it is from, for records.
 
     Args:
-        name: A path, or one of `qs3.shapes.CLASSES` where no file has that name.
+        name: A path, or a class of `qs3.shapes` if no file has that name.
         seed: Which draw of a built-in class.
         up: Up axis of a file; by default y for glTF, z for all others.
 
     Raises:
         InputError: if it is neither, or the file holds no mesh.
     """
-    if name in shapes.CLASSES and not Path(name).exists():
+    built_in = (*shapes.CLASSES, *shapes.PARTS)
+    if name in built_in and not Path(name).exists():
         return shapes.make(name, seed=seed), {"name": name, "source": "shapes", "sha256": ""}
     path = Path(name)
     if not path.suffix and not path.exists():
         raise InputError(
-            f"{name}: neither a mesh file nor a built-in class ({', '.join(shapes.CLASSES)})"
+            f"{name}: neither a mesh file nor a built-in class ({', '.join(built_in)})"
         )
     return load_mesh(path, up), {"name": path.name, "source": "file", "sha256": sha256(path)}

@@ -32,7 +32,7 @@ class MeshItem:
 
     id: str
     """Name within the collection: the path below its root without ending as far as that is unique,
-    or shapes/<class>/<n>."""
+    or shapes/<class>/<n> and parts/<class>/<n>."""
     class_name: str
     """Class by folder, synset, CSV or shape; empty in a flat folder."""
     split: str

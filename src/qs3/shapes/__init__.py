@@ -1,4 +1,4 @@
-"""Procedural furniture: ten classes that need no file and no download.
+"""Procedural furniture of ten classes and eight machine parts; no file, no download.
 
 Convention:
     Metres, z up. An object stands on z = 0 (one that hangs has its lowest point there) and its
@@ -14,6 +14,7 @@ from qs3.errors import InputError, no_such
 from qs3.shapes import bathtub, bed, bookshelf, cabinet, chair, lamp, monitor, plant, sofa, table
 from qs3.shapes._dice import Dice
 from qs3.shapes._solids import Solid, assemble
+from qs3.shapes.parts import PARTS as _PARTS
 
 _MODULES = (bathtub, bed, bookshelf, cabinet, chair, lamp, monitor, plant, sofa, table)
 _FAMILIES: dict[str, tuple[Callable[[Dice], list[Solid]], ...]] = {
@@ -22,6 +23,12 @@ _FAMILIES: dict[str, tuple[Callable[[Dice], list[Solid]], ...]] = {
 
 CLASSES: tuple[str, ...] = tuple(_FAMILIES)
 """The ten classes of PointDA-10, in the order of their label."""
+
+PARTS: tuple[str, ...] = tuple(_PARTS)
+"""Eight machine parts, 2 to 12 cm large; a seed changes them by a few percent."""
+
+_FAMILIES |= {name: (build,) for name, build in _PARTS.items()}
+_NAMES = (*CLASSES, *PARTS)
 
 
 def families(class_name: str) -> tuple[str, ...]:
@@ -35,7 +42,7 @@ def families(class_name: str) -> tuple[str, ...]:
         True
     """
     if class_name not in _FAMILIES:
-        raise no_such(f"class {class_name!r} is unknown", class_name, CLASSES)
+        raise no_such(f"class {class_name!r} is unknown", class_name, _NAMES)
     return tuple(family.__name__ for family in _FAMILIES[class_name])
 
 
@@ -43,7 +50,7 @@ def make(class_name: str, seed: int = 0, family: str | None = None) -> trimesh.T
     """Make one object; the same class, seed and family give the same vertices.
 
     Args:
-        class_name: One of ``CLASSES``.
+        class_name: One of ``CLASSES`` or ``PARTS``.
         seed: Any whole number ≥ 0; every size and option is drawn from it.
         family: One of ``families(class_name)``; drawn from the seed where it is None. Naming the
             family that the seed would draw gives the same object.
@@ -65,7 +72,7 @@ def make(class_name: str, seed: int = 0, family: str | None = None) -> trimesh.T
         raise no_such(f"family {family!r} of {class_name} is unknown", family, names)
     if seed < 0:
         raise InputError(f"seed {seed}: choose a whole number from 0 up")
-    rng = np.random.default_rng(np.random.SeedSequence([seed, CLASSES.index(class_name)]))
+    rng = np.random.default_rng(np.random.SeedSequence([seed, _NAMES.index(class_name)]))
     drawn = names[int(rng.integers(len(names)))]
     mirrored = bool(rng.integers(2))
     build = _FAMILIES[class_name][names.index(family or drawn)]

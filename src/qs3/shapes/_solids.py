@@ -80,10 +80,10 @@ def loft(
             j = size - 1 - i
             faces.append(np.stack([ring[i + 1], ring[i], ring[j]], axis=1))
             faces.append(np.stack([ring[i + 1], ring[j], ring[j - 1]], axis=1))
-    return _closed(vertices, np.concatenate(faces))
+    return weld(vertices, np.concatenate(faces))
 
 
-def _closed(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> Solid:
+def weld(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> Solid:
     """Weld points that coincide, drop the faces that vanish with them, turn the rest outward."""
     _, first, weld = np.unique(
         np.round(vertices, 7), axis=0, return_index=True, return_inverse=True

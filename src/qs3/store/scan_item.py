@@ -59,7 +59,7 @@ class GenerateSettings(ScanSettings):
     recipe: Annotated[RecipeName | None, tyro.conf.Suppress] = None
     """Name of the recipe that these settings began as; a label for the record."""
     meshes: Annotated[str, tyro.conf.Suppress] = "shapes"
-    """``shapes`` or the name (not the path) of the folder of meshes; a label for the record."""
+    """``shapes``, ``parts`` or the name (not the path) of the folder; a label for the record."""
     per_class: Annotated[int | None, tyro.conf.Suppress] = None
     """Objects a class; None takes all."""
     scans_per_mesh: int = 1
@@ -102,14 +102,14 @@ def settings_for(
 ) -> GenerateSettings:
     """Return settings that tell what is scanned: its classes, and where the meshes are from.
 
-    ``meshes`` are ``shapes`` and the folders that the work list was collected from, ``per_class``
-    the shapes' objects a class.
+    ``meshes`` are ``shapes``, ``parts`` and the folders that the work list was collected from,
+    ``per_class`` the built-in ones' objects a class.
     """
     return dataclasses.replace(
         settings,
         classes=label_order(sorted({item.class_name for item in items})),
         meshes="+".join(str(s) if str(s) == "shapes" else Path(s).resolve().name for s in meshes),
-        per_class=per_class if "shapes" in map(str, meshes) else None,
+        per_class=per_class if {"shapes", "parts"} & set(map(str, meshes)) else None,
     )
 
 
