@@ -110,7 +110,10 @@ def test_one_confident_class_is_told_in_the_last_lines(qs3, source, store, tmp_p
     warm, run = tmp_path / "warm", tmp_path / "run"
     told = qs3("train", "--source", source, "--out", warm, *QUICK).stderr
     right = read_checkpoints(warm)[-1].source_accuracy
-    assert f"right of the source's held-out part: {right:.1%}\nNext: qs3 evaluate" in told
+    assert (
+        f"held-out simulated scans of the same meshes: {100 * right:.0f} % (n=\nNext: qs3 evaluate"
+        in told
+    )
     loaded = load_model(warm)
     model, train = loaded.model, structure(loaded.settings["train"], TrainSettings, warm)
     with torch.no_grad():

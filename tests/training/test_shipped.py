@@ -19,8 +19,9 @@ from qs3.io.preparation import ROBUST, Preparation, unit_ball
 from qs3.training import evaluate, fit, load_model, read_run
 from qs3.training.answers import predict_files
 from qs3.training.checkpoint import load_tensors_into
+from qs3.training.checks import note_size
 from qs3.training.export import export_run
-from qs3.training.prepared import note_size, prepare_clouds
+from qs3.training.prepared import prepare_clouds
 from qs3.training.shipped import WEIGHTS, find_run, shipped, workplace
 
 from ..scripts import load_script

@@ -5,7 +5,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -27,8 +27,12 @@ from qs3.training.config import (
     preparation_of,
     usual_preset,
 )
-from qs3.training.run import MODEL, is_run, train_settings
+from qs3.training.run import FOREST_MODEL, MODEL, is_run, train_settings
 from qs3.training.shipped import find_run
+
+if TYPE_CHECKING:
+    from qs3.io.clouds import PointClouds, UnlabelledClouds
+    from qs3.training.rounds import RoundRecord
 
 TIME_UP = 3
 """Exit code where --max-time stopped a run that the same command takes up again."""
@@ -231,7 +235,6 @@ def train(options: Flat[TrainOptions]) -> int:
     from qs3.meshes.classes import POINTDA10, describe_renaming, read_class_map
     from qs3.training import Deadline, TimeUpError, fit, load_whole, parse_duration
     from qs3.training.plan import describe_plan
-    from qs3.training.rounds import all_skipped, remarks
 
     seconds = None if options.max_time is None else parse_duration(options.max_time)
     base, rule = split_method(options.method, options.rounds_rule)
@@ -257,6 +260,8 @@ def train(options: Flat[TrainOptions]) -> int:
         part = {"split": options.target_split, "cloud": options.target_cloud}
         target = load_whole(load_unlabelled, options.target, *how, **part)
     rounds = None if rule is None else options.self_training
+    if settings.model == FOREST_MODEL:
+        return _train_forest(options, source, target, settings, rounds)
     if options.dry_run:
         show(*describe_plan(base, source, target, settings, rounds, options.warm_up is not None))
         return 0
@@ -277,14 +282,65 @@ def train(options: Flat[TrainOptions]) -> int:
     except TimeUpError as stop:
         tell(f"qs3: {stop}")
         return TIME_UP
-    show(options.out)
+    right = None
     for made in result.checkpoints:
-        right = made.source_accuracy
-        if right is not None and result.chosen == {"stage": made.stage, "number": made.number}:
-            tell(f"right of the source's held-out part: {right:.1%}")
-    for line in remarks(result.rounds, options.self_training, result.source.class_names):
+        if result.chosen == {"stage": made.stage, "number": made.number}:
+            right = made.source_accuracy
+    count = 0 if result.holdout is None else len(result.holdout)
+    return _finish(options, result.source.class_names, result.rounds, right, count)
+
+
+def _train_forest(
+    options: TrainOptions,
+    source: "PointClouds | None",
+    target: "UnlabelledClouds | None",
+    settings: TrainSettings,
+    rounds: SelfTrainingSettings | None,
+) -> int:
+    from qs3.training.forest import train_forest
+
+    if source is None or options.warm_up is not None or options.max_time is not None:
+        raise InputError("a forest learns from --source, without --warm-up and --max-time")
+    if options.dry_run:
+        seen = "" if target is None else f", {len(target)} unlabelled clouds of the target"
+        show(f"a forest, {len(source)} labelled clouds of the source{seen}")
+        return 0
+    result = train_forest(
+        options.method,
+        source,
+        target,
+        settings,
+        rounds,
+        run_dir=options.out,
+        preset=options.preset,
+        supervised=options.supervised,
+        config=run_toml(replace(options, train=settings)),
+    )
+    names, right, count = source.class_names, result.source_accuracy, result.held_out
+    return _finish(options, names, result.rounds, right, count)
+
+
+def _finish(
+    options: TrainOptions,
+    class_names: Sequence[str],
+    rounds: "Sequence[RoundRecord]",
+    right: float | None,
+    held_out: int,
+) -> int:
+    """Print the folder, the accuracy on the held-out part of the source, and remarks."""
+    from qs3.io.load import is_store
+    from qs3.training.rounds import all_skipped, remarks
+
+    show(options.out)
+    if right is not None:
+        line = f"held-out part of the source: {100 * right:.0f} % (n={held_out})."
+        if options.source is not None and is_store(options.source):
+            line = line.replace("part of the source", "simulated scans of the same meshes")
+            line += " This says nothing about real scans."
+        tell(line)
+    for line in remarks(rounds, options.self_training, class_names):
         tell(f"qs3: {line}")
-    if all_skipped(result.rounds):
+    if all_skipped(rounds):
         return NO_ROUND
     tell(f"Next: qs3 evaluate {quoted(options.out)} --data DATA")
     return 0

@@ -16,13 +16,12 @@ from qs3.report.page import Cloud, Report
 from qs3.report.plots import Curve
 from qs3.structure import structure, unstructure
 from qs3.training.batches import load_whole
-from qs3.training.checkpoint import LoadedModel, load_model
 from qs3.training.history import HISTORY
 from qs3.training.overlap import caveats
-from qs3.training.predict import predict_probabilities
 from qs3.training.prepared import prepare_clouds
 from qs3.training.rounds import RoundRecord
 from qs3.training.run import MODEL, RUN, Run, data_record, read_run
+from qs3.training.trained import Trained, load_trained
 
 _ACCURACY = "accuracy in training", "labelled clouds, augmented"
 _MEANING = {
@@ -60,12 +59,12 @@ def collect(
     Raises:
         InputError: if something cannot be read, or classes differ.
     """
-    run, loaded = read_run(folder), load_model(folder)
+    run, loaded = read_run(folder), load_trained(folder)
     own = run.folder / "warm-up"
     place = own if before is None and (own / MODEL).is_file() else before
     models = {run.method: loaded}
     if place is not None:
-        models = {f"{place.name} (before)": load_model(place)} | models
+        models = {f"{place.name} (before)": load_trained(place)} | models
     for name, model in models.items():
         if model.class_names != loaded.class_names:
             raise InputError(f"{name}: knows other classes than {folder}; name another --before")
@@ -77,7 +76,7 @@ def collect(
     if data is not None:
         target = _read(data, loaded, split=split, cloud=cloud)
         answers = {
-            name: predict_probabilities(model, target.points).argmax(axis=1)
+            name: model.ask(target.points).probabilities.argmax(axis=1)
             for name, model in models.items()
         }
         scores = {
@@ -115,7 +114,7 @@ def collect(
     )
 
 
-def _read(data: str, loaded: LoadedModel, **part: Any) -> PointClouds:
+def _read(data: str, loaded: Trained, **part: Any) -> PointClouds:
     points = loaded.settings["train"]["num_points"]
     part |= {"class_names": loaded.class_names}
     return load_whole(load_clouds, data, points, loaded.preparation, **part)

@@ -18,9 +18,9 @@ from qs3.io.clouds import CloudKind
 from qs3.io.load import read_clouds
 from qs3.io.point_files import POINT_FILES
 from qs3.training.answers import answer_clouds
-from qs3.training.checkpoint import load_model
 from qs3.training.run import MODEL, is_run
 from qs3.training.shipped import find_run, shipped
+from qs3.training.trained import load_trained
 
 HOST = "127.0.0.1"
 KINDS: dict[CloudKind, str] = {"points": "scan", "clean": "clean twin", "surface": "surface"}
@@ -84,7 +84,7 @@ def open_items(what: str, data: str | None = None, split: str | None = None) -> 
     if path.suffix == ".safetensors" or is_run(path) or (path / MODEL).is_file():
         if data is None:
             raise InputError(f"{what}: is a run; name the clouds to predict with --data")
-        loaded, items = load_model(path), open_items(data, split=split)
+        loaded, items = load_trained(path), open_items(data, split=split)
         return Items(
             items.names,
             items.clouds,

@@ -22,9 +22,8 @@ from qs3.io.layouts import FORMATS
 from qs3.io.layouts.folders import check_class
 from qs3.io.load import read_clouds
 from qs3.io.point_files import POINT_FILES, depth_hint, read_cloud
-from qs3.training.checkpoint import LoadedModel, load_model
-from qs3.training.predict import ask
-from qs3.training.prepared import note_clouds
+from qs3.training.checks import note_clouds
+from qs3.training.trained import Trained, load_trained
 
 _BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|montage\.png")
 """What qs3 itself and others write beside clouds, and nobody takes for one."""
@@ -133,7 +132,7 @@ def predict_files(
     Raises:
         InputError: where the run cannot be read, or does not hold what was asked for.
     """
-    loaded = load_model(run)
+    loaded = load_trained(run)
     if calibrated or unknown is not None:
         loaded.require_known(run, unknown)
     for path in files:
@@ -158,7 +157,7 @@ def _fault(path: Path, error: InputError) -> Answer:
 
 
 def answer_clouds(
-    loaded: LoadedModel,
+    loaded: Trained,
     points: Float[np.ndarray, "b n 3"],
     unknown: float | None = None,
     calibrated: bool = False,
@@ -168,7 +167,7 @@ def answer_clouds(
     Raises:
         InputError: where a point is not finite, or the network does not hold what was asked for.
     """
-    said = ask(loaded, points)
+    said = loaded.ask(points)
     shares, familiar = said.probabilities, [None] * len(points)
     if calibrated or unknown is not None:
         known = loaded.require_known("this network", unknown)

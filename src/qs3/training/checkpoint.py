@@ -10,20 +10,21 @@ import numpy as np
 import safetensors
 import safetensors.torch
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.adaptation.confidence import UNKNOWN, Known
+from qs3.adaptation.confidence import Known
 from qs3.errors import InputError
 from qs3.files import parse_json, write_bytes
 from qs3.io.preparation import PAPER, Preparation
 from qs3.models import PointClassifier, create_model
 from qs3.models.aligned import Aligned
-from qs3.models.checks import check_range
 from qs3.models.sized import Sized
 from qs3.structure import structure, unstructure
 from qs3.training.config import TrainSettings
-from qs3.training.run import MODEL, SETTINGS, read_settings
+from qs3.training.run import FOREST, MODEL, SETTINGS, read_settings
 from qs3.training.shipped import find_run, not_a_run
+from qs3.training.trained import Description, known_for
 
 FORMAT = 1
 
@@ -49,22 +50,18 @@ class LoadedModel(NamedTuple):
         return self.settings["train"].get("num_points")
 
     def require_known(self, run: Path | str, share: float | None = None) -> Known:
-        """Return what held-out source tells of it, where a share of it may be refused.
+        """Return `known`; see `qs3.training.trained.known_for`."""
+        return known_for(self, run, share)
+
+    def ask(self, points: Float[np.ndarray, "b n 3"]) -> Description:
+        """Return all that the network says of clouds as read; it knows how it was trained.
 
         Raises:
-            InputError: where there is none, the share is not in 0 to 1, or a class has the
-                name of what is no class.
+            InputError: if a point is not finite.
         """
-        if share is not None:
-            check_range("unknown", share, 0, 1)
-            if UNKNOWN in self.class_names:
-                raise InputError(f"{run}: has a class {UNKNOWN} itself; leave the share out")
-        if self.known is None:
-            raise InputError(
-                f"{run}: cannot tell what is unknown to it, nor calibrate: no part of the source "
-                "was held out of its training; train it anew with holdout above 0"
-            )
-        return self.known
+        from qs3.training.predict import ask
+
+        return ask(self, points)
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> None:
@@ -266,6 +263,8 @@ def load_model(run_dir: Path) -> LoadedModel:
     """
     run_dir = find_run(run_dir)
     path = run_dir if run_dir.is_file() else run_dir / MODEL
+    if path.name == FOREST or (run_dir / FOREST).is_file():
+        raise InputError(f"{run_dir}: holds a forest, and this takes a network only")
     if not path.is_file():
         state = "the run is not finished" if (run_dir / SETTINGS).is_file() else not_a_run()
         raise InputError(f"{run_dir}: no {MODEL} here; {state}")

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -13,15 +13,15 @@ from qs3.adaptation.confidence import UNKNOWN, rescale
 from qs3.errors import InputError
 from qs3.files import write_json
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.models import PointClassifier
-from qs3.structure import structure
 from qs3.training.answers import list_clouds, read_listed
-from qs3.training.checkpoint import LoadedModel, load_model, save_model
-from qs3.training.config import TrainSettings
-from qs3.training.predict import Description, ask
-from qs3.training.prepared import note_clouds, require_finite
+from qs3.training.checks import note_clouds, require_finite
 from qs3.training.run import RUN, SETTINGS, Run, is_run, read_run, read_settings, write_run
 from qs3.training.shipped import find_run
+from qs3.training.trained import Description, LoadedForest, Trained, load_trained, save_trained
+
+if TYPE_CHECKING:
+    from qs3.forest import Forest
+    from qs3.models import PointClassifier
 
 Clouds = PointClouds | UnlabelledClouds | ArrayLike | str | Path | Sequence[str | Path]
 """Clouds: one array [n 3] or [b n 3], a list of arrays of different sizes, clouds as read, or paths
@@ -30,14 +30,14 @@ _EXPECTED = "a cloud is [n 3] numbers, in metres, z up"
 
 
 class Classifier:
-    """A trained network with the names of its classes; `load` makes one.
+    """A trained network or forest with the names of its classes; `load` makes one.
 
     Args:
-        loaded: Network, classes and settings.
+        loaded: Network or forest, classes and settings.
         run: The record of its training, for `save`; None for weights alone.
     """
 
-    def __init__(self, loaded: LoadedModel, run: Run | None = None) -> None:
+    def __init__(self, loaded: Trained, run: Run | None = None) -> None:
         self._loaded, self._run = loaded, run
 
     @classmethod
@@ -45,8 +45,8 @@ class Classifier:
         """Return the classifier of a run.
 
         Args:
-            run: Folder of a run, its ``model.safetensors``, or the name of a network that comes
-                with qs3, such as ``rooms``.
+            run: Folder of a run, its ``model.safetensors`` or ``forest.safetensors``, or the
+                name of a network that comes with qs3, such as ``rooms``.
 
         Raises:
             InputError: if the path is not a run, or a file of it is damaged.
@@ -58,12 +58,13 @@ class Classifier:
         """
         place = find_run(run)
         folder = place.parent if place.is_file() else place
-        return cls(load_model(place), read_run(folder) if (folder / RUN).is_file() else None)
+        return cls(load_trained(place), read_run(folder) if (folder / RUN).is_file() else None)
 
     @property
-    def model(self) -> PointClassifier:
-        """The network."""
-        return self._loaded.model
+    def model(self) -> "PointClassifier | Forest":
+        """The network or the forest."""
+        loaded = self._loaded
+        return loaded.forest if isinstance(loaded, LoadedForest) else loaded.model
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -109,8 +110,8 @@ class Classifier:
     def save(self, folder: str | Path) -> Path:
         """Write the network into a folder, for `load` and every command.
 
-        Writes ``model.safetensors``, and ``settings.json`` and ``run.json`` if it was loaded with
-        them. Returns the file of the weights.
+        Writes ``model.safetensors`` or ``forest.safetensors``, and ``settings.json`` and
+        ``run.json`` if it was loaded with them. Returns the file of the weights.
 
         Raises:
             InputError: if the folder is a file, or holds another run.
@@ -120,8 +121,7 @@ class Classifier:
             raise InputError(f"{folder}: is a file; name a folder")
         if is_run(folder) and (self._run is None or read_settings(folder) != settings):
             raise InputError(f"{folder}: holds another run; name another folder")
-        train = structure(settings["train"], TrainSettings, folder)
-        path = save_model(folder, self.model, self.class_names, train, known=self._loaded.known)
+        path = save_trained(folder, self._loaded)
         if self._run is not None:
             write_json(folder / SETTINGS, settings)
             write_run(replace(self._run, folder=folder))
@@ -130,7 +130,7 @@ class Classifier:
     def _ask(self, clouds: Clouds) -> Description:
         batches = _batches(read_paths(clouds))
         note_clouds(batches)
-        said = [ask(self._loaded, batch) for batch in batches]
+        said = [self._loaded.ask(batch) for batch in batches]
         return Description(*map(np.concatenate, zip(*said, strict=True)))
 
 

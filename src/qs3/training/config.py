@@ -95,7 +95,9 @@ class TrainSettings:
     """How a network is trained on labelled clouds."""
 
     model: str = "dgcnn"
-    """Network, one of `qs3.models.list_models`."""
+    """Network, one of `qs3.models.list_models`; or forest, which knows parts by their size in
+    metres and their shape, and trains in seconds. A forest for known parts (77 % of real machine
+    parts against a PointNet's 62 %), a network for categories (furniture: 51 % against 44 %)."""
     model_settings: Annotated[Mapping[str, Any], tyro.conf.Suppress] = field(default_factory=dict)
     """Arguments of the network that differ from its defaults."""
     num_points: int = 1024

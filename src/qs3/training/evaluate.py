@@ -14,13 +14,14 @@ from qs3.io import load_clouds
 from qs3.io.clouds import CloudChoice, PointClouds, relabel
 from qs3.meshes.classes import require_named
 from qs3.training.batches import load_whole
-from qs3.training.checkpoint import LoadedModel, load_model
+from qs3.training.checks import require_finite
 from qs3.training.overlap import both_checksums, caveats
 from qs3.training.predict import describe
-from qs3.training.prepared import Prepared, prepare_clouds, require_finite
+from qs3.training.prepared import Prepared, prepare_clouds
 from qs3.training.rounds import kept_clouds
 from qs3.training.run import data_record, read_run
 from qs3.training.shipped import workplace
+from qs3.training.trained import LoadedForest, Trained, load_trained
 
 
 def evaluate(
@@ -52,7 +53,7 @@ def evaluate(
         InputError: if the run is not finished, the data cannot be read, or a class of the data or
             of the map is unknown to the network.
     """
-    made, loaded = read_run(run), load_model(run)
+    made, loaded = read_run(run), load_trained(run)
     run = made.folder
     train = loaded.settings["train"]
     called = {name: (class_map or {}).get(name, name) for name in loaded.class_names}
@@ -101,10 +102,14 @@ def records_path(run: Path) -> Path:
 
 
 def _scores(
-    loaded: LoadedModel, test: Prepared[PointClouds], answer_of: Int[np.ndarray, "k"]
+    loaded: Trained, test: Prepared[PointClouds], answer_of: Int[np.ndarray, "k"]
 ) -> Scores:
     """Scores, where ``answer_of`` tells which class of the data each of the network's is."""
-    answers = answer_of[describe(loaded.model, test).probabilities.argmax(axis=1)]
+    if isinstance(loaded, LoadedForest):
+        said = loaded.ask(test.clouds.points)
+    else:
+        said = describe(loaded.model, test)
+    answers = answer_of[said.probabilities.argmax(axis=1)]
     return score(test.labels, answers, test.class_names)
 
 

@@ -26,13 +26,14 @@ from qs3.training.checkpoint import (
     read_facts,
     weights_fingerprint,
 )
+from qs3.training.checks import require_finite
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, usual_preset
 from qs3.training.device import choose_device
 from qs3.training.history import EpochRecord, History
 from qs3.training.job import Job, fresh_model, make_method, run_job
 from qs3.training.loop import EpochCallback
 from qs3.training.overlap import caveats, data_fields
-from qs3.training.prepared import Prepared, prepare_clouds, require_finite
+from qs3.training.prepared import Prepared, prepare_clouds
 from qs3.training.progress import Deadline
 from qs3.training.rounds import Hooks, RoundCallback, RoundRecord
 from qs3.training.run import (

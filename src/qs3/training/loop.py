@@ -15,10 +15,11 @@ from qs3.errors import InputError, QS3Error
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.training.batches import DeviceClouds, count_batches, endless_batches, make_batch
 from qs3.training.checkpoint import load_optimiser, optimiser_tensors, seed_sequence
+from qs3.training.checks import name_few
 from qs3.training.config import TrainSettings
 from qs3.training.device import autocast, choose_device
 from qs3.training.history import EpochRecord, Log
-from qs3.training.prepared import Prepared, as_prepared, name_few
+from qs3.training.prepared import Prepared, as_prepared
 from qs3.training.progress import Deadline, Progress, TimeUpError
 from qs3.training.state import TrainingState, averaged, make_average
 

@@ -1,7 +1,5 @@
 """Class probabilities of clouds."""
 
-from typing import NamedTuple
-
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -11,20 +9,11 @@ from qs3.io.preparation import PAPER, Preparation
 from qs3.models import PointClassifier
 from qs3.models.classifier import evaluating
 from qs3.training.checkpoint import LoadedModel
+from qs3.training.checks import require_finite
 from qs3.training.config import Precision
 from qs3.training.device import autocast
-from qs3.training.prepared import Prepared, prepare_clouds, require_finite
-
-
-class Description(NamedTuple):
-    """What a network says of clouds."""
-
-    probabilities: Float[np.ndarray, "b k"]
-    """Softmax in float64; rows sum to 1 to rounding."""
-    features: Float[np.ndarray, "b c"]
-    """Pooled features, float64."""
-    logits: Float[np.ndarray, "b k"]
-    """What the probabilities are the softmax of, float64."""
+from qs3.training.prepared import Prepared, prepare_clouds
+from qs3.training.trained import Description
 
 
 def predict_probabilities(

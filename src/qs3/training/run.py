@@ -21,6 +21,9 @@ RUN = "run.json"
 SETTINGS = "settings.json"
 CONFIG = "run.toml"
 MODEL = "model.safetensors"
+FOREST_MODEL = "forest"
+"""``model`` in the settings of a run that holds a forest and no network."""
+FOREST = "forest.safetensors"
 SCHEMA_VERSION = 3
 
 
@@ -123,14 +126,15 @@ def read_run(folder: Path) -> Run:
     """
     folder = find_run(folder)
     path = folder / RUN
-    if not is_run(folder) and (folder / MODEL).is_file():
+    has_weights = any((folder / name).is_file() for name in (MODEL, FOREST))
+    if not is_run(folder) and has_weights:
         raise InputError(
             f"{folder}: weights alone; {SETTINGS} and {RUN} are missing, which tell what the "
             "network learnt from: copy them from the folder of its run"
         )
     if not is_run(folder):
         raise InputError(f"{folder}: no {RUN} here; {not_a_run()}")
-    if not path.is_file() or not (folder / MODEL).is_file():
+    if not path.is_file() or not has_weights:
         raise InputError(
             f"{folder}: the run is not finished; run its qs3 train command again to go on"
         )

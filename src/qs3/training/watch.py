@@ -10,7 +10,7 @@ from qs3.io.cameras.frames import Camera
 from qs3.io.extract.segment import SegmentedObject, SegmentSettings, lift_scene, segment
 from qs3.io.preparation import LARGEST, stack
 from qs3.training.answers import Answer, answer_clouds
-from qs3.training.checkpoint import LoadedModel, load_model
+from qs3.training.trained import Trained, load_trained
 
 _DENSER = 4  # points kept of an object, as a multiple of the network's: stray removal is slow
 
@@ -38,7 +38,7 @@ def watch(
     Raises:
         InputError: if the run or the camera cannot be read, or the run cannot tell unknown objects.
     """
-    loaded = load_model(Path(run))
+    loaded = load_trained(Path(run))
     if unknown is not None:
         loaded.require_known(run, unknown)
     with closing(camera):
@@ -54,7 +54,7 @@ def watch(
 
 
 def predict_objects(
-    loaded: LoadedModel, items: Sequence[SegmentedObject], unknown: float | None = None
+    loaded: Trained, items: Sequence[SegmentedObject], unknown: float | None = None
 ) -> tuple[tuple[SegmentedObject, Answer], ...]:
     """Classify the objects of a frame in one pass.
 

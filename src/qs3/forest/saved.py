@@ -1,0 +1,86 @@
+"""A forest as one safetensors file: arrays and JSON; nothing is ever unpickled."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from qs3.errors import InputError
+from qs3.files import parse_json, write_bytes
+from qs3.forest.forest import Forest
+from qs3.reading import reading
+
+FORMAT = 1
+_TYPES = {"threshold": np.float64, "value": np.float32, "weights": np.float64, "bias": np.float64}
+_ARRAYS = {
+    field.name: np.dtype(_TYPES.get(field.name, np.int32))
+    for field in fields(Forest)
+    if field.name not in ("class_names", "up")
+}
+
+
+def save_forest(path: Path, forest: Forest, facts: Mapping[str, Any]) -> None:
+    """Write a forest and JSON facts beside it to one file, atomically."""
+    arrays = {n: np.ascontiguousarray(getattr(forest, n), kind) for n, kind in _ARRAYS.items()}
+    own = {"format": FORMAT, "class_names": list(forest.class_names), "up": forest.up}
+    metadata = {"qs3": json.dumps({**facts, **own}, allow_nan=False)}
+    write_bytes(path, safetensors.numpy.save(arrays, metadata))
+
+
+def read_forest(path: Path) -> tuple[Forest, dict[str, Any]]:
+    """Read a forest and the facts beside it.
+
+    Raises:
+        InputError: if the file is missing, damaged, or not a forest of qs3.
+    """
+    with reading(path, "forest"):
+        try:
+            with safetensors.safe_open(path, framework="numpy") as handle:  # pyright: ignore[reportPrivateImportUsage]
+                facts = parse_json((handle.metadata() or {})["qs3"], path)
+                arrays = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118
+        except (safetensors.SafetensorError, KeyError) as error:
+            raise InputError(f"not a safetensors file of qs3 ({error})") from error
+        fault = _fault(facts, arrays)
+        if fault:
+            raise InputError(f"not a forest of this version: {fault}")
+    return Forest(tuple(facts["class_names"]), facts["up"], **arrays), facts
+
+
+def _fault(facts: Any, arrays: Mapping[str, np.ndarray]) -> str:
+    """Say what would make a forest answer wrongly or never; empty if nothing does."""
+    if not isinstance(facts, dict) or facts.get("format") != FORMAT:
+        return f"the format is not {FORMAT}"
+    names = facts.get("class_names")
+    if not isinstance(names, list) or not all(isinstance(name, str) and name for name in names):
+        return "class names are missing or empty"
+    if len({*names}) != len(names) or len(names) < 2:
+        return "class names are repeated, or of one class alone"
+    if not isinstance(facts.get("up"), bool):
+        return "up is not true or false"
+    if {name: array.dtype for name, array in arrays.items()} != _ARRAYS:
+        return "arrays are missing or of another type"
+    nodes, width = arrays["feature"].size, arrays["weights"].shape[-1:]
+    shapes = dict.fromkeys(("feature", "threshold", "left", "right"), (nodes,))
+    shapes |= {"value": (nodes, len(names)), "roots": (arrays["roots"].size,)}
+    shapes |= {"weights": (len(names), *width), "bias": (len(names),)}
+    if {name: array.shape for name, array in arrays.items()} != shapes or not arrays["roots"].size:
+        return "arrays do not fit each other"
+    if not all(np.isfinite(array).all() for array in arrays.values()):
+        return "a number is not finite"
+    inner = arrays["feature"] >= 0
+    place = np.arange(nodes)
+    # A child comes after its parent, so that every walk ends.
+    for name in ("left", "right"):
+        child = arrays[name][inner]
+        if (child <= place[inner]).any() or (child >= nodes).any():
+            return f"an index of {name} is out of range"
+    ranges = {"feature": (-1, *width), "roots": (0, nodes)}
+    for name, (low, high) in ranges.items():
+        if (arrays[name] < low).any() or (arrays[name] >= high).any():
+            return f"an index of {name} is out of range"
+    return ""

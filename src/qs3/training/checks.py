@@ -1,0 +1,92 @@
+"""Checks of clouds before anything learns from them or answers, in NumPy alone."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from qs3.errors import InputError, say_once
+from qs3.io.preparation import BLOCK, Preparation, distinct_inliers
+
+_HUGE = 20.0  # metres, more than any object of a room
+_TINY = 0.005  # metres, less than what a depth camera sees of any
+_UNIT = 1e-3  # of a radius of 1 in half precision
+_FEW = 32  # points; fewer have no shape
+
+
+def require_finite(points: np.ndarray, ids: Sequence[str], where: str = "") -> None:
+    """Refuse clouds with coordinates that are not finite.
+
+    Args:
+        points: Clouds [b n 3].
+        ids: What each is called.
+        where: What they are, at the head of the message.
+
+    Raises:
+        InputError: with the ids of the first such clouds.
+    """
+    blocks = (points[start : start + BLOCK] for start in range(0, len(points), BLOCK))
+    good = np.concatenate([np.isfinite(block).all(axis=(1, 2)) for block in blocks] or [[True]])
+    if not good.all():
+        bad = [ids[row] for row in np.flatnonzero(~good).tolist()]
+        raise InputError(f"{where}points of {name_few(bad)} are not finite; leave these clouds out")
+
+
+def name_few(names: Sequence[str]) -> str:
+    """Name clouds, four of them at most.
+
+    Example:
+        >>> name_few(["a"]), name_few(["a", "b", "c", "d", "e"])
+        ('cloud a', 'clouds a, b, c, d and 1 more')
+    """
+    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+    return f"cloud{'s' if len(names) > 1 else ''} {', '.join(names[:4])}{more}"
+
+
+def note_clouds(clouds: Sequence[Float[np.ndarray, "_ _ 3"]], where: str = "a cloud") -> None:
+    """Say once where a network is asked about clouds of too few points.
+
+    Args:
+        clouds: Arrays of clouds.
+        where: The first of them, for the message.
+    """
+    for points in clouds:
+        if any(map(_has_few, points)):
+            say_once(
+                f"{where} has fewer than {_FEW} distinct points, too few to tell its class: its "
+                "answer means little (told once)",
+                "few distinct points",
+            )
+
+
+def _has_few(cloud: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether few of the points are distinct; mostly the first tell that they are not."""
+    parts = (cloud[: 2 * _FEW], cloud)
+    return all(len(distinct_inliers(part, False)) < _FEW for part in parts)
+
+
+def note_size(points: Float[np.ndarray, "b n 3"], preparation: Preparation) -> None:
+    """Say once where clouds have no size in metres, by the looks, and the network is told it."""
+    if preparation.size_input and points.size:
+        some = points[:: max(1, len(points) // BLOCK)]
+        # Strays are not gone yet: a twentieth of the points does not count on either side.
+        extents = np.ptp(np.quantile(some, (0.05, 0.95), axis=1), axis=0).max(axis=1)
+        size = float(np.median(extents))
+        if size > _HUGE:
+            say_once(
+                f"clouds are larger than {_HUGE:.0f} m, and their size in metres "
+                "counts: points in millimetres are to be divided by 1000"
+            )
+        if size < _TINY:
+            say_once(
+                f"clouds are smaller than {1000 * _TINY:.0f} mm, and their "
+                "size counts: points are to be in metres"
+            )
+        if len(some) == 1:  # which may be just so large
+            return
+        balls = np.linalg.norm(some - some.mean(axis=1, keepdims=True), axis=2).max(axis=1)
+        if np.abs(balls - 1).max() < _UNIT:
+            say_once(
+                "every cloud fills the unit ball, and their size counts: leave out "
+                "size_input, or give clouds of real sizes"
+            )

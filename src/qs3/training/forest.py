@@ -1,0 +1,241 @@
+"""Train a forest on labelled clouds; then in rounds on its own pseudo labels if asked."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from qs3.adaptation.confidence import Known, measure_known
+from qs3.adaptation.names import split_method
+from qs3.adaptation.selection import count_labels, select_confident
+from qs3.errors import InputError
+from qs3.files import write_text
+from qs3.forest import Forest, describe, fit_forest
+from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.io.preparation import PAPER, ROBUST
+from qs3.training.batches import require_unlabelled
+from qs3.training.checkpoint import write_tensors
+from qs3.training.checks import note_size, require_finite
+from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, usual_preset
+from qs3.training.history import EpochRecord
+from qs3.training.overlap import checksums, data_fields
+from qs3.training.prepared import Prepared, prepare_clouds
+from qs3.training.pseudo_labels import round_threshold, select_clouds
+from qs3.training.rounds import STATE, RoundRecord
+from qs3.training.run import CONFIG, Run, RunSettings, claim_run, sum_cost, write_run
+from qs3.training.trained import METRIC, LoadedForest, answers_of, counting, save_trained
+from qs3.training.validation import ROUND, held_out
+
+_READ = ("model", "holdout", "seed")
+_ROUNDS_READ = (
+    *("rule", "threshold", "step", "threshold_share", "rounds"),
+    *("selection", "inclusive", "single_class"),
+)
+"""Settings that a forest reads; a network reads the others."""
+
+
+@dataclass(frozen=True)
+class ForestResult:
+    """What the training of a forest gave."""
+
+    forest: Forest
+    rounds: tuple[RoundRecord, ...]
+    """Rounds of self-training."""
+    source_accuracy: float | None
+    """Accuracy on the held-out part of the source; None if there is none."""
+    held_out: int
+    """Clouds in that part."""
+
+
+def train_forest(
+    method: str,
+    source: PointClouds,
+    target: UnlabelledClouds | None,
+    settings: TrainSettings,
+    self_training: SelfTrainingSettings | None = None,
+    *,
+    run_dir: Path,
+    preset: str | None = None,
+    supervised: bool = False,
+    config: str | None = None,
+) -> ForestResult:
+    """Train a forest, then in rounds of self-training if asked, into the folder of a run.
+
+    A round labels the target, selects as a network's round does, and fits the forest to the source
+    and the selected clouds, each with weight 1.
+
+    Args:
+        method: ``source-only``, ``qbst`` or ``spst``.
+        source: Labelled clouds, z up, in metres. A share of ``settings.holdout`` is held out.
+        target: Clouds without labels, likewise.
+        settings: The seed and the share to hold out; the other settings are a network's.
+        self_training: Settings of the rounds; a method of rounds has its usual preset.
+        run_dir: Folder of the run: ``settings.json``, ``forest.safetensors``, at the end
+            ``run.json``.
+        preset: Name of the rounds' preset, for the record.
+        supervised: Whether the source is the labelled part of the target, for the record.
+        config: Text of ``run.toml``, from which the command line repeats the run.
+
+    Raises:
+        InputError: if arguments do not go together, a setting is a network's alone, points are not
+            finite, or the folder holds another run.
+    """
+    base, rule = split_method(method, None if self_training is None else self_training.rule)
+    if base != "source-only":
+        raise InputError(f"method {method} needs a network; a forest knows source-only, qbst, spst")
+    rounds = self_training
+    if rule is not None and rounds is None:
+        rounds = PRESETS[usual_preset(rule)]
+    settings = _own_settings(settings)
+    if rounds is not None:
+        _check_rounds(rounds)
+        if target is None or not len(target):
+            raise InputError(f"method {method} needs a target: give unlabelled clouds")
+    if target is not None:
+        require_unlabelled(target)
+        require_finite(target.points, target.ids, "target: ")
+    require_finite(source.points, source.ids, "source: ")
+    note_size(source.points, METRIC)
+    held = held_out(source, settings)
+    wanted = RunSettings.of(method, source, target, settings, rounds, None)
+    with claim_run(run_dir, wanted, lambda begun: begun or 1):
+        if config is not None:
+            write_text(run_dir / CONFIG, config)
+        clock = _Clock()
+        prepared = prepare_clouds(source, settings.num_points, ROBUST)
+        described = _describe(prepared)
+        train, labels = described[~held], source.labels[~held]
+        forest = fit_forest(train, labels, source.class_names, seed=settings.seed)
+        epochs = [EpochRecord(0, {}, 0.0, clock.wall, cpu_seconds=clock.cpu)]
+        records: list[RoundRecord] = []
+        unlabelled = None
+        if target is not None:
+            unlabelled = prepare_clouds(target, settings.num_points, ROBUST)
+        if rounds is not None and unlabelled is not None:
+            forest, records, kept = _run_rounds(
+                forest, train, labels, _describe(unlabelled), rounds, settings.seed
+            )
+            tensors = {f"kept/{i}": torch.from_numpy(rows) for i, rows in enumerate(kept)}
+            write_tensors(run_dir / STATE, tensors, {"clouds": checksums(unlabelled)})
+        known, right = _judge(forest, described[held], source.labels[held])
+        save_trained(run_dir, LoadedForest(forest, {}, known))
+        stage, number = (base, 1) if rounds is None else (ROUND, len(records))
+        run = Run(
+            method=method if rounds is None or method != base else f"{base}+{rounds.rule}",
+            selection="last",
+            chosen={"stage": stage, "number": number},
+            **data_fields(prepared, unlabelled, rounds is not None),
+            threads=1,
+            unknown_warm_up=False,
+            rounds=tuple(asdict(record) for record in records),
+            **sum_cost(epochs, records),
+            preset=None if rounds is None else preset,
+            supervised=supervised,
+            folder=run_dir,
+        )
+        write_run(run)
+    return ForestResult(forest, tuple(records), right, int(held.sum()))
+
+
+def _own_settings(settings: TrainSettings) -> TrainSettings:
+    """Return the settings that a forest reads; refuse any other that is not at its default."""
+    default = TrainSettings()
+    for field in fields(TrainSettings):
+        allowed = [getattr(default, field.name)]
+        if field.name == "preparation":
+            allowed = [PAPER, ROBUST]
+        if field.name not in _READ and getattr(settings, field.name) not in allowed:
+            raise InputError(f"setting {field.name} needs a network; leave it out for a forest")
+    read = {name: getattr(settings, name) for name in _READ}
+    return TrainSettings(preparation=ROBUST, **read)
+
+
+def _check_rounds(rounds: SelfTrainingSettings) -> None:
+    usual = [PRESETS[name] for name in ("default", "gentle", "spst")]
+    for field in fields(SelfTrainingSettings):
+        value = getattr(rounds, field.name)
+        if field.name not in _ROUNDS_READ and value not in [getattr(u, field.name) for u in usual]:
+            raise InputError(
+                f"setting {field.name} = {value} of the rounds needs a network; leave it out for "
+                "a forest, with its preset"
+            )
+
+
+def _describe(prepared: Prepared[Any]) -> Float[np.ndarray, "b f"]:
+    return describe([counting(cloud) for cloud in prepared.clouds.points])
+
+
+def _judge(
+    forest: Forest, descriptors: Float[np.ndarray, "v f"], labels: Int[np.ndarray, "v"]
+) -> tuple[Known | None, float | None]:
+    """Return what held-out clouds tell of a forest, and its accuracy on them."""
+    if not len(labels):
+        return None, None
+    said = answers_of(forest, descriptors)
+    right = float((said.probabilities.argmax(axis=1) == labels).mean())
+    return measure_known(said.logits, labels), right
+
+
+def _run_rounds(
+    forest: Forest,
+    source: Float[np.ndarray, "b f"],
+    labels: Int[np.ndarray, "b"],
+    target: Float[np.ndarray, "m f"],
+    rounds: SelfTrainingSettings,
+    seed: int,
+) -> tuple[Forest, list[RoundRecord], Sequence[Int[np.ndarray, "2 c"]]]:
+    """Do the rounds (Algorithm 1); return the last forest, and of each round what it kept."""
+    records: list[RoundRecord] = []
+    kept: list[np.ndarray] = []
+    before, classes = None, len(forest.class_names)
+    for number in range(1, rounds.rounds + 1):
+        clock = _Clock()
+        shares = forest.predict_proba(target)
+        answers = shares.argmax(axis=1)
+        theta = round_threshold(rounds, number, shares)
+        chosen = np.flatnonzero(select_clouds(shares, theta, rounds))
+        confident = count_labels(
+            shares, select_confident(shares, theta, inclusive=rounds.inclusive)
+        )
+        if len(chosen):
+            both = np.concatenate([source, target[chosen]])
+            given = np.concatenate([labels, answers[chosen]])
+            forest = fit_forest(both, given, forest.class_names, seed=seed)
+        record = RoundRecord(
+            round=number,
+            theta=theta,
+            pool=len(target),
+            confident=tuple(confident.tolist()),
+            kept=tuple(np.bincount(answers[chosen], minlength=classes).tolist()),
+            agreement=None if before is None else float((answers == before).mean()),
+            skipped=not len(chosen),
+            single_class=int(np.count_nonzero(confident)) == 1,
+            held_out=None,
+            losses=(),
+            seconds=clock.wall,
+            cpu_seconds=clock.cpu,
+        )
+        records.append(record)
+        kept.append(np.stack([chosen, answers[chosen]]))
+        before = answers
+    return forest, records, kept
+
+
+class _Clock:
+    """Seconds since it was made."""
+
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    @property
+    def wall(self) -> float:
+        return time.perf_counter() - self._wall
+
+    @property
+    def cpu(self) -> float:
+        return time.process_time() - self._cpu

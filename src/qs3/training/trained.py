@@ -1,0 +1,149 @@
+"""Load the network or the forest of a run. A forest needs neither PyTorch nor scikit-learn."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Union
+
+import numpy as np
+from jaxtyping import Float
+
+from qs3.adaptation.confidence import UNKNOWN, Known
+from qs3.errors import InputError
+from qs3.forest import Forest, describe
+from qs3.forest.saved import read_forest, save_forest
+from qs3.io.clouds import numbered
+from qs3.io.preparation import ROBUST, Preparation, distinct_inliers
+from qs3.models.checks import check_range
+from qs3.structure import structure, unstructure
+from qs3.training.checks import note_size, require_finite
+from qs3.training.config import TrainSettings
+from qs3.training.run import FOREST, FOREST_MODEL, SETTINGS, read_settings
+from qs3.training.shipped import find_run
+
+if TYPE_CHECKING:
+    from qs3.training.checkpoint import LoadedModel
+
+METRIC = replace(ROBUST, size_input=True)
+"""A forest looks at real sizes."""
+Trained = Union["LoadedModel", "LoadedForest"]
+"""A network or a forest, with its classes and settings."""
+
+
+class Description(NamedTuple):
+    """What a network or a forest says of clouds."""
+
+    probabilities: Float[np.ndarray, "b k"]
+    """Softmax in float64; rows sum to 1 to rounding."""
+    features: Float[np.ndarray, "b c"]
+    """Pooled features, or descriptors, float64."""
+    logits: Float[np.ndarray, "b k"]
+    """What the probabilities are the softmax of, float64."""
+
+
+@dataclass(frozen=True)
+class LoadedForest:
+    """The forest of a run."""
+
+    forest: Forest
+    settings: dict[str, Any]
+    """The content of ``settings.json``."""
+    known: Known | None = None
+    """How it answers clouds of its classes that it was not trained on; None without a held-out
+    part of the source."""
+    preparation: Preparation = ROBUST
+    num_points: int | None = None
+    """None: a forest takes all points that count."""
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Names of the classes, in the order of the probabilities."""
+        return self.forest.class_names
+
+    def require_known(self, run: Path | str, share: float | None = None) -> Known:
+        """Return `known`; see `known_for`."""
+        return known_for(self, run, share)
+
+    def ask(self, points: Float[np.ndarray, "b n 3"]) -> Description:
+        """Return all that the forest says of clouds as read.
+
+        Raises:
+            InputError: if a point is not finite.
+        """
+        require_finite(points, numbered(len(points)))
+        note_size(points, METRIC)
+        descriptors = describe([counting(cloud) for cloud in points], self.forest.up)
+        return answers_of(self.forest, descriptors)
+
+
+def counting(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """Return the points that a forest looks at: each place once, without strays."""
+    cloud = np.asarray(cloud, dtype=np.float32)
+    return cloud[distinct_inliers(cloud, ROBUST.remove_outliers)]
+
+
+def answers_of(forest: Forest, descriptors: Float[np.ndarray, "b f"]) -> Description:
+    """Return the probabilities of a forest, with logits whose energy is that of the confidence.
+
+    Log probabilities alone would all have the energy 0, and nothing would be unknown: the log odds
+    of the likeliest class are added.
+    """
+    shares = forest.predict_proba(descriptors)
+    logits = np.log(np.maximum(shares, np.finfo(np.float64).tiny))
+    ordered = np.sort(logits, axis=1)
+    odds = ordered[:, -1] - np.logaddexp.reduce(ordered[:, :-1], axis=1)
+    return Description(shares, descriptors, logits + odds[:, None])
+
+
+def load_trained(run: Path) -> Trained:
+    """Load a run.
+
+    Args:
+        run: Folder of the run, the name of a network that comes with qs3, or the file of a network
+            or a forest.
+
+    Raises:
+        InputError: if files are missing, damaged or do not belong together.
+    """
+    place = find_run(run)
+    path = place if place.is_file() else place / FOREST
+    if path.name != FOREST or not path.is_file():
+        from qs3.training.checkpoint import load_model  # it imports PyTorch
+
+        return load_model(run)
+    forest, facts = read_forest(path)
+    known = structure(facts["known"], Known, path) if "known" in facts else None
+    if (path.parent / SETTINGS).is_file():
+        settings = read_settings(path.parent)
+    else:
+        settings = {"train": unstructure(TrainSettings(model=FOREST_MODEL, preparation=ROBUST))}
+    return LoadedForest(forest, settings, known)
+
+
+def save_trained(folder: Path, loaded: Trained) -> Path:
+    """Write the file of a network or a forest into a folder, and return it."""
+    if isinstance(loaded, LoadedForest):
+        known = {} if loaded.known is None else {"known": unstructure(loaded.known)}
+        save_forest(folder / FOREST, loaded.forest, known)
+        return folder / FOREST
+    from qs3.training.checkpoint import save_model  # it imports PyTorch
+
+    train = structure(loaded.settings["train"], TrainSettings, folder)
+    return save_model(folder, loaded.model, loaded.class_names, train, known=loaded.known)
+
+
+def known_for(loaded: Trained, run: Path | str, share: float | None = None) -> Known:
+    """Return what held-out source tells of a run, of which a share may be refused.
+
+    Raises:
+        InputError: if there is none, the share is not in 0 to 1, or a class is called unknown.
+    """
+    if share is not None:
+        check_range("unknown", share, 0, 1)
+        if UNKNOWN in loaded.class_names:
+            raise InputError(f"{run}: has a class {UNKNOWN} itself; leave the share out")
+    if loaded.known is None:
+        raise InputError(
+            f"{run}: cannot tell what is unknown to it, nor calibrate: no part of the source "
+            "was held out of its training; train it anew with holdout above 0"
+        )
+    return loaded.known

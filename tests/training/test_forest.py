@@ -1,0 +1,180 @@
+"""Runs of forests: trained, saved, asked and scored; target labels never reach them."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from qs3.errors import InputError
+from qs3.forest.saved import read_forest
+from qs3.io.clouds import PointClouds
+from qs3.io.preparation import ROBUST
+from qs3.training import Classifier, SelfTrainingSettings, TrainSettings, evaluate, read_run
+from qs3.training.forest import train_forest
+from qs3.training.trained import load_trained
+
+from .common import make_clouds
+
+SETTINGS = TrainSettings(model="forest", holdout=0.2)
+ROUNDS = SelfTrainingSettings(rounds=2, threshold_share=0.5)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_trees():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("qs3.forest.forest.TREES", 60)
+        yield
+
+
+def scans(count=30, seed=0, noise=0.02) -> PointClouds:
+    clouds = make_clouds(count, seed, noise, points=200)
+    return dataclasses.replace(clouds, points=clouds.points * np.float32(0.05))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("forest") / "run"
+    target = scans(24, 1).without_labels()
+    result = train_forest("qbst", scans(), target, SETTINGS, ROUNDS, run_dir=folder)
+    return folder, result
+
+
+def test_a_run_predicts_as_it_was_trained_and_scores(run):
+    folder, result = run
+    test = scans(12, 7)
+    made = Classifier.load(folder)
+    assert made.class_names == test.class_names
+    assert made.predict_proba(test) == pytest.approx(
+        load_trained(folder / "forest.safetensors").ask(test.points).probabilities
+    )
+    record = evaluate(folder, scans(24, 1))
+    assert (record.model, record.method) == ("forest", "qbst")
+    assert record.scores.accuracy > 0.9
+    assert record.marks == ("transductive",)
+    assert sum(record.rounds[0]["right"]) == sum(record.rounds[0]["known"]) > 0
+    assert result.held_out == 6
+    assert result.source_accuracy == 1
+
+
+def test_objects_between_two_classes_are_unknown(run):
+    made, test = Classifier.load(run[0]), scans(60, 9)
+    blends = dataclasses.replace(test, points=test.points * np.float32([1, 1, 2.5]))
+    known, unsure = (
+        (made.predict(clouds, unknown=0.1) == "unknown").mean() for clouds in (test, blends)
+    )
+    assert known < 0.5
+    assert unsure > known
+
+
+def test_saved_again_it_answers_alike(run, tmp_path):
+    made, test = Classifier.load(run[0]), scans(6, 3)
+    made.save(tmp_path / "copy")
+    other = Classifier.load(tmp_path / "copy")
+    assert np.array_equal(made.predict_proba(test), other.predict_proba(test))
+    assert read_run(tmp_path / "copy").method == "qbst"
+
+
+@pytest.mark.parametrize("method", ["qbst", "spst"])
+def test_labels_of_the_target_change_nothing(tmp_path, method):
+    target = scans(24, 1)
+    poisoned = dataclasses.replace(target, labels=(target.labels + 1) % 3)
+    shares = []
+    for name, clouds in (("right", target), ("poisoned", poisoned)):
+        rounds = dataclasses.replace(ROUNDS, rule=method)
+        folder = tmp_path / name
+        train_forest(method, scans(), clouds.without_labels(), SETTINGS, rounds, run_dir=folder)
+        shares.append((folder / "forest.safetensors").read_bytes())
+    assert shares[0] == shares[1]
+    with pytest.raises((InputError, TypeError, ValueError)):
+        train_forest(method, scans(), target, SETTINGS, ROUNDS, run_dir=tmp_path / "labelled")
+
+
+def test_rounds_learn_a_domain_whose_sizes_drift(tmp_path):
+    """A class that is smaller in the target than in the source is found by what is sure."""
+    source, target = scans(60, noise=0.02), scans(60, 5, noise=0.02)
+    target = dataclasses.replace(target, points=target.points * np.float32(0.9))
+    plain = train_forest("source-only", source, None, SETTINGS, run_dir=tmp_path / "plain")
+    adapted = train_forest(
+        "qbst", source, target.without_labels(), SETTINGS, ROUNDS, run_dir=tmp_path / "adapted"
+    )
+    assert not plain.rounds
+    assert [record.skipped for record in adapted.rounds] == [False, False]
+    right = [evaluate(tmp_path / name, target).scores.accuracy for name in ("plain", "adapted")]
+    assert right[1] >= right[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [({"epochs": 3}, "epochs"), ({"rule": "source-val"}, "rule"), ({"threads": 2}, "threads")],
+)
+def test_settings_of_networks_are_refused(tmp_path, change, fault):
+    settings = dataclasses.replace(SETTINGS, **change)
+    with pytest.raises(InputError, match=fault):
+        train_forest("source-only", scans(), None, settings, run_dir=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("method", ["dann", "pointdan", "gast", "gast-spst"])
+def test_methods_of_networks_are_refused(tmp_path, method):
+    target = scans(6).without_labels()
+    with pytest.raises(InputError, match="needs a network"):
+        train_forest(method, scans(), target, SETTINGS, run_dir=tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "fault"),
+    [
+        ("left", 10**6, "left"),
+        ("left", 0, "left"),
+        ("feature", 66, "feature"),
+        ("roots", -1, "roots"),
+        ("threshold", np.nan, "finite"),
+        ("bias", np.inf, "finite"),
+    ],
+)
+def test_a_damaged_forest_is_refused(run, tmp_path, name, value, fault):
+    path = tmp_path / "forest.safetensors"
+    arrays = safetensors.numpy.load_file(run[0] / path.name)
+    with safetensors.safe_open(run[0] / path.name, framework="numpy") as handle:
+        facts = handle.metadata()
+    row = 0 if name in ("bias", "roots") else int(np.flatnonzero(arrays["feature"] >= 0)[0])
+    arrays[name][row] = value
+    safetensors.numpy.save_file(arrays, path, facts)
+    with pytest.raises(InputError, match=fault):
+        read_forest(path)
+
+
+@pytest.mark.parametrize("names", [["ball", "ball", "rod"], ["ball", "", "rod"], ["ball", "rod"]])
+def test_wrong_class_names_are_refused(run, tmp_path, names):
+    path = tmp_path / "forest.safetensors"
+    with safetensors.safe_open(run[0] / path.name, framework="numpy") as handle:
+        facts = json.loads(handle.metadata()["qs3"]) | {"class_names": names}
+    arrays = safetensors.numpy.load_file(run[0] / path.name)
+    safetensors.numpy.save_file(arrays, path, {"qs3": json.dumps(facts)})
+    with pytest.raises(InputError, match="not a forest of this version"):
+        read_forest(path)
+
+
+def test_predicting_imports_neither_torch_nor_scikit_learn(run, tmp_path):
+    np.save(tmp_path / "cloud.npy", scans(1).points[0])
+    code = (
+        "import sys; from qs3.cli import main\n"
+        "try: main(sys.argv[1:])\n"
+        "except SystemExit as ended: assert not ended.code\n"
+        "print(*(name for name in ('torch', 'sklearn', 'trimesh') if name in sys.modules))"
+    )
+    words = ["predict", str(run[0]), str(tmp_path / "cloud.npy"), "--unknown", "0.1"]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], capture_output=True, text=True, check=True
+    )
+    answer, loaded = done.stdout.splitlines()
+    assert "cloud.npy" in answer
+    assert loaded == ""
+
+
+def test_the_preparation_is_the_one_of_networks_for_real_scans(run):
+    assert load_trained(run[0]).preparation == ROBUST
