@@ -15,6 +15,7 @@ from qs3.io.clouds import PointClouds
 from qs3.io.preparation import ROBUST
 from qs3.training import Classifier, SelfTrainingSettings, TrainSettings, evaluate, read_run
 from qs3.training.forest import train_forest
+from qs3.training.labels import read_labels
 from qs3.training.trained import load_trained
 
 from .common import make_clouds
@@ -178,3 +179,56 @@ def test_predicting_imports_neither_torch_nor_scikit_learn(run, tmp_path):
 
 def test_the_preparation_is_the_one_of_networks_for_real_scans(run):
     assert load_trained(run[0]).preparation == ROBUST
+
+
+def test_a_few_labels_mend_a_class_and_have_a_name_of_their_own(tmp_path):
+    """The target is four times as wide as the source: labels tell."""
+    target = scans(30, 1)
+    target = dataclasses.replace(target, points=target.points * np.float32([4, 4, 1]))
+    few = target.select(np.arange(6))
+    rest = target.select(np.arange(6, 30))
+    for name, labelled in (("plain", None), ("few", few)):
+        train_forest(
+            "source-only", scans(), None, SETTINGS, run_dir=tmp_path / name, labelled=labelled
+        )
+    plain, mended = (evaluate(tmp_path / name, rest) for name in ("plain", "few"))
+    assert mended.scores.accuracy > plain.scores.accuracy + 0.2
+    assert (plain.method, mended.method) == ("source-only", "few-label")
+    assert evaluate(tmp_path / "few", few).marks == ("training clouds",)
+    with pytest.raises(InputError, match="another --labels"):
+        train_forest(
+            "source-only", scans(), None, SETTINGS, run_dir=tmp_path / "few", labelled=rest
+        )
+
+
+def test_labelled_scans_get_no_pseudo_label(tmp_path):
+    target = scans(24, 1)
+    given = {"run_dir": tmp_path / "run", "labelled": target.select(np.arange(4))}
+    made = train_forest("qbst", scans(), target.without_labels(), SETTINGS, ROUNDS, **given)
+    assert made.rounds[0].pool == 20
+    assert read_run(tmp_path / "run").method == "few-label+qbst"
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("file,class\na.npy,cube\n", "unknown class 'cube'"),
+        ("file,class\nb.npy,ball\n", "no such file"),
+        ("file,class\na.npy,\n", "no row has a class"),
+        ("file,class\na.npy,ball\na.npy,rod\n", "two classes"),
+        ("name,class\na.npy,ball\n", "columns file and class"),
+    ],
+)
+def test_a_table_of_labels_is_checked(tmp_path, text, fault):
+    np.save(tmp_path / "a.npy", scans(1).points[0])
+    (tmp_path / "labels.csv").write_text(text)
+    with pytest.raises(InputError, match=fault):
+        read_labels(tmp_path / "labels.csv", ("ball", "disc", "rod"))
+
+
+def test_a_table_of_labels_leaves_out_what_has_none(tmp_path):
+    for name in "ab":
+        np.save(tmp_path / f"{name}.npy", scans(1).points[0])
+    (tmp_path / "labels.csv").write_text("file,suggested,class\na.npy,rod,disc\nb.npy,rod,\n")
+    read = read_labels(tmp_path / "labels.csv", ("ball", "disc", "rod"))
+    assert (len(read), read.labels.tolist()) == (1, [1])

@@ -77,6 +77,10 @@ class TrainOptions(Choices):
     """Part of the source, such as train; all of it by default."""
     target_split: str | None = None
     """Part of the target."""
+    labels: Path | None = None
+    """CSV with the columns file and class of a few scans (qs3 suggest writes one to fill in), from
+    which a forest learns beside the source. The record then has the method few-label. Files are
+    found below --target too."""
     classes: Literal["pointda10"] | None = None
     """Names of the source's classes: as they stand by default, or PointDA-10's ten, onto which the
     table of aliases maps them (stool → chair)."""
@@ -260,6 +264,8 @@ def train(options: Flat[TrainOptions]) -> int:
         part = {"split": options.target_split, "cloud": options.target_cloud}
         target = load_whole(load_unlabelled, options.target, *how, **part)
     rounds = None if rule is None else options.self_training
+    if options.labels is not None and settings.model != FOREST_MODEL:
+        raise InputError("--labels: a network cannot learn from a few labels; use --model forest")
     if settings.model == FOREST_MODEL:
         return _train_forest(options, source, target, settings, rounds)
     if options.dry_run:
@@ -298,9 +304,14 @@ def _train_forest(
     rounds: SelfTrainingSettings | None,
 ) -> int:
     from qs3.training.forest import train_forest
+    from qs3.training.labels import read_labels
 
     if source is None or options.warm_up is not None or options.max_time is not None:
         raise InputError("a forest learns from --source, without --warm-up and --max-time")
+    labelled = None
+    if options.labels is not None:
+        folder = None if options.target is None else Path(options.target)
+        labelled = read_labels(options.labels, source.class_names, folder)
     if options.dry_run:
         seen = "" if target is None else f", {len(target)} unlabelled clouds of the target"
         show(f"a forest, {len(source)} labelled clouds of the source{seen}")
@@ -315,7 +326,10 @@ def _train_forest(
         preset=options.preset,
         supervised=options.supervised,
         config=run_toml(replace(options, train=settings)),
+        labelled=labelled,
     )
+    if labelled is not None:
+        tell(f"few-label: learnt from {len(labelled)} labelled scans")
     names, right, count = source.class_names, result.source_accuracy, result.held_out
     return _finish(options, names, result.rounds, right, count)
 

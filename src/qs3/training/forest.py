@@ -2,13 +2,13 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from qs3.adaptation.confidence import Known, measure_known
 from qs3.adaptation.names import split_method
@@ -27,10 +27,21 @@ from qs3.training.overlap import checksums, data_fields
 from qs3.training.prepared import Prepared, prepare_clouds
 from qs3.training.pseudo_labels import round_threshold, select_clouds
 from qs3.training.rounds import STATE, RoundRecord
-from qs3.training.run import CONFIG, Run, RunSettings, claim_run, sum_cost, write_run
+from qs3.training.run import (
+    CONFIG,
+    Run,
+    RunSettings,
+    claim_run,
+    fingerprint,
+    sum_cost,
+    write_run,
+)
 from qs3.training.trained import METRIC, LoadedForest, answers_of, counting, save_trained
 from qs3.training.validation import ROUND, held_out
 
+FEW_LABEL = "few-label"
+"""Method of a run that learnt from labelled scans of the target."""
+LABEL_WEIGHT = 10.0
 _READ = ("model", "holdout", "seed")
 _ROUNDS_READ = (
     *("rule", "threshold", "step", "threshold_share", "rounds"),
@@ -63,6 +74,7 @@ def train_forest(
     preset: str | None = None,
     supervised: bool = False,
     config: str | None = None,
+    labelled: PointClouds | None = None,
 ) -> ForestResult:
     """Train a forest, then in rounds of self-training if asked, into the folder of a run.
 
@@ -80,6 +92,8 @@ def train_forest(
         preset: Name of the rounds' preset, for the record.
         supervised: Whether the source is the labelled part of the target, for the record.
         config: Text of ``run.toml``, from which the command line repeats the run.
+        labelled: A few labelled scans; each has the weight of ten clouds of the source, and the
+            method of the record is ``few-label``, never that of a label-free run.
 
     Raises:
         InputError: if arguments do not go together, a setting is a network's alone, points are not
@@ -92,6 +106,11 @@ def train_forest(
     if rule is not None and rounds is None:
         rounds = PRESETS[usual_preset(rule)]
     settings = _own_settings(settings)
+    if labelled is not None:
+        require_finite(labelled.points, labelled.ids, "labelled: ")
+        method = FEW_LABEL if rounds is None else f"{FEW_LABEL}+{rounds.rule}"
+    elif rounds is not None and method == base:
+        method = f"{base}+{rounds.rule}"
     if rounds is not None:
         _check_rounds(rounds)
         if target is None or not len(target):
@@ -103,33 +122,47 @@ def train_forest(
     note_size(source.points, METRIC)
     held = held_out(source, settings)
     wanted = RunSettings.of(method, source, target, settings, rounds, None)
+    wanted = replace(wanted, labels=None if labelled is None else fingerprint(labelled))
     with claim_run(run_dir, wanted, lambda begun: begun or 1):
         if config is not None:
             write_text(run_dir / CONFIG, config)
         clock = _Clock()
         prepared = prepare_clouds(source, settings.num_points, ROBUST)
         described = _describe(prepared)
-        train, labels = described[~held], source.labels[~held]
-        forest = fit_forest(train, labels, source.class_names, seed=settings.seed)
+        learner = _Learner(
+            described[~held], source.labels[~held], np.ones(int((~held).sum())), source.class_names
+        )
+        given = None
+        if labelled is not None:
+            given = prepare_clouds(labelled, settings.num_points, ROBUST)
+            learner = learner.with_more(_describe(given), labelled.labels, LABEL_WEIGHT)
+        forest = learner.fit(settings.seed)
         epochs = [EpochRecord(0, {}, 0.0, clock.wall, cpu_seconds=clock.cpu)]
         records: list[RoundRecord] = []
         unlabelled = None
         if target is not None:
             unlabelled = prepare_clouds(target, settings.num_points, ROBUST)
         if rounds is not None and unlabelled is not None:
-            forest, records, kept = _run_rounds(
-                forest, train, labels, _describe(unlabelled), rounds, settings.seed
-            )
+            seen = _describe(unlabelled)
+            # A labelled scan needs no pseudo label.
+            pool = np.flatnonzero(~_rows_of(seen, learner.descriptors[int((~held).sum()) :]))
+            if not len(pool):
+                raise InputError("every cloud of the target is labelled; leave the rounds out")
+            forest, records, kept = _run_rounds(forest, learner, seen[pool], rounds, settings.seed)
+            kept = [np.stack([pool[rows], pseudo]) for rows, pseudo in kept]
             tensors = {f"kept/{i}": torch.from_numpy(rows) for i, rows in enumerate(kept)}
             write_tensors(run_dir / STATE, tensors, {"clouds": checksums(unlabelled)})
         known, right = _judge(forest, described[held], source.labels[held])
         save_trained(run_dir, LoadedForest(forest, {}, known))
         stage, number = (base, 1) if rounds is None else (ROUND, len(records))
+        data = data_fields(prepared, unlabelled, rounds is not None)
+        if given is not None:
+            data["source_clouds"] += tuple(checksums(given))
         run = Run(
-            method=method if rounds is None or method != base else f"{base}+{rounds.rule}",
+            method=method,
             selection="last",
             chosen={"stage": stage, "number": number},
-            **data_fields(prepared, unlabelled, rounds is not None),
+            **data,
             threads=1,
             unknown_warm_up=False,
             rounds=tuple(asdict(record) for record in records),
@@ -140,6 +173,39 @@ def train_forest(
         )
         write_run(run)
     return ForestResult(forest, tuple(records), right, int(held.sum()))
+
+
+@dataclass(frozen=True)
+class _Learner:
+    """Labelled clouds and their weights."""
+
+    descriptors: Float[np.ndarray, "b f"]
+    labels: Int[np.ndarray, "b"]
+    weights: Float[np.ndarray, "b"]
+    class_names: tuple[str, ...]
+
+    def with_more(
+        self, descriptors: Float[np.ndarray, "c f"], labels: Int[np.ndarray, "c"], weight: float
+    ) -> "_Learner":
+        """Return these clouds and others of one weight."""
+        return replace(
+            self,
+            descriptors=np.concatenate([self.descriptors, descriptors]),
+            labels=np.concatenate([self.labels, labels]),
+            weights=np.concatenate([self.weights, np.full(len(labels), weight)]),
+        )
+
+    def fit(self, seed: int) -> Forest:
+        """Fit a forest to them."""
+        return fit_forest(self.descriptors, self.labels, self.class_names, self.weights, seed=seed)
+
+
+def _rows_of(
+    descriptors: Float[np.ndarray, "m f"], some: Float[np.ndarray, "c f"]
+) -> Bool[np.ndarray, "m"]:
+    """Return which clouds are among some others: equal clouds have equal descriptors."""
+    known = {row.tobytes() for row in some}
+    return np.array([row.tobytes() in known for row in descriptors], dtype=bool)
 
 
 def _own_settings(settings: TrainSettings) -> TrainSettings:
@@ -183,8 +249,7 @@ def _judge(
 
 def _run_rounds(
     forest: Forest,
-    source: Float[np.ndarray, "b f"],
-    labels: Int[np.ndarray, "b"],
+    learner: _Learner,
     target: Float[np.ndarray, "m f"],
     rounds: SelfTrainingSettings,
     seed: int,
@@ -203,9 +268,7 @@ def _run_rounds(
             shares, select_confident(shares, theta, inclusive=rounds.inclusive)
         )
         if len(chosen):
-            both = np.concatenate([source, target[chosen]])
-            given = np.concatenate([labels, answers[chosen]])
-            forest = fit_forest(both, given, forest.class_names, seed=seed)
+            forest = learner.with_more(target[chosen], answers[chosen], 1.0).fit(seed)
         record = RoundRecord(
             round=number,
             theta=theta,

@@ -91,6 +91,8 @@ class RunSettings:
     """That of the weights that the run starts from."""
     threads: int | None = None
     """CPU threads."""
+    labels: str | None = None
+    """Checksum of the few labelled scans of the target; None without."""
 
     @classmethod
     def of(
@@ -210,6 +212,7 @@ _BY_CHECKSUM = {
     "source": "its points, its labels or the names of its classes",
     "target": "its points",
     "warm_up": "its weights",
+    "labels": "its clouds or their classes",
 }
 
 

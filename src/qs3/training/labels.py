@@ -1,0 +1,61 @@
+"""A few labelled scans: a CSV of files and classes."""
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from qs3.errors import InputError, no_such
+from qs3.io.clouds import Origin, PointClouds
+from qs3.io.point_files import read_cloud
+from qs3.io.preparation import LARGEST, stack
+from qs3.reading import reading
+
+FILE, CLASS = "file", "class"
+
+
+def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = None) -> PointClouds:
+    """Read the clouds that a CSV labels; rows without a class are left out.
+
+    Args:
+        table: CSV with the columns ``file`` and ``class``, such as ``qs3 suggest`` writes.
+        class_names: Classes that may be given.
+        folder: Where the files lie, if not where the table says, nor beside it.
+
+    Raises:
+        InputError: if a column, a file or a class is missing, a class is unknown, a file has two
+            classes, or no row has a class.
+    """
+    with reading(table, "CSV"):
+        try:
+            text = table.read_text(encoding="utf-8-sig")
+        except UnicodeDecodeError as error:
+            raise InputError("is not UTF-8 text; save it as CSV in UTF-8") from error
+        rows = list(csv.DictReader(text.splitlines()))
+    if not rows or not {FILE, CLASS} <= {*rows[0]}:
+        raise InputError(f"{table}: needs rows with the columns {FILE} and {CLASS}")
+    labels: dict[Path, int] = {}
+    for row in rows:
+        name = (row[CLASS] or "").strip()
+        if not name:
+            continue
+        if name not in class_names:
+            raise no_such(f"{table}: {row[FILE]}: unknown class {name!r}", name, class_names)
+        file = _find(table, Path(row[FILE] or ""), folder)
+        label = class_names.index(name)
+        if labels.setdefault(file, label) != label:
+            raise InputError(f"{table}: {row[FILE]}: has two classes")
+    if not labels:
+        raise InputError(f"{table}: no row has a class; fill in the column {CLASS}")
+    points = stack([read_cloud(file) for file in labels], None, str(table), LARGEST)
+    ids, given = tuple(map(str, labels)), np.array(list(labels.values()))
+    return PointClouds(points, given, tuple(class_names), ids, origin=Origin(table.name))
+
+
+def _find(table: Path, file: Path, folder: Path | None) -> Path:
+    places = [file, table.parent / file, *([] if folder is None else [folder / file])]
+    for place in places:
+        if place.is_file():
+            return place.resolve()
+    raise InputError(f"{table}: {file}: no such file; looked for {', '.join(map(str, places))}")
