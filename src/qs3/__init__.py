@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from qs3 import shapes as shapes
     from qs3.meshes import load_mesh as load_mesh
     from qs3.sensor.presets import Sensor as Sensor
+    from qs3.sensor.presets import load_sensor as load_sensor
     from qs3.sensor.rig import Pose as Pose
     from qs3.sensor.rig import StereoRig as StereoRig
     from qs3.sensor.scan import Scan as Scan
@@ -29,6 +30,7 @@ _LAZY = {
     "adapt": "qs3.training.adapt",
     "load_mesh": "qs3.meshes",
     "Sensor": "qs3.sensor.presets",
+    "load_sensor": "qs3.sensor.presets",
     "Pose": "qs3.sensor.rig",
     "StereoRig": "qs3.sensor.rig",
     "Scan": "qs3.sensor.scan",

@@ -173,6 +173,32 @@ def test_the_recipe_is_settings_and_what_is_given_beside_it_wins(typed, monkeypa
     assert list(changed.settings.randomise) == ["rooms"]
 
 
+def test_the_recipe_for_parts_takes_a_folder_and_ranges_in_one_word(typed, monkeypatch, tmp_path):
+    from qs3.store.plan import make_plan
+    from qs3.store.scan_item import RECIPES
+
+    asked = []
+
+    def stop(items, settings):
+        asked.append(make_plan(items, settings))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("qs3.store.plan.make_plan", stop)
+    for name in ("bolt", "nut"):
+        (tmp_path / name).mkdir()
+        trimesh.creation.box((60, 40, 20)).export(tmp_path / name / "a.stl")
+    words = ("generate", "--recipe", "parts", "--dry-run", "--variant", "scalar_rgb", "--meshes")
+    typed(*words, tmp_path, "--units", "mm", "--distance", "0.4:0.5", "--scene", "table", code=130)
+    (plan,) = asked
+    settings = plan.settings
+    assert (settings.distance, settings.elevation) == ((0.4, 0.5), (35.0, 80.0))
+    assert (settings.scene, settings.units, settings.pose) == ("table", "mm", "resting")
+    assert settings.sensor.placement.radius == (0.4, 0.5)
+    assert (plan.rows, settings.needs_neighbour) == (20, False)
+    assert RECIPES["parts"].needs_neighbour
+    assert "LOW:HIGH" in typed.refuses(*words, tmp_path, "--distance", "0.4")
+
+
 def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(qs3, tmp_path):
     from qs3.io import load_clouds
 

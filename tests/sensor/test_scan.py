@@ -268,7 +268,7 @@ def test_views_that_are_matched_side_by_side_have_the_bits_of_one_after_another(
     [
         ({"depth": DepthSettings(near=5.9)}, "saw no point"),
         # Smaller than a pixel.
-        ({"object_size": 1e-3}, "saw no point.*0.001 large.* 3 to 5 away; set placement.radius"),
+        ({"object_size": 1e-3}, "saw no point.*0.001 large.* 3 to 5 away; set distance"),
         # So few points show no shape.
         ({"object_size": 0.06}, r"saw \d+ points? of the object"),
         ({"object_size": 0.0}, "object_size"),
@@ -301,7 +301,7 @@ def test_few_points_are_told_with_size_distance_and_what_to_change(renderer, cap
         assert len(caplog.messages) == told
     (line,) = caplog.messages
     assert "num_points 512" in line
-    assert "about 0.1 large and is seen from 3 to 5 away; set placement.radius" in line
+    assert "about 0.1 large and is seen from 3 to 5 away; set distance" in line
 
 
 def test_wrong_matches_within_the_gate_make_no_cloud_of_an_object_beyond_it(renderer):

@@ -32,6 +32,8 @@ def defaults(words: Sequence[str]) -> dict[str, Any]:
     if chosen.recipe is None:
         return {}
     settings = RECIPES[chosen.recipe]
+    if settings.per_class is None:
+        return {"settings": settings}
     return {"meshes": ("shapes",), "per_class": settings.per_class, "settings": settings}
 
 
@@ -62,8 +64,9 @@ def generate(
             neighbour is another of them.
         out: Folder of the data set; run the same command again to go on after a stop. --dry-run
             needs none.
-        recipe: rooms: settings for a source that is to meet scans of real rooms (cameras, sizes,
-            layouts and views drawn); an option given beside it wins.
+        recipe: Settings by name; an option given beside it wins. parts: your own CAD in real units,
+            which lies on a table before one camera. rooms: a source that is to meet scans of real
+            rooms (cameras, sizes, layouts and views drawn).
         up: Up axis of every mesh file; by default y for glTF and ShapeNet, z for all others.
         per_class: Objects a class, of the built-in shapes and parts.
         classes: Classes to scan, by the names of their folders, or pointda10 for its ten, renamed;

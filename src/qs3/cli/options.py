@@ -87,6 +87,30 @@ def _read_path(word: str) -> Path:
     return Path(word)
 
 
+@_registry.primitive_rule
+def _range(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """Two numbers as one word, LOW:HIGH."""
+    if info.type not in (tuple[float, float], tuple[float, float] | None):
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="LOW:HIGH",
+        instance_from_str=lambda words: _read_range(words[0]),
+        is_instance=lambda value: value is None or isinstance(value, tuple),
+        str_from_instance=lambda value: ["None" if value is None else f"{value[0]:g}:{value[1]:g}"],
+    )
+
+
+def _read_range(word: str) -> tuple[float, float] | None:
+    if word == "None":
+        return None
+    low, _, high = word.partition(":")
+    try:
+        return float(low), float(high)
+    except ValueError:
+        raise QS3Error(f"{word!r} is not a range; give LOW:HIGH, such as 0.35:0.8") from None
+
+
 _LISTED: PrimitiveConstructorSpec[Any] = PrimitiveConstructorSpec(
     nargs=1,
     metavar="NAME[,NAME…]",

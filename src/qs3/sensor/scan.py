@@ -143,26 +143,28 @@ def scan(
     normalised, scale, size = sized(mesh, how, own_class, sensor.object_size, rng_size)
     posed = laid(normalised, how.pose, rng_pose)
     own = size | chosen | posed
-    sensor, drawn = resized(sensor, scale), drawn | own
+    sensor, drawn = resized(sensor, scale, how), drawn | own
     yaw = float(rng_place.uniform(0, 2 * np.pi))
     turned = normalised.copy()
     turned.vertices = turned.vertices @ rotation_z(yaw).T
     bounds = np.asarray(turned.bounds)
+    if not scene.needs_neighbour and "scene" in chosen:  # drawn: another scene needs it
+        neighbour = None
     if neighbour is not None:
         neighbour, _, size = sized(neighbour, how, other_class or None, scale, rng_size)
         neighbour.vertices = neighbour.vertices * scene.neighbour_size
         size |= laid(neighbour, how.pose, rng_pose)
         drawn |= {f"neighbour_{name}": value for name, value in size.items()}
     body = Body(turned, sensor.material)
+
+    def redraw() -> tuple[Sensor, dict[str, Any]]:
+        other, values = draw(given, how.ranges, rng_settings)
+        return resized(other, scale, how), values | own
+
     if how.room_layouts:
-
-        def redraw() -> tuple[Sensor, dict[str, Any]]:
-            other, values = draw(given, how.ranges, rng_settings)
-            return resized(other, scale), values | own
-
         rooms = stand_in_rooms(how, sensor, body, neighbour, rng_room, rng_scene, redraw)
     else:
-        rooms = [(sensor, stand(how, sensor, body, neighbour, rng_place, rng_scene), {})]
+        rooms = stand(how, sensor, body, neighbour, rng_place, rng_scene, redraw)
     points = np.empty((0, 3))
     # A room of which the sensor got little is drawn again, as one that shows too little is.
     for sensor, around, room in rooms:
@@ -221,12 +223,11 @@ def scan(
 def _standing(how: ScanSettings, sensor: Sensor, mesh: trimesh.Trimesh) -> str:
     """How large the object is and how far away, and what changes that; in digits that repeat."""
     unit = " m" if sensor.metric else ""
-    name = "room.distance" if how.room_layouts else "placement.radius"
-    where = "randomise" if how.room_layouts else "the sensor's TOML file"
-    near, far, *_ = how.ranges.get(name, sensor.placement.radius)
+    name = "room.distance in randomise" if how.room_layouts else "distance"
+    near, far, *_ = how.ranges.get("room.distance", sensor.placement.radius)
     return (
         f"the object is about {mesh.extents.max():.1g}{unit} large and is seen "
-        f"from {near:.2g} to {far:.2g}{unit} away; set {name} in {where} to see it from nearer"
+        f"from {near:.2g} to {far:.2g}{unit} away; set {name} to see it from nearer"
     )
 
 

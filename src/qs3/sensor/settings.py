@@ -5,9 +5,9 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TypeAlias, TypeVar
 
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.meshes.poses import PoseName
 from qs3.meshes.sizes import Unit
 from qs3.sensor.checks import check_choices, check_range
@@ -21,6 +21,9 @@ from qs3.sensor.render.scene import MOST_SAMPLES
 from qs3.sensor.scene import SceneSettings
 from qs3.sensor.speckle import pattern_image
 from qs3.sensor.views import ViewLayout
+
+Range: TypeAlias = tuple[float, float]
+"""Low and high; LOW:HIGH on the command line."""
 
 _BY_SENSOR = "by sensor"
 PRESETS: dict[str, dict[str, Any]] = {
@@ -168,6 +171,12 @@ class ScanSettings(CameraSettings):
     convex hull, drawn by its probability (parts on a table); any, turned at random."""
     views: int = 5
     """Views fused into one cloud."""
+    distance: Range | None = None
+    """Distance from the camera to the object's centre, in metres for real cameras, drawn for each
+    view; default by sensor. The camera keeps so far away that the depth gate holds the object."""
+    elevation: Range | None = None
+    """Angle of the camera above the horizontal in degrees, drawn for each view; default by
+    sensor."""
     least_views: int | None = None
     """Draw the number of views of each scan, from this up to views."""
     view_layout: ViewLayout | None = None
@@ -204,9 +213,10 @@ class ScanSettings(CameraSettings):
     material: Material | str | None = None
     """Surface of the object by name: diffuse, principled, rough-specular, glossy-plastic, metal,
     dark, mirror or glass; default by sensor."""
-    scene: SceneSettings | str = "alone"
+    scene: SceneSettings | str | tuple[str, ...] = "alone"
     """alone (the paper), floor, wall, room (both), behind a neighbour or beside one, on a table;
-    joined by + as in room+beside."""
+    joined by + as in room+beside. Of several, as in table,table,table+beside, each scan draws
+    one."""
     randomise: Mapping[str, Sequence[Any]] | Sequence[str] | None = None
     """Draw settings of the sensor anew for each scan: light.ambient=0:0.1,
     exposure.gain=0.5:2:log, material=diffuse,metal,dark, or default alone (materials, ambient
@@ -223,6 +233,8 @@ class ScanSettings(CameraSettings):
     _CHANGES: ClassVar[Mapping[str, str]] = {
         **CameraSettings._CHANGES,
         "principal_point": "depth.principal_point",
+        "distance": "placement.radius",
+        "elevation": "placement.elevation",
         "object_size": "object_size",
         "material": "material",
     }
@@ -237,12 +249,18 @@ class ScanSettings(CameraSettings):
                 "leave the units out"
             )
         words = [self.randomise] if isinstance(self.randomise, str) else self.randomise or ()
+        scenes = self.each_scene()
         if any(word == "rooms" or word.startswith("room.") for word in words):
-            layout = self.make_scene().layout
+            layout = ",".join(scene.layout for scene in scenes)
             if layout != "alone":
                 raise InputError(
                     f"scan: scene {layout} beside randomise rooms, which draws layouts: name "
                     f"room.layout={layout} beside rooms in its place"
+                )
+            if self.distance or self.elevation:
+                raise InputError(
+                    "scan: distance and elevation do not go with randomise rooms, which draws the "
+                    "camera's place; use room.distance=1:2 and room.height=0.8:1.8 instead"
                 )
         check_range(self, "scan", "least_pixels", low=1)
         check_range(self, "scan", "least_valid", high=1)
@@ -280,6 +298,17 @@ class ScanSettings(CameraSettings):
                 f"object_size {self.object_size} is in metres, and the sensor {sensor.name} is "
                 "not; take one that is, such as d435, or a number"
             )
+        if self.distance is not None and self.distance[0] < sensor.depth.near:
+            (low, high), near = self.distance, sensor.depth.near
+            if high <= near:
+                raise InputError(
+                    f"scan: distance {low:g}:{high:g}: the sensor {sensor.name} measures from "
+                    f"{near:g} on; stand farther off, or lower depth.near in a TOML file of yours"
+                )
+            say_once(
+                f"the sensor {sensor.name} measures from {near:g} on: of distance {low:g}:{high:g} "
+                "the scans leave out what is nearer; a TOML file of yours can lower depth.near"
+            )
         return sensor
 
     @property
@@ -304,12 +333,23 @@ class ScanSettings(CameraSettings):
         """Whether a second mesh is needed, if only for some draws of rooms."""
         layouts = self.room_layouts
         return any(SceneSettings(name).needs_neighbour for name in layouts) or (
-            not layouts and self.make_scene().needs_neighbour
+            not layouts and any(scene.needs_neighbour for scene in self.each_scene())
         )
 
+    def each_scene(self) -> tuple[SceneSettings, ...]:
+        """Return the scenes that a scan draws from; one if there is only one."""
+        scenes = self.scene if isinstance(self.scene, tuple) else (self.scene,)
+        return tuple(SceneSettings(s) if isinstance(s, str) else s for s in scenes)
+
     def make_scene(self) -> SceneSettings:
-        """What stands around the object."""
-        return SceneSettings(self.scene) if isinstance(self.scene, str) else self.scene
+        """What stands around the object.
+
+        Raises:
+            InputError: If there are several.
+        """
+        if isinstance(self.scene, tuple):
+            raise InputError("scene: one is needed here, not several; name one")
+        return self.each_scene()[0]
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for records; what the sensor and the renderer say of themselves is apart."""
@@ -318,10 +358,11 @@ class ScanSettings(CameraSettings):
         names = [f.name for f in dataclasses.fields(ScanSettings) if f.name not in apart]
         ranges = [dict(settings.ranges) for settings in self.each_sensor()]
         crop = self.chosen("crop")
+        scenes = [dataclasses.asdict(scene) for scene in self.each_scene()]
         return {name: self.chosen(name) for name in names} | {
             "object_size": self.object_size if isinstance(self.object_size, str) else None,
             "box_crop": crop in ("box", "both"),
             "mask_crop": crop in ("mask", "both"),
-            "scene": dataclasses.asdict(self.make_scene()),
+            "scene": scenes if isinstance(self.scene, tuple) else scenes[0],
             "randomise": ranges if isinstance(self.sensor, tuple) else ranges[0],
         }

@@ -1,19 +1,20 @@
 """With what, how large and where one scan is taken: all that is drawn before the pictures."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import trimesh
 
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.meshes import normalise
 from qs3.meshes.poses import PoseName, draw_pose
 from qs3.meshes.sizes import class_size, file_size
 from qs3.sensor.depth import gate
 from qs3.sensor.obstacles import check_views
-from qs3.sensor.presets import Sensor
+from qs3.sensor.presets import Sensor, changed
 from qs3.sensor.randomise import draw_room
 from qs3.sensor.render import Body
 from qs3.sensor.render.raycast import DepthCaster
@@ -23,16 +24,16 @@ from qs3.sensor.settings import ScanSettings
 from qs3.sensor.view import object_region
 from qs3.sensor.views import place_views
 
-_MOST_DRAWS = 50  # of a room, before it is given up
+_MOST_DRAWS, _MOST_STANDS = 50, 10  # of a room and of a place, before it is given up
 
 
 def choose(
     how: ScanSettings, rng: np.random.Generator
 ) -> tuple[ScanSettings, dict[str, str | int]]:
-    """Draw one of several sensors, and a number of views where ``least_views`` asks for it.
+    """Draw one of several sensors and scenes, and a number of views if ``least_views`` asks for it.
 
     Returns:
-        The settings with that sensor and that number, and what was drawn, by name.
+        The settings with what was drawn, and what was drawn, by name.
     """
     drawn: dict[str, str | int] = {}
     share = rng.random()  # drawn in any case: neither depends on whether the other is drawn
@@ -44,6 +45,9 @@ def choose(
         how = how.each_sensor()[int(rng.integers(len(how.sensor)))]
         sensor = how.make_sensor()
         how, drawn["sensor"] = dataclasses.replace(how, sensor=sensor, crop=crop), sensor.name
+    if isinstance(how.scene, tuple):
+        drawn["scene"] = how.scene[int(rng.integers(len(how.scene)))]
+        how = dataclasses.replace(how, scene=drawn["scene"])
     return how, drawn
 
 
@@ -97,12 +101,47 @@ def laid(mesh: trimesh.Trimesh, pose: PoseName, rng: np.random.Generator) -> dic
     return drawn
 
 
-def resized(sensor: Sensor, object_size: float) -> Sensor:
-    """The sensor with an object size; from a larger object than its own it stands off as much."""
-    away = max(0.0, object_size - sensor.object_size) / 2
+def resized(sensor: Sensor, object_size: float, how: ScanSettings) -> Sensor:
+    """The sensor with an object size; from a larger object than its own it stands off as much.
+
+    It stands at a given ``distance``, but so far away that the depth gate holds half the object.
+    The search for disparities is widened if it does not reach the object's nearest point.
+    """
     near, far = sensor.placement.radius
-    placement = dataclasses.replace(sensor.placement, radius=(near + away, far + away))
-    return dataclasses.replace(sensor, object_size=object_size, placement=placement)
+    if how.distance is None:
+        away = max(0.0, object_size - sensor.object_size) / 2
+        near, far = near + away, far + away
+    else:
+        near = max(near, sensor.depth.near + object_size / 2)
+        far = max(near, far)
+    placement = dataclasses.replace(sensor.placement, radius=(near, far))
+    placed = dataclasses.replace(sensor, object_size=object_size, placement=placement)
+    nearest = how.ranges["room.distance"][0] if how.room_layouts else near - object_size / 2
+    return reaching(placed, nearest)
+
+
+def reaching(sensor: Sensor, nearest: float) -> Sensor:
+    """The sensor with as many disparities as a point at ``nearest``, or at its gate, needs.
+
+    The fewest multiple of 16 above f·b/z, at most as many as the image has room for.
+
+    Example:
+        >>> from qs3.sensor.presets import SENSORS, changed
+        >>> reaching(changed(SENSORS["d435"], "depth.near", 0.1), 0.12).matching.num_disparities
+        192
+    """
+    matching = sensor.matching
+    room = min(1024, sensor.rig.width - matching.block_size) // 16 * 16
+    needed = float(sensor.rig.disparity(max(nearest, sensor.depth.near, 1e-6))) + 1
+    wanted = min(16 * math.ceil(needed / 16), room)
+    if needed <= matching.num_disparities or wanted <= matching.num_disparities:
+        return sensor
+    say_once(
+        f"the sensor {sensor.name} searches {wanted} disparities, not "
+        f"{matching.num_disparities}: the nearest point has f·b/z = {needed - 1:.0f} px",
+        kind=f"disparities of {sensor.name}",
+    )
+    return changed(sensor, "matching.num_disparities", wanted)
 
 
 def stand(
@@ -112,16 +151,28 @@ def stand(
     neighbour: trimesh.Trimesh | None,
     rng_place: np.random.Generator,
     rng_scene: np.random.Generator,
-) -> ArrangedScene:
+    redraw: Callable[[], tuple[Sensor, dict[str, Any]]],
+) -> Iterator[tuple[Sensor, ArrangedScene, dict[str, Any]]]:
     """Place the views, and everything else about the object.
+
+    With a ``distance`` of one's own a caller that sees too little can ask for nine other places,
+    each with the sensor and the material of ``redraw``.
+
+    Yields:
+        The sensor, the scene, and what was drawn, ``redraws`` among it.
 
     Raises:
         InputError: where a camera or the projector stands in something.
     """
-    poses = place_views(how.views, how.chosen("view_layout"), sensor.placement, rng_place)
-    around = arrange(how.make_scene(), body, poses, sensor.object_size, neighbour, rng_scene)
-    check_views(around, sensor)
-    return around
+    for draws in range(1 if how.distance is None else _MOST_STANDS):
+        drawn: dict[str, Any] = {}
+        if draws:
+            sensor, drawn = redraw()
+            body, drawn = Body(body.mesh, sensor.material), drawn | {"redraws": draws}
+        poses = place_views(how.views, how.chosen("view_layout"), sensor.placement, rng_place)
+        around = arrange(how.make_scene(), body, poses, sensor.object_size, neighbour, rng_scene)
+        check_views(around, sensor)
+        yield sensor, around, drawn
 
 
 def stand_in_rooms(

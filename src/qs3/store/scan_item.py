@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import trimesh
 
 
-RecipeName = Literal["rooms"]
+RecipeName = Literal["rooms", "parts"]
 _NEIGHBOURS = 8
 
 
@@ -122,9 +122,25 @@ RECIPES: dict[RecipeName, GenerateSettings] = {
         least_views=1,
         crop="mask",
         randomise=["rooms"],
-    )
+    ),
+    "parts": GenerateSettings(
+        recipe="parts",
+        scans_per_mesh=10,
+        sensor="d435",
+        object_size="file",
+        pose="resting",
+        scene=("table", "table", "table+beside"),
+        views=1,
+        distance=(0.35, 0.8),
+        elevation=(35.0, 80.0),
+        crop="mask",
+        depth_margin=0.03,
+        num_points=1024,
+        randomise=["default"],
+    ),
 }
-"""Whole settings by name. ``rooms``: a source that is to meet scans of real rooms.
+"""Whole settings by name. ``rooms``: a source that is to meet scans of real rooms; ``parts``: one
+for parts of known size that lie on a table before a camera.
 
 Example:
     >>> dataclasses.replace(RECIPES["rooms"], sensor="d435", seed=1).crop
@@ -195,8 +211,8 @@ def scan_item(
     surface = sample_surface(result.mesh, settings.num_points, surface_rng)
     label = map_labels([item.class_name], np.zeros(1, dtype=np.int64), settings.classes)[0]
     drawn = dict(result.drawn)
-    layout = drawn.get("room.layout", settings.make_scene().layout)
-    if neighbour is not None and SceneSettings(layout).needs_neighbour:  # not in all rooms
+    layout = drawn.get("room.layout") or drawn.get("scene") or settings.make_scene().layout
+    if neighbour is not None and SceneSettings(layout).needs_neighbour:  # not in all scenes
         drawn["neighbour"] = neighbour.id
     return CloudRow(
         id=row_id(item, scan_index),

@@ -82,12 +82,11 @@ class Sensor:
         if nearest <= 0:  # a camera that may stand within the object is the scan's to refuse
             return
         least = float(self.rig.disparity(farthest))
-        if least >= self.matching.num_disparities:
+        if least >= self.rig.width:
             raise InputError(
                 f"sensor {self.name}: the object's farthest point, at {farthest:g}{unit}, has a "
-                f"disparity f·b/z of {least:.0f} px, beyond matching.num_disparities "
-                f"{self.matching.num_disparities}; search more, or bring rig.focal, rig.baseline "
-                "and placement into one unit"
+                f"disparity f·b/z of {least:.0f} px, beyond rig.width {self.rig.width}; bring "
+                "rig.focal, rig.baseline and placement into one unit"
             )
 
 

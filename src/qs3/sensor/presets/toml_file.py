@@ -56,16 +56,23 @@ def sensor_name(name: str) -> str:
 
 
 def load_sensor(path: Path | str) -> Sensor:
-    """Read a sensor from a TOML file.
+    """Return a built-in sensor, or read one from a TOML file.
 
     Args:
-        path: The file. Its stem names the sensor where the file has no ``name``.
+        path: A name, such as ``"d415"``, or the file. Its stem names the sensor where the file has
+            no ``name``.
 
     Raises:
         InputError: in one line that names the file, and the key by its dotted name, where the file
             cannot be read, a key is unknown or of another type, the settings make no sensor, or
             every place of it is inside the object.
+
+    Example:
+        >>> load_sensor("d415").rig.baseline
+        0.055
     """
+    if isinstance(path, str) and not path.lower().endswith(".toml"):
+        return get_sensor(path)
     path = Path(path)
     table = _read(path)
     sensor = _sensor(table, path.stem, path)

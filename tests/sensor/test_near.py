@@ -1,0 +1,93 @@
+"""Cameras near the object: places of one's own, and a search that reaches as near."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from qs3 import load_sensor
+from qs3.errors import TOLD, InputError
+from qs3.sensor.presets import SENSORS, changed
+from qs3.sensor.render import Body
+from qs3.sensor.scan import scan
+from qs3.sensor.settings import ScanSettings
+from qs3.sensor.staging import resized, stand
+
+PART = trimesh.creation.box((0.08, 0.05, 0.03))
+D415 = load_sensor("d415")
+
+
+def test_a_sensor_is_loaded_by_its_name_or_its_file(tmp_path):
+    assert load_sensor("d435") is SENSORS["d435"]
+    path = tmp_path / "mine.toml"
+    path.write_text('base = "d415"\ndepth.near = 0.2\n')
+    assert load_sensor(str(path)) == load_sensor(path)
+    with pytest.raises(InputError, match="d415"):
+        load_sensor("d414")
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_presets_search_at_their_own_distances_as_far_as_ever(name):
+    sensor = SENSORS[name]
+    for share in (0.1, 1.0, 3.0):
+        placed = resized(sensor, share * sensor.object_size, ScanSettings(sensor=sensor))
+        assert placed.matching == sensor.matching
+
+
+def test_the_search_reaches_the_nearest_point_and_says_so_once(caplog):
+    TOLD.clear()
+    for near, wanted in ((0.3, 176), (0.2, 208)):  # the gate; the part, at 0.26 m
+        sensor = changed(D415, "depth.near", near)
+        how = ScanSettings(sensor=sensor, distance=(0.3, 0.5))
+        placed = resized(how.make_sensor(), 0.08, how)
+        nearest = max(near, placed.placement.radius[0] - 0.04)
+        assert placed.rig.disparity(nearest) < placed.matching.num_disparities == wanted
+    assert "176 disparities, not 128" in caplog.text
+    assert len(caplog.messages) == 1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_views_stand_at_the_distance_and_elevation_asked_for(seed):
+    how = ScanSettings(sensor="d435", distance=(0.35, 0.8), elevation=(35.0, 80.0), views=4)
+    sensor, rngs = how.make_sensor(), (np.random.default_rng(seed), np.random.default_rng(0))
+    body = Body(PART, sensor.material)
+    placed = resized(sensor, 0.08, how)
+    stands = list(stand(how, placed, body, None, *rngs, lambda: (placed, {})))
+    assert [drawn.get("redraws") for _, _, drawn in stands] == [None, *range(1, 10)]
+    for _, around, _ in stands:
+        places = np.array([pose.position for pose in around.poses])
+        radii = np.linalg.norm(places, axis=1)
+        height = np.degrees(np.arcsin(places[:, 2] / radii))
+        assert ((radii >= 0.35) & (radii <= 0.8)).all()
+        assert ((height >= 35) & (height <= 80)).all()
+
+
+def test_the_gate_holds_half_the_object():
+    how = ScanSettings(sensor="d415", distance=(0.3, 0.8))
+    assert resized(how.make_sensor(), 0.1, how).placement.radius == pytest.approx((0.5, 0.8))
+    assert resized(how.make_sensor(), 1.0, how).placement.radius == pytest.approx((0.95, 0.95))
+    with pytest.raises(InputError, match=r"d415 measures from 0\.45"):
+        ScanSettings(sensor="d415", distance=(0.3, 0.4)).make_sensor()
+    with pytest.raises(InputError, match=r"use room\.distance"):
+        ScanSettings(sensor="d435", distance=(1.0, 2.0), randomise=["rooms"])
+
+
+def test_a_drawn_scene_has_a_neighbour_only_where_it_needs_one(renderer):
+    """And without one the cloud is that of the scene alone."""
+    how = {
+        "sensor": "d435",
+        "object_size": "file",
+        "distance": (0.3, 0.4),
+        "views": 1,
+        "num_points": 64,
+        "crop": "mask",
+        "renderer": renderer,
+    }
+    drawn = {}
+    for seed in range(6):
+        made = scan(PART, scene=("table", "table+beside"), neighbour=PART, seed=seed, **how)
+        drawn.setdefault(made.drawn["scene"], made)
+        assert ("neighbour_object_size" in made.drawn) == (made.drawn["scene"] != "table")
+        if made.drawn["scene"] == "table" and len(drawn) == 1:
+            alone = scan(PART, scene="table", seed=seed, **how)
+            np.testing.assert_array_equal(alone.points, made.points)
+    assert len(drawn) == 2
