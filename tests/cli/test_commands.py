@@ -36,7 +36,7 @@ def test_the_table_of_verbs_says_what_each_verb_says_of_itself(verb):
 
 
 def test_help_and_version_import_no_verb():
-    code = "import sys, qs3.cli; qs3.cli._run(sys.argv[1:]); print(sorted(sys.modules))"
+    code = "import sys, qs3.cli; qs3.cli.run(sys.argv[1:]); print(sorted(sys.modules))"
     for option in ("--help", "--version"):
         done = subprocess.run([sys.executable, "-c", code, option], capture_output=True, text=True)
         for module in ("tyro", "numpy", "torch", "qs3.cli.scan", "qs3.errors"):

@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     prepare_streams()
     try:
-        code = _run(list(sys.argv[1:] if arguments is None else arguments))
+        code = run(list(sys.argv[1:] if arguments is None else arguments))
     except KeyboardInterrupt:
         tell("qs3: stopped; run the same command again to go on")
         code = 130
@@ -79,7 +79,7 @@ def _line_of(error: Exception) -> str | None:
     return line
 
 
-def _run(given: list[str]) -> int:
+def run(given: list[str]) -> int:
     """Import and run the verb that is asked for, and nothing else: a scan starts fast."""
     from qs3.cli.text import show, tell
 

@@ -22,6 +22,7 @@ def predict(
     sort_into: Path | None = None,
     unknown: float | None = None,
     calibrated: bool = False,
+    fit: bool = False,
 ) -> int:
     """Tell the class of each file and how confident the network is.
 
@@ -41,6 +42,9 @@ def predict(
             such as 0.05: so it answers whatever is less familiar to it than this share of the
             objects that were held out of its training, with the share that is more familiar.
         calibrated: Tell the confidence that is calibrated on held-out source.
+        fit: Lay the CAD of the four likeliest classes onto each cloud, of a run that was trained
+            with --meshes. The residuals join the decision; the residual and the share of the part
+            in sight that the cloud covers are printed, the pose (4 × 4) is in --json.
     """
     from qs3.adaptation.confidence import UNKNOWN
     from qs3.files import refuse_taken, write_text
@@ -70,7 +74,7 @@ def predict(
             "first: qs3 convert DATA FOLDER --to ply"
         )
     text = "predict" if sets or len(paths) > 1 else None
-    said = table.predict_files(run, paths, unknown=unknown, calibrated=calibrated)
+    said = table.predict_files(run, paths, unknown=unknown, calibrated=calibrated, fit=fit)
     bar = progress_bar(None if sets else len(paths), text, "cloud", items=said)
     answers: list[table.Answer] = [*bar]
     if json == Path("-"):
@@ -79,6 +83,10 @@ def predict(
         for answer in answers:
             if answer.best():
                 parts = [f"{printable(name, keep='')}\t{s:.3f}" for name, s in answer.best(top)]
+                if answer.fit is not None:
+                    laid = answer.fit.fit
+                    parts.append(f"residual {1000 * laid.residual:.1f} mm")
+                    parts.append(f"coverage {laid.coverage:.0%}")
                 show("\t".join([printable(str(answer.file), keep=""), *parts]))
     if csv is not None:
         write_text(csv, table.answers_csv(answers, top))

@@ -15,6 +15,7 @@ from qs3.cli.text import quoted, show, tell
 from qs3.errors import InputError
 from qs3.files import parse_json
 from qs3.io.clouds import CloudChoice
+from qs3.meshes.sizes import Unit
 from qs3.structure import structure, unstructure
 from qs3.toml_files import merged, read_toml, toml_lines
 from qs3.training.config import (
@@ -77,6 +78,13 @@ class TrainOptions(Choices):
     """Part of the source, such as train; all of it by default."""
     target_split: str | None = None
     """Part of the target."""
+    meshes: str | None = None
+    """Folder of the CAD of the classes, from which the source was made: a forest's run keeps it for
+    qs3 predict --fit."""
+    units: Unit | None = None
+    """Unit of the files of --meshes, as for qs3 generate."""
+    up: Literal["z", "y"] | None = None
+    """Up axis of the files of --meshes, as for qs3 generate."""
     labels: Path | None = None
     """CSV with the columns file and class of a few scans (qs3 suggest writes one to fill in), from
     which a forest learns beside the source. The record then has the method few-label. Files are
@@ -266,6 +274,10 @@ def train(options: Flat[TrainOptions]) -> int:
     rounds = None if rule is None else options.self_training
     if options.labels is not None and settings.model != FOREST_MODEL:
         raise InputError("--labels: a network cannot learn from a few labels; use --model forest")
+    if settings.model != FOREST_MODEL and options.meshes is not None:
+        raise InputError("--meshes: goes with --model forest, for qs3 predict --fit")
+    if options.meshes is None and (options.units is not None or options.up is not None):
+        raise InputError("--units and --up say how the files of --meshes are; name these")
     if settings.model == FOREST_MODEL:
         return _train_forest(options, source, target, settings, rounds)
     if options.dry_run:
@@ -303,6 +315,8 @@ def _train_forest(
     settings: TrainSettings,
     rounds: SelfTrainingSettings | None,
 ) -> int:
+    from qs3.forest.parts import PARTS, save_parts
+    from qs3.training.cad import read_cad
     from qs3.training.forest import train_forest
     from qs3.training.labels import read_labels
 
@@ -312,6 +326,9 @@ def _train_forest(
     if options.labels is not None:
         folder = None if options.target is None else Path(options.target)
         labelled = read_labels(options.labels, source.class_names, folder)
+    cad = []
+    if options.meshes is not None:
+        cad = read_cad(options.meshes, source.class_names, options.units, options.up)
     if options.dry_run:
         seen = "" if target is None else f", {len(target)} unlabelled clouds of the target"
         show(f"a forest, {len(source)} labelled clouds of the source{seen}")
@@ -328,6 +345,8 @@ def _train_forest(
         config=run_toml(replace(options, train=settings)),
         labelled=labelled,
     )
+    if cad:
+        save_parts(options.out / PARTS, cad)
     if labelled is not None:
         tell(f"few-label: learnt from {len(labelled)} labelled scans")
     names, right, count = source.class_names, result.source_accuracy, result.held_out

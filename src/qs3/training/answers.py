@@ -18,12 +18,14 @@ from qs3.adaptation.confidence import UNKNOWN, rescale
 from qs3.errors import InputError, say_once
 from qs3.escapes import utf8
 from qs3.files import describe_others, json_bytes, new_folder
+from qs3.forest.parts import PARTS, FittedPart, Part, fit_classes, read_parts
 from qs3.io.layouts import FORMATS
 from qs3.io.layouts.folders import check_class
 from qs3.io.load import read_clouds
 from qs3.io.point_files import POINT_FILES, depth_hint, read_cloud
 from qs3.training.checks import note_clouds
-from qs3.training.trained import Trained, load_trained
+from qs3.training.shipped import find_run
+from qs3.training.trained import Trained, counting, load_trained
 
 _BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|montage\.png")
 """What qs3 itself and others write beside clouds, and nobody takes for one."""
@@ -44,6 +46,8 @@ class Answer:
     """Share of held-out clouds of the source that are less familiar; None where not asked for."""
     refused: bool = False
     """Whether that is too little for any of the classes."""
+    fit: FittedPart | None = None
+    """CAD of the likeliest class, laid onto the cloud; None if none was asked for."""
 
     def best(self, count: int = 1) -> list[tuple[str, float]]:
         """Return the likeliest classes and their probabilities.
@@ -118,7 +122,12 @@ def read_listed(path: Path) -> list[tuple[Path, Float[np.ndarray, "n 3"]]]:
 
 
 def predict_files(
-    run: Path, files: Iterable[Path], *, unknown: float | None = None, calibrated: bool = False
+    run: Path,
+    files: Iterable[Path],
+    *,
+    unknown: float | None = None,
+    calibrated: bool = False,
+    fit: bool = False,
 ) -> Iterator[Answer]:
     """Tell the class of each cloud, one after another; a file that cannot be read has a fault.
 
@@ -128,6 +137,8 @@ def predict_files(
         unknown: Share of objects of the known classes that may be refused, by held-out source: what
             is less familiar is answered by `UNKNOWN`. None always answers a class.
         calibrated: Whether probabilities are those that held-out source calibrates.
+        fit: Whether to lay the CAD of the likeliest classes onto each cloud; the residuals join the
+            decision.
 
     Raises:
         InputError: where the run cannot be read, or does not hold what was asked for.
@@ -135,6 +146,7 @@ def predict_files(
     loaded = load_trained(run)
     if calibrated or unknown is not None:
         loaded.require_known(run, unknown)
+    parts = read_parts(_folder(run) / PARTS, loaded.class_names) if fit else []
     for path in files:
         try:
             clouds = read_listed(path)
@@ -145,10 +157,24 @@ def predict_files(
             try:
                 (answer,) = answer_clouds(loaded, points[None], unknown, calibrated)
                 note_clouds([points[None]], str(name))
+                if parts:
+                    answer = _fitted(answer, points, parts)
             except InputError as error:
                 yield _fault(name, error)
             else:
                 yield replace(answer, file=name)
+
+
+def _folder(run: Path) -> Path:
+    place = find_run(run)
+    return place.parent if place.is_file() else place
+
+
+def _fitted(answer: Answer, points: Float[np.ndarray, "n 3"], parts: Sequence[Part]) -> Answer:
+    """Return an answer to which the fit of the CAD is added."""
+    cloud = counting(points).astype(np.float64)
+    probabilities, fits = fit_classes(cloud, answer.probabilities, parts)
+    return replace(answer, probabilities=probabilities, fit=fits.get(next(iter(probabilities))))
 
 
 def _fault(path: Path, error: InputError) -> Answer:
@@ -208,6 +234,9 @@ def answers_csv(answers: Iterable[Answer], top: int = 1) -> str:
 def answers_json(answers: Iterable[Answer], ascii: bool = False) -> str:
     """A list of objects: file, class, confidence and the probability of every class; or a fault.
 
+    With a fit, its mesh, residual in metres, coverage and pose, from the mesh's frame in metres to
+    the cloud's, too.
+
     In ``ascii`` alone, nothing in it moves a terminal.
     """
     rows = []
@@ -217,6 +246,14 @@ def answers_json(answers: Iterable[Answer], ascii: bool = False) -> str:
             row |= {"class": name, "confidence": share, "probabilities": answer.probabilities}
         if answer.familiarity is not None:
             row["familiarity"] = answer.familiarity
+        if answer.fit is not None:
+            fit = answer.fit.fit
+            row["fit"] = {
+                "mesh": answer.fit.mesh,
+                "residual": fit.residual,
+                "coverage": fit.coverage,
+                "pose": fit.pose.tolist(),
+            }
         rows.append(row | ({"fault": answer.fault} if answer.fault else {}))
     if ascii:
         return f"{json.dumps(rows, indent=2, allow_nan=False)}\n"

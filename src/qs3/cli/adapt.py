@@ -1,0 +1,106 @@
+"""``qs3 adapt``: the whole way for your own parts, in five commands that each can be repeated."""
+
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from qs3.cli.text import show, tell
+from qs3.errors import InputError
+from qs3.meshes.sizes import Unit
+from qs3.store.failures import FAILURES
+
+
+def adapt(
+    cad: Annotated[Path, tyro.conf.Positional],
+    scans: Annotated[Path, tyro.conf.Positional],
+    out: Path = Path("adapted"),
+    camera: str = "d435",
+    units: Unit | None = None,
+    up: Literal["z", "y"] | None = None,
+    labels: Path | None = None,
+    method: Literal["qbst", "spst", "source-only"] = "qbst",
+    unknown: float = 0.05,
+    workers: int | None = None,
+    seed: int = 0,
+) -> int:
+    """Make a classifier of your own parts: CAD and unlabelled scans in, answers out.
+
+    Draws the meshes, scans them as they lie on a table, trains a forest, adapts it to the scans and
+    answers them. Each step prints the command that repeats it alone. The same command goes on after
+    a stop.
+
+    Args:
+        cad: Folder of meshes, one folder a class.
+        scans: Clouds of the camera, one part each, z up, in metres, as qs3 segment writes them.
+        out: Folder to write: contact-sheet.png, source, run, answers.csv, report.html.
+        camera: Preset of the camera (qs3 sensors), or your own TOML file.
+        units: Unit of the mesh files; by default what they say, else m up to a longest side of 5,
+            mm above.
+        up: Up axis of every mesh file; by default y for glTF, z for all others.
+        labels: CSV of a few labelled scans, columns file and class (qs3 suggest writes one to fill
+            in). The run is then named few-label.
+        method: Rounds of self-training on the scans, or none.
+        unknown: Share of known objects that may be answered by "unknown".
+        workers: Processes that scan; all cores by default.
+        seed: Root of all random steps.
+    """
+    from qs3.cli import run
+
+    for folder in (cad, scans):
+        if not folder.exists():
+            raise InputError(f"{folder}: no such file or folder")
+    out.mkdir(parents=True, exist_ok=True)
+    meshes = {"units": units, "up": up}
+    (out / "answers.csv").unlink(missing_ok=True)
+    code, faults = 0, []
+    for words in _steps(cad, scans, out, camera, meshes, labels, method, unknown, workers, seed):
+        tell("", f"qs3 {shlex.join(words)}")
+        try:
+            code = max(code, run(words))
+        except InputError as error:
+            # Some meshes that cannot be scanned, or scans that cannot be read, stop no other step.
+            partial = str(error).startswith(str(out / "source" / FAILURES))
+            if not partial and not (words[0] == "predict" and (out / "answers.csv").is_file()):
+                raise
+            faults.append(error)
+    show(out / "answers.csv", out / "report.html")
+    if faults:
+        raise faults[0]
+    return code
+
+
+def _steps(
+    cad: Path,
+    scans: Path,
+    out: Path,
+    camera: str,
+    meshes: dict[str, str | None],
+    labels: Path | None,
+    method: str,
+    unknown: float,
+    workers: int | None,
+    seed: int,
+) -> Iterator[list[str]]:
+    """Yield the words of each command."""
+    source, made = str(out / "source"), str(out / "run")
+    given = _options(**meshes)
+    yield ["meshes", str(cad), *given, "--out", str(out / "contact-sheet.png")]
+    yield [
+        *("generate", "--recipe", "parts", "--meshes", str(cad), *given, "--sensor", camera),
+        *_options(seed=seed, workers=workers, out=source),
+    ]
+    yield [
+        *("train", "--model", "forest", "--source", source, "--target", str(scans)),
+        *_options(method=method, labels=labels, seed=seed, out=made),
+    ]
+    answers = str(out / "answers.csv")
+    yield ["predict", made, str(scans), "--unknown", str(unknown), "--csv", answers]
+    yield ["report", made, "--source", source, "--out", str(out / "report.html")]
+
+
+def _options(**values: object) -> list[str]:
+    words = [(f"--{name}", str(value)) for name, value in values.items() if value is not None]
+    return [word for pair in words for word in pair]

@@ -1,0 +1,131 @@
+"""The CAD of a run's classes, for `qs3.forest.fit`: points, normals and resting poses in a file."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+from jaxtyping import Float
+
+from qs3.errors import InputError
+from qs3.files import parse_json, write_bytes
+from qs3.forest.fit import Fit, PartModel, fit_part
+from qs3.reading import reading
+
+PARTS = "parts.safetensors"
+CANDIDATES = 4
+"""Classes of a scan that are fitted, the likeliest."""
+_RESIDUAL = 400.0
+"""Taken off a class's log probability for each metre of residual."""
+_LEAST = 1e-9
+
+
+@dataclass(frozen=True)
+class Part:
+    """One mesh of a class."""
+
+    class_name: str
+    mesh: str
+    """Name of the mesh."""
+    model: PartModel
+    resting: Float[np.ndarray, "p 3 3"]
+    """Rotations in which it lies on a table."""
+
+
+@dataclass(frozen=True)
+class FittedPart:
+    """The mesh that fits a scan best."""
+
+    mesh: str
+    fit: Fit
+
+
+def fit_classes(
+    scan: Float[np.ndarray, "n 3"],
+    probabilities: Mapping[str, float],
+    parts: Sequence[Part],
+    up: bool = True,
+) -> tuple[dict[str, float], dict[str, FittedPart]]:
+    """Lay the CAD of the likeliest classes onto a scan, and let the residuals join the decision.
+
+    Args:
+        scan: Points in metres.
+        probabilities: Of each class.
+        parts: The CAD; every class has some.
+        up: Whether z is the vertical, so that parts lie in resting poses.
+
+    Returns:
+        Probabilities in proportion to p · exp(−400 r), r the residual in metres; classes that were
+        not fitted have the largest residual. And the best mesh of each fitted class.
+    """
+    names = sorted(probabilities, key=lambda name: -probabilities[name])[:CANDIDATES]
+    fits: dict[str, FittedPart] = {}
+    for part in parts:
+        if part.class_name in names:
+            fit = fit_part(scan, part.model, resting=part.resting if up else None)
+            best = fits.get(part.class_name)
+            if best is None or fit.residual < best.fit.residual:
+                fits[part.class_name] = FittedPart(part.mesh, fit)
+    worst = max(fitted.fit.residual for fitted in fits.values())
+    score = np.array(
+        [
+            np.log(max(share, _LEAST))
+            - _RESIDUAL * (fits[name].fit.residual if name in fits else worst)
+            for name, share in probabilities.items()
+        ]
+    )
+    shares = np.exp(score - np.logaddexp.reduce(score))
+    ordered = sorted(zip(probabilities, shares.tolist(), strict=True), key=lambda item: -item[1])
+    return dict(ordered), fits
+
+
+def save_parts(path: Path, parts: Sequence[Part]) -> None:
+    """Write parts to one safetensors file, atomically."""
+    arrays = {}
+    for i, part in enumerate(parts):
+        arrays |= {f"{i}/points": part.model.points, f"{i}/normals": part.model.normals}
+        arrays[f"{i}/resting"] = np.ascontiguousarray(part.resting, np.float64)
+    named = [[part.class_name, part.mesh] for part in parts]
+    write_bytes(path, safetensors.numpy.save(arrays, {"qs3": json.dumps({"parts": named})}))
+
+
+def read_parts(path: Path, class_names: Sequence[str]) -> list[Part]:
+    """Read the parts of a run.
+
+    Raises:
+        InputError: if the file is missing or damaged, or a class has no part.
+    """
+    if not path.is_file():
+        raise InputError(
+            f"{path.parent}: has no CAD to fit; train it again with --meshes, the folder of them"
+        )
+    with reading(path, "parts"):
+        try:
+            with safetensors.safe_open(path, framework="numpy") as handle:  # pyright: ignore[reportPrivateImportUsage]
+                facts = parse_json((handle.metadata() or {})["qs3"], path)
+                parts = [
+                    Part(
+                        str(name),
+                        str(mesh),
+                        PartModel(
+                            handle.get_tensor(f"{i}/points"), handle.get_tensor(f"{i}/normals")
+                        ),
+                        handle.get_tensor(f"{i}/resting"),
+                    )
+                    for i, (name, mesh) in enumerate(facts["parts"])
+                ]
+        except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
+            raise InputError(f"not the parts of a run ({error})") from error
+        for part in parts:
+            shapes = part.model.points.shape, part.model.normals.shape, part.resting.shape[1:]
+            arrays = part.model.points, part.model.normals, part.resting
+            sound = shapes[0] == shapes[1] and shapes[0][1:] == (3,) and shapes[2] == (3, 3)
+            if not sound or not all(array.size and np.isfinite(array).all() for array in arrays):
+                raise InputError(f"part {part.mesh} is damaged")
+        missing = {*class_names} - {part.class_name for part in parts}
+        if missing:
+            raise InputError(f"has no CAD of {', '.join(sorted(missing))}")
+    return parts

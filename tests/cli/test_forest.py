@@ -1,0 +1,112 @@
+"""A forest of one's own parts, from the command line: labels, CAD and the fit."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import safetensors.numpy
+import trimesh
+
+from qs3.errors import InputError
+from qs3.forest.parts import read_parts
+
+PARTS = {
+    "block": trimesh.creation.box((0.06, 0.04, 0.02)),
+    "rod": trimesh.creation.cylinder(0.01, 0.08),
+    "wedge": trimesh.creation.cone(0.03, 0.05),
+}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """CAD in millimetres, labelled clouds and scans of upper sides."""
+    root = tmp_path_factory.mktemp("parts")
+    rng = np.random.default_rng(0)
+    for name, mesh in PARTS.items():
+        for folder, count in (("source", 8), ("scans", 3)):
+            (root / folder / name).mkdir(parents=True)
+            for i in range(count):
+                points, faces = mesh.sample(1200, return_index=True, seed=int(rng.integers(2**31)))
+                seen = points[mesh.face_normals[faces][:, 2] > -0.5]
+                noisy = seen + rng.normal(0, 0.0003, seen.shape)
+                np.save(root / folder / name / f"{name}-{i}.npy", noisy.astype(np.float32))
+        (root / "cad" / name).mkdir(parents=True)
+        mesh.copy().apply_scale(1000).export(root / "cad" / name / f"{name}.stl")
+    return root
+
+
+@pytest.fixture(scope="module")
+def run(place):
+    from qs3.cli import run
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("qs3.forest.forest.TREES", 60)
+        words = ["train", "--model", "forest", "--source", str(place / "source")]
+        words += ["--meshes", str(place / "cad"), "--units", "mm", "--out", str(place / "run")]
+        assert run(words) == 0
+    return place / "run"
+
+
+def test_a_prediction_with_fit_tells_the_pose(typed, place, run):
+    answers = json.loads(typed("predict", run, place / "scans", "--fit", "--json", "-").stdout)
+    assert len(answers) == 9
+    for answer in answers:
+        assert answer["class"] in answer["file"]
+        fit, part = answer["fit"], PARTS[answer["class"]]
+        pose = np.array(fit["pose"])
+        assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
+        # The part lies where the scan is, within a few millimetres.
+        scan = np.load(answer["file"])
+        posed = trimesh.transform_points(part.sample(4000, seed=1), pose)
+        away = np.linalg.norm(scan[:, None] - posed[None], axis=2).min(axis=1)
+        assert np.median(away) < 0.003
+        assert fit["residual"] < 0.03
+    text = typed("predict", run, place / "scans" / "rod" / "rod-0.npy", "--fit").stdout
+    assert "rod\t" in text
+    assert "residual" in text
+
+
+def test_a_run_without_cad_cannot_fit(typed, place, tmp_path):
+    typed("train", "--model", "forest", "--source", place / "source", "--out", tmp_path / "bare")
+    fault = typed.refuses("predict", tmp_path / "bare", place / "scans", "--fit")
+    assert "train it again with --meshes" in fault
+
+
+@pytest.mark.parametrize("damage", ["nan", "missing"])
+def test_damaged_cad_is_refused(run, tmp_path, damage):
+    arrays = safetensors.numpy.load_file(run / "parts.safetensors")
+    with safetensors.safe_open(run / "parts.safetensors", framework="numpy") as handle:
+        facts = handle.metadata()
+    if damage == "nan":
+        arrays["0/points"][0] = np.nan
+    else:
+        del arrays["1/normals"]
+    safetensors.numpy.save_file(arrays, tmp_path / "parts.safetensors", facts)
+    with pytest.raises(InputError, match=r"damaged|not the parts"):
+        read_parts(tmp_path / "parts.safetensors", tuple(PARTS))
+
+
+@pytest.mark.parametrize(
+    ("words", "fault"),
+    [
+        (("--model", "pointnet", "--labels", "x.csv"), "use --model forest"),
+        (("--model", "pointnet", "--meshes", "cad"), "goes with --model forest"),
+        (("--model", "forest", "--units", "mm"), "name these"),
+        (("--model", "forest", "--epochs", 3), "epochs needs a network"),
+        (("--model", "forest", "--method", "dann", "--target", "."), "needs a network"),
+    ],
+)
+def test_what_a_forest_and_a_network_cannot_is_refused(typed, place, tmp_path, words, fault):
+    target = [str(place / "scans") if word == "." else word for word in words]
+    told = typed.refuses("train", "--source", place / "source", "--out", tmp_path / "r", *target)
+    assert fault in told
+    assert not (tmp_path / "r").exists()
+
+
+def test_labels_are_found_below_the_target(typed, place, tmp_path):
+    with (tmp_path / "labels.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([["file", "class"], ["rod/rod-0.npy", "rod"]])
+    command = ("train", "--model", "forest", "--source", place / "source", "--out", tmp_path / "r")
+    given = ("--target", place / "scans", "--labels", tmp_path / "labels.csv")
+    assert "few-label: learnt from 1 labelled scans" in typed(*command, *given).stderr
