@@ -121,9 +121,10 @@ def test_other_settings_do_not_overwrite_a_run_or_a_data_set(qs3, quick, run, st
     assert "epochs" in line
 
 
-def test_a_flat_folder_of_meshes_is_told_what_it_lacks(typed, quick, tmp_path):
-    (tmp_path / "cad").mkdir()
-    (tmp_path / "cad" / "a.off").write_text(TETRAHEDRON)
+def test_class_folders_mixed_with_flat_files_are_refused(typed, quick, tmp_path):
+    for name in ("a.off", "cup/b.off"):
+        (tmp_path / "cad" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "cad" / name).write_text(TETRAHEDRON)
     line = typed.refuses("generate", "--meshes", tmp_path / "cad", "--out", tmp_path / "o", *quick)
     assert "folder a class" in line
     assert not (tmp_path / "o").exists()

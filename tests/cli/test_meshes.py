@@ -36,15 +36,14 @@ def test_a_folder_is_shown_with_its_sizes_hints_and_faults(tmp_path, typed, capl
     (hint,) = [line for line in lines if line.startswith("hint")]
     assert "1 of 4, such as cup/a: tells no unit, looks to be in millimetres" in hint
     (fault,) = [line for line in lines if line.startswith("fault")]
-    assert "d.off: cut short" in fault
+    assert "d.off: declares 3 vertices" in fault
     assert "not read: 1 .dwg" in caplog.text
     assert lines[-1] == str(sheet)
     with Image.open(sheet) as picture:
         assert picture.width > picture.height
 
 
-def test_the_command_that_comes_next_keeps_the_options(parts, tmp_path, typed, monkeypatch):
-    monkeypatch.setattr("qs3.cli.generate._expected", lambda *_: [])  # no scan is measured
+def test_the_command_that_comes_next_keeps_the_options(parts, tmp_path, typed):
     folder, labels, sheet = parts(a=90.0, b=40.0), tmp_path / "my labels.csv", tmp_path / "s.png"
     labels.write_text("file,class\na.stl,cup\nb.stl,big lid\n")
     given = ["--units", "mm", "--labels", labels, "--up", "y", "--classes", "big lid", "cup"]
@@ -57,8 +56,8 @@ def test_the_command_that_comes_next_keeps_the_options(parts, tmp_path, typed, m
     assert plain.stderr.splitlines()[-1].endswith("parts' --classes cup --out SET")
 
 
-def test_a_flat_folder_is_told_that_it_wants_classes(parts, tmp_path, typed):
-    done = typed("meshes", parts(a=1.0), "--out", tmp_path / "sheet.png")
+def test_class_folders_mixed_with_flat_files_want_classes(parts, tmp_path, typed):
+    done = typed("meshes", parts(a=1.0, cup__b=1.0), "--out", tmp_path / "sheet.png")
     assert "one folder a class" in done.stderr
     assert "--labels CSV" in done.stderr
     assert "qs3 generate" not in done.stderr

@@ -100,10 +100,10 @@ def test_faulty_choices_of_classes(tree) -> None:
     with pytest.raises(InputError, match="at least one"):
         collect(root, classes=[])
     assert [item.id for item in collect(root, classes="chair")] == ["chair/a"]
-    with pytest.raises(InputError, match="lie flat, without classes"):
-        collect(root / "chair", classes=["chair"])
     with pytest.raises(InputError, match=r"no class 'x'; it has c00, .*c59 and 5 more"):
         collect(tree(*(f"c{i:02d}/a.off" for i in range(64))), classes=["x"])
+    with pytest.raises(InputError, match="lie flat, without classes"):
+        collect(tree("flat/test/b.off") / "flat", classes=["chair"])
 
 
 def test_shapenet_of_both_versions_with_and_without_splits(tree) -> None:
@@ -166,12 +166,21 @@ def test_shapenet_in_another_form_is_refused(tree) -> None:
         collect(root)
 
 
+def test_each_file_of_a_flat_folder_is_a_class(tree, caplog) -> None:
+    root = tree("m20.stl", "bearing box.step", "m20.off")
+    found = [(item.id, item.class_name) for item in collect(root)]
+    assert found == [("bearing box", "bearing box"), ("m20.off", "m20"), ("m20.stl", "m20")]
+    assert "each of its 3 files is a class" in caplog.text
+    assert {item.class_name for item in collect(tree("gear/a.off"))} == {"", "gear"}
+
+
 @pytest.mark.parametrize(
     ("names", "inner", "message"),
     [
         (["v2/03001627/a/models/model_normalized.obj"], "", "ShapeNet lies deeper; name .*root/v2"),
         (["03001627/a/model.obj"], "03001627", "one synset of ShapeNet; .* class chair"),
         (["M40/chair/train/a.off", "M40/readme.txt"], "", "ModelNet lies deeper; name .*root/M40"),
+        (["night stand/a.off", "cup/b.off"], "night stand", "named as one class; name the folder"),
     ],
 )
 def test_the_wrong_level_is_refused(tree, names, inner, message) -> None:

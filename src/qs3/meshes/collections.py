@@ -43,8 +43,8 @@ def collect(
 
     Args:
         source: ``"shapes"`` for built-in furniture, ``"parts"`` for built-in machine parts; else a
-            folder: ModelNet's, ShapeNet's, one folder a class, or meshes lying flat in it (then
-            without a class); see ``read_tree``. Any format of ``load_mesh`` will do. Write
+            folder: ModelNet's, ShapeNet's, one folder a class, or a flat one whose files are the
+            classes; see ``read_tree``. Any format of ``load_mesh`` will do. Write
             ``./shapes`` for a folder of that name.
         per_class: Number of draws of each built-in class.
         seed: Another seed gives other draws of built-in classes.

@@ -13,7 +13,7 @@ from qs3 import shapes
 from qs3.errors import InputError, MissingExtraError, say_once
 from qs3.files import describe_others
 from qs3.meshes.cad import NEEDS, check_extra
-from qs3.meshes.classes import MODELNET40, SHAPENET
+from qs3.meshes.classes import MODELNET40, POINTDA10, SHAPENET, canonical
 from qs3.meshes.labels_csv import read_labels, read_shapenet_splits
 from qs3.meshes.loading import EXTENSIONS, load_mesh
 from qs3.meshes.walking import entries, ids, is_file, walk
@@ -34,7 +34,7 @@ class MeshItem:
     """Name within the collection: the path below its root without ending as far as that is unique,
     or shapes/<class>/<n> and parts/<class>/<n>."""
     class_name: str
-    """Class by folder, synset, CSV or shape; empty in a flat folder."""
+    """Class by folder, synset, CSV, shape, or file in a flat folder; empty if unknown."""
     split: str
     """``"train"``, ``"test"`` or another, or empty if the collection has no split."""
     path: Path | None
@@ -71,6 +71,8 @@ def read_tree(root: Path, labels: Path | None = None) -> list[MeshItem]:
       ``<synset>/<id>/models/model_normalized.obj`` (v2) or ``<synset>/<id>/model.obj`` (v1), with
       splits from ``all.csv`` if that lies in the root;
     - ModelNet, told by all meshes being ``<class>/<train|test>/<file>`` of ModelNet40's classes;
+    - a flat folder, all of whose meshes lie right in the root: each file is a class, named by its
+      stem;
     - any other: the first folder is the class, a folder named train, test or val anywhere is the
       split; meshes right in the root have no class.
 
@@ -155,7 +157,18 @@ def _folders(root: Path, files: Sequence[str]) -> list[MeshItem]:
         len(parts) == 3 and parts[0] in MODELNET40 and parts[1] in ("train", "test")
         for parts in paths
     )
-    return list(_items(root, files, "modelnet" if is_modelnet else "folders"))
+    items = list(_items(root, files, "modelnet" if is_modelnet else "folders"))
+    if not files or any(len(parts) > 1 for parts in paths):
+        return items
+    if canonical(root.name) in POINTDA10 or root.name in MODELNET40:
+        raise InputError(
+            f"{root}: is named as one class; name the folder above it, or rename it if each of its "
+            "files is a class"
+        )
+    say_once(f"{root}: a flat folder: each of its {len(files)} files is a class, named by its stem")
+    return [
+        replace(item, class_name=Path(file).stem) for item, file in zip(items, files, strict=True)
+    ]
 
 
 def _labelled(root: Path, labels: Path, others: Counter[str]) -> list[MeshItem]:
