@@ -10,8 +10,9 @@ import pytest
 
 from qs3.evaluation.records import RECORDS, read_records
 from qs3.experiments.data import choose_meshes, make_plans
+from qs3.experiments.galleries import shown
 from qs3.experiments.grid import data_sets
-from qs3.experiments.reproduce import Workers, collect_runs, products, reproduce
+from qs3.experiments.reproduce import choose_tables, collect_runs, reproduce
 from qs3.experiments.scales import SCALES, Scale
 from qs3.experiments.setup import Setup, claim
 from qs3.store.generate import generate, scan_seed
@@ -46,7 +47,6 @@ TINY = Scale(
     sensors=("qs3", "d435"),
     pointda10=("ordinary", "qbst-paper"),
 )
-WORKERS = Workers(workers=1)
 
 
 def blob_row(item, scan, settings, neighbours=()):
@@ -76,11 +76,20 @@ def blob_row(item, scan, settings, neighbours=()):
     )
 
 
-def make_tables(out, names, rows=(), columns=(), seeds=(0, 1), tell=lambda line: None, **changes):
+def make_tables(
+    out,
+    names,
+    rows=(),
+    columns=(),
+    seeds=(0, 1),
+    tell=lambda line: None,
+    galleries=False,
+    **changes,
+):
     """Reproduce some tables at the tiny scale; blobs stand for the scans."""
     setup = Setup(out, TINY, seeds=seeds, threads=1, **changes)
-    parts = products(names, setup, rows, columns)
-    sets = [*data_sets(collect_runs(parts), setup.own), *(d for p in parts for d in p.sets())]
+    tables = choose_tables(names, setup, rows, columns)
+    sets = [*data_sets(collect_runs(tables)), *(shown(setup) if galleries else [])]
     plans = make_plans(TINY, choose_meshes(TINY, None), sets)
     claim(setup, "shapes")
     for name, plan in plans.items():
@@ -91,7 +100,7 @@ def make_tables(out, names, rows=(), columns=(), seeds=(0, 1), tell=lambda line:
             )  # fmt: skip
     with warnings.catch_warnings():  # so small a network may be sure of one class alone, or of none
         warnings.simplefilter("ignore")
-        return reproduce(parts, setup, WORKERS, tell)
+        return reproduce(tables, setup, tell, galleries=galleries)
 
 
 def name_of(record):

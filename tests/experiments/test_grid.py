@@ -1,6 +1,5 @@
 """Runs are made once, in their order, and taken up again after a stop or a fault."""
 
-import os
 import re
 import shutil
 import subprocess
@@ -19,11 +18,10 @@ from qs3.evaluation.records import RECORDS, append_record, score
 from qs3.experiments import grid
 from qs3.experiments.domains import Domain, parse_own
 from qs3.experiments.grid import make_record, run_grid
-from qs3.experiments.reproduce import Workers, products, reproduce
+from qs3.experiments.reproduce import choose_tables, reproduce
 from qs3.experiments.runs import ORDINARY, PAPER, make_run
-from qs3.experiments.setup import MARKER, Setup, count_own, read_setup
+from qs3.experiments.setup import Setup, count_own, read_setup
 from qs3.experiments.table import Table
-from qs3.files import read_json, write_json
 from qs3.store.executors import Failure
 
 from .conftest import TINY, drop, make_tables, records_of, rewrite
@@ -46,9 +44,9 @@ def counting(monkeypatch):
     """Count the runs that are made."""
     made: list[str] = []
 
-    def make(run, setup, device=""):
+    def make(run, setup):
         made.append(run.name)
-        return make_record(run, setup, device)
+        return make_record(run, setup)
 
     monkeypatch.setattr(grid, "make_record", make)
     return made
@@ -99,10 +97,10 @@ def test_data_made_anew_that_differ_are_told_before_a_training(finished, monkeyp
 def test_a_stop_between_training_and_record_loses_nothing(finished, whole, monkeypatch):
     (finished / RECORDS).unlink()
 
-    def stop(run, setup, device=""):
+    def stop(run, setup):
         if run.target == F:
             raise KeyboardInterrupt
-        return make_record(run, setup, device)
+        return make_record(run, setup)
 
     monkeypatch.setattr(grid, "make_record", stop)
     with pytest.raises(KeyboardInterrupt):
@@ -117,7 +115,7 @@ def test_a_stop_between_training_and_record_loses_nothing(finished, whole, monke
 def test_a_folder_of_other_settings_is_refused(finished):
     setup = Setup(finished, TINY, seeds=(0,), threads=2)
     with pytest.raises(InputError, match="another threads"):
-        reproduce(products(["ordinary"], setup), setup, Workers(), print)
+        reproduce(choose_tables(["ordinary"], setup), setup, print)
 
 
 def test_a_dry_run_prints_counts_and_writes_nothing(small_scales, finished, capsys):
@@ -141,7 +139,7 @@ def test_a_shared_folder_that_is_not_there_is_told(small_scales, tmp_path, monke
 
 
 def test_galleries_show_procedural_shapes_alone(finished):
-    make_tables(finished, ["galleries"], seeds=(0,))
+    make_tables(finished, [], seeds=(0,), galleries=True)
     names = sorted(path.name for path in (finished / "galleries").iterdir())
     assert names == ["D.png", "F.png", "M.png", "S.png"]
 
@@ -161,18 +159,13 @@ def test_data_of_the_user_takes_a_domain_s_place(whole, tmp_path):
         (f"D={data / 'source'}", "no cloud of split 'test'"),
     ):
         with pytest.raises(InputError, match=said):
-            changes = {"own": own | parse_own([changed])}
-            make_tables(out, ["ordinary"], ("dgcnn",), ("M-D",), (0,), **changes)
+            other = own | count_own(parse_own([changed]), TINY)
+            make_tables(out, ["ordinary"], ("dgcnn",), ("M-D",), (0,), own=other)
     again = read_setup(out)
     assert again.own["D"].train.cloud == "points" and again.seeds == (0,)
     assert [again.own[kind].train.count for kind in own] == [24, 30]
     filled = Table("ordinary", again, ("dgcnn",), ("M-D",)).read()
     assert filled.faults == () and filled.waiting == []
-    marker = read_json(out / MARKER)  # of a version that did not count them
-    for record in marker["data"].values():
-        del record["train_clouds"], record["test_clouds"]
-    write_json(out / MARKER, marker)
-    make_tables(out, ["ordinary"], ("dgcnn",), ("M-D",), (0,), own=own)
 
 
 class Inline:
@@ -225,7 +218,7 @@ def run_all(out, executor, tell=lambda line: None, **options):
 def ready_made(whole, monkeypatch):
     record = records_of(whole)["S-D_ordinary_seed-0"]
 
-    def make(run, setup, device):
+    def make(run, setup):
         return replace(record, experiment=run.fields)
 
     monkeypatch.setattr(grid, "make_record", make)
@@ -263,41 +256,17 @@ def test_a_failed_run_is_named_and_what_others_made_stays(ready_made, tmp_path):
     assert list(records_of(tmp_path)) == [NAMES[3]]
 
 
-def test_each_device_has_one_run_at_a_time(whole, tmp_path, monkeypatch):
-    record = records_of(whole)["S-D_ordinary_seed-0"]
-    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
-    executor, seen = Inline(), []
-
-    def make(run, setup, device):
-        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "7,8,3")  # a new process has the scheduler's
-        grid._see_alone(device)
-        seen.append(os.environ["CUDA_VISIBLE_DEVICES"])
-        return replace(record, experiment=run.fields)
-
-    monkeypatch.setattr(grid, "make_record", make)
-    assert run_all(tmp_path, executor, devices=("2", "0")) == []
-    assert set(seen) == {"3", "7"} and executor.most == 2
-
-
-def test_a_device_that_is_not_there_is_told(tmp_path):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CUDA_VISIBLE_DEVICES", "")
-        with pytest.raises(InputError, match="--devices 4: no such GPU"):
-            make_record(RUNS[0], Setup(tmp_path, TINY), "4")
-    for options in ({"devices": ("x",)}, {"workers": 0}):
-        with pytest.raises(InputError):
-            Workers(**options)
+def test_no_worker_is_refused(tmp_path):
+    with pytest.raises(InputError, match="--workers 0"):
+        reproduce([], Setup(tmp_path, TINY), print, workers=0)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [Workers(2), Workers(2, executor="ray", address="local")])
-def test_several_at_once_give_the_same_numbers(finished, whole, workers):
-    if workers.executor == "ray":
-        pytest.importorskip("ray", exc_type=ImportError)
+def test_several_at_once_give_the_same_numbers(finished, whole):
     shutil.rmtree(finished / "runs")
     (finished / RECORDS).unlink()
     setup = Setup(finished, TINY, seeds=(0,), threads=1)
-    reproduce(products(["thresholds"], setup), setup, workers, print)
+    reproduce(choose_tables(["thresholds"], setup), setup, print, workers=2)
     found, wanted = comparable(finished), comparable(whole)
     assert len(found) == 8 and found == {name: wanted[name] for name in found}
 

@@ -15,8 +15,8 @@ from qs3.experiments.data import choose_meshes, make_plans, side_of
 from qs3.experiments.domains import Domain, data_of, parse_own
 from qs3.experiments.experiment import load_experiment, published
 from qs3.experiments.grid import data_sets
-from qs3.experiments.reproduce import collect_runs, products
-from qs3.experiments.runs import ORDINARY, PAPER, ROWS, SUPERVISED, make_run, warm_up_of
+from qs3.experiments.reproduce import choose_tables, collect_runs
+from qs3.experiments.runs import ORDINARY, PAPER, ROWS, SUPERVISED, make_run
 from qs3.experiments.scales import SCALES
 from qs3.experiments.setup import Setup, count_own
 from qs3.experiments.table import Table
@@ -31,7 +31,7 @@ S, D, R = Domain("S"), Domain("D"), Domain("R")
 
 @pytest.mark.parametrize("scale", SCALES.values(), ids=SCALES)
 def test_every_cell_has_its_data_and_its_work_list(scale, tmp_path):
-    runs = collect_runs(products(TABLES, Setup(tmp_path, scale, seeds=(0,))))
+    runs = collect_runs(choose_tables(TABLES, Setup(tmp_path, scale, seeds=(0,))))
     sets = data_sets(runs)
     assert {data.kind for data in sets} == {
         "source", "held", "target", "fused", "jitter", "second", "views", "sensor"
@@ -40,7 +40,7 @@ def test_every_cell_has_its_data_and_its_work_list(scale, tmp_path):
     assert {d.sensor for d in sets} - {""} == {*scale.sensors}
     made: set[str] = set()
     for run in runs:
-        before = warm_up_of(scale, run)
+        before = run.warm_up
         assert before is None or before.folder in made
         made.add(run.folder)
     few = dataclasses.replace(scale, source_per_class=1, target_per_class=1, test_per_class=1)
@@ -55,7 +55,7 @@ def test_a_run_is_known_by_its_fields():
         "source": "A", "source_sensor": "kinect-v1", "target": "A", "target_sensor": "d435",
         "row": "ordinary", "seed": 3,
     }  # fmt: skip
-    assert [part.data.name for part in run.parts() if part] == ["sensor-kinect-v1", "sensor-d435"]
+    assert [part.data.name for part in run.parts if part] == ["sensor-kinect-v1", "sensor-d435"]
     theta = make_run(TINY, S, D, PAPER, threshold=0.2)
     assert theta.fields["threshold"] == theta.self_training.threshold == 0.2
     # The row's own value is one training with the table of methods.
@@ -69,7 +69,7 @@ def test_a_run_is_known_by_its_fields():
 def test_runs_have_the_settings_of_their_row():
     paper = make_run(TINY, S, D, PAPER)
     assert paper.self_training.pool == "shrinking" and paper.self_training.init == "scratch"
-    assert warm_up_of(TINY, paper) == make_run(TINY, S, D, ORDINARY)
+    assert paper.warm_up == make_run(TINY, S, D, ORDINARY)
     base = make_run(TINY, S, D, "qbst").self_training
     for name, row in ROWS.items():
         if row.changes:
@@ -77,14 +77,14 @@ def test_runs_have_the_settings_of_their_row():
             plain = {"threshold": 0.8} if "threshold_share" in row.changes else {}
             changed = dataclasses.replace(base, **plain, **row.changes)
             assert make_run(TINY, S, D, name).self_training == changed != base
-    assert warm_up_of(TINY, make_run(TINY, S, D, "gast-spst")).row == "gast"
+    assert make_run(TINY, S, D, "gast-spst").warm_up.row == "gast"
 
 
 def test_real_objects_must_be_at_hand_and_have_no_supervised_row(tmp_path):
     setup = Setup(tmp_path, dataclasses.replace(TINY, tasks=("S-D", "S-R")), seeds=(0,))
-    bench = products(["adaptation-bench"], setup)
+    bench = choose_tables(["adaptation-bench"], setup)
     assert {run.target for run in collect_runs(bench)} == {D}
-    asked = products(["adaptation-bench"], setup, columns=["S-R"])
+    asked = choose_tables(["adaptation-bench"], setup, columns=["S-R"])
     with pytest.raises(InputError, match="QS3_SHARED_DATA"):
         collect_runs(asked)
     assert asked[0].cells()[SUPERVISED, "S-R"] == []
@@ -126,7 +126,7 @@ def test_the_paper_s_cells_have_their_published_figures():
 def test_what_no_table_has_is_refused(names, rows, columns, seeds, said, tmp_path):
     setup = Setup(tmp_path, TINY, seeds=seeds)
     with pytest.raises(InputError, match=said):
-        collect_runs(products(names, setup, rows, columns))
+        collect_runs(choose_tables(names, setup, rows, columns))
 
 
 def test_small_is_at_the_floor_and_smoke_below():
@@ -168,10 +168,10 @@ def test_the_target_has_rooms_frequent_classes():
     ("given", "said"),
     [
         (["D"], "NAME=PATH"),
-        (["D=nowhere-at-all"], "not there"),
+        (["D=nowhere-at-all"], "does not exist"),
         (["Q=."], "the domains are"),
         (["D=.", "D=."], "each domain once"),
-        (["D=.:train"], "not there"),
+        (["D=.:train"], "does not exist"),
     ],
 )
 def test_data_of_the_user_that_cannot_be_is_refused(given, said):
@@ -183,15 +183,15 @@ def test_a_path_through_a_link_and_a_name_of_ours_are_the_user_s(tmp_path):
     (tmp_path / "target").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "target")
     own = parse_own([f"S={tmp_path / 'link'}"])
-    run = make_run(TINY, S, D, ORDINARY)
-    source, _, test = run.parts(own)
+    run = make_run(TINY, S, D, ORDINARY, own=own)
+    source, _, test = run.parts
     assert source.locate(tmp_path, None) == (tmp_path / "target").resolve()
     assert test.locate(tmp_path, None) == tmp_path / "data" / "target"  # not the user's
-    assert [data.name for data in data_sets([run], own)] == ["target"]
+    assert [data.name for data in data_sets([run])] == ["target"]
     with pytest.raises(InputError, match="partiality: compares S"):
-        products(["partiality"], Setup(tmp_path, TINY, own=own))
+        choose_tables(["partiality"], Setup(tmp_path, TINY, own=own))
     with pytest.raises(InputError, match="no clouds to score on"):
-        make_run(TINY, S, Domain("J"), ORDINARY).parts()
+        make_run(TINY, S, Domain("J"), ORDINARY)
     assert data_of(S, own).stands_for == "" and data_of(D, own).stands_for
 
 
@@ -231,7 +231,7 @@ def test_the_user_s_own_data_count_by_their_size(whole):
     for row, batches in (("ordinary", 1), ("gast", 1), ("gast-spst", 1)):
         run = make_run(scale, S, D, row, own=own)
         assert run.train.epochs == 4000 / batches
-        before = warm_up_of(scale, run, own)
+        before = run.warm_up
         assert before is None or before.train.epochs == run.train.epochs
     many = {
         "D": dataclasses.replace(own["D"], train=dataclasses.replace(own["D"].train, count=640))
@@ -244,10 +244,8 @@ def test_rounds_start_from_one_training_of_the_source():
     scale = SCALES["laptop"]
     rows = ("spst", PAPER, "qbst", "qbst-gentle")
     for network in ("", "dgcnn"):
-        first = {
-            warm_up_of(scale, make_run(scale, S, D, row, network=network)).folder for row in rows
-        }
-        also = warm_up_of(scale, make_run(scale, S, R, PAPER, network=network)).folder
+        first = {make_run(scale, S, D, row, network=network).warm_up.folder for row in rows}
+        also = make_run(scale, S, R, PAPER, network=network).warm_up.folder
         assert first == {also} == {make_run(scale, S, D, ORDINARY, network=network).folder}
     sized = {row: make_run(scale, S, D, row).train.preparation.size_input for row in ROWS}
     assert {row for row, told in sized.items() if not told} == {
@@ -271,7 +269,7 @@ def test_real_objects_are_adapted_to_in_early_frames_and_scored_in_late_ones(tmp
         label=np.arange(30) % 2, class_names=np.array(["bed", "chair"]), frame=frame, strict=strict,
     )  # fmt: skip
     run = make_run(SCALES["laptop"], S, R, PAPER)
-    _, target, test = run.parts()
+    _, target, test = run.parts
     files = {part.locate(tmp_path, tmp_path) for part in (target, test)}
     assert files == {tmp_path / "nyuv2_objects.npz"}
     (path,) = files

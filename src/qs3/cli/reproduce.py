@@ -1,7 +1,7 @@
 """``qs3 reproduce``: tables and figures anew, from data to records to files."""
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +11,6 @@ from qs3.cli.options import Flat
 from qs3.cli.text import show, tell
 from qs3.errors import InputError
 from qs3.experiments import GALLERIES, TABLES, ScaleName
-from qs3.experiments.reproduce import Workers
 
 ProductName = str
 if not TYPE_CHECKING:
@@ -46,14 +45,14 @@ class ReproduceOptions:
     """Print the numbers of scans and runs; write nothing."""
     threads: int = 1
     """CPU threads of a training; numbers are the same for the same count."""
-    workers: Flat[Workers] = field(default_factory=Workers)
-    """Who does the work."""
+    workers: int = 2
+    """Processes that scan and train."""
 
 
 def reproduce(options: Flat[ReproduceOptions]) -> int:
     """Make tables and figures anew, with their data and trainings; only what is missing is done."""
     from qs3.experiments.domains import parse_own
-    from qs3.experiments.reproduce import products
+    from qs3.experiments.reproduce import choose_tables
     from qs3.experiments.reproduce import reproduce as make
     from qs3.experiments.scales import SCALES
     from qs3.experiments.setup import Setup, count_own
@@ -73,9 +72,10 @@ def reproduce(options: Flat[ReproduceOptions]) -> int:
         own=count_own(parse_own(options.data), scale),
     )
     names = options.names or (*TABLES, GALLERIES)
-    parts = products(names, setup, options.methods, options.tasks)
+    tables = [name for name in names if name != GALLERIES]
+    chosen = choose_tables(tables, setup, options.methods, options.tasks)
     say = show if options.dry_run else tell
-    paths = make(parts, setup, options.workers, say, options.dry_run)
+    paths = make(chosen, setup, say, options.workers, GALLERIES in names, options.dry_run)
     show(*(path.read_text(encoding="utf-8") for path in paths if path.is_file()))
     tell(*(f"made: {path}" for path in paths))
     return 0

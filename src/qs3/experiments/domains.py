@@ -1,8 +1,8 @@
-"""Domains of the tables: where the clouds of each come from, and what stands in for the paper's.
+"""Domains of the tables, and the data of each.
 
-The paper's data sets cannot be had without asking (ScanNet) or have gone with their links. What is
-made here takes their places, under their letters and named as stand-ins in every table; a user's
-own folders take them with ``--data``.
+The paper's data sets need a request (ScanNet) or have lost their links. Data made here take their
+places, under their letters and named as stand-ins in every table; a user's own folders take them
+with ``--data``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,14 +31,13 @@ class Domain:
     """A source or a target of the tables."""
 
     kind: Kind
-    """Which clouds."""
     views: int = 0
-    """Number of fused views, of kind V."""
+    """Number of fused views of kind V."""
     sensor: str = ""
-    """Preset of the sensor, of kind A."""
+    """Sensor preset of kind A."""
 
     def __str__(self) -> str:
-        """Return its name in folders and files, which nothing reads back.
+        """Return its name in folders; nothing reads it back.
 
         Example:
             >>> str(Domain("V", views=3)), str(Domain("A", sensor="kinect-v1"))
@@ -51,14 +50,13 @@ class Domain:
 
 @dataclass(frozen=True)
 class DataSet:
-    """A data set that is made here; `qs3.experiments.data.make_plans` says of what."""
+    """A data set that `qs3.experiments.data.make_plans` describes."""
 
     kind: Literal["source", "held", "jitter", "views", "target", "fused", "second", "sensor"]
-    """Which meshes, and from where they are seen."""
     views: int = 0
-    """Number of fused views, of ``views``."""
+    """Number of fused views of ``views``."""
     sensor: str = ""
-    """Preset of the sensor, of ``sensor``."""
+    """Sensor preset of ``sensor``."""
 
     @property
     def name(self) -> str:
@@ -71,30 +69,30 @@ class Part:
     """Clouds that a run reads."""
 
     data: DataSet | Path
-    """Made here, or a path of the user's; the real objects are a file of the shared folder."""
+    """Made here, a path of the user's, or a file of the shared folder (`REAL_CLOUDS`)."""
     split: str | None
     """Part of the data; None takes all."""
     cloud: CloudChoice
-    """Which cloud of a generated data set."""
+    """Cloud of a generated data set."""
     count: int | None = None
-    """How many clouds these are; None of what is made here, and of what nobody has counted."""
+    """Number of clouds; None for data made here, and before `qs3.experiments.setup.count_own`."""
     checksum: str = ""
-    """That of the user's clouds as `qs3.experiments.setup.count_own` read them."""
+    """Checksum of the user's clouds, after `qs3.experiments.setup.count_own`."""
 
     def at_hand(self, shared: Path | None) -> bool:
-        """Whether these are no real objects, or are there."""
+        """Return False for real objects whose file is missing."""
         real = self.data in REAL_CLOUDS
         return not real or (shared is not None and (shared / str(self.data)).is_file())
 
     def locate(self, out: Path, shared: Path | None) -> Path:
-        """Return where the clouds lie.
+        """Return the path of the clouds.
 
         Args:
             out: Folder of the reproduction.
             shared: Folder with the real objects.
 
         Raises:
-            InputError: where they are real objects that are not at hand.
+            InputError: if they are real objects whose file is missing.
         """
         if isinstance(self.data, DataSet):
             return out / DATA / self.data.name
@@ -110,16 +108,16 @@ class Part:
 
 @dataclass(frozen=True)
 class DomainData:
-    """What a domain is made of."""
+    """Data of a domain."""
 
     title: str
-    """What tables and pictures call it; docs/reproduction.md tells the rest."""
+    """Name in tables and pictures; docs/reproduction.md describes it."""
     train: Part
     """Clouds to train on or to adapt to."""
     test: Part | None
     """Clouds to score on."""
     stands_for: str = ""
-    """Data set of the paper whose place it takes; empty where it takes none."""
+    """Data set of the paper whose place it takes."""
     own: bool = False
     """Whether it is the user's."""
 
@@ -164,7 +162,7 @@ _MADE: Mapping[str, DomainData] = {
 
 
 def data_of(domain: Domain, own: Own | None = None) -> DomainData:
-    """Return what a domain is made of; the user's own come first.
+    """Return the data of a domain; the user's own come first.
 
     Example:
         >>> data_of(Domain("V", views=3)).title
@@ -185,7 +183,7 @@ def parse_own(given: Sequence[str]) -> dict[str, DomainData]:
     """Read the user's data sets: ``NAME=PATH``, or ``NAME=PATH:TRAIN:TEST`` with two parts of it.
 
     Raises:
-        InputError: where one is not of this form, is unknown or comes twice, or is not there.
+        InputError: if one has another form, is unknown or repeated, or does not exist.
 
     Example:
         >>> import tempfile
@@ -200,25 +198,14 @@ def parse_own(given: Sequence[str]) -> dict[str, DomainData]:
         if not Path(path).exists() and rest.count(":") > 1:
             path, train, test = rest.rsplit(":", 2)
         if not equals or not path or kind in own:
-            raise InputError(f"--data {text}: say each domain once, as NAME=PATH[:TRAIN:TEST]")
+            raise InputError(f"--data {text}: name each domain once, as NAME=PATH[:TRAIN:TEST]")
         if kind not in _MADE:
             raise InputError(f"--data {text}: the domains are {', '.join(_MADE)}")
         if not Path(path).exists():
-            raise InputError(f"--data {text}: {path} is not there; name a folder or a file")
+            raise InputError(f"--data {text}: {path} does not exist; name a folder or a file")
         whole = Path(path).resolve()
-        # Samples of surfaces are one of the clouds of what `qs3 generate` makes.
+        # Samples of surfaces are one of the clouds of a data set of `qs3 generate`.
         cloud = _MADE[kind].train.cloud if (whole / MANIFEST).is_file() else "points"
-        own[kind] = own_data(kind, whole, cloud, (train or None, test or None))
+        parts = [Part(whole, split or None, cloud) for split in (train, test)]
+        own[kind] = DomainData(f"{kind}: {whole.name}", *parts, own=True)
     return own
-
-
-def own_data(
-    kind: str,
-    path: Path,
-    cloud: CloudChoice,
-    splits: tuple[str | None, str | None],
-    counts: tuple[int | None, int | None] = (None, None),
-) -> DomainData:
-    """Return a domain whose clouds are the user's: one data set with two parts."""
-    train, test = (Part(path, *part) for part in zip(splits, (cloud, cloud), counts, strict=True))
-    return DomainData(f"{kind}: {path.name}", train, test, own=True)

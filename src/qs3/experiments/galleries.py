@@ -5,59 +5,47 @@ Command: ``qs3 reproduce galleries --out DIR`` (minutes: scans alone).
 No figures are published. Procedural shapes alone are shown, which anybody may print.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from qs3.experiments import GALLERIES
-from qs3.experiments.domains import DataSet, Domain, Kind, data_of
-from qs3.experiments.runs import Run
+from qs3.experiments.domains import DataSet, Domain, DomainData, Kind, data_of
 from qs3.experiments.setup import Setup
 from qs3.io import load_clouds
 from qs3.report.clouds import gallery
 from qs3.report.figure import write_png
 
-_DOMAINS: tuple[Kind, ...] = ("M", "S", "D", "F")
+_KINDS: tuple[Kind, ...] = ("M", "S", "D", "F")
 _PER_CLASS = 4
 
 
-@dataclass(frozen=True)
-class Galleries:
-    """Pictures of the domains; one of the parts of `qs3.experiments.reproduce`."""
+def _domains(setup: Setup) -> dict[Kind, DomainData]:
+    return {kind: data_of(Domain(kind), setup.own) for kind in _KINDS}
 
-    setup: Setup
-    """Where and how large."""
-    name: str = GALLERIES
-    """Name of the folder of pictures."""
 
-    def runs(self) -> list[Run]:
-        """Return no runs."""
-        return []
+def shown(setup: Setup) -> list[DataSet]:
+    """Return the data sets that the galleries need."""
+    sets = [domain.train.data for domain in _domains(setup).values()]
+    return [data for data in sets if isinstance(data, DataSet)]
 
-    def sets(self) -> list[DataSet]:
-        """Return the data sets that are shown."""
-        shown = [data_of(Domain(kind), self.setup.own).train.data for kind in _DOMAINS]
-        return [data for data in shown if isinstance(data, DataSet)]
 
-    def write(self) -> Path:
-        """Draw each domain, and return the folder of the pictures."""
-        folder = self.setup.out / self.name
-        for kind in _DOMAINS:
-            data = data_of(Domain(kind), self.setup.own)
-            clouds = load_clouds(
-                data.train.locate(self.setup.out, self.setup.shared),
-                split=data.train.split,
-                cloud=data.train.cloud,
-                num_points=self.setup.scale.train.num_points,
-            )
-            shown = clouds
-            if not data.own:  # an artist's mesh has the name of its file
-                procedural = [name.startswith("shapes/") for name in clouds.ids]
-                shown = clouds.select(np.flatnonzero(procedural))
-            samples = {
-                name: list(shown.points[shown.labels == label][:_PER_CLASS])
-                for label, name in enumerate(shown.class_names)
-            }
-            write_png(folder / f"{kind}.png", gallery(samples, data.title))
-        return folder
+def draw_galleries(setup: Setup) -> Path:
+    """Draw each domain, and return the folder of the pictures."""
+    folder = setup.out / GALLERIES
+    for kind, domain in _domains(setup).items():
+        clouds = load_clouds(
+            domain.train.locate(setup.out, setup.shared),
+            split=domain.train.split,
+            cloud=domain.train.cloud,
+            num_points=setup.scale.train.num_points,
+        )
+        if not domain.own:  # an artist's mesh has the name of its file
+            procedural = [name.startswith("shapes/") for name in clouds.ids]
+            clouds = clouds.select(np.flatnonzero(procedural))
+        samples = {
+            name: list(clouds.points[clouds.labels == label][:_PER_CLASS])
+            for label, name in enumerate(clouds.class_names)
+        }
+        write_png(folder / f"{kind}.png", gallery(samples, domain.title))
+    return folder

@@ -1,10 +1,9 @@
 """Makes the missing runs of a grid: a folder and a line of ``records.jsonl`` for each."""
 
-import os
+import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from qs3.errors import InputError
@@ -15,8 +14,8 @@ from qs3.evaluation.records import (
     append_record,
     read_records,
 )
-from qs3.experiments.domains import DataSet, Own, Part
-from qs3.experiments.runs import SUPERVISED, Run, warm_up_of
+from qs3.experiments.domains import DATA, DataSet, Part
+from qs3.experiments.runs import SUPERVISED, Run
 from qs3.experiments.setup import Setup
 from qs3.io.clouds import CloudChoice
 from qs3.store.executors import Executor, Failure
@@ -24,13 +23,13 @@ from qs3.store.executors.executor import stop_if_fatal
 from qs3.structure import unstructure
 from qs3.training.run import MODEL, completed
 
-RUNS = "runs"
-"""Folder of the runs, in that of a reproduction."""
 Tell = Callable[[str], None]
-"""Is handed a line about how it goes."""
+"""Prints a line of progress."""
+Results = Mapping[frozenset[tuple[str, Any]], tuple[str, RunRecord]]
+"""Place and record of each run, by the fields of the run."""
 
 
-def data_sets(runs: Sequence[Run], own: Own | None = None) -> list[DataSet]:
+def data_sets(runs: Sequence[Run]) -> list[DataSet]:
     """Return the data sets to be made for some runs, each once.
 
     Example:
@@ -41,20 +40,16 @@ def data_sets(runs: Sequence[Run], own: Own | None = None) -> list[DataSet]:
         >>> [data.name for data in data_sets([run])]
         ['views-4', 'fused']
     """
-    parts = [part for run in runs for part in run.parts(own) if part is not None]
-    return list(dict.fromkeys(p.data for p in parts if isinstance(p.data, DataSet)))
-
-
-Results = Mapping[tuple[tuple[str, Any], ...], tuple[str, RunRecord]]
-"""Place and record of each run, by the fields of the run."""
+    data = [part.data for run in runs for part in run.parts if part is not None]
+    return list(dict.fromkeys(each for each in data if isinstance(each, DataSet)))
 
 
 def read_results(setup: Setup) -> tuple[Results, list[str]]:
-    """Return the records of a folder, and a message for each line that is none."""
+    """Return the records of a folder, and a message for each invalid line."""
     path = setup.out / RECORDS
     if not path.is_file():
         return {}, []
-    results: dict[tuple[tuple[str, Any], ...], tuple[str, RunRecord]] = {}
+    results: dict[frozenset[tuple[str, Any]], tuple[str, RunRecord]] = {}
     records, faults = read_records(path)
     for where, record in records:
         first, _ = results.setdefault(_key(record.experiment or {}), (where, record))
@@ -63,74 +58,64 @@ def read_results(setup: Setup) -> tuple[Results, list[str]]:
     return results, faults
 
 
-def _key(fields: Mapping[str, Any]) -> tuple[tuple[str, Any], ...]:
-    return tuple(sorted(fields.items()))
+def _key(fields: Mapping[str, Any]) -> frozenset[tuple[str, Any]]:
+    return frozenset(fields.items())
 
 
 def missing(runs: Sequence[Run], setup: Setup) -> list[Run]:
-    """Return the runs to be made; the records that are there are checked.
+    """Return the runs to make, after a check of all records that exist.
 
-    Those are the runs without a record, and those whose record is there and whose network is not,
-    though one without a record starts from it: records may come without their networks.
+    A run is missing if it has no record, or if its network is gone and a run without a record
+    starts from it.
 
     Raises:
-        InputError: if a record is damaged or not one of its run.
+        InputError: if a record is damaged or belongs to other settings.
     """
     results, faults = read_results(setup)
     if faults:
         raise InputError("; ".join(faults))
     left = [run for run in runs if find_result(run, setup, results) is None]
-    begun = [before for run in left if (before := warm_up_of(setup.scale, run, setup.own))]
     made = {run.folder for run in left}
-    needed = {run.folder: run for run in begun if run.folder not in made}
-    lost = [
-        run for place, run in needed.items() if not (setup.out / RUNS / place / MODEL).is_file()
-    ]
+    begun = [run.warm_up for run in left if run.warm_up and run.warm_up.folder not in made]
+    needed = {run.folder: run for run in begun}
+    lost = [run for run in needed.values() if not (run.place(setup.out) / MODEL).is_file()]
     return lost + left
 
 
 def require_same_data(runs: Sequence[Run], left: Sequence[Run], setup: Setup) -> None:
-    """Hold the data that runs will read to what the records of others read.
+    """Check before the training that the data are those of the existing records.
 
-    What another machine makes anew differs in rounding at least; tables refuse a mixture, which
-    would show after hours of training only.
+    Data that another machine made differ at least in rounding, and tables refuse such a mixture.
 
     Raises:
-        InputError: where a record read other data; the first such record is named.
+        InputError: if a record read other data.
     """
     from qs3.io.layouts.store import read_ragged
 
-    def made(run: Run) -> list[tuple[Path, CloudChoice] | None]:
-        return [
-            (part.locate(setup.out, setup.shared), part.cloud)
-            if part is not None and isinstance(part.data, DataSet)
-            else None
-            for part in run.parts(setup.own)
-        ]
+    @functools.cache
+    def checksum(name: str, cloud: CloudChoice) -> str:
+        return read_ragged(setup.out / DATA / name, cloud).checksum
 
-    needed = {data for run in left for data in made(run)}
-    sums: dict[tuple[Path, CloudChoice], str] = {}
+    needed = set(data_sets(left))
     results, _ = read_results(setup)
     for run in runs:
         if _key(run.fields) not in results:
             continue
         where, record = results[_key(run.fields)]
-        parts = record.source, record.target, record.test
-        for data, read in zip(made(run), parts, strict=True):
-            if data is None or read is None or data not in needed:
+        records = record.source, record.target, record.test
+        for part, read in zip(run.parts, records, strict=True):
+            if part is None or read is None or part.data not in needed:
                 continue
-            if data not in sums:
-                sums[data] = read_ragged(*data).checksum
-            if sums[data] != read.checksum:
+            if checksum(part.data.name, part.cloud) != read.checksum:
                 raise InputError(
-                    f"{where}: read other data than {data[0]} holds, which another machine or "
-                    "version may have made again; put the former back, or delete the records of "
-                    "the former, and run the same command again"
+                    f"{where}: read other data than {setup.out / DATA / part.data.name} holds, "
+                    "made by another machine or version; put the former data back, or delete "
+                    "their records, and run the same command again"
                 )
 
 
 def find_result(run: Run, setup: Setup, results: Results) -> RunRecord | None:
-    """Return the record of a run, if there is one; settings that it lacks have their defaults.
+    """Return the record of a run, if there is one; missing settings get their defaults.
 
     Raises:
         InputError: if its settings or its data are not those of the run.
@@ -140,21 +125,21 @@ def find_result(run: Run, setup: Setup, results: Results) -> RunRecord | None:
     where, record = results[_key(run.fields)]
     record = completed(record, where)
     settings = record.settings
-    source, target, test = run.parts(setup.own)
-    differing = {
-        "method": record.method != run.kind.method,
-        "seed": record.seed != run.seed,
-        "supervised": ("supervised" in record.marks) != (run.row == SUPERVISED),
-        "train": settings.get("train") != unstructure(run.train),
-        "self_training": settings.get("self_training") != unstructure(run.self_training),
-        "model": record.model != run.train.model,
-        "selection": record.selection != run.train.rule,
-        "source": _part(record.source) != _part(source),
-        "target": _part(record.target) != _part(target),
-        "test": _part(record.test) != _part(test),
+    source, target, test = run.parts
+    compared = {
+        "method": (record.method, run.kind.method),
+        "seed": (record.seed, run.seed),
+        "supervised": ("supervised" in record.marks, run.row == SUPERVISED),
+        "train": (settings.get("train"), unstructure(run.train)),
+        "self_training": (settings.get("self_training"), unstructure(run.self_training)),
+        "model": (record.model, run.train.model),
+        "selection": (record.selection, run.train.rule),
+        "source": (_part(record.source), _part(source)),
+        "target": (_part(record.target), _part(target)),
+        "test": (_part(record.test), _part(test)),
     }
-    for name, differs in differing.items():
-        if differs:
+    for name, (held, wanted) in compared.items():
+        if held != wanted:
             raise InputError(
                 f"{where}: is not the record of {run.name} ({name} differs); delete the line and "
                 "run the same command again"
@@ -170,76 +155,76 @@ def _part(data: DataRecord | Part | None) -> tuple[str, str | None, str] | None:
 
 
 def run_grid(
-    runs: Sequence[Run],
-    setup: Setup,
-    tell: Tell,
-    executor: Executor,
-    devices: Sequence[str] = (),
-    at_once: int = 1,
+    runs: Sequence[Run], setup: Setup, tell: Tell, executor: Executor, at_once: int = 1
 ) -> list[str]:
-    """Train and score every run that is given, but for what starts from one that failed.
+    """Train and score runs.
 
     Args:
         runs: Those of `missing`, a warm-up before what starts from it.
-        setup: Where they go.
-        tell: Is told of each run.
-        executor: Where runs are made.
-        devices: GPUs that share the work, one run each at a time.
-        at_once: Runs at a time where no device is named.
+        setup: Output folder, scale and data.
+        tell: Prints a line a run.
+        executor: Makes the runs.
+        at_once: Number of runs at a time.
 
     Returns:
-        A line for each run that failed, or was left out since its warm-up failed.
+        A line for each run that failed, or was skipped because its warm-up failed.
 
     Raises:
-        InputError: where something failed that no other run will be spared, such as a full disk.
+        InputError: if a failure would repeat in every run, such as a full disk.
     """
-    queue, busy, progress = list(runs), dict[str, tuple[Run, str]](), _Progress(len(runs), tell)
+    queue, busy, faults = list(runs), dict[str, Run](), list[str]()
+    failed: set[str] = set()
+    start, made = time.monotonic(), 0
+
+    def fail(run: Run, why: str) -> None:
+        failed.add(run.folder)
+        faults.append(f"{run.folder}: {why}")
+        tell(f"failed: {faults[-1]}")
+
     with executor:
-        free = list(devices) or [""] * at_once
         while queue or busy:
             for run in list(queue):
-                if progress.failed & _folders(run, setup):
+                if failed & run.folders:
                     queue.remove(run)
-                    progress.fail(run, "left out, as what it starts from failed")
-            for run in _ready(queue, [run for run, _ in busy.values()], setup)[: len(free)]:
+                    fail(run, "left out, as what it starts from failed")
+            for run in _ready(queue, list(busy.values()))[: at_once - len(busy)]:
                 queue.remove(run)
-                device = free.pop(0)
-                busy[run.name] = run, device
-                executor.submit(run.name, make_record, run, setup, device)
+                busy[run.name] = run
+                executor.submit(run.name, make_record, run, setup)
             if not busy:
                 break
             name, outcome = executor.next()
             stop_if_fatal(outcome)
-            run, device = busy.pop(name)
-            free.append(device)
+            run = busy.pop(name)
             if isinstance(outcome, Failure):
-                progress.fail(run, f"{outcome.kind}: {outcome.reason}")
-            else:
-                _keep(run, outcome, setup, tell)
-                progress.done(run, outcome)
-    return progress.faults
+                fail(run, f"{outcome.kind}: {outcome.reason}")
+                continue
+            _keep(run, outcome, setup, tell)
+            made += 1
+            left = len(runs) - made - len(faults)
+            tell(
+                f"[{made}/{len(runs)}] {run.folder} on {run.target}: accuracy "
+                f"{outcome.scores.accuracy:.1%}, class mean "
+                f"{outcome.scores.class_mean_accuracy:.1%}; "
+                f"{left * (time.monotonic() - start) / made / 60:.0f} min left"
+            )
+    return faults
 
 
-def _folders(run: Run, setup: Setup) -> set[str]:
-    """Return the folder of a run, and that of the run that it starts from."""
-    before = warm_up_of(setup.scale, run, setup.own)
-    return {run.folder} if before is None else {run.folder, before.folder}
-
-
-def _ready(queue: Sequence[Run], busy: Sequence[Run], setup: Setup) -> list[Run]:
-    """Return runs that may begin: their warm-up is there, and nobody trains in their folder."""
+def _ready(queue: Sequence[Run], busy: Sequence[Run]) -> list[Run]:
+    """Return the runs whose warm-up is made and whose folder no other run uses."""
     ready: list[Run] = []
     taken = {run.folder for run in busy}
     waiting = {run.folder for run in queue} | taken
     for run in queue:
-        if run.folder not in taken and not (_folders(run, setup) - {run.folder}) & waiting:
+        if run.folder not in taken and not (run.folders - {run.folder}) & waiting:
             ready.append(run)
         taken.add(run.folder)  # of several in one folder, the first goes first
     return ready
 
 
 def _keep(run: Run, record: RunRecord, setup: Setup, tell: Tell) -> None:
-    """Append a record; one that is there stays, as others were compared with it."""
+    """Append a record; an existing one stays, as others were compared with it."""
     results, _ = read_results(setup)
     where, before = results.get(_key(run.fields), ("", None))
     if before is None:
@@ -247,48 +232,16 @@ def _keep(run: Run, record: RunRecord, setup: Setup, tell: Tell) -> None:
     elif before.scores != record.scores:
         tell(
             f"{where}: {run.name} stays, with an accuracy of {before.scores.accuracy:.1%}; the "
-            "network that was made again, on another machine perhaps, is another one"
+            "network that was made again, perhaps on another machine, differs"
         )
 
 
-class _Progress:
-    """Prints a line a run: its scores, or its fault."""
-
-    def __init__(self, count: int, tell: Tell) -> None:
-        self.count, self.made, self.tell = count, 0, tell
-        self.failed: set[str] = set()
-        self.faults: list[str] = []
-        self.start = time.monotonic()
-
-    def fail(self, run: Run, why: str) -> None:
-        self.failed.add(run.folder)
-        self.faults.append(f"{run.folder}: {why}")
-        self.tell(f"failed: {self.faults[-1]}")
-
-    def done(self, run: Run, record: RunRecord) -> None:
-        self.made += 1
-        left = self.count - self.made - len(self.faults)
-        rest = left * (time.monotonic() - self.start) / self.made
-        self.tell(
-            f"[{self.made}/{self.count}] {run.folder} on {run.target}: accuracy "
-            f"{record.scores.accuracy:.1%}, class mean {record.scores.class_mean_accuracy:.1%}; "
-            f"{rest / 60:.0f} min left"
-        )
-
-
-def make_record(run: Run, setup: Setup, device: str = "") -> RunRecord:
-    """Train and score one run; after a stop it goes on where it was.
-
-    Args:
-        run: What.
-        setup: Where.
-        device: Index of the GPU to see alone; "" leaves all in sight.
+def make_record(run: Run, setup: Setup) -> RunRecord:
+    """Train and score one run; a stopped training resumes.
 
     Raises:
-        InputError: where there is no such GPU, or the data cannot be read.
+        InputError: if the data cannot be read.
     """
-    if device:
-        _see_alone(device)
     from qs3.io import load_clouds, load_unlabelled
     from qs3.io.clouds import relabel
     from qs3.meshes.classes import POINTDA10, canonical
@@ -301,41 +254,29 @@ def make_record(run: Run, setup: Setup, device: str = "") -> RunRecord:
         how = run.train.num_points, run.train.preparation
         return load_whole(reader, place(part), *how, split=part.split, cloud=part.cloud)
 
-    source, target, test = run.parts(setup.own)
+    source, target, test = run.parts
     labelled = load(load_clouds, source)
     kinds = {canonical(labelled.class_names[row]) for row in set(labelled.labels.tolist())}
-    if labelled.class_names != POINTDA10 and kinds <= set(POINTDA10):  # of which the tables are
+    if labelled.class_names != POINTDA10 and kinds <= set(POINTDA10):  # the classes of the tables
         labelled = relabel(labelled, POINTDA10, None, place(source))
-    before = warm_up_of(setup.scale, run, setup.own)
+    folder = run.place(setup.out)
     fit(
         run.kind.method,
         labelled,
         None if target is None else load(load_unlabelled, target),
         run.train,
         run.self_training,
-        run_dir=setup.out / RUNS / run.folder,
-        warm_up=None if before is None else setup.out / RUNS / before.folder,
+        run_dir=folder,
+        warm_up=None if run.warm_up is None else run.warm_up.place(setup.out),
         preset=run.kind.preset,
         supervised=run.row == SUPERVISED,
     )
-    folder = setup.out / RUNS / run.folder
 
     def score(part: Part, **options: Any) -> RunRecord:
         return evaluate(folder, place(part), split=part.split, cloud=part.cloud, **options)
 
     record = score(test, experiment=run.fields)
     if target is not None and record.rounds:
-        # Right by the labels of what they chose from, which a record alone is told.
+        # Counts right pseudo labels by the target's labels, after all training.
         record = replace(record, rounds=score(target).rounds)
     return replace(record, source_accuracy=evaluate(folder, labelled).scores.accuracy)
-
-
-def _see_alone(device: str) -> None:
-    import torch
-
-    inherited = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
-    # A cluster's scheduler may have given this process some of the machine's GPUs alone.
-    visible = inherited[int(device)] if int(device) < len(inherited) else device
-    os.environ["CUDA_VISIBLE_DEVICES"] = visible
-    if not torch.cuda.is_available():
-        raise InputError(f"--devices {device}: no such GPU here")

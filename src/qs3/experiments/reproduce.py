@@ -1,10 +1,8 @@
-"""Makes tables anew: data, runs, records, then the tables from the records alone."""
+"""Makes tables: data, runs, records, then the tables from the records alone."""
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Union
 from unittest import mock
 
 from qs3.errors import InputError, no_such
@@ -15,65 +13,22 @@ from qs3.experiments.grid import Tell, data_sets, missing, require_same_data, ru
 from qs3.experiments.runs import Run
 from qs3.experiments.setup import Setup, claim
 from qs3.experiments.table import Table
-from qs3.store.executors import Executor, InlineExecutor, LocalExecutor
-
-if TYPE_CHECKING:
-    from qs3.experiments.galleries import Galleries
+from qs3.store.executors import InlineExecutor, LocalExecutor
 
 
-@dataclass(frozen=True)
-class Workers:
-    """Who does the work."""
-
-    workers: int = 2
-    """Processes that scan, and that train where no device is named."""
-    devices: tuple[str, ...] = ()
-    """GPUs by index; each makes one run at a time, in a process of its own."""
-    executor: Literal["local", "ray"] = "local"
-    """Where runs are made: here, or on a Ray cluster whose machines all see --out."""
-    address: str = "auto"
-    """Of the Ray cluster's head; auto is the one that this machine belongs to, local starts one."""
-
-    def __post_init__(self) -> None:
-        if self.workers < 1:
-            raise InputError(f"--workers {self.workers}: must be at least 1")
-        for device in self.devices:
-            if not device.isdecimal():
-                raise InputError(f"--devices {device}: name GPUs by index, such as 0 1")
-
-    def start(self) -> Executor:
-        """Return what makes the runs.
-
-        Raises:
-            MissingExtraError: where Ray is asked for and absent.
-        """
-        if self.executor == "ray":
-            from qs3.store.executors.ray_cluster import RayExecutor
-
-            return RayExecutor(self.address, gpus=1.0 if self.devices else 0.0)
-        if self.devices:
-            # A process sees the GPU that it was started with: each run has its own.
-            return LocalExecutor(len(self.devices), calls_per_process=1)
-        return LocalExecutor(self.workers) if self.workers > 1 else InlineExecutor()
-
-
-Product = Union[Table, "Galleries"]
-"""What can be made: its runs and data sets, and its files from the records."""
-
-
-def products(
+def choose_tables(
     names: Sequence[str], setup: Setup, rows: Sequence[str] = (), columns: Sequence[str] = ()
-) -> list[Product]:
-    """Return what is to be made.
+) -> list[Table]:
+    """Return tables by name.
 
     Args:
-        names: Tables and ``galleries``.
-        setup: Where and how large.
+        names: Names of tables.
+        setup: Output folder, scale and data.
         rows: Lines of the tables; empty takes all.
         columns: Columns; empty takes the usual ones whose data are at hand.
 
     Raises:
-        InputError: where something is named twice, or a line or column is in none of the tables.
+        InputError: if something is named twice, or no table has a line or column.
     """
     given = {"names": names, "methods": rows, "tasks": columns, "seeds": setup.seeds}
     for option, values in given.items():
@@ -81,27 +36,20 @@ def products(
             raise InputError(f"--{option} {' '.join(map(str, values))}: name each once")
     if not setup.seeds:
         raise InputError("--seeds: name at least one")
-    made: list[Product] = []
-    choices: dict[str, set[str]] = {"methods": set(), "tasks": set()}
-    for name in names:
-        if name == GALLERIES:
-            from qs3.experiments.galleries import Galleries
-
-            made.append(Galleries(setup))
-            continue
-        experiment = load_experiment(name)
-        choices["methods"] |= {row.key for row in experiment.rows(setup.scale)}
-        choices["tasks"] |= {column.key for column in experiment.columns(setup.scale)}
-        made.append(Table(name, setup, tuple(rows), tuple(columns) or _at_hand(name, setup)))
-    for option, keys in choices.items():
+    experiments = [load_experiment(name) for name in names]
+    known = {
+        "methods": {row.key for each in experiments for row in each.rows(setup.scale)},
+        "tasks": {column.key for each in experiments for column in each.columns(setup.scale)},
+    }
+    for option, keys in known.items():
         for key in given[option]:
             if key not in keys:
                 raise no_such(f"--{option} {key}", key, sorted(keys))
-    return made
+    return [Table(n, setup, tuple(rows), tuple(columns) or _at_hand(n, setup)) for n in names]
 
 
 def _at_hand(name: str, setup: Setup) -> tuple[str, ...]:
-    """Return the usual columns, those on real objects only where they are at hand."""
+    """Return the usual columns without those whose real objects are absent."""
     shown: list[str] = []
     for column in Table(name, setup).headings()[1]:
         target = column.fields.get("target")
@@ -110,79 +58,85 @@ def _at_hand(name: str, setup: Setup) -> tuple[str, ...]:
     return tuple(shown)
 
 
-def collect_runs(products: Sequence[Product]) -> list[Run]:
-    """Return the runs of all products, each once.
+def collect_runs(tables: Sequence[Table]) -> list[Run]:
+    """Return the runs of all tables, each once.
 
     Raises:
-        InputError: where two products mean different runs by one name.
+        InputError: if two tables have different runs of one name.
     """
     runs: dict[str, Run] = {}
-    for product in products:
-        for run in product.runs():
+    for table in tables:
+        for run in table.runs():
             if runs.setdefault(run.name, run) != run:
-                raise InputError(f"{product.name}: its run {run.name} is another one elsewhere")
+                raise InputError(f"{table.name}: its run {run.name} is another one elsewhere")
     return list(runs.values())
 
 
 def reproduce(
-    products: Sequence[Product], setup: Setup, workers: Workers, tell: Tell, dry_run: bool = False
+    tables: Sequence[Table],
+    setup: Setup,
+    tell: Tell,
+    workers: int = 1,
+    galleries: bool = False,
+    dry_run: bool = False,
 ) -> list[Path]:
-    """Make data, runs and tables, whatever of them is missing.
+    """Make all missing data and runs, then the tables.
 
     Args:
-        products: What to make.
-        setup: Where and how large.
-        workers: Who makes it.
-        tell: Is told how it goes.
-        dry_run: Only tell how many scans and runs are missing; nothing is written.
+        tables: Tables to make.
+        setup: Output folder, scale and data.
+        tell: Prints a line of progress.
+        workers: Processes that scan and train.
+        galleries: Whether to draw the galleries, too.
+        dry_run: Only print the numbers of missing scans and runs; write nothing.
 
     Returns:
-        The main file of each product that was made.
+        The main file of each table, and the folder of the galleries.
 
     Raises:
-        InputError: where the folder is for other settings, a record is damaged or not of its run,
-            or a run failed; what was made stays made.
+        InputError: if the folder is for other settings, a record is damaged or belongs to other
+            settings, or a run failed; finished parts stay.
     """
     from qs3.experiments.data import choose_meshes, make_data, make_plans
+    from qs3.experiments.galleries import draw_galleries, shown
 
-    runs = collect_runs(products)
-    drawn = [data for product in products for data in product.sets()]
+    if workers < 1:
+        raise InputError(f"--workers {workers}: must be at least 1")
+    runs = collect_runs(tables)
+    drawn = shown(setup) if galleries else []
     sides = choose_meshes(setup.scale, setup.shared)
-    plans = make_plans(setup.scale, sides, [*data_sets(runs, setup.own), *drawn])
     if not dry_run:
         claim(setup, sides.meshes)
     left = missing(runs, setup)  # a damaged record stops here, not after hours
-    executor = workers.start()  # a missing extra is told before anything is made
-    needed = {data.name for data in [*data_sets(left, setup.own), *drawn]}
-    plans = {name: plan for name, plan in plans.items() if name in needed}
-    names = ", ".join(product.name for product in products)
+    plans = make_plans(setup.scale, sides, [*data_sets(left), *drawn])
+    names = ", ".join([*(table.name for table in tables), *[GALLERIES] * galleries])
     sets = [f"{plan.rows} scans of the {name}" for name, plan in plans.items()]
-    scans = ", ".join(sets) or "no scans"
     tell(
-        f"{names}, scale {setup.scale.name}: {scans}; {len(runs)} runs, {len(left)} of them missing"
+        f"{names}, scale {setup.scale.name}: {', '.join(sets) or 'no scans'}; {len(runs)} runs, "
+        f"{len(left)} of them missing"
     )
     if dry_run:
         return []
     if len(left) < len(runs):
         tell(f"{len(runs) - len(left)} of {len(runs)} runs are there already")
-    for name, count in make_data(setup.out / DATA, plans, workers.workers).items():
+    for name, count in make_data(setup.out / DATA, plans, workers).items():
         if count:
             tell(f"{name}: {count} scans failed and are absent")
     failed: list[str] = []
     if left:
         require_same_data(runs, left, setup)
-        # A cluster gives a run its GPU itself.
-        devices = () if workers.executor == "ray" else workers.devices
-        at_once = max(len(workers.devices), workers.workers)
-        # Processes start without progress bars: several would write over one another.
+        executor = LocalExecutor(workers) if workers > 1 else InlineExecutor()
+        # Progress bars of several processes would write over one another.
         with mock.patch.dict(os.environ, TQDM_DISABLE="1"):
-            failed = run_grid(left, setup, tell, executor, devices, at_once)
+            failed = run_grid(left, setup, tell, executor, workers)
     paths = []
-    for product in products:
+    for table in tables:
         try:
-            paths.append(product.write())
+            paths.append(table.write())
         except InputError as error:
             failed.append(str(error))
+    if galleries:
+        paths.append(draw_galleries(setup))
     if failed:
         raise InputError(f"{'; '.join(failed)}; mend that and run the same command again")
     return paths

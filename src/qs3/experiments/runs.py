@@ -1,7 +1,8 @@
-"""Runs as fields: what each trains, on what, and where its record lies."""
+"""Runs of the tables: method, settings, data and folder of each."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any, Literal
 
 from qs3.adaptation.names import WITHOUT_TARGET, MethodName, split_method
@@ -10,6 +11,8 @@ from qs3.experiments.domains import Domain, Own, Part, data_of
 from qs3.experiments.scales import Scale
 from qs3.training.config import GENTLE, PRESETS, SelfTrainingSettings, TrainSettings
 
+RUNS = "runs"
+"""Folder of the runs, in that of a reproduction."""
 SUPERVISED = "supervised"
 """Row of the network that is trained on the labelled training part of the target."""
 ORDINARY = "ordinary"
@@ -21,10 +24,9 @@ PAPER = "qbst-paper"
 
 @dataclass(frozen=True)
 class Row:
-    """How the networks of a line of a table are trained."""
+    """Method and settings of a line of a table."""
 
     method: MethodName = "source-only"
-    """Method of adaptation."""
     preset: Literal["default", "spst", "paper"] = "default"
     """Settings of the rounds of self-training."""
     warm_up: str = ""
@@ -32,7 +34,7 @@ class Row:
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the rounds that differ from the preset."""
     sized: bool = True
-    """Whether the network may be told sizes; a method in the unit ball knows none."""
+    """Whether the network may know sizes; methods in the unit ball know none."""
 
 
 _QBST = Row("qbst", warm_up=ORDINARY)
@@ -64,30 +66,32 @@ class Run:
     """One training of a grid with its scores."""
 
     source: Domain
-    """Whose labels it learns."""
+    """Domain of the labelled clouds."""
     target: Domain
-    """What it is adapted to, or the test set alone; on its test part the run is scored."""
+    """Domain to adapt to; its test part is scored."""
     row: str
-    """How it is trained: one of `ROWS`."""
+    """One of `ROWS`."""
     seed: int
-    """Root of all random steps."""
     train: TrainSettings
-    """How the network is trained."""
-    self_training: SelfTrainingSettings | None = None
-    """How it trains itself; None without rounds."""
-    network: str = ""
+    self_training: SelfTrainingSettings | None
+    """Settings of the rounds; None without rounds."""
+    network: str
     """Network of the tables of networks; "" is that of the bench."""
-    changes: Mapping[str, float] = field(default_factory=dict)
-    """Settings of the rounds in which it differs from its row."""
+    changes: Mapping[str, float]
+    """Settings of the rounds that differ from the row's."""
+    parts: tuple[Part, Part | None, Part]
+    """Clouds to learn from, to adapt to (None if it sees none), and to score on."""
+    warm_up: "Run | None"
+    """Run whose network self-training starts from; None without rounds."""
 
     @property
     def kind(self) -> Row:
-        """How networks of its row are trained."""
+        """Method and settings of its row."""
         return ROWS[self.row]
 
     @property
     def fields(self) -> dict[str, str | int | float]:
-        """What the run is known by in its record, beside its settings; what is empty is left out.
+        """Fields that identify the run in its record, without empty ones.
 
         Example:
             >>> from qs3.experiments.scales import SCALES
@@ -111,13 +115,22 @@ class Run:
         return f"{place}/{self._label}/seed-{self.seed}"
 
     @property
+    def folders(self) -> set[str]:
+        """Folders of the run and of its warm-up."""
+        return {self.folder} | ({self.warm_up.folder} if self.warm_up else set())
+
+    def place(self, out: Path) -> Path:
+        """Return the folder of the run in a reproduction."""
+        return out / RUNS / self.folder
+
+    @property
     def name(self) -> str:
-        """Name of its record; people read it, the program compares it and takes nothing from it."""
+        """Name for messages; nothing reads it back."""
         return f"{self._task}_{self._label}_seed-{self.seed}"
 
     @property
     def _task(self) -> str:
-        # Of the supervised row the source has always been written S.
+        # The source of the supervised row has always been written S.
         return f"{'S' if self.row == SUPERVISED else self.source}-{self.target}"
 
     @property
@@ -126,18 +139,6 @@ class Run:
         changed = [f"{words.get(name, name)}-{value:g}" for name, value in self.changes.items()]
         label = "-".join([self.kind.method, *changed]) if changed else self.row
         return f"{label}@{self.network}" if self.network else label
-
-    def parts(self, own: Own | None = None) -> tuple[Part, Part | None, Part]:
-        """Return the clouds to learn from, to adapt to (None where it sees none), to score on.
-
-        Raises:
-            InputError: where the target has no clouds to score on.
-        """
-        learnt, target = data_of(self.source, own), data_of(self.target, own)
-        if target.test is None:
-            raise InputError(f"task {self._task}: {self.target} has no clouds to score on")
-        adapted_to = None if self.row in (SUPERVISED, ORDINARY) else target.train
-        return learnt.train, adapted_to, target.test
 
 
 def make_run(
@@ -154,19 +155,19 @@ def make_run(
     """Return the run of a cell of a table.
 
     Args:
-        scale: How large.
-        source: Whose labels it learns; for the supervised row the target's own take its place.
-        target: What it is adapted to and scored on.
-        row: How it is trained: one of `ROWS`.
+        scale: Size of the bench.
+        source: Domain of the labelled clouds; the supervised row takes the target's own.
+        target: Domain to adapt to and to score.
+        row: One of `ROWS`.
         seed: Root of all random steps.
         threads: CPU threads.
         network: Network of the tables of networks; "" is that of the bench.
         own: The user's data sets, whose sizes may decide the epochs.
-        changes: Settings of the rounds that differ from the row's; those that do not are left out,
-            so that a cell with the row's own value is one training with the table of methods.
+        changes: Settings of the rounds that differ from the row's. Equal ones are left out, so
+            that such a cell shares its training with the table of methods.
 
     Raises:
-        InputError: where the row or the network is unknown.
+        InputError: if the row or the network is unknown, or the target has no clouds to score.
 
     Example:
         >>> from qs3.experiments.scales import SCALES
@@ -178,35 +179,32 @@ def make_run(
         raise no_such(f"unknown row {row!r}", row, ROWS)
     kind = ROWS[row]
     source = target if row == SUPERVISED else source
-    alone = split_method(kind.method)[0] in WITHOUT_TARGET
-    adapted_to = 0 if alone else _count(scale, target, own)
-    train = scale.train_with(threads, seed, network, _count(scale, source, own), adapted_to)
+    learnt, scored = data_of(source, own), data_of(target, own)
+    if scored.test is None:
+        raise InputError(f"task {source}-{target}: {target} has no clouds to score on")
+    adapted_to = None if row in (SUPERVISED, ORDINARY) else scored.train
+    counts = [_count(scale, source, learnt.train)]
+    if split_method(kind.method)[0] not in WITHOUT_TARGET:
+        counts.append(_count(scale, target, scored.train))
+    train = scale.train_with(threads, seed, network, *counts)
     if row == ORDINARY:
         # The last network is taken; it needs no checkpoints.
         train = replace(train, validate_every=0)
     if not kind.sized:
         train = replace(train, preparation=replace(train.preparation, size_input=False))
-    rounds = None
+    rounds = warm_up = None
     if kind.warm_up:
-        own = {**scale.rounds, **kind.changes}
-        if "threshold_share" in own:
-            own.pop("threshold", None)
-        usual = replace(PRESETS[kind.preset], **own)
+        warm_up = make_run(scale, source, target, kind.warm_up, seed, threads, network, own)
+        settings = {**scale.rounds, **kind.changes}
+        if "threshold_share" in settings:
+            settings.pop("threshold", None)
+        usual = replace(PRESETS[kind.preset], **settings)
         changes = {name: value for name, value in changes.items() if getattr(usual, name) != value}
         rounds = replace(usual, **changes)
-    return Run(source, target, row, seed, train, rounds, network, changes)
+    parts = learnt.train, adapted_to, scored.test
+    return Run(source, target, row, seed, train, rounds, network, changes, parts, warm_up)
 
 
-def _count(scale: Scale, domain: Domain, own: Own | None) -> int:
+def _count(scale: Scale, domain: Domain, part: Part) -> int:
     """Return how many clouds a domain has to train on."""
-    count = data_of(domain, own).train.count
-    return scale.count_clouds(domain.kind) if count is None else count
-
-
-def warm_up_of(scale: Scale, run: Run, own: Own | None = None) -> Run | None:
-    """Return the run that self-training starts from; None without rounds."""
-    row = run.kind.warm_up
-    if not row:
-        return None
-    threads = run.train.threads if isinstance(run.train.threads, int) else None
-    return make_run(scale, run.source, run.target, row, run.seed, threads, run.network, own)
+    return scale.count_clouds(domain.kind) if part.count is None else part.count

@@ -12,10 +12,9 @@ from qs3.errors import InputError
 from qs3.evaluation.compare import SeedComparison, compare_seeds
 from qs3.evaluation.records import RunRecord
 from qs3.evaluation.tables import average, frame
-from qs3.experiments.domains import DataSet
 from qs3.experiments.experiment import Experiment, Headings, Place, load_experiment
 from qs3.experiments.grid import find_result, read_results
-from qs3.experiments.runs import Run, warm_up_of
+from qs3.experiments.runs import Run
 from qs3.experiments.setup import Setup
 from qs3.files import write_bytes, write_text
 
@@ -82,17 +81,13 @@ class Table:
         cells = self.cells()
         for seed in self.setup.seeds:  # a seed is finished before the next begins
             for run in (run for runs in cells.values() for run in runs if run.seed == seed):
-                for part in run.parts(self.setup.own):
+                for part in run.parts:
                     if part is not None:
                         part.locate(self.setup.out, self.setup.shared)
-                for needed in (warm_up_of(self.setup.scale, run, self.setup.own), run):
+                for needed in (run.warm_up, run):
                     if needed is not None:
                         wanted.setdefault(needed.name, needed)
         return list(wanted.values())
-
-    def sets(self) -> list[DataSet]:
-        """Return no further data sets."""
-        return []
 
     def read(self) -> "FilledTable":
         """Fill the table from its records; ``faults`` names each record that is refused."""

@@ -37,15 +37,12 @@ class LocalExecutor:
     replaced. Workers end by themselves when this process is killed.
     """
 
-    def __init__(
-        self, workers: int = 1, timeout: float | None = None, calls_per_process: int = 0
-    ) -> None:
+    def __init__(self, workers: int = 1, timeout: float | None = None) -> None:
         """Check the settings; no process starts yet.
 
         Args:
             workers: Processes.
             timeout: Seconds that one call may take; None waits for ever.
-            calls_per_process: Calls after which a process is replaced; 0 keeps it.
 
         Raises:
             InputError: if a number is out of range.
@@ -56,7 +53,6 @@ class LocalExecutor:
             raise InputError(f"timeout must be above 0 seconds, not {timeout}")
         self.ahead = 2 * workers
         self._workers, self._timeout = workers, timeout
-        self._calls_per_process = calls_per_process
         self._keys: dict[Any, Any] = {}
 
     def submit(self, key: Any, function: Callable[..., Any], *arguments: Any) -> None:
@@ -106,7 +102,6 @@ class LocalExecutor:
         self._context.Process = _Process
         self._pool = ProcessPool(
             self._workers,
-            max_tasks=self._calls_per_process,
             initializer=_prepare_worker,
             context=self._context,
         )
