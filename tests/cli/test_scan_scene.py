@@ -198,6 +198,16 @@ def test_the_recipe_for_parts_takes_a_folder_and_ranges_in_one_word(typed, monke
     assert RECIPES["parts"].needs_neighbour
     assert "LOW:HIGH" in typed.refuses(*words, tmp_path, "--distance", "0.4")
 
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    np.savetxt(scans / "a.xyz", np.random.default_rng(0).random((200, 3)) * 0.1)
+    (scans / "objects.csv").write_text("distance,elevation\n0.5,60\n")
+    done = typed(*words, tmp_path, "--like", scans, "--distance", "0.4:0.6", code=130)
+    assert "distance 0.5 to 0.5 m, elevation 60 to 60°" in done.stderr
+    like = asked[-1].settings
+    assert (like.distance, like.elevation, like.num_points) == ((0.4, 0.6), (60, 60), 200)
+    assert like.like in done.stderr
+
 
 def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(qs3, tmp_path):
     from qs3.io import load_clouds

@@ -24,14 +24,20 @@ class Choices:
     """What chooses the defaults of other options."""
 
     recipe: RecipeName | None = None
+    like: Path | None = None
 
 
 def defaults(words: Sequence[str]) -> dict[str, Any]:
     """Return the defaults of ``qs3 generate`` under the recipe that a command line names."""
     chosen, _ = tyro.cli(Choices, args=list(words), return_unknown_args=True, add_help=False)
+    settings = GenerateSettings() if chosen.recipe is None else RECIPES[chosen.recipe]
+    if chosen.like is not None:
+        from qs3.io.like import like, measure
+
+        settings = like(settings, measure(chosen.like))
+        tell(f"{chosen.like}: {settings.like}")
     if chosen.recipe is None:
         return {}
-    settings = RECIPES[chosen.recipe]
     if settings.per_class is None:
         return {"settings": settings}
     return {"meshes": ("shapes",), "per_class": settings.per_class, "settings": settings}
@@ -41,6 +47,7 @@ def generate(
     meshes: tuple[str, ...],
     out: str = "",
     recipe: RecipeName | None = None,
+    like: Path | None = None,
     up: Literal["z", "y"] | None = None,
     per_class: int = 10,
     classes: tuple[str, ...] = (),
@@ -67,6 +74,8 @@ def generate(
         recipe: Settings by name; an option given beside it wins. parts: your own CAD in real units,
             which lies on a table before one camera. rooms: a source that is to meet scans of real
             rooms (cameras, sizes, layouts and views drawn).
+        like: Unlabelled scans in metres. Distance, elevation and number of points are measured on
+            them and replace those of the recipe parts. qs3 segment records the distance.
         up: Up axis of every mesh file; by default y for glTF and ShapeNet, z for all others.
         per_class: Objects a class, of the built-in shapes and parts.
         classes: Classes to scan, by the names of their folders, or pointda10 for its ten, renamed;

@@ -58,6 +58,8 @@ class GenerateSettings(ScanSettings):
 
     recipe: Annotated[RecipeName | None, tyro.conf.Suppress] = None
     """Name of the recipe that these settings began as; a label for the record."""
+    like: Annotated[str, tyro.conf.Suppress] = ""
+    """Measures of the scans that these settings resemble; a label for the record."""
     meshes: Annotated[str, tyro.conf.Suppress] = "shapes"
     """``shapes``, ``parts`` or the name (not the path) of the folder; a label for the record."""
     per_class: Annotated[int | None, tyro.conf.Suppress] = None

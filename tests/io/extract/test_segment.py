@@ -161,6 +161,7 @@ def test_a_scene_becomes_a_folder_and_a_table(tmp_path, ending):
     objects = segment_scene(path, tmp_path / "objects")
     check(objects)
     rows = pd.read_csv(tmp_path / "objects" / "objects.csv")
+    assert rows[["distance", "elevation"]].isna().all(axis=None)  # a cloud's camera is unknown
     assert rows["file"].tolist() == [f"object_00{i}.ply" for i in range(3)]
     for row, item in zip(rows.itertuples(), objects, strict=True):
         np.testing.assert_array_equal(read_cloud(tmp_path / "objects" / row.file), item.points)
@@ -188,8 +189,14 @@ def test_a_depth_image_of_a_table_seen_from_above(tmp_path):
     objects = segment_scene(tmp_path / "d.png", tmp_path / "o", settings)
     assert len(objects) == 3
     # The camera sees tops and near sides: heights are whole, tops tell the level sides.
-    for length, width, height, x, *_ in BOXES:
+    table = pd.read_csv(tmp_path / "o" / "objects.csv")
+    for length, width, height, x, y, _ in BOXES:
         item = min(objects, key=lambda o: abs(o.centre[0] - x))
+        away = np.array([0.0, -0.9, 1.1]) - [x, y, height / 2]  # the camera, as the object sees it
+        row = table.iloc[objects.index(item)]
+        assert row.distance == pytest.approx(np.linalg.norm(away), abs=0.02)
+        angle = np.degrees(np.arcsin(away[2] / np.linalg.norm(away)))
+        assert row.elevation == pytest.approx(angle, abs=1)
         assert item.size[2] == pytest.approx(height, abs=0.01)
         assert item.size[0] == pytest.approx(length, abs=0.01)
         assert item.size[1] == pytest.approx(width, abs=0.01)

@@ -114,6 +114,10 @@ class SegmentedObject:
     """Longer and shorter level side of the box, and height above the plane, metres."""
     heading: float
     """Degrees from x to the longer side, from 0 to below 180, counterclockwise from above."""
+    distance: float = math.nan
+    """From the scene's origin, which is the camera of a depth image, to the centre, metres."""
+    elevation: float = math.nan
+    """Of the origin above the horizontal, as the centre sees it, degrees."""
 
 
 def segment_scene(
@@ -152,8 +156,10 @@ def _cut_into(
         for number, item in enumerate(objects):
             name = f"object_{number:03d}.ply"
             write_bytes(folder / name, ply_bytes(item.points))
-            rows.append([name, len(item.points), *item.centre, *item.size, item.heading])
+            seen = (item.distance, item.elevation) if settings.intrinsics else (None, None)
+            rows.append([name, len(item.points), *item.centre, *item.size, item.heading, *seen])
         columns = ["file", "points", "x", "y", "z", "length", "width", "height", "heading"]
+        columns += ["distance", "elevation"]
         table = pd.DataFrame(rows, columns=columns).to_csv(index=False, float_format="%.4f")
         write_bytes(folder / TABLE, table.encode())
         if record is not None:
@@ -314,7 +320,15 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
             f"nothing stands on its plane: no cluster of {settings.min_points} points up to "
             f"{settings.height:g} m above it"
         )
-    return [_boxed(points[owner == number]) for number in order]
+    return [_seen(_boxed(points[owner == number]), -plane.offset) for number in order]
+
+
+def _seen(item: SegmentedObject, height: float) -> SegmentedObject:
+    """Add from where an object is seen: the origin, ``height`` above the plane."""
+    x, y, z = item.centre
+    level, up = math.hypot(x, y), height - z
+    elevation = math.degrees(math.atan2(up, level))
+    return replace(item, distance=math.hypot(level, up), elevation=elevation)
 
 
 def _voxels(

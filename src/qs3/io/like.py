@@ -1,0 +1,97 @@
+"""Settings of a scan that resemble scans of the user's own: distance, elevation and points.
+
+Only unlabelled scans are measured; classes are not read.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from qs3.errors import InputError
+from qs3.io.extract.segment import TABLE
+from qs3.io.load import read_clouds
+from qs3.store.scan_item import GenerateSettings
+
+_SHARE = 0.05
+"""Share of the scans left out at either end of a range."""
+
+Range: TypeAlias = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Ranges of 90 % of the scans. Places are None if the scans do not record them."""
+
+    scans: int
+    """Number of scans."""
+    points: Range
+    """Points of a cloud, equal ones once."""
+    size: Range
+    """Longest side of a cloud's box along its axes, metres."""
+    distance: Range | None = None
+    """From the camera to the middle of the object's box, metres."""
+    elevation: Range | None = None
+    """Of the camera above the horizontal, degrees."""
+
+    def __str__(self) -> str:
+        text = (
+            f"{self.scans} scans: {self.points[0]:.0f} to {self.points[1]:.0f} points, longest "
+            f"side {self.size[0]:.3g} to {self.size[1]:.3g} m"
+        )
+        if self.distance is None or self.elevation is None:
+            return f"{text}; they do not record where the camera stood"
+        (near, far), (low, high) = self.distance, self.elevation
+        return f"{text}, distance {near:.3g} to {far:.3g} m, elevation {low:.0f} to {high:.0f}°"
+
+
+def measure(scans: str | Path) -> Measured:
+    """Measure unlabelled scans, in metres; ``qs3 segment`` records the places of the camera.
+
+    Raises:
+        InputError: If they cannot be read, or are not in metres.
+    """
+    clouds = [np.asarray(cloud) for cloud in read_clouds(scans)[0].clouds]
+    points = _range([len(np.unique(cloud, axis=0)) for cloud in clouds])
+    size = _range([float(np.ptp(cloud, axis=0).max()) for cloud in clouds])
+    if size[0] > 10:
+        raise InputError(f"{scans}: clouds {size[0]:.3g} m large: are they in millimetres?")
+    distance = elevation = None
+    if places := _places(Path(scans)):
+        distance, elevation = (_range(column) for column in zip(*places, strict=True))
+    return Measured(len(clouds), points, size, distance, elevation)
+
+
+def like(settings: GenerateSettings, measured: Measured) -> GenerateSettings:
+    """Return the settings with the measured distance, elevation and number of points."""
+    if settings.distance is None or settings.elevation is None:
+        raise InputError(
+            "--like goes with --recipe parts, which gives the camera a place of its own"
+        )
+    return replace(
+        settings,
+        distance=measured.distance or settings.distance,
+        elevation=measured.elevation or settings.elevation,
+        num_points=int(np.clip(measured.points[1], 64, 4096)),
+        like=str(measured),
+    )
+
+
+def _places(scans: Path) -> list[tuple[float, float]]:
+    """Return distance and elevation of every object that ``qs3 segment`` cut out of an image."""
+    import pandas as pd
+
+    tables = sorted(scans.rglob(TABLE)) if scans.is_dir() else []
+    places: list[tuple[float, float]] = []
+    for path in tables:
+        table = pd.read_csv(path)
+        if {"distance", "elevation"} <= {*table}:
+            rows = table[["distance", "elevation"]].dropna()
+            places += [(float(d), float(e)) for d, e in rows.to_numpy()]
+    return places
+
+
+def _range(values: "list[float] | tuple[float, ...] | list[int]") -> Range:
+    low, high = np.quantile(np.asarray(values, dtype=np.float64), (_SHARE, 1 - _SHARE))
+    return float(low), float(high)
