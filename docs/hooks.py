@@ -39,6 +39,7 @@ PACKAGES = (
     "qs3.store",
     "qs3.io",
     "qs3.evaluation",
+    "qs3.forest",
     "qs3.models",
     "qs3.adaptation",
     "qs3.training",

@@ -110,3 +110,36 @@ def test_labels_are_found_below_the_target(typed, place, tmp_path):
     command = ("train", "--model", "forest", "--source", place / "source", "--out", tmp_path / "r")
     given = ("--target", place / "scans", "--labels", tmp_path / "labels.csv")
     assert "few-label: learnt from 1 labelled scans" in typed(*command, *given).stderr
+
+
+def test_adapt_runs_five_commands_that_can_be_repeated(typed, place, tmp_path, monkeypatch):
+    """Each printed command is one that ran; faults of single scans stop no later step."""
+    import shlex
+
+    import qs3.cli
+
+    ran, real = [], qs3.cli.run
+
+    def record(words):
+        if words[0] == "adapt":
+            return real(words)
+        ran.append(words)
+        if words[0] == "generate":
+            raise InputError(f"{words[words.index('--out') + 1]}/failures.jsonl: 1 scan failed")
+        return 0
+
+    monkeypatch.setattr(qs3.cli, "run", record)
+    done = typed("adapt", place / "cad", place / "scans", "--units", "mm", "--camera", "d415",
+                 "--out", tmp_path / "mine", "--seed", 3, code=2)  # fmt: skip
+    assert [words[0] for words in ran] == ["meshes", "generate", "train", "predict", "report"]
+    printed = [line for line in done.stderr.splitlines() if line.startswith("qs3 ")]
+    assert [shlex.split(line)[1:] for line in printed] == ran
+    assert "1 scan failed" in done.stderr
+    assert {"--recipe", "parts", "d415", "mm"} <= {*ran[1]}
+    assert {"forest", "qbst", "--meshes"} <= {*ran[2]}
+
+
+def test_adapt_refuses_folders_that_are_not_there(typed, place, tmp_path):
+    fault = typed.refuses("adapt", tmp_path / "none", place / "scans", "--out", tmp_path / "mine")
+    assert "no such file or folder" in fault
+    assert not (tmp_path / "mine").exists()

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Sequence
 
 VERBS = {
+    "adapt": "Make a classifier of your own parts: CAD and unlabelled scans in, answers out.",
     "scan": "Photograph one mesh: noisy cloud, clean twin, a picture of every stage.",
     "sensors": "List the sensors, or show one as TOML to copy and edit.",
     "realism": "Test a simulated camera against the laws of real ones.",

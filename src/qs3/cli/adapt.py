@@ -1,7 +1,6 @@
 """``qs3 adapt``: the whole way for your own parts, in five commands that each can be repeated."""
 
 import shlex
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -22,7 +21,8 @@ def adapt(
     up: Literal["z", "y"] | None = None,
     labels: Path | None = None,
     method: Literal["qbst", "spst", "source-only"] = "qbst",
-    unknown: float = 0.05,
+    unknown: float | None = None,
+    fit: bool = False,
     workers: int | None = None,
     seed: int = 0,
 ) -> int:
@@ -43,7 +43,10 @@ def adapt(
         labels: CSV of a few labelled scans, columns file and class (qs3 suggest writes one to fill
             in). The run is then named few-label.
         method: Rounds of self-training on the scans, or none.
-        unknown: Share of known objects that may be answered by "unknown".
+        unknown: Share of known objects that may be answered by "unknown", as in qs3 predict; by
+            default each scan gets a class.
+        fit: Lay the CAD of the four likeliest classes onto each scan, which helps to decide; about
+            0.3 s a scan.
         workers: Processes that scan; all cores by default.
         seed: Root of all random steps.
     """
@@ -52,53 +55,36 @@ def adapt(
     for folder in (cad, scans):
         if not folder.exists():
             raise InputError(f"{folder}: no such file or folder")
+    source, made, answers = out / "source", out / "run", out / "answers.csv"
+    report, sheet = out / "report.html", out / "contact-sheet.png"
+    files = _options(meshes=cad, units=units, up=up)
+    scanned = _options(sensor=camera, seed=seed, workers=workers, out=source)
+    learnt = _options(source=source, target=scans, method=method, labels=labels, seed=seed)
+    laid = ["--fit"] if fit else []
+    steps = [
+        ["meshes", str(cad), *files[2:], *_options(out=sheet)],
+        ["generate", "--recipe", "parts", *files, *scanned],
+        ["train", "--model", "forest", *learnt, *files, *_options(out=made)],
+        ["predict", str(made), str(scans), *_options(unknown=unknown, csv=answers), *laid],
+        ["report", str(made), *_options(source=source, out=report)],
+    ]
     out.mkdir(parents=True, exist_ok=True)
-    meshes = {"units": units, "up": up}
-    (out / "answers.csv").unlink(missing_ok=True)
+    answers.unlink(missing_ok=True)
     code, faults = 0, []
-    for words in _steps(cad, scans, out, camera, meshes, labels, method, unknown, workers, seed):
+    for words in steps:
         tell("", f"qs3 {shlex.join(words)}")
         try:
             code = max(code, run(words))
         except InputError as error:
             # Some meshes that cannot be scanned, or scans that cannot be read, stop no other step.
-            partial = str(error).startswith(str(out / "source" / FAILURES))
-            if not partial and not (words[0] == "predict" and (out / "answers.csv").is_file()):
+            partial = str(error).startswith(str(source / FAILURES))
+            if not partial and not (words[0] == "predict" and answers.is_file()):
                 raise
             faults.append(error)
-    show(out / "answers.csv", out / "report.html")
+    show(answers, report)
     if faults:
         raise faults[0]
     return code
-
-
-def _steps(
-    cad: Path,
-    scans: Path,
-    out: Path,
-    camera: str,
-    meshes: dict[str, str | None],
-    labels: Path | None,
-    method: str,
-    unknown: float,
-    workers: int | None,
-    seed: int,
-) -> Iterator[list[str]]:
-    """Yield the words of each command."""
-    source, made = str(out / "source"), str(out / "run")
-    given = _options(**meshes)
-    yield ["meshes", str(cad), *given, "--out", str(out / "contact-sheet.png")]
-    yield [
-        *("generate", "--recipe", "parts", "--meshes", str(cad), *given, "--sensor", camera),
-        *_options(seed=seed, workers=workers, out=source),
-    ]
-    yield [
-        *("train", "--model", "forest", "--source", source, "--target", str(scans)),
-        *_options(method=method, labels=labels, seed=seed, out=made),
-    ]
-    answers = str(out / "answers.csv")
-    yield ["predict", made, str(scans), "--unknown", str(unknown), "--csv", answers]
-    yield ["report", made, "--source", source, "--out", str(out / "report.html")]
 
 
 def _options(**values: object) -> list[str]:
