@@ -9,7 +9,6 @@ from jaxtyping import Float
 
 from qs3.errors import InputError
 from qs3.geometry import rotation_z
-from qs3.meshes.normalising import sample_surface
 
 if TYPE_CHECKING:
     import trimesh
@@ -43,6 +42,8 @@ def resting_poses(mesh: "trimesh.Trimesh") -> tuple[RestingPose, ...]:
     Raises:
         InputError: If the mesh is flat or has no stable pose.
     """
+    from qs3.meshes.normalising import sample_surface  # SciPy: settings import this module
+
     centre = mesh.center_mass if mesh.is_volume else mesh.centroid
     try:
         hull = mesh.convex_hull
