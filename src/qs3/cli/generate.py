@@ -76,13 +76,14 @@ def generate(
             rooms (cameras, sizes, layouts and views drawn).
         like: Unlabelled scans in metres. Distance, elevation and number of points are measured on
             them and replace those of the recipe parts. qs3 segment records the distance.
-        up: Up axis of every mesh file; by default y for glTF and ShapeNet, z for all others.
+        up: Up axis of every mesh file; by default y for glTF and ShapeNet, z for all others. A
+            column up of --labels wins.
         per_class: Objects a class, of the built-in shapes and parts.
         classes: Classes to scan, by the names of their folders, or pointda10 for its ten, renamed;
             all by default.
         class_map: TOML file of what classes shall be called: stool = "chair"; others keep theirs.
-        labels: CSV that tells the class of each mesh of the folder, and its split: columns file
-            (or uid), class and split.
+        labels: CSV with a row a mesh of the folder: columns file (or uid), class, and optionally
+            split, unit (m, cm, mm, in) and up (z, y).
         workers: Processes, of one thread each; all cores by default. The bytes written do not
             depend on it.
         timeout: Seconds that one scan may take; then it is stopped and logged as failed.
@@ -164,9 +165,7 @@ def _items(
     for source in meshes:
         named = None if source in BUILT_IN else labels
         kinds = classes or None
-        items += collect(source, per_class=per_class, seed=seed, classes=kinds, labels=named)
-    if up is not None:
-        items = [i if i.path is None else dataclasses.replace(i, up=up) for i in items]
+        items += collect(source, per_class=per_class, seed=seed, classes=kinds, labels=named, up=up)
     if class_map is not None:
         items = rename_items(items, class_map)
     if flat := [item.id for item in items if not item.class_name]:

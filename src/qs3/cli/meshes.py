@@ -1,6 +1,5 @@
 """``qs3 meshes``: what a folder of meshes holds, before anything is made of it."""
 
-import dataclasses
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -37,10 +36,10 @@ def meshes(
             shapes.
         out: The contact sheet to write, PNG: the first eight of each class with their names.
         up: Up axis of the meshes; by default y for glTF and ShapeNet, z for all others.
-        units: Unit of the files, but STEP and IGES; by default what they tell, else m up to a
-            longest side of 5, mm above.
+        units: Unit of the files that --labels gives none, but STEP and IGES; by default what they
+            tell, else m up to a longest side of 5, mm above.
         classes: Look at these classes only, or pointda10 for its ten; all by default.
-        labels: CSV that tells the class of each mesh.
+        labels: CSV with a row a mesh: columns file, class, and optionally split, unit and up.
     """
     from tqdm import tqdm
 
@@ -48,11 +47,10 @@ def meshes(
         raise InputError(f"--out {out}: the contact sheet is a PNG; name a file that ends in .png")
     from qs3.meshes.collections import collect
     from qs3.meshes.inspecting import inspect
+    from qs3.meshes.odd_sizes import Measured, odd_sizes
     from qs3.report.figure import write_png
 
-    items = collect(folder, classes=classes or None, labels=labels)
-    if up is not None:
-        items = [dataclasses.replace(item, up=up) for item in items]
+    items = collect(folder, classes=classes or None, labels=labels, up=up)
     looks = inspect(items, units, _PICTURED)
     inspections = list(tqdm(looks, total=len(items), unit="mesh", leave=False, disable=None))
     groups: dict[str, list[Inspection]] = {}
@@ -64,6 +62,15 @@ def meshes(
     counts = Counter(hint for look in inspections for hint in look.hints)
     for hint, count in counts.most_common():
         show(f"hint: {count} of {len(inspections)}, such as {examples[hint]}: {hint}")
+    odd = odd_sizes(
+        [
+            Measured(look.item.id, look.item.class_name, look.extents)
+            for look in inspections
+            if look.extents is not None
+        ]
+    )
+    for text in _first([text for _, text in odd], ""):
+        say_once(text)
     faults = [look.fault for look in inspections if look.fault]
     show(*_first(faults, "fault: "))
     alike, apart = _same_files(Path(folder), [look.item for look in inspections if not look.fault])

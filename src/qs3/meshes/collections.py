@@ -38,6 +38,7 @@ def collect(
     classes: str | Sequence[str] | None = None,
     split: str | None = None,
     labels: str | Path | None = None,
+    up: Literal["z", "y"] | None = None,
 ) -> list[MeshItem]:
     """List the meshes of a collection, always in the same order.
 
@@ -52,7 +53,8 @@ def collect(
             PointDA-10, by ModelNet's and ShapeNet's own lists or else by aliases; None keeps all.
         split: Keep this split only; None keeps all. Shapes have no split.
         labels: A CSV that names the class of each mesh, and its split if there is one, see
-            ``read_labels``; meshes without a row are left out.
+            ``read_labels``; meshes without a row are left out. It may give units and up axes too.
+        up: Up axis of the files, if the CSV gives none; None goes by format and layout.
 
     Raises:
         InputError: if the folder is missing or holds no mesh, a class is not in it, the CSV is
@@ -73,7 +75,7 @@ def collect(
             )
         items = _draws(str(source), per_class, seed, names)
     else:
-        items = _files(Path(source), names, None if labels is None else Path(labels))
+        items = _files(Path(source), names, None if labels is None else Path(labels), up)
     if split is not None:
         items = [item for item in items if item.split == split]
     if not items:
@@ -103,7 +105,12 @@ def _draws(
     return items
 
 
-def _files(root: Path, classes: tuple[str, ...] | None, labels: Path | None) -> list[MeshItem]:
+def _files(
+    root: Path,
+    classes: tuple[str, ...] | None,
+    labels: Path | None,
+    up: Literal["z", "y"] | None,
+) -> list[MeshItem]:
     """Meshes of a folder, those of the classes that are chosen, by their new names.
 
     Of ModelNet ``pointda10`` are exactly ten folders (night_stand becomes cabinet; dresser,
@@ -111,7 +118,7 @@ def _files(root: Path, classes: tuple[str, ...] | None, labels: Path | None) -> 
     monitor, pot becomes plant), of anything else whatever ``canonical`` maps onto them. Any of
     the ten may be missing. Other choices are names as they stand in the collection.
     """
-    items = read_tree(root, labels)
+    items = read_tree(root, labels, up)
     if classes is None:
         return items
     have = {(item.layout, item.class_name) for item in items}

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from qs3.errors import InputError
 from qs3.meshes.normalising import sample_surface
-from qs3.meshes.sizes import Unit, file_size
+from qs3.meshes.sizes import Unit, file_size, file_unit
 from qs3.meshes.trees import MeshItem
 
 _POINTS = 1024
@@ -23,7 +23,9 @@ class Inspection:
     item: MeshItem
     """Which one."""
     size: float | None = None
-    """Longest side in metres; None where it cannot be told."""
+    """Longest side in metres; None if it is unknown or no size of an object."""
+    extents: Float[np.ndarray, "3"] | None = None
+    """Sides along x, y and z in metres; None if the unit is unknown."""
     hints: tuple[str, ...] = ()
     """What looks wrong, in no more words than others have that look as wrong."""
     fault: str = ""
@@ -48,8 +50,9 @@ def inspect(
             continue
         hints = [_faces(mesh), "looks y-up (stands on y = 0, centred about z = 0): --up y"]
         hints = hints if looks_y_up(mesh) else hints[:1]
-        size = None
+        size = extents = None
         try:
+            extents = np.asarray(mesh.extents) * file_unit(mesh, units)[0]
             size, unit = file_size(mesh, units)
             if unit == "mm (guessed)":
                 hints.append("tells no unit, looks to be in millimetres: --units")
@@ -59,7 +62,7 @@ def inspect(
         if shown[item.class_name] < pictured:
             shown[item.class_name] += 1
             surface = sample_surface(mesh, _POINTS, np.random.default_rng(0))
-        yield Inspection(item, size, tuple(filter(None, hints)), surface=surface)
+        yield Inspection(item, size, extents, tuple(filter(None, hints)), surface=surface)
 
 
 def looks_y_up(mesh: trimesh.Trimesh) -> bool:

@@ -1,11 +1,9 @@
 """How large things are: what a mesh's own unit says, and what its class measures in homes."""
 
-import contextlib
 import functools
 import math
-from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
@@ -103,12 +101,7 @@ def class_size(mesh: "trimesh.Trimesh", class_name: str, rng: np.random.Generato
 
 
 def file_size(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float, str]:
-    """Return the longest side of a mesh in metres, and the unit that it is told or taken to be in.
-
-    It is ``unit``, also where a mesh's file (glTF, 3MF) says another; else what the mesh says
-    (``mesh.units``: the procedural shapes and what was turned from STEP and IGES are in a known
-    unit, whatever ``unit`` is); else metres up to a longest side of 5, millimetres above. The log
-    says once, of the first such mesh, where two differ or a unit is guessed.
+    """Return the longest side of a mesh in metres, and its unit, see `file_unit`.
 
     Raises:
         InputError: if the mesh's unit is unknown, or it is smaller than 1 mm or larger than
@@ -119,9 +112,35 @@ def file_size(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float,
         >>> file_size(trimesh.creation.box((60.0, 20.0, 10.0)), "mm")
         (0.06, 'mm')
     """
+    metres, title = file_unit(mesh, unit)
+    side = float(mesh.extents.max())
+    if not _LEAST <= side * metres <= _MOST:
+        raise InputError(
+            f"object_size file: the mesh is {side:g} {title} long, which is {side * metres:g} m, "
+            f"and no object of {_LEAST:g} to {_MOST:g} m; "
+            + ("" if _is_known(mesh) else "name its unit (units m, cm, mm or in), or ")
+            + "give a size in metres (object_size)"
+        )
+    return side * metres, title
+
+
+def file_unit(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float, str]:
+    """Return the metres of one unit of a mesh, and the name of that unit.
+
+    It is the one given for this file alone (`MeshItem.unit`); else ``unit``, also if a mesh's file
+    (glTF, 3MF) says another; else what the mesh says (``mesh.units``: the procedural shapes and
+    what was turned from STEP and IGES are in a known unit, whatever ``unit`` is); else metres up to
+    a longest side of 5, millimetres above. The log says once, of the first such mesh, if two differ
+    or a unit is guessed.
+
+    Raises:
+        InputError: if the mesh's unit is unknown.
+    """
     side = float(mesh.extents.max())
     file = str(mesh.metadata.get("file_name", ""))
-    is_known = bool(mesh.units) and (not file or Path(file).suffix.lower() in UNITS)
+    if given := mesh.metadata.get("unit_of_file"):
+        return _metres(given), given
+    is_known = _is_known(mesh)
     name = mesh.units if is_known else unit or mesh.units
     if mesh.units and unit and not math.isclose(_metres(mesh.units), _metres(unit)):
         taken = f"taken, not units {unit}" if is_known else f"taken for {unit}, as units says"
@@ -137,39 +156,13 @@ def file_size(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float,
         )
     else:
         title = _short(name)
-    size = side * _metres(name)
-    if not _LEAST <= size <= _MOST:
-        raise InputError(
-            f"object_size file: the mesh is {side:g} {title} long, which is {size:g} m, and no "
-            f"object of {_LEAST:g} to {_MOST:g} m; "
-            + ("" if is_known else "name its unit (units m, cm, mm or in), or ")
-            + "give a size in metres (object_size)"
-        )
-    return size, title
+    return _metres(name), title
 
 
-def check_guesses(items: Iterable[Any]) -> None:
-    """Refuse meshes whose units would be guessed, and not all alike: a small part of many.
-
-    A mesh that cannot be used is left to its scan.
-
-    Raises:
-        InputError: naming a mesh of either guess.
-    """
-    guesses: dict[str, str] = {}
-    for item in items:
-        if getattr(item, "path", None) is None:
-            continue
-        with contextlib.suppress(InputError):
-            title = file_size(item.load())[1]
-            if title.endswith("(guessed)"):
-                guesses.setdefault(title.split()[0], item.id)
-        if len(guesses) > 1:
-            raise InputError(
-                f"object_size file: {guesses['m']} would be taken for metres and {guesses['mm']} "
-                "for millimetres, by their lengths; where all have one unit, name it: --units mm, "
-                "say; otherwise save those of the other anew"
-            )
+def _is_known(mesh: "trimesh.Trimesh") -> bool:
+    """Return whether the unit of the vertices is certain."""
+    file = str(mesh.metadata.get("file_name", ""))
+    return bool(mesh.units) and (not file or Path(file).suffix.lower() in UNITS)
 
 
 def _say(file: str, text: str) -> None:

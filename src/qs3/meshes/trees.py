@@ -12,10 +12,11 @@ import trimesh
 from qs3 import shapes
 from qs3.errors import InputError, MissingExtraError, say_once
 from qs3.files import describe_others
-from qs3.meshes.cad import NEEDS, check_extra
+from qs3.meshes.cad import NEEDS, UNITS, check_extra
 from qs3.meshes.classes import MODELNET40, POINTDA10, SHAPENET, canonical
-from qs3.meshes.labels_csv import read_labels, read_shapenet_splits
+from qs3.meshes.labels_csv import Label, read_labels, read_shapenet_splits
 from qs3.meshes.loading import EXTENSIONS, load_mesh
+from qs3.meshes.sizes import Unit
 from qs3.meshes.walking import entries, ids, is_file, walk
 
 SPLITS: tuple[str, ...] = ("train", "test", "val")
@@ -47,6 +48,8 @@ class MeshItem:
     """Layout in which the file was found, or None for a procedural shape."""
     own_class: str = ""
     """Name of the class in the collection, if it was renamed; else empty."""
+    unit: Unit | None = None
+    """Unit of this file, if a CSV gives it; it wins over what the file says."""
 
     def load(self) -> trimesh.Trimesh:
         """Read or make the mesh.
@@ -55,18 +58,28 @@ class MeshItem:
             InputError: if the file cannot be used.
         """
         if self.path is not None:
-            return load_mesh(self.path, up=self.up)
+            mesh = load_mesh(self.path, up=self.up)
+            if self.unit is not None:
+                if self.path.suffix.lower() in UNITS:
+                    raise InputError(
+                        f"{self.path}: says its unit; leave the unit of this file empty in --labels"
+                    )
+                mesh.units = mesh.metadata["unit_of_file"] = self.unit
+            return mesh
         if self.shape_seed is None:
             raise InputError(f"{self.id}: has neither a file nor a shape seed")
         return shapes.make(self.own_class or self.class_name, self.shape_seed)
 
 
-def read_tree(root: Path, labels: Path | None = None) -> list[MeshItem]:
+def read_tree(
+    root: Path, labels: Path | None = None, up: Literal["z", "y"] | None = None
+) -> list[MeshItem]:
     """List the meshes of a folder with their classes and splits, in order of their ids.
 
     The layouts, tried in this order:
 
-    - with ``labels``: classes from the CSV, see ``read_labels``; splits too, else from folders;
+    - with ``labels``: classes from the CSV, see ``read_labels``; splits too, else from folders; a
+      CSV without classes gives units and axes to the files of any layout but ShapeNet's;
     - ShapeNetCore, told by a synset's number among the folders:
       ``<synset>/<id>/models/model_normalized.obj`` (v2) or ``<synset>/<id>/model.obj`` (v1), with
       splits from ``all.csv`` if that lies in the root;
@@ -77,7 +90,8 @@ def read_tree(root: Path, labels: Path | None = None) -> list[MeshItem]:
       split; meshes right in the root have no class.
 
     Convention:
-        ShapeNet's meshes are y up. A file is taken for ShapeNet's by its name alone.
+        ShapeNet's meshes are y up. A file is taken for ShapeNet's by its name alone. ``up`` is of
+        every file that the CSV gives no axis.
 
     What lies there and is no mesh is counted in the log, by ending, but for ShapeNet's synsets, of
     which one file a model is asked for.
@@ -91,11 +105,12 @@ def read_tree(root: Path, labels: Path | None = None) -> list[MeshItem]:
         raise InputError(f"{root}: {what}")
     others: Counter[str] = Counter()
     if labels is not None:
-        items = _labelled(root, labels, others)
+        items = _labelled(root, labels, others, up)
     else:
         synsets = _synsets(root)
         items = _shapenet(root, synsets) if synsets else []
         items += _folders(root, walk(root, synsets, others))
+        items = [replace(item, up=up or item.up) for item in items]
     unread = describe_others(others)
     if not items:
         raise InputError(
@@ -171,16 +186,21 @@ def _folders(root: Path, files: Sequence[str]) -> list[MeshItem]:
     ]
 
 
-def _labelled(root: Path, labels: Path, others: Counter[str]) -> list[MeshItem]:
+def _labelled(
+    root: Path, labels: Path, others: Counter[str], up: Literal["z", "y"] | None
+) -> list[MeshItem]:
     files = walk(root, others=others)
     table = read_labels(labels, root, files) if files else {}
+    names_classes = any(label.class_name for label in table.values())
+    own = list(_items(root, files, "labels")) if names_classes else _folders(root, files)
     items = []
     # The ids are those of all meshes: a row more or less leaves them as they are.
-    for file, item in zip(files, _items(root, files, "labels"), strict=True):
-        if file in table:
-            class_name, split = table[file]
-            split = item.split if split is None else split
-            items.append(replace(item, class_name=class_name, split=split))
+    for file, item in zip(files, own, strict=True):
+        if file in table or not names_classes:
+            row = table.get(file, Label(None, None, None, None))
+            class_name, split = row.class_name or item.class_name, row.split or item.split
+            axis = row.up or up or item.up
+            items.append(replace(item, class_name=class_name, split=split, up=axis, unit=row.unit))
     if len(items) < len(files):
         others["meshes without a row in the labels"] = len(files) - len(items)
     return items

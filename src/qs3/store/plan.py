@@ -12,7 +12,7 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.meshes.classes import map_labels
-from qs3.meshes.sizes import check_guesses, class_ranges
+from qs3.meshes.sizes import class_ranges
 from qs3.store.executors import Failure
 from qs3.store.manifest import Manifest, package_versions
 from qs3.store.scan_item import GenerateSettings, Item, neighbours_of, row_id, size_class
@@ -118,8 +118,10 @@ def make_plan(items: Sequence[Item], settings: GenerateSettings) -> Plan:
     if settings.real_size == "class":
         for name in sorted(set(map(size_class, items))):
             class_ranges(name)
-    if settings.real_size == "file" and settings.units is None:
-        check_guesses(items)
+    if settings.real_size == "file":
+        from qs3.meshes.odd_sizes import check_files  # it imports trimesh
+
+        check_files(items, settings.units, settings.pose)
     map_labels(names, np.arange(len(names)), settings.classes)
     return Plan(items, settings)
 
@@ -132,10 +134,11 @@ def resolve_renderer(settings: GenerateSettings) -> GenerateSettings:
 
 
 def work_list_checksum(items: Sequence[Item]) -> str:
-    """SHA-256 over the names, classes, splits, axes and shape seeds of a work list."""
+    """SHA-256 over the names, classes, splits, axes, units and shape seeds of a work list."""
     digest = hashlib.sha256()
     for item in items:
         line = [item.id, item.class_name, item.split]
         line += [getattr(item, name, None) for name in ("shape_seed", "up")]
+        line += filter(None, [getattr(item, "unit", None)])
         digest.update(json.dumps(line).encode("utf-8") + b"\n")
     return digest.hexdigest()

@@ -1,0 +1,102 @@
+"""Warnings of files whose unit or up axis differs from the others'."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from qs3.errors import TOLD, InputError
+from qs3.meshes import collect
+from qs3.meshes.odd_sizes import Measured, check_files, odd_sizes
+from qs3.meshes.sizes import file_size
+
+
+def boxes(*extents, one_class: bool = True) -> list[Measured]:
+    return [
+        Measured(f"{i}", "flange" if one_class else f"{i}", np.array(sides, float))
+        for i, sides in enumerate(extents)
+    ]
+
+
+FLANGE = np.array([0.1, 0.1, 0.02])
+
+
+@pytest.mark.parametrize(
+    ("factor", "text"),
+    [(1 / 25.4, "inches"), (25.4, "inches"), (1e-3, "metres"), (1e3, "metres"), (3, ""), (12, "")],
+)
+def test_a_file_in_another_unit_than_its_class_is_reported(factor, text) -> None:
+    odd = odd_sizes(boxes(FLANGE, 1.2 * FLANGE, FLANGE * factor))
+    assert [name for name, _ in odd] == ([] if factor == 3 else ["0" if factor == 12 else "2"])
+    if odd:
+        assert (text or "are their units right") in odd[0][1]  # a spread of more than ten
+
+
+def test_each_file_a_class_is_compared_with_all_and_absolute_sizes_are_bounded() -> None:
+    few = boxes(FLANGE, 2 * FLANGE, FLANGE / 2, 1e3 * FLANGE, one_class=False)
+    ((name, line),) = odd_sizes(few)
+    assert name == "3" and "the median of all files is" in line
+    assert "outside 1 mm to 5 m" in odd_sizes(boxes([0.0005, 1e-4, 1e-4]))[0][1]
+    assert odd_sizes(few[:3]) == []
+
+
+@pytest.mark.parametrize(
+    ("standing", "lying"), [([0.05, 0.05, 0.2], [0.2, 0.05, 0.05]), (FLANGE, [0.1, 0.02, 0.1])]
+)
+def test_a_file_on_its_side_is_reported(standing, lying) -> None:
+    ((name, line),) = odd_sizes(boxes(standing, standing, standing, lying))
+    assert name == "3" and "another side upwards" in line
+    assert odd_sizes(boxes(standing, standing, standing)) == []
+
+
+def put(root: Path, **boxes) -> Path:
+    for name, extents in boxes.items():
+        path = root / f"{name}.stl"
+        root.mkdir(exist_ok=True)
+        trimesh.creation.box(extents).export(path)
+    return root
+
+
+def test_unit_and_axis_of_a_file_win_over_those_of_all(tmp_path: Path) -> None:
+    root = put(tmp_path / "cad", a=(4, 1, 2), b=(100, 50, 20))
+    labels = tmp_path / "l.csv"
+    labels.write_text("file,unit,up\na,in,y\n")
+    first, second = collect(root, labels=labels, up="z")
+    assert (first.class_name, first.unit, first.up) == ("a", "in", "y")
+    assert (second.class_name, second.unit, second.up) == ("b", None, "z")
+    mesh = first.load()
+    assert mesh.extents.tolist() == [4, 2, 1]
+    assert file_size(mesh, "mm") == (pytest.approx(4 * 0.0254), "in")
+    labels.write_text("file,class,unit\na,flange,in\n")
+    assert [(item.class_name, item.unit) for item in collect(root, labels=labels)] == [
+        ("flange", "in")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("file,unit\na,inch\n", "line 2: unit 'inch' is unknown; choose m, cm, mm, in"),
+        ("file,up\na,x\n", "line 2: up 'x' is unknown; choose z, y"),
+        ("file,class,units\na,b,mm\n", "line 1: no column 'units' is read; call it unit or up"),
+    ],
+)
+def test_unknown_units_and_axes_are_errors(tmp_path: Path, text: str, message: str) -> None:
+    root, labels = put(tmp_path / "cad", a=(1, 1, 1)), tmp_path / "l.csv"
+    labels.write_text(text)
+    with pytest.raises(InputError, match=message):
+        collect(root, labels=labels)
+
+
+def test_a_scan_warns_of_odd_sizes_and_of_several_resting_poses(tmp_path: Path, caplog) -> None:
+    TOLD.clear()
+    items = collect(put(tmp_path / "cad", a=(40, 38, 30), b=(50, 40, 30), c=(1.6, 1.2, 1)))
+    check_files(items, "mm", "upright")
+    assert "c: is 0.0016 m long" in caplog.text
+    assert "class a: has 3 likely resting poses and is scanned upright alone" in caplog.text
+    assert caplog.text.count("resting poses") == 1
+    TOLD.clear()
+    caplog.clear()
+    check_files(items[:2], "mm", "resting")
+    assert not caplog.text
