@@ -197,7 +197,7 @@ def test_every_state_between_two_writes_is_mended(fake, tmp_path, monkeypatch):
         else:
             break
         left[0] = -1
-        (out / ".shard-00001.parquet.0123abcd.tmp.parquet").write_text("PAR1")  # torn
+        (out / ".0123456789abcdef.tmp.parquet").write_text("PAR1")  # torn
         fake.run(items, out, row=fake.flaky_row)
         assert fake.content(out) == wanted, steps
     assert stops == 5  # manifest, then three shards and two entries of the log

@@ -215,7 +215,8 @@ def segment_scenes(
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; name a folder")
     for entry in out.iterdir() if out.is_dir() else ():
-        if entry.name[0] != "." and not is_scene(entry):  # what begins so is of a stop
+        # What begins with a dot is of a stop; a link would lead elsewhere.
+        if entry.name[0] != "." and (entry.is_symlink() or not is_scene(entry)):
             raise InputError(
                 f"{out}: holds something else ({entry.name}); name a new or empty folder"
             )
