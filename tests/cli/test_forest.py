@@ -18,6 +18,13 @@ PARTS = {
 }
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_trees():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("qs3.forest.forest.TREES", 60)
+        yield
+
+
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
     """CAD in millimetres, labelled clouds and scans of upper sides."""
@@ -40,11 +47,9 @@ def place(tmp_path_factory):
 def run(place):
     from qs3.cli import run
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("qs3.forest.forest.TREES", 60)
-        words = ["train", "--model", "forest", "--source", str(place / "source")]
-        words += ["--meshes", str(place / "cad"), "--units", "mm", "--out", str(place / "run")]
-        assert run(words) == 0
+    words = ["train", "--model", "forest", "--source", str(place / "source")]
+    words += ["--meshes", str(place / "cad"), "--units", "mm", "--out", str(place / "run")]
+    assert run(words) == 0
     return place / "run"
 
 
@@ -143,3 +148,19 @@ def test_adapt_refuses_folders_that_are_not_there(typed, place, tmp_path):
     fault = typed.refuses("adapt", tmp_path / "none", place / "scans", "--out", tmp_path / "mine")
     assert "no such file or folder" in fault
     assert not (tmp_path / "mine").exists()
+
+
+def test_suggested_scans_can_be_labelled_and_learnt_from(typed, place, run, tmp_path):
+    table = tmp_path / "labels.csv"
+    typed("suggest", run, place / "scans", "-n", 4, "--out", table)
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    assert len({row["file"] for row in rows}) == 4
+    assert {row["suggested"] for row in rows} == {*PARTS}  # spread over the classes
+    assert {row["class"] for row in rows} == {""}
+    assert "may hold labels" in typed.refuses("suggest", run, place / "scans", "--out", table)
+    with table.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(row | {"class": row["suggested"]} for row in rows[:3])
+    command = ("train", "--model", "forest", "--source", place / "source", "--labels", table)
+    assert "learnt from 3 labelled" in typed(*command, "--out", tmp_path / "few").stderr

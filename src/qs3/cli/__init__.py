@@ -24,6 +24,7 @@ VERBS = {
     "train": "Train a classifier, with a method of adaptation to an unlabelled target if asked.",
     "evaluate": "Score a run: accuracy, class-mean accuracy, confusion matrix.",
     "predict": "Tell the class of each file and how confident the network is.",
+    "suggest": "Pick the scans whose labels help most, and write a CSV to fill in.",
     "watch": "Print the objects before a depth camera, frame by frame.",
     "export": "Export a network as ONNX.",
     "reproduce": "Make tables and figures anew, with their data and trainings.",

@@ -1,0 +1,55 @@
+"""``qs3 suggest``: scans whose labels help most, as a CSV to fill in."""
+
+import csv
+import io
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from qs3.cli.text import quoted, show, tell
+from qs3.errors import InputError
+
+
+def suggest(
+    run: Annotated[Path, tyro.conf.Positional],
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    count: Annotated[int, tyro.conf.arg(aliases=["-n"])] = 30,
+    out: Path = Path("labels.csv"),
+) -> int:
+    """Pick the scans whose labels help most, and write a CSV to fill in.
+
+    They are unsure and differ from each other. Fill in the column class, leave out what you do not
+    know, and train again with --labels.
+
+    Args:
+        run: Folder of a run.
+        files: Files of points, z up, or folders of them.
+        count: Scans to pick.
+        out: New CSV with the columns file, suggested, confidence and class.
+    """
+    from qs3.files import write_text
+    from qs3.training.answers import is_data_set, list_clouds
+    from qs3.training.labels import CLASS, FILE
+    from qs3.training.suggest import suggest as pick
+
+    if out.exists():
+        raise InputError(f"--out {out}: is there already and may hold labels; name a new file")
+    if count < 1:
+        raise InputError(f"--count {count}: must be at least 1")
+    listed = list_clouds(files)
+    if sets := [path for path in listed if is_data_set(path)]:
+        raise InputError(f"{sets[0]}: is a data set; name files of points, or folders of them")
+    buffer = io.StringIO()
+    table = csv.writer(buffer)
+    table.writerow([FILE, "suggested", "confidence", CLASS])
+    picked = pick(run, listed, count)
+    for one in picked:
+        table.writerow([one.file, one.class_name, f"{one.confidence:.3f}", ""])
+    write_text(out, buffer.getvalue())
+    show(out)
+    tell(
+        f"{len(picked)} of {len(listed)} scans. Look at one: qs3 view {quoted(picked[0].file)}. "
+        f"Fill in the column {CLASS}, then qs3 train --model forest --labels {quoted(out)}"
+    )
+    return 0
