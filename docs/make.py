@@ -457,7 +457,7 @@ def results(out: Path, name: str) -> None:
     if pictures.is_dir() and pictures.resolve() != (folder / GALLERIES).resolve():
         shutil.copytree(pictures, folder / GALLERIES, dirs_exist_ok=True)
     for table in TABLES:
-        made = Table(table, read_setup(folder)).read()
+        made = Table(table, read_setup(folder))
         if made.faults or not made.records:
             print(f"{table}: left out", *made.faults)
         else:

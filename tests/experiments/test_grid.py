@@ -164,8 +164,8 @@ def test_data_of_the_user_takes_a_domain_s_place(whole, tmp_path):
     again = read_setup(out)
     assert again.own["D"].train.cloud == "points" and again.seeds == (0,)
     assert [again.own[kind].train.count for kind in own] == [24, 30]
-    filled = Table("ordinary", again, ("dgcnn",), ("M-D",)).read()
-    assert filled.faults == () and filled.waiting == []
+    filled = Table("ordinary", again, ("dgcnn",), ("M-D",))
+    assert filled.faults == [] and filled.waiting == []
 
 
 class Inline:

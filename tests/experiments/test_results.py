@@ -35,8 +35,8 @@ def records_in(folder: str) -> list[RunRecord]:
 
 @pytest.mark.parametrize("path", FILES, ids=[f"{p.parent.name}-{p.stem}" for p in FILES])
 def test_a_table_is_what_its_records_say(path):
-    filled = Table(path.stem, read_setup(path.parent)).read().made_part()
-    assert filled.faults == ()
+    filled = Table(path.stem, read_setup(path.parent)).made_part()
+    assert filled.faults == []
     assert markdown(filled) == path.read_text(encoding="utf-8")
     assert draw(filled).axes
 
@@ -45,8 +45,8 @@ def test_every_record_is_of_a_run_of_a_table():
     for folder in FOLDERS:
         names = set()
         for name in TABLES:
-            filled = Table(name, read_setup(folder)).read()
-            assert filled.faults == ()
+            filled = Table(name, read_setup(folder))
+            assert filled.faults == []
             names |= set(filled.records)
         assert len(names) == len(records_in(folder.name))
 
@@ -79,8 +79,8 @@ def test_a_setting_that_is_added_leaves_all_records_readable(monkeypatch):
         place = read_setup(folder)
         assert place.scale.novelty == 0.5
         for name in TABLES:
-            filled = Table(name, place).read()
-            assert filled.faults == ()
+            filled = Table(name, place)
+            assert filled.faults == []
             for record in filled.records.values():
                 assert record.settings["train"]["novelty"] == 0.5
                 count += 1

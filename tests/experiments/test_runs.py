@@ -87,7 +87,7 @@ def test_real_objects_must_be_at_hand_and_have_no_supervised_row(tmp_path):
     asked = choose_tables(["adaptation-bench"], setup, columns=["S-R"])
     with pytest.raises(InputError, match="QS3_SHARED_DATA"):
         collect_runs(asked)
-    assert asked[0].cells()[SUPERVISED, "S-R"] == []
+    assert asked[0].cells[SUPERVISED, "S-R"] == []
 
 
 def test_the_paper_s_cells_have_their_published_figures():
@@ -253,10 +253,10 @@ def test_rounds_start_from_one_training_of_the_source():
     }
     gentle = make_run(SCALES["smoke"], S, D, "qbst-gentle").self_training
     assert gentle.threshold_share == 0.5 and gentle.threshold == 0.8  # the scale's has no say
-    rows, _ = Table("uda", Setup(Path(), scale)).headings()
+    rows, _ = Table("uda", Setup(Path(), scale)).headings
     keys = {row.key for row in rows}
     assert {*(f"{row}@dgcnn" for row in ("ordinary", "spst", PAPER, "qbst"))} <= keys
-    rows, _ = Table("uda", Setup(Path(), SCALES["small"])).headings()
+    rows, _ = Table("uda", Setup(Path(), SCALES["small"])).headings
     assert not any("@" in row.key for row in rows)  # its network is the paper's already
 
 

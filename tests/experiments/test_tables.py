@@ -38,7 +38,7 @@ def change(folder, name, *fields, value):
 
 
 def read(folder, name, **changes):
-    return dataclasses.replace(Table(name, read_setup(folder)), **changes).read()
+    return Table(name, read_setup(folder), **changes)
 
 
 def record(folder, name):
@@ -224,6 +224,6 @@ def test_figures_have_the_width_of_a_column_and_95_percent_intervals(whole):
 
 
 def test_the_text_tells_how_the_table_s_own_networks_were_trained(tmp_path):
-    text = markdown(Table("ordinary", Setup(tmp_path, SCALES["paper"], seeds=(0,))).read())
+    text = markdown(Table("ordinary", Setup(tmp_path, SCALES["paper"], seeds=(0,))))
     assert "1000 epochs, batches of 32, schedule plateau" in text
     assert "418 objects a class of M and S" in text

@@ -12,7 +12,7 @@ from qs3.errors import InputError
 from qs3.experiments import TABLES, FigureFormat, TableFormat
 
 if TYPE_CHECKING:
-    from qs3.experiments.table import FilledTable
+    from qs3.experiments.table import Table
 
 INCOMPLETE = 1
 """Exit code where a record was refused and the rest is shown."""
@@ -34,12 +34,12 @@ class TableOptions:
     tasks: tuple[str, ...] = ()
     """Columns, such as S-D; the usual ones by default."""
 
-    def read(self) -> "FilledTable":
-        """Read the records."""
+    def choose(self) -> "Table":
+        """Return the table."""
         from qs3.experiments.setup import read_setup
         from qs3.experiments.table import Table
 
-        return Table(self.name, read_setup(self.results), self.methods, self.tasks).read()
+        return Table(self.name, read_setup(self.results), self.methods, self.tasks)
 
 
 def table(options: Flat[TableOptions], format: TableFormat = "md") -> int:
@@ -53,9 +53,9 @@ def table(options: Flat[TableOptions], format: TableFormat = "md") -> int:
     """
     from qs3.experiments.text import FORMATS
 
-    filled = options.read()
-    show(FORMATS[format](filled))
-    return _refused(filled)
+    chosen = options.choose()
+    show(FORMATS[format](chosen))
+    return _refused(chosen)
 
 
 def figure(options: Flat[TableOptions], out: Path) -> int:
@@ -72,13 +72,13 @@ def figure(options: Flat[TableOptions], out: Path) -> int:
     from qs3.experiments.figures import picture
     from qs3.files import write_bytes
 
-    filled = options.read()
-    write_bytes(out, picture(filled, kind))
+    chosen = options.choose()
+    write_bytes(out, picture(chosen, kind))
     show(out)
-    return _refused(filled)
+    return _refused(chosen)
 
 
-def _refused(filled: "FilledTable") -> int:
-    for fault in filled.faults:
+def _refused(table: "Table") -> int:
+    for fault in table.faults:
         tell(f"qs3: refused: {fault}")
-    return INCOMPLETE if filled.faults else 0
+    return INCOMPLETE if table.faults else 0

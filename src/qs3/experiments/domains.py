@@ -206,6 +206,6 @@ def parse_own(given: Sequence[str]) -> dict[str, DomainData]:
         whole = Path(path).resolve()
         # Samples of surfaces are one of the clouds of a data set of `qs3 generate`.
         cloud = _MADE[kind].train.cloud if (whole / MANIFEST).is_file() else "points"
-        parts = [Part(whole, split or None, cloud) for split in (train, test)]
+        parts = Part(whole, train or None, cloud), Part(whole, test or None, cloud)
         own[kind] = DomainData(f"{kind}: {whole.name}", *parts, own=True)
     return own

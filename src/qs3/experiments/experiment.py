@@ -1,4 +1,4 @@
-"""What an experiment is: a grid of runs as fields, beside the figures that were published."""
+"""Experiments: grids of runs, beside the published figures."""
 
 import functools
 import tomllib
@@ -20,8 +20,8 @@ Place = tuple[str, str]
 Published = tuple[float, float | None]
 """Mean and standard error in per cent; PointDA-10's have none."""
 Pair = tuple[str, str, str]
-"""What is compared, and the keys of two rows or columns: first minus second, rows in every column
-and columns in every row."""
+"""Title, and the keys of two rows or columns: first minus second, rows in every column and columns
+in every row."""
 _TITLES = {
     "pointnet": "PointNet",
     "pointnet2": "PointNet++",
@@ -36,15 +36,14 @@ class Heading:
     """A row or a column of a table."""
 
     key: str
-    """Its name on the command line and in the CSV file."""
+    """Name on the command line and in the CSV file."""
     title: str
-    """What readers see."""
     fields: Mapping[str, Any] = field(default_factory=dict)
-    """What all its runs have: arguments of `qs3.experiments.runs.make_run`."""
+    """Arguments of `qs3.experiments.runs.make_run` for all its runs."""
     axis: str = ""
-    """Of a column in a figure of lines: the name of the axis that it stands on."""
+    """Axis of a column in a figure of lines."""
     number: float = 0.0
-    """Where it stands on that axis."""
+    """Position on that axis."""
 
 
 Headings = tuple[Heading, ...]
@@ -52,36 +51,33 @@ Headings = tuple[Heading, ...]
 
 @dataclass(frozen=True)
 class Experiment:
-    """A table or figure of the paper, or one that it lacks: a run of each row in each column."""
+    """A table with its figure: a run of each row in each column."""
 
     title: str
-    """Heading."""
     rows: Callable[[Scale], Headings]
-    """Lines of the table."""
     columns: Callable[[Scale], Headings]
     """Columns; those with an axis make a figure of lines, the others one of bars."""
     fields: Mapping[str, Any] = field(default_factory=dict)
-    """What all runs have, beside what their row and column say."""
+    """Arguments of `qs3.experiments.runs.make_run` for all runs."""
     source: str = ""
-    """Where the paper has it, where it prints no figures."""
+    """Place in the paper, if the paper prints no figures."""
     published: str = ""
     """Printed figures: a table of ``published.toml``."""
     published_as: Mapping[str, str] = field(default_factory=dict)
-    """Published names of our rows, where they are others."""
+    """Published names of our rows, if they differ."""
     pairs: Callable[[Scale], Sequence[Pair]] = lambda scale: ()
     """Comparisons over seeds."""
     notes: tuple[str, ...] = ()
-    """What a reader must know."""
     corner: str = "network"
     """Heading of the first column."""
     made: tuple[Kind, ...] = ()
-    """Domains that no data of the user can take the place of, since others are made beside them."""
+    """Domains that the user's data cannot replace, because others are made of the same meshes."""
     usual: Callable[[Scale], Sequence[str]] = lambda scale: ()
-    """Keys of the columns that are made where none is asked for; empty makes all."""
+    """Keys of the default columns; empty makes all."""
 
     @property
     def paper(self) -> str:
-        """Where its figures were published."""
+        """Source of its published figures."""
         return self.source or published()[self.published]["source"]
 
     def published_cell(self, row: str, column: str) -> Published | None:
@@ -96,9 +92,9 @@ class Experiment:
         return None if value is None else (value[0], value[1] if len(value) > 1 else None)
 
     def run(self, setup: Setup, row: Heading, column: Heading, seed: int) -> Run | None:
-        """Return the run of a cell; None where it has none.
+        """Return the run of a cell; None for the supervised row on real objects.
 
-        Real objects have no supervised row: there are none to spare for a training.
+        Their labels are too few to spare any for a training.
         """
         fields = {**self.fields, **row.fields, **column.fields}
         if fields["row"] == SUPERVISED and fields["target"].kind in ("R", "U"):
@@ -111,7 +107,7 @@ def load_experiment(name: str) -> Experiment:
     """Return the experiment of a file of `qs3.experiments.tables`.
 
     Raises:
-        InputError: where there is no such file.
+        InputError: if there is no such file.
     """
     if name not in TABLES:
         raise no_such(f"unknown table {name!r}", name, TABLES)
@@ -119,7 +115,7 @@ def load_experiment(name: str) -> Experiment:
 
 
 def networks(scale: Scale) -> Headings:
-    """Return the paper's networks as lines of a table, first the bench's where it is another."""
+    """Return the paper's networks as lines; the bench's comes first if it is another."""
     names = [name for name in NETWORKS if name in scale.networks]
     own = scale.train.model
     bench = () if own in NETWORKS else (Heading(own, _TITLES.get(own, own), {}),)

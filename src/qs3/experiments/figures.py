@@ -1,14 +1,12 @@
 """Figures of tables: lines over a number, or bars; ours beside the paper's."""
 
-from collections.abc import Sequence
-from typing import Any
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from qs3.experiments import FigureFormat
-from qs3.experiments.table import FilledTable
+from qs3.experiments.experiment import Heading
+from qs3.experiments.table import Table
 from qs3.report.figure import class_colour, house_style, png_bytes, svg_bytes
 
 _MARKERS = "osD^vP"
@@ -16,24 +14,32 @@ _WIDTH = 5.2
 """Inches, of which a column of a paper has two thirds."""
 
 
-def picture(filled: FilledTable, kind: FigureFormat) -> bytes:
+def picture(table: Table, kind: FigureFormat) -> bytes:
     """Return the figure as PNG or SVG."""
-    figure = draw(filled)
+    figure = draw(table)
     return png_bytes(figure) if kind == "png" else svg_bytes(figure)
 
 
 @house_style
-def draw(filled: FilledTable) -> Figure:
-    """Draw a filled table: means over seeds with 95 % intervals, and published means as marks.
+def draw(table: Table) -> Figure:
+    """Draw a table: means over seeds with 95 % intervals, and published means as marks.
 
-    It is as wide as a column of text can show it, however many rows and columns there are.
+    It fits a column of text, however many rows and columns there are.
     """
-    columns = filled.table.headings()[1]
-    return _lines(filled) if any(column.axis for column in columns) else _bars(filled)
+    lines = any(column.axis for column in table.headings[1])
+    figure, axes = _lines(table) if lines else _bars(table)
+    count = max((len(mean["seeds"]) for mean in table.means.values()), default=0)
+    seeds = "1 seed" if count == 1 else f"{count} seeds, 95 % intervals"
+    smoke = "smoke: " if table.setup.scale.smoke else ""
+    figure.suptitle(f"{smoke}{table.experiment.title}\n{seeds}", fontsize=10)
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8)
+    return figure
 
 
-def _lines(filled: FilledTable) -> Figure:
-    rows, columns = filled.table.headings()
+def _lines(table: Table) -> tuple[Figure, Axes]:
+    rows, columns = table.headings
     panels = dict.fromkeys(column.axis for column in columns)
     figure = Figure(figsize=(_WIDTH, 3.2 * len(panels) + 0.6), layout="constrained")
     axes = figure.subplots(len(panels), sharey=True, squeeze=False)[:, 0]
@@ -41,7 +47,7 @@ def _lines(filled: FilledTable) -> Figure:
         shown = [column for column in columns if column.axis == axis]
         x = [column.number for column in shown]
         for index, row in enumerate(rows):
-            mean, half = _scores([filled.means.get((row.key, column.key)) for column in shown])
+            mean, half = _scores(table, [(row, column) for column in shown])
             panel.errorbar(
                 x,
                 mean,
@@ -56,12 +62,11 @@ def _lines(filled: FilledTable) -> Figure:
         panel.set_xticks(x)
         panel.tick_params(axis="x", labelrotation=45 if len(x) > 5 else 0)
         panel.set_ylabel("accuracy [%]")
-    _finish(figure, axes[0], filled)
-    return figure
+    return figure, axes[0]
 
 
-def _bars(filled: FilledTable) -> Figure:
-    groups, bars = filled.table.headings()
+def _bars(table: Table) -> tuple[Figure, Axes]:
+    groups, bars = table.headings
     height = 0.8 / len(bars)
     figure = Figure(figsize=(_WIDTH, 1.6 + 0.13 * len(groups) * (len(bars) + 1)))
     figure.set_layout_engine("constrained")
@@ -69,24 +74,15 @@ def _bars(filled: FilledTable) -> Figure:
     centres = np.arange(len(groups))
     label: str | None = "published, on the paper's data"
     for index, bar in enumerate(bars):
-        places = [(group.key, bar.key) for group in groups]
-        mean, half = _scores([filled.means.get(place) for place in places])
+        mean, half = _scores(table, [(group, bar) for group in groups])
         y = centres + (index - (len(bars) - 1) / 2) * height
         axes.barh(y, mean, 0.9 * height, color=class_colour(index), label=bar.title)
         axes.errorbar(mean, y, xerr=half, linestyle="none", color="black", capsize=2, linewidth=1)
-        cells = [filled.table.experiment.published_cell(*place) for place in places]
-        paper = [cell[0] if cell else np.nan for cell in cells]
-        if not np.isnan(paper).all():
-            axes.plot(
-                paper,
-                y,
-                linestyle="none",
-                marker="D",
-                markersize=4,
-                markerfacecolor="white",
-                markeredgecolor="black",
-                label=label,
-            )
+        cells = [table.experiment.published_cell(group.key, bar.key) for group in groups]
+        if any(cells):
+            paper = [cell[0] if cell else np.nan for cell in cells]
+            style = {"markersize": 4, "markerfacecolor": "white", "markeredgecolor": "black"}
+            axes.plot(paper, y, linestyle="none", marker="D", label=label, **style)
             label = None
     titles = [group.title.replace(" without ", "\nwithout ") for group in groups]
     titles = [title.replace(" + ", "\n+ ").replace(", ", ",\n") for title in titles]
@@ -94,23 +90,13 @@ def _bars(filled: FilledTable) -> Figure:
     axes.set_ylim(len(groups) - 0.5, -0.5)  # the first row on top, as in the table
     axes.set_xlabel("accuracy [%]")
     axes.set_xlim(0, None)
-    _finish(figure, axes, filled)
-    return figure
+    return figure, axes
 
 
-def _scores(means: Sequence[Any]) -> tuple[list[float], list[float]]:
-    """Return means and halves of their intervals in per cent; NaN where there is none."""
+def _scores(table: Table, cells: list[tuple[Heading, Heading]]) -> tuple[list[float], list[float]]:
+    """Return means and halves of their intervals in per cent; NaN for missing ones."""
+    means = [table.means.get((row.key, column.key)) for row, column in cells]
     values = [None if mean is None else mean["accuracy"] for mean in means]
     mean = [np.nan if value is None else 100 * value.mean for value in values]
     half = [np.nan if v is None or v.half is None else 100 * v.half for v in values]
     return mean, half
-
-
-def _finish(figure: Figure, axes: Axes, filled: FilledTable) -> None:
-    count = max((len(mean["seeds"]) for mean in filled.means.values()), default=0)
-    seeds = "1 seed" if count == 1 else f"{count} seeds, 95 % intervals"
-    smoke = "smoke: " if filled.table.setup.scale.smoke else ""
-    figure.suptitle(f"{smoke}{filled.table.experiment.title}\n{seeds}", fontsize=10)
-    handles, labels = axes.get_legend_handles_labels()
-    if handles:
-        figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8)

@@ -51,7 +51,7 @@ def choose_tables(
 def _at_hand(name: str, setup: Setup) -> tuple[str, ...]:
     """Return the usual columns without those whose real objects are absent."""
     shown: list[str] = []
-    for column in Table(name, setup).headings()[1]:
+    for column in Table(name, setup).headings[1]:
         target = column.fields.get("target")
         if target is None or data_of(target, setup.own).train.at_hand(setup.shared):
             shown.append(column.key)

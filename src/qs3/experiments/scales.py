@@ -20,7 +20,6 @@ class Scale:
     """Size of a bench: its data and its trainings."""
 
     name: str
-    """Told in the title of the table."""
     source_per_class: int
     """Objects a class of the source, of which a tenth is held out."""
     target_per_class: int
@@ -40,31 +39,31 @@ class Scale:
     source_scan: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the source's scans that differ from those of `GenerateSettings`."""
     target_scan: Mapping[str, Any] = field(default_factory=dict)
-    """Those of D and F, in place of a D435 that looks at a floor and a neighbour."""
+    """Settings of D and F; empty takes a D435 that looks at a floor and a neighbour."""
     train: TrainSettings = field(default_factory=TrainSettings)
-    """How networks are trained; the seed is a run's own."""
+    """Settings of all trainings except their seed."""
     optimiser_steps: int | None = None
-    """About how many steps each training takes, in place of a number of epochs."""
+    """Approximate steps of each training, in place of a number of epochs."""
     rounds: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of self-training that differ from the preset of its rule."""
+    """Settings of self-training that differ from the row's preset."""
     tasks: tuple[str, ...] = ("M-D", "S-D", "M-R", "S-R")
-    """Columns of the bench of adaptation by default."""
+    """Usual columns of the adaptation bench."""
     networks: Mapping[str, Mapping[str, Any]] = field(
         default_factory=lambda: {name: {} for name in NETWORKS}
     )
-    """Settings of each network that differ from its defaults, for the tables of networks."""
+    """Settings of each network of the tables of networks that differ from its defaults."""
     sources: tuple[str, ...] = ("M-D", "S-D", "M-F", "S-F")
-    """Columns of the table of networks without adaptation by default."""
+    """Usual columns of the table of networks without adaptation."""
     ordinary: Mapping[str, Any] = field(default_factory=dict)
     """Settings of training that the tables of networks change."""
     fused_views: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7, 8)
-    """Numbers of views that Fig. 1 compares."""
+    """Numbers of views in Fig. 1."""
     thetas: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
-    """θ₀ that Fig. 2 compares."""
+    """Values of θ₀ in Fig. 2."""
     steps: tuple[float, ...] = (0.0, 0.005, 0.01, 0.02)
-    """ε that Fig. 2 compares."""
+    """Values of ε in Fig. 2."""
     sensors: tuple[str, ...] = ("qs3", "d435", "kinect-v1")
-    """Presets that are trained and tested on."""
+    """Presets of the table of sensors."""
     pointda10: tuple[str, ...] = (
         "ordinary",
         "dann",
@@ -79,31 +78,26 @@ class Scale:
 
     @property
     def smoke(self) -> bool:
-        """Whether it lies below what a comparison of methods needs."""
+        """Whether the scale is too small to compare methods."""
         trained = self.source_per_class * (1 - self.train.holdout)
         small = trained < _FLOOR_OBJECTS or self.train.num_points < _FLOOR_POINTS
         return small or any(self.networks.values())
 
     def train_with(
-        self,
-        threads: int | None,
-        seed: int = 0,
-        network: str = "",
-        learnt: int = 0,
-        adapted_to: int = 0,
+        self, threads: int | None, seed: int, network: str, learnt: int, adapted_to: int = 0
     ) -> TrainSettings:
-        """Return the settings of a training with a seed and a number of threads.
+        """Return the settings of a training.
 
         Args:
             threads: CPU threads.
             seed: Root of all random steps.
-            network: One of ``networks``, trained as the tables of networks do; "" is the bench's.
-            learnt: Clouds of the source.
-            adapted_to: Clouds of the target that it trains on, too. The larger of both decides the
-                epochs, as an epoch is one pass over it.
+            network: One of ``networks``, trained as in the tables of networks; "" is the bench's.
+            learnt: Number of clouds of the source.
+            adapted_to: Number of clouds of the target that it trains on, too. An epoch is one pass
+                over the larger of both.
 
         Raises:
-            InputError: where the scale has no such network.
+            InputError: if the scale has no such network.
         """
         train = replace(self.train, seed=seed, threads=threads)
         if self.optimiser_steps is not None:
@@ -118,13 +112,13 @@ class Scale:
         return replace(train, **own)
 
     def count_clouds(self, domain: str) -> int:
-        """Return how many clouds a kind of domain that is made here has to train on."""
+        """Return how many clouds a domain made here has to train on."""
         if domain in ("D", "F"):
             return sum(self.target_count(name, self.target_per_class) for name in POINTDA10)
         return self.source_per_class * len(POINTDA10) * (3 if domain == "S+C+M" else 1)
 
     def describe_rounds(self) -> str:
-        """Say where self-training is not the paper's; empty where it is.
+        """Return how self-training differs from the paper's; empty if it does not.
 
         Example:
             >>> SCALES["smoke"].describe_rounds()
@@ -138,7 +132,7 @@ class Scale:
         return f"Self-training here: {ours} (paper: {theirs})."
 
     def target_count(self, class_name: str, per_class: int) -> int:
-        """Return how many objects of a class stand in a part of the target."""
+        """Return how many objects of a class a part of the target has."""
         return per_class * (self.common_factor if class_name in self.common else 1)
 
 

@@ -1,4 +1,4 @@
-"""A table of a folder: its runs, and what their records say."""
+"""A table of a folder: its runs, and the numbers of their records."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,12 +21,11 @@ from qs3.files import write_bytes, write_text
 
 @dataclass(frozen=True)
 class Table:
-    """A table with its figure; one of the parts of `qs3.experiments.reproduce`."""
+    """A table with its figure; it reads the records of its folder once."""
 
     name: str
-    """Which one; also the name of its files."""
+    """Name of the experiment and of its files."""
     setup: Setup
-    """Where and how large."""
     rows: tuple[str, ...] = ()
     """Keys of lines; empty takes all."""
     columns: tuple[str, ...] = ()
@@ -34,14 +33,15 @@ class Table:
 
     @property
     def experiment(self) -> Experiment:
-        """What it is a table of."""
+        """Definition of the table."""
         return load_experiment(self.name)
 
+    @cached_property
     def headings(self) -> tuple[Headings, Headings]:
-        """Return rows and columns.
+        """Rows and columns.
 
         Raises:
-            InputError: where none is left, or data of the user do not fit the experiment.
+            InputError: if none is left, or data of the user do not fit the experiment.
         """
         experiment, setup = self.experiment, self.setup
         rows, columns = experiment.rows(setup.scale), experiment.columns(setup.scale)
@@ -59,28 +59,26 @@ class Table:
             raise InputError(f"{self.name}: its lines are {names[0]}; its columns are {names[1]}")
         return kept, shown
 
-    def cells(self) -> dict[Place, list[Run]]:
-        """Return the runs of each cell, in the order of the seeds."""
-        rows, columns = self.headings()
+    @cached_property
+    def cells(self) -> Mapping[Place, Sequence[Run]]:
+        """Runs of each cell, in the order of the seeds."""
+        rows, columns = self.headings
         cells: dict[Place, list[Run]] = {}
         for row in rows:
             for column in columns:
-                runs = [
-                    self.experiment.run(self.setup, row, column, seed) for seed in self.setup.seeds
-                ]
+                runs = [self.experiment.run(self.setup, row, column, n) for n in self.setup.seeds]
                 cells[row.key, column.key] = [run for run in runs if run is not None]
         return cells
 
     def runs(self) -> list[Run]:
-        """Return the runs of all cells, a warm-up before what starts from it.
+        """Return the runs of all cells, a warm-up before the runs that start from it.
 
         Raises:
-            InputError: where the data of one are not at hand.
+            InputError: if the data of a run are missing.
         """
         wanted: dict[str, Run] = {}
-        cells = self.cells()
         for seed in self.setup.seeds:  # a seed is finished before the next begins
-            for run in (run for runs in cells.values() for run in runs if run.seed == seed):
+            for run in (run for runs in self.cells.values() for run in runs if run.seed == seed):
                 for part in run.parts:
                     if part is not None:
                         part.locate(self.setup.out, self.setup.shared)
@@ -89,108 +87,82 @@ class Table:
                         wanted.setdefault(needed.name, needed)
         return list(wanted.values())
 
-    def read(self) -> "FilledTable":
-        """Fill the table from its records; ``faults`` names each record that is refused."""
-        cells = self.cells()
-        records: dict[str, RunRecord] = {}
-        results, faults = read_results(self.setup)
-        runs = {run.name: run for runs in cells.values() for run in runs}
-        for name, run in runs.items():
-            try:
-                record = find_result(run, self.setup, results)
-            except InputError as error:
-                faults.append(str(error))
-                continue
-            if record is not None:
-                records[name] = record
-        faults += _take_out_mixed(records, runs)
-        return FilledTable(self, cells, records, tuple(faults))
-
     def write(self) -> Path:
         """Write the table in all formats and the figure, from the records alone.
 
         Raises:
-            InputError: where a record is refused; the file is named, and the rest is written.
+            InputError: if a record is refused; the rest is written.
         """
         from qs3.experiments.figures import picture
         from qs3.experiments.text import FORMATS
 
-        filled = self.read()
         path = self.setup.out / f"{self.name}.md"
         for kind, make in FORMATS.items():
-            write_text(path.with_suffix(f".{kind}"), make(filled))
-        write_bytes(path.with_suffix(".png"), picture(filled, "png"))
-        if filled.faults:
-            raise InputError("; ".join(filled.faults))
+            write_text(path.with_suffix(f".{kind}"), make(self))
+        write_bytes(path.with_suffix(".png"), picture(self, "png"))
+        if self.faults:
+            raise InputError("; ".join(self.faults))
         return path
 
+    @cached_property
+    def _read(self) -> tuple[dict[str, RunRecord], list[str]]:
+        results, faults = read_results(self.setup)
+        records: dict[str, RunRecord] = {}
+        firsts: dict[str, tuple[str, str]] = {}
+        for run in {run.name: run for runs in self.cells.values() for run in runs}.values():
+            try:
+                record = find_result(run, self.setup, results)
+                if record is not None:
+                    _require_same_data(run, record, firsts)
+                    records[run.name] = record
+            except InputError as error:
+                faults.append(str(error))
+        return records, faults
 
-def _take_out_mixed(records: dict[str, RunRecord], runs: Mapping[str, Run]) -> list[str]:
-    """Take out records that read other data than the first of their domain, and name them."""
-    firsts: dict[str, tuple[str, str]] = {}
-    faults = []
-    for name, run in runs.items():
-        record = records.get(name)
-        if record is None:
-            continue
-        data = {f"train {run.source}": record.source, f"test {run.target}": record.test}
-        if record.target is not None:
-            data[f"train {run.target}"] = record.target
-        for part, read in data.items():
-            checksum, where = firsts.setdefault(part, (read.checksum, name))
-            if checksum != read.checksum:
-                faults.append(f"{name}: read other data ({part}) than {where}; delete its record")
-                records.pop(name, None)
-    return faults
+    @property
+    def records(self) -> Mapping[str, RunRecord]:
+        """Existing records, by the name of the run."""
+        return self._read[0]
 
+    @property
+    def faults(self) -> Sequence[str]:
+        """A message for each record that is refused."""
+        return self._read[1]
 
-@dataclass(frozen=True)
-class FilledTable:
-    """A table with its numbers."""
-
-    table: Table
-    """What it is."""
-    runs: Mapping[Place, Sequence[Run]]
-    """Runs of each cell."""
-    records: Mapping[str, RunRecord]
-    """Records that are there, by the name of the run."""
-    faults: tuple[str, ...] = ()
-    """What is wrong with each record that was refused."""
-
-    def made_part(self) -> "FilledTable":
-        """Return the table with the rows and columns alone that have records."""
-        places = [place for place in self.runs if self.records_of(place)]
+    def made_part(self) -> "Table":
+        """Return the table with only the rows and columns that have records."""
+        places = [place for place in self.cells if self.records_of(place)]
         if not places:
             return self
         rows, columns = (tuple(dict.fromkeys(place[i] for place in places)) for i in (0, 1))
-        return replace(self.table, rows=rows, columns=columns).read()
+        return replace(self, rows=rows, columns=columns)
 
     def records_of(self, place: Place) -> list[RunRecord]:
         """Return the records of a cell, in the order of the seeds."""
-        names = [run.name for run in self.runs[place]]
+        names = [run.name for run in self.cells[place]]
         return [self.records[name] for name in names if name in self.records]
 
     def frame(self) -> pd.DataFrame:
         """Return one line a run; see `qs3.evaluation.tables.frame`."""
-        records = {place: self.records_of(place) for place in self.runs}
-        fields = [
-            {"row": row, "column": column} for row, column in records for _ in records[row, column]
+        lines = [
+            (record, {"row": row, "column": column})
+            for row, column in self.cells
+            for record in self.records_of((row, column))
         ]
-        return frame([record for cell in records.values() for record in cell], fields)
+        return frame([record for record, _ in lines], [fields for _, fields in lines])
 
     @cached_property
-    def means(self) -> dict[Place, Mapping[str, Any]]:
+    def means(self) -> Mapping[Place, Mapping[str, Any]]:
         """Average of each cell that has runs; see `qs3.evaluation.tables.average`.
 
         Raises:
-            InputError: where runs of a cell differ in more than their seed.
+            InputError: if runs of a cell differ in more than their seed.
         """
-        means = average(self.frame(), ["row", "column"])
-        lines: list[Any] = means.to_dict("records")
+        lines: list[Any] = average(self.frame(), ["row", "column"]).to_dict("records")
         return {(mean["row"], mean["column"]): mean for mean in lines}
 
     def marks(self, place: Place) -> list[str]:
-        """Return the caveats of a cell, such as ``transductive``, and rounds that were skipped."""
+        """Return the caveats of a cell, such as ``transductive``, and the skipped rounds."""
         mean = self.means.get(place)
         if mean is None:
             return []
@@ -203,24 +175,37 @@ class FilledTable:
 
     @property
     def waiting(self) -> list[Place]:
-        """Places that wait for runs."""
-        return [p for p, runs in self.runs.items() if len(self.records_of(p)) < len(runs)]
+        """Places that lack runs."""
+        return [p for p, runs in self.cells.items() if len(self.records_of(p)) < len(runs)]
 
     def differences(self) -> list[tuple[str, SeedComparison]]:
-        """Return the comparisons for which there are runs of the same seeds."""
-        rows, columns = self.table.headings()
+        """Return the comparisons that have runs of the same seeds."""
+        rows, columns = self.headings
         differences = []
-        for what, first, second in self.table.experiment.pairs(self.table.setup.scale):
+        for what, first, second in self.experiment.pairs(self.setup.scale):
             cells: list[tuple[str, Place, Place]] = []
             if {first, second} <= {row.key for row in rows}:
                 cells = [(c.title, (first, c.key), (second, c.key)) for c in columns]
             elif {first, second} <= {column.key for column in columns}:
                 cells = [(r.title, (r.key, first), (r.key, second)) for r in rows]
             for title, *places in cells:
-                difference = compare_seeds(*(self._by_seed(place) for place in places))
+                difference = compare_seeds(*map(self._by_seed, places))
                 if difference is not None:
                     differences.append((f"{what}, {title}", difference))
         return differences
 
     def _by_seed(self, place: Place) -> dict[int, float]:
         return {record.seed: record.scores.accuracy for record in self.records_of(place)}
+
+
+def _require_same_data(run: Run, record: RunRecord, firsts: dict[str, tuple[str, str]]) -> None:
+    """Raise InputError if a record read other data than the first of its domain."""
+    data = {f"train {run.source}": record.source, f"test {run.target}": record.test}
+    if record.target is not None:
+        data[f"train {run.target}"] = record.target
+    for part, read in data.items():
+        checksum, where = firsts.setdefault(part, (read.checksum, run.name))
+        if checksum != read.checksum:
+            raise InputError(
+                f"{run.name}: read other data ({part}) than {where}; delete its record"
+            )
