@@ -85,12 +85,23 @@ def test_a_sheet_that_is_no_png_is_refused(parts, tmp_path, typed, name):
     assert not (tmp_path / name).exists()
 
 
-def test_a_sheet_tells_the_name_of_each_mesh(parts, tmp_path, typed, monkeypatch):
-    from qs3.report import clouds
+def test_a_sheet_names_each_mesh_and_draws_faults_in_red(parts, tmp_path, typed, monkeypatch):
+    from qs3.report import sheet
 
     drawn = []
-    plain = clouds.gallery
-    monkeypatch.setattr(clouds, "gallery", lambda *given: drawn.append(given) or plain(*given))
-    names = {"cup__a": 1.0, "cup__b": 2.0, "lid__x__model": 3.0, "lid__y__model": 4.0}
+    plain = sheet.contact_sheet
+    monkeypatch.setattr(sheet, "contact_sheet", lambda *given: drawn.append(given) or plain(*given))
+    names = {"cup__a": 1.0, "cup__b": 2.0, "cup__c": 0.04, "lid__x__model": 3.0, "lid__y__model": 4}
     typed("meshes", parts(**names), "--out", tmp_path / "sheet.png")
-    assert drawn[0][3] == {"cup": ["a", "b"], "lid": ["x", "y"]}
+    found = {(tile.class_name, tile.name, tile.is_faulty) for tile in drawn[0][0]}
+    cups = {("cup", "a", False), ("cup", "b", False), ("cup", "c", True)}
+    assert found == cups | {("lid", "x", False), ("lid", "y", False)}
+
+
+def test_a_shaded_mesh_has_the_size_of_its_scale():
+    from qs3.report.sheet import shaded
+
+    sphere = trimesh.creation.icosphere(radius=25.0)
+    shown = (shaded(sphere, 100.0) < 1).any(axis=-1)
+    assert shown.any(axis=0).sum() == pytest.approx(80, abs=2)  # half of the picture
+    assert shown.any(axis=1).sum() == pytest.approx(80, abs=2)

@@ -1,7 +1,7 @@
 """``qs3 meshes``: what a folder of meshes holds, before anything is made of it."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -12,7 +12,6 @@ from qs3.errors import InputError, say_once
 from qs3.meshes.sizes import Unit
 
 if TYPE_CHECKING:
-    import numpy as np
     from matplotlib.figure import Figure
 
     from qs3.meshes.inspecting import Inspection
@@ -51,7 +50,7 @@ def meshes(
     from qs3.report.figure import write_png
 
     items = collect(folder, classes=classes or None, labels=labels, up=up)
-    looks = inspect(items, units, _PICTURED)
+    looks = inspect(items, units)
     inspections = list(tqdm(looks, total=len(items), unit="mesh", leave=False, disable=None))
     groups: dict[str, list[Inspection]] = {}
     for look in sorted(inspections, key=lambda look: look.item.class_name):
@@ -77,7 +76,7 @@ def meshes(
     show(*_first(alike, "hint: "))
     for text in _first(apart, f"{folder}: "):
         say_once(text)
-    write_png(out, _sheet(groups, Path(folder).name))
+    write_png(out, _sheet(groups, dict(odd), Path(folder).name))
     show(out)
     given: dict[str, Sequence[object]] = {"classes": classes, "labels": (labels,), "up": (up,)}
     if units is not None:  # generate takes them for sizes by the file and a camera in metres
@@ -134,17 +133,20 @@ def _same_files(folder: Path, items: "Sequence[MeshItem]") -> tuple[list[str], l
     return alike, apart
 
 
-def _sheet(groups: "Mapping[str, Sequence[Inspection]]", title: str) -> "Figure":
+def _sheet(
+    groups: "Mapping[str, Sequence[Inspection]]", odd: Container[str], title: str
+) -> "Figure":
     """Draw the first of each class, with their names."""
-    from qs3.report.clouds import gallery
+    from qs3.report.sheet import Tile, contact_sheet
 
-    pictures: dict[str, list[np.ndarray]] = {}
-    captions: dict[str, list[str]] = {}
+    tiles = []
     for name, group in groups.items():
-        shown = [(look.item.id, look.surface) for look in group if look.surface is not None]
-        pictures[name] = [surface for _, surface in shown]
-        captions[name] = _captions([id for id, _ in shown])
-    return gallery(pictures, title, max(4, *map(len, pictures.values())), captions)
+        shown = group[:_PICTURED]
+        for look, text in zip(shown, _captions([look.item.id for look in shown]), strict=True):
+            load = None if look.fault else look.item.load
+            is_faulty = bool(look.fault) or look.size is None or look.item.id in odd
+            tiles.append(Tile(text, name, load, look.extents, is_faulty))
+    return contact_sheet(tiles, title)
 
 
 def _captions(ids: Sequence[str]) -> list[str]:

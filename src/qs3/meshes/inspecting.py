@@ -1,6 +1,5 @@
 """What a folder of meshes holds: sizes, faults, and what looks wrong though it can be read."""
 
-from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -9,11 +8,8 @@ import trimesh
 from jaxtyping import Float
 
 from qs3.errors import InputError
-from qs3.meshes.normalising import sample_surface
 from qs3.meshes.sizes import Unit, file_size, file_unit
 from qs3.meshes.trees import MeshItem
-
-_POINTS = 1024
 
 
 @dataclass(frozen=True)
@@ -30,18 +26,10 @@ class Inspection:
     """What looks wrong, in no more words than others have that look as wrong."""
     fault: str = ""
     """Why it cannot be read."""
-    surface: Float[np.ndarray, "n 3"] | None = None
-    """Points of its surface, of the first few of a class."""
 
 
-def inspect(
-    items: Iterable[MeshItem], units: Unit | None = None, pictured: int = 4
-) -> Iterable[Inspection]:
-    """Read meshes, and yield what each is like, in their order.
-
-    Of ``pictured`` meshes of each class the surface is sampled; for ``units`` see ``file_size``.
-    """
-    shown: Counter[str] = Counter()
+def inspect(items: Iterable[MeshItem], units: Unit | None = None) -> Iterable[Inspection]:
+    """Read meshes, and yield the inspection of each, in their order; see ``file_size``."""
     for item in items:
         try:
             mesh = item.load()
@@ -58,11 +46,7 @@ def inspect(
                 hints.append("tells no unit, looks to be in millimetres: --units")
         except InputError:
             hints.append(f"of no size that an object has (unit: {mesh.units or units or 'none'})")
-        surface = None
-        if shown[item.class_name] < pictured:
-            shown[item.class_name] += 1
-            surface = sample_surface(mesh, _POINTS, np.random.default_rng(0))
-        yield Inspection(item, size, extents, tuple(filter(None, hints)), surface=surface)
+        yield Inspection(item, size, extents, tuple(filter(None, hints)))
 
 
 def looks_y_up(mesh: trimesh.Trimesh) -> bool:

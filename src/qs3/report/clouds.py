@@ -28,7 +28,7 @@ _OBLIQUE = (30.0, 20.0)
 _MAP = matplotlib.colormaps["viridis"]
 _GROUND, _SHADOW = "#999999", "#dddddd"
 _FILLED, _RAISED = 0.84, 0.06  # of a cell: what a cloud takes, and how far above its middle
-_CAPTION, _LETTERS, _SIZE = 0.16, 17, 6.5  # cells a caption takes, its letters, their points
+_LETTERS = 17  # of a caption
 
 
 def project(
@@ -101,29 +101,22 @@ def gallery(
     samples: Mapping[str, Sequence[Float[np.ndarray, "_ 3"]]],
     title: str = "",
     columns: int = 4,
-    captions: Mapping[str, Sequence[str]] | None = None,
 ) -> Figure:
     """Draw a grid of clouds: one row a class, up to ``columns`` clouds a row, each fitted.
 
-    Clouds may differ in their number of points. ``captions`` tell what is written below each.
+    Clouds may differ in their number of points.
     """
     names, rows = [short(name) for name in samples], len(samples)
     # Inches.
     cell, left, top = 1.05, 0.25 + 0.09 * max(map(len, names), default=0), 0.35 * bool(title)
-    pitch = 1.0 if captions is None else 1.0 + _CAPTION
-    width, height = left + cell * columns, top + cell * rows * pitch
+    width, height = left + cell * columns, top + cell * rows
     figure = Figure(figsize=(width, height))
     axes = figure.add_axes((left / width, 0.0, 1.0 - left / width, 1.0 - top / height))
     spots, shadows, colours = [], [], []
-    for row, (name, clouds) in enumerate(samples.items()):
-        middle = -row * pitch
+    for row, clouds in enumerate(samples.values()):
+        middle = float(-row)
         if not clouds:
             axes.text(0.0, middle, "none", ha="center", va="center", color="#666666")
-        for column, text in enumerate((captions or {}).get(name, ())[:columns]):
-            axes.text(
-                column, middle - 0.5 - _CAPTION / 3, _caption(text), ha="center", va="center",
-                fontsize=_SIZE, color="#333333",
-            )  # fmt: skip
         for column, cloud in enumerate(clouds[:columns]):
             cloud = cloud[np.isfinite(cloud).all(axis=1)]
             if not len(cloud):
@@ -146,9 +139,9 @@ def gallery(
         spot, shadow = np.concatenate(spots), np.concatenate(shadows)
         axes.scatter(spot[:, 0], spot[:, 1], s=4.0, c=np.concatenate(colours), linewidths=0)
         axes.scatter(shadow[:, 0], shadow[:, 1], s=5.0, c=_SHADOW, linewidths=0, zorder=0.5)
-    axes.set(xlim=(-0.5, columns - 0.5), ylim=(0.5 - rows * pitch, 0.5), title=short(title, 40))
+    axes.set(xlim=(-0.5, columns - 0.5), ylim=(0.5 - rows, 0.5), title=short(title, 40))
     without_frame(axes)
-    axes.set_yticks(-np.arange(rows) * pitch, names)
+    axes.set_yticks(-np.arange(rows), names)
     axes.tick_params(axis="y", length=0)
     return figure
 
@@ -165,8 +158,8 @@ def bar_length(room: float) -> float:
     return float(f"{step * power:.3g}")
 
 
-def _caption(text: str) -> str:
-    """Cut a name within to what fits below a picture: files often differ at the end."""
+def caption(text: str) -> str:
+    """Cut a name in its middle to what fits below a picture: files often differ at the end."""
     font = get_font(findfont("DejaVu Sans"))
     text = "".join(c if font.get_char_index(ord(c)) else "□" for c in printable(text, keep=""))
     if len(text) <= _LETTERS:
