@@ -134,6 +134,8 @@ def generate(
     following = f"qs3 train --source {quoted(out)} --out RUN"
     if recipe is not None:
         following += " --source-cloud all"
+    if recipe == "parts":
+        following += " --model forest"
     if part[1] > 1:
         following = f"qs3 merge PART… --out DIR, once all {part[1]} parts are there"
     failures = read_failures(out)
