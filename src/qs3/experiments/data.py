@@ -1,4 +1,4 @@
-"""Data of the tables: sources, and targets of other meshes under another sensor."""
+"""Meshes and scans of the data sets that are made here."""
 
 import hashlib
 from collections import Counter
@@ -18,11 +18,10 @@ from qs3.sensor.scene import SceneSettings
 from qs3.store.generate import GenerateSettings, generate
 from qs3.store.plan import Plan, make_plan, resolve_renderer
 
-TARGET_SENSOR = "d435"
 # As annotated frames are cut: by the object's mask, and by its box with a margin, or a few flying
 # pixels would set the scale of the whole cloud.
 _ROOM: Mapping[str, Any] = {
-    "sensor": TARGET_SENSOR,
+    "sensor": "d435",
     "scene": SceneSettings("floor+behind", neighbour_size=0.5),
     "box_margin": 0.05,
     "crop": "both",
@@ -38,15 +37,14 @@ class Sides:
     """The meshes of both domains."""
 
     source: list[MeshItem]
-    """To learn from."""
     target: list[MeshItem]
-    """To adapt to (split ``train``) and to score on (``test``)."""
+    """Split ``train`` to adapt to, split ``test`` to score on."""
     cad: int
-    """How many of them are artists' meshes, not procedural shapes."""
+    """Number of artists' meshes; the others are procedural shapes."""
 
     @property
     def meshes(self) -> str:
-        """``shapes+cad`` where artists' meshes take part, else ``shapes``."""
+        """``shapes+cad`` if artists' meshes take part, else ``shapes``."""
         return "shapes+cad" if self.cad else "shapes"
 
 
@@ -65,8 +63,8 @@ def choose_meshes(scale: Scale, shared: Path | None) -> Sides:
     """Return the meshes of both domains, filled up with procedural shapes.
 
     Args:
-        scale: How many.
-        shared: Folder with artists' meshes in its folders; None takes shapes alone.
+        scale: Numbers of meshes.
+        shared: Folder that holds folders of artists' meshes; None takes shapes alone.
     """
     parts: dict[tuple[str, str], list[MeshItem]] = {}
     folders = [] if shared is None else [shared / name for name in scale.meshes]
@@ -104,22 +102,7 @@ def _draws(class_name: str, count: int, seed: int) -> list[MeshItem]:
 
 
 def make_plans(scale: Scale, sides: Sides, sets: Iterable[DataSet]) -> dict[str, Plan]:
-    """Return the work lists of data sets, by the names of their folders.
-
-    - ``source``: a row has the scan and samples of the surface of the same mesh, so that M and S
-      differ in the sensor alone; ``held`` is the same of the meshes that are scored on.
-    - ``jitter``: the source from one side, as the released code scans; ``views``: from a number of
-      sides.
-    - ``target``: other meshes on a floor, partly behind another object, one view, another sensor;
-      ``fused``: the same from all around.
-    - ``second``: further procedural shapes, for their surfaces.
-    - ``sensor``: source and scored meshes under another sensor, one view.
-
-    Args:
-        scale: How many.
-        sides: Of which meshes.
-        sets: Which data sets.
-    """
+    """Return the work lists of data sets, by the names of their folders."""
     common = {"meshes": sides.meshes, "num_points": scale.data_points, "rows_per_shard": 32}
     plans = {}
     for data in dict.fromkeys(sets):
@@ -130,50 +113,42 @@ def make_plans(scale: Scale, sides: Sides, sets: Iterable[DataSet]) -> dict[str,
 
 
 def _plan(data: DataSet, scale: Scale, sides: Sides) -> tuple[list[MeshItem], Mapping[str, Any]]:
-    """Return the meshes of a data set and the settings that are its own."""
+    """Return the meshes of a data set, and its own settings."""
     scored = [item for item in sides.target if item.split == "test"]
     source = {"views": scale.source_views, "seed": _SEEDS["source"], **scale.source_scan}
-    room = scale.target_scan or _ROOM
+    room = {"views": 1, **(scale.target_scan or _ROOM)}
     match data.kind:
-        case "source":
+        case "source":  # each row has a surface of the same mesh: M and S differ in the sensor only
             return sides.source, source
-        case "held":
+        case "held":  # the same of the scored meshes
             return scored, source | {"seed": _SEEDS["held"]}
-        case "jitter":
+        case "jitter":  # from one side, as the released code scans
             return sides.source, source | {"view_layout": "jitter"}
         case "views":
             return sides.source, source | {"views": data.views}
-        case "target":
-            return sides.target, {**room, "views": 1, "seed": _SEEDS["target"]}
-        case "fused":
-            return sides.target, {**room, "views": scale.source_views, "seed": _SEEDS["fused"]}
-        case "second":
-            own = {"meshes": "shapes", "views": 1, "seed": _SEEDS["second"]}
-            return _further_shapes(scale), source | own
-        case "sensor":
-            # Both sides count their shapes from 0.
+        case "target":  # other meshes in a room, another sensor
+            return sides.target, room | {"seed": _SEEDS["target"]}
+        case "fused":  # the same from all around
+            return sides.target, room | {"views": scale.source_views, "seed": _SEEDS["fused"]}
+        case "second":  # further procedural shapes, for their surfaces
+            splits = ["train"] * scale.source_per_class + ["test"] * scale.test_per_class
+            drawn = [_draws(name, len(splits), _SEEDS["second"]) for name in shapes.CLASSES]
+            items = [replace(i, split=s) for d in drawn for i, s in zip(d, splits, strict=True)]
+            return items, source | {"meshes": "shapes", "views": 1, "seed": _SEEDS["second"]}
+        case "sensor":  # both sides count their shapes from 0
             items = sides.source + [replace(item, id=f"{item.id}-scored") for item in scored]
             own = {"sensor": data.sensor, "views": 1, "seed": _SEEDS["sensor"]}
             return items, source | own
 
 
-def _further_shapes(scale: Scale) -> list[MeshItem]:
-    splits = ["train"] * scale.source_per_class + ["test"] * scale.test_per_class
-    items = []
-    for class_name in shapes.CLASSES:
-        drawn = _draws(class_name, len(splits), _SEEDS["second"])
-        items += [replace(item, split=split) for item, split in zip(drawn, splits, strict=True)]
-    return items
-
-
 def make_data(folder: Path, plans: Mapping[str, Plan], workers: int) -> dict[str, int]:
-    """Scan data sets below a folder, going on where an earlier call stopped.
+    """Scan data sets below a folder, and resume an earlier call.
 
     Returns:
-        Objects of each that could not be scanned, and are absent.
+        Number of absent objects of each, whose scans failed.
 
     Raises:
-        QS3Error: where those are more than one in twenty.
+        QS3Error: if more than one in twenty failed.
     """
     failed = {}
     for name, plan in plans.items():

@@ -1,4 +1,4 @@
-"""One file a table or figure, with an ``EXPERIMENT``; its name is that of the file.
+"""One file a table or figure, with an ``EXPERIMENT``; the file's name is the table's.
 
-Its command is ``qs3 reproduce NAME --out DIR``; with ``--dry-run`` it prints counts and hours.
+Its command is ``qs3 reproduce NAME --out DIR``; with ``--dry-run`` it prints counts.
 """

@@ -3,7 +3,7 @@
 Source of the tasks: PointDAN (NeurIPS 2019); the published cells are those of the aligned protocol
 of DefRec (WACV 2021) with DGCNN, as later papers cite them. QS³ has no such table.
 Command: ``qs3 reproduce pointda10 --out DIR --data M=modelnet N=shapenet F=scannet`` with the
-folders of PointDA_data; without ``--data`` stand-ins are made (``--dry-run`` prints the hours).
+folders of PointDA_data; without ``--data`` stand-ins are made.
 """
 
 from qs3.experiments.experiment import Experiment, Headings, Pair, lines, tasks

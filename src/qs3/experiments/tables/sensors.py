@@ -6,7 +6,7 @@ Not in the paper. One view of the same meshes by each sensor; scored on other me
 import itertools
 
 from qs3.experiments.domains import Domain
-from qs3.experiments.experiment import Experiment, Heading, Headings, Pair
+from qs3.experiments.experiment import Experiment, Heading, Headings
 from qs3.experiments.runs import ORDINARY
 from qs3.experiments.scales import Scale
 
@@ -18,20 +18,16 @@ def _headings(scale: Scale, what: str, domain: str) -> Headings:
     )
 
 
-def _pairs(scale: Scale) -> list[Pair]:
-    return [
-        (f"trained on {name} over {other}", name, other)
-        for name, other in itertools.combinations(scale.sensors, 2)
-    ]
-
-
 EXPERIMENT = Experiment(
     title="Transfer between sensors",
     source="not in the paper",
     rows=lambda scale: _headings(scale, "trained", "source"),
     columns=lambda scale: _headings(scale, "scored", "target"),
     fields={"row": ORDINARY},
-    pairs=_pairs,
+    pairs=lambda scale: [
+        (f"trained on {name} over {other}", name, other)
+        for name, other in itertools.combinations(scale.sensors, 2)
+    ],
     corner="source",
 )
 """A table that the paper lacks."""

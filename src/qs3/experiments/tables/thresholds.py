@@ -11,12 +11,6 @@ from qs3.experiments.runs import PAPER
 from qs3.experiments.scales import Scale
 
 
-def _rows(scale: Scale) -> Headings:
-    return tuple(
-        Heading(kind, f"QBST, {kind} → D", {"source": Domain(kind)}) for kind in ("M", "S")
-    )
-
-
 def _columns(scale: Scale) -> Headings:
     return tuple(
         Heading(f"qbst-{word}-{value:g}", f"{axis} = {value:g}", {name: value}, axis, value)
@@ -32,7 +26,9 @@ EXPERIMENT = Experiment(
     title="Threshold θ₀ and step ε of QBST",
     source="QS³, ECCV 2022, supplement, Fig. 2: a figure without printed numbers; best at 0.8 "
     "and 0.005",
-    rows=_rows,
+    rows=lambda scale: tuple(
+        Heading(kind, f"QBST, {kind} → D", {"source": Domain(kind)}) for kind in ("M", "S")
+    ),
     columns=_columns,
     fields={"row": PAPER, "target": Domain("D")},
     pairs=lambda scale: [("S over M", "S", "M")],
