@@ -173,11 +173,6 @@ def test_calibrated_probabilities_keep_their_order(knowing, folder):
         assert list(other.probabilities.values()) == pytest.approx(powers / powers.sum())
 
 
-def test_a_network_without_held_out_source_says_so(model, folder, typed):
-    for words in (["--unknown", 0.05], ["--calibrated"]):
-        assert "holdout above 0" in typed.refuses("predict", model, folder, *words)
-
-
 def test_a_share_that_is_none_and_a_class_of_that_name_are_refused(knowing, folder, tmp_path):
     for share in (-0.1, 1.5, float("nan")):
         with refused("unknown must be 0 to 1"):
@@ -244,15 +239,6 @@ def test_no_cloud_is_overwritten_by_a_table(model, folder, tmp_path, typed, opti
     for _ in range(2):
         typed("predict", model, folder / "a.npy", option, table)
     typed("predict", model, folder / "a.npy", option, tmp_path / "new.txt")
-
-
-def test_what_is_unknown_is_told_to_become_a_class(knowing, folder, tmp_path, typed):
-    for share, told in ((1.0, True), (0.0, False)):
-        into = tmp_path / str(share)
-        done = typed("predict", knowing, folder / "*.npy", "--unknown", share, "--sort-into", into)
-        line = done.stderr.splitlines()[-1]
-        assert (into / "unknown").exists() == (f"{into / 'unknown'} (it would" in line) == told
-        assert line.endswith(f"then qs3 train --source {into}")
 
 
 def test_the_command_does_the_rest_names_every_fault_and_ends_with_2(

@@ -10,10 +10,8 @@ from qs3.structure import structure, unstructure
 from qs3.training import Augmentation, augment_clouds
 from qs3.training.augmentation import (
     Box,
-    beyond_plane,
     floor_beneath,
     in_sight,
-    lose_highest,
     near_patch,
     replaced,
     robust_box,
@@ -104,13 +102,6 @@ def test_a_cloud_of_equal_points_stays_finite():
     assert alone.isfinite().all()
 
 
-def test_lost_are_the_highest_of_those_still_there():
-    kept = torch.tensor([[True, True, False, True, True], [True] * 5])
-    score = torch.tensor([[3.0, 1.0, 9.0, 5.0, 2.0], [0.0, 1.0, 2.0, 3.0, 4.0]])
-    left = lose_highest(kept, score, torch.tensor([[1], [4]]), 0.4)
-    assert left.tolist() == [[True, True, False, False, True], [True, True, False, False, False]]
-
-
 def test_a_plane_cuts_up_to_its_share(clouds):
     shares = []
     for seed in range(30):
@@ -129,11 +120,6 @@ def separable(cloud, stays):
     sign = np.where(stays, 1.0, -1.0)[:, None]
     rows = -sign * np.c_[cloud, np.ones(len(cloud))]
     return linprog(np.zeros(4), rows, -np.ones(len(cloud)), bounds=(None, None)).status == 0
-
-
-def test_a_plane_scores_along_its_normal(clouds):
-    normal = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64).expand(6, 1, 3)
-    assert torch.equal(beyond_plane(clouds, normal).argsort(1), clouds[..., 2].argsort(1))
 
 
 def test_patches_are_balls(clouds):

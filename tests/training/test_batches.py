@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from qs3.io.preparation import PAPER, Preparation, unit_ball
-from qs3.training.batches import DeviceClouds, augment, batches, first_places
+from qs3.training.batches import DeviceClouds, augment, first_places
 from qs3.training.prepared import prepare_clouds
 
 CPU = torch.device("cpu")
@@ -42,11 +42,6 @@ def test_jitter_is_clipped_gaussian(settings):
     assert abs(float(moves.mean())) < 2e-4
     off = replace(still, jitter_sigma=0.0)
     assert torch.equal(augment(torch.ones(2, 3, 3), off, generator()), torch.ones(2, 3, 3))
-
-
-def test_a_last_batch_of_one_cloud_is_dropped():
-    assert [len(rows) for rows in batches(9, 4, np.random.default_rng(0))] == [4, 4]
-    assert [len(rows) for rows in batches(10, 8, np.random.default_rng(0))] == [8, 2]
 
 
 def test_clouds_without_labels_are_taken(target):

@@ -56,7 +56,6 @@ def test_default_preset_is_the_default():
         (lambda: self_training_preset("paper", theta=0.9), "unknown setting 'theta'.*threshold"),
         (lambda: SelfTrainingSettings(threshold=1.5), "threshold = 1.5 must be in 0 to 1"),
         (lambda: SelfTrainingSettings(threshold=0.9, step=0.02), "step = 0.02 takes θ out"),
-        (lambda: SelfTrainingSettings(rounds=0), "rounds = 0"),
         (lambda: SelfTrainingSettings(weight_step=0.02), "takes a factor of the losses to 0"),
         (
             lambda: SelfTrainingSettings(rule="spst", selection="least-confident"),
@@ -68,23 +67,12 @@ def test_default_preset_is_the_default():
             "threshold = 0.7 is not read by threshold_share 0.5, only by None; leave it out",
         ),
         (
-            lambda: SelfTrainingSettings(teacher_decay=0.5),
-            "teacher_decay = 0.5 is not read by teacher latest, only by average",
-        ),
-        (
             lambda: SelfTrainingSettings(teacher="average", init="scratch"),
             "teacher = average has no sense over weights that start anew",
         ),
-        (lambda: TrainSettings(holdout=1.0), "holdout = 1.0"),
         (lambda: TrainSettings(rule="source-val", validate_every=0), "leaves no checkpoint"),
         (lambda: TrainSettings(batch_size=1), "batch_size = 1 must be at least 2"),
         (lambda: TrainSettings(num_points=99999), "99999 must be at most 16384; .* take 37.3 GiB"),
-        (lambda: TrainSettings(num_points=10**12), "num_points = 1000000000000 must be at most"),
-        (lambda: TrainSettings(epochs=0), "epochs = 0"),
-        (lambda: TrainSettings(label_smoothing=1.0), "label_smoothing"),
-        (lambda: TrainSettings(threads=0), "threads = 0 must be above 0"),
-        (lambda: TrainSettings(seed=-1), "seed = -1"),
-        (lambda: TrainSettings(clip_norm=0.0), "clip_norm = 0.0"),
         (lambda: TrainSettings(clip_norm=math.inf), "clip_norm = inf"),
         (lambda: TrainSettings(ema_decay=1.0), "ema_decay = 1.0"),
     ],
@@ -97,13 +85,7 @@ def test_faults_name_the_setting(call, message):
 def test_unknown_words_are_refused_without_the_type_checks_of_the_tests():
     calls = {
         'TrainSettings(rule="oracle")': "rule = oracle is none of last",
-        'TrainSettings(accelerator="mps")': "accelerator = mps is none of auto, cpu, cuda",
-        'TrainSettings(schedule="steps")': "schedule = steps is none of cosine, plateau",
-        'SelfTrainingSettings(rule="pst")': "rule = pst is none of qbst",
         'SelfTrainingSettings(pool="shrinkng")': "pool = shrinkng is none of all, shrinking, split",
-        'SelfTrainingSettings(init="fresh")': "init = fresh is none of warm-up, scratch",
-        'SelfTrainingSettings(selection="all")': "selection = all is none of most-confident",
-        'SelfTrainingSettings(schedule="cosine")': "schedule = cosine is none of per-round",
         'TrainSettings(precision="half")': "precision = half is none of 32-true, bf16-mixed",
     }
     script = "from qs3.training.config import *\n"

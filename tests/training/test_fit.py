@@ -167,15 +167,6 @@ def test_settings_that_are_not_the_weights_take_no_memory(settings, tmp_path, wi
         load_model(path)
 
 
-def test_tensors_round_trip(tmp_path):
-    tensors = {"a": torch.arange(3), "b": torch.zeros(2, 2)[:, 0], "c": torch.tensor(1.5)}
-    write_tensors(tmp_path / "x.safetensors", tensors, {"n": [1, 2]})
-    back, facts = read_tensors(tmp_path / "x.safetensors")
-    assert facts == {"n": [1, 2]}
-    assert back.keys() == tensors.keys()
-    assert all(torch.equal(back[name], tensors[name]) for name in tensors)
-
-
 def test_fingerprint_sees_points_labels_and_names(source):
     seen = {fingerprint(source), fingerprint(source.without_labels())}
     seen.add(fingerprint(replace(source, labels=source.labels[::-1].copy())))

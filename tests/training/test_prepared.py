@@ -1,6 +1,5 @@
 """Clouds on their way into a network: laws of `Preparation` from training to prediction."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -10,20 +9,15 @@ import torch
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds
 from qs3.io.preparation import PAPER, ROBUST, Preparation, distinct_inliers, normalise, resample
-from qs3.structure import structure
 from qs3.training import (
     TrainSettings,
     evaluate,
     fit,
     load_model,
     predict_probabilities,
-    save_model,
 )
 from qs3.training.config import preparation_of
 from qs3.training.prepared import Prepared, label_clouds, normalise_batch, prepare_clouds
-from qs3.training.run import SETTINGS, read_settings
-
-from .common import same
 
 OWN = replace(ROBUST, size_input=True)
 
@@ -168,23 +162,6 @@ def test_predictions_of_a_told_size_differ_with_it_and_others_do_not(run, target
     np.testing.assert_allclose(scaled[0], scaled[1], atol=1e-5)
 
 
-def test_runs_of_before_have_the_papers(source, settings, tmp_path):
-    """settings.json and weights without the field are those of the paper's preparation."""
-    result = fit("source-only", source, None, settings, run_dir=tmp_path)
-    path = tmp_path / SETTINGS
-    value = json.loads(path.read_text())
-    for name in ("preparation", "augmentation"):
-        del value["train"][name]
-    path.write_text(json.dumps(value))
-    assert structure(read_settings(tmp_path)["train"], TrainSettings, path).preparation == PAPER
-    assert load_model(tmp_path).preparation == PAPER
-    again = fit("source-only", source, None, settings, run_dir=tmp_path)  # the same run
-    assert same(result.model, again.model)
-    other = replace(settings, preparation=ROBUST)
-    with pytest.raises(InputError, match=r"train\.preparation\.\w+ = \S+, not"):
-        fit("source-only", source, None, other, run_dir=tmp_path)
-
-
 def test_a_warm_up_of_another_preparation_is_refused(run, source, target, settings, tmp_path):
     with pytest.raises(InputError, match=r"preparation\.radius_share = 0\.95, not 1\.0"):
         fit("qbst", source, target.without_labels(), replace(settings, num_points=40),
@@ -195,10 +172,3 @@ def test_a_preset_sets_the_preparation():
     assert TrainSettings().preparation == PAPER
     assert preparation_of("paper") == preparation_of("released") == PAPER
     assert preparation_of(None) == preparation_of("default") == preparation_of("spst") == ROBUST
-
-
-def test_weights_tell_their_preparation(run, tmp_path):
-    loaded = load_model(run)
-    settings = structure(loaded.settings["train"], TrainSettings, "here")
-    save_model(tmp_path, loaded.model, loaded.class_names, settings, name="w.safetensors")
-    assert load_model(tmp_path / "w.safetensors").preparation == OWN

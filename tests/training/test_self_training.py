@@ -180,16 +180,6 @@ def test_too_few_selected_keeps_the_network(domains, settings, caplog):
     assert "fewer than 6 (2 for each of 3 classes" in caplog.text
 
 
-@pytest.mark.parametrize(("count", "skipped"), [(5, True), (6, False)])
-def test_the_limit_is_two_a_class(domains, settings, count, skipped):
-    model = new_model(settings, 3, 0)
-    adapted, records = one_round(
-        domains, settings, lambda p, theta: np.arange(len(p)) < count, model
-    )
-    assert records[0].skipped is skipped
-    assert same(model, adapted) is skipped
-
-
 def one_round(domains, settings, select=None, model=None, on_epoch=None, **changes):
     """One round, or more, on all clouds unless a rule says otherwise."""
     rounds = replace(ROUNDS, **({"rounds": 1} | changes))
@@ -345,17 +335,6 @@ def test_the_first_round_by_hand(adapted):
     assert np.array_equal(rows, np.flatnonzero(chosen))
     assert np.array_equal(labels, probabilities[chosen].argmax(axis=1))
     assert record.kept == tuple(np.bincount(labels, minlength=3))
-
-
-def test_a_quantile_is_a_value(given, warm, tmp_path):
-    share = replace(ROUNDS, rounds=1, threshold=0.8, threshold_share=0.6)
-    one = fit(*given, share, run_dir=tmp_path / "share", warm_up=warm)
-    theta = one.rounds[0].theta
-    assert sum(one.rounds[0].confident) == 18
-    value = replace(ROUNDS, rounds=1, threshold=theta)
-    other = fit(*given, value, run_dir=tmp_path / "value", warm_up=warm)
-    assert same(one.model, other.model)
-    assert plain(one.rounds) == plain(other.rounds)
 
 
 def test_the_average_follows_the_network_epoch_by_epoch(domains, settings):

@@ -83,21 +83,6 @@ def test_a_file_of_the_name_wins_and_others_are_told_what_there_is(tmp_path):
         qs3.load("rooms")
 
 
-def test_load_takes_clouds_of_every_form(tmp_path):
-    network = qs3.load("rooms")
-    names = network.predict(CLOUDS)
-    assert names.shape == (6,)
-    assert set(names) <= set(network.class_names)
-    assert network.predict(CLOUDS[0]).tolist() == [names[0]]
-    shares = network.predict_proba([CLOUDS[0], CLOUDS[1, :100]])
-    assert shares.shape == (2, 10)
-    assert shares[0] == pytest.approx(network.predict_proba(CLOUDS)[0], abs=1e-6)
-    for row, cloud in enumerate(CLOUDS):
-        np.save(tmp_path / f"{row}.npy", cloud)
-    assert network.predict(tmp_path).tolist() == names.tolist()
-    assert network.predict(str(tmp_path / "3.npy")).tolist() == [names[3]]
-
-
 def test_what_is_made_from_it_goes_into_the_working_directory(tmp_path):
     before = {path: path.stat().st_mtime_ns for path in WEIGHTS.rglob("*")}
     names = load_model(Path("rooms")).class_names

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from qs3.errors import InputError
 from qs3.io.clouds import UnlabelledClouds, numbered
 from qs3.io.preparation import resample, unit_ball
 from qs3.training import prepared
@@ -56,9 +55,3 @@ def test_damaged_choice_is_made_again(clouds, tmp_path, damage):
     path.write_bytes(damage(path.read_bytes()))
     assert np.array_equal(subsample(clouds, 50, tmp_path), first)
     assert np.array_equal(subsample(clouds, 50, tmp_path), first)
-
-
-def test_point_that_is_not_finite(clouds):
-    clouds[1, 7, 2] = np.nan
-    with pytest.raises(InputError, match="not finite"):
-        subsample(clouds, 50)
