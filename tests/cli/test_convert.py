@@ -68,6 +68,7 @@ def test_clouds_without_labels_are_told_so(typed, tmp_path):
         (("ARCHIVE", "OUT", "--to", "obj"), ("'obj'", "modelnet-off")),
         (("ARCHIVE", "OUT", "--to", "ply", "--from", "zip"), ("'zip'", "modelnet-off")),
         (("ARCHIVE", "OUT", "--to", "npz"), ("npz", "ends in .npz")),
+        (("ARCHIVE", "OUT", "--to", "pointda10"), ("is only read",)),
         (("ARCHIVE", "OUT", "--to", "ply", "--classes", "pointda10"), ("toilet", "--unmapped")),
         (("ARCHIVE", "OUT", "--to", "ply", "--cloud", "clean"), ("clouds.npz", "'clean'")),
         (("ARCHIVE", "OUT", "--to", "ply", "--num-points", "-1"), ("--num-points -1",)),

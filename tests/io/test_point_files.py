@@ -98,39 +98,22 @@ def test_a_pcd_pixel_that_saw_nothing_is_left_out(tmp_path):
 
 
 def bad_cases() -> dict[str, tuple[str, bytes, str]]:
-    nan = POINTS.copy()
-    nan[1, 1] = np.nan
     header = pcd_header("ascii")
     return {
         "empty": ("a.xyz", b"", "the file is empty"),
-        "blank": ("a.ply", b"\n \n", "cannot be read as PLY"),
-        "comments alone": ("a.xyz", b"# nothing\n", "no data"),
         "garbage text": ("a.xyz", b"hello dear world\n", "could not convert string 'hello'"),
         "ragged": ("a.xyz", b"1 2 3\n1 2\n", "columns changed from 3 to 2 at row 2"),
-        "two columns": ("a.txt", b"1 2\n3 4\n", r"needs numbers of shape \[n, 3\]"),
         "NaN": ("a.xyz", b"1 2 nan\n", "not finite"),
-        "binary as text": ("a.txt", bytes(range(128, 256)), "cannot be read as TXT"),
         "too large for float32": ("a.xyz", b"1 2 1e200\n", "not finite"),
-        "npy NaN": ("a.npy", npy(nan), "not finite"),
-        "npy columns": ("a.npy", npy(POINTS[:, :2]), r"\[n, 3\]"),
-        "npy cube": ("a.npy", npy(np.zeros((2, 3, 3))), r"\[n, 3\]"),
-        "npy empty": ("a.npy", npy(np.zeros((0, 3))), "holds no point"),
-        "npy text": ("a.npy", npy(np.array([["a", "b", "c"]])), "needs numbers"),
-        "npy garbage": ("a.npy", b"not numpy", "cannot be read as NPY"),
         "npy cut": ("a.npy", npy(POINTS)[:-9], "cannot be read as NPY"),
         "npy of terabytes": ("a.npy", npy_header("(900000000000, 3)"), "GiB of memory"),
         "ply garbage": ("a.ply", b"just some words\n", "cannot be read as PLY"),
         "ply text cut": ("a.ply", ply("ascii").rpartition(b"\n0")[0], "declares 3 rows of vertex"),
         "ply cut": ("a.ply", ply("binary_little_endian")[:-1], "unexpected length"),
-        "off garbage": ("a.off", b"just some words\n", "cannot be read as OFF"),
         "off cut": ("a.off", b"OFF\n900000000 0 0\n1 2 3\n", "the file is cut short"),
-        "off empty": ("a.off", b"OFF\n0 0 0\n", "holds no point"),
         "pcd garbage": ("a.pcd", b"just some words\n", "no DATA line"),
-        "pcd short": ("a.pcd", header + b"1 2 3 4 1 2 3 4\n", "declares 3 points, but has 1"),
-        "pcd ragged": ("a.pcd", header + b"1 2 3\n" * 3, "its header declares 8"),
         "pcd header": ("a.pcd", b"FIELDS x y z\nDATA ascii\n1 2 3\n", "header is incomplete"),
         "pcd fields": ("a.pcd", header.replace(b" x y ", b" u v "), "no fields x, y and z"),
-        "pcd too large": ("a.pcd", header + (b"1e200 " * 8 + b"\n") * 3, "not finite"),
         "pcd data": ("a.pcd", pcd_header("zip"), "DATA zip is unknown"),
         "pcd cut": ("a.pcd", pcd_binary()[:-1], "declares 3 points, but has 2"),
         "pcd compressed": (

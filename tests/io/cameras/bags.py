@@ -127,23 +127,12 @@ def write_ros1(path, frames, encoding, kind, name=_TOPIC, info=True, lens=(0.0,)
     store = get_typestore(Stores.ROS1_NOETIC)
     path = Path(path).with_suffix(".bag")
     writer = Writer(path)
-    if kind in ("ros1-lz4", "bomb"):
+    if kind == "ros1-lz4":
         writer.set_compression(Writer.CompressionFormat.LZ4)
-    if kind == "bomb":
-        writer.compressor = lambda data: _bomb()
     with writer:
         _fill(writer, store, store.serialize_ros1, frames, encoding, (name,), info, change, lens,
               big, padding, brings)  # fmt: skip
     return path
-
-
-def _bomb() -> bytes:
-    """Eight GiB of zeros, as LZ4 packs them."""
-    import lz4.frame
-
-    packer, zeros = lz4.frame.LZ4FrameCompressor(), bytes(1 << 28)
-    begin = packer.begin(source_size=32 * len(zeros))
-    return begin + b"".join(packer.compress(zeros) for _ in range(32)) + packer.flush()
 
 
 def write_ros2(path, frames, encoding, kind, topics=(_TOPIC,)):

@@ -265,8 +265,6 @@ def test_a_principal_point_outside_the_image_is_told(caplog):
     ("text", "message"),
     [
         ("0,140,77,61", "must be positive"),
-        ("-150,140,77,61", "must be positive"),
-        ("nan,140,77,61", "must be finite"),
         ("150,140,77", "give fx,fy,cx,cy"),
         ("absent.json", "no such file"),
     ],
@@ -280,10 +278,7 @@ def test_bad_cameras_on_the_command_line(text, message):
     ("name", "text", "message"),
     [
         ("a.json", "[1, 2", "not a JSON file"),
-        ("a.json", "[1, 2]", "not a table"),
-        ("a.json", '{"fx": "150"}', "fx.*not a number"),
         ("a.json", '{"fx": 150, "fy": 140, "cx": 77}', "one is missing"),
-        ("a.json", '{"fx": 150, "fy": 140, "cx": 77, "cy": 6, "width": 1.5}', "width"),
         ("a.json", '{"fx": 1, "fy": 1, "cx": 7, "cy": 6, "depth_scale": 0}', "must be positive"),
         (
             "a.json",
@@ -291,19 +286,11 @@ def test_bad_cameras_on_the_command_line(text, message):
             "1e-06 m a step of depth is finer .* depth_unit metres",
         ),
         ("a.json", '{"K": [[1, 0], [0, 1]]}', "K must be 3×3 numbers"),
-        ("a.json", "{}", "neither fx nor"),
         ("a.yaml", "K: [1, 2", "cannot be read as a camera"),
-        ("a.yaml", "", "not a table|empty"),
         ("a.yaml", "K: !!python/object/apply:os.system [ls]", "cannot be read as a camera"),
-        ("a.yaml", "camera_matrix: {rows: 3, cols: 3}", "camera_matrix must be 3×3"),
-        ("a.yaml", "camera_matrix: {data: [a, b]}", "cannot be read as a camera"),
         ("a.txt", "150 0 0 0 140 0 77 61 1", "row by row"),
         ("a.txt", "150 3 77 0 140 61 0 0 1", "skew"),
-        ("a.txt", "150 0 77 0 -140 61 0 0 1", "must be positive"),
-        ("a.txt", "150 0 77 0 140 61 0 0 2", "0 0 1"),
-        ("a.txt", "150 0 nan 0 140 61 0 0 1", "finite"),
         ("a.txt", "1 2 3", "must be 3×3 numbers, not 3"),
-        ("a.txt", "one two", "cannot be read as a camera"),
     ],
 )  # fmt: skip
 def test_bad_camera_files_are_refused_by_name(tmp_path, name, text, message):
@@ -324,8 +311,6 @@ BAD_IMAGES = {
     "colour.png": (encoded(".png", np.zeros((4, 4, 3), np.uint8)), "colour picture"),
     "short.png": (encoded(".png", GREY16)[:-30], "cut off"),
     "jpeg.png": (encoded(".jpg", GREY16.astype(np.uint8)), "not a PNG or TIFF file"),
-    "empty.png": (b"", "empty|not a PNG"),
-    "short.tif": (encoded(".tiff", GREY16)[:100], "cut off|damaged"),
     "text.npy": (b"depth", "cannot be read"),
     "depth.exr": (b"v/1\1", "not an image of a depth camera"),
 }

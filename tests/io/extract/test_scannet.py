@@ -328,14 +328,6 @@ def test_wrong_scenes_and_splits_are_one_line(tmp_path: Path) -> None:
         read_splits(list_file, list_file)
 
 
-def test_an_empty_list_takes_no_scene(tmp_path: Path) -> None:
-    (tmp_path / "scans" / "scene0000_00").mkdir(parents=True)
-    (tmp_path / "train.txt").write_text("\n")
-    settings = ScanNetSettings(splits_train=tmp_path / "train.txt")
-    with pytest.raises(InputError, match="none of the scenes"):
-        extract_scannet(tmp_path, OutputSettings(str(tmp_path / "out")), settings)
-
-
 def test_labels() -> None:
     for label, name in {
         "Office  Chair": "chair",

@@ -7,8 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from qs3.errors import InputError, StorageError
-from qs3.files import new_folder
+from qs3.errors import InputError
 from qs3.io.clouds import RaggedClouds
 from qs3.io.convert import convert
 from qs3.io.layouts.folders import write_folder
@@ -18,7 +17,6 @@ from qs3.io.point_files import read_cloud
 from qs3.meshes.classes import POINTDA10
 from qs3.store.manifest import open_dataset
 
-from ..hostile import refused
 from .common import content, make_clouds
 
 PLAIN = ("store", "ply", "h5")
@@ -101,71 +99,6 @@ def test_one_number_of_points(rng, tmp_path):
     for bad in (0, 10**12):
         with pytest.raises(InputError, match=f"--num-points {bad}: must be in 1 to 1000000"):
             convert(tmp_path / "a", tmp_path / "c", "ply", num_points=bad)
-
-
-def test_coordinates_beyond_float32_are_refused(tmp_path):
-    path = tmp_path / "a.npz"
-    np.savez(path, points=np.full((2, 4, 3), 1e200), name=np.array(["one", "two"]))
-    with pytest.raises(InputError, match="cloud 'one' is empty, or a point of it is not finite"):
-        convert(path, tmp_path / "b", "ply")
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"to": "ply2"}, "'ply2' is no known layout.*did you mean ply"),
-        ({"to": "npz"}, "npz: out: name a file that ends in .npz"),
-        ({"to": "pointda10"}, "pointda10: is only read; written are store, npz, h5, ply$"),
-        ({"to": "ply", "cloud": "clean"}, "has 'clean' clouds"),
-        ({"to": "ply", "origin": "h5"}, "no HDF5 file of a known name"),
-    ],
-)
-def test_what_cannot_be_done_is_one_line_and_leaves_nothing(tmp_path, source, options, message):
-    with refused(message):
-        convert(source, tmp_path / "out", **options)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["source"]
-
-
-def test_the_target_is_new_or_empty(tmp_path, source):
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "mine.txt").write_text("keep")
-    (tmp_path / "file").write_text("keep")
-    for name in ("full", "file", "source"):
-        with pytest.raises(InputError, match=f"{name}: is there already"):
-            convert(source, tmp_path / name, "ply")
-    assert (tmp_path / "full" / "mine.txt").read_text() == "keep"
-    # Before anything is read, which can take minutes.
-    with pytest.raises(InputError, match="file: is there already"):
-        convert(tmp_path / "nowhere", tmp_path / "file", "ply")
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "link").symlink_to(tmp_path / "empty")
-    convert(source, tmp_path / "link", "ply")
-    assert len(list((tmp_path / "empty").iterdir())) == 10
-    convert(source, tmp_path / "new" / "deep", "ply")
-    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["deep"]
-
-
-def test_a_failure_half_way_leaves_nothing_and_a_full_disk_is_told(tmp_path, source, monkeypatch):
-    written = []
-
-    def fail_late(*arguments):
-        written.append(arguments)
-        if len(written) == 13:
-            raise OSError(28, "No space left on device")
-        return b"ply\n"
-
-    monkeypatch.setattr("qs3.io.layouts.folders.ply_bytes", fail_late)
-    with pytest.raises(StorageError, match=r"out: cannot be written \(No space left.*make room"):
-        convert(source, tmp_path / "out", "ply")
-    assert len(written) == 13
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["source"]
-
-
-def test_two_at_a_time_are_refused(tmp_path, source):
-    with new_folder(tmp_path / "out") as whole:
-        whole.mkdir()
-        with pytest.raises(InputError, match="another qs3 is writing"):
-            convert(source, tmp_path / "out", "ply")
 
 
 def test_the_longest_name_is_taken(tmp_path, source):

@@ -9,8 +9,6 @@ from qs3.io.load import detect, load_clouds
 from qs3.io.preparation import unit_ball
 from qs3.meshes.classes import POINTDA10
 
-from ..hostile import refused
-
 BY_NAME = {layout.name: layout for layout in pointda10.FORMATS}
 
 
@@ -148,20 +146,3 @@ def test_the_root_asks_for_one_domain(tmp_path, rng):
     np.testing.assert_array_equal(named.clouds, linked.clouds)
     with pytest.raises(InputError, match="no such folder"):
         read_pointda10(root / "nowhere")
-
-
-@pytest.mark.parametrize(
-    ("name", "array", "message"),
-    [
-        ("label", [10, 0], r"train_0\.h5: label 10 is out of range 0–9"),
-        ("data", np.ones((2, 2048, 2)), r"train_0\.h5: data must be floats of shape"),
-    ],
-    ids=["an eleventh label", "two columns"],
-)
-def test_hostile_trees_are_refused_in_one_line(tmp_path, rng, name, array, message):
-    release(tmp_path, rng)
-    with h5py.File(tmp_path / "scannet" / "train_0.h5", "a") as file:
-        del file[name]
-        file[name] = array
-    with refused(message):
-        read_pointda10(tmp_path / "scannet")
