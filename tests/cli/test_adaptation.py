@@ -161,13 +161,6 @@ def test_what_does_not_go_together_is_refused(qs3, store, tmp_path, arguments, s
     assert not (tmp_path / "run").exists()
 
 
-def test_a_setting_that_the_rule_does_not_read_is_refused(qs3, store, tmp_path):
-    done = qs3("train", "--source", store, "--out", tmp_path / "run", "--self-training", "spst",
-               "--self-training.selection", "least-confident", code=2)  # fmt: skip
-    assert "not read by rule spst" in " ".join(done.stderr.replace("│", " ").split())
-    assert not (tmp_path / "run").exists()
-
-
 def test_settings_are_json_or_words():
     deep = "[" * 100_000
     assert parse_settings("--x", [f"a={deep}", "b=NaN"]) == {"a": deep, "b": "NaN"}

@@ -75,32 +75,6 @@ def test_generate_draws_neighbours_and_settings_and_records_them(qs3, quick, tmp
     assert settings["randomise"]["light.projector"][2] == "log"
 
 
-def test_generate_draws_rooms_alike_with_any_number_of_workers(qs3, quick, tmp_path):
-    common = ("generate", "--meshes", "shapes", "--classes", "chair", "plant", "--per-class", 1,
-              "--scans-per-mesh", 2, "--sensor", "d435", "--randomise", "rooms", "material=diffuse",
-              "room.distance=0.8:1.5", "--num-points", 64, "--crop", "mask", *quick)  # fmt: skip
-    rows, drawn, settings, _ = written_alike(qs3, tmp_path, *common)
-    assert len({values["object_size"] for values in drawn}) == len(rows) == 4
-    for row, values in zip(rows, drawn, strict=True):
-        assert 0.8 <= values["room.distance"] <= 1.5
-        assert values["room.redraws"] >= 0
-        beside = bool({"behind", "beside"} & {*values["room.layout"].split("+")})
-        assert ("neighbour" in values) is beside
-        assert np.ptp(np.reshape(row["surface"], (-1, 3)), axis=0).max() <= values["object_size"]
-    assert settings["randomise"]["room.distance"] == [0.8, 1.5]
-
-
-def test_generate_refuses_a_class_without_a_real_size_before_it_begins(typed, tmp_path):
-    folder = tmp_path / "meshes" / "toilet"
-    folder.mkdir(parents=True)
-    trimesh.creation.box((1, 1, 1)).export(folder / "a.ply")
-    said = typed.refuses("generate", "--meshes", folder.parent, "--sensor", "d435", "--object-size",
-                         "class", "--out", tmp_path / "out", "--workers", 0,
-                         "--variant", "scalar_rgb")  # fmt: skip
-    assert "'toilet'" in said
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize(
     ("folder", "called"),
     [("dresser", "storage"), ("gizmo", "cabinet")],  # the size of its own name, that of its new one
