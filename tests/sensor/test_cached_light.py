@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from qs3.errors import InputError
 from qs3.sensor.materials import MATERIALS, Material
 from qs3.sensor.render import Body, LightSettings, Scene
 from qs3.sensor.render.cache import places
-from qs3.sensor.render.embree import EmbreePhotographer, _turns
+from qs3.sensor.render.embree import _turns
 from qs3.sensor.render.jit import JitPhotographer
 from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
 from qs3.sensor.rig import Pose, Region, StereoRig
@@ -196,11 +195,6 @@ def test_stored_pattern_has_no_right_camera(variant):
     photographed = pair(corner(), variant, rig=rig, samples=1)
     assert photographed.right.size == 0 and photographed.right_region.empty
     assert photographed.left.max() > 1
-
-
-def test_embree_takes_diffuse_bodies_only():
-    with pytest.raises(InputError, match="diffuse"):
-        EmbreePhotographer(corner(MATERIALS["metal"]), 1, 3, 4, 32)
 
 
 @needs_llvm

@@ -216,15 +216,6 @@ def test_only_what_is_seen_is_rendered(stand_in):
     assert whole.left_region == RIG.full_frame
 
 
-def test_settings_are_values(stand_in):
-    stand_in()
-    renderer = CyclesRenderer(samples=4)
-    maker(renderer)
-    assert pickle.loads(pickle.dumps(renderer)) == renderer  # noqa: S301
-    assert hash(renderer) == hash(CyclesRenderer(samples=4))
-    assert renderer.description["name"] == "cycles"
-
-
 def test_the_interpreter_is_looked_up_in_order(tmp_path, monkeypatch):
     for name in ("QS3_BLENDER", "QS3_CYCLES_PYTHON"):
         monkeypatch.delenv(name, raising=False)

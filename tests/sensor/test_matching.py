@@ -6,7 +6,7 @@ import pytest
 from scipy import ndimage
 
 from qs3.errors import InputError
-from qs3.sensor.matching import MatchingSettings, match, matching_canvas, matching_margin, zncc
+from qs3.sensor.matching import MatchingSettings, match, matching_canvas, zncc
 from qs3.sensor.matching.filters import drop_small_regions, median_of_valid, quantise
 from qs3.sensor.rig import Region, StereoRig
 
@@ -335,13 +335,6 @@ def test_region_matching_equals_full_frame_matching_bit_for_bit(name):
         y, x = region.y - canvas.y, region.x - canvas.x
         inner = part[y : y + region.height, x : x + region.width]
         np.testing.assert_array_equal(inner, whole[region.slices])
-
-
-def test_the_margin_holds_what_the_filters_reach():
-    assert matching_margin(BM) == 10
-    assert matching_margin(ZNCC) == 7
-    assert matching_margin(dataclasses.replace(ZNCC, median=5, min_region=9)) == 7 + 2 + 9
-    assert matching_margin(dataclasses.replace(ZNCC, min_region=50)) == 7 + 16
 
 
 @pytest.mark.parametrize("method", ["opencv-bm", "zncc", "ad-census"])

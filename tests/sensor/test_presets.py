@@ -166,14 +166,6 @@ def test_every_sensor_goes_through_a_file_unchanged_whatever_its_base(base, tmp_
         assert load_sensor(write(tmp_path, base + sensor_toml(sensor))) == sensor
 
 
-def test_the_papers_sensor_is_still_found_by_its_former_name(tmp_path, caplog):
-    assert get_sensor("paper") is SENSORS["paper"]
-    text = sensor_toml(SENSORS["paper"]).replace('name = "paper"', 'base = "qs3"\nname = "qs3"')
-    assert load_sensor(write(tmp_path, text)) == SENSORS["paper"]
-    # Said once a process, so that a data set of a thousand scans says it once.
-    assert len([r for r in caplog.records if "is called paper now" in r.getMessage()]) <= 1
-
-
 def test_every_field_is_written_with_its_meaning():
     lines = sensor_toml(SENSORS["d435"]).splitlines()
     keys = [i for i, line in enumerate(lines) if line and not line.startswith("# ")]
@@ -206,13 +198,6 @@ def test_a_file_gives_only_what_differs_from_its_base(tmp_path):
     assert get_sensor(str(path)) == made
 
 
-def test_a_whole_number_stands_for_a_number_with_a_point(tmp_path):
-    made = load_sensor(write(tmp_path, "[rig]\nfocal = 1400\n[placement]\nradius = [3, 4.5]\n"))
-    assert made.rig.focal == 1400
-    assert isinstance(made.rig.focal, float)
-    assert made.placement.radius == (3.0, 4.5)
-
-
 def test_a_picture_is_looked_for_beside_the_file(tmp_path, monkeypatch):
     (tmp_path / "parts").mkdir()
     (tmp_path / "parts" / "dots.png").write_bytes(b"x")
@@ -229,33 +214,17 @@ def test_a_picture_is_looked_for_beside_the_file(tmp_path, monkeypatch):
     [
         ("[rig]\nbaselne = 0.1", "'rig.baselne'.*did you mean rig.baseline"),
         ("[rgi]\nfocal = 3.0", "'rgi'.*did you mean rig"),
-        ("[light]\nx = 1", "'light.x' is unknown"),
         ("base = 'd345'", "base: .*'d345'.*d435"),
-        ("base = ['d435']", "base: .*d435"),
         ("[rig]\nfocal = true", "'rig.focal': True is not a number"),
-        ("[rig]\nfocal = nan", "nan is not a finite number"),
-        ("[rig]\nfocal = 1e400", "1e400 is not a finite number"),
-        (f"[rig]\nfocal = 1{'0' * 400}", "'rig.focal': "),
         ("[rig]\nwidth = 848.0", "'rig.width': 848.0 is not a whole number"),
-        ("rig = 5", "'rig': 5 is not a table"),
-        ("[placement]\nradius = [1, 2, 3]", "'placement.radius': a list of 3"),
         ("[rig]\nsecond = 'eye'", "'rig.second': 'eye' is none of camera, pattern"),
         ("[pattern]\nimage = 'absent.png'", "pattern.image.*absent.png.*no such file"),
-        ("[pattern]\nimage = ''", "pattern.image.*no such file"),
-        ("name = ''", "name"),
-        ("[rig", "not a TOML file"),
         # What the settings themselves refuse.
-        ("[rig]\nbaseline = -0.1", "baseline -0.1"),
-        ("[rig]\nprojector_offset = 40.0", "projector_offset 40"),
         ("[rig]\nsecond = 'pattern'", "projector_offset"),
-        ("[placement]\nradius = [3, 2]", "placement: radius"),
         ('base = "d435"\nobject_size = 60.0', r"placement.radius: 1.2 … 2 lies within.*size 60"),
-        ("[depth]\nnear = 3.0\nfar = 2.0", "depth: near"),
-        ("[matching]\nblock_size = 8", "block_size"),
         # What does not go together.
         ("[exposure]\nbits = 10", "opencv-bm takes 8 bits"),
         ("[depth]\nnear = 1.0\nfar = 1.5", "outside the depth gate.* 2 to 6.* 1 … 1.5"),
-        ("base = 'd435'\n[depth]\nnear = 4.0", "outside the depth gate.* 0.4 to 2.8 m"),
         ("base = 'd435'\n[rig]\nbaseline = 10.0", "f·b/z of 1536 px"),
         ("base = 'd435'\n[rig]\nbaseline = 50.0", "divide millimetres by 1000"),
     ],
@@ -280,8 +249,3 @@ def test_missing_and_unreadable_files_are_told(tmp_path):
     path.write_text("x = " + "[" * 5000)
     with pytest.raises(InputError, match=r"latin\.toml: not a TOML file"):
         load_sensor(path)
-
-
-def test_an_unknown_sensor_offers_the_nearest():
-    with pytest.raises(InputError, match=r"no sensor 'd453'.*did you mean d4.5.*kinect-v1"):
-        get_sensor("d453")

@@ -3,8 +3,6 @@ import pytest
 import trimesh
 
 from qs3.errors import InputError
-from qs3.sensor.exposure import ExposureSettings, expose
-from qs3.sensor.matching import MatchingSettings, match, matching_canvas
 from qs3.sensor.materials import Material
 from qs3.sensor.render import Body, LightSettings, Scene
 from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
@@ -81,22 +79,6 @@ def test_region_rendering_shows_what_full_frame_rendering_shows(small_rig):
         assert part.mean() == pytest.approx(whole.mean(), rel=2e-3)
 
 
-def test_region_pipeline_gives_the_bits_of_the_full_frame(shown, small_rig):
-    # The same rendered pair, matched in its region and in the whole frame.
-    settings = MatchingSettings(num_disparities=80)
-    region = small_rig.region_of(np.asarray(asymmetric().bounds), POSE, 16)
-    canvas = matching_canvas(region, small_rig, settings)
-    assert canvas.width * canvas.height < 0.8 * 540**2
-    whole, part = (
-        match(*(expose(image, ExposureSettings()) for image in shown.canvas(where)), settings)
-        for where in (small_rig.full_frame, canvas)
-    )
-    y, x = region.y - canvas.y, region.x - canvas.x
-    inner = part[y : y + region.height, x : x + region.width]
-    assert np.isfinite(inner).sum() > 10_000
-    np.testing.assert_array_equal(inner, whole[region.slices])
-
-
 def test_convention_projected_picture_is_upright(small_rig, renderer):
     # A picture that is bright in its top left quarter alone, thrown on a plate square to the rig.
     picture = np.zeros((64, 64), np.float32)
@@ -145,11 +127,6 @@ def test_a_variant_is_set_again_after_another(renderer):
     mitsuba.set_variant("scalar_spectral")
     assert renderer.description["variant"] == "scalar_rgb"
     assert mitsuba.variant() == "scalar_rgb"
-
-
-def test_each_pose_needs_a_seed(small_rig, renderer):
-    with pytest.raises(ValueError, match="seeds"):
-        renderer.render(scene_of(asymmetric()), small_rig, [POSE], [1, 2])
 
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_mono"])

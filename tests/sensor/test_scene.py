@@ -18,7 +18,7 @@ from qs3.sensor.presets import Sensor
 from qs3.sensor.render import Body
 from qs3.sensor.render.mitsuba import MitsubaRenderer
 from qs3.sensor.render.raycast import DepthCaster
-from qs3.sensor.rig import Pose, StereoRig
+from qs3.sensor.rig import StereoRig
 from qs3.sensor.scan import scan
 from qs3.sensor.scene import ArrangedScene, SceneSettings, arrange
 from qs3.sensor.speckle import PatternSettings
@@ -201,15 +201,6 @@ def test_a_rig_in_the_way_is_refused_before_rendering(sensor, scene, message):
     other = BOX if "be" in scene else None
     with pytest.raises(InputError, match=message):
         scan(BOX, sensor=sensor, scene=scene, neighbour=other, renderer=none, views=1)
-
-
-def test_a_projector_inside_the_object_is_refused():
-    pose = Pose.looking_at(np.array([0.0, -2.0, 0.0]), np.zeros(3))
-    box = trimesh.creation.box(extents=[1, 1, 1]).apply_translation([3.0, -2.0, 0.0])
-    made = ArrangedScene((Body(box),), ("object",), (pose,))
-    sensor = dataclasses.replace(TINY, rig=StereoRig(300, 300, 420.0, 0.3, projector_offset=10.0))
-    with pytest.raises(InputError, match="projector stands inside"):
-        check_views(made, sensor)
 
 
 @pytest.fixture(scope="module")
