@@ -97,25 +97,6 @@ def test_only_the_deformed_cloud_enters_the_network(monkeypatch):
     assert not (points == target).all(dim=2)[deformed.moved].any()
 
 
-@pytest.mark.slow
-def test_it_learns_to_rebuild():
-    """The error on one batch falls far below that of leaving the points where they are."""
-    method = DefRec(make_model(), weight=1.0, dropout=0.0)
-    batch = make_batch(2)
-    grid = torch.cartesian_prod(*3 * [torch.linspace(-0.8, 0.8, 4)])
-    target = torch.stack([grid, grid * torch.tensor([1.0, 0.6, 0.3])])
-    deformed = deform_voxels(target, seeded())
-    nothing = float(reconstruction_loss(deformed.points, target, deformed.moved))
-    optimiser = torch.optim.Adam(method.parameters(), lr=0.003)
-    value = torch.zeros(())
-    for _ in range(150):
-        value = method(batch, target, 0.0, seeded())["defrec_target"]
-        optimiser.zero_grad()
-        value.backward()
-        optimiser.step()
-    assert float(value.detach()) < 0.2 * nothing
-
-
 @pytest.mark.parametrize("kind", get_args(Deformation))
 @pytest.mark.parametrize(("n", "n_t"), [(60, 50), (3, 2)])
 def test_every_deformation_trains_every_parameter(kind, n, n_t):

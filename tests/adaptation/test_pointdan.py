@@ -14,7 +14,6 @@ from qs3.adaptation.pointdan import (
     PointDAN,
     fresh_head,
     head_parameters,
-    reversal_coefficient,
 )
 from qs3.models import Features, PointClassifier, create_model
 
@@ -178,51 +177,3 @@ def test_classifiers_learn_twice_as_fast(name):
     assert set(both) == {id(p) for p in method.parameters()}
     expected = [*method.model.classify.parameters(), *method.second.parameters()]
     assert {id(p) for p in classifiers["params"]} == {id(p) for p in expected}
-
-
-def nodes_apart(method):
-    """MMD of the attended nodes of fresh clouds, normalised over their own batch."""
-    source, target = batches(b=48, b_t=48, n=24, n_t=24, seed=99)
-    method.train()
-    with torch.no_grad():
-        nodes = [
-            method.attention[domain](method.nodes_of(points, method.model.encode(points)))
-            for domain, points in (("source", source.points), ("target", target))
-        ]
-    return mmd(*nodes, method.bandwidths).item()
-
-
-def trained(steps=50, **settings):
-    method = make("pointnet", **settings).train()
-    optimiser = torch.optim.Adam(method.parameter_groups(2e-3))
-    for step in range(steps):
-        optimiser.zero_grad()
-        sum(run(method, step / steps, b=16, b_t=16, n=24, n_t=24, seed=step).values()).backward()
-        optimiser.step()
-    return method
-
-
-def disagreement(method):
-    _, target = batches(b_t=24, n_t=24, seed=7)
-    method.eval()
-    with torch.no_grad():
-        features = method.model.encode(target)
-        p1, p2 = (h.head(features).softmax(dim=1) for h in (method.model, method.second))
-    return (p1 - p2).abs().mean().item()
-
-
-@pytest.mark.slow
-def test_both_alignments_do_what_they_are_for():
-    off = trained(node_weight=0.0, discrepancy_weight=0.0, bandwidths=(4.0, 8.0))
-    local = trained(node_weight=20.0, discrepancy_weight=0.0, bandwidths=(4.0, 8.0))
-    assert nodes_apart(local) < 0.8 * nodes_apart(off)
-    apart = trained(node_weight=0.0, discrepancy_weight=5.0)
-    assert disagreement(apart) > 3 * disagreement(off)
-
-
-def test_the_coefficient_rises_from_zero_to_one():
-    values = [reversal_coefficient(p) for p in np.linspace(0, 1, 11)]
-    assert values[0] == 0.0
-    assert values[-1] == 1.0
-    assert values == sorted(values)
-    assert reversal_coefficient(1 / 3) == pytest.approx(0.5)

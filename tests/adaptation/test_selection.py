@@ -122,7 +122,6 @@ def test_settings_are_checked(call, message):
     ("rows", "message"),
     [
         ([[np.nan, 1.0]], "NaN"),
-        ([[np.inf, 0.0]], "NaN or infinity"),
         ([[2.0, -1.0]], "negative"),
         ([[0.5, 0.6]], "sum to 1"),
         ([[]], "no class"),

@@ -1,25 +1,19 @@
 """The tables in results/ are what their records say: nothing in them is written by hand."""
 
-import dataclasses
 import importlib
 import json
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean, stdev
-from typing import Any
 
 import pytest
 
-from qs3 import structure
 from qs3.evaluation.records import RECORDS, RunRecord, read_records
-from qs3.experiments import TABLES, runs, scales, setup
-from qs3.experiments.experiment import load_experiment
+from qs3.experiments import TABLES
 from qs3.experiments.figures import draw
 from qs3.experiments.setup import read_setup
 from qs3.experiments.table import Table
 from qs3.experiments.text import markdown
-from qs3.training import config, run
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results"
@@ -49,43 +43,6 @@ def test_every_record_is_of_a_run_of_a_table():
             assert filled.faults == []
             names |= set(filled.records)
         assert len(names) == len(records_in(folder.name))
-
-
-def wider(kind: type, modules: Sequence[Any], patch: pytest.MonkeyPatch, **types: type) -> type:
-    """Add a setting to a dataclass, as a later version may; its modules see the wider one."""
-    fields = [(name, inner, dataclasses.field()) for name, inner in types.items()]
-    if kind is scales.Scale:  # a default goes on standing where there is one
-        fields = [(name, inner, dataclasses.field(default=None)) for name, inner in types.items()]
-    fields.append(("novelty", float, dataclasses.field(default=0.5)))
-    made = dataclasses.make_dataclass(kind.__name__, fields, bases=(kind,), frozen=True)
-    for module in modules:
-        patch.setattr(module, kind.__name__, made)
-    return made
-
-
-def test_a_setting_that_is_added_leaves_all_records_readable(monkeypatch):
-    for name in TABLES:
-        load_experiment(name)  # before its module could see a wider scale
-    train = wider(config.TrainSettings, (config, run, scales), monkeypatch)
-    rounds = wider(config.SelfTrainingSettings, (config, run), monkeypatch)
-    scale = wider(scales.Scale, (scales, setup), monkeypatch, train=train)
-    wider(setup.Marker, (setup,), monkeypatch, scale=scale)
-    presets = {
-        name: rounds(**structure.unstructure(preset)) for name, preset in config.PRESETS.items()
-    }
-    monkeypatch.setattr(runs, "PRESETS", presets)
-    count = 0
-    for folder in FOLDERS:
-        place = read_setup(folder)
-        assert place.scale.novelty == 0.5
-        for name in TABLES:
-            filled = Table(name, place)
-            assert filled.faults == []
-            for record in filled.records.values():
-                assert record.settings["train"]["novelty"] == 0.5
-                count += 1
-    made = sum(len(records_in(folder.name)) for folder in FOLDERS)
-    assert count >= made > 20  # some stand in several tables
 
 
 def test_the_networks_page_shows_what_the_records_of_modelnet10_say():
