@@ -4,7 +4,6 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from qs3.adaptation import defrec as module
 from qs3.adaptation.defrec import chamfer
 
 
@@ -72,23 +71,6 @@ def test_gradient_is_that_of_the_nearest_pairs(rng):
     mask = torch.from_numpy(rng.random((2, 9)) < 0.6)
     mask[:, 0] = True
     assert torch.autograd.gradcheck(lambda x, y: chamfer(x, y, mask), (x, y))
-
-
-def test_blocks_do_not_change_it(rng, monkeypatch):
-    """A block of one row of one cloud gives what one block of everything gives."""
-    x, y = clouds(rng, n=200, m=150)
-    whole = chamfer(x, y)
-    sizes = []
-    real = torch.Tensor.min
-
-    def spy(self, *args, **kwargs):
-        sizes.append(self.numel())
-        return real(self, *args, **kwargs)
-
-    monkeypatch.setattr(module, "_BLOCK", 1)
-    monkeypatch.setattr(torch.Tensor, "min", spy)
-    assert torch.equal(chamfer(x, y), whole)
-    assert max(sizes) == 200
 
 
 def test_half_precision_is_widened(rng):

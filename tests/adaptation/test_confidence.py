@@ -73,20 +73,6 @@ def test_temperature_is_bounded():
     assert fit_temperature(rows, rows.argmin(axis=1)) == BOUNDS[1]
 
 
-def test_label_smoothing_is_taken_back_in_the_mean():
-    """What smoothing does to a fitted network, q = (1 − ε) p + ε/k: below the share of right."""
-    rows, labels = calibrated()
-    smoothed = 0.8 * rows + 0.2 / 3
-    right = (rows.argmax(axis=1) == labels).mean()
-    found = fit_temperature(smoothed, labels)
-    assert found < 0.9
-    before, after = (
-        abs(p.max(axis=1).mean() - right) for p in (smoothed, rescale(smoothed, found))
-    )
-    assert before > 0.07
-    assert after < 0.01
-
-
 @given(st.integers(0, 99), st.sampled_from([0.25, 0.5, 1.0, 2.0, 4.0]))
 def test_rescaled_rows_are_probabilities_of_the_same_class(seed, temperature):
     rows = drawn(seed, peak=5.0)

@@ -12,10 +12,8 @@ from qs3.adaptation.mmd import mmd
 from qs3.adaptation.pointdan import (
     NodeAttention,
     PointDAN,
-    fresh_head,
-    head_parameters,
 )
-from qs3.models import Features, PointClassifier, create_model
+from qs3.models import create_model
 
 from ..models.common import SMALL
 
@@ -126,45 +124,6 @@ def test_the_second_head_is_the_first_anew(name):
     assert not own & {p.data_ptr() for p in method.second.parameters()}
     losses = run(method.train())
     assert all(value.isfinite() for value in losses.values())
-
-
-class Odd(PointClassifier):
-    """A head of several parts under names of their own, one a bare parameter."""
-
-    def __init__(self):
-        super().__init__()
-        self.body = nn.Linear(3, 6)
-        self.last, self.between = nn.Linear(5, 3), nn.Linear(6, 5)
-        self.scale = nn.Parameter(torch.ones(()))
-        self.shift = nn.Parameter(torch.zeros(3))
-
-    def encode(self, points):
-        local = self.body(points + self.shift).relu()
-        return Features(pooled=local.amax(dim=1), local=local)
-
-    def head(self, features):
-        return self.scale * self.last(self.between(features.pooled).relu())
-
-
-def test_the_head_of_any_network_is_found():
-    torch.manual_seed(0)
-    model = Odd().train()
-    head = head_parameters(model)
-    expected = [model.scale, *model.last.parameters(), *model.between.parameters()]
-    assert {id(p) for p in head} == {id(p) for p in expected}
-    assert model.training
-    assert all(p.grad is None for p in model.parameters())
-    twin = fresh_head(model)
-    assert {name for name, _ in twin.named_parameters()} == {
-        *("scale", "last.weight", "last.bias", "between.weight", "between.bias"),
-    }
-    features = model.encode(torch.randn(2, 7, 3))
-    assert twin.head(features).shape == (2, 3)
-    assert not torch.equal(twin.head(features), model.head(features))
-    assert dict(model.named_children()).keys() == {"body", "last", "between"}
-    method = PointDAN(model, nodes=4, neighbours=3, node_width=4)
-    sum(run(method).values()).backward()
-    assert all(p.grad is not None for p in method.parameters())
 
 
 @pytest.mark.parametrize("name", NETWORKS)

@@ -204,17 +204,3 @@ def test_faults_of_a_pair_are_one_line(
             options += [name, *(value if isinstance(value, tuple) else (value,))]
     assert words in refused(*options, "--sensor", camera, "--out", "out")
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.data
-def test_a_real_d435_pair(realism, d435_pair, tmp_path):
-    left, right, disparity = d435_pair
-    options = pair_options(tmp_path, left, right, 427.12 * 0.05 / disparity, 427.12)
-    out = tmp_path / "out"
-    realism(*options, "--sensor", "d435", "--matching", "ad-census", "--out", out)
-    made = json.loads((out / "pair.json").read_text())
-    assert made["valid"] >= 0.965
-    assert made["over_3px"] <= 0.004
-    assert made["over_1px_near_steps"] <= 0.08
-    assert made["planes"] > 50
-    assert made["camera_plane_rms_px"] == pytest.approx(0.064, abs=0.01)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import nn
 
 from qs3.errors import InputError
 from qs3.models import Features, create_model, list_models
@@ -156,39 +155,6 @@ def test_evaluation_changes_nothing_and_repeats_itself(name):
     assert torch.equal(first, model(clouds()))
     assert all(torch.equal(before[key], value) for key, value in model.state_dict().items())
     assert torch.equal(first, copy.deepcopy(model)(clouds()))
-
-
-def without_dropout(name):
-    model = small(name).double()
-    for layer in model.modules():
-        if isinstance(layer, nn.Dropout):
-            layer.p = 0.0
-    return model
-
-
-def norms(model):
-    return [m for m in model.modules() if isinstance(m, nn.BatchNorm1d | nn.BatchNorm2d)]
-
-
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("gradients", [True, False])
-def test_each_normalisation_goes_by_its_own_mode(name, gradients):
-    points = clouds().double()
-    trained, adapted, frozen, still = (without_dropout(name) for _ in range(4))
-    trained.train()
-    for model, others in ((adapted, False), (frozen, True)):
-        model.train(others)
-        for norm in norms(model):
-            norm.train(not others)
-    still.eval()
-    with torch.set_grad_enabled(gradients):
-        torch.testing.assert_close(adapted(points), trained(points), rtol=0, atol=1e-9)
-        torch.testing.assert_close(frozen(points), still(points), rtol=0, atol=1e-9)
-    for one, two in ((adapted, trained), (frozen, still)):
-        for key, value in one.state_dict().items():
-            torch.testing.assert_close(value, two.state_dict()[key], rtol=0, atol=1e-9)
-    for norm, twin in zip(norms(adapted), norms(still), strict=True):
-        assert not torch.equal(norm.running_mean, twin.running_mean)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -8,7 +8,7 @@ import torch
 
 from qs3.models import PointNetSA, create_model
 from qs3.models.ops import farthest_point_sampling, gather_points
-from qs3.models.pointnet_sa import SANode, fill_nodes
+from qs3.models.pointnet_sa import SANode
 
 from .common import clouds, make
 
@@ -93,9 +93,3 @@ def test_small_clouds_have_as_many_nodes_in_features(n):
     assert nodes.shape == (6, 64, 6)
     known = min(n, 64)
     assert torch.equal(nodes, nodes[:, torch.arange(64) % known])
-
-
-def test_filling_repeats_in_order():
-    nodes = torch.arange(6.0).view(1, 3, 2)
-    assert fill_nodes(nodes, 3) is nodes
-    assert fill_nodes(nodes, 7)[0, :, 0].tolist() == [0, 2, 4, 0, 2, 4, 0]

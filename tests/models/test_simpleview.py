@@ -9,9 +9,6 @@ from qs3.models import create_model
 from qs3.models.simpleview import ResNet18, depth_images
 
 from .common import make
-from .common import textbook as load_textbook
-
-textbook = load_textbook("simpleview")
 
 SIDES = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1.0]])
 UPS = np.array([[0, 0, 1]] * 4 + [[0, 1, 0], [0, -1, 0.0]])
@@ -105,11 +102,6 @@ def test_points_beyond_the_image_are_not_seen():
     assert images.isfinite().all()
     assert torch.equal(images[:, away], depth_images(inside, 16)[:, away])
     assert not depth_images(inside + 30, 16).any()
-
-
-def test_the_textbook_draws_the_same_images():
-    images = depth_images(ball(), 16)
-    torch.testing.assert_close(textbook.depth_images(ball(), 16), images)
 
 
 def test_pooled_holds_each_view_in_its_place():

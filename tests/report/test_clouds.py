@@ -37,15 +37,6 @@ def test_near_points_are_drawn_last_and_strongest():
     assert lightness[0] > lightness[1] > lightness[2]
 
 
-def test_shared_limits_frame_both_clouds_alike():
-    limits = np.array([-1.0, -1.0, -1.0]), np.array([1.0, 2.0, 3.0])
-    small, large = (Figure().add_subplot() for _ in range(2))
-    draw_cloud(small, np.zeros((1, 3)), *SIDES["side"], limits=limits)
-    draw_cloud(large, np.full((1, 3), 0.9), *SIDES["side"], limits=limits)
-    assert small.get_xlim() == large.get_xlim()
-    assert small.get_ylim()[0] < -1.0 < 3.0 < small.get_ylim()[1]
-
-
 def test_points_that_are_not_finite_are_left_out():
     axes = Figure().add_subplot()
     draw_cloud(axes, np.array([[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]), *SIDES["front"])
@@ -80,11 +71,6 @@ def test_gallery_keeps_every_cloud_in_its_cell(rng):
     assert f"{length:g}" == list(bars)[2]
     assert [t.get_text() for t in axes.get_yticklabels()] == list(samples)
     assert "none" in [t.get_text() for t in axes.texts]
-
-
-def test_gallery_shows_no_more_than_its_columns(rng):
-    figure = gallery({"a": [rng.normal(size=(7, 3)) for _ in range(5)]}, columns=2)
-    assert len(np.asarray(figure.axes[0].collections[0].get_offsets())) == 14
 
 
 def test_captions_are_cut_in_their_middle_and_printable():

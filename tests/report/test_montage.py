@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from qs3.report.figure import NO_VALUE, png_bytes, write_png
-from qs3.report.montage import MontageView, montage, montage_columns
+from qs3.report.montage import MontageView, montage
 
 HEIGHT, WIDTH = 40, 60
 
@@ -83,12 +83,6 @@ def test_error_is_signed_centred_and_tells_lost_from_won(view):
     assert error.to_rgba(error.get_array())[15, 50, 3] == 0
 
 
-def test_histogram_tells_median_and_share_seen(view):
-    label = axes_of(montage(view))["distribution of the error"].get_xlabel()
-    assert "median +0.01," in label
-    assert "93 % of the object seen" in label  # 28 of 30 columns
-
-
 def test_a_scan_that_saw_nothing_is_drawn_too(view):
     nothing = np.full((HEIGHT, WIDTH), np.nan)
     blind = dataclasses.replace(
@@ -103,15 +97,6 @@ def test_a_scan_that_saw_nothing_is_drawn_too(view):
     assert len(png_bytes(montage(blind), dpi=20)) > 1000
 
 
-def test_large_pattern_shows_its_middle(view):
-    pattern = np.zeros((300, 400), np.uint8)
-    pattern[150, 200] = 255
-    axes = axes_of(montage(dataclasses.replace(view, pattern=pattern)))
-    shown = axes["pattern (its middle 256 px)"].images[0]
-    assert shown.get_clim() == (0, 255)
-    assert np.argwhere(np.asarray(shown.get_array()) == 255).tolist() == [[128, 128]]
-
-
 def test_bytes_depend_on_the_view_alone(view, tmp_path):
     first = png_bytes(montage(view, "a"), dpi=20)
     with matplotlib.rc_context({"font.size": 30, "axes.facecolor": "red", "savefig.dpi": 10}):
@@ -119,16 +104,3 @@ def test_bytes_depend_on_the_view_alone(view, tmp_path):
     assert not any(word in first for word in (b"Software", b"matplotlib", b"tIME", b"Creation"))
     write_png(tmp_path / "new" / "a.png", Figure(figsize=(2, 1)), dpi=50)
     assert imread(tmp_path / "new" / "a.png").shape[:2] == (50, 100)
-
-
-def test_columns_for_a_phone_hold_the_same_panels(view):
-    """Two panels a row, and letters that are still letters where 358 px are all there is."""
-    whole = [*axes_of(montage(view))]
-    stages, clouds = montage_columns(view)
-    panels = [a for figure in (stages, clouds) for a in figure.axes if a.get_title()]
-    assert sorted(a.get_title() for a in panels) == sorted(whole)
-    for figure in (stages, clouds):
-        a_point = 358 / figure.get_figwidth() / 72  # pixels
-        assert min(a.title.get_fontsize() for a in figure.axes if a.get_title()) * a_point > 8
-        grids = [a.get_subplotspec() for a in figure.axes if a.get_title()]
-        assert {spec.get_gridspec().ncols for spec in grids if spec is not None} == {2}

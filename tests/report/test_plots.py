@@ -61,11 +61,6 @@ def test_rounds_of_other_classes_are_refused():
         selection_counts([a_round(1, [1, 2], [1, 2])], NAMES)
 
 
-def test_names_are_text_not_formulas():
-    figure = confusion_heatmap(((1, 0), (0, 1)), ("a$b$", r"$\frac{"))
-    assert len(png_bytes(figure, dpi=50)) > 1000
-
-
 def test_colours_differ_for_the_colour_blind():
     """Viénot's projection for protanopes and deuteranopes keeps all pairs of colours apart."""
     linear = np.array([to_rgb(colour) for colour in PALETTE]) ** 2.2
@@ -85,11 +80,3 @@ def test_no_global_state_of_pyplot():
     code = "import sys, qs3.report.page; "
     code += "sys.exit('matplotlib.pyplot' in sys.modules or 'torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
-def test_accuracy_begins_at_zero_however_few_points_it_differs_by():
-    scores = Curve("a", np.arange(3), np.array([0.91, 0.94, 0.93]), "accuracy in training")
-    (axes,) = training_curves([scores]).axes
-    assert axes.get_ylim()[0] == 0
-    assert axes.get_ylim()[1] >= 1
-    assert axes.yaxis.get_major_formatter()(0.5) == "50%"

@@ -183,14 +183,6 @@ def test_filmic_shows_the_released_background():
     assert np.diff(pair.left.ravel()[order]).min() > -1e-3
 
 
-def test_standard_view_transform_is_srgb():
-    light = LightSettings(ambient=0.2)
-    scene = Scene((Body(asymmetric()),), light, WHITE, 0.625, 0.625)
-    renderer = CyclesRenderer(samples=1, view_transform="Standard")
-    pair = renderer.render(scene, RIG, [POSE], [0], [Region(0, 60, 4, 4)])[0]
-    assert pair.background == pytest.approx(1.055 * 0.2 ** (1 / 2.4) - 0.055, abs=1e-3)
-
-
 def test_blackman_harris_blurs():
     # A wall lit up to one column: the box leaves one mixed column there, the wider filter three.
     half = np.zeros((4, 64), np.float32)
@@ -236,29 +228,6 @@ def test_a_ball_of_each_material_is_as_bright_as_mitsubas(name, tolerance):
         for renderer in (mitsuba(64), CyclesRenderer(samples=64))
     )
     assert ours == pytest.approx(theirs, rel=tolerance)
-
-
-def test_glass_is_a_thin_pane():
-    # Head on a pane of index 1.5 reflects R = 2F/(1 + F), F = 0.04, and the room is one level.
-    pane = Scene(
-        (Body(box([2, 0.01, 2], [0, 0, 0]), Material("glass")), Body(box([9, 0.1, 9], [0, 1, 0]))),
-        replace(DARK, projector=45.6),
-        WHITE,
-        0.6,
-        0.6,
-    )
-    bare = replace(pane, bodies=pane.bodies[1:])
-    direct, middle = CyclesRenderer(samples=64, max_bounces=0), Region(44, 28, 8, 8)
-    dimmed, plain = (shot(direct, scene, middle).mean() for scene in (pane, bare))
-    reflected = 2 * 0.04 / 1.04
-    # Two faces of the box, each a pane; there and back.
-    assert dimmed / plain == pytest.approx((1 - reflected) ** 4, abs=0.01)
-
-
-def test_a_mirror_shows_no_dots():
-    lit = LightSettings(sky=0.0, ambient=0.1)
-    scene = wall(Material("mirror", albedo=0.95), lit)
-    np.testing.assert_allclose(shot(CyclesRenderer(samples=8), scene), 0.095, rtol=1e-3)
 
 
 def test_bounces_end_where_mitsubas_do():

@@ -3,17 +3,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import trimesh
 from scipy import linalg, stats
 
-from qs3.sensor.depth import DepthSettings
 from qs3.sensor.exposure import ExposureSettings, expose, expose_pair
 from qs3.sensor.lens import blur, blur_reach
-from qs3.sensor.matching import MatchingSettings
-from qs3.sensor.presets import Sensor, get_sensor
+from qs3.sensor.presets import get_sensor
 from qs3.sensor.render import StereoPair
 from qs3.sensor.rig import Pose, Region, StereoRig
-from qs3.sensor.scan import scan
 from qs3.sensor.view import photograph, scene_of
 
 RIG = StereoRig(width=201, height=161, focal=100.0)
@@ -276,23 +272,3 @@ def test_grey_levels_do_not_depend_on_the_canvas(bits):
         part = exposed(textured(), settings, canvas=canvas)
         for full, cut in zip(whole, part, strict=True):
             np.testing.assert_array_equal(cut, full[canvas.slices])
-
-
-def test_a_scan_of_whole_frames_has_the_same_grey_levels(renderer):
-    sensor = Sensor(
-        rig=StereoRig(240, 200, 267.0),
-        exposure=EVERYTHING,
-        matching=MatchingSettings(num_disparities=16, block_size=9),
-        depth=DepthSettings(stride=1),
-    )
-    plate = trimesh.creation.box(extents=[1, 0.3, 0.02])
-    part, whole = (
-        scan(
-            plate, sensor=sensor, views=2, renderer=renderer, keep_images=True, full_frames=full
-        ).images
-        for full in (False, True)
-    )
-    for cut, frame in zip(part, whole, strict=True):
-        assert cut.region != frame.region
-        np.testing.assert_array_equal(cut.left, frame.part(frame.left, cut.region))
-        np.testing.assert_array_equal(cut.right, frame.part(frame.right, cut.region))

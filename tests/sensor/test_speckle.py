@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from scipy import signal, stats
+from scipy import signal
 from scipy.spatial import cKDTree
 
 from qs3.errors import InputError
@@ -77,45 +77,6 @@ def test_every_tile_has_one_spot_and_none_is_near_another(columns, rows, seed):
     assert distance.min() >= 1.5
     assert 1.9 < np.median(distance) < 2.2
     assert distance.max() < 3 * np.sqrt(8)
-
-
-def test_two_spots_are_spread_as_rejection_spreads_them():
-    rng = np.random.default_rng(0)
-    drawn = 3 * rng.random((20000, 2, 2)) + [[0, 0], [3, 0]]  # two tiles side by side
-    wanted = np.linalg.norm(drawn[:, 0] - drawn[:, 1], axis=1)
-    wanted = wanted[wanted >= 1.5]
-    apart = [np.linalg.norm(np.diff(spot_places(6, 3, seed), axis=0)) for seed in range(60)]
-    _, chance = stats.ks_2samp(apart, wanted)
-    assert chance > 0.01
-
-
-def test_spots_are_off_the_grid_and_lean_to_no_side():
-    inside = np.concatenate([spot_places(270, 168, seed) for seed in range(3)]) % 3
-    assert len(np.unique(inside)) == inside.size
-    half_way = 1.5 / np.sqrt(len(inside))  # the standard error of a mean is below 0.87/√n
-    np.testing.assert_allclose(inside.mean(axis=0), 1.5, atol=3 * half_way)
-    assert abs(np.corrcoef(inside.T)[0, 1]) < 3 / np.sqrt(len(inside))
-    # The rule of distance favours the middles of tiles, and nothing but that: the sides are alike,
-    # and so are the corners.
-    share = np.histogram2d(*inside.T, bins=3, range=[[0, 3]] * 2)[0] / len(inside)
-    error = np.sqrt(share.max() / len(inside))
-    corners, sides = share[::2, ::2].ravel(), share.ravel()[1::2]
-    assert np.ptp(corners) < 5 * error
-    assert np.ptp(sides) < 5 * error
-    assert corners.mean() < sides.mean() < share[1, 1]
-    # What is left of the period of 3 cells; it is 1 for a grid. Its square bounds the likeness
-    # at a distance.
-    assert np.abs(np.exp(2j * np.pi / 3 * inside).mean(axis=0)).max() < 0.15
-
-
-def test_the_field_is_evenly_filled():
-    image = pattern_image(SPOTS)
-    blocks = image.reshape(8, image.shape[0] // 8, 9, image.shape[1] // 9).mean(axis=(1, 3))
-    # 70 spots a block: were they strewn at random, blocks would differ by 12 %.
-    assert blocks.std() / blocks.mean() < 0.06
-    sigma = 0.7 / np.sqrt(8 * np.log(2))
-    assert image.mean() == pytest.approx(2 * np.pi * sigma**2 / 9, rel=0.01)
-    assert (image > 0.5).mean() == pytest.approx(np.pi * 0.35**2 / 9, rel=0.02)
 
 
 def self_correlation(image):

@@ -62,38 +62,6 @@ def test_pandas(made):
     assert frame.groupby("class_name").size().to_dict() == {"chair": 5, "sofa": 5}
 
 
-def test_polars(made):
-    polars = pytest.importorskip("polars")
-    frame = polars.read_parquet(made.folder / "*.parquet")
-    made.equals(frame["id"], frame["label"], [cloud.to_numpy() for cloud in frame["points"]])
-    lazy = polars.scan_parquet(made.folder / "*.parquet").filter(polars.col("class_name") == "sofa")
-    assert lazy.select("id").collect()["id"].to_list() == made.ids[1::2]
-
-
-def test_duckdb(made):
-    duckdb = pytest.importorskip("duckdb")
-    where = f"FROM '{made.folder}/*.parquet'"
-    with duckdb.connect() as db:  # a connection of its own: the page uses the common one
-        columns = db.sql(f"SELECT id, label, points {where} ORDER BY id").fetchnumpy()
-        count = db.sql(f"SELECT class_name, count(*) {where} GROUP BY ALL ORDER BY ALL").fetchall()
-        asked = db.execute(f"SELECT points {where} WHERE id = ?", [made.ids[7]]).fetchall()
-    made.equals(columns["id"], columns["label"], columns["points"])
-    assert count == [("chair", 5), ("sofa", 5)]
-    ((cloud,),) = asked
-    np.testing.assert_array_equal(np.array(cloud, np.float32).reshape(-1, 3), made.points[7])
-
-
-def test_hugging_face_datasets(made, tmp_path, monkeypatch):
-    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    monkeypatch.setenv("HF_HOME", str(tmp_path / "hf"))
-    datasets = pytest.importorskip("datasets")
-    cache = str(tmp_path / "cache")
-    loaded = datasets.load_dataset(
-        "parquet", data_files=made.files, split="train", cache_dir=cache
-    ).with_format("numpy")
-    made.equals(loaded["id"], loaded["label"], loaded["points"])
-
-
 def test_pyarrow(made):
     from pyarrow import dataset
 

@@ -81,28 +81,6 @@ def test_on_a_cluster_too_what_hangs_or_crashes_fails_alone(fake, tmp_path, clus
         assert [record["error"] for record in read_failures(tmp_path / name)] == [kind]
 
 
-@pytest.mark.slow
-def test_a_lost_raylet_is_no_failure_of_a_scan(fake, tmp_path, cluster):
-    out = tmp_path / "out"
-
-    def kill_head() -> None:
-        while not list(out.glob("shard-*.parquet")):
-            time.sleep(0.05)
-        for entry in cluster.head_node.all_processes["raylet"]:
-            entry.process.kill()
-
-    killer = threading.Thread(target=kill_head)
-    killer.start()
-    work = fake.work(ROWS, bad=(7,))
-    with pytest.raises(InputError, match="run the same command again, ") as caught:
-        fake.run(work, out, row=fake.slow_flaky_row, executor=RayExecutor())
-    killer.join()
-    assert "\n" not in str(caught.value)
-    assert {record["object"] for record in read_failures(out)} <= {"bad7"}
-    fake.run(work, out, row=fake.flaky_row)
-    assert fake.content(out) == whole(fake, tmp_path / "whole")
-
-
 def test_gpus_that_are_not_there_are_refused(fake, tmp_path, cluster):
     with pytest.raises(InputError, match="the cluster has no GPU"):
         fake.run([fake.FakeItem("m")], tmp_path / "out", executor=RayExecutor(gpus=0.25))

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from qs3.errors import InputError, MissingExtraError, QS3Error
-from qs3.io.preparation import PAPER, ROBUST, distinct_inliers, normalise, resample
+from qs3.io.preparation import PAPER, ROBUST, distinct_inliers, resample
 from qs3.models import create_model
 from qs3.models.aligned import Aligned
 from qs3.models.ops import farthest_point_sampling
@@ -18,7 +18,6 @@ from qs3.models.ops.sampling import _sample_in_a_loop
 from qs3.models.sized import Sized
 from qs3.training import TrainSettings, export, load_model, predict_probabilities, save_model
 from qs3.training.export import export_run
-from qs3.training.prepared import normalise_in_a_graph
 
 from ..models.common import SMALL
 
@@ -120,17 +119,6 @@ def test_the_way_of_docs_export_gives_the_answers_of_the_run(tmp_path):
             np.testing.assert_allclose(run(ready)[0], shares, rtol=0, atol=2e-5)
             answers.append(np.abs(run(16 * ready)[0] - shares).max())
     assert max(answers) > 1e-3  # sixteen times as large is another thing
-
-
-@pytest.mark.parametrize("n", [50, 51])
-@pytest.mark.parametrize("preparation", [PAPER, ROBUST, OWN])
-def test_normalise_in_a_graph_is_that_of_training(preparation, n):
-    points = clouds(4, n)
-    got = normalise_in_a_graph(torch.from_numpy(points).double(), preparation).float().numpy()
-    wanted = normalise(points, preparation)
-    np.testing.assert_allclose(got, wanted, rtol=2e-7, atol=1e-7)
-    same = torch.full((1, 7, 3), 0.1, dtype=torch.float64)
-    assert torch.equal(normalise_in_a_graph(same), torch.zeros(1, 7, 3, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("m", [1, 9, 40])

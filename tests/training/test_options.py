@@ -14,15 +14,13 @@ import pytest
 import torch
 
 from qs3.adaptation import SourceOnly
-from qs3.errors import InputError, QS3Error, UnevenSizesError
-from qs3.io.preparation import stack
+from qs3.errors import InputError, QS3Error
 from qs3.training import (
     Deadline,
     SelfTrainingSettings,
     TimeUpError,
     fit,
     history,
-    load_whole,
     parse_duration,
 )
 from qs3.training.checkpoint import new_model
@@ -150,24 +148,6 @@ def test_deadline_looks_one_epoch_ahead(monkeypatch):
     deadline.note(3.0)
     assert deadline.passed()
     assert deadline.elapsed() == 8.0
-
-
-def test_only_clouds_of_several_sizes_are_read_twice():
-    calls = []
-
-    def load(data, num_points, error):
-        calls.append(num_points)
-        if num_points is None or error is InputError:
-            raise error("no")
-        return num_points
-
-    assert load_whole(load, "here", 8, error=UnevenSizesError) == 8
-    assert calls == [None, 8]
-    with pytest.raises(InputError):
-        load_whole(load, "here", 8, error=InputError)
-    assert calls == [None, 8, None]
-    with pytest.raises(UnevenSizesError, match="5 to 6 points"):
-        stack([np.zeros((5, 3), np.float32), np.zeros((6, 3), np.float32)], None, "here")
 
 
 def test_stopped_in_time_again_and_again_is_uninterrupted(source, target, settings, tmp_path):

@@ -153,12 +153,6 @@ def test_frames_and_points_are_bounded(room: Room) -> None:
     assert extract(room, max_frames=0)[CHAIR].source["frames"] == 12
 
 
-def test_depth_limits(room: Room) -> None:
-    full, near = extract(room), extract(room, far=1.8)
-    assert near[TABLE].source["measured"] < full[TABLE].source["measured"]
-    assert extract(room, near=3.5, far=4.0) == {}
-
-
 def test_masks_of_the_depth_image_are_taken_pixel_by_pixel(tmp_path: Path) -> None:
     room = write_room(tmp_path / "scans", frames=4)
     sens = room.sens
