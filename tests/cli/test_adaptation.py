@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-import torch
 
 from qs3.cli.train import defaults, parse_settings
 from qs3.errors import InputError
@@ -14,9 +13,8 @@ from qs3.io import load_clouds, load_unlabelled
 from qs3.meshes.classes import POINTDA10
 from qs3.models import create_model
 from qs3.structure import structure, unstructure
-from qs3.training import PRESETS, Augmentation, TrainSettings, fit, load_model, save_model
+from qs3.training import PRESETS, Augmentation, TrainSettings, fit, save_model
 from qs3.training.run import RunSettings
-from qs3.training.validation import read_checkpoints
 
 QUICK = ("--model", "pointnet", "--model-set", "channels=[8, 8, 16]", "hidden=[8]", "--num-points",
          64, "--batch-size", 5, "--threads", 1, "--accelerator", "cpu", "--epochs", 2,
@@ -103,32 +101,6 @@ def test_a_run_whose_rounds_were_all_skipped_says_what_to_change(qs3, source, tm
         assert "Next:" not in done.stderr
     assert all(told["skipped"] for told in json.loads((run / "run.json").read_text())["rounds"])
     qs3("evaluate", run, "--data", source)
-
-
-def test_one_confident_class_is_told_in_the_last_lines(qs3, source, store, tmp_path):
-    """A network of one class: the round, the class and the count stand before what is next."""
-    warm, run = tmp_path / "warm", tmp_path / "run"
-    told = qs3("train", "--source", source, "--out", warm, *QUICK).stderr
-    right = read_checkpoints(warm)[-1].source_accuracy
-    assert (
-        f"held-out simulated scans of the same meshes: {100 * right:.0f} % (n=\nNext: qs3 evaluate"
-        in told
-    )
-    loaded = load_model(warm)
-    model, train = loaded.model, structure(loaded.settings["train"], TrainSettings, warm)
-    with torch.no_grad():
-        model.classify.layers[-1].bias[3] += 50.0
-    save_model(warm, model, loaded.class_names, train)
-    done = qs3("train", "--source", source, "--target", store, "--out", run, "--method", "qbst",
-               "--warm-up", warm, "--self-training.rounds", 1, "--self-training.epochs", 1,
-               *QUICK, code=4)  # fmt: skip
-    said = done.stderr.rstrip().splitlines()[-2]
-    assert said == (
-        f"qs3: round 1: all 10 confident clouds were of one class, {POINTDA10[3]}; 10 were kept"
-    )
-    assert "all 10 confident clouds are of class 3: keeping all of them\n" in done.stderr
-    assert "selection.py" not in done.stderr + done.stdout
-    assert "SingleClassWarning" not in done.stderr
 
 
 def test_source_only_looks_at_a_target_without_learning_from_it(qs3, store, source, tmp_path):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from qs3.models import PointNet, create_model
+from qs3.models import create_model
 from qs3.models import pointnet as module
 from qs3.models.pointnet import linear_max
 
@@ -36,34 +36,6 @@ def test_blocks_do_not_matter(monkeypatch, size):
         results.append((maximum.detach(), given.grad))
     for one, other in zip(*results, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize(("b", "n", "width"), [(1, 1, 1024), (5, 8192, 1024), (300, 8, 16)])
-def test_blocks_cover_every_point_once_in_bounded_memory(b, n, width):
-    seen = torch.zeros(b, n, dtype=torch.int64)
-    for cloud, row in module._blocks(torch.zeros(b, n, 1), width):
-        assert seen[cloud, row].numel() * width <= 2**20
-        seen[cloud, row] += 1
-    assert (seen == 1).all()
-
-
-def test_the_widest_layer_is_never_whole():
-    model, points = PointNet(5, transforms=False), clouds(b=2, n=64).float()
-    largest = 0
-
-    def pack(tensor):
-        nonlocal largest
-        largest = max(largest, tensor.numel())
-        return tensor
-
-    with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
-        model(points)
-    assert largest < 1024 * 512 + 1  # the head's first weights; the layer would be as large
-    few = largest
-    largest = 0
-    with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
-        model(points.repeat(1, 16, 1))
-    assert largest == few
 
 
 def test_default_is_the_published_network():

@@ -4,7 +4,6 @@ import itertools
 
 import pytest
 import torch
-from torch import nn
 
 from qs3.models import create_model
 
@@ -53,17 +52,3 @@ def test_released_sizes():
     model = create_model("pointnet2", 40)
     assert sum(p.numel() for p in model.parameters()) == total
     assert [(level.radius, level.neighbours) for level in model.levels] == [(0.2, 32), (0.4, 64)]
-
-
-def test_a_bias_before_normalisation_folds_into_the_running_mean():
-    model, points = make("pointnet2").eval(), clouds()
-    expected = textbook.from_ours(model)
-    for network in [*expected.levels, expected.embed]:
-        for layer, norm in zip(network[::3], network[1::3], strict=True):
-            layer.bias = nn.Parameter(torch.randn_like(norm.bias))
-    ours = [layer for layer in model.modules() if isinstance(layer, nn.BatchNorm1d)]
-    convolutions = [layer for layer in expected.modules() if isinstance(layer, nn.Conv2d)]
-    for norm, convolution in zip(ours, convolutions, strict=False):
-        norm.running_mean -= convolution.bias.detach()
-    expected.groups = groups(model, points)
-    close(model(points), expected(points), 1e-9)

@@ -16,15 +16,6 @@ PART = trimesh.creation.box((0.08, 0.05, 0.03))
 D415 = load_sensor("d415")
 
 
-def test_a_sensor_is_loaded_by_its_name_or_its_file(tmp_path):
-    assert load_sensor("d435") is SENSORS["d435"]
-    path = tmp_path / "mine.toml"
-    path.write_text('base = "d415"\ndepth.near = 0.2\n')
-    assert load_sensor(str(path)) == load_sensor(path)
-    with pytest.raises(InputError, match="d415"):
-        load_sensor("d414")
-
-
 @pytest.mark.parametrize("name", SENSORS)
 def test_presets_search_at_their_own_distances_as_far_as_ever(name):
     sensor = SENSORS[name]

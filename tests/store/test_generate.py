@@ -42,13 +42,6 @@ def test_processes_and_none_write_the_same_bytes(fake, tmp_path):
         assert os.uname().nodename.encode() not in data
 
 
-def test_the_bar_tells_a_folders_name_without_moving_a_terminal(fake, tmp_path, capfd):
-    fake.run(items(fake, 1), tmp_path / "a\x1b[31mb", SETTINGS, progress=True)
-    told = capfd.readouterr().err
-    assert r"a\x1b[31mb: scans" in told
-    assert "\x1b" not in told
-
-
 def test_a_broken_object_is_logged_and_stops_nothing(fake, tmp_path):
     work = items(fake, bad=[1])
     fake.run(work, tmp_path, SETTINGS, row=fake.flaky_row)
@@ -135,25 +128,6 @@ def test_bad_input_leaves_nothing_behind(fake, tmp_path):
     with pytest.raises(InputError, match="holds something else"):
         fake.run(items(fake), out, SETTINGS)
     assert sorted(fake.content(out)) == ["thesis.txt"]
-
-
-def test_settings_are_checked():
-    for name in ("scans_per_mesh", "views", "num_points", "rows_per_shard"):
-        with pytest.raises(InputError, match=name):
-            GenerateSettings(**{name: 0})
-    with pytest.raises(InputError, match="seed"):
-        GenerateSettings(seed=-1)
-
-
-def test_a_pattern_picture_is_recorded_by_name_and_content(tmp_path):
-    picture = tmp_path / "dots.png"
-    picture.write_bytes(b"dots")
-    qs3 = get_sensor("paper")
-    pattern = dataclasses.replace(qs3.pattern, image=str(picture))
-    settings = GenerateSettings(sensor=dataclasses.replace(qs3, pattern=pattern))
-    recorded = json.dumps(settings.as_dict())
-    assert "dots.png" in recorded
-    assert str(tmp_path) not in recorded
 
 
 def test_seeds_depend_on_root_object_and_scan_alone_and_do_not_collide():

@@ -18,10 +18,9 @@ from qs3.training import (
     is_run,
     read_run,
     records_path,
-    save_model,
     self_train,
 )
-from qs3.training.checkpoint import load_model, new_model, read_tensors, write_tensors
+from qs3.training.checkpoint import load_model, new_model
 from qs3.training.prepared import prepare_clouds
 from qs3.training.run import RunSettings, claim_run
 
@@ -150,24 +149,6 @@ def test_other_data_are_told_by_their_option_and_not_by_a_checksum(
         with pytest.raises(InputError, match=said) as caught:
             claim(tmp_path, "dann", clouds, aim, settings, None)
         assert str(tmp_path) in str(caught.value)
-
-
-@pytest.mark.parametrize("value", [1.5, "x", True, [1], 1e12, 10**12, None, -1])
-def test_settings_that_are_none_are_told_in_a_line(source, settings, tmp_path, value):
-    """In ``settings.json``, and in a file of weights on its own."""
-    claim(tmp_path, "source-only", source, None, settings, None)
-    model = new_model(settings, 3, 0)
-    save_model(tmp_path, model, source.class_names, settings)
-    spoilt = json.loads((tmp_path / "settings.json").read_text())
-    spoilt["train"]["num_points"] = value
-    (tmp_path / "settings.json").write_text(json.dumps(spoilt))
-    with pytest.raises(InputError, match=r"settings\.json: .*num_points"):
-        load_model(tmp_path)
-    tensors, facts = read_tensors(tmp_path / "model.safetensors")
-    alone = tmp_path / "alone" / "weights.safetensors"
-    write_tensors(alone, tensors, facts | {"num_points": value})
-    with pytest.raises(InputError, match=r"weights\.safetensors: .*num_points"):
-        load_model(alone)
 
 
 def test_one_training_at_a_time(source, settings, tmp_path):

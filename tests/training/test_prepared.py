@@ -96,8 +96,19 @@ def test_the_choice_is_kept_for_a_resumed_run(strayed, tmp_path, monkeypatch):
     again = prepare_clouds(strayed, 40, ROBUST, tmp_path)
     assert np.array_equal(again.order.index, first.order.index)
     assert np.array_equal(again.order.counts, first.order.counts)
-    with pytest.raises(AssertionError, match="made again"):
-        prepare_clouds(strayed, 41, ROBUST, tmp_path)
+    moved = replace(strayed, points=strayed.points + 1)
+    for clouds, count in ((strayed, 41), (moved, 40), (strayed.select(np.arange(20)), 40)):
+        with pytest.raises(AssertionError, match="made again"):
+            prepare_clouds(clouds, count, ROBUST, tmp_path)
+
+
+@pytest.mark.parametrize("damage", [lambda b: b"", lambda b: b[:-7], lambda b: b[:-1] + b"\x07"])
+def test_a_damaged_choice_is_made_again(strayed, tmp_path, damage):
+    first = prepare_clouds(strayed, 40, ROBUST, tmp_path).points
+    (path,) = tmp_path.glob("subsample-*.safetensors")
+    path.write_bytes(damage(path.read_bytes()))
+    for _ in range(2):
+        assert np.array_equal(prepare_clouds(strayed, 40, ROBUST, tmp_path).points, first)
 
 
 @pytest.mark.parametrize("preparation", [PAPER, replace(ROBUST, redraw=False), OWN])

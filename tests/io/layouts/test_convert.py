@@ -101,12 +101,6 @@ def test_one_number_of_points(rng, tmp_path):
             convert(tmp_path / "a", tmp_path / "c", "ply", num_points=bad)
 
 
-def test_the_longest_name_is_taken(tmp_path, source):
-    for to in ("store", "ply"):
-        convert(source, tmp_path / (to[0] * 250), to)
-        assert len(read_clouds(tmp_path / (to[0] * 250))[0].ids) == 20
-
-
 def test_names_of_other_bytes_are_escaped(tmp_path, source):
     """Names of files are bytes; those that are no UTF-8 are stored as escapes."""
     name = os.fsdecode(b"st\xfchle")
