@@ -87,13 +87,12 @@ def test_shapes_and_meshes_go_into_one_data_set(qs3, quick, cad, tmp_path):
     (tmp_path / "map.toml").write_text('sofa = "seat"\nmug = "cup"\n')
     done = qs3("generate", "--meshes", cad, "shapes", "--per-class", 1, "--classes", "chair",
         "sofa", "--map", tmp_path / "map.toml", "--out", tmp_path / "out", "--num-points", 64,
-        "--dtype", "float16", *quick)  # fmt: skip
+        *quick)  # fmt: skip
     assert "classes: sofa → seat\nclasses: none here is mug, as the map has it" in done.stderr
     contents = json.loads(qs3("info", tmp_path / "out", "--as-json").stdout)
     assert contents["classes"] == {"chair": 2, "seat": 2}
     assert contents["renamed"] == {"sofa": "seat"}
     assert contents["settings"]["meshes"] == "cad+shapes"
-    assert contents["settings"]["dtype"] == "float16"
 
 
 def test_labels_in_a_csv_and_the_ten_classes(qs3, quick, tmp_path):

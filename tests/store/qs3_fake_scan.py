@@ -4,33 +4,28 @@ import ctypes
 import os
 import signal
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from qs3.files import LOCK
+from qs3.meshes import MeshItem
 from qs3.meshes.classes import POINTDA10
 from qs3.sensor.compiled import compiled
-from qs3.store.generate import GenerateReport, GenerateSettings, Item, generate, scan_seed
+from qs3.store.generate import GenerateReport, GenerateSettings, generate, scan_seed
 from qs3.store.shards import CloudRow
 
 SETTINGS = GenerateSettings(num_points=16, rows_per_shard=4)
 
 
-@dataclass(frozen=True)
-class FakeItem:
-    id: str
-    class_name: str = "chair"
-    split: str | None = "train"
-
-    def load(self):
-        raise AssertionError("a fake has no mesh")
+def mesh(name: str, class_name: str = "chair", split: str = "train") -> MeshItem:
+    """A mesh that cannot be loaded."""
+    return MeshItem(name, class_name, split, path=None, shape_seed=None)
 
 
-def work(count: int, bad: tuple[int, ...] = (), called: str = "bad") -> list[FakeItem]:
+def work(count: int, bad: tuple[int, ...] = (), called: str = "bad") -> list[MeshItem]:
     """A work list of chairs, some of them bad; their name tells how (see ``deadly_row``)."""
-    return [FakeItem(f"{called}{i}" if i in bad else f"m{i}") for i in range(count)]
+    return [mesh(f"{called}{i}" if i in bad else f"m{i}") for i in range(count)]
 
 
 def run(items, out, settings=SETTINGS, *, row=None, **how) -> GenerateReport:
@@ -44,7 +39,7 @@ def content(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.name != LOCK}
 
 
-def fake_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+def fake_row(item: MeshItem, scan: int, settings: GenerateSettings) -> CloudRow:
     seed = scan_seed(settings.seed, item.id, scan)
     rng = np.random.default_rng(seed)
     n = settings.num_points
@@ -54,7 +49,7 @@ def fake_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
         scan=scan,
         label=POINTDA10.index(item.class_name),
         class_name=item.class_name,
-        split=item.split or "",
+        split=item.split,
         seed=seed,
         points=rng.random((n, 3), dtype=np.float32),
         view=rng.integers(0, settings.views, n, dtype=np.uint8),
@@ -66,17 +61,17 @@ def fake_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
     )
 
 
-def flaky_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+def flaky_row(item: MeshItem, scan: int, settings: GenerateSettings) -> CloudRow:
     if item.id.startswith("bad"):
         raise ValueError(f"{item.id} is broken\nsecond line")
     return fake_row(item, scan, settings)
 
 
-def unavailable_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+def unavailable_row(item: MeshItem, scan: int, settings: GenerateSettings) -> CloudRow:
     raise ModuleNotFoundError("No module named 'nowhere'")
 
 
-def compiling_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+def compiling_row(item: MeshItem, scan: int, settings: GenerateSettings) -> CloudRow:
     compiled(fake_row)
     return fake_row(item, scan, settings)
 
@@ -87,19 +82,19 @@ class Interrupting:
     def __init__(self, after: int) -> None:
         self.left = after
 
-    def __call__(self, item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+    def __call__(self, item: MeshItem, scan: int, settings: GenerateSettings) -> CloudRow:
         if self.left == 0:
             raise KeyboardInterrupt
         self.left -= 1
         return fake_row(item, scan, settings)
 
 
-def slow_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+def slow_row(item: MeshItem, scan: int, settings: GenerateSettings) -> CloudRow:
     time.sleep(0.05)
     return fake_row(item, scan, settings)
 
 
-def deadly_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+def deadly_row(item: MeshItem, scan: int, settings: GenerateSettings) -> CloudRow:
     """Hang, crash or end the process, by the object's name."""
     if item.id.startswith("hangs"):
         ctypes.PyDLL(None).sleep(600)  # the interpreter locked, as by a parser written in C
@@ -110,13 +105,13 @@ def deadly_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
     return fake_row(item, scan, settings)
 
 
-def marked_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+def marked_row(item: MeshItem, scan: int, settings: GenerateSettings) -> CloudRow:
     """Fail as long as the file is there that QS3_FAKE_MARKER names."""
     if item.id.startswith("bad") and Path(os.environ["QS3_FAKE_MARKER"]).exists():
         raise ValueError(f"{item.id} is broken")
     return fake_row(item, scan, settings)
 
 
-def slow_flaky_row(item: Item, scan: int, settings: GenerateSettings) -> CloudRow:
+def slow_flaky_row(item: MeshItem, scan: int, settings: GenerateSettings) -> CloudRow:
     time.sleep(0.25)
     return flaky_row(item, scan, settings)

@@ -25,8 +25,7 @@ SETTINGS = GenerateSettings(num_points=16, scans_per_mesh=3, rows_per_shard=4)
 
 def items(fake, count=5, bad=()):
     return [
-        fake.FakeItem(f"bad{i}" if i in bad else f"m{i}", POINTDA10[i], "train")
-        for i in range(count)
+        fake.mesh(f"bad{i}" if i in bad else f"m{i}", POINTDA10[i], "train") for i in range(count)
     ]
 
 
@@ -113,8 +112,8 @@ def test_bad_input_leaves_nothing_behind(fake, tmp_path):
     out = tmp_path / "out"
     for work, changed, message in [
         ([], {}, "no mesh to scan"),
-        ([fake.FakeItem("a"), fake.FakeItem("a")], {}, "two meshes are called 'a'"),
-        ([fake.FakeItem("a", "toilet")], {}, "'toilet'"),
+        ([fake.mesh("a"), fake.mesh("a")], {}, "two meshes are called 'a'"),
+        ([fake.mesh("a", "toilet")], {}, "'toilet'"),
         (items(fake), {"sensor": "kinect9"}, "no sensor 'kinect9'"),
         (items(fake), {"randomise": {"light.ambiant": (0.0, 0.1)}}, r"light\.ambient"),
     ]:

@@ -1,6 +1,5 @@
 """A data set is read as it is by the libraries that people have."""
 
-import dataclasses
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,24 +26,22 @@ class Made:
         return sorted(map(str, self.folder.glob("*.parquet")))
 
     def equals(self, ids, labels, clouds) -> None:
-        """Compare bit for bit; a library that knows no half precision may widen it."""
+        """Compare bit for bit."""
         assert list(ids) == self.ids
         assert list(labels) == self.labels
         rows = [np.asarray(cloud) for cloud in clouds]
-        assert {row.dtype for row in rows} <= {self.points.dtype, np.dtype(np.float32)}
-        read = np.stack(rows).reshape(self.points.shape).astype(np.float32)
-        wanted = self.points.astype(np.float32)
-        np.testing.assert_array_equal(read.view(np.uint32), wanted.view(np.uint32))
+        assert {row.dtype for row in rows} == {np.dtype(np.float32)}
+        read = np.stack(rows).reshape(self.points.shape)
+        np.testing.assert_array_equal(read.view(np.uint32), self.points.view(np.uint32))
 
 
-@pytest.fixture(params=["float32", "float16"])
-def made(request, fake, tmp_path):
-    work = [fake.FakeItem(f"m{i}", ("chair", "sofa")[i % 2]) for i in range(10)]
-    settings = dataclasses.replace(fake.SETTINGS, dtype=request.param)
+@pytest.fixture
+def made(fake, tmp_path):
+    work = [fake.mesh(f"m{i}", ("chair", "sofa")[i % 2]) for i in range(10)]
     folder = tmp_path / "set"
-    fake.run(work, folder, settings)
-    rows = [fake.fake_row(item, 0, settings) for item in work]
-    points = np.stack([row.points for row in rows]).astype(request.param)
+    fake.run(work, folder)
+    rows = [fake.fake_row(item, 0, fake.SETTINGS) for item in work]
+    points = np.stack([row.points for row in rows])
     return Made(folder, [row.id for row in rows], [row.label for row in rows], points)
 
 
@@ -71,7 +68,6 @@ def test_pyarrow(made):
     assert clouds[0].dtype == made.points.dtype
 
 
-@pytest.mark.parametrize("made", ["float16"], indirect=True)
 def test_the_page_about_data_works(made, tmp_path, monkeypatch):
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setenv("HF_HOME", str(tmp_path / "hf"))
@@ -95,13 +91,3 @@ def test_the_page_names_every_column_and_file(made):
     columns = parquet.read_schema(made.folder / "shard-00000.parquet").names
     names = [*columns, "shard-00000.parquet", "dataset.json", "meshes.json", "failures.jsonl"]
     assert [name for name in names if f"`{name}`" not in text] == []
-
-
-def test_the_page_tells_what_half_precision_costs(rng):
-    """On the surface of a ball of diameter 1, whose coordinates stay within 0.5."""
-    cloud = rng.normal(size=(200_000, 3))
-    cloud *= 0.5 / np.linalg.norm(cloud, axis=1, keepdims=True)
-    error = cloud.astype(np.float32).astype(np.float16) - cloud
-    largest, rms = np.abs(error).max(), np.sqrt(np.mean(error**2))
-    text = " ".join(PAGE.read_text(encoding="utf-8").split())
-    assert f"{largest:.5f} at most and {rms:.6f} RMS" in text

@@ -131,7 +131,7 @@ def test_workers_end_with_the_process_that_started_them(start, tmp_path):
 def test_objects_that_hang_or_crash_fail_alone(fake, tmp_path):
     items = fake.work(8)
     for row, name in ((2, "hangs"), (5, "crashes"), (6, "exits")):
-        items[row] = fake.FakeItem(name)
+        items[row] = fake.mesh(name)
     # A process loads its libraries within the time of its first scan.
     report = fake.run(items, tmp_path, row=fake.deadly_row, workers=2, timeout=30.0)
     assert report == GenerateReport(done=5, skipped=0, failed=3)
@@ -150,7 +150,7 @@ def test_what_failed_is_scanned_again_when_asked(fake, tmp_path, monkeypatch, wi
     marker = tmp_path / "marker"
     marker.touch()
     monkeypatch.setenv("QS3_FAKE_MARKER", str(marker))
-    items = [fake.FakeItem("bad\u2028\u0085é"), *fake.work(ROWS, bad=(5, 6, 23))[1:]]
+    items = [fake.mesh("bad\u2028\u0085é"), *fake.work(ROWS, bad=(5, 6, 23))[1:]]
 
     def run(**how):
         return fake.run(items, tmp_path / "out", row=fake.marked_row, **how)
@@ -273,16 +273,6 @@ def test_two_runs_do_not_write_into_one_folder(fake, tmp_path):
     with folder_lock(tmp_path), pytest.raises(InputError, match="another qs3 is writing"):
         fake.run(fake.work(4), tmp_path)
     assert fake.content(tmp_path) == {}
-
-
-def test_half_precision_is_the_nearest_half(fake, tmp_path):
-    for dtype in ("float32", "float16"):
-        settings = dataclasses.replace(fake.SETTINGS, dtype=dtype)
-        fake.run(fake.work(ROWS), tmp_path / dtype, settings)
-    single, half = (np.stack(read_ragged(tmp_path / d).clouds) for d in ("float32", "float16"))
-    assert half.dtype == np.float32
-    np.testing.assert_array_equal(half, single.astype(np.float16).astype(np.float32))
-    assert check(tmp_path / "float16", progress=False) == []
 
 
 def test_executors_refuse_numbers_out_of_range():

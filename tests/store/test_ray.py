@@ -83,13 +83,13 @@ def test_on_a_cluster_too_what_hangs_or_crashes_fails_alone(fake, tmp_path, clus
 
 def test_gpus_that_are_not_there_are_refused(fake, tmp_path, cluster):
     with pytest.raises(InputError, match="the cluster has no GPU"):
-        fake.run([fake.FakeItem("m")], tmp_path / "out", executor=RayExecutor(gpus=0.25))
+        fake.run([fake.mesh("m")], tmp_path / "out", executor=RayExecutor(gpus=0.25))
 
 
 def test_an_address_without_a_cluster_is_told(fake, tmp_path):
     pytest.importorskip("ray", exc_type=ImportError)
     with pytest.raises(InputError, match="no Ray cluster answers there"):
-        fake.run([fake.FakeItem("m")], tmp_path / "out", executor=RayExecutor("auto"))
+        fake.run([fake.mesh("m")], tmp_path / "out", executor=RayExecutor("auto"))
 
 
 @pytest.mark.parametrize("how", [{"timeout": 0.0}, {"gpus": -1.0}])

@@ -29,7 +29,7 @@ def load(folder: Path, columns: list[str] | None = None):
 
 def rows(fake, count=6):
     classes = ("chair", "bed", "sofa")
-    items = [fake.FakeItem(f"m{i}", classes[i % 3], ("train", "test")[i % 2]) for i in range(count)]
+    items = [fake.mesh(f"m{i}", classes[i % 3], ("train", "test")[i % 2]) for i in range(count)]
     return [fake.fake_row(item, 0, SETTINGS) for item in items]
 
 

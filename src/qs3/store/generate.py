@@ -13,6 +13,7 @@ import pyarrow as pa
 
 from qs3.errors import InputError
 from qs3.files import write_json
+from qs3.meshes.trees import MeshItem
 from qs3.store.executors import Executor, Failure, InlineExecutor, LocalExecutor, outcomes
 from qs3.store.failures import read_failures, write_failures
 from qs3.store.manifest import (
@@ -26,7 +27,6 @@ from qs3.store.manifest import (
 from qs3.store.plan import Plan, make_plan, resolve_renderer
 from qs3.store.progress import progress_bar
 from qs3.store.scan_item import GenerateSettings as GenerateSettings
-from qs3.store.scan_item import Item as Item
 from qs3.store.scan_item import scan_item as scan_item
 from qs3.store.scan_item import scan_seed as scan_seed
 from qs3.store.shards import CloudRow, load_shard, put_shard, table_of
@@ -45,7 +45,7 @@ class GenerateReport:
 
 
 def generate(
-    items: Sequence[Item],
+    items: Sequence[MeshItem],
     out: str | Path,
     settings: GenerateSettings,
     *,
@@ -171,7 +171,7 @@ class _Run:
         if failures:
             self.failures |= failures
             write_failures(self.folder, self.failures.values())
-        table = table_of(scans, self.plan.settings.dtype)
+        table = table_of(scans)
         if shard in self.finished:
             table = pa.concat_tables([load_shard(self.folder, shard), table])
         position = {name: i for i, name in enumerate(table["id"].to_pylist())}

@@ -13,16 +13,17 @@ import numpy as np
 from qs3.errors import InputError
 from qs3.meshes.classes import map_labels
 from qs3.meshes.sizes import class_ranges
+from qs3.meshes.trees import MeshItem
 from qs3.store.executors import Failure
 from qs3.store.manifest import Manifest, package_versions
-from qs3.store.scan_item import GenerateSettings, Item, neighbours_of, row_id, size_class
+from qs3.store.scan_item import GenerateSettings, neighbours_of, row_id, size_class
 
 
 @dataclass(frozen=True)
 class Plan:
     """Objects × scans, cut into shards of a fixed number of rows; rows are counted from 0."""
 
-    items: Sequence[Item]
+    items: Sequence[MeshItem]
     """Meshes, in the order of the rows."""
     settings: GenerateSettings
     """Settings of the data set."""
@@ -51,7 +52,7 @@ class Plan:
         """Return the shard of a row."""
         return row // self.settings.rows_per_shard
 
-    def item_of(self, row: int) -> Item:
+    def item_of(self, row: int) -> MeshItem:
         """Return the mesh of a row."""
         return self.items[row // self.settings.scans_per_mesh]
 
@@ -86,18 +87,14 @@ class Plan:
         return Manifest(
             settings={**self.settings.as_dict(), "work_list": work_list_checksum(self.items)},
             class_names=self.settings.classes,
-            renamed={
-                own: item.class_name
-                for item in self.items
-                if (own := getattr(item, "own_class", ""))
-            },
+            renamed={i.own_class: i.class_name for i in self.items if i.own_class},
             rows=self.rows,
             shards=self.shards,
             versions=package_versions(),
         )
 
 
-def make_plan(items: Sequence[Item], settings: GenerateSettings) -> Plan:
+def make_plan(items: Sequence[MeshItem], settings: GenerateSettings) -> Plan:
     """Check a work list.
 
     Raises:
@@ -133,12 +130,11 @@ def resolve_renderer(settings: GenerateSettings) -> GenerateSettings:
     return dataclasses.replace(settings, sensor=sensor, renderer=settings.make_renderer())
 
 
-def work_list_checksum(items: Sequence[Item]) -> str:
+def work_list_checksum(items: Sequence[MeshItem]) -> str:
     """SHA-256 over the names, classes, splits, axes, units and shape seeds of a work list."""
     digest = hashlib.sha256()
     for item in items:
-        line = [item.id, item.class_name, item.split]
-        line += [getattr(item, name, None) for name in ("shape_seed", "up")]
-        line += filter(None, [getattr(item, "unit", None)])
+        line = [item.id, item.class_name, item.split, item.shape_seed, item.up]
+        line += filter(None, [item.unit])
         digest.update(json.dumps(line).encode("utf-8") + b"\n")
     return digest.hexdigest()

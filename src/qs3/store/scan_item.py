@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -14,11 +14,12 @@ import tyro
 from qs3.errors import InputError, StorageError
 from qs3.meshes.classes import POINTDA10, label_order, map_labels
 from qs3.meshes.sizes import size_name
+from qs3.meshes.trees import MeshItem
 from qs3.sensor.checks import check_range
 from qs3.sensor.presets import settings_dict
 from qs3.sensor.scene import SceneSettings
 from qs3.sensor.settings import ScanSettings, renderer_dict
-from qs3.store.shards import STATISTICS, CloudRow, DType
+from qs3.store.shards import STATISTICS, CloudRow
 
 if TYPE_CHECKING:
     import trimesh
@@ -26,30 +27,6 @@ if TYPE_CHECKING:
 
 RecipeName = Literal["rooms", "parts"]
 _NEIGHBOURS = 8
-
-
-@runtime_checkable
-class Item(Protocol):
-    """One mesh of the work list, as `qs3.meshes.MeshItem` is."""
-
-    @property
-    def id(self) -> str:
-        """Unique name."""
-        ...
-
-    @property
-    def class_name(self) -> str:
-        """Name of the class."""
-        ...
-
-    @property
-    def split(self) -> str | None:
-        """``train``, ``test``, empty or None."""
-        ...
-
-    def load(self) -> "trimesh.Trimesh":
-        """Read or make the mesh."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -72,8 +49,6 @@ class GenerateSettings(ScanSettings):
     """Name of the split of every row, such as train or test; by default each item's own."""
     rows_per_shard: int = 64
     """Scans in one Parquet file."""
-    dtype: DType = "float32"
-    """Type of the coordinates on disk; half precision is good to 0.0005 at a size of 1."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -94,13 +69,16 @@ class GenerateSettings(ScanSettings):
         return plain
 
 
-def size_class(item: Item) -> str:
+def size_class(item: MeshItem) -> str:
     """Return the class whose real size an object has, see `qs3.meshes.sizes.size_name`."""
-    return size_name(item.class_name, getattr(item, "own_class", ""))
+    return size_name(item.class_name, item.own_class)
 
 
 def settings_for(
-    settings: GenerateSettings, items: Sequence[Item], meshes: Sequence[str | Path], per_class: int
+    settings: GenerateSettings,
+    items: Sequence[MeshItem],
+    meshes: Sequence[str | Path],
+    per_class: int,
 ) -> GenerateSettings:
     """Return settings that tell what is scanned: its classes, and where the meshes are from.
 
@@ -163,7 +141,9 @@ def scan_seed(root: int, object_id: str, scan: int) -> int:
     return int(state[0] >> np.uint64(1))
 
 
-def neighbours_of(items: Sequence[Item], position: int, scan: int, root: int) -> tuple[Item, ...]:
+def neighbours_of(
+    items: Sequence[MeshItem], position: int, scan: int, root: int
+) -> tuple[MeshItem, ...]:
     """Draw other items of a work list, of two at least, for a scan of the one at ``position``.
 
     Order and worker count do not matter.
@@ -174,7 +154,7 @@ def neighbours_of(items: Sequence[Item], position: int, scan: int, root: int) ->
     return tuple(items[other + (other >= position)] for other in drawn)
 
 
-def _first_readable(items: Sequence[Item]) -> "tuple[Item, trimesh.Trimesh]":
+def _first_readable(items: Sequence[MeshItem]) -> "tuple[MeshItem, trimesh.Trimesh]":
     """A damaged mesh is to cost its own scans, not those that it was drawn to stand beside."""
     for item in items[:-1]:
         try:
@@ -187,7 +167,7 @@ def _first_readable(items: Sequence[Item]) -> "tuple[Item, trimesh.Trimesh]":
 
 
 def scan_item(
-    item: Item, scan_index: int, settings: GenerateSettings, neighbours: Sequence[Item] = ()
+    item: MeshItem, scan_index: int, settings: GenerateSettings, neighbours: Sequence[MeshItem] = ()
 ) -> CloudRow:
     """Scan one object once with the simulated sensor.
 
@@ -222,7 +202,7 @@ def scan_item(
         scan=scan_index,
         label=int(label[0]),
         class_name=settings.classes[int(label[0])],
-        split=(item.split or "") if settings.split is None else settings.split,
+        split=item.split if settings.split is None else settings.split,
         seed=seed,
         points=result.points,
         view=result.view,
@@ -235,7 +215,7 @@ def scan_item(
     )
 
 
-def row_id(item: Item, scan: int) -> str:
+def row_id(item: MeshItem, scan: int) -> str:
     """Name of one scan of one object in its data set."""
     return f"{item.id}#{scan}"
 

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -30,37 +30,26 @@ STATISTICS = {
 }
 """Statistics of a scan, means over its views: what readers see of each, and how it is written."""
 
-DType = Literal["float32", "float16"]
-"""Type of the coordinates on disk. Half precision is good to 0.0005 at a size of 1."""
-
-
-def _schema(dtype: DType) -> pa.Schema:
-    real = pa.float32() if dtype == "float32" else pa.float16()
-    cloud = pa.list_(pa.field("element", real, nullable=False))
-    view = pa.list_(pa.field("element", pa.uint8(), nullable=False))
-    return pa.schema(
-        [
-            pa.field("id", pa.string(), nullable=False),
-            pa.field("object", pa.string(), nullable=False),
-            pa.field("scan", pa.int32(), nullable=False),
-            pa.field("label", pa.int32(), nullable=False),
-            pa.field("class_name", pa.string(), nullable=False),
-            pa.field("split", pa.string(), nullable=False),
-            pa.field("seed", pa.int64(), nullable=False),
-            pa.field("yaw", pa.float64(), nullable=False),
-            *(pa.field(name, pa.float64()) for name in STATISTICS),
-            pa.field("points", cloud, nullable=False),
-            pa.field("view", view, nullable=False),
-            pa.field("clean", cloud, nullable=False),
-            pa.field("clean_view", view, nullable=False),
-            pa.field("surface", cloud, nullable=False),
-            pa.field("drawn", pa.string(), nullable=False),
-        ]
-    )
-
-
-_SCHEMAS: dict[DType, pa.Schema] = {"float32": _schema("float32"), "float16": _schema("float16")}
-_NAMES = _SCHEMAS["float32"].names
+_CLOUD = pa.list_(pa.field("element", pa.float32(), nullable=False))
+_VIEW = pa.list_(pa.field("element", pa.uint8(), nullable=False))
+_COLUMNS = {
+    "id": pa.string(),
+    "object": pa.string(),
+    "scan": pa.int32(),
+    "label": pa.int32(),
+    "class_name": pa.string(),
+    "split": pa.string(),
+    "seed": pa.int64(),
+    "yaw": pa.float64(),
+    **dict.fromkeys(STATISTICS, pa.float64()),
+    "points": _CLOUD,
+    "view": _VIEW,
+    "clean": _CLOUD,
+    "clean_view": _VIEW,
+    "surface": _CLOUD,
+    "drawn": pa.string(),
+}
+_SCHEMA = pa.schema(pa.field(n, kind, nullable=n in STATISTICS) for n, kind in _COLUMNS.items())
 
 
 @dataclass(frozen=True)
@@ -110,20 +99,19 @@ def put_shard(folder: Path, index: int, table: pa.Table) -> None:
     write_bytes(folder / shard_name(index), shard_bytes(table))
 
 
-def table_of(rows: Sequence[CloudRow], dtype: DType = "float32") -> pa.Table:
+def table_of(rows: Sequence[CloudRow]) -> pa.Table:
     """Put rows, or none, into a table of the data set's columns."""
-    schema = _SCHEMAS[dtype]
-    columns: dict[str, list[Any]] = {name: [] for name in schema.names}
+    columns: dict[str, list[Any]] = {name: [] for name in _COLUMNS}
     for row in rows:
         for name, values in columns.items():
             value = getattr(row, name)
             if isinstance(value, np.ndarray):
-                kind = np.uint8 if name.endswith("view") else np.dtype(dtype)
+                kind = np.uint8 if name.endswith("view") else np.float32
                 value = np.ascontiguousarray(value, dtype=kind).reshape(-1)
             elif isinstance(value, float) and name in STATISTICS and math.isnan(value):
                 value = None
             values.append(value)
-    return pa.Table.from_pydict(columns, schema=schema)
+    return pa.Table.from_pydict(columns, schema=_SCHEMA)
 
 
 def shard_bytes(table: pa.Table) -> bytes:
@@ -155,9 +143,9 @@ def load_shard(folder: str | Path, index: int, columns: Sequence[str] | None = N
         reading(path, "Parquet"),
         pq.ParquetFile(path, page_checksum_verification=True, pre_buffer=False) as file,
     ):
-        if file.schema_arrow not in _SCHEMAS.values():
+        if file.schema_arrow != _SCHEMA:
             raise InputError(f"{path}: not a shard of a qs3 data set (other columns)")
-        table = file.read(list(_NAMES if columns is None else columns), use_threads=False)
+        table = file.read(list(_COLUMNS if columns is None else columns), use_threads=False)
         table.validate(full=True)  # texts too: Arrow takes any bytes for UTF-8
         return table
 
@@ -175,7 +163,6 @@ def flat_clouds(table: pa.Table, column: str, path: Any) -> list[Float32[np.ndar
         InputError: where a cloud is empty, not made of triples, or not finite; ``path`` is named.
     """
     values, offsets = flat(table[column])
-    values = values.astype(np.float32, copy=False)
     sizes = np.diff(offsets)
     bad = (sizes == 0) | (sizes % 3 != 0)
     if not bad.any() and not np.isfinite(values[offsets[0] : offsets[-1]]).all():
