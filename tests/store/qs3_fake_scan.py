@@ -12,7 +12,8 @@ from qs3.files import LOCK
 from qs3.meshes import MeshItem
 from qs3.meshes.classes import POINTDA10
 from qs3.sensor.compiled import compiled
-from qs3.store.generate import GenerateReport, GenerateSettings, generate, scan_seed
+from qs3.store.generate import GenerateSettings, generate, scan_seed
+from qs3.store.manifest import Report
 from qs3.store.shards import CloudRow
 
 SETTINGS = GenerateSettings(num_points=16, rows_per_shard=4)
@@ -28,7 +29,7 @@ def work(count: int, bad: tuple[int, ...] = (), called: str = "bad") -> list[Mes
     return [mesh(f"{called}{i}" if i in bad else f"m{i}") for i in range(count)]
 
 
-def run(items, out, settings=SETTINGS, *, row=None, **how) -> GenerateReport:
+def run(items, out, settings=SETTINGS, *, row=None, **how) -> Report:
     """Generate in this process where nothing else is said: these scans cost nothing."""
     how = {"workers": 0, "progress": False} | how
     return generate(items, out, settings, scan_one=row or fake_row, **how)

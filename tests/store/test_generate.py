@@ -15,9 +15,9 @@ from qs3.meshes.classes import POINTDA10
 from qs3.sensor.presets import get_sensor
 from qs3.sensor.scene import SceneSettings
 from qs3.store.failures import read_failures
-from qs3.store.generate import GenerateReport, GenerateSettings, scan_seed
+from qs3.store.generate import GenerateSettings, scan_seed
 from qs3.store.info import info
-from qs3.store.manifest import MANIFEST
+from qs3.store.manifest import MANIFEST, Report
 from qs3.store.scan_item import neighbours_of, scan_item
 
 SETTINGS = GenerateSettings(num_points=16, scans_per_mesh=3, rows_per_shard=4)
@@ -33,7 +33,7 @@ def test_processes_and_none_write_the_same_bytes(fake, tmp_path):
     for workers in (0, 2):
         out = tmp_path / str(workers)
         report = fake.run(items(fake, bad=[1]), out, SETTINGS, row=fake.flaky_row, workers=workers)
-        assert report == GenerateReport(done=12, skipped=0, failed=3)
+        assert report == Report(done=12, skipped=0, failed=3)
     assert fake.content(tmp_path / "0") == fake.content(tmp_path / "2")
     assert read_ragged(out).ids == tuple(f"m{i}#{s}" for i in (0, 2, 3, 4) for s in range(3))
     for data in fake.content(out).values():  # nothing of the machine is inside
@@ -69,7 +69,7 @@ def test_a_machine_that_cannot_compile_stops_the_run_and_fails_no_object(
     assert sorted(fake.content(tmp_path)) == [MANIFEST]
     monkeypatch.undo()
     report = fake.run(items(fake), tmp_path, SETTINGS, row=fake.compiling_row)
-    assert report == GenerateReport(done=15, skipped=0, failed=0)
+    assert report == Report(done=15, skipped=0, failed=0)
 
 
 def test_a_run_that_was_stopped_goes_on_and_ends_the_same(fake, tmp_path):
@@ -80,11 +80,11 @@ def test_a_run_that_was_stopped_goes_on_and_ends_the_same(fake, tmp_path):
     assert sorted(fake.content(folder)) == [MANIFEST, "shard-00000.parquet"]
     stamp = (folder / "shard-00000.parquet").stat().st_mtime_ns
     report = fake.run(items(fake), folder, SETTINGS)
-    assert report == GenerateReport(done=11, skipped=4, failed=0)
+    assert report == Report(done=11, skipped=4, failed=0)
     assert (folder / "shard-00000.parquet").stat().st_mtime_ns == stamp
     assert fake.content(whole) == fake.content(folder)
     again = fake.run(items(fake), folder, SETTINGS)
-    assert again == GenerateReport(done=0, skipped=15, failed=0)
+    assert again == Report(done=0, skipped=15, failed=0)
 
 
 def test_other_settings_or_another_work_list_are_refused(fake, tmp_path):

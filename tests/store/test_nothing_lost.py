@@ -17,9 +17,9 @@ from qs3.files import folder_lock
 from qs3.io.layouts.store import read_ragged
 from qs3.store.executors import InlineExecutor, LocalExecutor
 from qs3.store.failures import read_failures
-from qs3.store.generate import GenerateReport
 from qs3.store.info import check
-from qs3.store.merge import MergeReport, merge
+from qs3.store.manifest import Report
+from qs3.store.merge import merge
 
 HERE = Path(__file__).parent
 ROWS, ROWS_PER_SHARD = 24, 4
@@ -134,7 +134,7 @@ def test_objects_that_hang_or_crash_fail_alone(fake, tmp_path):
         items[row] = fake.mesh(name)
     # A process loads its libraries within the time of its first scan.
     report = fake.run(items, tmp_path, row=fake.deadly_row, workers=2, timeout=30.0)
-    assert report == GenerateReport(done=5, skipped=0, failed=3)
+    assert report == Report(done=5, skipped=0, failed=3)
     failures = {r["id"]: (r["error"], r["reason"]) for r in read_failures(tmp_path)}
     assert failures == {
         "hangs#0": ("Timeout", "took over 30 s and was stopped"),
@@ -155,14 +155,14 @@ def test_what_failed_is_scanned_again_when_asked(fake, tmp_path, monkeypatch, wi
     def run(**how):
         return fake.run(items, tmp_path / "out", row=fake.marked_row, **how)
 
-    assert run() == GenerateReport(done=20, skipped=0, failed=4)
-    assert run() == GenerateReport(done=0, skipped=24, failed=0)
-    assert run(retry_failed=True) == GenerateReport(done=0, skipped=20, failed=4)
+    assert run() == Report(done=20, skipped=0, failed=4)
+    assert run() == Report(done=0, skipped=24, failed=0)
+    assert run(retry_failed=True) == Report(done=0, skipped=20, failed=4)
     assert "bad\u2028\u0085é" in {record["object"] for record in read_failures(tmp_path / "out")}
     marker.unlink()
     if without_record:
         (tmp_path / "out" / "failures.jsonl").unlink()
-    assert run(retry_failed=True) == GenerateReport(done=4, skipped=20, failed=0)
+    assert run(retry_failed=True) == Report(done=4, skipped=20, failed=0)
     assert read_failures(tmp_path / "out") == []
     fake.run(items, tmp_path / "new")
     assert fake.content(tmp_path / "out") == fake.content(tmp_path / "new")
@@ -251,14 +251,14 @@ def test_parts_of_several_machines_merge_into_the_bytes_of_one(fake, tmp_path):
         merge([parts[0], *parts[2:]], merged, progress=False)
     assert not merged.exists()
     report = merge(parts, merged, progress=False)
-    assert report == MergeReport(copied=6, skipped=0, failed=2)
+    assert report == Report(done=6, skipped=0, failed=2)
     assert fake.content(merged) == fake.content(tmp_path / "whole")
-    assert merge(parts, merged, progress=False).copied == 0
+    assert merge(parts, merged, progress=False).done == 0
     fake.run(items, tmp_path / "other", dataclasses.replace(fake.SETTINGS, seed=1))
     with pytest.raises(InputError, match="seed = 1, not 0"):
         merge([*parts, tmp_path / "other"], merged, progress=False)
     assert fake.run(items, merged, retry_failed=True).done == 2
-    assert merge(parts, merged, progress=False) == MergeReport(copied=0, skipped=6, failed=0)
+    assert merge(parts, merged, progress=False) == Report(done=0, skipped=6, failed=0)
     assert check(merged, progress=False) == []
 
 

@@ -14,7 +14,7 @@ import pytest
 from qs3.errors import InputError, MissingExtraError
 from qs3.store.executors.ray_cluster import RayExecutor
 from qs3.store.failures import read_failures
-from qs3.store.generate import GenerateReport
+from qs3.store.manifest import Report
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
 
@@ -67,7 +67,7 @@ def test_a_node_killed_half_way_changes_no_byte(fake, tmp_path, cluster):
     killer.join()
     assert ROWS // 8 <= seen[0] < ROWS // 4 - 1, "the node was not killed half-way"
     assert len(cluster.list_all_nodes()) == 2
-    assert report == GenerateReport(done=ROWS - 1, skipped=0, failed=1)
+    assert report == Report(done=ROWS - 1, skipped=0, failed=1)
     assert fake.content(out) == whole(fake, tmp_path / "whole")
 
 
@@ -77,7 +77,7 @@ def test_on_a_cluster_too_what_hangs_or_crashes_fails_alone(fake, tmp_path, clus
         work = fake.work(6, (2,), name)
         executor = RayExecutor(timeout=12.0 if kind == "Timeout" else None)
         report = fake.run(work, tmp_path / name, row=fake.deadly_row, executor=executor)
-        assert report == GenerateReport(done=5, skipped=0, failed=1)
+        assert report == Report(done=5, skipped=0, failed=1)
         assert [record["error"] for record in read_failures(tmp_path / name)] == [kind]
 
 

@@ -114,9 +114,10 @@ def _same_files(folder: Path, items: "Sequence[MeshItem]") -> tuple[list[str], l
     """
     from qs3.store.manifest import mesh_sums
 
-    sizes = {item.id: item.path.stat().st_size for item in items if item.path is not None}
+    paths = {item.id: item.path for item in items if item.path is not None}
+    sizes = {name: path.stat().st_size for name, path in paths.items()}
     count = Counter(sizes.values())
-    sums = mesh_sums(item for item in items if item.id in sizes and count[sizes[item.id]] > 1)
+    sums = mesh_sums({name: path for name, path in paths.items() if count[sizes[name]] > 1})
     equal: dict[str, list[MeshItem]] = {}
     for item in items:
         if item.id in sums:

@@ -116,7 +116,7 @@ def merge(parts: Annotated[tuple[str, ...], tyro.conf.Positional], out: str) -> 
     report = put_together(parts, out)
     show(out)
     tell(
-        f"{report.copied} shards copied, {report.skipped} were there before; {report.failed} scans "
+        f"{report.done} shards copied, {report.skipped} were there before; {report.failed} scans "
         f"had failed. Next: qs3 info --check {quoted(out)}"
     )
     return 0

@@ -100,7 +100,8 @@ def _plain(clouds: RaggedClouds, num_points: int | None, where: str) -> RaggedCl
         raise InputError(f"{where}: holds no cloud")
     prepared = []
     pairs = zip(clouds.clouds, clouds.ids, strict=True)
-    for cloud, name in cloud_bar(pairs, "resample", len(clouds.clouds), num_points is not None):
+    count = 0 if num_points is None else len(clouds.clouds)
+    for cloud, name in cloud_bar(pairs, "resample", count):
         with np.errstate(over="ignore"):
             points = np.asarray(cloud, dtype=np.float32)
         if not len(points) or not np.isfinite(points).all():

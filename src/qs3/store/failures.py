@@ -21,10 +21,9 @@ def write_failures(folder: Path, records: Iterable[Mapping[str, Any]]) -> None:
 
 
 def read_failures(folder: str | Path) -> list[dict[str, Any]]:
-    """Return the objects that could not be scanned, one record each, in the order of the ids.
+    """Return the records of the scans that failed, in the order of their ids.
 
-    A record has ``id``, ``object``, ``scan``, ``class_name``, ``shard``, ``row`` (in its shard),
-    ``error`` and ``reason``.
+    Keys: ``id``, ``object``, ``scan``, ``class_name``, ``shard``, ``row``, ``error``, ``reason``.
 
     Raises:
         InputError: if the log is damaged.
@@ -36,7 +35,5 @@ def read_failures(folder: str | Path) -> list[dict[str, Any]]:
         records = [parse_json(line, path) for line in path.read_text("utf-8").splitlines()]
         return sorted(records, key=lambda record: record["id"])
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{path}: damaged ({error}); delete it and run the same command again with "
-            "--retry-failed"
-        ) from error
+        fix = "delete it and run the same command again with --retry-failed"
+        raise InputError(f"{path}: damaged ({error}); {fix}") from error

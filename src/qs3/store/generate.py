@@ -6,7 +6,6 @@ A scan that fails is logged and absent.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import pyarrow as pa
@@ -18,6 +17,7 @@ from qs3.store.executors import Executor, Failure, InlineExecutor, LocalExecutor
 from qs3.store.failures import read_failures, write_failures
 from qs3.store.manifest import (
     MESHES,
+    Report,
     claimed,
     finished_shards,
     mesh_sums,
@@ -32,18 +32,6 @@ from qs3.store.scan_item import scan_seed as scan_seed
 from qs3.store.shards import CloudRow, load_shard, put_shard, table_of
 
 
-@dataclass(frozen=True)
-class GenerateReport:
-    """Scans that one call of `generate` counted."""
-
-    done: int
-    """Scanned and written by this call."""
-    skipped: int
-    """Finished before."""
-    failed: int
-    """Failed in this call; each is in ``failures.jsonl``."""
-
-
 def generate(
     items: Sequence[MeshItem],
     out: str | Path,
@@ -56,7 +44,7 @@ def generate(
     shard: tuple[int, int] = (0, 1),
     retry_failed: bool = False,
     progress: bool = True,
-) -> GenerateReport:
+) -> Report:
     """Scan every item into the data set at ``out``, going on where an earlier call stopped.
 
     The bytes of the shards depend on the items and the settings alone. A stop, however abrupt,
@@ -101,7 +89,7 @@ def generate(
                 run.add(row, outcome)
                 bar.set_postfix(failed=run.failed, refresh=False)
                 bar.update()
-    return GenerateReport(run.left - run.failed, run.total - run.left, run.failed)
+    return Report(run.left - run.failed, run.total - run.left, run.failed)
 
 
 class _Run:
@@ -125,8 +113,9 @@ class _Run:
     def _check_meshes(self, shards: Iterable[int]) -> None:
         """Refuse a mesh that is not the one that was scanned; one that failed may be mended."""
         plan = self.plan
-        items = {(item := plan.item_of(r)).id: item for s in shards for r in plan.rows_of(s)}
-        noted, now = read_mesh_sums(self.folder), mesh_sums(items.values())
+        items = (plan.item_of(row) for shard in shards for row in plan.rows_of(shard))
+        noted = read_mesh_sums(self.folder)
+        now = mesh_sums({item.id: item.path for item in items if item.path is not None})
         changed = {name for name, digest in now.items() if noted.get(name, digest) != digest}
         for row in (row for shard in self.finished for row in plan.rows_of(shard) if changed):
             if plan.item_of(row).id in changed and plan.row_id(row) not in self.failures:

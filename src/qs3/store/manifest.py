@@ -1,32 +1,22 @@
 """The files beside the shards: ``dataset.json`` and the checksums of the scanned meshes."""
 
-import concurrent.futures
 import contextlib
 import hashlib
 import platform
-import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from qs3.errors import InputError
-from qs3.files import (
-    claim_folder,
-    folder_lock,
-    read_json,
-    remove_left_overs,
-    sha256,
-    write_json,
-)
+from qs3.files import claim_folder, folder_lock, read_json, remove_left_overs, sha256, write_json
 from qs3.structure import first_difference, structure, unstructure
 
 MANIFEST = "dataset.json"
 MESHES = "meshes.json"
 SCHEMA_VERSION = 3
-_SHARD = re.compile(r"shard-(\d{5,})\.parquet", re.ASCII)
 _PACKAGES = (
     *("qs3", "mitsuba", "numpy", "opencv-python-headless"),
     *("pyarrow", "scipy", "torch", "trimesh"),
@@ -51,6 +41,18 @@ class Manifest:
     """Classes of the meshes that have another name here; not in the file if empty."""
     schema: int = SCHEMA_VERSION
     """Version of the columns."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """Counts of one call of ``generate`` (scans) or ``merge`` (shards)."""
+
+    done: int
+    """Written by this call."""
+    skipped: int
+    """Written before."""
+    failed: int
+    """Scans that failed: in this call of ``generate``, or in all merged parts."""
 
 
 def package_versions(*more: str) -> dict[str, str]:
@@ -110,15 +112,11 @@ def check_same(folder: Path, present: Manifest, wanted: Manifest) -> None:
         difference = first_difference(old[key], new[key], key)
         if difference is not None:
             name, was, now = difference
+            made = f"made with {name.removeprefix('settings.')} = {was}, not {now}"
             if name == "settings.work_list":  # a checksum says nothing to a reader
-                raise InputError(
-                    f"{folder}: made of another list of meshes (their names, classes, splits, axes "
-                    "or shape seeds differ); name another folder, or the same meshes"
-                )
-            raise InputError(
-                f"{folder}: made with {name.removeprefix('settings.')} = {was}, not {now}; "
-                "name another folder, or use the same settings"
-            )
+                names = "names, classes, splits, axes or shape seeds"
+                made = f"made of another list of meshes (their {names} differ)"
+            raise InputError(f"{folder}: {made}; name another folder, or use what it was made with")
     for package in sorted({*present.versions} & {*wanted.versions}):
         if present.versions[package] != wanted.versions[package]:
             warnings.warn(
@@ -158,34 +156,22 @@ def shard_name(index: int) -> str:
 
 def finished_shards(folder: str | Path, count: int) -> list[int]:
     """Return the indices of the existing shards, of ``count`` planned."""
-    matches = (_SHARD.fullmatch(path.name) for path in Path(folder).glob("shard-*.parquet"))
-    numbers = sorted(int(match[1]) for match in matches if match)
-    return [number for number in numbers if number < count]
+    present = {path.name for path in Path(folder).glob("shard-*.parquet")}
+    return [index for index in range(count) if shard_name(index) in present]
 
 
-def mesh_sums(items: Iterable[Any]) -> dict[str, str]:
-    """Return the SHA-256 of every mesh's file, by the mesh's id; shapes have none.
+def mesh_sums(paths: Mapping[str, Path]) -> dict[str, str]:
+    """Return the SHA-256 of files of meshes by name; of a text glTF with the buffers beside it.
 
-    A file that cannot be read has none either: its scan will fail with the reason.
+    A file that cannot be read has none: its scan will fail with the reason.
     """
-    items = list(items)
-    with concurrent.futures.ThreadPoolExecutor() as pool:
-        sums = zip(items, pool.map(_mesh_sum, items), strict=True)
-        return {item.id: digest for item, digest in sums if digest}
-
-
-def _mesh_sum(item: Any) -> str:
-    """Checksum of a mesh file; of a text glTF with the buffers beside it."""
-    path = getattr(item, "path", None)
-    if path is None:
-        return ""
-    try:
-        if path.suffix.lower() != ".gltf":
-            return sha256(path)
-        parts = [path, *sorted(path.parent.glob("*.bin"))]
-        return hashlib.sha256("".join(map(sha256, parts)).encode()).hexdigest()
-    except OSError:
-        return ""
+    sums = {}
+    for name, path in paths.items():
+        beside = sorted(path.parent.glob("*.bin")) if path.suffix.lower() == ".gltf" else []
+        with contextlib.suppress(OSError):
+            one, *more = [sha256(part) for part in (path, *beside)]
+            sums[name] = hashlib.sha256("".join([one, *more]).encode()).hexdigest() if more else one
+    return sums
 
 
 def read_mesh_sums(folder: Path) -> dict[str, str]:

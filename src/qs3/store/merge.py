@@ -2,7 +2,6 @@
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from qs3.errors import InputError
@@ -10,6 +9,7 @@ from qs3.files import atomic_path, write_json
 from qs3.store.failures import read_failures, write_failures
 from qs3.store.manifest import (
     MESHES,
+    Report,
     check_same,
     claimed,
     finished_shards,
@@ -21,19 +21,7 @@ from qs3.store.manifest import (
 from qs3.store.progress import progress_bar
 
 
-@dataclass(frozen=True)
-class MergeReport:
-    """Counts of one call of `merge`."""
-
-    copied: int
-    """Shards copied by this call."""
-    skipped: int
-    """Shards that were there before."""
-    failed: int
-    """Failed scans in the log of the whole."""
-
-
-def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True) -> MergeReport:
+def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True) -> Report:
     """Copy the shards of several parts into one data set, as if one machine had made it.
 
     Run it again after a stop: existing shards are skipped. The parts are not changed.
@@ -82,4 +70,4 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True
         for index in progress_bar(len(left), "merge" if progress else None, "shard", items=left):
             with atomic_path(target / shard_name(index)) as temporary:
                 shutil.copyfile(sources[index] / shard_name(index), temporary)
-    return MergeReport(len(left), len(present), len(failures))
+    return Report(len(left), len(present), len(failures))

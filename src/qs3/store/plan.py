@@ -30,12 +30,12 @@ class Plan:
 
     @property
     def rows(self) -> int:
-        """Scans in all."""
+        """Number of scans."""
         return len(self.items) * self.settings.scans_per_mesh
 
     @property
     def shards(self) -> int:
-        """Shards in all."""
+        """Number of shards."""
         return -(-self.rows // self.settings.rows_per_shard)
 
     def objects(self) -> dict[str, int]:
@@ -85,7 +85,7 @@ class Plan:
     def manifest(self) -> Manifest:
         """Return the contents of ``dataset.json``."""
         return Manifest(
-            settings={**self.settings.as_dict(), "work_list": work_list_checksum(self.items)},
+            settings={**self.settings.as_dict(), "work_list": _checksum(self.items)},
             class_names=self.settings.classes,
             renamed={i.own_class: i.class_name for i in self.items if i.own_class},
             rows=self.rows,
@@ -130,11 +130,10 @@ def resolve_renderer(settings: GenerateSettings) -> GenerateSettings:
     return dataclasses.replace(settings, sensor=sensor, renderer=settings.make_renderer())
 
 
-def work_list_checksum(items: Sequence[MeshItem]) -> str:
-    """SHA-256 over the names, classes, splits, axes, units and shape seeds of a work list."""
-    digest = hashlib.sha256()
-    for item in items:
-        line = [item.id, item.class_name, item.split, item.shape_seed, item.up]
+def _checksum(items: Sequence[MeshItem]) -> str:
+    """Return the SHA-256 of a list's names, classes, splits, axes, units and shape seeds."""
+    lines = [[i.id, i.class_name, i.split, i.shape_seed, i.up] for i in items]
+    for line, item in zip(lines, items, strict=True):
         line += filter(None, [item.unit])
-        digest.update(json.dumps(line).encode("utf-8") + b"\n")
-    return digest.hexdigest()
+    text = "".join(json.dumps(line) + "\n" for line in lines)
+    return hashlib.sha256(text.encode()).hexdigest()

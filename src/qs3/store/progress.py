@@ -1,4 +1,4 @@
-"""One kind of progress bar: rate and time left, on the standard error stream."""
+"""Progress bars on the standard error stream: rate and time left."""
 
 import sys
 from collections.abc import Iterable
@@ -9,15 +9,12 @@ from tqdm import tqdm
 from qs3.escapes import printable
 
 _MANY = 500
-_IN_A_LOG = 10.0  # seconds between two lines where nobody watches
+_IN_A_LOG = 10.0  # seconds between two lines of a log file
 
 
-def cloud_bar(
-    items: Iterable[Any] | None, text: str, count: int, shown: bool = True
-) -> "tqdm[Any]":
-    """Return a bar over clouds; there is none for few of them, nor where nobody watches."""
-    hidden = None if shown and count > _MANY else True
-    return tqdm(items, text, count, unit="cloud", disable=hidden)
+def cloud_bar(items: Iterable[Any] | None, text: str, count: int) -> "tqdm[Any]":
+    """Return a bar over clouds; hidden for 500 or fewer, and outside a terminal."""
+    return tqdm(items, text, count, unit="cloud", disable=None if count > _MANY else True)
 
 
 def progress_bar(
@@ -27,19 +24,7 @@ def progress_bar(
     initial: int = 0,
     items: Iterable[Any] | None = None,
 ) -> "tqdm[Any]":
-    """Return a bar; ``text`` None shows none. In a log file it writes every ten seconds at most.
-
-    It is moved by hand, or by going through it where it has ``items``; ``total`` None tells a count
-    alone.
-    """
-    if text is not None:  # it begins with a folder's name, which may move a terminal
-        text = printable(text, keep="")
-    return tqdm(
-        items,
-        total=total,
-        initial=initial,
-        desc=text,
-        disable=text is None,
-        unit=unit,
-        mininterval=0.1 if sys.stderr.isatty() else _IN_A_LOG,
-    )
+    """Return a bar, hidden if ``text`` is None; a ``total`` of None counts only."""
+    text = text and printable(text, keep="")  # a folder's name may move a terminal
+    every = 0.1 if sys.stderr.isatty() else _IN_A_LOG
+    return tqdm(items, text, total, unit=unit, initial=initial, mininterval=every, disable=not text)
