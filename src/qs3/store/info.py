@@ -12,7 +12,7 @@ from qs3.errors import InputError
 from qs3.store.failures import FAILURES, read_failures
 from qs3.store.manifest import Manifest, finished_shards, open_dataset, shard_name
 from qs3.store.progress import progress_bar
-from qs3.store.shards import STATISTICS, flat, load_shard
+from qs3.store.shards import STATISTICS, fault_of, flat, load_shard, table_of
 
 _VIEWS = {"points": "view", "clean": "clean_view", "surface": None}
 
@@ -32,24 +32,19 @@ def info(folder: str | Path) -> dict[str, Any]:
     folder = Path(folder)
     manifest = open_dataset(folder)
     shards = finished_shards(folder, manifest.shards)
-    counts: dict[str, Counter[str]] = {"class_name": Counter(), "split": Counter()}
-    objects: set[str] = set()
-    sizes = [np.zeros(0, np.int32)]
-    figures = {name: [np.zeros(0)] for name in STATISTICS}
+    columns = ["class_name", "split", "object", *STATISTICS]
+    tables, sizes = [table_of([]).select(columns)], []
     for index in shards:
-        table = load_shard(folder, index, [*counts, "object", "points", *STATISTICS])
-        for name, counter in counts.items():
-            counter.update(table[name].to_pylist())
-        objects.update(table["object"].to_pylist())
-        sizes.append(np.diff(flat(table["points"])[1]) // 3)
-        for name, values in figures.items():
-            values.append(table[name].drop_null().to_numpy())
-    points = np.concatenate(sizes)
-    statistics = {name: np.concatenate(values) for name, values in figures.items()}
+        table = load_shard(folder, index, [*columns, "points"])
+        sizes += (np.diff(flat(table["points"])[1]) // 3).tolist()
+        tables.append(table.drop_columns("points"))
+    table = pa.concat_tables(tables)
+    counts = {name: Counter(table[name].to_pylist()) for name in columns[:3]}
+    statistics = {name: table[name].drop_null().to_numpy() for name in STATISTICS}
     return {
-        "rows": len(points),
+        "rows": len(table),
         "rows_planned": manifest.rows,
-        "objects": len(objects),
+        "objects": len(counts["object"]),
         "failed": len(read_failures(folder)),
         "shards": len(shards),
         "shards_planned": manifest.shards,
@@ -57,7 +52,7 @@ def info(folder: str | Path) -> dict[str, Any]:
         "classes": dict.fromkeys(manifest.class_names, 0) | counts["class_name"],
         "renamed": dict(manifest.renamed),
         "splits": dict(sorted(counts["split"].items())),
-        "points": [int(points.min()), int(points.max())] if len(points) else [],
+        "points": [min(sizes), max(sizes)] if sizes else [],
         "statistics": {name: float(np.median(v)) for name, v in statistics.items() if len(v)},
         "settings": dict(manifest.settings),
         "versions": dict(manifest.versions),
@@ -123,7 +118,7 @@ def _faults(table: pa.Table, manifest: Manifest) -> Iterator[str]:
         views = np.diff(starts) // 3 if view is None else np.diff(flat(table[view])[1])
         for i, identifier in enumerate(ids):
             cloud = values[starts[i] : starts[i + 1]]
-            if not len(cloud) or len(cloud) % 3 or not np.isfinite(cloud).all():
-                yield f"{column} of {identifier} is empty, not made of triples, or not finite"
+            if fault := fault_of(cloud):
+                yield f"{column} of {identifier} is {fault}"
             elif views[i] not in (0, len(cloud) // 3):
                 yield f"{column} of {identifier} has {len(cloud) // 3} points and {views[i]} views"

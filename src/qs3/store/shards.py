@@ -95,8 +95,24 @@ class CloudRow:
 
 
 def put_shard(folder: Path, index: int, table: pa.Table) -> None:
-    """Write a table as shard ``index`` of a data set, whole or not at all."""
-    write_bytes(folder / shard_name(index), shard_bytes(table))
+    """Write a table as shard ``index`` of a data set, whole or not at all.
+
+    Its pages have checksums. Equal rows give equal bytes.
+    """
+    buffer = io.BytesIO()
+    pq.write_table(
+        table.combine_chunks(),
+        buffer,
+        row_group_size=max(len(table), 1),
+        compression="zstd",
+        compression_level=3,
+        use_dictionary=False,
+        write_statistics=False,
+        write_page_checksum=True,
+        version="2.6",
+        data_page_version="1.0",
+    )
+    write_bytes(folder / shard_name(index), buffer.getvalue())
 
 
 def table_of(rows: Sequence[CloudRow]) -> pa.Table:
@@ -112,24 +128,6 @@ def table_of(rows: Sequence[CloudRow]) -> pa.Table:
                 value = None
             values.append(value)
     return pa.Table.from_pydict(columns, schema=_SCHEMA)
-
-
-def shard_bytes(table: pa.Table) -> bytes:
-    """Return the Parquet file of a table, its pages with checksums; equal rows give equal bytes."""
-    buffer = io.BytesIO()
-    pq.write_table(
-        table.combine_chunks(),
-        buffer,
-        row_group_size=max(len(table), 1),
-        compression="zstd",
-        compression_level=3,
-        use_dictionary=False,
-        write_statistics=False,
-        write_page_checksum=True,
-        version="2.6",
-        data_page_version="1.0",
-    )
-    return buffer.getvalue()
 
 
 def load_shard(folder: str | Path, index: int, columns: Sequence[str] | None = None) -> pa.Table:
@@ -151,26 +149,26 @@ def load_shard(folder: str | Path, index: int, columns: Sequence[str] | None = N
 
 
 def flat(column: pa.ChunkedArray) -> tuple[np.ndarray, np.ndarray]:
-    """All values of a column of lists, and where each list begins."""
+    """Return all values of a column of lists, and the start of each list."""
     rows = column.combine_chunks()
     return rows.values.to_numpy(zero_copy_only=False), rows.offsets.to_numpy()
+
+
+def fault_of(cloud: Float32[np.ndarray, "_"]) -> str:
+    """Return the fault of a cloud's flat coordinates, or empty text."""
+    sound = len(cloud) and len(cloud) % 3 == 0 and np.isfinite(cloud).all()
+    return "" if sound else "empty, not made of triples, or not finite"
 
 
 def flat_clouds(table: pa.Table, column: str, path: Any) -> list[Float32[np.ndarray, "_ 3"]]:
     """Return the clouds of one column, a row each.
 
     Raises:
-        InputError: where a cloud is empty, not made of triples, or not finite; ``path`` is named.
+        InputError: if a cloud is empty, not made of triples, or not finite; ``path`` is named.
     """
     values, offsets = flat(table[column])
-    sizes = np.diff(offsets)
-    bad = (sizes == 0) | (sizes % 3 != 0)
-    if not bad.any() and not np.isfinite(values[offsets[0] : offsets[-1]]).all():
-        pairs = itertools.pairwise(offsets)
-        bad = np.array([not np.isfinite(values[begin:end]).all() for begin, end in pairs])
-    if bad.any():
-        name = table["id"][int(np.flatnonzero(bad)[0])].as_py()
-        raise InputError(
-            f"{path}: {column} of {name!r} is empty, not made of triples, or not finite"
-        )
-    return [values[begin:end].reshape(-1, 3) for begin, end in itertools.pairwise(offsets)]
+    clouds = [values[begin:end] for begin, end in itertools.pairwise(offsets)]
+    for name, cloud in zip(table["id"], clouds, strict=True):
+        if fault := fault_of(cloud):
+            raise InputError(f"{path}: {column} of {name.as_py()!r} is {fault}")
+    return [cloud.reshape(-1, 3) for cloud in clouds]

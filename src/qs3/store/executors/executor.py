@@ -47,14 +47,9 @@ class Executor(Protocol):
 
 
 def outcomes(executor: Executor, calls: Iterable[tuple[Any, ...]]) -> Iterator[tuple[Any, Any]]:
-    """Keep an executor busy; yield key and outcome of each call, as they end.
+    """Keep an entered executor busy; yield key and outcome of each call, as they end.
 
-    Args:
-        executor: Entered already.
-        calls: Key, function and arguments of each.
-
-    Raises:
-        InputError: if a call failed as every other must.
+    ``calls`` are key, function and arguments. Raises InputError if one failed as all must.
     """
     left, under_way = iter(calls), 0
     while True:
@@ -70,12 +65,7 @@ def outcomes(executor: Executor, calls: Iterable[tuple[Any, ...]]) -> Iterator[t
 
 
 def guarded(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function and return a `Failure` in place of an exception, which may not pickle.
-
-    Example:
-        >>> guarded(int, "x").kind
-        'ValueError'
-    """
+    """Call a function; return a `Failure` in place of an exception, which may not pickle."""
     try:
         return function(*arguments)
     except Exception as error:
@@ -84,20 +74,13 @@ def guarded(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def stop_if_fatal(outcome: Any) -> None:
-    """Raise a failure that every other call would share.
-
-    Raises:
-        InputError: with the reason.
-    """
+    """Raise InputError for a failure that every other call would share."""
     if isinstance(outcome, Failure) and outcome.fatal:
         raise InputError(outcome.reason)
 
 
 class InlineExecutor:
-    """Does each call in this process when its outcome is asked for: for debugging, and cheap calls.
-
-    A crash or a hang of one ends or hangs all.
-    """
+    """Does each call in this process, where a crash or a hang of one ends or hangs all."""
 
     ahead = 1
 
