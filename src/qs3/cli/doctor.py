@@ -11,6 +11,8 @@ from qs3.cli.text import show
 from qs3.errors import QS3Error, describe_import_error
 
 _NOT_TO_RUN = {"cycles", "dev", "docs"}  # Cycles has its own line; the others are for developers
+_MODULES = {"opencv-python-headless": "cv2", "pillow": "PIL", "pyyaml": "yaml"}
+_MODULES |= {"scikit-learn": "sklearn", "karellen-llvm-core": ""}  # LLVM has no module
 
 
 def doctor(json_output: bool = False) -> int:
@@ -24,51 +26,40 @@ def doctor(json_output: bool = False) -> int:
     from qs3.sensor.render.cycles import find_cycles
     from qs3.sensor.render.mitsuba import VARIANTS, usable
 
-    modules: dict[str, list[str]] = {}
-    for module, names in metadata.packages_distributions().items():
-        for name in names:
-            modules.setdefault(name.lower(), []).append(module)
     wanted = [Requirement(line) for line in metadata.requires("qs3") or ()]
-    core = [need for need in wanted if need.marker is None]
-    packages = {need.name: _state(need, modules) for need in core}
+    packages = {need.name: _state(need) for need in wanted if need.marker is None}
     renderers = {variant: "ok" if usable(variant) else "does not work" for variant in VARIANTS}
-    ready = all(map(_good, packages.values())) and "ok" in renderers.values()
+    ready = {state[:2] for state in packages.values()} == {"ok"} <= {*renderers.values()}
     try:
         renderers["cycles"] = "ok" if find_cycles() else "not installed; in a checkout: make cycles"
     except QS3Error as error:
         renderers["cycles"] = str(error)
     extras = {}
     for extra in sorted({*metadata.metadata("qs3").get_all("Provides-Extra", [])} - _NOT_TO_RUN):
-        needs = [n for n in wanted if n.marker and n.marker.evaluate({"extra": extra})]
-        extras[extra] = next(
-            filter(lambda s: not _good(s), (_state(n, modules) for n in needs)), "ok"
-        )
+        needs = [need for need in wanted if need.marker and need.marker.evaluate({"extra": extra})]
+        extras[extra] = next((state for state in map(_state, needs) if state[:2] != "ok"), "ok")
     parts = {"packages": packages, "renderers": renderers, "extras": extras}
     if json_output:
         show(json.dumps({"python": platform.python_version(), **parts, "ready": ready}, indent=2))
-        return 0 if ready else 1
-    show(f"Python {platform.python_version()}")
-    for title, part in parts.items():
-        show(f"{title}:", *(f"  {name}: {state}" for name, state in part.items()))
-    show("Ready." if ready else "Not ready: install what is missing above.")
+    else:
+        show(f"Python {platform.python_version()}")
+        for title, part in parts.items():
+            show(f"{title}:", *(f"  {name}: {state}" for name, state in part.items()))
+        show("Ready." if ready else "Not ready: install what is missing above.")
     return 0 if ready else 1
 
 
-def _good(state: str) -> bool:
-    return state.startswith("ok")
-
-
-def _state(need: Requirement, modules: dict[str, list[str]]) -> str:
+def _state(need: Requirement) -> str:
     """Import a package and return "ok" with its version, or what is wrong and the fix."""
+    fix = f"pip install '{need.name}{need.specifier}'"
     try:
         version = metadata.version(need.name)
         if not need.specifier.contains(version, prereleases=True):
-            return f"{need.name} {version} does not fit; pip install '{need.name}{need.specifier}'"
-        named = sorted(m for m in modules.get(need.name.lower(), ()) if not m.startswith("_"))
-        for module in [m for m in named if m == need.name.replace("-", "_")] or named[:1]:
+            return f"{need.name} {version} does not fit; {fix}"
+        if module := _MODULES.get(need.name, need.name.replace("-", "_")):
             importlib.import_module(module)
         return f"ok {version}"
     except (metadata.PackageNotFoundError, ModuleNotFoundError):
-        return f"{need.name} is not installed; pip install '{need.name}{need.specifier}'"
+        return f"{need.name} is not installed; {fix}"
     except ImportError as error:
         return f"{need.name} cannot be loaded: {describe_import_error(error)}"
