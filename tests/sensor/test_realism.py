@@ -11,8 +11,7 @@ from qs3.sensor.realism import RealismSettings, realism
 from qs3.sensor.realism.bench import distances
 from qs3.sensor.realism.edges import band_row, edge_rows, shadow_row
 from qs3.sensor.realism.faces import inside_faces, off_faces, scan_rows
-from qs3.sensor.realism.metrics import autocorrelation, off_plane, plane_noise
-from qs3.sensor.realism.rows import row
+from qs3.sensor.realism.metrics import autocorrelation, off_plane, plane_noise, row
 from qs3.sensor.realism.walls import bias_rows, noise_rows, phases
 from qs3.sensor.rig import StereoRig
 from qs3.sensor.view import ViewImages

@@ -9,7 +9,7 @@ from scipy.spatial.distance import cdist
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.outliers import inliers
 from qs3.sensor.presets import get_sensor
-from qs3.sensor.realism.clouds import ratio_rows
+from qs3.sensor.realism.faces import ratio_rows
 from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.scan import scan
 from qs3.sensor.settings import ScanSettings

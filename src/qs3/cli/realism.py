@@ -14,6 +14,18 @@ from qs3.sensor.realism.pair import InfraredPair
 from qs3.sensor.settings import CameraSettings
 
 _VERDICTS = {True: "pass", False: "MISS", None: ""}
+_PAIR_FIGURES = (
+    ("valid", "valid pixels right of the left band", "%"),
+    ("holes", "of these only the other has", "%"),
+    ("plane_rms_px", "RMS on planes [px]", ""),
+    ("autocorrelation", "its autocorrelation at 1, 4, 8 px along x", ""),
+    ("median_abs_px", "median |difference of disparity| [px]", ""),
+    ("difference_px", "median difference, ours − the camera's [px]", ""),
+    ("scale", "scale, ours / the camera's", ""),
+    ("over_1px", "more than 1 px off", "%"),
+    ("over_1px_near_steps", "the same near steps of 4 px", "%"),
+    ("over_3px", "more than 3 px off", "%"),
+)
 
 
 def realism(
@@ -71,7 +83,7 @@ def _pair(out: Path, pair: InfraredPair, camera: CameraSettings, files: PairFile
 
 
 def pair_table(record: Mapping[str, Any]) -> list[str]:
-    """Lines of the table: what, ours, the camera's."""
+    """Return the lines of the table: what, ours, the camera's."""
 
     def cell(value: Any, unit: str) -> str:
         if isinstance(value, list):
@@ -79,34 +91,15 @@ def pair_table(record: Mapping[str, Any]) -> list[str]:
         return "–" if value is None else f"{value:.2%}" if unit == "%" else f"{value:.3f}"
 
     rows = [("", "ours", "the camera")]
-    for name, what, unit in (
-        ("valid", "valid pixels right of the left band", "%"),
-        ("holes", "of these only the other has", "%"),
-        ("plane_rms_px", "RMS on planes [px]", ""),
-        ("autocorrelation", "its autocorrelation at 1, 4, 8 px along x", ""),
-    ):
-        rows.append((what, cell(record[name], unit), cell(record[f"camera_{name}"], unit)))
-    for name, what, unit in (
-        ("median_abs_px", "median |difference of disparity| [px]", ""),
-        ("difference_px", "median difference, ours − the camera's [px]", ""),
-        ("scale", "scale, ours / the camera's", ""),
-        ("over_1px", "more than 1 px off", "%"),
-        ("over_1px_near_steps", "the same near steps of 4 px", "%"),
-        ("over_3px", "more than 3 px off", "%"),
-    ):
-        rows.append((what, cell(record[name], unit), ""))
+    for name, what, unit in _PAIR_FIGURES:
+        camera = f"camera_{name}"
+        theirs = cell(record[camera], unit) if camera in record else ""
+        rows.append((what, cell(record[name], unit), theirs))
     return columns(rows)
 
 
 def table(results: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Lines of the table: test, what, measured, expected, verdict.
-
-    Example:
-        >>> row = {"what": "slope", "measured": 2.0, "expected": "≥ 1", "unit": "", "passed": True}
-        >>> lines = table([{"id": "T1", "title": "Noise", "passed": True, "rows": [row]}])
-        >>> lines[-1].split()
-        ['slope', '2', '≥', '1', 'pass']
-    """
+    """Return the lines of the table: test, what, measured, expected, verdict."""
     cells = [("test", "what", "measured", "expected", "")]
     for result in results:
         cells.append((result["id"], result["title"], "", "", _VERDICTS[result["passed"]]))

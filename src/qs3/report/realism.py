@@ -25,19 +25,9 @@ _OFF = 2.0  # pixels of disparity at which the difference has its full colour
 def test_camera(
     out: Path, sensor: Sensor, renderer: Renderer, settings: RealismSettings
 ) -> list[dict[str, Any]]:
-    """Test a camera and write the record.
+    """Return the results of `qs3.sensor.realism.realism`; write them and the settings to ``out``.
 
-    Args:
-        out: New or empty folder, or one of earlier tests, whose record is replaced.
-        sensor: The sensor.
-        renderer: Its renderer.
-        settings: Choice of the tests.
-
-    Returns:
-        The results of `qs3.sensor.realism.realism`.
-
-    Raises:
-        InputError: If the folder holds something else.
+    An earlier record is replaced. Raises InputError if the folder holds something else.
     """
     folder = claim_folder(out, RECORD)
     results = realism(sensor, renderer, settings)
@@ -55,19 +45,10 @@ def test_camera(
 def compare_pair(
     out: Path, pair: InfraredPair, sensor: Sensor, images: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Compare the sensor's matcher with a camera's own depth; write figures and picture.
+    """Compare the sensor's matcher with a camera's own depth; return and write the record.
 
-    Args:
-        out: New or empty folder, or one of an earlier comparison.
-        pair: The pair.
-        sensor: The sensor.
-        images: Names and checksums of the files, as `PairFiles.checksums` returns them.
-
-    Returns:
-        The record.
-
-    Raises:
-        InputError: If the folder holds something else, or as `compare` does.
+    ``images`` are names and checksums of the files, from `PairFiles.checksums`. A picture lies
+    beside the record. Raises InputError if the folder holds something else, or as `compare` does.
     """
     comparison = compare(pair, sensor.matching)
     record = comparison.figures | {

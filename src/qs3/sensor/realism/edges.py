@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from qs3.sensor.matching import MatchingSettings
 from qs3.sensor.realism.bench import Bench, distances, painted, plate, wall
-from qs3.sensor.realism.rows import Row, row
+from qs3.sensor.realism.metrics import Row, row
 from qs3.sensor.render import Body
 from qs3.sensor.rig import Region
 from qs3.sensor.view import ViewImages
@@ -59,9 +59,6 @@ def _shoot_edges(bench: Bench) -> tuple[ViewImages, float, float, tuple[int, int
     return view, near, far, (int(front[0]), int(front[-1]))
 
 
-# T4
-
-
 def bands(bench: Bench) -> list[Row]:
     """T4: the band at the left border of a wall and the shadow left of a plate.
 
@@ -91,25 +88,15 @@ def band_row(disparity: Float[np.ndarray, "h w"], expected: float, where: str = 
 def shadow_row(
     disparity: Float[np.ndarray, "h w"], first: int, near: float, far: float, off: float
 ) -> Row:
-    """Judge the shadow of a plate on the wall to its left.
+    """Judge the shadow on a wall (disparity ``far``) left of a plate (``near``, from ``first``).
 
-    The shadow reaches from the plate's edge to the nearest column in which at least half of the
-    rows have the wall's disparity; matches of the plate's fattened edge lie within it.
-
-    Args:
-        disparity: Of plate and wall.
-        first: The plate's first column.
-        near: The plate's disparity.
-        far: The wall's disparity.
-        off: By how many pixels its width may be off.
+    It reaches left to the nearest column in which at least half of the rows have the wall's
+    disparity; matches of the plate's fattened edge lie within it. Its width may be ``off`` px off.
     """
     behind = (np.abs(disparity[:, :first] - far) < NEAR).mean(axis=0) >= 0.5
     width = float(np.argmax(behind[::-1])) if behind.any() else np.nan
     least, most = max(0.0, near - far - off), near - far + off
     return row("shadow left of an edge", width, least, most, "px")
-
-
-# T5
 
 
 def edges(bench: Bench) -> list[Row]:
@@ -130,14 +117,9 @@ def edge_rows(
     reach: int,
     most: float,
 ) -> list[Row]:
-    """Judge how far a plate reaches beyond its true edges.
+    """Judge how far a plate of disparity ``near`` reaches beyond its first and last column.
 
-    Args:
-        disparity: Of plate and wall.
-        sides: The plate's first and last column.
-        near: The plate's disparity.
-        reach: Pixels to either side of an edge within which the plate's depth is looked for.
-        most: Pixels by which either edge may be off.
+    Its depth is looked for within ``reach`` px of either edge, which may be ``most`` px off.
     """
     wide = ((0, 0), (reach, reach))
     padded = np.pad(disparity.astype(np.float64), wide, constant_values=np.nan)

@@ -1,4 +1,4 @@
-"""How flat a wall is, by the definitions of librealsense's depth-quality tool.
+"""Figures of the laws and their bounds; how flat a wall is, as librealsense measures it.
 
 The plane is fitted to all points by least squares along z; the lowest and highest 0.5 % of z are
 left out before the errors are formed. Source: librealsense, tools/depth-quality.
@@ -6,6 +6,7 @@ left out before the errors are formed. Source: librealsense, tools/depth-quality
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -14,6 +15,49 @@ from qs3.sensor.depth import DepthSettings, backproject
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 _TRIM = 0.005
+
+Row = dict[str, Any]
+
+
+def row(
+    what: str,
+    measured: float | np.floating,
+    low: float | None = None,
+    high: float | None = None,
+    unit: str = "",
+    *,
+    strict: bool = False,
+) -> Row:
+    """Return one figure beside its bounds; without bounds it has no verdict.
+
+    A value that is not finite misses; if ``strict``, one at a bound does too.
+
+    Example:
+        >>> row("slope", 2.0, 1.85, 2.15)["expected"], row("fill", 0.98, 0.99)["passed"]
+        ('1.85 … 2.15', False)
+    """
+    value, passed, expected = plain(measured), None, ""
+    if low is not None or high is not None:
+        least, most = -math.inf if low is None else low, math.inf if high is None else high
+        inside = value is not None and least <= value <= most
+        passed = bool(inside and not (strict and value in (low, high)))
+        above, below = (">", "<") if strict else ("≥", "≤")
+        expected = f"{least:.4g} … {most:.4g}"
+        if low is None or high is None:
+            expected = f"{below} {most:.4g}" if low is None else f"{above} {least:.4g}"
+    return {"what": what, "measured": value, "expected": expected, "unit": unit, "passed": passed}
+
+
+def plain(value: Any) -> Any:
+    """Return numbers as floats, arrays and sequences as lists, and None for what is not finite.
+
+    Example:
+        >>> plain(np.float32(0.5)), plain([1, float("nan")])
+        (0.5, [1.0, None])
+    """
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [plain(part) for part in value]
+    return None if value is None or not math.isfinite(value) else float(value)
 
 
 def fit_plane(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], float]:

@@ -11,8 +11,7 @@ from jaxtyping import Bool, Float
 
 from qs3.errors import InputError
 from qs3.sensor.matching import Image, MatchingSettings, match
-from qs3.sensor.realism.metrics import autocorrelation, off_plane
-from qs3.sensor.realism.rows import plain
+from qs3.sensor.realism.metrics import autocorrelation, off_plane, plain
 from qs3.sensor.realism.walls import LAGS
 
 PATCH = (80, 60)
@@ -75,8 +74,7 @@ def compare(pair: InfraredPair, settings: MatchingSettings) -> Comparison:
     """Match a real pair and measure the result beside the camera's own depth.
 
     Raises:
-        InputError: If the images are too small for the search range, or the matcher does not take
-            them.
+        InputError: If the matcher refuses the images: too small for the search range, or of a kind.
     """
     camera = pair.disparity
     settings = search_range(pair, settings)
@@ -174,10 +172,6 @@ def plane_noise(
     """RMS in pixels about the planes of patches, and autocorrelation along x at `LAGS`; medians.
 
     Patches of which less than half lies within 1 px of a plane are left out; NaN if none is left.
-
-    Args:
-        disparity: Disparity in pixels, NaN where there is none.
-        patches: First column and row of each.
     """
     figures = []
     for x, y in patches:

@@ -7,11 +7,8 @@ from jaxtyping import Float
 
 from qs3.sensor.matching import MatchingSettings
 from qs3.sensor.realism.bench import Bench, distances, middle, shoot_wall
-from qs3.sensor.realism.metrics import autocorrelation, off_plane, plane_noise
-from qs3.sensor.realism.rows import Row, row
+from qs3.sensor.realism.metrics import Row, autocorrelation, off_plane, plane_noise, row
 from qs3.sensor.rig import StereoRig
-
-# T1
 
 LAGS = (1, 4, 8)
 """Pixels apart. A D415 on a table: 0.97, 0.82, 0.52 with 0.131 px RMS (0.10 to 0.18)."""
@@ -38,11 +35,10 @@ def noise(bench: Bench) -> list[Row]:
 def wall_noise(
     bench: Bench, distance: float, share: float, index: int = 0, high: float | None = None
 ) -> tuple[float, float]:
-    """Both figures of `plane_noise` of a facing wall, whatever disparity it happens to have.
+    """Return both figures of `plane_noise`, averaged over the phase of a wall's disparity.
 
-    Noise is the greatest half way between two whole disparities, and rounding to steps adds none
-    where a whole wall falls on one of them. So two walls are measured, half a pixel and half a
-    step apart, and their squares averaged.
+    Noise is greatest half way between two whole disparities, and rounding adds none if a whole wall
+    falls on a step. So two walls, half a pixel and half a step apart, are measured.
     """
     step = disparity_step(bench.sensor.matching)
     disparity, figures = float(bench.rig.disparity(distance)), []
@@ -68,9 +64,6 @@ def noise_rows(sweep: Sequence[float], figures: Float[np.ndarray, "n 2"]) -> lis
         row("least sub-pixel RMS", pixels.min(), 0.04, 0.12, "px"),
         row("greatest sub-pixel RMS", pixels.max(), 0.04, 0.12, "px"),
     ]
-
-
-# T2
 
 
 def bias(bench: Bench) -> list[Row]:
