@@ -33,7 +33,7 @@ def adapt(
     a stop.
 
     Args:
-        cad: Folder of meshes, one folder a class.
+        cad: Folder of meshes, one file or one folder a class.
         scans: Clouds of the camera, one part each, z up, in metres, as qs3 segment writes them.
         out: Folder to write: contact-sheet.png, source, run, answers.csv, report.html.
         camera: Preset of the camera (qs3 sensors), or your own TOML file.

@@ -131,7 +131,7 @@ def draw_pose(
     if pose == "any":
         from scipy.spatial.transform import Rotation
 
-        return Rotation.random(random_state=rng).as_matrix(), {}
+        return Rotation.from_quat(rng.normal(size=4)).as_matrix(), {}  # uniform
     poses = resting_poses(mesh)
     drawn = int(rng.choice(len(poses), p=[resting.probability for resting in poses]))
     return poses[drawn].rotation, {
