@@ -129,7 +129,8 @@ def _starts(cloud: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarr
     own[:, 0] *= np.linalg.det(own)
     its[:, 0] *= np.linalg.det(its)
     along = its @ Rotation.create_group("O").as_matrix() @ own.T
-    turns = np.concatenate([along, Rotation.random(_SPREAD, random_state=0).as_matrix()])
+    spread = Rotation.random(_SPREAD, random_state=0)  # pyright: ignore[reportCallIssue]
+    turns = np.concatenate([along, spread.as_matrix()])
     sight = turns @ own[:, 0]
     depth = np.ptp(points @ sight.T, axis=0)[:, None] / 4
     middle = points.mean(axis=0)

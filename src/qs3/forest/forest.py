@@ -88,16 +88,16 @@ def fit_forest(
     """
     from sklearn.ensemble import ExtraTreesClassifier
 
-    weights = np.ones(len(labels)) if weights is None else np.asarray(weights, dtype=np.float64)
-    totals = np.bincount(labels, weights=weights, minlength=len(class_names))
+    given = np.ones(len(labels)) if weights is None else np.asarray(weights, dtype=np.float64)
+    totals = np.bincount(labels, weights=given, minlength=len(class_names))
     if len(totals) < 2:
         raise InputError("a forest needs clouds of two classes at least")
     if not totals.all():
         raise InputError(f"class {class_names[int(np.argmin(totals))]} has no cloud to learn from")
-    weights = weights * (totals.sum() / len(totals) / totals)[labels]
+    balanced = given * (totals.sum() / len(totals) / totals)[labels]
     trees = ExtraTreesClassifier(TREES, min_samples_leaf=LEAF, random_state=seed, n_jobs=1)
-    trees.fit(descriptors.astype(np.float32), labels, sample_weight=weights)
-    coefficients, bias = _linear(descriptors, labels, weights, len(class_names))
+    trees.fit(descriptors.astype(np.float32), labels, sample_weight=balanced)
+    coefficients, bias = _linear(descriptors, labels, balanced, len(class_names))
     return Forest(tuple(class_names), up, **_arrays(trees), weights=coefficients, bias=bias)
 
 
